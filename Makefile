@@ -1,0 +1,80 @@
+# make demo   install into .venv and run SLAM on the built-in synthetic room
+# make test   install with the development tools, then lint, types, tests
+# make native compile the kernels beside their sources, for work with PYTHONPATH=src
+# make clean  remove .venv and everything built
+#
+# PYTHON=python3.12    another interpreter
+# PIP_ARGS="…"         extra pip options, for instance --extra-index-url https://download.pytorch.org/whl/cpu
+# PYTEST_ARGS="…"      extra pytest options, for instance -k trajectory -x
+
+PYTHON ?= python3
+PIP_ARGS ?=
+PYTEST_ARGS ?=
+VENV := .venv
+BIN := $(VENV)/bin
+PACKAGED := pyproject.toml CMakeLists.txt constraints.txt LICENSE README.md \
+            $(shell find src -type f -not -name '*.so' -not -path '*/__pycache__/*')
+INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet $(PIP_ARGS) -c constraints.txt
+
+refuse = { echo "make: $(1)" >&2; exit 1; }
+# Debian keeps ensurepip in python3-venv; with python3-pip alone, that pip fills the new environment.
+venv_without_ensurepip = { $(PYTHON) -m venv --clear --without-pip $(VENV) && \
+	$(PYTHON) -m pip --python $(BIN)/python install --quiet $(PIP_ARGS) pip; }
+
+.PHONY: demo test lint types pytest install install-dev native clean
+.DELETE_ON_ERROR:
+
+demo: install
+	$(BIN)/sigmasplat demo
+
+test: lint types pytest
+
+lint: install-dev
+	$(BIN)/ruff check .
+
+types: install-dev
+	$(BIN)/mypy --strict src
+
+# One after the other even under -j, so that the closing line of pytest is the last one.
+pytest: lint types
+	$(BIN)/pytest $(PYTEST_ARGS)
+
+install: $(VENV)/installed
+install-dev: $(VENV)/installed-dev
+
+$(VENV)/installed: $(VENV)/build-tools $(PACKAGED)
+	@echo "installing sigmasplat into $(VENV) (the first time a few minutes)"
+	$(INSTALL) --no-build-isolation .
+	@touch $@
+
+# The development install is a full install too: it spares `make demo` its own.
+$(VENV)/installed-dev: $(VENV)/build-tools $(PACKAGED)
+	@echo "installing sigmasplat[dev] into $(VENV) (the first time a few minutes)"
+	$(INSTALL) --no-build-isolation '.[dev]'
+	@touch $@ $(VENV)/installed
+
+$(VENV)/created:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || $(call refuse,sigmasplat needs Python 3.11 or newer; \
+		$(PYTHON) is $$($(PYTHON) --version 2>&1 | head -n 1): try make PYTHON=python3.12)
+	@$(PYTHON) -c 'import os, sys, sysconfig; sys.exit(not os.path.exists(sysconfig.get_path("include") + "/Python.h"))' \
+		|| $(call refuse,Python.h is missing: sudo apt install python3-dev)
+	@command -v $(CXX) >/dev/null || $(call refuse,no C++ compiler: sudo apt install g++)
+	@$(PYTHON) -m venv $(VENV) >/dev/null 2>&1 || $(venv_without_ensurepip) \
+		|| $(call refuse,cannot make $(VENV): sudo apt install python3-venv)
+	@touch $@
+
+# In the environment itself, not in pip's throw-away one: then a later install compiles only what changed.
+$(VENV)/build-tools: $(VENV)/created
+	@echo "installing the build tools into $(VENV)"
+	$(INSTALL) scikit-build-core nanobind cmake ninja
+	@touch $@
+
+native: $(VENV)/build-tools
+	$(BIN)/cmake -S . -B build/inplace -G Ninja -DSIGMASPLAT_INPLACE=ON \
+		-DPython_EXECUTABLE=$(abspath $(BIN)/python) -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN)/ninja)
+	$(BIN)/cmake --build build/inplace
+
+clean:
+	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	find src -name '*.so' -delete
+	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,58 @@
+"""RGB-D SLAM on 3D Gaussians that knows how sure it is.
+
+from sigmasplat import Slam, open_source, preset
+
+slam = Slam(preset("varsplat-fast"))
+for frame in open_source("path/to/sequence"):
+    step = slam.step(frame)
+"""
+
+from importlib import import_module, metadata
+from typing import TYPE_CHECKING, Any
+
+from sigmasplat import env as env  # before torch: it sets how OpenMP's threads wait
+
+if TYPE_CHECKING:
+    from sigmasplat.config import Config as Config
+    from sigmasplat.errors import SigmaSplatError as SigmaSplatError
+    from sigmasplat.model.camera import Camera as Camera
+    from sigmasplat.model.field import GaussianField as GaussianField
+    from sigmasplat.model.frame import Frame as Frame
+    from sigmasplat.presets import preset as preset
+    from sigmasplat.slam.slam import Slam as Slam
+    from sigmasplat.sources import open_source as open_source
+
+# Looked up at first use, so that `import sigmasplat` and `sigmasplat --help` do not load torch. The function `render`
+# is not among them: `sigmasplat.render` is the folder it lives in (`from sigmasplat.render import render`).
+_HOMES = {
+    "Camera": "sigmasplat.model.camera",
+    "Config": "sigmasplat.config",
+    "Frame": "sigmasplat.model.frame",
+    "GaussianField": "sigmasplat.model.field",
+    "SigmaSplatError": "sigmasplat.errors",
+    "Slam": "sigmasplat.slam.slam",
+    "open_source": "sigmasplat.sources",
+    "preset": "sigmasplat.presets",
+}
+__all__ = [*sorted(_HOMES), "__version__"]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return _version()
+    if name not in _HOMES:
+        raise AttributeError(f"module 'sigmasplat' has no attribute {name!r}")
+    value = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def _version() -> str:
+    try:
+        return metadata.version("sigmasplat")
+    except metadata.PackageNotFoundError:  # a bare checkout on PYTHONPATH
+        return "unknown"

@@ -1,0 +1,240 @@
+"""Offer the command line: sigmasplat demo | run | eval | export | doctor. Torch is loaded by commands that need it."""
+
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from sigmasplat import env
+from sigmasplat.config import Config
+from sigmasplat.errors import ConfigError, RunError, SigmaSplatError
+from sigmasplat.options import (
+    DemoFolder,
+    Evaluate,
+    Format,
+    Frames,
+    Limit,
+    MovedSource,
+    OutFile,
+    OutFolder,
+    Overwrite,
+    PresetName,
+    RunPath,
+    Seed,
+    Settings,
+    SourcePath,
+    Strict,
+    Stride,
+)
+from sigmasplat.presets import default_preset, override, preset as preset_of, split_settings
+
+if TYPE_CHECKING:
+    from sigmasplat.io.runs import RunFolder
+    from sigmasplat.screen import Screen
+    from sigmasplat.sources.base import Source
+
+OK, UNHEALTHY, REFUSED, INTERRUPTED = 0, 1, 2, 130
+DEFAULT_PRESET = default_preset()
+DEMO_FOLDER, DEMO_FRAMES = Path("runs/demo"), 120
+DESCRIPTION = """RGB-D SLAM on 3D Gaussians that knows how sure it is.
+
+Start with: sigmasplat demo, then: sigmasplat run PATH"""
+
+
+def demo(
+    frames: Frames = DEMO_FRAMES,
+    preset: PresetName = DEFAULT_PRESET,
+    settings: Settings = (),
+    out: DemoFolder = DEMO_FOLDER,
+    seed: Seed = None,
+) -> int:
+    """Run SLAM on a room made in code, against exact truth; replaces the last demo.
+
+    example: sigmasplat demo --frames 40
+    """
+    if frames < 1:
+        raise ConfigError(f"--frames must be at least 1, found {frames}")
+    whole_walk = max(frames, DEMO_FRAMES)  # fewer frames are a part of the walk: a hurried one loses the tracker
+    return run(f"synthetic:frames={whole_walk}", preset, settings, out, overwrite=True, limit=frames, seed=seed)
+
+
+def run(
+    path: SourcePath,
+    preset: PresetName = DEFAULT_PRESET,
+    settings: Settings = (),
+    out: OutFolder = None,
+    overwrite: Overwrite = False,
+    limit: Limit = None,
+    stride: Stride = 1,
+    strict: Strict = False,
+    seed: Seed = None,
+    evaluate: Evaluate = True,
+) -> int:
+    """Run SLAM on a sequence: trajectory, map, uncertainty, report.
+
+    example: sigmasplat run data/kitchen --limit 200 --set input.width=480
+    """
+    from sigmasplat.screen import Screen
+    from sigmasplat.session import new_folder
+    from sigmasplat.sources import open_source
+    from sigmasplat.sources.depth_check import depth_warning
+
+    screen, config = Screen(), configured(preset, settings, seed)
+    source = open_source(path, strict=strict, stride=stride, limit=limit)
+    warning = depth_warning(source)
+    if warning:
+        screen.warn(warning)
+    folder = new_folder(out, config, source, overwrite, source_path=_absolute(path), stride=stride, limit=limit)
+    screen.say(f"{source.name}: {len(source)} frames, {config.name} → {folder.path}")
+    return _record(screen, config, source, folder, evaluate)
+
+
+def evaluate_run(run: RunPath, moved_to: MovedSource = None) -> int:
+    """Score an earlier run again; replaces its metrics, pictures and report.
+
+    example: sigmasplat eval runs/kitchen
+    """
+    from sigmasplat.io.runs import RunFolder
+    from sigmasplat.screen import Screen
+    from sigmasplat.sources import open_source
+
+    folder = RunFolder.open(run)
+    facts = folder.facts()
+    path = moved_to or facts.get("source_path")
+    if not path:
+        raise RunError(f"run {run} does not say where its sequence was; give --source PATH")
+    _prepare_torch()
+    _evaluate(Screen(), folder, open_source(path, stride=facts.get("stride") or 1, limit=facts.get("limit")))
+    return OK
+
+
+def export(run: RunPath, out: OutFile = None, format: Format = None, overwrite: Overwrite = False) -> int:
+    """Write a run's map as 3DGS PLY for SuperSplat and other viewers, or its path as TUM text.
+
+    example: sigmasplat export runs/kitchen --out kitchen.ply
+    """
+    from sigmasplat.io import ply, trajectory
+    from sigmasplat.io.runs import RunFolder
+
+    folder = RunFolder.open(run)
+    chosen = format or ("trajectory" if out and out.suffix == ".txt" else "ply")
+    target = out or Path(folder.path.resolve().name + {"ply": ".ply", "trajectory": ".txt"}[chosen])
+    if target.exists() and not overwrite:
+        raise RunError(f"{target} exists; give another --out, or --overwrite to replace it")
+    if chosen == "ply":
+        ply.write_field(target, folder.read_map())
+    else:
+        trajectory.write_trajectory(target, folder.read_trajectory())
+    print(target)
+    return OK
+
+
+def doctor() -> int:
+    """Examine the installation: versions, processor, kernels, self-test.
+
+    exit code 1 if something is wrong; example: sigmasplat doctor
+    """
+    from sigmasplat.doctor import Finding, examine, verdict
+
+    findings: list[Finding] = []
+    for finding in examine():
+        findings.append(finding)
+        mark = {True: "ok  ", False: "FAIL", None: "    "}[finding.ok]
+        print(f"{mark} {finding.name:<16}{finding.value}", flush=True)
+    healthy, sentence = verdict(findings)
+    print(sentence)
+    return OK if healthy else UNHEALTHY
+
+
+def configured(preset: str, settings: Sequence[str], seed: int | None) -> Config:
+    """Return a preset's settings with those of --set and --seed in place. Raises ConfigError."""
+    config = override(preset_of(preset), split_settings(settings))
+    return config if seed is None else override(config, {"seed": str(seed)})
+
+
+def _record(screen: "Screen", config: Config, source: "Source", folder: "RunFolder", evaluate: bool) -> int:
+    """Run SLAM into the folder, then score it; return the exit code."""
+    from sigmasplat.session import record
+    from sigmasplat.slam.slam import Slam
+
+    _prepare_torch()
+    with screen.steps(len(source)) as watch:
+        outcome = record(Slam(config), source, folder, watch)
+    if source.skipped:
+        screen.warn(f"{len(source.skipped)} unreadable images passed over (first: {source.skipped[0]})")
+    counts = f"{outcome.frames} frames, {outcome.lost} lost, {outcome.frames / outcome.wall_s:.1f} frames/s"
+    if outcome.status == "interrupted":
+        screen.say(f"interrupted after {counts}; trajectory, map and checkpoint so far are in {folder.path}")
+        return INTERRUPTED
+    if evaluate:
+        _evaluate(screen, folder, source)
+    else:
+        screen.say(f"{counts}: {folder.path}")
+    return OK
+
+
+def _evaluate(screen: "Screen", folder: "RunFolder", source: "Source") -> None:
+    """Score the run, print the table, and where the report is: it exists even where the truth does not fit."""
+    from sigmasplat.evaluate import evaluate
+
+    try:
+        with screen.counting("evaluation") as progress:
+            metrics = evaluate(folder, source, progress=progress)
+        screen.results(metrics)
+    except Exception as problem:
+        problem.add_note(f"the run is in {folder.path}")
+        raise
+    finally:
+        report = folder.path / "report.html"
+        if report.exists():
+            screen.say(f"report: {report.resolve()}")
+
+
+def _prepare_torch() -> None:
+    """Give torch as many threads as the kernels are given."""
+    import torch
+
+    if env.switches().threads:
+        torch.set_num_threads(env.switches().threads)
+
+
+def _absolute(path: str) -> str:
+    return str(Path(path).resolve()) if Path(path).exists() else path
+
+
+COMMANDS: dict[str, Callable[..., int]] = {
+    "demo": demo,
+    "run": run,
+    "eval": evaluate_run,
+    "export": export,
+    "doctor": doctor,
+}
+
+
+def _obey(arguments: Sequence[str]) -> int:
+    """Run the command that the arguments name; return the exit code."""
+    code: int = tyro.extras.subcommand_cli_from_dict(
+        COMMANDS, prog="sigmasplat", description=DESCRIPTION, args=arguments, config=(tyro.conf.FlagCreatePairsOff,)
+    )
+    return code
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command and exit: 0 done, 1 unhealthy (doctor), 2 refused (one line says why), 130 interrupted."""
+    given = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    try:
+        env.switches()
+        code = _obey(given)
+    except SigmaSplatError as problem:
+        print(f"sigmasplat: {problem}", file=sys.stderr)
+        code = REFUSED
+    except KeyboardInterrupt:
+        print("sigmasplat: interrupted", file=sys.stderr)
+        code = INTERRUPTED
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,179 @@
+"""Hold every setting of a run: frozen dataclasses with units in the names; values of systems live in `presets`."""
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from sigmasplat.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class InputConfig:
+    """What is taken from the source."""
+
+    width: int = 0
+    """Working image width in pixels, height in proportion; 0 keeps the source's size."""
+    min_depth_m: float = 0.1
+    max_depth_m: float = 8.0
+    """Readings beyond are treated as no reading."""
+
+
+@dataclass(frozen=True)
+class RenderConfig:
+    """How splats become pixels; the thresholds are 3DGS's."""
+
+    alpha_min: float = 1.0 / 255.0
+    """A splat adds nothing to a pixel where its alpha is below this."""
+    transmittance_stop: float = 1e-4
+    """A splat contributes to a pixel if at least this share of light still passes in front of it."""
+    near_m: float = 0.05
+    low_pass_px2: float = 0.3
+    """Added to the 2D covariance's diagonal, px²."""
+    covariance_pose_gradient: bool = True
+    """Whether the pose gradient includes the path through the 2D covariance."""
+    mean_pose_gradient: bool = True
+    depth_pose_gradient: bool = True
+
+
+@dataclass(frozen=True)
+class SeedConfig:
+    """Where new splats come from (VarSplat §2, seeding)."""
+
+    first_uniform: int = 100_000
+    first_gradient: int = 50_000
+    first_edges: bool = True
+    later_max: int = 30_000
+    """At most this many new splats per keyframe; 0 = no limit."""
+    alpha_below: float = 0.6
+    depth_error_factor: float = 40.0
+    """Seed where the rendered surface lies behind the measured one by this multiple of the median depth error."""
+    depth_error_least_m: float = 0.0
+    """… and by at least this much."""
+    min_distance_m: float = 0.01
+    """No seed nearer than this to an existing splat in view."""
+    opacity: float = 0.5
+    scale_from: Literal["neighbours", "pixel"] = "neighbours"
+    """neighbours: root mean squared distance to the 3 nearest (the papers'); pixel: a pixel's size at that depth × seed spacing."""
+    scale_factor: float = 1.0
+    spacing_max_px: float = 2.0
+    """With "pixel": sparse seeds are spaced at most this many pixels apart."""
+    outlier_neighbours: int = 0
+    """Statistical outlier removal over this many neighbours; 0 = off."""
+    max_splats: int = 0
+    """Budget of the whole map; 0 = no limit."""
+
+
+@dataclass(frozen=True)
+class MappingConfig:
+    """fit_field: iterations, weights, learning rates (VarSplat §2)."""
+
+    every: int = 1
+    """A keyframe is mapped every so many frames."""
+    iterations: int = 100
+    first_iterations: int = 100
+    newest_probability: float = 0.4
+    weight_l1: float = 0.8
+    weight_ssim: float = 0.2
+    weight_depth: float = 1.0
+    weight_isotropy: float = 1.0
+    weight_nll_color: float = 1e-4
+    weight_nll_depth: float = 0.0
+    weight_moment: float = 0.0
+    """Weight of the depth-variance map U about the sensor depth (CG-SLAM's L_var)."""
+    lr_means: float = 1e-4
+    lr_quats: float = 1e-3
+    lr_log_scales: float = 5e-3
+    lr_opacity_logits: float = 0.05
+    lr_colors: float = 2.5e-3
+    lr_log_variances: float = 2.5e-3
+    freeze_old_colors: bool = False
+    prune_opacity: float = 0.5
+    keyframe_history: int = 0
+    """Older keyframes drawn from the latest so many; 0 = all."""
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """fit_pose: method, iterations, masks, weights (VarSplat §3)."""
+
+    method: Literal["adam", "align"] = "adam"
+    """adam: gradient descent through the renderer, as in the papers; align: one render, then Gauss–Newton on it."""
+    iterations: int = 200
+    align_iterations: int = 8
+    """Gauss–Newton steps at most, per pyramid level."""
+    align_weight_color: float = 0.5
+    """Share of the gray residual against depth when aligning."""
+    lr_rotation: float = 2e-3
+    lr_translation: float = 1e-2
+    weight_color: float = 0.6
+    """λ_c; depth has 1 − λ_c."""
+    uncertainty: bool = True
+    """Weight pixels by exp(−(log V − median)/τ); off = LoopSplat."""
+    tau: float = 50.0
+    weight_max: float = 3.0
+    alpha_power: float = 3.0
+    alpha_above: float = 0.0
+    """Only pixels whose rendered alpha exceeds this; 0 = off."""
+    outlier_factor: float = 50.0
+    """Only pixels whose depth error is below this multiple of its median; 0 = off."""
+    motion_model: bool = True
+    reinit_factor: float = 5.0
+    """When the first loss exceeds this multiple of its running median: RGB-D odometry start and twice the iterations."""
+    exposure: bool = False
+    lr_exposure: float = 0.01
+    lost_share: float = 0.2
+    """Lost when the map agrees with less than this share of what the sensor sees (agreement × overlap)."""
+    update_stop: float = 0.0
+    """Stop when a step is below this (metres and radians); 0 = run every iteration."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """A whole run. Every value has a working default; `presets.preset` fills in those of the published systems."""
+
+    name: str = "custom"
+    seed: int = 0
+    backend: Literal["auto", "cpu", "reference"] = "auto"
+    input: InputConfig = field(default_factory=InputConfig)
+    render: RenderConfig = field(default_factory=RenderConfig)
+    seeding: SeedConfig = field(default_factory=SeedConfig)
+    mapping: MappingConfig = field(default_factory=MappingConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain nested values, as written to a run's config.json."""
+        return dataclasses.asdict(self)
+
+    def save(self, path: Path) -> None:
+        """Write as JSON."""
+        path.write_text(json.dumps(self.to_dict(), indent=2) + "\n")
+
+    @staticmethod
+    def from_dict(values: dict[str, Any]) -> "Config":
+        """Rebuild from nested values. Raises ConfigError on an unknown name."""
+        sections: dict[str, Any] = {}
+        known = {f.name: f for f in dataclasses.fields(Config)}
+        for name, value in values.items():
+            if name not in known:
+                raise ConfigError(f"unknown setting {name!r} (known: {', '.join(known)})")
+            if isinstance(value, dict):
+                section = type(getattr(Config(), name))
+                names = {f.name for f in dataclasses.fields(section)}
+                unknown = set(value) - names
+                if unknown:
+                    raise ConfigError(
+                        f"unknown setting {name}.{sorted(unknown)[0]} (known: {', '.join(sorted(names))})"
+                    )
+                value = section(**value)
+            sections[name] = value
+        return Config(**sections)
+
+    @staticmethod
+    def load(path: Path) -> "Config":
+        """Read a config.json. Raises ConfigError if it is missing, not JSON, or names unknown settings."""
+        try:
+            return Config.from_dict(json.loads(path.read_text()))
+        except (OSError, json.JSONDecodeError) as problem:
+            raise ConfigError(f"cannot read settings from {path}: {problem}") from problem

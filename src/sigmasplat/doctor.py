@@ -1,0 +1,97 @@
+"""Examine the installation: versions, processor, kernels, and a small picture rendered twice."""
+
+import os
+import platform
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import import_module, metadata
+from typing import Any
+
+from sigmasplat import env
+from sigmasplat.io import machine
+
+MAX_DIFFERENCE = 1e-2
+"""Where rounding puts one splat on the other side of alpha_min, a pixel changes by up to 1/255."""
+MEAN_DIFFERENCE = 1e-4
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the examination; `ok` is None for a plain fact."""
+
+    name: str
+    value: str
+    ok: bool | None = None
+
+
+def examine() -> Iterator[Finding]:
+    """Yield what there is to know, the tests last."""
+    versions = ", ".join(f"{name} {_version(name)}" for name in ("torch", "numpy", "scipy"))
+    switches = env.switches()
+    yield Finding("sigmasplat", f"{machine.package_version()} on Python {platform.python_version()}")
+    yield Finding("libraries", versions)
+    yield Finding("processor", f"{machine.cpu_model()}, {machine.usable_cores()} cores usable")
+    yield Finding("switches", f"threads={switches.threads or 'all'} isa={switches.isa} backend={switches.backend}")
+    yield Finding("OMP_WAIT_POLICY", os.environ.get("OMP_WAIT_POLICY", "unset"))
+    native = kernels()
+    yield native
+    if native.ok:
+        yield self_test()
+
+
+def verdict(findings: list[Finding]) -> tuple[bool, str]:
+    """Return whether all tests passed, and a sentence saying so."""
+    failed = [finding.name for finding in findings if finding.ok is False]
+    if failed:
+        return False, f"not healthy: {', '.join(failed)} failed; reinstall with `make demo`, or report this output"
+    return True, "healthy: the kernels draw what their definition says"
+
+
+def kernels() -> Finding:
+    """Load the compiled kernels and say which instruction set is used, of those this processor runs."""
+    try:
+        core: Any = import_module("sigmasplat.render.cpu") and import_module("sigmasplat.native._core")
+    except ImportError as problem:
+        return Finding("kernels", f"not built ({problem}); install with pip install .", False)
+    offered = ", ".join(core.supported_isas())
+    return Finding("kernels", f"{core.isa_name()} (this processor runs {offered}), {core.threads()} threads", True)
+
+
+def self_test() -> Finding:
+    """Render a few hundred splats with the kernels and with their definition, and compare."""
+    import torch
+
+    from sigmasplat.render import cpu, reference
+
+    started_s = time.perf_counter()
+    with torch.no_grad():
+        ours, definition = _picture(cpu), _picture(reference)
+    difference = (ours - definition).abs()
+    largest, mean = float(difference.max()), float(difference.mean())
+    ok = bool(torch.isfinite(ours).all()) and largest < MAX_DIFFERENCE and mean < MEAN_DIFFERENCE
+    seconds = time.perf_counter() - started_s
+    return Finding("self-test", f"largest difference {largest:.1e}, mean {mean:.1e} ({seconds:.2f} s)", ok)
+
+
+def _picture(backend: Any) -> Any:
+    """Render a fixed cloud of splats: colour and alpha, [H, W, 4]."""
+    import torch
+
+    from sigmasplat.config import RenderConfig
+    from sigmasplat.model.camera import Camera
+
+    random = torch.Generator().manual_seed(0)
+    means, shapes, quats, colors = (torch.rand(300, n, generator=random) for n in (3, 3, 4, 3))
+    camera, options = Camera(64, 48, 60.0, 60.0, 31.5, 23.5), RenderConfig()
+    means = (means - 0.5) * torch.tensor([3.0, 2.0, 2.0]) + torch.tensor([0.0, 0.0, 2.0])
+    seen = backend.project(means, quats - 0.5, 0.01 + 0.1 * shapes, torch.eye(4), camera, options)
+    blended = backend.blend(*seen[:4], 0.2 + 0.7 * colors[:, 0], colors, None, camera, options)
+    return torch.cat([blended.sums, blended.alpha[..., None]], -1)
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return "missing"

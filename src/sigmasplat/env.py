@@ -1,0 +1,61 @@
+"""Read the environment switches, once; imported before anything that loads OpenMP.
+
+| variable | values | meaning |
+|---|---|---|
+| SIGMASPLAT_THREADS | whole number ≥ 0 | threads of the kernels and of torch; 0 or unset = all cores |
+| SIGMASPLAT_ISA | auto, avx512, avx2, baseline | instruction set of the CPU kernels; auto = the widest there is |
+| SIGMASPLAT_BACKEND | auto, cpu, reference | renderer where the settings say auto |
+"""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal, cast, get_args
+
+from sigmasplat.errors import ConfigError
+
+Isa = Literal["auto", "avx512", "avx2", "baseline"]
+Backend = Literal["auto", "cpu", "reference"]
+
+# libgomp reads this when it is loaded: idle threads then sleep instead of spinning, on a busy machine 5× faster.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+
+@dataclass(frozen=True)
+class Switches:
+    """What the environment asks for."""
+
+    threads: int = 0
+    """0 = all cores."""
+    isa: Isa = "auto"
+    backend: Backend = "auto"
+
+
+@cache
+def switches() -> Switches:
+    """Return the switches of this process, read at the first call. Raises ConfigError on a value that means nothing."""
+    return read(os.environ)
+
+
+def read(environment: Mapping[str, str]) -> Switches:
+    """Read the switches from a mapping such as `os.environ`; unset and empty mean the default. Raises ConfigError."""
+    return Switches(
+        threads=_whole_number(environment, "SIGMASPLAT_THREADS"),
+        isa=cast(Isa, _choice(environment, "SIGMASPLAT_ISA", get_args(Isa))),
+        backend=cast(Backend, _choice(environment, "SIGMASPLAT_BACKEND", get_args(Backend))),
+    )
+
+
+def _whole_number(environment: Mapping[str, str], name: str) -> int:
+    text = environment.get(name, "").strip() or "0"
+    if not (text.isascii() and text.isdigit()):
+        raise ConfigError(f"{name} is {text!r}; give a whole number of threads, 0 for all cores")
+    return int(text)
+
+
+def _choice(environment: Mapping[str, str], name: str, allowed: tuple[str, ...]) -> str:
+    text = environment.get(name, "").strip().lower() or "auto"
+    if text not in allowed:
+        raise ConfigError(f"{name} is {text!r}; give one of {', '.join(allowed)}")
+    return text

@@ -1,0 +1,33 @@
+"""Turn rendered variance and depth error into weights and masks for tracking. Nothing here carries a gradient."""
+
+import torch
+from torch import Tensor
+
+
+@torch.no_grad()
+def uncertainty_weights(variance: Tensor, mask: Tensor, tau: float, weight_max: float, eps: float = 1e-6) -> Tensor:
+    """Weigh pixels by how sure the map is of their colour (VarSplat §3, w̃), [H, W, 3], stop-gradient.
+
+    w̃ = clamp(exp(−(log(V+ε) − median)/τ), 1/weight_max, weight_max) per channel, with V [H, W, 3] ≥ 0 up to rounding
+    and the median of log(V+ε) over mask [H, W] (of an even count the lower middle one). Every pixel gets a weight, the
+    mask chooses whose median; an empty mask gives weight 1 everywhere.
+    """
+    if not mask.any():
+        return torch.ones_like(variance)
+    log_variance = (variance.clamp(min=0.0) + eps).log()
+    median = log_variance[mask].median(0).values
+    return torch.exp((median - log_variance) / tau).clamp(1.0 / weight_max, weight_max)
+
+
+@torch.no_grad()
+def outlier_mask(depth_error_m: Tensor, valid: Tensor, factor: float) -> Tensor:
+    """Tell which valid pixels agree in depth: |error| ≤ factor × its median over them, bool [H, W] (VarSplat §3).
+
+    depth_error_m [H, W] metres, any sign; factor 0 = off. The bound itself passes, so that a perfect render (median 0)
+    keeps its perfect pixels; NaN never passes.
+    """
+    if factor <= 0.0 or not valid.any():
+        return valid.clone()
+    error = depth_error_m.abs()
+    known = error[valid].nan_to_num(nan=torch.inf)
+    return valid & (error <= factor * known.median())

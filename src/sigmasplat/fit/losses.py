@@ -1,0 +1,129 @@
+"""Write each loss term once: a function of the maps it names.
+
+A term is a function registered by `@term`; its name is what a weight is given to, its parameters are the maps it takes.
+`total` hands each term its maps by those names, so a new term is one function (and a weight).
+
+Maps: color, color_target [H, W, 3] in [0, 1]; depth, depth_target [H, W] m; variance [H, W, 3] (V, VarSplat §1);
+moment [H, W] m² (U, CG-SLAM eq. 10); valid [H, W] bool, pixels with a depth reading; scales [N, 3] m.
+Every image term is a mean over valid pixels (and channels), SSIM over all pixels of the masked images; without valid
+pixels it is 0 with zero gradient, never NaN.
+"""
+
+import inspect
+from collections.abc import Callable, Mapping
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+from sigmasplat.errors import ConfigError
+
+TERMS: dict[str, Callable[..., Tensor]] = {}
+NLL_EPS = 1e-6
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+
+
+def term(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """Register a loss term under its function's name."""
+    TERMS[function.__name__] = function
+    return function
+
+
+def total(weights: Mapping[str, float], maps: Mapping[str, Tensor]) -> Tensor:
+    """Add up weight × term; a term of weight 0 is not computed and its maps may be absent.
+
+    Raises ConfigError if a weight names no term, KeyError if a term's map is missing.
+    """
+    loss = torch.zeros(())
+    for name, weight in weights.items():
+        if name not in TERMS:
+            raise ConfigError(f"unknown loss term {name!r} (known: {', '.join(TERMS)})")
+        if weight != 0.0:
+            takes = inspect.signature(TERMS[name]).parameters
+            loss = loss + weight * TERMS[name](**{p: maps[p] for p in takes})
+    return loss
+
+
+def masked(values: Tensor, valid: Tensor, fill: float = 0.0) -> Tensor:
+    """Put `fill` where valid [H, W] is false in values [H, W] or [H, W, C]; NaN there neither passes nor returns."""
+    return torch.where(valid if values.ndim == valid.ndim else valid[..., None], values, fill)
+
+
+def mean_over(values: Tensor, valid: Tensor) -> Tensor:
+    """Average values [H, W] or [H, W, C] over valid pixels and channels; 0 if there are none."""
+    channels = values.numel() // max(valid.numel(), 1)
+    return masked(values, valid).sum() / (valid.sum() * channels).clamp(min=1)
+
+
+@term
+def l1(color: Tensor, color_target: Tensor, valid: Tensor) -> Tensor:
+    """Take mean |Ĉ − C| over valid pixels × 3 (VarSplat §2, L_color)."""
+    return mean_over(masked(color - color_target, valid).abs(), valid)
+
+
+@term
+def ssim(color: Tensor, color_target: Tensor, valid: Tensor) -> Tensor:
+    """Take 1 − mean SSIM over all pixels × 3 with both images 0 where not valid and beyond the border (VarSplat §2).
+
+    Windows without valid pixels are equal in both (SSIM 1): they dilute the mean, as in the released code.
+    """
+    return 1.0 - ssim_map(masked(color, valid), masked(color_target, valid)).mean()
+
+
+def ssim_map(a: Tensor, b: Tensor) -> Tensor:
+    """Compare two images [H, W, C] window by window, [H, W, C] in [−1, 1] (11×11 Gaussian, σ 1.5, zero padding)."""
+    x, y = a.movedim(-1, 0), b.movedim(-1, 0)
+    mx, my, xx, yy, xy = _blur(torch.cat([x, y, x * x, y * y, x * y])).chunk(5)
+    var_x, var_y, cov = xx - mx * mx, yy - my * my, xy - mx * my
+    luminance = (2 * mx * my + SSIM_C1) / (mx * mx + my * my + SSIM_C1)
+    structure = (2 * cov + SSIM_C2) / (var_x + var_y + SSIM_C2)
+    return (luminance * structure).movedim(0, -1)
+
+
+def _blur(planes: Tensor) -> Tensor:
+    """Convolve planes [C, H, W] with a normalised 11×11 Gaussian of σ 1.5 px, zero beyond the border."""
+    taps = torch.arange(-5, 6, dtype=planes.dtype, device=planes.device)
+    kernel = torch.exp(-(taps**2) / (2 * 1.5**2))
+    kernel = kernel / kernel.sum()
+    rows = conv2d(planes[:, None], kernel.reshape(1, 1, 1, 11), padding=(0, 5))
+    return conv2d(rows, kernel.reshape(1, 1, 11, 1), padding=(5, 0))[:, 0]
+
+
+@term
+def depth(depth: Tensor, depth_target: Tensor, valid: Tensor) -> Tensor:
+    """Take mean |D̂ − D| in metres over valid pixels with a reading (VarSplat §2, L_depth)."""
+    valid = valid & (depth_target > 0)
+    return mean_over(masked(depth - depth_target, valid).abs(), valid)
+
+
+@term
+def isotropy(scales: Tensor) -> Tensor:
+    """Take mean |s_i − mean(s_i)| in metres over splats × 3 axes (VarSplat §2, L_reg); 0 without splats."""
+    off = scales - scales.mean(1, keepdim=True)
+    return off.abs().sum() / max(off.numel(), 1)
+
+
+@term
+def nll_color(color: Tensor, color_target: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
+    """Take the Gaussian NLL of the colour residual under V (VarSplat §2, L_var); trains variance only."""
+    return gaussian_nll(color - color_target, variance, valid)
+
+
+@term
+def nll_depth(depth: Tensor, depth_target: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
+    """Take the Gaussian NLL of the depth residual, the same for each channel of V (VarSplat §2, L_var)."""
+    residual = (depth - depth_target)[..., None].expand_as(variance)
+    return gaussian_nll(residual, variance, valid & (depth_target > 0))
+
+
+def gaussian_nll(residual: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
+    """Take mean ½ r²/(V+ε) + ½ log(V+ε), ε = 1e-6, r detached; V is clamped at 0 here only, never the map itself."""
+    r = masked(residual.detach(), valid)
+    v = masked(variance, valid, fill=1.0).clamp(min=0.0) + NLL_EPS
+    return mean_over(0.5 * r * r / v + 0.5 * v.log(), valid)
+
+
+@term
+def moment(moment: Tensor, valid: Tensor) -> Tensor:
+    """Take mean |U| in m² over valid pixels (CG-SLAM, L_var)."""
+    return mean_over(masked(moment, valid).abs(), valid)

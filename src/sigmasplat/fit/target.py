@@ -1,0 +1,49 @@
+"""Lay a frame out as a fit wants it: image planes padded like the view's, with what can be computed once."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.frame import Frame
+
+
+@dataclass(eq=False)
+class Target:
+    """What a view should look like: color [3, rows, columns], depth [rows, columns] m (0 = no reading or padding)."""
+
+    camera: Camera
+    color: Tensor
+    depth: Tensor
+    valid_pixels: int
+
+    @staticmethod
+    def of(frame: Frame, size: tuple[int, int]) -> "Target":
+        """Lay out a frame on planes of `size` = (rows, columns) ≥ its own."""
+        h, w = frame.depth_m.shape
+        color, depth = torch.zeros(3, *size), torch.zeros(size)
+        color[:, :h, :w] = torch.from_numpy(np.ascontiguousarray(frame.color.transpose(2, 0, 1)))
+        depth[:h, :w] = torch.tensor(frame.depth_m)
+        return Target(frame.camera, color, depth, int((frame.depth_m > 0).sum()))
+
+    @property
+    def image(self) -> Tensor:
+        """Return the colour as [H, W, 3]."""
+        return self.color[:, : self.camera.height, : self.camera.width].movedim(0, -1)
+
+    @property
+    def depth_image(self) -> Tensor:
+        """Return the depth as [H, W], metres."""
+        return self.depth[: self.camera.height, : self.camera.width]
+
+
+@dataclass(eq=False)
+class Keyframe:
+    """A target with the pose it was seen from, T_world_camera float64 [4, 4]."""
+
+    index: int
+    target: Target
+    T_world_camera: NDArray[np.float64]

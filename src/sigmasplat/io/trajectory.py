@@ -1,0 +1,57 @@
+"""Read and write paths as TUM text: one pose per line, `t tx ty tz qx qy qz qw` (seconds, metres, T_world_camera)."""
+
+from pathlib import Path
+
+import numpy as np
+
+from sigmasplat.errors import SourceError
+from sigmasplat.io.atomic import write_text
+from sigmasplat.model import se3
+from sigmasplat.model.trajectory import Trajectory
+
+COLUMNS = "t tx ty tz qx qy qz qw"
+
+
+def write_trajectory(path: Path, trajectory: Trajectory) -> None:
+    """Write T_world_camera as TUM text: nanoseconds and 12 significant digits. Raises RunError if not writable."""
+    lines = [f"# {COLUMNS} (seconds, metres, camera to world)"]
+    for t, T in zip(trajectory.timestamps_s, trajectory.T_world_camera, strict=True):
+        w, x, y, z = se3.quaternion_from_rotation(T[:3, :3])
+        lines.append(f"{t:.9f} " + " ".join(f"{value:.12g}" for value in (*T[:3, 3], x, y, z, w)))
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Read TUM text; empty lines and lines from # on are passed over.
+
+    Raises SourceError, naming file and line, if it is missing, not text, empty, or holds a line without eight finite
+    numbers or with a zero quaternion.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as problem:
+        raise SourceError(f"cannot read trajectory {path}: {problem}") from problem
+    bare = ((number, line.split("#")[0].strip()) for number, line in enumerate(lines, 1))
+    rows = [_parse(line, f"{path}:{number}") for number, line in bare if line]
+    if not rows:
+        raise SourceError(f"no poses in {path} (expected lines of '{COLUMNS}')")
+    table = np.array(rows)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = se3.rotation_from_quaternion(table[:, [7, 4, 5, 6]])
+    poses[:, :3, 3] = table[:, 1:4]
+    return Trajectory(table[:, 0], poses)
+
+
+def _parse(line: str, where: str) -> list[float]:
+    """Turn one line into eight numbers. Raises SourceError that names the place."""
+    try:
+        values = [float(word) for word in line.split()]
+    except ValueError as problem:
+        raise SourceError(f"{where}: not numbers: {line[:60]!r} (expected '{COLUMNS}')") from problem
+    if len(values) != 8:
+        raise SourceError(f"{where}: {len(values)} numbers, expected 8: '{COLUMNS}'")
+    if not np.isfinite(values).all():
+        raise SourceError(f"{where}: the pose holds nan or inf; remove the line: {line[:60]!r}")
+    if np.linalg.norm(values[4:]) < 1e-6:
+        raise SourceError(f"{where}: the quaternion is zero, which is no rotation; identity is '0 0 0 1'")
+    return values

@@ -1,0 +1,83 @@
+"""Score a rendered image against the recorded one: PSNR, SSIM, depth L1. Pixels without a reading are masked."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import correlate1d
+
+from sigmasplat.errors import SigmaSplatError
+
+Pixels = NDArray[np.floating[Any]]
+Mask = NDArray[np.bool_]
+
+WINDOW_RADIUS = 5
+WINDOW_SIGMA = 1.5
+
+
+def psnr(rendered: Pixels, recorded: Pixels, valid: Mask | None = None) -> float:
+    """Return the peak signal-to-noise ratio, dB, of colours [H, W, 3] in [0, 1] on the pixels of `valid` [H, W].
+
+    inf where both are equal, nan where no pixel is valid.
+    """
+    squared = (rendered.astype(np.float64) - recorded) ** 2
+    if valid is not None:
+        squared = squared[valid]
+    if not squared.size:
+        return float("nan")
+    mse = float(squared.mean())
+    return float("inf") if mse == 0.0 else -10.0 * float(np.log10(mse))
+
+
+def ssim(rendered: Pixels, recorded: Pixels, valid: Mask | None = None) -> float:
+    """Return the structural similarity of colours [H, W, 3] in [0, 1] (Wang et al. 2004, eq. 13).
+
+    Gaussian window 11×11, σ 1.5, C1 = 0.01², C2 = 0.03²; only windows that lie inside the image, averaged over
+    channels and over windows whose centre is in `valid` [H, W]; nan if there is none.
+    Raises SigmaSplatError if the image is smaller than a window.
+    """
+    if min(rendered.shape[:2]) < 2 * WINDOW_RADIUS + 1:
+        height, width = rendered.shape[:2]
+        raise SigmaSplatError(f"SSIM needs an image of at least 11×11 pixels, found {width}×{height}")
+    similarity = ssim_map(rendered, recorded)
+    if valid is None:
+        return float(similarity.mean())
+    inner = valid[WINDOW_RADIUS:-WINDOW_RADIUS, WINDOW_RADIUS:-WINDOW_RADIUS]
+    return float(similarity[inner].mean()) if inner.any() else float("nan")
+
+
+def ssim_map(rendered: Pixels, recorded: Pixels) -> NDArray[np.float64]:
+    """Return the similarity of every window [H − 10, W − 10, 3], indexed by its centre less 5 pixels."""
+    x, y = rendered.astype(np.float64), recorded.astype(np.float64)
+    mean_x, mean_y = _window_mean(x), _window_mean(y)
+    variance_x = _window_mean(x * x) - mean_x**2
+    variance_y = _window_mean(y * y) - mean_y**2
+    covariance = _window_mean(x * y) - mean_x * mean_y
+    c1, c2 = 0.01**2, 0.03**2
+    out: NDArray[np.float64] = ((2 * mean_x * mean_y + c1) * (2 * covariance + c2)) / (
+        (mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2)
+    )
+    return out
+
+
+def _window_mean(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Average over the Gaussian window, keeping only windows inside the image."""
+    offsets = np.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1)
+    weights = np.exp(-0.5 * (offsets / WINDOW_SIGMA) ** 2)
+    weights /= weights.sum()
+    smooth = correlate1d(correlate1d(image, weights, axis=0), weights, axis=1)
+    inside = slice(WINDOW_RADIUS, -WINDOW_RADIUS)
+    return np.asarray(smooth[inside, inside])
+
+
+def depth_l1(rendered_m: Pixels, recorded_m: Pixels, valid: Mask | None = None) -> float:
+    """Return the mean absolute depth error, metres, of [H, W] maps where both have a reading (> 0) and `valid` holds.
+
+    nan where no pixel is left.
+    """
+    both = (rendered_m > 0) & (recorded_m > 0)
+    if valid is not None:
+        both &= valid
+    if not both.any():
+        return float("nan")
+    return float(np.abs(rendered_m[both].astype(np.float64) - recorded_m[both]).mean())

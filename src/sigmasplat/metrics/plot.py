@@ -1,0 +1,179 @@
+"""Draw curves with PIL: the path from above and its height, seconds per frame, the reliability of V."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+Matrix = NDArray[np.float64]
+Colour = tuple[int, int, int]
+Box = tuple[float, float, float, float]
+
+DRAW_SCALE = 2
+"""Pixels drawn per pixel kept: PIL's lines are smooth only when shrunk."""
+SIZE = (1040, 430)
+
+
+@dataclass(frozen=True)
+class Theme:
+    """Colours of a plot on a light or a dark page."""
+
+    name: str
+    background: Colour
+    text: Colour
+    grid: Colour
+    curves: tuple[Colour, ...]
+
+
+LIGHT = Theme(
+    "light", (255, 255, 255), (70, 78, 88), (226, 229, 233),
+    ((214, 90, 30), (40, 110, 190), (60, 150, 90), (130, 90, 170)),
+)  # fmt: skip
+DARK = Theme(
+    "dark", (24, 27, 32), (176, 184, 194), (52, 57, 65),
+    ((255, 140, 70), (100, 170, 250), (110, 200, 140), (190, 150, 230)),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A named line through points [N, 2] (x, y), or dots."""
+
+    name: str
+    points: Matrix
+    colour: int
+    dots: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """One pair of axes and the curves on it; `square` gives both axes one scale."""
+
+    title: str
+    x_label: str
+    y_label: str
+    curves: list[Curve]
+    square: bool = False
+    from_zero: bool = False
+
+
+def trajectory_charts(estimate: Matrix, truth: Matrix | None, lost: NDArray[np.bool_] | None = None) -> list[Chart]:
+    """Lay out a path from above (x right, z forward) and its height (−y) over frames.
+
+    estimate: positions [N, 3], metres, in the first camera's frame; truth: the same frames' [N, 3], aligned to it, nan
+    where unknown; lost: frames [N] to mark.
+    """
+    top, height = [], []
+    frames = np.arange(len(estimate))
+    if truth is not None:
+        top.append(Curve("truth", truth[:, [0, 2]], 1))
+        height.append(Curve("truth", np.stack([frames, -truth[:, 1]], 1), 1))
+    rise = np.stack([frames, -estimate[:, 1]], 1)
+    top.append(Curve("estimate", estimate[:, [0, 2]], 0))
+    height.append(Curve("estimate", rise, 0))
+    if lost is not None and lost.any():
+        top.append(Curve("lost", estimate[lost][:, [0, 2]], 3, dots=True))
+        height.append(Curve("lost", rise[lost], 3, dots=True))
+    return [
+        Chart("Path from above", "right, m", "forward, m", top, square=True),
+        Chart("Height", "frame", "up, m", height),
+    ]
+
+
+def seconds_chart(frames: NDArray[np.int_], stages: dict[str, Matrix]) -> Chart:
+    """Lay out the seconds each frame took, by stage: frames [N], seconds [N] per stage; "total" stands out."""
+    curves = [
+        Curve(name, np.stack([frames, seconds], 1).astype(np.float64), 0 if name == "total" else i % 3 + 1)
+        for i, (name, seconds) in enumerate(stages.items())
+    ]
+    return Chart("Seconds per frame", "frame", "", curves, from_zero=True)
+
+
+def draw_charts(charts: list[Chart], theme: Theme, size: tuple[int, int] = SIZE) -> Image.Image:
+    """Draw charts beside each other on one picture of `size` pixels."""
+    width, height = size[0] * DRAW_SCALE, size[1] * DRAW_SCALE
+    image = Image.new("RGB", (width, height), theme.background)
+    share = width / len(charts)
+    for i, chart in enumerate(charts):
+        _draw_chart(ImageDraw.Draw(image), chart, theme, (i * share, 0.0, (i + 1) * share, float(height)))
+    return image.resize(size, Image.Resampling.LANCZOS)
+
+
+def nice_ticks(low: float, high: float, wanted: int = 5) -> Matrix:
+    """Return round numbers (1, 2 or 5 times a power of ten apart) inside [low, high], about `wanted` of them."""
+    raw = (high - low) / wanted
+    power = 10.0 ** np.floor(np.log10(raw))
+    step = power * min((1.0, 2.0, 5.0, 10.0), key=lambda m: abs(m * power - raw))
+    return np.asarray(np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) * step)
+
+
+def _limits(chart: Chart, box: Box) -> tuple[Matrix, Matrix]:
+    """Return the data range of both axes (low [2], high [2]), widened a little, to one scale where `square`."""
+    points = np.concatenate([curve.points for curve in chart.curves])
+    points = points[np.isfinite(points).all(1)]
+    if not len(points):
+        return np.zeros(2), np.ones(2)
+    low, high = points.min(0), points.max(0)
+    if chart.from_zero:
+        low[1] = min(low[1], 0.0)
+    margin = np.maximum(0.06 * (high - low), [1e-3, 1e-3])
+    low, high = low - margin * (0.0 if chart.from_zero else 1.0), high + margin
+    if chart.square:
+        pixels = np.array([box[2] - box[0], box[3] - box[1]])
+        half = 0.5 * pixels * ((high - low) / pixels).max()
+        middle = 0.5 * (low + high)
+        low, high = middle - half, middle + half
+    return low, high
+
+
+def _draw_chart(draw: ImageDraw.ImageDraw, chart: Chart, theme: Theme, cell: Box) -> None:
+    """Draw title, grid, curves and legend of one chart into its cell."""
+    s = DRAW_SCALE
+    box = (cell[0] + 64 * s, cell[1] + 48 * s, cell[2] - 20 * s, cell[3] - 52 * s)
+    low, high = _limits(chart, box)
+
+    def place(points: Matrix) -> list[tuple[float, float]]:
+        unit = (points - low) / (high - low)
+        return [(box[0] + u * (box[2] - box[0]), box[3] - v * (box[3] - box[1])) for u, v in unit]
+
+    _draw_grid(draw, chart, theme, box, (low, high))
+    for curve in chart.curves:
+        places = place(curve.points[np.isfinite(curve.points).all(1)])
+        colour = theme.curves[curve.colour]
+        if curve.dots or len(places) == 1:
+            for x, y in places:
+                draw.ellipse((x - 3 * s, y - 3 * s, x + 3 * s, y + 3 * s), fill=colour)
+        elif places:
+            draw.line(places, colour, 2 * s, joint="curve")
+    _draw_head(draw, chart, theme, box, cell[1] + 24 * s)
+
+
+def _draw_grid(draw: ImageDraw.ImageDraw, chart: Chart, theme: Theme, box: Box, limits: tuple[Matrix, Matrix]) -> None:
+    """Draw grid lines with their numbers, and the names of the axes."""
+    s, (low, high) = DRAW_SCALE, limits
+    font = ImageFont.load_default(13 * s)
+    for x in nice_ticks(low[0], high[0]):
+        at = box[0] + (x - low[0]) / (high[0] - low[0]) * (box[2] - box[0])
+        draw.line((at, box[1], at, box[3]), theme.grid, s)
+        draw.text((at, box[3] + 8 * s), f"{x + 0.0:g}", theme.text, font, anchor="mt")
+    for y in nice_ticks(low[1], high[1]):
+        at = box[3] - (y - low[1]) / (high[1] - low[1]) * (box[3] - box[1])
+        draw.line((box[0], at, box[2], at), theme.grid, s)
+        draw.text((box[0] - 8 * s, at), f"{y + 0.0:g}", theme.text, font, anchor="rm")
+    draw.text(((box[0] + box[2]) / 2, box[3] + 30 * s), chart.x_label, theme.text, font, anchor="mt")
+
+
+def _draw_head(draw: ImageDraw.ImageDraw, chart: Chart, theme: Theme, box: Box, middle: float) -> None:
+    """Draw the title with the y axis's name on the left and the legend on the right."""
+    s = DRAW_SCALE
+    title, font = ImageFont.load_default(17 * s), ImageFont.load_default(14 * s)
+    draw.text((box[0], middle), chart.title, theme.text, title, anchor="lm")
+    after = box[0] + draw.textlength(chart.title, title) + 10 * s
+    draw.text((after, middle), chart.y_label, theme.text, font, anchor="lm")
+    right = box[2]
+    for curve in reversed(chart.curves if len(chart.curves) > 1 else []):
+        draw.text((right, middle), curve.name, theme.text, font, anchor="rm")
+        right -= draw.textlength(curve.name, font) + 8 * s
+        draw.line((right - 16 * s, middle, right, middle), theme.curves[curve.colour], 3 * s)
+        right -= 32 * s

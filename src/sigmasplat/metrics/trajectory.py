@@ -1,0 +1,136 @@
+"""Score a path against the truth: absolute (ATE) and relative (RPE) error after a rigid fit."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.errors import SourceError
+from sigmasplat.model import se3
+from sigmasplat.model.trajectory import Trajectory
+
+Matrix = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class AbsoluteError:
+    """Distances between aligned positions, metres, over `pairs` poses."""
+
+    rmse_m: float
+    mean_m: float
+    median_m: float
+    max_m: float
+    pairs: int
+
+
+@dataclass(frozen=True)
+class RelativeError:
+    """Error of the motion over `delta_frames` frames: metres and degrees, root mean square over `pairs` motions."""
+
+    translation_rmse_m: float
+    rotation_rmse_deg: float
+    pairs: int
+    delta_frames: int
+
+
+def align_rigid(estimate: Matrix, truth: Matrix) -> Matrix:
+    """Fit T_truth_estimate [4, 4] that carries positions `estimate` [N, 3] onto `truth` [N, 3] with least squares.
+
+    Closed form without scale: the rotation nearest to the cross-covariance, by SVD (Umeyama 1991, eq. 40–42, c = 1).
+    """
+    centre_estimate, centre_truth = estimate.mean(0), truth.mean(0)
+    covariance = (truth - centre_truth).T @ (estimate - centre_estimate)
+    u, _, vt = np.linalg.svd(covariance)
+    R = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = centre_truth - R @ centre_estimate
+    return T
+
+
+def associate(times_a_s: Matrix, times_b_s: Matrix, max_difference_s: float = 0.02) -> tuple[Rows, Rows]:
+    """Pair timestamps that are each other's nearest and at most `max_difference_s` apart: rows of a, rows of b.
+
+    One-to-one, so that a slow truth never pairs one pose with two frames (which would fake a standstill in the RPE).
+    """
+    if not len(times_a_s) or not len(times_b_s):
+        return np.empty(0, np.intp), np.empty(0, np.intp)
+    nearest_b = _nearest(times_a_s, times_b_s)
+    nearest_a = _nearest(times_b_s, times_a_s)
+    rows_a = np.arange(len(times_a_s))
+    mutual = nearest_a[nearest_b] == rows_a
+    close = np.abs(times_a_s - times_b_s[nearest_b]) <= max_difference_s
+    chosen = rows_a[mutual & close]
+    return chosen, nearest_b[chosen]
+
+
+def _nearest(wanted: Matrix, among: Matrix) -> Rows:
+    """Return for each value of `wanted` the row of the nearest value of `among` (any order, ties to the earlier)."""
+    order = np.argsort(among, kind="stable")
+    ordered = among[order]
+    right = np.clip(np.searchsorted(ordered, wanted), 1, max(len(among) - 1, 1))
+    left = right - 1
+    right = np.minimum(right, len(among) - 1)
+    nearer_right = np.abs(ordered[right] - wanted) < np.abs(ordered[left] - wanted)
+    return order[np.where(nearer_right, right, left)]
+
+
+def paired(estimate: Trajectory, truth: Trajectory, max_difference_s: float = 0.02) -> tuple[Matrix, Matrix]:
+    """Return T_world_camera of both paths [M, 4, 4] at the timestamps they share, in the estimate's order.
+
+    Raises SourceError if none lies within `max_difference_s`.
+    """
+    rows, truth_rows = associate(estimate.timestamps_s, truth.timestamps_s, max_difference_s)
+    if not len(rows):
+        raise SourceError(
+            f"estimate and truth share no timestamps within {max_difference_s} s: {_span(estimate)} against "
+            f"{_span(truth)}; are both in seconds, from one clock and one recording?"
+        )
+    return estimate.T_world_camera[rows], truth.T_world_camera[truth_rows]
+
+
+def _span(path: Trajectory) -> str:
+    """Say from when to when a path lasts."""
+    if not len(path):
+        return "no poses"
+    return f"{path.timestamps_s.min():.3f} … {path.timestamps_s.max():.3f} s ({len(path)} poses)"
+
+
+def ate(estimate: Trajectory, truth: Trajectory, max_difference_s: float = 0.02) -> AbsoluteError:
+    """Measure the absolute trajectory error: position distances after `align_rigid` (Sturm et al. 2012, eq. 3).
+
+    Raises SourceError if no timestamps match.
+    """
+    ours, theirs = paired(estimate, truth, max_difference_s)
+    T = align_rigid(ours[:, :3, 3], theirs[:, :3, 3])
+    distance = np.linalg.norm(ours[:, :3, 3] @ T[:3, :3].T + T[:3, 3] - theirs[:, :3, 3], axis=1)
+    return AbsoluteError(
+        _root_mean_square(distance),
+        float(distance.mean()),
+        float(np.median(distance)),
+        float(distance.max()),
+        len(distance),
+    )
+
+
+def rpe(
+    estimate: Trajectory, truth: Trajectory, delta_frames: int = 1, max_difference_s: float = 0.02
+) -> RelativeError:
+    """Measure the relative pose error over `delta_frames` paired frames (Sturm et al. 2012, eq. 1); needs no alignment.
+
+    Fewer than delta_frames + 1 pairs give nan and pairs = 0. Raises SourceError if no timestamps match.
+    """
+    ours, theirs = paired(estimate, truth, max_difference_s)
+    motion_ours = se3.inverse(ours[:-delta_frames]) @ ours[delta_frames:]
+    motion_theirs = se3.inverse(theirs[:-delta_frames]) @ theirs[delta_frames:]
+    error = se3.inverse(motion_theirs) @ motion_ours
+    angles = np.array([se3.rotation_angle(E[:3, :3]) for E in error])
+    shift = np.linalg.norm(error[:, :3, 3], axis=1)
+    rotation_deg = float(np.degrees(_root_mean_square(angles)))
+    return RelativeError(_root_mean_square(shift), rotation_deg, len(error), delta_frames)
+
+
+def _root_mean_square(values: Matrix) -> float:
+    """Return √mean(x²), nan for no values."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")

@@ -1,0 +1,81 @@
+"""Ask whether a predicted variance is worth something: does it rank, match and remove the errors that occur?
+
+Everything takes two arrays of one shape: predicted variance V and squared error r², both in colour² (or m²), already
+restricted to valid pixels.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import spearmanr
+
+Values = NDArray[np.floating[Any]]
+
+EPSILON = 1e-6
+"""VarSplat's ε, colour²: keeps log and division finite where V is 0."""
+
+
+@dataclass(frozen=True)
+class ReliabilityBin:
+    """One row of the reliability table: mean predicted variance, mean squared error, number of pixels."""
+
+    predicted: float
+    empirical: float
+    pixels: int
+
+
+def spearman(variance: Values, squared_error: Values) -> float:
+    """Return the rank correlation of V and r² in [−1, 1]; nan if one of them is constant or there are < 2 values."""
+    v, e = variance.ravel(), squared_error.ravel()
+    if v.size < 2 or v.min() == v.max() or e.min() == e.max():
+        return float("nan")
+    return float(spearmanr(v, e).statistic)
+
+
+def gaussian_nll(variance: Values, squared_error: Values, epsilon: float = EPSILON) -> float:
+    """Return mean ½ r²/(V+ε) + ½ log(V+ε) (VarSplat §2, NLL_x; without the constant ½ log 2π). V < 0 counts as 0."""
+    v = np.maximum(variance.astype(np.float64), 0.0) + epsilon
+    return float(np.mean(0.5 * squared_error / v + 0.5 * np.log(v))) if v.size else float("nan")
+
+
+def reliability(variance: Values, squared_error: Values, bins: int = 10) -> list[ReliabilityBin]:
+    """Split the pixels into `bins` equal shares by V and compare mean V with mean r² in each, from sure to unsure."""
+    v, e = variance.ravel().astype(np.float64), squared_error.ravel().astype(np.float64)
+    order = np.argsort(v, kind="stable")
+    parts = [rows for rows in np.array_split(order, bins) if len(rows)]
+    return [ReliabilityBin(float(v[rows].mean()), float(e[rows].mean()), len(rows)) for rows in parts]
+
+
+def sparsification(order_by: Values, squared_error: Values, steps: int = 100) -> NDArray[np.float64]:
+    """Return the RMSE [steps] left after removing the share 0, 1/steps, … of pixels that `order_by` ranks highest."""
+    e = squared_error.ravel().astype(np.float64)
+    rising = e[np.argsort(order_by.ravel(), kind="stable")]
+    kept = np.ceil(len(e) * (1.0 - np.arange(steps) / steps)).astype(int).clip(1)
+    return np.asarray(np.sqrt(np.cumsum(rising)[kept - 1] / kept))
+
+
+def ause(variance: Values, squared_error: Values, steps: int = 100) -> float:
+    """Return the area between the sparsification curves by V and by the true error, as a share of the RMSE (Ilg 2018).
+
+    0 = V ranks like the error itself; chance has the area of the oracle's own drop. nan without pixels or error.
+    """
+    if not squared_error.size or not float(squared_error.max()) > 0.0:
+        return float("nan")
+    by_variance = sparsification(variance, squared_error, steps)
+    by_error = sparsification(squared_error, squared_error, steps)
+    return float(np.mean(by_variance - by_error) / by_error[0])
+
+
+def score(variance: Values, squared_error: Values) -> dict[str, Any]:
+    """Return every score of this file, with both means and the number of pixels, as plain values."""
+    return {
+        "pixels": int(variance.size),
+        "spearman": spearman(variance, squared_error),
+        "nll": gaussian_nll(variance, squared_error),
+        "ause": ause(variance, squared_error),
+        "mean_variance": float(variance.mean()) if variance.size else float("nan"),
+        "mean_squared_error": float(squared_error.mean()) if variance.size else float("nan"),
+        "reliability": [asdict(row) for row in reliability(variance, squared_error)],
+    }

@@ -1,0 +1,36 @@
+"""Describe a pinhole camera: x right, y down, z forward, pixel centres at integer coordinates."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Camera:
+    """An undistorted pinhole: image size in pixels, focal lengths and principal point in pixels."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx, self.fy, self.cx, self.cy)
+        if self.width < 1 or self.height < 1 or not np.isfinite(numbers).all() or self.fx <= 0 or self.fy <= 0:
+            raise ConfigError(f"not a camera: {self} (sizes and focal lengths must be positive and finite)")
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """Return the camera of the same view sampled at another size (centres of corner pixels map half a pixel in)."""
+        sx, sy = width / self.width, height / self.height
+        return Camera(width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
+
+    def rays(self) -> NDArray[np.float32]:
+        """Return the point at depth 1 m on each pixel's ray, camera frame, [H, W, 3]; times depth it is the surface."""
+        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
+        x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
+        return np.stack([x, y, np.ones_like(x)], -1).astype(np.float32)

@@ -1,0 +1,142 @@
+"""Hold the Gaussians: one row per splat, parameters and optimiser state edited together."""
+
+from dataclasses import dataclass, field as dataclass_field
+
+import torch
+from torch import Tensor
+
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.model import se3
+
+COLUMNS: dict[str, slice] = {
+    "means": slice(0, 3),
+    "quats": slice(3, 7),
+    "log_scales": slice(7, 10),
+    "opacity_logits": slice(10, 11),
+    "colors": slice(11, 14),
+    "log_variances": slice(14, 17),
+}
+WIDTH = 17
+
+
+@dataclass(eq=False)
+class GaussianField:
+    """N splats as one float32 tensor `params` [N, 17], columns named in `COLUMNS`.
+
+    means: metres, world (or submap) frame; quats: wxyz, any positive norm; log_scales: log metres; opacity_logits:
+    logit of opacity; colors: RGB in [0, 1]; log_variances: log σ² of observed colour about `colors` (VarSplat §3,
+    s_i). `moment1`, `moment2` are Adam's moments of the same rows.
+    """
+
+    params: Tensor
+    moment1: Tensor = dataclass_field(default_factory=lambda: torch.empty(0))
+    moment2: Tensor = dataclass_field(default_factory=lambda: torch.empty(0))
+
+    def __post_init__(self) -> None:
+        if self.params.ndim != 2 or self.params.shape[1] != WIDTH:
+            raise SigmaSplatError(f"a field needs params [N, {WIDTH}], found {tuple(self.params.shape)}")
+        if self.moment1.shape != self.params.shape:
+            self.moment1 = torch.zeros_like(self.params)
+        if self.moment2.shape != self.params.shape:
+            self.moment2 = torch.zeros_like(self.params)
+
+    @staticmethod
+    def empty() -> "GaussianField":
+        """Make a field without splats."""
+        return GaussianField(torch.zeros(0, WIDTH))
+
+    @staticmethod
+    def from_values(
+        means: Tensor,
+        scales: Tensor,
+        colors: Tensor,
+        *,
+        quats: Tensor | None = None,
+        opacities: Tensor | float = 0.5,
+        log_variances: Tensor | float = -7.0,
+    ) -> "GaussianField":
+        """Build a field from activated values: means [N,3] m, scales [N,3] or [N] m, colors [N,3]; s₀ = −7 (VarSplat §1)."""
+        n = len(means)
+        params = torch.zeros(n, WIDTH, dtype=means.dtype)
+        params[:, COLUMNS["means"]] = means
+        params[:, 3] = 1.0
+        if quats is not None:
+            params[:, COLUMNS["quats"]] = quats
+        params[:, COLUMNS["log_scales"]] = (scales if scales.ndim == 2 else scales[:, None]).log()
+        opacity = torch.as_tensor(opacities, dtype=means.dtype).reshape(-1, 1)
+        params[:, COLUMNS["opacity_logits"]] = torch.logit(opacity)
+        params[:, COLUMNS["colors"]] = colors
+        params[:, COLUMNS["log_variances"]] = torch.as_tensor(log_variances, dtype=means.dtype)
+        return GaussianField(params)
+
+    def __len__(self) -> int:
+        return len(self.params)
+
+    @property
+    def means(self) -> Tensor:
+        """Return positions [N, 3], metres."""
+        return self.params[:, COLUMNS["means"]]
+
+    @property
+    def quats(self) -> Tensor:
+        """Return rotations [N, 4], wxyz, not normalised."""
+        return self.params[:, COLUMNS["quats"]]
+
+    @property
+    def scales(self) -> Tensor:
+        """Return standard deviations along the axes [N, 3], metres."""
+        return self.params[:, COLUMNS["log_scales"]].exp()
+
+    @property
+    def opacities(self) -> Tensor:
+        """Return opacities [N] in (0, 1)."""
+        return torch.sigmoid(self.params[:, 10])
+
+    @property
+    def colors(self) -> Tensor:
+        """Return mean colours [N, 3]."""
+        return self.params[:, COLUMNS["colors"]]
+
+    @property
+    def variances(self) -> Tensor:
+        """Return appearance variances σ² [N, 3] (VarSplat §1)."""
+        return self.params[:, COLUMNS["log_variances"]].exp()
+
+    def append(self, other: "GaussianField") -> None:
+        """Add another field's rows at the end, their optimiser state with them."""
+        self.params = torch.cat([self.params, other.params])
+        self.moment1 = torch.cat([self.moment1, other.moment1])
+        self.moment2 = torch.cat([self.moment2, other.moment2])
+
+    def keep(self, rows: Tensor) -> None:
+        """Keep the rows chosen by a bool mask [N] or an index tensor, drop the others."""
+        self.params = self.params[rows]
+        self.moment1 = self.moment1[rows]
+        self.moment2 = self.moment2[rows]
+
+    def moved(self, T_new_old: Tensor) -> "GaussianField":
+        """Return the field carried by a rigid 4×4 transform: positions and rotations move, shapes and looks stay."""
+        T = T_new_old.to(self.params)
+        out = self.params.clone()
+        out[:, COLUMNS["means"]] = self.means @ T[:3, :3].T + T[:3, 3]
+        out[:, COLUMNS["quats"]] = quaternion_product(quaternion_of(T[:3, :3]), self.quats)
+        return GaussianField(out, self.moment1.clone(), self.moment2.clone())
+
+
+def quaternion_of(R: Tensor) -> Tensor:
+    """Turn a 3×3 rotation tensor into a unit quaternion wxyz."""
+    return torch.as_tensor(se3.quaternion_from_rotation(R.detach().double().numpy()), dtype=R.dtype)
+
+
+def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
+    """Multiply quaternions wxyz: a [4] times each row of b [N, 4]."""
+    w, x, y, z = a
+    rows = torch.stack(
+        [
+            torch.stack([w, -x, -y, -z]),
+            torch.stack([x, w, -z, y]),
+            torch.stack([y, z, w, -x]),
+            torch.stack([z, -y, x, w]),
+        ]
+    )
+    return b @ rows.T

@@ -1,0 +1,72 @@
+"""Carry one RGB-D image through the system: immutable, checked once at the border, without ground truth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sigmasplat.errors import SourceError
+from sigmasplat.model.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One colour + depth image.
+
+    color: float32 [H, W, 3] in [0, 1]; depth_m: float32 [H, W] along the optical axis in metres, 0 = no reading;
+    camera: the pinhole of both; timestamp_s: seconds; index: position in the source.
+    Raises SourceError on shapes that disagree, values that are not finite, negative depth.
+    """
+
+    index: int
+    timestamp_s: float
+    color: NDArray[np.float32]
+    depth_m: NDArray[np.float32]
+    camera: Camera
+
+    def __post_init__(self) -> None:
+        size = (self.camera.height, self.camera.width)
+        if self.color.shape != (*size, 3) or self.depth_m.shape != size:
+            raise SourceError(
+                f"frame {self.index}: colour is {self.color.shape}, depth is {self.depth_m.shape}, the camera says "
+                f"{size[1]}×{size[0]}; register depth to colour and give both one size"
+            )
+        for name, array in (("colour", self.color), ("depth", self.depth_m)):
+            if not np.isfinite(array).all():
+                raise SourceError(f"frame {self.index}: {name} holds NaN or inf; write 0 where there is no reading")
+        if float(self.depth_m.min(initial=0.0)) < 0.0:
+            raise SourceError(f"frame {self.index}: depth is negative ({self.depth_m.min():.3f} m); 0 means no reading")
+        self.color.setflags(write=False)
+        self.depth_m.setflags(write=False)
+
+    def resized(self, width: int, height: int) -> "Frame":
+        """Return the frame at another size: colour averaged over the pixel's area, depth of the nearest pixel.
+
+        Depth is picked, never averaged: the mean of a near and a far surface lies on neither.
+        """
+        if (width, height) == (self.camera.width, self.camera.height):
+            return self
+        planes = [
+            np.asarray(
+                Image.fromarray(np.ascontiguousarray(self.color[..., c])).resize((width, height), Image.Resampling.BOX)
+            )
+            for c in range(3)
+        ]
+        depth = Image.fromarray(self.depth_m).resize((width, height), Image.Resampling.NEAREST)
+        return Frame(
+            self.index,
+            self.timestamp_s,
+            np.clip(np.stack(planes, -1), 0.0, 1.0).astype(np.float32),
+            np.array(depth, np.float32),
+            self.camera.resized(width, height),
+        )
+
+    def prepared(self, width: int, min_depth_m: float, max_depth_m: float) -> "Frame":
+        """Return the frame as the system works on it: `width` pixels wide (0 = as it is), depth out of range = no reading."""
+        small = self.resized(width, round(self.camera.height * width / self.camera.width)) if width else self
+        depth = small.depth_m
+        keep = (depth >= min_depth_m) & (depth <= max_depth_m)
+        if keep.all():
+            return small
+        return Frame(self.index, self.timestamp_s, small.color, np.where(keep, depth, np.float32(0.0)), small.camera)

@@ -1,0 +1,122 @@
+"""Move rigidly: SE(3) in double precision with numpy. `T_a_b` takes coordinates in b to coordinates in a.
+
+A twist is ξ = (ρ, φ): translation first, then rotation vector (radians).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Matrix = NDArray[np.float64]
+
+
+def hat(w: Matrix) -> Matrix:
+    """Build the cross-product matrix [w]× of a 3-vector."""
+    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+
+
+def _series(theta2: float) -> tuple[float, float, float]:
+    """Return sinθ/θ, (1−cosθ)/θ², (θ−sinθ)/θ³, by Taylor series where θ is small."""
+    if theta2 < 1e-8:
+        return 1.0 - theta2 / 6.0, 0.5 - theta2 / 24.0, 1.0 / 6.0 - theta2 / 120.0
+    theta = float(np.sqrt(theta2))
+    return (
+        float(np.sin(theta) / theta),
+        float((1.0 - np.cos(theta)) / theta2),
+        float((theta - np.sin(theta)) / (theta2 * theta)),
+    )
+
+
+def exp(xi: Matrix) -> Matrix:
+    """Map a twist ξ=(ρ, φ), shape [6], to a 4×4 rigid transform."""
+    rho, phi = np.asarray(xi[:3], float), np.asarray(xi[3:], float)
+    k = hat(phi)
+    a, b, c = _series(float(phi @ phi))
+    kk = k @ k
+    T = np.eye(4)
+    T[:3, :3] = np.eye(3) + a * k + b * kk
+    T[:3, 3] = (np.eye(3) + b * k + c * kk) @ rho
+    return T
+
+
+def log(T: Matrix) -> Matrix:
+    """Map a 4×4 rigid transform to its twist ξ=(ρ, φ), shape [6], |φ| ≤ π."""
+    phi = log_rotation(T[:3, :3])
+    k = hat(phi)
+    _, b, c = _series(float(phi @ phi))
+    left_jacobian = np.eye(3) + b * k + c * (k @ k)
+    return np.concatenate([np.linalg.solve(left_jacobian, T[:3, 3]), phi])
+
+
+def log_rotation(R: Matrix) -> Matrix:
+    """Map a 3×3 rotation to its rotation vector, radians, stable near 0 and near π."""
+    w, x, y, z = quaternion_from_rotation(R)
+    vector = np.array([x, y, z])
+    norm = float(np.linalg.norm(vector))
+    if norm < 1e-12:
+        return 2.0 * vector
+    return vector * (2.0 * float(np.arctan2(norm, w)) / norm)
+
+
+def inverse(T: Matrix) -> Matrix:
+    """Invert a rigid transform (or a stack [..., 4, 4]) without a general matrix inverse."""
+    out = np.zeros_like(T)
+    Rt = np.swapaxes(T[..., :3, :3], -1, -2)
+    out[..., :3, :3] = Rt
+    out[..., :3, 3] = -(Rt @ T[..., :3, 3, None])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def rotation_from_quaternion(q_wxyz: Matrix) -> Matrix:
+    """Turn quaternions [..., 4] (w first, any norm > 0) into rotations [..., 3, 3]."""
+    q = np.asarray(q_wxyz, float)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def quaternion_from_rotation(R: Matrix) -> Matrix:
+    """Turn one 3×3 rotation into a unit quaternion wxyz with w ≥ 0 (largest-pivot form, stable everywhere)."""
+    trace = float(np.trace(R))
+    pivots = np.array([trace, R[0, 0], R[1, 1], R[2, 2]])
+    i = int(np.argmax(pivots))
+    q = np.empty(4)
+    if i == 0:
+        q[:] = [1.0 + trace, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]
+    else:
+        a, b, c = (i - 1), i % 3, (i + 1) % 3
+        q[0] = R[c, b] - R[b, c]
+        q[1 + a] = 1.0 + R[a, a] - R[b, b] - R[c, c]
+        q[1 + b] = R[b, a] + R[a, b]
+        q[1 + c] = R[c, a] + R[a, c]
+    q /= np.linalg.norm(q)
+    return q if q[0] >= 0 else -q
+
+
+def rotation_angle(R: Matrix) -> float:
+    """Return the angle of a rotation in radians."""
+    return float(np.linalg.norm(log_rotation(R)))
+
+
+def orthonormalise(T: Matrix) -> Matrix:
+    """Project the rotation part onto SO(3), so that thousands of products do not drift off the group."""
+    u, _, vt = np.linalg.svd(T[:3, :3])
+    out = T.copy()
+    out[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return out
+
+
+def is_rigid(T: Matrix, tolerance: float = 1e-3) -> bool:
+    """Tell whether a 4×4 matrix is finite, its rotation orthonormal with determinant +1, its last row 0 0 0 1."""
+    return bool(
+        T.shape == (4, 4)
+        and np.isfinite(T).all()
+        and np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < tolerance
+        and np.linalg.det(T[:3, :3]) > 0
+        and np.abs(T[3] - [0, 0, 0, 1]).max() < tolerance
+    )

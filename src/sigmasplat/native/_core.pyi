@@ -1,0 +1,134 @@
+from typing import Any
+
+Array = Any
+
+def isa_name() -> str: ...
+def supported_isas() -> list[str]: ...
+def set_isa(name: str) -> None: ...
+def set_threads(n: int) -> None: ...
+def threads() -> int: ...
+def tile_size() -> list[int]: ...
+def project_forward(
+    view: Array, means: Array, quats: Array, scales: Array, means2d: Array, conics: Array, z: Array, radii: Array
+) -> None: ...
+def project_backward(
+    view: Array,
+    means: Array,
+    quats: Array,
+    scales: Array,
+    radii: Array,
+    g_means2d: Array,
+    g_conics: Array,
+    g_z: Array,
+    g_means: Array,
+    g_quats: Array,
+    g_scales: Array,
+    g_twist: Array,
+) -> None: ...
+def project_double(
+    view: Array, means: Array, quats: Array, scales: Array, g: Array, footprint: Array, gradient: Array
+) -> None: ...
+def adam(
+    params: Array,
+    grad: Array,
+    moment1: Array,
+    moment2: Array,
+    rates: Array,
+    beta1: float,
+    beta2: float,
+    epsilon: float,
+    step: int,
+) -> None: ...
+def ssim_cache_floats(width: int, height: int) -> int: ...
+def ssim_target(target: Array, width: int, height: int, cache: Array) -> None: ...
+def ssim(
+    image: Array, target: Array, cache: Array, width: int, height: int, weight: float, gradient: Array
+) -> float: ...
+def align_step(
+    reference_gray: Array,
+    reference_depth: Array,
+    weight: Array | None,
+    live_gray: Array,
+    live_depth: Array,
+    intrinsics: list[float],
+    weight_color: float,
+    weight_depth: float,
+    huber_gray: float,
+    huber_depth_relative: float,
+    depth_gate: float,
+    T: Array,
+    H: Array,
+    b: Array,
+    sums: Array,
+) -> None: ...
+
+class Rasteriser:
+    def __init__(self) -> None: ...
+    @property
+    def bytes(self) -> int: ...
+    def blend_forward(
+        self,
+        means2d: Array,
+        conics: Array,
+        z: Array,
+        radii: Array,
+        opacities: Array,
+        features: Array,
+        width: int,
+        height: int,
+        alpha_min: float,
+        stop: float,
+        reference: Array | None,
+        sums: Array,
+        moment: Array | None,
+        alpha: Array,
+        median_id: Array | None,
+        median_weight: Array | None,
+        dominant_id: Array | None,
+        dominant_weight: Array | None,
+    ) -> None: ...
+    def blend_backward(
+        self,
+        sums: Array,
+        moment: Array | None,
+        alpha: Array,
+        g_sums: Array,
+        g_moment: Array | None,
+        g_alpha: Array | None,
+        g_means2d: Array,
+        g_conics: Array,
+        g_z: Array,
+        g_opacities: Array,
+        g_features: Array,
+    ) -> None: ...
+    def view_forward(
+        self,
+        view: Array,
+        params: Array,
+        k: int,
+        alpha_min: float,
+        stop: float,
+        reference: Array | None,
+        sums: Array,
+        moment: Array | None,
+        alpha: Array,
+        median_id: Array | None,
+        median_weight: Array | None,
+        dominant_id: Array | None,
+        dominant_weight: Array | None,
+        seconds: Array,
+    ) -> None: ...
+    def view_backward(
+        self,
+        params: Array,
+        sums: Array,
+        moment: Array | None,
+        alpha: Array,
+        g_sums: Array,
+        g_moment: Array | None,
+        g_alpha: Array | None,
+        g_params: Array | None,
+        g_twist: Array,
+        seconds: Array,
+    ) -> None: ...
+    def visible(self, out: Array) -> None: ...

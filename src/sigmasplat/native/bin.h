@@ -1,0 +1,219 @@
+// Stage 2: footprints → for every tile, the splats that reach it, near to far.
+
+#if defined(__AVX512F__)
+constexpr int TILE_WIDTH = 32, TILE_HEIGHT = 16;
+#elif defined(__AVX2__)
+constexpr int TILE_WIDTH = 32, TILE_HEIGHT = 16;
+#else
+constexpr int TILE_WIDTH = 16, TILE_HEIGHT = 16;
+#endif
+constexpr int BLOCKS_X = TILE_WIDTH / BLOCK_WIDTH, BLOCKS_Y = TILE_HEIGHT / BLOCK_HEIGHT, BLOCKS = BLOCKS_X * BLOCKS_Y;
+static_assert(BLOCKS <= 64, "a tile's blocks must fit one mask");
+
+constexpr float LOG2_E = 1.4426950408889634f;
+// Exponents are carried as log2/8: alpha = 2^(8t), t = log2(o)/8 − p² − q², p = L1·dx + L2·dy, q = L3·dy, L = CONIC_SCALE·l.
+constexpr float CONIC_SCALE = 0.30028060219661246f;   // sqrt(log2(e)/16)
+constexpr float ALPHA_MAX = 0.99f;
+
+struct alignas(32) Geometry { float l1, l2, l3, u, v, log_opacity, z; int id; };
+struct Box { uint16_t x0, y0, x1, y1; };              // in blocks, inclusive
+
+constexpr int ALPHA_CHUNK = 32;
+struct AlphaBuffer {                                  // one chunk of a block's splats that survive the alpha test
+    alignas(64) float alpha[ALPHA_CHUNK + 4][W];
+    alignas(64) float pairs[ALPHA_CHUNK + 4][2 * W];
+    int entry[ALPHA_CHUNK + 4];
+};
+struct Scratch {                                      // one thread's tile
+    Buffer<Geometry> geometry;
+    Buffer<float> features, records;
+    Buffer<int> lists;
+    Buffer<uint64_t> sorted;
+    AlphaBuffer alphas;
+    int counts[BLOCKS];
+    size_t list_capacity = 0;
+    size_t bytes() const {
+        return geometry.bytes() + features.bytes() + records.bytes() + lists.bytes() + sorted.bytes() + sizeof(*this);
+    }
+};
+
+
+// The feature counts compiled in; a count between them is padded with zeros.
+constexpr int feature_slots(int k) { return k <= 4 ? 4 : k <= 7 ? 7 : k <= 11 ? 11 : 16; }
+
+struct Render {                                       // what one forward pass leaves for its backward pass
+    int64_t n = 0;
+    int k = 0, used = 0, stride = 0, width = 0, height = 0, tiles_x = 0, tiles_y = 0;
+    View<float> view;
+    BlendOptions options;
+    const float* reference = nullptr;
+    int64_t intersections = 0;
+    Buffer<Geometry> geometry;
+    Buffer<Box> boxes;
+    Buffer<float> features, partials;
+    Buffer<int> tiles_of, slot, tile_begin, histogram, chunk_total;
+    Buffer<uint64_t> items;
+    Scratch* scratch = nullptr;
+    int threads = 0;
+
+    ~Render() { delete[] scratch; }
+    void prepare(int64_t splats, int features_used, int w, int h, BlendOptions o) {
+        n = splats; used = features_used; k = feature_slots(features_used); stride = (k + 3) / 4 * 4; width = w; height = h; options = o;
+        tiles_x = (w + TILE_WIDTH - 1) / TILE_WIDTH; tiles_y = (h + TILE_HEIGHT - 1) / TILE_HEIGHT;
+        geometry.reserve(n + W); boxes.reserve(n + W); features.reserve((n + W) * stride);
+        tiles_of.reserve(n + W); slot.reserve(n + W + 1);
+        chunk_total.reserve(n / CHUNK + 2);
+        if (threads < omp_get_max_threads()) {
+            delete[] scratch;
+            threads = omp_get_max_threads();
+            scratch = new Scratch[threads];
+        }
+    }
+    size_t padded_width() const { return size_t(tiles_x) * TILE_WIDTH; }
+    size_t plane() const { return padded_width() * tiles_y * TILE_HEIGHT; }
+    size_t bytes() const {
+        size_t b = geometry.bytes() + boxes.bytes() + features.bytes() + partials.bytes() + tiles_of.bytes() + slot.bytes()
+                   + items.bytes() + histogram.bytes() + tile_begin.bytes();
+        for (int t = 0; t < threads; t++) b += scratch[t].bytes();
+        return b;
+    }
+};
+
+// Store W footprints; return how many tiles they reach. Bounds are those of alpha ≥ alpha_min, not three sigma, so the
+// image does not depend on the tiling.
+SIGMA_INLINE int pack(Render& r, const Footprint<vf>& f, vf opacity, Mask seen, int64_t i) {
+    const vf log_opacity = log2(max(opacity, splat(1e-30f)));
+    const vf reach = log_opacity - splat(__builtin_log2f(r.options.alpha_min));
+    seen = both(seen, gt(reach, splat(0.f)));
+    const vf radius2 = max(reach, splat(0.f)) * (2.f / LOG2_E) * 1.0002f;
+    const vf du = sqrt(radius2 * f.var_u) + 1e-3f, dv = sqrt(radius2 * f.var_v) + 1e-3f;
+    const int blocks_x = (r.width + BLOCK_WIDTH - 1) / BLOCK_WIDTH, blocks_y = (r.height + BLOCK_HEIGHT - 1) / BLOCK_HEIGHT;
+    // Block b holds pixels b·B … b·B+B−1; clamp before converting so that huge splats cannot overflow.
+    const vf x0 = clamp(-floor((float(BLOCK_WIDTH - 1) - f.u + du) * (1.f / BLOCK_WIDTH)), 0.f, float(blocks_x));
+    const vf x1 = clamp(floor((f.u + du) * (1.f / BLOCK_WIDTH)), -1.f, float(blocks_x - 1));
+    const vf y0 = clamp(-floor((float(BLOCK_HEIGHT - 1) - f.v + dv) * (1.f / BLOCK_HEIGHT)), 0.f, float(blocks_y));
+    const vf y1 = clamp(floor((f.v + dv) * (1.f / BLOCK_HEIGHT)), -1.f, float(blocks_y - 1));
+    seen = both(seen, both(ge(x1, x0), ge(y1, y0)));
+    const unsigned live = bits(seen) & (r.n - i < W ? (1u << (r.n - i)) - 1u : ~0u);
+    alignas(64) int box[4][W];
+    store(box[0], to_int(x0)); store(box[1], to_int(y0)); store(box[2], to_int(x1)); store(box[3], to_int(y1));
+    alignas(64) float g[7][W];
+    store(g[0], f.l1 * CONIC_SCALE); store(g[1], f.l2 * CONIC_SCALE); store(g[2], f.l3 * CONIC_SCALE);
+    store(g[3], f.u); store(g[4], f.v); store(g[5], log_opacity * 0.125f); store(g[6], f.z);
+    int total = 0;
+    for (int l = 0; l < W; l++) {
+        int count = 0;
+        if (live >> l & 1) {
+            const int bx0 = box[0][l], by0 = box[1][l], bx1 = box[2][l], by1 = box[3][l];
+            r.boxes[i + l] = {uint16_t(bx0), uint16_t(by0), uint16_t(bx1), uint16_t(by1)};
+            r.geometry[i + l] = {g[0][l], g[1][l], g[2][l], g[3][l], g[4][l], g[5][l], g[6][l], int(i + l)};
+            count = (bx1 / BLOCKS_X - bx0 / BLOCKS_X + 1) * (by1 / BLOCKS_Y - by0 / BLOCKS_Y + 1);
+        }
+        r.tiles_of[i + l] = count;
+        total += count;
+    }
+    return total;
+}
+
+// Sort (depth bits << 32 | splat) by depth, keeping the order of equals: least-significant-digit radix over the bits that differ.
+static void sort_tile(uint64_t* a, uint64_t* spare, int n) {
+    if (n <= 24) {
+        for (int i = 1; i < n; i++) {
+            const uint64_t x = a[i];
+            int j = i - 1;
+            for (; j >= 0 && a[j] > x; j--) a[j + 1] = a[j];
+            a[j + 1] = x;
+        }
+        return;
+    }
+    uint32_t low = ~0u, high = 0;
+    for (int i = 0; i < n; i++) {
+        const uint32_t key = a[i] >> 32;
+        low = key < low ? key : low;
+        high = key > high ? key : high;
+    }
+    const uint32_t range = high - low;
+    const int used = range ? 32 - __builtin_clz(range) : 1, passes = (used + 7) / 8, digit = (used + passes - 1) / passes;
+    const uint32_t mask = (1u << digit) - 1;
+    uint32_t counts[4][256];
+    memset(counts, 0, sizeof(counts[0]) * passes);
+    for (int i = 0; i < n; i++) {
+        const uint32_t key = uint32_t(a[i] >> 32) - low;
+        for (int p = 0; p < passes; p++) counts[p][key >> (p * digit) & mask]++;
+    }
+    uint64_t *from = a, *to = spare;
+    for (int p = 0; p < passes; p++) {
+        uint32_t sum = 0;
+        for (uint32_t d = 0; d <= mask; d++) { const uint32_t c = counts[p][d]; counts[p][d] = sum; sum += c; }
+        for (int i = 0; i < n; i++) to[counts[p][(uint32_t(from[i] >> 32) - low) >> (p * digit) & mask]++] = from[i];
+        uint64_t* t = from; from = to; to = t;
+    }
+    if (from != a) memcpy(a, from, size_t(n) * sizeof *a);
+}
+
+template <class Visit> SIGMA_INLINE void for_tiles(const Render& r, int64_t i, Visit visit) {
+    const Box b = r.boxes[i];
+    const int tx0 = b.x0 / BLOCKS_X, tx1 = b.x1 / BLOCKS_X, ty1 = b.y1 / BLOCKS_Y;
+    for (int ty = b.y0 / BLOCKS_Y; ty <= ty1; ty++)
+        for (int tx = tx0; tx <= tx1; tx++) visit(ty * r.tiles_x + tx);
+}
+
+static void fill_slots(Render& r) {                   // where each splat's per-tile gradients will lie
+    const int64_t chunks = (r.n + CHUNK - 1) / CHUNK;
+    int sum = 0;
+    for (int64_t c = 0; c < chunks; c++) { const int t = r.chunk_total[c]; r.chunk_total[c] = sum; sum += t; }
+    r.intersections = sum;
+#pragma omp parallel for schedule(static)
+    for (int64_t c = 0; c < chunks; c++) {
+        int s = r.chunk_total[c];
+        for (int64_t i = c * CHUNK; i < r.n && i < (c + 1) * CHUNK; i++) { r.slot[i] = s; s += r.tiles_of[i]; }
+    }
+    r.slot[r.n] = sum;
+}
+
+static void bin(Render& r) {
+    fill_slots(r);
+    const int tiles = r.tiles_x * r.tiles_y, threads = omp_get_max_threads();
+    r.tile_begin.reserve(tiles + 1);
+    r.histogram.reserve(size_t(threads) * tiles);
+    r.items.reserve(r.intersections + 1);
+#pragma omp parallel num_threads(threads)
+    {
+        const int t = omp_get_thread_num(), team = omp_get_num_threads();
+        const int64_t begin = r.n * t / team, end = r.n * (t + 1) / team;
+        int* mine = r.histogram.data + size_t(t) * tiles;
+        memset(mine, 0, size_t(tiles) * sizeof(int));
+        for (int64_t i = begin; i < end; i++)
+            if (r.tiles_of[i]) for_tiles(r, i, [&](int tile) { mine[tile]++; });
+#pragma omp barrier
+#pragma omp single
+        {
+            int sum = 0;
+            for (int q = 0; q < tiles; q++) {
+                r.tile_begin[q] = sum;
+                for (int w = 0; w < team; w++) {
+                    int& h = r.histogram[size_t(w) * tiles + q];
+                    const int count = h;
+                    h = sum;
+                    sum += count;
+                }
+            }
+            r.tile_begin[tiles] = sum;
+        }
+        for (int64_t i = begin; i < end; i++)
+            if (r.tiles_of[i]) {
+                uint32_t depth_bits;                  // positive floats order as their bits
+                memcpy(&depth_bits, &r.geometry[i].z, 4);
+                const uint64_t item = uint64_t(depth_bits) << 32 | uint32_t(i);
+                for_tiles(r, i, [&](int tile) { r.items[mine[tile]++] = item; });
+            }
+#pragma omp barrier
+        Scratch& s = r.scratch[t];
+#pragma omp for schedule(dynamic, 4)
+        for (int q = 0; q < tiles; q++) {
+            const int count = r.tile_begin[q + 1] - r.tile_begin[q];
+            s.sorted.reserve(count);
+            sort_tile(r.items.data + r.tile_begin[q], s.sorted.data, count);
+        }
+    }
+}

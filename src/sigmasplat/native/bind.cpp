@@ -1,0 +1,217 @@
+// Offer the kernels to Python: arrays in, arrays out, no copies, the GIL released; the instruction set chosen at run time.
+#include <cmath>
+#include <cstring>
+#include <memory>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include <omp.h>
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include "kernels.h"
+
+namespace nb = nanobind;
+
+namespace sigmasplat {
+#if defined(SIGMASPLAT_HAS_avx2)
+namespace avx512 { extern const Kernels table; }
+namespace avx2 { extern const Kernels table; }
+#endif
+namespace baseline { extern const Kernels table; }
+
+namespace scalar {                         // splat.h in double precision, for tests of the header itself
+using std::sqrt;
+inline double max(double a, double b) { return a > b ? a : b; }
+inline double clamp(double a, double lo, double hi) { return a < lo ? lo : a > hi ? hi : a; }
+inline bool ge(double a, double b) { return a >= b; }
+inline bool both(bool a, bool b) { return a && b; }
+inline double select(bool m, double a, double b) { return m ? a : b; }
+inline double only(bool m, double a) { return m ? a : 0.0; }
+#include "splat.h"
+}  // namespace scalar
+}  // namespace sigmasplat
+
+using namespace sigmasplat;
+using Floats = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
+using ConstFloats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
+using Ints = nb::ndarray<int, nb::c_contig, nb::device::cpu>;
+using Bytes = nb::ndarray<uint8_t, nb::c_contig, nb::device::cpu>;
+using Doubles = nb::ndarray<double, nb::c_contig, nb::device::cpu>;
+template <class T> using Maybe = std::optional<T>;
+
+static std::vector<const Kernels*> supported() {
+    std::vector<const Kernels*> found;
+#if defined(SIGMASPLAT_HAS_avx2)
+    __builtin_cpu_init();
+    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512dq"))
+        found.push_back(&avx512::table);
+    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) found.push_back(&avx2::table);
+#endif
+    found.push_back(&baseline::table);
+    return found;
+}
+static const Kernels* active = supported().front();
+
+template <class A> static auto* pointer(Maybe<A>& a) { return a ? a->data() : nullptr; }
+static void need(bool ok, const char* what) { if (!ok) throw std::invalid_argument(what); }
+static Outputs outputs(Floats& sums, Maybe<Floats>& moment, Floats& alpha, Maybe<Ints>& median_id, Maybe<Floats>& median_weight,
+                       Maybe<Ints>& dominant_id, Maybe<Floats>& dominant_weight) {
+    return {sums.data(), pointer(moment), alpha.data(), pointer(median_id), pointer(median_weight), pointer(dominant_id), pointer(dominant_weight)};
+}
+
+// The buffers of one render, bound to the instruction set that was active when it was made.
+class Rasteriser {
+public:
+    Rasteriser() : kernels(active), context(kernels->create()) {}
+    ~Rasteriser() { kernels->destroy(context); }
+    Rasteriser(const Rasteriser&) = delete;
+    size_t bytes() const { return kernels->bytes(context); }
+
+    void blend_forward(ConstFloats means2d, ConstFloats conics, ConstFloats z, ConstFloats radii, ConstFloats opacities,
+                       ConstFloats features, int width, int height, float alpha_min, float stop, Maybe<ConstFloats> reference,
+                       Floats sums, Maybe<Floats> moment, Floats alpha, Maybe<Ints> median_id, Maybe<Floats> median_weight,
+                       Maybe<Ints> dominant_id, Maybe<Floats> dominant_weight) {
+        const Outputs o = outputs(sums, moment, alpha, median_id, median_weight, dominant_id, dominant_weight);
+        const int64_t n = z.shape(0);
+        const int k = int(features.shape(1));
+        need(k >= 1 && k <= 16, "blend takes 1 to 16 features at once");
+        need(!o.moment == !reference, "a moment needs a reference depth");
+        nb::gil_scoped_release unlocked;
+        kernels->blend_forward(context, means2d.data(), conics.data(), z.data(), radii.data(), opacities.data(), features.data(),
+                               n, k, width, height, pointer(reference), {alpha_min, stop}, o);
+    }
+    void blend_backward(Floats sums, Maybe<Floats> moment, Floats alpha, ConstFloats g_sums, Maybe<ConstFloats> g_moment,
+                        Maybe<ConstFloats> g_alpha, Floats g_means2d, Floats g_conics, Floats g_z, Floats g_opacities, Floats g_features) {
+        nb::gil_scoped_release unlocked;
+        kernels->blend_backward(context, {sums.data(), pointer(moment), alpha.data(), nullptr, nullptr, nullptr, nullptr},
+                                {g_sums.data(), pointer(g_moment), pointer(g_alpha)},
+                                {g_means2d.data(), g_conics.data(), g_z.data(), g_opacities.data(), g_features.data()});
+    }
+    void view_forward(ConstFloats view, ConstFloats params, int k, float alpha_min, float stop, Maybe<ConstFloats> reference,
+                      Floats sums, Maybe<Floats> moment, Floats alpha, Maybe<Ints> median_id, Maybe<Floats> median_weight,
+                      Maybe<Ints> dominant_id, Maybe<Floats> dominant_weight, Doubles seconds) {
+        const Outputs o = outputs(sums, moment, alpha, median_id, median_weight, dominant_id, dominant_weight);
+        need(params.ndim() == 2 && params.shape(1) == 17, "params must be [N, 17]");
+        need(k == 4 || k == 7, "a view has 4 features (colour, depth) or 7 (and variance)");
+        need(!o.moment == !reference, "a moment needs a reference depth");
+        need(seconds.size() >= 3, "seconds needs 3 places");
+        nb::gil_scoped_release unlocked;
+        kernels->view_forward(context, view.data(), params.data(), int64_t(params.shape(0)), k, pointer(reference),
+                              {alpha_min, stop}, o, seconds.data());
+    }
+    void view_backward(ConstFloats params, Floats sums, Maybe<Floats> moment, Floats alpha, ConstFloats g_sums,
+                       Maybe<ConstFloats> g_moment, Maybe<ConstFloats> g_alpha, Maybe<Floats> g_params, Doubles g_twist, Doubles seconds) {
+        need(g_twist.size() == 6 && seconds.size() >= 2, "g_twist has 6 numbers, seconds 2");
+        nb::gil_scoped_release unlocked;
+        kernels->view_backward(context, params.data(), {sums.data(), pointer(moment), alpha.data(), nullptr, nullptr, nullptr, nullptr},
+                               {g_sums.data(), pointer(g_moment), pointer(g_alpha)}, pointer(g_params), g_twist.data(), seconds.data());
+    }
+    void visible(Bytes out) const { kernels->view_visible(context, out.data()); }
+
+private:
+    const Kernels* kernels;
+    Context* context;
+};
+
+static void project_double(Doubles view, Doubles means, Doubles quats, Doubles scales, Doubles g, Doubles footprint, Doubles gradient) {
+    scalar::View<double> v;
+    need(view.size() * sizeof(double) == sizeof v, "a view has 27 numbers");
+    memcpy(&v, view.data(), sizeof v);
+    for (size_t i = 0; i < means.shape(0); i++) {
+        scalar::Shape<double> s;
+        memcpy(s.mean, means.data() + 3 * i, sizeof s.mean);
+        memcpy(s.quat, quats.data() + 4 * i, sizeof s.quat);
+        memcpy(s.scale, scales.data() + 3 * i, sizeof s.scale);
+        const auto f = scalar::project(v, s, v.near_m);
+        const double out[6] = {f.u, f.v, f.z, f.l1, f.l2, f.l3};
+        memcpy(footprint.data() + 6 * i, out, sizeof out);
+        scalar::FootprintGradient<double> gf;
+        memcpy(&gf, g.data() + 6 * i, sizeof gf);
+        scalar::ShapeGradient<double> gs;
+        scalar::project_backward(v, s, v.near_m, gf, gs);
+        memcpy(gradient.data() + 16 * i, &gs, sizeof gs);
+    }
+}
+
+NB_MODULE(_core, m) {
+    nb::set_leak_warnings(false);         // autograd graphs may outlive the interpreter's orderly end
+    m.doc() = "SigmaSplat's CPU kernels. Arrays are float32, C-contiguous, on the CPU; see sigmasplat.render.cpu for the shapes.";
+    m.def("isa_name", [] { return std::string(active->name); });
+    m.def("supported_isas", [] { std::vector<std::string> names; for (auto* k : supported()) names.push_back(k->name); return names; });
+    m.def("set_isa", [](const std::string& name) {
+        for (auto* k : supported()) if (name == k->name || name == "auto") { active = k; return; }
+        throw std::invalid_argument("instruction set " + name + " is not supported on this machine");
+    });
+    m.def("set_threads", [](int n) { omp_set_num_threads(n); });
+    m.def("threads", [] { return omp_get_max_threads(); });
+    m.def("tile_size", [] { return std::vector<int>{active->pad.tile_width, active->pad.tile_height}; });
+    m.def("project_forward", [](ConstFloats view, ConstFloats means, ConstFloats quats, ConstFloats scales, Floats means2d, Floats conics, Floats z, Floats radii) {
+        nb::gil_scoped_release unlocked;
+        active->project_forward(view.data(), means.data(), quats.data(), scales.data(), int64_t(means.shape(0)), means2d.data(), conics.data(), z.data(), radii.data());
+    });
+    m.def("project_backward", [](ConstFloats view, ConstFloats means, ConstFloats quats, ConstFloats scales, ConstFloats radii, ConstFloats g_means2d,
+                                 ConstFloats g_conics, ConstFloats g_z, Floats g_means, Floats g_quats, Floats g_scales, Doubles g_twist) {
+        nb::gil_scoped_release unlocked;
+        active->project_backward(view.data(), means.data(), quats.data(), scales.data(), int64_t(means.shape(0)), radii.data(), g_means2d.data(),
+                                 g_conics.data(), g_z.data(), g_means.data(), g_quats.data(), g_scales.data(), g_twist.data());
+    });
+    m.def("project_double", project_double);
+    m.def("adam", [](Floats params, ConstFloats grad, Floats moment1, Floats moment2, ConstFloats rates, float beta1, float beta2, float epsilon, int64_t step) {
+        need(rates.size() == 17, "one rate per column");
+        nb::gil_scoped_release unlocked;
+        active->adam(params.data(), grad.data(), moment1.data(), moment2.data(), int64_t(params.shape(0)), rates.data(), beta1, beta2, epsilon, step);
+    });
+    m.def("ssim_cache_floats", [](int width, int height) { const size_t w = active->pad.lanes; return 6 * ((width + w - 1) / w * w) * height; });
+    m.def("ssim_target", [](ConstFloats target, int width, int height, Floats cache) {
+        nb::gil_scoped_release unlocked;
+        active->ssim_target(target.data(), width, height, target.shape(2), target.shape(1) * target.shape(2), cache.data());
+    });
+    m.def("ssim", [](ConstFloats image, ConstFloats target, ConstFloats cache, int width, int height, Maybe<ConstFloats> mask, float weight, Floats gradient) {
+        nb::gil_scoped_release unlocked;
+        return active->ssim(image.data(), target.data(), cache.data(), width, height, image.shape(2), image.shape(1) * image.shape(2), pointer(mask), weight, gradient.data());
+    }, nb::arg("image"), nb::arg("target"), nb::arg("cache"), nb::arg("width"), nb::arg("height"), nb::arg("mask").none(), nb::arg("weight"), nb::arg("gradient"));
+    m.def("mapping_losses", [](ConstFloats sums, ConstFloats target_color, ConstFloats target_depth, int height, std::vector<float> weights,
+                               double valid_pixels, Floats g_sums, Floats masked_color, Doubles losses) {
+        need(weights.size() == 4 && losses.size() == 4, "mapping_losses: four weights, four losses");
+        const size_t stride = sums.shape(2), plane = sums.shape(1) * stride;
+        nb::gil_scoped_release unlocked;
+        active->mapping_losses(sums.data(), target_color.data(), target_depth.data(), height, stride, plane, sums.shape(0) >= 7,
+                               {weights[0], weights[1], weights[2], weights[3]}, valid_pixels, g_sums.data(), masked_color.data(), losses.data());
+    });
+    m.def("isotropy", [](ConstFloats params, float weight, Floats g_params) {
+        nb::gil_scoped_release unlocked;
+        return active->isotropy(params.data(), int64_t(params.shape(0)), weight, g_params.data());
+    });
+    m.def("align_step", [](ConstFloats reference_gray, ConstFloats reference_depth, Maybe<ConstFloats> weight, ConstFloats live_gray, ConstFloats live_depth,
+                           std::vector<float> intrinsics, float weight_color, float weight_depth, float huber_gray, float huber_depth_relative, float depth_gate,
+                           Doubles T, Doubles H, Doubles b, Doubles sums) {
+        need(intrinsics.size() == 4 && T.size() >= 12 && H.size() == 21 && b.size() == 6 && sums.size() == 4, "align_step: wrong sizes");
+        const AlignLevel level{reference_gray.data(), reference_depth.data(), pointer(weight), live_gray.data(), live_depth.data(),
+                               int(reference_gray.shape(1)), int(reference_gray.shape(0)), intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]};
+        const AlignOptions options{weight_color, weight_depth, huber_gray, huber_depth_relative, depth_gate};
+        nb::gil_scoped_release unlocked;
+        active->align_step(&level, &options, T.data(), H.data(), b.data(), sums.data());
+    }, nb::arg("reference_gray"), nb::arg("reference_depth"), nb::arg("weight").none(), nb::arg("live_gray"), nb::arg("live_depth"), nb::arg("intrinsics"),
+       nb::arg("weight_color"), nb::arg("weight_depth"), nb::arg("huber_gray"), nb::arg("huber_depth_relative"), nb::arg("depth_gate"), nb::arg("T"),
+       nb::arg("H"), nb::arg("b"), nb::arg("sums"));
+    nb::class_<Rasteriser>(m, "Rasteriser")
+        .def(nb::init<>())
+        .def_prop_ro("bytes", &Rasteriser::bytes)
+        .def("blend_forward", &Rasteriser::blend_forward, nb::arg("means2d"), nb::arg("conics"), nb::arg("z"), nb::arg("radii"), nb::arg("opacities"),
+             nb::arg("features"), nb::arg("width"), nb::arg("height"), nb::arg("alpha_min"), nb::arg("stop"), nb::arg("reference").none(), nb::arg("sums"),
+             nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(), nb::arg("median_weight").none(), nb::arg("dominant_id").none(), nb::arg("dominant_weight").none())
+        .def("blend_backward", &Rasteriser::blend_backward, nb::arg("sums"), nb::arg("moment").none(), nb::arg("alpha"), nb::arg("g_sums"), nb::arg("g_moment").none(),
+             nb::arg("g_alpha").none(), nb::arg("g_means2d"), nb::arg("g_conics"), nb::arg("g_z"), nb::arg("g_opacities"), nb::arg("g_features"))
+        .def("view_forward", &Rasteriser::view_forward, nb::arg("view"), nb::arg("params"), nb::arg("k"), nb::arg("alpha_min"), nb::arg("stop"), nb::arg("reference").none(),
+             nb::arg("sums"), nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(), nb::arg("median_weight").none(), nb::arg("dominant_id").none(),
+             nb::arg("dominant_weight").none(), nb::arg("seconds"))
+        .def("view_backward", &Rasteriser::view_backward, nb::arg("params"), nb::arg("sums"), nb::arg("moment").none(), nb::arg("alpha"), nb::arg("g_sums"),
+             nb::arg("g_moment").none(), nb::arg("g_alpha").none(), nb::arg("g_params").none(), nb::arg("g_twist"), nb::arg("seconds"))
+        .def("visible", &Rasteriser::visible);
+}

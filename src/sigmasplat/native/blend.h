@@ -1,0 +1,317 @@
+// Stage 3: tiles → pixels, and back. A tile is cut into blocks of W pixels; lanes are pixels; a block walks its own list of
+// splats near to far. Alphas come first, a chunk at a time, so that the transmittance chain stays one multiply-add long.
+
+struct Tile { int index, x, y, count; };              // x, y: pixel of its corner
+
+SIGMA_INLINE uint64_t block_mask(Box b, int tile_bx, int tile_by) {
+    const int c0 = b.x0 > tile_bx ? b.x0 - tile_bx : 0, c1 = (b.x1 < tile_bx + BLOCKS_X - 1 ? b.x1 - tile_bx : BLOCKS_X - 1);
+    const int r0 = b.y0 > tile_by ? b.y0 - tile_by : 0, r1 = (b.y1 < tile_by + BLOCKS_Y - 1 ? b.y1 - tile_by : BLOCKS_Y - 1);
+    const uint64_t columns = ((1ull << (c1 - c0 + 1)) - 1) << c0;
+    uint64_t every_row = 0;                           // bit 0 of each row, a constant
+    for (int y = 0; y < BLOCKS_Y; y++) every_row |= 1ull << (y * BLOCKS_X);
+    const int rows = (r1 - r0 + 1) * BLOCKS_X;
+    const uint64_t span = (rows == 64 ? ~0ull : (1ull << rows) - 1) << (r0 * BLOCKS_X);
+    return (columns * every_row) & span;
+}
+
+// Bring a tile's splats together, near to far, coordinates about the tile's centre, and list them per block.
+static Tile gather_tile(const Render& r, Scratch& s, int index, int record_floats) {
+    const int begin = r.tile_begin[index], n = r.tile_begin[index + 1] - begin;
+    const int tx = index % r.tiles_x, ty = index / r.tiles_x;
+    const Tile tile{index, tx * TILE_WIDTH, ty * TILE_HEIGHT, n};
+    const float cx = tile.x + (TILE_WIDTH - 1) * 0.5f, cy = tile.y + (TILE_HEIGHT - 1) * 0.5f;
+    s.geometry.reserve(n + 1);
+    s.features.reserve(size_t(n + 1) * r.stride);
+    s.list_capacity = size_t(n) + 4;
+    s.lists.reserve(s.list_capacity * BLOCKS);
+    if (record_floats) memset(s.records.reserve(size_t(n + 1) * record_floats), 0, size_t(n) * record_floats * sizeof(float));
+    memset(s.counts, 0, sizeof s.counts);
+    const uint64_t* items = r.items.data + begin;
+    for (int k = 0; k < n; k++) {
+        if (k + 8 < n) {
+            const uint32_t ahead = uint32_t(items[k + 8]);
+            __builtin_prefetch(&r.geometry[ahead]);
+            __builtin_prefetch(&r.features[size_t(ahead) * r.stride]);
+            __builtin_prefetch(&r.boxes[ahead]);
+        }
+        const uint32_t i = uint32_t(items[k]);
+        Geometry g = r.geometry[i];
+        const float u = g.u - cx, v = g.v - cy;
+        g.u = -(g.l1 * u + g.l2 * v);                 // p = l1·x + l2·y + g.u, q = l3·y + g.v with x, y from the tile's centre
+        g.v = -g.l3 * v;
+        s.geometry[k] = g;
+        memcpy(&s.features[size_t(k) * r.stride], &r.features[size_t(i) * r.stride], size_t(r.stride) * sizeof(float));
+        for (uint64_t m = block_mask(r.boxes[i], tx * BLOCKS_X, ty * BLOCKS_Y); m; m &= m - 1) {
+            const int b = __builtin_ctzll(m);
+            s.lists[b * s.list_capacity + s.counts[b]++] = k;
+        }
+    }
+    s.geometry[n] = {0, 0, 0, 0, 0, -1e30f, 0, -1};   // what the lists are padded with: never alive
+    memset(&s.features[size_t(n) * r.stride], 0, size_t(r.stride) * sizeof(float));
+    for (int b = 0; b < BLOCKS; b++)
+        for (int q = 0; q < 4; q++) s.lists[b * s.list_capacity + s.counts[b] + q] = n;
+    return tile;
+}
+
+SIGMA_INLINE vf block_x(int b) {
+    vf x;
+    for (int l = 0; l < W; l++) x[l] = float(l % BLOCK_WIDTH) + float(b % BLOCKS_X * BLOCK_WIDTH) - (TILE_WIDTH - 1) * 0.5f;
+    return x;
+}
+SIGMA_INLINE vf block_y(int b) {
+    vf y;
+    for (int l = 0; l < W; l++) y[l] = float(l / BLOCK_WIDTH) + float(b / BLOCKS_X * BLOCK_HEIGHT) - (TILE_HEIGHT - 1) * 0.5f;
+    return y;
+}
+
+// Alphas of up to ALPHA_CHUNK entries of a block's list; entries that reach no live pixel are dropped, without a branch.
+SIGMA_INLINE int live_alphas(const Geometry* geometry, const int* list, int begin, int end, vf x, vf y, Mask alive,
+                             float log_alpha_min, AlphaBuffer& out) {
+    const vf floor_ = splat(log_alpha_min), top = splat(ALPHA_MAX);
+    int n = 0;
+    for (int j = begin; j < end; j += 4) {
+        vf t[4];
+        Mask live[4];
+#pragma GCC unroll 4
+        for (int e = 0; e < 4; e++) {
+            const Geometry& g = geometry[list[j + e]];
+            const vf q = fma(splat(g.l3), y, splat(g.v)), p = fma(splat(g.l1), x, fma(splat(g.l2), y, splat(g.u)));
+            t[e] = fnma(p, p, fnma(q, q, splat(g.log_opacity)));
+            live[e] = both(alive, ge(t[e], floor_));
+        }
+#pragma GCC unroll 4
+        for (int e = 0; e < 4; e++) {
+            store(out.alpha[n], only(live[e], min(exp2_eighth(t[e]), top)));
+            out.entry[n] = list[j + e];
+            n += any(live[e]);
+        }
+    }
+    return n;
+}
+
+template <int K, bool MOMENT, bool IDS> static void blend_tiles(Render& r, Outputs o) {
+    const size_t plane = r.plane(), stride = r.padded_width();
+    const float log_alpha_min = __builtin_log2f(r.options.alpha_min) * 0.125f;
+    const vf stop = splat(r.options.transmittance_stop), half = splat(0.5f), zero = splat(0.f), one = splat(1.f);
+#pragma omp parallel
+    {
+        Scratch& s = r.scratch[omp_get_thread_num()];
+#pragma omp for schedule(dynamic, 1)
+        for (int index = 0; index < r.tiles_x * r.tiles_y; index++) {
+            const Tile tile = gather_tile(r, s, index, 0);
+            for (int b = 0; b < BLOCKS; b++) {
+                const vf x = block_x(b), y = block_y(b);
+                const int* list = &s.lists[b * s.list_capacity];
+                const size_t at = (tile.y + size_t(b / BLOCKS_X) * BLOCK_HEIGHT) * stride + tile.x + b % BLOCKS_X * BLOCK_WIDTH;
+                vf sum[K], moment = zero, ref = zero, T = one, T_end = one, best = zero, median_w = zero;
+                vi dominant = splat(-1), median = splat(-1);
+                for (auto& c : sum) c = zero;
+                if (MOMENT) ref = load_block(r.reference + at, stride);
+                const int count = s.counts[b];
+                for (int j = 0; j < count; j += ALPHA_CHUNK) {
+                    const int end = count < j + ALPHA_CHUNK ? count : j + ALPHA_CHUNK;
+                    const int n = live_alphas(s.geometry.data, list, j, end, x, y, ge(T, stop), log_alpha_min, s.alphas);
+                    for (int e = 0; e < n; e++) {
+                        const int entry = s.alphas.entry[e];
+                        const float* f = &s.features[size_t(entry) * r.stride];
+                        const vf a = load(s.alphas.alpha[e]);
+                        const Mask on = ge(T, stop);
+                        const vf w = only(on, T * a);
+                        const Mask before_half = ge(T, half);
+                        T = fnma(T, a, T);
+                        T_end = select(on, T, T_end);
+                        for (int c = 0; c < K; c++) sum[c] = fma(w, splat(f[c]), sum[c]);
+                        if (MOMENT) { const vf d = s.geometry[entry].z - ref; moment = fma(w * d, d, moment); }
+                        if (IDS) {
+                            const vi id = splat(s.geometry[entry].id);
+                            const Mask more = gt(w, best), crossing = both(before_half, gt(w, zero));
+                            best = max(w, best);
+                            dominant = select(more, id, dominant);
+                            median = select(crossing, id, median);
+                            median_w = select(crossing, w, median_w);
+                        }
+                    }
+                    if (!any(ge(T, stop))) break;
+                }
+                for (int c = 0; c < K; c++) store_block(o.sums + c * plane + at, stride, sum[c]);
+                store_block(o.alpha + at, stride, one - T_end);
+                if (MOMENT) store_block(o.moment + at, stride, only(gt(ref, zero), moment));
+                if (IDS) {
+                    const Mask crossed = gt(half, T_end);
+                    store_block(o.dominant_id + at, stride, dominant);
+                    store_block(o.dominant_weight + at, stride, best);
+                    store_block(o.median_id + at, stride, select(crossed, median, splat(-1)));
+                    store_block(o.median_weight + at, stride, only(crossed, median_w));
+                }
+            }
+        }
+    }
+}
+
+// A splat's gradient in one tile: 8 interleaved pairs (even: sums of g·{1, x, y, xx, xy, yy}; odd: sums of w·∂L/∂feature),
+// then the features that did not fit. With a moment, two further w-sums: 2·∂L/∂moment and its product with −ref.
+template <int K, bool MOMENT> constexpr int weight_columns = K + (MOMENT ? 2 : 0);
+template <int K, bool MOMENT> constexpr int extra_floats =
+    weight_columns<K, MOMENT> <= 8 ? 0 : (weight_columns<K, MOMENT> - 8 + W - 1) / W * W;
+template <int K, bool MOMENT> constexpr int record_floats = 16 + extra_floats<K, MOMENT>;
+
+#if defined(__AVX512F__)
+SIGMA_INLINE void store_pairs(float* out, vf g, vf w) {
+    store(out, (vf)_mm512_unpacklo_ps((__m512)g, (__m512)w));
+    store(out + W, (vf)_mm512_unpackhi_ps((__m512)g, (__m512)w));
+}
+#elif defined(__AVX2__)
+SIGMA_INLINE void store_pairs(float* out, vf g, vf w) {
+    store(out, (vf)_mm256_unpacklo_ps((__m256)g, (__m256)w));
+    store(out + W, (vf)_mm256_unpackhi_ps((__m256)g, (__m256)w));
+}
+#else
+SIGMA_INLINE void store_pairs(float* out, vf g, vf w) {
+    store(out, __builtin_shuffle(g, w, vi{0, 4, 1, 5}));
+    store(out + W, __builtin_shuffle(g, w, vi{2, 6, 3, 7}));
+}
+#endif
+constexpr int pixel_of_pair(int m) { return m < W / 2 ? m / 2 * 4 + m % 2 : (m - W / 2) / 2 * 4 + 2 + m % 2; }
+
+typedef long long vpair __attribute__((vector_size(W * 4)));
+SIGMA_INLINE vf splat_pair(const float* p) { long long bits; memcpy(&bits, p, 8); return (vf)(bits - vpair{}); }
+
+// Move a tile's records to each splat's own slots, moments now about the splat's mean.
+template <int RECORD> static void flush_records(Render& r, Scratch& s, const Tile& tile) {
+    const uint64_t* items = r.items.data + r.tile_begin[tile.index];
+    const int tx = tile.index % r.tiles_x, ty = tile.index / r.tiles_x;
+    for (int k = 0; k < tile.count; k++) {
+        const uint32_t i = uint32_t(items[k]);
+        const Box box = r.boxes[i];
+        const int columns = box.x1 / BLOCKS_X - box.x0 / BLOCKS_X + 1;
+        const size_t slot = r.slot[i] + (ty - box.y0 / BLOCKS_Y) * columns + (tx - box.x0 / BLOCKS_X);
+        float* m = &s.records[size_t(k) * RECORD];
+        const Geometry& g = r.geometry[i];
+        const float u = g.u - (tile.x + (TILE_WIDTH - 1) * 0.5f), v = g.v - (tile.y + (TILE_HEIGHT - 1) * 0.5f);
+        const float m0 = m[0], mx = m[2], my = m[4];
+        m[6] += u * (u * m0 - 2.f * mx);
+        m[8] += u * (v * m0 - my) - v * mx;
+        m[10] += v * (v * m0 - 2.f * my);
+        m[2] = mx - u * m0;
+        m[4] = my - v * m0;
+        memcpy(&r.partials[slot * RECORD], m, RECORD * sizeof(float));
+    }
+}
+
+template <int K, bool MOMENT> static void blend_tiles_backward(Render& r, Outputs o, OutputGradients g) {
+    constexpr int RECORD = record_floats<K, MOMENT>, EXTRA = extra_floats<K, MOMENT>, COLUMNS = weight_columns<K, MOMENT>;
+    const size_t plane = r.plane(), stride = r.padded_width();
+    const float log_alpha_min = __builtin_log2f(r.options.alpha_min) * 0.125f;
+    const vf stop = splat(r.options.transmittance_stop), zero = splat(0.f), one = splat(1.f), top = splat(ALPHA_MAX);
+    r.partials.reserve(size_t(r.intersections + 1) * RECORD);
+#pragma omp parallel
+    {
+        Scratch& s = r.scratch[omp_get_thread_num()];
+        alignas(64) float basis[W][16 + (EXTRA ? EXTRA : 1)];
+#pragma omp for schedule(dynamic, 1)
+        for (int index = 0; index < r.tiles_x * r.tiles_y; index++) {
+            const Tile tile = gather_tile(r, s, index, RECORD);
+            for (int b = 0; b < BLOCKS; b++) {
+                const int count = s.counts[b];
+                if (!count) continue;
+                const vf x = block_x(b), y = block_y(b);
+                const int* list = &s.lists[b * s.list_capacity];
+                const size_t at = (tile.y + size_t(b / BLOCKS_X) * BLOCK_HEIGHT) * stride + tile.x + b % BLOCKS_X * BLOCK_WIDTH;
+                vf gs[K], gm = zero, ref = zero;
+                const vf ga = g.alpha ? load_block(g.alpha + at, stride) : zero;
+                vf behind = ga * load_block(o.alpha + at, stride);       // Σ over what lies behind of w·G
+                alignas(64) float columns[COLUMNS][W];
+                for (int c = 0; c < K; c++) {
+                    gs[c] = load_block(g.sums + c * plane + at, stride);
+                    behind = fma(gs[c], load_block(o.sums + c * plane + at, stride), behind);
+                    store(columns[c], gs[c]);
+                }
+                if (MOMENT) {
+                    ref = load_block(r.reference + at, stride);
+                    gm = only(gt(ref, zero), load_block(g.moment + at, stride));
+                    behind = fma(gm, load_block(o.moment + at, stride), behind);
+                    store(columns[K], 2.f * gm);
+                    store(columns[K + 1], -2.f * gm * ref);
+                }
+                for (int m = 0; m < W; m++) {
+                    const int p = pixel_of_pair(m);
+                    const float px = x[p], py = y[p];
+                    const float moments[8] = {1.f, px, py, px * px, px * py, py * py, 0.f, 0.f};
+                    for (int c = 0; c < 8; c++) {
+                        basis[m][2 * c] = moments[c];
+                        basis[m][2 * c + 1] = c < COLUMNS ? columns[c < COLUMNS ? c : 0][p] : 0.f;
+                    }
+                    for (int c = 0; c < EXTRA; c++) basis[m][16 + c] = 8 + c < COLUMNS ? columns[8 + c < COLUMNS ? 8 + c : 0][p] : 0.f;
+                }
+                vf T = one;
+                for (int j = 0; j < count; j += ALPHA_CHUNK) {
+                    const int end = count < j + ALPHA_CHUNK ? count : j + ALPHA_CHUNK;
+                    const int n = live_alphas(s.geometry.data, list, j, end, x, y, ge(T, stop), log_alpha_min, s.alphas);
+                    for (int e = 0; e < n; e++) {
+                        const int entry = s.alphas.entry[e];
+                        const float* f = &s.features[size_t(entry) * r.stride];
+                        const vf a = load(s.alphas.alpha[e]);
+                        const Mask on = ge(T, stop);
+                        const vf w = only(on, T * a);
+                        vf G = ga;
+                        for (int c = 0; c < K; c++) G = fma(gs[c], splat(f[c]), G);
+                        if (MOMENT) { const vf d = s.geometry[entry].z - ref; G = fma(gm * d, d, G); }
+                        behind = fnma(w, G, behind);
+                        const vf g_alpha = fma(T, G, -(behind / (one - a)));
+                        const vf g_power = only(both(on, gt(top, a)), g_alpha * a);
+                        store_pairs(s.alphas.pairs[e], g_power, w);
+                        T = fnma(T, a, T);
+                    }
+                    for (int e = 0; e < n; e++) {
+                        const float* pairs = s.alphas.pairs[e];
+                        float* record = &s.records[size_t(s.alphas.entry[e]) * RECORD];
+                        vf acc[16 / W], rest[EXTRA ? EXTRA / W : 1];
+                        for (int h = 0; h < 16 / W; h++) acc[h] = load(record + h * W);
+                        for (int h = 0; h < EXTRA / W; h++) rest[h] = load(record + 16 + h * W);
+#pragma GCC unroll 16
+                        for (int m = 0; m < W; m++) {
+                            const vf pair = splat_pair(pairs + 2 * m);
+                            for (int h = 0; h < 16 / W; h++) acc[h] = fma(pair, load(basis[m] + h * W), acc[h]);
+                            if (EXTRA) {
+                                const vf weight = splat(pairs[2 * m + 1]);
+                                for (int h = 0; h < EXTRA / W; h++) rest[h] = fma(weight, load(basis[m] + 16 + h * W), rest[h]);
+                            }
+                        }
+                        for (int h = 0; h < 16 / W; h++) store(record + h * W, acc[h]);
+                        for (int h = 0; h < EXTRA / W; h++) store(record + 16 + h * W, rest[h]);
+                    }
+                    if (!any(ge(T, stop))) break;
+                }
+            }
+            flush_records<RECORD>(r, s, tile);
+        }
+    }
+}
+
+// Sum W splats' per-tile records in slot order and turn them to lanes: sums[column][lane].
+template <int RECORD> SIGMA_INLINE void reduce_records(const Render& r, int64_t i, float (*sums)[W]) {
+    for (int l = 0; l < W; l++) {
+        float row[RECORD] = {};
+        if (i + l < r.n)
+            for (int s = r.slot[i + l]; s < r.slot[i + l + 1]; s++)
+                for (int c = 0; c < RECORD; c++) row[c] += r.partials[size_t(s) * RECORD + c];
+        for (int c = 0; c < RECORD; c++) sums[c][l] = row[c];
+    }
+}
+
+// ∂L/∂feature c of W splats, from their reduced records.
+SIGMA_INLINE vf weight_sum(const float (*sums)[W], int c) { return load(sums[c < 8 ? 2 * c + 1 : 8 + c]); }
+
+// ∂L/∂(mean, conic) of W splats: power = −½(p² + q²), so every derivative is a moment of g about the splat's mean.
+SIGMA_INLINE FootprintGradient<vf> footprint_gradient(const float (*sums)[W], vf l1, vf l2, vf l3) {
+    const vf mx = load(sums[2]), my = load(sums[4]), mxx = load(sums[6]), mxy = load(sums[8]), myy = load(sums[10]);
+    FootprintGradient<vf> g;
+    const vf p = l1 * mx + l2 * my;
+    g.u = l1 * p;
+    g.v = l2 * p + l3 * l3 * my;
+    g.l1 = -(l1 * mxx + l2 * mxy);
+    g.l2 = -(l1 * mxy + l2 * myy);
+    g.l3 = -l3 * myy;
+    g.z = splat(0.f);
+    return g;
+}

@@ -1,0 +1,47 @@
+// Compile every kernel for one instruction set. CMake builds this file once per ISA with its own flags and
+// SIGMASPLAT_ISA; nothing with external linkage but the table leaves it, so no AVX-512 code can leak into the rest.
+#include <cmath>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+
+#include <omp.h>
+
+#include "kernels.h"
+#include "lanes.h"
+
+namespace sigmasplat::SIGMASPLAT_ISA {
+namespace {
+
+template <int N> struct std_int { static constexpr int value = N; };
+#include "buffer.h"
+#include "splat.h"
+#include "project.h"
+#include "bin.h"
+#include "blend.h"
+#include "view.h"
+#include "adam.h"
+#include "ssim.h"
+#include "losses.h"
+#include "align.h"
+
+Context* create() { return reinterpret_cast<Context*>(new Render); }
+void destroy(Context* c) { delete reinterpret_cast<Render*>(c); }
+size_t bytes(const Context* c) { return reinterpret_cast<const Render*>(c)->bytes(); }
+
+#define SIGMA_NAME_(x) #x
+#define SIGMA_NAME(x) SIGMA_NAME_(x)
+
+}  // namespace
+
+extern const Kernels table;
+const Kernels table = {
+    SIGMA_NAME(SIGMASPLAT_ISA),
+    {TILE_WIDTH, TILE_HEIGHT, W},
+    create, destroy, bytes,
+    project_forward, project_backward, blend_forward, blend_backward,
+    view_forward, view_backward, view_visible,
+    adam, ssim_target, ssim, mapping_losses, isotropy, align_step,
+};
+
+}  // namespace sigmasplat::SIGMASPLAT_ISA

@@ -1,0 +1,72 @@
+// What the kernels offer: one table of functions per instruction set, filled by kernels.cpp, chosen at run time by bind.cpp.
+#pragma once
+#include <cstddef>
+#include <cstdint>
+
+namespace sigmasplat {
+
+struct Context;                            // buffers of one render, private to the instruction set that made it
+
+struct PadSize { int tile_width, tile_height, lanes; };
+
+struct BlendOptions { float alpha_min, transmittance_stop; };
+
+struct Outputs {                           // planes of Hp × Wp, padded to whole tiles
+    float* sums;                           // [K] planes
+    float* moment;                         // or null
+    float* alpha;
+    int* median_id; float* median_weight;  // all four or none
+    int* dominant_id; float* dominant_weight;
+};
+
+struct OutputGradients { const float *sums, *moment, *alpha; };   // planes like Outputs; moment and alpha may be null
+
+struct SplatGradients { float *means2d, *conics, *z, *opacities, *features; };
+
+struct LossWeights { float l1, depth, nll_color, nll_depth; };
+
+struct AlignLevel {                        // one pyramid level, planes of width × height
+    const float *reference_gray, *reference_depth, *weight, *live_gray, *live_depth;
+    int width, height;
+    float fx, fy, cx, cy;
+};
+
+struct AlignOptions {
+    float weight_color, weight_depth;      // of residuals measured in units of their Huber widths
+    float huber_gray, huber_depth_relative;
+    float depth_gate;                      // metres
+};
+
+struct Kernels {
+    const char* name;
+    PadSize pad;
+    Context* (*create)();
+    void (*destroy)(Context*);
+    size_t (*bytes)(const Context*);
+    void (*project_forward)(const float* view, const float* means, const float* quats, const float* scales, int64_t n,
+                            float* means2d, float* conics, float* z, float* radii);
+    void (*project_backward)(const float* view, const float* means, const float* quats, const float* scales, int64_t n,
+                             const float* radii, const float* g_means2d, const float* g_conics, const float* g_z,
+                             float* g_means, float* g_quats, float* g_scales, double* g_twist);
+    void (*blend_forward)(Context*, const float* means2d, const float* conics, const float* z, const float* radii,
+                          const float* opacities, const float* features, int64_t n, int k, int width, int height,
+                          const float* reference, BlendOptions, Outputs);
+    void (*blend_backward)(Context*, Outputs, OutputGradients, SplatGradients);
+    // Fused: rows of raw parameters [n, 17] straight to images of (r, g, b, z[, q, q, q]) with q = σ² + c².
+    void (*view_forward)(Context*, const float* view, const float* params, int64_t n, int k, const float* reference,
+                         BlendOptions, Outputs, double* seconds);
+    void (*view_backward)(Context*, const float* params, Outputs, OutputGradients, float* g_params, double* g_twist, double* seconds);
+    void (*view_visible)(const Context*, uint8_t* visible);
+    void (*adam)(float* params, const float* grad, float* moment1, float* moment2, int64_t n, const float* rates,
+                 float beta1, float beta2, float epsilon, int64_t step);
+    void (*ssim_target)(const float* target, int width, int height, size_t stride, size_t plane, float* cache);
+    double (*ssim)(const float* image, const float* target, const float* cache, int width, int height, size_t stride,
+                   size_t plane, const float* mask, float weight, float* gradient);
+    void (*mapping_losses)(const float* sums, const float* target_color, const float* target_depth, int height,
+                           size_t stride, size_t plane, bool variance, LossWeights, double valid_pixels, float* g_sums,
+                           float* masked_color, double* losses);
+    double (*isotropy)(const float* params, int64_t n, float weight, float* g_params);
+    void (*align_step)(const AlignLevel*, const AlignOptions*, const double* T, double* H, double* b, double* sums);
+};
+
+}  // namespace sigmasplat

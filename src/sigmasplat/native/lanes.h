@@ -1,0 +1,152 @@
+// Compute on many floats at once: one vector of W lanes per instruction set, on GCC vector extensions.
+// Every kernel is written once against this page; only masks and a few moves know their instruction set.
+#pragma once
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#if defined(__AVX512F__) || defined(__AVX2__)
+#include <immintrin.h>
+#elif defined(__SSE2__)
+#include <emmintrin.h>
+#endif
+
+#define SIGMA_INLINE static inline __attribute__((always_inline))
+
+namespace sigmasplat::SIGMASPLAT_ISA {
+
+#if defined(__AVX512F__)
+constexpr int W = 16, BLOCK_WIDTH = 4, BLOCK_HEIGHT = 4;
+#elif defined(__AVX2__)
+constexpr int W = 8, BLOCK_WIDTH = 4, BLOCK_HEIGHT = 2;
+#else
+constexpr int W = 4, BLOCK_WIDTH = 2, BLOCK_HEIGHT = 2;
+#endif
+
+typedef float vf __attribute__((vector_size(W * 4)));
+typedef int vi __attribute__((vector_size(W * 4)));
+
+SIGMA_INLINE vf splat(float a) { return a - vf{}; }
+SIGMA_INLINE vi splat(int a) { return a - vi{}; }
+SIGMA_INLINE vf load(const float* p) { vf r; memcpy(&r, p, sizeof r); return r; }
+SIGMA_INLINE vi load(const int* p) { vi r; memcpy(&r, p, sizeof r); return r; }
+SIGMA_INLINE void store(float* p, vf a) { memcpy(p, &a, sizeof a); }
+SIGMA_INLINE void store(int* p, vi a) { memcpy(p, &a, sizeof a); }
+SIGMA_INLINE vf fma(vf a, vf b, vf c) { return a * b + c; }   // contracted by -ffp-contract=fast where the ISA has it
+SIGMA_INLINE vf fnma(vf a, vf b, vf c) { return c - a * b; }
+SIGMA_INLINE vf to_float(vi a) { return __builtin_convertvector(a, vf); }
+SIGMA_INLINE vi to_int(vf a) { return __builtin_convertvector(a, vi); }  // towards zero
+SIGMA_INLINE vi bits_of(vf a) { return (vi)a; }
+SIGMA_INLINE vf float_of_bits(vi a) { return (vf)a; }
+SIGMA_INLINE float lane_sum(vf a) { float s = 0; for (int i = 0; i < W; i++) s += a[i]; return s; }
+
+#if defined(__AVX512F__)
+typedef __mmask16 Mask;
+SIGMA_INLINE Mask gt(vf a, vf b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GT_OQ); }
+SIGMA_INLINE Mask ge(vf a, vf b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GE_OQ); }
+SIGMA_INLINE Mask both(Mask a, Mask b) { return (Mask)(a & b); }
+SIGMA_INLINE Mask mask_or(Mask a, Mask b) { return (Mask)(a | b); }
+SIGMA_INLINE Mask mask_not(Mask a) { return (Mask)~a; }
+SIGMA_INLINE bool any(Mask m) { return m != 0; }
+SIGMA_INLINE unsigned bits(Mask m) { return m; }
+SIGMA_INLINE Mask mask_of_bits(unsigned b) { return (Mask)b; }
+SIGMA_INLINE vf select(Mask m, vf a, vf b) { return (vf)_mm512_mask_blend_ps(m, (__m512)b, (__m512)a); }
+SIGMA_INLINE vi select(Mask m, vi a, vi b) { return (vi)_mm512_mask_blend_epi32(m, (__m512i)b, (__m512i)a); }
+SIGMA_INLINE vf only(Mask m, vf a) { return (vf)_mm512_maskz_mov_ps(m, (__m512)a); }
+SIGMA_INLINE vf min(vf a, vf b) { return (vf)_mm512_min_ps((__m512)a, (__m512)b); }
+SIGMA_INLINE vf max(vf a, vf b) { return (vf)_mm512_max_ps((__m512)a, (__m512)b); }
+SIGMA_INLINE vf sqrt(vf a) { return (vf)_mm512_sqrt_ps((__m512)a); }
+SIGMA_INLINE vf floor(vf a) { return (vf)_mm512_roundscale_ps((__m512)a, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC); }
+SIGMA_INLINE vf gather(const float* p, vi i) { return (vf)_mm512_i32gather_ps((__m512i)i, p, 4); }
+#else
+typedef vi Mask;
+SIGMA_INLINE Mask gt(vf a, vf b) { return a > b; }
+SIGMA_INLINE Mask ge(vf a, vf b) { return a >= b; }
+SIGMA_INLINE Mask both(Mask a, Mask b) { return a & b; }
+SIGMA_INLINE Mask mask_or(Mask a, Mask b) { return a | b; }
+SIGMA_INLINE Mask mask_not(Mask a) { return ~a; }
+SIGMA_INLINE vf select(Mask m, vf a, vf b) { return m ? a : b; }
+SIGMA_INLINE vi select(Mask m, vi a, vi b) { return m ? a : b; }
+SIGMA_INLINE vf only(Mask m, vf a) { return (vf)(m & (vi)a); }
+SIGMA_INLINE Mask mask_of_bits(unsigned b) { vi r; for (int i = 0; i < W; i++) r[i] = (b >> i) & 1 ? -1 : 0; return r; }
+#if defined(__AVX2__)
+SIGMA_INLINE unsigned bits(Mask m) { return (unsigned)_mm256_movemask_ps((__m256)m); }
+SIGMA_INLINE bool any(Mask m) { return _mm256_movemask_ps((__m256)m) != 0; }
+SIGMA_INLINE vf min(vf a, vf b) { return (vf)_mm256_min_ps((__m256)a, (__m256)b); }
+SIGMA_INLINE vf max(vf a, vf b) { return (vf)_mm256_max_ps((__m256)a, (__m256)b); }
+SIGMA_INLINE vf sqrt(vf a) { return (vf)_mm256_sqrt_ps((__m256)a); }
+SIGMA_INLINE vf floor(vf a) { return (vf)_mm256_floor_ps((__m256)a); }
+SIGMA_INLINE vf gather(const float* p, vi i) { return (vf)_mm256_i32gather_ps(p, (__m256i)i, 4); }
+#else
+SIGMA_INLINE unsigned bits(Mask m) {
+#if defined(__SSE2__)
+    return (unsigned)_mm_movemask_ps((__m128)m);
+#else
+    unsigned r = 0; for (int i = 0; i < W; i++) r |= (unsigned)(m[i] & 1) << i; return r;
+#endif
+}
+SIGMA_INLINE bool any(Mask m) { return bits(m) != 0; }
+SIGMA_INLINE vf min(vf a, vf b) { return a < b ? a : b; }
+SIGMA_INLINE vf max(vf a, vf b) { return a > b ? a : b; }
+SIGMA_INLINE vf sqrt(vf a) { vf r; for (int i = 0; i < W; i++) r[i] = __builtin_sqrtf(a[i]); return r; }
+SIGMA_INLINE vf floor(vf a) { vf t = to_float(to_int(a)); return t > a ? t - 1.f : t; }
+SIGMA_INLINE vf gather(const float* p, vi i) { vf r; for (int k = 0; k < W; k++) r[k] = p[i[k]]; return r; }
+#endif
+#endif
+
+SIGMA_INLINE vf abs(vf a) { return max(a, -a); }
+SIGMA_INLINE vf clamp(vf a, float lo, float hi) { return min(max(a, splat(lo)), splat(hi)); }
+SIGMA_INLINE Mask first_lanes(int n) { return mask_of_bits(n >= 32 ? ~0u : (1u << n) - 1u); }
+SIGMA_INLINE vf lane_index() { vf r; for (int i = 0; i < W; i++) r[i] = (float)i; return r; }
+
+// 2^x for any x in float range (relative error 2e-9 before rounding; flushes below 2^-126).
+SIGMA_INLINE vf exp2(vf x) {
+    x = clamp(x, -126.f, 127.f);
+    vf whole = floor(x + 0.5f), f = x - whole;
+    vf p = fma(splat(1.534581201e-4f), f, splat(1.339993122e-3f));
+    p = fma(p, f, splat(9.618488957e-3f));
+    p = fma(p, f, splat(5.550328777e-2f));
+    p = fma(p, f, splat(0.2402264689f));
+    p = fma(p, f, splat(0.6931472057f));
+    p = fma(p, f, splat(1.000000001f));
+    return float_of_bits(bits_of(p) + (to_int(whole) << 23));
+}
+SIGMA_INLINE vf exp(vf x) { return exp2(x * 1.4426950408889634f); }
+
+// 2^(8x) for x in [-1, 0]: no range reduction, because a live alpha lies in [1/256, 1] (relative error 6e-7).
+SIGMA_INLINE vf exp2_eighth(vf x) {
+    vf x2 = x * x;
+    vf high = fma(splat(9.387883367e-4f), x, splat(9.188611731e-3f));
+    vf middle = fma(splat(5.527972258e-2f), x, splat(0.2401721892f));
+    vf low = fma(splat(0.6931422526f), x, splat(0.9999999251f));
+    vf p = fma(fma(high, x2, middle), x2, low);
+    p *= p; p *= p;
+    return p * p;
+}
+
+// log2 of positive normal numbers: exponent plus an odd series in (m-1)/(m+1), m in [sqrt(1/2), sqrt(2)).
+SIGMA_INLINE vf log2(vf a) {
+    vi i = bits_of(a), e = ((i - 0x3f3504f3) >> 23);
+    vf m = float_of_bits(i - (e << 23));
+    vf s = (m - 1.f) / (m + 1.f), s2 = s * s;
+    vf p = fma(fma(fma(splat(0.4317420243f), s2, splat(0.5767141614f)), s2, splat(0.9617988495f)), s2, splat(2.88539008f));
+    return fma(p, s, to_float(e));
+}
+
+// A (BLOCK_WIDTH × BLOCK_HEIGHT) block of an image plane whose rows are `stride` floats apart.
+SIGMA_INLINE vf load_block(const float* p, size_t stride) {
+    alignas(64) float t[W];
+    for (int r = 0; r < BLOCK_HEIGHT; r++) memcpy(t + r * BLOCK_WIDTH, p + r * stride, BLOCK_WIDTH * 4);
+    return load(t);
+}
+SIGMA_INLINE void store_block(float* p, size_t stride, vf v) {
+    alignas(64) float t[W];
+    store(t, v);
+    for (int r = 0; r < BLOCK_HEIGHT; r++) memcpy(p + r * stride, t + r * BLOCK_WIDTH, BLOCK_WIDTH * 4);
+}
+SIGMA_INLINE void store_block(int* p, size_t stride, vi v) {
+    alignas(64) int t[W];
+    store(t, v);
+    for (int r = 0; r < BLOCK_HEIGHT; r++) memcpy(p + r * stride, t + r * BLOCK_WIDTH, BLOCK_WIDTH * 4);
+}
+
+}  // namespace sigmasplat::SIGMASPLAT_ISA

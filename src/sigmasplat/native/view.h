@@ -1,0 +1,219 @@
+// Stages 1–3 joined: the two operators of the kernel seam, and the fused way from raw parameter rows to images and back.
+
+template <class F> SIGMA_INLINE void with_features(int k, F f) {   // K is compiled in: colour + depth pays for no variance
+    switch (k) {
+        case 4: f(std_int<4>{}); break;
+        case 7: f(std_int<7>{}); break;
+        case 11: f(std_int<11>{}); break;
+        default: f(std_int<16>{});
+    }
+}
+
+static void blend(Render& r, Outputs o) {
+    with_features(r.k, [&](auto k) {
+        constexpr int K = decltype(k)::value;
+        if (o.moment) o.dominant_id ? blend_tiles<K, true, true>(r, o) : blend_tiles<K, true, false>(r, o);
+        else o.dominant_id ? blend_tiles<K, false, true>(r, o) : blend_tiles<K, false, false>(r, o);
+    });
+}
+static void blend_gradients(Render& r, Outputs o, OutputGradients g) {
+    with_features(r.k, [&](auto k) {
+        constexpr int K = decltype(k)::value;
+        g.moment ? blend_tiles_backward<K, true>(r, o, g) : blend_tiles_backward<K, false>(r, o, g);
+    });
+}
+
+// ---- the seam: blend on its own -------------------------------------------------------------------------------------
+
+static void blend_forward(Context* context, const float* means2d, const float* conics, const float* z, const float* radii,
+                          const float* opacities, const float* features, int64_t n, int k, int width, int height,
+                          const float* reference, BlendOptions options, Outputs o) {
+    Render& r = *reinterpret_cast<Render*>(context);
+    r.prepare(n, k, width, height, options);
+    r.reference = reference;
+    const int64_t chunks = (n + CHUNK - 1) / CHUNK;
+#pragma omp parallel for schedule(static)
+    for (int64_t c = 0; c < chunks; c++) {
+        int total = 0;
+        for (int64_t i = c * CHUNK; i < n && i < (c + 1) * CHUNK; i += W) {
+            alignas(64) float t[3][W];
+            Footprint<vf> f;
+            load_rows<2>(means2d, i, n, t);
+            f.u = load(t[0]); f.v = load(t[1]);
+            load_rows<3>(conics, i, n, t);
+            f.l1 = load(t[0]); f.l2 = load(t[1]); f.l3 = load(t[2]);
+            f.var_v = 1.f / (f.l3 * f.l3);
+            f.var_u = (f.l2 * f.l2 * f.var_v + 1.f) / (f.l1 * f.l1);
+            load_rows<1>(z, i, n, t);
+            f.z = load(t[0]);
+            load_rows<1>(opacities, i, n, t);
+            const vf opacity = load(t[0]);
+            load_rows<2>(radii, i, n, t);
+            total += pack(r, f, opacity, gt(load(t[0]), splat(0.f)), i);
+            for (int l = 0; l < W && i + l < n; l++) {
+                float* row = &r.features[size_t(i + l) * r.stride];
+                for (int q = 0; q < r.stride; q++) row[q] = q < r.used ? features[size_t(i + l) * k + q] : 0.f;
+            }
+        }
+        r.chunk_total[c] = total;
+    }
+    bin(r);
+    blend(r, o);
+}
+
+static void blend_backward(Context* context, Outputs o, OutputGradients g, SplatGradients out) {
+    Render& r = *reinterpret_cast<Render*>(context);
+    blend_gradients(r, o, g);
+    with_features(r.k, [&](auto k) {
+        constexpr int K = decltype(k)::value;
+        const auto finish = [&](auto record, auto moment) {
+#pragma omp parallel for schedule(static)
+            for (int64_t i = 0; i < r.n; i += W) {
+                alignas(64) float sums[decltype(record)::value][W], t[3][W], l[8][W];
+                reduce_records<decltype(record)::value>(r, i, sums);
+                for (int q = 0; q < W; q++) {         // unseen splats left no geometry: any finite conic will do
+                    const bool seen = i + q < r.n && r.tiles_of[i + q];
+                    const Geometry g0 = seen ? r.geometry[i + q] : Geometry{1, 0, 1, 0, 0, 0, 1, 0};
+                    l[0][q] = g0.l1 / CONIC_SCALE; l[1][q] = g0.l2 / CONIC_SCALE; l[2][q] = g0.l3 / CONIC_SCALE;
+                    l[3][q] = g0.z; l[4][q] = seen ? exp2f(8.f * g0.log_opacity) : 1.f;
+                }
+                FootprintGradient<vf> f = footprint_gradient(sums, load(l[0]), load(l[1]), load(l[2]));
+                if constexpr (decltype(moment)::value) f.z = fma(load(l[3]), weight_sum(sums, K), weight_sum(sums, K + 1));
+                store(t[0], f.u); store(t[1], f.v);
+                store_rows<2>(out.means2d, i, r.n, t);
+                store(t[0], f.l1); store(t[1], f.l2); store(t[2], f.l3);
+                store_rows<3>(out.conics, i, r.n, t);
+                store(t[0], f.z);
+                store_rows<1>(out.z, i, r.n, t);
+                store(t[0], load(sums[0]) / load(l[4]));
+                store_rows<1>(out.opacities, i, r.n, t);
+                for (int c = 0; c < K && c < r.used; c++) {
+                    alignas(64) float lane[W];
+                    store(lane, weight_sum(sums, c));
+                    for (int q = 0; q < W && i + q < r.n; q++) out.features[size_t(i + q) * r.used + c] = lane[q];
+                }
+            }
+        };
+        g.moment ? finish(std_int<record_floats<K, true>>{}, std_int<1>{}) : finish(std_int<record_floats<K, false>>{}, std_int<0>{});
+    });
+}
+
+// ---- fused: rows of raw parameters to images and back ----------------------------------------------------------------
+
+struct Splats { Shape<vf> shape; vf opacity, color[3], variance[3]; };
+
+SIGMA_INLINE Splats activate(const float (*row)[W]) { // GaussianField's columns, activated
+    Splats s;
+    for (int k = 0; k < 3; k++) s.shape.mean[k] = load(row[k]);
+    for (int k = 0; k < 4; k++) s.shape.quat[k] = load(row[3 + k]);
+    for (int k = 0; k < 3; k++) s.shape.scale[k] = exp(load(row[7 + k]));
+    s.opacity = 1.f / (1.f + exp(-load(row[10])));
+    for (int k = 0; k < 3; k++) s.color[k] = load(row[11 + k]);
+    for (int k = 0; k < 3; k++) s.variance[k] = exp(load(row[14 + k]));
+    return s;
+}
+
+static void view_forward(Context* context, const float* view_numbers, const float* params, int64_t n, int k,
+                         const float* reference, BlendOptions options, Outputs o, double* seconds) {
+    Render& r = *reinterpret_cast<Render*>(context);
+    const double t0 = omp_get_wtime();
+    r.view = read_view(view_numbers);
+    r.prepare(n, k, int(r.view.width), int(r.view.height), options);
+    r.reference = reference;
+    const int64_t chunks = (n + CHUNK - 1) / CHUNK;
+#pragma omp parallel for schedule(static)
+    for (int64_t c = 0; c < chunks; c++) {
+        int total = 0;
+        for (int64_t i = c * CHUNK; i < n && i < (c + 1) * CHUNK; i += W) {
+            alignas(64) float row[ROW][W], f[8][W];
+            load_rows<ROW>(params, i, n, row);
+            const Splats s = activate(row);
+            const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
+            const int tiles = pack(r, p, s.opacity, gt(p.z, splat(r.view.near_m)), i);
+            total += tiles;
+            if (!tiles) continue;
+            for (int q = 0; q < 3; q++) store(f[q], s.color[q]);
+            store(f[3], p.z);
+            for (int q = 0; q < 3; q++) store(f[4 + q], fma(s.color[q], s.color[q], s.variance[q]));
+            store(f[7], splat(0.f));
+            for (int l = 0; l < W; l++)
+                for (int q = 0; q < r.stride; q++) r.features[size_t(i + l) * r.stride + q] = f[q][l];
+        }
+        r.chunk_total[c] = total;
+    }
+    const double t1 = omp_get_wtime();
+    bin(r);
+    const double t2 = omp_get_wtime();
+    blend(r, o);
+    if (seconds) { seconds[0] += t1 - t0; seconds[1] += t2 - t1; seconds[2] += omp_get_wtime() - t2; }
+}
+
+// Chain the reduced records of all splats to parameter rows (unless g_params is null) and to the pose twist.
+template <int K, bool MOMENT>
+static void chain_to_params(const Render& r, const float* params, float* g_params, double* g_twist) {
+    constexpr int RECORD = record_floats<K, MOMENT>;
+    const int64_t chunks = (r.n + CHUNK - 1) / CHUNK;
+    Buffer<double> partial;
+    partial.reserve(chunks * 6 + 1);
+#pragma omp parallel for schedule(static)
+    for (int64_t c = 0; c < chunks; c++) {
+        vf twist[6];
+        for (auto& x : twist) x = splat(0.f);
+        for (int64_t i = c * CHUNK; i < r.n && i < (c + 1) * CHUNK; i += W) {
+            alignas(64) float row[ROW][W], sums[RECORD][W];
+            unsigned seen_bits = 0;
+            for (int l = 0; l < W && i + l < r.n; l++) seen_bits |= unsigned(r.tiles_of[i + l] > 0) << l;
+            if (!seen_bits) {
+                if (g_params) memset(g_params + i * ROW, 0, size_t(r.n - i < W ? r.n - i : W) * ROW * sizeof(float));
+                continue;
+            }
+            const Mask seen = mask_of_bits(seen_bits);
+            load_rows<ROW>(params, i, r.n, row);
+            reduce_records<RECORD>(r, i, sums);
+            const Splats s = activate(row);
+            const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
+            FootprintGradient<vf> g = footprint_gradient(sums, p.l1, p.l2, p.l3);
+            g.z = weight_sum(sums, 3);
+            if constexpr (MOMENT) g.z += fma(p.z, weight_sum(sums, K), weight_sum(sums, K + 1));
+            ShapeGradient<vf> out;
+            project_backward(r.view, s.shape, splat(r.view.near_m), g, out);
+            for (int q = 0; q < 6; q++) twist[q] += only(seen, out.twist[q]);
+            if (!g_params) continue;
+            for (int q = 0; q < 3; q++) store(row[q], only(seen, out.mean[q]));
+            for (int q = 0; q < 4; q++) store(row[3 + q], only(seen, out.quat[q]));
+            for (int q = 0; q < 3; q++) store(row[7 + q], only(seen, out.scale[q] * s.shape.scale[q]));
+            store(row[10], only(seen, load(sums[0]) * (1.f - s.opacity)));
+            for (int q = 0; q < 3; q++) {
+                vf g_square = splat(0.f);
+                if constexpr (K > 4) g_square = weight_sum(sums, 4 + q);
+                store(row[11 + q], only(seen, fma(2.f * s.color[q], g_square, weight_sum(sums, q))));
+                store(row[14 + q], only(seen, g_square * s.variance[q]));
+            }
+            store_rows<ROW>(g_params, i, r.n, row);
+        }
+        for (int q = 0; q < 6; q++) partial[c * 6 + q] = lane_sum(twist[q]);
+    }
+    for (int q = 0; q < 6; q++) {
+        g_twist[q] = 0;
+        for (int64_t c = 0; c < chunks; c++) g_twist[q] += partial[c * 6 + q];
+    }
+}
+
+static void view_backward(Context* context, const float* params, Outputs o, OutputGradients g, float* g_params,
+                          double* g_twist, double* seconds) {
+    Render& r = *reinterpret_cast<Render*>(context);
+    const double t0 = omp_get_wtime();
+    blend_gradients(r, o, g);
+    const double t1 = omp_get_wtime();
+    const auto chain = [&](auto k) {
+        constexpr int K = decltype(k)::value;
+        g.moment ? chain_to_params<K, true>(r, params, g_params, g_twist) : chain_to_params<K, false>(r, params, g_params, g_twist);
+    };
+    r.k <= 4 ? chain(std_int<4>{}) : chain(std_int<7>{});
+    if (seconds) { seconds[0] += t1 - t0; seconds[1] += omp_get_wtime() - t1; }
+}
+
+static void view_visible(const Context* context, uint8_t* visible) {
+    const Render& r = *reinterpret_cast<const Render*>(context);
+    for (int64_t i = 0; i < r.n; i++) visible[i] = r.tiles_of[i] > 0;
+}

@@ -1,0 +1,224 @@
+"""Give the settings of the published systems by name: values only, each from its paper unless marked as ours.
+
+`varsplat-*` follow VarSplat (arXiv 2603.09673) §2–3. `loopsplat-*` are the same with every uncertainty weight off,
+which is LoopSplat's front end (arXiv 2408.10154). `*-fast` are ours, sized for two CPU cores.
+"""
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from sigmasplat.config import Config, InputConfig, MappingConfig, SeedConfig, TrackingConfig
+from sigmasplat.errors import ConfigError
+
+# Synthetic, exact depth. Ours: max_depth_m (the PNGs end at 10 m) and no masks, which the paper leaves open.
+REPLICA = Config(
+    input=InputConfig(max_depth_m=10.0),
+    seeding=SeedConfig(
+        first_uniform=600_000,
+        first_gradient=50_000,
+        later_max=0,
+        alpha_below=0.6,
+        depth_error_factor=40.0,
+        min_distance_m=1e-7**0.5,
+        opacity=0.5,
+        outlier_neighbours=0,
+    ),
+    mapping=MappingConfig(
+        every=5,
+        iterations=100,
+        first_iterations=1000,
+        weight_nll_color=1e-4,
+        weight_nll_depth=1e-4,
+        freeze_old_colors=True,
+        prune_opacity=0.1,
+    ),
+    tracking=TrackingConfig(
+        iterations=60,
+        lr_rotation=2e-4,
+        lr_translation=2e-3,
+        weight_color=0.95,
+        tau=10.0,
+        weight_max=3.0,
+        alpha_above=0.0,
+        outlier_factor=0.0,
+    ),
+)
+
+# Kinect v1. Ours: max_depth_m, beyond which its readings scatter by 10 cm. The masks are the paper's options, on.
+TUM = Config(
+    input=InputConfig(max_depth_m=8.0),
+    seeding=SeedConfig(
+        first_uniform=100_000,
+        first_gradient=50_000,
+        later_max=30_000,
+        alpha_below=0.6,
+        depth_error_factor=40.0,
+        min_distance_m=1e-4**0.5,
+        opacity=0.5,
+        outlier_neighbours=40,
+    ),
+    mapping=MappingConfig(
+        every=1,
+        iterations=100,
+        first_iterations=100,
+        weight_nll_color=1e-4,
+        weight_nll_depth=0.0,
+        freeze_old_colors=True,
+        prune_opacity=0.5,
+    ),
+    tracking=TrackingConfig(
+        iterations=200,
+        lr_rotation=2e-3,
+        lr_translation=1e-2,
+        weight_color=0.6,
+        tau=50.0,
+        weight_max=3.0,
+        alpha_above=0.98,
+        outlier_factor=50.0,
+    ),
+)
+
+# As TUM, with exposure. Ours: tau, which the paper gives for Replica and TUM only.
+SCANNET = dataclasses.replace(TUM, tracking=dataclasses.replace(TUM.tracking, exposure=True))
+
+# Two CPU cores. The loss weights, σ² and its learning rate, w_max, tau and the depth of the seeding test stay the
+# paper's. Ours, and why:
+FAST = Config(
+    input=InputConfig(width=320, max_depth_m=8.0),  # a quarter of the pixels; the render's cost follows them
+    seeding=SeedConfig(
+        first_uniform=40_000,  # half of 320×240: with 100 iterations more splats than that are never trained
+        first_gradient=15_000,
+        later_max=5_000,  # a keyframe five frames on shows about that many new pixels
+        max_splats=250_000,  # a render with its gradient then stays below 50 ms on two cores
+        outlier_neighbours=0,  # a search over the whole map costs more than the outliers it finds
+    ),
+    mapping=MappingConfig(
+        every=5,  # Replica's; on every frame mapping would take five times as long
+        iterations=30,
+        first_iterations=100,
+        weight_nll_color=1e-4,
+        weight_nll_depth=0.0,
+        prune_opacity=0.1,  # Replica's; seeds start at 0.5, 30 steps move them little: TUM's 0.5 is a lottery
+    ),
+    tracking=TrackingConfig(
+        method="align",  # Gauss–Newton on one render instead of 200 renders a frame
+        iterations=20,
+        weight_color=0.6,
+        tau=50.0,
+        weight_max=3.0,
+        outlier_factor=50.0,
+    ),
+)
+
+DATASETS = {"replica": REPLICA, "tum": TUM, "scannet": SCANNET, "fast": FAST}
+
+
+def _without_uncertainty(config: Config) -> Config:
+    """Switch off every weight that uncertainty has: tracking's and the likelihoods that train it."""
+    return dataclasses.replace(
+        config,
+        tracking=dataclasses.replace(config.tracking, uncertainty=False),
+        mapping=dataclasses.replace(config.mapping, weight_nll_color=0.0, weight_nll_depth=0.0),
+    )
+
+
+PRESETS = {
+    name: dataclasses.replace(config, name=name)
+    for dataset, base in DATASETS.items()
+    for name, config in ((f"varsplat-{dataset}", base), (f"loopsplat-{dataset}", _without_uncertainty(base)))
+}
+
+
+def default_preset() -> str:
+    """Name the preset used where none is asked for: the one sized for a machine without a GPU."""
+    return "varsplat-fast"
+
+
+def list_presets() -> list[str]:
+    """List every preset's name."""
+    return sorted(PRESETS)
+
+
+def preset(name: str) -> Config:
+    """Return a preset's settings. Raises ConfigError on an unknown name, saying which there are."""
+    if name not in PRESETS:
+        raise ConfigError(f"no preset {name!r}{_nearest(name, PRESETS)}; there are {', '.join(list_presets())}")
+    return PRESETS[name]
+
+
+def override(config: Config, settings: Mapping[str, str]) -> Config:
+    """Return the settings with some replaced, as in {"tracking.iterations": "60", "seed": "1"}; text becomes its type.
+
+    Raises ConfigError on an unknown name (saying which there are), text that is not of the type, a negative number.
+    """
+    for name, text in settings.items():
+        section, _, field = name.rpartition(".")
+        if not section:
+            config = _replaced(config, name, name, text)
+            continue
+        inner = getattr(config, section, None)
+        if not dataclasses.is_dataclass(inner) or isinstance(inner, type):
+            sections = [f.name for f in dataclasses.fields(config) if dataclasses.is_dataclass(getattr(config, f.name))]
+            raise ConfigError(f"unknown setting {name!r}{_nearest(section, sections)}; sections: {', '.join(sections)}")
+        config = dataclasses.replace(config, **{section: _replaced(inner, field, name, text)})
+    return config
+
+
+def split_settings(settings: Iterable[str]) -> dict[str, str]:
+    """Split SECTION.NAME=VALUE at the equals sign; of a name given twice the last counts. Raises ConfigError."""
+    pairs = [setting.partition("=") for setting in settings]
+    for name, equals, _ in pairs:
+        if not equals:
+            raise ConfigError(f"a setting is SECTION.NAME=VALUE, found {name!r}")
+    return {name.strip(): value for name, _, value in pairs}
+
+
+def _replaced(section: Any, field: str, name: str, text: str) -> Any:
+    """Return a section with one value replaced; `name` is how the user called it."""
+    types = {known: kind for known, kind in get_type_hints(type(section)).items() if not dataclasses.is_dataclass(kind)}
+    if field not in types:
+        raise ConfigError(f"unknown setting {name!r}{_nearest(field, types)}; there are {', '.join(types)}")
+    return dataclasses.replace(section, **{field: _converted(name, types[field], text.strip())})
+
+
+def _converted(name: str, kind: Any, text: str) -> Any:
+    """Turn text into a setting's type. Raises ConfigError."""
+    if get_origin(kind) is Literal:
+        return _chosen(name, {str(value): value for value in get_args(kind)}, text)
+    if kind is bool:
+        words = {
+            "true": True,
+            "1": True,
+            "yes": True,
+            "on": True,
+            "false": False,
+            "0": False,
+            "no": False,
+            "off": False,
+        }
+        return _chosen(name, words, text.lower())
+    if kind is str:
+        return text
+    try:
+        value = kind(text)
+    except ValueError:
+        wanted = "a whole number" if kind is int else "a number"
+        raise ConfigError(f"{name} needs {wanted}, found {text!r}") from None
+    if not math.isfinite(value) or value < 0:
+        raise ConfigError(f"{name} must be finite and not negative, found {text!r}")
+    return value
+
+
+def _chosen(name: str, allowed: Mapping[str, Any], text: str) -> Any:
+    if text not in allowed:
+        raise ConfigError(f"{name} must be one of {', '.join(allowed)}, found {text!r}")
+    return allowed[text]
+
+
+def _nearest(name: str, known: Mapping[str, Any] | list[str]) -> str:
+    """Suggest the known name that a misspelt one resembles."""
+    close = difflib.get_close_matches(name, list(known), 1)
+    return f" (did you mean {close[0]}?)" if close else ""

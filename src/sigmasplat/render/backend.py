@@ -1,0 +1,24 @@
+"""Choose what computes: the compiled CPU kernels, or their definition in plain torch."""
+
+from types import ModuleType
+
+from sigmasplat.errors import BackendError
+from sigmasplat.render import reference
+
+BACKENDS = ("auto", "cpu", "reference")
+
+
+def backend_module(name: str) -> ModuleType:
+    """Return the module whose `project` and `blend` do the work. Raises BackendError if it is unknown or not built."""
+    if name == "reference":
+        return reference
+    if name not in BACKENDS:
+        raise BackendError(f"unknown backend {name!r} (known: {', '.join(BACKENDS)})")
+    try:
+        from sigmasplat.render import cpu
+    except ImportError as problem:
+        raise BackendError(
+            f"the compiled kernels cannot be loaded ({problem}); reinstall with `pip install .`, or use the slow "
+            "plain-torch backend: --set backend=reference"
+        ) from problem
+    return cpu

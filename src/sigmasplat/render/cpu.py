@@ -1,0 +1,169 @@
+"""Run the compiled kernels: `project` and `blend` as autograd operators, float32, to the definition in `reference`."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.config import RenderConfig
+from sigmasplat.errors import BackendError
+from sigmasplat.model.camera import Camera
+from sigmasplat.native import _core
+from sigmasplat.render.reference import FRUSTUM_MARGIN, Blended, Projection
+
+FEATURES_AT_ONCE = 16
+
+
+def feature_slots(k: int) -> int:
+    """Return how many feature planes a blend of k features writes: the next count the kernels are compiled for."""
+    return next(slots for slots in (4, 7, 11, 16) if slots >= k)
+
+
+def padded_size(camera: Camera) -> tuple[int, int]:
+    """Return (rows, columns) of an image plane padded to whole tiles of the active instruction set."""
+    tile_width, tile_height = _core.tile_size()
+    return -(-camera.height // tile_height) * tile_height, -(-camera.width // tile_width) * tile_width
+
+
+def view_numbers(
+    camera: Camera, T_camera_world: NDArray[np.floating], options: RenderConfig, dtype: type = np.float32
+) -> NDArray[np.floating]:
+    """Lay out camera, pose and switches as the kernels' `View` (native/splat.h)."""
+    T = np.asarray(T_camera_world, np.float64)
+    margin_u, margin_v = FRUSTUM_MARGIN * camera.width, FRUSTUM_MARGIN * camera.height
+    limits = [
+        -(camera.cx + margin_u) / camera.fx,
+        (camera.width - camera.cx + margin_u) / camera.fx,
+        -(camera.cy + margin_v) / camera.fy,
+        (camera.height - camera.cy + margin_v) / camera.fy,
+    ]
+    switches = [options.mean_pose_gradient, options.covariance_pose_gradient, options.depth_pose_gradient]
+    numbers = [camera.fx, camera.fy, camera.cx, camera.cy, *T[:3, :3].ravel(), *T[:3, 3]]
+    numbers += [options.near_m, options.low_pass_px2, *limits, camera.width, camera.height, *map(float, switches)]
+    return np.array(numbers, dtype)
+
+
+def pose_gradient(T_camera_world: Tensor, twist: NDArray[np.float64]) -> Tensor:
+    """Express a left-twist gradient (ρ, φ) as a [4, 4] matrix gradient with the same value along every rigid motion.
+
+    <G, [φ]× R | φ×t + ρ> = ρ·g_ρ + φ·g_φ for G = (½ [g_φ − t × g_ρ]× R | g_ρ).
+    """
+    T = T_camera_world.detach().double().numpy()
+    g_rho, g_phi = twist[:3], twist[3:]
+    a = 0.5 * (g_phi - np.cross(T[:3, 3], g_rho))
+    G = np.zeros((4, 4))
+    G[:3, :3] = np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]]) @ T[:3, :3]
+    G[:3, 3] = g_rho
+    return torch.as_tensor(G, dtype=T_camera_world.dtype)
+
+
+def _float32(name: str, value: Tensor) -> Tensor:
+    if value.dtype != torch.float32 or value.device.type != "cpu":
+        raise BackendError(
+            f"the cpu backend takes float32 tensors on the CPU; {name} is {value.dtype} on {value.device}"
+        )
+    return value.detach().contiguous()
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, means, quats, scales, T, camera, options):  # type: ignore[no-untyped-def]
+        m, q, s = _float32("means", means), _float32("quats", quats), _float32("scales", scales)
+        view = view_numbers(camera, T.detach().double().numpy(), options)
+        n = len(m)
+        means2d, conics, z, radii = m.new_empty(n, 2), m.new_empty(n, 3), m.new_empty(n), m.new_empty(n, 2)
+        _core.project_forward(view, m, q, s, means2d, conics, z, radii)
+        seen = radii[:, :1] > 0
+        means2d, conics = torch.where(seen, means2d, 0.0), torch.where(seen, conics, 0.0)
+        ctx.save_for_backward(m, q, s, radii, T)
+        ctx.view = view
+        ctx.mark_non_differentiable(radii)
+        return means2d, conics, z, radii
+
+    @staticmethod
+    def backward(ctx, g_means2d, g_conics, g_z, _):  # type: ignore[no-untyped-def]
+        m, q, s, radii, T = ctx.saved_tensors
+        g_m, g_q, g_s, twist = torch.empty_like(m), torch.empty_like(q), torch.empty_like(s), np.zeros(6)
+        _core.project_backward(
+            ctx.view,
+            m,
+            q,
+            s,
+            radii,
+            g_means2d.contiguous(),
+            g_conics.contiguous(),
+            g_z.contiguous(),
+            g_m,
+            g_q,
+            g_s,
+            twist,
+        )
+        return g_m, g_q, g_s, pose_gradient(T, twist), None, None
+
+
+def project(
+    means: Tensor, quats: Tensor, scales: Tensor, T_camera_world: Tensor, camera: Camera, options: RenderConfig
+) -> Projection:
+    """Project splats to the image; arguments and result as `reference.project`, float32 (the pose may be float64)."""
+    return Projection(*_Project.apply(means, quats, scales, T_camera_world, camera, options))
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, means2d, conics, z, radii, opacities, features, ref_depth, camera, options):  # type: ignore[no-untyped-def]
+        names = ("means2d", "conics", "z", "radii", "opacities", "features")
+        inputs = [_float32(n, t) for n, t in zip(names, (means2d, conics, z, radii, opacities, features), strict=True)]
+        rows, columns = padded_size(camera)
+        k = features.shape[1]
+        sums = torch.empty(feature_slots(k), rows, columns)
+        alpha, weights = torch.empty(rows, columns), torch.empty(2, rows, columns)
+        ids = torch.empty(2, rows, columns, dtype=torch.int32)
+        moment = ref = None
+        if ref_depth is not None:
+            moment, ref = torch.empty(rows, columns), torch.zeros(rows, columns)
+            ref[: camera.height, : camera.width] = ref_depth
+        raster = _core.Rasteriser()
+        raster.blend_forward(
+            *inputs, camera.width, camera.height, options.alpha_min, options.transmittance_stop, ref,
+            sums, moment, alpha, ids[0], weights[0], ids[1], weights[1],
+        )  # fmt: skip
+        ctx.raster, ctx.planes, ctx.ref, ctx.shapes = raster, (sums, moment, alpha), ref, [t.shape for t in inputs]
+        ctx.size, ctx.k = (camera.height, camera.width), k
+        h, w = ctx.size
+        maps = [sums[:k, :h, :w].permute(1, 2, 0), moment[:h, :w] if moment is not None else None, alpha[:h, :w]]
+        detached = [ids[0][:h, :w], weights[0][:h, :w], ids[1][:h, :w], weights[1][:h, :w]]
+        ctx.mark_non_differentiable(*detached)
+        return (*(m.clone() if m is not None else None for m in maps), *detached)
+
+    @staticmethod
+    def backward(ctx, g_sums, g_moment, g_alpha, *_):  # type: ignore[no-untyped-def]
+        sums, moment, alpha = ctx.planes
+        h, w = ctx.size
+        planes = [torch.zeros_like(sums), None if moment is None else torch.zeros_like(moment), torch.zeros_like(alpha)]
+        planes[0][: ctx.k, :h, :w] = g_sums.permute(2, 0, 1)
+        if planes[1] is not None and g_moment is not None:
+            planes[1][:h, :w] = g_moment
+        planes[2][:h, :w] = g_alpha
+        g_means2d, g_conics, g_z, _, g_opacities, g_features = (torch.zeros(s) for s in ctx.shapes)
+        ctx.raster.blend_backward(
+            sums, moment, alpha, planes[0], planes[1], planes[2], g_means2d, g_conics, g_z, g_opacities, g_features
+        )
+        return g_means2d, g_conics, g_z, None, g_opacities, g_features, None, None, None
+
+
+def blend(
+    means2d: Tensor,
+    conics: Tensor,
+    z: Tensor,
+    radii: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    ref_depth: Tensor | None,
+    camera: Camera,
+    options: RenderConfig,
+) -> Blended:
+    """Composite splats front to back; arguments and result as `reference.blend`, float32, any number of features."""
+    groups = torch.split(features, FEATURES_AT_ONCE, dim=1)
+    first = _Blend.apply(means2d, conics, z, radii, opacities, groups[0], ref_depth, camera, options)
+    more = [_Blend.apply(means2d, conics, z, radii, opacities, g, None, camera, options)[0] for g in groups[1:]]
+    return Blended(torch.cat([first[0], *more], -1) if more else first[0], *first[1:])

@@ -1,0 +1,207 @@
+"""Define both kernels in plain torch: slow, exact, readable, any float type. Compiled backends are tested against it.
+
+Pixel centres lie at integer coordinates, (u, v) = (column, row). Depth is z along the optical axis in metres.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from sigmasplat.config import RenderConfig
+from sigmasplat.model.camera import Camera
+
+ALPHA_MAX = 0.99
+"""No splat is more opaque than this, so that light always passes and the backward pass may divide by 1 − α (3DGS)."""
+FRUSTUM_MARGIN = 0.15
+"""The projection is linearised no further outside the image than this share of its size (3DGS's factor 1.3)."""
+PAIRS_AT_ONCE = 1 << 22
+
+
+class Projection(NamedTuple):
+    """Splats on the image plane; a culled one (z ≤ near_m) has radii 0, means2d 0, conics 0 and takes no gradient."""
+
+    means2d: Tensor
+    """[N, 2] px."""
+    conics: Tensor
+    """[N, 3] (l1, l2, l3), upper Cholesky factor of the inverse 2D covariance, 1/px."""
+    z: Tensor
+    """[N] m."""
+    radii: Tensor
+    """[N, 2] standard deviations along u and v in px, detached."""
+
+
+class Blended(NamedTuple):
+    """What the pixels gather, with w = α·T the weight of a splat at a pixel."""
+
+    sums: Tensor
+    """[H, W, K] Σ w f."""
+    moment: Tensor | None
+    """[H, W] Σ w (z − ref)² in m², 0 where ref ≤ 0; None without ref."""
+    alpha: Tensor
+    """[H, W] Σ w, one minus the light that passes."""
+    median_id: Tensor
+    """[H, W] int32, the splat that takes the light from ≥ ½ to < ½; −1 = none."""
+    median_weight: Tensor
+    """[H, W] its w, detached; 0 = none."""
+    dominant_id: Tensor
+    """[H, W] int32, the splat of largest w, the nearer of equals; −1 = none."""
+    dominant_weight: Tensor
+    """[H, W] its w, detached; 0 = none."""
+
+
+def project(
+    means: Tensor, quats: Tensor, scales: Tensor, T_camera_world: Tensor, camera: Camera, options: RenderConfig
+) -> Projection:
+    """Project splats to the image (EWA splatting, 3DGS eq. 5; CG-SLAM eq. 2).
+
+    means [N, 3] m, world; quats [N, 4] wxyz, any norm; scales [N, 3] m, activated; T_camera_world [4, 4].
+    The pose gradient is the sum of three paths (CG-SLAM spec §2.1), each switched off by a constant pose in its place.
+    """
+    T = T_camera_world.to(means)
+    in_view = (means @ T[:3, :3].T + T[:3, 3])[:, 2].detach() > options.near_m
+    T_mean, T_covariance, T_depth = (
+        T if on else T.detach()
+        for on in (options.mean_pose_gradient, options.covariance_pose_gradient, options.depth_pose_gradient)
+    )
+    means2d = _pinhole(_to_camera(means, T_mean, in_view), camera)
+    A = _footprints(means, quats, scales, T_covariance, in_view, camera)
+    conics, radii = _whiten(A, options.low_pass_px2)
+    z = means @ T_depth[2, :3] + T_depth[2, 3]
+    seen = in_view[:, None]
+    return Projection(
+        torch.where(seen, means2d, 0.0),
+        torch.where(seen, conics, 0.0),
+        torch.where(in_view, z, z.detach()),
+        torch.where(seen, radii, 0.0),
+    )
+
+
+def _to_camera(means: Tensor, T: Tensor, in_view: Tensor) -> Tensor:
+    """Bring positions [N, 3] to the camera frame; culled ones to (0, 0, 1), where every gradient is finite."""
+    p = means @ T[:3, :3].T + T[:3, 3]
+    return torch.where(in_view[:, None], p, p.new_tensor([0.0, 0.0, 1.0]))
+
+
+def _pinhole(p: Tensor, camera: Camera) -> Tensor:
+    x, y, z = p.unbind(1)
+    return torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
+
+
+def _footprints(means: Tensor, quats: Tensor, scales: Tensor, T: Tensor, in_view: Tensor, camera: Camera) -> Tensor:
+    """Build A = J R_cw R_q diag(s), [N, 2, 3] px: the splat's own axes seen in the image, Σ2D = A Aᵀ + low-pass."""
+    J = _projection_jacobian(_to_camera(means, T, in_view), camera)
+    return J @ T[:3, :3] @ (rotations(quats) * scales[:, None, :])
+
+
+def _projection_jacobian(p: Tensor, camera: Camera) -> Tensor:
+    """Linearise the pinhole at p [N, 3] → [N, 2, 3], with x/z and y/z held inside the widened image (3DGS)."""
+    x, y, z = p.unbind(1)
+    margin_u, margin_v = FRUSTUM_MARGIN * camera.width, FRUSTUM_MARGIN * camera.height
+    tx = (x / z).clamp(-(camera.cx + margin_u) / camera.fx, (camera.width - camera.cx + margin_u) / camera.fx)
+    ty = (y / z).clamp(-(camera.cy + margin_v) / camera.fy, (camera.height - camera.cy + margin_v) / camera.fy)
+    zero = torch.zeros_like(z)
+    row_u = torch.stack([camera.fx / z, zero, -camera.fx * tx / z], 1)
+    row_v = torch.stack([zero, camera.fy / z, -camera.fy * ty / z], 1)
+    return torch.stack([row_u, row_v], 1)
+
+
+def rotations(quats: Tensor) -> Tensor:
+    """Turn quaternions [N, 4] wxyz of any norm into rotations [N, 3, 3]."""
+    w, x, y, z = normalize(quats, dim=1).unbind(1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1),
+    ]
+    return torch.stack(rows, 1)
+
+
+def _whiten(A: Tensor, low_pass_px2: float) -> tuple[Tensor, Tensor]:
+    """Factor (A Aᵀ + low_pass·I)⁻¹: conics [N, 3], and standard deviations [N, 2] px, detached.
+
+    The determinant is a sum of positive terms (Lagrange's identity); ca·cc − cb² would cancel on needles.
+    """
+    a, b = A.unbind(1)
+    aa, bb, cb = (a * a).sum(1), (b * b).sum(1), (a * b).sum(1)
+    cross = torch.linalg.cross(a, b)
+    det = (cross * cross).sum(1) + low_pass_px2 * (aa + bb) + low_pass_px2**2
+    ca, cc = aa + low_pass_px2, bb + low_pass_px2
+    conics = torch.stack([(cc / det).sqrt(), -cb / (cc * det).sqrt(), cc.rsqrt()], 1)
+    return conics, torch.stack([ca, cc], 1).detach().sqrt()
+
+
+def blend(
+    means2d: Tensor,
+    conics: Tensor,
+    z: Tensor,
+    radii: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    ref_depth: Tensor | None,
+    camera: Camera,
+    options: RenderConfig,
+) -> Blended:
+    """Composite splats front to back at every pixel (3DGS eq. 3; VarSplat §1; CG-SLAM eq. 3, 6, 8-10).
+
+    means2d, conics, z, radii as `project` returns them; opacities [N]; features [N, K]; ref_depth [H, W] m or None.
+    Order is z, ties by index. A pair counts where o·exp(power) ≥ alpha_min and the light before it is at least
+    transmittance_stop; no other cut, so the result does not depend on tiles. Ids and their weights carry no gradient.
+    """
+    order = torch.sort(z.detach(), stable=True).indices
+    order = order[radii[order, 0] > 0]
+    v, u = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    pixels = torch.stack([u, v], -1).reshape(-1, 2).to(means2d)
+    ref = torch.zeros(len(pixels)).to(z) if ref_depth is None else ref_depth.detach().reshape(-1).to(z)
+    step = max(1, PAIRS_AT_ONCE // (len(order) + 1))
+    parts = [
+        _blend_pixels(
+            _alphas(some_pixels, means2d[order], conics[order], opacities[order], options),
+            features[order],
+            z[order],
+            some_ref,
+            order,
+            options.transmittance_stop,
+        )
+        for some_pixels, some_ref in zip(torch.split(pixels, step), torch.split(ref, step), strict=True)
+    ]
+    size = (camera.height, camera.width)
+    sums, moment, *maps = (torch.cat(part) for part in zip(*parts, strict=True))
+    images = [m.reshape(size) for m in maps]
+    return Blended(sums.reshape(*size, -1), None if ref_depth is None else moment.reshape(size), *images)
+
+
+def _alphas(pixels: Tensor, means2d: Tensor, conics: Tensor, opacities: Tensor, options: RenderConfig) -> Tensor:
+    """Evaluate α [N, P] = min(0.99, o·exp(power)), 0 where below alpha_min; the clamp passes no gradient."""
+    dx, dy = (pixels[None] - means2d[:, None]).unbind(-1)
+    l1, l2, l3 = conics[:, :, None].unbind(1)
+    power = -0.5 * ((l1 * dx + l2 * dy) ** 2 + (l3 * dy) ** 2)
+    raw = opacities[:, None] * power.exp()
+    return torch.where(raw >= options.alpha_min, raw.clamp(max=ALPHA_MAX), 0.0)
+
+
+def _blend_pixels(
+    alphas: Tensor, features: Tensor, z: Tensor, ref: Tensor, order: Tensor, stop: float
+) -> tuple[Tensor, ...]:
+    """Composite sorted splats at P pixels; returns `Blended`'s maps flat.
+
+    A row of clear air (id −1, α = 0) stands in front: it makes the light before each splat a plain shift of the light
+    after, and is what `argmax` finds where no splat qualifies.
+    """
+    air = alphas.new_zeros(1, alphas.shape[1])
+    alphas = torch.cat([air, alphas])
+    after = torch.cumprod(1.0 - alphas, 0)
+    before = torch.cat([torch.ones_like(air), after[:-1]])
+    counts = before >= stop
+    w = torch.where(counts, alphas * before, 0.0)
+    off = torch.where(ref > 0, z[:, None] - ref, 0.0)
+    ids = torch.cat([order.new_full((1,), -1), order]).int()
+    median = (counts & (before >= 0.5) & (after < 0.5)).int().argmax(0, keepdim=True)
+    dominant = w.detach().argmax(0, keepdim=True)
+    return (
+        w[1:].T @ features,
+        (w[1:] * off**2).sum(0),
+        w.sum(0),
+        *(m for pick in (median, dominant) for m in (ids[pick[0]], w.detach().gather(0, pick)[0])),
+    )

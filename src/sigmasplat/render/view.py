@@ -1,0 +1,132 @@
+"""Render the same view again and again without allocating: raw parameter rows to image planes, and gradients back.
+
+The loops of `fit` live on this. Planes are padded to whole tiles: [rows, columns] ≥ [H, W]; what lies outside the image
+is defined but means nothing, and a loss masks it (targets have depth 0 there).
+"""
+
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.config import RenderConfig
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import GaussianField
+from sigmasplat.render import reference
+from sigmasplat.render.render import features_of
+
+Matrix = NDArray[np.float64]
+
+
+class View(Protocol):
+    """One camera with its planes: sums [K, rows, columns] of (r, g, b, z[, σ²+c² ×3]), alpha, and their gradients."""
+
+    camera: Camera
+    sums: Tensor
+    alpha: Tensor
+    g_sums: Tensor
+    g_alpha: Tensor
+    seconds: NDArray[np.float64]
+    """Time spent so far in project, sort, blend, blend backward, project backward."""
+
+    def forward(self, params: Tensor, T_camera_world: Matrix) -> None:
+        """Render parameter rows [N, 17] at a pose into `sums` and `alpha`."""
+
+    def backward(self, params: Tensor, g_params: Tensor | None) -> Matrix:
+        """Carry `g_sums`, `g_alpha` to parameter rows (written to g_params unless None); return the pose twist's [6]."""
+
+    def visible(self, n: int) -> Tensor:
+        """Tell which of the n splats of the last forward pass reach the image, bool [n]."""
+
+
+class CpuView:
+    """A view on the compiled kernels."""
+
+    def __init__(self, camera: Camera, options: RenderConfig, variance: bool = True) -> None:
+        from sigmasplat.native import _core
+        from sigmasplat.render import cpu
+
+        self.camera, self.options = camera, options
+        self._numbers = cpu.view_numbers
+        self._raster = _core.Rasteriser()
+        self._k = 7 if variance else 4
+        size = cpu.padded_size(camera)
+        self.sums, self.g_sums = torch.zeros(self._k, *size), torch.zeros(self._k, *size)
+        self.alpha, self.g_alpha = torch.zeros(size), torch.zeros(size)
+        self.seconds = np.zeros(5)
+
+    def forward(self, params: Tensor, T_camera_world: Matrix) -> None:
+        o = self.options
+        view = self._numbers(self.camera, T_camera_world, o)
+        self._raster.view_forward(
+            view, params, self._k, o.alpha_min, o.transmittance_stop, None,
+            self.sums, None, self.alpha, None, None, None, None, self.seconds[:3],
+        )  # fmt: skip
+
+    def backward(self, params: Tensor, g_params: Tensor | None) -> Matrix:
+        twist = np.zeros(6)
+        self._raster.view_backward(
+            params, self.sums, None, self.alpha, self.g_sums, None, self.g_alpha, g_params, twist, self.seconds[3:]
+        )
+        return twist
+
+    def visible(self, n: int) -> Tensor:
+        seen = torch.empty(n, dtype=torch.uint8)
+        self._raster.visible(seen)
+        return seen.bool()
+
+    @property
+    def bytes(self) -> int:
+        """Return the memory held by this view's buffers."""
+        return self._raster.bytes + 4 * 2 * (self.sums.numel() + self.alpha.numel())
+
+
+class ReferenceView:
+    """The same view on the plain-torch definition: slow, for tests and for machines without the compiled kernels."""
+
+    def __init__(self, camera: Camera, options: RenderConfig, variance: bool = True) -> None:
+        self.camera, self.options = camera, options
+        self._k = 7 if variance else 4
+        size = (camera.height, camera.width)
+        self.sums, self.g_sums = torch.zeros(self._k, *size), torch.zeros(self._k, *size)
+        self.alpha, self.g_alpha = torch.zeros(size), torch.zeros(size)
+        self.seconds = np.zeros(5)
+
+    def forward(self, params: Tensor, T_camera_world: Matrix) -> None:
+        self._leaf = params.detach().clone().requires_grad_()
+        self._twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+        T = torch.linalg.matrix_exp(twist_matrix(self._twist)) @ torch.as_tensor(T_camera_world)
+        f = GaussianField(self._leaf)
+        p = reference.project(f.means, f.quats, f.scales, T, self.camera, self.options)
+        features = features_of(f.colors, p.z, f.variances)[:, : self._k]
+        b = reference.blend(*p, f.opacities, features, None, self.camera, self.options)
+        self._maps = (b.sums.movedim(-1, 0), b.alpha)
+        self._radii = p.radii
+        self.sums.copy_(self._maps[0].detach())
+        self.alpha.copy_(b.alpha.detach())
+
+    def backward(self, params: Tensor, g_params: Tensor | None) -> Matrix:
+        g_leaf, g_twist = torch.autograd.grad(self._maps, (self._leaf, self._twist), (self.g_sums, self.g_alpha))
+        if g_params is not None:
+            g_params.copy_(g_leaf)
+        return np.asarray(g_twist.numpy(), np.float64)
+
+    def visible(self, n: int) -> Tensor:
+        return self._radii[:, 0] > 0
+
+
+def twist_matrix(xi: Tensor) -> Tensor:
+    """Write a twist (ρ, φ) [6] as the 4×4 matrix whose exponential is the motion."""
+    zero = torch.zeros((), dtype=xi.dtype)
+    x, y, z, a, b, c = xi
+    rows = [[zero, -c, b, x], [c, zero, -a, y], [-b, a, zero, z], [zero, zero, zero, zero]]
+    return torch.stack([torch.stack(row) for row in rows])
+
+
+def make_view(backend: str, camera: Camera, options: RenderConfig, variance: bool = True) -> View:
+    """Make a view on a backend by name ("auto", "cpu", "reference")."""
+    if backend == "reference":
+        return ReferenceView(camera, options, variance)
+    return CpuView(camera, options, variance)

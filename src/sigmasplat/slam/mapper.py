@@ -1,0 +1,65 @@
+"""Grow and adjust the map at keyframes: seed what is new, fit the field, prune what has faded (VarSplat §2)."""
+
+from dataclasses import dataclass, field as dataclass_field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sigmasplat.config import Config
+from sigmasplat.fit.adam import Rates
+from sigmasplat.fit.field import FieldFit, fit_field
+from sigmasplat.fit.pose import PoseMaps
+from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.model import se3
+from sigmasplat.model.field import GaussianField
+from sigmasplat.render.view import View
+from sigmasplat.slam.rules import draw_keyframes
+from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats
+
+
+@dataclass(eq=False)
+class Mapper:
+    """Owns the field and its keyframes; nobody else writes them."""
+
+    config: Config
+    random: np.random.Generator
+    field: GaussianField = dataclass_field(default_factory=GaussianField.empty)
+    keyframes: list[Keyframe] = dataclass_field(default_factory=list)
+
+    def map(self, view: View, index: int, target: Target, T_world_camera: NDArray[np.float64]) -> FieldFit:
+        """Take in one keyframe: seed, then fit in two halves with a pruning after each."""
+        first = not self.keyframes
+        old = len(self.field)
+        self.keyframes.append(Keyframe(index, target, T_world_camera))
+        self._seed(view, target, T_world_camera)
+        c = self.config.mapping
+        iterations = c.first_iterations if first else c.iterations
+        fit = FieldFit()
+        for half in (iterations // 2, iterations - iterations // 2):
+            order = draw_keyframes(self.keyframes, half, c.newest_probability, c.keyframe_history, self.random)
+            done = fit_field(self.field, view, order, c, Rates.of(c), old if c.freeze_old_colors else 0)
+            old -= self._prune(old)
+            fit.losses += done.losses
+            for stage, seconds in done.seconds.items():
+                fit.seconds[stage] = fit.seconds.get(stage, 0.0) + seconds
+        return fit
+
+    def _seed(self, view: View, target: Target, T_world_camera: NDArray[np.float64]) -> None:
+        c = self.config.seeding
+        if len(self.field) == 0:
+            pixels = first_pixels(target, c, self.random)
+        else:
+            view.forward(self.field.params, se3.inverse(T_world_camera))
+            pixels = later_pixels(PoseMaps.of(view), target, c, self.random)
+        new = make_splats(target, T_world_camera, pixels, self.field, c)
+        room = c.max_splats - len(self.field) if c.max_splats else len(new)
+        if len(new) > room:
+            new.keep(torch.from_numpy(self.random.permutation(len(new))[: max(room, 0)].copy()).sort().values)
+        self.field.append(new)
+
+    def _prune(self, old: int) -> int:
+        """Drop splats that have faded; return how many of the first `old` went."""
+        keep = self.field.opacities > self.config.mapping.prune_opacity
+        self.field.keep(keep)
+        return int((~keep[:old]).sum())

@@ -1,0 +1,94 @@
+"""Follow the camera: guess, fit the pose against the frozen map, judge, and try again from elsewhere if it failed."""
+
+from dataclasses import dataclass, field as dataclass_field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.config import TrackingConfig
+from sigmasplat.fit.align import Pyramid, align
+from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
+from sigmasplat.fit.target import Target
+from sigmasplat.model import se3
+from sigmasplat.model.field import GaussianField
+from sigmasplat.render.view import View
+from sigmasplat.slam.rules import is_lost, jumped
+
+Matrix = NDArray[np.float64]
+DOUBT = 0.7
+"""Below this share of its usual agreement a pose is doubted and other starts are tried."""
+
+
+@dataclass(eq=False)
+class Tracker:
+    """Remembers the last two poses, the last image, and how well tracking usually goes."""
+
+    config: TrackingConfig
+    previous: Matrix = dataclass_field(default_factory=lambda: np.eye(4))
+    velocity: Matrix = dataclass_field(default_factory=lambda: np.eye(4))
+    last_image: Pyramid | None = None
+    agreements: list[float] = dataclass_field(default_factory=list)
+    first_losses: list[float] = dataclass_field(default_factory=list)
+    lost: bool = False
+
+    def start(self, live: Pyramid) -> None:
+        """Fix the gauge: the first camera is the world."""
+        self.last_image = live
+
+    def track(self, field: GaussianField, view: View, target: Target, live: Pyramid) -> PoseFit:
+        """Find T_camera_world of a frame; `self.lost` says afterwards whether to believe it.
+
+        A lost frame keeps the best guess there is (odometry, else the last pose), and the velocity is forgotten.
+        """
+        predicted = self.previous @ self.velocity if self.config.motion_model else self.previous
+        fit = self._fit(field, view, target, live, predicted, self.config.iterations)
+        if self._doubtful(fit):
+            fit = self._retry(field, view, target, live, fit)
+        self.lost = is_lost(fit, self.config.lost_share)
+        fit.T_camera_world = se3.orthonormalise(fit.T_camera_world)
+        T_world_camera = se3.inverse(fit.T_camera_world)
+        if self.lost:
+            self.velocity = np.eye(4)
+        else:
+            self.velocity = se3.inverse(self.previous) @ T_world_camera
+            self.agreements.append(fit.agreement * fit.overlap)
+            self.first_losses.append(fit.first_loss)
+        self.previous = T_world_camera
+        self.last_image = live
+        return fit
+
+    def _fit(
+        self, field: GaussianField, view: View, target: Target, live: Pyramid, guess: Matrix, iterations: int
+    ) -> PoseFit:
+        T_camera_world = se3.inverse(guess)
+        if self.config.method == "align":
+            return fit_pose_align(field.params, view, target, live, T_camera_world, self.config)
+        return fit_pose_adam(field.params, view, target, T_camera_world, self.config, iterations)
+
+    def _doubtful(self, fit: PoseFit) -> bool:
+        usual = float(np.median(self.agreements[-50:])) if self.agreements else 1.0
+        worse = fit.agreement * fit.overlap < DOUBT * usual
+        return worse or jumped(fit.first_loss, self.first_losses, self.config.reinit_factor)
+
+    def _retry(self, field: GaussianField, view: View, target: Target, live: Pyramid, fit: PoseFit) -> PoseFit:
+        """Start again from RGB-D odometry with twice the iterations (VarSplat §3), and from standing still; keep the best."""
+        starts = [self.previous]
+        odometry = self._odometry(live)
+        if odometry is not None:
+            starts.insert(0, odometry)
+        fits = [fit] + [self._fit(field, view, target, live, s, 2 * self.config.iterations) for s in starts]
+        best = max(fits, key=lambda f: f.agreement * f.overlap)
+        if is_lost(best, self.config.lost_share):
+            best.T_camera_world = se3.inverse(starts[0])
+        return best
+
+    def _odometry(self, live: Pyramid) -> Matrix | None:
+        """Align the last image to this one; None if they do not fit together either."""
+        if self.last_image is None:
+            return None
+        guesses = (se3.inverse(self.velocity), np.eye(4))
+        found = [align(self.last_image, live, g, 2 * self.config.align_iterations) for g in guesses]
+        best = max(found, key=lambda a: a.agreement * a.overlap)
+        if best.agreement * best.overlap < self.config.lost_share:
+            return None
+        return np.asarray(self.previous @ se3.inverse(best.T_live_reference))

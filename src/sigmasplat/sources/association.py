@@ -1,0 +1,39 @@
+"""Pair events of two clocks by time."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Times = NDArray[np.float64]
+
+
+def associate(first_s: Times, second_s: Times, tolerance_s: float = 0.02) -> NDArray[np.intp]:
+    """Pair timestamps [N] and [M], seconds, that differ by less than `tolerance_s`; return indices [K, 2] by time.
+
+    Every index is used at most once and the closest pairs are served first; neither list need be sorted. Ties go to
+    the earlier entry of the first list, then of the second, so the answer does not depend on the sort's whims.
+    """
+    rows, columns = _candidates(first_s, second_s, tolerance_s)
+    gaps_s = np.abs(first_s[rows] - second_s[columns])
+    used_first, used_second = np.zeros(len(first_s), bool), np.zeros(len(second_s), bool)
+    pairs = []
+    for k in np.lexsort((columns, rows, gaps_s)):
+        i, j = rows[k], columns[k]
+        if not (used_first[i] or used_second[j]):
+            used_first[i] = used_second[j] = True
+            pairs.append((i, j))
+    pairs.sort(key=lambda pair: (first_s[pair[0]], pair[0]))
+    return np.array(pairs, np.intp).reshape(-1, 2)
+
+
+def _candidates(first_s: Times, second_s: Times, tolerance_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """List all index pairs strictly within the tolerance."""
+    order = np.argsort(second_s, kind="stable")
+    ordered = second_s[order]
+    low = np.searchsorted(ordered, first_s - tolerance_s, "left")
+    high = np.searchsorted(ordered, first_s + tolerance_s, "right")
+    rows = np.repeat(np.arange(len(first_s)), high - low)
+    starts = np.repeat(low, high - low)
+    within = np.arange(len(rows)) - np.repeat(np.cumsum(high - low) - (high - low), high - low)
+    columns = order[starts + within]
+    near = np.abs(first_s[rows] - second_s[columns]) < tolerance_s
+    return rows[near], columns[near]

@@ -1,0 +1,116 @@
+"""Know the cameras of the public data sets, and read the calibration that lies beside a recording."""
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sigmasplat.errors import ConfigError, SourceError
+from sigmasplat.model.camera import Camera
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A camera, its PNG depth units per metre, and its lens (k1, k2, p1, p2, k3), None for none."""
+
+    camera: Camera
+    depth_units_per_metre: float
+    distortion: tuple[float, ...] | None = None
+
+
+TUM_UNITS_PER_METRE = 5000.0
+
+# The numbers published with the TUM RGB-D benchmark (repeated in CG-SLAM's loaders), 640×480.
+FREIBURG = {
+    "1": Calibration(
+        Camera(640, 480, 517.3, 516.5, 318.6, 255.3), TUM_UNITS_PER_METRE, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
+    ),
+    "2": Calibration(
+        Camera(640, 480, 520.9, 521.0, 325.1, 249.7), TUM_UNITS_PER_METRE, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)
+    ),
+    "3": Calibration(Camera(640, 480, 535.4, 539.2, 320.1, 247.6), TUM_UNITS_PER_METRE),
+}
+
+REPLICA = Calibration(Camera(1200, 680, 600.0, 600.0, 599.5, 339.5), 6553.5)
+
+
+def freiburg_calibration(folder: Path) -> Calibration | None:
+    """Return the TUM camera that a folder's name gives away (`freiburg1` or `fr1` in it or a parent), else None."""
+    for part in reversed(folder.resolve().parts):
+        match = re.search(r"freiburg([123])|(?:^|[^a-z0-9])fr([123])(?:[^0-9]|$)", part.lower())
+        if match:
+            return FREIBURG[match.group(1) or match.group(2)]
+    return None
+
+
+def read_calibration(path: Path, size: tuple[int, int], default_units_per_metre: float) -> Calibration:
+    """Read `calibration.json`: fx, fy, cx, cy; optional width, height, depth_scale (PNG units per metre), distortion.
+
+    `size` (width, height) in pixels stands in where the file gives none. Raises SourceError naming file and field.
+    """
+    fields = read_object(path)
+    width = number(path, fields, "width", size[0])
+    height = number(path, fields, "height", size[1])
+    focal = [number(path, fields, key) for key in ("fx", "fy", "cx", "cy")]
+    units = number(path, fields, "depth_scale", default_units_per_metre)
+    return Calibration(
+        camera_of(path, int(width), int(height), focal), positive(path, "depth_scale", units), _distortion(path, fields)
+    )
+
+
+def read_replica_calibration(path: Path) -> Calibration:
+    """Read Replica's `cam_params.json`: {"camera": {w, h, fx, fy, cx, cy, scale}}. Raises SourceError."""
+    fields = read_object(path).get("camera")
+    if not isinstance(fields, dict):
+        raise SourceError(f'{path}: no "camera" object with w, h, fx, fy, cx, cy, scale')
+    w, h, fx, fy, cx, cy, scale = (number(path, fields, key) for key in ("w", "h", "fx", "fy", "cx", "cy", "scale"))
+    return Calibration(camera_of(path, int(w), int(h), [fx, fy, cx, cy]), positive(path, "scale", scale))
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """Read a JSON file that holds one object. Raises SourceError naming the file."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise SourceError(f"{path}: not readable as JSON ({error}); mend it") from error
+    if not isinstance(content, dict):
+        raise SourceError(f"{path}: holds a {type(content).__name__}, not an object with fx, fy, cx, cy")
+    return content
+
+
+def number(path: Path, fields: dict[str, Any], key: str, default: float | None = None) -> float:
+    """Take one finite number from a JSON object. Raises SourceError naming file and field."""
+    value = fields.get(key, default)
+    if value is None:
+        raise SourceError(f'{path}: field "{key}" is missing (found {", ".join(sorted(fields)) or "nothing"}); add it')
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        raise SourceError(f'{path}: field "{key}" is {value!r}, a finite number is wanted')
+    return float(value)
+
+
+def positive(path: Path, key: str, value: float) -> float:
+    """Return a number that must be above 0. Raises SourceError naming file and field."""
+    if value <= 0:
+        raise SourceError(f'{path}: field "{key}" is {value:g}, it must be above 0 (depth units per metre)')
+    return value
+
+
+def camera_of(path: Path, width: int, height: int, focal: list[float]) -> Camera:
+    """Build a camera from numbers of a file. Raises SourceError naming the file if they make none."""
+    try:
+        return Camera(width, height, *focal)
+    except ConfigError as error:
+        raise SourceError(f"{path}: {error}") from error
+
+
+def _distortion(path: Path, fields: dict[str, Any]) -> tuple[float, ...] | None:
+    values = fields.get("distortion")
+    if values is None:
+        return None
+    if not isinstance(values, list) or len(values) not in (4, 5):
+        raise SourceError(f'{path}: field "distortion" is {values!r}, [k1, k2, p1, p2, k3] is wanted')
+    numbers = [number(path, {"distortion": v}, "distortion") for v in [*values, 0.0][:5]]
+    return tuple(numbers) if any(numbers) else None

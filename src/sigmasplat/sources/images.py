@@ -1,0 +1,85 @@
+"""Read colour and depth images; whatever a file does wrong becomes one line that names it."""
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sigmasplat.errors import SourceError
+
+Value = TypeVar("Value")
+
+OVERFLOW = 65535
+"""Several sensors write the largest 16-bit number where they saw nothing."""
+
+_COLOR_OF_BYTE = (np.arange(256) / 255.0).astype(np.float32)
+
+
+def color_from_bytes(values: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Turn 8-bit colour into float32 in [0, 1], same shape."""
+    return _COLOR_OF_BYTE[values]
+
+
+def read_color(path: Path) -> NDArray[np.uint8]:
+    """Read an image as 8-bit RGB [H, W, 3]. Raises SourceError naming a missing, cut short or corrupt file."""
+    return _guarded(path, lambda: _decode(path, "RGB"))
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Return (width, height) in pixels from the header alone. Raises SourceError if the file is no image."""
+    if path.suffix == ".npy":
+        height, width = _guarded(path, lambda: np.load(path, mmap_mode="r").shape[:2])
+        return int(width), int(height)
+    return _guarded(path, lambda: _header_size(path))
+
+
+def read_depth(path: Path, units_per_metre: float) -> NDArray[np.float32]:
+    """Read depth along the optical axis as float32 metres [H, W], 0 = no reading.
+
+    Whole numbers (16-bit PNG, integer .npy) are divided by `units_per_metre`; floats (.tiff, .npy) are metres already.
+    Raises SourceError if the file is unreadable, not a single-channel depth image, negative, or holds NaN or inf.
+    """
+    raw = _guarded(path, lambda: np.load(path) if path.suffix == ".npy" else _decode(path))
+    if raw.ndim != 2 or raw.dtype == np.uint8 or raw.dtype.kind not in "iuf":
+        raise SourceError(
+            f"{path}: not a depth image (found {raw.dtype} {raw.shape}); 16-bit PNG or float metres wanted"
+        )
+    if raw.dtype.kind == "f":
+        return _checked_metres(path, raw.astype(np.float32))
+    readings = np.where(raw == OVERFLOW, 0, raw)
+    return _checked_metres(path, (readings / units_per_metre).astype(np.float32))
+
+
+def _checked_metres(path: Path, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    bad = int((~np.isfinite(depth_m)).sum())
+    if bad:
+        raise SourceError(f"{path}: depth holds {bad} NaN or inf pixels; write 0 where there is no reading")
+    if float(depth_m.min(initial=0.0)) < 0.0:
+        raise SourceError(f"{path}: depth is negative ({depth_m.min():.3f} m); write 0 where there is no reading")
+    return depth_m
+
+
+def _decode(path: Path, mode: str | None = None) -> NDArray[Any]:
+    with Image.open(path) as image:
+        return np.asarray(image if mode is None else image.convert(mode))
+
+
+def _header_size(path: Path) -> tuple[int, int]:
+    with Image.open(path) as image:
+        return image.size
+
+
+def _guarded(path: Path, read: Callable[[], Value]) -> Value:
+    """Run a reader; decoders fail in many ways on damaged bytes, and all of them mean: this file is unreadable."""
+    if not path.is_file():
+        raise SourceError(f"{path}: the image is missing; download it again or drop it from the list")
+    try:
+        return read()
+    except (OSError, ValueError, SyntaxError, EOFError, IndexError, KeyError, TypeError, struct.error) as error:
+        raise SourceError(f"{path}: unreadable image ({error}); download or copy it again") from error
+    except Image.DecompressionBombError as error:
+        raise SourceError(f"{path}: unreadable image ({error})") from error

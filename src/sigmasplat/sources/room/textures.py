@@ -1,0 +1,176 @@
+"""Colour surfaces by formula, without detail finer than a pixel.
+
+A texture maps surface coordinates u, v [N] and the pixel's width on the surface [N], all metres, to RGB [3, N] in
+[0, 1] as shown on a screen. Every pattern fades to its mean as the pixel outgrows it, so that a distant surface does
+not sparkle: noise that changes with the viewpoint could be explained by no map.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating[Any]]  # float32 throughout; numpy's types lose that at every factor
+Texture = Callable[[Floats, Floats, Floats], Floats]
+Color = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """How a surface looks: texture; glow = light of its own (1 = lit by nothing else); mirror = share of the reflected
+    ray; gloss = strength of a lamp's highlight."""
+
+    texture: Texture
+    glow: float = 0.0
+    mirror: float = 0.0
+    gloss: float = 0.0
+
+
+def hashed(i: Floats, j: Floats | int, seed: int) -> Floats:
+    """Give each integer cell (i, j) a number in [0, 1), the same on every machine."""
+    a = np.atleast_1d(np.asarray(i, np.int32)).view(np.uint32) * np.uint32(0x9E3779B1)
+    b = np.atleast_1d(np.asarray(j, np.int32)).view(np.uint32) * np.uint32(0x85EBCA77)
+    h = a ^ b ^ np.uint32((seed * 0xC2B2AE3D + 0x27D4EB2F) & 0xFFFFFFFF)
+    h = (h ^ (h >> np.uint32(15))) * np.uint32(0x2C1B3C6D)
+    h = (h ^ (h >> np.uint32(12))) * np.uint32(0x297A2D39)
+    return ((h ^ (h >> np.uint32(15))) >> np.uint32(8)).astype(np.float32) / np.float32(1 << 24)
+
+
+def smooth(x: Floats) -> Floats:
+    """Rise from 0 at x ≤ 0 to 1 at x ≥ 1 with no kink."""
+    x = np.clip(x, 0.0, 1.0)
+    return (x * x * (3.0 - 2.0 * x)).astype(np.float32)
+
+
+def visible(detail_m: float, pixel_m: Floats) -> Floats:
+    """Return how much of a pattern with details of this size survives under pixels of that size, 1 … 0."""
+    return smooth(2.0 - 2.0 * pixel_m / np.float32(detail_m))
+
+
+def noise(u: Floats, v: Floats, pixel_m: Floats, cell_m: float, seed: int) -> Floats:
+    """Return smooth random values in [−1, 1], one independent value per lattice point `cell_m` apart."""
+    x, y = u / np.float32(cell_m), v / np.float32(cell_m)
+    i, j = np.floor(x), np.floor(y)
+    a, b = smooth(x - i), smooth(y - j)
+    low = hashed(i, j, seed) * (1 - a) + hashed(i + 1, j, seed) * a
+    high = hashed(i, j + 1, seed) * (1 - a) + hashed(i + 1, j + 1, seed) * a
+    return ((low * (1 - b) + high * b) * 2 - 1) * visible(cell_m, pixel_m)
+
+
+def line(distance_m: Floats, width_m: float, pixel_m: Floats) -> Floats:
+    """Draw a line: 1 on it, 0 away from it; a line thinner than a pixel keeps its share of it."""
+    soft = np.maximum(np.float32(width_m), pixel_m)
+    return smooth(1.0 - np.abs(distance_m) / soft) * (np.float32(width_m) / soft)
+
+
+def step(x_m: Floats, pixel_m: Floats, soft_m: float = 0.004) -> Floats:
+    """Rise from 0 to 1 around x = 0 within a pixel's width."""
+    return smooth(0.5 + x_m / np.maximum(2 * pixel_m, np.float32(soft_m)))
+
+
+def mixed(a: Color | Floats, b: Color | Floats, share: Floats) -> Floats:
+    """Blend two colours by the share [N] of the second, [3, N]."""
+    first, second = _column(a), _column(b)
+    return (first + (second - first) * share).astype(np.float32)
+
+
+def _column(color: Color | Floats) -> Floats:
+    array = np.asarray(color, np.float32)
+    return array[:, None] if array.ndim == 1 else array
+
+
+def plain(color: Color, grain: float = 0.03, cell_m: float = 0.09, seed: int = 0) -> Texture:
+    """Paint one colour with a little cloudiness, `grain` = its amplitude."""
+
+    def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
+        clouds = 0.6 * noise(u, v, pixel_m, cell_m, seed) + 0.4 * noise(u, v, pixel_m, 0.37 * cell_m, seed + 1)
+        return _column(color) * (1.0 + np.float32(grain) * clouds)
+
+    return texture
+
+
+def wood(color: Color, plank_m: float = 0.14, seed: int = 0, length_m: float = 1.1) -> Texture:
+    """Lay planks along u: each of its own tone, with grain and dark seams."""
+
+    def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
+        row = np.floor(v / np.float32(plank_m))
+        along = u + hashed(row, 0, seed) * np.float32(length_m)
+        plank = np.floor(along / np.float32(length_m))
+        tone = (hashed(row, plank, seed + 1) - 0.5) * visible(plank_m, pixel_m)
+        grain = noise(u * 0.16, v, pixel_m, 0.016, seed + 2) + noise(u * 0.2, v, pixel_m, 0.045, seed + 3)
+        across = np.abs(v / np.float32(plank_m) - row - 0.5) * np.float32(plank_m)
+        ends = np.abs(along / np.float32(length_m) - plank - 0.5) * np.float32(length_m)
+        seam = np.maximum(line(across - plank_m / 2, 0.006, pixel_m), line(ends - length_m / 2, 0.006, pixel_m))
+        return _column(color) * (1.0 + 0.3 * tone + 0.09 * grain) * (1.0 - 0.4 * seam)
+
+    return texture
+
+
+def wallpaper(ground: Color, figure: Color, period_m: float, seed: int = 0) -> Texture:
+    """Print wide stripes and a lattice of soft flowers over a faintly clouded ground."""
+
+    def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
+        k = np.float32(2 * np.pi / period_m)
+        stripes = 0.35 * smooth(0.5 + 1.5 * np.sin(k * u)) * visible(period_m / 3, pixel_m)
+        flower = np.cos(k * u) * np.cos(k * v) + 0.55 * np.cos(2 * k * (u + v)) * np.cos(2 * k * (u - v))
+        flowers = 0.6 * smooth(2.2 * flower - 1.0) * visible(period_m / 5, pixel_m)
+        clouds = 0.05 * noise(u, v, pixel_m, 0.21, seed) + 0.05 * noise(u, v, pixel_m, 0.05, seed + 1)
+        return mixed(ground, figure, stripes + flowers) * (1.0 + clouds)
+
+    return texture
+
+
+def brick(color: Color, mortar: Color, seed: int = 0, width_m: float = 0.26, height_m: float = 0.09) -> Texture:
+    """Lay bricks in half bond, each of its own tone."""
+
+    def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
+        row = np.floor(v / np.float32(height_m))
+        x = u / np.float32(width_m) + 0.5 * (row % 2)
+        column = np.floor(x)
+        tone = (hashed(row, column, seed) - 0.5) * visible(height_m, pixel_m)
+        rough = noise(u, v, pixel_m, 0.03, seed + 1)
+        joint_u = line((np.abs(x - column - 0.5) - 0.5) * width_m, 0.011, pixel_m)
+        joint_v = line((np.abs(v / np.float32(height_m) - row - 0.5) - 0.5) * height_m, 0.011, pixel_m)
+        body = _column(color) * (1.0 + 0.32 * tone + 0.07 * rough)
+        return mixed(body, mortar, np.maximum(joint_u, joint_v))
+
+    return texture
+
+
+def two_tone(upper: Color, lower: Color, height_m: float, seed: int = 0) -> Texture:
+    """Paint a wall in two colours that meet in a pale band at v = `height_m`, over plaster."""
+
+    def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
+        plaster = 0.04 * noise(u, v, pixel_m, 0.3, seed) + 0.05 * noise(u, v, pixel_m, 0.06, seed + 1)
+        paint = mixed(lower, upper, step(v - np.float32(height_m), pixel_m))
+        panel = line(np.abs(u / 0.5 - np.floor(u / 0.5) - 0.5) * 0.5 - 0.25, 0.012, pixel_m) * (v < height_m)
+        band = line(v - np.float32(height_m), 0.035, pixel_m)
+        return mixed(mixed(paint, (0.35, 0.33, 0.3), 0.5 * panel), (0.93, 0.91, 0.86), band) * (1.0 + plaster)
+
+    return texture
+
+
+def checks(a: Color, b: Color, size_m: float, seed: int = 0) -> Texture:
+    """Weave soft-edged checks of two colours."""
+
+    def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
+        k = np.float32(np.pi / size_m)
+        wave = np.sin(k * u) * np.sin(k * v)
+        share = 0.5 + (smooth(0.5 + 2.5 * wave) - 0.5) * visible(size_m, pixel_m)
+        return mixed(a, b, share) * (1.0 + 0.06 * noise(u, v, pixel_m, 0.02, seed))
+
+    return texture
+
+
+def weave(a: Color, b: Color, period_m: float, seed: int = 0) -> Texture:
+    """Weave cloth: two crossing ribs and worn patches."""
+
+    def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
+        k = np.float32(2 * np.pi / period_m)
+        ribs = (np.sin(k * u) + np.sin(k * v)) * 0.25 * visible(period_m / 2, pixel_m)
+        worn = 0.35 * noise(u, v, pixel_m, 0.12, seed) + 0.25 * noise(u, v, pixel_m, 0.04, seed + 1)
+        return mixed(a, b, 0.5 + ribs + worn)
+
+    return texture

@@ -1,0 +1,78 @@
+"""Walk a camera through the room on a smooth closed path."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+
+from sigmasplat.sources.room.furnish import HALF_X_M, PITCH_M
+
+Matrix = NDArray[np.float64]
+
+FINE = 4000
+"""Steps in which a path is measured."""
+CALM_M = 0.9
+"""Standard deviation, along the way, of the average that smooths where the camera looks."""
+
+
+def path(frames: int, loops: int, rooms: int, seed: int) -> Matrix:
+    """Return T_world_camera [frames, 4, 4], camera x right, y down, z forward; the last pose is the first one again.
+
+    One room: an ellipse, looking across it, one turn per loop, each loop at another height: at 200 frames a loop 1.4 to
+    2.8 cm and under 2° a frame. Several rooms: there and back through the doorways, looking ahead; 300 frames a room
+    keep that pace.
+    """
+    u = np.arange(frames) / max(frames - 1, 1)
+    phase = 2 * np.pi * np.random.default_rng((seed, 3)).uniform()
+    positions, yaw_rad = _ellipse(loops * u, phase) if rooms == 1 else _corridor((loops * u) % 1.0, rooms)
+    turns = 2 * np.pi * loops * u
+    positions[:, 2] = 1.42 + 0.07 * np.sin(2 * turns + phase) + 0.16 * np.sin(2 * np.pi * u) * (loops > 1)
+    pitch_rad = np.deg2rad(-11.0 + 5.0 * np.sin(2 * turns))
+    roll_rad = np.deg2rad(1.5) * np.sin(3 * turns)
+    return np.stack([_pose(*values) for values in zip(positions, yaw_rad, pitch_rad, roll_rad, strict=True)])
+
+
+def _ellipse(loop: Matrix, phase: float) -> tuple[Matrix, Matrix]:
+    """Circle the middle of the room, looking across it: yaw turns evenly, the camera stays behind the middle."""
+    yaw_rad = 2 * np.pi * loop + phase
+    ahead = np.stack([0.85 * np.cos(yaw_rad), 0.65 * np.sin(yaw_rad), np.zeros_like(yaw_rad)], -1)
+    return -ahead, yaw_rad
+
+
+def _corridor(loop: Matrix, rooms: int) -> tuple[Matrix, Matrix]:
+    """Go through all rooms and back at even speed on a closed spline, narrow at the doors and wide in the rooms."""
+    doors = [HALF_X_M + k * PITCH_M for k in range(rooms - 1)]
+    out: list[tuple[float, float]] = [(0.0, -0.75)]
+    for k, x in enumerate(doors):
+        out += [(x, -0.12), (PITCH_M * (k + 1), -0.75)]
+    back = [(x, -y) for x, y in reversed(out)]
+    turn_x = 1.15
+    corners = [*out, (PITCH_M * (rooms - 1) + turn_x, 0.0), *back, (-turn_x, 0.0), out[0]]
+    knots = np.array(corners)
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))])
+    curve = CubicSpline(length, knots, bc_type="periodic")
+    fine = np.linspace(0.0, length[-1], FINE + 1)
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve(fine), axis=0), axis=1))])
+    where = np.interp(loop * travelled[-1], travelled, fine)
+    yaw_rad = _calm_yaw(curve(np.interp(np.linspace(0, travelled[-1], FINE + 1), travelled, fine), 1), travelled[-1])
+    return np.column_stack([curve(where), np.zeros(len(loop))]), np.interp(loop, np.linspace(0, 1, FINE + 1), yaw_rad)
+
+
+def _calm_yaw(ahead: Matrix, length_m: float) -> Matrix:
+    """Return the yaw of a closed path's directions, evenly spaced, averaged over `CALM_M` so that turns begin early."""
+    turn = np.linspace(0.0, 2 * np.pi, len(ahead))
+    wobble = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])) - turn
+    calm = gaussian_filter1d(wobble[:-1], CALM_M / length_m * FINE, mode="wrap")
+    return np.asarray(turn + np.append(calm, calm[0]))
+
+
+def _pose(position: Matrix, yaw_rad: float, pitch_rad: float, roll_rad: float) -> Matrix:
+    """Look along yaw (from +x about z) and pitch (up positive), rolled about the viewing direction."""
+    forward = np.array([np.cos(pitch_rad) * np.cos(yaw_rad), np.cos(pitch_rad) * np.sin(yaw_rad), np.sin(pitch_rad)])
+    right = np.array([np.sin(yaw_rad), -np.cos(yaw_rad), 0.0])
+    down = np.cross(forward, right)
+    c, s = np.cos(roll_rad), np.sin(roll_rad)
+    T = np.eye(4)
+    T[:3, 0], T[:3, 1], T[:3, 2] = c * right + s * down, c * down - s * right, forward
+    T[:3, 3] = position
+    return T

@@ -1,0 +1,105 @@
+"""Film the built-in room: exact depth and poses, any length and size, the same bytes from the same seed."""
+
+from typing import Any
+
+import numpy as np
+
+from sigmasplat.errors import SourceError
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.frame import Frame
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.sources.base import Source
+from sigmasplat.sources.images import color_from_bytes
+from sigmasplat.sources.opening import Format
+from sigmasplat.sources.room.sensor import measured_color, measured_depth
+from sigmasplat.sources.room.view import picture, scene
+from sigmasplat.sources.room.walk import path
+
+FRAMES_PER_SECOND = 30.0
+FOCAL_PER_WIDTH = 0.8
+EXPOSURE_SWING = 0.08
+
+
+class SyntheticRoom(Source):
+    """A furnished room (or several), ray-cast frame by frame.
+
+    frames, width, height: of the sequence, pixels; seed: looks of the room, start of the walk and all noise;
+    noise: whether depth and colour have a sensor's faults; loops: turns of the walk; exposure_change: whether the
+    picture's gain swings by ±8 % over the sequence; rooms: how many, joined by doorways.
+    Frame i depends on these and on i alone, never on what was read before.
+    """
+
+    def __init__(
+        self,
+        frames: int = 200,
+        width: int = 320,
+        height: int = 240,
+        seed: int = 0,
+        noise: bool = False,
+        loops: int = 1,
+        exposure_change: bool = True,
+        rooms: int = 1,
+    ) -> None:
+        """Plan the walk; nothing is drawn yet. Raises SourceError unless counts and sizes are ≥ 1 and seed ≥ 0."""
+        counts = {"frames": frames, "width": width, "height": height, "loops": loops, "rooms": rooms}
+        for key, value in counts.items():
+            if value < 1:
+                raise SourceError(f"synthetic room: {key} must be at least 1, found {value}")
+        if seed < 0:
+            raise SourceError(f"synthetic room: seed must be at least 0, found {seed}")
+        focal_px = FOCAL_PER_WIDTH * width
+        camera = Camera(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
+        super().__init__("synthetic", camera)
+        self._seed, self._noise, self._rooms = seed, noise, rooms
+        self._exposure_change = exposure_change
+        self._T_world_camera = path(frames, loops, rooms, seed)
+
+    def __len__(self) -> int:
+        return len(self._T_world_camera)
+
+    def frame(self, i: int) -> Frame:
+        """Draw frame i, colour in steps of 1/255 as a camera delivers it."""
+        T_world_camera = self._T_world_camera[self._checked_index(i)]
+        color, depth_m = picture(scene(self._rooms, self._seed), self.camera, T_world_camera)
+        color = np.clip(color * np.float32(self._gain(i)), 0.0, 1.0)
+        if self._noise:
+            rng = np.random.default_rng((self._seed, i, 7))
+            color, depth_m = measured_color(color, rng), measured_depth(depth_m, self.camera, rng)
+        bytes_ = np.rint(color * 255.0).astype(np.uint8)
+        return Frame(i, i / FRAMES_PER_SECOND, color_from_bytes(bytes_), depth_m, self.camera)
+
+    def truth(self) -> Trajectory:
+        """Return the exact pose of every frame, in the room's frame (z up)."""
+        return Trajectory(np.arange(len(self)) / FRAMES_PER_SECOND, self._T_world_camera.copy())
+
+    def _gain(self, i: int) -> float:
+        """Return the exposure of frame i: one slow swing over the sequence, back at its start with the camera."""
+        if not self._exposure_change:
+            return 1.0
+        return 1.0 + EXPOSURE_SWING * float(np.sin(2 * np.pi * i / max(len(self) - 1, 1)))
+
+
+def parse(text: str) -> SyntheticRoom:
+    """Build a room from "synthetic" or "synthetic:frames=200,seed=1,noise=1". Raises SourceError on any other."""
+    options: dict[str, Any] = {}
+    for part in filter(None, text.partition(":")[2].split(",")):
+        key, _, value = (word.strip() for word in part.partition("="))
+        if key not in _OPTIONS or not value.lstrip("-").isdigit():
+            raise SourceError(
+                f"synthetic room: option {part!r} not understood; whole numbers for {', '.join(_OPTIONS)}"
+            )
+        options[key] = int(value)
+    for key in ("noise", "exposure_change"):
+        if key in options:
+            options[key] = bool(options[key])
+    return SyntheticRoom(**options)
+
+
+_OPTIONS = ("frames", "width", "height", "seed", "noise", "loops", "exposure_change", "rooms")
+
+FORMAT = Format(
+    "synthetic",
+    "the word 'synthetic'",
+    lambda path: path.partition(":")[0] == "synthetic",
+    lambda path, strict: parse(path),
+)

@@ -1,0 +1,53 @@
+"""Fixtures for every test folder: where real sequences lie, and a tiny recorded sequence to damage."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+TINY_SIZE = (32, 24)  # width, height
+TINY_DEPTH_M = 2.0
+
+
+@pytest.fixture
+def data_folder() -> Callable[[str], Path]:
+    """Find a real sequence by name under $SIGMASPLAT_DATA or ../shared/data; skip the test where it is absent."""
+    root = Path(os.environ.get("SIGMASPLAT_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+    def find(name: str) -> Path:
+        if not (root / name).is_dir():
+            pytest.skip(f"no real data: {root / name} is absent (set SIGMASPLAT_DATA to the folder that holds {name}/)")
+        return root / name
+
+    return find
+
+
+@pytest.fixture
+def tiny_tum(tmp_path: Path) -> Path:
+    """Write a TUM folder of 4 frames, 32×24, a wall 2 m ahead, by hand: no code under test is involved."""
+    folder = tmp_path / "tiny"
+    for part in ("rgb", "depth"):
+        (folder / part).mkdir(parents=True)
+    width, height = TINY_SIZE
+    for i in range(4):
+        color = np.random.default_rng(i).integers(0, 256, (height, width, 3), np.uint8)
+        Image.fromarray(color).save(folder / f"rgb/{i}.png")
+        Image.fromarray(np.full((height, width), int(1000 * TINY_DEPTH_M), np.uint16)).save(folder / f"depth/{i}.png")
+    (folder / "rgb.txt").write_text("# a comment\n" + "".join(f"{i / 10:.3f} rgb/{i}.png\n" for i in range(4)))
+    (folder / "depth.txt").write_text("".join(f"{i / 10 + 0.004:.3f} depth/{i}.png\n" for i in range(4)))
+    (folder / "groundtruth.txt").write_text("".join(f"{i / 10:.3f} {i} 0 0 0 0 0 1\n" for i in range(4)))
+    calibration = {
+        "fx": 30.0,
+        "fy": 30.0,
+        "cx": 15.5,
+        "cy": 11.5,
+        "width": width,
+        "height": height,
+        "depth_scale": 1000.0,
+    }
+    (folder / "calibration.json").write_text(json.dumps(calibration))
+    return folder

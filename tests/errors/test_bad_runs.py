@@ -1,0 +1,101 @@
+"""Run folders that cannot be used: one line that says what is wrong and how to go on, and nothing lost."""
+
+from pathlib import Path
+
+import pytest
+
+from sigmasplat.config import Config
+from sigmasplat.errors import ConfigError, RunError
+from sigmasplat.io.runs import RunFolder
+
+
+def make(path: Path) -> RunFolder:
+    return RunFolder.create(path, Config(), "room")
+
+
+def refused(path: Path, overwrite: bool = False) -> str:
+    with pytest.raises(RunError) as caught:
+        RunFolder.create(path, Config(), "room", overwrite=overwrite)
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+    return str(caught.value)
+
+
+def test_an_existing_run_is_kept_unless_told(tmp_path: Path) -> None:
+    make(tmp_path / "run").log({"index": 0})
+    assert "--overwrite" in refused(tmp_path / "run")
+    assert len(RunFolder.open(tmp_path / "run").read_log()) == 1
+
+
+@pytest.mark.parametrize("names", [["photo.jpg"], ["config.json"], ["run.json"], ["config.json", "run.json"]])
+def test_a_folder_of_somebody_else_is_never_overwritten(tmp_path: Path, names: list[str]) -> None:
+    for name in names:
+        (tmp_path / name).write_text('{"model": "theirs"}')
+    assert "not a run folder of ours" in refused(tmp_path, overwrite=True)
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
+    assert all((tmp_path / name).read_text() == '{"model": "theirs"}' for name in names)
+
+
+def test_an_empty_folder_is_used(tmp_path: Path) -> None:
+    assert make(tmp_path).facts()["status"] == "running"
+
+
+def test_output_that_is_a_file(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("")
+    assert "is a file; give a folder" in refused(tmp_path / "out")
+
+
+def test_output_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    assert "choose a writable --output" in refused(tmp_path / "file" / "run")
+    assert "choose a writable --output" in refused(Path("/proc/sigmasplat-run"))
+
+
+def test_opening_says_what_is_missing(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"no run folder .*/nothing; `sigmasplat run` makes one"):
+        RunFolder.open(tmp_path / "nothing")
+    with pytest.raises(RunError, match=r"no config\.json and no run\.json"):
+        RunFolder.open(tmp_path)
+    run = make(tmp_path / "run")
+    (run.path / "config.json").unlink()
+    with pytest.raises(RunError, match=r"not a run folder of ours: no config\.json$"):
+        RunFolder.open(run.path)
+
+
+def test_reading_what_was_never_written(tmp_path: Path) -> None:
+    run = make(tmp_path / "run")
+    for name, read in {
+        "trajectory.txt": run.read_trajectory,
+        "map.ply": run.read_map,
+        "checkpoint.safetensors": run.read_checkpoint,
+        "log.jsonl": run.read_log,
+        "metrics.json": run.read_metrics,
+    }.items():
+        with pytest.raises(RunError, match=f"has no {name}; did it stop before writing it"):
+            read()
+
+
+def test_damaged_files_are_named(tmp_path: Path) -> None:
+    run = make(tmp_path / "run")
+    (run.path / "checkpoint.safetensors").write_bytes(b"\0" * 5)
+    with pytest.raises(RunError, match=r"checkpoint .* is damaged"):
+        run.read_checkpoint()
+    (run.path / "metrics.json").write_text("{")
+    with pytest.raises(RunError, match=r"metrics\.json is not JSON"):
+        run.read_metrics()
+    (run.path / "metrics.json").write_text("[1]")
+    with pytest.raises(RunError, match="does not hold named values"):
+        run.read_metrics()
+    (run.path / "run.json").write_text("half a f")
+    with pytest.raises(RunError, match=r"run\.json is not JSON"):
+        RunFolder.open(run.path)
+    (run.path / "config.json").write_text('{"sede": 1}')
+    with pytest.raises(ConfigError, match="unknown setting 'sede'"):
+        run.config()
+
+
+def test_a_folder_that_vanished_while_running(tmp_path: Path) -> None:
+    run = RunFolder(tmp_path / "gone")
+    with pytest.raises(RunError, match=r"cannot write .*log\.jsonl"):
+        run.log({"index": 0})
+    with pytest.raises(RunError, match=r"cannot write .*metrics\.json"):
+        run.write_metrics({})

@@ -1,0 +1,93 @@
+"""Bad input at the command line: one clear line on standard error, exit code 2, nothing written."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sigmasplat import cli
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Run a command that must be refused; return its one line."""
+    with pytest.raises(SystemExit) as left:
+        cli.main(arguments)
+    said = capsys.readouterr()
+    assert left.value.code == 2, said
+    assert said.err.startswith("sigmasplat: ")
+    assert said.err.count("\n") == 1
+    assert said.out == ""
+    return said.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["run", "/no/such/place"], "/no/such/place"),
+        (["run", "."], "looked for"),
+        (["run", "/no/such/place", "--preset", "quick"], "no preset 'quick'"),
+        (["run", "/no/such/place", "--set", "tracking.speed=9"], "unknown setting 'tracking.speed'"),
+        (["run", "/no/such/place", "--set", "fast"], "SECTION.NAME=VALUE"),
+        (["run", "/no/such/place", "--seed", "-1"], "seed must be finite and not negative"),
+        (["demo", "--frames", "0"], "--frames must be at least 1"),
+        (["demo", "--frames", "3", "--set", "tracking.method=guess"], "must be one of adam, align"),
+        (["eval", "/no/such/run"], "no run folder /no/such/run"),
+        (["eval", "."], "not a run folder of ours"),
+        (["export", "/no/such/run"], "no run folder /no/such/run"),
+    ],
+    ids=" ".join,
+)
+def test_refusals(
+    arguments: list[str], says: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert says in refused(capsys, *arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_folder_is_not_touched(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("ten years of work")
+    sequence = "synthetic:frames=2"
+    assert "not empty" in refused(capsys, "run", sequence, "--out", str(tmp_path))
+    assert "not a run folder of ours" in refused(capsys, "run", sequence, "--out", str(tmp_path), "--overwrite")
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
+def test_an_unwritable_place_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    assert "cannot write" in refused(capsys, "run", "synthetic:frames=2", "--out", str(tmp_path / "run"))
+
+
+def test_output_below_a_file_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    assert "cannot write" in refused(capsys, "run", "synthetic:frames=2", "--out", str(tmp_path / "file" / "run"))
+
+
+def _sigmasplat(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "sigmasplat.cli", *arguments]
+    return subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, timeout=60)
+
+
+def test_a_bad_environment_switch_is_one_line() -> None:
+    answer = _sigmasplat("doctor", SIGMASPLAT_ISA="sse9")
+    assert answer.returncode == 2
+    assert answer.stderr == "sigmasplat: SIGMASPLAT_ISA is 'sse9'; give one of auto, avx512, avx2, baseline\n"
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["run", "--help"], ["export", "--help"]])
+def test_help_has_an_example_and_loads_no_torch(arguments: list[str]) -> None:
+    code = "import sys, sigmasplat.cli as c\ntry: c.main(sys.argv[1:])\nfinally: assert 'torch' not in sys.modules"
+    answer = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, timeout=60)
+    assert answer.returncode == 0, answer.stderr
+    assert "example: sigmasplat" in answer.stdout
+
+
+@pytest.mark.parametrize("arguments", [["fly"], ["run"], ["run", "x", "--limit", "many"], ["run", "x", "--no-such"]])
+def test_mistyped_commands_exit_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        cli.main(arguments)
+    assert left.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err

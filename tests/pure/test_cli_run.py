@@ -1,0 +1,264 @@
+"""The command line end to end with a make-believe SLAM: what is written, said and returned, also when cut short."""
+
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from sigmasplat import cli, session
+from sigmasplat.config import Config
+from sigmasplat.errors import SourceError
+from sigmasplat.io.ply import read_field
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.io.trajectory import read_trajectory
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.frame import Frame
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.sources.base import Source
+
+CAMERA = Camera(8, 6, 8.0, 8.0, 3.5, 2.5)
+METRICS = {"ate": {"rmse_m": 0.0123}, "held_out": {"psnr_db": 27.31}, "training": {"psnr_db": 31.25}, "splats": 2}
+
+
+class Corridor(Source):
+    """Six blank frames one second apart."""
+
+    depth_m = 2.0
+
+    def __init__(self) -> None:
+        super().__init__("my corridor", CAMERA)
+        self.broken: set[int] = set()
+
+    def __len__(self) -> int:
+        return 6
+
+    def frame(self, i: int) -> Frame:
+        if i in self.broken:
+            raise SourceError(f"{i}.png is truncated")
+        return Frame(
+            i, float(i), np.full((6, 8, 3), 0.5, np.float32), np.full((6, 8), self.depth_m, np.float32), CAMERA
+        )
+
+    def truth(self) -> Trajectory | None:
+        return None
+
+
+@dataclass
+class MadeUpStep:
+    """A step as slam.slam makes it."""
+
+    index: int
+    timestamp_s: float
+    T_world_camera: np.ndarray
+    is_keyframe: bool
+    lost: bool
+    splats: int = 2
+    tracking: dict[str, float] = field(default_factory=lambda: {"loss": float("nan")})
+    seconds: dict[str, float] = field(default_factory=lambda: {"total": 0.1})
+
+
+class MadeUpSlam:
+    """Walk 10 cm a frame; `at` runs something at a frame, `lost` names frames without tracking."""
+
+    at: dict[int, Callable[[], None]]
+    lost: set[int]
+    latest: "MadeUpSlam"
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.field = GaussianField.from_values(torch.rand(2, 3), torch.full((2,), 0.1), torch.rand(2, 3))
+        self.steps: list[MadeUpStep] = []
+        MadeUpSlam.latest = self
+
+    def step(self, frame: Frame) -> MadeUpStep:
+        self.at.get(frame.index, lambda: None)()
+        T = np.eye(4)
+        T[0, 3] = 0.1 * frame.index
+        self.steps.append(MadeUpStep(frame.index, frame.timestamp_s, T, frame.index % 5 == 0, frame.index in self.lost))
+        return self.steps[-1]
+
+    def trajectory(self) -> Trajectory:
+        poses = np.array([step.T_world_camera for step in self.steps]).reshape(-1, 4, 4)
+        return Trajectory(np.array([step.timestamp_s for step in self.steps]), poses)
+
+    def checkpoint(self) -> dict[str, torch.Tensor]:
+        return {"field.params": self.field.params}
+
+
+@pytest.fixture
+def corridor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Corridor:
+    """Put a made-up source, SLAM and evaluation in place of the real ones, and work in an empty folder."""
+    source = Corridor()
+    module = ModuleType("sigmasplat.slam.slam")
+    module.Slam = MadeUpSlam  # type: ignore[attr-defined]
+    scores = ModuleType("sigmasplat.evaluate")
+    scores.evaluate = evaluate  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setitem(sys.modules, scores.__name__, scores)
+    monkeypatch.setattr("sigmasplat.sources.open_source", lambda path, **options: source)
+    monkeypatch.setattr(MadeUpSlam, "at", {}, raising=False)
+    monkeypatch.setattr(MadeUpSlam, "lost", set(), raising=False)
+    monkeypatch.chdir(tmp_path)
+    return source
+
+
+def evaluate(run: RunFolder, source: Source, *, progress: Callable[[int, int], None]) -> dict[str, Any]:
+    """Stand in for the evaluation."""
+    progress(1, 1)
+    log = run.read_log()
+    lost = [record["index"] for record in log if record["lost"]]
+    metrics = METRICS | {"frames": len(log), "lost": len(lost), "lost_frames": lost}
+    run.write_metrics(metrics)
+    run.write_report("<html></html>")
+    return metrics
+
+
+def sigmasplat(*arguments: str) -> int:
+    """Run the command line; return its exit code."""
+    with pytest.raises(SystemExit) as left:
+        cli.main(arguments)
+    assert isinstance(left.value.code, int)
+    return left.value.code
+
+
+def test_run_leaves_a_whole_run_folder(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
+    assert sigmasplat("run", "corridor", "--set", "tracking.tau=7", "--set", "mapping.every=2", "--seed", "4") == 0
+    run = RunFolder.open(Path("runs/my-corridor-varsplat-fast"))
+    config = run.config()
+    assert (config.tracking.tau, config.mapping.every, config.seed) == (7.0, 2, 4)
+    assert MadeUpSlam.latest.config == config
+    assert run.facts()["status"] == "complete"
+    assert run.facts()["wall_s"] > 0
+    np.testing.assert_allclose(run.read_trajectory().T_world_camera[:, 0, 3], 0.1 * np.arange(6), atol=1e-12)
+    assert torch.allclose(run.read_map().means, MadeUpSlam.latest.field.means)
+    assert set(run.read_checkpoint()[0]) == {"field.params"}
+    log = run.read_log()
+    assert [record["index"] for record in log] == list(range(6))
+    assert [record["is_keyframe"] for record in log] == [True, False, False, False, False, True]
+    assert log[3]["T_world_camera"][0][3] == pytest.approx(0.3)
+    assert log[3]["tracking"] == {"loss": None}
+    said = capsys.readouterr().out
+    for figure in ("1.23", "27.31", "31.25", str(Path("runs/my-corridor-varsplat-fast/report.html").resolve())):
+        assert figure in said
+    assert "LOST" not in said
+
+
+def test_a_second_run_takes_another_folder(corridor: Corridor) -> None:
+    for _ in range(3):
+        assert sigmasplat("run", "corridor", "--no-eval") == 0
+    names = sorted(path.name for path in Path("runs").iterdir())
+    assert names == [f"my-corridor-varsplat-fast{ending}" for ending in ("", "-2", "-3")]
+
+
+def test_overwrite_replaces_the_default_folder(corridor: Corridor) -> None:
+    assert sigmasplat("run", "corridor", "--no-eval") == 0
+    assert sigmasplat("run", "corridor", "--no-eval", "--overwrite", "--preset", "varsplat-fast") == 0
+    assert [path.name for path in Path("runs").iterdir()] == ["my-corridor-varsplat-fast"]
+    assert len(RunFolder.open(Path("runs/my-corridor-varsplat-fast")).read_log()) == 6
+
+
+def test_lost_frames_are_said_plainly(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
+    MadeUpSlam.lost = {2, 3, 5}
+    assert sigmasplat("run", "corridor") == 0
+    said = capsys.readouterr().out
+    assert "frame 2 (t = 2.000 s): tracking lost" in said
+    assert "frame 4 (t = 4.000 s): tracking found again, lost since frame 2" in said
+    assert "tracking was LOST on 3 of 6 frames: 2–3, 5" in said
+    assert said.count("tracking lost") == 2
+
+
+@pytest.mark.skipif(not hasattr(signal, "raise_signal"), reason="needs signals")
+def test_ctrl_c_finishes_the_frame_and_leaves_a_valid_folder(
+    corridor: Corridor, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = signal.getsignal(signal.SIGINT)
+    MadeUpSlam.at = {3: lambda: os.kill(os.getpid(), signal.SIGINT)}
+    assert sigmasplat("run", "corridor", "--out", "cut") == 130
+    run = RunFolder.open(Path("cut"))
+    assert run.facts()["status"] == "interrupted"
+    assert len(run.read_log()) == len(run.read_trajectory()) == 4
+    assert len(run.read_map()) == 2
+    assert run.read_checkpoint()[0]
+    assert "interrupted after 4 frames" in capsys.readouterr().out
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_second_ctrl_c_stops_at_once(corridor: Corridor) -> None:
+    def twice() -> None:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+    MadeUpSlam.at = {3: twice}
+    assert sigmasplat("run", "corridor", "--out", "cut") == 130
+    run = RunFolder.open(Path("cut"))
+    assert run.facts()["status"] == "interrupted"
+    assert len(run.read_log()) == len(run.read_trajectory()) == 3
+
+
+def test_a_crash_keeps_its_traceback_and_names_the_folder(corridor: Corridor) -> None:
+    def crash() -> None:
+        raise ZeroDivisionError("a bug")
+
+    MadeUpSlam.at = {2: crash}
+    with pytest.raises(ZeroDivisionError, match="a bug") as crashed:
+        cli.main(["run", "corridor", "--out", "crashed"])
+    assert "crashed" in "".join(crashed.value.__notes__)
+    run = RunFolder.open(Path("crashed"))
+    assert run.facts()["status"] == "failed"
+    assert len(run.read_trajectory()) == 2
+
+
+def test_unreadable_images_are_counted(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
+    corridor.broken = {1, 4}
+    assert sigmasplat("run", "corridor", "--no-eval", "--out", "some") == 0
+    assert "2 unreadable images passed over (first: 1.png is truncated)" in capsys.readouterr().err
+    facts = json.loads(Path("some/run.json").read_text())
+    assert facts["skipped"] == ["1.png is truncated", "4.png is truncated"]
+    assert [record["index"] for record in RunFolder.open(Path("some")).read_log()] == [0, 2, 3, 5]
+
+
+def test_strict_damage_is_one_line_and_nothing_is_lost(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
+    corridor.broken, corridor.strict = {3}, True
+    assert sigmasplat("run", "corridor", "--out", "strict") == 2
+    assert capsys.readouterr().err.strip() == "sigmasplat: 3.png is truncated"
+    run = RunFolder.open(Path("strict"))
+    assert run.facts()["status"] == "failed"
+    assert len(run.read_trajectory()) == 3
+
+
+def test_a_wrong_depth_unit_is_warned_of(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
+    corridor.depth_m = 2000.0
+    assert sigmasplat("run", "corridor", "--no-eval") == 0
+    err = capsys.readouterr().err
+    assert err.startswith("warning: ")
+    assert "2000 m" in err
+
+
+def test_eval_and_export_read_what_run_wrote(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
+    sigmasplat("run", "corridor", "--no-eval", "--out", "mine", "--limit", "5")
+    assert sigmasplat("eval", "mine") == 0
+    assert "27.31" in capsys.readouterr().out
+    assert RunFolder.open(Path("mine")).read_metrics()["frames"] == 6
+    assert sigmasplat("export", "mine") == 0
+    assert torch.allclose(read_field(Path("mine.ply")).params, RunFolder.open(Path("mine")).read_map().params)
+    assert sigmasplat("export", "mine", "--out", "path.txt") == 0
+    assert len(read_trajectory(Path("path.txt"))) == 6
+    assert sigmasplat("export", "mine") == 2
+    assert "mine.ply exists" in capsys.readouterr().err
+    assert sigmasplat("export", "mine", "--overwrite", "--format", "ply") == 0
+
+
+def test_record_needs_no_screen(corridor: Corridor) -> None:
+    outcome = session.record(MadeUpSlam(Config()), corridor, RunFolder.create(Path("direct"), Config(), "corridor"))
+    assert (outcome.status, outcome.frames, outcome.lost) == ("complete", 6, 0)
+    assert outcome.wall_s > 0

@@ -1,0 +1,143 @@
+"""The map file: round trip, the columns other programs look for, and maps of other programs."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sigmasplat.errors import RunError, SourceError
+from sigmasplat.io.ply import SH_C0, read_field, write_field
+from sigmasplat.model.field import GaussianField
+
+
+def random_field(n: int = 50, seed: int = 0) -> GaussianField:
+    generator = torch.Generator().manual_seed(seed)
+    return GaussianField(torch.randn(n, 17, generator=generator))
+
+
+def header_of(data: bytes) -> list[str]:
+    return data[: data.index(b"end_header\n")].decode("ascii").splitlines()
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    field = random_field()
+    write_field(tmp_path / "map.ply", field)
+    back = read_field(tmp_path / "map.ply")
+    torch.testing.assert_close(back.params, field.params, rtol=0, atol=1e-6)
+    others = [i for i in range(17) if not 11 <= i < 14]
+    assert torch.equal(back.params[:, others], field.params[:, others]), "only colours are converted"
+    assert [p.name for p in tmp_path.iterdir()] == ["map.ply"], "no temporary file stays"
+
+
+def test_layout_is_that_of_3dgs(tmp_path: Path) -> None:
+    """One splat, its bytes picked apart by hand: names, order, and the values a viewer expects."""
+    field = GaussianField.from_values(
+        torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([[0.1, 0.2, 0.3]]), torch.tensor([[1.0, 0.5, 0.25]]),
+        quats=torch.tensor([[0.5, 0.5, -0.5, 0.5]]), opacities=0.75, log_variances=-4.0,
+    )  # fmt: skip
+    write_field(tmp_path / "map.ply", field)
+    data = (tmp_path / "map.ply").read_bytes()
+    header = header_of(data)
+    assert header[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 1"]
+    names = [line.split()[2] for line in header if line.startswith("property float")]
+    assert " ".join(names) == (
+        "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3 "
+        "log_variance_0 log_variance_1 log_variance_2"
+    )
+    values = dict(zip(names, np.frombuffer(data[data.index(b"end_header\n") + 11 :], "<f4"), strict=True))
+    assert [values[c] for c in "xyz"] == [1.0, 2.0, 3.0]
+    assert values["f_dc_0"] == pytest.approx(0.5 * 2 * np.sqrt(np.pi)) and values["f_dc_1"] == 0.0
+    assert values["opacity"] == pytest.approx(np.log(3.0)) and values["scale_2"] == pytest.approx(np.log(0.3))
+    assert [values[f"rot_{i}"] for i in range(4)] == [0.5, 0.5, -0.5, 0.5]
+
+
+def other_programs_ply(path: Path, order: str, drop: str = "", rows: int = 3) -> None:
+    """Write a map as the 3DGS reference does: with f_rest and another order of columns, after comments."""
+    names = ["rot_0", "rot_1", "rot_2", "rot_3", "x", "y", "z", *(f"f_dc_{i}" for i in range(3)),
+             *(f"f_rest_{i}" for i in range(45)), "opacity", "scale_0", "scale_1", "scale_2"]  # fmt: skip
+    names = [name for name in names if name != drop]
+    table = np.zeros(rows, [(name, f"{order}f8" if name == "x" else f"{order}f4") for name in names])
+    for i, name in enumerate(names):
+        table[name] = i + np.arange(rows) / 8
+    properties = "".join(f"property {'double' if name == 'x' else 'float'} {name}\n" for name in names)
+    kind = {"<": "little", ">": "big"}[order]
+    header = f"ply\nformat binary_{kind}_endian 1.0\ncomment of another\nelement vertex {rows}\n{properties}"
+    path.write_bytes((header + "element face 0\nproperty list uchar int v\nend_header\n").encode() + table.tobytes())
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_maps_of_others_are_read_by_name(tmp_path: Path, order: str) -> None:
+    other_programs_ply(tmp_path / "other.ply", order)
+    field = read_field(tmp_path / "other.ply")
+    assert field.means[1].tolist() == [4.125, 5.125, 6.125]
+    assert field.quats[0].tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert field.colors[0].tolist() == pytest.approx([0.5 + SH_C0 * i for i in (7, 8, 9)])
+    assert field.params[2, 10] == 55.25 and (field.params[:, 14:] == -7.0).all()
+
+
+def test_an_empty_map_is_a_map(tmp_path: Path) -> None:
+    write_field(tmp_path / "map.ply", GaussianField.empty())
+    assert len(read_field(tmp_path / "map.ply")) == 0
+
+
+def test_a_column_short_is_named(tmp_path: Path) -> None:
+    other_programs_ply(tmp_path / "other.ply", "<", drop="scale_1")
+    with pytest.raises(SourceError, match=r"other\.ply is no map of splats: no column scale_1"):
+        read_field(tmp_path / "other.ply")
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_values_that_are_no_numbers_are_refused(tmp_path: Path, value: float) -> None:
+    field = random_field()
+    field.params[7, 5] = value
+    write_field(tmp_path / "map.ply", field)
+    with pytest.raises(SourceError, match=r"splat 7 holds nan or inf \(1 of 50 splats do\)"):
+        read_field(tmp_path / "map.ply")
+
+
+def test_a_zero_quaternion_is_refused(tmp_path: Path) -> None:
+    field = random_field()
+    field.params[3, 3:7] = 0.0
+    write_field(tmp_path / "map.ply", field)
+    with pytest.raises(SourceError, match="splat 3 has a zero quaternion"):
+        read_field(tmp_path / "map.ply")
+
+
+def test_truncation_is_noticed_at_every_length(tmp_path: Path) -> None:
+    """Cut a good file anywhere: never a wrong map, never another kind of exception."""
+    write_field(tmp_path / "map.ply", random_field(3))
+    data = (tmp_path / "map.ply").read_bytes()
+    for length in range(0, len(data), 13):
+        (tmp_path / "cut.ply").write_bytes(data[:length])
+        with pytest.raises(SourceError, match=r"cut\.ply"):
+            read_field(tmp_path / "cut.ply")
+
+
+BINARY = b"ply\nformat binary_little_endian 1.0\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (b"\x89PNG\r\n\x1a\n" + b"\0" * 100, "not a PLY file"),
+        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", r"not binary \(format ascii"),
+        (b"ply\nelement vertex 1\nend_header\n", "not binary"),
+        (BINARY + b"element face 2\nend_header\n", "first element is not 'vertex'"),
+        (BINARY + b"element vertex -2\nend_header\n", "first element is not 'vertex'"),
+        (BINARY + b"element vertex 1\nproperty list uchar int a\nend_header\n", "list uchar int a"),
+        (BINARY + b"element vertex 1\nproperty float x\nproperty float x\nend_header\n", "twice"),
+    ],
+)  # fmt: skip
+def test_other_files_are_refused_in_one_line(tmp_path: Path, content: bytes, complaint: str) -> None:
+    (tmp_path / "x.ply").write_bytes(content)
+    with pytest.raises(SourceError, match=complaint) as caught:
+        read_field(tmp_path / "x.ply")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_map_and_an_unwritable_place(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"cannot read map .*No such file"):
+        read_field(tmp_path / "no.ply")
+    with pytest.raises(RunError, match="cannot write"):
+        write_field(tmp_path / "no" / "map.ply", random_field())

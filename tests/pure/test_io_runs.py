@@ -1,0 +1,106 @@
+"""The run folder: everything comes back as it went in, and an interruption at any moment leaves it readable."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from sigmasplat.config import Config, InputConfig
+from sigmasplat.errors import RunError
+from sigmasplat.io import atomic
+from sigmasplat.io.runs import RunFolder, plain
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.trajectory import Trajectory
+
+CONFIG = replace(Config(), name="test", seed=7, input=InputConfig(width=160))
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    return RunFolder.create(tmp_path / "out" / "run", CONFIG, "/data/room")
+
+
+def test_a_new_run_says_what_made_it(run: RunFolder) -> None:
+    facts = RunFolder.open(run.path).facts()
+    assert facts["program"] == "sigmasplat" and facts["source"] == "/data/room" and facts["status"] == "running"
+    assert facts["machine"]["cpu"] and facts["machine"]["cores"] >= 1 and facts["version"]
+    assert run.config() == CONFIG and run.images.is_dir()
+
+
+def test_notes_are_added(run: RunFolder) -> None:
+    run.note(status="complete", wall_s=12.5)
+    facts = run.facts()
+    assert facts["status"] == "complete" and facts["wall_s"] == 12.5 and facts["source"] == "/data/room"
+
+
+def test_everything_comes_back(run: RunFolder) -> None:
+    path = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
+    field = GaussianField(torch.randn(5, 17))
+    run.write_trajectory(path)
+    run.write_map(field)
+    run.write_metrics({"ate": {"rmse_m": 0.01}, "psnr": float("nan")})
+    np.testing.assert_allclose(run.read_trajectory().T_world_camera, path.T_world_camera)
+    torch.testing.assert_close(run.read_map().params, field.params)
+    assert run.read_metrics() == {"ate": {"rmse_m": 0.01}, "psnr": None}
+
+
+def test_checkpoints_keep_bits_even_of_views(run: RunFolder) -> None:
+    base = torch.randn(6, 4)
+    tensors = {"params": base, "rows": base[:2], "turned": base.T, "ids": torch.arange(3)}
+    run.write_checkpoint(tensors, {"step": "12"})
+    back, metadata = run.read_checkpoint()
+    assert metadata == {"step": "12"} and all(torch.equal(back[name], tensors[name]) for name in tensors)
+
+
+def test_the_log_grows_by_whole_lines(run: RunFolder) -> None:
+    records = [{"index": i, "pose": np.eye(2) * i, "loss": np.float32(0.5), "bad": float("inf")} for i in range(3)]
+    for i, record in enumerate(records):
+        run.log(record)
+        assert len(run.read_log()) == i + 1, "each line is readable at once"
+    assert run.read_log()[2] == {"index": 2, "pose": [[2.0, 0.0], [0.0, 2.0]], "loss": 0.5, "bad": None}
+
+
+def test_a_cut_off_last_line_is_passed_over_and_others_are_not(run: RunFolder) -> None:
+    run.log({"index": 0})
+    log = run.path / "log.jsonl"
+    log.write_text(log.read_text() + '{"index": 1, "sec')
+    assert run.read_log() == [{"index": 0}]
+    log.write_text('{"index": 0}\n{"ind\n{"index": 2}\n')
+    with pytest.raises(RunError, match=r"log\.jsonl:2: not JSON"):
+        run.read_log()
+
+
+def test_ctrl_c_while_writing_keeps_the_old_file(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    old = GaussianField(torch.randn(4, 17))
+    run.write_map(old)
+    run.write_checkpoint({"a": torch.ones(2)}, {})
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(atomic.os, "replace", interrupt)
+    for write in (lambda: run.write_map(GaussianField(torch.randn(9, 17))), lambda: run.write_checkpoint({}, {})):
+        with pytest.raises(KeyboardInterrupt):
+            write()
+    torch.testing.assert_close(run.read_map().params, old.params)
+    assert torch.equal(run.read_checkpoint()[0]["a"], torch.ones(2))
+    assert not list(run.path.glob(".*")), "no half file stays"
+
+
+def test_overwriting_removes_our_files_and_no_others(run: RunFolder) -> None:
+    run.log({"index": 0})
+    run.write_image("view.png", Image.new("RGB", (4, 4)))
+    (run.path / "notes.txt").write_text("mine")
+    again = RunFolder.create(run.path, Config(), "elsewhere", overwrite=True)
+    assert again.facts()["source"] == "elsewhere" and (run.path / "notes.txt").read_text() == "mine"
+    assert not (run.path / "log.jsonl").exists() and not list(run.images.iterdir())
+
+
+def test_plain_values_are_json() -> None:
+    value = {"a": np.arange(2), "b": [torch.tensor(1.5), np.bool_(True)], "c": (Path("x"), None, float("nan"))}
+    back = json.loads(json.dumps(plain(value), allow_nan=False))
+    assert back == {"a": [0, 1], "b": [1.5, True], "c": ["x", None, None]}

@@ -1,0 +1,170 @@
+"""Pictures and the page: colours mean what their bar says, strips show what they are given, the page stands alone."""
+
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sigmasplat.metrics import palette, plot
+from sigmasplat.metrics.panels import GAP, HEAD, PANEL_WIDTH, View, panels_of, side_by_side
+from sigmasplat.metrics.report import Contents, build_report, headline, number
+
+VOID = {"meta", "img", "source", "br", "!doctype"}
+
+
+def some_view(seed: int = 0) -> View:
+    rng = np.random.default_rng(seed)
+    color = rng.uniform(size=(30, 40, 3)).astype(np.float32)
+    depth = rng.uniform(1, 3, (30, 40)).astype(np.float32)
+    depth[:10] = 0.0
+    alpha = np.full((30, 40), 0.9, np.float32)
+    alpha[20:] = 0.1
+    rendered_depth = np.where(alpha > 0.5, depth + 0.1, 0).astype(np.float32)
+    variance = np.full((30, 40, 3), 0.04, np.float32)
+    return View(12, "held-out", color, depth, np.clip(color + 0.1, 0, 1), rendered_depth, alpha, variance, ("lost",))
+
+
+@pytest.mark.parametrize("colours", [palette.VIRIDIS, palette.INFERNO])
+def test_palettes_grow_brighter_throughout(colours: np.ndarray) -> None:
+    ramp = palette.colour(np.linspace(0, 1, 200), 0, 1, colours).astype(float)
+    brightness = ramp @ [0.2126, 0.7152, 0.0722]
+    assert (np.diff(brightness) > -0.5).all() and brightness[-1] - brightness[0] > 150
+
+
+def test_colours_hold_their_ends_and_holes_are_slate() -> None:
+    values = np.array([[-5.0, 0.0, 1.0, 9.0]])
+    out = palette.colour(values, 0.0, 1.0)
+    assert (out[0, 0] == out[0, 1]).all() and (out[0, 2] == out[0, 3]).all() and tuple(out[0, 0]) == (68, 1, 84)
+    holes = palette.picture(values, np.array([[True, False, True, True]]), 0.0, 1.0, palette.VIRIDIS)
+    assert tuple(holes[0, 1]) == palette.NO_READING
+    assert palette.span(values, np.zeros_like(values, bool)) == (0.0, 1.0)
+    palette.colour(values, 2.0, 2.0)
+
+
+def test_scores_of_a_view_are_taken_where_there_is_a_reading() -> None:
+    view = some_view()
+    score = view.scores()
+    valid = np.zeros((30, 40), bool)
+    valid[10:] = True
+    mse = ((view.rendered - view.recorded)[valid].astype(float) ** 2).mean()
+    assert score["psnr_db"] == pytest.approx(-10 * np.log10(mse))
+    assert score["depth_l1_m"] == pytest.approx(0.1, abs=1e-5) and score["depth_coverage"] == pytest.approx(0.5)
+    np.testing.assert_allclose(view.uncertainty, 0.04)
+
+
+def test_the_strip_shows_the_five_panels() -> None:
+    view = some_view()
+    for word, shown in zip(("input", "colour", "depth", "V", "error"), panels_of(view), strict=True):
+        assert word in shown.title
+    strip = np.asarray(side_by_side(view), float)
+    assert strip.shape[1] == 5 * (PANEL_WIDTH + GAP) + GAP
+
+    def panel(i: int) -> np.ndarray:
+        left = GAP + i * (PANEL_WIDTH + GAP)
+        return strip[HEAD : HEAD + 240, left : left + PANEL_WIDTH]
+
+    shown = Image.fromarray((view.recorded * 255).round().astype(np.uint8)).resize((320, 240), Image.Resampling.LANCZOS)
+    np.testing.assert_allclose(panel(0), np.asarray(shown, float))
+    assert (panel(2)[-70:] == palette.NO_READING).all(), "nothing mapped there"
+    assert (panel(4)[:70] == palette.NO_READING).all(), "no reading there"
+    # V is the same at every mapped pixel: one colour, and the bar ends at its root, 0.2.
+    assert len(np.unique(panel(3)[:150].reshape(-1, 3), axis=0)) == 1 and panels_of(view)[3].ends[1] == "0.200"
+
+
+@pytest.mark.parametrize(("low", "high"), [(-0.3, 1.7), (0, 1e-4), (-2000, 5), (3.1, 3.9)])
+def test_ticks_are_round_and_few(low: float, high: float) -> None:
+    ticks = plot.nice_ticks(low, high)
+    assert 2 <= len(ticks) <= 12 and ticks[0] >= low - 1e-9 and ticks[-1] <= high + 1e-9
+    leading = float(f"{ticks[1] - ticks[0]:e}".split("e")[0])
+    assert round(leading, 6) in (1, 2, 5)
+
+
+def test_a_path_is_drawn_to_one_scale_and_where_it_is() -> None:
+    """A 2 m × 2 m square walked once: the curve's extent in pixels is square too, its colour the estimate's."""
+    corners = np.array([[0, 0, 0], [2, 0, 0], [2, 0, 2], [0, 0, 2], [0, 0, 0.0]])
+    charts = plot.trajectory_charts(corners, None)
+    image = np.asarray(plot.draw_charts(charts[:1], plot.LIGHT, (600, 400))).astype(int)
+    orange = np.abs(image - plot.LIGHT.curves[0]).sum(-1) < 60
+    rows, columns = np.nonzero(orange)
+    assert np.ptp(rows) == pytest.approx(np.ptp(columns), abs=3) and np.ptp(rows) > 150
+
+
+def test_height_is_up_and_truth_may_have_gaps() -> None:
+    estimate = np.array([[0, 0, 0], [0, -1.5, 0], [0, -3, 0.0]])
+    truth = estimate.copy()
+    truth[1] = np.nan
+    charts = plot.trajectory_charts(estimate, truth, np.array([False, True, False]))
+    assert [curve.name for curve in charts[1].curves] == ["truth", "estimate", "lost"]
+    assert charts[1].curves[1].points[:, 1].tolist() == [0, 1.5, 3]
+    plot.draw_charts(charts, plot.DARK)
+
+
+def test_a_standstill_and_a_single_frame_can_be_drawn() -> None:
+    for n in (1, 5):
+        plot.draw_charts(plot.trajectory_charts(np.zeros((n, 3)), None), plot.LIGHT)
+        plot.draw_charts([plot.seconds_chart(np.arange(n), {"total": np.zeros(n)})], plot.LIGHT)
+
+
+class Balance(HTMLParser):
+    """Note tags that close what was not open, and every address used."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.wrong: list[str] = []
+        self.addresses: list[str] = []
+        self.text: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "srcset")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if not self.open or self.open.pop() != tag:
+            self.wrong.append(tag)
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+
+METRICS = {
+    "frames": 200, "lost": 0, "splats": 123456, "frames_per_s": 3.21,
+    "ate": {"rmse_m": 0.0123, "mean_m": 0.01, "median_m": 0.009, "max_m": 0.03, "pairs": 200},
+    "rpe": {"translation_rmse_m": 0.001, "rotation_rmse_deg": 0.05, "pairs": 199, "delta_frames": 1},
+    "training": {"views": 40, "psnr_db": 31.25, "ssim": 0.95, "depth_l1_m": 0.01, "depth_coverage": 0.99},
+    "held_out": {"views": 40, "psnr_db": 29.5, "ssim": 0.94, "depth_l1_m": 0.012, "depth_coverage": 0.98},
+    "uncertainty": {"pixels": 8, "spearman": 0.412, "spearman_covered": 0.5, "nll": -2.5, "ause": 0.2,
+                    "mean_variance": 0.001, "mean_squared_error": 0.002,
+                    "reliability": [{"predicted": 1e-3, "empirical": 2e-3, "pixels": 8}]},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("metrics", [METRICS, {"frames": 0}], ids=["full", "bare"])
+def test_the_page_is_whole_and_needs_nothing_from_outside(metrics: dict[str, object]) -> None:
+    contents = Contents(
+        "SigmaSplat · <room> & more", "fast", metrics, {"held-out views": ["images/a.png"]}, {"trajectory": "caption"},
+        '{"name": "</pre><script>"}', ["estimate and truth share no timestamps"],
+    )  # fmt: skip
+    page = build_report(contents)
+    reader = Balance()
+    reader.feed(page)
+    assert not reader.wrong and not reader.open
+    assert set(reader.addresses) == {"images/a.png", "images/trajectory-dark.png", "images/trajectory-light.png"}
+    assert "http" not in page and "<script" not in page and "prefers-color-scheme: dark" in page
+    text = "".join(reader.text)
+    assert "<room> & more" in text and "</pre><script>" in text and "share no timestamps" in text
+
+
+def test_figures_on_the_page_are_those_measured() -> None:
+    page = build_report(Contents("t", "s", METRICS))
+    text = re.sub("<[^>]+>", " ", page)
+    for figure in ("1.23", "29.50", "31.25", "0.9500", "0.412", "123\u202f456", "3.21", "−2.500", "98.0"):
+        assert figure in text, figure
+
+
+def test_absent_figures_are_dashes() -> None:
+    assert number(None, 2) == number(float("nan"), 1) == "–" and number(-1234.5, 1) == "−1\u202f234.5"
+    assert dict((name, value) for name, value, _ in headline({"ate": None}))["ATE RMSE"] == "–"

@@ -1,0 +1,74 @@
+"""Scores of V against closed forms and against noise whose variance is known."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from sigmasplat.metrics.uncertainty import ause, gaussian_nll, reliability, score, sparsification, spearman
+
+
+def noise(n: int = 40_000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Draw squared errors from the very Gaussians whose variances are predicted."""
+    rng = np.random.default_rng(seed)
+    variance = np.exp(rng.uniform(np.log(1e-4), np.log(1e-1), n))
+    return variance, variance * rng.normal(size=n) ** 2
+
+
+def test_spearman_is_about_ranks() -> None:
+    v = np.linspace(0.1, 2.0, 50)
+    assert spearman(v, v**5) == pytest.approx(1.0)
+    assert spearman(v, -np.exp(v)) == pytest.approx(-1.0)
+    x, y = noise(500)
+    ranks = np.corrcoef(stats.rankdata(x), stats.rankdata(y))[0, 1]
+    assert spearman(x, y) == pytest.approx(ranks)
+    assert np.isnan(spearman(np.ones(5), v[:5])) and np.isnan(spearman(v[:1], v[:1]))
+
+
+def test_nll_is_the_gaussian_log_density_without_its_constant() -> None:
+    v, e = noise(1000)
+    expected = -stats.norm.logpdf(np.sqrt(e), 0.0, np.sqrt(v + 1e-6)).mean() - 0.5 * np.log(2 * np.pi)
+    assert gaussian_nll(v, e) == pytest.approx(expected)
+
+
+def test_nll_is_least_at_the_true_variance() -> None:
+    v, e = noise()
+    for wrong in (v * 2, v / 2, np.full_like(v, e.mean())):
+        assert gaussian_nll(v, e) < gaussian_nll(wrong, e)
+
+
+def test_rounding_below_zero_does_not_break_the_nll() -> None:
+    assert np.isfinite(gaussian_nll(np.array([-1e-6, 0.0]), np.array([0.1, 0.0])))
+
+
+def test_reliability_rows_are_calibrated_for_true_variances() -> None:
+    v, e = noise()
+    rows = reliability(v, e)
+    assert [row.pixels for row in rows] == [4000] * 10
+    predicted, empirical = (np.array([getattr(row, name) for row in rows]) for name in ("predicted", "empirical"))
+    assert (np.diff(predicted) > 0).all()
+    np.testing.assert_allclose(empirical / predicted, 1.0, atol=0.12)
+    np.testing.assert_allclose(predicted.mean(), v.mean())
+    assert sum(row.pixels for row in reliability(v[:7], e[:7])) == 7
+
+
+def test_sparsification_by_hand() -> None:
+    e = np.array([4.0, 1.0, 9.0, 0.0])
+    np.testing.assert_allclose(sparsification(e, e, 4) ** 2, [14 / 4, 5 / 3, 1 / 2, 0.0])
+    np.testing.assert_allclose(sparsification(-e, e, 4) ** 2, [14 / 4, 14 / 3, 13 / 2, 9.0])
+
+
+def test_ause_ranks_rankings() -> None:
+    v, e = noise()
+    shuffled = np.random.default_rng(1).permutation(v)
+    assert ause(e, e) == 0.0
+    assert ause(np.sqrt(e), e) == 0.0, "only the order counts"
+    assert 0.0 < ause(v, e) < ause(shuffled, e) < ause(-v, e)
+    # A chance order leaves the error where it was, so its area is the oracle's own drop.
+    drop = 1.0 - sparsification(e, e).mean() / sparsification(e, e)[0]
+    assert ause(shuffled, e) == pytest.approx(drop, abs=0.03)
+    assert np.isnan(ause(np.empty(0), np.empty(0))) and np.isnan(ause(np.ones(3), np.zeros(3)))
+
+
+def test_score_of_nothing_is_nan_not_a_crash() -> None:
+    values = score(np.empty(0), np.empty(0))
+    assert values["pixels"] == 0 and np.isnan(values["spearman"]) and values["reliability"] == []

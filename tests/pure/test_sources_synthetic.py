@@ -1,0 +1,209 @@
+"""The synthetic room: geometry, agreement of its views, determinism, sensor faults."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.sources import SyntheticRoom, open_source
+from sigmasplat.sources.room.sensor import measured_depth, noise_sigma_m
+from sigmasplat.sources.room.shapes import Rays, Shape, cast, image_windows, surface
+from sigmasplat.sources.room.textures import Material, noise, plain
+from sigmasplat.sources.room.view import picture, scene
+from sigmasplat.sources.room.walk import path
+from view_agreement import agreement
+
+MATT = Material(plain((0.5, 0.5, 0.5)))
+
+
+def shape(kind, center, half, yaw_rad=0.0):
+    return Shape(kind, np.array(center, np.float32), np.array(half, np.float32), yaw_rad, MATT)
+
+
+@pytest.mark.parametrize(("i", "j"), [(0, 4), (60, 66), (130, 120)])
+def test_two_views_agree_on_the_surfaces_both_see(i, j):
+    """A wrong pose direction, axis, focal length or a ray length instead of z moves points by far more than this."""
+    behind_m, near = agreement(SyntheticRoom(width=160, height=120), i, j)
+    assert near.mean() > 0.9
+    assert np.median(np.abs(behind_m[near])) < 0.004
+    assert (behind_m < -0.05).mean() < 0.02, "nothing seen before may float in front of what is seen now"
+
+
+def test_two_views_agree_across_rooms():
+    behind_m, near = agreement(SyntheticRoom(frames=600, width=200, height=150, rooms=2), 70, 76)
+    assert near.mean() > 0.85
+    assert np.median(np.abs(behind_m[near])) < 0.006
+
+
+def test_matt_surfaces_keep_their_colour_between_views():
+    room = SyntheticRoom(frames=200, width=160, height=120, exposure_change=False)
+    a, b = room.frame(70), room.frame(72)
+    T = se3.inverse(room.truth().T_world_camera[72]) @ room.truth().T_world_camera[70]
+    x, y, z = np.moveaxis(room.camera.rays() * a.depth_m[..., None], -1, 0).reshape(3, -1)
+    x, y, z = (T[:3, :3] @ np.stack([x, y, z])) + T[:3, 3:]
+    u = np.rint(room.camera.fx * x / z + room.camera.cx).astype(int)
+    v = np.rint(room.camera.fy * y / z + room.camera.cy).astype(int)
+    inside = (u >= 0) & (u < 160) & (v >= 0) & (v < 120)
+    difference = np.abs(a.color.reshape(-1, 3)[inside] - b.color[v[inside], u[inside]]).max(-1)
+    assert np.median(difference) < 0.03
+
+
+def test_depth_is_along_the_axis_not_along_the_ray():
+    wall = shape("box", (0, 3, 0), (50, 1, 50))  # its face is the plane y = 2
+    camera = Camera(64, 48, 40.0, 40.0, 31.5, 23.5)
+    looking_along_y = np.eye(4)
+    looking_along_y[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    rays = camera.rays().reshape(-1, 3).T
+    directions = (looking_along_y[:3, :3] @ rays).astype(np.float32)
+    t, hit = cast([wall], Rays(np.zeros((3, 1), np.float32), directions))
+    assert (hit == 0).all() and np.abs(t - 2.0).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("kind", "half", "yaw_rad", "direction", "entry", "normal"),
+    [
+        ("ball", (1, 1, 1), 0.0, (1, 0, 0), 4.0, (-1, 0, 0)),
+        ("ball", (2, 1, 1), 0.0, (1, 0, 0), 3.0, (-1, 0, 0)),
+        ("ball", (2, 1, 1), np.pi / 2, (1, 0, 0), 4.0, (-1, 0, 0)),
+        ("box", (1, 2, 3), 0.0, (1, 0, 0), 4.0, (-1, 0, 0)),
+        ("box", (1, 2, 3), np.pi / 2, (1, 0, 0), 3.0, (-1, 0, 0)),
+        ("box", (1, 1, 1), np.pi / 4, (1, 0.001, 0), 5.0 - np.sqrt(2), (-np.sqrt(0.5), np.sqrt(0.5), 0)),
+        ("drum", (1, 1, 2), 0.0, (1, 0, 0), 4.0, (-1, 0, 0)),
+        ("drum", (1, 1, 0.5), 0.0, (1, 0, 0.12), 0.5 / 0.12, (0, 0, 1)),
+    ],
+)
+def test_entry_points_and_normals_worked_by_hand(kind, half, yaw_rad, direction, entry, normal):
+    start_z = 1.0 if normal == (0, 0, 1) else 0.0  # the last ray comes from above the cap
+    slope = np.array(direction, np.float32) * [1, 1, -1 if start_z else 1]
+    solid = shape(kind, (5, 0, 0), half, yaw_rad)
+    origin, ray = np.array([[0], [0], [start_z]], np.float32), slope.astype(np.float32)[:, None]
+    t = solid.first_hit(origin, ray)
+    assert t[0] == pytest.approx(entry, rel=2e-3)
+    normals, _, _ = surface(solid, origin + ray * t)
+    assert normals[:, 0] == pytest.approx(np.array(normal), abs=2e-3)
+
+
+def test_a_ray_that_passes_by_or_starts_behind_misses():
+    for kind in ("box", "ball", "drum"):
+        solid = shape(kind, (5, 0, 0), (1, 1, 1))
+        rays = np.array([[1, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32)  # columns: beside, backwards, upwards
+        assert np.isinf(solid.first_hit(np.zeros((3, 1), np.float32), rays)).all()
+
+
+def test_windows_hide_nothing():
+    """The image windows are only a saving: casting every shape at every pixel finds the same surfaces."""
+    view, room = scene(1, 0), SyntheticRoom(frames=8, width=80, height=60)
+    for T in room.truth().T_world_camera[::3]:
+        pixels = np.indices((60, 80), np.float32).reshape(2, -1)[::-1]
+        directions = (T[:3, :3] @ room.camera.rays().reshape(-1, 3).T).astype(np.float32)
+        rays = Rays(T[:3, 3:].astype(np.float32), directions, pixels)
+        t, hit = cast(view.shapes, rays, image_windows(view.shapes, se3.inverse(T), room.camera))
+        t_all, hit_all = cast(view.shapes, rays)
+        assert np.array_equal(hit, hit_all) and np.array_equal(t, t_all)
+
+
+def test_every_ray_meets_the_room():
+    for rooms in (1, 2):
+        source = SyntheticRoom(frames=9, width=48, height=36, rooms=rooms, seed=3)
+        for i in range(9):
+            frame = source.frame(i)
+            assert (frame.depth_m > 0.2).all() and (frame.depth_m < 13).all()
+
+
+def test_same_seed_same_bytes_in_any_order():
+    first = SyntheticRoom(frames=12, width=64, height=48, seed=3, noise=True)
+    second = SyntheticRoom(frames=12, width=64, height=48, seed=3, noise=True)
+    forwards = [first.frame(i) for i in (2, 5, 9)]
+    backwards = [second.frame(i) for i in (9, 5, 2)][::-1]
+    for a, b in zip(forwards, backwards, strict=True):
+        assert a.color.tobytes() == b.color.tobytes() and a.depth_m.tobytes() == b.depth_m.tobytes()
+    other = SyntheticRoom(frames=12, width=64, height=48, seed=4, noise=True)
+    assert other.frame(2).color.tobytes() != forwards[0].color.tobytes()
+
+
+@pytest.mark.parametrize(("frames", "loops", "rooms"), [(200, 1, 1), (400, 2, 1), (600, 1, 2), (900, 1, 3)])
+def test_the_walk_is_smooth_closed_and_rigid(frames, loops, rooms):
+    T = path(frames, loops, rooms, seed=1)
+    assert all(se3.is_rigid(pose, 1e-9) for pose in T)
+    assert np.abs(T[0] - T[-1]).max() < 1e-6
+    steps_m = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
+    turns_deg = [np.degrees(se3.rotation_angle(a[:3, :3].T @ b[:3, :3])) for a, b in pairwise(T)]
+    assert steps_m.min() > 0.01 and steps_m.max() < 0.032
+    assert max(turns_deg) < 2.2
+    if loops > 1:
+        half = frames // 2
+        assert np.abs(T[:half, 2, 3] - T[half:, 2, 3]).max() > 0.2, "loops run at different heights"
+
+
+def test_exposure_swings_by_eight_percent_and_back():
+    room, steady = (SyntheticRoom(frames=9, width=32, height=24, exposure_change=e) for e in (True, False))
+    dark = steady.frame(2).color < 0.9
+    gain = room.frame(2).color[dark].mean() / steady.frame(2).color[dark].mean()
+    assert gain == pytest.approx(1.08, abs=0.005)
+    assert np.array_equal(room.frame(8).color, room.frame(0).color)
+
+
+def test_the_mirror_shows_another_colour_from_another_place():
+    """The panel and the sphere are the surfaces whose colour depends on the viewpoint; depth is the panel's own."""
+    view, camera = scene(1, 0), Camera(40, 30, 40.0, 40.0, 19.5, 14.5)
+    mirror = next(s for s in view.shapes if s.material.mirror > 0.5)
+    seen = []
+    for x in (0.6, 1.9):
+        eye = np.array([x, 0.6, 1.5])
+        forward = mirror.center - eye
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0, 0, 1])
+        right /= np.linalg.norm(right)
+        T = np.eye(4)
+        T[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+        T[:3, 3] = eye
+        color, depth_m = picture(view, camera, T)
+        assert depth_m[14, 20] == pytest.approx(np.linalg.norm(mirror.center - eye), abs=0.1)
+        seen.append(color[10:20, 15:25].reshape(-1, 3).mean(0))
+    assert np.abs(seen[0] - seen[1]).max() > 0.02
+
+
+def test_sensor_noise_grows_with_the_square_of_depth():
+    camera, rng = Camera(160, 120, 128.0, 128.0, 79.5, 59.5), np.random.default_rng(0)
+    for depth_m in (1.0, 2.0, 4.0):
+        wall = np.full((120, 160), depth_m, np.float32)
+        read = measured_depth(wall, camera, rng)
+        spread = (read[read > 0] - depth_m).std()
+        assert spread == pytest.approx(0.0012 + 0.0019 * (depth_m - 0.4) ** 2, rel=0.05)
+        assert spread == pytest.approx(float(noise_sigma_m(wall)[0, 0]), rel=0.05)
+        assert 0.005 < (read == 0).mean() < 0.1, "speckles and patches, but few"
+
+
+def test_sensor_loses_grazing_surfaces_edges_and_far_ones():
+    camera, rng = Camera(160, 120, 128.0, 128.0, 79.5, 59.5), np.random.default_rng(0)
+    assert (measured_depth(np.full((120, 160), 9.0, np.float32), camera, rng) == 0).all()
+    step = np.full((120, 160), 3.0, np.float32)
+    step[:, 80:] = 1.0
+    lost = measured_depth(step, camera, rng) == 0
+    assert lost[:, 79:81].mean() > 0.6 and lost[:, 20:60].mean() < 0.1
+    down = camera.rays()[..., 1]  # a floor 10 cm below the eye, seen at less than 4°
+    floor = np.where(down > 0.02, 0.1 / np.maximum(down, 1e-6), 5.0).astype(np.float32)
+    band = (down > 0.025) & (down < 0.06)
+    assert (measured_depth(floor, camera, rng)[band] == 0).mean() > 0.95
+
+
+def test_noise_option_changes_depth_and_leaves_holes():
+    clean, noisy = (SyntheticRoom(frames=5, width=96, height=72, noise=n).frame(1) for n in (False, True))
+    both = (clean.depth_m > 0) & (noisy.depth_m > 0)
+    assert 0.01 < (noisy.depth_m == 0).mean() < 0.3 and (clean.depth_m > 0).all()
+    assert 0.001 < np.median(np.abs(clean.depth_m - noisy.depth_m)[both]) < 0.03
+
+
+def test_texture_noise_is_smooth_and_fades_under_large_pixels():
+    u = np.linspace(-2, 2, 4001, dtype=np.float32)
+    fine = noise(u, 0.3 * u, np.full_like(u, 1e-4), 0.1, seed=1)
+    assert np.abs(np.diff(fine)).max() < 0.05 and fine.std() > 0.2 and np.abs(fine).max() <= 1
+    assert np.abs(noise(u, u, np.full_like(u, 0.1), 0.1, seed=1)).max() == 0
+
+
+def test_options_in_the_path():
+    source = open_source("synthetic:frames=7,width=40,height=30,seed=2,noise=1", stride=2)
+    assert (len(source), source.camera.width, source.camera.height) == (4, 40, 30)
+    assert open_source("synthetic", limit=3).truth().timestamps_s[1] == pytest.approx(1 / 30)
