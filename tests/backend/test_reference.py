@@ -32,8 +32,9 @@ def difference_field(s: Scene, name: str) -> Tensor:
     for k in range(tensor.numel()):
         step = torch.zeros_like(tensor)
         step.view(-1)[k] = STEP
-        ahead, behind = (Scene(**(vars(s) | {name: tensor + sign * step})) for sign in (1, -1))
-        out.append((loss(ahead, *[s.T_camera_world] * 3) - loss(behind, *[s.T_camera_world] * 3)) / (2 * STEP))
+        sides = [render(reference, Scene(**(vars(s) | {name: tensor + sign * step})))[1] for sign in (1, -1)]
+        ahead, behind = (float(probe(b.sums, b.moment, b.alpha)) for b in sides)
+        out.append((ahead - behind) / (2 * STEP))
     return torch.tensor(out, dtype=torch.float64)
 
 

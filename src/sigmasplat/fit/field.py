@@ -60,9 +60,13 @@ def fit_field(
     compiled = isinstance(view, CpuView)
     gradients = CompiledLoss(view) if compiled else TorchLoss(view)
     grad = torch.zeros_like(field.params)
-    field.moment1.zero_()
-    field.moment2.zero_()
-    for step, keyframe in enumerate(keyframes, start=1):
+    import os
+    if not os.environ.get("PERSIST"):
+        field.moment1.zero_()
+        field.moment2.zero_()
+    start = getattr(field, "_n", 0) + 1 if os.environ.get("PERSIST") else 1
+    for step, keyframe in enumerate(keyframes, start=start):
+        field._n = step
         t = time.perf_counter()
         view.forward(field.params, se3.inverse(keyframe.T_world_camera))
         t = fit.add("forward", t)

@@ -1,12 +1,8 @@
 // Stage 2: footprints → for every tile, the splats that reach it, near to far.
 
-#if defined(__AVX512F__)
-constexpr int TILE_WIDTH = 32, TILE_HEIGHT = 16;
-#elif defined(__AVX2__)
-constexpr int TILE_WIDTH = 32, TILE_HEIGHT = 16;
-#else
+// Gradients sum g·x² about the tile's centre and subtract; on needles that costs digits with the square of the tile's size.
+// 32×16 is 5 % faster and misses 1e-4 on them, 16×16 does not.
 constexpr int TILE_WIDTH = 16, TILE_HEIGHT = 16;
-#endif
 constexpr int BLOCKS_X = TILE_WIDTH / BLOCK_WIDTH, BLOCKS_Y = TILE_HEIGHT / BLOCK_HEIGHT, BLOCKS = BLOCKS_X * BLOCKS_Y;
 static_assert(BLOCKS <= 64, "a tile's blocks must fit one mask");
 
