@@ -55,10 +55,10 @@ class SeedConfig:
     """No seed nearer than this to an existing splat in view."""
     opacity: float = 0.5
     scale_from: Literal["neighbours", "pixel"] = "neighbours"
-    """neighbours: root mean squared distance to the 3 nearest (the papers'); pixel: a pixel's size at that depth × seed spacing."""
+    """neighbours: root mean squared distance to the 3 nearest (papers'); pixel: its size at that depth × spacing."""
     scale_factor: float = 1.0
-    spacing_max_px: float = 2.0
-    """With "pixel": sparse seeds are spaced at most this many pixels apart."""
+    density: float = 1.0
+    """Share of the pixels chosen at a later keyframe that become splats."""
     outlier_neighbours: int = 0
     """Statistical outlier removal over this many neighbours; 0 = off."""
     max_splats: int = 0
@@ -88,6 +88,9 @@ class MappingConfig:
     lr_opacity_logits: float = 0.05
     lr_colors: float = 2.5e-3
     lr_log_variances: float = 2.5e-3
+    lr_pose_translation: float = 0.0
+    lr_pose_rotation: float = 0.0
+    """Above 0, mapping moves its keyframes' poses too (metres, radians per step); the first stays."""
     freeze_old_colors: bool = False
     prune_opacity: float = 0.5
     keyframe_history: int = 0
@@ -103,6 +106,8 @@ class TrackingConfig:
     iterations: int = 200
     align_iterations: int = 8
     """Gauss–Newton steps at most, per pyramid level."""
+    align_renders: int = 1
+    """How often the map is rendered anew at the pose found so far, and aligned to again."""
     align_weight_color: float = 0.5
     """Share of the gray residual against depth when aligning."""
     lr_rotation: float = 2e-3
@@ -120,7 +125,7 @@ class TrackingConfig:
     """Only pixels whose depth error is below this multiple of its median; 0 = off."""
     motion_model: bool = True
     reinit_factor: float = 5.0
-    """When the first loss exceeds this multiple of its running median: RGB-D odometry start and twice the iterations."""
+    """When the first loss exceeds this multiple of its running median: odometry start and twice the iterations."""
     exposure: bool = False
     lr_exposure: float = 0.01
     lost_share: float = 0.2

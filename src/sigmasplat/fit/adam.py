@@ -1,8 +1,10 @@
 """Step every splat by Adam (Kingma & Ba 2015), a learning rate per column of the field."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field as dataclass_field
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig
@@ -43,3 +45,21 @@ def adam_step(field: GaussianField, grad: Tensor, rates: Rates, step: int, compi
     unbiased1 = field.moment1 / (1 - BETA1**step)
     unbiased2 = field.moment2 / (1 - BETA2**step)
     field.params -= rates.per_column * unbiased1 / (unbiased2.sqrt() + EPSILON)
+
+
+@dataclass(eq=False)
+class TwistAdam:
+    """Adam on one pose, in its tangent space: each step starts from the pose of the last."""
+
+    moment1: NDArray[np.float64] = dataclass_field(default_factory=lambda: np.zeros(6))
+    moment2: NDArray[np.float64] = dataclass_field(default_factory=lambda: np.zeros(6))
+    steps: int = 0
+
+    def step(self, gradient: NDArray[np.float64], rates: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the twist update [6] (to be applied on the left of T_camera_world) for a gradient [6]."""
+        self.steps += 1
+        self.moment1 += (1 - BETA1) * (gradient - self.moment1)
+        self.moment2 += (1 - BETA2) * (gradient**2 - self.moment2)
+        unbiased1 = self.moment1 / (1 - BETA1**self.steps)
+        unbiased2 = self.moment2 / (1 - BETA2**self.steps)
+        return np.asarray(-rates * unbiased1 / (np.sqrt(unbiased2) + EPSILON))

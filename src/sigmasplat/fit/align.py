@@ -19,7 +19,7 @@ Matrix = NDArray[np.float64]
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 HUBER_GRAY = 0.02
 HUBER_DEPTH_RELATIVE = 0.003
-"""Width of the depth residual's quadratic part as a share of z²: a structured-light sensor's noise (Khoshelham 2012)."""
+"""Width of the depth residual's quadratic part as a share of z²: structured light's noise (Khoshelham 2012)."""
 DEPTH_GATES_M = (0.1, 0.2, 0.4)
 """Depth residuals beyond are other surfaces; from the finest level up."""
 MIN_PIXELS = 60
@@ -73,8 +73,8 @@ def gray_of(color: Image) -> Image:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """T_live_reference; agreement: share of overlapping pixels whose depths agree; overlap: share of reference pixels that
-    land on a live reading; covariance [6, 6] of the left twist (ρ, φ), m and rad; cost per pixel; steps taken."""
+    """T_live_reference; agreement: share of overlapping pixels whose depths agree; overlap: share of reference pixels
+    that land on a live reading; covariance [6, 6] of the left twist (ρ, φ), m and rad; cost per pixel; steps taken."""
 
     T_live_reference: Matrix
     agreement: float
@@ -106,9 +106,9 @@ def align(
         c = reference.cameras[level]
         for _ in range(iterations):
             _core.align_step(
-                reference.gray[level], reference.depth[level], reference.weight[level], live.gray[level], live.depth[level],
-                [c.fx, c.fy, c.cx, c.cy], weight_color, 1.0 - weight_color, HUBER_GRAY, HUBER_DEPTH_RELATIVE,
-                DEPTH_GATES_M[min(level, 2)], T, H, b, sums,
+                reference.gray[level], reference.depth[level], reference.weight[level], live.gray[level],
+                live.depth[level], [c.fx, c.fy, c.cx, c.cy], weight_color, 1.0 - weight_color, HUBER_GRAY,
+                HUBER_DEPTH_RELATIVE, DEPTH_GATES_M[min(level, 2)], T, H, b, sums,
             )  # fmt: skip
             steps += 1
             if sums[1] < MIN_PIXELS:

@@ -1,4 +1,4 @@
-"""fit_field: adjust the splats to keyframes, poses fixed. Mapping and refinement are this one function."""
+"""fit_field: adjust the splats to keyframes, and the keyframes' poses too if asked. Mapping is this one function."""
 
 import time
 from collections.abc import Iterable
@@ -52,31 +52,30 @@ def fit_field(
     rates: Rates | None = None,
     frozen_colors: int = 0,
 ) -> FieldFit:
-    """Take one Adam step on the field per keyframe drawn, in the order given; the first `frozen_colors` keep their colour.
+    """Take one Adam step on the field per keyframe drawn, in the order given; the first `frozen_colors` keep theirs.
 
-    Moments start from zero: splats that were just added and splats that are old then have the same step size.
+    Adam's moments live on from fit to fit. A new splat's start from zero while the bias correction has run out, so its
+    first steps are a few times longer: it has farther to go.
     """
     fit, rates, weights = FieldFit(), rates or Rates.of(config), loss_weights(config)
+    pose_rates = np.repeat([config.lr_pose_translation, config.lr_pose_rotation], 3)
     compiled = isinstance(view, CpuView)
     gradients = CompiledLoss(view) if compiled else TorchLoss(view)
     grad = torch.zeros_like(field.params)
-    import os
-    if not os.environ.get("PERSIST"):
-        field.moment1.zero_()
-        field.moment2.zero_()
-    start = getattr(field, "_n", 0) + 1 if os.environ.get("PERSIST") else 1
-    for step, keyframe in enumerate(keyframes, start=start):
-        field._n = step
+    for keyframe in keyframes:
+        field.steps += 1
         t = time.perf_counter()
         view.forward(field.params, se3.inverse(keyframe.T_world_camera))
         t = fit.add("forward", t)
         loss = gradients.images(keyframe.target, weights)
         t = fit.add("loss", t)
-        view.backward(field.params, grad)
+        twist = view.backward(field.params, grad)
+        if pose_rates.any() and not keyframe.fixed:
+            keyframe.move(twist, pose_rates)
         t = fit.add("backward", t)
         loss += gradients.splats(field.params, grad, weights["isotropy"])
         grad[:frozen_colors, COLUMNS["colors"]] = 0.0
-        adam_step(field, grad, rates, step, compiled)
+        adam_step(field, grad, rates, field.steps, compiled)
         fit.add("optimiser", t)
         fit.losses.append(loss)
     return fit
@@ -105,14 +104,14 @@ class TorchLoss:
         used = {n: x for n, x in weights.items() if n != "isotropy" and (len(planes) == 7 or not n.startswith("nll"))}
         loss = losses.total(used, maps)
         (self.view.g_sums[:],) = torch.autograd.grad(loss, (planes,))
-        return float(loss)
+        return float(loss.detach())
 
     def splats(self, params: Tensor, grad: Tensor, weight: float) -> float:
         """Add the isotropy term's gradient to parameter rows; return the term, weighted."""
         leaf = params.detach().clone().requires_grad_()
         loss = weight * losses.isotropy(GaussianField(leaf).scales)
         grad += torch.autograd.grad(loss, (leaf,))[0]
-        return float(loss)
+        return float(loss.detach())
 
 
 class CompiledLoss:

@@ -1,4 +1,4 @@
-"""fit_pose: move one camera, the field fixed. Tracking by the papers' Adam through the renderer, or by aligning to a render."""
+"""fit_pose: move one camera, the field fixed. By the papers' Adam through the renderer, or by aligning to a render."""
 
 from dataclasses import dataclass, field as dataclass_field
 
@@ -23,9 +23,9 @@ ALIGN_ALPHA = 0.95
 
 @dataclass(eq=False)
 class PoseFit:
-    """T_camera_world; agreement: share of pixels seen by both map and sensor whose depths agree; overlap: share of sensor
-    readings where the map has a surface; first and last loss; iterations; covariance [6, 6] of the left twist or None;
-    exposure (a, b) of exp(a)·Ĉ + b; numbers worth logging."""
+    """T_camera_world; agreement: share of pixels seen by both map and sensor whose depths agree; overlap: share of
+    sensor readings where the map has a surface; first and last loss; iterations; covariance [6, 6] of the left twist or
+    None; exposure (a, b) of exp(a)·Ĉ + b; numbers worth logging."""
 
     T_camera_world: Matrix
     agreement: float
@@ -56,7 +56,7 @@ class PoseMaps:
 
 
 def agreement(maps: PoseMaps, target: Target) -> tuple[float, float]:
-    """Measure how well a render explains a depth image: (share of common pixels within 5 % or 5 cm, share in common)."""
+    """Measure how well a render explains a depth image: (share of common pixels within 5 % or 5 cm, common share)."""
     common = (maps.alpha > 0.5) & (target.depth_image > 0)
     surface = maps.depth / maps.alpha.clamp(min=0.5)
     close = (surface - target.depth_image).abs() < (0.05 * target.depth_image).clamp(min=0.05)
@@ -102,7 +102,7 @@ def tracking_gradient(view: View, target: Target, config: TrackingConfig, exposu
 def fit_pose_adam(
     params: Tensor, view: View, target: Target, T_camera_world: Matrix, config: TrackingConfig, iterations: int
 ) -> PoseFit:
-    """Descend L_track by Adam over a unit quaternion and a translation that follow the first guess; the best iterate wins.
+    """Descend L_track by Adam over a unit quaternion and a translation after the first guess; the best iterate wins.
 
     params [N, 17] and σ² are frozen (VarSplat §3). Raises nothing: without common pixels the guess comes back.
     """
@@ -118,7 +118,7 @@ def fit_pose_adam(
     start = torch.tensor([1.0, 0, 0, 0, 0, 0, 0], dtype=torch.float64)
     best, best_T, best_exposure, first, previous = np.inf, T_camera_world, (0.0, 0.0), np.inf, np.inf
     steps = 0
-    for steps in range(1, iterations + 1):  # noqa: B007 - the count is reported
+    for steps in range(1, iterations + 1):
         T = _motion(start + (motion - start) * unit) @ torch.as_tensor(T_camera_world)
         pose = T.detach().numpy()
         view.forward(params, pose)
@@ -166,10 +166,25 @@ def _pose_gradient(T: Tensor, twist: Matrix) -> Tensor:
 def fit_pose_align(
     params: Tensor, view: View, target: Target, live: Pyramid, T_camera_world: Matrix, config: TrackingConfig
 ) -> PoseFit:
-    """Render the map once at the guess and align the live image to that render by Gauss–Newton (`fit.align`).
+    """Render the map at the guess and align the live image to that render by Gauss–Newton (`fit.align`), once or a few times.
 
     Pixels count by A and by w̃ (mean over channels), where the map is opaque; the map's colour and depth are C/A, D/A.
     """
+    first = float("nan")
+    steps = 0
+    for _ in range(max(config.align_renders, 1)):
+        reference = render_reference(params, view, T_camera_world, config)
+        first = first if steps else depth_difference(reference, target)
+        found = align(reference, live, np.eye(4), config.align_iterations, config.align_weight_color)
+        T_camera_world = found.T_live_reference @ T_camera_world
+        steps += found.steps
+    return PoseFit(
+        T_camera_world, found.agreement, found.overlap, first, found.cost, steps, covariance=found.covariance
+    )
+
+
+def render_reference(params: Tensor, view: View, T_camera_world: Matrix, config: TrackingConfig) -> Pyramid:
+    """Render the map as an image to align to: gray, depth where it is opaque, and a weight that falls with V."""
     view.forward(params, T_camera_world)
     maps = PoseMaps.of(view)
     opaque = maps.alpha > ALIGN_ALPHA
@@ -179,16 +194,10 @@ def fit_pose_align(
     weight = None
     if config.uncertainty and maps.variance is not None:
         weight = uncertainty_weights(maps.variance, opaque, config.tau, config.weight_max).mean(-1).numpy()
-    reference = Pyramid.of(gray.numpy(), surface.numpy(), view.camera, weight)
-    found = align(reference, live, np.eye(4), config.align_iterations, config.align_weight_color)
-    error = mean_over((surface - target.depth_image).abs(), opaque & (target.depth_image > 0))
-    return PoseFit(
-        found.T_live_reference @ T_camera_world,
-        found.agreement,
-        found.overlap,
-        float(error),
-        found.cost,
-        found.steps,
-        covariance=found.covariance,
-        numbers={"cost": found.cost},
-    )
+    return Pyramid.of(gray.numpy(), surface.numpy(), view.camera, weight)
+
+
+def depth_difference(reference: Pyramid, target: Target) -> float:
+    """Average |rendered − measured| depth in metres where both exist: how wrong the first guess was."""
+    surface = torch.from_numpy(reference.depth[0])
+    return float(mean_over((surface - target.depth_image).abs(), (surface > 0) & (target.depth_image > 0)))

@@ -1,12 +1,14 @@
 """Lay a frame out as a fit wants it: image planes padded like the view's, with what can be computed once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field as dataclass_field
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sigmasplat.fit.adam import TwistAdam
+from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
 
@@ -25,7 +27,7 @@ class Target:
         """Lay out a frame on planes of `size` = (rows, columns) ≥ its own."""
         h, w = frame.depth_m.shape
         color, depth = torch.zeros(3, *size), torch.zeros(size)
-        color[:, :h, :w] = torch.from_numpy(np.ascontiguousarray(frame.color.transpose(2, 0, 1)))
+        color[:, :h, :w] = torch.tensor(frame.color).movedim(-1, 0)
         depth[:h, :w] = torch.tensor(frame.depth_m)
         return Target(frame.camera, color, depth, int((frame.depth_m > 0).sum()))
 
@@ -42,8 +44,15 @@ class Target:
 
 @dataclass(eq=False)
 class Keyframe:
-    """A target with the pose it was seen from, T_world_camera float64 [4, 4]."""
+    """A target with the pose it was seen from, T_world_camera float64 [4, 4]; the map may move it unless it is `fixed`."""
 
     index: int
     target: Target
     T_world_camera: NDArray[np.float64]
+    fixed: bool = False
+    motion: TwistAdam = dataclass_field(default_factory=TwistAdam)
+
+    def move(self, gradient: NDArray[np.float64], rates: NDArray[np.float64]) -> None:
+        """Take an Adam step on the pose; gradient [6] by the left twist of T_camera_world, rates [6] in m and rad."""
+        update = self.motion.step(gradient, rates)
+        self.T_world_camera = se3.orthonormalise(self.T_world_camera @ se3.exp(-update))

@@ -25,12 +25,13 @@ class GaussianField:
 
     means: metres, world (or submap) frame; quats: wxyz, any positive norm; log_scales: log metres; opacity_logits:
     logit of opacity; colors: RGB in [0, 1]; log_variances: log σ² of observed colour about `colors` (VarSplat §3,
-    s_i). `moment1`, `moment2` are Adam's moments of the same rows.
+    s_i). `moment1`, `moment2` are Adam's moments of the same rows; `steps` counts Adam's steps.
     """
 
     params: Tensor
     moment1: Tensor = dataclass_field(default_factory=lambda: torch.empty(0))
     moment2: Tensor = dataclass_field(default_factory=lambda: torch.empty(0))
+    steps: int = 0
 
     def __post_init__(self) -> None:
         if self.params.ndim != 2 or self.params.shape[1] != WIDTH:
@@ -55,7 +56,10 @@ class GaussianField:
         opacities: Tensor | float = 0.5,
         log_variances: Tensor | float = -7.0,
     ) -> "GaussianField":
-        """Build a field from activated values: means [N,3] m, scales [N,3] or [N] m, colors [N,3]; s₀ = −7 (VarSplat §1)."""
+        """Build a field from activated values: means [N, 3] m, scales [N, 3] or [N] m, colors [N, 3].
+
+        log_variances defaults to s₀ = −7 (VarSplat §1).
+        """
         n = len(means)
         params = torch.zeros(n, WIDTH, dtype=means.dtype)
         params[:, COLUMNS["means"]] = means
@@ -120,7 +124,7 @@ class GaussianField:
         out = self.params.clone()
         out[:, COLUMNS["means"]] = self.means @ T[:3, :3].T + T[:3, 3]
         out[:, COLUMNS["quats"]] = quaternion_product(quaternion_of(T[:3, :3]), self.quats)
-        return GaussianField(out, self.moment1.clone(), self.moment2.clone())
+        return GaussianField(out, self.moment1.clone(), self.moment2.clone(), self.steps)
 
 
 def quaternion_of(R: Tensor) -> Tensor:

@@ -63,7 +63,7 @@ class Frame:
         )
 
     def prepared(self, width: int, min_depth_m: float, max_depth_m: float) -> "Frame":
-        """Return the frame as the system works on it: `width` pixels wide (0 = as it is), depth out of range = no reading."""
+        """Return the frame as the system works on it: `width` pixels wide (0 = as it is), depth out of range 0."""
         small = self.resized(width, round(self.camera.height * width / self.camera.width)) if width else self
         depth = small.depth_m
         keep = (depth >= min_depth_m) & (depth <= max_depth_m)

@@ -26,7 +26,7 @@ def _series(theta2: float) -> tuple[float, float, float]:
     )
 
 
-def exp(xi: Matrix) -> Matrix:
+def exp(xi: NDArray[np.floating]) -> Matrix:
     """Map a twist ξ=(ρ, φ), shape [6], to a 4×4 rigid transform."""
     rho, phi = np.asarray(xi[:3], float), np.asarray(xi[3:], float)
     k = hat(phi)

@@ -27,7 +27,8 @@ class Trajectory:
         for t, T in zip(self.timestamps_s, self.T_world_camera, strict=True):
             if not (np.isfinite(t) and se3.is_rigid(T)):
                 raise SourceError(
-                    f"pose at t={t} s is not a finite rigid transform; drop it or mend its rotation (found {T.tolist()})"
+                    f"pose at t={t} s is not a finite rigid transform; drop it or mend its rotation "
+                    f"(found {T.tolist()})"
                 )
 
     def __len__(self) -> int:

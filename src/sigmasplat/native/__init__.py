@@ -1,1 +1,1 @@
-"""Hold the compiled kernels: `_core`, built from the sources beside this file; it knows numpy arrays and tensors, not torch."""
+"""Hold the compiled kernels: `_core`, built from the sources beside this file; it takes arrays and links no torch."""

@@ -42,8 +42,27 @@ def adam(
 def ssim_cache_floats(width: int, height: int) -> int: ...
 def ssim_target(target: Array, width: int, height: int, cache: Array) -> None: ...
 def ssim(
-    image: Array, target: Array, cache: Array, width: int, height: int, weight: float, gradient: Array
+    image: Array,
+    target: Array,
+    cache: Array,
+    width: int,
+    height: int,
+    mask: Array | None,
+    weight: float,
+    gradient: Array,
 ) -> float: ...
+def mapping_losses(
+    sums: Array,
+    target_color: Array,
+    target_depth: Array,
+    height: int,
+    weights: list[float],
+    valid_pixels: float,
+    g_sums: Array,
+    masked_color: Array,
+    losses: Array,
+) -> None: ...
+def isotropy(params: Array, weight: float, g_params: Array) -> float: ...
 def align_step(
     reference_gray: Array,
     reference_depth: Array,

@@ -2,6 +2,7 @@
 
 from types import ModuleType
 
+from sigmasplat import env
 from sigmasplat.errors import BackendError
 from sigmasplat.render import reference
 
@@ -9,7 +10,12 @@ BACKENDS = ("auto", "cpu", "reference")
 
 
 def backend_module(name: str) -> ModuleType:
-    """Return the module whose `project` and `blend` do the work. Raises BackendError if it is unknown or not built."""
+    """Return the module whose `project` and `blend` do the work; "auto" is SIGMASPLAT_BACKEND's, else the kernels.
+
+    Raises BackendError if it is unknown or not built.
+    """
+    if name == "auto":
+        name = env.switches().backend
     if name == "reference":
         return reference
     if name not in BACKENDS:

@@ -1,10 +1,13 @@
 """Run the compiled kernels: `project` and `blend` as autograd operators, float32, to the definition in `reference`."""
 
+from typing import Any
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sigmasplat import env
 from sigmasplat.config import RenderConfig
 from sigmasplat.errors import BackendError
 from sigmasplat.model.camera import Camera
@@ -12,6 +15,21 @@ from sigmasplat.native import _core
 from sigmasplat.render.reference import FRUSTUM_MARGIN, Blended, Projection
 
 FEATURES_AT_ONCE = 16
+
+
+def apply_switches(asked: env.Switches) -> None:
+    """Set the kernels' instruction set and threads. Raises BackendError if this machine has not what is asked for."""
+    offered = _core.supported_isas()
+    if asked.isa not in ("auto", *offered):
+        raise BackendError(
+            f"SIGMASPLAT_ISA is {asked.isa!r}, which this machine cannot run; unset it or give {', '.join(offered)}"
+        )
+    _core.set_isa(asked.isa)
+    if asked.threads:
+        _core.set_threads(asked.threads)
+
+
+apply_switches(env.switches())
 
 
 def feature_slots(k: int) -> int:
@@ -65,6 +83,10 @@ def _float32(name: str, value: Tensor) -> Tensor:
     return value.detach().contiguous()
 
 
+def _apply(function: type[torch.autograd.Function], *inputs: Any) -> Any:
+    return function.apply(*inputs)  # type: ignore[no-untyped-call] # torch leaves apply untyped
+
+
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, quats, scales, T, camera, options):  # type: ignore[no-untyped-def]
@@ -84,20 +106,8 @@ class _Project(torch.autograd.Function):
     def backward(ctx, g_means2d, g_conics, g_z, _):  # type: ignore[no-untyped-def]
         m, q, s, radii, T = ctx.saved_tensors
         g_m, g_q, g_s, twist = torch.empty_like(m), torch.empty_like(q), torch.empty_like(s), np.zeros(6)
-        _core.project_backward(
-            ctx.view,
-            m,
-            q,
-            s,
-            radii,
-            g_means2d.contiguous(),
-            g_conics.contiguous(),
-            g_z.contiguous(),
-            g_m,
-            g_q,
-            g_s,
-            twist,
-        )
+        given = [g.contiguous() for g in (g_means2d, g_conics, g_z)]
+        _core.project_backward(ctx.view, m, q, s, radii, given[0], given[1], given[2], g_m, g_q, g_s, twist)
         return g_m, g_q, g_s, pose_gradient(T, twist), None, None
 
 
@@ -105,14 +115,15 @@ def project(
     means: Tensor, quats: Tensor, scales: Tensor, T_camera_world: Tensor, camera: Camera, options: RenderConfig
 ) -> Projection:
     """Project splats to the image; arguments and result as `reference.project`, float32 (the pose may be float64)."""
-    return Projection(*_Project.apply(means, quats, scales, T_camera_world, camera, options))
+    return Projection(*_apply(_Project, means, quats, scales, T_camera_world, camera, options))
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means2d, conics, z, radii, opacities, features, ref_depth, camera, options):  # type: ignore[no-untyped-def]
         names = ("means2d", "conics", "z", "radii", "opacities", "features")
-        inputs = [_float32(n, t) for n, t in zip(names, (means2d, conics, z, radii, opacities, features), strict=True)]
+        given = (means2d, conics, z, radii, opacities, features)
+        m, c, depth, r, o, f = inputs = [_float32(n, t) for n, t in zip(names, given, strict=True)]
         rows, columns = padded_size(camera)
         k = features.shape[1]
         sums = torch.empty(feature_slots(k), rows, columns)
@@ -124,7 +135,7 @@ class _Blend(torch.autograd.Function):
             ref[: camera.height, : camera.width] = ref_depth
         raster = _core.Rasteriser()
         raster.blend_forward(
-            *inputs, camera.width, camera.height, options.alpha_min, options.transmittance_stop, ref,
+            m, c, depth, r, o, f, camera.width, camera.height, options.alpha_min, options.transmittance_stop, ref,
             sums, moment, alpha, ids[0], weights[0], ids[1], weights[1],
         )  # fmt: skip
         ctx.raster, ctx.planes, ctx.ref, ctx.shapes = raster, (sums, moment, alpha), ref, [t.shape for t in inputs]
@@ -139,16 +150,15 @@ class _Blend(torch.autograd.Function):
     def backward(ctx, g_sums, g_moment, g_alpha, *_):  # type: ignore[no-untyped-def]
         sums, moment, alpha = ctx.planes
         h, w = ctx.size
-        planes = [torch.zeros_like(sums), None if moment is None else torch.zeros_like(moment), torch.zeros_like(alpha)]
-        planes[0][: ctx.k, :h, :w] = g_sums.permute(2, 0, 1)
-        if planes[1] is not None and g_moment is not None:
-            planes[1][:h, :w] = g_moment
-        planes[2][:h, :w] = g_alpha
-        g_means2d, g_conics, g_z, _, g_opacities, g_features = (torch.zeros(s) for s in ctx.shapes)
-        ctx.raster.blend_backward(
-            sums, moment, alpha, planes[0], planes[1], planes[2], g_means2d, g_conics, g_z, g_opacities, g_features
-        )
-        return g_means2d, g_conics, g_z, None, g_opacities, g_features, None, None, None
+        on_sums, on_alpha = torch.zeros_like(sums), torch.zeros_like(alpha)
+        on_moment = None if moment is None else torch.zeros_like(moment)
+        on_sums[: ctx.k, :h, :w] = g_sums.permute(2, 0, 1)
+        on_alpha[:h, :w] = g_alpha
+        if on_moment is not None and g_moment is not None:
+            on_moment[:h, :w] = g_moment
+        m, c, z, _radii, o, f = (torch.zeros(s) for s in ctx.shapes)
+        ctx.raster.blend_backward(sums, moment, alpha, on_sums, on_moment, on_alpha, m, c, z, o, f)
+        return m, c, z, None, o, f, None, None, None
 
 
 def blend(
@@ -164,6 +174,6 @@ def blend(
 ) -> Blended:
     """Composite splats front to back; arguments and result as `reference.blend`, float32, any number of features."""
     groups = torch.split(features, FEATURES_AT_ONCE, dim=1)
-    first = _Blend.apply(means2d, conics, z, radii, opacities, groups[0], ref_depth, camera, options)
-    more = [_Blend.apply(means2d, conics, z, radii, opacities, g, None, camera, options)[0] for g in groups[1:]]
+    first = _apply(_Blend, means2d, conics, z, radii, opacities, groups[0], ref_depth, camera, options)
+    more = [_apply(_Blend, means2d, conics, z, radii, opacities, g, None, camera, options)[0] for g in groups[1:]]
     return Blended(torch.cat([first[0], *more], -1) if more else first[0], *first[1:])

@@ -40,7 +40,7 @@ def features_of(colors: Tensor, z: Tensor, variances: Tensor) -> Tensor:
 
 
 def variance_of(sums: Tensor) -> Tensor:
-    """Apply the law of total variance to gathered features [H, W, 7]: V = E[σ² + c²] − E[c]² (VarSplat §1), [H, W, 3]."""
+    """Apply the law of total variance to features [H, W, 7]: V = E[σ² + c²] − E[c]² [H, W, 3] (VarSplat §1)."""
     return sums[..., 4:7] - sums[..., 0:3] ** 2
 
 

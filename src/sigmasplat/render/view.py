@@ -15,6 +15,7 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render import reference
+from sigmasplat.render.backend import backend_module
 from sigmasplat.render.render import features_of
 
 Matrix = NDArray[np.float64]
@@ -35,7 +36,7 @@ class View(Protocol):
         """Render parameter rows [N, 17] at a pose into `sums` and `alpha`."""
 
     def backward(self, params: Tensor, g_params: Tensor | None) -> Matrix:
-        """Carry `g_sums`, `g_alpha` to parameter rows (written to g_params unless None); return the pose twist's [6]."""
+        """Carry `g_sums`, `g_alpha` to parameter rows (written to g_params unless None); return the pose twist [6]."""
 
     def visible(self, n: int) -> Tensor:
         """Tell which of the n splats of the last forward pass reach the image, bool [n]."""
@@ -126,7 +127,7 @@ def twist_matrix(xi: Tensor) -> Tensor:
 
 
 def make_view(backend: str, camera: Camera, options: RenderConfig, variance: bool = True) -> View:
-    """Make a view on a backend by name ("auto", "cpu", "reference")."""
-    if backend == "reference":
+    """Make a view on a backend by name ("auto", "cpu", "reference"). Raises BackendError as `backend_module` does."""
+    if backend_module(backend) is reference:
         return ReferenceView(camera, options, variance)
     return CpuView(camera, options, variance)

@@ -15,7 +15,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render.view import View
 from sigmasplat.slam.rules import draw_keyframes
-from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats
+from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats, thin_out
 
 
 @dataclass(eq=False)
@@ -31,7 +31,7 @@ class Mapper:
         """Take in one keyframe: seed, then fit in two halves with a pruning after each."""
         first = not self.keyframes
         old = len(self.field)
-        self.keyframes.append(Keyframe(index, target, T_world_camera))
+        self.keyframes.append(Keyframe(index, target, T_world_camera, fixed=first))
         self._seed(view, target, T_world_camera)
         c = self.config.mapping
         iterations = c.first_iterations if first else c.iterations
@@ -48,11 +48,14 @@ class Mapper:
     def _seed(self, view: View, target: Target, T_world_camera: NDArray[np.float64]) -> None:
         c = self.config.seeding
         if len(self.field) == 0:
+            wanted = target.depth_image.numpy() > 0
             pixels = first_pixels(target, c, self.random)
         else:
             view.forward(self.field.params, se3.inverse(T_world_camera))
-            pixels = later_pixels(PoseMaps.of(view), target, c, self.random)
-        new = make_splats(target, T_world_camera, pixels, self.field, c)
+            wanted = later_pixels(PoseMaps.of(view), target, c)
+            pixels = thin_out(wanted, c, self.random)
+        spacing_px = float(np.sqrt(wanted.sum() / max(pixels.sum(), 1)))
+        new = make_splats(target, T_world_camera, pixels, spacing_px, self.field, c)
         room = c.max_splats - len(self.field) if c.max_splats else len(new)
         if len(new) > room:
             new.keep(torch.from_numpy(self.random.permutation(len(new))[: max(room, 0)].copy()).sort().values)

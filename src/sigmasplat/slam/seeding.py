@@ -15,7 +15,7 @@ from sigmasplat.model.field import GaussianField
 
 Mask = NDArray[np.bool_]
 PUSH_BACK = 1.005
-"""The released VarSplat code seeds half a percent behind the reading: blending near splats first pulls depth forward."""
+"""The released code seeds half a percent behind the reading: blending near splats first pulls depth forward."""
 
 
 def first_pixels(target: Target, config: SeedConfig, random: np.random.Generator) -> Mask:
@@ -25,12 +25,13 @@ def first_pixels(target: Target, config: SeedConfig, random: np.random.Generator
     chosen = _draw(valid.astype(float), config.first_uniform, random)
     chosen |= _draw(gradient_magnitude(gray) * valid, config.first_gradient, random)
     if config.first_edges:
-        chosen |= binary_dilation(canny(gray, low_threshold=100 / 255, high_threshold=200 / 255), np.ones((2, 2)))
+        edges = canny(gray, low_threshold=100 / 255, high_threshold=200 / 255)  # type: ignore[no-untyped-call]
+        chosen |= binary_dilation(edges, np.ones((2, 2), bool))
     return np.asarray(chosen & valid)
 
 
-def later_pixels(maps: PoseMaps, target: Target, config: SeedConfig, random: np.random.Generator) -> Mask:
-    """Pick pixels [H, W] the map does not explain: thin (A < alpha_below), or a surface well behind the reading."""
+def later_pixels(maps: PoseMaps, target: Target, config: SeedConfig) -> Mask:
+    """Find pixels [H, W] the map does not explain: thin (A < alpha_below), or a surface well behind the reading."""
     measured = target.depth_image.numpy()
     valid = measured > 0
     alpha = maps.alpha.numpy()
@@ -41,13 +42,17 @@ def later_pixels(maps: PoseMaps, target: Target, config: SeedConfig, random: np.
         error = np.abs(surface - measured)
         limit = max(config.depth_error_factor * float(np.median(error[seen])), config.depth_error_least_m)
         chosen |= seen & (surface - measured > limit)
-    if config.later_max and int(chosen.sum()) > config.later_max:
-        chosen = _draw(chosen.astype(float), config.later_max, random)
     return chosen
 
 
+def thin_out(pixels: Mask, config: SeedConfig, random: np.random.Generator) -> Mask:
+    """Keep a random share of the pixels [H, W]: `density` of them, at most `later_max`."""
+    count = round(config.density * int(pixels.sum()))
+    return _draw(pixels.astype(float), min(count, config.later_max) if config.later_max else count, random)
+
+
 def _draw(weight: NDArray[np.floating], count: int, random: np.random.Generator) -> Mask:
-    """Draw up to `count` distinct pixels with probability ∝ weight [H, W] (exponential keys: one sort, no rejection)."""
+    """Draw up to `count` distinct pixels with probability ∝ weight [H, W] (exponential keys: one sort, no retries)."""
     candidates = np.flatnonzero(weight > 0)
     chosen = np.zeros(weight.shape, bool)
     if count <= 0:
@@ -60,20 +65,24 @@ def _draw(weight: NDArray[np.floating], count: int, random: np.random.Generator)
 
 
 def make_splats(
-    target: Target, T_world_camera: NDArray[np.float64], pixels: Mask, field: GaussianField, config: SeedConfig
+    target: Target,
+    T_world_camera: NDArray[np.float64],
+    pixels: Mask,
+    spacing_px: float,
+    field: GaussianField,
+    config: SeedConfig,
 ) -> GaussianField:
     """Unproject the chosen pixels to splats: opacity and colour from settings and image, isotropic scale, σ² = e⁻⁷.
 
-    Scale follows the distance to the 3 nearest neighbours, old and new; or, with `scale_from` "pixel", the size of a pixel
-    at that depth times the spacing of the seeds. New points closer than `min_distance_m` to an old splat are dropped.
+    Scale follows the distance to the 3 nearest neighbours, old and new; or, with `scale_from` "pixel", a pixel's size
+    at that depth times `spacing_px`, how far seeds lie apart. New points closer than `min_distance_m` to an old splat are dropped.
     """
     depth = target.depth_image.numpy()[pixels].astype(np.float64)
     points = target.camera.rays()[pixels] * depth[:, None] * PUSH_BACK
     colors = target.image.numpy()[pixels]
     world = points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
     if config.scale_from == "pixel":
-        share = len(world) / max(target.valid_pixels, 1)
-        spread = depth / target.camera.fx * min(1.0 / np.sqrt(max(share, 1e-6)), config.spacing_max_px)
+        spread = depth / target.camera.fx * spacing_px
         keep = np.ones(len(world), bool)
     else:
         keep, spread = _neighbour_spread(world, field.means.numpy(), config)
@@ -95,12 +104,13 @@ def _neighbour_spread(
         return keep, np.zeros(0)
     near = old[((old > points.min(0) - 0.1) & (old < points.max(0) + 0.1)).all(1)] if len(old) else old
     if len(near) and config.min_distance_m > 0:
-        keep = cKDTree(near).query(points, distance_upper_bound=config.min_distance_m)[0] > config.min_distance_m
+        nearest = cKDTree(near).query(points, distance_upper_bound=config.min_distance_m)[0]
+        keep = np.asarray(nearest) > config.min_distance_m
     if config.outlier_neighbours and len(points) > config.outlier_neighbours:
-        mean = cKDTree(points).query(points, config.outlier_neighbours + 1)[0][:, 1:].mean(1)
+        mean = np.asarray(cKDTree(points).query(points, config.outlier_neighbours + 1)[0])[:, 1:].mean(1)
         keep &= mean < mean.mean() + 2.0 * mean.std()
     everything = np.concatenate([points, near]) if len(near) else points
     if len(everything) < 4:
         return keep, np.full(len(points), 0.01)
-    distances = cKDTree(everything).query(points, 4)[0][:, 1:]
+    distances = np.asarray(cKDTree(everything).query(points, 4)[0])[:, 1:]
     return keep, np.sqrt((distances**2).mean(1))

@@ -16,6 +16,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.presets import default_preset, preset
 from sigmasplat.render.view import View, make_view
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.rules import is_keyframe
@@ -24,7 +25,7 @@ from sigmasplat.slam.tracker import Tracker
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What one frame brought: its pose T_world_camera [4, 4], whether it was mapped, whether tracking was lost, numbers."""
+    """What one frame brought: its pose T_world_camera [4, 4], whether it was mapped, whether it was lost, numbers."""
 
     index: int
     timestamp_s: float
@@ -43,12 +44,11 @@ class Slam:
     """
 
     def __init__(self, config: Config | None = None) -> None:
-        from sigmasplat.presets import default_preset
-
-        self.config = config or default_preset()
+        self.config = config or preset(default_preset())
         self.mapper = Mapper(self.config, np.random.default_rng(self.config.seed))
         self.tracker = Tracker(self.config.tracking)
         self.steps: list[Step] = []
+        self._relative: list[tuple[int, NDArray[np.float64]]] = []
         self._view: View | None = None
 
     @property
@@ -57,9 +57,13 @@ class Slam:
         return self.mapper.field
 
     def trajectory(self) -> Trajectory:
-        """Return the poses of all frames so far, lost ones included (their log lines say so)."""
-        poses = np.stack([s.T_world_camera for s in self.steps]) if self.steps else np.zeros((0, 4, 4))
-        return Trajectory(np.array([s.timestamp_s for s in self.steps]), poses)
+        """Return the poses of all frames so far, lost ones included (their log lines say so).
+
+        A frame is remembered relative to the newest keyframe of its time: where mapping moves that, the frame follows.
+        """
+        keyframes = self.mapper.keyframes
+        poses = [keyframes[k].T_world_camera @ T_keyframe_camera for k, T_keyframe_camera in self._relative]
+        return Trajectory(np.array([s.timestamp_s for s in self.steps]), np.array(poses).reshape(-1, 4, 4))
 
     def step(self, frame: Frame) -> Step:
         """Take in one frame. Raises SourceError if the first frame has no depth or a later one another camera."""
@@ -72,14 +76,18 @@ class Slam:
         seconds = {"prepare": time.perf_counter() - clock}
 
         first = not self.mapper.keyframes
+        tracking: dict[str, float] = {}
         if first:
-            T_world_camera, tracking = self._begin(frame, live), {}
+            T_world_camera = self._begin(frame, live)
         else:
             T_world_camera, tracking = self._track(view, target, live, seconds)
         lost = self.tracker.lost
         mapped = first or (is_keyframe(len(self.steps), self.config.mapping.every) and not lost)
         if mapped:
-            self._map(view, target, T_world_camera, seconds)
+            T_world_camera = self._map(view, target, T_world_camera, seconds)
+        newest = self.mapper.keyframes[-1]
+        relative = se3.inverse(newest.T_world_camera) @ T_world_camera
+        self._relative.append((len(self.mapper.keyframes) - 1, se3.orthonormalise(relative)))
 
         step = Step(
             frame.index, frame.timestamp_s, T_world_camera, mapped, lost, tracking, len(self.field),
@@ -113,7 +121,7 @@ class Slam:
         if not (frame.depth_m > 0).any():
             raise SourceError(
                 f"frame {frame.index} has no depth reading in [{self.config.input.min_depth_m}, "
-                f"{self.config.input.max_depth_m}] m to start a map from; check the depth scale or start at a later frame"
+                f"{self.config.input.max_depth_m}] m to start a map from; check the depth scale or start at a later one"
             )
         self.tracker.start(live)
         return np.eye(4)
@@ -130,8 +138,14 @@ class Slam:
         }  # fmt: skip
         return se3.inverse(fit.T_camera_world), numbers
 
-    def _map(self, view: View, target: Target, T_world_camera: NDArray[np.float64], seconds: dict[str, float]) -> None:
+    def _map(
+        self, view: View, target: Target, T_world_camera: NDArray[np.float64], seconds: dict[str, float]
+    ) -> NDArray[np.float64]:
+        """Map a keyframe; return its pose, which mapping may have moved."""
         clock = time.perf_counter()
         fit = self.mapper.map(view, len(self.steps), target, T_world_camera)
         seconds["map"] = time.perf_counter() - clock
         seconds.update({f"map_{stage}": s for stage, s in fit.seconds.items()})
+        T_world_camera = self.mapper.keyframes[-1].T_world_camera
+        self.tracker.previous = T_world_camera
+        return T_world_camera

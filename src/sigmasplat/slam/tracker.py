@@ -71,7 +71,7 @@ class Tracker:
         return worse or jumped(fit.first_loss, self.first_losses, self.config.reinit_factor)
 
     def _retry(self, field: GaussianField, view: View, target: Target, live: Pyramid, fit: PoseFit) -> PoseFit:
-        """Start again from RGB-D odometry with twice the iterations (VarSplat §3), and from standing still; keep the best."""
+        """Start again from odometry with twice the iterations (VarSplat §3), and from standing still; keep the best."""
         starts = [self.previous]
         odometry = self._odometry(live)
         if odometry is not None:

@@ -1,0 +1,188 @@
+"""Run SLAM on sequences × presets × seeds, as the command line does, and sum up what each run was worth.
+
+Every job is `sigmasplat run` in a process of its own, its run folder under runs/bench/. A job whose code and settings
+have been run before is read, not run, unless --fresh. Writes benchmarks/results/<name>-<machine>.json, prints tables.
+
+example: python benchmarks/accuracy.py --sources synthetic redkitchen --seeds 0 1
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import asdict, dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Annotated, Any
+
+import record
+import tables
+import tyro
+
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.options import Settings
+from sigmasplat.presets import default_preset, override, preset as preset_of, split_settings
+
+arg = tyro.conf.arg
+SYNTHETIC = "synthetic:frames=200"
+SOURCES = ("synthetic", "redkitchen", "livingroom", "hololens", "cubicles")
+RUNS = record.ROOT / "runs" / "bench"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Run SLAM on sequences × presets × seeds and sum up what each run was worth."""
+
+    sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths; synthetic has 200 frames")] = SOURCES
+    presets: Annotated[tuple[str, ...], arg(help="settings to start from")] = (default_preset(),)
+    seeds: Annotated[tuple[int, ...], arg(help="starts of the random numbers, a run each")] = (0, 1, 2)
+    settings: Settings = ()
+    limit: Annotated[int | None, arg(help="take at most so many frames", help_behavior_hint="(default: all)")] = None
+    name: Annotated[str, arg(help="name of the results; another one for other --set")] = "accuracy"
+    fresh: Annotated[bool, arg(help="run also what has been run before")] = False
+    runs: Annotated[Path, arg(help="folder of the run folders")] = RUNS
+    out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run: a sequence by name and path, all that changes its result, and the code it is run with."""
+
+    source: str
+    path: str
+    preset: str
+    seed: int
+    settings: tuple[str, ...]
+    limit: int | None
+    code: str
+
+    def key(self) -> dict[str, Any]:
+        """Return what must be equal for an earlier result to be this job's: code, source, every setting in full."""
+        settings = split_settings(self.settings) | {"seed": str(self.seed)}
+        config = override(preset_of(self.preset), settings).to_dict()
+        return {"code": self.code, "path": self.path, "limit": self.limit, "config": config}
+
+    def folder(self, runs: Path) -> Path:
+        """Return where the job leaves its run, log and result; other settings or lengths have other folders."""
+        told_apart = sha256(json.dumps([self.path, self.settings, self.limit]).encode()).hexdigest()[:8]
+        return runs / f"{record.slug(self.source)}-{self.preset}-seed{self.seed}-{told_apart}"
+
+    def command(self, run: Path) -> list[str]:
+        """Return the command line that does it."""
+        words = [sys.executable, "-m", "sigmasplat.cli", "run", self.path, "--preset", self.preset]
+        words += ["--seed", str(self.seed), "--out", str(run), "--overwrite"]
+        words += [word for setting in self.settings for word in ("--set", setting)]
+        return words + (["--limit", str(self.limit)] if self.limit else [])
+
+
+def located(name: str) -> str:
+    """Return the path of a sequence: in the data folder if it is there, else the name as it stands."""
+    if name == "synthetic":
+        return SYNTHETIC
+    known = record.data_root() / name
+    return str(known.resolve()) if known.is_dir() else name
+
+
+def jobs_of(options: Options) -> list[Job]:
+    """List the jobs, source by source. Raises ConfigError on an unknown preset or setting."""
+    code = record.code_digest()
+    jobs = [
+        Job(Path(source).name, located(source), preset, seed, options.settings, options.limit, code)
+        for source in options.sources
+        for preset in options.presets
+        for seed in options.seeds
+    ]
+    for job in jobs:
+        job.key()
+    return jobs
+
+
+def finished(job: Job, runs: Path) -> dict[str, Any] | None:
+    """Return the result of an earlier run of the same job with the same code, None if there is none or it failed."""
+    try:
+        result = record.read(job.folder(runs) / "result.json")
+    except (OSError, ValueError):
+        return None
+    same = json.loads(json.dumps(job.key())) == result["key"]
+    return result if same and result["problem"] is None else None
+
+
+def perform(job: Job, runs: Path) -> dict[str, Any]:
+    """Run a job to its end and write result.json; a run that fails has its last line as `problem`."""
+    folder = job.folder(runs)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "result.json").unlink(missing_ok=True)
+    start, output = time.perf_counter(), folder / "output.txt"
+    with output.open("w") as log:
+        process = subprocess.Popen(job.command(folder / "run"), stdout=log, stderr=subprocess.STDOUT)
+        _, status, usage = os.wait4(process.pid, 0)  # wait4: the peak memory of this child alone
+        process.returncode = os.waitstatus_to_exitcode(status)
+    failed = process.returncode != 0
+    result = {
+        "job": asdict(job),
+        "key": job.key(),
+        **record.commit(),
+        "problem": _last_line(output) if failed else None,
+        "wall_s": round(time.perf_counter() - start, 2),
+        "peak_mib": round(usage.ru_maxrss / 1024, 1),
+        "figures": {} if failed else figures_of(json.loads((folder / "run" / "metrics.json").read_text())),
+    }
+    (folder / "result.json").write_text(json.dumps(result, indent=1) + "\n")
+    return result
+
+
+def _last_line(output: Path) -> str:
+    lines = [line for line in output.read_text(errors="replace").splitlines() if line.strip()]
+    return lines[-1][:300] if lines else "no output"
+
+
+def figures_of(metrics: dict[str, Any]) -> dict[str, float | None]:
+    """Pick the figures of a run's metrics.json under the names of `accuracy_tables.FIGURES`; None where there is none."""
+    ate, rpe = metrics.get("ate") or {}, metrics.get("rpe") or {}
+    picked: dict[str, float | None] = {
+        "ate_m": ate.get("rmse_m"),
+        "rpe_m": rpe.get("translation_rmse_m"),
+        "rpe_deg": rpe.get("rotation_rmse_deg"),
+        **{name: metrics.get(name) for name in ("frames", "keyframes", "lost", "splats", "frames_per_s")},
+    }
+    for kind in ("held_out", "training"):
+        views = metrics.get(kind) or {}
+        picked |= {f"{kind}_{name}": views.get(name) for name in ("psnr_db", "ssim", "depth_l1_m")}
+    uncertainty = metrics.get("uncertainty") or {}
+    return picked | {name: uncertainty.get(name) for name in ("spearman", "ause", "nll")}
+
+
+def run_all(jobs: list[Job], options: Options) -> list[dict[str, Any]]:
+    """Run or read every job, one after the other, a line each on standard error."""
+    done = []
+    for number, job in enumerate(jobs, 1):
+        earlier = None if options.fresh else finished(job, options.runs)
+        result = earlier or perform(job, options.runs)
+        done.append(result)
+        how = "run before" if earlier else result["problem"] or f"{result['wall_s']:.0f} s"
+        told = f"[{number}/{len(jobs)}] {job.source}, {job.preset}, seed {job.seed}: {how}"
+        print(told, file=sys.stderr, flush=True)
+    return done
+
+
+def main(options: Options) -> int:
+    """Run, write, print; exit code 1 if a job failed, 2 if the options mean nothing."""
+    try:
+        jobs = jobs_of(options)
+    except SigmaSplatError as problem:
+        print(f"accuracy.py: {problem}", file=sys.stderr)
+        return 2
+    results = run_all(jobs, options)
+    kept = [{name: value for name, value in result.items() if name != "key"} for result in results]
+    for result in kept:
+        result["job"] |= {"path": Path(result["job"]["path"]).name}
+    config = {n: v for n, v in asdict(options).items() if n not in ("runs", "out", "fresh")}
+    measured = record.results("accuracy", {"jobs": kept}, name=options.name, seeds=options.seeds, config=config)
+    print(record.write(measured, options.out), file=sys.stderr)
+    print(tables.table(measured))
+    return int(any(result["problem"] for result in results))
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))

@@ -1,0 +1,119 @@
+"""Time the CPU core on maps back-projected from real depth: every piece of work, instruction set, number of threads.
+
+Writes benchmarks/results/cpu-<machine>.json and prints its tables; benchmarks/README.md says what each figure means.
+Leave the machine alone while it runs.
+
+example: python benchmarks/cpu.py --quick
+"""
+
+import multiprocessing
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import record
+import tables
+import tyro
+
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.io.machine import usable_cores
+
+arg = tyro.conf.arg
+REFERENCE, QUICK_REFERENCE = 20_000, 4_000
+"""Splats that plain torch renders at 80 pixels' width: every pair of them takes seconds."""
+SYNTHETIC = "synthetic:frames=200,width=640,height=480"
+
+
+def default_source() -> str:
+    """Return the Kinect kitchen where the real data lies, else the built-in room."""
+    kitchen = record.data_root() / "redkitchen"
+    return str(kitchen) if kitchen.is_dir() else SYNTHETIC
+
+
+@dataclass(frozen=True)
+class Options:
+    """Time the CPU core on maps back-projected from real depth."""
+
+    source: Annotated[str, arg(help="sequence whose depth becomes splats")] = field(default_factory=default_source)
+    frame: Annotated[int, arg(help="frame of it")] = 150
+    splats: Annotated[tuple[int, ...], arg(help="sizes of the map")] = (20_000, 77_000, 100_000, 300_000)
+    widths: Annotated[tuple[int, ...], arg(help="widths of the image, pixels")] = (320, 640)
+    isas: Annotated[tuple[str, ...], arg(help="instruction sets, the main one first; none = all supported")] = ()
+    threads: Annotated[tuple[int, ...], arg(help="numbers of threads; none = 1 and all cores")] = ()
+    runs: Annotated[int, arg(help="runs of each piece of work; at least 7 for a median to publish")] = 15
+    seed: int = 0
+    peer: Annotated[
+        str | None,
+        arg(help="MODULE:FUNCTION of another CPU rasteriser, see benchmarks/README.md", help_behavior_hint=""),
+    ] = None
+    quick: Annotated[bool, arg(help="a minute: two small maps, one width, 7 runs; nothing is written")] = False
+    name: Annotated[str, arg(help="name of the results")] = "cpu"
+    out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
+
+
+def alone(work: Callable[..., Any], *arguments: Any) -> Any:
+    """Run a function in a fresh process and return its result: nothing is warm, peak memory is its own."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(work, *arguments).result()
+
+
+def supported_isas() -> tuple[str, ...]:
+    """List the instruction sets of the kernels on this machine, widest first."""
+    from sigmasplat.native import _core
+
+    return tuple(_core.supported_isas())
+
+
+def wanted(options: Options) -> list[dict[str, Any]]:
+    """List the requests that the options ask for, small maps first."""
+    quick = options.quick
+    shared = {
+        "path": options.source,
+        "index": options.frame,
+        "runs": min(options.runs, 7) if quick else options.runs,
+        "isas": options.isas or supported_isas(),
+        "threads": options.threads or tuple(sorted({1, usable_cores()})),
+        "seed": options.seed,
+        "peer": options.peer,
+    }
+    widths, maps = sorted(options.widths)[: 1 if quick else None], sorted(options.splats)[: 2 if quick else None]
+    return [{"splats": splats, "width": width, **shared} for width in widths for splats in maps]
+
+
+def measure_all(options: Options) -> dict[str, Any]:
+    """Measure every scene, then plain torch on a small one; return the figures."""
+    from cpu_scene import Request, compare_reference, load_peer, measure
+
+    if options.peer:
+        load_peer(options.peer)
+    requests, figures = [Request(**request) for request in wanted(options)], []
+    for request in requests:
+        start = time.perf_counter()
+        figures.append(alone(measure, request))
+        took = time.perf_counter() - start
+        print(f"{request.splats:>7} splats, {request.width} pixels wide: {took:.0f} s", file=sys.stderr, flush=True)
+    plain_torch = alone(compare_reference, requests[0], QUICK_REFERENCE if options.quick else REFERENCE)
+    return {"source": Path(options.source).name, "scenes": figures, "reference": plain_torch}
+
+
+def main(options: Options) -> int:
+    """Measure, write, print; return the exit code."""
+    try:
+        figures = measure_all(options)
+    except (SigmaSplatError, ValueError, ImportError, AttributeError) as problem:
+        print(f"cpu.py: {problem}", file=sys.stderr)
+        return 2
+    config = {n: v for n, v in asdict(options).items() if n != "out"} | {"source": figures["source"]}
+    measured = record.results("cpu", figures, name=options.name, seeds=[options.seed], config=config)
+    if not options.quick:
+        print(record.write(measured, options.out), file=sys.stderr)
+    print(tables.table(measured))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))

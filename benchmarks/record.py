@@ -1,0 +1,97 @@
+"""Keep what a benchmark measured: one JSON per benchmark and machine, with all it takes to measure it again."""
+
+import hashlib
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from sigmasplat.io import machine
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+MEASURED = ("src", "CMakeLists.txt", "benchmarks", ":!benchmarks/results", ":!benchmarks/*.md")
+"""What the figures depend on, as git path specifications."""
+CODE = (".py", ".cpp", ".h")
+
+
+def data_root() -> Path:
+    """Return the folder of the real sequences: $SIGMASPLAT_DATA, else ../shared/data beside the checkout."""
+    return Path(os.environ.get("SIGMASPLAT_DATA", ROOT.parent / "shared" / "data"))
+
+
+def slug(text: str) -> str:
+    """Turn a processor's or a sequence's name into a file name: lower case, words joined by hyphens."""
+    return re.sub(r"[^a-z0-9]+", "-", re.sub(r"\((r|tm)\)", " ", text.lower())).strip("-") or "unknown"
+
+
+def machine_slug(described: dict[str, Any]) -> str:
+    """Name a machine by processor and cores, from `sigmasplat.io.machine.describe()`."""
+    return f"{slug(str(described['cpu']))}-{described['cores']}-cores"
+
+
+def commit() -> dict[str, Any]:
+    """Return the checkout's commit and whether code differs from it; both None outside git."""
+    head = machine.git_commit()
+    if head is None:
+        return {"commit": None, "dirty": None}
+    command = ["git", "-C", str(ROOT), "status", "--porcelain", "--untracked-files=no", "--", *MEASURED]
+    changed = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+    return {"commit": head, "dirty": bool(changed)}
+
+
+def code_digest(folder: Path = ROOT / "src") -> str:
+    """Digest every source file of a folder, names and bytes: equal digests mean equal code, committed or not."""
+    digest = hashlib.sha256()
+    for path in sorted(p for p in folder.rglob("*") if p.suffix in CODE):
+        digest.update(str(path.relative_to(folder)).encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def results(
+    benchmark: str, figures: dict[str, Any], *, name: str = "", seeds: Sequence[int] = (), config: Any = None
+) -> dict[str, Any]:
+    """Lay out figures with their circumstances: benchmark is the program, name what it is called here (the same)."""
+    return {
+        "name": name or benchmark,
+        "benchmark": benchmark,
+        "machine": machine.describe(),
+        "load_average_1min": round(os.getloadavg()[0], 2),
+        **commit(),
+        "code": code_digest(),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "seeds": list(seeds),
+        "config": config,
+        "command": shlex.join(["python", *sys.argv]),
+        "figures": figures,
+    }
+
+
+def write(measured: dict[str, Any], folder: Path = RESULTS) -> Path:
+    """Write results as <name>-<machine>.json, replacing those of the same name and machine; return the path."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{slug(measured['name'])}-{machine_slug(measured['machine'])}.json"
+    temporary = path.with_suffix(".part")
+    temporary.write_text(json.dumps(measured, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    temporary.replace(path)
+    return path
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Read results written by `write`. Raises OSError or ValueError if they are not there or damaged."""
+    measured: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return measured
+
+
+def latest(name: str, folder: Path = RESULTS) -> dict[str, Any] | None:
+    """Return the newest results of a name whatever the machine, or those of an exact file stem; None without any."""
+    exact = folder / f"{name}.json"
+    found = [read(exact)] if exact.is_file() else [read(path) for path in sorted(folder.glob(f"{slug(name)}-*.json"))]
+    named = found if exact.is_file() else [measured for measured in found if measured["name"] == name]
+    return max(named, key=lambda measured: str(measured["date"]), default=None)

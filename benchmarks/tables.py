@@ -1,0 +1,102 @@
+"""Turn committed results into markdown, and keep the tables in the documents equal to them.
+
+A document holds <!-- bench:NAME --> … <!-- /bench -->, or bench:NAME/SECTION for one table of several;
+`python benchmarks/tables.py` rewrites what stands between, in README.md and docs/*.md. NAME is that of the results
+(the newest of any machine) or the whole file name without .json; SECTION is a heading of the full table in lower case.
+"""
+
+import importlib
+import math
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import record
+import tyro
+
+BLOCK = re.compile(r"(<!-- bench:(?P<what>[\w./-]+) -->\n)(?P<body>.*?)(<!-- /bench -->)", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Section:
+    """One table: title, head, rows of text, and a line or two below."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
+
+    def markdown(self) -> str:
+        """Write as a markdown table under a bold title; the first column is aligned left, the others right."""
+        rule = ["---", *["---:"] * (len(self.columns) - 1)]
+        lines = [f"| {' | '.join(row)} |" for row in (self.columns, rule, *self.rows)]
+        return f"**{self.title}**\n\n" + "\n".join(lines) + "\n" + (f"\n{self.note}\n" if self.note else "")
+
+
+def significant(value: float | None, digits: int = 3) -> str:
+    """Write a figure with so many significant digits and no exponent; a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    places = digits - 1 - math.floor(math.log10(abs(value))) if value else digits - 1
+    return f"{round(value, places):.{max(places, 0)}f}"
+
+
+def headline(measured: dict[str, Any]) -> str:
+    """Say on what, when and from which code the figures are."""
+    made_on, commit = measured["machine"], measured["commit"]
+    code = f"commit {commit[:9]}{' with changes' if measured['dirty'] else ''}" if commit else "no commit"
+    return f"{made_on['cpu']}, {made_on['cores']} cores · {code} · {measured['date'][:10]} · `{measured['command']}`"
+
+
+def sections(measured: dict[str, Any]) -> list[Section]:
+    """Return the tables of results, laid out by the benchmark that made them (module <benchmark>_tables)."""
+    made: list[Section] = importlib.import_module(f"{measured['benchmark']}_tables").sections(measured)
+    return made
+
+
+def table(measured: dict[str, Any], section: str | None = None) -> str:
+    """Write results as markdown: every table, or the one whose title is `section`. Raises KeyError if there is none."""
+    made = {s.title.lower(): s for s in sections(measured)}
+    chosen = list(made.values()) if section is None else [made[section]]
+    return "\n".join([f"{headline(measured)}\n", *(s.markdown() for s in chosen)])
+
+
+def rewritten(text: str, folder: Path = record.RESULTS) -> str:
+    """Return a document with every block replaced by its table. Raises KeyError for a block without results."""
+
+    def block(match: re.Match[str]) -> str:
+        name, _, section = match["what"].partition("/")
+        measured = record.latest(name, folder)
+        if measured is None:
+            raise KeyError(f"no results {name!r} in {folder}")
+        return f"{match[1]}{table(measured, section or None)}{match[4]}"
+
+    return BLOCK.sub(block, text)
+
+
+Check = Annotated[bool, tyro.conf.arg(help="change nothing; exit 1 if a document is out of date")]
+
+
+def main(check: Check = False) -> int:
+    """Rewrite the benchmark tables of README.md and docs/*.md from benchmarks/results/*.json."""
+    stale = 0
+    for path in [record.ROOT / "README.md", *sorted((record.ROOT / "docs").glob("*.md"))]:
+        before = path.read_text(encoding="utf-8") if path.exists() else ""
+        try:
+            after = rewritten(before)
+        except KeyError as problem:
+            print(f"{path.name}: {problem.args[0]}", file=sys.stderr)
+            return 2
+        if after != before:
+            stale += 1
+            print(f"{'out of date' if check else 'rewritten'}: {path.relative_to(record.ROOT)}")
+            if not check:
+                path.write_text(after, encoding="utf-8")
+    return int(check and stale > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(main, config=(tyro.conf.FlagCreatePairsOff,)))

@@ -1,0 +1,179 @@
+"""Name the pieces of work the CPU benchmark times, each as the product does it, on one scene."""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from scenes import Scene
+from torch import Tensor
+
+from sigmasplat.config import RenderConfig, TrackingConfig
+from sigmasplat.fit import losses
+from sigmasplat.fit.align import Pyramid, gray_of
+from sigmasplat.fit.field import fit_field
+from sigmasplat.fit.pose import fit_pose_adam, fit_pose_align, tracking_gradient
+from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.model.field import GaussianField
+from sigmasplat.native import _core
+from sigmasplat.presets import default_preset, preset
+from sigmasplat.render import cpu
+from sigmasplat.render.view import CpuView
+
+RENDER = RenderConfig()
+ADAM_ITERATIONS = 60
+STAGES = ("project", "sort", "blend", "blend backward", "project backward")
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Median and least time of `runs` runs, milliseconds."""
+
+    median_ms: float
+    min_ms: float
+    runs: int
+
+    @staticmethod
+    def of(seconds: list[float]) -> "Timing":
+        """Sum up single times."""
+        return Timing(1e3 * float(np.median(seconds)), 1e3 * min(seconds), len(seconds))
+
+    def plain(self) -> dict[str, float]:
+        """Return plain values, to the microsecond."""
+        return {name: round(value, 3) for name, value in asdict(self).items()}
+
+
+def timed(work: Callable[[], object], runs: int, warmups: int = 2) -> Timing:
+    """Time a piece of work by the wall clock, after a few runs that do not count."""
+    for _ in range(warmups):
+        work()
+    seconds = []
+    for _ in range(runs):
+        start = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - start)
+    return Timing.of(seconds)
+
+
+def set_up(isa: str, threads: int) -> None:
+    """Choose instruction set and threads for what is made from now on, torch's threads included."""
+    _core.set_isa(isa)
+    _core.set_threads(threads)
+    torch.set_num_threads(threads)
+
+
+class Works:
+    """Everything a frame costs on one scene, on the instruction set active when this is made.
+
+    The world is the scene's camera: rendering is at the identity. Each method is one piece of work, run once.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene, self.params = scene, scene.field.params
+        self.view, self.color_depth = (CpuView(scene.camera, RENDER, variance=on) for on in (True, False))
+        size = tuple(self.view.alpha.shape)
+        self.raster = _core.Rasteriser()
+        self.maps, self.ids = torch.zeros(9, *size), torch.zeros(2, *size, dtype=torch.int32)
+        self.weights = torch.zeros(2, *size)
+        self.target, self.later = (Target.of(f, (size[0], size[1])) for f in (scene.frame, scene.later))
+        self.reference = self.target.depth.contiguous()
+        self.numbers = cpu.view_numbers(scene.camera, np.eye(4), RENDER)
+        self.grad = torch.zeros_like(self.params)
+        self.tracking, self.mapping = TrackingConfig(), preset(default_preset()).mapping
+        self.exposure = torch.zeros(2)
+        self.live = Pyramid.of(gray_of(scene.later.color), scene.later.depth_m, scene.camera)
+        self.masked_target = self.target.color * (self.target.depth > 0)
+        self.color = 0.9 * self.masked_target
+        self.cache = torch.zeros(_core.ssim_cache_floats(scene.camera.width, scene.camera.height))
+
+    def forward_all(self) -> None:
+        """Render all: colour, depth, σ² + c², moment about the sensor's depth, alpha, median and dominant splat."""
+        maps, ids, weights = self.maps, self.ids, self.weights
+        self.raster.view_forward(
+            self.numbers, self.params, 7, RENDER.alpha_min, RENDER.transmittance_stop, self.reference,
+            maps[:7], maps[7], maps[8], ids[0], weights[0], ids[1], weights[1], np.zeros(3),
+        )  # fmt: skip
+
+    def forward(self) -> None:
+        """Render what a fit needs: colour, depth, σ² + c², alpha."""
+        self.view.forward(self.params, np.eye(4))
+
+    def forward_color_depth(self) -> None:
+        """Render colour, depth and alpha only."""
+        self.color_depth.forward(self.params, np.eye(4))
+
+    def pose_only(self) -> None:
+        """Take one step's gradient of tracking by Adam: forward, loss, backward to the pose alone."""
+        self.view.forward(self.params, np.eye(4))
+        tracking_gradient(self.view, self.later, self.tracking, self.exposure)
+        self.view.backward(self.params, None)
+
+    def backward(self) -> None:
+        """Carry the image gradients of the last loss to every parameter and the pose."""
+        self.view.backward(self.params, self.grad)
+
+    def mapping_iterations(self, count: int) -> list[float]:
+        """Fit a copy of the field; return the seconds of each iteration, from one keyframe asked for to the next."""
+        field, keyframe, starts = GaussianField(self.params.clone()), Keyframe(0, self.target, np.eye(4)), []
+
+        def ticking() -> Iterator[Keyframe]:
+            for _ in range(count):
+                starts.append(time.perf_counter())
+                yield keyframe
+            starts.append(time.perf_counter())
+
+        fit_field(field, self.view, ticking(), self.mapping)
+        return [end - start for start, end in pairwise(starts)]
+
+    def ssim(self) -> None:
+        """Take SSIM and its gradient in the kernels, the target's half included, as each iteration does."""
+        c = self.scene.camera
+        _core.ssim_target(self.masked_target, c.width, c.height, self.cache)
+        _core.ssim(
+            self.color, self.masked_target, self.cache, c.width, c.height, self.target.depth, -0.2, self.view.g_sums[:3]
+        )
+
+    def ssim_torch(self) -> Tensor:
+        """Take SSIM and its gradient by the loss term's definition in torch."""
+        image = self.target.image.clone().requires_grad_()
+        losses.ssim(image, self.target.image, self.target.depth_image > 0).backward()  # type: ignore[no-untyped-call]
+        return image
+
+    def pyramid(self) -> None:
+        """Halve a live frame twice for tracking."""
+        Pyramid.of(gray_of(self.scene.later.color), self.scene.later.depth_m, self.scene.camera)
+
+    def track_align(self) -> None:
+        """Track the later frame by Gauss–Newton, its render included."""
+        fit_pose_align(self.params, self.view, self.later, self.live, np.eye(4), self.tracking)
+
+    def track_adam(self) -> None:
+        """Track the later frame by 60 Adam iterations, as the papers do."""
+        fit_pose_adam(self.params, self.view, self.later, np.eye(4), self.tracking, ADAM_ITERATIONS)
+
+    def stages(self, runs: int) -> dict[str, float]:
+        """Return the mean milliseconds of the stages inside forward and backward."""
+        self.view.seconds[:] = 0.0
+        for _ in range(runs):
+            self.forward()
+            self.backward()
+        means = 1e3 * self.view.seconds[: len(STAGES)] / runs
+        return dict(zip(STAGES, (round(float(ms), 3) for ms in means), strict=True))
+
+
+ALWAYS = (
+    "forward_all", "forward", "forward_color_depth", "pose_only", "backward", "ssim", "pyramid", "track_align",
+)  # fmt: skip
+"""What is timed on every instruction set and number of threads; mapping_iteration joins them."""
+ONCE = ("ssim_torch", "track_adam")
+"""What is timed on the widest instruction set and all threads only: it is slow and for comparison."""
+
+
+def time_works(works: Works, runs: int, once: bool) -> dict[str, dict[str, float]]:
+    """Time every piece of work; `once` adds those that are timed in one configuration only."""
+    found = {name: timed(getattr(works, name), runs).plain() for name in (*ALWAYS, *(ONCE if once else ()))}
+    # pose_only left its loss in the gradient planes, so backward carried a real one; mapping writes its own.
+    found["mapping_iteration"] = Timing.of(works.mapping_iterations(runs + 2)[2:]).plain()
+    return found

@@ -1,0 +1,68 @@
+"""Read a folder of .npz files as an RGB-D sequence: a whole dataset format in one file.
+
+camera.npz      width, height, fx, fy, cx, cy
+000000.npz …    t (seconds), color (uint8 [H, W, 3]), depth_m (float [H, W], 0 = no reading), optional T_world_camera [4, 4]
+
+Copy this file into src/sigmasplat/sources/ and `sigmasplat run FOLDER` knows the format; nothing else is to be told.
+"""
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sigmasplat.errors import SourceError
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.frame import Frame
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.sources.base import Source
+from sigmasplat.sources.images import color_from_bytes
+from sigmasplat.sources.opening import Format
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Read the arrays of one file. Raises SourceError naming it if it is damaged."""
+    try:
+        with np.load(path) as arrays:
+            return dict(arrays)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as problem:
+        raise SourceError(f"{path}: not a readable .npz ({problem}); write it again") from problem
+
+
+class NpzFrames(Source):
+    """One frame per file, in the order of the names."""
+
+    def __init__(self, folder: Path, strict: bool = False) -> None:
+        """Open a folder. Raises SourceError if the camera cannot be read or there are no frames."""
+        c = read(folder / "camera.npz")
+        camera = Camera(int(c["width"]), int(c["height"]), *(float(c[name]) for name in ("fx", "fy", "cx", "cy")))
+        super().__init__(folder.resolve().name, camera, strict)
+        self._paths = sorted(path for path in folder.glob("*.npz") if path.stem.isdigit())
+        if not self._paths:
+            raise SourceError(f"no frames in {folder} (looked for 000000.npz and so on)")
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    def frame(self, i: int) -> Frame:
+        """Read frame i; `Frame` itself refuses sizes that differ, NaN and negative depth."""
+        arrays = read(self._paths[self._checked_index(i)])
+        depth_m = arrays["depth_m"].astype(np.float32)
+        return Frame(i, float(arrays["t"]), color_from_bytes(arrays["color"]), depth_m, self.camera)
+
+    def truth(self) -> Trajectory | None:
+        """Return the recorded poses, None unless every frame has one."""
+        arrays = [read(path) for path in self._paths]
+        if not all("T_world_camera" in frame for frame in arrays):
+            return None
+        times_s = np.array([float(frame["t"]) for frame in arrays])
+        return Trajectory(times_s, np.stack([frame["T_world_camera"] for frame in arrays]).astype(np.float64))
+
+
+FORMAT = Format(
+    "npz frames",
+    "camera.npz and 000000.npz",
+    lambda path: (Path(path) / "camera.npz").is_file(),
+    lambda path, strict: NpzFrames(Path(path), strict),
+)

@@ -1,0 +1,46 @@
+"""Draw a map's colour and uncertainty, side by side, as seen from one pose of its path.
+
+python examples/render_map.py RUN [PICTURE.png] [ROW]      RUN a run folder, ROW a row of its trajectory (default: 0)
+
+What is drawn right is √V averaged over the channels: black = sure, bright = unsure. Where the map is empty (A < ½) V says
+nothing; those pixels are slate.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from sigmasplat import Camera, SigmaSplatError
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.metrics import palette
+from sigmasplat.model import se3
+from sigmasplat.render import render
+
+CAMERA = Camera(width=320, height=240, fx=260.0, fy=260.0, cx=159.5, cy=119.5)
+"""Any pinhole will do: the map is not tied to the camera that made it."""
+
+
+def main(run: str, picture: str = "view.png", row: str = "0") -> None:
+    """Render the run's map from a pose of its trajectory and save colour and uncertainty as one PNG."""
+    folder = RunFolder.open(Path(run))
+    T_world_camera = folder.read_trajectory().T_world_camera[int(row)]
+    with torch.no_grad():
+        view = render(folder.read_map(), CAMERA, se3.inverse(T_world_camera))
+    covered = view.alpha.numpy() > 0.5
+    color = (view.color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
+    deviation = view.variance.mean(-1).clamp(min=0.0).sqrt().numpy()
+    unsure = palette.picture(deviation, covered, 0.0, palette.span(deviation, covered)[1], palette.INFERNO)
+    Image.fromarray(np.concatenate([color, unsure], axis=1)).save(picture)
+    print(f"{picture}: {covered.mean():.0%} of the view is mapped")
+    if covered.any():
+        print(f"median √V there is {np.median(deviation[covered]):.3f} (colour in 0 … 1)")
+
+
+if __name__ == "__main__":
+    try:
+        main(*sys.argv[1:])
+    except SigmaSplatError as problem:
+        sys.exit(str(problem))

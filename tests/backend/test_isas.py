@@ -1,0 +1,133 @@
+"""Hold every instruction set this processor runs to the reference, and to the same bytes on any number of threads."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from sigmasplat.render import reference
+from splat_fields import BIG, OPTIONS, crowd, exact_view, params_of, there_and_back
+from splat_scenes import KINDS, assert_same_vector, gradients, probe, render, scene
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+
+from sigmasplat.fit.align import Pyramid
+from sigmasplat.native import _core
+from sigmasplat.render import cpu
+from sigmasplat.render.view import CpuView
+
+Outputs = dict[str, Tensor]
+THREADS = (1, 2, 3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_maps_and_gradients_agree_with_the_reference(isa: str, kind: str) -> None:
+    s = scene(kind, 60)
+    want, got = render(reference, s)[1], render(cpu, s.to(torch.float32))[1]
+    for name in ("sums", "moment", "alpha", "dominant_weight", "median_weight"):
+        a, b = getattr(got, name), getattr(want, name)
+        assert float((a - b).norm()) < 2e-5 * float(b.norm()), f"{isa} {kind} {name}"
+    assert torch.equal(got.median_id, want.median_id)
+    exact, found = gradients(reference, s), gradients(cpu, s.to(torch.float32))
+    for name in exact:
+        assert_same_vector(found[name], exact[name], what=f"{isa} {kind} {name}")
+
+
+@pytest.mark.parametrize("kind", ["needles", "huge", "off_screen"])
+def test_views_agree_with_the_reference(isa: str, kind: str) -> None:
+    s = scene(kind, 60)
+    params, T = params_of(s), s.T_camera_world.numpy()
+    got = there_and_back(CpuView(s.camera, OPTIONS), params, T)
+    want = there_and_back(exact_view(s.camera, True), params.double(), T)
+    assert float((got[0] - want[0]).norm()) < 2e-5 * float(want[0].norm())
+    assert_same_vector(got[1], want[1], what=f"{isa} {kind} rows")
+    assert_same_vector(got[2], want[2], what=f"{isa} {kind} twist")
+
+
+def seam() -> Outputs:
+    """Run `project` and `blend` and their gradients on a crowd."""
+    s = crowd().to(torch.float32)
+    x = s.requiring_grad()
+    p, b = render(cpu, x)
+    probe(b.sums, b.moment, b.alpha).backward()
+    found = {name: getattr(x, name).grad for name in ("means", "quats", "scales", "opacities", "features")}
+    return found | {"pose": x.T_camera_world.grad} | p._asdict() | b._asdict()
+
+
+def view() -> Outputs:
+    """Run the fused way on a crowd."""
+    s = crowd()
+    maps, rows, twist = there_and_back(CpuView(s.camera, OPTIONS), params_of(s), s.T_camera_world)
+    return {"maps": maps, "rows": rows, "twist": twist}
+
+
+def images(seed: int) -> tuple[Tensor, Tensor]:
+    """Draw planes like a view's, (colour, depth, q) [7, rows, columns], and depths [rows, columns] with holes."""
+    rng = np.random.default_rng(seed)
+    size = cpu.padded_size(BIG)
+    planes = rng.uniform(0, 1, (7, *size))
+    planes[4:] = planes[:3] ** 2 + rng.uniform(1e-3, 0.2, (3, *size))
+    depth = rng.uniform(0.5, 4.0, size) * (rng.random(size) > 0.2)
+    depth[BIG.height :], depth[:, BIG.width :] = 0.0, 0.0
+    return torch.as_tensor(planes).float(), torch.as_tensor(depth).float()
+
+
+def losses() -> Outputs:
+    """Run SSIM, the pixel losses and the isotropy loss."""
+    (sums, _), (target, depth) = images(1), images(2)
+    target = target[:3] * (depth > 0)
+    gradient, masked, parts = torch.full_like(sums, torch.nan), torch.zeros_like(target), np.zeros(4)
+    valid = float((depth > 0).sum())
+    _core.mapping_losses(sums, target, depth, BIG.height, [0.8, 1.0, 1e-2, 1e-2], valid, gradient, masked, parts)
+    cache = torch.zeros(_core.ssim_cache_floats(BIG.width, BIG.height))
+    _core.ssim_target(target, BIG.width, BIG.height, cache)
+    similarity = _core.ssim(masked, target, cache, BIG.width, BIG.height, depth, -0.2, gradient[:3])
+    params = params_of(crowd())
+    rows = torch.zeros_like(params)
+    isotropy = _core.isotropy(params, 0.7, rows)
+    values = torch.tensor([*parts, similarity, isotropy], dtype=torch.float64)
+    return {"values": values, "gradient": gradient[:, : BIG.height, : BIG.width], "masked": masked, "rows": rows}
+
+
+def adam() -> Outputs:
+    """Take three steps on a crowd."""
+    params = params_of(crowd())
+    moments = [torch.zeros_like(params), torch.zeros_like(params)]
+    rates = np.random.default_rng(3).uniform(0, 1e-2, 17).astype(np.float32)
+    for step in (1, 2, 3):
+        grad = torch.as_tensor(np.random.default_rng(step).normal(size=params.shape)).float()
+        _core.adam(params, grad, *moments, rates, 0.9, 0.999, 1e-15, step)
+    return {"params": params, "moment1": moments[0], "moment2": moments[1]}
+
+
+def align() -> Outputs:
+    """Take the normal equations of one alignment."""
+    (a, near), (b, far) = images(4), images(5)
+    crop = (slice(BIG.height), slice(BIG.width))
+    shapes = [Pyramid.of(x[0][crop].numpy(), d[crop].numpy() + 1.0, BIG) for x, d in ((a, near), (b, far))]
+    H, g, sums = np.zeros(21), np.zeros(6), np.zeros(4)
+    T, intrinsics = np.eye(4), [BIG.fx, BIG.fy, BIG.cx, BIG.cy]
+    T[:3, 3] = [0.02, -0.01, 0.03]
+    _core.align_step(
+        shapes[0].gray[0], shapes[0].depth[0], b[1][crop].numpy().copy(), shapes[1].gray[0], shapes[1].depth[0],
+        intrinsics, 0.5, 0.5, 0.02, 0.3, 4.0, T, H, g, sums,
+    )  # fmt: skip
+    assert sums.min() > 100, "the test needs residuals of both kinds"
+    return {"H": torch.as_tensor(H), "b": torch.as_tensor(g), "sums": torch.as_tensor(sums)}
+
+
+@pytest.mark.parametrize("work", [seam, view, losses, adam, align], ids=lambda work: work.__name__)
+def test_any_number_of_threads_gives_the_same_bytes(
+    isa: str, work: Callable[[], Outputs], set_threads: Callable[[int], None]
+) -> None:
+    found = []
+    for threads in THREADS:
+        set_threads(threads)
+        assert _core.threads() == threads
+        found.append(work())
+    for other in found[1:]:
+        for name, value in found[0].items():
+            assert torch.isfinite(value).all() and torch.count_nonzero(value) > 0, name
+            assert torch.equal(value, other[name]), f"{isa} {work.__name__} {name}"

@@ -1,0 +1,110 @@
+"""Hold the fused view, raw rows to planes and back, against the reference in float64."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import COLUMNS
+from splat_fields import OPTIONS, crowd, exact_view, maps_of, params_of, there_and_back
+from splat_scenes import KINDS, SMALL, WIDE, Scene, assert_same_vector, scene
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+
+from sigmasplat.render.view import CpuView
+
+SIZES = (SMALL, WIDE, Camera(1, 1, 20.0, 20.0, 0.0, 0.0), Camera(33, 17, 30.0, 30.0, 15.5, 8.2))
+
+
+def assert_same_view(s: Scene, params: Tensor, variance: bool) -> None:
+    """Compare maps, gradient rows column group by column group, and twist."""
+    T = s.T_camera_world.numpy()
+    maps, rows, twist = there_and_back(CpuView(s.camera, OPTIONS, variance), params, T)
+    want_maps, want_rows, want_twist = there_and_back(exact_view(s.camera, variance), params.double(), T)
+    for plane, (got, want) in enumerate(zip(maps, want_maps, strict=True)):
+        assert float((got - want).abs().max()) < 2e-4 * max(float(want.abs().max()), 1.0), f"plane {plane}"
+        assert float((got - want).norm()) < 2e-5 * float(want.norm()), f"plane {plane}"
+    for name, columns in COLUMNS.items():
+        if name == "log_variances" and not variance:
+            assert torch.count_nonzero(rows[:, columns]) == 0
+        else:
+            assert_same_vector(rows[:, columns], want_rows[:, columns], what=name)
+    assert_same_vector(twist, want_twist, what="twist")
+
+
+@pytest.mark.parametrize("variance", [False, True], ids=["K4", "K7"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_planes_rows_and_twist_agree(kind: str, variance: bool) -> None:
+    s = scene(kind, 60)
+    assert_same_view(s, params_of(s), variance)
+
+
+@pytest.mark.parametrize("camera", SIZES, ids=lambda c: f"{c.width}x{c.height}")
+def test_any_image_size(camera: Camera) -> None:
+    s = scene("huge", 19, camera)
+    assert_same_view(s, params_of(s), True)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5, 8, 9, 16, 17])
+def test_any_number_of_splats(n: int) -> None:
+    s = scene("huge", 40)
+    few = replace(s, **{k: getattr(s, k)[:n] for k in ("means", "quats", "scales", "opacities", "features")})
+    assert_same_view(few, params_of(few), True)
+
+
+@pytest.mark.parametrize("variance", [False, True], ids=["K4", "K7"])
+def test_nothing_to_see_gives_zeros(variance: bool) -> None:
+    s = scene("random", 60)
+    params, T = params_of(s), s.T_camera_world.numpy()
+    away = np.diag([-1.0, 1.0, -1.0, 1.0]) @ T  # turned round: every splat lies behind
+    view = CpuView(s.camera, OPTIONS, variance)
+    for rows, pose in ((params[:0], T), (params, away)):
+        view.forward(params, T)
+        assert float(view.alpha.max()) > 0.1
+        maps, gradient, twist = there_and_back(view, rows, pose)
+        assert all(torch.count_nonzero(x) == 0 for x in (maps, gradient, twist))
+        assert not view.visible(len(rows)).any() and len(view.visible(len(rows))) == len(rows)
+
+
+def test_a_pose_alone_needs_no_rows() -> None:
+    s = scene("random", 60)
+    view, params = CpuView(s.camera, OPTIONS), params_of(s)
+    _, _, twist = there_and_back(view, params, s.T_camera_world)
+    assert np.array_equal(view.backward(params, None), twist.numpy())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_visible_are_at_least_those_that_feel_a_gradient(kind: str) -> None:
+    s = scene(kind, 60)
+    view = CpuView(s.camera, OPTIONS)
+    _, rows, _ = there_and_back(view, params_of(s), s.T_camera_world)
+    visible, felt = view.visible(60), (rows != 0).any(1)
+    assert felt.any() and not (felt & ~visible).any()
+    depth = (s.means @ s.T_camera_world[:3, :3].T + s.T_camera_world[:3, 3])[:, 2]
+    assert not visible[depth <= s.options.near_m].any()
+
+
+def test_one_view_serves_fields_that_grow_and_shrink() -> None:
+    s = crowd()
+    params, view = params_of(s), CpuView(s.camera, OPTIONS)
+    T = s.T_camera_world.numpy()
+    for n in (50, 2003, 1, 700, 0, 512, 513, 1300):
+        kept = there_and_back(view, params[:n].contiguous(), T)
+        fresh = there_and_back(CpuView(s.camera, OPTIONS), params[:n].contiguous(), T)
+        assert all(torch.equal(a, b) for a, b in zip(kept, fresh, strict=True)), n
+
+
+def test_two_views_do_not_disturb_each_other() -> None:
+    s = crowd()
+    params, T = params_of(s), s.T_camera_world.numpy()
+    alone = there_and_back(CpuView(s.camera, OPTIONS), params, T)
+    first, second = CpuView(s.camera, OPTIONS), CpuView(WIDE, OPTIONS, variance=False)
+    there_and_back(first, params, T)
+    there_and_back(second, params[:300].contiguous(), T)
+    rows = torch.empty_like(params)
+    twist = first.backward(params, rows)
+    assert torch.equal(rows, alone[1]) and np.array_equal(twist, alone[2].numpy())
+    assert torch.equal(maps_of(first), alone[0])

@@ -1,0 +1,244 @@
+"""What the documents print is true: Python runs, commands parse, links lead somewhere, names exist."""
+
+import ast
+import dataclasses
+import functools
+import importlib.util
+import re
+import shlex
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+import sigmasplat
+import sigmasplat.sources
+from sigmasplat import cli
+from sigmasplat.config import Config
+from sigmasplat.io.runs import FILES
+from sigmasplat.presets import list_presets, override, preset
+from sigmasplat.sources import open_source
+from sigmasplat.sources.opening import formats
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "src" / "sigmasplat"
+DOCUMENTS = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+TINY = "synthetic:frames=120,width=64,height=48"
+TINY_SETTINGS = {"input.width": "64", "mapping.first_iterations": "6", "mapping.iterations": "4"}
+each_document = pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+
+
+def blocks(path: Path, language: str) -> list[str]:
+    """Return the fenced blocks of a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", path.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+
+
+def prose(path: Path) -> str:
+    """Return a document without its fenced blocks."""
+    return re.sub(r"^```.*?^```", "", path.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+
+
+def example(name: str) -> ModuleType:
+    """Load examples/NAME.py."""
+    spec = importlib.util.spec_from_file_location(f"example_{name}", ROOT / "examples" / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def tiny(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Make every sequence three frames of 64×48 pixels and every preset short; work in an empty folder."""
+    pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
+    small, short = open_source(TINY, limit=3), override(preset("varsplat-fast"), TINY_SETTINGS)
+    monkeypatch.setattr(sigmasplat, "open_source", lambda path: small)
+    monkeypatch.setattr(sigmasplat, "preset", lambda name: dataclasses.replace(short, name=preset(name).name))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Run the smallest demo once; return the folder that holds runs/demo."""
+    pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
+    place = tmp_path_factory.mktemp("demo")
+    settings = [word for pair in TINY_SETTINGS.items() for word in ("--set", "=".join(pair))]
+    with pytest.raises(SystemExit) as left:
+        cli.main(["run", TINY, "--limit", "3", "--out", str(place / "runs" / "demo"), *settings])
+    assert left.value.code == 0
+    return place
+
+
+def test_the_readmes_ten_lines(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (code,) = blocks(ROOT / "README.md", "python")
+    assert len([line for line in code.splitlines() if line.strip()]) == 10
+    exec(compile(code, "README.md", "exec"), {})
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 3 + 1 and lines[-1].startswith("torch.Size([48, 64, 3])")
+
+
+@pytest.mark.parametrize("name", ["kernels.md", "recipes.md", "runs.md"])
+def test_python_in_the_documents(name: str, demo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(demo)
+    from sigmasplat.fit import losses
+
+    monkeypatch.setattr(losses, "TERMS", dict(losses.TERMS))
+    found = blocks(ROOT / "docs" / name, "python")
+    assert found
+    for code in found:
+        exec(compile(code, name, "exec"), {})
+
+
+def test_the_run_folder_holds_what_the_documents_say(demo: Path) -> None:
+    run = demo / "runs" / "demo"
+    assert {path.name for path in run.iterdir()} == {*FILES, "images"}
+    text = (ROOT / "docs" / "runs.md").read_text(encoding="utf-8")
+    assert all(f"`{name}`" in text for name in FILES if name != "report.html") and "report.html" in text
+    folder = sigmasplat.io.runs.RunFolder.open(run)  # type: ignore[attr-defined]
+    record, metrics, facts = folder.read_log()[-1], folder.read_metrics(), folder.facts()
+    inner = [f"tracking.{k}" for k in record["tracking"]] + [f"seconds.{k}" for k in ("prepare", "track", "total")]
+    views = [*metrics["held_out"], *metrics["ate"], *metrics["rpe"], *metrics["uncertainty"]]
+    named = {*record, *inner, *metrics, *views, *facts} - {"tracking", "seconds"}
+    assert [name for name in sorted(named) if not re.search(rf"\b{re.escape(name)}\b", text)] == []
+
+
+def test_example_run_sequence(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    example("run_sequence").main("any", "out")
+    assert capsys.readouterr().out.count("splats") == 3
+    assert (tiny / "out" / "trajectory.txt").stat().st_size and (tiny / "out" / "map.ply").stat().st_size
+
+
+def test_example_render_map(demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from PIL import Image
+
+    picture = tmp_path / "view.png"
+    example("render_map").main(str(demo / "runs" / "demo"), str(picture))
+    pixels = np.asarray(Image.open(picture))
+    assert pixels.shape == (240, 640, 3) and pixels.std() > 10
+    assert "of the view is mapped" in capsys.readouterr().out
+
+
+def test_example_own_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
+    from sigmasplat.fit import losses
+
+    monkeypatch.setattr(losses, "TERMS", dict(losses.TERMS))
+    found = example("own_loss").main("15")
+    assert found[-1] < 0.7 * found[0]
+
+
+def test_a_format_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    extra, data = tmp_path / "extra", tmp_path / "data"
+    extra.mkdir()
+    data.mkdir()
+    (extra / "npz_frames.py").write_text((ROOT / "examples" / "npz_frames.py").read_text(encoding="utf-8"))
+    monkeypatch.setattr(sigmasplat.sources, "__path__", [*sigmasplat.sources.__path__, str(extra)])
+    whole = open_source(TINY, limit=3)
+    np.savez(data / "camera.npz", **dataclasses.asdict(whole.camera))
+    for frame, T in zip(whole, whole.truth().T_world_camera, strict=False):  # type: ignore[union-attr]
+        color = np.rint(frame.color * 255).astype(np.uint8)
+        arrays = {"t": frame.timestamp_s, "color": color, "depth_m": frame.depth_m, "T_world_camera": T}
+        np.savez(data / f"{frame.index:06d}.npz", **arrays)
+    formats.cache_clear()
+    try:
+        source = open_source(data)
+        same = [np.array_equal(a.color, b.color) for a, b in zip(source, whole, strict=True)]
+        assert same == [True] * 3 and len(source.truth()) == 3  # type: ignore[arg-type]
+        (data / "000001.npz").write_bytes(b"PK damaged")
+        assert [f.index for f in open_source(data)] == [0, 2]
+    finally:
+        formats.cache_clear()
+        sys.modules.pop("sigmasplat.sources.npz_frames", None)
+
+
+def commands() -> list[str]:
+    """Return every `sigmasplat …` command line of the documents' shell blocks."""
+    lines = [line for path in DOCUMENTS for block in blocks(path, "sh") for line in block.splitlines()]
+    words = [shlex.split(line, comments=True) for line in lines if re.match(r"(\.venv/bin/)?sigmasplat ", line)]
+    return [shlex.join(line) for line in words]
+
+
+def test_there_are_commands_to_check() -> None:
+    assert {line.split()[1] for line in commands()} == set(cli.COMMANDS)
+
+
+@pytest.mark.parametrize("line", commands())
+def test_documented_commands_parse(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def parsed_only(command):
+        @functools.wraps(command)
+        def stand_in(*args, **named):
+            settings, seed = named.get("settings", ()), named.get("seed")
+            cli.configured(named.get("preset", cli.DEFAULT_PRESET), settings, seed)  # names and values exist
+            return 0
+
+        return stand_in
+
+    monkeypatch.setattr(cli, "COMMANDS", {name: parsed_only(command) for name, command in cli.COMMANDS.items()})
+    with pytest.raises(SystemExit) as left:
+        cli.main(shlex.split(line)[1:])
+    assert left.value.code == 0
+
+
+def anchors(path: Path) -> set[str]:
+    """Return the anchors of a document's headings, made as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", prose(path), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@each_document
+def test_links_lead_somewhere(path: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", prose(path)):
+        if target.startswith("http"):
+            continue
+        file, _, anchor = target.partition("#")
+        linked = (path.parent / file).resolve() if file else path
+        assert linked.exists(), f"{path.name} links to {target}, which does not exist"
+        assert not anchor or anchor in anchors(linked), f"{path.name}: no heading for {target}"
+
+
+@each_document
+def test_named_tests_files_and_settings_exist(path: Path) -> None:
+    text = prose(path)
+    for file, name in re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text):
+        assert f"def {name}(" in (ROOT / file).read_text(encoding="utf-8"), f"{path.name} names {file}::{name}"
+    for name in re.findall(r"`((?:native|model|render|fit|slam|sources|io|metrics)/\w+\.\w+)`", text):
+        assert (PACKAGE / name).is_file(), f"{path.name} names {name}"
+    for section, name in re.findall(r"`(input|render|seeding|mapping|tracking)\.([a-z]\w+)`", text):
+        known = {*vars(getattr(Config(), section)), "py"}
+        logged = {"agreement", "overlap", "first_loss", "loss", "cost", "blend"} if path.name == "runs.md" else set()
+        assert name in known | logged or (PACKAGE / section / f"{name}.py").is_file(), f"{path.name}: {section}.{name}"
+    for name in re.findall(r"`((?:varsplat|loopsplat)-(?!NAME|X)[a-z]+)`", text):
+        assert name in list_presets()
+
+
+def test_the_equations_functions_exist() -> None:
+    """Every function beside a file in varsplat.md is defined there."""
+    pairs = re.findall(r"`(\w+/\w+\.py)` ((?:`\w+`(?:, )?)+)", (ROOT / "docs" / "varsplat.md").read_text(encoding="utf-8"))
+    assert len(pairs) > 15
+    for file, names in pairs:
+        tree = ast.parse((PACKAGE / file).read_text(encoding="utf-8"))
+        defined = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+        assert set(re.findall(r"\w+", names)) <= defined, f"varsplat.md: {file} {names}"
+
+
+def test_documented_messages_are_those_of_the_source() -> None:
+    constants = {
+        node.value
+        for file in PACKAGE.rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+    rows = re.findall(r"^\| [^|]+ \| `([^`]+)` \|", (ROOT / "docs" / "errors.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert len(rows) > 35
+    for message in rows:
+        for words in filter(None, (part.strip() for part in message.split("…"))):
+            assert any(words in constant for constant in constants), f"errors.md: no message says {words!r}"
+
+
+def test_measured_tables_have_their_places() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    for name in ("accuracy", "cpu"):
+        assert re.search(rf"<!-- bench:{name} -->\n(.*\n)*?<!-- /bench -->", text)

@@ -1,0 +1,240 @@
+"""Direct alignment: it finds known motions, and its normal equations are those of the residuals it claims to have."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.sources import SyntheticRoom
+
+_core = pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+
+from sigmasplat.fit.align import Pyramid, align, gray_of
+
+Array = NDArray[np.float64]
+CAMERA = Camera(53, 41, 45.0, 47.0, 24.6, 21.3)
+HUGE = 1e6
+MOTION = se3.exp(np.array([0.011, -0.017, 0.013, 0.012, -0.009, 0.015]))
+
+
+@cache
+def room(width: int = 160, height: int = 120) -> SyntheticRoom:
+    return SyntheticRoom(frames=200, width=width, height=height, exposure_change=False)
+
+
+@cache
+def seen(i: int, width: int = 160, height: int = 120) -> Pyramid:
+    frame = room(width, height).frame(i)
+    return Pyramid.of(gray_of(frame.color), frame.depth_m, frame.camera)
+
+
+def motion(i: int, j: int) -> Array:
+    """Return the true T_j_i."""
+    T = room().truth().T_world_camera
+    return se3.inverse(T[j]) @ T[i]
+
+
+def assert_same_pose(found: Array, true: Array, metres: float = 2e-3, degrees: float = 0.1) -> None:
+    off = se3.inverse(true) @ found
+    assert np.linalg.norm(off[:3, 3]) < metres, f"{1e3 * np.linalg.norm(off[:3, 3]):.2f} mm"
+    assert np.rad2deg(se3.rotation_angle(off[:3, :3])) < degrees, f"{np.rad2deg(se3.rotation_angle(off[:3, :3])):.3f}°"
+
+
+@pytest.mark.parametrize("size", [(160, 120), (161, 119), (95, 73)], ids=str)
+@pytest.mark.parametrize(("i", "j"), [(10, 12), (101, 99)])
+def test_a_known_motion_is_found_from_standing_still(i: int, j: int, size: tuple[int, int]) -> None:
+    true = motion(i, j)
+    assert np.linalg.norm(true[:3, 3]) > 0.03
+    found = align(seen(i, *size), seen(j, *size), np.eye(4), iterations=20)
+    assert_same_pose(found.T_live_reference, true, *((2e-3, 0.1) if size[0] > 100 else (4e-3, 0.15)))
+    assert found.agreement > 0.9 and 0.7 < found.overlap <= 1.0
+    assert se3.is_rigid(found.T_live_reference, 1e-9)
+
+
+def test_either_kind_of_residual_finds_the_motion() -> None:
+    for weight_color in (0.0, 1.0):
+        found = align(seen(10), seen(12), np.eye(4), iterations=30, weight_color=weight_color)
+        assert_same_pose(found.T_live_reference, motion(10, 12), 5e-3, 0.2)
+
+
+def test_covariance_is_positive_definite_and_grows_with_the_residual() -> None:
+    covariances = [align(seen(10), seen(j), motion(10, j), 20).covariance for j in (10, 14)]
+    for covariance in covariances:
+        assert np.linalg.eigvalsh(covariance).min() > 0 and np.allclose(covariance, covariance.T)
+    assert np.trace(covariances[1]) > 3 * np.trace(covariances[0])
+
+
+def test_weight_zero_silences_a_part_of_the_reference() -> None:
+    frame = room().frame(10)
+    gray, depth, weight = gray_of(frame.color).copy(), frame.depth_m.copy(), np.ones((120, 160), np.float32)
+    gray[:, :64], weight[:, :64] = np.roll(gray[:, :64], 9, 1), 0.0
+    depth[:, :64] *= np.float32(0.97)
+    silenced, heard = (Pyramid.of(gray, depth, frame.camera, w) for w in (weight, None))
+    assert_same_pose(align(silenced, seen(12), np.eye(4), 20).T_live_reference, motion(10, 12), 3e-3, 0.15)
+    off = se3.inverse(motion(10, 12)) @ align(heard, seen(12), np.eye(4), 20).T_live_reference
+    assert np.linalg.norm(off[:3, 3]) > 6e-3, "the damage must matter, or the test proves nothing"
+
+
+def test_no_motion_leaves_no_residual() -> None:
+    found = align(seen(10), seen(10), np.eye(4))
+    assert np.abs(found.T_live_reference - np.eye(4)).max() < 1e-5
+    assert found.cost < 1e-4 and found.agreement == 1.0 and found.overlap > 0.9
+
+
+@pytest.mark.parametrize("blind", ["reference", "both"])
+def test_without_depth_the_guess_comes_back(blind: str) -> None:
+    frame = room().frame(10)
+    dark = Pyramid.of(gray_of(frame.color), np.zeros_like(frame.depth_m), frame.camera)
+    guess = motion(10, 12)
+    found = align(dark, dark if blind == "both" else seen(12), guess)
+    np.testing.assert_allclose(found.T_live_reference, guess, atol=1e-12)
+    assert found.overlap == 0.0 and found.agreement == 0.0 and np.isfinite(found.covariance).all()
+
+
+def test_views_apart_do_not_agree() -> None:
+    found = align(seen(10), seen(110), np.eye(4))
+    assert np.isfinite(found.T_live_reference).all() and found.agreement * found.overlap < 0.5
+
+
+def test_a_pyramids_camera_looks_through_the_middle_of_each_cell() -> None:
+    frame = room(161, 119).frame(10)
+    rays = [c.rays() for c in seen(10, 161, 119).cameras]
+    assert [r.shape[:2] for r in rays] == [(119, 161), (59, 80), (29, 40)]
+    for fine, coarse in zip(rays, rays[1:], strict=False):
+        h, w = coarse.shape[0] * 2, coarse.shape[1] * 2
+        cells = fine[:h, :w].reshape(h // 2, 2, w // 2, 2, 3).mean((1, 3))
+        np.testing.assert_allclose(coarse, cells, atol=1e-6)
+    assert np.allclose(seen(10, 161, 119).gray[1][3, 5], gray_of(frame.color)[6:8, 10:12].mean(), atol=1e-6)
+
+
+def test_half_depth_never_averages_two_surfaces() -> None:
+    depth = np.full((64, 64), 2.0, np.float32)
+    depth[10, 10], depth[20:, 31:] = 0.0, 3.0
+    p = Pyramid.of(depth, depth, Camera(64, 64, 50.0, 50.0, 31.5, 31.5), levels=2)
+    assert set(np.unique(p.depth[1])) == {0.0, 2.0, 3.0}
+    assert p.depth[1][5, 5] == 0.0 and p.depth[1][5, 6] == 2.0 and p.depth[1][12, 15] == 0.0
+
+
+# ---- one step against an oracle that differentiates its residuals numerically
+
+
+@dataclass
+class Pair:
+    """Two images of a wavy surface, and what one step is told about them."""
+
+    gray: Array
+    depth: Array
+    weight: Array
+    live_gray: Array
+    live_depth: Array
+    T: Array
+    huber_gray: float
+    huber_depth: float
+    colors: float = 0.4
+    depths: float = 0.6
+    gate: float = 0.5
+
+
+def waves(seed: int, size: float, level: float) -> Array:
+    """Draw an image of a few slow sines, exact in float32."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    a = sum(np.sin(rng.uniform(-0.25, 0.25) * u + rng.uniform(-0.25, 0.25) * v + rng.uniform(0, 6)) for _ in range(4))
+    return (level + size * a).astype(np.float32).astype(float)
+
+
+def pair(huber_gray: float = HUGE, huber_depth: float = HUGE, holes: bool = False) -> Pair:
+    depth, live_depth, weight = waves(2, 0.01, 2.0), waves(4, 0.01, 2.02), waves(5, 0.1, 1.0)
+    if holes:
+        rng = np.random.default_rng(6)
+        depth[rng.random(depth.shape) < 0.2] = 0.0
+        live_depth[rng.random(depth.shape) < 0.05] = 0.0
+        live_depth[30:, 40:] += 1.0  # a step, and readings beyond the gate
+        depth[5:9, 5:20] -= 0.7
+    return Pair(waves(1, 0.1, 0.5), depth, weight, waves(3, 0.1, 0.5), live_depth, MOTION, huber_gray, huber_depth)
+
+
+def step(p: Pair, T: Array | None = None) -> tuple[Array, Array, Array]:
+    """Run the kernel: H [6, 6], b [6], sums [4]."""
+    images = [np.ascontiguousarray(x, np.float32) for x in (p.gray, p.depth, p.weight, p.live_gray, p.live_depth)]
+    H, b, sums = np.zeros(21), np.zeros(6), np.zeros(4)
+    _core.align_step(
+        *images, [CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy], p.colors, p.depths, p.huber_gray, p.huber_depth,
+        p.gate, p.T if T is None else T, H, b, sums,
+    )  # fmt: skip
+    full = np.zeros((6, 6))
+    full[np.triu_indices(6)] = H
+    return full + np.triu(full, 1).T, b, sums
+
+
+def bilinear(image: Array, uv: Array) -> Array:
+    return np.asarray(map_coordinates(image, uv[::-1], order=1, mode="nearest"))
+
+
+def warped(p: Pair, T: Array) -> tuple[Array, Array, Array, Array]:
+    """Return pixels [2, N], z [N], gray and depth residuals [N] of every reference pixel, seen or not."""
+    x, y, z = T[:3, :3] @ (CAMERA.rays().reshape(-1, 3) * p.depth.reshape(-1, 1)).T + T[:3, 3:]
+    uv = np.stack([CAMERA.fx * x / z + CAMERA.cx, CAMERA.fy * y / z + CAMERA.cy])
+    return uv, z, bilinear(p.live_gray, uv) - p.gray.ravel(), bilinear(p.live_depth, uv) - z
+
+
+def oracle(p: Pair) -> tuple[Array, Array, Array]:
+    """Compute H, b and sums in float64: weights and masks at p.T, derivatives by central differences."""
+    uv, z, r_gray, r_depth = warped(p, p.T)
+    inside = (uv >= 0).all(0) & (uv[0] < CAMERA.width - 1) & (uv[1] < CAMERA.height - 1) & (p.depth.ravel() > 0)
+    corner = np.floor(np.where(inside, uv, 0)).astype(int)
+    cells = np.stack([p.live_depth[corner[1] + b, corner[0] + a] for a in (0, 1) for b in (0, 1)])
+    read = inside & (cells.min(0) > 0)
+    agrees = read & (np.abs(r_depth) < p.gate)
+    smooth = agrees & (np.ptp(cells, axis=0) < 0.03 * z)
+    colored = inside & (agrees | ~read)
+    width = p.huber_depth * z**2
+    w_gray = colored * p.weight.ravel() * p.colors / p.huber_gray**2 * np.minimum(1, p.huber_gray / np.abs(r_gray))
+    w_depth = smooth * p.weight.ravel() * p.depths / width**2 * np.minimum(1, width / np.abs(r_depth))
+    J = []
+    for e in 1e-6 * np.eye(6):
+        ahead, behind = warped(p, se3.exp(e) @ p.T), warped(p, se3.exp(-e) @ p.T)
+        J.append([(ahead[k] - behind[k]) / 2e-6 for k in (2, 3)])
+    Jg, Jd = (np.stack([row[k] for row in J]) for k in (0, 1))
+    cost = (w_gray * r_gray**2 + w_depth * r_depth**2).sum()
+    sums = np.array([cost, colored.sum(), read.sum(), agrees.sum()])
+    return (Jg * w_gray) @ Jg.T + (Jd * w_depth) @ Jd.T, (Jg * w_gray) @ r_gray + (Jd * w_depth) @ r_depth, sums
+
+
+@pytest.mark.parametrize("holes", [False, True], ids=["whole", "holes"])
+@pytest.mark.parametrize("huber", [(HUGE, HUGE), (0.05, 0.004)], ids=["quadratic", "huber"])
+@pytest.mark.parametrize("kinds", [(1.0, 0.0), (0.0, 1.0), (0.4, 0.6)], ids=["gray", "depth", "both"])
+def test_normal_equations_are_those_of_the_residuals(kinds: tuple[float, float], huber: Any, holes: bool) -> None:
+    p = pair(*huber, holes)
+    p.colors, p.depths = kinds
+    (H, b, sums), (want_H, want_b, want_sums) = step(p), oracle(p)
+    np.testing.assert_array_equal(sums[1:], want_sums[1:])
+    assert sums[1] > 800 and (not holes or sums[1] > sums[3] + 20 < sums[2])
+    assert sums[0] == pytest.approx(want_sums[0], rel=1e-4)
+    assert np.linalg.norm(b - want_b) < 1e-3 * np.linalg.norm(want_b)
+    assert np.linalg.norm(H - want_H) < 1e-3 * np.linalg.norm(want_H)
+    assert np.linalg.eigvalsh(H).min() > 0
+
+
+def test_gray_gradient_is_half_the_derivative_of_the_cost_itself() -> None:
+    p = pair(huber_gray=1e3)
+    p.colors, p.depths = 1.0, 0.0
+    # Only pixels far from the border, so that the sums at both ends run over the same pixels.
+    p.weight[:8], p.weight[-8:], p.weight[:, :8], p.weight[:, -8:] = 0.0, 0.0, 0.0, 0.0
+    b, derivative = step(p)[1], []
+    for e in 3e-4 * np.eye(6):
+        ahead, behind = (step(p, se3.exp(sign * e) @ p.T)[2][0] for sign in (1, -1))
+        derivative.append((ahead - behind) / 6e-4)
+    assert np.linalg.norm(2 * b - derivative) < 2e-2 * np.linalg.norm(derivative)
+
+
+def test_a_reference_behind_the_camera_contributes_nothing() -> None:
+    away = np.diag([-1.0, 1.0, -1.0, 1.0])
+    H, b, sums = step(pair(), away)
+    assert not H.any() and not b.any() and not sums.any()
