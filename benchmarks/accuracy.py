@@ -20,6 +20,7 @@ import record
 import tables
 import tyro
 
+import sigmasplat
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.options import Settings
 from sigmasplat.presets import default_preset, override, preset as preset_of, split_settings
@@ -34,7 +35,7 @@ RUNS = record.ROOT / "runs" / "bench"
 class Options:
     """Run SLAM on sequences × presets × seeds and sum up what each run was worth."""
 
-    sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths; synthetic has 200 frames")] = SOURCES
+    sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = SOURCES
     presets: Annotated[tuple[str, ...], arg(help="settings to start from")] = (default_preset(),)
     seeds: Annotated[tuple[int, ...], arg(help="starts of the random numbers, a run each")] = (0, 1, 2)
     settings: Settings = ()
@@ -86,7 +87,7 @@ def located(name: str) -> str:
 
 def jobs_of(options: Options) -> list[Job]:
     """List the jobs, source by source. Raises ConfigError on an unknown preset or setting."""
-    code = record.code_digest()
+    code = record.code_digest(Path(sigmasplat.__file__).parent, record.RUNNING)
     jobs = [
         Job(Path(source).name, located(source), preset, seed, options.settings, options.limit, code)
         for source in options.sources
@@ -138,7 +139,7 @@ def _last_line(output: Path) -> str:
 
 
 def figures_of(metrics: dict[str, Any]) -> dict[str, float | None]:
-    """Pick the figures of a run's metrics.json under the names of `accuracy_tables.FIGURES`; None where there is none."""
+    """Pick a run's figures from its metrics.json, under the names of `accuracy_tables`; None where there is none."""
     ate, rpe = metrics.get("ate") or {}, metrics.get("rpe") or {}
     picked: dict[str, float | None] = {
         "ate_m": ate.get("rmse_m"),

@@ -65,10 +65,12 @@ def mean_std(values: list[float]) -> tuple[float, float | None]:
 
 
 def spread(values: list[float]) -> str:
-    """Write mean ± standard deviation; a dash without values."""
+    """Write mean ± standard deviation; a count that never differs as it is, a dash without values."""
     if not values:
         return "–"
     mean, std = mean_std(values)
+    if mean.is_integer() and not std:
+        return f"{mean:.0f}"
     return significant(mean) + ("" if std is None else f" ± {significant(std, 2)}")
 
 

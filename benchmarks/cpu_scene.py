@@ -16,8 +16,8 @@ from sigmasplat.render import render
 from sigmasplat.render.view import CpuView, ReferenceView
 
 PAIR_PIXELS = 400
-REFERENCE_WIDTH, REFERENCE_BACKWARD_SPLATS = 80, 2_000
-"""Plain torch holds every (pixel, splat) pair, so its backward pass gets fewer."""
+REFERENCE_WIDTH, REFERENCE_BACKWARD_SHARE = 80, 10
+"""Plain torch holds every (pixel, splat) pair for its backward pass, so that gets a tenth of the splats."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def compare_reference(request: Request, splats: int) -> dict[str, Any]:
     """Time plain torch and the kernels on the same small work: forward, and forward with the full backward pass."""
     set_up(request.isas[0], max(request.threads))
     whole = make_scene(request.path, request.index, splats, REFERENCE_WIDTH, request.seed)
-    part = make_scene(request.path, request.index, REFERENCE_BACKWARD_SPLATS, REFERENCE_WIDTH, request.seed)
+    part = make_scene(request.path, request.index, splats // REFERENCE_BACKWARD_SHARE, REFERENCE_WIDTH, request.seed)
     compared = []
     for name, scene, backward, runs in (("forward", whole, False, 3), ("forward + backward", part, True, 3)):
         kernels = timed(_passes(CpuView(scene.camera, RENDER), scene, backward), request.runs)

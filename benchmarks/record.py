@@ -18,7 +18,10 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 MEASURED = ("src", "CMakeLists.txt", "benchmarks", ":!benchmarks/results", ":!benchmarks/*.md")
 """What the figures depend on, as git path specifications."""
-CODE = (".py", ".cpp", ".h")
+SOURCES, RUNNING = (".py", ".cpp", ".h"), (".py", ".h", ".so")
+"""Endings of what a checkout is made of, and of what runs where the package is installed."""
+LOAD_AVERAGE = round(os.getloadavg()[0], 2)
+"""Of the minute before the program started: near 0 where the machine was left alone."""
 
 
 def data_root() -> Path:
@@ -38,18 +41,27 @@ def machine_slug(described: dict[str, Any]) -> str:
 
 def commit() -> dict[str, Any]:
     """Return the checkout's commit and whether code differs from it; both None outside git."""
-    head = machine.git_commit()
+    head = _git("rev-parse", "--verify", "HEAD")
     if head is None:
         return {"commit": None, "dirty": None}
-    command = ["git", "-C", str(ROOT), "status", "--porcelain", "--untracked-files=no", "--", *MEASURED]
-    changed = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
-    return {"commit": head, "dirty": bool(changed)}
+    return {"commit": head, "dirty": bool(_git("status", "--porcelain", "--untracked-files=no", "--", *MEASURED))}
 
 
-def code_digest(folder: Path = ROOT / "src") -> str:
-    """Digest every source file of a folder, names and bytes: equal digests mean equal code, committed or not."""
+def _git(*words: str) -> str | None:
+    """Return what git says of the checkout, None if it cannot."""
+    try:
+        answer = subprocess.run(
+            ["git", "-C", str(ROOT), *words], capture_output=True, text=True, timeout=20, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return answer.stdout.strip()
+
+
+def code_digest(folder: Path, endings: Sequence[str] = SOURCES) -> str:
+    """Digest the files of a folder with these endings, names and bytes: equal digests mean equal code."""
     digest = hashlib.sha256()
-    for path in sorted(p for p in folder.rglob("*") if p.suffix in CODE):
+    for path in sorted(p for p in folder.rglob("*") if p.suffix in endings):
         digest.update(str(path.relative_to(folder)).encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()[:16]
 
@@ -62,9 +74,9 @@ def results(
         "name": name or benchmark,
         "benchmark": benchmark,
         "machine": machine.describe(),
-        "load_average_1min": round(os.getloadavg()[0], 2),
+        "load_average_before": LOAD_AVERAGE,
         **commit(),
-        "code": code_digest(),
+        "code": code_digest(ROOT / "src"),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "seeds": list(seeds),
         "config": config,

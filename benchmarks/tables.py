@@ -2,7 +2,7 @@
 
 A document holds <!-- bench:NAME --> … <!-- /bench -->, or bench:NAME/SECTION for one table of several;
 `python benchmarks/tables.py` rewrites what stands between, in README.md and docs/*.md. NAME is that of the results
-(the newest of any machine) or the whole file name without .json; SECTION is a heading of the full table in lower case.
+(the newest of any machine) or the whole file name without .json; SECTION is a table's title, as in path-and-speed.
 """
 
 import importlib
@@ -58,23 +58,30 @@ def sections(measured: dict[str, Any]) -> list[Section]:
 
 
 def table(measured: dict[str, Any], section: str | None = None) -> str:
-    """Write results as markdown: every table, or the one whose title is `section`. Raises KeyError if there is none."""
-    made = {s.title.lower(): s for s in sections(measured)}
-    chosen = list(made.values()) if section is None else [made[section]]
+    """Write results as markdown: every table, or the one `section` names. Raises KeyError if there is none."""
+    made = {record.slug(s.title): s for s in sections(measured)}
+    if section is not None and section not in made:
+        raise KeyError(f"results {measured['name']!r} have no table {section!r} (there are {', '.join(made)})")
+    chosen = [s for name, s in made.items() if section in (None, name)]
     return "\n".join([f"{headline(measured)}\n", *(s.markdown() for s in chosen)])
 
 
-def rewritten(text: str, folder: Path = record.RESULTS) -> str:
-    """Return a document with every block replaced by its table. Raises KeyError for a block without results."""
+def rewritten(text: str, folder: Path = record.RESULTS) -> tuple[str, list[str]]:
+    """Return a document with every block replaced by its table, and the names of blocks left as they were: no results.
+
+    Raises KeyError for a table that the results do not have.
+    """
+    missing: list[str] = []
 
     def block(match: re.Match[str]) -> str:
         name, _, section = match["what"].partition("/")
         measured = record.latest(name, folder)
         if measured is None:
-            raise KeyError(f"no results {name!r} in {folder}")
+            missing.append(name)
+            return match[0]
         return f"{match[1]}{table(measured, section or None)}{match[4]}"
 
-    return BLOCK.sub(block, text)
+    return BLOCK.sub(block, text), missing
 
 
 Check = Annotated[bool, tyro.conf.arg(help="change nothing; exit 1 if a document is out of date")]
@@ -82,20 +89,22 @@ Check = Annotated[bool, tyro.conf.arg(help="change nothing; exit 1 if a document
 
 def main(check: Check = False) -> int:
     """Rewrite the benchmark tables of README.md and docs/*.md from benchmarks/results/*.json."""
-    stale = 0
+    wrong = 0
     for path in [record.ROOT / "README.md", *sorted((record.ROOT / "docs").glob("*.md"))]:
         before = path.read_text(encoding="utf-8") if path.exists() else ""
         try:
-            after = rewritten(before)
+            after, missing = rewritten(before)
         except KeyError as problem:
             print(f"{path.name}: {problem.args[0]}", file=sys.stderr)
             return 2
+        for name in missing:
+            print(f"{path.name}: no results {name!r} yet, the block is left as it is", file=sys.stderr)
+        wrong += len(missing) + (after != before)
         if after != before:
-            stale += 1
             print(f"{'out of date' if check else 'rewritten'}: {path.relative_to(record.ROOT)}")
             if not check:
                 path.write_text(after, encoding="utf-8")
-    return int(check and stale > 0)
+    return int(check and wrong > 0)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Read a folder of .npz files as an RGB-D sequence: a whole dataset format in one file.
 
 camera.npz      width, height, fx, fy, cx, cy
-000000.npz …    t (seconds), color (uint8 [H, W, 3]), depth_m (float [H, W], 0 = no reading), optional T_world_camera [4, 4]
+000000.npz …    t (seconds), color (uint8 [H, W, 3]), depth_m (float [H, W], 0 = no reading); T_world_camera if known
 
 Copy this file into src/sigmasplat/sources/ and `sigmasplat run FOLDER` knows the format; nothing else is to be told.
 """

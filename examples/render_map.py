@@ -2,8 +2,8 @@
 
 python examples/render_map.py RUN [PICTURE.png] [ROW]      RUN a run folder, ROW a row of its trajectory (default: 0)
 
-What is drawn right is √V averaged over the channels: black = sure, bright = unsure. Where the map is empty (A < ½) V says
-nothing; those pixels are slate.
+Right is √V, V averaged over the channels: black = sure, bright = unsure. Where the map is empty (A < ½) V says nothing;
+those pixels are slate.
 """
 
 import sys

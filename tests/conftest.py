@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import sigmasplat  # noqa: F401 - before any test imports torch: idle OpenMP threads then sleep (sigmasplat.env), 5× faster
+
 TINY_SIZE = (32, 24)  # width, height
 TINY_DEPTH_M = 2.0
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -9,13 +10,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from sigmasplat.fit.align import Pyramid, align, gray_of
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources import SyntheticRoom
 
 _core = pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
-
-from sigmasplat.fit.align import Pyramid, align, gray_of
 
 Array = NDArray[np.float64]
 CAMERA = Camera(53, 41, 45.0, 47.0, 24.6, 21.3)
@@ -98,15 +98,16 @@ def test_without_depth_the_guess_comes_back(blind: str) -> None:
 
 
 def test_views_apart_do_not_agree() -> None:
-    found = align(seen(10), seen(110), np.eye(4))
-    assert np.isfinite(found.T_live_reference).all() and found.agreement * found.overlap < 0.5
+    apart, near = (align(seen(10), seen(j), np.eye(4)) for j in (110, 12))
+    assert np.isfinite(apart.T_live_reference).all()
+    assert apart.agreement * apart.overlap < 0.7 * near.agreement * near.overlap
 
 
 def test_a_pyramids_camera_looks_through_the_middle_of_each_cell() -> None:
     frame = room(161, 119).frame(10)
     rays = [c.rays() for c in seen(10, 161, 119).cameras]
     assert [r.shape[:2] for r in rays] == [(119, 161), (59, 80), (29, 40)]
-    for fine, coarse in zip(rays, rays[1:], strict=False):
+    for fine, coarse in pairwise(rays):
         h, w = coarse.shape[0] * 2, coarse.shape[1] * 2
         cells = fine[:h, :w].reshape(h // 2, 2, w // 2, 2, 3).mean((1, 3))
         np.testing.assert_allclose(coarse, cells, atol=1e-6)

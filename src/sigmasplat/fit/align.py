@@ -17,9 +17,10 @@ Image = NDArray[np.float32]
 Matrix = NDArray[np.float64]
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-HUBER_GRAY = 0.02
-HUBER_DEPTH_RELATIVE = 0.003
-"""Width of the depth residual's quadratic part as a share of z²: structured light's noise (Khoshelham 2012)."""
+HUBER_GRAY = (0.02, 0.05, 0.1)
+"""Width of the gray residual's quadratic part, from the finest level up: far from the answer all of them are large."""
+HUBER_DEPTH_RELATIVE = (0.003, 0.006, 0.012)
+"""The same for depth, times z² (m): from a structured-light sensor's noise (Khoshelham & Elberink 2012) up."""
 DEPTH_GATES_M = (0.1, 0.2, 0.4)
 """Depth residuals beyond are other surfaces; from the finest level up."""
 MIN_PIXELS = 60
@@ -104,11 +105,12 @@ def align(
     full = np.eye(6)
     for level in reversed(range(len(reference.cameras))):
         c = reference.cameras[level]
+        huber_depth = HUBER_DEPTH_RELATIVE[min(level, 2)]
         for _ in range(iterations):
             _core.align_step(
                 reference.gray[level], reference.depth[level], reference.weight[level], live.gray[level],
-                live.depth[level], [c.fx, c.fy, c.cx, c.cy], weight_color, 1.0 - weight_color, HUBER_GRAY,
-                HUBER_DEPTH_RELATIVE, DEPTH_GATES_M[min(level, 2)], T, H, b, sums,
+                live.depth[level], [c.fx, c.fy, c.cx, c.cy], weight_color, 1.0 - weight_color,
+                HUBER_GRAY[min(level, 2)], huber_depth, DEPTH_GATES_M[min(level, 2)], T, H, b, sums,
             )  # fmt: skip
             steps += 1
             if sums[1] < MIN_PIXELS:

@@ -44,7 +44,7 @@ class Target:
 
 @dataclass(eq=False)
 class Keyframe:
-    """A target with the pose it was seen from, T_world_camera float64 [4, 4]; the map may move it unless it is `fixed`."""
+    """A target with the pose it was seen from, T_world_camera float64 [4, 4]; mapping may move it unless `fixed`."""
 
     index: int
     target: Target

@@ -75,7 +75,8 @@ def make_splats(
     """Unproject the chosen pixels to splats: opacity and colour from settings and image, isotropic scale, σ² = e⁻⁷.
 
     Scale follows the distance to the 3 nearest neighbours, old and new; or, with `scale_from` "pixel", a pixel's size
-    at that depth times `spacing_px`, how far seeds lie apart. New points closer than `min_distance_m` to an old splat are dropped.
+    at that depth times `spacing_px`, how far seeds lie apart. New points closer than `min_distance_m` to an old splat
+    are dropped.
     """
     depth = target.depth_image.numpy()[pixels].astype(np.float64)
     points = target.camera.rays()[pixels] * depth[:, None] * PUSH_BACK

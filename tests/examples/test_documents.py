@@ -1,0 +1,94 @@
+"""What the documents say is true: links lead somewhere; files, functions, tests, settings and messages exist."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from documents import DOCUMENTS, ROOT, prose
+from sigmasplat.config import Config
+from sigmasplat.presets import list_presets, preset
+
+PACKAGE = ROOT / "src" / "sigmasplat"
+each_document = pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+
+
+def anchors(path: Path) -> set[str]:
+    """Return the anchors of a document's headings, made as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", prose(path), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@each_document
+def test_links_lead_somewhere(path: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", prose(path)):
+        if target.startswith("http"):
+            continue
+        file, _, anchor = target.partition("#")
+        linked = (path.parent / file).resolve() if file else path
+        assert linked.exists(), f"{path.name} links to {target}, which does not exist"
+        assert not anchor or anchor in anchors(linked), f"{path.name}: no heading for {target}"
+
+
+@each_document
+def test_named_tests_files_and_settings_exist(path: Path) -> None:
+    text = prose(path)
+    for file, name in re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text):
+        assert f"def {name}(" in (ROOT / file).read_text(encoding="utf-8"), f"{path.name} names {file}::{name}"
+    for name in re.findall(r"`((?:native|model|render|fit|slam|sources|io|metrics)/\w+\.\w+)`", text):
+        assert (PACKAGE / name).is_file(), f"{path.name} names {name}"
+    for section, name in re.findall(r"`(input|render|seeding|mapping|tracking)\.([a-z]\w+)`", text):
+        known = {*vars(getattr(Config(), section)), "py"}
+        logged = {"agreement", "overlap", "first_loss", "loss", "iterations"} if path.name == "runs.md" else set()
+        assert name in known | logged or (PACKAGE / section / f"{name}.py").is_file(), f"{path.name}: {section}.{name}"
+    for name in re.findall(r"`((?:varsplat|loopsplat)-(?!NAME|X)[a-z]+)`", text):
+        assert name in list_presets()
+
+
+def test_the_equations_functions_exist() -> None:
+    """Every function beside a file in varsplat.md is defined there."""
+    text = (ROOT / "docs" / "varsplat.md").read_text(encoding="utf-8")
+    pairs = re.findall(r"`(\w+/\w+\.py)` ((?:`\w+`(?:, )?)+)", text)
+    assert len(pairs) > 15
+    for file, names in pairs:
+        tree = ast.parse((PACKAGE / file).read_text(encoding="utf-8"))
+        defined = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+        assert set(re.findall(r"\w+", names)) <= defined, f"varsplat.md: {file} {names}"
+
+
+def test_the_fast_presets_table_is_whole() -> None:
+    """docs/varsplat.md says of every number in which fast differs from the paper's what it is, and why."""
+    tum, fast = preset("varsplat-tum").to_dict(), preset("varsplat-fast").to_dict()
+    differing = {
+        f"{section}.{name}": (str(value), str(fast[section][name]))
+        for section, values in tum.items()
+        if isinstance(values, dict)
+        for name, value in values.items()
+        if fast[section][name] != value
+    }
+    text = (ROOT / "docs" / "varsplat.md").read_text(encoding="utf-8")
+    table = text.partition("**`varsplat-fast` against `varsplat-tum`**")[2].partition("ScanNet++")[0]
+    rows = re.findall(r"^\| `([\w.]+)` \| (\S+) \| (\S+) \| .+ \|$", table, re.MULTILINE)
+    assert {name: (theirs, ours) for name, theirs, ours in rows} == differing
+
+
+def test_documented_messages_are_those_of_the_source() -> None:
+    constants = {
+        node.value
+        for file in PACKAGE.rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+    text = (ROOT / "docs" / "errors.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| [^|]+ \| (`[^|]+`) \|", text, re.MULTILINE)
+    assert len(rows) > 40
+    for message in re.findall(r"`([^`]+)`", "\n".join(rows)):
+        for words in filter(None, (part.strip() for part in message.split("…"))):
+            assert any(words in constant for constant in constants), f"errors.md: no message says {words!r}"
+
+
+def test_measured_tables_have_their_places() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    for name in ("accuracy", "cpu"):
+        assert re.search(rf"<!-- bench:{name} -->\n(.*\n)*?<!-- /bench -->", text)

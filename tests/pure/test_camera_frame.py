@@ -1,0 +1,118 @@
+"""The camera and the frame: rays survive resizing, bad images are refused at the border, depth is never averaged."""
+
+import numpy as np
+import pytest
+
+from sigmasplat.errors import ConfigError, SourceError
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.frame import Frame
+
+CAMERA = Camera(8, 6, 7.0, 6.5, 3.2, 2.9)
+
+
+def frame(camera: Camera = CAMERA, seed: int = 0) -> Frame:
+    rng = np.random.default_rng(seed)
+    size = (camera.height, camera.width)
+    color, depth = rng.uniform(0, 1, (*size, 3)), rng.uniform(0.05, 9.0, size)
+    return Frame(3, 0.5, color.astype(np.float32), depth.astype(np.float32), camera)
+
+
+def test_rays_go_through_pixel_centres_at_whole_numbers() -> None:
+    rays = CAMERA.rays()
+    assert rays.shape == (6, 8, 3) and rays.dtype == np.float32
+    np.testing.assert_allclose(rays[4, 5], [(5 - 3.2) / 7.0, (4 - 2.9) / 6.5, 1.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(4, 3), (16, 12), (2, 2), (24, 6)])
+def test_a_resized_camera_keeps_the_edges_of_the_image(size: tuple[int, int]) -> None:
+    """The outer edges of the corner pixels lie on the same rays at every size."""
+    small = CAMERA.resized(*size)
+    for c in (CAMERA, small):
+        assert (c.width, c.height) == (size if c is small else (8, 6))
+    for old, new in ((-0.5, -0.5), (8 - 0.5, size[0] - 0.5)):
+        assert (new - small.cx) / small.fx == pytest.approx((old - CAMERA.cx) / CAMERA.fx)
+    for old, new in ((-0.5, -0.5), (6 - 0.5, size[1] - 0.5)):
+        assert (new - small.cy) / small.fy == pytest.approx((old - CAMERA.cy) / CAMERA.fy)
+
+
+def test_half_the_size_looks_through_the_middle_of_four_pixels() -> None:
+    cells = CAMERA.rays().reshape(3, 2, 4, 2, 3).mean((1, 3))
+    np.testing.assert_allclose(CAMERA.resized(4, 3).rays(), cells, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "numbers", [(0, 6, 7.0, 7.0), (8, -1, 7.0, 7.0), (8, 6, 0.0, 7.0), (8, 6, 7.0, -7.0), (8, 6, np.nan, 7.0)]
+)
+def test_an_impossible_camera_is_refused(numbers: tuple[int, int, float, float]) -> None:
+    with pytest.raises(ConfigError, match="not a camera"):
+        Camera(*numbers, 3.5, 2.5)
+    with pytest.raises(ConfigError):
+        Camera(8, 6, 7.0, 7.0, np.inf, 2.5)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("image", ["colour", "depth"])
+def test_values_that_are_no_numbers_are_refused(image: str, value: float) -> None:
+    color, depth = np.zeros((6, 8, 3), np.float32), np.ones((6, 8), np.float32)
+    (color if image == "colour" else depth)[2, 3] = value
+    with pytest.raises(SourceError, match=f"frame 7: {image} holds NaN or inf"):
+        Frame(7, 0.0, color, depth, CAMERA)
+
+
+def test_negative_depth_is_refused_and_zero_is_not() -> None:
+    color, depth = np.zeros((6, 8, 3), np.float32), np.zeros((6, 8), np.float32)
+    Frame(0, 0.0, color, depth.copy(), CAMERA)
+    depth[1, 1] = -0.25
+    with pytest.raises(SourceError, match=r"frame 0: depth is negative \(-0\.250 m\)"):
+        Frame(0, 0.0, color, depth, CAMERA)
+
+
+@pytest.mark.parametrize(
+    ("color", "depth"),
+    [((6, 8, 3), (8, 6)), ((8, 6, 3), (6, 8)), ((6, 8), (6, 8)), ((6, 8, 4), (6, 8)), ((3, 4, 3), (3, 4))],
+)
+def test_sizes_that_differ_are_refused(color: tuple[int, ...], depth: tuple[int, ...]) -> None:
+    with pytest.raises(SourceError, match="the camera says 8×6"):
+        Frame(0, 0.0, np.zeros(color, np.float32), np.ones(depth, np.float32), CAMERA)
+
+
+def test_a_frame_cannot_be_written_to() -> None:
+    f = frame()
+    with pytest.raises(ValueError):
+        f.depth_m[0, 0] = 1.0
+    with pytest.raises(ValueError):
+        f.color[0, 0, 0] = 1.0
+
+
+def test_resizing_averages_colour_over_the_area_and_picks_depth() -> None:
+    f = frame()
+    small = f.resized(4, 3)
+    np.testing.assert_allclose(small.color, f.color.reshape(3, 2, 4, 2, 3).mean((1, 3)), atol=1e-6)
+    cells = f.depth_m.reshape(3, 2, 4, 2).transpose(0, 2, 1, 3).reshape(3, 4, 4)
+    assert (cells == small.depth_m[..., None]).any(-1).all(), "each depth is one of the four readings"
+    assert small.camera == CAMERA.resized(4, 3) and (small.index, small.timestamp_s) == (3, 0.5)
+    assert f.resized(8, 6) is f
+
+
+def test_prepared_takes_out_of_range_readings_away() -> None:
+    f = frame()
+    out = f.prepared(0, 1.0, 4.0)
+    keep = (f.depth_m >= 1.0) & (f.depth_m <= 4.0)
+    assert 0 < keep.sum() < keep.size
+    np.testing.assert_array_equal(out.depth_m, np.where(keep, f.depth_m, 0.0))
+    np.testing.assert_array_equal(out.color, f.color)
+    assert out.camera == CAMERA
+    assert (f.prepared(0, 0.0, 100.0).depth_m == f.depth_m).all()
+
+
+def test_prepared_keeps_the_bounds_and_the_holes() -> None:
+    depth = np.tile(np.array([0.0, 0.99, 1.0, 2.0, 4.0, 4.01, 0.0, 3.0], np.float32), (6, 1))
+    out = Frame(0, 0.0, np.zeros((6, 8, 3), np.float32), depth, CAMERA).prepared(0, 1.0, 4.0)
+    np.testing.assert_array_equal(out.depth_m[0], np.array([0, 0, 1, 2, 4, 0, 0, 3], np.float32))
+
+
+@pytest.mark.parametrize(("width", "height"), [(4, 3), (16, 12), (6, 4)])
+def test_prepared_sets_the_width_and_keeps_the_proportion(width: int, height: int) -> None:
+    out = frame().prepared(width, 0.1, 8.0)
+    assert (out.camera.width, out.camera.height) == (width, height) and out.depth_m.shape == (height, width)
+    assert out.camera.fx == pytest.approx(7.0 * width / 8)

@@ -1,0 +1,122 @@
+"""The field: one row per splat, edited once for parameters and both moments; carried rigidly with what it shows."""
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from sigmasplat.config import RenderConfig
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import COLUMNS, WIDTH, GaussianField, quaternion_of, quaternion_product
+from sigmasplat.render import render
+
+CAMERA = Camera(33, 21, 30.0, 31.0, 15.2, 10.7)
+
+
+def numbered(n: int, first: int) -> GaussianField:
+    """Make rows in which every value says whose it is: row + a tenth per tensor."""
+    rows = torch.arange(first, first + n).float()[:, None].repeat(1, WIDTH)
+    return GaussianField(rows.clone(), rows + 0.1, rows + 0.2)
+
+
+def assert_rows(field: GaussianField, rows: list[int]) -> None:
+    want = torch.tensor(rows).float()[:, None].repeat(1, WIDTH)
+    for tensor, off in ((field.params, 0.0), (field.moment1, 0.1), (field.moment2, 0.2)):
+        torch.testing.assert_close(tensor, want + off)
+    assert len(field) == len(rows)
+
+
+def test_columns_cover_every_parameter_once() -> None:
+    taken = [k for columns in COLUMNS.values() for k in range(columns.start, columns.stop)]
+    assert taken == list(range(WIDTH))
+
+
+def test_append_and_keep_edit_all_three_together() -> None:
+    field = numbered(4, 0)
+    field.append(numbered(3, 10))
+    assert_rows(field, [0, 1, 2, 3, 10, 11, 12])
+    field.keep(torch.tensor([True, False, False, True, False, True, True]))
+    assert_rows(field, [0, 3, 11, 12])
+    field.keep(torch.tensor([3, 1]))
+    assert_rows(field, [12, 3])
+    field.keep(torch.zeros(2, dtype=torch.bool))
+    assert_rows(field, [])
+    field.append(numbered(2, 5))
+    assert_rows(field, [5, 6])
+
+
+def test_new_rows_start_without_moments() -> None:
+    field = numbered(2, 0)
+    field.append(GaussianField(torch.full((1, WIDTH), 7.0)))
+    assert torch.count_nonzero(field.moment1[2]) == 0 and torch.count_nonzero(field.moment2[2]) == 0
+    assert len(GaussianField.empty()) == 0
+
+
+@pytest.mark.parametrize("shape", [(3, 16), (17,), (2, 3, 17)])
+def test_another_shape_is_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(SigmaSplatError, match=r"params \[N, 17\]"):
+        GaussianField(torch.zeros(shape))
+
+
+def random_field(n: int = 40, seed: int = 0) -> GaussianField:
+    rng = np.random.default_rng(seed)
+    means = torch.as_tensor(rng.uniform([-1, -0.7, 1.0], [1, 0.7, 3.0], (n, 3))).float()
+    scales, colors, quats = (torch.as_tensor(x).float() for x in (
+        rng.uniform(0.02, 0.3, (n, 3)), rng.uniform(0, 1, (n, 3)), rng.normal(size=(n, 4))
+    ))  # fmt: skip
+    opacities, s = torch.as_tensor(rng.uniform(0.2, 0.9, n)).float(), torch.as_tensor(rng.uniform(-7, -2, (n, 3)))
+    return GaussianField.from_values(means, scales, colors, quats=quats, opacities=opacities, log_variances=s.float())
+
+
+def test_values_come_back_activated() -> None:
+    rng = np.random.default_rng(1)
+    means, scales, colors = (torch.as_tensor(rng.uniform(0.1, 0.9, (5, 3))).float() for _ in range(3))
+    field = GaussianField.from_values(means, scales, colors, opacities=0.3)
+    torch.testing.assert_close(field.scales, scales)
+    torch.testing.assert_close(field.opacities, torch.full((5,), 0.3))
+    torch.testing.assert_close(field.variances, torch.full((5, 3), float(np.exp(-7.0))))
+    assert torch.equal(field.means, means) and torch.equal(field.colors, colors)
+    assert torch.equal(field.quats, torch.tensor([[1.0, 0, 0, 0]]).repeat(5, 1))
+    balls = GaussianField.from_values(means, scales[:, 0], colors)
+    torch.testing.assert_close(balls.scales, scales[:, :1].repeat(1, 3))
+
+
+def picture(field: GaussianField, T_camera_world: Tensor) -> list[Tensor]:
+    r = render(field, CAMERA, T_camera_world, options=RenderConfig(), backend="reference")
+    return [r.color, r.depth, r.alpha, r.variance]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_moved_carries_what_is_seen(seed: int) -> None:
+    """A camera that moves along sees the same: the render at T·M⁻¹ of the field moved by M."""
+    field = random_field(seed=seed)
+    M = se3.exp(np.random.default_rng(seed).normal(size=6))
+    moved = field.moved(torch.as_tensor(M))
+    before, after = picture(field, torch.eye(4)), picture(moved, torch.as_tensor(se3.inverse(M)).float())
+    for a, b in zip(before, after, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=2e-4)
+        assert float((a - b).norm()) < 1e-4 * float(a.norm())
+    stayed = picture(moved, torch.eye(4))
+    assert float((before[0] - stayed[0]).norm()) > 0.1 * float(before[0].norm())
+
+
+def test_moved_leaves_looks_shapes_and_the_original_alone() -> None:
+    field, M = random_field(), se3.exp(np.array([0.3, -0.2, 0.5, 0.4, -0.8, 0.2]))
+    field.steps = 12
+    original, moved = field.params.clone(), field.moved(torch.as_tensor(M))
+    assert torch.equal(field.params, original)
+    assert torch.equal(moved.params[:, 7:], original[:, 7:]) and moved.steps == 12
+    back = moved.moved(torch.as_tensor(se3.inverse(M)))
+    torch.testing.assert_close(back.means, field.means, rtol=0, atol=1e-6)
+    torch.testing.assert_close(moved.quats.norm(dim=1), field.quats.norm(dim=1))
+    moved.moment1 += 1.0
+    assert torch.count_nonzero(field.moment1) == 0
+
+
+def test_quaternion_products_compose_rotations() -> None:
+    rng = np.random.default_rng(0)
+    A, b = se3.exp(rng.normal(size=6))[:3, :3], rng.normal(size=(6, 4))
+    product = quaternion_product(quaternion_of(torch.as_tensor(A)), torch.as_tensor(b)).numpy()
+    np.testing.assert_allclose(se3.rotation_from_quaternion(product), A @ se3.rotation_from_quaternion(b), atol=1e-12)
