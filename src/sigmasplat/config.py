@@ -71,6 +71,8 @@ class MappingConfig:
 
     every: int = 1
     """A keyframe is mapped every so many frames."""
+    overlap_below: float = 0.0
+    """… and as soon as a frame shares less than this with the newest keyframe; 0 = off."""
     iterations: int = 100
     first_iterations: int = 100
     newest_probability: float = 0.4
@@ -106,8 +108,10 @@ class TrackingConfig:
     iterations: int = 200
     align_iterations: int = 8
     """Gauss–Newton steps at most, per pyramid level."""
-    align_renders: int = 1
-    """How often the map is rendered anew at the pose found so far, and aligned to again."""
+    align_to: Literal["keyframe", "map"] = "keyframe"
+    """keyframe: the newest keyframe's own image, weighed by V; map: the map rendered at the predicted pose."""
+    align_stop: float = 1e-4
+    """A level is done when a step is below this (metres and radians)."""
     align_weight_color: float = 0.5
     """Share of the gray residual against depth when aligning."""
     lr_rotation: float = 2e-3
@@ -128,6 +132,8 @@ class TrackingConfig:
     """When the first loss exceeds this multiple of its running median: odometry start and twice the iterations."""
     exposure: bool = False
     lr_exposure: float = 0.01
+    lost_agreement: float = 0.6
+    """Lost when less than this share of the surfaces that map and sensor have in common agrees in depth."""
     lost_share: float = 0.2
     """Lost when the map agrees with less than this share of what the sensor sees (agreement × overlap)."""
     update_stop: float = 0.0

@@ -120,16 +120,22 @@ def align(
             T = se3.exp(update) @ T
             if np.abs(update).max() < update_stop:
                 break
-    used = max(sums[1], 1.0)
     reference_pixels = max(int((reference.depth[0] > 0).sum()), 1)
     return Alignment(
         se3.orthonormalise(T),
         agreement=float(sums[3] / max(sums[2], 1.0)),
         overlap=float(sums[2] / reference_pixels),
-        covariance=np.linalg.pinv(full) * (sums[0] / used),
-        cost=float(sums[0] / used),
+        covariance=_covariance(full, sums),
+        cost=float(sums[0] / max(sums[1], 1.0)),
         steps=steps,
     )
+
+
+def _covariance(information: Matrix, sums: Matrix) -> Matrix:
+    """Invert the normal matrix and scale it by the mean squared residual; infinite where nothing was in common."""
+    if sums[1] < MIN_PIXELS:
+        return np.diag(np.full(6, np.inf))
+    return np.asarray(np.linalg.pinv(information) * (sums[0] / sums[1]))
 
 
 def _symmetric(upper: Matrix) -> Matrix:

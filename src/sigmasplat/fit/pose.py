@@ -1,6 +1,6 @@
 """fit_pose: move one camera, the field fixed. By the papers' Adam through the renderer, or by aligning to a render."""
 
-from dataclasses import dataclass, field as dataclass_field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from sigmasplat.fit.align import LUMA, Pyramid, align
 from sigmasplat.fit.confidence import outlier_mask, uncertainty_weights
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
+from sigmasplat.render.pose_gradient import pose_gradient
 from sigmasplat.render.render import variance_of
 from sigmasplat.render.view import View
 
@@ -24,7 +25,7 @@ ALIGN_ALPHA = 0.95
 class PoseFit:
     """T_camera_world; agreement: share of pixels seen by both map and sensor whose depths agree; overlap: share of
     sensor readings where the map has a surface; first and last loss; iterations; covariance [6, 6] of the left twist or
-    None; exposure (a, b) of exp(a)·Ĉ + b; numbers worth logging."""
+    None; exposure (a, b) of exp(a)·Ĉ + b."""
 
     T_camera_world: Matrix
     agreement: float
@@ -34,7 +35,6 @@ class PoseFit:
     iterations: int
     covariance: Matrix | None = None
     exposure: tuple[float, float] = (0.0, 0.0)
-    numbers: dict[str, float] = dataclass_field(default_factory=dict)
 
 
 @dataclass(eq=False)
@@ -127,7 +127,7 @@ def fit_pose_adam(
             best, best_T, best_exposure = loss, pose.copy(), tuple(exposure.detach().tolist())
         twist = view.backward(params, None)
         optimiser.zero_grad()
-        T.backward(_pose_gradient(T, twist))  # type: ignore[no-untyped-call]
+        T.backward(pose_gradient(T, twist))  # type: ignore[no-untyped-call]
         exposure.grad = g_exposure
         before = motion.detach().clone()
         optimiser.step()
@@ -156,49 +156,59 @@ def _motion(quaternion_translation: Tensor) -> Tensor:
     return torch.stack([torch.stack(row) for row in rows])
 
 
-def _pose_gradient(T: Tensor, twist: Matrix) -> Tensor:
-    from sigmasplat.render.cpu import pose_gradient
+@dataclass(eq=False)
+class Reference:
+    """An image with depth and pixel weights to align others to, and where it was seen from, T_camera_world [4, 4]."""
 
-    return pose_gradient(T, twist)
+    pyramid: Pyramid
+    T_camera_world: Matrix
 
 
-def fit_pose_align(
-    params: Tensor, view: View, target: Target, live: Pyramid, T_camera_world: Matrix, config: TrackingConfig
-) -> PoseFit:
-    """Render the map at the guess and align the live image to that by Gauss–Newton (`fit.align`), once or a few times.
-
-    Pixels count by A and by w̃ (mean over channels), where the map is opaque; the map's colour and depth are C/A, D/A.
-    """
-    first = float("nan")
-    steps = 0
-    for _ in range(max(config.align_renders, 1)):
-        reference = render_reference(params, view, T_camera_world, config)
-        first = first if steps else depth_difference(reference, target)
-        found = align(reference, live, np.eye(4), config.align_iterations, config.align_weight_color)
-        T_camera_world = found.T_live_reference @ T_camera_world
-        steps += found.steps
+def fit_pose_align(reference: Reference, live: Pyramid, T_camera_world: Matrix, config: TrackingConfig) -> PoseFit:
+    """Align the live image to a reference by Gauss–Newton (`fit.align`), from a first guess."""
+    guess = T_camera_world @ se3.inverse(reference.T_camera_world)
+    found = align(reference.pyramid, live, guess, config.align_iterations, config.align_weight_color, config.align_stop)
     return PoseFit(
-        T_camera_world, found.agreement, found.overlap, first, found.cost, steps, covariance=found.covariance
+        found.T_live_reference @ reference.T_camera_world,
+        found.agreement,
+        found.overlap,
+        float("nan"),
+        found.cost,
+        found.steps,
+        covariance=found.covariance,
     )
 
 
-def render_reference(params: Tensor, view: View, T_camera_world: Matrix, config: TrackingConfig) -> Pyramid:
-    """Render the map as an image to align to: gray, depth where it is opaque, and a weight that falls with V."""
+def map_reference(params: Tensor, view: View, T_camera_world: Matrix, config: TrackingConfig) -> Reference:
+    """Render the map as a reference: gray C/A and depth D/A where it is opaque, weighed by w̃ (VarSplat §3)."""
     view.forward(params, T_camera_world)
     maps = PoseMaps.of(view)
     opaque = maps.alpha > ALIGN_ALPHA
     divisor = maps.alpha.clamp(min=0.5)
     gray = (maps.color @ torch.from_numpy(LUMA)) / divisor
     surface = torch.where(opaque, maps.depth / divisor, 0.0)
-    weight = None
-    if config.uncertainty and maps.variance is not None:
-        weight = uncertainty_weights(maps.variance, opaque, config.tau, config.weight_max).mean(-1).numpy()
-    return Pyramid.of(gray.numpy(), surface.numpy(), view.camera, weight)
+    pyramid = Pyramid.of(gray.numpy(), surface.numpy(), view.camera, _confidence(maps, opaque, config))
+    return Reference(pyramid, T_camera_world)
 
 
-def depth_difference(reference: Pyramid, target: Target) -> float:
-    """Average |rendered − measured| depth in metres where both exist: how wrong the first guess was."""
-    surface, measured = reference.depth[0], target.depth_image.numpy()
-    both = (surface > 0) & (measured > 0)
-    # numpy, for torch splits long sums between threads and the last digits would depend on how many there are.
-    return float(np.abs(surface - measured)[both].mean()) if both.any() else 0.0
+def keyframe_reference(
+    params: Tensor, view: View, image: Pyramid, T_camera_world: Matrix, config: TrackingConfig
+) -> Reference:
+    """Take a keyframe's own image as a reference, each pixel weighed by w̃ of the map seen from there (VarSplat §3).
+
+    The sensor's surface is unbiased where a young map still renders too near; the map says which pixels to trust.
+    """
+    if not config.uncertainty:
+        return Reference(image, T_camera_world)
+    view.forward(params, T_camera_world)
+    maps = PoseMaps.of(view)
+    weight = _confidence(maps, maps.alpha > ALIGN_ALPHA, config)
+    return Reference(Pyramid.of(image.gray[0], image.depth[0], view.camera, weight), T_camera_world)
+
+
+def _confidence(maps: PoseMaps, opaque: Tensor, config: TrackingConfig) -> NDArray[np.float32] | None:
+    """Average w̃ over the channels, [H, W]; where the map is thin, V says nothing and the weight is 1."""
+    if not config.uncertainty or maps.variance is None:
+        return None
+    weight = uncertainty_weights(maps.variance, opaque, config.tau, config.weight_max).mean(-1)
+    return np.asarray(torch.where(opaque, weight, 1.0).numpy())

@@ -12,6 +12,7 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.errors import BackendError
 from sigmasplat.model.camera import Camera
 from sigmasplat.native import _core
+from sigmasplat.render.pose_gradient import pose_gradient
 from sigmasplat.render.reference import FRUSTUM_MARGIN, Blended, Projection
 
 FEATURES_AT_ONCE = 16
@@ -59,20 +60,6 @@ def view_numbers(
     numbers = [camera.fx, camera.fy, camera.cx, camera.cy, *T[:3, :3].ravel(), *T[:3, 3]]
     numbers += [options.near_m, options.low_pass_px2, *limits, camera.width, camera.height, *map(float, switches)]
     return np.array(numbers, dtype)
-
-
-def pose_gradient(T_camera_world: Tensor, twist: NDArray[np.float64]) -> Tensor:
-    """Express a left-twist gradient (ρ, φ) as a [4, 4] matrix gradient with the same value along every rigid motion.
-
-    <G, [φ]× R | φ×t + ρ> = ρ·g_ρ + φ·g_φ for G = (½ [g_φ − t × g_ρ]× R | g_ρ).
-    """
-    T = T_camera_world.detach().double().numpy()
-    g_rho, g_phi = twist[:3], twist[3:]
-    a = 0.5 * (g_phi - np.cross(T[:3, 3], g_rho))
-    G = np.zeros((4, 4))
-    G[:3, :3] = np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]]) @ T[:3, :3]
-    G[:3, 3] = g_rho
-    return torch.as_tensor(G, dtype=T_camera_world.dtype)
 
 
 def _float32(name: str, value: Tensor) -> Tensor:

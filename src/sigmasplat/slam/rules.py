@@ -10,14 +10,14 @@ from sigmasplat.fit.pose import PoseFit
 Item = TypeVar("Item")
 
 
-def is_keyframe(index: int, every: int) -> bool:
-    """Tell whether a frame is mapped: every so many frames, the first always (VarSplat §2)."""
-    return index % max(every, 1) == 0
+def is_keyframe(frames_since: int, every: int, overlap: float, overlap_below: float) -> bool:
+    """Tell whether a frame is mapped: so many frames after the last one (VarSplat §2), or when too little is shared."""
+    return frames_since >= every or overlap < overlap_below
 
 
-def is_lost(fit: PoseFit, least_share: float) -> bool:
-    """Tell whether the map explains too little of what the sensor sees for the pose to be believed."""
-    return fit.agreement * fit.overlap < least_share
+def is_lost(fit: PoseFit, least_agreement: float, least_share: float) -> bool:
+    """Tell whether a pose is not to be believed: the surfaces in common disagree, or there are too few of them."""
+    return fit.agreement < least_agreement or fit.agreement * fit.overlap < least_share
 
 
 def jumped(value: float, history: Sequence[float], factor: float) -> bool:

@@ -82,9 +82,9 @@ class Slam:
         else:
             T_world_camera, tracking = self._track(view, target, live, seconds)
         lost = self.tracker.lost
-        mapped = first or (is_keyframe(len(self.steps), self.config.mapping.every) and not lost)
+        mapped = first or (not lost and self._is_keyframe(tracking["overlap"]))
         if mapped:
-            T_world_camera = self._map(view, target, T_world_camera, seconds)
+            T_world_camera = self._map(view, target, live, T_world_camera, seconds)
         newest = self.mapper.keyframes[-1]
         relative = se3.inverse(newest.T_world_camera) @ T_world_camera
         self._relative.append((len(self.mapper.keyframes) - 1, se3.orthonormalise(relative)))
@@ -117,6 +117,10 @@ class Slam:
             raise SourceError(f"frame {frame.index} comes from another camera ({frame.camera}) than the first")
         return self._view
 
+    def _is_keyframe(self, overlap: float) -> bool:
+        c = self.config.mapping
+        return is_keyframe(len(self.steps) - self.mapper.keyframes[-1].index, c.every, overlap, c.overlap_below)
+
     def _begin(self, frame: Frame, live: Pyramid) -> NDArray[np.float64]:
         if not (frame.depth_m > 0).any():
             raise SourceError(
@@ -134,12 +138,17 @@ class Slam:
         seconds["track"] = time.perf_counter() - clock
         numbers = {
             "agreement": fit.agreement, "overlap": fit.overlap, "first_loss": fit.first_loss,
-            "loss": fit.loss, "iterations": float(fit.iterations), **fit.numbers,
+            "loss": fit.loss, "iterations": float(fit.iterations),
         }  # fmt: skip
         return se3.inverse(fit.T_camera_world), numbers
 
     def _map(
-        self, view: View, target: Target, T_world_camera: NDArray[np.float64], seconds: dict[str, float]
+        self,
+        view: View,
+        target: Target,
+        live: Pyramid,
+        T_world_camera: NDArray[np.float64],
+        seconds: dict[str, float],
     ) -> NDArray[np.float64]:
         """Map a keyframe; return its pose, which mapping may have moved."""
         clock = time.perf_counter()
@@ -147,5 +156,5 @@ class Slam:
         seconds["map"] = time.perf_counter() - clock
         seconds.update({f"map_{stage}": s for stage, s in fit.seconds.items()})
         T_world_camera = self.mapper.keyframes[-1].T_world_camera
-        self.tracker.previous = T_world_camera
+        self.tracker.keep_keyframe(self.field, view, live, T_world_camera)
         return T_world_camera

@@ -7,7 +7,14 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.align import Pyramid, align
-from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
+from sigmasplat.fit.pose import (
+    PoseFit,
+    Reference,
+    fit_pose_adam,
+    fit_pose_align,
+    keyframe_reference,
+    map_reference,
+)
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
@@ -21,12 +28,13 @@ DOUBT = 0.7
 
 @dataclass(eq=False)
 class Tracker:
-    """Remembers the last two poses, the last image, and how well tracking usually goes."""
+    """Remembers the last two poses, the last image, the newest keyframe, and how well tracking usually goes."""
 
     config: TrackingConfig
     previous: Matrix = dataclass_field(default_factory=lambda: np.eye(4))
     velocity: Matrix = dataclass_field(default_factory=lambda: np.eye(4))
     last_image: Pyramid | None = None
+    keyframe: Reference | None = None
     agreements: list[float] = dataclass_field(default_factory=list)
     first_losses: list[float] = dataclass_field(default_factory=list)
     lost: bool = False
@@ -44,7 +52,7 @@ class Tracker:
         fit = self._fit(field, view, target, live, predicted, self.config.iterations)
         if self._doubtful(fit):
             fit = self._retry(field, view, target, live, fit)
-        self.lost = is_lost(fit, self.config.lost_share)
+        self.lost = is_lost(fit, self.config.lost_agreement, self.config.lost_share)
         fit.T_camera_world = se3.orthonormalise(fit.T_camera_world)
         T_world_camera = se3.inverse(fit.T_camera_world)
         if self.lost:
@@ -61,9 +69,12 @@ class Tracker:
         self, field: GaussianField, view: View, target: Target, live: Pyramid, guess: Matrix, iterations: int
     ) -> PoseFit:
         T_camera_world = se3.inverse(guess)
-        if self.config.method == "align":
-            return fit_pose_align(field.params, view, target, live, T_camera_world, self.config)
-        return fit_pose_adam(field.params, view, target, T_camera_world, self.config, iterations)
+        if self.config.method == "adam":
+            return fit_pose_adam(field.params, view, target, T_camera_world, self.config, iterations)
+        if self.config.align_to == "keyframe" and self.keyframe is not None:
+            return fit_pose_align(self.keyframe, live, T_camera_world, self.config)
+        reference = map_reference(field.params, view, T_camera_world, self.config)
+        return fit_pose_align(reference, live, T_camera_world, self.config)
 
     def _doubtful(self, fit: PoseFit) -> bool:
         usual = float(np.median(self.agreements[-50:])) if self.agreements else 1.0
@@ -71,14 +82,19 @@ class Tracker:
         return worse or jumped(fit.first_loss, self.first_losses, self.config.reinit_factor)
 
     def _retry(self, field: GaussianField, view: View, target: Target, live: Pyramid, fit: PoseFit) -> PoseFit:
-        """Start again from odometry with twice the iterations (VarSplat §3), and from standing still; keep the best."""
-        starts = [self.previous]
+        """Start again from odometry with twice the iterations (VarSplat §3), and from standing still; keep the best.
+
+        Aligning also tries the map seen from there: it knows more than the newest keyframe.
+        """
         odometry = self._odometry(live)
-        if odometry is not None:
-            starts.insert(0, odometry)
+        starts = [self.previous] if odometry is None else [odometry, self.previous]
         fits = [fit] + [self._fit(field, view, target, live, s, 2 * self.config.iterations) for s in starts]
+        if self.config.method == "align":
+            for start in starts:
+                reference = map_reference(field.params, view, se3.inverse(start), self.config)
+                fits.append(fit_pose_align(reference, live, se3.inverse(start), self.config))
         best = max(fits, key=lambda f: f.agreement * f.overlap)
-        if is_lost(best, self.config.lost_share):
+        if is_lost(best, self.config.lost_agreement, self.config.lost_share):
             best.T_camera_world = se3.inverse(starts[0])
         return best
 
@@ -87,8 +103,17 @@ class Tracker:
         if self.last_image is None:
             return None
         guesses = (se3.inverse(self.velocity), np.eye(4))
-        found = [align(self.last_image, live, g, 2 * self.config.align_iterations) for g in guesses]
+        found = [
+            align(self.last_image, live, g, 2 * self.config.align_iterations, self.config.align_weight_color)
+            for g in guesses
+        ]
         best = max(found, key=lambda a: a.agreement * a.overlap)
         if best.agreement * best.overlap < self.config.lost_share:
             return None
         return np.asarray(self.previous @ se3.inverse(best.T_live_reference))
+
+    def keep_keyframe(self, field: GaussianField, view: View, live: Pyramid, T_world_camera: Matrix) -> None:
+        """Take note of a freshly mapped keyframe: where mapping left its pose, and its image as the next reference."""
+        self.previous = T_world_camera
+        if self.config.method == "align" and self.config.align_to == "keyframe":
+            self.keyframe = keyframe_reference(field.params, view, live, se3.inverse(T_world_camera), self.config)
