@@ -10,11 +10,11 @@ import torch
 from scenes import Scene
 from torch import Tensor
 
-from sigmasplat.config import RenderConfig, TrackingConfig
+from sigmasplat.config import RenderConfig
 from sigmasplat.fit import losses
 from sigmasplat.fit.align import Pyramid, gray_of
 from sigmasplat.fit.field import fit_field
-from sigmasplat.fit.pose import fit_pose_adam, fit_pose_align, tracking_gradient
+from sigmasplat.fit.pose import fit_pose_adam, fit_pose_align, keyframe_reference, map_reference, tracking_gradient
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model.field import GaussianField
 from sigmasplat.native import _core
@@ -81,9 +81,11 @@ class Works:
         self.reference = self.target.depth.contiguous()
         self.numbers = cpu.view_numbers(scene.camera, np.eye(4), RENDER)
         self.grad = torch.zeros_like(self.params)
-        self.tracking, self.mapping = TrackingConfig(), preset(default_preset()).mapping
+        chosen = preset(default_preset())
+        self.tracking, self.mapping = chosen.tracking, chosen.mapping
         self.exposure = torch.zeros(2)
-        self.live = Pyramid.of(gray_of(scene.later.color), scene.later.depth_m, scene.camera)
+        self.image, self.live = (Pyramid.of(gray_of(f.color), f.depth_m, f.camera) for f in (scene.frame, scene.later))
+        self.keyframe = keyframe_reference(self.params, self.view, self.image, np.eye(4), self.tracking)
         self.masked_target = self.target.color * (self.target.depth > 0)
         self.color = 0.9 * self.masked_target
         self.cache = torch.zeros(_core.ssim_cache_floats(scene.camera.width, scene.camera.height))
@@ -145,9 +147,18 @@ class Works:
         """Halve a live frame twice for tracking."""
         Pyramid.of(gray_of(self.scene.later.color), self.scene.later.depth_m, self.scene.camera)
 
+    def keyframe_reference(self) -> None:
+        """Make a keyframe the reference that later frames are aligned to: once per keyframe, its render included."""
+        keyframe_reference(self.params, self.view, self.image, np.eye(4), self.tracking)
+
     def track_align(self) -> None:
-        """Track the later frame by Gauss–Newton, its render included."""
-        fit_pose_align(self.params, self.view, self.later, self.live, np.eye(4), self.tracking)
+        """Track the later frame by Gauss–Newton on the keyframe's image: what each frame costs, nothing rendered."""
+        fit_pose_align(self.keyframe, self.live, np.eye(4), self.tracking)
+
+    def track_align_map(self) -> None:
+        """Track the later frame by Gauss–Newton on the map seen from the guess, its render included."""
+        reference = map_reference(self.params, self.view, np.eye(4), self.tracking)
+        fit_pose_align(reference, self.live, np.eye(4), self.tracking)
 
     def track_adam(self) -> None:
         """Track the later frame by 60 Adam iterations, as the papers do."""
@@ -164,7 +175,8 @@ class Works:
 
 
 ALWAYS = (
-    "forward_all", "forward", "forward_color_depth", "pose_only", "backward", "ssim", "pyramid", "track_align",
+    "forward_all", "forward", "forward_color_depth", "pose_only", "backward", "ssim", "pyramid", "keyframe_reference",
+    "track_align", "track_align_map",
 )  # fmt: skip
 """What is timed on every instruction set and number of threads; mapping_iteration joins them."""
 ONCE = ("ssim_torch", "track_adam")

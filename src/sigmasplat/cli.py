@@ -21,6 +21,7 @@ from sigmasplat.options import (
     OutFolder,
     Overwrite,
     PresetName,
+    Profile,
     RunPath,
     Seed,
     Settings,
@@ -71,6 +72,7 @@ def run(
     strict: Strict = False,
     seed: Seed = None,
     evaluate: Evaluate = True,
+    profile: Profile = False,
 ) -> int:
     """Run SLAM on a sequence: trajectory, map, uncertainty, report.
 
@@ -88,7 +90,7 @@ def run(
         screen.warn(warning)
     folder = new_folder(out, config, source, overwrite, source_path=_absolute(path), stride=stride, limit=limit)
     screen.say(f"{source.name}: {len(source)} frames, {config.name} → {folder.path}")
-    return _record(screen, config, source, folder, evaluate)
+    return _record(screen, config, source, folder, evaluate, profile)
 
 
 def evaluate_run(run: RunPath, moved_to: MovedSource = None) -> int:
@@ -154,7 +156,9 @@ def configured(preset: str, settings: Sequence[str], seed: int | None) -> Config
     return config if seed is None else override(config, {"seed": str(seed)})
 
 
-def _record(screen: "Screen", config: Config, source: "Source", folder: "RunFolder", evaluate: bool) -> int:
+def _record(
+    screen: "Screen", config: Config, source: "Source", folder: "RunFolder", evaluate: bool, profile: bool
+) -> int:
     """Run SLAM into the folder, then score it; return the exit code."""
     from sigmasplat.session import record
     from sigmasplat.slam.slam import Slam
@@ -162,6 +166,8 @@ def _record(screen: "Screen", config: Config, source: "Source", folder: "RunFold
     _prepare_torch()
     with screen.steps(len(source)) as watch:
         outcome = record(Slam(config), source, folder, watch)
+    if profile:
+        screen.profile(folder.read_profile())
     if source.skipped:
         screen.warn(f"{len(source.skipped)} unreadable images passed over (first: {source.skipped[0]})")
     counts = f"{outcome.frames} frames, {outcome.lost} lost, {outcome.frames / outcome.wall_s:.1f} frames/s"

@@ -82,8 +82,6 @@ class MappingConfig:
     weight_isotropy: float = 1.0
     weight_nll_color: float = 1e-4
     weight_nll_depth: float = 0.0
-    weight_moment: float = 0.0
-    """Weight of the depth-variance map U about the sensor depth (CG-SLAM's L_var)."""
     lr_means: float = 1e-4
     lr_quats: float = 1e-3
     lr_log_scales: float = 5e-3

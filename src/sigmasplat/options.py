@@ -29,6 +29,7 @@ Overwrite = Annotated[bool, arg(help="replace what is there", help_behavior_hint
 Limit = Annotated[int | None, arg(metavar="N", help="take at most N frames", help_behavior_hint="(default: all)")]
 Stride = Annotated[int, arg(metavar="N", help="take every N-th frame")]
 Strict = Annotated[bool, arg(help="stop at an unreadable image, do not pass it over", help_behavior_hint="")]
+Profile = Annotated[bool, arg(help="print where the time went", help_behavior_hint="")]
 Evaluate = Annotated[bool, arg(name="eval", help="make no metrics and no report", help_behavior_hint="")]
 MovedSource = Annotated[
     str | None,

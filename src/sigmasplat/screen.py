@@ -1,7 +1,7 @@
 """Show a run on a terminal, or as plain lines where there is none."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -10,6 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from sigmasplat.metrics.report import headline, number
+from sigmasplat.profile import shares
 from sigmasplat.session import Stepped
 
 PLAIN_LINES_EVERY_S = 10.0
@@ -63,6 +64,15 @@ class Screen:
         if lost:
             frames = metrics.get("frames")
             self.say(f"tracking was LOST on {len(lost)} of {frames} frames: {_ranges(lost)}; do not trust those poses")
+
+    def profile(self, seconds: Mapping[str, float]) -> None:
+        """Print where the time went, a stage a line."""
+        table = Table("stage", "seconds", "share")
+        for column in table.columns[1:]:
+            column.justify = "right"
+        for stage, spent, share in shares(seconds):
+            table.add_row(stage, f"{spent:.2f}", f"{share:.1%}")
+        self.out.print(table)
 
 
 def _console(stderr: bool) -> Console:

@@ -19,6 +19,7 @@ from sigmasplat.io.runs import RunFolder
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.profile import profile
 from sigmasplat.sources.base import Source
 
 
@@ -107,7 +108,7 @@ def record(
         raise
     finally:
         wall_s = time.perf_counter() - tally.started_s
-        _save(slam, run, tally.frames)
+        _save(slam, run, tally.frames, wall_s)
         run.note(status=status, wall_s=wall_s, skipped=source.skipped)
     return Outcome(status, tally.frames, tally.lost, wall_s)
 
@@ -153,13 +154,14 @@ def log_line(step: Stepped) -> dict[str, Any]:
     }
 
 
-def _save(slam: Stepper, run: RunFolder, frames: int) -> None:
+def _save(slam: Stepper, run: RunFolder, frames: int, wall_s: float) -> None:
     """Write what the frames so far have made."""
     if frames == 0:
         return
     run.write_trajectory(slam.trajectory())
     run.write_map(slam.field)
     run.write_checkpoint(slam.checkpoint(), {"frames": str(frames)})
+    run.write_profile(profile(run.read_log(), wall_s))
 
 
 @contextmanager

@@ -18,7 +18,7 @@ FLOORS = [
     ["sources"],
     ["io"],
     ["metrics"],
-    ["evaluate", "session", "screen", "doctor", "options", "cli", "__init__"],
+    ["evaluate", "profile", "session", "screen", "doctor", "options", "cli", "__init__"],
 ]
 STOREY = {name: storey for storey, names in enumerate(FLOORS) for name in names}
 # Sources, results and scores know nothing of how SLAM decides, though they stand below it.

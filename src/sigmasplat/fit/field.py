@@ -60,7 +60,8 @@ def fit_field(
     fit, rates, weights = FieldFit(), rates or Rates.of(config), loss_weights(config)
     pose_rates = np.repeat([config.lr_pose_translation, config.lr_pose_rotation], 3)
     compiled = isinstance(view, CpuView)
-    gradients = CompiledLoss(view) if compiled else TorchLoss(view)
+    fused = compiled and {name for name, weight in weights.items() if weight} <= COMPILED_TERMS
+    gradients = CompiledLoss(view) if fused else TorchLoss(view)
     grad = torch.zeros_like(field.params)
     for keyframe in keyframes:
         field.steps += 1
@@ -112,6 +113,10 @@ class TorchLoss:
         loss = weight * losses.isotropy(GaussianField(leaf).scales)
         grad += torch.autograd.grad(loss, (leaf,))[0]
         return float(loss.detach())
+
+
+COMPILED_TERMS = {"l1", "ssim", "depth", "nll_color", "nll_depth", "isotropy"}
+"""What `CompiledLoss` knows; with any other term in play the whole loss goes through `TorchLoss`."""
 
 
 class CompiledLoss:

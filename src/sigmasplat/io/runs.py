@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,14 +23,14 @@ from sigmasplat.model.trajectory import Trajectory
 PROGRAM = "sigmasplat"
 FILES = (
     "config.json", "run.json", "trajectory.txt", "map.ply", "checkpoint.safetensors", "log.jsonl", "metrics.json",
-    "report.html",
+    "profile.json", "report.html",
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class RunFolder:
     """One run on disk: config.json, run.json (source, version, machine, status), log.jsonl (a line per frame),
-    trajectory.txt, map.ply, checkpoint.safetensors, metrics.json, report.html, images/.
+    trajectory.txt, map.ply, checkpoint.safetensors, profile.json, metrics.json, report.html, images/.
 
     Every file but the log is replaced whole; the log grows by whole lines. So an interrupted run can still be read.
     """
@@ -158,6 +159,7 @@ class RunFolder:
         own = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in tensors.items()}
         with replacing(self.path / "checkpoint.safetensors") as temporary:
             save_file(own, temporary, metadata)
+            temporary.chmod(0o666 & ~_umask())  # safetensors makes it private
 
     def read_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, str]]:
         """Read checkpoint.safetensors: tensors and text. Raises RunError if it is missing or damaged."""
@@ -171,6 +173,14 @@ class RunFolder:
     def write_metrics(self, metrics: dict[str, Any]) -> None:
         """Write metrics.json; nan and inf become null."""
         self._write_json("metrics.json", metrics)
+
+    def write_profile(self, seconds: dict[str, float]) -> None:
+        """Write profile.json: seconds by stage."""
+        self._write_json("profile.json", seconds)
+
+    def read_profile(self) -> dict[str, float]:
+        """Read profile.json. Raises RunError if it is missing or damaged."""
+        return self._read_json("profile.json")
 
     def read_metrics(self) -> dict[str, Any]:
         """Read metrics.json. Raises RunError if it is missing or damaged."""
@@ -220,3 +230,9 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return str(value) if isinstance(value, Path) else value
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -22,6 +22,9 @@ from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.rules import is_keyframe
 from sigmasplat.slam.tracker import Tracker
 
+KERNELS = ("project", "sort", "blend", "blend_backward", "project_backward")
+"""What `View.seconds` counts, in its order."""
+
 
 @dataclass(frozen=True, eq=False)
 class Step:
@@ -71,6 +74,7 @@ class Slam:
         i = self.config.input
         frame = frame.prepared(i.width, i.min_depth_m, i.max_depth_m)
         view = self._view_for(frame)
+        before = view.seconds.copy()
         target = Target.of(frame, (view.sums.shape[1], view.sums.shape[2]))
         live = Pyramid.of(gray_of(frame.color), frame.depth_m, frame.camera)
         seconds = {"prepare": time.perf_counter() - clock}
@@ -89,6 +93,7 @@ class Slam:
         relative = se3.inverse(newest.T_world_camera) @ T_world_camera
         self._relative.append((len(self.mapper.keyframes) - 1, se3.orthonormalise(relative)))
 
+        seconds |= dict(zip(KERNELS, (view.seconds - before).tolist(), strict=True))
         step = Step(
             frame.index, frame.timestamp_s, T_world_camera, mapped, lost, tracking, len(self.field),
             seconds | {"total": time.perf_counter() - clock},
@@ -103,6 +108,7 @@ class Slam:
             "params": self.field.params,
             "moment1": self.field.moment1,
             "moment2": self.field.moment2,
+            "adam_steps": torch.tensor(self.field.steps),
             "timestamps_s": torch.from_numpy(path.timestamps_s),
             "T_world_camera": torch.from_numpy(path.T_world_camera),
             "keyframes": torch.tensor([k.index for k in self.mapper.keyframes], dtype=torch.int64),
@@ -134,8 +140,10 @@ class Slam:
         self, view: View, target: Target, live: Pyramid, seconds: dict[str, float]
     ) -> tuple[NDArray[np.float64], dict[str, float]]:
         clock = time.perf_counter()
+        before = view.seconds.sum()
         fit = self.tracker.track(self.field, view, target, live)
         seconds["track"] = time.perf_counter() - clock
+        seconds["track_kernels"] = float(view.seconds.sum() - before)
         numbers = {
             "agreement": fit.agreement, "overlap": fit.overlap, "first_loss": fit.first_loss,
             "loss": fit.loss, "iterations": float(fit.iterations),
