@@ -1,0 +1,94 @@
+"""The rules of slam/: each is a question with a known answer on either side of its bound."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from sigmasplat.fit.pose import PoseFit
+from sigmasplat.slam.rules import draw_keyframes, is_keyframe, is_lost, jumped
+
+NAN = float("nan")
+
+
+def fit(agreement: float, overlap: float) -> PoseFit:
+    return PoseFit(np.eye(4), agreement, overlap, NAN, 0.0, 1)
+
+
+@pytest.mark.parametrize(
+    ("frames_since", "overlap", "yes"),
+    [(4, 1.0, False), (5, 1.0, True), (6, 1.0, True), (1, 0.71, False), (1, 0.69, True), (1, 0.0, True)],
+)
+def test_a_keyframe_is_due_after_so_many_frames_or_when_too_little_is_shared(
+    frames_since: int, overlap: float, yes: bool
+) -> None:
+    assert is_keyframe(frames_since, 5, overlap, 0.7) is yes
+
+
+def test_overlap_zero_switches_that_rule_off() -> None:
+    assert not is_keyframe(1, 5, 0.0, 0.0)
+    assert is_keyframe(1, 1, 1.0, 0.0), "every frame, as TUM's preset has it"
+
+
+@pytest.mark.parametrize(
+    ("agreement", "overlap", "lost"),
+    [
+        (0.95, 0.90, False),
+        (0.59, 1.00, True),  # the surfaces in common disagree
+        (0.61, 1.00, False),
+        (0.99, 0.15, True),  # too few are in common
+        (0.99, 0.25, False),
+        (0.61, 0.30, True),  # both middling: their product counts
+        (0.00, 0.00, True),
+    ],
+)
+def test_a_pose_is_lost_by_disagreement_or_by_too_little_in_common(
+    agreement: float, overlap: float, lost: bool
+) -> None:
+    assert is_lost(fit(agreement, overlap), 0.6, 0.2) is lost
+
+
+def test_a_loss_jumps_against_the_median_of_its_recent_past() -> None:
+    assert jumped(5.1, [1.0] * 5, 5.0) and not jumped(4.9, [1.0] * 5, 5.0)
+    assert not jumped(1e9, [1.0] * 4, 5.0), "four values are no habit yet"
+    assert jumped(5.1, [1.0, 1.0, 1.0, 900.0, 900.0], 5.0), "outliers do not move the median"
+    assert jumped(5.1, [100.0] * 60 + [1.0] * 50, 5.0), "only the last fifty count"
+    assert not jumped(NAN, [NAN] * 9, 5.0), "aligning has no first loss: the rule is silent"
+
+
+def shares(keyframes: int, newest_probability: float, history: int = 0, draws: int = 20_000) -> dict[int, float]:
+    found = Counter(draw_keyframes(range(keyframes), draws, newest_probability, history, np.random.default_rng(0)))
+    return {keyframe: count / draws for keyframe, count in found.items()}
+
+
+def test_the_newest_keyframe_is_drawn_with_its_probability_and_the_others_alike() -> None:
+    found = shares(5, 0.4)
+    expected = {4: 0.4} | dict.fromkeys(range(4), 0.15)
+    assert set(found) == set(expected)
+    for keyframe, share in expected.items():
+        error = np.sqrt(share * (1 - share) / 20_000)
+        assert abs(found[keyframe] - share) < 4 * error, f"keyframe {keyframe}: {found[keyframe]} for {share}"
+
+
+def test_history_leaves_out_what_is_older() -> None:
+    assert set(shares(9, 0.4, history=3)) == {5, 6, 7, 8}
+    assert set(shares(3, 0.4, history=5)) == {0, 1, 2}
+    assert shares(9, 0.4, history=3)[8] == pytest.approx(0.4, abs=0.02)
+
+
+@pytest.mark.parametrize(("keyframes", "probability"), [(1, 0.0), (1, 0.4), (6, 1.0)])
+def test_the_newest_alone_where_there_is_no_other_or_none_is_wanted(keyframes: int, probability: float) -> None:
+    assert shares(keyframes, probability, draws=200) == {keyframes - 1: 1.0}
+
+
+def test_never_the_newest_at_probability_zero() -> None:
+    assert set(shares(4, 0.0)) == {0, 1, 2}
+
+
+def test_draws_follow_from_the_seed() -> None:
+    def drawn(seed: int) -> list[int]:
+        return list(draw_keyframes(range(7), 50, 0.4, 0, np.random.default_rng(seed)))
+
+    assert drawn(3) == drawn(3) != drawn(4)
+    assert len(drawn(3)) == 50
+    assert list(draw_keyframes(range(7), 0, 0.4, 0, np.random.default_rng(0))) == []
