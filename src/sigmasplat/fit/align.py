@@ -12,6 +12,7 @@ from scipy.ndimage import sobel
 
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.render.backend import backend_module
 
 Image = NDArray[np.float32]
 Matrix = NDArray[np.float64]
@@ -97,7 +98,9 @@ def align(
 
     Each level takes up to `iterations` Gauss–Newton steps with Huber weights and stops below `update_stop` (m, rad).
     weight_color in [0, 1] balances gray against depth, each in units of its Huber width.
+    Raises BackendError without the compiled kernels.
     """
+    backend_module("cpu")  # refuses in one line where the kernels are not built
     from sigmasplat.native import _core
 
     T, steps = np.array(T_live_reference, np.float64), 0
