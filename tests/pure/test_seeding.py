@@ -1,7 +1,6 @@
 """Seeding: which pixels become splats, where these lie and how large they are, on scenes with known answers."""
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -237,36 +236,3 @@ def test_few_pixels_or_none_make_few_splats_or_none(count: int, scale_from: str)
 
 def test_no_splat_is_smaller_than_a_tenth_of_a_millimetre() -> None:
     assert float(made(SOME, np.full(SIZE, 2.0, np.float32), 1e-6, scale_from="pixel")[0].scales.min()) >= 0.99e-4
-
-
-# ---- through the mapper
-
-
-@pytest.fixture
-def mapped() -> Callable[..., GaussianField]:
-    """Map one keyframe without fitting it; return the field."""
-    from sigmasplat.config import Config, MappingConfig, RenderConfig
-    from sigmasplat.render.view import ReferenceView
-    from sigmasplat.slam.mapper import Mapper
-
-    def once(**values: object) -> GaussianField:
-        config = Config(seeding=changed(scale_from="pixel", **values), mapping=MappingConfig(first_iterations=0))
-        mapper = Mapper(dataclasses.replace(config, mapping=dataclasses.replace(config.mapping, prune_opacity=0.1)),
-                        random())  # fmt: skip
-        mapper.map(ReferenceView(CAMERA, RenderConfig()), 0, target(np.full(SIZE, 2.0)), np.eye(4))
-        return mapper.field
-
-    return once
-
-
-def test_the_mapper_makes_seeds_as_wide_as_they_lie_apart(mapped: Callable[..., GaussianField]) -> None:
-    pixel_m = 2.0 / CAMERA.fx
-    whole = mapped(first_uniform=10**6, first_gradient=0).scales
-    quarter = mapped(first_uniform=CAMERA.width * CAMERA.height // 4, first_gradient=0).scales
-    assert float(whole.mean()) == pytest.approx(pixel_m, rel=1e-3)
-    assert float(quarter.mean()) == pytest.approx(2 * pixel_m, rel=1e-3), "one in four pixels: two pixels apart"
-
-
-def test_the_budget_of_splats_is_kept(mapped: Callable[..., GaussianField]) -> None:
-    assert len(mapped()) > 400
-    assert len(mapped(max_splats=123)) == 123

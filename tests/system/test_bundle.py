@@ -1,5 +1,6 @@
 """Mapping that moves its keyframes: a pose that is off is pulled back towards the truth, and otherwise left alone."""
 
+import copy
 from functools import cache
 from typing import Any
 
@@ -65,11 +66,18 @@ def take_in(mapper: Mapper, i: int, T_world_camera: Array) -> Keyframe:
     return mapper.keyframes[-1]
 
 
-def between_two(T_true_start: Array, **changes: str) -> Keyframe:
-    """Map frames 0 and 6 from where they are and hold them; then let frame 3 in, put off in its own axes."""
+@cache
+def two_held() -> Mapper:
+    """Map frames 0 and 6 from where they are, and hold them there."""
     mapper = Mapper(settings(**STILL), np.random.default_rng(0))
     for i in (0, 6):
         take_in(mapper, i, true_pose(i)).fixed = True
+    return mapper
+
+
+def between_two(T_true_start: Array, **changes: str) -> Keyframe:
+    """Let frame 3 in, put off in its own axes, between two keyframes that are right and held."""
+    mapper = copy.deepcopy(two_held())
     mapper.config = settings(**changes)
     return take_in(mapper, 3, true_pose(3) @ T_true_start)
 
@@ -79,13 +87,13 @@ def test_a_keyframe_that_is_off_is_pulled_back() -> None:
     assert (was_mm, was_deg) == (pytest.approx(5.0, abs=0.05), pytest.approx(0.2, abs=0.005))
     found = between_two(OFF)
     is_mm, is_deg = error(found.T_world_camera, 3)
-    assert is_mm < 2.0 and is_deg < 0.08, f"{is_mm:.2f} mm, {is_deg:.3f}°"
+    assert is_mm < 3.0 and is_deg < 0.1, f"{is_mm:.2f} mm, {is_deg:.3f}°"
     assert 20 < found.motion.steps < 60 and se3.is_rigid(found.T_world_camera, 1e-9)
 
 
 def test_a_keyframe_that_is_right_stays_about_there() -> None:
     is_mm, is_deg = error(between_two(np.eye(4)).T_world_camera, 3)
-    assert is_mm < 2.0 and is_deg < 0.08, f"{is_mm:.2f} mm, {is_deg:.3f}°"
+    assert is_mm < 1.5 and is_deg < 0.05, f"{is_mm:.2f} mm, {is_deg:.3f}°"
 
 
 @pytest.mark.parametrize("moving", ["translation", "rotation"])
@@ -113,7 +121,7 @@ def test_the_first_keyframe_is_the_world_and_stays() -> None:
 
 
 def followed(**changes: str) -> tuple[Slam, list[Any]]:
-    slam = Slam(settings(mapping__first_iterations="60", mapping__iterations="20", **changes))
+    slam = Slam(settings(mapping__first_iterations="40", mapping__iterations="10", **changes))
     return slam, [slam.step(room().frame(i)) for i in range(13)]
 
 

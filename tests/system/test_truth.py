@@ -1,0 +1,97 @@
+"""Ground truth stays out: a run neither asks for it nor depends on it; the evaluation alone does."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sigmasplat import cli, session
+from sigmasplat.config import Config
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.model import se3
+from sigmasplat.model.frame import Frame
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.presets import default_preset, override, preset
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources import SyntheticRoom
+from sigmasplat.sources.base import Source
+from sigmasplat.sources.tum import write_tum
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+
+SETTINGS = {"input.width": "64", "mapping.first_iterations": "10", "mapping.iterations": "4"}
+FRAMES = 7
+OPTIONS = [word for pair in SETTINGS.items() for word in ("--set", "=".join(pair))]
+LEFT = ("trajectory.txt", "map.ply", "checkpoint.safetensors")
+
+
+class Asked(Exception):
+    """Somebody asked for the truth."""
+
+
+class Secretive(Source):
+    """The first frames of a room whose truth may not be asked for."""
+
+    def __init__(self, truth: Trajectory | None = None) -> None:
+        self._room, self._truth = SyntheticRoom(frames=120, width=64, height=48), truth
+        super().__init__("room", self._room.camera)
+
+    def __len__(self) -> int:
+        return FRAMES
+
+    def frame(self, i: int) -> Frame:
+        return self._room.frame(self._checked_index(i))
+
+    def truth(self) -> Trajectory | None:
+        if self._truth is None:
+            raise Asked
+        return self._truth
+
+
+def config() -> Config:
+    return override(preset(default_preset()), SETTINGS)
+
+
+def sigmasplat(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as left:
+        cli.main(arguments)
+    assert isinstance(left.value.code, int)
+    return left.value.code
+
+
+def test_slam_and_session_never_ask_for_the_truth(tmp_path: Path) -> None:
+    source, run = Secretive(), RunFolder.create(tmp_path / "run", config(), "room")
+    outcome = session.record(Slam(config()), source, run)
+    assert (outcome.status, outcome.frames, outcome.lost) == ("complete", FRAMES, 0)
+    assert len(run.read_trajectory()) == FRAMES
+
+
+def test_the_command_line_asks_only_to_evaluate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sigmasplat.sources.open_source", lambda path, **options: Secretive())
+    assert sigmasplat("run", "room", "--out", str(tmp_path / "run"), "--no-eval", *OPTIONS) == 0
+    with pytest.raises(Asked):
+        cli.main(["eval", str(tmp_path / "run")])
+
+
+def tum_folder(folder: Path, kind: str) -> Path:
+    """Write the same frames with the true path, another one, or none."""
+    whole = SyntheticRoom(frames=120, width=64, height=48).truth()
+    poses = whole.T_world_camera[:FRAMES]
+    if kind == "another":
+        poses = np.array([se3.exp(np.random.default_rng(i).normal(size=6)) for i in range(FRAMES)])
+    write_tum(Secretive(Trajectory(whole.timestamps_s[:FRAMES], poses)), folder)
+    if kind == "none":
+        (folder / "groundtruth.txt").unlink()
+    return folder
+
+
+def test_the_same_bytes_with_the_truth_with_another_and_with_none(tmp_path: Path) -> None:
+    found, errors_m = {}, {}
+    for kind in ("true", "another", "none"):
+        out = tmp_path / "runs" / kind
+        assert sigmasplat("run", str(tum_folder(tmp_path / kind, kind)), "--out", str(out), *OPTIONS) == 0
+        found[kind] = [(out / name).read_bytes() for name in LEFT]
+        ate = RunFolder.open(out).read_metrics()["ate"]
+        errors_m[kind] = ate["rmse_m"] if ate else None
+    assert found["true"] == found["another"] == found["none"]
+    assert errors_m["none"] is None and errors_m["true"] < 0.05 < errors_m["another"]
