@@ -82,6 +82,16 @@ def test_texture_draws_splats() -> None:
     assert chosen.sum() == 200 and not chosen[:, :31].any(), "a blank wall has no gradient"
 
 
+def test_strong_texture_draws_in_proportion() -> None:
+    """Stripes four times as strong in the right half: four of five seeds lie there."""
+    gray = 0.5 + 0.4 * (np.arange(64) // 2 % 2 - 0.5) * np.where(np.arange(64) < 32, 0.25, 1.0)
+    color = np.broadcast_to(gray[None, :, None], (*SIZE, 3)).astype(np.float32)
+    seen = target(np.full(SIZE, 2.0), color)
+    drawn = [first_pixels(seen, changed(first_uniform=0, first_gradient=60), random(seed)) for seed in range(30)]
+    right = np.mean([chosen[:, 32:].sum() / chosen.sum() for chosen in drawn])
+    assert right == pytest.approx(0.8, abs=0.04)
+
+
 def test_edges_are_seeded_whatever_the_draw() -> None:
     color = np.zeros((*SIZE, 3), np.float32)
     color[:, 40:] = 1.0

@@ -25,6 +25,6 @@ def backend_module(name: str) -> ModuleType:
     except ImportError as problem:
         raise BackendError(
             f"the compiled kernels cannot be loaded ({problem}); reinstall with `pip install .`, or use the slow "
-            "plain-torch backend: --set backend=reference"
+            "plain-torch backend: --set backend=reference --set tracking.method=adam"
         ) from problem
     return cpu

@@ -18,7 +18,7 @@ from sigmasplat.fit.pose import (
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
-from sigmasplat.render.view import View
+from sigmasplat.render.view import ReferenceView, View
 from sigmasplat.slam.rules import is_lost, jumped
 
 Matrix = NDArray[np.float64]
@@ -86,7 +86,7 @@ class Tracker:
 
         Aligning also tries the map seen from there: it knows more than the newest keyframe.
         """
-        odometry = self._odometry(live)
+        odometry = self._odometry(view, live)
         starts = [self.previous] if odometry is None else [odometry, self.previous]
         fits = [fit] + [self._fit(field, view, target, live, s, 2 * self.config.iterations) for s in starts]
         if self.config.method == "align":
@@ -98,10 +98,10 @@ class Tracker:
             best.T_camera_world = se3.inverse(starts[0])
         return best
 
-    def _odometry(self, live: Pyramid) -> Matrix | None:
+    def _odometry(self, view: View, live: Pyramid) -> Matrix | None:
         """Align the last image to this one; None if they do not fit together either."""
-        if self.last_image is None:
-            return None
+        if self.last_image is None or self.config.method == "adam" and isinstance(view, ReferenceView):
+            return None  # alignment needs the compiled kernels
         guesses = (se3.inverse(self.velocity), np.eye(4))
         found = [
             align(self.last_image, live, g, 2 * self.config.align_iterations, self.config.align_weight_color)
