@@ -169,7 +169,8 @@ def _record(
     if profile:
         screen.profile(folder.read_profile())
     if source.skipped:
-        screen.warn(f"unreadable images passed over: {len(source.skipped)} (first: {source.skipped[0]})")
+        images = "image" if len(source.skipped) == 1 else "images"
+        screen.warn(f"{len(source.skipped)} unreadable {images} passed over (first: {source.skipped[0]})")
     counts = f"{outcome.frames} frames, {outcome.lost} lost, {outcome.frames / outcome.wall_s:.1f} frames/s"
     if outcome.status == "interrupted":
         screen.say(f"interrupted after {counts}; trajectory, map and checkpoint so far are in {folder.path}")

@@ -100,7 +100,7 @@ class Tracker:
 
     def _odometry(self, view: View, live: Pyramid) -> Matrix | None:
         """Align the last image to this one; None if they do not fit together either."""
-        if self.last_image is None or self.config.method == "adam" and isinstance(view, ReferenceView):
+        if self.last_image is None or (self.config.method == "adam" and isinstance(view, ReferenceView)):
             return None  # alignment needs the compiled kernels
         guesses = (se3.inverse(self.velocity), np.eye(4))
         found = [
