@@ -1,4 +1,4 @@
-"""fit_pose: move one camera, the field fixed. By the papers' Adam through the renderer, or by aligning to a render."""
+"""fit_pose: move one camera, the field fixed. By the papers' Adam through the renderer, or by aligning images."""
 
 from dataclasses import dataclass
 

@@ -89,7 +89,7 @@ class Tracker:
         odometry = self._odometry(view, live)
         starts = [self.previous] if odometry is None else [odometry, self.previous]
         fits = [fit] + [self._fit(field, view, target, live, s, 2 * self.config.iterations) for s in starts]
-        if self.config.method == "align":
+        if self.config.method == "align" and self.config.align_to == "keyframe":  # with "map", `_fit` has tried it
             for start in starts:
                 reference = map_reference(field.params, view, se3.inverse(start), self.config)
                 fits.append(fit_pose_align(reference, live, se3.inverse(start), self.config))
