@@ -13,7 +13,10 @@ constexpr float LOG2_E = 1.4426950408889634f;
 constexpr float CONIC_SCALE = 0.30028060219661246f;   // sqrt(log2(e)/16)
 constexpr float ALPHA_MAX = 0.99f;
 
-struct alignas(32) Geometry { float l1, l2, l3, u, v, log_opacity, z; int id; };
+// A splat as the pixels read it: one row of 8 floats of geometry, then its features. `tag`: where its gradients begin among
+// its chunk's slots; in a tile's own copy the splat's number (forward) or the slot of this tile (backward).
+struct Geometry { float l1, l2, l3, u, v, log_opacity, z; int tag; };
+constexpr int GEOMETRY = sizeof(Geometry) / sizeof(float);
 struct Box { uint16_t x0, y0, x1, y1; };              // in blocks, inclusive
 
 constexpr int ALPHA_CHUNK = 32;
@@ -22,16 +25,18 @@ struct AlphaBuffer {                                  // one chunk of a block's 
     alignas(64) float pairs[ALPHA_CHUNK + 4][2 * W];
     int entry[ALPHA_CHUNK + 4];
 };
+struct Center { float u, v; };
 struct Scratch {                                      // one thread's tile
-    Buffer<Geometry> geometry;
-    Buffer<float> features, records;
+    Buffer<float> rows, records;
+    Buffer<Center> centers;                           // from the tile's centre
+    Buffer<uint64_t> masks;
     Buffer<int> lists;
     Buffer<uint64_t> sorted;
     AlphaBuffer alphas;
     int counts[BLOCKS];
     size_t list_capacity = 0;
     size_t bytes() const {
-        return geometry.bytes() + features.bytes() + records.bytes() + lists.bytes() + sorted.bytes() + sizeof(*this);
+        return rows.bytes() + records.bytes() + centers.bytes() + masks.bytes() + lists.bytes() + sorted.bytes() + sizeof(*this);
     }
 };
 
@@ -41,45 +46,45 @@ constexpr int feature_slots(int k) { return k <= 4 ? 4 : k <= 7 ? 7 : k <= 11 ? 
 
 struct Render {                                       // what one forward pass leaves for its backward pass
     int64_t n = 0;
-    int k = 0, used = 0, stride = 0, width = 0, height = 0, tiles_x = 0, tiles_y = 0;
+    int k = 0, used = 0, row = 0, width = 0, height = 0, tiles_x = 0, tiles_y = 0;
     View<float> view;
     BlendOptions options;
     const float* reference = nullptr;
     int64_t intersections = 0;
-    Buffer<Geometry> geometry;
+    Buffer<float> rows, partials;
     Buffer<Box> boxes;
-    Buffer<float> features, partials;
-    Buffer<int> tiles_of, slot, tile_begin, histogram, chunk_total;
+    Buffer<int> tiles_of, tile_begin, histogram, chunk_begin;   // chunk_begin: first slot of each chunk
     Buffer<uint64_t> items;
     Scratch* scratch = nullptr;
     int threads = 0;
 
     ~Render() { delete[] scratch; }
     void prepare(int64_t splats, int features_used, int w, int h, BlendOptions o) {
-        n = splats; used = features_used; k = feature_slots(features_used); stride = (k + 3) / 4 * 4; width = w; height = h; options = o;
+        n = splats; used = features_used; k = feature_slots(features_used); row = GEOMETRY + (k + 3) / 4 * 4; width = w; height = h; options = o;
         tiles_x = (w + TILE_WIDTH - 1) / TILE_WIDTH; tiles_y = (h + TILE_HEIGHT - 1) / TILE_HEIGHT;
-        geometry.reserve(n + W); boxes.reserve(n + W); features.reserve((n + W) * stride);
-        tiles_of.reserve(n + W); slot.reserve(n + W + 1);
-        chunk_total.reserve(n / CHUNK + 2);
+        rows.reserve((n + W) * row); boxes.reserve(n + W); tiles_of.reserve(n + W);
+        chunk_begin.reserve(n / CHUNK + 2);
         if (threads < omp_get_max_threads()) {
             delete[] scratch;
             threads = omp_get_max_threads();
             scratch = new Scratch[threads];
         }
     }
+    const Geometry& geometry(int64_t i) const { return *reinterpret_cast<const Geometry*>(&rows[size_t(i) * row]); }
     size_t padded_width() const { return size_t(tiles_x) * TILE_WIDTH; }
     size_t plane() const { return padded_width() * tiles_y * TILE_HEIGHT; }
     size_t bytes() const {
-        size_t b = geometry.bytes() + boxes.bytes() + features.bytes() + partials.bytes() + tiles_of.bytes() + slot.bytes()
-                   + items.bytes() + histogram.bytes() + tile_begin.bytes();
+        size_t b = rows.bytes() + boxes.bytes() + partials.bytes() + tiles_of.bytes() + items.bytes() + histogram.bytes()
+                   + tile_begin.bytes();
         for (int t = 0; t < threads; t++) b += scratch[t].bytes();
         return b;
     }
 };
 
-// Store W footprints; return how many tiles they reach. Bounds are those of alpha ≥ alpha_min, not three sigma, so the
-// image does not depend on the tiling.
-SIGMA_INLINE int pack(Render& r, const Footprint<vf>& f, vf opacity, Mask seen, int64_t i) {
+// Store W footprints and their features (lanes, `row - GEOMETRY` of them); return how many tiles they reach, `before` being
+// the slots of the chunk in use already. Bounds are those of alpha ≥ alpha_min, not three sigma, so the image does not
+// depend on the tiling.
+SIGMA_INLINE int pack(Render& r, const Footprint<vf>& f, vf opacity, Mask seen, int64_t i, int before, const float (*features)[W]) {
     const vf log_opacity = log2(max(opacity, splat(1e-30f)));
     const vf reach = log_opacity - splat(__builtin_log2f(r.options.alpha_min));
     seen = both(seen, gt(reach, splat(0.f)));
@@ -93,24 +98,36 @@ SIGMA_INLINE int pack(Render& r, const Footprint<vf>& f, vf opacity, Mask seen, 
     const vf y1 = clamp(floor((f.v + dv) * (1.f / BLOCK_HEIGHT)), -1.f, float(blocks_y - 1));
     seen = both(seen, both(ge(x1, x0), ge(y1, y0)));
     const unsigned live = bits(seen) & (r.n - i < W ? (1u << (r.n - i)) - 1u : ~0u);
-    alignas(64) int box[4][W];
+    memset(&r.tiles_of[i], 0, W * sizeof(int));
+    if (!live) return 0;
+    alignas(64) int box[4][W], tag[W];
     store(box[0], to_int(x0)); store(box[1], to_int(y0)); store(box[2], to_int(x1)); store(box[3], to_int(y1));
-    alignas(64) float g[7][W];
-    store(g[0], f.l1 * CONIC_SCALE); store(g[1], f.l2 * CONIC_SCALE); store(g[2], f.l3 * CONIC_SCALE);
-    store(g[3], f.u); store(g[4], f.v); store(g[5], log_opacity * 0.125f); store(g[6], f.z);
-    int total = 0;
-    for (int l = 0; l < W; l++) {
-        int count = 0;
-        if (live >> l & 1) {
-            const int bx0 = box[0][l], by0 = box[1][l], bx1 = box[2][l], by1 = box[3][l];
-            r.boxes[i + l] = {uint16_t(bx0), uint16_t(by0), uint16_t(bx1), uint16_t(by1)};
-            r.geometry[i + l] = {g[0][l], g[1][l], g[2][l], g[3][l], g[4][l], g[5][l], g[6][l], int(i + l)};
-            count = (bx1 / BLOCKS_X - bx0 / BLOCKS_X + 1) * (by1 / BLOCKS_Y - by0 / BLOCKS_Y + 1);
-        }
+    int used = before;
+    for (unsigned m = live; m; m &= m - 1) {
+        const int l = __builtin_ctz(m), bx0 = box[0][l], by0 = box[1][l], bx1 = box[2][l], by1 = box[3][l];
+        r.boxes[i + l] = {uint16_t(bx0), uint16_t(by0), uint16_t(bx1), uint16_t(by1)};
+        const int count = (bx1 / BLOCKS_X - bx0 / BLOCKS_X + 1) * (by1 / BLOCKS_Y - by0 / BLOCKS_Y + 1);
         r.tiles_of[i + l] = count;
-        total += count;
+        tag[l] = used;
+        used += count;
     }
-    return total;
+    const vf geometry[GEOMETRY] = {f.l1 * CONIC_SCALE, f.l2 * CONIC_SCALE, f.l3 * CONIC_SCALE, f.u, f.v,
+                                   log_opacity * 0.125f, f.z, float_of_bits(load(tag))};
+    const int columns = r.row;
+    for (int c = 0; c < columns; c += W) {            // turn W columns at a time into W rows' next W floats
+        vf turn[W];
+        const int count = columns - c < W ? columns - c : W;
+        for (int q = 0; q < W; q++)
+            turn[q] = q >= count ? splat(0.f) : c + q < GEOMETRY ? geometry[c + q] : load(features[c + q - GEOMETRY]);
+        transpose(turn);
+        for (unsigned m = live; m; m &= m - 1) {
+            const int l = __builtin_ctz(m);
+            float* to = &r.rows[size_t(i + l) * columns + c];
+            if (count == W) store(to, turn[l]);
+            else memcpy(to, &turn[l], count * sizeof(float));
+        }
+    }
+    return used - before;
 }
 
 // Sort (depth bits << 32 | splat) by depth, keeping the order of equals: least-significant-digit radix over the bits that differ.
@@ -156,21 +173,15 @@ template <class Visit> SIGMA_INLINE void for_tiles(const Render& r, int64_t i, V
         for (int tx = tx0; tx <= tx1; tx++) visit(ty * r.tiles_x + tx);
 }
 
-static void fill_slots(Render& r) {                   // where each splat's per-tile gradients will lie
+static void number_slots(Render& r) {                 // where each splat's per-tile gradients will lie
     const int64_t chunks = (r.n + CHUNK - 1) / CHUNK;
     int sum = 0;
-    for (int64_t c = 0; c < chunks; c++) { const int t = r.chunk_total[c]; r.chunk_total[c] = sum; sum += t; }
+    for (int64_t c = 0; c < chunks; c++) { const int t = r.chunk_begin[c]; r.chunk_begin[c] = sum; sum += t; }
     r.intersections = sum;
-#pragma omp parallel for schedule(static)
-    for (int64_t c = 0; c < chunks; c++) {
-        int s = r.chunk_total[c];
-        for (int64_t i = c * CHUNK; i < r.n && i < (c + 1) * CHUNK; i++) { r.slot[i] = s; s += r.tiles_of[i]; }
-    }
-    r.slot[r.n] = sum;
 }
 
 static void bin(Render& r) {
-    fill_slots(r);
+    number_slots(r);
     const int tiles = r.tiles_x * r.tiles_y, threads = omp_get_max_threads();
     r.tile_begin.reserve(tiles + 1);
     r.histogram.reserve(size_t(threads) * tiles);
@@ -201,7 +212,7 @@ static void bin(Render& r) {
         for (int64_t i = begin; i < end; i++)
             if (r.tiles_of[i]) {
                 uint32_t depth_bits;                  // positive floats order as their bits
-                memcpy(&depth_bits, &r.geometry[i].z, 4);
+                memcpy(&depth_bits, &r.geometry(i).z, 4);
                 const uint64_t item = uint64_t(depth_bits) << 32 | uint32_t(i);
                 for_tiles(r, i, [&](int tile) { r.items[mine[tile]++] = item; });
             }

@@ -1,6 +1,7 @@
 // Stage 3: tiles → pixels, and back. A tile is cut into blocks of W pixels; lanes are pixels; a block walks its own list of
 // splats near to far. Alphas come first, a chunk at a time, so that the transmittance chain stays one multiply-add long.
 
+constexpr int AHEAD = 12;                             // splats fetched before they are needed
 struct Tile { int index, x, y, count; };              // x, y: pixel of its corner
 
 SIGMA_INLINE uint64_t block_mask(Box b, int tile_bx, int tile_by) {
@@ -14,42 +15,74 @@ SIGMA_INLINE uint64_t block_mask(Box b, int tile_bx, int tile_by) {
     return (columns * every_row) & span;
 }
 
+// List, block by block, which of a tile's n splats reach it, in order; each list ends in four entries that are never alive.
+SIGMA_INLINE void list_blocks(Scratch& s, int n) {
+    s.list_capacity = size_t(n) + W + 4;
+    s.lists.reserve(s.list_capacity * BLOCKS);
+#if defined(__AVX512F__)
+    uint32_t halves[2][W];
+    for (int b = 0; b < BLOCKS; b++) s.counts[b] = 0;
+    for (int k = 0; k < n; k += W) {
+        for (int l = 0; l < W; l++) { halves[0][l] = uint32_t(s.masks[k + l]); halves[1][l] = uint32_t(s.masks[k + l] >> 32); }
+        const __m512i low = _mm512_loadu_si512(halves[0]), high = _mm512_loadu_si512(halves[1]);
+        const __m512i entry = _mm512_add_epi32(_mm512_set1_epi32(k), (__m512i)to_int(lane_index()));
+        for (int b = 0; b < BLOCKS; b++) {
+            const __mmask16 on = _mm512_test_epi32_mask(b < 32 ? low : high, _mm512_set1_epi32(int(1u << (b & 31))));
+            _mm512_storeu_si512(&s.lists[b * s.list_capacity + s.counts[b]], _mm512_maskz_compress_epi32(on, entry));
+            s.counts[b] += __builtin_popcount(on);
+        }
+    }
+#else
+    memset(s.counts, 0, sizeof s.counts);
+    for (int k = 0; k < n; k++)
+        for (uint64_t m = s.masks[k]; m; m &= m - 1) {
+            const int b = __builtin_ctzll(m);
+            s.lists[b * s.list_capacity + s.counts[b]++] = k;
+        }
+#endif
+    for (int b = 0; b < BLOCKS; b++)
+        for (int q = 0; q < 4; q++) s.lists[b * s.list_capacity + s.counts[b] + q] = n;
+}
+
 // Bring a tile's splats together, near to far, coordinates about the tile's centre, and list them per block.
-static Tile gather_tile(const Render& r, Scratch& s, int index, int record_floats) {
+template <bool BACKWARD> static Tile gather_tile(const Render& r, Scratch& s, int index) {
     const int begin = r.tile_begin[index], n = r.tile_begin[index + 1] - begin;
     const int tx = index % r.tiles_x, ty = index / r.tiles_x;
     const Tile tile{index, tx * TILE_WIDTH, ty * TILE_HEIGHT, n};
     const float cx = tile.x + (TILE_WIDTH - 1) * 0.5f, cy = tile.y + (TILE_HEIGHT - 1) * 0.5f;
-    s.geometry.reserve(n + 1);
-    s.features.reserve(size_t(n + 1) * r.stride);
-    s.list_capacity = size_t(n) + 4;
-    s.lists.reserve(s.list_capacity * BLOCKS);
-    if (record_floats) memset(s.records.reserve(size_t(n + 1) * record_floats), 0, size_t(n) * record_floats * sizeof(float));
-    memset(s.counts, 0, sizeof s.counts);
+    const size_t row = r.row, row_bytes = row * sizeof(float);
+    s.rows.reserve(size_t(n + 1) * row);
+    s.masks.reserve(n + W);
+    if (BACKWARD) s.centers.reserve(n);
     const uint64_t* items = r.items.data + begin;
     for (int k = 0; k < n; k++) {
-        if (k + 8 < n) {
-            const uint32_t ahead = uint32_t(items[k + 8]);
-            __builtin_prefetch(&r.geometry[ahead]);
-            __builtin_prefetch(&r.features[size_t(ahead) * r.stride]);
+        if (k + AHEAD < n) {
+            const uint32_t ahead = uint32_t(items[k + AHEAD]);
+            __builtin_prefetch(&r.rows[size_t(ahead) * row]);
+            __builtin_prefetch(&r.rows[size_t(ahead) * row + row - 1]);
             __builtin_prefetch(&r.boxes[ahead]);
         }
         const uint32_t i = uint32_t(items[k]);
-        Geometry g = r.geometry[i];
+        const Box box = r.boxes[i];
+        float* to = &s.rows[k * row];
+        memcpy(to, &r.rows[i * row], row_bytes);
+        Geometry& g = *reinterpret_cast<Geometry*>(to);
         const float u = g.u - cx, v = g.v - cy;
         g.u = -(g.l1 * u + g.l2 * v);                 // p = l1·x + l2·y + g.u, q = l3·y + g.v with x, y from the tile's centre
         g.v = -g.l3 * v;
-        s.geometry[k] = g;
-        memcpy(&s.features[size_t(k) * r.stride], &r.features[size_t(i) * r.stride], size_t(r.stride) * sizeof(float));
-        for (uint64_t m = block_mask(r.boxes[i], tx * BLOCKS_X, ty * BLOCKS_Y); m; m &= m - 1) {
-            const int b = __builtin_ctzll(m);
-            s.lists[b * s.list_capacity + s.counts[b]++] = k;
+        if (BACKWARD) {
+            const int columns = box.x1 / BLOCKS_X - box.x0 / BLOCKS_X + 1;
+            g.tag += r.chunk_begin[i / CHUNK] + (ty - box.y0 / BLOCKS_Y) * columns + (tx - box.x0 / BLOCKS_X);
+            s.centers[k] = {u, v};
+        } else {
+            g.tag = int(i);
         }
+        s.masks[k] = block_mask(box, tx * BLOCKS_X, ty * BLOCKS_Y);
     }
-    s.geometry[n] = {0, 0, 0, 0, 0, -1e30f, 0, -1};   // what the lists are padded with: never alive
-    memset(&s.features[size_t(n) * r.stride], 0, size_t(r.stride) * sizeof(float));
-    for (int b = 0; b < BLOCKS; b++)
-        for (int q = 0; q < 4; q++) s.lists[b * s.list_capacity + s.counts[b] + q] = n;
+    memset(&s.masks[n], 0, W * sizeof(uint64_t));
+    memset(&s.rows[n * row], 0, row_bytes);           // what the lists end in: never alive
+    reinterpret_cast<Geometry*>(&s.rows[n * row])->log_opacity = -1e30f;
+    list_blocks(s, n);
     return tile;
 }
 
@@ -64,8 +97,13 @@ SIGMA_INLINE vf block_y(int b) {
     return y;
 }
 
+template <int K> constexpr int row_floats = GEOMETRY + (K + 3) / 4 * 4;
+template <int ROW_FLOATS> SIGMA_INLINE const Geometry& geometry_of(const float* rows, int entry) {
+    return *reinterpret_cast<const Geometry*>(rows + size_t(entry) * ROW_FLOATS);
+}
+
 // Alphas of up to ALPHA_CHUNK entries of a block's list; entries that reach no live pixel are dropped, without a branch.
-SIGMA_INLINE int live_alphas(const Geometry* geometry, const int* list, int begin, int end, vf x, vf y, Mask alive,
+template <int ROW_FLOATS> SIGMA_INLINE int live_alphas(const float* rows, const int* list, int begin, int end, vf x, vf y, Mask alive,
                              float log_alpha_min, AlphaBuffer& out) {
     const vf floor_ = splat(log_alpha_min), top = splat(ALPHA_MAX);
     int n = 0;
@@ -74,7 +112,7 @@ SIGMA_INLINE int live_alphas(const Geometry* geometry, const int* list, int begi
         Mask live[4];
 #pragma GCC unroll 4
         for (int e = 0; e < 4; e++) {
-            const Geometry& g = geometry[list[j + e]];
+            const Geometry& g = geometry_of<ROW_FLOATS>(rows, list[j + e]);
             const vf q = fma(splat(g.l3), y, splat(g.v)), p = fma(splat(g.l1), x, fma(splat(g.l2), y, splat(g.u)));
             t[e] = fnma(p, p, fnma(q, q, splat(g.log_opacity)));
             live[e] = both(alive, ge(t[e], floor_));
@@ -90,6 +128,7 @@ SIGMA_INLINE int live_alphas(const Geometry* geometry, const int* list, int begi
 }
 
 template <int K, bool MOMENT, bool IDS> static void blend_tiles(Render& r, Outputs o) {
+    constexpr int ROW_FLOATS = row_floats<K>;
     const size_t plane = r.plane(), stride = r.padded_width();
     const float log_alpha_min = __builtin_log2f(r.options.alpha_min) * 0.125f;
     const vf stop = splat(r.options.transmittance_stop), half = splat(0.5f), zero = splat(0.f), one = splat(1.f);
@@ -98,7 +137,8 @@ template <int K, bool MOMENT, bool IDS> static void blend_tiles(Render& r, Outpu
         Scratch& s = r.scratch[omp_get_thread_num()];
 #pragma omp for schedule(dynamic, 1)
         for (int index = 0; index < r.tiles_x * r.tiles_y; index++) {
-            const Tile tile = gather_tile(r, s, index, 0);
+            const Tile tile = gather_tile<false>(r, s, index);
+            const float* rows = s.rows.data;
             for (int b = 0; b < BLOCKS; b++) {
                 const vf x = block_x(b), y = block_y(b);
                 const int* list = &s.lists[b * s.list_capacity];
@@ -110,10 +150,11 @@ template <int K, bool MOMENT, bool IDS> static void blend_tiles(Render& r, Outpu
                 const int count = s.counts[b];
                 for (int j = 0; j < count; j += ALPHA_CHUNK) {
                     const int end = count < j + ALPHA_CHUNK ? count : j + ALPHA_CHUNK;
-                    const int n = live_alphas(s.geometry.data, list, j, end, x, y, ge(T, stop), log_alpha_min, s.alphas);
+                    const int n = live_alphas<ROW_FLOATS>(rows, list, j, end, x, y, ge(T, stop), log_alpha_min, s.alphas);
                     for (int e = 0; e < n; e++) {
                         const int entry = s.alphas.entry[e];
-                        const float* f = &s.features[size_t(entry) * r.stride];
+                        const Geometry& geometry = geometry_of<ROW_FLOATS>(rows, entry);
+                        const float* f = rows + size_t(entry) * ROW_FLOATS + GEOMETRY;
                         const vf a = load(s.alphas.alpha[e]);
                         const Mask on = ge(T, stop);
                         const vf w = only(on, T * a);
@@ -121,9 +162,9 @@ template <int K, bool MOMENT, bool IDS> static void blend_tiles(Render& r, Outpu
                         T = fnma(T, a, T);
                         T_end = select(on, T, T_end);
                         for (int c = 0; c < K; c++) sum[c] = fma(w, splat(f[c]), sum[c]);
-                        if (MOMENT) { const vf d = s.geometry[entry].z - ref; moment = fma(w * d, d, moment); }
+                        if (MOMENT) { const vf d = geometry.z - ref; moment = fma(w * d, d, moment); }
                         if (IDS) {
-                            const vi id = splat(s.geometry[entry].id);
+                            const vi id = splat(geometry.tag);
                             const Mask more = gt(w, best), crossing = both(before_half, gt(w, zero));
                             best = max(w, best);
                             dominant = select(more, id, dominant);
@@ -178,28 +219,26 @@ SIGMA_INLINE vf splat_pair(const float* p) { long long bits; memcpy(&bits, p, 8)
 
 // Move a tile's records to each splat's own slots, moments now about the splat's mean.
 template <int RECORD> static void flush_records(Render& r, Scratch& s, const Tile& tile) {
-    const uint64_t* items = r.items.data + r.tile_begin[tile.index];
-    const int tx = tile.index % r.tiles_x, ty = tile.index / r.tiles_x;
     for (int k = 0; k < tile.count; k++) {
-        const uint32_t i = uint32_t(items[k]);
-        const Box box = r.boxes[i];
-        const int columns = box.x1 / BLOCKS_X - box.x0 / BLOCKS_X + 1;
-        const size_t slot = r.slot[i] + (ty - box.y0 / BLOCKS_Y) * columns + (tx - box.x0 / BLOCKS_X);
         float* m = &s.records[size_t(k) * RECORD];
-        const Geometry& g = r.geometry[i];
-        const float u = g.u - (tile.x + (TILE_WIDTH - 1) * 0.5f), v = g.v - (tile.y + (TILE_HEIGHT - 1) * 0.5f);
+        const auto [u, v] = s.centers[k];
         const float m0 = m[0], mx = m[2], my = m[4];
         m[6] += u * (u * m0 - 2.f * mx);
         m[8] += u * (v * m0 - my) - v * mx;
         m[10] += v * (v * m0 - 2.f * my);
         m[2] = mx - u * m0;
         m[4] = my - v * m0;
-        memcpy(&r.partials[slot * RECORD], m, RECORD * sizeof(float));
+    }
+    for (int k = 0; k < tile.count; k++) {
+        const Geometry& g = *reinterpret_cast<const Geometry*>(&s.rows[size_t(k) * r.row]);
+        float* to = &r.partials[size_t(g.tag) * RECORD];
+        for (int c = 0; c < RECORD; c += W) stream(to + c, load(&s.records[size_t(k) * RECORD + c]));
     }
 }
 
 template <int K, bool MOMENT> static void blend_tiles_backward(Render& r, Outputs o, OutputGradients g) {
     constexpr int RECORD = record_floats<K, MOMENT>, EXTRA = extra_floats<K, MOMENT>, COLUMNS = weight_columns<K, MOMENT>;
+    constexpr int ROW_FLOATS = row_floats<K>;
     const size_t plane = r.plane(), stride = r.padded_width();
     const float log_alpha_min = __builtin_log2f(r.options.alpha_min) * 0.125f;
     const vf stop = splat(r.options.transmittance_stop), zero = splat(0.f), one = splat(1.f), top = splat(ALPHA_MAX);
@@ -210,7 +249,9 @@ template <int K, bool MOMENT> static void blend_tiles_backward(Render& r, Output
         alignas(64) float basis[W][16 + (EXTRA ? EXTRA : 1)];
 #pragma omp for schedule(dynamic, 1)
         for (int index = 0; index < r.tiles_x * r.tiles_y; index++) {
-            const Tile tile = gather_tile(r, s, index, RECORD);
+            const Tile tile = gather_tile<true>(r, s, index);
+            memset(s.records.reserve(size_t(tile.count + 1) * RECORD), 0, size_t(tile.count) * RECORD * sizeof(float));
+            const float* rows = s.rows.data;
             for (int b = 0; b < BLOCKS; b++) {
                 const int count = s.counts[b];
                 if (!count) continue;
@@ -246,16 +287,17 @@ template <int K, bool MOMENT> static void blend_tiles_backward(Render& r, Output
                 vf T = one;
                 for (int j = 0; j < count; j += ALPHA_CHUNK) {
                     const int end = count < j + ALPHA_CHUNK ? count : j + ALPHA_CHUNK;
-                    const int n = live_alphas(s.geometry.data, list, j, end, x, y, ge(T, stop), log_alpha_min, s.alphas);
+                    const int n = live_alphas<ROW_FLOATS>(rows, list, j, end, x, y, ge(T, stop), log_alpha_min, s.alphas);
                     for (int e = 0; e < n; e++) {
                         const int entry = s.alphas.entry[e];
-                        const float* f = &s.features[size_t(entry) * r.stride];
+                        const Geometry& geometry = geometry_of<ROW_FLOATS>(rows, entry);
+                        const float* f = rows + size_t(entry) * ROW_FLOATS + GEOMETRY;
                         const vf a = load(s.alphas.alpha[e]);
                         const Mask on = ge(T, stop);
                         const vf w = only(on, T * a);
                         vf G = ga;
                         for (int c = 0; c < K; c++) G = fma(gs[c], splat(f[c]), G);
-                        if (MOMENT) { const vf d = s.geometry[entry].z - ref; G = fma(gm * d, d, G); }
+                        if (MOMENT) { const vf d = geometry.z - ref; G = fma(gm * d, d, G); }
                         behind = fnma(w, G, behind);
                         const vf g_alpha = fma(T, G, -(behind / (one - a)));
                         const vf g_power = only(both(on, gt(top, a)), g_alpha * a);
@@ -285,17 +327,23 @@ template <int K, bool MOMENT> static void blend_tiles_backward(Render& r, Output
             }
             flush_records<RECORD>(r, s, tile);
         }
+        fence();
     }
 }
 
-// Sum W splats' per-tile records in slot order and turn them to lanes: sums[column][lane].
-template <int RECORD> SIGMA_INLINE void reduce_records(const Render& r, int64_t i, float (*sums)[W]) {
+// Sum W splats' per-tile records in slot order and turn them to lanes, sums[column][lane]; `slot` walks on.
+template <int RECORD> SIGMA_INLINE void reduce_records(const Render& r, int64_t i, int& slot, float (*sums)[W]) {
+    constexpr int PARTS = RECORD / W;
+    vf turn[PARTS][W];
     for (int l = 0; l < W; l++) {
-        float row[RECORD] = {};
-        if (i + l < r.n)
-            for (int s = r.slot[i + l]; s < r.slot[i + l + 1]; s++)
-                for (int c = 0; c < RECORD; c++) row[c] += r.partials[size_t(s) * RECORD + c];
-        for (int c = 0; c < RECORD; c++) sums[c][l] = row[c];
+        const int count = i + l < r.n ? r.tiles_of[i + l] : 0;
+        for (int h = 0; h < PARTS; h++) turn[h][l] = splat(0.f);
+        for (int q = 0; q < count; q++, slot++)
+            for (int h = 0; h < PARTS; h++) turn[h][l] += load(&r.partials[size_t(slot) * RECORD + h * W]);
+    }
+    for (int h = 0; h < PARTS; h++) {
+        transpose(turn[h]);
+        for (int c = 0; c < W; c++) store(sums[h * W + c], turn[h][c]);
     }
 }
 

@@ -4,6 +4,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
+#include <utility>
 #if defined(__AVX512F__) || defined(__AVX2__)
 #include <immintrin.h>
 #elif defined(__SSE2__)
@@ -131,6 +132,37 @@ SIGMA_INLINE vf log2(vf a) {
     vf p = fma(fma(fma(splat(0.4317420243f), s2, splat(0.5767141614f)), s2, splat(0.9617988495f)), s2, splat(2.88539008f));
     return fma(p, s, to_float(e));
 }
+
+// Turn W rows of W lanes into W columns, in place: log2(W) rounds of exchanges between rows `S` apart.
+template <int S, int... L> SIGMA_INLINE void exchange(vf& a, vf& b, std::integer_sequence<int, L...>) {
+    const vf low = __builtin_shufflevector(a, b, (L & S ? L - S + W : L)...);
+    b = __builtin_shufflevector(a, b, (L & S ? L + W : L + S)...);
+    a = low;
+}
+template <int S = 1> SIGMA_INLINE void transpose(vf* rows) {
+    if constexpr (S < W) {
+#pragma GCC unroll 16
+        for (int i = 0; i < W; i++)
+            if (!(i & S)) exchange<S>(rows[i], rows[i + S], std::make_integer_sequence<int, W>{});
+        transpose<2 * S>(rows);
+    }
+}
+
+// Store past the caches what is not read again soon; `fence` before another thread reads it.
+#if defined(__AVX512F__)
+SIGMA_INLINE void stream(float* p, vf a) { _mm512_stream_ps(p, (__m512)a); }
+#elif defined(__AVX2__)
+SIGMA_INLINE void stream(float* p, vf a) { _mm256_stream_ps(p, (__m256)a); }
+#elif defined(__SSE2__)
+SIGMA_INLINE void stream(float* p, vf a) { _mm_stream_ps(p, (__m128)a); }
+#else
+SIGMA_INLINE void stream(float* p, vf a) { store(p, a); }
+#endif
+#if defined(__SSE2__)
+SIGMA_INLINE void fence() { _mm_sfence(); }
+#else
+SIGMA_INLINE void fence() {}
+#endif
 
 // A (BLOCK_WIDTH × BLOCK_HEIGHT) block of an image plane whose rows are `stride` floats apart.
 SIGMA_INLINE vf load_block(const float* p, size_t stride) {

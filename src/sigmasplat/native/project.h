@@ -5,16 +5,32 @@ constexpr int CHUNK = 512;                 // splats per unit of work: fixed, so
 
 SIGMA_INLINE View<float> read_view(const float* numbers) { View<float> v; memcpy(&v, numbers, sizeof v); return v; }
 
-// W rows of a row-major [n, columns] array as lanes; rows past the end repeat the last one.
+// W rows of a row-major [n, columns] array as lanes; rows past the end repeat the last one. Whole groups of W columns are
+// turned in registers, the rest goes one by one.
 template <int COLUMNS> SIGMA_INLINE void load_rows(const float* rows, int64_t first, int64_t n, float (*lanes)[W]) {
-    for (int l = 0; l < W; l++) {
-        const float* row = rows + (first + l < n ? first + l : n - 1) * COLUMNS;
-        for (int k = 0; k < COLUMNS; k++) lanes[k][l] = row[k];
+    const float* row[W];
+    for (int l = 0; l < W; l++) row[l] = rows + (first + l < n ? first + l : n - 1) * COLUMNS;
+    constexpr int TURNED = COLUMNS / W * W;
+    for (int g = 0; g < TURNED; g += W) {
+        vf turn[W];
+        for (int l = 0; l < W; l++) turn[l] = load(row[l] + g);
+        transpose(turn);
+        for (int k = 0; k < W; k++) store(lanes[g + k], turn[k]);
     }
+    for (int k = TURNED; k < COLUMNS; k++)
+        for (int l = 0; l < W; l++) lanes[k][l] = row[l][k];
 }
 template <int COLUMNS> SIGMA_INLINE void store_rows(float* rows, int64_t first, int64_t n, const float (*lanes)[W]) {
-    for (int l = 0; l < W && first + l < n; l++)
-        for (int k = 0; k < COLUMNS; k++) rows[(first + l) * COLUMNS + k] = lanes[k][l];
+    const int count = n - first < W ? int(n - first) : W;
+    constexpr int TURNED = COLUMNS / W * W;
+    for (int g = 0; g < TURNED; g += W) {
+        vf turn[W];
+        for (int k = 0; k < W; k++) turn[k] = load(lanes[g + k]);
+        transpose(turn);
+        for (int l = 0; l < count; l++) store(rows + (first + l) * COLUMNS + g, turn[l]);
+    }
+    for (int k = TURNED; k < COLUMNS; k++)
+        for (int l = 0; l < count; l++) rows[(first + l) * COLUMNS + k] = lanes[k][l];
 }
 
 SIGMA_INLINE Shape<vf> load_shape(const float* means, const float* quats, const float* scales, int64_t i, int64_t n) {

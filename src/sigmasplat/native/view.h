@@ -36,7 +36,7 @@ static void blend_forward(Context* context, const float* means2d, const float* c
     for (int64_t c = 0; c < chunks; c++) {
         int total = 0;
         for (int64_t i = c * CHUNK; i < n && i < (c + 1) * CHUNK; i += W) {
-            alignas(64) float t[3][W];
+            alignas(64) float t[3][W], lanes[16][W] = {};
             Footprint<vf> f;
             load_rows<2>(means2d, i, n, t);
             f.u = load(t[0]); f.v = load(t[1]);
@@ -49,13 +49,11 @@ static void blend_forward(Context* context, const float* means2d, const float* c
             load_rows<1>(opacities, i, n, t);
             const vf opacity = load(t[0]);
             load_rows<2>(radii, i, n, t);
-            total += pack(r, f, opacity, gt(load(t[0]), splat(0.f)), i);
-            for (int l = 0; l < W && i + l < n; l++) {
-                float* row = &r.features[size_t(i + l) * r.stride];
-                for (int q = 0; q < r.stride; q++) row[q] = q < r.used ? features[size_t(i + l) * k + q] : 0.f;
-            }
+            for (int l = 0; l < W && i + l < n; l++)
+                for (int q = 0; q < r.used; q++) lanes[q][l] = features[size_t(i + l) * k + q];
+            total += pack(r, f, opacity, gt(load(t[0]), splat(0.f)), i, total, lanes);
         }
-        r.chunk_total[c] = total;
+        r.chunk_begin[c] = total;
     }
     bin(r);
     blend(r, o);
@@ -67,13 +65,16 @@ static void blend_backward(Context* context, Outputs o, OutputGradients g, Splat
     with_features(r.k, [&](auto k) {
         constexpr int K = decltype(k)::value;
         const auto finish = [&](auto record, auto moment) {
+            const int64_t chunks = (r.n + CHUNK - 1) / CHUNK;
 #pragma omp parallel for schedule(static)
-            for (int64_t i = 0; i < r.n; i += W) {
+            for (int64_t chunk = 0; chunk < chunks; chunk++) {
+              int slot = r.chunk_begin[chunk];
+              for (int64_t i = chunk * CHUNK; i < r.n && i < (chunk + 1) * CHUNK; i += W) {
                 alignas(64) float sums[decltype(record)::value][W], t[3][W], l[8][W];
-                reduce_records<decltype(record)::value>(r, i, sums);
+                reduce_records<decltype(record)::value>(r, i, slot, sums);
                 for (int q = 0; q < W; q++) {         // unseen splats left no geometry: any finite conic will do
                     const bool seen = i + q < r.n && r.tiles_of[i + q];
-                    const Geometry g0 = seen ? r.geometry[i + q] : Geometry{1, 0, 1, 0, 0, 0, 1, 0};
+                    const Geometry g0 = seen ? r.geometry(i + q) : Geometry{1, 0, 1, 0, 0, 0, 1, 0};
                     l[0][q] = g0.l1 / CONIC_SCALE; l[1][q] = g0.l2 / CONIC_SCALE; l[2][q] = g0.l3 / CONIC_SCALE;
                     l[3][q] = g0.z; l[4][q] = seen ? exp2f(8.f * g0.log_opacity) : 1.f;
                 }
@@ -92,6 +93,7 @@ static void blend_backward(Context* context, Outputs o, OutputGradients g, Splat
                     store(lane, weight_sum(sums, c));
                     for (int q = 0; q < W && i + q < r.n; q++) out.features[size_t(i + q) * r.used + c] = lane[q];
                 }
+              }
             }
         };
         g.moment ? finish(std_int<record_floats<K, true>>{}, std_int<1>{}) : finish(std_int<record_floats<K, false>>{}, std_int<0>{});
@@ -129,17 +131,13 @@ static void view_forward(Context* context, const float* view_numbers, const floa
             load_rows<ROW>(params, i, n, row);
             const Splats s = activate(row);
             const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
-            const int tiles = pack(r, p, s.opacity, gt(p.z, splat(r.view.near_m)), i);
-            total += tiles;
-            if (!tiles) continue;
             for (int q = 0; q < 3; q++) store(f[q], s.color[q]);
             store(f[3], p.z);
             for (int q = 0; q < 3; q++) store(f[4 + q], fma(s.color[q], s.color[q], s.variance[q]));
             store(f[7], splat(0.f));
-            for (int l = 0; l < W; l++)
-                for (int q = 0; q < r.stride; q++) r.features[size_t(i + l) * r.stride + q] = f[q][l];
+            total += pack(r, p, s.opacity, gt(p.z, splat(r.view.near_m)), i, total, f);
         }
-        r.chunk_total[c] = total;
+        r.chunk_begin[c] = total;
     }
     const double t1 = omp_get_wtime();
     bin(r);
@@ -159,6 +157,7 @@ static void chain_to_params(const Render& r, const float* params, float* g_param
     for (int64_t c = 0; c < chunks; c++) {
         vf twist[6];
         for (auto& x : twist) x = splat(0.f);
+        int slot = r.chunk_begin[c];
         for (int64_t i = c * CHUNK; i < r.n && i < (c + 1) * CHUNK; i += W) {
             alignas(64) float row[ROW][W], sums[RECORD][W];
             unsigned seen_bits = 0;
@@ -169,7 +168,7 @@ static void chain_to_params(const Render& r, const float* params, float* g_param
             }
             const Mask seen = mask_of_bits(seen_bits);
             load_rows<ROW>(params, i, r.n, row);
-            reduce_records<RECORD>(r, i, sums);
+            reduce_records<RECORD>(r, i, slot, sums);
             const Splats s = activate(row);
             const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
             FootprintGradient<vf> g = footprint_gradient(sums, p.l1, p.l2, p.l3);
