@@ -14,8 +14,10 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.fit import losses
 from sigmasplat.fit.align import Pyramid, gray_of
 from sigmasplat.fit.field import fit_field
-from sigmasplat.fit.pose import fit_pose_adam, fit_pose_align, keyframe_reference, map_reference, tracking_gradient
+from sigmasplat.fit.pose import fit_pose_adam, fit_pose_align
+from sigmasplat.fit.references import keyframe_reference, map_reference
 from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.fit.tracking_loss import tracking_gradient
 from sigmasplat.model.field import GaussianField
 from sigmasplat.native import _core
 from sigmasplat.presets import default_preset, preset
@@ -86,8 +88,7 @@ class Works:
         self.exposure = torch.zeros(2)
         self.image, self.live = (Pyramid.of(gray_of(f.color), f.depth_m, f.camera) for f in (scene.frame, scene.later))
         self.keyframe = keyframe_reference(self.params, self.view, self.image, np.eye(4), self.tracking)
-        self.masked_target = self.target.color * (self.target.depth > 0)
-        self.color = 0.9 * self.masked_target
+        self.color = 0.9 * self.target.color
         self.cache = torch.zeros(_core.ssim_cache_floats(scene.camera.width, scene.camera.height))
 
     def forward_all(self) -> None:
@@ -110,7 +111,7 @@ class Works:
         """Take one step's gradient of tracking by Adam: forward, loss, backward to the pose alone."""
         self.view.forward(self.params, np.eye(4))
         tracking_gradient(self.view, self.later, self.tracking, self.exposure)
-        self.view.backward(self.params, None)
+        self.view.backward_pose(self.params)
 
     def backward(self) -> None:
         """Carry the image gradients of the last loss to every parameter and the pose."""
@@ -132,9 +133,9 @@ class Works:
     def ssim(self) -> None:
         """Take SSIM and its gradient in the kernels, the target's half included, as each iteration does."""
         c = self.scene.camera
-        _core.ssim_target(self.masked_target, c.width, c.height, self.cache)
+        _core.ssim_target(self.target.color, self.target.depth, c.width, c.height, self.cache)
         _core.ssim(
-            self.color, self.masked_target, self.cache, c.width, c.height, self.target.depth, -0.2, self.view.g_sums[:3]
+            self.color, self.target.color, self.cache, c.width, c.height, self.target.depth, -0.2, self.view.g_sums[:3]
         )
 
     def ssim_torch(self) -> Tensor:

@@ -8,8 +8,8 @@ STAGES: dict[str, tuple[str, ...]] = {
     "sort": ("sort",),
     "blend": ("blend",),
     "loss": ("map_loss",),
-    "backward": ("blend_backward", "project_backward"),
-    "optimiser": ("map_optimiser",),
+    "backward": ("blend_backward",),
+    "optimiser": ("project_backward",),
     "prepare": ("prepare",),
 }
 """Stages that a step's log line counts by itself, and the counters each adds up."""
@@ -18,7 +18,8 @@ STAGES: dict[str, tuple[str, ...]] = {
 def profile(steps: Iterable[Mapping[str, Any]], wall_s: float) -> dict[str, float]:
     """Add up log lines' seconds by stage; the stages sum to wall_s.
 
-    align: tracking without its renders; other: seeding, pruning and Python; io: waiting for frames and writing the log.
+    backward: from pixels to splats; optimiser: on from there to parameters, and Adam, in one pass; align: tracking
+    without its renders; other: seeding, pruning and Python; io: waiting for frames and writing the log.
     """
     lines = [step["seconds"] for step in steps]
     total = {stage: sum(line.get(name, 0.0) for line in lines for name in names) for stage, names in STAGES.items()}

@@ -13,7 +13,10 @@ from splat_scenes import KINDS, assert_same_vector, gradients, probe, render, sc
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
+from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.align import Pyramid
+from sigmasplat.fit.field import CompiledStep
+from sigmasplat.model.field import GaussianField
 from sigmasplat.native import _core
 from sigmasplat.render import cpu
 from sigmasplat.render.view import CpuView
@@ -75,31 +78,42 @@ def images(seed: int) -> tuple[Tensor, Tensor]:
 
 
 def losses() -> Outputs:
-    """Run SSIM, the pixel losses and the isotropy loss."""
-    (sums, _), (target, depth) = images(1), images(2)
-    target = target[:3] * (depth > 0)
-    gradient, masked, parts = torch.full_like(sums, torch.nan), torch.zeros_like(target), np.zeros(4)
+    """Run SSIM, the pixel losses of mapping, and tracking's loss and reference."""
+    (sums, depth_seen), (target, depth) = images(1), images(2)
+    target, size = target[:3], (BIG.width, BIG.height)
+    gradient, parts = torch.full_like(sums, torch.nan), np.zeros(4)
     valid = float((depth > 0).sum())
-    _core.mapping_losses(sums, target, depth, BIG.height, [0.8, 1.0, 1e-2, 1e-2], valid, gradient, masked, parts)
-    cache = torch.zeros(_core.ssim_cache_floats(BIG.width, BIG.height))
-    _core.ssim_target(target, BIG.width, BIG.height, cache)
-    similarity = _core.ssim(masked, target, cache, BIG.width, BIG.height, depth, -0.2, gradient[:3])
-    params = params_of(crowd())
-    rows = torch.zeros_like(params)
-    isotropy = _core.isotropy(params, 0.7, rows)
-    values = torch.tensor([*parts, similarity, isotropy], dtype=torch.float64)
-    return {"values": values, "gradient": gradient[:, : BIG.height, : BIG.width], "masked": masked, "rows": rows}
+    _core.mapping_losses(sums, target, depth, BIG.height, [0.8, 1.0, 1e-2, 1e-2], valid, gradient, parts)
+    cache = torch.zeros(_core.ssim_cache_floats(*size))
+    _core.ssim_target(target, depth, *size, cache)
+    similarity = _core.ssim(sums[:3], target, cache, *size, depth, -0.2, gradient[:3])
+    alpha, pull, g_exposure = (depth_seen / 4.0).contiguous(), torch.full_like(sums, torch.nan), np.zeros(2)
+    numbers = [0.1, 3.0, 5.0, 0.6, 2.0, 3.0]
+    loss = _core.tracking_loss(sums, alpha, target, depth, *size, numbers, True, 1.1, 0.02, pull, g_exposure)
+    maps = [np.zeros((BIG.height, BIG.width), np.float32) for _ in range(3)]
+    _core.reference_maps(sums, alpha, *size, numbers, True, *maps)
+    crop = (slice(4), slice(BIG.height), slice(BIG.width))
+    values = torch.tensor([*parts, similarity, loss, *g_exposure], dtype=torch.float64)
+    return {
+        "values": values,
+        "gradient": gradient[:, : BIG.height, : BIG.width],
+        "tracking": pull[crop],
+        "reference": torch.as_tensor(np.stack(maps)),
+    }
 
 
-def adam() -> Outputs:
-    """Take three steps on a crowd."""
-    params = params_of(crowd())
-    moments = [torch.zeros_like(params), torch.zeros_like(params)]
-    rates = np.random.default_rng(3).uniform(0, 1e-2, 17).astype(np.float32)
-    for step in (1, 2, 3):
-        grad = torch.as_tensor(np.random.default_rng(step).normal(size=params.shape)).float()
-        _core.adam(params, grad, *moments, rates, 0.9, 0.999, 1e-15, step)
-    return {"params": params, "moment1": moments[0], "moment2": moments[1]}
+def step() -> Outputs:
+    """Take three fused steps on a crowd."""
+    s = crowd()
+    field, view, rates = GaussianField(params_of(s)), CpuView(s.camera, OPTIONS), np.full(17, 1e-2, np.float32)
+    twists = []
+    for field.steps in (1, 2, 3):
+        view.forward(field.params, s.T_camera_world.numpy())
+        view.g_sums[:] = torch.as_tensor(np.random.default_rng(field.steps).normal(size=view.g_sums.shape))
+        twist, isotropy = CompiledStep(view).splats(field, Rates(torch.as_tensor(rates)), 0.7, 100)
+        twists.append(torch.tensor([*twist, isotropy]))
+        twists.append(torch.as_tensor(view.backward_pose(field.params)))
+    return {"params": field.params, "moment1": field.moment1, "moment2": field.moment2, "twists": torch.cat(twists)}
 
 
 def align() -> Outputs:
@@ -107,18 +121,18 @@ def align() -> Outputs:
     (a, near), (b, far) = images(4), images(5)
     crop = (slice(BIG.height), slice(BIG.width))
     shapes = [Pyramid.of(x[0][crop].numpy(), d[crop].numpy() + 1.0, BIG) for x, d in ((a, near), (b, far))]
-    H, g, sums = np.zeros(21), np.zeros(6), np.zeros(4)
+    H, g, S, sums = np.zeros(21), np.zeros(6), np.zeros(21), np.zeros(4)
     T, intrinsics = np.eye(4), [BIG.fx, BIG.fy, BIG.cx, BIG.cy]
     T[:3, 3] = [0.02, -0.01, 0.03]
     _core.align_step(
         shapes[0].gray[0], shapes[0].depth[0], b[1][crop].numpy().copy(), shapes[1].gray[0], shapes[1].depth[0],
-        intrinsics, 0.5, 0.5, 0.02, 0.3, 4.0, T, H, g, sums,
+        intrinsics, 0.5, 0.5, 0.02, 0.3, 4.0, T, H, g, S, sums,
     )  # fmt: skip
     assert sums.min() > 100, "the test needs residuals of both kinds"
-    return {"H": torch.as_tensor(H), "b": torch.as_tensor(g), "sums": torch.as_tensor(sums)}
+    return {"H": torch.as_tensor(H), "b": torch.as_tensor(g), "S": torch.as_tensor(S), "sums": torch.as_tensor(sums)}
 
 
-@pytest.mark.parametrize("work", [seam, view, losses, adam, align], ids=lambda work: work.__name__)
+@pytest.mark.parametrize("work", [seam, view, losses, step, align], ids=lambda work: work.__name__)
 def test_any_number_of_threads_gives_the_same_bytes(
     isa: str, work: Callable[[], Outputs], set_threads: Callable[[int], None]
 ) -> None:

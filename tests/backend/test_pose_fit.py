@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
-from sigmasplat.fit.pose import PoseFit, fit_pose_adam, tracking_gradient
+from sigmasplat.fit.pose import PoseFit, fit_pose_adam
 from sigmasplat.fit.target import Target
+from sigmasplat.fit.tracking_loss import tracking_gradient
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
@@ -115,7 +116,7 @@ def test_the_twist_is_the_loss_differentiated_by_the_pose_through_the_renderer(v
     T_start = se3.exp(OFF) @ TRUTH
     view.forward(wall(), T_start)
     tracking_gradient(view, target, config, PLAIN)
-    twist = view.backward(wall(), None)
+    twist = view.backward_pose(wall())
     T = torch.as_tensor(T_start).requires_grad_()
     with torch.no_grad():
         frozen = view.sums[:, :h, :w].double()

@@ -7,7 +7,8 @@ from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.align import Pyramid, gray_of
-from sigmasplat.fit.pose import Reference, fit_pose_align, keyframe_reference, map_reference
+from sigmasplat.fit.pose import fit_pose_align
+from sigmasplat.fit.references import Reference, keyframe_reference, map_reference
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS

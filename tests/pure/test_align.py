@@ -165,10 +165,10 @@ def pair(huber_gray: float = HUGE, huber_depth: float = HUGE, holes: bool = Fals
 def step(p: Pair, T: Array | None = None) -> tuple[Array, Array, Array]:
     """Run the kernel: H [6, 6], b [6], sums [4]."""
     images = [np.ascontiguousarray(x, np.float32) for x in (p.gray, p.depth, p.weight, p.live_gray, p.live_depth)]
-    H, b, sums = np.zeros(21), np.zeros(6), np.zeros(4)
+    H, b, S, sums = np.zeros(21), np.zeros(6), np.zeros(21), np.zeros(4)
     _core.align_step(
         *images, [CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy], p.colors, p.depths, p.huber_gray, p.huber_depth,
-        p.gate, p.T if T is None else T, H, b, sums,
+        p.gate, p.T if T is None else T, H, b, S, sums,
     )  # fmt: skip
     full = np.zeros((6, 6))
     full[np.triu_indices(6)] = H

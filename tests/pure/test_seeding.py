@@ -8,8 +8,8 @@ import torch
 from numpy.typing import NDArray
 
 from sigmasplat.config import SeedConfig
-from sigmasplat.fit.pose import PoseMaps
 from sigmasplat.fit.target import Target
+from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField

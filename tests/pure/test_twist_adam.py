@@ -6,7 +6,7 @@ import torch
 from numpy.typing import NDArray
 
 from sigmasplat.config import MappingConfig, RenderConfig
-from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, TwistAdam
+from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, VectorAdam
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model import se3
@@ -47,7 +47,7 @@ def test_updates_are_those_of_torch() -> None:
     gradients[5:9] = 0.0  # unseen for a while: it coasts
     halves = [torch.zeros(3, dtype=torch.float64, requires_grad=True) for _ in range(2)]
     groups = [{"params": [half], "lr": rate} for half, rate in zip(halves, (RATES[0], RATES[3]), strict=True)]
-    theirs, ours, position = torch.optim.Adam(groups, betas=(BETA1, BETA2), eps=EPSILON), TwistAdam(), np.zeros(6)
+    theirs, ours, position = torch.optim.Adam(groups, betas=(BETA1, BETA2), eps=EPSILON), VectorAdam.of(6), np.zeros(6)
     for g in gradients:
         for half, part in zip(halves, np.split(g, 2), strict=True):
             half.grad = torch.tensor(part)
@@ -59,7 +59,7 @@ def test_updates_are_those_of_torch() -> None:
 
 def test_a_step_is_as_long_as_its_rate_whatever_the_gradients_size() -> None:
     g = np.array([1e-7, -1.0, 1e4, 3.0, -1e-5, 2.0])
-    np.testing.assert_allclose(TwistAdam().step(g, RATES), -RATES * np.sign(g), rtol=1e-6)
+    np.testing.assert_allclose(VectorAdam.of(6).step(g, RATES), -RATES * np.sign(g), rtol=1e-6)
 
 
 @pytest.mark.parametrize("axis", range(6))

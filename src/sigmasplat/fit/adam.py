@@ -1,6 +1,6 @@
 """Step every splat by Adam (Kingma & Ba 2015), a learning rate per column of the field."""
 
-from dataclasses import dataclass, field as dataclass_field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -28,35 +28,40 @@ class Rates:
         return Rates(rates)
 
 
-def adam_step(field: GaussianField, grad: Tensor, rates: Rates, step: int, compiled: bool) -> None:
-    """Move `field.params` against grad [N, 17], in place; step counts from 1 and removes the moments' start-up bias.
+def adam_step(field: GaussianField, grad: Tensor, rates: Rates, visible: Tensor) -> None:
+    """Move the rows of `field.params` in view (bool [N]) against grad [N, 17], in place; `field.steps` is this step.
 
-    Unseen splats have gradient 0: their moments decay and they coast, exactly as in dense Adam.
+    Rows out of view keep still. When one is seen again, its moments are first decayed by the steps it missed, as dense
+    Adam's would have been. Left out is dense Adam's coasting meanwhile: at most β₁/(√β₂ − β₁) ≈ 9.1 times the row's
+    last step in each column, however long it stays away (once the bias correction has worn off, some 1000 steps). The
+    native kernels do the same, fused (native/adam.h).
     """
-    if compiled:
-        from sigmasplat.native import _core
-
-        _core.adam(
-            field.params, grad, field.moment1, field.moment2, rates.per_column.numpy(), BETA1, BETA2, EPSILON, step
-        )
-        return
-    field.moment1.lerp_(grad, 1 - BETA1)
-    field.moment2.mul_(BETA2).addcmul_(grad, grad, value=1 - BETA2)
-    unbiased1 = field.moment1 / (1 - BETA1**step)
-    unbiased2 = field.moment2 / (1 - BETA2**step)
-    field.params -= rates.per_column * unbiased1 / (unbiased2.sqrt() + EPSILON)
+    rows = visible.nonzero().squeeze(1)
+    age = (field.steps - field.last_step[rows])[:, None].to(grad)
+    g = grad[rows]
+    moment1 = field.moment1[rows] * BETA1**age + (1 - BETA1) * g
+    moment2 = field.moment2[rows] * BETA2**age + (1 - BETA2) * g * g
+    unbiased1, unbiased2 = moment1 / (1 - BETA1**field.steps), moment2 / (1 - BETA2**field.steps)
+    field.params[rows] -= rates.per_column * unbiased1 / (unbiased2.sqrt() + EPSILON)
+    field.moment1[rows], field.moment2[rows] = moment1, moment2
+    field.last_step[rows] = field.steps
 
 
 @dataclass(eq=False)
-class TwistAdam:
-    """Adam on one pose, in its tangent space: each step starts from the pose of the last."""
+class VectorAdam:
+    """Adam on a few numbers: a pose's twist, where each step starts from the pose of the last, or its coordinates."""
 
-    moment1: NDArray[np.float64] = dataclass_field(default_factory=lambda: np.zeros(6))
-    moment2: NDArray[np.float64] = dataclass_field(default_factory=lambda: np.zeros(6))
+    moment1: NDArray[np.float64]
+    moment2: NDArray[np.float64]
     steps: int = 0
 
+    @staticmethod
+    def of(size: int) -> "VectorAdam":
+        """Start at rest on so many numbers."""
+        return VectorAdam(np.zeros(size), np.zeros(size))
+
     def step(self, gradient: NDArray[np.float64], rates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the twist update [6] (to be applied on the left of T_camera_world) for a gradient [6]."""
+        """Return the update for a gradient, a rate for each number."""
         self.steps += 1
         self.moment1 += (1 - BETA1) * (gradient - self.moment1)
         self.moment2 += (1 - BETA2) * (gradient**2 - self.moment2)

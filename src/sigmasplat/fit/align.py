@@ -25,6 +25,12 @@ HUBER_DEPTH_RELATIVE = (0.003, 0.006, 0.012)
 DEPTH_GATES_M = (0.1, 0.2, 0.4)
 """Depth residuals beyond are other surfaces; from the finest level up."""
 MIN_PIXELS = 60
+RISE = 1e-3
+"""A step that raises the cost per pixel by more than this share of it is taken back."""
+DEGENERATE = 1e-5
+"""A direction with less than this share of the best one's information is not decided by the images."""
+UNKNOWN_M = 1.0
+"""Standard deviation given to such a direction, metres (of shift at the usual depth)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,23 +42,29 @@ class Pyramid:
     weight: list[Image | None]
     cameras: list[Camera]
 
+    def weighed(self, weight: Image | None) -> "Pyramid":
+        """Return the same images with another weight [H, W] of their pixels."""
+        halves = [weight]
+        for _ in self.cameras[1:]:
+            last = halves[-1]
+            halves.append(None if last is None else _quarter(last).mean(0))
+        return Pyramid(self.gray, self.depth, halves, self.cameras)
+
     @staticmethod
     def of(gray: Image, depth_m: Image, camera: Camera, weight: Image | None = None, levels: int = 3) -> "Pyramid":
         """Halve gray [H, W], depth [H, W] and an optional weight [H, W] until `levels` sizes exist."""
-        p = Pyramid([np.ascontiguousarray(gray)], [np.ascontiguousarray(depth_m)], [weight], [camera])
+        p = Pyramid([np.ascontiguousarray(gray)], [np.ascontiguousarray(depth_m)], [None], [camera])
         for _ in range(levels - 1):
             c = p.cameras[-1]
             if min(c.width, c.height) < 32:
                 break
-            last = p.weight[-1]
             p.gray.append(_quarter(p.gray[-1]).mean(0))
             p.depth.append(_half_depth(p.depth[-1]))
-            p.weight.append(None if last is None else _quarter(last).mean(0))
             # Odd sizes drop their last row or column, so the scale is exactly ½.
             p.cameras.append(
                 Camera(c.width // 2, c.height // 2, c.fx / 2, c.fy / 2, (c.cx - 0.5) / 2, (c.cy - 0.5) / 2)
             )
-        return p
+        return p.weighed(weight)
 
 
 def _quarter(image: Image) -> Image:
@@ -76,14 +88,32 @@ def gray_of(color: Image) -> Image:
 @dataclass(frozen=True, eq=False)
 class Alignment:
     """T_live_reference; agreement: share of overlapping pixels whose depths agree; overlap: share of reference pixels
-    that land on a live reading; covariance [6, 6] of the left twist (ρ, φ), m and rad; cost per pixel; steps taken."""
+    that land on a live reading; covariance [6, 6] of the left twist (ρ, φ), m and rad; degenerate: how many directions
+    of motion the images say nothing about; cost per pixel; steps taken."""
 
     T_live_reference: Matrix
     agreement: float
     overlap: float
     covariance: Matrix
+    degenerate: int
     cost: float
     steps: int
+
+
+@dataclass(eq=False)
+class Normal:
+    """The normal equations of one step, as `_core.align_step` writes them: information H and pull b of a left twist,
+    S = Σ b_c b_cᵀ over cells c of the image."""
+
+    H: Matrix
+    b: Matrix
+    S: Matrix
+    sums: Matrix
+    """Weighted cost, pixels used, pixels in view with depth, pixels agreeing in depth."""
+
+    @property
+    def cost(self) -> float:
+        return float(self.sums[0] / max(self.sums[1], 1.0))
 
 
 def align(
@@ -96,49 +126,89 @@ def align(
 ) -> Alignment:
     """Find the motion that lays the reference onto the live image, from a first guess.
 
-    Each level takes up to `iterations` Gauss–Newton steps with Huber weights and stops below `update_stop` (m, rad).
-    weight_color in [0, 1] balances gray against depth, each in units of its Huber width.
+    Each level takes up to `iterations` Gauss–Newton steps with Huber weights and ends below `update_stop` (m, rad), or
+    when a step raises the cost: then the level's best iterate stands. Directions the images say nothing about keep the
+    guess. weight_color in [0, 1] balances gray against depth, each in units of its Huber width.
     Raises BackendError without the compiled kernels.
     """
     backend_module("cpu")  # refuses in one line where the kernels are not built
-    from sigmasplat.native import _core
-
-    T, steps = np.array(T_live_reference, np.float64), 0
-    H, b, sums = np.zeros(21), np.zeros(6), np.zeros(4)
-    full = np.eye(6)
+    T, steps, depth_m = np.array(T_live_reference, np.float64), 0, _usual_depth(reference)
     for level in reversed(range(len(reference.cameras))):
-        c = reference.cameras[level]
-        huber_depth = HUBER_DEPTH_RELATIVE[min(level, 2)]
+        best, best_T = None, T
         for _ in range(iterations):
-            _core.align_step(
-                reference.gray[level], reference.depth[level], reference.weight[level], live.gray[level],
-                live.depth[level], [c.fx, c.fy, c.cx, c.cy], weight_color, 1.0 - weight_color,
-                HUBER_GRAY[min(level, 2)], huber_depth, DEPTH_GATES_M[min(level, 2)], T, H, b, sums,
-            )  # fmt: skip
+            n = _normal_equations(reference, live, level, weight_color, T)
             steps += 1
-            if sums[1] < MIN_PIXELS:
+            if n.sums[1] < MIN_PIXELS or (best is not None and n.cost > best.cost * (1.0 + RISE)):
+                T = best_T
                 break
-            full = _symmetric(H)
-            update = -np.linalg.solve(full + np.diag(1e-6 * np.diag(full) + 1e-9), b)
+            best, best_T = n, T
+            update, _ = _solve(n, depth_m)
             T = se3.exp(update) @ T
             if np.abs(update).max() < update_stop:
                 break
+    last = best if best is not None else n
     reference_pixels = max(int((reference.depth[0] > 0).sum()), 1)
+    enough = last.sums[1] >= MIN_PIXELS
+    covariance, degenerate = _covariance(last, depth_m) if enough else (np.diag(np.full(6, np.inf)), 6)
     return Alignment(
         se3.orthonormalise(T),
-        agreement=float(sums[3] / max(sums[2], 1.0)),
-        overlap=float(sums[2] / reference_pixels),
-        covariance=_covariance(full, sums),
-        cost=float(sums[0] / max(sums[1], 1.0)),
+        agreement=float(last.sums[3] / max(last.sums[2], 1.0)),
+        overlap=float(last.sums[2] / reference_pixels),
+        covariance=covariance,
+        degenerate=degenerate,
+        cost=last.cost,
         steps=steps,
     )
 
 
-def _covariance(information: Matrix, sums: Matrix) -> Matrix:
-    """Invert the normal matrix and scale it by the mean squared residual; infinite where nothing was in common."""
-    if sums[1] < MIN_PIXELS:
-        return np.diag(np.full(6, np.inf))
-    return np.asarray(np.linalg.pinv(information) * (sums[0] / sums[1]))
+def _normal_equations(reference: Pyramid, live: Pyramid, level: int, weight_color: float, T: Matrix) -> Normal:
+    from sigmasplat.native import _core
+
+    c, width = reference.cameras[level], min(level, 2)
+    H, b, S, sums = np.zeros(21), np.zeros(6), np.zeros(21), np.zeros(4)
+    _core.align_step(
+        reference.gray[level], reference.depth[level], reference.weight[level], live.gray[level],
+        live.depth[level], [c.fx, c.fy, c.cx, c.cy], weight_color, 1.0 - weight_color,
+        HUBER_GRAY[width], HUBER_DEPTH_RELATIVE[width], DEPTH_GATES_M[width], T, H, b, S, sums,
+    )  # fmt: skip
+    return Normal(_symmetric(H), b, _symmetric(S), sums)
+
+
+def _usual_depth(reference: Pyramid) -> float:
+    """Return the mean depth of a reference, metres: what turns a rotation into the shift it makes."""
+    coarse = reference.depth[-1]
+    read = coarse[coarse > 0]
+    return float(read.mean()) if len(read) else 1.0
+
+
+def _axes(n: Normal, depth_m: float) -> tuple[Matrix, Matrix, NDArray[np.bool_]]:
+    """Split the information into principal directions, rotations measured by the shift they make at the usual depth.
+
+    Returns (eigenvalues [6], directions as columns [6, 6], which ones the images decide [6]) (Zhang et al. 2016).
+    """
+    unit = np.repeat([1.0, 1.0 / depth_m], 3)
+    eigenvalues, directions = np.linalg.eigh(n.H * np.outer(unit, unit))
+    return eigenvalues, directions * unit[:, None], eigenvalues > DEGENERATE * max(eigenvalues[-1], 1e-300)
+
+
+def _solve(n: Normal, depth_m: float) -> tuple[Matrix, Matrix]:
+    """Return the Gauss–Newton update −H⁻¹ b and H⁻¹, both within the directions the images decide."""
+    eigenvalues, directions, decided = _axes(n, depth_m)
+    basis = directions[:, decided]
+    inverse = basis @ np.diag(1.0 / eigenvalues[decided]) @ basis.T
+    return -inverse @ n.b, inverse
+
+
+def _covariance(n: Normal, depth_m: float) -> tuple[Matrix, int]:
+    """Estimate the covariance H⁻¹ S H⁻¹ of the left twist, and count the degenerate directions.
+
+    Residuals of neighbouring pixels err together, so that H⁻¹ alone is far too sure; summed by cells they hardly do
+    (cluster-robust sandwich estimator, Liang & Zeger 1986). A degenerate direction has `UNKNOWN_M` of deviation.
+    """
+    _, directions, decided = _axes(n, depth_m)
+    _, inverse = _solve(n, depth_m)
+    unknown = directions[:, ~decided]
+    return inverse @ n.S @ inverse + UNKNOWN_M**2 * unknown @ unknown.T, int((~decided).sum())
 
 
 def _symmetric(upper: Matrix) -> Matrix:

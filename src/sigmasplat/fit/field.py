@@ -10,12 +10,12 @@ from torch import Tensor
 
 from sigmasplat.config import MappingConfig
 from sigmasplat.fit import losses
-from sigmasplat.fit.adam import Rates, adam_step
+from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates, adam_step
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.render.render import variance_of
-from sigmasplat.render.view import CpuView, View
+from sigmasplat.render.view import CpuView, Matrix, View
 
 
 @dataclass
@@ -59,31 +59,31 @@ def fit_field(
     """
     fit, rates, weights = FieldFit(), rates or Rates.of(config), loss_weights(config)
     pose_rates = np.repeat([config.lr_pose_translation, config.lr_pose_rotation], 3)
-    compiled = isinstance(view, CpuView)
-    fused = compiled and {name for name, weight in weights.items() if weight} <= COMPILED_TERMS
-    gradients = CompiledLoss(view) if fused else TorchLoss(view)
-    grad = torch.zeros_like(field.params)
+    step = _step_for(view, weights)
     for keyframe in keyframes:
         field.steps += 1
         t = time.perf_counter()
         view.forward(field.params, se3.inverse(keyframe.T_world_camera))
         t = fit.add("forward", t)
-        loss = gradients.images(keyframe.target, weights)
+        loss = step.images(keyframe.target, weights)
         t = fit.add("loss", t)
-        twist = view.backward(field.params, grad)
+        twist, regulariser = step.splats(field, rates, weights["isotropy"], frozen_colors)
         if pose_rates.any() and not keyframe.fixed:
             keyframe.move(twist, pose_rates)
-        t = fit.add("backward", t)
-        loss += gradients.splats(field.params, grad, weights["isotropy"])
-        grad[:frozen_colors, COLUMNS["colors"]] = 0.0
-        adam_step(field, grad, rates, field.steps, compiled)
-        fit.add("optimiser", t)
-        fit.losses.append(loss)
+        fit.add("backward", t)
+        fit.losses.append(loss + regulariser)
     return fit
 
 
-class TorchLoss:
-    """The mapping loss by its definition: terms of `losses`, gradients by autograd."""
+def _step_for(view: View, weights: dict[str, float]) -> "TorchStep | CompiledStep":
+    """Take the fused kernels where they know every term that has weight, else the definition."""
+    if isinstance(view, CpuView) and {name for name, weight in weights.items() if weight} <= COMPILED_TERMS:
+        return CompiledStep(view)
+    return TorchStep(view)
+
+
+class TorchStep:
+    """One mapping step by its definition: terms of `losses`, gradients by autograd, `adam_step`."""
 
     def __init__(self, view: View) -> None:
         self.view = view
@@ -107,52 +107,64 @@ class TorchLoss:
         (self.view.g_sums[:],) = torch.autograd.grad(loss, (planes,))
         return float(loss.detach())
 
-    def splats(self, params: Tensor, grad: Tensor, weight: float) -> float:
-        """Add the isotropy term's gradient to parameter rows; return the term, weighted."""
-        leaf = params.detach().clone().requires_grad_()
-        loss = weight * losses.isotropy(GaussianField(leaf).scales)
-        grad += torch.autograd.grad(loss, (leaf,))[0]
-        return float(loss.detach())
+    def splats(
+        self, field: GaussianField, rates: Rates, weight_isotropy: float, frozen_colors: int
+    ) -> tuple[Matrix, float]:
+        """Carry the planes to the splats in view, add the isotropy term's pull on them, and step.
+
+        Returns the pose twist [6] and what the splats in view add to the isotropy term, weighted.
+        """
+        grad, visible = torch.zeros_like(field.params), self.view.visible(len(field))
+        twist = self.view.backward(field.params, grad)
+        leaf = field.params.detach()[visible].requires_grad_()
+        share = len(leaf) / max(len(field), 1)  # the term is a mean over all splats, in view or not
+        regulariser = weight_isotropy * share * losses.isotropy(GaussianField(leaf).scales)
+        grad[visible] += torch.autograd.grad(regulariser, (leaf,))[0]
+        grad[:frozen_colors, COLUMNS["colors"]] = 0.0
+        adam_step(field, grad, rates, visible)
+        return twist, float(regulariser.detach())
 
 
 COMPILED_TERMS = {"l1", "ssim", "depth", "nll_color", "nll_depth", "isotropy"}
-"""What `CompiledLoss` knows; with any other term in play the whole loss goes through `TorchLoss`."""
+"""What `CompiledStep` knows; with any other term in play every step is a `TorchStep`."""
 
 
-class CompiledLoss:
-    """The same loss fused in the native kernels (tests hold it to `TorchLoss`)."""
+class CompiledStep:
+    """The same step fused in the native kernels (tests hold it to `TorchStep`)."""
 
-    def __init__(self, view: View) -> None:
+    def __init__(self, view: CpuView) -> None:
         from sigmasplat.native import _core
 
         self.core, self.view = _core, view
-        camera = view.camera
-        self.masked_color = torch.zeros_like(view.sums[:3])
-        self.cache = torch.zeros(_core.ssim_cache_floats(camera.width, camera.height))
-        self.masked_target = torch.zeros_like(self.masked_color)
+        self.cache = torch.zeros(_core.ssim_cache_floats(view.camera.width, view.camera.height))
         self.parts = np.zeros(4)
 
     def images(self, target: Target, weights: dict[str, float]) -> float:
         """Write the gradient of every image term to the view's gradient planes; return the loss."""
-        width, height = target.camera.width, target.camera.height
+        width, height, sums, g_sums = target.camera.width, target.camera.height, self.view.sums, self.view.g_sums
         local = [weights[name] for name in ("l1", "depth", "nll_color", "nll_depth")]
         self.core.mapping_losses(
-            self.view.sums, target.color, target.depth, height, local, target.valid_pixels,
-            self.view.g_sums, self.masked_color, self.parts,
-        )  # fmt: skip
-        if len(self.view.sums) < 7:
+            sums, target.color, target.depth, height, local, target.valid_pixels, g_sums, self.parts
+        )
+        if len(sums) < 7:
             local[2:] = [0.0, 0.0]
         loss = float(np.dot(local, self.parts))
         if weights["ssim"]:
-            torch.mul(target.color, target.depth > 0, out=self.masked_target)
-            self.core.ssim_target(self.masked_target, width, height, self.cache)
+            self.core.ssim_target(target.color, target.depth, width, height, self.cache)
             similarity = self.core.ssim(
-                self.masked_color, self.masked_target, self.cache, width, height, target.depth,
-                -weights["ssim"], self.view.g_sums[:3],
-            )  # fmt: skip
+                sums[:3], target.color, self.cache, width, height, target.depth, -weights["ssim"], g_sums[:3]
+            )
             loss += weights["ssim"] * (1.0 - similarity)
         return loss
 
-    def splats(self, params: Tensor, grad: Tensor, weight: float) -> float:
-        """Add the isotropy term's gradient to parameter rows; return the term, weighted."""
-        return weight * self.core.isotropy(params, weight, grad) if weight else 0.0
+    def splats(
+        self, field: GaussianField, rates: Rates, weight_isotropy: float, frozen_colors: int
+    ) -> tuple[Matrix, float]:
+        """Do what `TorchStep.splats` does in one pass, without a gradient row in memory."""
+        twist, v = np.zeros(6), self.view
+        isotropy = v.raster.step(
+            field.params, field.moment1, field.moment2, field.last_step, v.sums, v.alpha, v.g_sums,
+            rates.per_column.numpy(), BETA1, BETA2, EPSILON, field.steps, weight_isotropy, frozen_colors,
+            twist, v.seconds[3:],
+        )  # fmt: skip
+        return twist, weight_isotropy * isotropy

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.fit.adam import TwistAdam
+from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
@@ -50,7 +50,7 @@ class Keyframe:
     target: Target
     T_world_camera: NDArray[np.float64]
     fixed: bool = False
-    motion: TwistAdam = dataclass_field(default_factory=TwistAdam)
+    motion: VectorAdam = dataclass_field(default_factory=lambda: VectorAdam.of(6))
 
     def move(self, gradient: NDArray[np.float64], rates: NDArray[np.float64]) -> None:
         """Take an Adam step on the pose; gradient [6] by the left twist of T_camera_world, rates [6] in m and rad."""

@@ -25,12 +25,14 @@ class GaussianField:
 
     means: metres, world (or submap) frame; quats: wxyz, any positive norm; log_scales: log metres; opacity_logits:
     logit of opacity; colors: RGB in [0, 1]; log_variances: log σ² of observed colour about `colors` (VarSplat §3,
-    s_i). `moment1`, `moment2` are Adam's moments of the same rows; `steps` counts Adam's steps.
+    s_i). `moment1`, `moment2` are Adam's moments of the same rows, `last_step` [N] int32 says which step last moved
+    each; `steps` counts Adam's steps.
     """
 
     params: Tensor
     moment1: Tensor = dataclass_field(default_factory=lambda: torch.empty(0))
     moment2: Tensor = dataclass_field(default_factory=lambda: torch.empty(0))
+    last_step: Tensor = dataclass_field(default_factory=lambda: torch.empty(0, dtype=torch.int32))
     steps: int = 0
 
     def __post_init__(self) -> None:
@@ -40,6 +42,8 @@ class GaussianField:
             self.moment1 = torch.zeros_like(self.params)
         if self.moment2.shape != self.params.shape:
             self.moment2 = torch.zeros_like(self.params)
+        if len(self.last_step) != len(self.params):
+            self.last_step = torch.zeros(len(self.params), dtype=torch.int32)
 
     @staticmethod
     def empty() -> "GaussianField":
@@ -111,12 +115,14 @@ class GaussianField:
         self.params = torch.cat([self.params, other.params])
         self.moment1 = torch.cat([self.moment1, other.moment1])
         self.moment2 = torch.cat([self.moment2, other.moment2])
+        self.last_step = torch.cat([self.last_step, other.last_step])
 
     def keep(self, rows: Tensor) -> None:
         """Keep the rows chosen by a bool mask [N] or an index tensor, drop the others."""
         self.params = self.params[rows]
         self.moment1 = self.moment1[rows]
         self.moment2 = self.moment2[rows]
+        self.last_step = self.last_step[rows]
 
     def moved(self, T_new_old: Tensor) -> "GaussianField":
         """Return the field carried by a rigid 4×4 transform: positions and rotations move, shapes and looks stay."""
@@ -124,7 +130,7 @@ class GaussianField:
         out = self.params.clone()
         out[:, COLUMNS["means"]] = self.means @ T[:3, :3].T + T[:3, 3]
         out[:, COLUMNS["quats"]] = quaternion_product(quaternion_of(T[:3, :3]), self.quats)
-        return GaussianField(out, self.moment1.clone(), self.moment2.clone(), self.steps)
+        return GaussianField(out, self.moment1.clone(), self.moment2.clone(), self.last_step.clone(), self.steps)
 
 
 def quaternion_of(R: Tensor) -> Tensor:

@@ -28,19 +28,8 @@ def project_backward(
 def project_double(
     view: Array, means: Array, quats: Array, scales: Array, g: Array, footprint: Array, gradient: Array
 ) -> None: ...
-def adam(
-    params: Array,
-    grad: Array,
-    moment1: Array,
-    moment2: Array,
-    rates: Array,
-    beta1: float,
-    beta2: float,
-    epsilon: float,
-    step: int,
-) -> None: ...
 def ssim_cache_floats(width: int, height: int) -> int: ...
-def ssim_target(target: Array, width: int, height: int, cache: Array) -> None: ...
+def ssim_target(target: Array, mask: Array | None, width: int, height: int, cache: Array) -> None: ...
 def ssim(
     image: Array,
     target: Array,
@@ -59,10 +48,33 @@ def mapping_losses(
     weights: list[float],
     valid_pixels: float,
     g_sums: Array,
-    masked_color: Array,
     losses: Array,
 ) -> None: ...
-def isotropy(params: Array, weight: float, g_params: Array) -> float: ...
+def tracking_loss(
+    sums: Array,
+    alpha: Array,
+    target_color: Array,
+    target_depth: Array,
+    width: int,
+    height: int,
+    options: list[float],
+    uncertainty: bool,
+    gain: float,
+    offset: float,
+    g_sums: Array,
+    g_exposure: Array,
+) -> float: ...
+def reference_maps(
+    sums: Array,
+    alpha: Array,
+    width: int,
+    height: int,
+    options: list[float],
+    uncertainty: bool,
+    gray: Array,
+    depth: Array,
+    weight: Array,
+) -> None: ...
 def align_step(
     reference_gray: Array,
     reference_depth: Array,
@@ -78,6 +90,7 @@ def align_step(
     T: Array,
     H: Array,
     b: Array,
+    S: Array,
     sums: Array,
 ) -> None: ...
 
@@ -146,8 +159,30 @@ class Rasteriser:
         g_sums: Array,
         g_moment: Array | None,
         g_alpha: Array | None,
-        g_params: Array | None,
+        g_params: Array,
         g_twist: Array,
         seconds: Array,
+    ) -> None: ...
+    def step(
+        self,
+        params: Array,
+        moment1: Array,
+        moment2: Array,
+        last_step: Array,
+        sums: Array,
+        alpha: Array,
+        g_sums: Array,
+        rates: Array,
+        beta1: float,
+        beta2: float,
+        epsilon: float,
+        step: int,
+        isotropy_weight: float,
+        frozen_colors: int,
+        g_twist: Array,
+        seconds: Array,
+    ) -> float: ...
+    def backward_pose(
+        self, params: Array, sums: Array, alpha: Array, g_sums: Array, g_twist: Array, seconds: Array
     ) -> None: ...
     def visible(self, out: Array) -> None: ...

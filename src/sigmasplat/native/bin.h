@@ -43,6 +43,15 @@ struct Scratch {                                      // one thread's tile
 
 // The feature counts compiled in; a count between them is padded with zeros.
 constexpr int feature_slots(int k) { return k <= 4 ? 4 : k <= 7 ? 7 : k <= 11 ? 11 : 16; }
+template <int K> constexpr int row_floats = GEOMETRY + (K + 3) / 4 * 4;
+template <class F> SIGMA_INLINE void with_features(int k, F f) {   // K is compiled in: colour + depth pays for no variance
+    switch (k) {
+        case 4: f(std_int<4>{}); break;
+        case 7: f(std_int<7>{}); break;
+        case 11: f(std_int<11>{}); break;
+        default: f(std_int<16>{});
+    }
+}
 
 struct Render {                                       // what one forward pass leaves for its backward pass
     int64_t n = 0;
@@ -81,9 +90,10 @@ struct Render {                                       // what one forward pass l
     }
 };
 
-// Store W footprints and their features (lanes, `row - GEOMETRY` of them); return how many tiles they reach, `before` being
+// Store W footprints and their features (lanes, padded to ROW_FLOATS - GEOMETRY of them); return how many tiles they reach, `before` being
 // the slots of the chunk in use already. Bounds are those of alpha ≥ alpha_min, not three sigma, so the image does not
 // depend on the tiling.
+template <int ROW_FLOATS>
 SIGMA_INLINE int pack(Render& r, const Footprint<vf>& f, vf opacity, Mask seen, int64_t i, int before, const float (*features)[W]) {
     const vf log_opacity = log2(max(opacity, splat(1e-30f)));
     const vf reach = log_opacity - splat(__builtin_log2f(r.options.alpha_min));
@@ -97,6 +107,7 @@ SIGMA_INLINE int pack(Render& r, const Footprint<vf>& f, vf opacity, Mask seen, 
     const vf y0 = clamp(-floor((float(BLOCK_HEIGHT - 1) - f.v + dv) * (1.f / BLOCK_HEIGHT)), 0.f, float(blocks_y));
     const vf y1 = clamp(floor((f.v + dv) * (1.f / BLOCK_HEIGHT)), -1.f, float(blocks_y - 1));
     seen = both(seen, both(ge(x1, x0), ge(y1, y0)));
+    seen = both(seen, both(ge(splat(r.width - 1.f), f.u - du), ge(splat(r.height - 1.f), f.v - dv)));   // not in padding only
     const unsigned live = bits(seen) & (r.n - i < W ? (1u << (r.n - i)) - 1u : ~0u);
     memset(&r.tiles_of[i], 0, W * sizeof(int));
     if (!live) return 0;
@@ -113,18 +124,17 @@ SIGMA_INLINE int pack(Render& r, const Footprint<vf>& f, vf opacity, Mask seen, 
     }
     const vf geometry[GEOMETRY] = {f.l1 * CONIC_SCALE, f.l2 * CONIC_SCALE, f.l3 * CONIC_SCALE, f.u, f.v,
                                    log_opacity * 0.125f, f.z, float_of_bits(load(tag))};
-    const int columns = r.row;
-    for (int c = 0; c < columns; c += W) {            // turn W columns at a time into W rows' next W floats
+    for (int c = 0; c < ROW_FLOATS; c += W) {         // turn W columns at a time into W rows' next W floats
         vf turn[W];
-        const int count = columns - c < W ? columns - c : W;
+        const int count = ROW_FLOATS - c < W ? ROW_FLOATS - c : W;
         for (int q = 0; q < W; q++)
             turn[q] = q >= count ? splat(0.f) : c + q < GEOMETRY ? geometry[c + q] : load(features[c + q - GEOMETRY]);
         transpose(turn);
         for (unsigned m = live; m; m &= m - 1) {
             const int l = __builtin_ctz(m);
-            float* to = &r.rows[size_t(i + l) * columns + c];
+            float* to = &r.rows[size_t(i + l) * ROW_FLOATS + c];
             if (count == W) store(to, turn[l]);
-            else memcpy(to, &turn[l], count * sizeof(float));
+            else for (int q = 0; q < count; q += 4) memcpy(to + q, reinterpret_cast<const float*>(&turn[l]) + q, 16);
         }
     }
     return used - before;

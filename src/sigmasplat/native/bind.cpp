@@ -65,6 +65,11 @@ static Outputs outputs(Floats& sums, Maybe<Floats>& moment, Floats& alpha, Maybe
     return {sums.data(), pointer(moment), alpha.data(), pointer(median_id), pointer(median_weight), pointer(dominant_id), pointer(dominant_weight)};
 }
 
+static TrackOptions track_options(const std::vector<float>& v, bool uncertainty) {
+    need(v.size() == 6, "tracking has six numbers");
+    return {v[0], v[1], v[2], v[3], v[4], v[5], uncertainty};
+}
+
 // The buffers of one render, bound to the instruction set that was active when it was made.
 class Rasteriser {
 public:
@@ -106,11 +111,26 @@ public:
                               {alpha_min, stop}, o, seconds.data());
     }
     void view_backward(ConstFloats params, Floats sums, Maybe<Floats> moment, Floats alpha, ConstFloats g_sums,
-                       Maybe<ConstFloats> g_moment, Maybe<ConstFloats> g_alpha, Maybe<Floats> g_params, Doubles g_twist, Doubles seconds) {
+                       Maybe<ConstFloats> g_moment, Maybe<ConstFloats> g_alpha, Floats g_params, Doubles g_twist, Doubles seconds) {
         need(g_twist.size() == 6 && seconds.size() >= 2, "g_twist has 6 numbers, seconds 2");
         nb::gil_scoped_release unlocked;
         kernels->view_backward(context, params.data(), {sums.data(), pointer(moment), alpha.data(), nullptr, nullptr, nullptr, nullptr},
-                               {g_sums.data(), pointer(g_moment), pointer(g_alpha)}, pointer(g_params), g_twist.data(), seconds.data());
+                               {g_sums.data(), pointer(g_moment), pointer(g_alpha)}, g_params.data(), g_twist.data(), seconds.data());
+    }
+    double step(Floats params, Floats moment1, Floats moment2, Ints last_step, Floats sums, Floats alpha, ConstFloats g_sums, ConstFloats rates,
+                float beta1, float beta2, float epsilon, int step, float isotropy_weight, int64_t frozen_colors, Doubles g_twist, Doubles seconds) {
+        need(g_twist.size() == 6 && seconds.size() >= 2 && rates.size() == 17, "g_twist has 6 numbers, seconds 2, rates 17");
+        need(last_step.size() == params.shape(0) && moment1.size() == params.size() && moment2.size() == params.size(), "Adam's state must fit the rows");
+        nb::gil_scoped_release unlocked;
+        return kernels->view_step(context, params.data(), {sums.data(), nullptr, alpha.data(), nullptr, nullptr, nullptr, nullptr}, {g_sums.data(), nullptr, nullptr},
+                                  {moment1.data(), moment2.data(), last_step.data()}, {rates.data(), beta1, beta2, epsilon, step}, isotropy_weight, frozen_colors,
+                                  g_twist.data(), seconds.data());
+    }
+    void backward_pose(ConstFloats params, Floats sums, Floats alpha, ConstFloats g_sums, Doubles g_twist, Doubles seconds) {
+        need(g_twist.size() == 6 && seconds.size() >= 1, "g_twist has 6 numbers, seconds 1");
+        nb::gil_scoped_release unlocked;
+        kernels->view_backward_pose(context, params.data(), {sums.data(), nullptr, alpha.data(), nullptr, nullptr, nullptr, nullptr},
+                                    {g_sums.data(), nullptr, nullptr}, g_twist.data(), seconds.data());
     }
     void visible(Bytes out) const { kernels->view_visible(context, out.data()); }
 
@@ -162,44 +182,51 @@ NB_MODULE(_core, m) {
                                  g_conics.data(), g_z.data(), g_means.data(), g_quats.data(), g_scales.data(), g_twist.data());
     });
     m.def("project_double", project_double);
-    m.def("adam", [](Floats params, ConstFloats grad, Floats moment1, Floats moment2, ConstFloats rates, float beta1, float beta2, float epsilon, int64_t step) {
-        need(rates.size() == 17, "one rate per column");
-        nb::gil_scoped_release unlocked;
-        active->adam(params.data(), grad.data(), moment1.data(), moment2.data(), int64_t(params.shape(0)), rates.data(), beta1, beta2, epsilon, step);
-    });
     m.def("ssim_cache_floats", [](int width, int height) { const size_t w = active->pad.lanes; return 6 * ((width + w - 1) / w * w) * height; });
-    m.def("ssim_target", [](ConstFloats target, int width, int height, Floats cache) {
+    m.def("ssim_target", [](ConstFloats target, Maybe<ConstFloats> mask, int width, int height, Floats cache) {
         nb::gil_scoped_release unlocked;
-        active->ssim_target(target.data(), width, height, target.shape(2), target.shape(1) * target.shape(2), cache.data());
-    });
+        active->ssim_target(target.data(), pointer(mask), width, height, target.shape(2), target.shape(1) * target.shape(2), cache.data());
+    }, nb::arg("target"), nb::arg("mask").none(), nb::arg("width"), nb::arg("height"), nb::arg("cache"));
     m.def("ssim", [](ConstFloats image, ConstFloats target, ConstFloats cache, int width, int height, Maybe<ConstFloats> mask, float weight, Floats gradient) {
         nb::gil_scoped_release unlocked;
         return active->ssim(image.data(), target.data(), cache.data(), width, height, image.shape(2), image.shape(1) * image.shape(2), pointer(mask), weight, gradient.data());
     }, nb::arg("image"), nb::arg("target"), nb::arg("cache"), nb::arg("width"), nb::arg("height"), nb::arg("mask").none(), nb::arg("weight"), nb::arg("gradient"));
     m.def("mapping_losses", [](ConstFloats sums, ConstFloats target_color, ConstFloats target_depth, int height, std::vector<float> weights,
-                               double valid_pixels, Floats g_sums, Floats masked_color, Doubles losses) {
+                               double valid_pixels, Floats g_sums, Doubles losses) {
         need(weights.size() == 4 && losses.size() == 4, "mapping_losses: four weights, four losses");
         const size_t stride = sums.shape(2), plane = sums.shape(1) * stride;
         nb::gil_scoped_release unlocked;
         active->mapping_losses(sums.data(), target_color.data(), target_depth.data(), height, stride, plane, sums.shape(0) >= 7,
-                               {weights[0], weights[1], weights[2], weights[3]}, valid_pixels, g_sums.data(), masked_color.data(), losses.data());
+                               {weights[0], weights[1], weights[2], weights[3]}, valid_pixels, g_sums.data(), losses.data());
     });
-    m.def("isotropy", [](ConstFloats params, float weight, Floats g_params) {
+    m.def("tracking_loss", [](ConstFloats sums, ConstFloats alpha, ConstFloats target_color, ConstFloats target_depth, int width, int height,
+                              std::vector<float> options, bool uncertainty, float gain, float offset, Floats g_sums, Doubles g_exposure) {
+        need(g_exposure.size() == 2, "g_exposure has 2 numbers");
+        const Plane plane{width, height, sums.shape(2), sums.shape(1) * sums.shape(2)};
+        const TrackOptions o = track_options(options, uncertainty);
         nb::gil_scoped_release unlocked;
-        return active->isotropy(params.data(), int64_t(params.shape(0)), weight, g_params.data());
+        return active->tracking_loss(sums.data(), alpha.data(), sums.shape(0) >= 7, target_color.data(), target_depth.data(), plane, o, gain, offset,
+                                     g_sums.data(), g_exposure.data());
+    });
+    m.def("reference_maps", [](ConstFloats sums, ConstFloats alpha, int width, int height, std::vector<float> options, bool uncertainty,
+                               Floats gray, Floats depth, Floats weight) {
+        const Plane plane{width, height, sums.shape(2), sums.shape(1) * sums.shape(2)};
+        const TrackOptions o = track_options(options, uncertainty);
+        nb::gil_scoped_release unlocked;
+        active->reference_maps(sums.data(), alpha.data(), sums.shape(0) >= 7, plane, o, gray.data(), depth.data(), weight.data());
     });
     m.def("align_step", [](ConstFloats reference_gray, ConstFloats reference_depth, Maybe<ConstFloats> weight, ConstFloats live_gray, ConstFloats live_depth,
                            std::vector<float> intrinsics, float weight_color, float weight_depth, float huber_gray, float huber_depth_relative, float depth_gate,
-                           Doubles T, Doubles H, Doubles b, Doubles sums) {
-        need(intrinsics.size() == 4 && T.size() >= 12 && H.size() == 21 && b.size() == 6 && sums.size() == 4, "align_step: wrong sizes");
+                           Doubles T, Doubles H, Doubles b, Doubles S, Doubles sums) {
+        need(intrinsics.size() == 4 && T.size() >= 12 && H.size() == 21 && b.size() == 6 && S.size() == 21 && sums.size() == 4, "align_step: wrong sizes");
         const AlignLevel level{reference_gray.data(), reference_depth.data(), pointer(weight), live_gray.data(), live_depth.data(),
                                int(reference_gray.shape(1)), int(reference_gray.shape(0)), intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]};
         const AlignOptions options{weight_color, weight_depth, huber_gray, huber_depth_relative, depth_gate};
         nb::gil_scoped_release unlocked;
-        active->align_step(&level, &options, T.data(), H.data(), b.data(), sums.data());
+        active->align_step(&level, &options, T.data(), H.data(), b.data(), S.data(), sums.data());
     }, nb::arg("reference_gray"), nb::arg("reference_depth"), nb::arg("weight").none(), nb::arg("live_gray"), nb::arg("live_depth"), nb::arg("intrinsics"),
        nb::arg("weight_color"), nb::arg("weight_depth"), nb::arg("huber_gray"), nb::arg("huber_depth_relative"), nb::arg("depth_gate"), nb::arg("T"),
-       nb::arg("H"), nb::arg("b"), nb::arg("sums"));
+       nb::arg("H"), nb::arg("b"), nb::arg("S"), nb::arg("sums"));
     nb::class_<Rasteriser>(m, "Rasteriser")
         .def(nb::init<>())
         .def_prop_ro("bytes", &Rasteriser::bytes)
@@ -212,6 +239,8 @@ NB_MODULE(_core, m) {
              nb::arg("sums"), nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(), nb::arg("median_weight").none(), nb::arg("dominant_id").none(),
              nb::arg("dominant_weight").none(), nb::arg("seconds"))
         .def("view_backward", &Rasteriser::view_backward, nb::arg("params"), nb::arg("sums"), nb::arg("moment").none(), nb::arg("alpha"), nb::arg("g_sums"),
-             nb::arg("g_moment").none(), nb::arg("g_alpha").none(), nb::arg("g_params").none(), nb::arg("g_twist"), nb::arg("seconds"))
+             nb::arg("g_moment").none(), nb::arg("g_alpha").none(), nb::arg("g_params"), nb::arg("g_twist"), nb::arg("seconds"))
+        .def("step", &Rasteriser::step)
+        .def("backward_pose", &Rasteriser::backward_pose)
         .def("visible", &Rasteriser::visible);
 }

@@ -53,7 +53,7 @@ template <bool BACKWARD> static Tile gather_tile(const Render& r, Scratch& s, in
     const size_t row = r.row, row_bytes = row * sizeof(float);
     s.rows.reserve(size_t(n + 1) * row);
     s.masks.reserve(n + W);
-    if (BACKWARD) s.centers.reserve(n);
+    if (BACKWARD) memset(static_cast<void*>(s.centers.reserve(n + W) + n), 0, W * sizeof(Center));
     const uint64_t* items = r.items.data + begin;
     for (int k = 0; k < n; k++) {
         if (k + AHEAD < n) {
@@ -97,7 +97,6 @@ SIGMA_INLINE vf block_y(int b) {
     return y;
 }
 
-template <int K> constexpr int row_floats = GEOMETRY + (K + 3) / 4 * 4;
 template <int ROW_FLOATS> SIGMA_INLINE const Geometry& geometry_of(const float* rows, int entry) {
     return *reinterpret_cast<const Geometry*>(rows + size_t(entry) * ROW_FLOATS);
 }
@@ -217,17 +216,20 @@ constexpr int pixel_of_pair(int m) { return m < W / 2 ? m / 2 * 4 + m % 2 : (m -
 typedef long long vpair __attribute__((vector_size(W * 4)));
 SIGMA_INLINE vf splat_pair(const float* p) { long long bits; memcpy(&bits, p, 8); return (vf)(bits - vpair{}); }
 
+// Move a record's moments from the tile's centre to the splat's mean at (u, v) from there.
+template <class T> SIGMA_INLINE void shift_moments(T m0, T& mx, T& my, T& mxx, T& mxy, T& myy, T u, T v) {
+    mxx += u * (u * m0 - 2.f * mx);
+    mxy += u * (v * m0 - my) - v * mx;
+    myy += v * (v * m0 - 2.f * my);
+    mx -= u * m0;
+    my -= v * m0;
+}
+
 // Move a tile's records to each splat's own slots, moments now about the splat's mean.
 template <int RECORD> static void flush_records(Render& r, Scratch& s, const Tile& tile) {
     for (int k = 0; k < tile.count; k++) {
         float* m = &s.records[size_t(k) * RECORD];
-        const auto [u, v] = s.centers[k];
-        const float m0 = m[0], mx = m[2], my = m[4];
-        m[6] += u * (u * m0 - 2.f * mx);
-        m[8] += u * (v * m0 - my) - v * mx;
-        m[10] += v * (v * m0 - 2.f * my);
-        m[2] = mx - u * m0;
-        m[4] = my - v * m0;
+        shift_moments(m[0], m[2], m[4], m[6], m[8], m[10], s.centers[k].u, s.centers[k].v);
     }
     for (int k = 0; k < tile.count; k++) {
         const Geometry& g = *reinterpret_cast<const Geometry*>(&s.rows[size_t(k) * r.row]);
@@ -236,13 +238,15 @@ template <int RECORD> static void flush_records(Render& r, Scratch& s, const Til
     }
 }
 
-template <int K, bool MOMENT> static void blend_tiles_backward(Render& r, Outputs o, OutputGradients g) {
-    constexpr int RECORD = record_floats<K, MOMENT>, EXTRA = extra_floats<K, MOMENT>, COLUMNS = weight_columns<K, MOMENT>;
-    constexpr int ROW_FLOATS = row_floats<K>;
+// Walk every tile's pixels once more and hand its records to `finish(scratch, tile)`. The first K of a row's ROW_K features
+// have gradients; the others have none and are passed over.
+template <int ROW_K, int K, bool MOMENT, class Finish>
+static void blend_tiles_backward(Render& r, Outputs o, OutputGradients g, Finish finish) {
+    constexpr int RECORD = record_floats<K, MOMENT>, EXTRA = extra_floats<K, MOMENT>;
+    constexpr int ROW_FLOATS = row_floats<ROW_K>;
     const size_t plane = r.plane(), stride = r.padded_width();
     const float log_alpha_min = __builtin_log2f(r.options.alpha_min) * 0.125f;
     const vf stop = splat(r.options.transmittance_stop), zero = splat(0.f), one = splat(1.f), top = splat(ALPHA_MAX);
-    r.partials.reserve(size_t(r.intersections + 1) * RECORD);
 #pragma omp parallel
     {
         Scratch& s = r.scratch[omp_get_thread_num()];
@@ -250,7 +254,7 @@ template <int K, bool MOMENT> static void blend_tiles_backward(Render& r, Output
 #pragma omp for schedule(dynamic, 1)
         for (int index = 0; index < r.tiles_x * r.tiles_y; index++) {
             const Tile tile = gather_tile<true>(r, s, index);
-            memset(s.records.reserve(size_t(tile.count + 1) * RECORD), 0, size_t(tile.count) * RECORD * sizeof(float));
+            memset(s.records.reserve(size_t(tile.count + W) * RECORD), 0, size_t(tile.count + W) * RECORD * sizeof(float));
             const float* rows = s.rows.data;
             for (int b = 0; b < BLOCKS; b++) {
                 const int count = s.counts[b];
@@ -261,28 +265,26 @@ template <int K, bool MOMENT> static void blend_tiles_backward(Render& r, Output
                 vf gs[K], gm = zero, ref = zero;
                 const vf ga = g.alpha ? load_block(g.alpha + at, stride) : zero;
                 vf behind = ga * load_block(o.alpha + at, stride);       // Σ over what lies behind of w·G
-                alignas(64) float columns[COLUMNS][W];
+                vf columns[16 + EXTRA];                 // what a pixel's (g, w) pairs are multiplied with
+                for (auto& c : columns) c = zero;
+                const vf moments[6] = {one, x, y, x * x, x * y, y * y};
+                for (int c = 0; c < 6; c++) columns[2 * c] = moments[c];
+                const auto weighed = [&](int c, vf v) { columns[c < 8 ? 2 * c + 1 : 8 + c] = v; };
                 for (int c = 0; c < K; c++) {
                     gs[c] = load_block(g.sums + c * plane + at, stride);
                     behind = fma(gs[c], load_block(o.sums + c * plane + at, stride), behind);
-                    store(columns[c], gs[c]);
+                    weighed(c, gs[c]);
                 }
                 if (MOMENT) {
                     ref = load_block(r.reference + at, stride);
                     gm = only(gt(ref, zero), load_block(g.moment + at, stride));
                     behind = fma(gm, load_block(o.moment + at, stride), behind);
-                    store(columns[K], 2.f * gm);
-                    store(columns[K + 1], -2.f * gm * ref);
+                    weighed(K, 2.f * gm);
+                    weighed(K + 1, -2.f * gm * ref);
                 }
-                for (int m = 0; m < W; m++) {
-                    const int p = pixel_of_pair(m);
-                    const float px = x[p], py = y[p];
-                    const float moments[8] = {1.f, px, py, px * px, px * py, py * py, 0.f, 0.f};
-                    for (int c = 0; c < 8; c++) {
-                        basis[m][2 * c] = moments[c];
-                        basis[m][2 * c + 1] = c < COLUMNS ? columns[c < COLUMNS ? c : 0][p] : 0.f;
-                    }
-                    for (int c = 0; c < EXTRA; c++) basis[m][16 + c] = 8 + c < COLUMNS ? columns[8 + c < COLUMNS ? 8 + c : 0][p] : 0.f;
+                for (int h = 0; h < 16 + EXTRA; h += W) {
+                    transpose(columns + h);
+                    for (int m = 0; m < W; m++) store(basis[m] + h, columns[h + pixel_of_pair(m)]);
                 }
                 vf T = one;
                 for (int j = 0; j < count; j += ALPHA_CHUNK) {
@@ -299,7 +301,7 @@ template <int K, bool MOMENT> static void blend_tiles_backward(Render& r, Output
                         for (int c = 0; c < K; c++) G = fma(gs[c], splat(f[c]), G);
                         if (MOMENT) { const vf d = geometry.z - ref; G = fma(gm * d, d, G); }
                         behind = fnma(w, G, behind);
-                        const vf g_alpha = fma(T, G, -(behind / (one - a)));
+                        const vf g_alpha = fma(T, G, -(behind * reciprocal(one - a)));
                         const vf g_power = only(both(on, gt(top, a)), g_alpha * a);
                         store_pairs(s.alphas.pairs[e], g_power, w);
                         T = fnma(T, a, T);
@@ -307,27 +309,27 @@ template <int K, bool MOMENT> static void blend_tiles_backward(Render& r, Output
                     for (int e = 0; e < n; e++) {
                         const float* pairs = s.alphas.pairs[e];
                         float* record = &s.records[size_t(s.alphas.entry[e]) * RECORD];
-                        vf acc[16 / W], rest[EXTRA ? EXTRA / W : 1];
-                        for (int h = 0; h < 16 / W; h++) acc[h] = load(record + h * W);
+                        vf acc[16 / W][2], rest[EXTRA ? EXTRA / W : 1];       // two chains: the sum waits half as long
+                        for (int h = 0; h < 16 / W; h++) { acc[h][0] = load(record + h * W); acc[h][1] = zero; }
                         for (int h = 0; h < EXTRA / W; h++) rest[h] = load(record + 16 + h * W);
 #pragma GCC unroll 16
                         for (int m = 0; m < W; m++) {
                             const vf pair = splat_pair(pairs + 2 * m);
-                            for (int h = 0; h < 16 / W; h++) acc[h] = fma(pair, load(basis[m] + h * W), acc[h]);
+                            for (int h = 0; h < 16 / W; h++) acc[h][m & 1] = fma(pair, load(basis[m] + h * W), acc[h][m & 1]);
                             if (EXTRA) {
                                 const vf weight = splat(pairs[2 * m + 1]);
                                 for (int h = 0; h < EXTRA / W; h++) rest[h] = fma(weight, load(basis[m] + 16 + h * W), rest[h]);
                             }
                         }
-                        for (int h = 0; h < 16 / W; h++) store(record + h * W, acc[h]);
+                        for (int h = 0; h < 16 / W; h++) store(record + h * W, acc[h][0] + acc[h][1]);
                         for (int h = 0; h < EXTRA / W; h++) store(record + 16 + h * W, rest[h]);
                     }
                     if (!any(ge(T, stop))) break;
                 }
             }
-            flush_records<RECORD>(r, s, tile);
+            finish(s, tile);
         }
-        fence();
+        fence();                                      // records may have been streamed
     }
 }
 
@@ -351,8 +353,14 @@ template <int RECORD> SIGMA_INLINE void reduce_records(const Render& r, int64_t 
 SIGMA_INLINE vf weight_sum(const float (*sums)[W], int c) { return load(sums[c < 8 ? 2 * c + 1 : 8 + c]); }
 
 // ∂L/∂(mean, conic) of W splats: power = −½(p² + q²), so every derivative is a moment of g about the splat's mean.
-SIGMA_INLINE FootprintGradient<vf> footprint_gradient(const float (*sums)[W], vf l1, vf l2, vf l3) {
-    const vf mx = load(sums[2]), my = load(sums[4]), mxx = load(sums[6]), mxy = load(sums[8]), myy = load(sums[10]);
+struct Moments { vf m[6]; };                           // Σ g·{1, x, y, xx, xy, yy} about the splat's mean
+SIGMA_INLINE Moments moments_of(const float (*sums)[W]) {
+    Moments a;
+    for (int q = 0; q < 6; q++) a.m[q] = load(sums[2 * q]);
+    return a;
+}
+SIGMA_INLINE FootprintGradient<vf> footprint_gradient(const Moments& moments, vf l1, vf l2, vf l3) {
+    const vf *m = moments.m, mx = m[1], my = m[2], mxx = m[3], mxy = m[4], myy = m[5];
     FootprintGradient<vf> g;
     const vf p = l1 * mx + l2 * my;
     g.u = l1 * p;

@@ -19,10 +19,11 @@ template <int N> struct std_int { static constexpr int value = N; };
 #include "project.h"
 #include "bin.h"
 #include "blend.h"
-#include "view.h"
 #include "adam.h"
-#include "ssim.h"
 #include "losses.h"
+#include "view.h"
+#include "ssim.h"
+#include "track.h"
 #include "align.h"
 
 Context* create() { return reinterpret_cast<Context*>(new Render); }
@@ -40,8 +41,8 @@ const Kernels table = {
     {TILE_WIDTH, TILE_HEIGHT, W},
     create, destroy, bytes,
     project_forward, project_backward, blend_forward, blend_backward,
-    view_forward, view_backward, view_visible,
-    adam, ssim_target, ssim, mapping_losses, isotropy, align_step,
+    view_forward, view_backward, view_step, view_backward_pose, view_visible,
+    ssim_target, ssim, mapping_losses, tracking_loss, reference_maps, align_step,
 };
 
 }  // namespace sigmasplat::SIGMASPLAT_ISA

@@ -25,6 +25,16 @@ struct SplatGradients { float *means2d, *conics, *z, *opacities, *features; };
 
 struct LossWeights { float l1, depth, nll_color, nll_depth; };
 
+struct AdamOptions { const float* rates; float beta1, beta2, epsilon; int step; };   // rates: one per column
+struct AdamState { float *moment1, *moment2; int* last_step; };                       // last_step: when a row last moved
+
+struct Plane { int width, height; size_t stride, plane; };   // image planes of rows `stride` floats long, `plane` floats apart
+
+struct TrackOptions {                      // settings of TrackingConfig
+    float alpha_above, alpha_power, outlier_factor, weight_color, tau, weight_max;
+    bool uncertainty;
+};
+
 struct AlignLevel {                        // one pyramid level, planes of width × height
     const float *reference_gray, *reference_depth, *weight, *live_gray, *live_depth;
     int width, height;
@@ -56,17 +66,22 @@ struct Kernels {
     void (*view_forward)(Context*, const float* view, const float* params, int64_t n, int k, const float* reference,
                          BlendOptions, Outputs, double* seconds);
     void (*view_backward)(Context*, const float* params, Outputs, OutputGradients, float* g_params, double* g_twist, double* seconds);
+    double (*view_step)(Context*, float* params, Outputs, OutputGradients, AdamState, AdamOptions, float isotropy_weight,
+                        int64_t frozen_colors, double* g_twist, double* seconds);
+    void (*view_backward_pose)(Context*, const float* params, Outputs, OutputGradients, double* g_twist, double* seconds);
     void (*view_visible)(const Context*, uint8_t* visible);
-    void (*adam)(float* params, const float* grad, float* moment1, float* moment2, int64_t n, const float* rates,
-                 float beta1, float beta2, float epsilon, int64_t step);
-    void (*ssim_target)(const float* target, int width, int height, size_t stride, size_t plane, float* cache);
+    void (*ssim_target)(const float* target, const float* mask, int width, int height, size_t stride, size_t plane, float* cache);
     double (*ssim)(const float* image, const float* target, const float* cache, int width, int height, size_t stride,
                    size_t plane, const float* mask, float weight, float* gradient);
     void (*mapping_losses)(const float* sums, const float* target_color, const float* target_depth, int height,
                            size_t stride, size_t plane, bool variance, LossWeights, double valid_pixels, float* g_sums,
-                           float* masked_color, double* losses);
-    double (*isotropy)(const float* params, int64_t n, float weight, float* g_params);
-    void (*align_step)(const AlignLevel*, const AlignOptions*, const double* T, double* H, double* b, double* sums);
+                           double* losses);
+    double (*tracking_loss)(const float* sums, const float* alpha, bool variance, const float* target_color,
+                            const float* target_depth, Plane, TrackOptions, float gain, float offset, float* g_sums,
+                            double* g_exposure);
+    void (*reference_maps)(const float* sums, const float* alpha, bool variance, Plane, TrackOptions, float* gray, float* depth,
+                           float* weight);
+    void (*align_step)(const AlignLevel*, const AlignOptions*, const double* T, double* H, double* b, double* S, double* sums);
 };
 
 }  // namespace sigmasplat

@@ -164,11 +164,25 @@ SIGMA_INLINE void fence() { _mm_sfence(); }
 SIGMA_INLINE void fence() {}
 #endif
 
+// 1/x of positive normal numbers (relative error 1e-7): Newton from a guess on the bits. Four times the division's rate.
+SIGMA_INLINE vf reciprocal(vf x) {
+    vf y = float_of_bits(0x7ef311c7 - bits_of(x));
+    for (int i = 0; i < 3; i++) y *= fnma(x, y, splat(2.f));
+    return y;
+}
+
 // A (BLOCK_WIDTH × BLOCK_HEIGHT) block of an image plane whose rows are `stride` floats apart.
-SIGMA_INLINE vf load_block(const float* p, size_t stride) {
-    alignas(64) float t[W];
-    for (int r = 0; r < BLOCK_HEIGHT; r++) memcpy(t + r * BLOCK_WIDTH, p + r * stride, BLOCK_WIDTH * 4);
-    return load(t);
+typedef float row_of_block __attribute__((vector_size(BLOCK_WIDTH * 4)));
+SIGMA_INLINE row_of_block load_row(const float* p) { row_of_block r; memcpy(&r, p, sizeof r); return r; }
+template <int... L, class V> SIGMA_INLINE auto joined(V a, V b, std::integer_sequence<int, L...>) { return __builtin_shufflevector(a, b, L...); }
+SIGMA_INLINE vf load_block(const float* p, size_t stride) {   // joined in registers: a load of fresh stores would stall
+    constexpr auto two_rows = std::make_integer_sequence<int, 2 * BLOCK_WIDTH>{};
+    const auto top = joined(load_row(p), load_row(p + stride), two_rows);
+#if defined(__AVX512F__)                              // four rows, elsewhere two
+    return joined(top, joined(load_row(p + 2 * stride), load_row(p + 3 * stride), two_rows), std::make_integer_sequence<int, W>{});
+#else
+    return top;
+#endif
 }
 SIGMA_INLINE void store_block(float* p, size_t stride, vf v) {
     alignas(64) float t[W];

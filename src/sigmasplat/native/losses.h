@@ -1,6 +1,6 @@
 // The mapping loss on image planes and its gradient, in one pass; fit/losses.py is the definition of every term.
 // `sums` are planes (r, g, b, z[, q, q, q]); a pixel counts where the target depth is above 0. The gradient planes are
-// written whole (0 where nothing counts), and the masked colour is left behind for SSIM.
+// written whole (0 where nothing counts).
 constexpr float NLL_EPSILON = 1e-6f;
 
 SIGMA_INLINE vf signed_weight(vf error, float weight) {
@@ -9,7 +9,7 @@ SIGMA_INLINE vf signed_weight(vf error, float weight) {
 
 static void mapping_losses(const float* sums, const float* target_color, const float* target_depth, int height,
                            size_t stride, size_t plane, bool variance, LossWeights weights, double valid_pixels,
-                           float* g_sums, float* masked_color, double* losses) {
+                           float* g_sums, double* losses) {
     const float per_pixel = float(1.0 / (valid_pixels > 1 ? valid_pixels : 1)), per_value = per_pixel / 3.f;
     Buffer<double> rows;
     rows.reserve(size_t(height) * 4);
@@ -28,7 +28,6 @@ static void mapping_losses(const float* sums, const float* target_color, const f
                 const vf color = load(sums + c * plane + at), error = only(valid, color - load(target_color + c * plane + at));
                 vf g = signed_weight(error, weights.l1 * per_value);
                 total[0] += abs(error);
-                store(masked_color + c * plane + at, only(valid, color));
                 if (variance) {                       // ½ r²/(V+ε) + ½ log(V+ε), r detached, V clamped at 0 here only
                     const vf raw = load(sums + (4 + c) * plane + at) - color * color, v = max(raw, zero) + NLL_EPSILON;
                     const vf inv = 1.f / v, log_v = log2(v) * 0.6931471805599453f;
@@ -56,35 +55,16 @@ static void mapping_losses(const float* sums, const float* target_color, const f
         memset(g_sums + c * plane + size_t(height) * stride, 0, (plane - size_t(height) * stride) * sizeof(float));
 }
 
-// mean |s − mean(s)| over splats × 3 (losses.isotropy): return it, add weight × its gradient by log-scale to g_params.
-static double isotropy(const float* params, int64_t n, float weight, float* g_params) {
-    const int64_t chunks = (n + CHUNK - 1) / CHUNK;
-    Buffer<double> partial;
-    partial.reserve(chunks + 1);
-    const float scale = weight / (3.f * float(n > 0 ? n : 1));
-#pragma omp parallel for schedule(static)
-    for (int64_t c = 0; c < chunks; c++) {
-        vf total = splat(0.f);
-        for (int64_t i = c * CHUNK; i < n && i < (c + 1) * CHUNK; i += W) {
-            alignas(64) float t[3][W];
-            const int lanes = n - i < W ? int(n - i) : W;
-            for (int k = 0; k < 3; k++)
-                for (int l = 0; l < W; l++) t[k][l] = params[(i + (l < lanes ? l : 0)) * ROW + 7 + k];
-            vf s[3], sign[3];
-            for (int k = 0; k < 3; k++) s[k] = exp(load(t[k]));
-            const vf mean = (s[0] + s[1] + s[2]) * (1.f / 3.f);
-            for (int k = 0; k < 3; k++) {
-                sign[k] = signed_weight(s[k] - mean, 1.f);
-                total += only(first_lanes(lanes), abs(s[k] - mean));
-            }
-            const vf shared = (sign[0] + sign[1] + sign[2]) * (1.f / 3.f);
-            for (int k = 0; k < 3; k++) store(t[k], scale * (sign[k] - shared) * s[k]);
-            for (int l = 0; l < lanes; l++)
-                for (int k = 0; k < 3; k++) g_params[(i + l) * ROW + 7 + k] += t[k][l];
-        }
-        partial[c] = lane_sum(total);
+// |s − mean(s)| summed over W splats' axes (losses.isotropy, to be divided by 3n): return it over those seen, add
+// `scale` × its gradient by log-scale to three gradient lanes.
+SIGMA_INLINE double add_isotropy(const vf* s, Mask seen, float scale, float (*gradient)[W]) {
+    const vf mean = (s[0] + s[1] + s[2]) * (1.f / 3.f);
+    vf sign[3], total = splat(0.f);
+    for (int k = 0; k < 3; k++) {
+        sign[k] = signed_weight(s[k] - mean, 1.f);
+        total += only(seen, abs(s[k] - mean));
     }
-    double sum = 0;
-    for (int64_t c = 0; c < chunks; c++) sum += partial[c];
-    return sum / (3.0 * double(n > 0 ? n : 1));
+    const vf shared = (sign[0] + sign[1] + sign[2]) * (1.f / 3.f);
+    for (int k = 0; k < 3; k++) store(gradient[k], load(gradient[k]) + only(seen, scale * (sign[k] - shared) * s[k]));
+    return lane_sum(total);
 }

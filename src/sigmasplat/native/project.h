@@ -5,20 +5,23 @@ constexpr int CHUNK = 512;                 // splats per unit of work: fixed, so
 
 SIGMA_INLINE View<float> read_view(const float* numbers) { View<float> v; memcpy(&v, numbers, sizeof v); return v; }
 
-// W rows of a row-major [n, columns] array as lanes; rows past the end repeat the last one. Whole groups of W columns are
-// turned in registers, the rest goes one by one.
-template <int COLUMNS> SIGMA_INLINE void load_rows(const float* rows, int64_t first, int64_t n, float (*lanes)[W]) {
-    const float* row[W];
-    for (int l = 0; l < W; l++) row[l] = rows + (first + l < n ? first + l : n - 1) * COLUMNS;
+// W rows as lanes, lanes[column][row]. Whole groups of W columns are turned in registers, the rest goes one by one.
+template <int COLUMNS> SIGMA_INLINE void turn_rows(const float* const* rows, float (*lanes)[W]) {
     constexpr int TURNED = COLUMNS / W * W;
     for (int g = 0; g < TURNED; g += W) {
         vf turn[W];
-        for (int l = 0; l < W; l++) turn[l] = load(row[l] + g);
+        for (int l = 0; l < W; l++) turn[l] = load(rows[l] + g);
         transpose(turn);
         for (int k = 0; k < W; k++) store(lanes[g + k], turn[k]);
     }
     for (int k = TURNED; k < COLUMNS; k++)
-        for (int l = 0; l < W; l++) lanes[k][l] = row[l][k];
+        for (int l = 0; l < W; l++) lanes[k][l] = rows[l][k];
+}
+// W rows of a row-major [n, columns] array as lanes; rows past the end repeat the last one.
+template <int COLUMNS> SIGMA_INLINE void load_rows(const float* rows, int64_t first, int64_t n, float (*lanes)[W]) {
+    const float* row[W];
+    for (int l = 0; l < W; l++) row[l] = rows + (first + l < n ? first + l : n - 1) * COLUMNS;
+    turn_rows<COLUMNS>(row, lanes);
 }
 template <int COLUMNS> SIGMA_INLINE void store_rows(float* rows, int64_t first, int64_t n, const float (*lanes)[W]) {
     const int count = n - first < W ? int(n - first) : W;

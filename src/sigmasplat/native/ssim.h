@@ -41,8 +41,13 @@ template <int F> SIGMA_INLINE void blur_columns(const Window& k, const float* co
 
 SIGMA_INLINE size_t wide_of(int width) { return size_t(width + W - 1) / W * W; }
 
-// What depends on the target alone: its blurred mean and mean square, 6 planes of height × wide_of(width).
-static void ssim_target(const float* target, int width, int height, size_t stride, size_t plane, float* cache) {
+SIGMA_INLINE vf masked(const float* p, const float* mask, ptrdiff_t at) {
+    return mask ? only(gt(load(mask + at), splat(0.f)), load(p + at)) : load(p + at);
+}
+
+// What depends on the target alone: its blurred mean and mean square, 6 planes of height × wide_of(width). Where a mask is
+// given, both images are 0 where it is not above 0.
+static void ssim_target(const float* target, const float* mask, int width, int height, size_t stride, size_t plane, float* cache) {
     static const Window window;
     const size_t wide = wide_of(width), field = wide * height;
     Buffer<float> mean, square;
@@ -54,9 +59,10 @@ static void ssim_target(const float* target, int width, int height, size_t strid
         padded.reserve(2 * pad);
 #pragma omp for schedule(static)
         for (int q = 0; q < 3 * height; q++) {
-            const float* y = target + q / height * plane + size_t(q % height) * stride;
+            const size_t line = size_t(q % height) * stride;
+            const float *y = target + q / height * plane + line, *m = mask ? mask + line : nullptr;
             float* out[2] = {mean.data + q * wide, square.data + q * wide};
-            blur_rows<2>(window, width, padded.data, pad, out, [&](int f, int x) { const vf v = load(y + x); return f ? v * v : v; });
+            blur_rows<2>(window, width, padded.data, pad, out, [&](int f, int x) { const vf v = masked(y, m, x); return f ? v * v : v; });
         }
 #pragma omp for schedule(static)
         for (int q = 0; q < 3 * height; q++) {
@@ -90,11 +96,11 @@ static double ssim(const float* image, const float* target, const float* cache, 
         padded.reserve(3 * pad);
 #pragma omp for schedule(static)
         for (int q = 0; q < 3 * height; q++) {
-            const size_t at = q / height * plane + size_t(q % height) * stride;
-            const float *a = image + at, *b = target + at;
+            const size_t line = size_t(q % height) * stride, at = q / height * plane + line;
+            const float *a = image + at, *b = target + at, *on = mask ? mask + line : nullptr;
             float* out[3] = {f[0] + q * wide, f[1] + q * wide, f[2] + q * wide};
             blur_rows<3>(window, width, padded.data, pad, out, [&](int k, int x) {
-                const vf v = load(a + x);
+                const vf v = masked(a, on, x);
                 return k == 0 ? v : k == 1 ? v * v : v * load(b + x);
             });
         }

@@ -1,14 +1,5 @@
 // Stages 1–3 joined: the two operators of the kernel seam, and the fused way from raw parameter rows to images and back.
 
-template <class F> SIGMA_INLINE void with_features(int k, F f) {   // K is compiled in: colour + depth pays for no variance
-    switch (k) {
-        case 4: f(std_int<4>{}); break;
-        case 7: f(std_int<7>{}); break;
-        case 11: f(std_int<11>{}); break;
-        default: f(std_int<16>{});
-    }
-}
-
 static void blend(Render& r, Outputs o) {
     with_features(r.k, [&](auto k) {
         constexpr int K = decltype(k)::value;
@@ -16,22 +7,23 @@ static void blend(Render& r, Outputs o) {
         else o.dominant_id ? blend_tiles<K, false, true>(r, o) : blend_tiles<K, false, false>(r, o);
     });
 }
-static void blend_gradients(Render& r, Outputs o, OutputGradients g) {
+static void blend_gradients(Render& r, Outputs o, OutputGradients g) {   // to each splat's slots
     with_features(r.k, [&](auto k) {
-        constexpr int K = decltype(k)::value;
-        g.moment ? blend_tiles_backward<K, true>(r, o, g) : blend_tiles_backward<K, false>(r, o, g);
+        const auto to_slots = [&](auto moment) {
+            constexpr int K = decltype(k)::value, RECORD = record_floats<K, decltype(moment)::value != 0>;
+            r.partials.reserve(size_t(r.intersections + 1) * RECORD);
+            blend_tiles_backward<K, K, decltype(moment)::value != 0>(
+                r, o, g, [&](Scratch& s, const Tile& tile) { flush_records<RECORD>(r, s, tile); });
+        };
+        g.moment ? to_slots(std_int<1>{}) : to_slots(std_int<0>{});
     });
 }
 
 // ---- the seam: blend on its own -------------------------------------------------------------------------------------
 
-static void blend_forward(Context* context, const float* means2d, const float* conics, const float* z, const float* radii,
-                          const float* opacities, const float* features, int64_t n, int k, int width, int height,
-                          const float* reference, BlendOptions options, Outputs o) {
-    Render& r = *reinterpret_cast<Render*>(context);
-    r.prepare(n, k, width, height, options);
-    r.reference = reference;
-    const int64_t chunks = (n + CHUNK - 1) / CHUNK;
+template <int K> static void pack_given(Render& r, const float* means2d, const float* conics, const float* z, const float* radii,
+                                        const float* opacities, const float* features, int k) {
+    const int64_t n = r.n, chunks = (n + CHUNK - 1) / CHUNK;
 #pragma omp parallel for schedule(static)
     for (int64_t c = 0; c < chunks; c++) {
         int total = 0;
@@ -50,11 +42,22 @@ static void blend_forward(Context* context, const float* means2d, const float* c
             const vf opacity = load(t[0]);
             load_rows<2>(radii, i, n, t);
             for (int l = 0; l < W && i + l < n; l++)
-                for (int q = 0; q < r.used; q++) lanes[q][l] = features[size_t(i + l) * k + q];
-            total += pack(r, f, opacity, gt(load(t[0]), splat(0.f)), i, total, lanes);
+                for (int q = 0; q < k; q++) lanes[q][l] = features[size_t(i + l) * k + q];
+            total += pack<row_floats<K>>(r, f, opacity, gt(load(t[0]), splat(0.f)), i, total, lanes);
         }
         r.chunk_begin[c] = total;
     }
+}
+
+static void blend_forward(Context* context, const float* means2d, const float* conics, const float* z, const float* radii,
+                          const float* opacities, const float* features, int64_t n, int k, int width, int height,
+                          const float* reference, BlendOptions options, Outputs o) {
+    Render& r = *reinterpret_cast<Render*>(context);
+    r.prepare(n, k, width, height, options);
+    r.reference = reference;
+    with_features(r.k, [&](auto slots) {
+        pack_given<decltype(slots)::value>(r, means2d, conics, z, radii, opacities, features, k);
+    });
     bin(r);
     blend(r, o);
 }
@@ -78,7 +81,7 @@ static void blend_backward(Context* context, Outputs o, OutputGradients g, Splat
                     l[0][q] = g0.l1 / CONIC_SCALE; l[1][q] = g0.l2 / CONIC_SCALE; l[2][q] = g0.l3 / CONIC_SCALE;
                     l[3][q] = g0.z; l[4][q] = seen ? exp2f(8.f * g0.log_opacity) : 1.f;
                 }
-                FootprintGradient<vf> f = footprint_gradient(sums, load(l[0]), load(l[1]), load(l[2]));
+                FootprintGradient<vf> f = footprint_gradient(moments_of(sums), load(l[0]), load(l[1]), load(l[2]));
                 if constexpr (decltype(moment)::value) f.z = fma(load(l[3]), weight_sum(sums, K), weight_sum(sums, K + 1));
                 store(t[0], f.u); store(t[1], f.v);
                 store_rows<2>(out.means2d, i, r.n, t);
@@ -104,15 +107,37 @@ static void blend_backward(Context* context, Outputs o, OutputGradients g, Splat
 
 struct Splats { Shape<vf> shape; vf opacity, color[3], variance[3]; };
 
-SIGMA_INLINE Splats activate(const float (*row)[W]) { // GaussianField's columns, activated
+template <bool VARIANCE> SIGMA_INLINE Splats activate(const float (*row)[W]) {   // GaussianField's columns, activated
     Splats s;
     for (int k = 0; k < 3; k++) s.shape.mean[k] = load(row[k]);
     for (int k = 0; k < 4; k++) s.shape.quat[k] = load(row[3 + k]);
     for (int k = 0; k < 3; k++) s.shape.scale[k] = exp(load(row[7 + k]));
     s.opacity = 1.f / (1.f + exp(-load(row[10])));
     for (int k = 0; k < 3; k++) s.color[k] = load(row[11 + k]);
-    for (int k = 0; k < 3; k++) s.variance[k] = exp(load(row[14 + k]));
+    for (int k = 0; k < 3; k++) s.variance[k] = VARIANCE ? exp(load(row[14 + k])) : splat(0.f);
     return s;
+}
+
+template <int K> static void pack_view(Render& r, const float* params) {
+    const int64_t n = r.n, chunks = (n + CHUNK - 1) / CHUNK;
+#pragma omp parallel for schedule(static)
+    for (int64_t c = 0; c < chunks; c++) {
+        int total = 0;
+        for (int64_t i = c * CHUNK; i < n && i < (c + 1) * CHUNK; i += W) {
+            alignas(64) float row[ROW][W], f[8][W];
+            load_rows<ROW>(params, i, n, row);
+            const Splats s = activate<(K > 4)>(row);
+            const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
+            for (int q = 0; q < 3; q++) store(f[q], s.color[q]);
+            store(f[3], p.z);
+            if (K > 4) {
+                for (int q = 0; q < 3; q++) store(f[4 + q], fma(s.color[q], s.color[q], s.variance[q]));
+                store(f[7], splat(0.f));
+            }
+            total += pack<row_floats<K>>(r, p, s.opacity, gt(p.z, splat(r.view.near_m)), i, total, f);
+        }
+        r.chunk_begin[c] = total;
+    }
 }
 
 static void view_forward(Context* context, const float* view_numbers, const float* params, int64_t n, int k,
@@ -122,23 +147,7 @@ static void view_forward(Context* context, const float* view_numbers, const floa
     r.view = read_view(view_numbers);
     r.prepare(n, k, int(r.view.width), int(r.view.height), options);
     r.reference = reference;
-    const int64_t chunks = (n + CHUNK - 1) / CHUNK;
-#pragma omp parallel for schedule(static)
-    for (int64_t c = 0; c < chunks; c++) {
-        int total = 0;
-        for (int64_t i = c * CHUNK; i < n && i < (c + 1) * CHUNK; i += W) {
-            alignas(64) float row[ROW][W], f[8][W];
-            load_rows<ROW>(params, i, n, row);
-            const Splats s = activate(row);
-            const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
-            for (int q = 0; q < 3; q++) store(f[q], s.color[q]);
-            store(f[3], p.z);
-            for (int q = 0; q < 3; q++) store(f[4 + q], fma(s.color[q], s.color[q], s.variance[q]));
-            store(f[7], splat(0.f));
-            total += pack(r, p, s.opacity, gt(p.z, splat(r.view.near_m)), i, total, f);
-        }
-        r.chunk_begin[c] = total;
-    }
+    k <= 4 ? pack_view<4>(r, params) : pack_view<7>(r, params);
     const double t1 = omp_get_wtime();
     bin(r);
     const double t2 = omp_get_wtime();
@@ -146,9 +155,10 @@ static void view_forward(Context* context, const float* view_numbers, const floa
     if (seconds) { seconds[0] += t1 - t0; seconds[1] += t2 - t1; seconds[2] += omp_get_wtime() - t2; }
 }
 
-// Chain the reduced records of all splats to parameter rows (unless g_params is null) and to the pose twist.
-template <int K, bool MOMENT>
-static void chain_to_params(const Render& r, const float* params, float* g_params, double* g_twist) {
+// Chain the reduced records of all splats to the pose twist, and to rows of parameters: where any of W splats is seen,
+// `sink(i, seen, splats, gradient lanes, parameter lanes)` takes what ∂L/∂params is; `unseen(i)` hears of the others.
+template <int K, bool MOMENT, class Sink, class Unseen>
+static void chain_to_params(const Render& r, const float* params, double* g_twist, Sink sink, Unseen unseen) {
     constexpr int RECORD = record_floats<K, MOMENT>;
     const int64_t chunks = (r.n + CHUNK - 1) / CHUNK;
     Buffer<double> partial;
@@ -159,36 +169,32 @@ static void chain_to_params(const Render& r, const float* params, float* g_param
         for (auto& x : twist) x = splat(0.f);
         int slot = r.chunk_begin[c];
         for (int64_t i = c * CHUNK; i < r.n && i < (c + 1) * CHUNK; i += W) {
-            alignas(64) float row[ROW][W], sums[RECORD][W];
             unsigned seen_bits = 0;
             for (int l = 0; l < W && i + l < r.n; l++) seen_bits |= unsigned(r.tiles_of[i + l] > 0) << l;
-            if (!seen_bits) {
-                if (g_params) memset(g_params + i * ROW, 0, size_t(r.n - i < W ? r.n - i : W) * ROW * sizeof(float));
-                continue;
-            }
+            if (!seen_bits) { unseen(i); continue; }
+            alignas(64) float row[ROW][W], sums[RECORD][W], gradient[ROW][W];
             const Mask seen = mask_of_bits(seen_bits);
             load_rows<ROW>(params, i, r.n, row);
             reduce_records<RECORD>(r, i, slot, sums);
-            const Splats s = activate(row);
+            const Splats s = activate<(K > 4)>(row);
             const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
-            FootprintGradient<vf> g = footprint_gradient(sums, p.l1, p.l2, p.l3);
+            FootprintGradient<vf> g = footprint_gradient(moments_of(sums), p.l1, p.l2, p.l3);
             g.z = weight_sum(sums, 3);
             if constexpr (MOMENT) g.z += fma(p.z, weight_sum(sums, K), weight_sum(sums, K + 1));
             ShapeGradient<vf> out;
             project_backward(r.view, s.shape, splat(r.view.near_m), g, out);
             for (int q = 0; q < 6; q++) twist[q] += only(seen, out.twist[q]);
-            if (!g_params) continue;
-            for (int q = 0; q < 3; q++) store(row[q], only(seen, out.mean[q]));
-            for (int q = 0; q < 4; q++) store(row[3 + q], only(seen, out.quat[q]));
-            for (int q = 0; q < 3; q++) store(row[7 + q], only(seen, out.scale[q] * s.shape.scale[q]));
-            store(row[10], only(seen, load(sums[0]) * (1.f - s.opacity)));
+            for (int q = 0; q < 3; q++) store(gradient[q], only(seen, out.mean[q]));
+            for (int q = 0; q < 4; q++) store(gradient[3 + q], only(seen, out.quat[q]));
+            for (int q = 0; q < 3; q++) store(gradient[7 + q], only(seen, out.scale[q] * s.shape.scale[q]));
+            store(gradient[10], only(seen, load(sums[0]) * (1.f - s.opacity)));
             for (int q = 0; q < 3; q++) {
                 vf g_square = splat(0.f);
                 if constexpr (K > 4) g_square = weight_sum(sums, 4 + q);
-                store(row[11 + q], only(seen, fma(2.f * s.color[q], g_square, weight_sum(sums, q))));
-                store(row[14 + q], only(seen, g_square * s.variance[q]));
+                store(gradient[11 + q], only(seen, fma(2.f * s.color[q], g_square, weight_sum(sums, q))));
+                store(gradient[14 + q], only(seen, g_square * s.variance[q]));
             }
-            store_rows<ROW>(g_params, i, r.n, row);
+            sink(i, seen_bits, s, gradient);
         }
         for (int q = 0; q < 6; q++) partial[c * 6 + q] = lane_sum(twist[q]);
     }
@@ -197,6 +203,15 @@ static void chain_to_params(const Render& r, const float* params, float* g_param
         for (int64_t c = 0; c < chunks; c++) g_twist[q] += partial[c * 6 + q];
     }
 }
+template <class Sink, class Unseen>
+static void chain_any(const Render& r, const float* params, bool moment, double* g_twist, Sink sink, Unseen unseen) {
+    const auto chain = [&](auto k) {
+        constexpr int K = decltype(k)::value;
+        moment ? chain_to_params<K, true>(r, params, g_twist, sink, unseen)
+               : chain_to_params<K, false>(r, params, g_twist, sink, unseen);
+    };
+    r.k <= 4 ? chain(std_int<4>{}) : chain(std_int<7>{});
+}
 
 static void view_backward(Context* context, const float* params, Outputs o, OutputGradients g, float* g_params,
                           double* g_twist, double* seconds) {
@@ -204,12 +219,76 @@ static void view_backward(Context* context, const float* params, Outputs o, Outp
     const double t0 = omp_get_wtime();
     blend_gradients(r, o, g);
     const double t1 = omp_get_wtime();
-    const auto chain = [&](auto k) {
-        constexpr int K = decltype(k)::value;
-        g.moment ? chain_to_params<K, true>(r, params, g_params, g_twist) : chain_to_params<K, false>(r, params, g_params, g_twist);
-    };
-    r.k <= 4 ? chain(std_int<4>{}) : chain(std_int<7>{});
+    chain_any(r, params, g.moment, g_twist,
+        [&](int64_t i, unsigned, const Splats&, const float (*gradient)[W]) { store_rows<ROW>(g_params, i, r.n, gradient); },
+        [&](int64_t i) { memset(g_params + i * ROW, 0, size_t(r.n - i < W ? r.n - i : W) * ROW * sizeof(float)); });
     if (seconds) { seconds[0] += t1 - t0; seconds[1] += omp_get_wtime() - t1; }
+}
+
+// Backward and one Adam step in one go: no gradient row reaches memory. Splats out of view wait (adam.h); L_reg's gradient
+// is that of the mean over all splats. Returns its sum over those in view, over 3n.
+static double view_step(Context* context, float* params, Outputs o, OutputGradients g, AdamState state, AdamOptions options,
+                        float isotropy_weight, int64_t frozen_colors, double* g_twist, double* seconds) {
+    Render& r = *reinterpret_cast<Render*>(context);
+    const double t0 = omp_get_wtime();
+    blend_gradients(r, o, g);
+    const double t1 = omp_get_wtime();
+    const AdamRates adam(options);
+    const float scale = isotropy_weight / (3.f * float(r.n > 0 ? r.n : 1));
+    Buffer<double> isotropy;
+    isotropy.reserve(r.n / W + 1);                    // zero where nothing is seen
+    chain_any(r, params, g.moment, g_twist,
+        [&](int64_t i, unsigned seen, const Splats& s, float (*gradient)[W]) {
+            isotropy[i / W] = add_isotropy(s.shape.scale, mask_of_bits(seen), scale, gradient + 7);
+            for (int64_t l = 0; l < W && i + l < frozen_colors; l++)
+                for (int q = 11; q < 14; q++) gradient[q][l] = 0.f;
+            adam_rows(adam, params, state, i, r.n, seen, gradient);
+        },
+        [](int64_t) {});
+    double sum = 0;
+    for (int64_t i = 0; i * W < r.n; i++) sum += isotropy[i];
+    if (seconds) { seconds[0] += t1 - t0; seconds[1] += omp_get_wtime() - t1; }
+    return sum / (3.0 * double(r.n > 0 ? r.n : 1));
+}
+
+// ∂L/∂pose alone, from gradients on colour and depth: chained tile by tile, no splat's gradient is ever formed.
+static void view_backward_pose(Context* context, const float* params, Outputs o, OutputGradients g, double* g_twist, double* seconds) {
+    Render& r = *reinterpret_cast<Render*>(context);
+    const double t0 = omp_get_wtime();
+    const int tiles = r.tiles_x * r.tiles_y;
+    Buffer<double> partial;
+    partial.reserve(size_t(tiles) * 6);
+    const auto finish = [&](Scratch& scratch, const Tile& tile) {
+        const uint64_t* items = r.items.data + r.tile_begin[tile.index];
+        vf twist[6];
+        for (auto& x : twist) x = splat(0.f);
+        for (int k = 0; k < tile.count; k += W) {
+            alignas(64) float row[ROW][W], sums[16][W], center[2][W];
+            const float* rows[W];
+            const int count = tile.count - k < W ? tile.count - k : W;
+            for (int l = k + W; l < k + 2 * W && l < tile.count; l++) __builtin_prefetch(params + size_t(uint32_t(items[l])) * ROW);
+            for (int l = 0; l < W; l++) rows[l] = params + size_t(uint32_t(items[k + (l < count ? l : 0)])) * ROW;
+            turn_rows<ROW>(rows, row);
+            load_rows<2>(&scratch.centers[0].u, k, tile.count, center);
+            load_rows<16>(scratch.records.data, k, tile.count, sums);
+            Moments a = moments_of(sums);
+            shift_moments(a.m[0], a.m[1], a.m[2], a.m[3], a.m[4], a.m[5], load(center[0]), load(center[1]));
+            const Splats s = activate<false>(row);
+            const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
+            FootprintGradient<vf> f = footprint_gradient(a, p.l1, p.l2, p.l3);
+            f.z = weight_sum(sums, 3);
+            ShapeGradient<vf> out;
+            project_backward(r.view, s.shape, splat(r.view.near_m), f, out);
+            for (int q = 0; q < 6; q++) twist[q] += only(first_lanes(count), out.twist[q]);
+        }
+        for (int q = 0; q < 6; q++) partial[tile.index * 6 + q] = lane_sum(twist[q]);
+    };
+    r.k <= 4 ? blend_tiles_backward<4, 4, false>(r, o, g, finish) : blend_tiles_backward<7, 4, false>(r, o, g, finish);
+    for (int q = 0; q < 6; q++) {
+        g_twist[q] = 0;
+        for (int t = 0; t < tiles; t++) g_twist[q] += partial[t * 6 + q];
+    }
+    if (seconds) seconds[0] += omp_get_wtime() - t0;
 }
 
 static void view_visible(const Context* context, uint8_t* visible) {

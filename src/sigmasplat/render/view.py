@@ -35,8 +35,11 @@ class View(Protocol):
     def forward(self, params: Tensor, T_camera_world: Matrix) -> None:
         """Render parameter rows [N, 17] at a pose into `sums` and `alpha`."""
 
-    def backward(self, params: Tensor, g_params: Tensor | None) -> Matrix:
-        """Carry `g_sums`, `g_alpha` to parameter rows (written to g_params unless None); return the pose twist [6]."""
+    def backward(self, params: Tensor, g_params: Tensor) -> Matrix:
+        """Carry `g_sums`, `g_alpha` to parameter rows, written to g_params [N, 17]; return the pose twist [6]."""
+
+    def backward_pose(self, params: Tensor) -> Matrix:
+        """Carry the gradient planes of colour and depth to the pose alone; return the twist [6]."""
 
     def visible(self, n: int) -> Tensor:
         """Tell which of the n splats of the last forward pass reach the image, bool [n]."""
@@ -51,7 +54,8 @@ class CpuView:
 
         self.camera, self.options = camera, options
         self._numbers = cpu.view_numbers
-        self._raster = _core.Rasteriser()
+        self.raster = _core.Rasteriser()
+        """The kernels' own buffers of this view; `fit` steps a field through it (`Rasteriser.step`)."""
         self._k = 7 if variance else 4
         size = cpu.padded_size(camera)
         self.sums, self.g_sums = torch.zeros(self._k, *size), torch.zeros(self._k, *size)
@@ -61,27 +65,32 @@ class CpuView:
     def forward(self, params: Tensor, T_camera_world: Matrix) -> None:
         o = self.options
         view = self._numbers(self.camera, T_camera_world, o)
-        self._raster.view_forward(
+        self.raster.view_forward(
             view, params, self._k, o.alpha_min, o.transmittance_stop, None,
             self.sums, None, self.alpha, None, None, None, None, self.seconds[:3],
         )  # fmt: skip
 
-    def backward(self, params: Tensor, g_params: Tensor | None) -> Matrix:
+    def backward(self, params: Tensor, g_params: Tensor) -> Matrix:
         twist = np.zeros(6)
-        self._raster.view_backward(
+        self.raster.view_backward(
             params, self.sums, None, self.alpha, self.g_sums, None, self.g_alpha, g_params, twist, self.seconds[3:]
         )
         return twist
 
+    def backward_pose(self, params: Tensor) -> Matrix:
+        twist = np.zeros(6)
+        self.raster.backward_pose(params, self.sums, self.alpha, self.g_sums, twist, self.seconds[3:])
+        return twist
+
     def visible(self, n: int) -> Tensor:
         seen = torch.empty(n, dtype=torch.uint8)
-        self._raster.visible(seen)
+        self.raster.visible(seen)
         return seen.bool()
 
     @property
     def bytes(self) -> int:
         """Return the memory held by this view's buffers."""
-        return self._raster.bytes + 4 * 2 * (self.sums.numel() + self.alpha.numel())
+        return self.raster.bytes + 4 * 2 * (self.sums.numel() + self.alpha.numel())
 
 
 class ReferenceView:
@@ -104,18 +113,30 @@ class ReferenceView:
         features = features_of(f.colors, p.z, f.variances)[:, : self._k]
         b = reference.blend(*p, f.opacities, features, None, self.camera, self.options)
         self._maps = (b.sums.movedim(-1, 0), b.alpha)
-        self._radii = p.radii
+        self._visible = reaches(p, f.opacities.detach(), self.camera, self.options)
         self.sums.copy_(self._maps[0].detach())
         self.alpha.copy_(b.alpha.detach())
 
-    def backward(self, params: Tensor, g_params: Tensor | None) -> Matrix:
+    def backward(self, params: Tensor, g_params: Tensor) -> Matrix:
         g_leaf, g_twist = torch.autograd.grad(self._maps, (self._leaf, self._twist), (self.g_sums, self.g_alpha))
-        if g_params is not None:
-            g_params.copy_(g_leaf)
+        g_params.copy_(g_leaf)
+        return np.asarray(g_twist.numpy(), np.float64)
+
+    def backward_pose(self, params: Tensor) -> Matrix:
+        (g_twist,) = torch.autograd.grad(self._maps[0][:4], (self._twist,), (self.g_sums[:4],))
         return np.asarray(g_twist.numpy(), np.float64)
 
     def visible(self, n: int) -> Tensor:
-        return self._radii[:, 0] > 0
+        return self._visible
+
+
+def reaches(p: reference.Projection, opacities: Tensor, camera: Camera, options: RenderConfig) -> Tensor:
+    """Tell which splats' bounds of alpha ≥ alpha_min overlap the image, bool [N]: those a view can feel."""
+    reach = (2.0 * (opacities / options.alpha_min).log()).clamp(min=0.0).sqrt()[:, None] * p.radii.detach()
+    low, high = p.means2d.detach() - reach, p.means2d.detach() + reach
+    last = low.new_tensor([camera.width - 1.0, camera.height - 1.0])
+    inside = ((high >= 0) & (low <= last)).all(1)
+    return inside & (p.radii[:, 0] > 0) & (opacities > options.alpha_min)
 
 
 def twist_matrix(xi: Tensor) -> Tensor:

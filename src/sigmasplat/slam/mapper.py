@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from sigmasplat.config import Config
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.field import FieldFit, fit_field
-from sigmasplat.fit.pose import PoseMaps
 from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render.view import View

@@ -9,8 +9,8 @@ from skimage.feature import canny
 
 from sigmasplat.config import SeedConfig
 from sigmasplat.fit.align import gradient_magnitude, gray_of
-from sigmasplat.fit.pose import PoseMaps
 from sigmasplat.fit.target import Target
+from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.model.field import GaussianField
 
 Mask = NDArray[np.bool_]

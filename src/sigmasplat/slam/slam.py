@@ -108,6 +108,7 @@ class Slam:
             "params": self.field.params,
             "moment1": self.field.moment1,
             "moment2": self.field.moment2,
+            "last_step": self.field.last_step,
             "adam_steps": torch.tensor(self.field.steps),
             "timestamps_s": torch.from_numpy(path.timestamps_s),
             "T_world_camera": torch.from_numpy(path.T_world_camera),

@@ -1,0 +1,96 @@
+"""The papers' tracking loss: which pixels count and how much, the loss and its gradient on a view's planes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sigmasplat.config import TrackingConfig
+from sigmasplat.fit.confidence import outlier_mask, uncertainty_weights
+from sigmasplat.fit.target import Target
+from sigmasplat.render.render import variance_of
+from sigmasplat.render.view import CpuView, View
+
+
+@dataclass(eq=False)
+class PoseMaps:
+    """A render of the map laid beside a target: what both pose fits and the tracker's judgement read."""
+
+    color: Tensor
+    depth: Tensor
+    alpha: Tensor
+    variance: Tensor | None
+
+    @staticmethod
+    def of(view: View) -> "PoseMaps":
+        """Take the maps of a view's last forward pass, without padding."""
+        h, w = view.camera.height, view.camera.width
+        sums = view.sums[:, :h, :w].movedim(0, -1)
+        variance = variance_of(sums) if sums.shape[-1] == 7 else None
+        return PoseMaps(sums[..., :3], sums[..., 3], view.alpha[:h, :w], variance)
+
+
+def agreement(maps: PoseMaps, target: Target) -> tuple[float, float]:
+    """Measure how well a render explains a depth image: (share of common pixels within 5 % or 5 cm, common share)."""
+    common = (maps.alpha > 0.5) & (target.depth_image > 0)
+    surface = maps.depth / maps.alpha.clamp(min=0.5)
+    close = (surface - target.depth_image).abs() < (0.05 * target.depth_image).clamp(min=0.05)
+    n = int(common.sum())
+    return float((close & common).sum()) / max(n, 1), n / max(target.valid_pixels, 1)
+
+
+def pixel_weights(maps: PoseMaps, target: Target, config: TrackingConfig) -> tuple[Tensor, Tensor]:
+    """Return (A³·M [H, W], w̃ [H, W, 3]) of VarSplat §3, both stop-gradient."""
+    valid = target.depth_image > 0
+    if config.alpha_above > 0:
+        valid = valid & (maps.alpha > config.alpha_above)
+    mask = outlier_mask(maps.depth - target.depth_image, valid, config.outlier_factor)
+    soft = maps.alpha.clamp(min=0.0) ** config.alpha_power * mask
+    if not config.uncertainty or maps.variance is None:
+        return soft, torch.ones_like(maps.color)
+    return soft, uncertainty_weights(maps.variance, mask, config.tau, config.weight_max)
+
+
+def tracking_gradient(view: View, target: Target, config: TrackingConfig, exposure: Tensor) -> tuple[float, Tensor]:
+    """Write ∂L_track/∂(color, depth) to the view's planes; return the loss and its gradient by exposure (a, b).
+
+    L_track = Σ A³ M (λ_c w̃ |exp(a) Ĉ + b − C| + (1 − λ_c) |D̂ − D|), here a mean over pixels (VarSplat §3).
+    """
+    if isinstance(view, CpuView):
+        return _compiled(view, target, config, exposure)
+    maps = PoseMaps.of(view)
+    soft, weights = pixel_weights(maps, target, config)
+    count = soft.numel()
+    gain, offset = exposure[0].exp(), exposure[1]
+    color_error = gain * maps.color + offset - target.image
+    depth_error = maps.depth - target.depth_image
+    on_color = config.weight_color / count * soft[..., None] * weights
+    on_depth = (1.0 - config.weight_color) / count * soft
+    g_color = on_color * color_error.sign()
+    h, w = soft.shape
+    view.g_sums.zero_()
+    view.g_sums[:3, :h, :w] = (gain * g_color).movedim(-1, 0)
+    view.g_sums[3, :h, :w] = on_depth * depth_error.sign()
+    loss = (on_color * color_error.abs()).sum() + (on_depth * depth_error.abs()).sum()
+    g_exposure = torch.stack([(g_color * gain * maps.color).sum(), g_color.sum()])
+    return float(loss), g_exposure
+
+
+def _compiled(view: CpuView, target: Target, config: TrackingConfig, exposure: Tensor) -> tuple[float, Tensor]:
+    """Do the same in the kernels (native/track.h): medians, weights and loss without a torch round trip."""
+    from sigmasplat.native import _core
+
+    g_exposure, camera = np.zeros(2), view.camera
+    loss = _core.tracking_loss(
+        view.sums, view.alpha, target.color, target.depth, camera.width, camera.height,
+        tracking_numbers(config, config.alpha_above), config.uncertainty,
+        float(exposure[0].exp()), float(exposure[1]), view.g_sums, g_exposure,
+    )  # fmt: skip
+    return loss, torch.as_tensor(g_exposure, dtype=exposure.dtype)
+
+
+def tracking_numbers(config: TrackingConfig, alpha_above: float) -> list[float]:
+    """Lay settings out as the kernels' `TrackOptions`."""
+    c = config
+    return [alpha_above, c.alpha_power, c.outlier_factor, c.weight_color, c.tau, c.weight_max]

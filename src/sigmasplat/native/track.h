@@ -1,0 +1,172 @@
+// What tracking reads off a render: how far each pixel is to be trusted, the papers' loss with its gradient, and the
+// reference that images are aligned to. fit/confidence.py and fit/pose.py are the definitions.
+
+constexpr float WEIGHT_EPSILON = 1e-6f;
+
+// Selection among the floats ≥ 0 of an image, as their bits (whose order is theirs): 11 bits first, in parallel over rows;
+// then those that share them.
+constexpr int DIGITS = 2048;
+struct Selection { Buffer<int> keys, counts; };
+
+// The lower middle one of n ≥ 1 numbers of 31 bits that share their upper 11.
+static uint32_t select_low_bits(int* keys, int64_t n, int64_t rank) {
+    uint32_t found = 0;
+    for (int shift : {10, 0}) {
+        int64_t counts[1024] = {};
+        for (int64_t i = 0; i < n; i++) counts[keys[i] >> shift & 1023]++;
+        uint32_t digit = 0;
+        while (rank >= counts[digit]) rank -= counts[digit++];
+        found |= digit << shift;
+        int64_t kept = 0;
+        for (int64_t i = 0; i < n; i++) { keys[kept] = keys[i]; kept += uint32_t(keys[i] >> shift & 1023) == digit; }
+        n = kept;
+    }
+    return found;
+}
+
+// The lower middle one of value(at) [lanes] over the pixels where chosen(at, value) holds; false where none does.
+template <class Value, class Chosen>
+static bool lower_median(const Plane& p, Selection& s, Value value, Chosen chosen, float* median) {
+    const int threads = omp_get_max_threads();
+    int* keys = s.keys.reserve(p.stride * p.height + W);
+    int* counts = s.counts.reserve(size_t(threads) * 2 * DIGITS);
+    memset(counts, 0, size_t(threads) * 2 * DIGITS * sizeof(int));
+#pragma omp parallel num_threads(threads)
+    {
+        int* mine = counts + size_t(omp_get_thread_num()) * 2 * DIGITS;   // the upper half counts what is not chosen
+#pragma omp for schedule(static)
+        for (int y = 0; y < p.height; y++) {
+            int* row = keys + size_t(y) * p.stride;
+            for (int x = 0; x < p.width; x += W) {
+                const vf v = value(size_t(y) * p.stride + x);
+                store(row + x, select(both(first_lanes(p.width - x), chosen(size_t(y) * p.stride + x, v)), bits_of(v), splat(-1)));
+            }
+            for (int x = 0; x < p.width; x++) mine[uint32_t(row[x]) >> 20]++;
+        }
+    }
+    int64_t n = 0, before = 0;
+    for (int q = 0; q < DIGITS; q++)
+        for (int t = 0; t < threads; t++) n += counts[size_t(t) * 2 * DIGITS + q];
+    if (!n) return false;
+    const int64_t rank = (n - 1) / 2;
+    int digit = 0;
+    for (;; digit++) {
+        int64_t here = 0;
+        for (int t = 0; t < threads; t++) here += counts[size_t(t) * 2 * DIGITS + digit];
+        if (rank < before + here) break;
+        before += here;
+    }
+    int64_t kept = 0;                                 // over the keys read already: kept never overtakes the reading
+    for (int y = 0; y < p.height; y++)
+        for (int x = 0; x < p.width; x++) {
+            const int key = keys[size_t(y) * p.stride + x];
+            keys[kept] = key;
+            kept += key >> 20 == digit;
+        }
+    const uint32_t bits = uint32_t(digit) << 20 | select_low_bits(keys, kept, rank - before);
+    memcpy(median, &bits, 4);
+    return true;
+}
+
+SIGMA_INLINE vf variance_of(const float* sums, const Plane& p, size_t at, int c) {   // V + ε, V held at 0 from below
+    const vf color = load(sums + c * p.plane + at);
+    return max(fnma(color, color, load(sums + (4 + c) * p.plane + at)), splat(0.f)) + WEIGHT_EPSILON;
+}
+
+// log2 of the median of V + ε over the pixels chosen, per channel; false where none is.
+template <class Chosen>
+static bool median_log_variance(const float* sums, const Plane& p, Selection& s, Chosen chosen, float* log_median) {
+    for (int c = 0; c < 3; c++) {
+        float median;
+        const auto value = [&](size_t at) { return variance_of(sums, p, at, c); };
+        if (!lower_median(p, s, value, [&](size_t at, vf) { return chosen(at); }, &median)) return false;
+        log_median[c] = log2f(median);
+    }
+    return true;
+}
+
+// w̃ of channel c (VarSplat §3).
+SIGMA_INLINE vf uncertainty_weight(const float* sums, const Plane& p, size_t at, int c, const TrackOptions& o, float log_median) {
+    return clamp(exp2((log_median - log2(variance_of(sums, p, at, c))) * (1.f / o.tau)), 1.f / o.weight_max, o.weight_max);
+}
+
+// L_track (VarSplat §3) as a mean over pixels: write its gradient by colour and depth to planes, return the loss;
+// g_exposure [2] is its gradient by (a, b) of exp(a)·Ĉ + b. The mask needs the median depth error, the weights that of V.
+static double tracking_loss(const float* sums, const float* alpha, bool variance, const float* target_color,
+                            const float* target_depth, Plane p, TrackOptions o, float gain, float offset, float* g_sums,
+                            double* g_exposure) {
+    static Selection scratch;                         // one caller at a time, as for every kernel here
+    const float* depth = sums + 3 * p.plane;
+    const auto error_at = [&](size_t at) { return abs(load(depth + at) - load(target_depth + at)); };
+    const auto counts = [&](size_t at) {
+        const Mask read = gt(load(target_depth + at), splat(0.f));
+        return o.alpha_above > 0.f ? both(read, gt(load(alpha + at), splat(o.alpha_above))) : read;
+    };
+    float limit = __builtin_inff(), median;
+    if (o.outlier_factor > 0.f && lower_median(p, scratch, error_at, [&](size_t at, vf) { return counts(at); }, &median))
+        limit = o.outlier_factor * median;
+    float log_median[3];
+    const auto used = [&](size_t at) { return both(counts(at), ge(splat(limit), error_at(at))); };
+    const bool weigh = o.uncertainty && variance && median_log_variance(sums, p, scratch, used, log_median);
+    const float count = float(p.width) * float(p.height), per_color = o.weight_color / count, per_depth = (1.f - o.weight_color) / count;
+    Buffer<double> rows;
+    rows.reserve(size_t(p.height) * 3);
+#pragma omp parallel for schedule(static)
+    for (int y = 0; y < p.height; y++) {
+        vf total[3] = {splat(0.f), splat(0.f), splat(0.f)};
+        for (int x = 0; x < int(p.stride); x += W) {
+            const size_t at = size_t(y) * p.stride + x;
+            const vf A = max(load(alpha + at), splat(0.f)), error = load(depth + at) - load(target_depth + at);
+            const Mask valid = both(first_lanes(p.width - x), used(at));
+            const vf power = o.alpha_power == 0.f ? splat(1.f) : exp2(o.alpha_power * log2(max(A, splat(1e-30f))));
+            const vf soft = only(valid, power), on_depth = per_depth * soft;
+            store(g_sums + 3 * p.plane + at, signed_weight(error, 1.f) * on_depth);
+            total[0] += on_depth * abs(error);
+            for (int c = 0; c < 3; c++) {
+                const vf rendered = load(sums + c * p.plane + at), e = fma(splat(gain), rendered, offset - load(target_color + c * p.plane + at));
+                vf on = per_color * soft;
+                if (weigh) on *= uncertainty_weight(sums, p, at, c, o, log_median[c]);
+                const vf g = signed_weight(e, 1.f) * on;
+                store(g_sums + c * p.plane + at, gain * g);
+                total[0] += on * abs(e);
+                total[1] = fma(gain * g, rendered, total[1]);
+                total[2] += g;
+            }
+        }
+        for (int k = 0; k < 3; k++) rows[size_t(y) * 3 + k] = lane_sum(total[k]);
+    }
+    double sum[3] = {};
+    for (int y = 0; y < p.height; y++)
+        for (int k = 0; k < 3; k++) sum[k] += rows[size_t(y) * 3 + k];
+    for (int c = 0; c < (variance ? 7 : 4); c++)      // padding below the image, and the planes without a gradient
+        if (c < 4) memset(g_sums + c * p.plane + size_t(p.height) * p.stride, 0, (p.plane - size_t(p.height) * p.stride) * sizeof(float));
+        else memset(g_sums + c * p.plane, 0, p.plane * sizeof(float));
+    g_exposure[0] = sum[1];
+    g_exposure[1] = sum[2];
+    return sum[0];
+}
+
+// A render as a reference image [height, width]: gray C/A, depth D/A where A > alpha_above (else 0), and w̃ averaged over
+// channels there (else 1: where the map is thin V says nothing).
+static void reference_maps(const float* sums, const float* alpha, bool variance, Plane p, TrackOptions o, float* gray,
+                           float* depth, float* weight) {
+    static Selection scratch;
+    float log_median[3];
+    const bool weigh = o.uncertainty && variance && median_log_variance(
+        sums, p, scratch, [&](size_t at) { return gt(load(alpha + at), splat(o.alpha_above)); }, log_median);
+#pragma omp parallel for schedule(static)
+    for (int y = 0; y < p.height; y++)
+        for (int x = 0; x < p.width; x += W) {
+            const size_t at = size_t(y) * p.stride + x, to = size_t(y) * p.width + x;
+            const vf A = load(alpha + at), inv = 1.f / max(A, splat(0.5f));
+            const Mask opaque = gt(A, splat(o.alpha_above));
+            const vf luma = 0.299f * load(sums + at) + (0.587f * load(sums + p.plane + at) + 0.114f * load(sums + 2 * p.plane + at));
+            vf w = splat(0.f);
+            if (weigh) for (int c = 0; c < 3; c++) w += uncertainty_weight(sums, p, at, c, o, log_median[c]);
+            const vf out[3] = {luma * inv, only(opaque, load(sums + 3 * p.plane + at) * inv), select(opaque, weigh ? w * (1.f / 3.f) : splat(1.f), splat(1.f))};
+            float* planes[3] = {gray, depth, weight};
+            for (int q = 0; q < 3; q++)
+                if (x + W <= p.width) store(planes[q] + to, out[q]);
+                else memcpy(planes[q] + to, &out[q], (p.width - x) * sizeof(float));
+        }
+}
