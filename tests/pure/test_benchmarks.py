@@ -14,12 +14,16 @@ import pytest
 import torch
 
 from sigmasplat import cli
-from sigmasplat.config import RenderConfig
+from sigmasplat.config import Config, RenderConfig
 from sigmasplat.errors import ConfigError, SourceError
+from sigmasplat.fit.pose import PoseFit
+from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.native import _core
+from sigmasplat.presets import override, preset
 from sigmasplat.render import reference, render
+from sigmasplat.slam.tracker import Tracker
 from sigmasplat.sources import open_source
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
@@ -28,6 +32,7 @@ accuracy, accuracy_tables, cpu, cpu_scene, cpu_tables, record, scenes, tables, w
     importlib.import_module,
     ("accuracy", "accuracy_tables", "cpu", "cpu_scene", "cpu_tables", "record", "scenes", "tables", "works"),
 )
+tracking, tracking_tables = map(importlib.import_module, ("tracking", "tracking_tables"))
 ROOM = "synthetic:frames=200,width=64,height=48"
 
 
@@ -53,7 +58,7 @@ def job_result(source: str, seed: int, problem: str | None = None, **figures: fl
 
 
 def test_every_program_explains_itself() -> None:
-    programs = {"cpu": "--quick", "accuracy": "--seeds", "tables": "--check"}
+    programs = {"cpu": "--quick", "accuracy": "--seeds", "tracking": "--experiments", "tables": "--check"}
     running = {
         name: subprocess.Popen([sys.executable, BENCHMARKS / f"{name}.py", "--help"], stdout=-1, stderr=-1, text=True)
         for name in programs
@@ -336,3 +341,141 @@ def test_the_quick_way_is_a_part_of_the_whole() -> None:
     assert [(r["splats"], r["width"]) for r in whole[:3]] == [(20_000, 320), (77_000, 320), (300_000, 320)]
     quick = cpu.wanted(replace(options, quick=True))
     assert [(r["splats"], r["width"], r["runs"]) for r in quick] == [(20_000, 320, 7), (77_000, 320, 7)]
+
+
+def test_errors_drawn_from_their_covariance_are_covered_and_from_a_wider_one_are_not() -> None:
+    random = np.random.default_rng(0)
+    roots = random.normal(size=(4000, 6, 6)) * [1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4]
+    covariances = np.swapaxes(roots, 1, 2) @ roots + np.diag([1e-8] * 3 + [1e-10] * 3)
+    twists = (np.linalg.cholesky(covariances) @ random.normal(size=(4000, 6, 1)))[..., 0]
+    right = tracking_tables.coverage(twists, covariances)
+    assert right["inside"] == pytest.approx(0.95, abs=0.012) and right["mean_nees"] == pytest.approx(6.0, rel=0.03)
+    assert right["inside"] + right["below"] + right["above"] == pytest.approx(1.0)
+    np.testing.assert_allclose(right["z_std"], 1.0, atol=0.04)
+    for factor, where in ((0.25, "above"), (25.0, "below")):
+        wrong = tracking_tables.coverage(twists, factor * covariances)
+        assert wrong["mean_nees"] == pytest.approx(right["mean_nees"] / factor)
+        assert wrong[where] > 0.5 > wrong["inside"]
+
+
+def test_a_pairs_error_is_that_of_the_motion() -> None:
+    T = se3.exp(np.array([0.3, -0.2, 0.5, 0.4, 0.1, -0.6]))
+    off = se3.exp(np.array([0.003, 0.0, 0.004, 0.0, 0.0, 0.0])) @ se3.exp(np.array([0, 0, 0, 0.0, np.radians(2.0), 0]))
+    error = tracking.relative_error(T @ off, T)
+    assert error == {"translation_cm": pytest.approx(0.5), "rotation_deg": pytest.approx(2.0)}
+
+
+def test_starts_have_their_frames_before_and_after() -> None:
+    options = tracking.Options(source=ROOM, starts=4, gaps=(1, 5), before=3)
+    assert tracking.spread(100, options) == [2, 33, 63, 94]
+    assert tracking.spread(9, options) == [2, 3]
+    with pytest.raises(SourceError, match="too few"):
+        tracking.spread(7, options)
+
+
+def test_pairs_are_fitted_on_a_fresh_keyframe_and_held_against_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tracking.Options, "config", small_config)
+    options = tracking.Options(source=ROOM, starts=2, gaps=(1, 3), before=3, iterations=3)
+    found = tracking.measure_pairs(ROOM, options)
+    assert (found["starts"], found["lost"], len(found["pairs"])) == ([2, 196], 0, 2 * 2 * 5)
+    truth = open_source(ROOM).truth().T_world_camera
+    moved = [100 * np.linalg.norm(truth[s + g][:3, 3] - truth[s][:3, 3]) for s in (2, 196) for g in (1, 3)]
+    guesses = [pair["translation_cm"] for pair in found["pairs"] if pair["method"] == "guess"]
+    np.testing.assert_allclose(guesses, moved, atol=1e-4)
+    aligned = [pair["translation_cm"] for pair in found["pairs"] if pair["method"] == "keyframe"]
+    assert max(np.divide(aligned, guesses)) < 0.5
+    made = {s.title: s for s in tables.sections(results("tracking", {"pairs": json.loads(json.dumps(found))}))}
+    assert len(made["Pairs"].rows) == 2 * 5 and len(made["Ratios"].rows) == 2 * 2
+    assert all(len(row) == len(section.columns) for section in made.values() for row in section.rows)
+
+
+def small_config(options: Any, seed: int) -> Config:
+    """Return settings for tiny images and hardly any mapping."""
+    settings = {"mapping.iterations": "2", "mapping.first_iterations": "5", "input.width": "64", "seed": str(seed)}
+    return override(preset("varsplat-fast"), settings)
+
+
+def test_a_followed_pose_has_the_error_of_its_own_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poses that are off by a known twist in the live camera come back as that twist, whatever mapping moves."""
+    known, claimed = np.array([1e-3, -2e-3, 3e-3, 1e-3, 2e-3, -1e-3]), np.diag([1e-6] * 6)
+    source = open_source(ROOM, limit=8)
+    T_world_room = se3.inverse(source.truth().T_world_camera[0])
+
+    def off(self: Tracker, field: Any, view: Any, target: Any, live: Any) -> PoseFit:
+        i = len(seen) + 1
+        seen.append(i)
+        T_camera_world = se3.inverse(T_world_room @ source.truth().T_world_camera[i])
+        return PoseFit(se3.exp(known) @ T_camera_world, 1.0, 1.0, 0.0, 0.0, 1, covariance=claimed)
+
+    seen: list[int] = []
+    monkeypatch.setattr(Tracker, "track", off)
+    config = override(small_config(None, 0), {"mapping.lr_pose_translation": "0", "mapping.lr_pose_rotation": "0"})
+    twists, covariances, ages, lost = tracking.follow(source, config)
+    assert (lost, ages.tolist()) == (0, [1, 2, 3, 4, 5, 1, 2])
+    np.testing.assert_allclose(twists[:5], np.tile(known, (5, 1)), atol=1e-9)  # their keyframe is the first, exact
+    assert np.abs(twists[5:]).max() < 5e-3 and (covariances == claimed).all()
+
+
+def test_a_room_is_followed_with_covariances_and_laid_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tracking.Options, "config", small_config)
+    found = tracking.measure_consistency(ROOM, tracking.Options(source=ROOM, limit=8, seeds=(0, 1)))
+    assert found["lost"] == 0 and found["all"]["frames"] == 14
+    assert sum(part["frames"] for part in found["by_age"].values()) == 14
+    made = {s.title: s for s in tables.sections(results("tracking", {"consistency": json.loads(json.dumps([found]))}))}
+    assert len(made["Consistency"].rows) == 1 + len(found["by_age"]) and len(made["Components"].rows) == 6
+    with pytest.raises(SourceError, match="with a covariance"):
+        descent = override(small_config(None, 0), {"tracking.method": "adam", "tracking.iterations": "1"})
+        monkeypatch.setattr(tracking.Options, "config", lambda options, seed: descent)
+        tracking.measure_consistency(ROOM, tracking.Options(source=ROOM, limit=2))
+
+
+def pair(gap: int, method: str, cm: float, deg: float, ms: float) -> dict[str, Any]:
+    return {"gap": gap, "method": method, "translation_cm": cm, "rotation_deg": deg, "ms": ms}
+
+
+def test_alignment_is_held_to_the_better_rates_of_each_column() -> None:
+    found = [
+        pair(2, "guess", 9.0, 9.0, 0.0),
+        pair(2, "adam TUM", 1.0, 0.4, 500.0),
+        pair(2, "adam Replica", 2.0, 0.2, 400.0),
+        *(pair(2, "keyframe", cm, 0.21, 10.0) for cm in (1.0, 1.05, 7.0)),
+        pair(2, "map", 1.2, 0.1, 30.0),
+    ]
+    figures = {"pairs": {"source": "x", "starts": [3], "lost": 0, "pairs": found}}
+    made = {s.title: s for s in tables.sections(results("tracking", figures))}
+    assert [row[2:] for row in made["Ratios"].rows] == [["1.05", "1.05", "40.0"], ["1.20", "0.500", "13.3"]]
+    held = {row[0].removeprefix("Gauss–Newton, ").replace(", 2 apart:", ""): row[3] for row in made["Goals"].rows}
+    assert held == {
+        "keyframe translation error / Adam's": "yes", "keyframe rotation error / Adam's": "yes",
+        "keyframe time / Adam's": "yes", "map translation error / Adam's": "**no**",
+        "map rotation error / Adam's": "yes", "map time / Adam's": "**no**",
+    }  # fmt: skip
+
+
+def test_whole_runs_are_held_to_adam_by_the_better_rates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ate_m = {"align": 0.025, "adam TUM": 0.03, "adam Replica": 0.01}
+
+    def ran(jobs: list[Any], options: Any) -> list[dict[str, Any]]:
+        asked.extend(jobs)
+        config = jobs[0].key()["config"]["tracking"]
+        method = {2e-3: "adam TUM", 2e-4: "adam Replica"}[config["lr_rotation"]]
+        method = "align" if config["method"] == "align" else method
+        return [job_result(job.source, job.seed, ate_m=ate_m[method]) | {"wall_s": 1.0} for job in jobs]
+
+    asked: list[Any] = []
+    monkeypatch.setattr(accuracy, "run_all", ran)
+    options = tracking.Options(source=ROOM, sources=("s",), seeds=(0, 1), iterations=7, limit=20, runs=tmp_path)
+    jobs = tracking.measure_sequences(options)
+    assert [(job["method"], job["seed"]) for job in jobs] == [(method, seed) for method in ate_m for seed in (0, 1)]
+    assert {job.limit for job in asked} == {20}
+    assert [job.key()["config"]["tracking"]["iterations"] for job in asked[2:]] == [7] * 4
+    made = {s.title: s for s in tables.sections(results("tracking", {"sequence": jobs}))}
+    assert [row[:4] for row in made["Sequence"].rows] == [
+        ["s", "Gauss–Newton", "2", "2.50 ± 0.0"],
+        ["s", "Adam, TUM's rates", "2", "3"],
+        ["s", "Adam, Replica's rates", "2", "1"],
+    ]
+    assert list(made["Goals"].rows) == [["s: ATE, cm, against the better Adam's", "2.50", "≤ 1.00", "**no**"]]
+    failed = [{**job, "problem": "a | b"} for job in jobs[:2]] + jobs[2:]
+    made = {s.title: s for s in tables.sections(results("tracking", {"sequence": failed}))}
+    assert "Goals" not in made and len(made["Failed"].rows) == 2
