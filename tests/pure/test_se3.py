@@ -57,6 +57,46 @@ def test_exp_undoes_log(seed: int) -> None:
     np.testing.assert_allclose(se3.exp(se3.log(T)), T, atol=1e-8)
 
 
+def twists(count: int = 5) -> Array:
+    """Stack twists of every angle, |φ| ≤ π: exactly 0, tiny, on both sides of the series' bounds, nearly π."""
+    return np.stack([twist(angle, seed) for angle in [*ANGLES, 0.0999, 0.1001, 2.0] for seed in range(count)])
+
+
+def test_stacks_are_one_by_one() -> None:
+    xi = twists()
+    T = se3.exp_stack(xi)
+    np.testing.assert_allclose(T, np.stack([se3.exp(x) for x in xi]), atol=1e-14)
+    np.testing.assert_allclose(se3.log_stack(T), np.stack([se3.log(t) for t in T]), atol=1e-9)
+    np.testing.assert_allclose(se3.exp_stack(se3.log_stack(T)), T, atol=1e-9)
+    np.testing.assert_array_equal(se3.hat(xi[:, 3:])[7], se3.hat(xi[7, 3:]))
+    np.testing.assert_array_equal(se3.adjoint(T)[7], se3.adjoint(T[7]))
+
+
+@given(seeds)
+def test_adjoint_carries_twists_across(seed: int) -> None:
+    T, xi = rigid(seed), twist(0.7, seed + 1)
+    np.testing.assert_allclose(T @ se3.exp(xi) @ se3.inverse(T), se3.exp(se3.adjoint(T) @ xi), atol=1e-13)
+
+
+def test_left_jacobian_inverse_inverts_the_integral_of_the_adjoint() -> None:
+    """J(ξ) = ∫₀¹ Ad(exp(sξ)) ds, read off the exponential of [[ad, 1], [0, 0]]."""
+    xi = np.concatenate([twists(), [twist(4.0), twist(6.0)]])
+    found = se3.left_jacobian_inverse(xi)
+    for x, inverse in zip(xi, found, strict=True):
+        generator = np.zeros((12, 12))
+        generator[:3, :3] = generator[3:6, 3:6] = se3.hat(x[3:])
+        generator[:3, 3:6], generator[:6, 6:] = se3.hat(x[:3]), np.eye(6)
+        np.testing.assert_allclose(inverse @ expm(generator)[:6, 6:], np.eye(6), atol=1e-10)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-5, 0.1, 1.0, 3.0])
+def test_left_jacobian_inverse_is_the_derivative_of_log(angle: float) -> None:
+    xi, h = twist(angle), 1e-6
+    ends = [[se3.log(se3.exp(sign * h * axis) @ se3.exp(xi)) for axis in np.eye(6)] for sign in (1, -1)]
+    slopes = (np.array(ends[0]) - np.array(ends[1])).T / (2 * h)
+    np.testing.assert_allclose(se3.left_jacobian_inverse(xi[None])[0], slopes, atol=1e-8)
+
+
 @given(seeds)
 def test_inverse_of_one_and_of_a_stack(seed: int) -> None:
     stack = np.stack([rigid(seed), rigid(seed + 1)])

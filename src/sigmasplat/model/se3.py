@@ -5,13 +5,17 @@ A twist is ξ = (ρ, φ): translation first, then rotation vector (radians).
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 Matrix = NDArray[np.float64]
 
 
 def hat(w: Matrix) -> Matrix:
-    """Build the cross-product matrix [w]× of a 3-vector."""
-    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+    """Build the cross-product matrix [w]× of a 3-vector (or of a stack [..., 3])."""
+    out = np.zeros((*w.shape, 3))
+    out[..., 2, 1], out[..., 0, 2], out[..., 1, 0] = w[..., 0], w[..., 1], w[..., 2]
+    out[..., 1, 2], out[..., 2, 0], out[..., 0, 1] = -w[..., 0], -w[..., 1], -w[..., 2]
+    return out
 
 
 def _series(theta2: float) -> tuple[float, float, float]:
@@ -65,6 +69,64 @@ def inverse(T: Matrix) -> Matrix:
     out[..., :3, 3] = -(Rt @ T[..., :3, 3, None])[..., 0]
     out[..., 3, 3] = 1.0
     return out
+
+
+def adjoint(T: Matrix) -> Matrix:
+    """Build Ad(T) [..., 6, 6], which carries twists from one frame to the other: T exp(ξ) T⁻¹ = exp(Ad(T) ξ)."""
+    R = T[..., :3, :3]
+    out = np.zeros((*T.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = R
+    out[..., :3, 3:] = hat(T[..., :3, 3]) @ R
+    return out
+
+
+def exp_stack(xi: Matrix) -> Matrix:
+    """Map twists [N, 6] to transforms [N, 4, 4]: `exp` for many at once."""
+    k = hat(xi[:, 3:])
+    kk = k @ k
+    theta = np.linalg.norm(xi[:, 3:], axis=1)[:, None, None]
+    a, b = np.sinc(theta / np.pi), 0.5 * np.sinc(theta / (2 * np.pi)) ** 2
+    # (1 − a)/θ² loses its digits where θ vanishes, but there it multiplies k² = O(θ²).
+    c = (1.0 - a) / np.maximum(theta, 1e-100) ** 2
+    T = np.tile(np.eye(4), (len(xi), 1, 1))
+    T[:, :3, :3] += a * k + b * kk
+    T[:, :3, 3] = ((np.eye(3) + b * k + c * kk) @ xi[:, :3, None])[..., 0]
+    return T
+
+
+def log_stack(T: Matrix) -> Matrix:
+    """Map transforms [N, 4, 4] to twists [N, 6], |φ| ≤ π: `log` for many at once."""
+    phi = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
+    k, theta2 = hat(phi), (phi * phi).sum(1)[:, None, None]
+    h, _ = _half_cotangent(theta2)
+    inverse_v = np.eye(3) - 0.5 * k + (1.0 - h) / np.maximum(theta2, 1e-200) * (k @ k)
+    return np.concatenate([(inverse_v @ T[:, :3, 3, None])[..., 0], phi], axis=1)
+
+
+def left_jacobian_inverse(xi: Matrix) -> Matrix:
+    """Build J⁻¹(ξ) [N, 6, 6] for twists [N, 6], |φ| < 2π: log(exp(δ) exp(ξ)) = ξ + J⁻¹(ξ) δ + O(δ²).
+
+    J⁻¹ = ad / (exp(ad) − 1), ad = ad(ξ). As ad (ad² + θ²)² = 0, the power series closes as 1 − ad/2 + p ad² + q ad⁴;
+    p and q follow from the value and slope of x/2·coth(x/2) at x = iθ.
+    """
+    k = hat(xi[:, 3:])
+    ad = np.zeros((len(xi), 6, 6))
+    ad[:, :3, :3] = ad[:, 3:, 3:] = k
+    ad[:, :3, 3:] = hat(xi[:, :3])
+    theta2 = (xi[:, 3:] ** 2).sum(1)[:, None, None]
+    h, slope = _half_cotangent(theta2)
+    safe = np.maximum(theta2, 1e-2)
+    q = np.where(theta2 > 1e-2, (theta2 * slope - h + 1.0) / safe**2, -1 / 720 - theta2 / 15120 - theta2**2 / 403200)
+    p = np.where(theta2 > 1e-2, 2.0 * q * theta2 - slope, 1 / 12 - theta2**2 / 30240)
+    ad2 = ad @ ad
+    return np.asarray(np.eye(6) - 0.5 * ad + p * ad2 + q * (ad2 @ ad2))
+
+
+def _half_cotangent(theta2: Matrix) -> tuple[Matrix, Matrix]:
+    """Return h = θ/2·cot(θ/2) and its slope dh/dθ², 0 ≤ θ < 2π."""
+    half = 0.5 * np.sqrt(np.maximum(theta2, 1e-16))
+    h = half / np.tan(half)
+    return h, (h - (half / np.sin(half)) ** 2) / (8.0 * half**2)
 
 
 def rotation_from_quaternion(q_wxyz: Matrix) -> Matrix:

@@ -1,0 +1,226 @@
+"""Correct submaps' poses by what loops say about them: Levenberg–Marquardt on SE(3), with loops under suspicion.
+
+Odometry edges are trusted. Loop edges are judged while the graph is solved, by graduated non-convexity with the
+Geman–McClure loss (Yang et al., RA-L 2020): at first every loop pulls nearly fully, at last only those that agree with
+the rest of the graph. Those accepted then count fully and the others not at all.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csc_array
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
+from scipy.special import gammaincinv
+
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.model import se3
+
+Matrix = NDArray[np.float64]
+
+PRUNE_WEIGHT = 0.25
+"""Below this weight a loop is rejected (VarSplat §6). At μ = 1 the weight is ¼ exactly where r² = c²: the χ² test."""
+GRADUATION = 1.4
+"""Factor from one μ to the next (Yang et al. 2020, remark 5)."""
+STEPS_PER_MU = 2
+"""Ten give the same verdicts: the next weights move the minimum further than more steps towards this one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """T_a_b as measured between nodes a and b, and the information [6, 6] (inverse covariance, 1/m² and 1/rad²) of its
+    left twist ξ = (ρ, φ): the truth is exp(ξ) T_a_b. Odometry is trusted, a loop is judged."""
+
+    a: int
+    b: int
+    T_a_b: Matrix
+    information: Matrix
+    loop: bool
+
+
+@dataclass(frozen=True)
+class LoopVerdict:
+    """Whether loop a → b was believed; its Geman–McClure weight in [0, 1] when that was decided; and the χ² (6 degrees
+    of freedom) by which it differs from the solution."""
+
+    a: int
+    b: int
+    weight: float
+    chi2: float
+    accepted: bool
+
+
+@dataclass(frozen=True, eq=False)
+class PoseGraphSolution:
+    """T_world_node [N, 4, 4]; one verdict per loop edge in the order of the edges; steps of Levenberg–Marquardt; cost
+    Σ χ² of odometry and accepted loops, at the given poses and at the solution."""
+
+    T_world_node: Matrix
+    verdicts: tuple[LoopVerdict, ...]
+    iterations: int
+    cost_before: float
+    cost_after: float
+
+
+def optimise(
+    T_world_node: Matrix, edges: Sequence[Edge], confidence: float = 0.99, max_iterations: int = 100
+) -> PoseGraphSolution:
+    """Find the poses [N, 4, 4] that agree best with the edges; node 0 stays where it is.
+
+    A loop is rejected where its χ² exceeds the `confidence` quantile of 6 degrees of freedom; confidence = 1 believes
+    every loop (plain least squares). Without loops the poses come back as they are. Up to `max_iterations` steps follow
+    once the verdicts stand.
+    Raises SigmaSplatError on poses or edges that are not rigid, edges to nodes that do not exist, information that is
+    not symmetric positive definite, and nodes that no chain of odometry edges ties to node 0: with their loops rejected
+    they would hang on nothing.
+    """
+    if not 0.0 < confidence <= 1.0:
+        raise SigmaSplatError(f"pose graph: confidence is {confidence}; give a probability above 0 and at most 1")
+    poses = np.array(T_world_node, np.float64)
+    _refuse_bad_input(poses, edges)
+    if not edges:
+        return PoseGraphSolution(poses, (), 0, 0.0, 0.0)
+    graph = PoseGraph(len(poses), edges)
+    # Relative to node 0: neither rounding nor the optimiser's path depends on where the world has its origin.
+    start = se3.inverse(poses[:1]) @ poses
+    if not graph.loop.any():
+        cost = float(graph.chi2(start).sum())
+        return PoseGraphSolution(poses, (), 0, cost, cost)
+
+    chi2_limit = 2.0 * float(gammaincinv(3.0, confidence))
+    T, weights, graduating = _graduate(graph, start, chi2_limit)
+    believed = np.where(graph.loop, weights >= PRUNE_WEIGHT, True)
+    T, finishing = _minimise(graph, T, believed.astype(np.float64), max_iterations)
+    chi2 = graph.chi2(T)
+    verdicts = tuple(
+        LoopVerdict(edge.a, edge.b, float(weights[i]), float(chi2[i]), bool(believed[i]))
+        for i, edge in enumerate(edges)
+        if edge.loop
+    )
+    solved = poses[0] @ T
+    solved[0] = poses[0]
+    cost_before, cost_after = float(graph.chi2(start)[believed].sum()), float(chi2[believed].sum())
+    return PoseGraphSolution(solved, verdicts, graduating + finishing, cost_before, cost_after)
+
+
+class PoseGraph:
+    """The edges as stacks, and where each one's blocks lie in the normal equations. Node 0 has no row: it is fixed."""
+
+    def __init__(self, nodes: int, edges: Sequence[Edge]) -> None:
+        self.nodes = nodes
+        self.a = np.array([edge.a for edge in edges], np.intp)
+        self.b = np.array([edge.b for edge in edges], np.intp)
+        self.loop = np.array([edge.loop for edge in edges], bool)
+        self.T_b_a = se3.inverse(np.stack([edge.T_a_b for edge in edges]).astype(np.float64))
+        self.information = np.stack([edge.information for edge in edges]).astype(np.float64)
+        rows = np.stack([self.a, self.b, self.a, self.b])[:, :, None, None] - 1
+        columns = np.stack([self.a, self.b, self.b, self.a])[:, :, None, None] - 1
+        blocks, six = (4, len(edges), 6, 6), np.arange(6)
+        self._free = np.broadcast_to((rows >= 0) & (columns >= 0), blocks)
+        self._rows = np.broadcast_to(6 * rows + six[:, None], blocks)[self._free]
+        self._columns = np.broadcast_to(6 * columns + six, blocks)[self._free]
+
+    def residuals(self, T_world_node: Matrix) -> Matrix:
+        """Return the twists e [E, 6] by which the poses differ from the edges: T_a⁻¹ T_b = exp(e) T_a_b."""
+        T_a_b = se3.inverse(T_world_node[self.a]) @ T_world_node[self.b]
+        return se3.log_stack(T_a_b @ self.T_b_a)
+
+    def chi2(self, T_world_node: Matrix) -> Matrix:
+        """Return eᵀΩe of every edge, [E]."""
+        e = self.residuals(T_world_node)
+        return np.asarray(np.einsum("ei,eij,ej->e", e, self.information, e))
+
+    def jacobians(self, T_world_node: Matrix, e: Matrix) -> Matrix:
+        """Return ∂e/∂δ_b = J⁻¹(e) Ad(T_a⁻¹), [E, 6, 6], for T_b ← exp(δ_b) T_b; ∂e/∂δ_a is its negative."""
+        return se3.left_jacobian_inverse(e) @ se3.adjoint(se3.inverse(T_world_node[self.a]))
+
+    def normal_equations(self, T_world_node: Matrix, weights: Matrix) -> tuple[csc_array, Matrix]:
+        """Return H = Σ w JᵀΩJ and g = Σ w JᵀΩe of the free nodes. H is the graph's Laplacian in 6×6 blocks."""
+        e = self.residuals(T_world_node)
+        J = self.jacobians(T_world_node, e)
+        weighted = weights[:, None, None] * (np.swapaxes(J, 1, 2) @ self.information)
+        block, pull = weighted @ J, (weighted @ e[:, :, None])[..., 0]
+        values = np.stack([block, block, -block, -block])[self._free]
+        size = 6 * (self.nodes - 1)
+        g = np.zeros((self.nodes, 6))
+        np.add.at(g, self.b, pull)
+        np.add.at(g, self.a, -pull)
+        return coo_array((values, (self._rows, self._columns)), shape=(size, size)).tocsc(), g[1:].ravel()
+
+
+def _graduate(graph: PoseGraph, T: Matrix, chi2_limit: float) -> tuple[Matrix, Matrix, int]:
+    """Solve with ever stricter loops: poses, weights [E] of the Geman–McClure loss with c² = chi2_limit, steps taken.
+
+    w = (μc² / (r² + μc²))², μ from 2 max r² / c² down to 1 (Yang et al. 2020, eq. 12 and remark 5). The first r² is
+    that of the given poses; where all loops weigh alike, false ones have bent the graph most.
+    """
+    chi2, steps = graph.chi2(T), 0
+    mu = max(2.0 * float(chi2[graph.loop].max()) / chi2_limit, 1.0)
+    while True:
+        weights = np.where(graph.loop, 1.0 / (1.0 + chi2 / (mu * chi2_limit)) ** 2, 1.0)
+        T, taken = _minimise(graph, T, weights, STEPS_PER_MU)
+        chi2, steps = graph.chi2(T), steps + taken
+        if mu == 1.0:
+            return T, 1.0 / (1.0 + chi2 / chi2_limit) ** 2, steps
+        mu = max(mu / GRADUATION, 1.0)
+
+
+def _minimise(graph: PoseGraph, T: Matrix, weights: Matrix, max_iterations: int) -> tuple[Matrix, int]:
+    """Minimise Σ w eᵀΩe by Levenberg–Marquardt from poses T; return the poses and the number of steps tried.
+
+    Damping scales with H's diagonal and starts tiny: the soft modes of a chain are N² times smaller than that.
+    """
+    cost, damping = float(weights @ graph.chi2(T)), 1e-9
+    for step in range(1, max_iterations + 1):
+        H, g = graph.normal_equations(T, weights)
+        H.setdiag(H.diagonal() * (1.0 + damping))
+        delta = splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}).solve(-g)
+        moved = T.copy()
+        moved[1:] = se3.exp_stack(delta.reshape(-1, 6)) @ T[1:]
+        cost_moved = float(weights @ graph.chi2(moved))
+        if cost_moved < cost:
+            settled = cost - cost_moved < 1e-10 * cost and damping < 1e-6
+            T, cost, damping = moved, cost_moved, damping / 10.0
+        else:
+            settled = bool(np.abs(delta).max() < 1e-9) or damping > 1e6
+            damping *= 100.0
+        if settled:
+            return T, step
+    return T, max_iterations
+
+
+def _refuse_bad_input(poses: Matrix, edges: Sequence[Edge]) -> None:
+    """Raise SigmaSplatError in one line that names the node or the edge."""
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
+        raise SigmaSplatError(
+            f"pose graph: poses have shape {list(poses.shape)}; give [N, 4, 4] with at least one node"
+        )
+    for node, T in enumerate(poses):
+        if not se3.is_rigid(T):
+            raise SigmaSplatError(f"pose graph: the pose of node {node} is not a rigid motion; orthonormalise it first")
+    for edge in edges:
+        name = f"pose graph: edge {edge.a} → {edge.b}"
+        if edge.a == edge.b or not (0 <= edge.a < len(poses) and 0 <= edge.b < len(poses)):
+            raise SigmaSplatError(f"{name} does not join two of the {len(poses)} nodes; they are numbered from 0")
+        if not se3.is_rigid(edge.T_a_b):
+            raise SigmaSplatError(f"{name} measures no rigid motion; orthonormalise it first")
+        if not _is_positive_definite(edge.information):
+            raise SigmaSplatError(f"{name} has an information matrix that is not 6×6 symmetric positive definite")
+    trusted = [(edge.a, edge.b) for edge in edges if not edge.loop]
+    a, b = np.array(trusted, np.intp).reshape(-1, 2).T
+    _, part = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(len(poses),) * 2), directed=False)
+    loose = np.flatnonzero(part != part[0])
+    if len(loose):
+        raise SigmaSplatError(f"pose graph: no chain of odometry edges ties node {loose[0]} to node 0; add its edge")
+
+
+def _is_positive_definite(information: Matrix) -> bool:
+    """Tell whether a matrix is finite, 6×6, symmetric to rounding and its least eigenvalue above rounding."""
+    if information.shape != (6, 6) or not np.isfinite(information).all():
+        return False
+    if np.abs(information - information.T).max() > 1e-9 * np.abs(information).max():
+        return False
+    eigenvalues = np.linalg.eigvalsh(information)
+    return bool(eigenvalues[0] > np.finfo(np.float64).eps * eigenvalues[-1])
