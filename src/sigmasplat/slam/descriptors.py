@@ -1,0 +1,134 @@
+"""Sum a frame up in one vector, so that two views of the same place are recognised by the angle between them."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from sigmasplat.fit.align import gray_of
+
+Plane = NDArray[np.float32]
+Matrix = NDArray[np.float64]
+
+WORKING_SIZE = (80, 60)
+"""Width and height in pixels at which gradients are taken, whatever the camera's."""
+BLUR_PX = 1.0
+"""Standard deviation of the blur at that size."""
+LEAST_READINGS = 0.25
+"""A small pixel has a depth if at least this share of the large ones it covers has."""
+SOFTENING = 0.5
+"""Cells with far less gradient than this multiple of the typical are noise: they fade, not grow to norm 1."""
+LEAST_GRADIENT = 1e-4
+"""A mean gradient below this (√gray or log m over two pixels) is rounding: the half shows nothing."""
+CENTRING = 0.5
+"""Share of the mean taken off. Histograms are ≥ 0, hence all alike; taking all of it off lost wide-baseline matches."""
+
+
+class Descriptor(Protocol):
+    """Describe a view by a vector; built in is `OrientationGrid`, with weights of one's own `netvlad.NetVlad`."""
+
+    def describe(self, color: NDArray[np.float32], depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return a float32 vector [D] of unit norm, or of zeros where there is nothing to describe.
+
+        color [H, W, 3] RGB in [0, 1]; depth_m [H, W] metres, 0 = no reading. All vectors of one descriptor have one
+        length, whatever H and W.
+        """
+        ...
+
+
+def similarity(a: NDArray[np.float32], b: NDArray[np.float32]) -> Matrix:
+    """Return the cosines [n, m] between descriptors a [n, D] and b [m, D], each of unit norm or zero (VarSplat §4)."""
+    return a.astype(np.float64) @ b.astype(np.float64).T
+
+
+@dataclass(frozen=True)
+class OrientationGrid:
+    """Histograms of gradient orientation on a coarse grid, of gray and of log depth. Needs no weights.
+
+    Directions are taken modulo 180°, so that it does not matter which side of an edge is the brighter; magnitudes are
+    compared within a cell only, so that neither exposure nor the unit of depth matters. The coarse grid with cells that
+    fade into each other bears a shift of a fifth of the image. `depth_share` of the squared norm is depth's.
+    """
+
+    columns: int = 4
+    rows: int = 3
+    bins: int = 8
+    depth_share: float = 0.35
+
+    def describe(self, color: NDArray[np.float32], depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return float32 [2 · rows · columns · bins] of unit norm: gray's half, then depth's (`Descriptor.describe`).
+
+        A half that shows no gradient at all (a blank wall, no readings) is zero, the other one then stands alone.
+        """
+        gray = gaussian_filter(_small(np.sqrt(gray_of(color))), BLUR_PX)
+        log_depth, valid = _small_log_depth(depth_m)
+        halves = [
+            np.sqrt(1.0 - self.depth_share) * self._histograms(gray, np.ones_like(valid)),
+            np.sqrt(self.depth_share) * self._histograms(log_depth, valid),
+        ]
+        return _unit(np.concatenate(halves)).astype(np.float32)
+
+    def _histograms(self, image: Plane, valid: NDArray[np.bool_]) -> Matrix:
+        """Return the cells' histograms [rows · columns · bins], unit norm; zero where no gradient is known."""
+        magnitude, turn, known = _gradients(image, valid)
+        bin_ = turn * self.bins
+        lower = np.floor(bin_).astype(int)
+        upper_share = bin_ - lower
+        down, across = _tents(self.rows, image.shape[0]), _tents(self.columns, image.shape[1])
+        cells = np.empty((self.rows, self.columns, self.bins))
+        for k in range(self.bins):
+            share = (lower % self.bins == k) * (1.0 - upper_share) + ((lower + 1) % self.bins == k) * upper_share
+            cells[..., k] = down @ (magnitude * share) @ across.T
+        pixels = down @ known.astype(np.float64) @ across.T
+        cells /= np.maximum(pixels, 1e-9)[..., None]
+        cells = np.sqrt(cells)
+        norms = np.sqrt((cells**2).sum(-1, keepdims=True))
+        some = pixels > 0.0
+        mean_gradient = float((norms[some] ** 2).mean()) if some.any() else 0.0
+        if mean_gradient < LEAST_GRADIENT:
+            return np.zeros(cells.size)
+        cells /= norms + SOFTENING * np.sqrt(mean_gradient)
+        cells[some] -= CENTRING * cells[some].mean()
+        return _unit(cells.ravel())
+
+
+def _small(plane: Plane) -> Plane:
+    """Average a plane [H, W] over areas to the working size."""
+    whole = Image.fromarray(np.ascontiguousarray(plane, dtype=np.float32))
+    return np.asarray(whole.resize(WORKING_SIZE, Image.Resampling.BOX))
+
+
+def _small_log_depth(depth_m: Plane) -> tuple[Plane, NDArray[np.bool_]]:
+    """Average log depth over readings only, and blur it likewise; return it and where there is any."""
+    measured = depth_m > 0.0
+    share = _small(measured.astype(np.float32))
+    total = _small(np.log(depth_m, where=measured, out=np.zeros(depth_m.shape, np.float32)))
+    valid = share >= LEAST_READINGS
+    mean = np.divide(total, share, where=valid, out=np.zeros_like(total))
+    weight = gaussian_filter(valid.astype(np.float32), BLUR_PX)
+    return np.divide(gaussian_filter(mean, BLUR_PX), weight, where=valid, out=np.zeros_like(mean)), valid
+
+
+def _gradients(image: Plane, valid: NDArray[np.bool_]) -> tuple[Matrix, Matrix, NDArray[np.bool_]]:
+    """Return central differences' magnitude, their direction in half turns [0, 1), and where both are known."""
+    image = image.astype(np.float64)
+    dx, dy = np.zeros_like(image), np.zeros_like(image)
+    dx[:, 1:-1] = image[:, 2:] - image[:, :-2]
+    dy[1:-1] = image[2:] - image[:-2]
+    known = np.zeros(image.shape, bool)
+    known[1:-1, 1:-1] = valid[1:-1, 2:] & valid[1:-1, :-2] & valid[2:, 1:-1] & valid[:-2, 1:-1]
+    return np.hypot(dx, dy) * known, np.arctan2(dy, dx) / np.pi % 1.0, known
+
+
+def _tents(cells: int, pixels: int) -> Matrix:
+    """Return weights [cells, pixels] that fall linearly from a cell's centre to its neighbours' centres."""
+    position = (np.arange(pixels) + 0.5) / pixels * cells - 0.5
+    return np.maximum(0.0, 1.0 - np.abs(position[None] - np.arange(cells)[:, None]))
+
+
+def _unit(vector: Matrix) -> Matrix:
+    norm = float(np.linalg.norm(vector))
+    return vector / norm if norm > 0.0 else vector

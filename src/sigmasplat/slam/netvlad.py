@@ -1,0 +1,250 @@
+"""Describe places by NetVLAD (Arandjelović et al. 2016), with weights from a file that the user brings."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from safetensors.torch import load_file, save_file
+from scipy.io import loadmat
+from torch import Tensor
+
+from sigmasplat.errors import ConfigError
+
+CONVOLUTIONS = tuple(f"conv{block}_{i + 1}" for block, count in enumerate((2, 2, 3, 3, 3), 1) for i in range(count))
+"""VGG16's up to conv5_3, after which NetVLAD leaves out ReLU and pooling."""
+POOLED_BEFORE = ("conv2_1", "conv3_1", "conv4_1", "conv5_1")
+SMALLEST_PX = 2 ** len(POOLED_BEFORE)
+LAYER_NUMBERS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
+"""Where the convolutions stand when ReLUs and poolings are counted too, as both formats met in the wild do."""
+VLAD_LAYER, WHITEN_LAYER = 30, 33
+"""Where the Matlab network has its NetVLAD layer and the whitening after it."""
+IMAGENET_MEAN, IMAGENET_STD = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+FORMATS = "a pytorch-NetVlad checkpoint, hloc's VGG16-NetVLAD-Pitts30K.mat or a file NetVladWeights.save wrote"
+
+
+@dataclass(frozen=True, eq=False)
+class NetVladWeights:
+    """VGG16 and NetVLAD layer in float32, whatever file they came from; the shapes say how wide the network is.
+
+    convolutions: 13 of weight [out, in, 3, 3] and bias [out], the last out = D; assign [K, D] and assign_bias [K]: the
+    soft assignment to K clusters; centroids [K, D]; whitening: weight [P, K · D] and bias [P] of the PCA over the
+    clusters one after another, if any; the network sees (RGB in [0, 1] · scale − mean [3]) / std [3].
+    """
+
+    convolutions: list[tuple[Tensor, Tensor]]
+    assign: Tensor
+    assign_bias: Tensor
+    centroids: Tensor
+    whitening: tuple[Tensor, Tensor] | None
+    scale: float
+    mean: Tensor
+    std: Tensor
+
+    @staticmethod
+    def load(path: Path | str) -> "NetVladWeights":
+        """Read a weights file of any of the three formats, told apart by content.
+
+        Raises ConfigError naming the file, and the tensor with its found and expected shape, if that does not fit.
+        """
+        path = Path(path)
+        read = _reader(path)
+        try:
+            file = read(path)
+        except UnpicklingError as problem:
+            raise ConfigError(
+                f"{path}: holds more than tensors and numbers, or is damaged, and loading that could run anything; "
+                "if it comes from someone you trust, save its state_dict alone"
+            ) from problem
+        except Exception as problem:  # decoders fail in many ways on damaged bytes, and all of them mean: not usable
+            reason = " ".join(f"{type(problem).__name__}: {problem}".split())[:200]
+            raise ConfigError(f"{path}: unreadable as NetVLAD weights ({reason}); give {FORMATS}") from problem
+        return file.weights()
+
+    def save(self, path: Path | str) -> None:
+        """Write as safetensors: loads faster than the other formats, and runs no code."""
+        tensors = {"vlad.assign.weight": self.assign, "vlad.assign.bias": self.assign_bias}
+        tensors |= {"vlad.centroids": self.centroids, "input.mean": self.mean, "input.std": self.std}
+        tensors["input.scale"] = torch.tensor([self.scale])
+        for name, (weight, bias) in zip(CONVOLUTIONS, self.convolutions, strict=True):
+            tensors |= {f"vgg.{name}.weight": weight, f"vgg.{name}.bias": bias}
+        if self.whitening:
+            tensors |= {"whiten.weight": self.whitening[0], "whiten.bias": self.whitening[1]}
+        save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, path)
+
+
+@dataclass(frozen=True, eq=False)
+class NetVlad:
+    """A `Descriptor` of colour alone; width: pixels to work at (0 = as the image comes; 640 is what it learned on)."""
+
+    weights: NetVladWeights
+    width: int = 0
+
+    @torch.inference_mode()
+    def describe(self, color: NDArray[np.float32], depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return float32 [P], or [K · D] without whitening, of unit norm (`Descriptor.describe`).
+
+        Raises ConfigError if the image is below 16 pixels at the working width: nothing would be left of it.
+        """
+        w = self.weights
+        image = torch.tensor(color, dtype=torch.float32).permute(2, 0, 1)[None]
+        if self.width and self.width != image.shape[3]:
+            size = (round(image.shape[2] * self.width / image.shape[3]), self.width)
+            image = F.interpolate(image, size, mode="bilinear", antialias=True)
+        if min(image.shape[2:]) < SMALLEST_PX:
+            raise ConfigError(
+                f"NetVLAD needs images of at least {SMALLEST_PX} pixels each way, found {image.shape[3]}×"
+                f"{image.shape[2]}; raise input.width, or use the built-in descriptor"
+            )
+        return self._vlad(_vgg(w, (image * w.scale - w.mean[:, None, None]) / w.std[:, None, None])).numpy()
+
+    def _vlad(self, features: Tensor) -> Tensor:
+        """Sum residuals to the clusters, features [D, pixels]: V_k = Σ a_k (x − c_k), normalised per k, then as one."""
+        w = self.weights
+        x = F.normalize(features, dim=0)
+        a = torch.softmax(w.assign @ x + w.assign_bias[:, None], dim=0)
+        residuals = a @ x.T - a.sum(1, keepdim=True) * w.centroids
+        vector = F.normalize(F.normalize(residuals, dim=1).flatten(), dim=0)
+        if w.whitening is None:
+            return vector
+        return F.normalize(w.whitening[0] @ vector + w.whitening[1], dim=0)
+
+
+def _vgg(weights: NetVladWeights, image: Tensor) -> Tensor:
+    """Return conv5_3 [D, pixels] of an image [1, 3, H, W], before its ReLU."""
+    x = image
+    for name, (weight, bias) in zip(CONVOLUTIONS, weights.convolutions, strict=True):
+        if name != CONVOLUTIONS[0]:
+            x = F.relu(x)
+        if name in POOLED_BEFORE:
+            x = F.max_pool2d(x, 2)
+        x = F.conv2d(x, weight, bias, padding=1)
+    return x[0].flatten(1)
+
+
+@dataclass(frozen=True, eq=False)
+class _TensorFile:
+    """The tensors of a file by our names, in PyTorch's order of axes; alias: the names they have there."""
+
+    path: Path
+    tensors: dict[str, Tensor]
+    alias: dict[str, str]
+
+    def take(self, name: str, *shape: int | None) -> Tensor:
+        """Return a tensor as float32 of the given shape, None = any; dimensions of 1 at either end do not count.
+
+        Raises ConfigError if it is missing, of another shape, or not finite.
+        """
+        where = f"{self.path}: {self.alias.get(name, name)}"
+        expected = " × ".join("any" if size is None else str(size) for size in shape)
+        if name not in self.tensors:
+            raise ConfigError(f"{where} is missing (expected {expected}); give {FORMATS}")
+        tensor = self.tensors[name]
+        found = list(tensor.shape)
+        while len(found) > len(shape) and 1 in (found[0], found[-1]):
+            found.pop(0 if found[0] == 1 else -1)
+        if len(found) != len(shape) or any(s not in (f, None) for f, s in zip(found, shape, strict=True)):
+            sizes = " × ".join(map(str, tensor.shape)) or "a single number"
+            raise ConfigError(f"{where} is {sizes}, expected {expected}; give {FORMATS}")
+        if not torch.isfinite(tensor).all():
+            raise ConfigError(f"{where} holds NaN or inf, expected finite weights; download the file again")
+        # A copy: the last bits of a product depend on how its factors are aligned, and a file aligns them anyhow.
+        return torch.empty(found).copy_(tensor.reshape(found))
+
+    def weights(self) -> NetVladWeights:
+        """Check all tensors against each other and gather them."""
+        chain, width = [], 3
+        for name in CONVOLUTIONS:
+            kernel = self.take(f"vgg.{name}.weight", None, width, 3, 3)
+            width = len(kernel)
+            chain.append((kernel, self.take(f"vgg.{name}.bias", width)))
+        centroids = self.take("vlad.centroids", None, width)
+        count = len(centroids)
+        bias = self.take("vlad.assign.bias", count) if "vlad.assign.bias" in self.tensors else torch.zeros(count)
+        whitening = None
+        if "whiten.weight" in self.tensors:
+            pca = self.take("whiten.weight", None, count * width)
+            whitening = (pca, self.take("whiten.bias", len(pca)))
+        scale, mean, std = self.take("input.scale", 1).item(), self.take("input.mean", 3), self.take("input.std", 3)
+        assign = self.take("vlad.assign.weight", count, width)
+        return NetVladWeights(chain, assign, bias, centroids, whitening, scale, mean, std)
+
+
+def _read_safetensors(path: Path) -> _TensorFile:
+    return _TensorFile(path, load_file(path), {})
+
+
+def _read_checkpoint(path: Path) -> _TensorFile:
+    """Read pytorch-NetVlad's state_dict, wrapped or bare; Patch-NetVLAD adds the whitening.
+
+    Trained on torchvision's normalisation. Besides tensors only numpy's numbers (its scores) may be in the file.
+    """
+    numbers: list[Any] = [np.dtype, type(np.dtype(np.float64)), type(np.dtype(np.int64))]
+    scalar = np.float64(0.0).__reduce__()[0]
+    numbers += [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
+    with torch.serialization.safe_globals(numbers):
+        loaded = torch.load(path, map_location="cpu", weights_only=True)
+    tensors = {name: tensor for name, tensor in loaded.get("state_dict", loaded).items() if isinstance(tensor, Tensor)}
+    module = ".module" if "pool.module.centroids" in tensors else ""  # trained on several GPUs
+    alias = _alias(f"encoder{module}.{{}}.weight", f"encoder{module}.{{}}.bias")
+    alias |= {"vlad.centroids": f"pool{module}.centroids"}
+    for part in ("weight", "bias"):
+        alias |= {f"vlad.assign.{part}": f"pool{module}.conv.{part}", f"whiten.{part}": f"WPCA.0.{part}"}
+    named = {ours: tensors[theirs] for ours, theirs in alias.items() if theirs in tensors}
+    named |= {"input.scale": torch.ones(1), "input.mean": IMAGENET_MEAN, "input.std": IMAGENET_STD}
+    return _TensorFile(path, named, alias)
+
+
+def _read_matlab(path: Path) -> _TensorFile:
+    """Read the layers where hloc does; they take RGB in 0…255 less the mean image's first pixel."""
+    net = loadmat(path, struct_as_record=False, squeeze_me=True, variable_names=["net"])["net"]
+    tensors: dict[str, Tensor] = {}
+    for i, layer in enumerate(np.ravel(net.layers)):
+        for j, weights in enumerate(np.ravel(getattr(layer, "weights", ()))):
+            # Matlab has axes the other way round: [height, width, in, out], [D, K].
+            array = np.asarray(weights, np.float32).T
+            array = array.swapaxes(2, 3) if array.ndim == 4 else array
+            tensors[f"net.layers[{i}].weights[{j}]"] = torch.tensor(array.copy())
+    alias = _alias("net.layers[{}].weights[0]", "net.layers[{}].weights[1]")
+    vlad, white = f"net.layers[{VLAD_LAYER}].weights", f"net.layers[{WHITEN_LAYER}].weights"
+    alias |= {"vlad.assign.weight": f"{vlad}[0]", "vlad.centroids": f"{vlad}[1]"}
+    alias |= {"whiten.weight": f"{white}[0]", "whiten.bias": f"{white}[1]"}
+    named = {ours: tensors[theirs] for ours, theirs in alias.items() if theirs in tensors}
+    if "vlad.centroids" in named:
+        named["vlad.centroids"] = -named["vlad.centroids"]  # −c_k is what the file holds
+        shape = named["vlad.centroids"].T.shape
+        if "whiten.weight" in named and named["whiten.weight"][0].numel() == shape.numel():
+            # From the clusters of one feature side by side to the features of one cluster.
+            named["whiten.weight"] = named["whiten.weight"].reshape(-1, *shape).transpose(1, 2).flatten(1)
+    image = np.asarray(net.meta.normalization.averageImage, np.float32)
+    named["input.mean"] = torch.tensor(image.reshape(-1, image.shape[-1])[0])
+    named |= {"input.scale": torch.tensor([255.0]), "input.std": torch.ones(3)}
+    return _TensorFile(path, named, alias)
+
+
+def _alias(weight: str, bias: str) -> dict[str, str]:
+    """Map our names of the convolutions to a file's, given as patterns of the layer's number."""
+    patterns = {"weight": weight, "bias": bias}.items()
+    layers = list(zip(CONVOLUTIONS, LAYER_NUMBERS, strict=True))
+    return {f"vgg.{name}.{part}": pattern.format(number) for part, pattern in patterns for name, number in layers}
+
+
+def _reader(path: Path) -> Callable[[Path], _TensorFile]:
+    """Choose the reader by how the file begins."""
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(16)
+    except OSError as problem:
+        raise ConfigError(f"cannot read NetVLAD weights {path}: {problem.strerror}; give {FORMATS}") from problem
+    if head.startswith(b"MATLAB"):
+        return _read_matlab
+    if head[5:9] == b"\0\0\0{":  # JSON after its length, which may begin with any byte: a pickle's, too
+        return _read_safetensors
+    if head.startswith((b"PK", b"\x80")):
+        return _read_checkpoint
+    raise ConfigError(f"{path}: neither PyTorch, Matlab nor safetensors (found {head[:8]!r}); give {FORMATS}")
