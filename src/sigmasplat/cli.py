@@ -1,37 +1,20 @@
-"""Offer the command line: sigmasplat demo | run | eval | export | doctor. Torch is loaded by commands that need it."""
+"""Offer the command line: sigmasplat demo | run | eval | mesh | export | doctor; torch loads where it is needed."""
 
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import tyro
 
-from sigmasplat import env
-from sigmasplat.config import Config
-from sigmasplat.errors import ConfigError, RunError, SigmaSplatError
-from sigmasplat.options import (
-    DemoFolder,
-    Evaluate,
-    Format,
-    Frames,
-    Limit,
-    MovedSource,
-    OutFile,
-    OutFolder,
-    Overwrite,
-    PresetName,
-    Profile,
-    RunPath,
-    Seed,
-    Settings,
-    SourcePath,
-    Strict,
-    Stride,
-)
-from sigmasplat.presets import default_preset, override, preset as preset_of, split_settings
+from sigmasplat import env, options
+from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.options import absolute, configured, refuse_existing, source_of
+from sigmasplat.presets import default_preset
 
 if TYPE_CHECKING:
+    from sigmasplat.config import Config
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.screen import Screen
     from sigmasplat.sources.base import Source
@@ -45,11 +28,11 @@ Start with: sigmasplat demo, then: sigmasplat run PATH"""
 
 
 def demo(
-    frames: Frames = DEMO_FRAMES,
-    preset: PresetName = DEFAULT_PRESET,
-    settings: Settings = (),
-    out: DemoFolder = DEMO_FOLDER,
-    seed: Seed = None,
+    frames: options.Frames = DEMO_FRAMES,
+    preset: options.PresetName = DEFAULT_PRESET,
+    settings: options.Settings = (),
+    out: options.DemoFolder = DEMO_FOLDER,
+    seed: options.Seed = None,
 ) -> int:
     """Run SLAM on a room made in code, against exact truth; replaces the last demo.
 
@@ -62,17 +45,17 @@ def demo(
 
 
 def run(
-    path: SourcePath,
-    preset: PresetName = DEFAULT_PRESET,
-    settings: Settings = (),
-    out: OutFolder = None,
-    overwrite: Overwrite = False,
-    limit: Limit = None,
-    stride: Stride = 1,
-    strict: Strict = False,
-    seed: Seed = None,
-    evaluate: Evaluate = True,
-    profile: Profile = False,
+    path: options.SourcePath,
+    preset: options.PresetName = DEFAULT_PRESET,
+    settings: options.Settings = (),
+    out: options.OutFolder = None,
+    overwrite: options.Overwrite = False,
+    limit: options.Limit = None,
+    stride: options.Stride = 1,
+    strict: options.Strict = False,
+    seed: options.Seed = None,
+    evaluate: options.Evaluate = True,
+    profile: options.Profile = False,
 ) -> int:
     """Run SLAM on a sequence: trajectory, map, uncertainty, report.
 
@@ -88,31 +71,60 @@ def run(
     warning = depth_warning(source)
     if warning:
         screen.warn(warning)
-    folder = new_folder(out, config, source, overwrite, source_path=_absolute(path), stride=stride, limit=limit)
+    folder = new_folder(out, config, source, overwrite, source_path=absolute(path), stride=stride, limit=limit)
     screen.say(f"{source.name}: {len(source)} frames, {config.name} → {folder.path}")
     return _record(screen, config, source, folder, evaluate, profile)
 
 
-def evaluate_run(run: RunPath, moved_to: MovedSource = None) -> int:
+def evaluate_run(run: options.RunPath, mesh: options.WithMesh = False, moved_to: options.MovedSource = None) -> int:
     """Score an earlier run again; replaces its metrics, pictures and report.
 
     example: sigmasplat eval runs/kitchen
     """
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.screen import Screen
-    from sigmasplat.sources import open_source
 
     folder = RunFolder.open(run)
-    facts = folder.facts()
-    path = moved_to or facts.get("source_path")
-    if not path:
-        raise RunError(f"run {run} does not say where its sequence was; give --source PATH")
+    source = source_of(folder, moved_to)
     _prepare_torch()
-    _evaluate(Screen(), folder, open_source(path, stride=facts.get("stride") or 1, limit=facts.get("limit")))
+    _evaluate(Screen(), folder, source, mesh)
     return OK
 
 
-def export(run: RunPath, out: OutFile = None, format: Format = None, overwrite: Overwrite = False) -> int:
+def make_mesh(
+    run: options.RunPath,
+    voxel_m: options.VoxelM = 0.01,
+    out: options.MeshFile = None,
+    overwrite: options.Overwrite = False,
+    moved_to: options.MovedSource = None,
+) -> int:
+    """Make a surface of a run's map, coloured triangles, from what it shows at its keyframes.
+
+    example: sigmasplat mesh runs/kitchen --out kitchen.glb
+    """
+    from sigmasplat.io.mesh import check_name, write_mesh
+    from sigmasplat.io.runs import RunFolder
+    from sigmasplat.screen import Screen
+    from sigmasplat.surface import MESH, reconstruct
+
+    screen, folder, target = Screen(), RunFolder.open(run), out or run / MESH
+    check_name(target)
+    refuse_existing(out, overwrite)
+    source = source_of(folder, moved_to)
+    _prepare_torch()
+    with screen.counting("surface") as progress:
+        surface = reconstruct(folder, source.camera, voxel_m=voxel_m, progress=progress)
+    write_mesh(target, surface)
+    screen.say(f"{len(surface.vertices):,} vertices, {len(surface.faces):,} triangles: {target}")
+    return OK
+
+
+def export(
+    run: options.RunPath,
+    out: options.OutFile = None,
+    format: options.Format = None,
+    overwrite: options.Overwrite = False,
+) -> int:
     """Write a run's map as 3DGS PLY for SuperSplat and other viewers, or its path as TUM text.
 
     example: sigmasplat export runs/kitchen --out kitchen.ply
@@ -123,8 +135,7 @@ def export(run: RunPath, out: OutFile = None, format: Format = None, overwrite: 
     folder = RunFolder.open(run)
     chosen = format or ("trajectory" if out and out.suffix == ".txt" else "ply")
     target = out or Path(folder.path.resolve().name + {"ply": ".ply", "trajectory": ".txt"}[chosen])
-    if target.exists() and not overwrite:
-        raise RunError(f"{target} exists; give another --out, or --overwrite to replace it")
+    refuse_existing(target, overwrite)
     if chosen == "ply":
         ply.write_field(target, folder.read_map())
     else:
@@ -150,14 +161,8 @@ def doctor() -> int:
     return OK if healthy else UNHEALTHY
 
 
-def configured(preset: str, settings: Sequence[str], seed: int | None) -> Config:
-    """Return a preset's settings with those of --set and --seed in place. Raises ConfigError."""
-    config = override(preset_of(preset), split_settings(settings))
-    return config if seed is None else override(config, {"seed": str(seed)})
-
-
 def _record(
-    screen: "Screen", config: Config, source: "Source", folder: "RunFolder", evaluate: bool, profile: bool
+    screen: "Screen", config: "Config", source: "Source", folder: "RunFolder", evaluate: bool, profile: bool
 ) -> int:
     """Run SLAM into the folder, then score it; return the exit code."""
     from sigmasplat.session import record
@@ -182,13 +187,13 @@ def _record(
     return OK
 
 
-def _evaluate(screen: "Screen", folder: "RunFolder", source: "Source") -> None:
+def _evaluate(screen: "Screen", folder: "RunFolder", source: "Source", mesh: bool = False) -> None:
     """Score the run, print the table, and where the report is: it exists even where the truth does not fit."""
     from sigmasplat.evaluate import evaluate
 
     try:
         with screen.counting("evaluation") as progress:
-            metrics = evaluate(folder, source, progress=progress)
+            metrics = (partial(evaluate, mesh=True) if mesh else evaluate)(folder, source, progress=progress)
         screen.results(metrics)
     except Exception as problem:
         problem.add_note(f"the run is in {folder.path}")
@@ -207,14 +212,11 @@ def _prepare_torch() -> None:
         torch.set_num_threads(env.switches().threads)
 
 
-def _absolute(path: str) -> str:
-    return str(Path(path).resolve()) if Path(path).exists() else path
-
-
 COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo,
     "run": run,
     "eval": evaluate_run,
+    "mesh": make_mesh,
     "export": export,
     "doctor": doctor,
 }

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sigmasplat import surface
 from sigmasplat.config import Config
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.io.runs import RunFolder
@@ -42,6 +43,7 @@ def evaluate(
     renderer: Renderer | None = None,
     views_per_kind: int = 40,
     strips_per_kind: int = 6,
+    mesh: bool = False,
     progress: Progress = lambda done, total: None,
 ) -> dict[str, Any]:
     """Score trajectory, map and uncertainty of a run against its source, and return the metrics written.
@@ -49,6 +51,7 @@ def evaluate(
     Training views are the run's keyframes, held-out views the frames that no map was fitted to; of each at most
     `views_per_kind`, evenly spread. Both are rendered at the estimated poses, at the run's working resolution, with the
     run's render settings unless a `renderer` is given. `progress` is told (views done, of how many).
+    With `mesh` the keyframes are fused into mesh.ply, which is scored where the source knows its true surface.
     Raises RunError if the run stopped before it had a map; SourceError if the truth shares no timestamps with the run,
     after everything else has been written.
     """
@@ -63,7 +66,11 @@ def evaluate(
     gallery, config = Gallery(run, strips_per_kind), run.config()
     renderer = renderer or partial(render, options=config.render, backend=config.backend)
     scores = _score_views(config, source, field, chosen, gallery, renderer, progress)
-    metrics = _facts(run, source, log, field) | path_scores | scores
+    metrics = _facts(run, source, log, field) | path_scores | scores | {"reconstruction": None}
+    if mesh:
+        known = None if problem else truth
+        found = surface.fuse_and_score(run, source.camera, source.true_surface(), known, renderer, progress)
+        metrics["reconstruction"] = found
     run.write_metrics(metrics)
     plots = _draw_plots(run, log, None if problem else truth)
     warnings = [str(problem)] if problem else []

@@ -1,11 +1,18 @@
-"""Describe the options of the command line: type, placeholder, one line of help each."""
+"""Describe the options of the command line: type, placeholder, one line of help each; and turn them into values."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sigmasplat.presets import list_presets
+from sigmasplat.config import Config
+from sigmasplat.errors import RunError
+from sigmasplat.presets import list_presets, override, preset as preset_of, split_settings
+
+if TYPE_CHECKING:
+    from sigmasplat.io.runs import RunFolder
+    from sigmasplat.sources.base import Source
 
 arg = tyro.conf.arg
 PresetName = Annotated[str, arg(metavar="NAME", help=f"settings to start from: {', '.join(list_presets())}")]
@@ -43,6 +50,15 @@ MovedSource = Annotated[
 OutFile = Annotated[
     Path | None, arg(metavar="FILE", help="file to write", help_behavior_hint="(default: RUN's name, here)")
 ]
+MeshFile = Annotated[
+    Path | None,
+    arg(metavar="FILE", help="file to write: .ply, .obj or .glb", help_behavior_hint="(default: mesh.ply in RUN)"),
+]
+VoxelM = Annotated[float, arg(metavar="M", help="edge of a voxel in metres; distances are truncated at four of them")]
+WithMesh = Annotated[
+    bool,
+    arg(name="mesh", help="make mesh.ply too, and score it where the true surface is known", help_behavior_hint=""),
+]
 Format = Annotated[
     Literal["ply", "trajectory"] | None,
     arg(
@@ -51,3 +67,31 @@ Format = Annotated[
         help_behavior_hint="(default: by the ending of FILE, else ply)",
     ),
 ]
+
+
+def configured(preset: str, settings: Sequence[str], seed: int | None) -> Config:
+    """Return a preset's settings with those of --set and --seed in place. Raises ConfigError."""
+    config = override(preset_of(preset), split_settings(settings))
+    return config if seed is None else override(config, {"seed": str(seed)})
+
+
+def source_of(folder: "RunFolder", moved_to: str | None) -> "Source":
+    """Open the sequence that a run was made of. Raises RunError if the run does not say where it was."""
+    from sigmasplat.sources import open_source
+
+    facts = folder.facts()
+    path = moved_to or facts.get("source_path")
+    if not path:
+        raise RunError(f"run {folder.path} does not say where its sequence was; give --source PATH")
+    return open_source(path, stride=facts.get("stride") or 1, limit=facts.get("limit"))
+
+
+def refuse_existing(target: Path | None, overwrite: bool) -> None:
+    """Raise RunError if there is something at `target` that may not be overwritten."""
+    if target and target.exists() and not overwrite:
+        raise RunError(f"{target} exists; give another --out, or --overwrite to replace it")
+
+
+def absolute(path: str) -> str:
+    """Return a path in full where there is something, else as it is: it may name a built-in sequence."""
+    return str(Path(path).resolve()) if Path(path).exists() else path

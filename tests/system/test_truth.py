@@ -10,6 +10,7 @@ from sigmasplat.config import Config
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.model import se3
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, override, preset
 from sigmasplat.slam.slam import Slam
@@ -47,6 +48,9 @@ class Secretive(Source):
             raise Asked
         return self._truth
 
+    def true_surface(self) -> Mesh | None:
+        raise Asked
+
 
 def config() -> Config:
     return override(preset(default_preset()), SETTINGS)
@@ -69,6 +73,7 @@ def test_slam_and_session_never_ask_for_the_truth(tmp_path: Path) -> None:
 def test_the_command_line_asks_only_to_evaluate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sigmasplat.sources.open_source", lambda path, **options: Secretive())
     assert sigmasplat("run", "room", "--out", str(tmp_path / "run"), "--no-eval", *OPTIONS) == 0
+    assert sigmasplat("mesh", str(tmp_path / "run"), "--voxel-m", "0.1") == 0
     with pytest.raises(Asked):
         cli.main(["eval", str(tmp_path / "run")])
 

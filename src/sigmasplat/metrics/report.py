@@ -81,10 +81,13 @@ def number(value: float | None, digits: int, scale: float = 1.0) -> str:
 def headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     """Return the figures of first interest as (name, value, unit), in order; for the page's top and the CLI's table."""
     ate, held_out = metrics.get("ate") or {}, metrics.get("held_out") or {}
+    found = metrics.get("reconstruction")
+    surface = [("Surface F1 at 1 cm", number(found["f1"], 1, 100.0), "%")] if found else []
     return [
         ("ATE RMSE", number(ate.get("rmse_m"), 2, 100.0), "cm"),
         ("PSNR, held-out", number(held_out.get("psnr_db"), 2), "dB"),
         ("Depth L1, held-out", number(held_out.get("depth_l1_m"), 2, 100.0), "cm"),
+        *surface,
         ("Spearman V ~ error²", number((metrics.get("uncertainty") or {}).get("spearman"), 3), ""),
         ("Speed", number(metrics.get("frames_per_s"), 2), "frames/s"),
         ("Splats", number(metrics.get("splats"), 0), ""),
@@ -131,10 +134,11 @@ def _plot(contents: Contents, name: str, title: str) -> str:
 
 
 def _tables(metrics: dict[str, Any]) -> str:
-    """Show the scores of pictures, path and uncertainty in full."""
+    """Show the scores of pictures, path, surface and uncertainty in full."""
     cards = [
         ("Pictures", _picture_rows(metrics)),
         ("Path", _path_rows(metrics)),
+        ("Surface", _surface_rows(metrics)),
         ("Uncertainty V, held-out", _uncertainty_rows(metrics)),
         ("Reliability of V, held-out", _reliability_rows(metrics)),
     ]
@@ -168,6 +172,19 @@ def _path_rows(metrics: dict[str, Any]) -> list[list[str]]:
         *rows,
         ["RPE translation, cm per frame", number(rpe["translation_rmse_m"], 3, 100.0)],
         ["RPE rotation, ° per frame", number(rpe["rotation_rmse_deg"], 3)],
+    ]
+
+
+def _surface_rows(metrics: dict[str, Any]) -> list[list[str]]:
+    found = metrics.get("reconstruction")
+    if not found:
+        return []
+    lines = [("Accuracy, cm", "accuracy_m", 2), ("Completion, cm", "completion_m", 2),
+             ("Completion ratio (< 5 cm), %", "completion_ratio", 1), ("Precision (< 1 cm), %", "precision", 1),
+             ("Recall (< 1 cm), %", "recall", 1), ("F1 (1 cm), %", "f1", 1),
+             ("Depth L1, novel views, cm", "depth_l1_m", 2), ("… covered, %", "depth_coverage", 1)]  # fmt: skip
+    return [["of what a keyframe could see", "mesh.ply"]] + [
+        [label, number(found.get(key), digits, 100.0)] for label, key, digits in lines
     ]
 
 

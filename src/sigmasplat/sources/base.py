@@ -7,6 +7,7 @@ from dataclasses import replace
 from sigmasplat.errors import SourceError
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.read_ahead import read_ahead
 
@@ -41,6 +42,10 @@ class Source(ABC):
     @abstractmethod
     def truth(self) -> Trajectory | None:
         """Return the true path as recorded, on its own timestamps and in its own world frame; None if there is none."""
+
+    def true_surface(self) -> Mesh | None:
+        """Return the true surface in `truth`'s world frame, hidden parts too, faces of a few cm; None if not known."""
+        return None
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames in order, decoded a few ahead in a background thread.
@@ -97,3 +102,7 @@ class Subset(Source):
     def truth(self) -> Trajectory | None:
         """Return the true path of the whole source: it is kept by time, not by frame."""
         return self._whole.truth()
+
+    def true_surface(self) -> Mesh | None:
+        """Return the true surface of the whole source."""
+        return self._whole.true_surface()

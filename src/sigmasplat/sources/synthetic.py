@@ -7,11 +7,14 @@ import numpy as np
 from sigmasplat.errors import SourceError
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
 from sigmasplat.sources.images import color_from_bytes
 from sigmasplat.sources.opening import Format
+from sigmasplat.sources.room.furnish import furnished
 from sigmasplat.sources.room.sensor import measured_color, measured_depth
+from sigmasplat.sources.room.solid import triangles
 from sigmasplat.sources.room.view import picture, scene
 from sigmasplat.sources.room.walk import path
 
@@ -71,6 +74,10 @@ class SyntheticRoom(Source):
     def truth(self) -> Trajectory:
         """Return the exact pose of every frame, in the room's frame (z up)."""
         return Trajectory(np.arange(len(self)) / FRAMES_PER_SECOND, self._T_world_camera.copy())
+
+    def true_surface(self) -> Mesh:
+        """Return the outsides of all shapes, those against a wall or inside another shape too, in the room's frame."""
+        return triangles([shape for shapes in furnished(self._rooms, self._seed) for shape in shapes])
 
     def _gain(self, i: int) -> float:
         """Return the exposure of frame i: one slow swing over the sequence, back at its start with the camera."""

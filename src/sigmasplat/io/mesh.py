@@ -1,0 +1,169 @@
+"""Write surfaces as PLY, OBJ or GLB, all with a colour per vertex; read PLY back."""
+
+import json
+import struct
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.errors import RunError, SourceError
+from sigmasplat.io.atomic import replacing
+from sigmasplat.io.ply import BYTE_ORDERS, MAX_HEADER_BYTES, PLY_TYPES
+from sigmasplat.model.mesh import Mesh
+
+Element = tuple[str, int, list[list[str]]]
+
+FLOAT32, UINT32, VERTEX_TARGET, INDEX_TARGET = 5126, 5125, 34962, 34963
+"""Numbers of the glTF 2.0 specification."""
+
+
+def write_mesh(path: Path, mesh: Mesh) -> None:
+    """Write a mesh as its file's ending says, in one step. Raises RunError on another ending or an unwritable place."""
+    check_name(path)
+    content = _FORMATS[path.suffix.lower()](mesh)
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def check_name(path: Path) -> None:
+    """Raise RunError unless a mesh can be written under this name."""
+    if path.suffix.lower() not in _FORMATS:
+        raise RunError(f"cannot write a mesh as {path.name}; give a name that ends in {', '.join(_FORMATS)}")
+
+
+def read_mesh(path: Path) -> Mesh:
+    """Read a binary PLY of triangles, of ours or of another program; colours as bytes or as floats in [0, 1].
+
+    Raises SourceError if it is missing, truncated, no such PLY, or holds values that are no mesh.
+    """
+    try:
+        with path.open("rb") as file:
+            order, elements = _header(file, path)
+            rows = {name: _rows(file, path, order, name, count, fields) for name, count, fields in elements}
+    except OSError as problem:
+        raise SourceError(f"cannot read mesh {path}: {problem.strerror or problem}") from problem
+    vertices, faces = rows.get("vertex"), rows.get("face")
+    if vertices is None or faces is None or not {"x", "y", "z"} <= set(vertices.dtype.names or ()):
+        raise SourceError(f"{path} is no mesh: it needs vertices with x, y, z and faces; is it a point cloud?")
+    corners = [name for name in ("vertex_indices", "vertex_index") if name in (faces.dtype.names or ())]
+    if not corners or (faces[f"{corners[0]} count"] != 3).any():
+        raise SourceError(f"{path}: not all faces are triangles; triangulate the mesh first")
+    points = np.stack([vertices[name] for name in "xyz"], -1).astype(np.float32)
+    chosen = faces[corners[0]].astype(np.int64)
+    if not np.isfinite(points).all() or (chosen.size and not 0 <= chosen.min() <= chosen.max() < len(points)):
+        raise SourceError(f"{path}: the mesh holds nan or inf, or faces of vertices that do not exist")
+    return Mesh(points, chosen.astype(np.int32), _colors(vertices))
+
+
+def _colors(vertices: NDArray[np.void]) -> NDArray[np.float32] | None:
+    names = ("red", "green", "blue")
+    if not set(names) <= set(vertices.dtype.names or ()):
+        return None
+    colors = np.stack([vertices[name] for name in names], -1)
+    scale = 255.0 if colors.dtype.kind in "iu" else 1.0
+    return np.clip(colors / np.float32(scale), 0.0, 1.0).astype(np.float32)
+
+
+def _header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
+    """Read up to end_header: byte order, and name, count and properties of each element. Raises SourceError."""
+    if file.readline(8).strip() != b"ply":
+        raise SourceError(f"{path} is not a PLY file (its first line is not 'ply')")
+    order, elements = "", list[Element]()
+    while file.tell() < MAX_HEADER_BYTES and (raw := file.readline(MAX_HEADER_BYTES)):
+        words = raw.decode("ascii", "replace").split()
+        if words == ["end_header"] and order:
+            return order, elements
+        if words[:1] == ["format"]:
+            order = BYTE_ORDERS.get(" ".join(words[1:2]), "")
+            if not order:
+                raise SourceError(f"{path}: the PLY is not binary ({' '.join(words)}); save it as binary")
+        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
+            elements.append((words[1], int(words[2]), []))
+        elif words[:1] == ["property"] and elements:
+            elements[-1][2].append(words[1:])
+    raise SourceError(f"{path} is truncated: the PLY's header has no 'end_header'")
+
+
+def _rows(
+    file: BinaryIO, path: Path, order: str, name: str, count: int, properties: list[list[str]]
+) -> NDArray[np.void]:
+    """Read one element; lists are taken to hold three values, and their lengths are kept as "NAME count"."""
+    fields: list[tuple[str, str] | tuple[str, str, int]] = []
+    for words in properties:
+        kinds = [PLY_TYPES.get(word) for word in words[:-1] if word != "list"]
+        if None in kinds or len(kinds) != (2 if words[0] == "list" else 1):
+            raise SourceError(f"{path}: cannot read the PLY's properties ({' '.join(words)})")
+        if len(kinds) == 2:
+            fields += [(f"{words[-1]} count", f"{order}{kinds[0]}"), (words[-1], f"{order}{kinds[1]}", 3)]
+        else:
+            fields.append((words[-1], f"{order}{kinds[0]}"))
+    row = np.dtype(fields)
+    data = file.read(count * row.itemsize)
+    whole = np.frombuffer(data[: len(data) // max(row.itemsize, 1) * row.itemsize], row)
+    if len(whole) < count and not any((whole[k] != 3).any() for k in row.names or () if k.endswith(" count")):
+        raise SourceError(f"{path} is truncated: its header promises {count} of element {name}, found {len(whole)}")
+    return whole
+
+
+def _ply(mesh: Mesh) -> bytes:
+    """Return a binary little-endian PLY: float x y z, uchar red green blue, faces as lists of int."""
+    columns = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    vertices = np.zeros(len(mesh.vertices), np.dtype(columns))
+    for k, name in enumerate("xyz"):
+        vertices[name] = mesh.vertices[:, k]
+    for k, name in enumerate(("red", "green", "blue")):
+        vertices[name] = _bytes(mesh)[:, k]
+    faces = np.zeros(len(mesh.faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
+    faces["count"], faces["corners"] = 3, mesh.faces
+    properties = [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in columns]
+    header = [
+        "ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}", *properties,
+        f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header",
+    ]  # fmt: skip
+    return "".join(f"{line}\n" for line in header).encode("ascii") + vertices.tobytes() + faces.tobytes()
+
+
+def _obj(mesh: Mesh) -> bytes:
+    """Return Wavefront text; the colour follows each vertex, as MeshLab and Blender read it."""
+    rows = np.concatenate([mesh.vertices.astype(np.float64), _bytes(mesh) / 255.0], 1)
+    vertices = ("v %.5f %.5f %.5f %.4f %.4f %.4f\n" * len(rows)) % tuple(rows.ravel().tolist())
+    faces = ("f %d %d %d\n" * len(mesh.faces)) % tuple((mesh.faces + 1).ravel().tolist())
+    return (vertices + faces).encode("ascii")
+
+
+def _glb(mesh: Mesh) -> bytes:
+    """Return binary glTF 2.0, turned so that the camera's y, down, becomes glTF's −y."""
+    arrays = [mesh.vertices.astype("<f4"), (_bytes(mesh) / np.float32(255.0)).astype("<f4"), mesh.faces.astype("<u4")]
+    starts = np.cumsum([0, *(array.nbytes for array in arrays)]).tolist()
+    views = [
+        {"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": target}
+        for array, start, target in zip(arrays, starts, (VERTEX_TARGET, VERTEX_TARGET, INDEX_TARGET), strict=False)
+    ]
+    bounds = {"min": mesh.vertices.min(0).tolist(), "max": mesh.vertices.max(0).tolist()} if len(mesh.vertices) else {}
+    accessors = [
+        {"bufferView": 0, "componentType": FLOAT32, "count": len(mesh.vertices), "type": "VEC3"} | bounds,
+        {"bufferView": 1, "componentType": FLOAT32, "count": len(mesh.vertices), "type": "VEC3"},
+        {"bufferView": 2, "componentType": UINT32, "count": mesh.faces.size, "type": "SCALAR"},
+    ]
+    primitive = {"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2}
+    scene = {
+        "asset": {"version": "2.0", "generator": "sigmasplat"}, "scene": 0, "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "rotation": [1.0, 0.0, 0.0, 0.0]}], "meshes": [{"primitives": [primitive]}],
+        "buffers": [{"byteLength": starts[-1]}], "bufferViews": views, "accessors": accessors,
+    }  # fmt: skip
+    text = json.dumps(scene).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", starts[-1], b"BIN\0")
+    binary = b"".join(array.tobytes() for array in arrays)
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks) + len(binary)) + chunks + binary
+
+
+def _bytes(mesh: Mesh) -> NDArray[np.uint8]:
+    """Return the colours as bytes [V, 3]; gray where the mesh has none."""
+    colors = np.full(mesh.vertices.shape, 0.7, np.float32) if mesh.colors is None else mesh.colors
+    return np.asarray(np.rint(np.clip(colors, 0.0, 1.0) * 255.0), np.uint8)
+
+
+_FORMATS = {".ply": _ply, ".obj": _obj, ".glb": _glb}

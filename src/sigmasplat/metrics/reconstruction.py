@@ -1,0 +1,189 @@
+"""Score a surface against the true one, as iMAP and NICE-SLAM do: of both, only what a camera of the run could see.
+
+Distances are from points drawn on one surface to the other *surface*, not to points drawn on it: two samples of the
+same room, 200 000 points each, lie a centimetre apart, which would drown the errors of a good map.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.mesh import Mesh
+from sigmasplat.render.mesh import mesh_depth
+
+Doubles = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Progress = Callable[[int, int], None]
+
+POINTS = 200_000
+"""Drawn on each surface."""
+COMPLETE_M = 0.05
+"""Completion ratio: the share of the true surface that has a reconstructed one within this distance."""
+CORRECT_M = 0.01
+"""Precision, recall and F1 are at this distance."""
+SLACK_M = 0.005
+"""A true face may be smaller than a pixel and lie between pixel centres; then its own centre decides, this near."""
+BEHIND_M = 0.05
+"""A reconstructed face this far behind the true surface is hidden by it."""
+CANDIDATES = 8
+"""Faces examined for each point: those of the nearest centroids."""
+POINTS_AT_ONCE = 20_000
+NOVEL_VIEWS = 20
+NOVEL_SHIFT_M, NOVEL_TURN_RAD, NOVEL_LEAST_M = 0.3, 0.35, 0.2
+"""A novel view is a training view, shifted and turned by up to this much along each axis, that is nowhere nearer to
+the true surface than the last."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Distances in metres, shares in [0, 1].
+
+    accuracy_m: mean distance from the reconstruction to the truth; completion_m: from the truth to the reconstruction;
+    completion_ratio: share of the truth within 5 cm; precision, recall: shares of reconstruction and truth within 1 cm;
+    f1: their harmonic mean; depth_l1_m: mean |depth difference| in novel views where both have a surface and a training
+    view saw the true one; depth_coverage: share of such pixels of the truth that have one.
+    """
+
+    accuracy_m: float
+    completion_m: float
+    completion_ratio: float
+    precision: float
+    recall: float
+    f1: float
+    depth_l1_m: float
+    depth_coverage: float
+
+
+def score(
+    found: Mesh,
+    truth: Mesh,
+    camera: Camera,
+    T_world_camera: Doubles,
+    *,
+    points: int = POINTS,
+    novel_views: int = NOVEL_VIEWS,
+    seed: int = 0,
+    progress: Progress = lambda done, total: None,
+) -> Reconstruction:
+    """Score mesh `found` against mesh `truth`, both in the truth's frame, seen from true poses [K, 4, 4].
+
+    The truth's faces should be small (a few cm): one is counted if a training view shows it at a pixel, or has its
+    centre within `SLACK_M` of what it shows there; a face found counts if its centre is in some training view no more
+    than `BEHIND_M` behind the truth. `progress` is told (views done, of how many). Values that do not exist are nan.
+    """
+    total = len(T_world_camera) + novel_views
+    seen_true, seen_found = np.zeros(len(truth.faces), bool), np.zeros(len(found.faces), bool)
+    centers, true_centers = found.corners.mean(1), truth.corners.mean(1)
+    for done, T in enumerate(T_world_camera, 1):
+        depth_m, face = mesh_depth(truth, camera, se3.inverse(T))
+        seen_true[face[face >= 0]] = True
+        seen_true |= in_front(true_centers, depth_m, camera, T, SLACK_M)
+        seen_found |= in_front(centers, depth_m, camera, T, BEHIND_M)
+        progress(done, total)
+    ours, theirs = found.with_faces(seen_found), truth.with_faces(seen_true)
+    to_truth = distances(ours.sampled(points, seed), theirs)
+    to_found = distances(theirs.sampled(points, seed + 1), ours)
+    precision, recall = _share(to_truth, CORRECT_M), _share(to_found, CORRECT_M)
+    views = novel(truth, camera, T_world_camera, novel_views, seed)
+    compared = []
+    for done, (T, depth_m, face) in enumerate(views, len(T_world_camera) + 1):
+        compared.append(_depth_pairs(found, seen_true, camera, T, depth_m, face))
+        progress(done, total)
+    both = np.concatenate([*compared, np.empty((2, 0))], axis=1)
+    has = both[0] > 0
+    return Reconstruction(
+        _mean(to_truth), _mean(to_found), _share(to_found, COMPLETE_M), precision, recall, f1(precision, recall),
+        _mean(np.abs(both[0] - both[1])[has]), _mean(has.astype(np.float64)),
+    )  # fmt: skip
+
+
+def f1(precision: float, recall: float) -> float:
+    """Return the harmonic mean, 0 where both are 0."""
+    return 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0 * (precision + recall)
+
+
+def in_front(
+    points: Doubles, depth_m: NDArray[np.float32], camera: Camera, T_world_camera: Doubles, slack_m: float
+) -> Mask:
+    """Tell which points [N, 3] a camera sees: in its image, at most `slack_m` behind the depth [H, W] if any."""
+    T = se3.inverse(T_world_camera)
+    x, y, z = T[:3, :3] @ points.T + T[:3, 3:]
+    ahead = np.maximum(z, 1e-6)
+    u, v = np.rint(camera.fx * x / ahead + camera.cx), np.rint(camera.fy * y / ahead + camera.cy)
+    inside = np.flatnonzero((z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height))
+    seen = np.zeros(len(points), bool)
+    there = depth_m[v[inside].astype(np.intp), u[inside].astype(np.intp)]
+    seen[inside] = (there == 0) | (z[inside] <= there + slack_m)
+    return seen
+
+
+def distances(points: Doubles, mesh: Mesh) -> Doubles:
+    """Return the distance [N] of each point to the nearest of the mesh's faces near it, inf where there is none."""
+    if not len(mesh.faces) or not len(points):
+        return np.full(len(points), np.inf)
+    corners = mesh.corners
+    _, near = cKDTree(corners.mean(1)).query(points, min(CANDIDATES, len(corners)))
+    near = near.reshape(len(points), -1)
+    out = np.empty(len(points))
+    for start in range(0, len(points), POINTS_AT_ONCE):
+        rows = slice(start, start + POINTS_AT_ONCE)
+        squared = _squared_distance(points[rows, None], *np.moveaxis(corners[near[rows]], 2, 0))
+        out[rows] = np.sqrt(squared.min(1))
+    return out
+
+
+def _squared_distance(p: Doubles, a: Doubles, b: Doubles, c: Doubles) -> Doubles:
+    """Return squared distances [...] of points to triangles [..., 3]: to the plane if above it, else to an edge."""
+    edges = [(a, b - a), (b, c - b), (c, a - c)]
+    normal = np.cross(b - a, c - a)
+    to_edges, above = np.full(normal.shape[:-1], np.inf), _dot(normal, normal) > 0
+    for start, along in edges:
+        q = p - start
+        share = np.clip(_dot(q, along) / np.maximum(_dot(along, along), 1e-24), 0.0, 1.0)
+        rest = q - share[..., None] * along
+        to_edges = np.minimum(to_edges, _dot(rest, rest))
+        above &= _dot(np.cross(along, q), normal) >= 0
+    to_plane = _dot(p - a, normal) ** 2 / np.maximum(_dot(normal, normal), 1e-24)
+    return np.where(above, np.minimum(to_plane, to_edges), to_edges)
+
+
+def _dot(a: Doubles, b: Doubles) -> Doubles:
+    return np.asarray(np.einsum("...k,...k->...", a, b))
+
+
+def novel(
+    truth: Mesh, camera: Camera, T_world_camera: Doubles, views: int, seed: int
+) -> list[tuple[Doubles, NDArray[np.float32], NDArray[np.intp]]]:
+    """Choose up to so many novel views: each pose, with the truth's depth and faces there (see `NOVEL_SHIFT_M`)."""
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(4 * views if len(T_world_camera) else 0):
+        shift, turn = rng.uniform(-1, 1, (2, 3)) * np.array([[NOVEL_SHIFT_M], [NOVEL_TURN_RAD]])
+        T = T_world_camera[rng.integers(len(T_world_camera))] @ se3.exp(np.concatenate([shift, turn]))
+        depth_m, face = mesh_depth(truth, camera, se3.inverse(T))
+        if depth_m[face >= 0].min(initial=np.inf) >= NOVEL_LEAST_M:
+            found.append((T, depth_m, face))
+        if len(found) == views:
+            break
+    return found
+
+
+def _depth_pairs(
+    found: Mesh, seen_true: Mask, camera: Camera, T: Doubles, depth_m: NDArray[np.float32], face: NDArray[np.intp]
+) -> Doubles:
+    """Return found and true depth [2, P] at the pixels whose true face a training view saw; 0 = nothing found."""
+    ours, _ = mesh_depth(found, camera, se3.inverse(T))
+    counted = (face >= 0) & seen_true[face]
+    return np.stack([ours[counted], depth_m[counted]]).astype(np.float64)
+
+
+def _mean(values: Doubles) -> float:
+    return float(values.mean()) if values.size else float("nan")
+
+
+def _share(distance_m: Doubles, limit_m: float) -> float:
+    return float((distance_m < limit_m).mean()) if distance_m.size else float("nan")

@@ -1,0 +1,88 @@
+"""Hold a surface of triangles: sample it, move it, keep parts of it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from sigmasplat.errors import SigmaSplatError
+
+Floats = NDArray[np.float32]
+Indices = NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles: vertices [V, 3] m, world frame; faces [F, 3], counter-clockwise from outside; colors [V, 3] in [0, 1].
+
+    Raises SigmaSplatError on shapes that disagree, values that are not finite, faces of vertices that do not exist.
+    """
+
+    vertices: Floats
+    faces: Indices
+    colors: Floats | None = None
+
+    def __post_init__(self) -> None:
+        v, f, c = self.vertices, self.faces, self.colors
+        if v.ndim != 2 or v.shape[1] != 3 or f.ndim != 2 or f.shape[1] != 3 or (c is not None and c.shape != v.shape):
+            shapes = (v.shape, f.shape, None if c is None else c.shape)
+            raise SigmaSplatError(f"a mesh needs vertices [V, 3], faces [F, 3], colors [V, 3], found {shapes}")
+        if not np.isfinite(v).all() or not (c is None or np.isfinite(c).all()):
+            raise SigmaSplatError("a mesh needs finite vertices and colors, found NaN or inf")
+        if f.size and (f.min() < 0 or f.max() >= len(v)):
+            raise SigmaSplatError(f"a mesh of {len(v)} vertices has faces of vertices {f.min()} to {f.max()}")
+
+    @staticmethod
+    def joined(parts: "list[Mesh]") -> "Mesh":
+        """Put meshes side by side in one, without colours; nothing is welded."""
+        starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+        faces = [part.faces + np.int32(start) for part, start in zip(parts, starts, strict=False)]
+        vertices = [part.vertices for part in parts]
+        return Mesh(np.concatenate([*vertices, np.empty((0, 3), np.float32)]),
+                    np.concatenate([*faces, np.empty((0, 3), np.int32)]))  # fmt: skip
+
+    @property
+    def corners(self) -> NDArray[np.float64]:
+        """Return the corners of each face [F, 3 corners, 3], m."""
+        return self.vertices[self.faces].astype(np.float64)
+
+    def areas(self) -> NDArray[np.float64]:
+        """Return the area of each face [F], m²."""
+        a, b, c = np.moveaxis(self.corners, 1, 0)
+        return 0.5 * np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+
+    def sampled(self, points: int, seed: int) -> NDArray[np.float64]:
+        """Draw points [points, 3] evenly over the area; none where there is no area."""
+        rng, areas = np.random.default_rng(seed), self.areas()
+        if not float(areas.sum()) > 0.0:
+            return np.empty((0, 3))
+        chosen = rng.choice(len(areas), points, p=areas / areas.sum())
+        a, b, c = np.moveaxis(self.vertices[self.faces[chosen]].astype(np.float64), 1, 0)
+        s, t = rng.uniform(size=(2, points, 1))
+        s, t = np.where(s + t > 1.0, 1.0 - s, s), np.where(s + t > 1.0, 1.0 - t, t)  # folded back into the triangle
+        return np.asarray(a + s * (b - a) + t * (c - a))
+
+    def moved(self, T_new_old: NDArray[np.float64]) -> "Mesh":
+        """Return the mesh carried by a rigid 4×4 transform."""
+        vertices = self.vertices @ T_new_old[:3, :3].T + T_new_old[:3, 3]
+        return replace(self, vertices=vertices.astype(np.float32))
+
+    def with_faces(self, keep: NDArray[np.bool_]) -> "Mesh":
+        """Keep the faces that a mask [F] marks, and the vertices they use, in their order."""
+        faces = self.faces[keep]
+        used = np.zeros(len(self.vertices), bool)
+        used[faces] = True
+        number = np.cumsum(used, dtype=np.int32) - np.int32(1)
+        return Mesh(self.vertices[used], number[faces], None if self.colors is None else self.colors[used])
+
+    def without_small_parts(self, vertices: int) -> "Mesh":
+        """Drop connected parts of fewer than so many vertices (VarSplat §7: 200), and vertices without a face."""
+        if not len(self.faces):
+            return self.with_faces(np.zeros(0, bool))
+        start, end = self.faces[:, [0, 1]].ravel(), self.faces[:, [1, 2]].ravel()
+        n = len(self.vertices)
+        edges = coo_array((np.ones(len(start), bool), (start, end)), shape=(n, n))
+        _, part = connected_components(edges, directed=False)
+        return self.with_faces((np.bincount(part) >= vertices)[part[self.faces[:, 0]]])

@@ -1,0 +1,183 @@
+"""Scores of a surface by their laws: itself, shifted, halved, hidden; distances and depth found another way too."""
+
+import numpy as np
+import pytest
+
+from sigmasplat.metrics.reconstruction import Reconstruction, distances, f1, in_front, novel, score
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.mesh import Mesh
+from sigmasplat.render.mesh import mesh_depth
+
+CAMERA = Camera(80, 60, 60.0, 60.0, 39.5, 29.5)
+EMPTY = Mesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32))
+
+
+def grid(columns: int, rows: int, place: np.ndarray) -> Mesh:
+    """Cover the unit square with triangles and take each point (s, t) to `place`(s, t) [N, 3]."""
+    s, t = np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1), indexing="ij")
+    n = np.arange(s.size).reshape(s.shape)
+    a, b, c, d = n[:-1, :-1].ravel(), n[1:, :-1].ravel(), n[1:, 1:].ravel(), n[:-1, 1:].ravel()
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    return Mesh(np.stack(place(s.ravel(), t.ravel()), 1).astype(np.float32), faces.astype(np.int32))
+
+
+def ball(radius_m: float = 1.0) -> Mesh:
+    """Return a ball about the origin, its faces' corners exactly on it."""
+
+    def place(s: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, ...]:
+        level = radius_m * np.sin(np.pi * t)
+        return level * np.cos(2 * np.pi * s), level * np.sin(2 * np.pi * s), radius_m * np.cos(np.pi * t)
+
+    return grid(120, 60, place)
+
+
+def wall(z_m: float, half_m: float = 0.6) -> Mesh:
+    """Return a square across the optical axis of the world's camera."""
+    return grid(30, 30, lambda s, t: ((2 * s - 1) * half_m, (2 * t - 1) * half_m, np.full_like(s, z_m)))
+
+
+def around(views: int = 12, distance_m: float = 3.0) -> np.ndarray:
+    """Return poses on all sides of the origin that look at it."""
+    back = se3.exp(np.array([0, 0, -distance_m, 0, 0, 0]))
+    turns = [np.array([0, 0, 0, 0, 2 * np.pi * k / views, 0]) for k in range(views)]
+    turns += [np.array([0, 0, 0, side * np.pi / 2, 0, 0]) for side in (-1, 1)]
+    return np.stack([se3.exp(turn) @ back for turn in turns])
+
+
+AHEAD = np.eye(4)[None]
+
+
+def scored(found: Mesh, truth: Mesh, poses: np.ndarray) -> Reconstruction:
+    return score(found, truth, CAMERA, poses, points=10_000, novel_views=3)
+
+
+def test_a_surface_is_as_good_as_itself() -> None:
+    found = scored(ball(), ball(), around())
+    assert found.accuracy_m < 1e-5 and found.completion_m < 1e-5 and found.depth_l1_m == 0.0
+    shares = [found.completion_ratio, found.precision, found.recall, found.f1, found.depth_coverage]
+    assert shares == pytest.approx([1.0] * 5, abs=1e-3), "but for faces at the rim of what was seen"
+
+
+@pytest.mark.parametrize(("shift_m", "correct", "complete"), [(0.005, 1, 1), (0.02, 0, 1), (-0.02, 0, 1), (0.08, 0, 0)])
+def test_a_shift_along_the_normals_is_the_distance(shift_m: float, correct: float, complete: float) -> None:
+    found = scored(ball(1.0 + shift_m), ball(), around())
+    assert found.accuracy_m == pytest.approx(abs(shift_m), rel=0.03)
+    assert found.completion_m == pytest.approx(abs(shift_m), rel=0.03)
+    assert [found.precision, found.recall, found.f1] == pytest.approx([correct] * 3, abs=1e-3)
+    assert found.completion_ratio == pytest.approx(complete, abs=1e-3)
+
+
+def test_half_a_surface_is_half_complete_and_all_accurate() -> None:
+    whole = ball()
+    half = whole.with_faces(whole.corners.mean(1)[:, 0] > 0)
+    found = scored(half, whole, around())
+    # A point is complete if it lies within the limit of the half: a zone of a sphere has the area of its height.
+    assert found.completion_ratio == pytest.approx(0.5 + 0.05 / 2, abs=0.01)
+    assert found.recall == pytest.approx(0.5 + 0.01 / 2, abs=0.01)
+    assert found.accuracy_m < 1e-5 and found.precision > 0.999 and found.f1 == pytest.approx(2 / 3, abs=0.02)
+    back = scored(whole, half, around())
+    assert back.completion_ratio > 0.999 and back.accuracy_m > 0.1, (
+        "the other way round it is the accuracy that suffers"
+    )
+
+
+def test_what_no_camera_saw_is_not_counted() -> None:
+    front, hidden = wall(2.0), wall(3.0, half_m=0.5)
+    truth = Mesh.joined([front, hidden])
+    assert scored(front, truth, AHEAD).completion_ratio == 1.0, "the wall behind is hidden"
+    assert scored(truth, front, AHEAD).accuracy_m < 1e-6, "and so is what was made up behind"
+    behind = around(2)[1]
+    behind[2, 3] += 2.0
+    seen = scored(front, truth, np.stack([AHEAD[0], behind]))
+    assert seen.completion_ratio < 0.7 and seen.completion_m > 0.3, "seen from the other side it counts"
+    aside = Mesh.joined([front, wall(2.0).moved(se3.exp(np.array([5.0, 0, 0, 0, 0, 0])))])
+    assert scored(front, aside, AHEAD).completion_ratio == scored(aside, front, AHEAD).precision == 1.0
+
+
+def test_what_is_made_up_in_front_is_counted() -> None:
+    front = wall(2.0)
+    found = scored(Mesh.joined([front, wall(1.5, half_m=0.6)]), front, AHEAD)
+    assert found.precision == pytest.approx(0.5, abs=0.02) and found.accuracy_m == pytest.approx(0.25, abs=0.01)
+    assert found.recall == 1.0 and found.depth_l1_m > 0.3
+
+
+def test_depth_of_novel_views_is_taken_where_a_training_view_saw_the_surface() -> None:
+    front = wall(2.0)
+    nearer = scored(wall(1.9), front, AHEAD)
+    assert nearer.depth_l1_m == pytest.approx(0.1, rel=0.2) and 0.9 < nearer.depth_coverage <= 1.0
+    left = front.with_faces(front.corners.mean(1)[:, 0] < 0)
+    part = scored(left, front, AHEAD)
+    assert part.depth_l1_m < 1e-6 and part.depth_coverage == pytest.approx(0.5, abs=0.15)
+    aside = wall(2.0).moved(se3.exp(np.array([2.0, 0, 0, 0, 0, 0])))
+    unseen = score(front, Mesh.joined([front, aside]), CAMERA, AHEAD, points=1000, novel_views=8)
+    assert unseen.depth_coverage > 0.99, "novel views see the other wall, but no training view did"
+
+
+def test_novel_views_are_new_clear_and_repeatable() -> None:
+    truth, poses = Mesh.joined([wall(2.0), wall(0.35)]), around(3)
+    views = novel(truth, CAMERA, np.concatenate([AHEAD, poses]), 8, seed=3)
+    assert len(views) == 8
+    for T, depth_m, face in views:
+        assert np.abs(poses - T).max((1, 2)).min() > 0.02 and depth_m[face >= 0].min(initial=9.0) >= 0.2
+    again = novel(truth, CAMERA, np.concatenate([AHEAD, poses]), 8, seed=3)
+    assert all((a[0] == b[0]).all() for a, b in zip(views, again, strict=True))
+    assert novel(truth, CAMERA, np.empty((0, 4, 4)), 8, seed=3) == []
+
+
+def test_nothing_found_is_said_not_hidden() -> None:
+    found = scored(EMPTY, wall(2.0), AHEAD)
+    assert np.isnan(found.accuracy_m) and np.isnan(found.precision) and np.isnan(found.depth_l1_m)
+    assert found.completion_ratio == found.recall == found.depth_coverage == 0.0 and found.completion_m == np.inf
+    assert f1(0.0, 0.0) == 0.0 and f1(1.0, 0.5) == pytest.approx(2 / 3)
+
+
+def test_the_same_meshes_get_the_same_scores() -> None:
+    found = ball(1.01).moved(se3.exp(np.array([0.01, 0, 0, 0.1, 0, 0])))
+    assert scored(found, ball(), around()) == scored(found, ball(), around())
+
+
+def test_distances_to_triangles_are_those_of_a_fine_net_of_points_on_them() -> None:
+    rng = np.random.default_rng(5)
+    mesh = Mesh(rng.normal(size=(12, 3)).astype(np.float32), np.arange(12, dtype=np.int32).reshape(4, 3))
+    points = 1.5 * rng.normal(size=(300, 3))
+    s, t = np.meshgrid(np.linspace(0, 1, 80), np.linspace(0, 1, 80))
+    inside = s + t <= 1 + 1e-9
+    s, t = s[inside][:, None], t[inside][:, None]
+    net = np.concatenate([a + s * (b - a) + t * (c - a) for a, b, c in mesh.corners])
+    brute = np.sqrt(((points[:, None] - net) ** 2).sum(-1)).min(1)
+    ours = distances(points, mesh)
+    assert (ours <= brute + 1e-9).all() and np.abs(ours - brute).max() < 0.02 and np.median(brute - ours) < 1e-3
+    assert distances(net[::97], mesh).max() < 1e-7 and (distances(points, EMPTY) == np.inf).all()
+
+
+def test_depth_of_a_slanted_plane_is_exact_and_the_nearer_face_wins() -> None:
+    """The plane z = 2 + ½x, and a small square before it."""
+    plane = grid(20, 20, lambda s, t: (2 * s - 1, 2 * t - 1, 2 + 0.5 * (2 * s - 1)))
+    square = wall(1.2, half_m=0.2)
+    depth_m, face = mesh_depth(Mesh.joined([plane, square]), CAMERA, np.eye(4))
+    x, y = np.moveaxis(CAMERA.rays(), 2, 0)[:2].astype(float)
+    expected = 2 / (1 - 0.5 * x)
+    before = (np.abs(1.2 * x) < 0.199) & (np.abs(1.2 * y) < 0.199)
+    on = (
+        (np.abs(expected * x) < 0.99)
+        & (np.abs(expected * y) < 0.99)
+        & ~((np.abs(1.2 * x) < 0.201) & (np.abs(1.2 * y) < 0.201))
+    )
+    np.testing.assert_allclose(depth_m[before], 1.2, atol=1e-6)
+    np.testing.assert_allclose(depth_m[on], expected[on], rtol=1e-6)
+    assert (face[before] >= len(plane.faces)).all() and ((face[on] >= 0) & (face[on] < len(plane.faces))).all()
+    assert (depth_m[face < 0] == 0).all() and (face < 0).any() and before.sum() > 100
+
+
+def test_faces_behind_or_at_the_camera_are_not_seen() -> None:
+    for mesh in (wall(-1.0), wall(0.01), EMPTY, wall(2.0).moved(se3.exp(np.array([9.0, 0, 0, 0, 0, 0])))):
+        depth_m, face = mesh_depth(mesh, CAMERA, np.eye(4))
+        assert not depth_m.any() and (face == -1).all()
+
+
+def test_points_are_seen_up_to_the_depth_and_a_little() -> None:
+    depth_m = np.full((60, 80), 2.0, np.float32)
+    depth_m[:, :40] = 0.0  # nothing there: seen through
+    points = np.array([[0.3, 0, 1.0], [0.3, 0, 2.04], [0.3, 0, 2.06], [-0.3, 0, 9.0], [0.3, 0, -1.0], [9, 0, 1.0]])
+    assert in_front(points, depth_m, CAMERA, np.eye(4), 0.05).tolist() == [True, True, False, True, False, False]

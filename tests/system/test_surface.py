@@ -1,0 +1,219 @@
+"""Surfaces out of runs: of a map whose view is known exactly, of a tiny real run, and of the room itself."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from sigmasplat import cli
+from sigmasplat.config import Config, InputConfig
+from sigmasplat.errors import ConfigError, RunError
+from sigmasplat.evaluate import evaluate
+from sigmasplat.io.mesh import read_mesh
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.metrics.reconstruction import distances
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.frame import Frame
+from sigmasplat.model.mesh import Mesh
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.sources import SyntheticRoom, open_source
+from sigmasplat.sources.base import Source
+from sigmasplat.surface import keyframe_poses, reconstruct, working_camera
+
+CAMERA = Camera(96, 72, 80.0, 80.0, 47.5, 35.5)
+"""The run works at half its size."""
+CONFIG = replace(Config(), name="hand-made", input=InputConfig(width=48, max_depth_m=4.0))
+KEYFRAMES, WALL_M, VOXEL_M = [0, 2, 4], 2.0, 0.05
+WORLD = se3.exp(np.array([5.0, 6, 7, 0.5, 1.0, 1.5]))
+
+
+def poses() -> np.ndarray:
+    """Return six poses before a wall at z = 2 m, frames 1, 3 and 5 of them far to the side."""
+    T = [se3.exp(np.array([0.1 * i, 0.03 * i * i, 0.02 * i, 0.0, 0.03 * i, 0.0])) for i in range(6)]
+    for i in (1, 3, 5):
+        T[i][0, 3] += 30.0
+    return np.stack(T)
+
+
+class WallAhead(Source):
+    """A wall before the camera; it knows its true surface and path, in a frame of their own."""
+
+    def __init__(self, known: bool = True) -> None:
+        super().__init__("wall", CAMERA)
+        self.known = known
+
+    def __len__(self) -> int:
+        return 6
+
+    def frame(self, i: int) -> Frame:
+        return Frame(i, float(i), np.full((72, 96, 3), 0.5, np.float32), np.full((72, 96), 2.0, np.float32), CAMERA)
+
+    def truth(self) -> Trajectory:
+        return Trajectory(np.arange(6.0), WORLD @ poses())
+
+    def true_surface(self) -> Mesh | None:
+        steps = np.linspace(-3, 3, 121)
+        x, y = np.meshgrid(steps, steps, indexing="ij")
+        n = np.arange(x.size).reshape(x.shape)
+        quads = [n[:-1, :-1], n[1:, :-1], n[1:, 1:], n[:-1, 1:]]
+        faces = np.concatenate([np.stack([quads[i].ravel() for i in corners], 1) for corners in ((0, 1, 2), (0, 2, 3))])
+        vertices = np.stack([x.ravel(), y.ravel(), np.full(x.size, WALL_M)], 1)
+        return Mesh(vertices.astype(np.float32), faces.astype(np.int32)).moved(WORLD) if self.known else None
+
+
+class KnownView:
+    """Show the wall, `off_m` too near, thin on the left and too far away at the top; remember from where."""
+
+    def __init__(self, off_m: float = 0.0) -> None:
+        self.off_m, self.seen = off_m, list[np.ndarray]()
+
+    def __call__(self, field: GaussianField, camera: Camera, T_camera_world: np.ndarray) -> Any:
+        assert camera == CAMERA.resized(48, 36)
+        T = se3.inverse(T_camera_world)
+        self.seen.append(T)
+        ahead = camera.rays().astype(float) @ T[:3, :3].T[:, 2]
+        alpha = np.full((36, 48), 0.95, np.float32)
+        alpha[:, :12] = 0.5
+        depth = (WALL_M - self.off_m - T[2, 3]) / ahead
+        depth[:6] = 4.5
+        color = np.full((36, 48, 3), 0.4)
+        maps = {"depth": depth * alpha, "alpha": alpha, "color": color * alpha[..., None], "variance": 0 * color}
+        return SimpleNamespace(**{name: torch.tensor(values, dtype=torch.float32) for name, values in maps.items()})
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    run = RunFolder.create(tmp_path / "run", CONFIG, "wall")
+    for i in range(6):
+        run.log({"index": i, "timestamp_s": float(i), "is_keyframe": i in KEYFRAMES, "lost": False, "seconds": {}})
+    run.write_trajectory(Trajectory(np.arange(6.0), poses()))
+    run.write_map(GaussianField(torch.ones(3, 17)))
+    write_checkpoint(run, KEYFRAMES)
+    return run
+
+
+def write_checkpoint(run: RunFolder, keyframes: list[int]) -> None:
+    tensors = {"timestamps_s": torch.arange(6.0).double(), "T_world_camera": torch.from_numpy(poses())}
+    run.write_checkpoint(tensors | {"keyframes": torch.tensor(keyframes, dtype=torch.int64)}, {})
+
+
+def test_the_surface_is_where_the_map_shows_it_at_its_keyframes(run: RunFolder) -> None:
+    renderer, told = KnownView(), list[tuple[int, int]]()
+    mesh = reconstruct(run, CAMERA, voxel_m=VOXEL_M, renderer=renderer, progress=lambda *at: told.append(at))
+    np.testing.assert_allclose(renderer.seen, poses()[KEYFRAMES], atol=1e-12)
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert len(mesh.vertices) > 200 and np.abs(mesh.vertices[:, 2] - WALL_M).max() < 0.1 * VOXEL_M, "depth is D / A"
+    np.testing.assert_allclose(mesh.colors, 0.4, atol=1e-5)
+    # Thin alpha on the left and readings beyond max_depth_m at the top are no surface: the first camera's left edge is
+    # outermost in x, its sixth row from above in y.
+    camera = CAMERA.resized(48, 36)
+    assert mesh.vertices[:, 0].min() > (11 - camera.cx) / camera.fx * WALL_M - VOXEL_M
+    assert mesh.vertices[:, 1].min() > (5 - camera.cy) / camera.fy * WALL_M - VOXEL_M
+
+
+def test_evaluation_scores_the_mesh_in_the_truths_frame(run: RunFolder) -> None:
+    found = evaluate(run, WallAhead(), renderer=KnownView(off_m=0.005), strips_per_kind=0, mesh=True)["reconstruction"]
+    assert found["accuracy_m"] == pytest.approx(0.005, rel=0.05) and found["precision"] > 0.999
+    assert found["depth_l1_m"] == pytest.approx(0.005, rel=0.2)
+    assert 0.5 < found["recall"] < found["completion_ratio"] < 0.9, "the map is thin on the left and far off at the top"
+    assert run.read_metrics()["reconstruction"] == found
+    page = (run.path / "report.html").read_text()
+    assert "Surface F1 at 1 cm" in page and "Completion ratio (&lt; 5 cm), %" in page
+    off = read_mesh(run.path / "mesh.ply").vertices[:, 2] - (WALL_M - 0.005)
+    assert np.abs(off).max() < 0.004 and np.median(np.abs(off)) < 1e-5, "in the run's own world"
+
+
+def test_without_a_known_surface_there_is_a_mesh_and_no_score(run: RunFolder) -> None:
+    metrics = evaluate(run, WallAhead(known=False), renderer=KnownView(), strips_per_kind=0, mesh=True)
+    assert metrics["reconstruction"] is None and (run.path / "mesh.ply").exists()
+    (run.path / "mesh.ply").unlink()
+    metrics = evaluate(run, WallAhead(), renderer=KnownView(), strips_per_kind=0)
+    assert metrics["reconstruction"] is None and not (run.path / "mesh.ply").exists(), "only where asked for"
+    assert "Surface" not in (run.path / "report.html").read_text()
+
+
+def test_runs_without_keyframes_and_voxels_without_size_are_refused(run: RunFolder) -> None:
+    with pytest.raises(ConfigError, match="a voxel must be above 0"):
+        reconstruct(run, CAMERA, voxel_m=0.0, renderer=KnownView())
+    write_checkpoint(run, [])
+    with pytest.raises(RunError, match="no keyframes in its checkpoint"):
+        keyframe_poses(run)
+    (run.path / "checkpoint.safetensors").unlink()
+    with pytest.raises(RunError, match=r"no checkpoint\.safetensors"):
+        reconstruct(run, CAMERA, renderer=KnownView())
+
+
+def test_the_working_camera_is_that_of_prepared_frames(run: RunFolder) -> None:
+    frame = WallAhead().frame(0).prepared(48, 0.1, 4.0)
+    assert working_camera(run, CAMERA) == frame.camera
+
+
+def sigmasplat(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as left:
+        cli.main(arguments)
+    assert isinstance(left.value.code, int)
+    return left.value.code
+
+
+def test_the_command_makes_the_surface_of_a_real_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+    room, out = "synthetic:frames=120,width=64,height=48", str(tmp_path / "run")
+    small = ["--set", "mapping.first_iterations=30", "--set", "mapping.iterations=8", "--set", "input.width=64"]
+    assert sigmasplat("run", room, "--limit", "6", "--no-eval", "--out", out, *small) == 0
+    capsys.readouterr()
+    assert sigmasplat("mesh", out, "--voxel-m", "0.05") == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].startswith("surface 2/2") and said[-1].endswith(f"triangles: {out}/mesh.ply")
+    first, mesh = (tmp_path / "run" / "mesh.ply").read_bytes(), read_mesh(tmp_path / "run" / "mesh.ply")
+    source = open_source(room)
+    off = distances(mesh.moved(source.truth().T_world_camera[0]).vertices.astype(float), source.true_surface())
+    assert len(mesh.faces) > 1000 and np.median(off) < 0.03
+    assert sigmasplat("mesh", out, "--voxel-m", "0.05") == 0, "the run's own mesh is replaced"
+    assert (tmp_path / "run" / "mesh.ply").read_bytes() == first, "and the same"
+    for refused, words in (
+        (["--out", str(tmp_path / "a.stl")], "give a name that ends in .ply, .obj, .glb"),
+        (["--out", str(tmp_path / "run" / "mesh.ply")], "exists; give another --out"),
+        (["--voxel-m", "-1"], "a voxel must be above 0"),
+        (["--source", str(tmp_path / "nowhere")], "no such folder"),
+    ):
+        capsys.readouterr()
+        assert sigmasplat("mesh", out, *refused) == 2
+        said = capsys.readouterr().err.splitlines()
+        assert len(said) == 1 and words in said[0]
+
+
+def test_the_rooms_triangles_are_where_its_rays_hit() -> None:
+    """Every reading of a noiseless frame lies on the true surface, and nothing of that is before a reading."""
+    from sigmasplat.render.mesh import mesh_depth
+
+    room = SyntheticRoom(frames=40, width=96, height=72, seed=1)
+    surface = room.true_surface()
+    edges = np.linalg.norm(surface.corners - np.roll(surface.corners, 1, axis=1), axis=2)
+    assert edges.max() < 0.08 and surface.areas().min() > 0
+    for i in (0, 13, 27):
+        frame, T = room.frame(i), room.truth().T_world_camera[i]
+        points = (frame.camera.rays() * frame.depth_m[..., None]).reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
+        assert np.quantile(distances(points, surface), 0.999) < 1e-3
+        depth_m, _ = mesh_depth(surface, room.camera, se3.inverse(T))
+        assert (np.abs(depth_m - frame.depth_m) < 5e-3).mean() > 0.998
+    assert (
+        open_source("synthetic:frames=40,width=96,height=72,seed=1", stride=2).true_surface().faces.shape
+        == surface.faces.shape
+    )
+
+
+@pytest.mark.parametrize("kind", ["box", "ball", "drum"])
+def test_the_rooms_shapes_are_closed_and_face_outwards(kind: str) -> None:
+    from sigmasplat.sources.room.furnish import furnished
+    from sigmasplat.sources.room.solid import triangles
+
+    shape = next(s for s in furnished(1, 0)[0] if s.kind == kind)
+    a, b, c = np.moveaxis(triangles([shape]).corners - shape.center, 1, 0)
+    per_half = {"box": 8.0, "ball": 4 / 3 * np.pi, "drum": 2 * np.pi}
+    assert (a * np.cross(b, c)).sum() / 6 == pytest.approx(per_half[kind] * float(np.prod(shape.half)), rel=0.01)
