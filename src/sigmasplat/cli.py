@@ -103,9 +103,9 @@ def make_mesh(
     example: sigmasplat mesh runs/kitchen --out kitchen.glb
     """
     from sigmasplat.io.mesh import check_name, write_mesh
-    from sigmasplat.io.runs import RunFolder
+    from sigmasplat.io.runs import MESH, RunFolder
     from sigmasplat.screen import Screen
-    from sigmasplat.surface import MESH, reconstruct
+    from sigmasplat.surface import reconstruct
 
     screen, folder, target = Screen(), RunFolder.open(run), out or run / MESH
     check_name(target)

@@ -104,7 +104,7 @@ class TrackingConfig:
     method: Literal["adam", "align"] = "adam"
     """adam: gradient descent through the renderer, as in the papers; align: one render, then Gauss–Newton on it."""
     iterations: int = 200
-    align_iterations: int = 8
+    align_iterations: int = 15
     """Gauss–Newton steps at most, per pyramid level."""
     align_to: Literal["keyframe", "map"] = "keyframe"
     """keyframe: the newest keyframe's own image, weighed by V; map: the map rendered at the predicted pose."""

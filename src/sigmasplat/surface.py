@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sigmasplat.errors import RunError
 from sigmasplat.io.mesh import write_mesh
-from sigmasplat.io.runs import RunFolder
+from sigmasplat.io.runs import MESH, RunFolder
 from sigmasplat.metrics import reconstruction
 from sigmasplat.metrics.trajectory import align_rigid, associate, paired
 from sigmasplat.model import isosurface, se3
@@ -26,7 +26,6 @@ from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.model.tsdf import Tsdf
 from sigmasplat.render import Render, render
 
-MESH = "mesh.ply"
 VOXEL_M = 0.01
 TRUNCATION_VOXELS = 4
 """VarSplat §7: 1 cm, truncated at 4 cm."""

@@ -240,3 +240,30 @@ def test_a_reference_behind_the_camera_contributes_nothing() -> None:
     away = np.diag([-1.0, 1.0, -1.0, 1.0])
     H, b, sums = step(pair(), away)
     assert not H.any() and not b.any() and not sums.any()
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.4])
+def test_a_bare_wall_decides_three_directions_and_the_guess_keeps_the_others(tilt: float) -> None:
+    """Sliding along a plane without texture and turning about its normal change nothing that can be seen."""
+    normal = np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
+    depth = (-2.0 * np.cos(tilt) / (CAMERA.rays() @ normal)).astype(np.float32)
+    wall = Pyramid.of(np.full(depth.shape, 0.5, np.float32), depth, CAMERA)
+    along = np.cross(normal, [0.0, 1.0, 0.0])
+    slide = 0.03 * along + 0.02 * np.array([0.0, 1.0, 0.0])
+    off = np.concatenate([slide + 0.02 * normal, [0.004, -0.003, 0.0]])
+    found = align(wall, wall, se3.exp(off), 20)
+    assert found.degenerate == 3
+    left = se3.log(found.T_live_reference)
+    assert abs(left[:3] @ normal) < 1e-3, "the distance to the wall is found"
+    assert abs(left[:3] @ along) == pytest.approx(0.03, abs=2e-3) and left[1] == pytest.approx(0.02, abs=2e-3)
+    deviation = np.sqrt([axis @ found.covariance[:3, :3] @ axis for axis in (normal, along, np.array([0.0, 1.0, 0.0]))])
+    assert deviation[0] < 0.01 and deviation[1:].min() > 0.3
+
+
+def test_what_was_never_settled_is_the_best_seen() -> None:
+    """One step at most: the finest level has seen one iterate, and that one is returned with its own cost."""
+    first = align(seen(10), seen(12), motion(10, 12), 1, update_stop=0.0)
+    again = align(seen(10), seen(12), first.T_live_reference, 1, update_stop=0.0)
+    assert first.steps == again.steps == len(seen(10).cameras)
+    many = align(seen(10), seen(12), motion(10, 12), 15, update_stop=0.0)
+    assert many.cost <= min(first.cost, again.cost) * (1 + 1e-6)

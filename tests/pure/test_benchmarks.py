@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -398,14 +399,14 @@ def small_config(options: Any, seed: int) -> Config:
 def test_a_followed_pose_has_the_error_of_its_own_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     """Poses that are off by a known twist in the live camera come back as that twist, whatever mapping moves."""
     known, claimed = np.array([1e-3, -2e-3, 3e-3, 1e-3, 2e-3, -1e-3]), np.diag([1e-6] * 6)
-    source = open_source(ROOM, limit=8)
+    covering, source = SimpleNamespace(covariance=claimed), open_source(ROOM, limit=8)
     T_world_room = se3.inverse(source.truth().T_world_camera[0])
 
     def off(self: Tracker, field: Any, view: Any, target: Any, live: Any) -> PoseFit:
         i = len(seen) + 1
         seen.append(i)
         T_camera_world = se3.inverse(T_world_room @ source.truth().T_world_camera[i])
-        return PoseFit(se3.exp(known) @ T_camera_world, 1.0, 1.0, 0.0, 0.0, 1, covariance=claimed)
+        return PoseFit(se3.exp(known) @ T_camera_world, 1.0, 1.0, 0.0, 0.0, 1, covering)  # type: ignore[arg-type]
 
     seen: list[int] = []
     monkeypatch.setattr(Tracker, "track", off)

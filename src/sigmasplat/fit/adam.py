@@ -31,20 +31,48 @@ class Rates:
 def adam_step(field: GaussianField, grad: Tensor, rates: Rates, visible: Tensor) -> None:
     """Move the rows of `field.params` in view (bool [N]) against grad [N, 17], in place; `field.steps` is this step.
 
-    Rows out of view keep still. When one is seen again, its moments are first decayed by the steps it missed, as dense
-    Adam's would have been. Left out is dense Adam's coasting meanwhile: at most β₁/(√β₂ − β₁) ≈ 9.1 times the row's
-    last step in each column, however long it stays away (once the bias correction has worn off, some 1000 steps). The
-    native kernels do the same, fused (native/adam.h).
+    Rows out of view wait. What dense Adam would have done to one meanwhile, coast on its decaying moments, is made up
+    for when it is seen again (`_catch_up`) or by `settle`. The native kernels do the same, fused (native/adam.h).
     """
     rows = visible.nonzero().squeeze(1)
-    age = (field.steps - field.last_step[rows])[:, None].to(grad)
+    params, moment1, moment2 = _catch_up(field, rows, rates, field.steps - 1)
     g = grad[rows]
-    moment1 = field.moment1[rows] * BETA1**age + (1 - BETA1) * g
-    moment2 = field.moment2[rows] * BETA2**age + (1 - BETA2) * g * g
+    moment1 = BETA1 * moment1 + (1 - BETA1) * g
+    moment2 = BETA2 * moment2 + (1 - BETA2) * g * g
     unbiased1, unbiased2 = moment1 / (1 - BETA1**field.steps), moment2 / (1 - BETA2**field.steps)
-    field.params[rows] -= rates.per_column * unbiased1 / (unbiased2.sqrt() + EPSILON)
-    field.moment1[rows], field.moment2[rows] = moment1, moment2
+    field.params[rows] = params - rates.per_column * unbiased1 / (unbiased2.sqrt() + EPSILON)
+    field.moment1[rows], field.moment2[rows], field.last_step[rows] = moment1, moment2, field.steps
+
+
+def settle(field: GaussianField, rates: Rates, compiled: bool) -> None:
+    """Bring every row to the present step, as dense Adam would have it: to be called when a fit ends."""
+    if compiled:
+        from sigmasplat.native import _core
+
+        _core.adam_settle(
+            field.params, field.moment1, field.moment2, field.last_step, rates.per_column.numpy(),
+            BETA1, BETA2, EPSILON, field.steps,
+        )  # fmt: skip
+        return
+    rows = (field.last_step != field.steps).nonzero().squeeze(1)
+    field.params[rows], field.moment1[rows], field.moment2[rows] = _catch_up(field, rows, rates, field.steps)
     field.last_step[rows] = field.steps
+
+
+def _catch_up(field: GaussianField, rows: Tensor, rates: Rates, to: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return params and moments of rows as dense Adam without a gradient would have left them after step `to`.
+
+    A step without gradient is β₁/√β₂ times the one before it, so that the missed ones add up to a geometric series.
+    Left out is only how the bias correction changes meanwhile.
+    """
+    last = field.last_step[rows][:, None].to(field.params)
+    missed, ratio, moved = to - last, BETA1 / BETA2**0.5, last > 0
+    steps = torch.where(moved, ratio * (1 - ratio**missed) / (1 - ratio), 0.0)
+    moment1, moment2 = field.moment1[rows], field.moment2[rows]
+    unbiased1 = moment1 / torch.where(moved, 1 - BETA1**last, 1.0)
+    unbiased2 = moment2 / torch.where(moved, 1 - BETA2**last, 1.0)
+    params = field.params[rows] - rates.per_column * steps * unbiased1 / (unbiased2.sqrt() + EPSILON)
+    return params, moment1 * BETA1**missed, moment2 * BETA2**missed
 
 
 @dataclass(eq=False)

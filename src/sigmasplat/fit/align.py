@@ -5,6 +5,7 @@ replace dozens of renders.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,15 +19,14 @@ Image = NDArray[np.float32]
 Matrix = NDArray[np.float64]
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-HUBER_GRAY = (0.02, 0.05, 0.1)
+LEVELS = 4
+HUBER_GRAY = (0.02, 0.05, 0.1, 0.2)
 """Width of the gray residual's quadratic part, from the finest level up: far from the answer all of them are large."""
-HUBER_DEPTH_RELATIVE = (0.003, 0.006, 0.012)
+HUBER_DEPTH_RELATIVE = (0.003, 0.006, 0.012, 0.05)
 """The same for depth, times z² (m): from a structured-light sensor's noise (Khoshelham & Elberink 2012) up."""
-DEPTH_GATES_M = (0.1, 0.2, 0.4)
+DEPTH_GATES_M = (0.1, 0.3, 0.8, 2.0)
 """Depth residuals beyond are other surfaces; from the finest level up."""
 MIN_PIXELS = 60
-RISE = 1e-3
-"""A step that raises the cost per pixel by more than this share of it is taken back."""
 DEGENERATE = 1e-5
 """A direction with less than this share of the best one's information is not decided by the images."""
 UNKNOWN_M = 1.0
@@ -51,7 +51,7 @@ class Pyramid:
         return Pyramid(self.gray, self.depth, halves, self.cameras)
 
     @staticmethod
-    def of(gray: Image, depth_m: Image, camera: Camera, weight: Image | None = None, levels: int = 3) -> "Pyramid":
+    def of(gray: Image, depth_m: Image, camera: Camera, weight: Image | None = None, levels: int = LEVELS) -> "Pyramid":
         """Halve gray [H, W], depth [H, W] and an optional weight [H, W] until `levels` sizes exist."""
         p = Pyramid([np.ascontiguousarray(gray)], [np.ascontiguousarray(depth_m)], [None], [camera])
         for _ in range(levels - 1):
@@ -88,16 +88,69 @@ def gray_of(color: Image) -> Image:
 @dataclass(frozen=True, eq=False)
 class Alignment:
     """T_live_reference; agreement: share of overlapping pixels whose depths agree; overlap: share of reference pixels
-    that land on a live reading; covariance [6, 6] of the left twist (ρ, φ), m and rad; degenerate: how many directions
-    of motion the images say nothing about; cost per pixel; steps taken."""
+    that land on a live reading; degenerate: how many directions of motion the images say nothing about; cost per pixel;
+    steps taken."""
 
     T_live_reference: Matrix
     agreement: float
     overlap: float
-    covariance: Matrix
     degenerate: int
     cost: float
     steps: int
+    pair: "Pair"
+
+    @cached_property
+    def covariance(self) -> Matrix:
+        """Estimate the covariance [6, 6] of the left twist (ρ, φ), m and rad, when asked for: 13 steps' time.
+
+        D⁻¹ S D⁻ᵀ: S sums the pull's outer products cell by cell, for residuals of neighbouring pixels err together
+        (cluster-robust sandwich estimator, Liang & Zeger 1986); D is how the pull really changes within half a pixel,
+        for H, built of noisy image gradients, is several times too steep. A degenerate direction has `UNKNOWN_M` of
+        deviation. Infinite where nothing was in common.
+        """
+        n = self.pair.normal_equations(self.T_live_reference, 0)
+        if n.sums[1] < MIN_PIXELS:
+            return np.diag(np.full(6, np.inf))
+        _, directions, decided = _axes(n, self.pair.depth_m)
+        basis, unknown = directions[:, decided], directions[:, ~decided]
+        slope = basis.T @ self._slope() @ basis
+        bread = basis @ np.linalg.inv(slope) @ basis.T
+        return np.asarray(bread @ n.S @ bread.T + UNKNOWN_M**2 * unknown @ unknown.T)
+
+    def _slope(self) -> Matrix:
+        """Differentiate the pull by the twist, by central differences of half a pixel; symmetric."""
+        half_rad = 0.5 / self.pair.reference.cameras[0].fx
+        steps, D = np.repeat([half_rad * self.pair.depth_m, half_rad], 3), np.zeros((6, 6))
+        for k, step in enumerate(steps):
+            ahead, behind = (
+                self.pair.normal_equations(se3.exp(sign * step * np.eye(6)[k]) @ self.T_live_reference, 0).b
+                for sign in (1.0, -1.0)
+            )
+            D[:, k] = (ahead - behind) / (2.0 * step)
+        return 0.5 * (D + D.T)
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two images to align and how gray weighs against depth; depth_m: mean depth of the reference."""
+
+    reference: Pyramid
+    live: Pyramid
+    weight_color: float
+    depth_m: float
+
+    def normal_equations(self, T_live_reference: Matrix, level: int) -> "Normal":
+        """Linearise the residuals at a motion on one level of the pyramids."""
+        from sigmasplat.native import _core
+
+        reference, live, width = self.reference, self.live, min(level, LEVELS - 1)
+        c, H, b, S, sums = reference.cameras[level], np.zeros(21), np.zeros(6), np.zeros(21), np.zeros(4)
+        _core.align_step(
+            reference.gray[level], reference.depth[level], reference.weight[level], live.gray[level],
+            live.depth[level], [c.fx, c.fy, c.cx, c.cy], self.weight_color, 1.0 - self.weight_color,
+            HUBER_GRAY[width], HUBER_DEPTH_RELATIVE[width], DEPTH_GATES_M[width], T_live_reference, H, b, S, sums,
+        )  # fmt: skip
+        return Normal(_symmetric(H), b, _symmetric(S), sums)
 
 
 @dataclass(eq=False)
@@ -120,58 +173,45 @@ def align(
     reference: Pyramid,
     live: Pyramid,
     T_live_reference: Matrix,
-    iterations: int = 8,
+    iterations: int = 15,
     weight_color: float = 0.5,
     update_stop: float = 1e-4,
 ) -> Alignment:
     """Find the motion that lays the reference onto the live image, from a first guess.
 
-    Each level takes up to `iterations` Gauss–Newton steps with Huber weights and ends below `update_stop` (m, rad), or
-    when a step raises the cost: then the level's best iterate stands. Directions the images say nothing about keep the
-    guess. weight_color in [0, 1] balances gray against depth, each in units of its Huber width.
+    Each level takes up to `iterations` Gauss–Newton steps with Huber weights and ends below `update_stop` (m, rad). If
+    the finest does not get there its best iterate stands. Directions the images say nothing about keep the guess.
+    weight_color in [0, 1] balances gray against depth, each in units of its Huber width.
     Raises BackendError without the compiled kernels.
     """
     backend_module("cpu")  # refuses in one line where the kernels are not built
-    T, steps, depth_m = np.array(T_live_reference, np.float64), 0, _usual_depth(reference)
+    pair = Pair(reference, live, weight_color, _usual_depth(reference))
+    T, steps = np.array(T_live_reference, np.float64), 0
     for level in reversed(range(len(reference.cameras))):
-        best, best_T = None, T
+        best, best_T, settled = None, T, False
         for _ in range(iterations):
-            n = _normal_equations(reference, live, level, weight_color, T)
+            n = pair.normal_equations(T, level)
             steps += 1
-            if n.sums[1] < MIN_PIXELS or (best is not None and n.cost > best.cost * (1.0 + RISE)):
-                T = best_T
+            if n.sums[1] < MIN_PIXELS:
                 break
-            best, best_T = n, T
-            update, _ = _solve(n, depth_m)
+            if best is None or n.cost < best.cost:
+                best, best_T = n, T
+            update, degenerate = _solve(n, pair.depth_m)
             T = se3.exp(update) @ T
-            if np.abs(update).max() < update_stop:
+            settled = bool(np.abs(update).max() < update_stop)
+            if settled:
                 break
-    last = best if best is not None else n
+    last = n if settled or best is None else best
     reference_pixels = max(int((reference.depth[0] > 0).sum()), 1)
-    enough = last.sums[1] >= MIN_PIXELS
-    covariance, degenerate = _covariance(last, depth_m) if enough else (np.diag(np.full(6, np.inf)), 6)
     return Alignment(
-        se3.orthonormalise(T),
+        se3.orthonormalise(T if settled else best_T),
         agreement=float(last.sums[3] / max(last.sums[2], 1.0)),
         overlap=float(last.sums[2] / reference_pixels),
-        covariance=covariance,
-        degenerate=degenerate,
+        degenerate=6 if best is None else degenerate,
         cost=last.cost,
         steps=steps,
+        pair=pair,
     )
-
-
-def _normal_equations(reference: Pyramid, live: Pyramid, level: int, weight_color: float, T: Matrix) -> Normal:
-    from sigmasplat.native import _core
-
-    c, width = reference.cameras[level], min(level, 2)
-    H, b, S, sums = np.zeros(21), np.zeros(6), np.zeros(21), np.zeros(4)
-    _core.align_step(
-        reference.gray[level], reference.depth[level], reference.weight[level], live.gray[level],
-        live.depth[level], [c.fx, c.fy, c.cx, c.cy], weight_color, 1.0 - weight_color,
-        HUBER_GRAY[width], HUBER_DEPTH_RELATIVE[width], DEPTH_GATES_M[width], T, H, b, S, sums,
-    )  # fmt: skip
-    return Normal(_symmetric(H), b, _symmetric(S), sums)
 
 
 def _usual_depth(reference: Pyramid) -> float:
@@ -191,24 +231,11 @@ def _axes(n: Normal, depth_m: float) -> tuple[Matrix, Matrix, NDArray[np.bool_]]
     return eigenvalues, directions * unit[:, None], eigenvalues > DEGENERATE * max(eigenvalues[-1], 1e-300)
 
 
-def _solve(n: Normal, depth_m: float) -> tuple[Matrix, Matrix]:
-    """Return the Gauss–Newton update −H⁻¹ b and H⁻¹, both within the directions the images decide."""
+def _solve(n: Normal, depth_m: float) -> tuple[Matrix, int]:
+    """Return the Gauss–Newton update −H⁻¹ b within the directions the images decide, and how many they do not."""
     eigenvalues, directions, decided = _axes(n, depth_m)
     basis = directions[:, decided]
-    inverse = basis @ np.diag(1.0 / eigenvalues[decided]) @ basis.T
-    return -inverse @ n.b, inverse
-
-
-def _covariance(n: Normal, depth_m: float) -> tuple[Matrix, int]:
-    """Estimate the covariance H⁻¹ S H⁻¹ of the left twist, and count the degenerate directions.
-
-    Residuals of neighbouring pixels err together, so that H⁻¹ alone is far too sure; summed by cells they hardly do
-    (cluster-robust sandwich estimator, Liang & Zeger 1986). A degenerate direction has `UNKNOWN_M` of deviation.
-    """
-    _, directions, decided = _axes(n, depth_m)
-    _, inverse = _solve(n, depth_m)
-    unknown = directions[:, ~decided]
-    return inverse @ n.S @ inverse + UNKNOWN_M**2 * unknown @ unknown.T, int((~decided).sum())
+    return -basis @ ((basis.T @ n.b) / eigenvalues[decided]), int((~decided).sum())
 
 
 def _symmetric(upper: Matrix) -> Matrix:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sigmasplat.config import MappingConfig
 from sigmasplat.fit import losses
-from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates, adam_step
+from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates, adam_step, settle
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField
@@ -72,6 +72,7 @@ def fit_field(
             keyframe.move(twist, pose_rates)
         fit.add("backward", t)
         fit.losses.append(loss + regulariser)
+    settle(field, rates, compiled=isinstance(view, CpuView))
     return fit
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.adam import VectorAdam
-from sigmasplat.fit.align import Pyramid, align
+from sigmasplat.fit.align import Alignment, Pyramid, align
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import PoseMaps, agreement, tracking_gradient
@@ -24,8 +24,8 @@ PLATEAU = 1e-4
 @dataclass(eq=False)
 class PoseFit:
     """T_camera_world; agreement: share of pixels seen by both map and sensor whose depths agree; overlap: share of
-    sensor readings where the map has a surface; first and last loss; iterations; covariance [6, 6] of the left twist or
-    None; degenerate: how many directions of motion the images say nothing about (there the guess stays); exposure
+    sensor readings where the map has a surface; first and last loss; iterations; alignment: what found it, or None;
+    degenerate: how many directions of motion the images say nothing about (there the guess stays); exposure
     (a, b) of exp(a)·Ĉ + b."""
 
     T_camera_world: Matrix
@@ -34,9 +34,14 @@ class PoseFit:
     first_loss: float
     loss: float
     iterations: int
-    covariance: Matrix | None = None
+    alignment: Alignment | None = None
     degenerate: int = 0
     exposure: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def covariance(self) -> Matrix | None:
+        """Return the covariance [6, 6] of the left twist (ρ, φ), m and rad, to the reference; None from descent."""
+        return None if self.alignment is None else self.alignment.covariance
 
 
 def fit_pose_adam(
@@ -104,6 +109,6 @@ def fit_pose_align(reference: Reference, live: Pyramid, T_camera_world: Matrix, 
         float("nan"),
         found.cost,
         found.steps,
-        covariance=found.covariance,
+        alignment=found,
         degenerate=found.degenerate,
     )

@@ -21,6 +21,8 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 
 PROGRAM = "sigmasplat"
+MESH = "mesh.ply"
+"""What `sigmasplat mesh` adds."""
 FILES = (
     "config.json", "run.json", "trajectory.txt", "map.ply", "checkpoint.safetensors", "log.jsonl", "metrics.json",
     "profile.json", "report.html",
@@ -92,7 +94,7 @@ class RunFolder:
             RunFolder.open(self.path)
         except RunError as problem:
             raise RunError(f"not overwriting {self.path}: {problem}; give another --output") from problem
-        for name in FILES:
+        for name in (*FILES, MESH):
             (self.path / name).unlink(missing_ok=True)
         for picture in self.images.glob("*.png"):
             picture.unlink()

@@ -28,6 +28,17 @@ def project_backward(
 def project_double(
     view: Array, means: Array, quats: Array, scales: Array, g: Array, footprint: Array, gradient: Array
 ) -> None: ...
+def adam_settle(
+    params: Array,
+    moment1: Array,
+    moment2: Array,
+    last_step: Array,
+    rates: Array,
+    beta1: float,
+    beta2: float,
+    epsilon: float,
+    step: int,
+) -> None: ...
 def ssim_cache_floats(width: int, height: int) -> int: ...
 def ssim_target(target: Array, mask: Array | None, width: int, height: int, cache: Array) -> None: ...
 def ssim(

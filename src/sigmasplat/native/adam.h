@@ -1,6 +1,6 @@
-// Adam (Kingma & Ba 2015) on parameter rows [n, 17], a learning rate per column (0 freezes it), for rows in view only.
-// A row out of view keeps still; when it is seen again its moments are first decayed by the steps it missed, as dense
-// Adam's would have been. What is left out is dense Adam's coasting meanwhile (fit/adam.py bounds it).
+// Adam (Kingma & Ba 2015) on parameter rows [n, 17], a learning rate per column (0 freezes it). Only rows in view are
+// stepped. What dense Adam would have done to a row meanwhile - coast on its moments, which decay - is made up for when it is
+// seen again, or by `adam_settle`; fit/adam.py is the definition.
 
 struct AdamRates {
     alignas(64) float rate[ROW * W];                  // rates of W rows on end: 17 whole vectors
@@ -13,13 +13,39 @@ struct AdamRates {
     }
 };
 
-// decay1, decay2: β to the power of the steps since the row's last one, this one included.
-SIGMA_INLINE void adam_vector(const AdamRates& a, vf g, vf rate, vf decay1, vf decay2, float* p, float* m1, float* m2) {
-    const vf m = fma(decay1, load(m1), (1.f - a.beta1) * g);
-    const vf v = fma(decay2, load(m2), (1.f - a.beta2) * g * g);
+// What a row that last moved at step `last` has to make up for before step `to`.
+struct Absence {
+    float decay1, decay2;                             // of the moments, by step `to`
+    float coasted, unbias1, unbias2;                  // steps' worth of its last one: Σ (β1/√β2)^j, j = 1 … to − last (− 1)
+    Absence(const AdamRates& a, int last, bool stepped) {
+        const int age = a.step - last, missed = stepped ? age - 1 : age;
+        decay1 = __builtin_powf(a.beta1, float(age));
+        decay2 = __builtin_powf(a.beta2, float(age));
+        const float r = a.beta1 / __builtin_sqrtf(a.beta2);
+        coasted = missed > 0 && last > 0 ? r * (1.f - __builtin_powf(r, float(missed))) / (1.f - r) : 0.f;
+        unbias1 = coasted ? 1.f / (1.f - __builtin_powf(a.beta1, float(last))) : 0.f;
+        unbias2 = coasted ? 1.f / (1.f - __builtin_powf(a.beta2, float(last))) : 0.f;
+    }
+};
+
+SIGMA_INLINE void adam_vector(const AdamRates& a, const Absence& away, vf g, vf rate, float* p, float* m1, float* m2, bool stepped) {
+    const vf m0 = load(m1), v0 = load(m2), m = fma(splat(away.decay1), m0, (1.f - a.beta1) * g),
+             v = fma(splat(away.decay2), v0, (1.f - a.beta2) * g * g);
+    vf value = load(p);
+    if (away.coasted) value = fnma(rate * away.coasted, m0 * away.unbias1 / (sqrt(v0 * away.unbias2) + a.epsilon), value);
+    if (stepped) value = fnma(rate, m * a.unbias1 / (sqrt(v * a.unbias2) + a.epsilon), value);
     store(m1, m);
     store(m2, v);
-    store(p, fnma(rate, m * a.unbias1 / (sqrt(v * a.unbias2) + a.epsilon), load(p)));
+    store(p, value);
+}
+
+SIGMA_INLINE void adam_row(const AdamRates& a, const Absence& away, const float* g, float* p, float* m1, float* m2, bool stepped) {
+    alignas(64) float t[3][(ROW + W - 1) / W * W] = {};
+    float* from[3] = {p, m1, m2};
+    for (int k = 0; k < 3; k++) memcpy(t[k], from[k], ROW * sizeof(float));
+    for (int q = 0; q < ROW; q += W)
+        adam_vector(a, away, g ? load(g + q) : splat(0.f), load(a.rate + q), t[0] + q, t[1] + q, t[2] + q, stepped);
+    for (int k = 0; k < 3; k++) memcpy(from[k], t[k], ROW * sizeof(float));
 }
 
 // Step the seen among rows i … i+W−1; gradient in lanes.
@@ -29,27 +55,31 @@ SIGMA_INLINE void adam_rows(const AdamRates& a, float* params, const AdamState& 
     store_rows<ROW>(g, 0, W, gradient);
     int* last = state.last_step + i;
     const size_t at = size_t(i) * ROW;
-    bool alike = i + W <= n && seen == (W == 32 ? ~0u : (1u << W) - 1u);
+    bool alike = i + W <= n && seen == (1u << W) - 1u;
     for (int l = 1; alike && l < W; l++) alike = last[l] == last[0];
     if (alike) {
-        const float age = float(a.step - last[0]);
-        const vf decay1 = splat(__builtin_powf(a.beta1, age)), decay2 = splat(__builtin_powf(a.beta2, age));
+        const Absence away(a, last[0], true);
         for (int q = 0; q < ROW * W; q += W)
-            adam_vector(a, load(g + q), load(a.rate + q), decay1, decay2, params + at + q, state.moment1 + at + q, state.moment2 + at + q);
+            adam_vector(a, away, load(g + q), load(a.rate + q), params + at + q, state.moment1 + at + q, state.moment2 + at + q, true);
         for (int l = 0; l < W; l++) last[l] = a.step;
         return;
     }
     for (; seen; seen &= seen - 1) {
         const int l = __builtin_ctz(seen);
         const size_t row = at + size_t(l) * ROW;
-        const float age = float(a.step - last[l]);
-        const vf decay1 = splat(__builtin_powf(a.beta1, age)), decay2 = splat(__builtin_powf(a.beta2, age));
-        alignas(64) float t[3][(ROW + W - 1) / W * W] = {};
-        float* from[3] = {params + row, state.moment1 + row, state.moment2 + row};
-        for (int k = 0; k < 3; k++) memcpy(t[k], from[k], ROW * sizeof(float));
-        for (int q = 0; q < ROW; q += W)
-            adam_vector(a, load(g + l * ROW + q), load(a.rate + q), decay1, decay2, t[0] + q, t[1] + q, t[2] + q);
-        for (int k = 0; k < 3; k++) memcpy(from[k], t[k], ROW * sizeof(float));
+        adam_row(a, Absence(a, last[l], true), g + l * ROW, params + row, state.moment1 + row, state.moment2 + row, true);
         last[l] = a.step;
+    }
+}
+
+// Bring every row to the present step: what was not seen lately has coasted, its moments have decayed.
+static void adam_settle(float* params, int64_t n, AdamState state, AdamOptions options) {
+    const AdamRates a(options);
+#pragma omp parallel for schedule(static)
+    for (int64_t i = 0; i < n; i++) {
+        if (state.last_step[i] == a.step) continue;
+        const size_t row = size_t(i) * ROW;
+        adam_row(a, Absence(a, state.last_step[i], false), nullptr, params + row, state.moment1 + row, state.moment2 + row, false);
+        state.last_step[i] = a.step;
     }
 }

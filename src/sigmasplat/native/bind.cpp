@@ -182,6 +182,11 @@ NB_MODULE(_core, m) {
                                  g_conics.data(), g_z.data(), g_means.data(), g_quats.data(), g_scales.data(), g_twist.data());
     });
     m.def("project_double", project_double);
+    m.def("adam_settle", [](Floats params, Floats moment1, Floats moment2, Ints last_step, ConstFloats rates, float beta1, float beta2, float epsilon, int step) {
+        need(rates.size() == 17 && last_step.size() == params.shape(0) && moment1.size() == params.size() && moment2.size() == params.size(), "Adam's state must fit the rows");
+        nb::gil_scoped_release unlocked;
+        active->adam_settle(params.data(), int64_t(params.shape(0)), {moment1.data(), moment2.data(), last_step.data()}, {rates.data(), beta1, beta2, epsilon, step});
+    });
     m.def("ssim_cache_floats", [](int width, int height) { const size_t w = active->pad.lanes; return 6 * ((width + w - 1) / w * w) * height; });
     m.def("ssim_target", [](ConstFloats target, Maybe<ConstFloats> mask, int width, int height, Floats cache) {
         nb::gil_scoped_release unlocked;

@@ -68,6 +68,7 @@ struct Kernels {
     void (*view_backward)(Context*, const float* params, Outputs, OutputGradients, float* g_params, double* g_twist, double* seconds);
     double (*view_step)(Context*, float* params, Outputs, OutputGradients, AdamState, AdamOptions, float isotropy_weight,
                         int64_t frozen_colors, double* g_twist, double* seconds);
+    void (*adam_settle)(float* params, int64_t n, AdamState, AdamOptions);
     void (*view_backward_pose)(Context*, const float* params, Outputs, OutputGradients, double* g_twist, double* seconds);
     void (*view_visible)(const Context*, uint8_t* visible);
     void (*ssim_target)(const float* target, const float* mask, int width, int height, size_t stride, size_t plane, float* cache);

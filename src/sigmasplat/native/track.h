@@ -1,5 +1,5 @@
 // What tracking reads off a render: how far each pixel is to be trusted, the papers' loss with its gradient, and the
-// reference that images are aligned to. fit/confidence.py and fit/pose.py are the definitions.
+// reference that images are aligned to. fit/confidence.py, tracking_loss.py and references.py are the definitions.
 
 constexpr float WEIGHT_EPSILON = 1e-6f;
 

@@ -225,8 +225,8 @@ static void view_backward(Context* context, const float* params, Outputs o, Outp
     if (seconds) { seconds[0] += t1 - t0; seconds[1] += omp_get_wtime() - t1; }
 }
 
-// Backward and one Adam step in one go: no gradient row reaches memory. Splats out of view wait (adam.h); L_reg's gradient
-// is that of the mean over all splats. Returns its sum over those in view, over 3n.
+// Backward and one Adam step in one go: no gradient row reaches memory. Splats out of view wait (adam.h), and feel no L_reg,
+// whose gradient is that of the mean over all splats. Returns its sum over those in view, over 3n.
 static double view_step(Context* context, float* params, Outputs o, OutputGradients g, AdamState state, AdamOptions options,
                         float isotropy_weight, int64_t frozen_colors, double* g_twist, double* seconds) {
     Render& r = *reinterpret_cast<Render*>(context);
