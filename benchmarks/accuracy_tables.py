@@ -1,7 +1,7 @@
 """Lay out the figures of the accuracy benchmark: mean ± standard deviation over seeds, and the goals."""
 
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,6 +49,7 @@ GOALS = (
     Goal("redkitchen", "lost", "never lost", lambda x: x == 0),
     Goal("redkitchen", "ate_m", "ATE ≤ 4 cm", lambda x: x <= 0.04),
     Goal("redkitchen", "frames_per_s", "≥ 12 frames/s", lambda x: x >= 12.0),
+    Goal("redkitchen", "held_out_psnr_db", "held-out PSNR ≥ 23.4 dB", lambda x: x >= 23.4),
     Goal("redkitchen", "peak_mib", "memory < 4 GB", lambda x: x < 4e9 / 2**20),
     Goal("redkitchen", "spearman", "Spearman > 0", lambda x: x > 0.0),
     Goal("livingroom", "ate_m", "ATE ≤ 1 cm", lambda x: x <= 0.01),
@@ -95,6 +96,24 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     results = measured["figures"]["jobs"]
     made = [_figures("Path and speed", PLACE, results), _figures("Map and uncertainty", PICTURES, results)]
     return [s for s in [*made, goals(measured), failures(results)] if s.rows]
+
+
+COMPARED = (*(f for f in PLACE if f[1] in ("frames_per_s", "ate_m", "splats")), *PICTURES[:2], PICTURES[4])
+
+
+def compared(measured: Sequence[dict[str, Any]], source: str) -> Section:
+    """Compare results made with different settings on one source, a row each, in order of their speed."""
+    rows = []
+    for results in measured:
+        runs = [r for r in results["figures"]["jobs"] if r["problem"] is None and r["job"]["source"] == source]
+        speed = statistics.fmean(values_of(runs, "frames_per_s") or [0.0])
+        figures = [spread([factor * value for value in values_of(runs, name)]) for _, name, factor in COMPARED]
+        settings = ", ".join(results["config"].get("settings") or ()) or "as the preset is"
+        rows.append((speed, [settings, str(results["machine"]["cores"]), str(len(runs)), *figures]))
+    ordered = [row for _, row in sorted(rows, key=lambda pair: -pair[0])]
+    return Section(
+        f"Settings compared on {source}", ["settings", "cores", "runs", *(title for title, *_ in COMPARED)], ordered
+    )
 
 
 def _figures(title: str, figures: tuple[tuple[str, str, float], ...], results: list[Result]) -> Section:

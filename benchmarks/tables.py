@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import record
 import tyro
 
-BLOCK = re.compile(r"(<!-- bench:(?P<what>[\w./-]+) -->\n)(?P<body>.*?)(<!-- /bench -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- bench:(?P<what>[\w./+-]+) -->\n)(?P<body>.*?)(<!-- /bench -->)", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -66,19 +66,32 @@ def table(measured: dict[str, Any], section: str | None = None) -> str:
     return "\n".join([f"{headline(measured)}\n", *(s.markdown() for s in chosen)])
 
 
+def compared(measured: Sequence[dict[str, Any]], source: str) -> str:
+    """Write results of one benchmark with different settings as one table, a row each, of one source's runs."""
+    section: Section = importlib.import_module(f"{measured[0]['benchmark']}_tables").compared(measured, source)
+    made_on, commits = measured[0]["machine"], sorted({(m["commit"] or "no commit")[:9] for m in measured})
+    dates = sorted({m["date"][:10] for m in measured})
+    head = f"{made_on['cpu']}, {made_on['cores']} cores · commit {', '.join(commits)} · {', '.join(dates)}"
+    return f"{head}\n\n{section.markdown()}"
+
+
 def rewritten(text: str, folder: Path = record.RESULTS) -> tuple[str, list[str]]:
     """Return a document with every block replaced by its table, and the names of blocks left as they were: no results.
 
-    Raises KeyError for a table that the results do not have.
+    `bench:NAME+NAME/SOURCE` compares several results. Raises KeyError for a table that the results do not have.
     """
     missing: list[str] = []
 
     def block(match: re.Match[str]) -> str:
         name, _, section = match["what"].partition("/")
-        measured = record.latest(name, folder)
-        if measured is None:
-            missing.append(name)
+        found = {part: record.latest(part, folder) for part in name.split("+")}
+        missing.extend(part for part, results in found.items() if results is None)
+        known = [results for results in found.values() if results is not None]
+        if len(known) < len(found):
             return match[0]
+        if len(known) > 1:
+            return f"{match[1]}{compared(known, section)}{match[4]}"
+        measured = known[0]
         return f"{match[1]}{table(measured, section or None)}{match[4]}"
 
     return BLOCK.sub(block, text), missing

@@ -124,6 +124,20 @@ def test_blocks_are_rewritten_and_nothing_else(tmp_path: Path) -> None:
         tables.rewritten("<!-- bench:accuracy/nothing -->\n<!-- /bench -->", tmp_path)
 
 
+def test_results_of_several_settings_are_compared_fastest_first(tmp_path: Path) -> None:
+    for name, settings, speed in (("accuracy", [], 12.0), ("iterations-5", ["mapping.iterations=5"], 20.0)):
+        jobs = [job_result("synthetic", 0, frames_per_s=speed, ate_m=0.004), job_result("livingroom", 0, ate_m=0.9)]
+        measured = results("accuracy", {"jobs": jobs}, name=name)
+        record.write({**measured, "config": {"settings": settings}}, tmp_path)
+    text = "<!-- bench:accuracy+iterations-5/synthetic -->\n<!-- /bench -->"
+    new, missing = tables.rewritten(text, tmp_path)
+    rows = [line for line in new.splitlines() if line.startswith("| mapping") or line.startswith("| as")]
+    assert missing == [] and [row.split(" | ")[0] for row in rows] == ["| mapping.iterations=5", "| as the preset is"]
+    assert "20" in rows[0] and "0.400" in rows[0] and "90" not in new
+    absent = text.replace("iterations-5", "iterations-7")
+    assert tables.rewritten(absent, tmp_path) == (absent, ["iterations-7"])
+
+
 def timing(**works_ms: float) -> dict[str, dict[str, float]]:
     return {name: {"median_ms": ms, "min_ms": 0.9 * ms, "runs": 7} for name, ms in works_ms.items()}
 
