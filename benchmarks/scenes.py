@@ -9,7 +9,8 @@ from scipy.spatial import cKDTree
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.errors import SourceError
-from sigmasplat.fit.align import Pyramid, align, gray_of
+from sigmasplat.fit.align import align
+from sigmasplat.fit.pyramid import Pyramid, gray_of
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.fit import losses
-from sigmasplat.fit.align import Pyramid, gray_of
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.pose import fit_pose_adam, fit_pose_align
+from sigmasplat.fit.pyramid import Pyramid, gray_of
 from sigmasplat.fit.references import keyframe_reference, map_reference
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.fit.tracking_loss import tracking_gradient

@@ -108,6 +108,8 @@ class TrackingConfig:
     """Gauss–Newton steps at most, per pyramid level."""
     align_to: Literal["keyframe", "map"] = "keyframe"
     """keyframe: the newest keyframe's own image, weighed by V; map: the map rendered at the predicted pose."""
+    align_depth_by: Literal["V", "U"] = "V"
+    """Weigh depth residuals by V like gray ones, or by the map's depth variance U (CG-SLAM eq. 10) in the same form."""
     align_stop: float = 1e-4
     """A level is done when a step is below this (metres and radians)."""
     align_weight_color: float = 0.5

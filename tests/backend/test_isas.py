@@ -14,8 +14,8 @@ from splat_scenes import KINDS, assert_same_vector, gradients, probe, render, sc
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.align import Pyramid
 from sigmasplat.fit.field import CompiledStep
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.model.field import GaussianField
 from sigmasplat.native import _core
 from sigmasplat.render import cpu
@@ -90,8 +90,8 @@ def losses() -> Outputs:
     alpha, pull, g_exposure = (depth_seen / 4.0).contiguous(), torch.full_like(sums, torch.nan), np.zeros(2)
     numbers = [0.1, 3.0, 5.0, 0.6, 2.0, 3.0]
     loss = _core.tracking_loss(sums, alpha, target, depth, *size, numbers, True, 1.1, 0.02, pull, g_exposure)
-    maps = [np.zeros((BIG.height, BIG.width), np.float32) for _ in range(3)]
-    _core.reference_maps(sums, alpha, *size, numbers, True, *maps)
+    maps = [np.zeros((BIG.height, BIG.width), np.float32) for _ in range(4)]
+    _core.reference_maps(sums, alpha, depth, *size, numbers, True, *maps)
     crop = (slice(4), slice(BIG.height), slice(BIG.width))
     values = torch.tensor([*parts, similarity, loss, *g_exposure], dtype=torch.float64)
     return {
@@ -124,10 +124,11 @@ def align() -> Outputs:
     H, g, S, sums = np.zeros(21), np.zeros(6), np.zeros(21), np.zeros(4)
     T, intrinsics = np.eye(4), [BIG.fx, BIG.fy, BIG.cx, BIG.cy]
     T[:3, 3] = [0.02, -0.01, 0.03]
-    _core.align_step(
-        shapes[0].gray[0], shapes[0].depth[0], b[1][crop].numpy().copy(), shapes[1].gray[0], shapes[1].depth[0],
-        intrinsics, 0.5, 0.5, 0.02, 0.3, 4.0, T, H, g, S, sums,
+    level = _core.Level(
+        shapes[0].gray[0], shapes[0].depth[0], b[1][crop].numpy().copy(), b[2][crop].numpy().copy(), shapes[1].gray[0],
+        shapes[1].depth[0], intrinsics, [0.5, 0.5, 0.02, 0.3, 4.0],
     )  # fmt: skip
+    _core.align_step(level, T, H, g, S, sums)
     assert sums.min() > 100, "the test needs residuals of both kinds"
     return {"H": torch.as_tensor(H), "b": torch.as_tensor(g), "S": torch.as_tensor(S), "sums": torch.as_tensor(sums)}
 

@@ -1,17 +1,20 @@
 """fit_pose by alignment: what images are aligned to, how their pixels are weighed, and in whose world the pose is."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
-from sigmasplat.fit.align import Pyramid, gray_of
 from sigmasplat.fit.pose import fit_pose_align
+from sigmasplat.fit.pyramid import Pyramid, gray_of
 from sigmasplat.fit.references import Reference, keyframe_reference, map_reference
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
-from sigmasplat.model.field import COLUMNS
+from sigmasplat.model.field import COLUMNS, GaussianField
+from sigmasplat.render import render
 from sigmasplat.render.view import View, make_view
 from sigmasplat.sources import SyntheticRoom
 from splat_fields import OPTIONS
@@ -66,6 +69,36 @@ def test_a_reference_weighs_pixels_by_the_papers_weights(view: View, kind: str) 
     medians = torch.stack([lower_median(channel[opaque]) for channel in log])
     expected = torch.exp((medians[:, None, None] - log) / 3.0).clamp(0.5, 2.0).mean(0)
     np.testing.assert_allclose(reference.pyramid.weight[0], torch.where(opaque, expected, 1.0), rtol=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["keyframe", "map"])
+def test_depth_is_weighed_by_the_maps_depth_variance_where_asked(view: View, kind: str) -> None:
+    """U = Σ w (z − D)² about the reference's own depth, in the form of w̃; gray keeps its weight."""
+    image, config = pyramid(seen_from(view, TRUTH)), TrackingConfig(tau=3.0, weight_max=2.0, align_depth_by="U")
+    thick = wall().clone()
+    thick[::2, 2] += 0.05  # every second splat lies behind the others: light comes from two depths
+    if kind == "keyframe":
+        reference = keyframe_reference(thick, view, image, TRUTH, config)
+    else:
+        reference = map_reference(thick, view, TRUTH, config)
+    field = GaussianField(thick.double())
+    depth = torch.as_tensor(reference.pyramid.depth[0]).double()
+    maps = render(field, CAMERA, TRUTH, depth, OPTIONS, "reference")
+    assert maps.uncertainty is not None
+    known = (maps.alpha > 0.95) & (maps.uncertainty > 0)
+    log = (maps.uncertainty + 1e-6).log()
+    expected = torch.exp((lower_median(log[known]) - log) / 3.0).clamp(0.5, 2.0)
+    got = reference.pyramid.weight_depth[0]
+    assert got is not None and known.sum() > 100 and float(log[known].std()) > 0.1
+    np.testing.assert_allclose(got, torch.where(known, expected, 1.0), rtol=5e-3)
+    by_V = dataclasses.replace(config, align_depth_by="V")
+    plain = (
+        keyframe_reference(thick, view, image, TRUTH, by_V)
+        if kind == "keyframe"
+        else map_reference(thick, view, TRUTH, by_V)
+    )
+    np.testing.assert_array_equal(reference.pyramid.weight[0], plain.pyramid.weight[0])
+    assert plain.pyramid.weight_depth[0] is plain.pyramid.weight[0]
 
 
 def test_without_uncertainty_a_keyframe_is_its_image_alone(view: View) -> None:

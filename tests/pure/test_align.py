@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from sigmasplat.fit.align import Pyramid, align, gray_of
+from sigmasplat.fit.align import align
+from sigmasplat.fit.pyramid import Pyramid, gray_of
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources import SyntheticRoom
@@ -133,6 +134,7 @@ class Pair:
     gray: Array
     depth: Array
     weight: Array
+    weight_depth: Array
     live_gray: Array
     live_depth: Array
     T: Array
@@ -152,24 +154,24 @@ def waves(seed: int, size: float, level: float) -> Array:
 
 
 def pair(huber_gray: float = HUGE, huber_depth: float = HUGE, holes: bool = False) -> Pair:
-    depth, live_depth, weight = waves(2, 0.01, 2.0), waves(4, 0.01, 2.02), waves(5, 0.1, 1.0)
+    depth, live_depth, weights = waves(2, 0.01, 2.0), waves(4, 0.01, 2.02), (waves(5, 0.1, 1.0), waves(6, 0.1, 1.0))
     if holes:
         rng = np.random.default_rng(6)
         depth[rng.random(depth.shape) < 0.2] = 0.0
         live_depth[rng.random(depth.shape) < 0.05] = 0.0
         live_depth[30:, 40:] += 1.0  # a step, and readings beyond the gate
         depth[5:9, 5:20] -= 0.7
-    return Pair(waves(1, 0.1, 0.5), depth, weight, waves(3, 0.1, 0.5), live_depth, MOTION, huber_gray, huber_depth)
+    return Pair(waves(1, 0.1, 0.5), depth, *weights, waves(3, 0.1, 0.5), live_depth, MOTION, huber_gray, huber_depth)
 
 
 def step(p: Pair, T: Array | None = None) -> tuple[Array, Array, Array]:
     """Run the kernel: H [6, 6], b [6], sums [4]."""
-    images = [np.ascontiguousarray(x, np.float32) for x in (p.gray, p.depth, p.weight, p.live_gray, p.live_depth)]
+    planes = (p.gray, p.depth, p.weight, p.weight_depth, p.live_gray, p.live_depth)
+    images = [np.ascontiguousarray(x, np.float32) for x in planes]
     H, b, S, sums = np.zeros(21), np.zeros(6), np.zeros(21), np.zeros(4)
-    _core.align_step(
-        *images, [CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy], p.colors, p.depths, p.huber_gray, p.huber_depth,
-        p.gate, p.T if T is None else T, H, b, S, sums,
-    )  # fmt: skip
+    intrinsics = [CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy]
+    level = _core.Level(*images, intrinsics, [p.colors, p.depths, p.huber_gray, p.huber_depth, p.gate])
+    _core.align_step(level, p.T if T is None else T, H, b, S, sums)
     full = np.zeros((6, 6))
     full[np.triu_indices(6)] = H
     return full + np.triu(full, 1).T, b, sums
@@ -198,7 +200,7 @@ def oracle(p: Pair) -> tuple[Array, Array, Array]:
     colored = inside & (agrees | ~read)
     width = p.huber_depth * z**2
     w_gray = colored * p.weight.ravel() * p.colors / p.huber_gray**2 * np.minimum(1, p.huber_gray / np.abs(r_gray))
-    w_depth = smooth * p.weight.ravel() * p.depths / width**2 * np.minimum(1, width / np.abs(r_depth))
+    w_depth = smooth * p.weight_depth.ravel() * p.depths / width**2 * np.minimum(1, width / np.abs(r_depth))
     J = []
     for e in 1e-6 * np.eye(6):
         ahead, behind = warped(p, se3.exp(e) @ p.T), warped(p, se3.exp(-e) @ p.T)

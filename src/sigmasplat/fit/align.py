@@ -6,20 +6,20 @@ replace dozens of renders.
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import sobel
 
+from sigmasplat.fit.pyramid import LEVELS, Pyramid
 from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
 from sigmasplat.render.backend import backend_module
 
-Image = NDArray[np.float32]
+if TYPE_CHECKING:
+    from sigmasplat.native import _core
+
 Matrix = NDArray[np.float64]
 
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-LEVELS = 4
 HUBER_GRAY = (0.02, 0.05, 0.1, 0.2)
 """Width of the gray residual's quadratic part, from the finest level up: far from the answer all of them are large."""
 HUBER_DEPTH_RELATIVE = (0.003, 0.006, 0.012, 0.05)
@@ -31,58 +31,6 @@ DEGENERATE = 1e-5
 """A direction with less than this share of the best one's information is not decided by the images."""
 UNKNOWN_M = 1.0
 """Standard deviation given to such a direction, metres (of shift at the usual depth)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Pyramid:
-    """Gray in [0, 1] and depth in metres (0 = none) at halving sizes, finest first, with their cameras."""
-
-    gray: list[Image]
-    depth: list[Image]
-    weight: list[Image | None]
-    cameras: list[Camera]
-
-    def weighed(self, weight: Image | None) -> "Pyramid":
-        """Return the same images with another weight [H, W] of their pixels."""
-        halves = [weight]
-        for _ in self.cameras[1:]:
-            last = halves[-1]
-            halves.append(None if last is None else _quarter(last).mean(0))
-        return Pyramid(self.gray, self.depth, halves, self.cameras)
-
-    @staticmethod
-    def of(gray: Image, depth_m: Image, camera: Camera, weight: Image | None = None, levels: int = LEVELS) -> "Pyramid":
-        """Halve gray [H, W], depth [H, W] and an optional weight [H, W] until `levels` sizes exist."""
-        p = Pyramid([np.ascontiguousarray(gray)], [np.ascontiguousarray(depth_m)], [None], [camera])
-        for _ in range(levels - 1):
-            c = p.cameras[-1]
-            if min(c.width, c.height) < 32:
-                break
-            p.gray.append(_quarter(p.gray[-1]).mean(0))
-            p.depth.append(_half_depth(p.depth[-1]))
-            # Odd sizes drop their last row or column, so the scale is exactly ½.
-            p.cameras.append(
-                Camera(c.width // 2, c.height // 2, c.fx / 2, c.fy / 2, (c.cx - 0.5) / 2, (c.cy - 0.5) / 2)
-            )
-        return p.weighed(weight)
-
-
-def _quarter(image: Image) -> Image:
-    """Stack the four pixels of each 2×2 cell, [4, H/2, W/2]."""
-    h, w = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
-    return np.stack([image[0:h:2, 0:w:2], image[0:h:2, 1:w:2], image[1:h:2, 0:w:2], image[1:h:2, 1:w:2]])
-
-
-def _half_depth(depth: Image) -> Image:
-    """Average 2×2 cells that lie on one surface; a cell with a hole or a step has no reading."""
-    cells = _quarter(depth)
-    near, far = cells.min(0), cells.max(0)
-    return np.where((near > 0) & (far - near < 0.05), cells.mean(0), np.float32(0.0))
-
-
-def gray_of(color: Image) -> Image:
-    """Reduce colour [H, W, 3] to luma [H, W]."""
-    return np.asarray(color @ LUMA)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +56,7 @@ class Alignment:
         for H, built of noisy image gradients, is several times too steep. A degenerate direction has `UNKNOWN_M` of
         deviation. Infinite where nothing was in common.
         """
-        n = self.pair.normal_equations(self.T_live_reference, 0)
+        n = self.pair.normal_equations(self.T_live_reference)
         if n.sums[1] < MIN_PIXELS:
             return np.diag(np.full(6, np.inf))
         _, directions, decided = _axes(n, self.pair.depth_m)
@@ -123,7 +71,7 @@ class Alignment:
         steps, D = np.repeat([half_rad * self.pair.depth_m, half_rad], 3), np.zeros((6, 6))
         for k, step in enumerate(steps):
             ahead, behind = (
-                self.pair.normal_equations(se3.exp(sign * step * np.eye(6)[k]) @ self.T_live_reference, 0).b
+                self.pair.normal_equations(se3.exp(sign * step * np.eye(6)[k]) @ self.T_live_reference).b
                 for sign in (1.0, -1.0)
             )
             D[:, k] = (ahead - behind) / (2.0 * step)
@@ -139,17 +87,25 @@ class Pair:
     weight_color: float
     depth_m: float
 
-    def normal_equations(self, T_live_reference: Matrix, level: int) -> "Normal":
-        """Linearise the residuals at a motion on one level of the pyramids."""
+    def level(self, k: int) -> "_core.Level":
+        """Lay one level of the pyramids out for the kernels."""
         from sigmasplat.native import _core
 
-        reference, live, width = self.reference, self.live, min(level, LEVELS - 1)
-        c, H, b, S, sums = reference.cameras[level], np.zeros(21), np.zeros(6), np.zeros(21), np.zeros(4)
-        _core.align_step(
-            reference.gray[level], reference.depth[level], reference.weight[level], live.gray[level],
-            live.depth[level], [c.fx, c.fy, c.cx, c.cy], self.weight_color, 1.0 - self.weight_color,
-            HUBER_GRAY[width], HUBER_DEPTH_RELATIVE[width], DEPTH_GATES_M[width], T_live_reference, H, b, S, sums,
+        reference, live, width = self.reference, self.live, min(k, LEVELS - 1)
+        c = reference.cameras[k]
+        numbers = [self.weight_color, 1.0 - self.weight_color]
+        numbers += [HUBER_GRAY[width], HUBER_DEPTH_RELATIVE[width], DEPTH_GATES_M[width]]
+        return _core.Level(
+            reference.gray[k], reference.depth[k], reference.weight[k], reference.weight_depth[k],
+            live.gray[k], live.depth[k], [c.fx, c.fy, c.cx, c.cy], numbers,
         )  # fmt: skip
+
+    def normal_equations(self, T_live_reference: Matrix) -> "Normal":
+        """Linearise the residuals at a motion on the finest level."""
+        from sigmasplat.native import _core
+
+        H, b, S, sums = np.zeros(21), np.zeros(6), np.zeros(21), np.zeros(4)
+        _core.align_step(self.level(0), T_live_reference, H, b, S, sums)
         return Normal(_symmetric(H), b, _symmetric(S), sums)
 
 
@@ -163,10 +119,6 @@ class Normal:
     S: Matrix
     sums: Matrix
     """Weighted cost, pixels used, pixels in view with depth, pixels agreeing in depth."""
-
-    @property
-    def cost(self) -> float:
-        return float(self.sums[0] / max(self.sums[1], 1.0))
 
 
 def align(
@@ -185,30 +137,20 @@ def align(
     Raises BackendError without the compiled kernels.
     """
     backend_module("cpu")  # refuses in one line where the kernels are not built
+    from sigmasplat.native import _core
+
     pair = Pair(reference, live, weight_color, _usual_depth(reference))
-    T, steps = np.array(T_live_reference, np.float64), 0
-    for level in reversed(range(len(reference.cameras))):
-        best, best_T, settled = None, T, False
-        for _ in range(iterations):
-            n = pair.normal_equations(T, level)
-            steps += 1
-            if n.sums[1] < MIN_PIXELS:
-                break
-            if best is None or n.cost < best.cost:
-                best, best_T = n, T
-            update, degenerate = _solve(n, pair.depth_m)
-            T = se3.exp(update) @ T
-            settled = bool(np.abs(update).max() < update_stop)
-            if settled:
-                break
-    last = n if settled or best is None else best
+    T, sums, levels = np.array(T_live_reference, np.float64), np.zeros(4), range(len(reference.cameras))
+    steps, degenerate = _core.align_images(
+        [pair.level(k) for k in levels], iterations, update_stop, pair.depth_m, DEGENERATE, MIN_PIXELS, T, sums
+    )
     reference_pixels = max(int((reference.depth[0] > 0).sum()), 1)
     return Alignment(
-        se3.orthonormalise(T if settled else best_T),
-        agreement=float(last.sums[3] / max(last.sums[2], 1.0)),
-        overlap=float(last.sums[2] / reference_pixels),
-        degenerate=6 if best is None else degenerate,
-        cost=last.cost,
+        se3.orthonormalise(T),
+        agreement=float(sums[3] / max(sums[2], 1.0)),
+        overlap=float(sums[2] / reference_pixels),
+        degenerate=degenerate,
+        cost=float(sums[0] / max(sums[1], 1.0)),
         steps=steps,
         pair=pair,
     )
@@ -231,19 +173,7 @@ def _axes(n: Normal, depth_m: float) -> tuple[Matrix, Matrix, NDArray[np.bool_]]
     return eigenvalues, directions * unit[:, None], eigenvalues > DEGENERATE * max(eigenvalues[-1], 1e-300)
 
 
-def _solve(n: Normal, depth_m: float) -> tuple[Matrix, int]:
-    """Return the Gauss–Newton update −H⁻¹ b within the directions the images decide, and how many they do not."""
-    eigenvalues, directions, decided = _axes(n, depth_m)
-    basis = directions[:, decided]
-    return -basis @ ((basis.T @ n.b) / eigenvalues[decided]), int((~decided).sum())
-
-
 def _symmetric(upper: Matrix) -> Matrix:
     full = np.zeros((6, 6))
     full[np.triu_indices(6)] = upper
     return full + np.triu(full, 1).T
-
-
-def gradient_magnitude(gray: Image) -> Image:
-    """Return the Sobel gradient magnitude of gray [H, W]."""
-    return np.hypot(sobel(gray, 0), sobel(gray, 1))

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.adam import VectorAdam
-from sigmasplat.fit.align import Alignment, Pyramid, align
+from sigmasplat.fit.align import Alignment, align
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import PoseMaps, agreement, tracking_gradient

@@ -1,6 +1,7 @@
 """What live images are aligned to: the map rendered somewhere, or a keyframe's own image, weighed by the map's V."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -8,8 +9,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
-from sigmasplat.fit.align import LUMA, Image, Pyramid
 from sigmasplat.fit.confidence import uncertainty_weights
+from sigmasplat.fit.pyramid import LUMA, Image, Pyramid
 from sigmasplat.fit.tracking_loss import PoseMaps, tracking_numbers
 from sigmasplat.render.view import CpuView, View
 
@@ -27,10 +28,16 @@ class Reference:
 
 
 def map_reference(params: Tensor, view: View, T_camera_world: Matrix, config: TrackingConfig) -> Reference:
-    """Render the map as a reference: gray C/A and depth D/A where it is opaque, weighed by w̃ (VarSplat §3)."""
+    """Render the map as a reference: gray C/A and depth D/A where it is opaque, weighed by w̃ (VarSplat §3).
+
+    With depth weighed by U it is rendered twice: U is about the surface that the first render finds.
+    """
     view.forward(params, T_camera_world)
-    gray, surface, weight = _reference_maps(view, config)
-    return Reference(Pyramid.of(gray, surface, view.camera, weight), T_camera_world)
+    maps = _reference_maps(view, config, None)
+    if config.align_depth_by == "U":
+        view.forward(params, T_camera_world, torch.from_numpy(maps.depth))
+        maps = _reference_maps(view, config, view.moment)
+    return Reference(Pyramid.of(maps.gray, maps.depth, view.camera).weighed(*maps.weights), T_camera_world)
 
 
 def keyframe_reference(
@@ -38,34 +45,49 @@ def keyframe_reference(
 ) -> Reference:
     """Take a keyframe's own image as a reference, each pixel weighed by w̃ of the map seen from there (VarSplat §3).
 
-    The sensor's surface is unbiased where a young map still renders too near; the map says which pixels to trust.
+    The sensor's surface is unbiased where a young map still renders too near; the map says which pixels to trust. Depth
+    may be weighed by U about the sensor's depth instead (CG-SLAM eq. 10).
     """
     if not config.uncertainty:
         return Reference(image, T_camera_world)
-    view.forward(params, T_camera_world)
-    _, _, weight = _reference_maps(view, config)
-    return Reference(image.weighed(weight), T_camera_world)
+    by_U = config.align_depth_by == "U"
+    view.forward(params, T_camera_world, torch.from_numpy(image.depth[0]) if by_U else None)
+    maps = _reference_maps(view, config, view.moment if by_U else None)
+    return Reference(image.weighed(*maps.weights), T_camera_world)
 
 
-def _reference_maps(view: View, config: TrackingConfig) -> tuple[Image, Image, Image | None]:
-    """Read gray, surface (0 where the map is thin) and w̃ averaged over the channels off a view, each [H, W].
+class ReferenceMaps(NamedTuple):
+    """Gray, surface (0 where the map is thin) and the weights of gray and depth, each [H, W]; a weight may be None."""
 
-    Where the map is thin V says nothing and the weight is 1; without uncertainty the weight is None.
+    gray: Image
+    depth: Image
+    weights: tuple[Image | None, Image | None]
+
+
+def _reference_maps(view: View, config: TrackingConfig, moment: Tensor | None) -> ReferenceMaps:
+    """Read a reference off a view: w̃ averaged over the channels, and the same form of U where its moment is given.
+
+    Where the map is thin V says nothing and the weight is 1, as for depth where there is no U.
     """
     weighed = config.uncertainty and len(view.sums) == 7
+    by_U = weighed and moment is not None
     if isinstance(view, CpuView):
         from sigmasplat.native import _core
 
         shape = (view.camera.height, view.camera.width)
-        gray, surface, weight = (np.empty(shape, np.float32) for _ in range(3))
-        numbers = tracking_numbers(config, ALIGN_ALPHA)
-        _core.reference_maps(view.sums, view.alpha, shape[1], shape[0], numbers, weighed, gray, surface, weight)
-        return gray, surface, weight if weighed else None
+        gray, surface, weight, weight_depth = (np.empty(shape, np.float32) for _ in range(4))
+        _core.reference_maps(
+            view.sums, view.alpha, moment if by_U else None, shape[1], shape[0],
+            tracking_numbers(config, ALIGN_ALPHA), weighed, gray, surface, weight, weight_depth,
+        )  # fmt: skip
+        return ReferenceMaps(gray, surface, (weight if weighed else None, weight_depth if by_U else None))
     maps = PoseMaps.of(view)
     opaque, divisor = maps.alpha > ALIGN_ALPHA, maps.alpha.clamp(min=0.5)
     gray = ((maps.color @ torch.from_numpy(LUMA)) / divisor).numpy()
     surface = torch.where(opaque, maps.depth / divisor, 0.0).numpy()
-    if not weighed or maps.variance is None:
-        return gray, surface, None
-    mean = uncertainty_weights(maps.variance, opaque, config.tau, config.weight_max).mean(-1)
-    return gray, surface, torch.where(opaque, mean, 1.0).numpy()
+    weights: list[Image | None] = [None, None]
+    for k, (variance, known) in enumerate(((maps.variance, opaque), (moment, opaque & (view.moment > 0)))):
+        if weighed and variance is not None:
+            w = uncertainty_weights(variance.reshape(*opaque.shape, -1), known, config.tau, config.weight_max).mean(-1)
+            weights[k] = torch.where(known, w, 1.0).numpy()
+    return ReferenceMaps(gray, surface, (weights[0], weights[1]))

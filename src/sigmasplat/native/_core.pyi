@@ -78,32 +78,40 @@ def tracking_loss(
 def reference_maps(
     sums: Array,
     alpha: Array,
+    moment: Array | None,
     width: int,
     height: int,
     options: list[float],
     uncertainty: bool,
     gray: Array,
     depth: Array,
-    weight: Array,
+    weight_gray: Array,
+    weight_depth: Array,
 ) -> None: ...
-def align_step(
-    reference_gray: Array,
-    reference_depth: Array,
-    weight: Array | None,
-    live_gray: Array,
-    live_depth: Array,
-    intrinsics: list[float],
-    weight_color: float,
-    weight_depth: float,
-    huber_gray: float,
-    huber_depth_relative: float,
-    depth_gate: float,
+def align_step(level: Level, T: Array, H: Array, b: Array, S: Array, sums: Array) -> None: ...
+def align_images(
+    levels: list[Level],
+    iterations: int,
+    update_stop: float,
+    depth_m: float,
+    degenerate_share: float,
+    min_pixels: float,
     T: Array,
-    H: Array,
-    b: Array,
-    S: Array,
     sums: Array,
-) -> None: ...
+) -> tuple[int, int]: ...
+
+class Level:
+    def __init__(
+        self,
+        reference_gray: Array,
+        reference_depth: Array,
+        weight_gray: Array | None,
+        weight_depth: Array | None,
+        live_gray: Array,
+        live_depth: Array,
+        intrinsics: list[float],
+        options: list[float],
+    ) -> None: ...
 
 class Rasteriser:
     def __init__(self) -> None: ...

@@ -18,12 +18,13 @@ SIGMA_INLINE void add_pixels(const AlignLevel& L, const AlignOptions& o, const f
     const int lanes = L.width - x < W ? L.width - x : W;
     const Mask inside = first_lanes(lanes);
     alignas(64) float edge[4][W] = {};
-    const float *dp = L.reference_depth + at, *gp = L.reference_gray + at, *wp = L.weight ? L.weight + at : nullptr;
-    if (lanes < W) {
-        memcpy(edge[0], dp, lanes * 4); memcpy(edge[1], gp, lanes * 4);
-        if (wp) memcpy(edge[2], wp, lanes * 4);
-        dp = edge[0]; gp = edge[1]; wp = wp ? edge[2] : nullptr;
+    const float* planes[4] = {L.reference_depth, L.reference_gray, L.weight_gray, L.weight_depth};
+    for (int k = 0; k < 4; k++) {
+        if (!planes[k]) continue;
+        planes[k] += at;
+        if (lanes < W) { memcpy(edge[k], planes[k], lanes * 4); planes[k] = edge[k]; }
     }
+    const auto [dp, gp, wi_p, wd_p] = planes;
     const vf d = load(dp);
     Mask ok = both(inside, gt(d, splat(0.f)));
     if (!any(ok)) return;
@@ -49,10 +50,10 @@ SIGMA_INLINE void add_pixels(const AlignLevel& L, const AlignOptions& o, const f
     // A depth step inside the 2×2 cell has no derivative; where the live depth is missing colour alone decides.
     const Mask smooth = both(agrees, gt(0.03f * pz, farthest - nearest));
     const Mask color_ok = both(ok, mask_or(agrees, mask_not(read)));
-    const vf weight = wp ? load(wp) : splat(1.f);
+    const vf weight_gray = wi_p ? load(wi_p) : splat(1.f), weight_depth = wd_p ? load(wd_p) : splat(1.f);
     const vf hd = splat(o.huber_depth_relative) * pz * pz;    // sensor noise grows with z²
-    const vf wi = only(color_ok, weight * (o.weight_color / (o.huber_gray * o.huber_gray)) * huber_weight(r_gray, splat(o.huber_gray)));
-    const vf wd = only(smooth, weight * (o.weight_depth / (hd * hd)) * huber_weight(r_depth, hd));
+    const vf wi = only(color_ok, weight_gray * (o.weight_color / (o.huber_gray * o.huber_gray)) * huber_weight(r_gray, splat(o.huber_gray)));
+    const vf wd = only(smooth, weight_depth * (o.weight_depth / (hd * hd)) * huber_weight(r_depth, hd));
     const vf fxz = L.fx * iz, fyz = L.fy * iz, zero = splat(0.f);
     const vf du[6] = {fxz, zero, -fxz * xn, -fxz * xn * py, fma(fxz * xn, px, fxz * pz), -fxz * py};
     const vf dv[6] = {zero, fyz, -fyz * yn, -fma(fyz * yn, py, fyz * pz), fyz * yn * px, fyz * px};
@@ -107,4 +108,96 @@ static void align_step(const AlignLevel* level, const AlignOptions* o, const dou
     memcpy(b, total + 21, 6 * sizeof(double));
     memcpy(sums, total + 27, 4 * sizeof(double));
     memcpy(S, total + 31, 21 * sizeof(double));
+}
+
+// ---- the loop: steps of a tenth of a millisecond do not wait for Python ------------------------------------------------
+
+// Eigenvalues and, as columns of V, eigenvectors of a symmetric 6×6 matrix, by cyclic Jacobi rotations.
+static void eigen6(double (*A)[6], double* values, double (*V)[6]) {
+    for (int i = 0; i < 6; i++)
+        for (int j = 0; j < 6; j++) V[i][j] = i == j;
+    for (int sweep = 0; sweep < 30; sweep++) {
+        double off = 0, all = 0;
+        for (int i = 0; i < 6; i++)
+            for (int j = 0; j < 6; j++) { all += A[i][j] * A[i][j]; if (i != j) off += A[i][j] * A[i][j]; }
+        if (off <= 1e-30 * all) break;
+        for (int p = 0; p < 5; p++)
+            for (int q = p + 1; q < 6; q++) {
+                if (A[p][q] == 0) continue;
+                const double theta = (A[q][q] - A[p][p]) / (2 * A[p][q]);
+                const double t = (theta < 0 ? -1 : 1) / (__builtin_fabs(theta) + __builtin_sqrt(theta * theta + 1));
+                const double c = 1 / __builtin_sqrt(t * t + 1), s = t * c;
+                for (int k = 0; k < 6; k++) { const double a = A[k][p], b = A[k][q]; A[k][p] = c * a - s * b; A[k][q] = s * a + c * b; }
+                for (int k = 0; k < 6; k++) { const double a = A[p][k], b = A[q][k]; A[p][k] = c * a - s * b; A[q][k] = s * a + c * b; }
+                for (int k = 0; k < 6; k++) { const double a = V[k][p], b = V[k][q]; V[k][p] = c * a - s * b; V[k][q] = s * a + c * b; }
+            }
+    }
+    for (int i = 0; i < 6; i++) values[i] = A[i][i];
+}
+
+// Gauss–Newton update −H⁻¹ b within the directions whose information is more than `share` of the best one's, rotations
+// measured by the shift they make at depth_m; returns how many directions are left out (fit/align.py `_axes`).
+static int solve_decided(const double* H, const double* b, double depth_m, double share, double* update) {
+    double A[6][6], V[6][6], values[6], best = 1e-300;
+    for (int i = 0, q = 0; i < 6; i++)
+        for (int j = i; j < 6; j++, q++) A[i][j] = A[j][i] = H[q] / ((i < 3 ? 1.0 : depth_m) * (j < 3 ? 1.0 : depth_m));
+    eigen6(A, values, V);
+    for (double v : values) best = v > best ? v : best;
+    int left_out = 0;
+    for (int i = 0; i < 6; i++) update[i] = 0;
+    for (int k = 0; k < 6; k++) {
+        if (!(values[k] > share * best)) { left_out++; continue; }
+        double along = 0;
+        for (int i = 0; i < 6; i++) along += V[i][k] * b[i] / (i < 3 ? 1.0 : depth_m);
+        for (int i = 0; i < 6; i++) update[i] -= V[i][k] / (i < 3 ? 1.0 : depth_m) * along / values[k];
+    }
+    return left_out;
+}
+
+// T ← exp(twist) · T, T a 4×4 of a rigid motion.
+static void move_left(const double* twist, double* T) {
+    const double *r = twist, *w = twist + 3, theta2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2], theta = __builtin_sqrt(theta2);
+    const bool small = theta2 < 1e-12;
+    const double a = small ? 1 - theta2 / 6 : __builtin_sin(theta) / theta, b = small ? 0.5 - theta2 / 24 : (1 - __builtin_cos(theta)) / theta2,
+                 c = small ? 1.0 / 6 - theta2 / 120 : (1 - a) / theta2;
+    const double K[3][3] = {{0, -w[2], w[1]}, {w[2], 0, -w[0]}, {-w[1], w[0], 0}};
+    double E[3][4], moved[3][4];
+    for (int i = 0; i < 3; i++) {
+        E[i][3] = 0;
+        for (int j = 0; j < 3; j++) {
+            const double K2 = w[i] * w[j] - (i == j ? theta2 : 0);
+            E[i][j] = (i == j) + a * K[i][j] + b * K2;
+            E[i][3] += ((i == j) + b * K[i][j] + c * K2) * r[j];
+        }
+    }
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 4; j++) moved[i][j] = E[i][0] * T[j] + E[i][1] * T[4 + j] + E[i][2] * T[8 + j] + (j == 3 ? E[i][3] : 0);
+    memcpy(T, moved, sizeof moved);
+}
+
+// Align from the coarsest level, `levels[count - 1]`, to the finest; fit/align.py `align` says how. T goes in as the guess and
+// comes out as the motion; found: sums of the last or best iterate of the finest level. Returns the steps taken.
+static int align_images(const AlignLevel* levels, const AlignOptions* options, int count, AlignLoop o, double* T, double* found, int* degenerate) {
+    double H[21], b[6], S[21], sums[4] = {}, update[6], best_T[12], best_sums[4];
+    int steps = 0;
+    for (int level = count - 1; level >= 0; level--) {
+        double best = __builtin_inf();
+        bool settled = false;
+        *degenerate = 6;
+        for (int i = 0; i < o.iterations && !settled; i++) {
+            align_step(&levels[level], &options[level], T, H, b, S, sums);
+            steps++;
+            if (sums[1] < o.min_pixels) break;
+            const double cost = sums[0] / sums[1];
+            if (cost < best) { best = cost; memcpy(best_T, T, sizeof best_T); memcpy(best_sums, sums, sizeof best_sums); }
+            *degenerate = solve_decided(H, b, o.depth_m, o.degenerate_share, update);
+            move_left(update, T);
+            settled = true;
+            for (double u : update) settled = settled && __builtin_fabs(u) < o.update_stop;
+        }
+        const bool keep_best = !settled && best < __builtin_inf();
+        if (keep_best) memcpy(T, best_T, sizeof best_T);
+        memcpy(found, keep_best ? best_sums : sums, 4 * sizeof(double));
+    }
+    return steps;
 }

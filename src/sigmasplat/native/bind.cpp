@@ -11,6 +11,7 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
@@ -64,6 +65,28 @@ static Outputs outputs(Floats& sums, Maybe<Floats>& moment, Floats& alpha, Maybe
                        Maybe<Ints>& dominant_id, Maybe<Floats>& dominant_weight) {
     return {sums.data(), pointer(moment), alpha.data(), pointer(median_id), pointer(median_weight), pointer(dominant_id), pointer(dominant_weight)};
 }
+
+// One level of two images to align, and how their residuals are weighed; holds on to the arrays.
+struct Level {
+    ConstFloats reference_gray, reference_depth;
+    Maybe<ConstFloats> weight_gray, weight_depth;
+    ConstFloats live_gray, live_depth;
+    std::vector<float> intrinsics;
+    AlignOptions options;
+
+    Level(ConstFloats rg, ConstFloats rd, Maybe<ConstFloats> wg, Maybe<ConstFloats> wd, ConstFloats lg, ConstFloats ld, std::vector<float> camera, std::vector<float> o)
+        : reference_gray(rg), reference_depth(rd), weight_gray(wg), weight_depth(wd), live_gray(lg), live_depth(ld), intrinsics(camera) {
+        need(camera.size() == 4 && o.size() == 5, "a level has 4 intrinsics and 5 options");
+        need(rg.ndim() == 2 && rd.size() == rg.size() && lg.size() == rg.size() && ld.size() == rg.size()
+             && (!wg || wg->size() == rg.size()) && (!wd || wd->size() == rg.size()), "the planes of a level are of one size");
+        options = {o[0], o[1], o[2], o[3], o[4]};
+    }
+    AlignLevel planes() const {
+        return {reference_gray.data(), reference_depth.data(), weight_gray ? weight_gray->data() : nullptr, weight_depth ? weight_depth->data() : nullptr,
+                live_gray.data(), live_depth.data(), int(reference_gray.shape(1)), int(reference_gray.shape(0)),
+                intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]};
+    }
+};
 
 static TrackOptions track_options(const std::vector<float>& v, bool uncertainty) {
     need(v.size() == 6, "tracking has six numbers");
@@ -213,25 +236,39 @@ NB_MODULE(_core, m) {
         return active->tracking_loss(sums.data(), alpha.data(), sums.shape(0) >= 7, target_color.data(), target_depth.data(), plane, o, gain, offset,
                                      g_sums.data(), g_exposure.data());
     });
-    m.def("reference_maps", [](ConstFloats sums, ConstFloats alpha, int width, int height, std::vector<float> options, bool uncertainty,
-                               Floats gray, Floats depth, Floats weight) {
+    m.def("reference_maps", [](ConstFloats sums, ConstFloats alpha, Maybe<ConstFloats> moment, int width, int height, std::vector<float> options,
+                               bool uncertainty, Floats gray, Floats depth, Floats weight_gray, Floats weight_depth) {
         const Plane plane{width, height, sums.shape(2), sums.shape(1) * sums.shape(2)};
         const TrackOptions o = track_options(options, uncertainty);
         nb::gil_scoped_release unlocked;
-        active->reference_maps(sums.data(), alpha.data(), sums.shape(0) >= 7, plane, o, gray.data(), depth.data(), weight.data());
-    });
-    m.def("align_step", [](ConstFloats reference_gray, ConstFloats reference_depth, Maybe<ConstFloats> weight, ConstFloats live_gray, ConstFloats live_depth,
-                           std::vector<float> intrinsics, float weight_color, float weight_depth, float huber_gray, float huber_depth_relative, float depth_gate,
-                           Doubles T, Doubles H, Doubles b, Doubles S, Doubles sums) {
-        need(intrinsics.size() == 4 && T.size() >= 12 && H.size() == 21 && b.size() == 6 && S.size() == 21 && sums.size() == 4, "align_step: wrong sizes");
-        const AlignLevel level{reference_gray.data(), reference_depth.data(), pointer(weight), live_gray.data(), live_depth.data(),
-                               int(reference_gray.shape(1)), int(reference_gray.shape(0)), intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]};
-        const AlignOptions options{weight_color, weight_depth, huber_gray, huber_depth_relative, depth_gate};
+        active->reference_maps(sums.data(), alpha.data(), pointer(moment), sums.shape(0) >= 7, plane, o, gray.data(), depth.data(),
+                               weight_gray.data(), weight_depth.data());
+    }, nb::arg("sums"), nb::arg("alpha"), nb::arg("moment").none(), nb::arg("width"), nb::arg("height"), nb::arg("options"), nb::arg("uncertainty"),
+       nb::arg("gray"), nb::arg("depth"), nb::arg("weight_gray"), nb::arg("weight_depth"));
+    nb::class_<Level>(m, "Level")
+        .def(nb::init<ConstFloats, ConstFloats, Maybe<ConstFloats>, Maybe<ConstFloats>, ConstFloats, ConstFloats, std::vector<float>, std::vector<float>>(),
+             nb::arg("reference_gray"), nb::arg("reference_depth"), nb::arg("weight_gray").none(), nb::arg("weight_depth").none(), nb::arg("live_gray"),
+             nb::arg("live_depth"), nb::arg("intrinsics"), nb::arg("options"));
+    m.def("align_step", [](const Level& level, Doubles T, Doubles H, Doubles b, Doubles S, Doubles sums) {
+        need(T.size() >= 12 && H.size() == 21 && b.size() == 6 && S.size() == 21 && sums.size() == 4, "align_step: wrong sizes");
+        const AlignLevel planes = level.planes();
         nb::gil_scoped_release unlocked;
-        active->align_step(&level, &options, T.data(), H.data(), b.data(), S.data(), sums.data());
-    }, nb::arg("reference_gray"), nb::arg("reference_depth"), nb::arg("weight").none(), nb::arg("live_gray"), nb::arg("live_depth"), nb::arg("intrinsics"),
-       nb::arg("weight_color"), nb::arg("weight_depth"), nb::arg("huber_gray"), nb::arg("huber_depth_relative"), nb::arg("depth_gate"), nb::arg("T"),
-       nb::arg("H"), nb::arg("b"), nb::arg("S"), nb::arg("sums"));
+        active->align_step(&planes, &level.options, T.data(), H.data(), b.data(), S.data(), sums.data());
+    });
+    m.def("align_images", [](const std::vector<Level*>& levels, int iterations, double update_stop, double depth_m, double degenerate_share,
+                             double min_pixels, Doubles T, Doubles sums) {
+        need(!levels.empty() && T.size() >= 12 && sums.size() == 4, "align_images: wrong sizes");
+        std::vector<AlignLevel> planes;
+        std::vector<AlignOptions> options;
+        for (auto* level : levels) { planes.push_back(level->planes()); options.push_back(level->options); }
+        int degenerate = 6, steps;
+        {
+            nb::gil_scoped_release unlocked;
+            steps = active->align_images(planes.data(), options.data(), int(planes.size()), {iterations, update_stop, depth_m, degenerate_share, min_pixels},
+                                         T.data(), sums.data(), &degenerate);
+        }
+        return std::make_pair(steps, degenerate);
+    });
     nb::class_<Rasteriser>(m, "Rasteriser")
         .def(nb::init<>())
         .def_prop_ro("bytes", &Rasteriser::bytes)

@@ -42,7 +42,7 @@ const Kernels table = {
     create, destroy, bytes,
     project_forward, project_backward, blend_forward, blend_backward,
     view_forward, view_backward, view_step, adam_settle, view_backward_pose, view_visible,
-    ssim_target, ssim, mapping_losses, tracking_loss, reference_maps, align_step,
+    ssim_target, ssim, mapping_losses, tracking_loss, reference_maps, align_step, align_images,
 };
 
 }  // namespace sigmasplat::SIGMASPLAT_ISA

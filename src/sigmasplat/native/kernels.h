@@ -36,7 +36,7 @@ struct TrackOptions {                      // settings of TrackingConfig
 };
 
 struct AlignLevel {                        // one pyramid level, planes of width × height
-    const float *reference_gray, *reference_depth, *weight, *live_gray, *live_depth;
+    const float *reference_gray, *reference_depth, *weight_gray, *weight_depth, *live_gray, *live_depth;   // weights may be null
     int width, height;
     float fx, fy, cx, cy;
 };
@@ -46,6 +46,8 @@ struct AlignOptions {
     float huber_gray, huber_depth_relative;
     float depth_gate;                      // metres
 };
+
+struct AlignLoop { int iterations; double update_stop, depth_m, degenerate_share, min_pixels; };
 
 struct Kernels {
     const char* name;
@@ -80,9 +82,10 @@ struct Kernels {
     double (*tracking_loss)(const float* sums, const float* alpha, bool variance, const float* target_color,
                             const float* target_depth, Plane, TrackOptions, float gain, float offset, float* g_sums,
                             double* g_exposure);
-    void (*reference_maps)(const float* sums, const float* alpha, bool variance, Plane, TrackOptions, float* gray, float* depth,
-                           float* weight);
+    void (*reference_maps)(const float* sums, const float* alpha, const float* moment, bool variance, Plane, TrackOptions,
+                           float* gray, float* depth, float* weight_gray, float* weight_depth);
     void (*align_step)(const AlignLevel*, const AlignOptions*, const double* T, double* H, double* b, double* S, double* sums);
+    int (*align_images)(const AlignLevel*, const AlignOptions*, int levels, AlignLoop, double* T, double* sums, int* degenerate);
 };
 
 }  // namespace sigmasplat

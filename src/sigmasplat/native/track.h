@@ -85,9 +85,13 @@ static bool median_log_variance(const float* sums, const Plane& p, Selection& s,
     return true;
 }
 
-// w̃ of channel c (VarSplat §3).
+// exp(−(log(V+ε) − median)/τ), clamped (VarSplat §3); of V + ε itself.
+SIGMA_INLINE vf confidence(vf variance, float log_median, const TrackOptions& o) {
+    return clamp(exp2((log_median - log2(variance)) * (1.f / o.tau)), 1.f / o.weight_max, o.weight_max);
+}
+// w̃ of channel c.
 SIGMA_INLINE vf uncertainty_weight(const float* sums, const Plane& p, size_t at, int c, const TrackOptions& o, float log_median) {
-    return clamp(exp2((log_median - log2(variance_of(sums, p, at, c))) * (1.f / o.tau)), 1.f / o.weight_max, o.weight_max);
+    return confidence(variance_of(sums, p, at, c), log_median, o);
 }
 
 // L_track (VarSplat §3) as a mean over pixels: write its gradient by colour and depth to planes, return the loss;
@@ -146,26 +150,33 @@ static double tracking_loss(const float* sums, const float* alpha, bool variance
     return sum[0];
 }
 
-// A render as a reference image [height, width]: gray C/A, depth D/A where A > alpha_above (else 0), and w̃ averaged over
-// channels there (else 1: where the map is thin V says nothing).
-static void reference_maps(const float* sums, const float* alpha, bool variance, Plane p, TrackOptions o, float* gray,
-                           float* depth, float* weight) {
+// A render as a reference image [height, width]: gray C/A, depth D/A where A > alpha_above (else 0), and weights there
+// (else 1: where the map is thin it says nothing): of gray w̃ averaged over channels, of depth the same form of U, the moment
+// about a reference depth, where there is one.
+static void reference_maps(const float* sums, const float* alpha, const float* moment, bool variance, Plane p, TrackOptions o,
+                           float* gray, float* depth, float* weight_gray, float* weight_depth) {
     static Selection scratch;
-    float log_median[3];
-    const bool weigh = o.uncertainty && variance && median_log_variance(
-        sums, p, scratch, [&](size_t at) { return gt(load(alpha + at), splat(o.alpha_above)); }, log_median);
+    const auto opaque_at = [&](size_t at) { return gt(load(alpha + at), splat(o.alpha_above)); };
+    const auto U = [&](size_t at) { return load(moment + at) + WEIGHT_EPSILON; };
+    const auto measured = [&](size_t at) { return both(opaque_at(at), gt(load(moment + at), splat(0.f))); };
+    float log_median[3], median_U = 1.f;
+    const bool weigh = o.uncertainty && variance && median_log_variance(sums, p, scratch, opaque_at, log_median);
+    const bool weigh_depth = moment && lower_median(p, scratch, U, [&](size_t at, vf) { return measured(at); }, &median_U);
+    const float log_median_U = log2f(median_U);
 #pragma omp parallel for schedule(static)
     for (int y = 0; y < p.height; y++)
         for (int x = 0; x < p.width; x += W) {
             const size_t at = size_t(y) * p.stride + x, to = size_t(y) * p.width + x;
-            const vf A = load(alpha + at), inv = 1.f / max(A, splat(0.5f));
-            const Mask opaque = gt(A, splat(o.alpha_above));
+            const vf A = load(alpha + at), inv = 1.f / max(A, splat(0.5f)), one = splat(1.f);
+            const Mask opaque = opaque_at(at);
             const vf luma = 0.299f * load(sums + at) + (0.587f * load(sums + p.plane + at) + 0.114f * load(sums + 2 * p.plane + at));
-            vf w = splat(0.f);
-            if (weigh) for (int c = 0; c < 3; c++) w += uncertainty_weight(sums, p, at, c, o, log_median[c]);
-            const vf out[3] = {luma * inv, only(opaque, load(sums + 3 * p.plane + at) * inv), select(opaque, weigh ? w * (1.f / 3.f) : splat(1.f), splat(1.f))};
-            float* planes[3] = {gray, depth, weight};
-            for (int q = 0; q < 3; q++)
+            vf of_gray = splat(0.f), of_depth = one;
+            if (weigh) for (int c = 0; c < 3; c++) of_gray += uncertainty_weight(sums, p, at, c, o, log_median[c]);
+            if (weigh_depth) of_depth = select(measured(at), confidence(U(at), log_median_U, o), one);
+            const vf out[4] = {luma * inv, only(opaque, load(sums + 3 * p.plane + at) * inv),
+                               select(opaque, weigh ? of_gray * (1.f / 3.f) : one, one), of_depth};
+            float* planes[4] = {gray, depth, weight_gray, weight_depth};
+            for (int q = 0; q < 4; q++)
                 if (x + W <= p.width) store(planes[q] + to, out[q]);
                 else memcpy(planes[q] + to, &out[q], (p.width - x) * sizeof(float));
         }

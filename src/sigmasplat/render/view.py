@@ -29,11 +29,13 @@ class View(Protocol):
     alpha: Tensor
     g_sums: Tensor
     g_alpha: Tensor
+    moment: Tensor
+    """U about the reference depth of the last forward pass that was given one, [rows, columns] m² (CG-SLAM eq. 10)."""
     seconds: NDArray[np.float64]
     """Time spent so far in project, sort, blend, blend backward, project backward."""
 
-    def forward(self, params: Tensor, T_camera_world: Matrix) -> None:
-        """Render parameter rows [N, 17] at a pose into `sums` and `alpha`."""
+    def forward(self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None) -> None:
+        """Render parameter rows [N, 17] at a pose into `sums` and `alpha`; with a depth [H, W] m into `moment` too."""
 
     def backward(self, params: Tensor, g_params: Tensor) -> Matrix:
         """Carry `g_sums`, `g_alpha` to parameter rows, written to g_params [N, 17]; return the pose twist [6]."""
@@ -60,14 +62,18 @@ class CpuView:
         size = cpu.padded_size(camera)
         self.sums, self.g_sums = torch.zeros(self._k, *size), torch.zeros(self._k, *size)
         self.alpha, self.g_alpha = torch.zeros(size), torch.zeros(size)
+        self.moment, self._reference = torch.zeros(size), torch.zeros(size)
         self.seconds = np.zeros(5)
 
-    def forward(self, params: Tensor, T_camera_world: Matrix) -> None:
-        o = self.options
+    def forward(self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None) -> None:
+        o, reference_depth, moment = self.options, None, None
+        if depth_reference is not None:
+            self._reference[: self.camera.height, : self.camera.width] = depth_reference
+            reference_depth, moment = self._reference, self.moment
         view = self._numbers(self.camera, T_camera_world, o)
         self.raster.view_forward(
-            view, params, self._k, o.alpha_min, o.transmittance_stop, None,
-            self.sums, None, self.alpha, None, None, None, None, self.seconds[:3],
+            view, params, self._k, o.alpha_min, o.transmittance_stop, reference_depth,
+            self.sums, moment, self.alpha, None, None, None, None, self.seconds[:3],
         )  # fmt: skip
 
     def backward(self, params: Tensor, g_params: Tensor) -> Matrix:
@@ -90,7 +96,7 @@ class CpuView:
     @property
     def bytes(self) -> int:
         """Return the memory held by this view's buffers."""
-        return self.raster.bytes + 4 * 2 * (self.sums.numel() + self.alpha.numel())
+        return self.raster.bytes + 4 * 2 * (self.sums.numel() + 2 * self.alpha.numel())
 
 
 class ReferenceView:
@@ -101,21 +107,23 @@ class ReferenceView:
         self._k = 7 if variance else 4
         size = (camera.height, camera.width)
         self.sums, self.g_sums = torch.zeros(self._k, *size), torch.zeros(self._k, *size)
-        self.alpha, self.g_alpha = torch.zeros(size), torch.zeros(size)
+        self.alpha, self.g_alpha, self.moment = torch.zeros(size), torch.zeros(size), torch.zeros(size)
         self.seconds = np.zeros(5)
 
-    def forward(self, params: Tensor, T_camera_world: Matrix) -> None:
+    def forward(self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None) -> None:
         self._leaf = params.detach().clone().requires_grad_()
         self._twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
         T = torch.linalg.matrix_exp(twist_matrix(self._twist)) @ torch.as_tensor(T_camera_world)
         f = GaussianField(self._leaf)
         p = reference.project(f.means, f.quats, f.scales, T, self.camera, self.options)
         features = features_of(f.colors, p.z, f.variances)[:, : self._k]
-        b = reference.blend(*p, f.opacities, features, None, self.camera, self.options)
+        b = reference.blend(*p, f.opacities, features, depth_reference, self.camera, self.options)
         self._maps = (b.sums.movedim(-1, 0), b.alpha)
         self._visible = reaches(p, f.opacities.detach(), self.camera, self.options)
         self.sums.copy_(self._maps[0].detach())
         self.alpha.copy_(b.alpha.detach())
+        if b.moment is not None:
+            self.moment.copy_(b.moment.detach())
 
     def backward(self, params: Tensor, g_params: Tensor) -> Matrix:
         g_leaf, g_twist = torch.autograd.grad(self._maps, (self._leaf, self._twist), (self.g_sums, self.g_alpha))

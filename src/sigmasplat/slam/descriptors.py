@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from sigmasplat.fit.align import gray_of
+from sigmasplat.fit.pyramid import gray_of
 
 Plane = NDArray[np.float32]
 Matrix = NDArray[np.float64]

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from skimage.feature import canny
 
 from sigmasplat.config import SeedConfig
-from sigmasplat.fit.align import gradient_magnitude, gray_of
+from sigmasplat.fit.pyramid import gradient_magnitude, gray_of
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.model.field import GaussianField

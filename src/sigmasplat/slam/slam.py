@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sigmasplat.config import Config
 from sigmasplat.errors import SourceError
-from sigmasplat.fit.align import Pyramid, gray_of
+from sigmasplat.fit.pyramid import Pyramid, gray_of
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField

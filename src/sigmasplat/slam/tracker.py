@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import TrackingConfig
-from sigmasplat.fit.align import Pyramid, align
+from sigmasplat.fit.align import align
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, map_reference
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
