@@ -137,7 +137,9 @@ class TrackingConfig:
     lost_share: float = 0.2
     """Lost when the map agrees with less than this share of what the sensor sees (agreement × overlap)."""
     update_stop: float = 0.0
-    """Stop when a step is below this (metres and radians); 0 = run every iteration."""
+    """Adam stops when a step is below this (metres and radians); 0 = run every iteration."""
+    plateau_stop: float = 0.0
+    """Either method stops (aligning: a level) when a step changes the loss by less than this share of it; 0 = off."""
 
 
 @dataclass(frozen=True)

@@ -173,5 +173,7 @@ def test_exposure_is_found_where_asked() -> None:
 
 def test_descent_that_stands_still_stops(view: View) -> None:
     crawling = dataclasses.replace(STEPS, lr_rotation=1e-9, lr_translation=1e-9, update_stop=1e-6)
-    assert descended(view, crawling, iterations=9).iterations == 2
-    assert descended(view, dataclasses.replace(crawling, update_stop=0.0), iterations=9).iterations == 9
+    assert descended(view, crawling, iterations=9).iterations == 1
+    crawling = dataclasses.replace(crawling, update_stop=0.0)
+    assert descended(view, crawling, iterations=9).iterations == 9
+    assert descended(view, dataclasses.replace(crawling, plateau_stop=1e-3), iterations=9).iterations == 2

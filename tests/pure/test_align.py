@@ -269,3 +269,10 @@ def test_what_was_never_settled_is_the_best_seen() -> None:
     assert first.steps == again.steps == len(seen(10).cameras)
     many = align(seen(10), seen(12), motion(10, 12), 15, update_stop=0.0)
     assert many.cost <= min(first.cost, again.cost) * (1 + 1e-6)
+
+
+def test_a_plateau_ends_a_level() -> None:
+    whole = align(seen(10), seen(12), np.eye(4), 15, update_stop=0.0)
+    early = align(seen(10), seen(12), np.eye(4), 15, update_stop=0.0, plateau_stop=1e-3)
+    assert whole.steps == 15 * len(seen(10).cameras) and early.steps < 0.6 * whole.steps
+    assert_same_pose(early.T_live_reference, whole.T_live_reference, 1e-3, 0.05)

@@ -128,11 +128,13 @@ def align(
     iterations: int = 15,
     weight_color: float = 0.5,
     update_stop: float = 1e-4,
+    plateau_stop: float = 0.0,
 ) -> Alignment:
     """Find the motion that lays the reference onto the live image, from a first guess.
 
-    Each level takes up to `iterations` Gauss–Newton steps with Huber weights and ends below `update_stop` (m, rad). If
-    the finest does not get there its best iterate stands. Directions the images say nothing about keep the guess.
+    Each level takes up to `iterations` Gauss–Newton steps with Huber weights and ends below `update_stop` (m, rad), or
+    when the cost has changed by less than `plateau_stop` of it (0 = off). If the finest does neither its best iterate
+    stands. Directions the images say nothing about keep the guess.
     weight_color in [0, 1] balances gray against depth, each in units of its Huber width.
     Raises BackendError without the compiled kernels.
     """
@@ -142,8 +144,9 @@ def align(
     pair = Pair(reference, live, weight_color, _usual_depth(reference))
     T, sums, levels = np.array(T_live_reference, np.float64), np.zeros(4), range(len(reference.cameras))
     steps, degenerate = _core.align_images(
-        [pair.level(k) for k in levels], iterations, update_stop, pair.depth_m, DEGENERATE, MIN_PIXELS, T, sums
-    )
+        [pair.level(k) for k in levels], iterations, update_stop, plateau_stop, pair.depth_m, DEGENERATE, MIN_PIXELS,
+        T, sums,
+    )  # fmt: skip
     reference_pixels = max(int((reference.depth[0] > 0).sum()), 1)
     return Alignment(
         se3.orthonormalise(T),

@@ -18,8 +18,6 @@ from sigmasplat.model import se3
 from sigmasplat.render.view import View
 
 Matrix = NDArray[np.float64]
-PLATEAU = 1e-4
-"""The loss stands still when a step changes it by less than this share."""
 
 
 @dataclass(eq=False)
@@ -50,8 +48,8 @@ def fit_pose_adam(
 ) -> PoseFit:
     """Descend L_track by Adam over a unit quaternion and a translation after the first guess; the best iterate wins.
 
-    params [N, 17] and σ² are frozen (VarSplat §3). Ends early when a step is below `update_stop` and the loss has stood
-    still. Raises nothing: without common pixels the guess comes back.
+    params [N, 17] and σ² are frozen (VarSplat §3). Ends early when a step is below `update_stop`, or when it changed
+    the loss by less than `plateau_stop` of it. Raises nothing: without common pixels the guess comes back.
     """
     motion, exposure = np.array([1.0, 0, 0, 0, 0, 0, 0]), np.zeros(2)
     adam, adam_exposure = VectorAdam.of(7), VectorAdam.of(2)
@@ -69,7 +67,7 @@ def fit_pose_adam(
         moved = adam.step(_motion_gradient(motion, view.backward_pose(params)), rates)
         motion += moved
         exposure += adam_exposure.step(g_exposure.double().numpy(), rate_exposure)
-        if np.abs(moved).max() < config.update_stop and abs(loss - previous) < PLATEAU * previous:
+        if np.abs(moved).max() < config.update_stop or abs(loss - previous) < config.plateau_stop * loss:
             break
         previous = loss
     view.forward(params, best_T)
@@ -102,7 +100,10 @@ def _motion_gradient(quaternion_translation: NDArray[np.float64], twist: NDArray
 def fit_pose_align(reference: Reference, live: Pyramid, T_camera_world: Matrix, config: TrackingConfig) -> PoseFit:
     """Align the live image to a reference by Gauss–Newton (`fit.align`), from a first guess."""
     guess = T_camera_world @ se3.inverse(reference.T_camera_world)
-    found = align(reference.pyramid, live, guess, config.align_iterations, config.align_weight_color, config.align_stop)
+    found = align(
+        reference.pyramid, live, guess, config.align_iterations, config.align_weight_color, config.align_stop,
+        config.plateau_stop,
+    )  # fmt: skip
     return PoseFit(
         found.T_live_reference @ reference.T_camera_world,
         found.agreement,

@@ -93,6 +93,7 @@ def align_images(
     levels: list[Level],
     iterations: int,
     update_stop: float,
+    plateau_stop: float,
     depth_m: float,
     degenerate_share: float,
     min_pixels: float,

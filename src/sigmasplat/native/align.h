@@ -181,7 +181,7 @@ static int align_images(const AlignLevel* levels, const AlignOptions* options, i
     double H[21], b[6], S[21], sums[4] = {}, update[6], best_T[12], best_sums[4];
     int steps = 0;
     for (int level = count - 1; level >= 0; level--) {
-        double best = __builtin_inf();
+        double best = __builtin_inf(), previous = __builtin_inf();
         bool settled = false;
         *degenerate = 6;
         for (int i = 0; i < o.iterations && !settled; i++) {
@@ -194,6 +194,8 @@ static int align_images(const AlignLevel* levels, const AlignOptions* options, i
             move_left(update, T);
             settled = true;
             for (double u : update) settled = settled && __builtin_fabs(u) < o.update_stop;
+            settled = settled || __builtin_fabs(cost - previous) < o.plateau_stop * cost;
+            previous = cost;
         }
         const bool keep_best = !settled && best < __builtin_inf();
         if (keep_best) memcpy(T, best_T, sizeof best_T);

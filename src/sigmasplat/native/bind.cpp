@@ -255,7 +255,7 @@ NB_MODULE(_core, m) {
         nb::gil_scoped_release unlocked;
         active->align_step(&planes, &level.options, T.data(), H.data(), b.data(), S.data(), sums.data());
     });
-    m.def("align_images", [](const std::vector<Level*>& levels, int iterations, double update_stop, double depth_m, double degenerate_share,
+    m.def("align_images", [](const std::vector<Level*>& levels, int iterations, double update_stop, double plateau_stop, double depth_m, double degenerate_share,
                              double min_pixels, Doubles T, Doubles sums) {
         need(!levels.empty() && T.size() >= 12 && sums.size() == 4, "align_images: wrong sizes");
         std::vector<AlignLevel> planes;
@@ -264,7 +264,7 @@ NB_MODULE(_core, m) {
         int degenerate = 6, steps;
         {
             nb::gil_scoped_release unlocked;
-            steps = active->align_images(planes.data(), options.data(), int(planes.size()), {iterations, update_stop, depth_m, degenerate_share, min_pixels},
+            steps = active->align_images(planes.data(), options.data(), int(planes.size()), {iterations, update_stop, plateau_stop, depth_m, degenerate_share, min_pixels},
                                          T.data(), sums.data(), &degenerate);
         }
         return std::make_pair(steps, degenerate);

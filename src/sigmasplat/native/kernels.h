@@ -47,7 +47,7 @@ struct AlignOptions {
     float depth_gate;                      // metres
 };
 
-struct AlignLoop { int iterations; double update_stop, depth_m, degenerate_share, min_pixels; };
+struct AlignLoop { int iterations; double update_stop, plateau_stop, depth_m, degenerate_share, min_pixels; };
 
 struct Kernels {
     const char* name;

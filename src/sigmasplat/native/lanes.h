@@ -96,7 +96,7 @@ SIGMA_INLINE vf gather(const float* p, vi i) { vf r; for (int k = 0; k < W; k++)
 
 SIGMA_INLINE vf abs(vf a) { return max(a, -a); }
 SIGMA_INLINE vf clamp(vf a, float lo, float hi) { return min(max(a, splat(lo)), splat(hi)); }
-SIGMA_INLINE Mask first_lanes(int n) { return mask_of_bits(n >= 32 ? ~0u : (1u << n) - 1u); }
+SIGMA_INLINE Mask first_lanes(int n) { return mask_of_bits(n <= 0 ? 0u : n >= 32 ? ~0u : (1u << n) - 1u); }
 SIGMA_INLINE vf lane_index() { vf r; for (int i = 0; i < W; i++) r[i] = (float)i; return r; }
 
 // 2^x for any x in float range (relative error 2e-9 before rounding; flushes below 2^-126).
