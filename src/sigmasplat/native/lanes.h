@@ -86,9 +86,15 @@ SIGMA_INLINE unsigned bits(Mask m) {
 #endif
 }
 SIGMA_INLINE bool any(Mask m) { return bits(m) != 0; }
+#if defined(__SSE2__)
+SIGMA_INLINE vf min(vf a, vf b) { return (vf)_mm_min_ps((__m128)a, (__m128)b); }
+SIGMA_INLINE vf max(vf a, vf b) { return (vf)_mm_max_ps((__m128)a, (__m128)b); }
+SIGMA_INLINE vf sqrt(vf a) { return (vf)_mm_sqrt_ps((__m128)a); }
+#else
 SIGMA_INLINE vf min(vf a, vf b) { return a < b ? a : b; }
 SIGMA_INLINE vf max(vf a, vf b) { return a > b ? a : b; }
 SIGMA_INLINE vf sqrt(vf a) { vf r; for (int i = 0; i < W; i++) r[i] = __builtin_sqrtf(a[i]); return r; }
+#endif
 SIGMA_INLINE vf floor(vf a) { vf t = to_float(to_int(a)); return t > a ? t - 1.f : t; }
 SIGMA_INLINE vf gather(const float* p, vi i) { vf r; for (int k = 0; k < W; k++) r[k] = p[i[k]]; return r; }
 #endif
