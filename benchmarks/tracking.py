@@ -63,6 +63,7 @@ class Options:
     sources: Annotated[tuple[str, ...], arg(help="whole sequences, names or paths")] = ("redkitchen", "synthetic")
     preset: Annotated[str, arg(help="settings to start from")] = default_preset()
     iterations: Annotated[int, arg(help="of Adam, per frame")] = 60
+    rates: Annotated[tuple[str, ...], arg(help="whose learning rates Adam takes on whole sequences")] = tuple(RATES)
     seeds: Annotated[tuple[int, ...], arg(help="starts of the random numbers, a map each")] = (0,)
     limit: Annotated[
         int | None, arg(help="frames at most, of rooms and whole sequences", help_behavior_hint="(default: all)")
@@ -201,7 +202,8 @@ def measure_consistency(path: str, options: Options) -> dict[str, Any]:
 def measure_sequences(options: Options) -> list[dict[str, Any]]:
     """Run whole sequences by every method as `accuracy.py` does; a run that failed has its `problem`."""
     ways, jobs = {"align": ("tracking.method=align",)}, []
-    for name, (rotation, translation) in RATES.items():
+    for name in options.rates:
+        rotation, translation = RATES[name]
         rates = (f"tracking.lr_rotation={rotation}", f"tracking.lr_translation={translation}")
         ways[f"adam {name}"] = ("tracking.method=adam", f"tracking.iterations={options.iterations}", *rates)
     for method, settings in ways.items():
