@@ -19,6 +19,7 @@ template <int N> struct std_int { static constexpr int value = N; };
 #include "project.h"
 #include "bin.h"
 #include "blend.h"
+#include "blend_backward.h"
 #include "adam.h"
 #include "losses.h"
 #include "view.h"

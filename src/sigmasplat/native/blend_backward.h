@@ -1,0 +1,185 @@
+// Stage 3 backwards: gradients on pixels → a record for each splat of each tile → sums for each splat. docs/kernels.md derives it.
+
+// A splat's gradient in one tile: 8 interleaved pairs (even: sums of g·{1, x, y, xx, xy, yy}; odd: sums of w·∂L/∂feature),
+// then the features that did not fit. With a moment, two further w-sums: 2·∂L/∂moment and its product with −ref.
+template <int K, bool MOMENT> constexpr int weight_columns = K + (MOMENT ? 2 : 0);
+template <int K, bool MOMENT> constexpr int extra_floats =
+    weight_columns<K, MOMENT> <= 8 ? 0 : (weight_columns<K, MOMENT> - 8 + W - 1) / W * W;
+template <int K, bool MOMENT> constexpr int record_floats = 16 + extra_floats<K, MOMENT>;
+
+#if defined(__AVX512F__)
+SIGMA_INLINE void store_pairs(float* out, vf g, vf w) {
+    store(out, (vf)_mm512_unpacklo_ps((__m512)g, (__m512)w));
+    store(out + W, (vf)_mm512_unpackhi_ps((__m512)g, (__m512)w));
+}
+#elif defined(__AVX2__)
+SIGMA_INLINE void store_pairs(float* out, vf g, vf w) {
+    store(out, (vf)_mm256_unpacklo_ps((__m256)g, (__m256)w));
+    store(out + W, (vf)_mm256_unpackhi_ps((__m256)g, (__m256)w));
+}
+#else
+SIGMA_INLINE void store_pairs(float* out, vf g, vf w) {
+    store(out, __builtin_shuffle(g, w, vi{0, 4, 1, 5}));
+    store(out + W, __builtin_shuffle(g, w, vi{2, 6, 3, 7}));
+}
+#endif
+constexpr int pixel_of_pair(int m) { return m < W / 2 ? m / 2 * 4 + m % 2 : (m - W / 2) / 2 * 4 + 2 + m % 2; }
+
+typedef long long vpair __attribute__((vector_size(W * 4)));
+SIGMA_INLINE vf splat_pair(const float* p) { long long bits; memcpy(&bits, p, 8); return (vf)(bits - vpair{}); }
+
+// Move a record's moments from the tile's centre to the splat's mean at (u, v) from there.
+template <class T> SIGMA_INLINE void shift_moments(T m0, T& mx, T& my, T& mxx, T& mxy, T& myy, T u, T v) {
+    mxx += u * (u * m0 - 2.f * mx);
+    mxy += u * (v * m0 - my) - v * mx;
+    myy += v * (v * m0 - 2.f * my);
+    mx -= u * m0;
+    my -= v * m0;
+}
+
+// Move a tile's records to each splat's own slots, moments now about the splat's mean.
+template <int RECORD> static void flush_records(Render& r, Scratch& s, const Tile& tile) {
+    for (int k = 0; k < tile.count; k++) {
+        float* m = &s.records[size_t(k) * RECORD];
+        shift_moments(m[0], m[2], m[4], m[6], m[8], m[10], s.centers[k].u, s.centers[k].v);
+    }
+    for (int k = 0; k < tile.count; k++) {
+        const Geometry& g = *reinterpret_cast<const Geometry*>(&s.rows[size_t(k) * r.row]);
+        float* to = &r.partials[size_t(g.tag) * RECORD];
+        for (int c = 0; c < RECORD; c += W) stream(to + c, load(&s.records[size_t(k) * RECORD + c]));
+    }
+}
+
+// Walk every tile's pixels once more and hand its records to `finish(scratch, tile)`. The first K of a row's ROW_K features
+// have gradients; the others have none and are passed over.
+template <int ROW_K, int K, bool MOMENT, class Finish>
+static void blend_tiles_backward(Render& r, Outputs o, OutputGradients g, Finish finish) {
+    constexpr int RECORD = record_floats<K, MOMENT>, EXTRA = extra_floats<K, MOMENT>;
+    constexpr int ROW_FLOATS = row_floats<ROW_K>;
+    const size_t plane = r.plane(), stride = r.padded_width();
+    const float log_alpha_min = __builtin_log2f(r.options.alpha_min) * 0.125f;
+    const vf stop = splat(r.options.transmittance_stop), zero = splat(0.f), one = splat(1.f), top = splat(ALPHA_MAX);
+#pragma omp parallel
+    {
+        Scratch& s = r.scratch[omp_get_thread_num()];
+        alignas(64) float basis[W][16 + EXTRA];
+#pragma omp for schedule(dynamic, 1)
+        for (int index = 0; index < r.tiles_x * r.tiles_y; index++) {
+            const Tile tile = gather_tile<true>(r, s, index);
+            memset(s.records.reserve(size_t(tile.count + W) * RECORD), 0, size_t(tile.count + W) * RECORD * sizeof(float));
+            const float* rows = s.rows.data;
+            for (int b = 0; b < BLOCKS; b++) {
+                const int count = s.counts[b];
+                if (!count) continue;
+                const vf x = block_x(b), y = block_y(b);
+                const int* list = &s.lists[b * s.list_capacity];
+                const size_t at = (tile.y + size_t(b / BLOCKS_X) * BLOCK_HEIGHT) * stride + tile.x + b % BLOCKS_X * BLOCK_WIDTH;
+                vf gs[K], gm = zero, ref = zero;
+                const vf ga = g.alpha ? load_block(g.alpha + at, stride) : zero;
+                vf behind = ga * load_block(o.alpha + at, stride);       // Σ over what lies behind of w·G
+                vf columns[16 + EXTRA];                 // what a pixel's (g, w) pairs are multiplied with
+                for (auto& c : columns) c = zero;
+                const vf moments[6] = {one, x, y, x * x, x * y, y * y};
+                for (int c = 0; c < 6; c++) columns[2 * c] = moments[c];
+                const auto weighed = [&](int c, vf v) { columns[c < 8 ? 2 * c + 1 : 8 + c] = v; };
+                for (int c = 0; c < K; c++) {
+                    gs[c] = load_block(g.sums + c * plane + at, stride);
+                    behind = fma(gs[c], load_block(o.sums + c * plane + at, stride), behind);
+                    weighed(c, gs[c]);
+                }
+                if (MOMENT) {
+                    ref = load_block(r.reference + at, stride);
+                    gm = only(gt(ref, zero), load_block(g.moment + at, stride));
+                    behind = fma(gm, load_block(o.moment + at, stride), behind);
+                    weighed(K, 2.f * gm);
+                    weighed(K + 1, -2.f * gm * ref);
+                }
+                for (int h = 0; h < 16 + EXTRA; h += W) {
+                    transpose(columns + h);
+                    for (int m = 0; m < W; m++) store(basis[m] + h, columns[h + pixel_of_pair(m)]);
+                }
+                vf T = one;
+                for (int j = 0; j < count; j += ALPHA_CHUNK) {
+                    const int end = count < j + ALPHA_CHUNK ? count : j + ALPHA_CHUNK;
+                    const int n = live_alphas<ROW_FLOATS>(rows, list, j, end, x, y, ge(T, stop), log_alpha_min, s.alphas);
+                    for (int e = 0; e < n; e++) {
+                        const int entry = s.alphas.entry[e];
+                        const Geometry& geometry = geometry_of<ROW_FLOATS>(rows, entry);
+                        const float* f = rows + size_t(entry) * ROW_FLOATS + GEOMETRY;
+                        const vf a = load(s.alphas.alpha[e]);
+                        const Mask on = ge(T, stop);
+                        const vf w = only(on, T * a);
+                        vf G = ga;
+                        for (int c = 0; c < K; c++) G = fma(gs[c], splat(f[c]), G);
+                        if (MOMENT) { const vf d = geometry.z - ref; G = fma(gm * d, d, G); }
+                        behind = fnma(w, G, behind);
+                        const vf g_alpha = fma(T, G, -(behind * reciprocal(one - a)));
+                        const vf g_power = only(both(on, gt(top, a)), g_alpha * a);
+                        store_pairs(s.alphas.pairs[e], g_power, w);
+                        T = fnma(T, a, T);
+                    }
+                    for (int e = 0; e < n; e++) {
+                        const float* pairs = s.alphas.pairs[e];
+                        float* record = &s.records[size_t(s.alphas.entry[e]) * RECORD];
+                        vf acc[16 / W][2], rest[EXTRA ? EXTRA / W : 1];       // two chains: the sum waits half as long
+                        for (int h = 0; h < 16 / W; h++) { acc[h][0] = load(record + h * W); acc[h][1] = zero; }
+                        for (int h = 0; h < EXTRA / W; h++) rest[h] = load(record + 16 + h * W);
+#pragma GCC unroll 16
+                        for (int m = 0; m < W; m++) {
+                            const vf pair = splat_pair(pairs + 2 * m);
+                            for (int h = 0; h < 16 / W; h++) acc[h][m & 1] = fma(pair, load(basis[m] + h * W), acc[h][m & 1]);
+                            if (EXTRA) {
+                                const vf weight = splat(pairs[2 * m + 1]);
+                                for (int h = 0; h < EXTRA / W; h++) rest[h] = fma(weight, load(basis[m] + 16 + h * W), rest[h]);
+                            }
+                        }
+                        for (int h = 0; h < 16 / W; h++) store(record + h * W, acc[h][0] + acc[h][1]);
+                        for (int h = 0; h < EXTRA / W; h++) store(record + 16 + h * W, rest[h]);
+                    }
+                    if (!any(ge(T, stop))) break;
+                }
+            }
+            finish(s, tile);
+        }
+        fence();                                      // records may have been streamed
+    }
+}
+
+// Sum W splats' per-tile records in slot order and turn them to lanes, sums[column][lane]; `slot` walks on.
+template <int RECORD> SIGMA_INLINE void reduce_records(const Render& r, int64_t i, int& slot, float (*sums)[W]) {
+    constexpr int PARTS = RECORD / W;
+    vf turn[PARTS][W];
+    for (int l = 0; l < W; l++) {
+        const int count = i + l < r.n ? r.tiles_of[i + l] : 0;
+        for (int h = 0; h < PARTS; h++) turn[h][l] = splat(0.f);
+        for (int q = 0; q < count; q++, slot++)
+            for (int h = 0; h < PARTS; h++) turn[h][l] += load(&r.partials[size_t(slot) * RECORD + h * W]);
+    }
+    for (int h = 0; h < PARTS; h++) {
+        transpose(turn[h]);
+        for (int c = 0; c < W; c++) store(sums[h * W + c], turn[h][c]);
+    }
+}
+
+// ∂L/∂feature c of W splats, from their reduced records.
+SIGMA_INLINE vf weight_sum(const float (*sums)[W], int c) { return load(sums[c < 8 ? 2 * c + 1 : 8 + c]); }
+
+// ∂L/∂(mean, conic) of W splats: power = −½(p² + q²), so every derivative is a moment of g about the splat's mean.
+struct Moments { vf m[6]; };                           // Σ g·{1, x, y, xx, xy, yy} about the splat's mean
+SIGMA_INLINE Moments moments_of(const float (*sums)[W]) {
+    Moments a;
+    for (int q = 0; q < 6; q++) a.m[q] = load(sums[2 * q]);
+    return a;
+}
+SIGMA_INLINE FootprintGradient<vf> footprint_gradient(const Moments& moments, vf l1, vf l2, vf l3) {
+    const vf *m = moments.m, mx = m[1], my = m[2], mxx = m[3], mxy = m[4], myy = m[5];
+    FootprintGradient<vf> g;
+    const vf p = l1 * mx + l2 * my;
+    g.u = l1 * p;
+    g.v = l2 * p + l3 * l3 * my;
+    g.l1 = -(l1 * mxx + l2 * mxy);
+    g.l2 = -(l1 * mxy + l2 * myy);
+    g.l3 = -l3 * myy;
+    g.z = splat(0.f);
+    return g;
+}
