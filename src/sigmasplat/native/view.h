@@ -156,7 +156,7 @@ static void view_forward(Context* context, const float* view_numbers, const floa
 }
 
 // Chain the reduced records of all splats to the pose twist, and to rows of parameters: where any of W splats is seen,
-// `sink(i, seen, splats, gradient lanes, parameter lanes)` takes what ∂L/∂params is; `unseen(i)` hears of the others.
+// `sink(i, seen, splats, gradient lanes)` takes what ∂L/∂params is; `unseen(i)` hears of the others.
 template <int K, bool MOMENT, class Sink, class Unseen>
 static void chain_to_params(const Render& r, const float* params, double* g_twist, Sink sink, Unseen unseen) {
     constexpr int RECORD = record_floats<K, MOMENT>;
