@@ -17,17 +17,15 @@ COLUMNS: dict[str, slice] = {
     "log_variances": slice(14, 17),
 }
 WIDTH = 17
+EXTRAS = {"correlations": 3, "harmonics": 45}
+"""What splats may carry besides, and how many numbers of each: off-diagonals of the Cholesky factor of their colour
+covariance (red–green, red–blue, green–blue); spherical harmonics of degrees 1 to 3."""
 
 
 @dataclass(eq=False)
-class GaussianField:
-    """N splats as one float32 tensor `params` [N, 17], columns named in `COLUMNS`.
-
-    means: metres, world (or submap) frame; quats: wxyz, any positive norm; log_scales: log metres; opacity_logits:
-    logit of opacity; colors: RGB in [0, 1]; log_variances: log σ² of observed colour about `colors` (VarSplat §3,
-    s_i). `moment1`, `moment2` are Adam's moments of the same rows, `last_step` [N] int32 says which step last moved
-    each; `steps` counts Adam's steps.
-    """
+class Rows:
+    """Parameters [N, m] of N splats with Adam's state: moments of the same shape; `last_step` [N] int32 says which step
+    last moved each row; `steps` counts Adam's steps."""
 
     params: Tensor
     moment1: Tensor = dataclass_field(default_factory=lambda: torch.empty(0))
@@ -36,14 +34,44 @@ class GaussianField:
     steps: int = 0
 
     def __post_init__(self) -> None:
-        if self.params.ndim != 2 or self.params.shape[1] != WIDTH:
-            raise SigmaSplatError(f"a field needs params [N, {WIDTH}], found {tuple(self.params.shape)}")
         if self.moment1.shape != self.params.shape:
             self.moment1 = torch.zeros_like(self.params)
         if self.moment2.shape != self.params.shape:
             self.moment2 = torch.zeros_like(self.params)
         if len(self.last_step) != len(self.params):
             self.last_step = torch.zeros(len(self.params), dtype=torch.int32)
+
+    def __len__(self) -> int:
+        return len(self.params)
+
+    def join(self, other: "Rows") -> None:
+        """Add another's rows at the end, their optimiser state with them."""
+        self.params = torch.cat([self.params, other.params])
+        self.moment1 = torch.cat([self.moment1, other.moment1])
+        self.moment2 = torch.cat([self.moment2, other.moment2])
+        self.last_step = torch.cat([self.last_step, other.last_step])
+
+    def choose(self, rows: Tensor) -> None:
+        """Keep the rows chosen by a bool mask [N] or an index tensor."""
+        self.params, self.last_step = self.params[rows], self.last_step[rows]
+        self.moment1, self.moment2 = self.moment1[rows], self.moment2[rows]
+
+
+@dataclass(eq=False)
+class GaussianField(Rows):
+    """N splats as one float32 tensor `params` [N, 17], columns named in `COLUMNS`.
+
+    means: metres, world (or submap) frame; quats: wxyz, any positive norm; log_scales: log metres; opacity_logits:
+    logit of opacity; colors: RGB in [0, 1]; log_variances: log σ² of observed colour about `colors` (VarSplat §3,
+    s_i). `extras` holds what only some maps need, by its name in `EXTRAS`, rows of the same splats.
+    """
+
+    extras: dict[str, Rows] = dataclass_field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.params.ndim != 2 or self.params.shape[1] != WIDTH:
+            raise SigmaSplatError(f"a field needs params [N, {WIDTH}], found {tuple(self.params.shape)}")
+        super().__post_init__()
 
     @staticmethod
     def empty() -> "GaussianField":
@@ -77,9 +105,6 @@ class GaussianField:
         params[:, COLUMNS["log_variances"]] = torch.as_tensor(log_variances, dtype=means.dtype)
         return GaussianField(params)
 
-    def __len__(self) -> int:
-        return len(self.params)
-
     @property
     def means(self) -> Tensor:
         """Return positions [N, 3], metres."""
@@ -110,19 +135,22 @@ class GaussianField:
         """Return appearance variances σ² [N, 3] (VarSplat §1)."""
         return self.params[:, COLUMNS["log_variances"]].exp()
 
+    def carry(self, name: str) -> Rows:
+        """Return an extra by its name, zeros where the field had none yet."""
+        if name not in self.extras:
+            self.extras[name] = Rows(self.params.new_zeros(len(self), EXTRAS[name]))
+        return self.extras[name]
+
     def append(self, other: "GaussianField") -> None:
-        """Add another field's rows at the end, their optimiser state with them."""
-        self.params = torch.cat([self.params, other.params])
-        self.moment1 = torch.cat([self.moment1, other.moment1])
-        self.moment2 = torch.cat([self.moment2, other.moment2])
-        self.last_step = torch.cat([self.last_step, other.last_step])
+        """Add another field's splats at the end; extras that only one of them has are 0 for the other's."""
+        for name in {**self.extras, **other.extras}:
+            self.carry(name).join(other.carry(name))
+        self.join(other)
 
     def keep(self, rows: Tensor) -> None:
-        """Keep the rows chosen by a bool mask [N] or an index tensor, drop the others."""
-        self.params = self.params[rows]
-        self.moment1 = self.moment1[rows]
-        self.moment2 = self.moment2[rows]
-        self.last_step = self.last_step[rows]
+        """Keep the splats chosen by a bool mask [N] or an index tensor, drop the others."""
+        for part in (self, *self.extras.values()):
+            part.choose(rows)
 
     def moved(self, T_new_old: Tensor) -> "GaussianField":
         """Return the field carried by a rigid 4×4 transform: positions and rotations move, shapes and looks stay."""

@@ -1,12 +1,7 @@
-"""Hold every setting of a run: frozen dataclasses with units in the names; values of systems live in `presets`."""
+"""Settings of what is done frame by frame: input, render, seeding, mapping, tracking."""
 
-import dataclasses
-import json
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Literal
-
-from sigmasplat.errors import ConfigError
+from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -91,6 +86,8 @@ class MappingConfig:
     lr_pose_translation: float = 0.0
     lr_pose_rotation: float = 0.0
     """Above 0, mapping moves its keyframes' poses too (metres, radians per step); the first stays."""
+    color_covariance: Literal["diagonal", "full"] = "diagonal"
+    """Whether a splat's appearance variance is one number a channel (paper) or a full 3×3 covariance."""
     freeze_old_colors: bool = False
     prune_opacity: float = 0.5
     keyframe_history: int = 0
@@ -140,53 +137,3 @@ class TrackingConfig:
     """Adam stops when a step is below this (metres and radians); 0 = run every iteration."""
     plateau_stop: float = 0.0
     """Either method stops (aligning: a level) when a step changes the loss by less than this share of it; 0 = off."""
-
-
-@dataclass(frozen=True)
-class Config:
-    """A whole run. Every value has a working default; `presets.preset` fills in those of the published systems."""
-
-    name: str = "custom"
-    seed: int = 0
-    backend: Literal["auto", "cpu", "reference"] = "auto"
-    input: InputConfig = field(default_factory=InputConfig)
-    render: RenderConfig = field(default_factory=RenderConfig)
-    seeding: SeedConfig = field(default_factory=SeedConfig)
-    mapping: MappingConfig = field(default_factory=MappingConfig)
-    tracking: TrackingConfig = field(default_factory=TrackingConfig)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain nested values, as written to a run's config.json."""
-        return dataclasses.asdict(self)
-
-    def save(self, path: Path) -> None:
-        """Write as JSON."""
-        path.write_text(json.dumps(self.to_dict(), indent=2) + "\n")
-
-    @staticmethod
-    def from_dict(values: dict[str, Any]) -> "Config":
-        """Rebuild from nested values. Raises ConfigError on an unknown name."""
-        sections: dict[str, Any] = {}
-        known = {f.name: f for f in dataclasses.fields(Config)}
-        for name, value in values.items():
-            if name not in known:
-                raise ConfigError(f"unknown setting {name!r} (known: {', '.join(known)})")
-            if isinstance(value, dict):
-                section = type(getattr(Config(), name))
-                names = {f.name for f in dataclasses.fields(section)}
-                unknown = set(value) - names
-                if unknown:
-                    raise ConfigError(
-                        f"unknown setting {name}.{sorted(unknown)[0]} (known: {', '.join(sorted(names))})"
-                    )
-                value = section(**value)
-            sections[name] = value
-        return Config(**sections)
-
-    @staticmethod
-    def load(path: Path) -> "Config":
-        """Read a config.json. Raises ConfigError if it is missing, not JSON, or names unknown settings."""
-        try:
-            return Config.from_dict(json.loads(path.read_text()))
-        except (OSError, json.JSONDecodeError) as problem:
-            raise ConfigError(f"cannot read settings from {path}: {problem}") from problem

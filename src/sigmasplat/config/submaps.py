@@ -1,0 +1,90 @@
+"""Settings of what is done submap by submap: cutting, loops, registration, the final map."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class SubmapConfig:
+    """When the active submap is finished and the next one begun: asked at each keyframe (VarSplat §2)."""
+
+    distance_m: float = 0.0
+    """Farther than this from the submap's first pose; 0 = off, as below. With all four off the map is one submap."""
+    angle_deg: float = 0.0
+    """… or turned by more than this from it."""
+    frames: int = 0
+    """… or so many frames after it."""
+    uncertainty_m: float = 0.0
+    """… or tracking has lost so much of its hold: standard deviation of the camera's position in the submap, summed up
+    from keyframe to keyframe (`slam.drift`)."""
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """Which submaps may show one place (VarSplat §4)."""
+
+    close: bool = True
+    """Whether loops are looked for at all."""
+    descriptor: Literal["grid", "netvlad"] = "grid"
+    """grid: built in (`slam.descriptors.OrientationGrid`); netvlad: from the file `weights`."""
+    weights: str = ""
+    min_similarity: float = 0.5
+    """A submap's own views are this share alike: which of their similarities is the threshold."""
+    min_interval: int = 2
+    """Submaps nearer than this in the sequence are neighbours, not loops."""
+    similarity_floor: float = 0.0
+    """No pair less alike than this is tried, however unlike a submap's own views are."""
+    most: int = 4
+    """At most so many pairs are registered per finished submap, the most alike first; 0 = no limit."""
+    uncertainty: bool = True
+    """Gate similarity by the variance-weighted opacity ratio; off = LoopSplat."""
+    tau: float = 10.0
+    weight_max: float = 3.0
+
+
+@dataclass(frozen=True)
+class RegistrationConfig:
+    """How two submaps are laid onto each other, and when that is believed (VarSplat §5)."""
+
+    keyframes: int = 2
+    """Of each submap so many keyframes are localised in the other one."""
+    iterations: int = 100
+    lr_rotation: float = 1.5e-2
+    lr_translation: float = 5e-3
+    plateau_stop: float = 1e-4
+    exposure: bool = True
+    weight_color: float = 0.95
+    uncertainty: bool = True
+    """Weigh pixels by the other submap's V; off = LoopSplat."""
+    tau: float = 50.0
+    weight_max: float = 3.0
+    overlap_least: float = 0.2
+    """Refused where fewer of the splats than this have a neighbour within `overlap_m` in the other submap."""
+    overlap_m: float = 0.1
+    agreement_least: float = 0.8
+    """A localisation counts if this share of the surfaces in common agrees in depth …"""
+    share_least: float = 0.3
+    """… and the other submap explains this share of the readings."""
+    spread_m: float = 0.1
+    spread_deg: float = 5.0
+    """Refused where localisations that count differ from their mean by more than this, or fewer than two count."""
+
+
+@dataclass(frozen=True)
+class FinalConfig:
+    """The global map, made of all submaps once the frames have ended (VarSplat §7)."""
+
+    seed_from: Literal["submaps", "mesh"] = "submaps"
+    """submaps: their splats as they are; mesh: new ones on the fused surface (paper)."""
+    iterations: int = 0
+    """Steps of refinement over all keyframes; 0 = none."""
+    sh_degree: int = 0
+    """Degree of view-dependent colour reached in refinement, 0 to 3."""
+    sh_every: int = 1000
+    """One degree more each so many steps."""
+    spacing_m: float = 0.02
+    """Distance of splats seeded on the mesh."""
+    prune_every: int = 500
+    prune_opacity: float = 0.005
+    uncertainty: bool = True
+    """Merge by variance, keep σ² and its likelihood in refinement; off = paper."""

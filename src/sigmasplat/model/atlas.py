@@ -1,0 +1,53 @@
+"""Know where everything is: submaps in the world, keyframes in submaps, frames beside keyframes."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.model import se3
+
+Matrix = NDArray[np.float64]
+
+
+class Place(NamedTuple):
+    """Where a frame was seen from: beside which keyframe of which submap, both counted from 0."""
+
+    submap: int
+    keyframe: int
+    T_keyframe_camera: Matrix
+
+
+@dataclass(eq=False)
+class Atlas:
+    """Poses of submaps, keyframes and frames, each relative to the one before: world poses are worked out on reading.
+
+    anchors: T_world_submap of each submap, the first one the identity; closing a loop changes these and nothing else.
+    keyframes: T_submap_camera of each submap's keyframes; those of the last submap change while it is mapped.
+    places: of each frame.
+    """
+
+    anchors: list[Matrix] = field(default_factory=list)
+    keyframes: list[list[Matrix]] = field(default_factory=list)
+    places: list[Place] = field(default_factory=list)
+
+    def begin_submap(self, T_world_submap: Matrix) -> None:
+        """Take note of a new submap at the end."""
+        self.anchors.append(se3.orthonormalise(T_world_submap))
+        self.keyframes.append([])
+
+    def place_frame(self, T_submap_camera: Matrix) -> None:
+        """Take note of the next frame, in the last submap, beside its newest keyframe."""
+        T_keyframe_camera = se3.inverse(self.keyframes[-1][-1]) @ T_submap_camera
+        place = Place(len(self.anchors) - 1, len(self.keyframes[-1]) - 1, se3.orthonormalise(T_keyframe_camera))
+        self.places.append(place)
+
+    def T_world_camera(self) -> Matrix:
+        """Return the poses of all frames [F, 4, 4]."""
+        poses = [self.anchors[s] @ self.keyframes[s][k] @ T_keyframe_camera for s, k, T_keyframe_camera in self.places]
+        return np.array(poses).reshape(-1, 4, 4)
+
+    def T_world_keyframe(self, submap: int) -> Matrix:
+        """Return the poses of a submap's keyframes [K, 4, 4]."""
+        return np.array([self.anchors[submap] @ T for T in self.keyframes[submap]]).reshape(-1, 4, 4)

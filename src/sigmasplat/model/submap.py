@@ -1,0 +1,87 @@
+"""Hold a finished piece of the map, and say where finished pieces are put."""
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import GaussianField
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What a keyframe saw: color [H, W, 3] uint8 RGB, depth_m [H, W] float32 metres, 0 = no reading."""
+
+    color: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Submap:
+    """A finished piece of the map in its own frame, which is its first keyframe's camera.
+
+    field: its splats; frames [K]: which frames of the sequence are its keyframes; T_submap_camera [K, 4, 4] their
+    poses; camera: of all their pictures, which a `SubmapStore` keeps. Where it lies in the world the `Atlas` knows.
+    """
+
+    index: int
+    field: GaussianField
+    frames: tuple[int, ...]
+    T_submap_camera: Matrix
+    camera: Camera
+
+
+class SubmapStore(Protocol):
+    """Where finished submaps are kept; numbers count from 0 in the order of saving."""
+
+    def __len__(self) -> int: ...
+
+    def save(self, submap: Submap, pictures: list[Picture]) -> None:
+        """Keep a submap and its keyframes' pictures, for good: nothing changes a finished submap."""
+
+    def load(self, index: int) -> Submap:
+        """Return a submap, in memory of its own."""
+        ...
+
+    def picture(self, index: int, keyframe: int) -> Picture:
+        """Return what one keyframe of a submap saw."""
+        ...
+
+
+@dataclass(eq=False)
+class MemoryStore:
+    """Keep submaps in memory: for short runs and where nothing may be written."""
+
+    submaps: list[Submap] = field(default_factory=list)
+    pictures: list[list[Picture]] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.submaps)
+
+    def save(self, submap: Submap, pictures: list[Picture]) -> None:
+        """Keep a submap. Raises SigmaSplatError unless it is the next one and has a picture per keyframe."""
+        refuse_misfit(submap, pictures, len(self))
+        self.submaps.append(submap)
+        self.pictures.append(pictures)
+
+    def load(self, index: int) -> Submap:
+        """Return a submap."""
+        return self.submaps[index]
+
+    def picture(self, index: int, keyframe: int) -> Picture:
+        """Return what one keyframe of a submap saw."""
+        return self.pictures[index][keyframe]
+
+
+def refuse_misfit(submap: Submap, pictures: list[Picture], next_index: int) -> None:
+    """Raise SigmaSplatError if a submap is not the next one to keep, or its keyframes and pictures do not match."""
+    if submap.index != next_index:
+        raise SigmaSplatError(f"submap {submap.index} cannot be kept: the next one is {next_index}")
+    if not len(submap.frames) == len(submap.T_submap_camera) == len(pictures):
+        counts = f"{len(submap.frames)} frames, {len(submap.T_submap_camera)} poses, {len(pictures)} pictures"
+        raise SigmaSplatError(f"submap {submap.index} cannot be kept: {counts}")
