@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
-from accuracy_tables import spread, values_of
+from accuracy_tables import PLACE, spread, values_of
 from numpy.typing import NDArray
 from scipy.stats import chi2
 from tables import Section, significant
@@ -21,14 +21,7 @@ NAMES = {
     "align": "Gauss–Newton",
 }
 ERRORS = ("translation_cm", "rotation_deg")
-RUN = (
-    ("ATE, cm", "ate_m", 100.0),
-    ("RPE, cm", "rpe_m", 100.0),
-    ("RPE, °", "rpe_deg", 1.0),
-    ("lost", "lost", 1.0),
-    ("frames", "frames", 1.0),
-    ("frames/s", "frames_per_s", 1.0),
-)
+RUN = PLACE[:6]
 """Title, name of the figure, factor."""
 ERROR_FACTOR, TIME_FACTOR, COVERED = 1.1, 20.0, 0.9
 """Issue 3: Gauss–Newton's median error ≤ 1.1 × Adam's at ≤ 1/20 of its time; NEES inside the band on 90 % of frames."""

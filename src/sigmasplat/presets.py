@@ -5,13 +5,23 @@ which is LoopSplat's front end (arXiv 2408.10154). `*-fast` are ours, sized for 
 """
 
 import dataclasses
-import difflib
-import math
-from collections.abc import Iterable, Mapping
-from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from sigmasplat.config import Config, InputConfig, MappingConfig, SeedConfig, TrackingConfig
+from sigmasplat.config import (
+    Config,
+    FinalConfig,
+    InputConfig,
+    LoopConfig,
+    MappingConfig,
+    RegistrationConfig,
+    SeedConfig,
+    SubmapConfig,
+    TrackingConfig,
+)
+from sigmasplat.config.text import nearest
 from sigmasplat.errors import ConfigError
+
+PAPER_FINAL = FinalConfig(seed_from="mesh", iterations=30_000, sh_degree=3, uncertainty=False)
+"""VarSplat §7: V is unused there."""
 
 # Synthetic, exact depth. Ours: max_depth_m (the PNGs end at 10 m) and no masks, which the paper leaves open.
 REPLICA = Config(
@@ -45,6 +55,9 @@ REPLICA = Config(
         alpha_above=0.0,
         outlier_factor=0.0,
     ),
+    submaps=SubmapConfig(distance_m=0.5, angle_deg=50.0),
+    registration=RegistrationConfig(lr_translation=1e-3, lr_rotation=3e-3, tau=10.0),
+    final=PAPER_FINAL,
 )
 
 # Kinect v1. Ours: max_depth_m, beyond which its readings scatter by 10 cm. The masks are the paper's options, on.
@@ -79,10 +92,14 @@ TUM = Config(
         alpha_above=0.98,
         outlier_factor=50.0,
     ),
+    submaps=SubmapConfig(distance_m=0.5, angle_deg=50.0),
+    final=PAPER_FINAL,
 )
 
-# As TUM, with exposure. Ours: tau, which the paper gives for Replica and TUM only.
-SCANNET = dataclasses.replace(TUM, tracking=dataclasses.replace(TUM.tracking, exposure=True))
+# As TUM, with exposure and submaps of 50 frames. Ours: tau, which the paper gives for Replica and TUM only.
+SCANNET = dataclasses.replace(
+    TUM, tracking=dataclasses.replace(TUM.tracking, exposure=True), submaps=SubmapConfig(frames=50)
+)
 
 # Two CPU cores. λ_d, λ_r, the 0.8 L1 + 0.2 SSIM, σ²'s start, w_max and tau are the paper's (Replica). Ours, and why:
 FAST = Config(
@@ -121,6 +138,13 @@ FAST = Config(
         tau=10.0,
         weight_max=3.0,
     ),
+    submaps=SubmapConfig(
+        distance_m=1.0,
+        angle_deg=60.0,
+        inherit=True,  # a new submap from nothing costs two seconds of first iterations
+    ),
+    loops=LoopConfig(similarity_floor=0.8),  # what the built-in descriptor needs: it knows no places, only shapes
+    registration=RegistrationConfig(iterations=20, lr_translation=1e-3, lr_rotation=1e-3, tau=10.0),
 )
 
 DATASETS = {"replica": REPLICA, "tum": TUM, "scannet": SCANNET, "fast": FAST}
@@ -132,6 +156,9 @@ def _without_uncertainty(config: Config) -> Config:
         config,
         tracking=dataclasses.replace(config.tracking, uncertainty=False),
         mapping=dataclasses.replace(config.mapping, weight_nll_color=0.0, weight_nll_depth=0.0),
+        loops=dataclasses.replace(config.loops, uncertainty=False),
+        registration=dataclasses.replace(config.registration, uncertainty=False),
+        final=dataclasses.replace(config.final, uncertainty=False),
     )
 
 
@@ -155,80 +182,5 @@ def list_presets() -> list[str]:
 def preset(name: str) -> Config:
     """Return a preset's settings. Raises ConfigError on an unknown name, saying which there are."""
     if name not in PRESETS:
-        raise ConfigError(f"no preset {name!r}{_nearest(name, PRESETS)}; there are {', '.join(list_presets())}")
+        raise ConfigError(f"no preset {name!r}{nearest(name, PRESETS)}; there are {', '.join(list_presets())}")
     return PRESETS[name]
-
-
-def override(config: Config, settings: Mapping[str, str]) -> Config:
-    """Return the settings with some replaced, as in {"tracking.iterations": "60", "seed": "1"}; text becomes its type.
-
-    Raises ConfigError on an unknown name (saying which there are), text that is not of the type, a negative number.
-    """
-    for name, text in settings.items():
-        section, _, field = name.rpartition(".")
-        if not section:
-            config = _replaced(config, name, name, text)
-            continue
-        inner = getattr(config, section, None)
-        if not dataclasses.is_dataclass(inner) or isinstance(inner, type):
-            sections = [f.name for f in dataclasses.fields(config) if dataclasses.is_dataclass(getattr(config, f.name))]
-            raise ConfigError(f"unknown setting {name!r}{_nearest(section, sections)}; sections: {', '.join(sections)}")
-        config = dataclasses.replace(config, **{section: _replaced(inner, field, name, text)})
-    return config
-
-
-def split_settings(settings: Iterable[str]) -> dict[str, str]:
-    """Split SECTION.NAME=VALUE at the equals sign; of a name given twice the last counts. Raises ConfigError."""
-    pairs = [setting.partition("=") for setting in settings]
-    for name, equals, _ in pairs:
-        if not equals:
-            raise ConfigError(f"a setting is SECTION.NAME=VALUE, found {name!r}")
-    return {name.strip(): value for name, _, value in pairs}
-
-
-def _replaced(section: Any, field: str, name: str, text: str) -> Any:
-    """Return a section with one value replaced; `name` is how the user called it."""
-    types = {known: kind for known, kind in get_type_hints(type(section)).items() if not dataclasses.is_dataclass(kind)}
-    if field not in types:
-        raise ConfigError(f"unknown setting {name!r}{_nearest(field, types)}; there are {', '.join(types)}")
-    return dataclasses.replace(section, **{field: _converted(name, types[field], text.strip())})
-
-
-def _converted(name: str, kind: Any, text: str) -> Any:
-    """Turn text into a setting's type. Raises ConfigError."""
-    if get_origin(kind) is Literal:
-        return _chosen(name, {str(value): value for value in get_args(kind)}, text)
-    if kind is bool:
-        words = {
-            "true": True,
-            "1": True,
-            "yes": True,
-            "on": True,
-            "false": False,
-            "0": False,
-            "no": False,
-            "off": False,
-        }
-        return _chosen(name, words, text.lower())
-    if kind is str:
-        return text
-    try:
-        value = kind(text)
-    except ValueError:
-        wanted = "a whole number" if kind is int else "a number"
-        raise ConfigError(f"{name} needs {wanted}, found {text!r}") from None
-    if not math.isfinite(value) or value < 0:
-        raise ConfigError(f"{name} must be finite and not negative, found {text!r}")
-    return value
-
-
-def _chosen(name: str, allowed: Mapping[str, Any], text: str) -> Any:
-    if text not in allowed:
-        raise ConfigError(f"{name} must be one of {', '.join(allowed)}, found {text!r}")
-    return allowed[text]
-
-
-def _nearest(name: str, known: Mapping[str, Any] | list[str]) -> str:
-    """Suggest the known name that a misspelt one resembles."""
-    close = difflib.get_close_matches(name, list(known), 1)
-    return f" (did you mean {close[0]}?)" if close else ""

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings, strategies as st
 
 from sigmasplat.model import se3
-from sigmasplat.model.field import quaternion_of, quaternion_product
+from sigmasplat.model.field import left_factor, quaternion_of, transformed
 from splat_oracle import depths, flat, jacobian
 from splat_scenes import SMALL, Scene, assert_same_vector, make, probe, render, scene, twist_gradient
 
@@ -40,7 +40,7 @@ def test_moving_field_and_camera_together_changes_nothing(backend: Any, kind: st
     moved = replace(
         s,
         means=(s.means.double() @ move[:3, :3].T + move[:3, 3]).float(),
-        quats=quaternion_product(quaternion_of(move[:3, :3]), s.quats.double()).float(),
+        quats=transformed(s.quats.double(), left_factor(quaternion_of(move[:3, :3]))).float(),
         T_camera_world=(s.T_camera_world.double() @ back).float(),
     )
     a, b = render(backend, s)[1], render(backend, moved)[1]

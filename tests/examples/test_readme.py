@@ -16,8 +16,9 @@ import sigmasplat
 import sigmasplat.sources
 from documents import DOCUMENTS, ROOT, blocks
 from sigmasplat import cli
+from sigmasplat.config.text import override
 from sigmasplat.io.runs import FILES, RunFolder
-from sigmasplat.presets import override, preset
+from sigmasplat.presets import preset
 from sigmasplat.sources import open_source
 from sigmasplat.sources.opening import formats
 

@@ -10,8 +10,9 @@ import pytest
 
 from sigmasplat import env
 from sigmasplat.config import Config
+from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError
-from sigmasplat.presets import default_preset, list_presets, override, preset, split_settings
+from sigmasplat.presets import default_preset, list_presets, preset
 
 
 def test_presets_hold_the_papers_numbers() -> None:
@@ -49,9 +50,11 @@ def test_the_baseline_differs_by_uncertainty_alone(dataset: str) -> None:
         for name, value in values.items()
         if baseline[section][name] != value
     }
-    weights = {"tracking.uncertainty", "mapping.weight_nll_color", "mapping.weight_nll_depth"}
-    assert {"tracking.uncertainty", "mapping.weight_nll_color"} <= differing <= weights
-    assert not baseline["tracking"]["uncertainty"]
+    switches = {"tracking.uncertainty", "loops.uncertainty", "registration.uncertainty"}
+    optional = {"mapping.weight_nll_depth", "final.uncertainty"}
+    always = {*switches, "mapping.weight_nll_color"}
+    assert always <= differing <= always | optional
+    assert not any(baseline[name.partition(".")[0]]["uncertainty"] for name in (*switches, "final.uncertainty"))
     assert baseline["mapping"]["weight_nll_color"] == baseline["mapping"]["weight_nll_depth"] == 0.0
 
 

@@ -8,7 +8,7 @@ import torch
 
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.io.ply import SH_C0, read_field, write_field
-from sigmasplat.model.field import GaussianField
+from sigmasplat.model.field import GaussianField, Rows
 
 
 def random_field(n: int = 50, seed: int = 0) -> GaussianField:
@@ -52,10 +52,57 @@ def test_layout_is_that_of_3dgs(tmp_path: Path) -> None:
     assert [values[f"rot_{i}"] for i in range(4)] == [0.5, 0.5, -0.5, 0.5]
 
 
-def other_programs_ply(path: Path, order: str, drop: str = "", rows: int = 3) -> None:
+def test_harmonics_are_written_as_3dgs_does_and_read_back(tmp_path: Path) -> None:
+    """f_rest after f_dc: all fifteen of red, then green, then blue; the rest of the file as without."""
+    field = random_field(5)
+    write_field(tmp_path / "plain.ply", field)
+    k = torch.randn(5, 45, generator=torch.Generator().manual_seed(1))
+    field.extras["harmonics"] = Rows(k)
+    write_field(tmp_path / "shiny.ply", field)
+    plain, shiny = ((tmp_path / name).read_bytes() for name in ("plain.ply", "shiny.ply"))
+    names = [line.split()[2] for line in header_of(shiny) if line.startswith("property float")]
+    rest = [f"f_rest_{i}" for i in range(45)]
+    assert names[6:10] == ["f_dc_0", "f_dc_1", "f_dc_2", "f_rest_0"] and names[9:54] == rest
+    tables = []
+    for data in (plain, shiny):
+        columns = [line.split()[2] for line in header_of(data) if line.startswith("property float")]
+        tables.append(np.frombuffer(data[data.index(b"end_header\n") + 11 :], [(n, "<f4") for n in columns]))
+    assert [n for n in names if n not in rest] == list(tables[0].dtype.names or ())
+    assert all((tables[0][n] == tables[1][n]).all() for n in tables[0].dtype.names or ())
+    for channel, harmonic in ((0, 0), (1, 0), (2, 14), (1, 7)):
+        assert (tables[1][f"f_rest_{15 * channel + harmonic}"] == k[:, 3 * harmonic + channel].numpy()).all()
+    back = read_field(tmp_path / "shiny.ply")
+    assert torch.equal(back.extras["harmonics"].params, k) and not read_field(tmp_path / "plain.ply").extras
+
+
+@pytest.mark.parametrize(("given", "each"), [(9, 3), (24, 8), (45, 15)])
+def test_harmonics_of_lower_degrees_are_read(tmp_path: Path, given: int, each: int) -> None:
+    other_programs_ply(tmp_path / "other.ply", "<", rest=given)
+    k = read_field(tmp_path / "other.ply").extras["harmonics"].params
+    assert k.shape == (3, 45) and torch.count_nonzero(k[:, 3 * each :]) == 0
+    first = 10  # column of f_rest_0, whose value in row 0 is its number
+    assert k[0, :3].tolist() == [first, first + each, first + 2 * each] and k[0, 3 * each - 1] == first + given - 1
+
+
+@pytest.mark.parametrize("given", [1, 12, 46])
+def test_another_number_of_harmonics_is_refused(tmp_path: Path, given: int) -> None:
+    other_programs_ply(tmp_path / "other.ply", "<", rest=given)
+    with pytest.raises(SourceError, match=f"has {given} columns f_rest, expected 0 or f_rest_0 to 8, 23 or 44"):
+        read_field(tmp_path / "other.ply")
+
+
+def test_harmonics_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    field = random_field()
+    field.carry("harmonics").params[4, 44] = float("nan")
+    write_field(tmp_path / "map.ply", field)
+    with pytest.raises(SourceError, match=r"splat 4 holds nan or inf \(1 of 50 splats do\)"):
+        read_field(tmp_path / "map.ply")
+
+
+def other_programs_ply(path: Path, order: str, drop: str = "", rows: int = 3, rest: int = 45) -> None:
     """Write a map as the 3DGS reference does: with f_rest and another order of columns, after comments."""
     names = ["rot_0", "rot_1", "rot_2", "rot_3", "x", "y", "z", *(f"f_dc_{i}" for i in range(3)),
-             *(f"f_rest_{i}" for i in range(45)), "opacity", "scale_0", "scale_1", "scale_2"]  # fmt: skip
+             *(f"f_rest_{i}" for i in range(rest)), "opacity", "scale_0", "scale_1", "scale_2"]  # fmt: skip
     names = [name for name in names if name != drop]
     table = np.zeros(rows, [(name, f"{order}f8" if name == "x" else f"{order}f4") for name in names])
     for i, name in enumerate(names):

@@ -12,7 +12,8 @@ from sigmasplat.errors import ConfigError
 from sigmasplat.fit import losses
 
 H, W = 24, 31
-IMAGE_TERMS = ("l1", "ssim", "depth", "nll_color", "nll_depth", "moment")
+IMAGE_TERMS = ("l1", "ssim", "depth", "nll_color", "nll_color_full", "nll_depth", "moment")
+RENDERED = ("color", "depth", "variance", "covariance", "moment")
 
 
 def maps(seed: int = 0, valid: Tensor | None = None) -> dict[str, Tensor]:
@@ -24,7 +25,14 @@ def maps(seed: int = 0, valid: Tensor | None = None) -> dict[str, Tensor]:
 
     rendered = {"color": leaf(H, W, 3), "depth": leaf(H, W), "variance": leaf(H, W, 3), "moment": leaf(H, W)}
     target = {"color_target": leaf(H, W, 3).detach(), "depth_target": leaf(H, W).detach(), "scales": leaf(7, 3)}
+    rendered["covariance"] = six(rng.normal(size=(H, W, 3, 3))).requires_grad_()
     return rendered | target | {"valid": torch.ones(H, W, dtype=torch.bool) if valid is None else valid}
+
+
+def six(factor: Any) -> Tensor:
+    """Write 0.1 F Fᵀ + 0.05 I of F [..., 3, 3] as (rr, gg, bb, rg, rb, gb) [..., 6]."""
+    V = torch.as_tensor(0.1 * factor @ np.swapaxes(factor, -1, -2) + 0.05 * np.eye(3))
+    return torch.stack([V[..., i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))], -1)
 
 
 def half() -> Tensor:
@@ -53,13 +61,13 @@ def test_depth_without_reading_is_masked_even_if_called_valid() -> None:
 def test_invalid_pixels_reach_neither_value_nor_gradient(name: str, poison: float) -> None:
     clean, dirty = maps(valid=half()), maps(valid=half())
     with torch.no_grad():
-        for key in ("color", "depth", "variance", "moment", "color_target", "depth_target"):
+        for key in (*RENDERED, "color_target", "depth_target"):
             dirty[key][:, : W // 2] = poison
     values = [losses.total({name: 1.0}, m) for m in (clean, dirty)]
     assert values[0].item() == values[1].item()
     values[0].backward()
     values[1].backward()
-    for key in ("color", "depth", "variance", "moment"):
+    for key in RENDERED:
         a, b = clean[key].grad, dirty[key].grad
         assert (a is None) == (b is None)
         if a is not None and b is not None:
@@ -72,7 +80,7 @@ def test_empty_mask_gives_zero_with_zero_gradient(name: str) -> None:
     value = losses.total({name: 1.0}, m)
     value.backward()
     assert value.item() == pytest.approx(0.0, abs=1e-15)
-    for key in ("color", "depth", "variance", "moment"):
+    for key in RENDERED:
         assert m[key].grad is None or torch.count_nonzero(m[key].grad) == 0
 
 
@@ -137,16 +145,75 @@ def test_nll_bears_variance_below_zero_by_rounding_without_changing_the_map() ->
     assert torch.equal(m["variance"], before)
 
 
+def test_full_nll_is_the_gaussian_one_and_trains_covariance_only() -> None:
+    m = maps(valid=half())
+    value = losses.total({"nll_color_full": 1.0}, m)
+    r, v = ((m[k].detach()[half()]) for k in ("color", "covariance"))
+    r = r - m["color_target"][half()]
+    V = v[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3) + losses.NLL_EPS * torch.eye(3, dtype=torch.float64)
+    normal = torch.distributions.MultivariateNormal(torch.zeros_like(r), V).log_prob(r)
+    want = -normal.mean().item() / 3 - 0.5 * np.log(2 * np.pi)
+    assert value.item() == pytest.approx(want, rel=1e-9)
+    value.backward()
+    assert m["color"].grad is None and m["covariance"].grad is not None
+
+
+def test_full_nll_of_a_diagonal_is_the_diagonal_one() -> None:
+    """Value and gradient by the variances, with V below 0 by rounding among them."""
+    m = maps(valid=half())
+    with torch.no_grad():
+        m["variance"][0, -5:] = torch.tensor([-1e-7, 0.3, 0.2])
+        m["covariance"].zero_()[..., :3] = m["variance"]
+    values = [losses.total({name: 1.0}, m) for name in ("nll_color", "nll_color_full")]
+    assert values[0].item() == pytest.approx(values[1].item(), rel=1e-12)
+    (values[0] + values[1]).backward()
+    assert m["variance"].grad is not None and m["covariance"].grad is not None
+    torch.testing.assert_close(m["covariance"].grad[..., :3], m["variance"].grad, rtol=1e-9, atol=1e-15)
+
+
+def test_full_nll_is_least_where_the_covariance_is_that_of_the_residuals() -> None:
+    rng = np.random.default_rng(3)
+    residuals = torch.as_tensor(0.2 * rng.normal(size=(H, W, 3)) @ (np.eye(3) + 0.5 * rng.uniform(size=(3, 3))))
+    own = (residuals[..., :, None] * residuals[..., None, :]).mean((0, 1)) - losses.NLL_EPS * torch.eye(
+        3, dtype=torch.float64
+    )
+    V = own[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].requires_grad_()
+    target, valid = torch.zeros(H, W, 3, dtype=torch.float64), torch.ones(H, W, dtype=torch.bool)
+    losses.nll_color_full(residuals, target, V.expand(H, W, 6), valid).backward()
+    assert V.grad is not None and float(V.grad.abs().max()) < 1e-12
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_full_nll_bears_what_rounding_makes_of_a_covariance(dtype: torch.dtype) -> None:
+    """Nothing at all, one direction only, and indefinite by a rounding error: finite, with finite gradients."""
+    m = {name: x.detach().to(dtype) if name != "valid" else x for name, x in maps().items()}
+    line = torch.rand(W, 3, dtype=dtype)
+    odd = torch.stack([line[:, i] * line[:, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))], -1)
+    with torch.no_grad():
+        m["covariance"][0] = 0.0
+        m["covariance"][1] = odd
+        m["covariance"][2] = odd + 1e-6 * torch.randn(W, 6, dtype=dtype)
+        m["covariance"][3] = 1e-7 * torch.randn(W, 6, dtype=dtype)
+        m["covariance"][4] = torch.tensor([1e-4, -1e-7, 1e-4, 1e-5, 1e-4, 1e-5])
+    before = m["covariance"].clone()
+    value = losses.total({"nll_color_full": 1.0}, m | {"covariance": m["covariance"].requires_grad_()})
+    value.backward()
+    assert torch.isfinite(value) and m["covariance"].grad is not None and torch.isfinite(m["covariance"].grad).all()
+    assert torch.equal(m["covariance"], before)
+
+
 @pytest.mark.parametrize("name", IMAGE_TERMS)
 def test_gradients_equal_finite_differences(name: str) -> None:
     m = maps(valid=half())
-    trains = {"l1": "color", "ssim": "color", "depth": "depth", "moment": "moment"}.get(name, "variance")
-    direction = torch.tensor(np.random.default_rng(1).normal(size=tuple(m[trains].shape)))
+    trains = {"l1": "color", "ssim": "color", "depth": "depth", "moment": "moment", "nll_color_full": "covariance"}
+    trained = trains.get(name, "variance")
+    direction = torch.tensor(np.random.default_rng(1).normal(size=tuple(m[trained].shape)))
     losses.total({name: 1.0}, m).backward()
-    assert m[trains].grad is not None
-    sides = [losses.total({name: 1.0}, m | {trains: m[trains].detach() + s * 1e-7 * direction}) for s in (1, -1)]
+    gradient = m[trained].grad
+    assert gradient is not None
+    sides = [losses.total({name: 1.0}, m | {trained: m[trained].detach() + s * 1e-7 * direction}) for s in (1, -1)]
     slope = (sides[0] - sides[1]).item() / 2e-7
-    assert (m[trains].grad * direction).sum().item() == pytest.approx(slope, rel=1e-5)
+    assert (gradient * direction).sum().item() == pytest.approx(slope, rel=1e-5)
 
 
 def test_total_weighs_terms_skips_zeros_and_refuses_unknown_names() -> None:

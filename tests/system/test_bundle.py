@@ -9,9 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config
+from sigmasplat.config.text import override
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model import se3
-from sigmasplat.presets import default_preset, override, preset
+from sigmasplat.presets import default_preset, preset
 from sigmasplat.render.view import make_view
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.slam import Slam

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from sigmasplat.config import Config
+from sigmasplat.config.text import override
 from sigmasplat.errors import SourceError
 from sigmasplat.metrics.image import psnr
 from sigmasplat.metrics.trajectory import ate
@@ -16,7 +17,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.presets import default_preset, override, preset
+from sigmasplat.presets import default_preset, preset
 from sigmasplat.render import render
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import SyntheticRoom

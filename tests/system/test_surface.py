@@ -21,10 +21,11 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.mesh import Mesh
+from sigmasplat.model.submap import Picture, Submap
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources import SyntheticRoom, open_source
 from sigmasplat.sources.base import Source
-from sigmasplat.surface import keyframe_poses, reconstruct, working_camera
+from sigmasplat.surface import Recording, reconstruct
 
 CAMERA = Camera(96, 72, 80.0, 80.0, 47.5, 35.5)
 """The run works at half its size."""
@@ -98,8 +99,8 @@ def run(tmp_path: Path) -> RunFolder:
     return run
 
 
-def write_checkpoint(run: RunFolder, keyframes: list[int]) -> None:
-    tensors = {"timestamps_s": torch.arange(6.0).double(), "T_world_camera": torch.from_numpy(poses())}
+def write_checkpoint(run: RunFolder, keyframes: list[int], **more: torch.Tensor) -> None:
+    tensors = {"timestamps_s": torch.arange(6.0).double(), "T_world_camera": torch.from_numpy(poses()), **more}
     run.write_checkpoint(tensors | {"keyframes": torch.tensor(keyframes, dtype=torch.int64)}, {})
 
 
@@ -115,6 +116,36 @@ def test_the_surface_is_where_the_map_shows_it_at_its_keyframes(run: RunFolder) 
     camera = CAMERA.resized(48, 36)
     assert mesh.vertices[:, 0].min() > (11 - camera.cx) / camera.fx * WALL_M - VOXEL_M
     assert mesh.vertices[:, 1].min() > (5 - camera.cy) / camera.fy * WALL_M - VOXEL_M
+
+
+def submap_of(index: int, T_world_submap: np.ndarray, frames: tuple[int, ...]) -> tuple[Submap, list[Picture]]:
+    """Make a submap of keyframes of the run, as many splats in it as says its number."""
+    camera, T = CAMERA.resized(48, 36), np.array([se3.inverse(T_world_submap) @ poses()[i] for i in frames])
+    picture = Picture(np.zeros((36, 48, 3), np.uint8), np.zeros((36, 48), np.float32))
+    return Submap(index, GaussianField(torch.ones(index + 1, 17)), frames, T, camera), [picture] * len(frames)
+
+
+def test_with_submaps_each_keyframe_sees_its_own(run: RunFolder) -> None:
+    """Rendered in the submap's frame, placed by its anchor: the same surface as of the run in one piece."""
+    whole = reconstruct(run, CAMERA, voxel_m=VOXEL_M, renderer=KnownView())
+    anchors = [np.eye(4), se3.exp(np.array([0.3, -0.1, 0.2, 0.1, 0.4, 0.0]))]
+    for index, frames in enumerate(((0, 2), (4,))):
+        run.submaps.save(*submap_of(index, anchors[index], frames))
+    show, seen, told = KnownView(), list[tuple[int, np.ndarray]](), list[tuple[int, int]]()
+
+    def renderer(field: GaussianField, camera: Camera, T_camera_submap: np.ndarray) -> Any:
+        seen.append((len(field), T_camera_submap))
+        return show(field, camera, T_camera_submap @ se3.inverse(anchors[len(field) - 1]))
+
+    with pytest.raises(RunError, match="has 2 submaps, its checkpoint places 0; run it again"):
+        reconstruct(run, CAMERA, renderer=renderer)
+    write_checkpoint(run, KEYFRAMES, T_world_submap=torch.from_numpy(np.stack(anchors)))
+    (run.path / "map.ply").unlink()  # which nothing asks for
+    mesh = reconstruct(run, CAMERA, voxel_m=VOXEL_M, renderer=renderer, progress=lambda *at: told.append(at))
+    assert [splats for splats, _ in seen] == [1, 1, 2] and told == [(1, 3), (2, 3), (3, 3)]
+    np.testing.assert_allclose(seen[2][1], se3.inverse(poses()[4]) @ anchors[1], atol=1e-9)
+    np.testing.assert_allclose(mesh.vertices, whole.vertices, atol=1e-4)
+    np.testing.assert_array_equal(mesh.faces, whole.faces)
 
 
 def test_evaluation_scores_the_mesh_in_the_truths_frame(run: RunFolder) -> None:
@@ -143,7 +174,7 @@ def test_runs_without_keyframes_and_voxels_without_size_are_refused(run: RunFold
         reconstruct(run, CAMERA, voxel_m=0.0, renderer=KnownView())
     write_checkpoint(run, [])
     with pytest.raises(RunError, match="no keyframes in its checkpoint"):
-        keyframe_poses(run)
+        reconstruct(run, CAMERA, renderer=KnownView())
     (run.path / "checkpoint.safetensors").unlink()
     with pytest.raises(RunError, match=r"no checkpoint\.safetensors"):
         reconstruct(run, CAMERA, renderer=KnownView())
@@ -151,7 +182,7 @@ def test_runs_without_keyframes_and_voxels_without_size_are_refused(run: RunFold
 
 def test_the_working_camera_is_that_of_prepared_frames(run: RunFolder) -> None:
     frame = WallAhead().frame(0).prepared(48, 0.1, 4.0)
-    assert working_camera(run, CAMERA) == frame.camera
+    assert Recording.of(run, CAMERA).camera == frame.camera
 
 
 def sigmasplat(*arguments: str) -> int:

@@ -7,12 +7,13 @@ import pytest
 
 from sigmasplat import cli, session
 from sigmasplat.config import Config
+from sigmasplat.config.text import override
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.model import se3
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.presets import default_preset, override, preset
+from sigmasplat.presets import default_preset, preset
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import SyntheticRoom
 from sigmasplat.sources.base import Source

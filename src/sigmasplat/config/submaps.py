@@ -17,6 +17,8 @@ class SubmapConfig:
     uncertainty_m: float = 0.0
     """… or tracking has lost so much of its hold: standard deviation of the camera's position in the submap, summed up
     from keyframe to keyframe (`slam.drift`)."""
+    inherit: bool = False
+    """Begin the next submap with copies of the splats in view, and map them like any; off = from nothing (paper)."""
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig
-from sigmasplat.model.field import COLUMNS, WIDTH, GaussianField
+from sigmasplat.model.field import COLUMNS, EXTRAS, WIDTH, Rows
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
+EXTRA_RATES = {"correlations": ("log_variances", 0.03), "harmonics": ("colors", 1.0 / 20.0)}
+"""The rate of an extra, as a share of that of some columns (harmonics: 3DGS's; correlations: ours, from 0.1 on they fit
+the errors of single pixels, and likelihood on held-out frames falls)."""
+ROWS_AT_ONCE = 8192
+"""So many rows and what is worked out of them fit the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rates:
-    """Learning rates [17], one per column of `GaussianField.params`; 0 freezes a column."""
+    """Learning rates [m], one per column of `GaussianField.params` or of an extra; 0 freezes a column."""
 
     per_column: Tensor
 
@@ -27,25 +32,38 @@ class Rates:
             rates[columns] = getattr(config, f"lr_{name}")
         return Rates(rates)
 
+    def of_extra(self, name: str) -> "Rates":
+        """Return the rates of an extra of a field that has these ones."""
+        columns, share = EXTRA_RATES[name]
+        return Rates(self.per_column.new_full((EXTRAS[name],), share * float(self.per_column[COLUMNS[columns]][0])))
 
-def adam_step(field: GaussianField, grad: Tensor, rates: Rates, visible: Tensor) -> None:
-    """Move the rows of `field.params` in view (bool [N]) against grad [N, 17], in place; `field.steps` is this step.
+
+def adam_step(field: Rows, grad: Tensor, rates: Rates, visible: Tensor) -> None:
+    """Move the rows of `field.params` in view (bool [N]) against grad [N, m], in place; `field.steps` is this step.
 
     Rows out of view wait. What dense Adam would have done to one meanwhile, coast on its decaying moments, is made up
     for when it is seen again (`_catch_up`) or by `settle`. The native kernels do the same, fused (native/adam.h).
     """
-    rows = visible.nonzero().squeeze(1)
+    for rows in torch.split(visible.nonzero().squeeze(1), ROWS_AT_ONCE):
+        adam_rows(field, rows, grad[rows], rates)
+
+
+def adam_rows(field: Rows, rows: Tensor, g: Tensor, rates: Rates) -> None:
+    """Move some rows (indices [n]) against their gradients g [n, m], as `adam_step` does."""
     params, moment1, moment2 = _catch_up(field, rows, rates, field.steps - 1)
-    g = grad[rows]
-    moment1 = BETA1 * moment1 + (1 - BETA1) * g
-    moment2 = BETA2 * moment2 + (1 - BETA2) * g * g
-    unbiased1, unbiased2 = moment1 / (1 - BETA1**field.steps), moment2 / (1 - BETA2**field.steps)
-    field.params[rows] = params - rates.per_column * unbiased1 / (unbiased2.sqrt() + EPSILON)
-    field.moment1[rows], field.moment2[rows], field.last_step[rows] = moment1, moment2, field.steps
+    moment1.lerp_(g, 1 - BETA1)
+    moment2.mul_(BETA2).addcmul_(g, g, value=1 - BETA2)
+    _move(params, moment1, moment2, rates, 1 / (1 - BETA1**field.steps), (1 - BETA2**field.steps) ** -0.5)
+    for all_rows, some in ((field.params, params), (field.moment1, moment1), (field.moment2, moment2)):
+        all_rows.index_copy_(0, rows, some)
+    field.last_step[rows] = field.steps
 
 
-def settle(field: GaussianField, rates: Rates, compiled: bool) -> None:
-    """Bring every row to the present step, as dense Adam would have it: to be called when a fit ends."""
+def settle(field: Rows, rates: Rates, compiled: bool) -> None:
+    """Bring every row to the present step, as dense Adam would have it: to be called when a fit ends.
+
+    `compiled` is for rows of a field's 17 columns only.
+    """
     if compiled:
         from sigmasplat.native import _core
 
@@ -59,7 +77,7 @@ def settle(field: GaussianField, rates: Rates, compiled: bool) -> None:
     field.last_step[rows] = field.steps
 
 
-def _catch_up(field: GaussianField, rows: Tensor, rates: Rates, to: int) -> tuple[Tensor, Tensor, Tensor]:
+def _catch_up(field: Rows, rows: Tensor, rates: Rates, to: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return params and moments of rows as dense Adam without a gradient would have left them after step `to`.
 
     A step without gradient is β₁/√β₂ times the one before it, so that the missed ones add up to a geometric series.
@@ -67,12 +85,22 @@ def _catch_up(field: GaussianField, rows: Tensor, rates: Rates, to: int) -> tupl
     """
     last = field.last_step[rows][:, None].to(field.params)
     missed, ratio, moved = to - last, BETA1 / BETA2**0.5, last > 0
-    steps = torch.where(moved, ratio * (1 - ratio**missed) / (1 - ratio), 0.0)
-    moment1, moment2 = field.moment1[rows], field.moment2[rows]
-    unbiased1 = moment1 / torch.where(moved, 1 - BETA1**last, 1.0)
-    unbiased2 = moment2 / torch.where(moved, 1 - BETA2**last, 1.0)
-    params = field.params[rows] - rates.per_column * steps * unbiased1 / (unbiased2.sqrt() + EPSILON)
-    return params, moment1 * BETA1**missed, moment2 * BETA2**missed
+    params, moment1, moment2 = (x.index_select(0, rows) for x in (field.params, field.moment1, field.moment2))
+    if bool((missed > 0).any()):
+        steps = torch.where(moved, ratio * (1 - ratio**missed) / (1 - ratio), 0.0)
+        unbias1 = steps / torch.where(moved, 1 - BETA1**last, 1.0)
+        _move(params, moment1, moment2, rates, unbias1, torch.where(moved, 1 - BETA2**last, 1.0).rsqrt())
+        moment1.mul_(BETA1**missed)
+        moment2.mul_(BETA2**missed)
+    return params, moment1, moment2
+
+
+def _move(
+    params: Tensor, moment1: Tensor, moment2: Tensor, rates: Rates, unbias1: Tensor | float, unbias2: Tensor | float
+) -> None:
+    """Take Adam's step on rows in place; unbias1, unbias2: what corrects moment1 and the root of moment2."""
+    spread = moment2.sqrt().mul_(unbias2).add_(EPSILON)
+    params.addcmul_((moment1 * unbias1).div_(spread), rates.per_column, value=-1.0)
 
 
 @dataclass(eq=False)

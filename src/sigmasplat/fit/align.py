@@ -56,22 +56,23 @@ class Alignment:
         for H, built of noisy image gradients, is several times too steep. A degenerate direction has `UNKNOWN_M` of
         deviation. Infinite where nothing was in common.
         """
-        n = self.pair.normal_equations(self.T_live_reference)
+        finest = self.pair.level(0)
+        n = normal_equations(finest, self.T_live_reference)
         if n.sums[1] < MIN_PIXELS:
             return np.diag(np.full(6, np.inf))
-        _, directions, decided = _axes(n, self.pair.depth_m)
+        directions, decided = _axes(n, self.pair.depth_m)
         basis, unknown = directions[:, decided], directions[:, ~decided]
-        slope = basis.T @ self._slope() @ basis
+        slope = basis.T @ self._slope(finest) @ basis
         bread = basis @ np.linalg.inv(slope) @ basis.T
         return np.asarray(bread @ n.S @ bread.T + UNKNOWN_M**2 * unknown @ unknown.T)
 
-    def _slope(self) -> Matrix:
+    def _slope(self, finest: "_core.Level") -> Matrix:
         """Differentiate the pull by the twist, by central differences of half a pixel; symmetric."""
         half_rad = 0.5 / self.pair.reference.cameras[0].fx
         steps, D = np.repeat([half_rad * self.pair.depth_m, half_rad], 3), np.zeros((6, 6))
         for k, step in enumerate(steps):
             ahead, behind = (
-                self.pair.normal_equations(se3.exp(sign * step * np.eye(6)[k]) @ self.T_live_reference).b
+                normal_equations(finest, se3.exp(sign * step * np.eye(6)[k]) @ self.T_live_reference).b
                 for sign in (1.0, -1.0)
             )
             D[:, k] = (ahead - behind) / (2.0 * step)
@@ -100,14 +101,6 @@ class Pair:
             live.gray[k], live.depth[k], [c.fx, c.fy, c.cx, c.cy], numbers,
         )  # fmt: skip
 
-    def normal_equations(self, T_live_reference: Matrix) -> "Normal":
-        """Linearise the residuals at a motion on the finest level."""
-        from sigmasplat.native import _core
-
-        H, b, S, sums = np.zeros(21), np.zeros(6), np.zeros(21), np.zeros(4)
-        _core.align_step(self.level(0), T_live_reference, H, b, S, sums)
-        return Normal(_symmetric(H), b, _symmetric(S), sums)
-
 
 @dataclass(eq=False)
 class Normal:
@@ -119,6 +112,15 @@ class Normal:
     S: Matrix
     sums: Matrix
     """Weighted cost, pixels used, pixels in view with depth, pixels agreeing in depth."""
+
+
+def normal_equations(level: "_core.Level", T_live_reference: Matrix) -> Normal:
+    """Linearise the residuals of a level at a motion."""
+    from sigmasplat.native import _core
+
+    H, b, S, sums = np.zeros(21), np.zeros(6), np.zeros(21), np.zeros(4)
+    _core.align_step(level, T_live_reference, H, b, S, sums)
+    return Normal(_symmetric(H), b, _symmetric(S), sums)
 
 
 def align(
@@ -166,14 +168,14 @@ def _usual_depth(reference: Pyramid) -> float:
     return float(read.mean()) if len(read) else 1.0
 
 
-def _axes(n: Normal, depth_m: float) -> tuple[Matrix, Matrix, NDArray[np.bool_]]:
+def _axes(n: Normal, depth_m: float) -> tuple[Matrix, NDArray[np.bool_]]:
     """Split the information into principal directions, rotations measured by the shift they make at the usual depth.
 
-    Returns (eigenvalues [6], directions as columns [6, 6], which ones the images decide [6]) (Zhang et al. 2016).
+    Returns (directions as columns [6, 6], which ones the images decide [6]) (Zhang et al. 2016).
     """
     unit = np.repeat([1.0, 1.0 / depth_m], 3)
     eigenvalues, directions = np.linalg.eigh(n.H * np.outer(unit, unit))
-    return eigenvalues, directions * unit[:, None], eigenvalues > DEGENERATE * max(eigenvalues[-1], 1e-300)
+    return directions * unit[:, None], eigenvalues > DEGENERATE * max(eigenvalues[-1], 1e-300)
 
 
 def _symmetric(upper: Matrix) -> Matrix:

@@ -11,11 +11,13 @@ from torch import Tensor
 from sigmasplat.config import MappingConfig
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates, adam_step, settle
+from sigmasplat.fit.color_covariance import CovarianceView, FullCovarianceStep
 from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.fit.view_dependent import ViewDependentStep
 from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.render.render import variance_of
-from sigmasplat.render.view import CpuView, Matrix, View
+from sigmasplat.render.view import CpuView, Matrix, ReferenceView, View
 
 
 @dataclass
@@ -34,11 +36,13 @@ class FieldFit:
 
 def loss_weights(config: MappingConfig) -> dict[str, float]:
     """List the mapping loss as (term, weight), VarSplat §2: 0.8 L1 + 0.2 (1 − SSIM) + depth + L_reg + NLL."""
+    full = config.color_covariance == "full"
     return {
         "l1": config.weight_l1,
         "ssim": config.weight_ssim,
         "depth": config.weight_depth,
-        "nll_color": config.weight_nll_color,
+        "nll_color": 0.0 if full else config.weight_nll_color,
+        "nll_color_full": config.weight_nll_color if full else 0.0,
         "nll_depth": config.weight_nll_depth,
         "isotropy": config.weight_isotropy,
     }
@@ -51,19 +55,20 @@ def fit_field(
     config: MappingConfig,
     rates: Rates | None = None,
     frozen_colors: int = 0,
+    degree: int = 0,
 ) -> FieldFit:
     """Take one Adam step on the field per keyframe drawn, in the order given; the first `frozen_colors` keep theirs.
 
-    Adam's moments live on from fit to fit. A new splat's start from zero while the bias correction has run out, so its
-    first steps are a few times longer: it has farther to go.
+    degree: of view-dependent colour, fitted too if above 0. Adam's moments live on from fit to fit. A new splat's start
+    from zero while the bias correction has run out, so its first steps are a few times longer: it has farther to go.
     """
     fit, rates, weights = FieldFit(), rates or Rates.of(config), loss_weights(config)
     pose_rates = np.repeat([config.lr_pose_translation, config.lr_pose_rotation], 3)
-    step = _step_for(view, weights)
+    step = _step_for(field, view, weights, degree)
     for keyframe in keyframes:
         field.steps += 1
         t = time.perf_counter()
-        view.forward(field.params, se3.inverse(keyframe.T_world_camera))
+        step.forward(field, se3.inverse(keyframe.T_world_camera))
         t = fit.add("forward", t)
         loss = step.images(keyframe.target, weights)
         t = fit.add("loss", t)
@@ -73,14 +78,24 @@ def fit_field(
         fit.add("backward", t)
         fit.losses.append(loss + regulariser)
     settle(field, rates, compiled=isinstance(view, CpuView))
+    for name, extra in field.extras.items():
+        settle(extra, rates.of_extra(name), compiled=False)
     return fit
 
 
-def _step_for(view: View, weights: dict[str, float]) -> "TorchStep | CompiledStep":
+def _step_for(
+    field: GaussianField, view: View, weights: dict[str, float], degree: int
+) -> "TorchStep | CompiledStep | FullCovarianceStep | ViewDependentStep":
     """Take the fused kernels where they know every term that has weight, else the definition."""
-    if isinstance(view, CpuView) and {name for name, weight in weights.items() if weight} <= COMPILED_TERMS:
-        return CompiledStep(view)
-    return TorchStep(view)
+    step: TorchStep | CompiledStep | FullCovarianceStep = TorchStep(view)
+    compiled = {name for name, weight in weights.items() if weight} <= {*COMPILED_TERMS, "nll_color_full"}
+    if weights["nll_color_full"] and isinstance(view, CpuView | ReferenceView):
+        wide = CovarianceView(view, field.carry("correlations"))
+        fused = compiled and isinstance(view, CpuView)
+        step = FullCovarianceStep(wide, CompiledImages(wide) if fused else TorchStep(wide))
+    elif compiled and isinstance(view, CpuView):
+        step = CompiledStep(view)
+    return ViewDependentStep(step, degree) if degree else step
 
 
 class TorchStep:
@@ -88,6 +103,10 @@ class TorchStep:
 
     def __init__(self, view: View) -> None:
         self.view = view
+
+    def forward(self, field: GaussianField, T_camera_world: Matrix) -> None:
+        """Render the field to the view's planes."""
+        self.view.forward(field.params, T_camera_world)
 
     def images(self, target: Target, weights: dict[str, float]) -> float:
         """Write the gradient of every image term to the view's gradient planes; return the loss."""
@@ -101,9 +120,9 @@ class TorchStep:
             "depth_target": target.depth_image,
             "valid": target.depth_image > 0,
         }
-        if len(planes) == 7:
+        if len(planes) >= 7:
             maps["variance"] = variance_of(sums)
-        used = {n: x for n, x in weights.items() if n != "isotropy" and (len(planes) == 7 or not n.startswith("nll"))}
+        used = {n: x for n, x in weights.items() if n != "isotropy" and (len(planes) >= 7 or not n.startswith("nll"))}
         loss = losses.total(used, maps)
         (self.view.g_sums[:],) = torch.autograd.grad(loss, (planes,))
         return float(loss.detach())
@@ -127,22 +146,22 @@ class TorchStep:
 
 
 COMPILED_TERMS = {"l1", "ssim", "depth", "nll_color", "nll_depth", "isotropy"}
-"""What `CompiledStep` knows; with any other term in play every step is a `TorchStep`."""
+"""What `CompiledImages` knows; with any other term in play, but `nll_color_full`, every step is a `TorchStep`."""
 
 
-class CompiledStep:
-    """The same step fused in the native kernels (tests hold it to `TorchStep`)."""
+class CompiledImages:
+    """The image terms fused in the native kernels, on a view's planes (r, g, b, z[, σ²+c² ×3])."""
 
-    def __init__(self, view: CpuView) -> None:
+    def __init__(self, planes: View) -> None:
         from sigmasplat.native import _core
 
-        self.core, self.view = _core, view
-        self.cache = torch.zeros(_core.ssim_cache_floats(view.camera.width, view.camera.height))
+        self.core, self.planes = _core, planes
+        self.cache = torch.zeros(_core.ssim_cache_floats(planes.camera.width, planes.camera.height))
         self.parts = np.zeros(4)
 
     def images(self, target: Target, weights: dict[str, float]) -> float:
         """Write the gradient of every image term to the view's gradient planes; return the loss."""
-        width, height, sums, g_sums = target.camera.width, target.camera.height, self.view.sums, self.view.g_sums
+        width, height, sums, g_sums = target.camera.width, target.camera.height, self.planes.sums, self.planes.g_sums
         local = [weights[name] for name in ("l1", "depth", "nll_color", "nll_depth")]
         self.core.mapping_losses(
             sums, target.color, target.depth, height, local, target.valid_pixels, g_sums, self.parts
@@ -157,6 +176,18 @@ class CompiledStep:
             )
             loss += weights["ssim"] * (1.0 - similarity)
         return loss
+
+
+class CompiledStep(CompiledImages):
+    """The same step fused in the native kernels (tests hold it to `TorchStep`)."""
+
+    def __init__(self, view: CpuView) -> None:
+        super().__init__(view)
+        self.view = view
+
+    def forward(self, field: GaussianField, T_camera_world: Matrix) -> None:
+        """Render the field to the view's planes."""
+        self.view.forward(field.params, T_camera_world)
 
     def splats(
         self, field: GaussianField, rates: Rates, weight_isotropy: float, frozen_colors: int

@@ -4,7 +4,8 @@ A term is a function registered by `@term`; its name is what a weight is given t
 `total` hands each term its maps by those names, so a new term is one function (and a weight).
 
 Maps: color, color_target [H, W, 3] in [0, 1]; depth, depth_target [H, W] m; variance [H, W, 3] (V, VarSplat §1);
-moment [H, W] m² (U, CG-SLAM eq. 10); valid [H, W] bool, pixels with a depth reading; scales [N, 3] m.
+covariance [H, W, 6] (V with what lies beside its diagonal: rr, gg, bb, rg, rb, gb); moment [H, W] m² (U, CG-SLAM
+eq. 10); valid [H, W] bool, pixels with a depth reading; scales [N, 3] m.
 Every image term is a mean over valid pixels (and channels), SSIM over all pixels of the masked images; without valid
 pixels it is 0 with zero gradient, never NaN.
 """
@@ -121,6 +122,27 @@ def gaussian_nll(residual: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
     r = masked(residual.detach(), valid)
     v = masked(variance, valid, fill=1.0).clamp(min=0.0) + NLL_EPS
     return mean_over(0.5 * r * r / v + 0.5 * v.log(), valid)
+
+
+@term
+def nll_color_full(color: Tensor, color_target: Tensor, covariance: Tensor, valid: Tensor) -> Tensor:
+    """Take the Gaussian NLL of the colour residual under the full V; trains V only, as `nll_color` does.
+
+    Mean over valid pixels × 3 of ½ rᵀ (V+εI)⁻¹ r + ½ log det (V+εI), so that it is `nll_color` where nothing lies
+    beside the diagonal. V+εI = L diag(d) Lᵀ, L with ones on its diagonal: then it is ½ y²/d + ½ log d with L y = r. No
+    d of a true covariance is below ε: one that is by rounding is put there.
+    """
+    r1, r2, r3 = masked((color - color_target).detach(), valid).unbind(-1)
+    d1, v2, v3 = (masked(covariance[..., :3], valid, fill=1.0).clamp(min=0.0) + NLL_EPS).unbind(-1)
+    v12, v13, v23 = masked(covariance[..., 3:], valid).unbind(-1)
+    l21, l31 = v12 / d1, v13 / d1
+    d2, v23_left = (v2 - l21 * v12).clamp(min=NLL_EPS), v23 - l31 * v12
+    l32 = v23_left / d2
+    d3 = (v3 - l31 * v13 - l32 * v23_left).clamp(min=NLL_EPS)
+    y2 = r2 - l21 * r1
+    y3 = r3 - l31 * r1 - l32 * y2
+    squares = r1 * r1 / d1 + y2 * y2 / d2 + y3 * y3 / d3
+    return mean_over(0.5 * (squares + d1.log() + d2.log() + d3.log()), valid) / 3.0
 
 
 @term

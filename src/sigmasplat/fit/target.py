@@ -11,6 +11,7 @@ from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.submap import Picture
 
 
 @dataclass(eq=False)
@@ -40,6 +41,16 @@ class Target:
     def depth_image(self) -> Tensor:
         """Return the depth as [H, W], metres."""
         return self.depth[: self.camera.height, : self.camera.width]
+
+    def picture(self) -> Picture:
+        """Return what was seen, colour in 256 steps as a camera delivers it."""
+        color = (self.image.numpy() * 255.0).round().clip(0, 255).astype(np.uint8)
+        return Picture(np.ascontiguousarray(color), self.depth_image.numpy().copy())
+
+    @staticmethod
+    def of_picture(picture: Picture, camera: Camera, size: tuple[int, int]) -> "Target":
+        """Lay out what an earlier keyframe saw."""
+        return Target.of(Frame(0, 0.0, picture.unit_color, picture.depth_m, camera), size)
 
 
 @dataclass(eq=False)

@@ -1,7 +1,8 @@
 """Read and write splats as the field's standard 3DGS PLY, which SuperSplat and other viewers open.
 
-Columns: x y z, nx ny nz (0), f_dc_0..2 = (colour − ½)/C0, opacity (logit), scale_0..2 (log metres), rot_0..3 (wxyz),
-and ours at the end: log_variance_0..2. Readers look columns up by name, so extra ones do no harm.
+Columns: x y z, nx ny nz (0), f_dc_0..2 = (colour − ½)/C0, f_rest_0..44 where colours depend on the direction (all
+harmonics of red, of green, of blue), opacity (logit), scale_0..2 (log metres), rot_0..3 (wxyz), and ours at the end:
+log_variance_0..2. Readers look columns up by name, so extra ones do no harm.
 """
 
 from pathlib import Path
@@ -13,7 +14,8 @@ from numpy.typing import NDArray
 
 from sigmasplat.errors import SourceError
 from sigmasplat.io.atomic import replacing
-from sigmasplat.model.field import COLUMNS, GaussianField
+from sigmasplat.model.field import COLUMNS, EXTRAS, GaussianField, Rows
+from sigmasplat.model.harmonics import DEGREES, count
 
 SH_C0 = 0.28209479177387814
 """Y₀₀ = 1/(2√π): the value of the constant spherical harmonic."""
@@ -36,33 +38,46 @@ PLY_COLUMNS: dict[str, list[str]] = {
     "colors": [f"f_dc_{i}" for i in range(3)],
     "log_variances": [f"log_variance_{i}" for i in range(3)],
 }
-FILE_ORDER = [
-    *PLY_COLUMNS["means"], "nx", "ny", "nz", *PLY_COLUMNS["colors"], "opacity", *PLY_COLUMNS["log_scales"],
-    *PLY_COLUMNS["quats"], *PLY_COLUMNS["log_variances"],
-]  # fmt: skip
+BEFORE_HARMONICS = [*PLY_COLUMNS["means"], "nx", "ny", "nz", *PLY_COLUMNS["colors"]]
+AFTER_HARMONICS = ["opacity", *PLY_COLUMNS["log_scales"], *PLY_COLUMNS["quats"], *PLY_COLUMNS["log_variances"]]
+REST = "f_rest_"
 
 
 def write_field(path: Path, field: GaussianField) -> None:
     """Write the splats as binary little-endian 3DGS PLY, in one step. Raises RunError if the place is not writable."""
     params = field.params.detach().cpu().numpy().astype(np.float32)
-    rows = np.zeros(len(params), np.dtype([(name, "<f4") for name in FILE_ORDER]))
+    harmonics = _by_channel(field)
+    rest = [f"{REST}{i}" for i in range(harmonics.shape[1])]
+    names_in_file = [*BEFORE_HARMONICS, *rest, *AFTER_HARMONICS]
+    rows = np.zeros(len(params), np.dtype([(name, "<f4") for name in names_in_file]))
     for group, names in PLY_COLUMNS.items():
         values = params[:, COLUMNS[group]]
         if group == "colors":
             values = ((values.astype(np.float64) - 0.5) / SH_C0).astype(np.float32)
         for i, name in enumerate(names):
             rows[name] = values[:, i]
-    properties = "".join(f"property float {name}\n" for name in FILE_ORDER)
+    for i, name in enumerate(rest):
+        rows[name] = harmonics[:, i]
+    properties = "".join(f"property float {name}\n" for name in names_in_file)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(header.encode("ascii"))
         file.write(rows.tobytes())
 
 
-def read_field(path: Path) -> GaussianField:
-    """Read a 3DGS PLY of ours or of another program; missing log_variance becomes −7, f_rest is passed over.
+def _by_channel(field: GaussianField) -> NDArray[np.float32]:
+    """Return a field's harmonics in the file's order [N, 45], or [N, 0]."""
+    if "harmonics" not in field.extras:
+        return np.empty((len(field), 0), np.float32)
+    values = field.extras["harmonics"].params.detach().cpu().numpy().astype(np.float32)
+    return values.reshape(len(field), -1, 3).swapaxes(1, 2).reshape(values.shape)
 
-    Raises SourceError if it is missing, not a binary PLY of splats, truncated, or holds nan, inf or a zero quaternion.
+
+def read_field(path: Path) -> GaussianField:
+    """Read a 3DGS PLY of ours or of another program; missing log_variance becomes −7.
+
+    Raises SourceError if it is missing, not a binary PLY of splats, truncated, holds nan, inf or a zero quaternion, or
+    f_rest of another number than 9, 24 or 45.
     """
     try:
         with path.open("rb") as file:
@@ -73,7 +88,27 @@ def read_field(path: Path) -> GaussianField:
     if len(data) < count * row_type.itemsize:
         size = count * row_type.itemsize
         raise SourceError(f"{path} is truncated: its header promises {count} splats = {size} bytes, found {len(data)}")
-    return GaussianField(torch.from_numpy(_params(np.frombuffer(data, row_type), path)))
+    rows = np.frombuffer(data, row_type)
+    field, harmonics = GaussianField(torch.from_numpy(_params(rows, path))), _harmonics(rows, path)
+    if harmonics is not None:
+        field.extras["harmonics"] = Rows(torch.from_numpy(harmonics))
+    return field
+
+
+def _harmonics(rows: NDArray[np.void], path: Path) -> NDArray[np.float32] | None:
+    """Gather harmonics [N, 45] from f_rest, which lower degrees have fewer of; None without. Raises SourceError."""
+    given = sum(name.startswith(REST) for name in rows.dtype.names or ())
+    names, each = [f"{REST}{i}" for i in range(given)], given // 3
+    if not names:
+        return None
+    known = [3 * count(degree) for degree in range(1, DEGREES + 1)]
+    if given not in known or not set(names) <= set(rows.dtype.names or ()):
+        raise SourceError(f"{path} has {given} columns f_rest, expected 0 or f_rest_0 to 8, 23 or 44 (degree 1 to 3)")
+    harmonics = np.zeros((len(rows), EXTRAS["harmonics"]), np.float32)
+    for i, name in enumerate(names):
+        harmonics[:, 3 * (i % each) + i // each] = rows[name]
+    _refuse_not_finite(harmonics, path)
+    return harmonics
 
 
 def _params(rows: NDArray[np.void], path: Path) -> NDArray[np.float32]:
@@ -95,12 +130,16 @@ def _params(rows: NDArray[np.void], path: Path) -> NDArray[np.float32]:
 
 def _check_values(params: NDArray[np.float32], path: Path) -> None:
     """Raise SourceError at the first splat with nan, inf or a zero quaternion."""
-    bad = np.flatnonzero(~np.isfinite(params).all(1))
-    if len(bad):
-        raise SourceError(f"{path}: splat {bad[0]} holds nan or inf ({len(bad)} of {len(params)} splats do)")
+    _refuse_not_finite(params, path)
     zero = np.flatnonzero(np.linalg.norm(params[:, COLUMNS["quats"]], axis=1) == 0)
     if len(zero):
         raise SourceError(f"{path}: splat {zero[0]} has a zero quaternion, which is no rotation")
+
+
+def _refuse_not_finite(values: NDArray[np.float32], path: Path) -> None:
+    bad = np.flatnonzero(~np.isfinite(values).all(1))
+    if len(bad):
+        raise SourceError(f"{path}: splat {bad[0]} holds nan or inf ({len(bad)} of {len(values)} splats do)")
 
 
 def _read_header(file: BinaryIO, path: Path) -> tuple[np.dtype[np.void], int]:

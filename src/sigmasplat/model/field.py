@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.model import se3
+from sigmasplat.model import harmonics, se3
 
 COLUMNS: dict[str, slice] = {
     "means": slice(0, 3),
@@ -19,7 +19,8 @@ COLUMNS: dict[str, slice] = {
 WIDTH = 17
 EXTRAS = {"correlations": 3, "harmonics": 45}
 """What splats may carry besides, and how many numbers of each: off-diagonals of the Cholesky factor of their colour
-covariance (red–green, red–blue, green–blue); spherical harmonics of degrees 1 to 3."""
+covariance (red–green, red–blue, green–blue); spherical harmonics of degrees 1 to 3, harmonic by harmonic in the order
+of `model.harmonics.basis`, red, green and blue of each: columns 3·i + channel."""
 
 
 @dataclass(eq=False)
@@ -43,6 +44,10 @@ class Rows:
 
     def __len__(self) -> int:
         return len(self.params)
+
+    def state(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return copies of params, both moments and last_step."""
+        return self.params.clone(), self.moment1.clone(), self.moment2.clone(), self.last_step.clone()
 
     def join(self, other: "Rows") -> None:
         """Add another's rows at the end, their optimiser state with them."""
@@ -153,12 +158,22 @@ class GaussianField(Rows):
             part.choose(rows)
 
     def moved(self, T_new_old: Tensor) -> "GaussianField":
-        """Return the field carried by a rigid 4×4 transform: positions and rotations move, shapes and looks stay."""
+        """Return the field carried by a rigid 4×4 transform: positions and rotations move, shapes and looks stay.
+
+        Looks that depend on the direction turn with it, and so do Adam's moments (the second ones as if a gradient's
+        components were independent).
+        """
         T = T_new_old.to(self.params)
-        out = self.params.clone()
-        out[:, COLUMNS["means"]] = self.means @ T[:3, :3].T + T[:3, 3]
-        out[:, COLUMNS["quats"]] = quaternion_product(quaternion_of(T[:3, :3]), self.quats)
-        return GaussianField(out, self.moment1.clone(), self.moment2.clone(), self.last_step.clone(), self.steps)
+        params, moment1, moment2, last_step = self.state()
+        for name, matrix in (("means", T[:3, :3]), ("quats", left_factor(quaternion_of(T[:3, :3])))):
+            columns = COLUMNS[name]
+            for rows, by in ((params, matrix), (moment1, matrix), (moment2, matrix**2)):
+                rows[:, columns] = transformed(rows[:, columns], by)
+        params[:, COLUMNS["means"]] += T[:3, 3]
+        extras = {name: Rows(*extra.state(), extra.steps) for name, extra in self.extras.items()}
+        if "harmonics" in extras:
+            extras["harmonics"].params = harmonics.turned(extras["harmonics"].params, T[:3, :3])
+        return GaussianField(params, moment1, moment2, last_step, self.steps, extras)
 
 
 def quaternion_of(R: Tensor) -> Tensor:
@@ -166,15 +181,13 @@ def quaternion_of(R: Tensor) -> Tensor:
     return torch.as_tensor(se3.quaternion_from_rotation(R.detach().double().numpy()), dtype=R.dtype)
 
 
-def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
-    """Multiply quaternions wxyz: a [4] times each row of b [N, 4]."""
-    w, x, y, z = a
-    rows = torch.stack(
-        [
-            torch.stack([w, -x, -y, -z]),
-            torch.stack([x, w, -z, y]),
-            torch.stack([y, z, w, -x]),
-            torch.stack([z, -y, x, w]),
-        ]
-    )
-    return b @ rows.T
+def left_factor(quaternion: Tensor) -> Tensor:
+    """Write multiplication by a quaternion wxyz from the left as a matrix [4, 4]."""
+    w, x, y, z = quaternion
+    rows = [(w, -x, -y, -z), (x, w, -z, y), (y, z, w, -x), (z, -y, x, w)]
+    return torch.stack([torch.stack(row) for row in rows])
+
+
+def transformed(rows: Tensor, matrix: Tensor) -> Tensor:
+    """Return rows [N, m] times matrixᵀ [m, m], column by column: a library product rounds as memory happens to lie."""
+    return sum((rows[:, k, None] * matrix[:, k] for k in range(len(matrix))), torch.zeros_like(rows))

@@ -20,6 +20,11 @@ class Picture:
     color: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
 
+    @property
+    def unit_color(self) -> NDArray[np.float32]:
+        """Return the colour in [0, 1]."""
+        return self.color.astype(np.float32) / np.float32(255.0)
+
 
 @dataclass(frozen=True, eq=False)
 class Submap:

@@ -9,18 +9,21 @@ from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.color_covariance import covariances_of, outer
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.harmonics import view_colors
 from sigmasplat.render.backend import backend_module
 
 
 @dataclass(frozen=True, eq=False)
 class Render:
-    """What a camera sees of a field, all [H, W] or [H, W, 3].
+    """What a camera sees of a field, all [H, W] or [H, W, 3], covariance [H, W, 6].
 
     color Ĉ = Σ w c; depth D̂ = Σ w z (m, not divided by alpha); alpha A = Σ w; variance V = Σ w (σ² + c²) − Ĉ², the law
     of total variance (VarSplat §1); uncertainty U = Σ w (z − D)² about a reference depth D (m², CG-SLAM eq. 10), None
     without one; median_depth: z where half the light is gone, 0 where it never is (CG-SLAM eq. 8); median_id,
-    dominant_id: the splat of that depth, the splat of largest weight, −1 = none.
+    dominant_id: the splat of that depth, the splat of largest weight, −1 = none; covariance: V with what lies beside
+    its diagonal, in the order rr, gg, bb, rg, rb, gb, None where the field has no `correlations`.
     """
 
     color: Tensor
@@ -32,6 +35,7 @@ class Render:
     median_id: Tensor
     dominant_id: Tensor
     dominant_weight: Tensor
+    covariance: Tensor | None = None
 
 
 def features_of(colors: Tensor, z: Tensor, variances: Tensor) -> Tensor:
@@ -42,6 +46,33 @@ def features_of(colors: Tensor, z: Tensor, variances: Tensor) -> Tensor:
 def variance_of(sums: Tensor) -> Tensor:
     """Apply the law of total variance to features [H, W, 7]: V = E[σ² + c²] − E[c]² [H, W, 3] (VarSplat §1)."""
     return sums[..., 4:7] - sums[..., 0:3] ** 2
+
+
+def covariance_features(colors: Tensor, z: Tensor, variances: Tensor, correlations: Tensor) -> Tensor:
+    """Stack what a pixel gathers where colours vary together: (r, g, b, z, Σ + c cᵀ ×6), [N, 10], as `features_of`."""
+    return torch.cat([colors, z[:, None], covariances_of(variances, correlations) + outer(colors)], 1)
+
+
+def covariance_of(color: Tensor, second: Tensor) -> Tensor:
+    """Apply the law of total covariance to E[c] [H, W, 3] and E[Σ + c cᵀ] [H, W, 6]: V = E[Σ + c cᵀ] − E[c] E[c]ᵀ."""
+    return second - outer(color)
+
+
+def _colors_from(field: GaussianField, T_camera_world: Tensor) -> Tensor:
+    """Return the colours [N, 3] that a camera sees."""
+    if "harmonics" not in field.extras:
+        return field.colors
+    T = T_camera_world.to(field.params)
+    position = -(T[:3, :3] * T[:3, 3:]).sum(0)
+    return view_colors(field.colors, field.extras["harmonics"].params, field.means, position)
+
+
+def _features_from(field: GaussianField, z: Tensor, T_camera_world: Tensor) -> Tensor:
+    """Return what a pixel gathers of each splat, [N, 7], or [N, 10] where colours vary together."""
+    colors = _colors_from(field, T_camera_world)
+    if "correlations" not in field.extras:
+        return features_of(colors, z, field.variances)
+    return covariance_features(colors, z, field.variances, field.extras["correlations"].params)
 
 
 def render(
@@ -59,7 +90,7 @@ def render(
     kernels, options = backend_module(backend), options or RenderConfig()
     T = torch.as_tensor(T_camera_world)
     p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
-    features = features_of(field.colors, p.z, field.variances)
+    features = _features_from(field, p.z, T)
     b = kernels.blend(*p, field.opacities, features, depth_reference, camera, options)
     crossed = b.median_id >= 0
     nearest = p.z[b.median_id.clamp(min=0).long()] if len(field) else torch.zeros_like(b.alpha)
@@ -73,4 +104,5 @@ def render(
         b.median_id,
         b.dominant_id,
         b.dominant_weight,
+        covariance_of(b.sums[..., :3], b.sums[..., 4:]) if "correlations" in field.extras else None,
     )

@@ -12,7 +12,8 @@ from sigmasplat.fit.field import FieldFit, fit_field
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
+from sigmasplat.model.field import GaussianField, Rows
+from sigmasplat.model.submap import Picture, Submap
 from sigmasplat.render.view import View
 from sigmasplat.slam.rules import draw_keyframes
 from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats, thin_out
@@ -20,7 +21,7 @@ from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats, thi
 
 @dataclass(eq=False)
 class Mapper:
-    """Owns the field and its keyframes; nobody else writes them."""
+    """Owns the active submap's field and keyframes; nobody else writes them. Poses are in the submap's frame."""
 
     config: Config
     random: np.random.Generator
@@ -29,12 +30,12 @@ class Mapper:
 
     def map(self, view: View, index: int, target: Target, T_world_camera: NDArray[np.float64]) -> FieldFit:
         """Take in one keyframe: seed, then fit in two halves with a pruning after each."""
-        first = not self.keyframes
+        first, empty = not self.keyframes, len(self.field) == 0
         old = len(self.field)
         self.keyframes.append(Keyframe(index, target, T_world_camera, fixed=first))
         self._seed(view, target, T_world_camera)
         c = self.config.mapping
-        iterations = c.first_iterations if first else c.iterations
+        iterations = c.first_iterations if empty else c.iterations
         fit = FieldFit()
         for half in (iterations // 2, iterations - iterations // 2):
             order = draw_keyframes(self.keyframes, half, c.newest_probability, c.keyframe_history, self.random)
@@ -44,6 +45,27 @@ class Mapper:
             for stage, seconds in done.seconds.items():
                 fit.seconds[stage] = fit.seconds.get(stage, 0.0) + seconds
         return fit
+
+    def finished(self, index: int) -> tuple[Submap, list[Picture]]:
+        """Return what has been mapped as a finished submap, and what its keyframes saw."""
+        poses = np.stack([keyframe.T_world_camera for keyframe in self.keyframes])
+        frames = tuple(keyframe.index for keyframe in self.keyframes)
+        pictures = [keyframe.target.picture() for keyframe in self.keyframes]
+        field = GaussianField(
+            self.field.params.clone(), extras={n: Rows(e.params.clone()) for n, e in self.field.extras.items()}
+        )
+        return Submap(index, field, frames, poses, self.keyframes[0].target.camera), pictures
+
+    def successor(self, view: View, T_submap_camera: NDArray[np.float64]) -> "Mapper":
+        """Return the mapper of the next submap, whose frame is the camera at T_submap_camera: empty, or with copies of
+        the splats in view from there (`submaps.inherit`)."""
+        field = GaussianField.empty()
+        if self.config.submaps.inherit:
+            T_new_old = se3.inverse(T_submap_camera)
+            view.forward(self.field.params, T_new_old)
+            field = self.field.moved(torch.from_numpy(T_new_old))
+            field.keep(view.visible(len(field)))
+        return Mapper(self.config, self.random, field)
 
     def _seed(self, view: View, target: Target, T_world_camera: NDArray[np.float64]) -> None:
         c = self.config.seeding

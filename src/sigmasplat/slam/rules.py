@@ -4,8 +4,11 @@ from collections.abc import Iterator, Sequence
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sigmasplat.config import SubmapConfig
 from sigmasplat.fit.pose import PoseFit
+from sigmasplat.model import se3
 
 Item = TypeVar("Item")
 
@@ -13,6 +16,23 @@ Item = TypeVar("Item")
 def is_keyframe(frames_since: int, every: int, overlap: float, overlap_below: float) -> bool:
     """Tell whether a frame is mapped: so many frames after the last one (VarSplat §2), or when too little is shared."""
     return frames_since >= every or overlap < overlap_below
+
+
+def ends_submap(
+    T_submap_camera: NDArray[np.float64], frames_since: int, uncertainty_m: float, config: SubmapConfig
+) -> str:
+    """Name the rule by which the active submap ends at a keyframe, or "" (VarSplat §2).
+
+    frames_since: frames since the submap began; uncertainty_m: `Drift.position_m` of the keyframe.
+    """
+    c = config
+    found = {
+        "distance": (float(np.linalg.norm(T_submap_camera[:3, 3])), c.distance_m),
+        "angle": (float(np.rad2deg(se3.rotation_angle(T_submap_camera[:3, :3]))), c.angle_deg),
+        "frames": (float(frames_since), c.frames - 1e-9 if c.frames else 0.0),
+        "uncertainty": (uncertainty_m, c.uncertainty_m),
+    }
+    return next((rule for rule, (value, limit) in found.items() if limit and value > limit), "")
 
 
 def is_lost(fit: PoseFit, least_agreement: float, least_share: float) -> bool:

@@ -1,7 +1,7 @@
-"""SLAM in one submap: track every frame, map every keyframe. `Slam.step` reads like the paper's overview."""
+"""SLAM: track every frame, map keyframes, cut submaps, close loops. `Slam.step` reads like the paper's overview."""
 
 import time
-from dataclasses import dataclass, field as dataclass_field
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -10,63 +10,79 @@ from torch import Tensor
 
 from sigmasplat.config import Config
 from sigmasplat.errors import SourceError
+from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.pyramid import Pyramid, gray_of
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
+from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.submap import MemoryStore, SubmapStore
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, preset
 from sigmasplat.render.view import View, make_view
+from sigmasplat.slam.drift import Drift
+from sigmasplat.slam.final import final_map
+from sigmasplat.slam.loops import Loop, LoopCloser, make_descriptor
 from sigmasplat.slam.mapper import Mapper
-from sigmasplat.slam.rules import is_keyframe
+from sigmasplat.slam.rules import ends_submap, is_keyframe
+from sigmasplat.slam.step import KERNELS, Step, numbers_of
 from sigmasplat.slam.tracker import Tracker
 
-KERNELS = ("project", "sort", "blend", "blend_backward", "project_backward")
-"""What `View.seconds` counts, in its order."""
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """What one frame brought: its pose T_world_camera [4, 4], whether it was mapped, whether it was lost, numbers."""
-
-    index: int
-    timestamp_s: float
-    T_world_camera: NDArray[np.float64]
-    is_keyframe: bool
-    lost: bool
-    tracking: dict[str, float]
-    splats: int
-    seconds: dict[str, float] = dataclass_field(default_factory=dict)
+Matrix = NDArray[np.float64]
 
 
 class Slam:
-    """Simultaneous localisation and mapping: feed frames to `step`; read `field` and `trajectory()` at any time.
+    """Simultaneous localisation and mapping: feed frames to `step`, then call `finish`; read `field` and `trajectory()`
+    at any time.
 
-    Frame 0 fixes the gauge: the world is the first camera. Nothing here knows ground truth.
+    Frame 0 fixes the gauge: the world is the first camera. Nothing here knows ground truth. Finished submaps go to
+    `store`, by default in memory.
     """
 
-    def __init__(self, config: Config | None = None) -> None:
+    def __init__(self, config: Config | None = None, store: SubmapStore | None = None) -> None:
         self.config = config or preset(default_preset())
-        self.mapper = Mapper(self.config, np.random.default_rng(self.config.seed))
+        self.random = np.random.default_rng(self.config.seed)
+        self.store = MemoryStore() if store is None else store
+        self.atlas = Atlas()
+        self.mapper = Mapper(self.config, self.random)
         self.tracker = Tracker(self.config.tracking)
+        self.drift = Drift()
+        self.descriptor = make_descriptor(self.config.loops)
         self.steps: list[Step] = []
-        self._relative: list[tuple[int, NDArray[np.float64]]] = []
+        self.keyframes: list[int] = []
+        self._descriptors: list[NDArray[np.float32]] = []
         self._view: View | None = None
+        self._closer: LoopCloser | None = None
+        self._final: GaussianField | None = None
 
     @property
     def field(self) -> GaussianField:
-        """Return the map."""
-        return self.mapper.field
+        """Return the map in the world: the final one once finished, till then all submaps side by side."""
+        if self._final is not None:
+            return self._final
+        active = self.mapper.field
+        if not len(self.store):
+            return active
+        merged = GaussianField.empty()
+        for index in range(len(self.store)):
+            merged.append(self.store.load(index).field.moved(torch.from_numpy(self.atlas.anchors[index])))
+        if len(self.store) < len(self.atlas.anchors):
+            merged.append(active.moved(torch.from_numpy(self.atlas.anchors[-1])))
+        return merged
+
+    @property
+    def loops(self) -> list[Loop]:
+        """Return every pair of submaps tried, with the latest verdict."""
+        return list(self._closer.loops) if self._closer else []
 
     def trajectory(self) -> Trajectory:
         """Return the poses of all frames so far, lost ones included (their log lines say so).
 
-        A frame is remembered relative to the newest keyframe of its time: where mapping moves that, the frame follows.
+        A frame is remembered relative to the newest keyframe of its time, a keyframe to its submap: where mapping moves
+        the one or a loop the other, the frame follows.
         """
-        keyframes = self.mapper.keyframes
-        poses = [keyframes[k].T_world_camera @ T_keyframe_camera for k, T_keyframe_camera in self._relative]
-        return Trajectory(np.array([s.timestamp_s for s in self.steps]), np.array(poses).reshape(-1, 4, 4))
+        return Trajectory(np.array([s.timestamp_s for s in self.steps]), self.atlas.T_world_camera())
 
     def step(self, frame: Frame) -> Step:
         """Take in one frame. Raises SourceError if the first frame has no depth or a later one another camera."""
@@ -79,47 +95,94 @@ class Slam:
         live = Pyramid.of(gray_of(frame.color), frame.depth_m, frame.camera)
         seconds = {"prepare": time.perf_counter() - clock}
 
-        first = not self.mapper.keyframes
         tracking: dict[str, float] = {}
-        if first:
-            T_world_camera = self._begin(frame, live)
+        loops: list[Loop] = []
+        if not self.steps:
+            T_submap_camera, mapped = self._begin(frame, live), True
         else:
-            T_world_camera, tracking = self._track(view, target, live, seconds)
-        lost = self.tracker.lost
-        mapped = first or (not lost and self._is_keyframe(tracking["overlap"]))
+            T_submap_camera, fit = self._track(view, target, live, seconds)
+            tracking = numbers_of(fit)
+            mapped = not self.tracker.lost and self._is_keyframe(fit.overlap)
         if mapped:
-            T_world_camera = self._map(view, target, live, T_world_camera, seconds)
-        newest = self.mapper.keyframes[-1]
-        relative = se3.inverse(newest.T_world_camera) @ T_world_camera
-        self._relative.append((len(self.mapper.keyframes) - 1, se3.orthonormalise(relative)))
+            if self.steps and self._cuts:
+                self.drift.hop(T_submap_camera, self.tracker.hop_covariance(fit, live))
+                tracking["drift_m"] = self.drift.position_m(T_submap_camera)
+            T_submap_camera = self._map(view, frame, target, live, T_submap_camera, seconds)
+            if self._submap_ends(T_submap_camera):
+                loops = self._cut(view, T_submap_camera, seconds)
+                T_submap_camera = self._map(view, frame, target, live, np.eye(4), seconds)
+        self.atlas.place_frame(T_submap_camera)
 
         seconds |= dict(zip(KERNELS, (view.seconds - before).tolist(), strict=True))
         step = Step(
-            frame.index, frame.timestamp_s, T_world_camera, mapped, lost, tracking, len(self.field),
+            frame.index, frame.timestamp_s, self.atlas.anchors[-1] @ T_submap_camera, mapped, self.tracker.lost,
+            tracking, len(self.mapper.field), len(self.atlas.anchors) - 1, tuple(loops),
             seconds | {"total": time.perf_counter() - clock},
         )  # fmt: skip
         self.steps.append(step)
         return step
 
+    def finish(self, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
+        """Finish the last submap, look for its loops, and make the final map (VarSplat §7); once, after all frames.
+
+        `progress` is told (steps of refinement done, of how many). With one submap and no refinement nothing is done.
+        """
+        if not self.steps or not (len(self.store) or self._cuts or self.config.final.iterations):
+            return
+        self._freeze()
+        view = self._view
+        assert view is not None
+        self._final = final_map(self.store, self.atlas.anchors, self.config, view, self.random, progress)
+
     def checkpoint(self) -> dict[str, Tensor]:
-        """Return what a run needs to be read back: the field with its optimiser state, poses, times, keyframes."""
-        path = self.trajectory()
+        """Return what a run needs to be read back: the active submap's field with its optimiser state, poses, times,
+        keyframes, anchors, and which submap each frame belongs to."""
+        path, active = self.trajectory(), self.mapper.field
         return {
-            "params": self.field.params,
-            "moment1": self.field.moment1,
-            "moment2": self.field.moment2,
-            "last_step": self.field.last_step,
-            "adam_steps": torch.tensor(self.field.steps),
+            "params": active.params,
+            "moment1": active.moment1,
+            "moment2": active.moment2,
+            "last_step": active.last_step,
+            "adam_steps": torch.tensor(active.steps),
             "timestamps_s": torch.from_numpy(path.timestamps_s),
             "T_world_camera": torch.from_numpy(path.T_world_camera),
-            "keyframes": torch.tensor([k.index for k in self.mapper.keyframes], dtype=torch.int64),
+            "keyframes": torch.tensor(self.keyframes, dtype=torch.int64),
+            "T_world_submap": torch.from_numpy(np.array(self.atlas.anchors).reshape(-1, 4, 4)),
+            "frame_submap": torch.tensor([place.submap for place in self.atlas.places], dtype=torch.int64),
         }
+
+    @property
+    def _cuts(self) -> bool:
+        """Tell whether any rule may end a submap."""
+        s = self.config.submaps
+        return bool(s.distance_m or s.angle_deg or s.frames or s.uncertainty_m)
+
+    def _freeze(self) -> list[Loop]:
+        """Hand the active submap to the store and look for its loops, which may move anchors."""
+        assert self._closer is not None
+        submap, pictures = self.mapper.finished(len(self.store))
+        self.store.save(submap, pictures)
+        return self._closer.submap_finished(submap, self._descriptors, self.atlas)
+
+    def _cut(self, view: View, T_submap_camera: Matrix, seconds: dict[str, float]) -> list[Loop]:
+        """Finish the active submap and begin the next one at its newest keyframe, which both share; return the loops
+        tried."""
+        clock = time.perf_counter()
+        loops = self._freeze()
+        assert self._closer is not None
+        self._closer.submap_begun(len(self.store), T_submap_camera, self.drift.information)
+        self.atlas.begin_submap(self.atlas.anchors[-1] @ T_submap_camera)
+        self.mapper = self.mapper.successor(view, T_submap_camera)
+        self.drift, self._descriptors = Drift(), []
+        seconds["cut"] = time.perf_counter() - clock
+        return loops
 
     def _view_for(self, frame: Frame) -> View:
         c = self.config
         if self._view is None:
             weights = c.mapping.weight_nll_color or c.mapping.weight_nll_depth
             self._view = make_view(c.backend, frame.camera, c.render, variance=bool(weights or c.tracking.uncertainty))
+            self._closer = LoopCloser(c, self.store, self._view)
         if frame.camera != self._view.camera:
             raise SourceError(f"frame {frame.index} comes from another camera ({frame.camera}) than the first")
         return self._view
@@ -128,6 +191,10 @@ class Slam:
         c = self.config.mapping
         return is_keyframe(len(self.steps) - self.mapper.keyframes[-1].index, c.every, overlap, c.overlap_below)
 
+    def _submap_ends(self, T_submap_camera: Matrix) -> bool:
+        since, moved_m = len(self.steps) - self.mapper.keyframes[0].index, self.drift.position_m(T_submap_camera)
+        return bool(ends_submap(T_submap_camera, since, moved_m, self.config.submaps))
+
     def _begin(self, frame: Frame, live: Pyramid) -> NDArray[np.float64]:
         if not (frame.depth_m > 0).any():
             raise SourceError(
@@ -135,35 +202,34 @@ class Slam:
                 f"{self.config.input.max_depth_m}] m to start a map from; check the depth scale or start at a later one"
             )
         self.tracker.start(live)
+        self.atlas.begin_submap(np.eye(4))
         return np.eye(4)
 
-    def _track(
-        self, view: View, target: Target, live: Pyramid, seconds: dict[str, float]
-    ) -> tuple[NDArray[np.float64], dict[str, float]]:
+    def _track(self, view: View, target: Target, live: Pyramid, seconds: dict[str, float]) -> tuple[Matrix, PoseFit]:
         clock = time.perf_counter()
         before = view.seconds.sum()
-        fit = self.tracker.track(self.field, view, target, live)
+        fit = self.tracker.track(self.mapper.field, view, target, live)
         seconds["track"] = time.perf_counter() - clock
         seconds["track_kernels"] = float(view.seconds.sum() - before)
-        numbers = {
-            "agreement": fit.agreement, "overlap": fit.overlap, "first_loss": fit.first_loss,
-            "loss": fit.loss, "iterations": float(fit.iterations),
-        }  # fmt: skip
-        return se3.inverse(fit.T_camera_world), numbers
+        return se3.inverse(fit.T_camera_world), fit
 
     def _map(
-        self,
-        view: View,
-        target: Target,
-        live: Pyramid,
-        T_world_camera: NDArray[np.float64],
+        self, view: View, frame: Frame, target: Target, live: Pyramid, T_submap_camera: Matrix,
         seconds: dict[str, float],
-    ) -> NDArray[np.float64]:
+    ) -> Matrix:  # fmt: skip
         """Map a keyframe; return its pose, which mapping may have moved."""
         clock = time.perf_counter()
-        fit = self.mapper.map(view, len(self.steps), target, T_world_camera)
-        seconds["map"] = time.perf_counter() - clock
-        seconds.update({f"map_{stage}": s for stage, s in fit.seconds.items()})
-        T_world_camera = self.mapper.keyframes[-1].T_world_camera
-        self.tracker.keep_keyframe(self.field, view, live, T_world_camera)
-        return T_world_camera
+        fit = self.mapper.map(view, len(self.steps), target, T_submap_camera)
+        for stage, spent in {
+            "map": time.perf_counter() - clock,
+            **{f"map_{n}": s for n, s in fit.seconds.items()},
+        }.items():
+            seconds[stage] = seconds.get(stage, 0.0) + spent
+        self.keyframes += [len(self.steps)] * (self.keyframes[-1:] != [len(self.steps)])  # a shared one counts once
+        self.atlas.keyframes[-1] = [keyframe.T_world_camera for keyframe in self.mapper.keyframes]
+        self.tracker.keep_keyframe(self.mapper.field, view, live, self.atlas.keyframes[-1][-1])
+        if self._cuts and self.config.loops.close:
+            clock = time.perf_counter()
+            self._descriptors.append(self.descriptor.describe(frame.color, frame.depth_m))
+            seconds["describe"] = time.perf_counter() - clock
+        return self.atlas.keyframes[-1][-1]

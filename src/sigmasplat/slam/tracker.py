@@ -13,7 +13,7 @@ from sigmasplat.fit.references import Reference, keyframe_reference, map_referen
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
-from sigmasplat.render.view import ReferenceView, View
+from sigmasplat.render.view import CpuView, ReferenceView, View
 from sigmasplat.slam.rules import is_lost, jumped
 
 Matrix = NDArray[np.float64]
@@ -110,5 +110,15 @@ class Tracker:
     def keep_keyframe(self, field: GaussianField, view: View, live: Pyramid, T_world_camera: Matrix) -> None:
         """Take note of a freshly mapped keyframe: where mapping left its pose, and its image as the next reference."""
         self.previous = T_world_camera
-        if self.config.method == "align" and self.config.align_to == "keyframe":
+        if isinstance(view, CpuView):
             self.keyframe = keyframe_reference(field.params, view, live, se3.inverse(T_world_camera), self.config)
+
+    def hop_covariance(self, fit: PoseFit, live: Pyramid) -> Matrix | None:
+        """Estimate the covariance [6, 6] of a fit's left twist to the newest keyframe; None without the kernels.
+
+        A pose found by descent is judged by how sharply the keyframe's image would pull it back.
+        """
+        if fit.alignment is not None or self.keyframe is None:
+            return fit.covariance
+        T_live_keyframe = fit.T_camera_world @ se3.inverse(self.keyframe.T_camera_world)
+        return align(self.keyframe.pyramid, live, T_live_keyframe, 0, self.config.align_weight_color).covariance

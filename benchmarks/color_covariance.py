@@ -1,0 +1,193 @@
+"""Map the same stretches with one variance a colour channel (paper) and with the full 3×3 colour covariance.
+
+Both maps grow side by side, frame by frame, each with poses of its own. Then both are asked how likely the colours of
+the frames are that no map was fitted to: on the same pixels, under the diagonal of V and under all of V.
+Writes benchmarks/results/color-covariance-<machine>.json, prints a table.
+
+example: python benchmarks/color_covariance.py --sources redkitchen --frames 30 --seeds 0
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import accuracy
+import numpy as np
+import record
+import torch
+import tyro
+from accuracy_tables import spread
+from cpu import alone
+from numpy.typing import NDArray
+from tables import Section, headline
+from torch import Tensor
+
+from sigmasplat.config import Config
+from sigmasplat.errors import SigmaSplatError, SourceError
+from sigmasplat.fit import losses
+from sigmasplat.metrics import views
+from sigmasplat.metrics.panels import COVERED_ALPHA, View
+from sigmasplat.model import se3
+from sigmasplat.model.color_covariance import correlations_of
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.frame import Frame
+from sigmasplat.presets import default_preset, preset as preset_of
+from sigmasplat.render import Render, render
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources import open_source
+
+arg = tyro.conf.arg
+KINDS = ("diagonal", "full")
+CHANNELS = 3
+
+
+@dataclass(frozen=True)
+class Options:
+    """Map the same stretches with one variance a channel and with the full colour covariance."""
+
+    sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = (
+        "redkitchen",
+        f"{accuracy.SYNTHETIC},noise=1",
+    )
+    frames: Annotated[int, arg(help="of each sequence, from its start")] = 60
+    preset: Annotated[str, arg(help="settings to start from")] = default_preset()
+    seeds: Annotated[tuple[int, ...], arg(help="starts of the random numbers, a pair of maps each")] = (0, 1, 2)
+    name: Annotated[str, arg(help="name of the results")] = "color-covariance"
+    out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
+
+    def config(self, seed: int, kind: str) -> Config:
+        """Return a run's settings. Raises ConfigError on an unknown preset."""
+        config = replace(preset_of(self.preset), seed=seed)
+        return replace(config, mapping=replace(config.mapping, color_covariance=kind))
+
+
+def measure(path: str, options: Options, seed: int) -> dict[str, Any]:
+    """Grow both maps and score them on the frames that neither was fitted to. Raises SourceError if there are none."""
+    source = open_source(path, limit=options.frames)
+    runs = {kind: Slam(options.config(seed, kind)) for kind in KINDS}
+    for index, frame in enumerate(source):
+        for kind in KINDS if index % 2 else reversed(KINDS):  # neither is always the first on a warm cache
+            runs[kind].step(frame)
+    steps = list(zip(*(run.steps for run in runs.values()), strict=True))
+    held_out = [i for i, pair in enumerate(steps) if not any(step.is_keyframe or step.lost for step in pair)]
+    if not held_out:
+        raise SourceError(f"{path}: both maps were fitted to every frame; a preset that maps each frame leaves none")
+    i = options.config(seed, "full").input
+    frames = [source.frame(steps[k][0].index).prepared(i.width, i.min_depth_m, i.max_depth_m) for k in held_out]
+    return {"seed": seed, "held_out": len(held_out), **score(runs, held_out, frames)}
+
+
+def score(runs: dict[str, Slam], rows: Sequence[int], frames: Sequence[Frame]) -> dict[str, Any]:
+    """Score both maps on frames (`rows` of their trajectories): on pixels with a reading that both maps cover."""
+    fields = {kind: with_correlations(run.field) for kind, run in runs.items()}
+    poses = {kind: se3.inverse(run.trajectory().T_world_camera) for kind, run in runs.items()}
+    sums: dict[str, list[Any]] = {kind: [] for kind in KINDS}
+    seen: dict[str, list[View]] = {kind: [] for kind in KINDS}
+    for row, frame in zip(rows, frames, strict=True):
+        renders = {kind: render(fields[kind], frame.camera, poses[kind][row]) for kind in KINDS}
+        pixels = torch.from_numpy(frame.depth_m > 0)
+        for r in renders.values():
+            pixels &= r.alpha > COVERED_ALPHA
+        for kind, r in renders.items():
+            sums[kind].append(likelihoods(r, frame, pixels))
+            seen[kind].append(view_of(r, frame, pixels))
+    found = {kind: figures(runs[kind], fields[kind], np.array(sums[kind]), seen[kind]) for kind in KINDS}
+    ratio = found["full"]["mapping_s"] / found["diagonal"]["mapping_s"]
+    return {**found, "mapping_time_ratio": round(ratio, 3)}
+
+
+def with_correlations(field: GaussianField) -> GaussianField:
+    """Return a field whose colours vary together, not at all where it had no such numbers: V is rendered whole."""
+    field.carry("correlations")
+    return field
+
+
+def likelihoods(r: Render, frame: Frame, pixels: Tensor) -> NDArray[np.float64]:
+    """Return pixels, the NLL of their colours under V's diagonal and under all of V, and Σ r rᵀ: sums over them [9].
+
+    Float64, ε = 1e-6 as in training, the constant 3/2 log 2π left out.
+    """
+    color, target, count = r.color.double(), torch.tensor(frame.color).double(), float(pixels.sum())
+    assert r.covariance is not None
+    V, scale = r.covariance.double(), CHANNELS * count
+    diagonal = losses.nll_color(color, target, V[..., :CHANNELS], pixels)
+    full = losses.nll_color_full(color, target, V, pixels)
+    residual = (color - target)[pixels]
+    second = (residual.T @ residual)[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    return np.array([count, scale * float(diagonal), scale * float(full), *second.tolist()])
+
+
+def view_of(r: Render, frame: Frame, pixels: Tensor) -> View:
+    """Lay out a render as evaluation scores it, other pixels taken as without a reading."""
+    depth = torch.where(pixels, r.depth / r.alpha.clamp(min=COVERED_ALPHA), 0.0)
+    return View(
+        frame.index, "held-out", frame.color, np.where(pixels.numpy(), frame.depth_m, np.float32(0.0)),
+        r.color.clamp(0.0, 1.0).numpy(), depth.numpy(), r.alpha.numpy(), r.variance.numpy(),
+    )  # fmt: skip
+
+
+def figures(run: Slam, field: GaussianField, sums: NDArray[np.float64], seen: list[View]) -> dict[str, Any]:
+    """Sum up one map: time, likelihoods per pixel, how its splats' colours and its errors go together, PSNR, ranks."""
+    count, diagonal, full, *second = sums.sum(0)
+    deviations = np.sqrt(second[:CHANNELS])
+    errors = second[CHANNELS:] / np.array([deviations[a] * deviations[b] for a, b in ((0, 1), (0, 2), (1, 2))])
+    correlations = correlations_of(field.extras["correlations"].params).abs().mean(0)
+    scores, judged = views.average([view.scores() for view in seen]), views.judge([views.sample(v) for v in seen]) or {}
+    return {
+        "mapping_s": round(sum(step.seconds.get("map", 0.0) for step in run.steps), 3),
+        "keyframes": sum(step.is_keyframe for step in run.steps),
+        "splats": len(field),
+        "pixels": int(count),
+        "nll_diagonal": diagonal / count,
+        "nll_full": full / count,
+        "mean_correlation": correlations.tolist(),
+        "error_correlation": errors.tolist(),
+        "psnr_db": scores["psnr_db"],
+        "spearman": judged.get("spearman"),
+    }
+
+
+def sections(measured: dict[str, Any]) -> list[Section]:
+    """Lay out the figures: one row for each sequence and map, means ± deviations over the seeds."""
+    rows = []
+    for source in measured["figures"]["sources"]:
+        for kind in KINDS:
+            found = [run[kind] for run in source["runs"]]
+            ratios = [run["mapping_time_ratio"] for run in source["runs"]] if kind == "full" else [1.0]
+            together = [float(np.mean(run["mean_correlation"])) for run in found]
+            names = ("nll_diagonal", "nll_full", "psnr_db", "spearman")
+            columns = [ratios, *([run[name] for run in found] for name in names[:2]), together]
+            columns += [[run[name] for run in found] for name in names[2:]]
+            rows.append([source["source"], kind, *(spread(values) for values in columns)])
+    columns_ = ("sequence", "map", "mapping time", "NLL, diagonal", "NLL, full", "mean |ρ|", "PSNR, dB", "Spearman")
+    note = "NLL in nats per pixel, 3 channels, on held-out frames, under V's diagonal and under all of V."
+    return [Section("colour covariance", columns_, rows, note)]
+
+
+def main(options: Options) -> int:
+    """Measure, write, print; exit code 2 if the options mean nothing."""
+    try:
+        found = []
+        for source in options.sources:
+            runs = []
+            for seed in options.seeds:
+                runs.append(alone(measure, accuracy.located(source), options, seed))
+                told = f"{Path(source).name}, seed {seed}: {runs[-1]['mapping_time_ratio']} times the mapping time"
+                print(told, file=sys.stderr, flush=True)
+            found.append({"source": Path(source).name, "runs": runs})
+    except SigmaSplatError as problem:
+        print(f"color_covariance.py: {problem}", file=sys.stderr)
+        return 2
+    config = {name: value for name, value in asdict(options).items() if name != "out"}
+    measured = record.results(
+        "color_covariance", {"sources": found}, name=options.name, seeds=options.seeds, config=config
+    )
+    print(record.write(measured, options.out), file=sys.stderr)
+    print("\n".join([f"{headline(measured)}\n", *(section.markdown() for section in sections(measured))]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))

@@ -1,0 +1,85 @@
+"""Change settings by text, as on the command line: SECTION.NAME=VALUE."""
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from sigmasplat.config import Config
+from sigmasplat.errors import ConfigError
+
+
+def override(config: Config, settings: Mapping[str, str]) -> Config:
+    """Return the settings with some replaced, as in {"tracking.iterations": "60", "seed": "1"}; text becomes its type.
+
+    Raises ConfigError on an unknown name (saying which there are), text that is not of the type, a negative number.
+    """
+    for name, text in settings.items():
+        section, _, field = name.rpartition(".")
+        if not section:
+            config = _replaced(config, name, name, text)
+            continue
+        inner = getattr(config, section, None)
+        if not dataclasses.is_dataclass(inner) or isinstance(inner, type):
+            sections = [f.name for f in dataclasses.fields(config) if dataclasses.is_dataclass(getattr(config, f.name))]
+            raise ConfigError(f"unknown setting {name!r}{nearest(section, sections)}; sections: {', '.join(sections)}")
+        config = dataclasses.replace(config, **{section: _replaced(inner, field, name, text)})
+    return config
+
+
+def split_settings(settings: Iterable[str]) -> dict[str, str]:
+    """Split SECTION.NAME=VALUE at the equals sign; of a name given twice the last counts. Raises ConfigError."""
+    pairs = [setting.partition("=") for setting in settings]
+    for name, equals, _ in pairs:
+        if not equals:
+            raise ConfigError(f"a setting is SECTION.NAME=VALUE, found {name!r}")
+    return {name.strip(): value for name, _, value in pairs}
+
+
+def _replaced(section: Any, field: str, name: str, text: str) -> Any:
+    """Return a section with one value replaced; `name` is how the user called it."""
+    types = {known: kind for known, kind in get_type_hints(type(section)).items() if not dataclasses.is_dataclass(kind)}
+    if field not in types:
+        raise ConfigError(f"unknown setting {name!r}{nearest(field, types)}; there are {', '.join(types)}")
+    return dataclasses.replace(section, **{field: _converted(name, types[field], text.strip())})
+
+
+def _converted(name: str, kind: Any, text: str) -> Any:
+    """Turn text into a setting's type. Raises ConfigError."""
+    if get_origin(kind) is Literal:
+        return _chosen(name, {str(value): value for value in get_args(kind)}, text)
+    if kind is bool:
+        words = {
+            "true": True,
+            "1": True,
+            "yes": True,
+            "on": True,
+            "false": False,
+            "0": False,
+            "no": False,
+            "off": False,
+        }
+        return _chosen(name, words, text.lower())
+    if kind is str:
+        return text
+    try:
+        value = kind(text)
+    except ValueError:
+        wanted = "a whole number" if kind is int else "a number"
+        raise ConfigError(f"{name} needs {wanted}, found {text!r}") from None
+    if not math.isfinite(value) or value < 0:
+        raise ConfigError(f"{name} must be finite and not negative, found {text!r}")
+    return value
+
+
+def _chosen(name: str, allowed: Mapping[str, Any], text: str) -> Any:
+    if text not in allowed:
+        raise ConfigError(f"{name} must be one of {', '.join(allowed)}, found {text!r}")
+    return allowed[text]
+
+
+def nearest(name: str, known: Mapping[str, Any] | list[str]) -> str:
+    """Suggest the known name that a misspelt one resembles."""
+    close = difflib.get_close_matches(name, list(known), 1)
+    return f" (did you mean {close[0]}?)" if close else ""

@@ -1,0 +1,106 @@
+"""Fit colours that depend on where they are seen from: one mapping step with harmonics (VarSplat §7, refinement)."""
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from sigmasplat.fit import losses
+from sigmasplat.fit.adam import ROWS_AT_ONCE, Rates, adam_rows
+from sigmasplat.fit.target import Target
+from sigmasplat.model.field import COLUMNS, GaussianField, Rows
+from sigmasplat.model.harmonics import basis, count, view_colors
+from sigmasplat.render.view import Matrix, View
+
+COLORS, MEANS, SCALES = (COLUMNS[name] for name in ("colors", "means", "log_scales"))
+
+
+class ImageStep(Protocol):
+    """What is needed of another step: its view, and the gradient of the image terms."""
+
+    @property
+    def view(self) -> View: ...
+
+    def images(self, target: Target, weights: dict[str, float]) -> float:
+        """Write the gradient of every image term to the view's gradient planes; return the loss."""
+        ...
+
+
+class ViewDependentStep:
+    """One mapping step of a field whose colours depend on the direction they are seen from, up to a degree 1 to 3.
+
+    The view knows nothing of it: it renders rows that hold the colours as this camera sees them, and hands back the
+    gradient of those.
+    """
+
+    def __init__(self, base: ImageStep, degree: int) -> None:
+        self.base, self.view, self.degree = base, base.view, degree
+        self.width = 3 * count(degree)
+        self._rows, self._R, self._position = torch.empty(0), torch.empty(0), torch.empty(0)
+
+    def forward(self, field: GaussianField, T_camera_world: Matrix) -> None:
+        """Render the field, as it looks from there, to the view's planes."""
+        self._R, t = (
+            torch.as_tensor(part).to(field.params) for part in (T_camera_world[:3, :3], T_camera_world[:3, 3])
+        )
+        self._position = -(self._R * t[:, None]).sum(0)
+        self._rows, harmonics = field.params.clone(), field.carry("harmonics").params
+        ahead = field.means @ self._R[2] + t[2] > 0
+        for rows in torch.split(ahead.nonzero().squeeze(1), ROWS_AT_ONCE):
+            own, k = field.params.index_select(0, rows), harmonics.index_select(0, rows)
+            own[:, COLORS] = view_colors(own[:, COLORS], k, own[:, MEANS], self._position, self.degree)
+            self._rows.index_copy_(0, rows, own)
+        self.view.forward(self._rows, T_camera_world)
+
+    def images(self, target: Target, weights: dict[str, float]) -> float:
+        """Write the gradient of every image term to the view's gradient planes; return the loss."""
+        return self.base.images(target, weights)
+
+    def splats(
+        self, field: GaussianField, rates: Rates, weight_isotropy: float, frozen_colors: int
+    ) -> tuple[Matrix, float]:
+        """Carry the planes to the splats in view and their harmonics, add the isotropy term's pull on them, and step.
+
+        Returns the pose twist [6] and what the splats in view add to the isotropy term, weighted.
+        """
+        grad, regulariser = torch.zeros_like(field.params), 0.0
+        twist = self.view.backward(self._rows, grad)
+        harmonics = self._begin(field.carry("harmonics"))
+        harmonic_rates = Rates(rates.of_extra("harmonics").per_column[: self.width])
+        for rows in torch.split(self.view.visible(len(field)).nonzero().squeeze(1), ROWS_AT_ONCE):
+            g, own, k = (x.index_select(0, rows) for x in (grad, field.params, harmonics.params))
+            g[rows < frozen_colors, COLORS] = 0.0
+            g_harmonics, g_means = self._through_colors(own, k, g[:, COLORS])
+            pull, term = isotropy(own[:, SCALES], weight_isotropy * len(rows) / len(field))
+            g[:, MEANS] += g_means
+            g[:, SCALES] += pull
+            twist[:3] += (self._R @ g_means.sum(0)).numpy()  # a camera that moves by ρ leaves the directions to −ρ
+            regulariser += term
+            adam_rows(field, rows, g, rates)
+            adam_rows(harmonics, rows, g_harmonics, harmonic_rates)
+        return twist, regulariser
+
+    def _begin(self, harmonics: Rows) -> Rows:
+        """Begin a step of the harmonics; return those of the degrees in use, in the memory of all."""
+        harmonics.steps += 1
+        params, moment1, moment2 = (
+            x[:, : self.width] for x in (harmonics.params, harmonics.moment1, harmonics.moment2)
+        )
+        return Rows(params, moment1, moment2, harmonics.last_step, harmonics.steps)
+
+    def _through_colors(self, own: Tensor, harmonics: Tensor, g_shown: Tensor) -> tuple[Tensor, Tensor]:
+        """Carry the gradient of shown colours [n, 3] to harmonics [n, width] and, by the direction, to means [n, 3]."""
+        means = own[:, MEANS].clone().requires_grad_()
+        values = basis(normalize(means - self._position, dim=1), self.degree)
+        g_harmonics = values.detach()[:, :, None] * g_shown[:, None, :]
+        g_values = (harmonics.reshape(-1, self.width // 3, 3) @ g_shown[:, :, None])[:, :, 0]
+        (g_means,) = torch.autograd.grad(values, means, g_values)
+        return g_harmonics.reshape(-1, self.width), g_means
+
+
+def isotropy(log_scales: Tensor, weight: float) -> tuple[Tensor, float]:
+    """Return the pull of the weighted isotropy term on log scales [n, 3], and its value."""
+    leaf = log_scales.clone().requires_grad_()
+    term = weight * losses.isotropy(leaf.exp())
+    return torch.autograd.grad(term, leaf)[0], float(term.detach())

@@ -1,0 +1,299 @@
+"""The final map on plain torch: two submaps before one wall, merged without doubles, seeded anew, refined."""
+
+from copy import deepcopy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from sigmasplat.config import Config, FinalConfig, MappingConfig, RenderConfig
+from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.fit.adam import EXTRA_RATES
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import COLUMNS, GaussianField, Rows
+from sigmasplat.model.submap import MemoryStore, Picture, Submap
+from sigmasplat.render import render
+from sigmasplat.render.view import ReferenceView
+from sigmasplat.slam.final import Keyframes, final_map, merged, survivors
+from sigmasplat.slam.fusion import Standpoint, count_keyframes, fuse, standpoints_of
+
+CAMERA = Camera(20, 15, 16.0, 16.0, 9.5, 7.0)
+CONFIG = Config(backend="reference", mapping=MappingConfig(weight_nll_color=1e-3, prune_opacity=0.1))
+WALL_M, SPACING_M = 1.55, 0.1
+ANCHORS = [np.eye(4), se3.exp(np.array([0.5, 0.1, -0.2, 0.1, -0.3, 0.05]))]
+LOG_VARIANCES = (-3.0, -6.0)
+
+
+def config(**final: object) -> Config:
+    return replace(CONFIG, final=FinalConfig(**{"spacing_m": SPACING_M, **final}))  # type: ignore[arg-type]
+
+
+def color_at(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return 0.5 + 0.3 * np.stack([np.sin(3 * x), np.cos(4 * y), np.sin(2 * x + 3 * y)], -1)
+
+
+def wall(x_from: float, x_to: float) -> GaussianField:
+    """Cover z = 1.55 m of the world with splats 10 cm apart."""
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(x_from + 0.05, x_to, 0.1), np.arange(-0.75, 0.8, 0.1)))
+    means, colors = np.stack([x, y, np.full(x.shape, WALL_M)], 1), color_at(x, y)
+    values = [torch.as_tensor(v).float() for v in (means, np.full(len(x), 0.06), colors)]
+    return GaussianField.from_values(*values, opacities=0.95)
+
+
+def poses(submap: int, keyframes: int = 3) -> list[np.ndarray]:
+    """Return T_world_camera of a submap's keyframes: side by side before its half of the wall."""
+    return [se3.exp(np.array([0.4 * submap + 0.06 * k - 0.2, 0.03 * k, 0, 0, 0.05 * k, 0])) for k in range(keyframes)]
+
+
+def look(T_world_camera: np.ndarray, field: GaussianField) -> Picture:
+    """Take a picture of a field that is in the world."""
+    seen = render(
+        field, CAMERA, torch.as_tensor(se3.inverse(T_world_camera)), options=RenderConfig(), backend="reference"
+    )
+    depth_m = np.where(seen.alpha > 0.5, seen.depth / seen.alpha.clamp(min=0.5), 0.0).astype(np.float32)
+    return Picture((seen.color.clamp(0, 1) * 255).round().byte().numpy(), depth_m)
+
+
+def make_store(spoil: float = 0.0) -> MemoryStore:
+    """Make two submaps of overlapping parts of the wall, their colours spoiled; the second is the steadier."""
+    store, rng = MemoryStore(), np.random.default_rng(0)
+    world = wall(-1.4, 1.6)
+    for index, part in enumerate((wall(-1.4, 0.4), wall(-0.2, 1.6))):
+        field = part.moved(torch.as_tensor(se3.inverse(ANCHORS[index])))
+        field.params[:, COLUMNS["log_variances"]] = LOG_VARIANCES[index]
+        field.params[:, COLUMNS["colors"]] += torch.as_tensor(rng.normal(0, spoil, (len(field), 3))).float()
+        T = np.array([se3.inverse(ANCHORS[index]) @ pose for pose in poses(index)])
+        store.save(Submap(index, field, (0, 1, 2), T, CAMERA), [look(pose, world) for pose in poses(index)])
+    return store
+
+
+def refined(store: MemoryStore, settings: Config, seed: int = 0) -> GaussianField:
+    view = ReferenceView(CAMERA, settings.render)
+    return final_map(store, ANCHORS, settings, view, np.random.default_rng(seed))
+
+
+def psnr_of_held(field: GaussianField, true: GaussianField) -> float:
+    """Score views between the keyframes, dB, over pixels where the wall is."""
+    errors = []
+    for submap in (0, 1):
+        T = se3.exp(np.array([0.4 * submap - 0.15, -0.02, 0.05, 0.01, 0.02, 0]))
+        want, got = look(T, true), look(T, field)
+        errors.append(((want.color[want.depth_m > 0] / 255.0 - got.color[want.depth_m > 0] / 255.0) ** 2).ravel())
+    return float(-10 * np.log10(np.concatenate(errors).mean()))
+
+
+# ---- merging ----
+
+
+@pytest.mark.parametrize("uncertainty", [True, False])
+def test_where_submaps_overlap_one_of_them_stays(uncertainty: bool) -> None:
+    store = make_store()
+    field = merged(store, ANCHORS, config(uncertainty=uncertainty))
+    assert float((field.means[:, 2] - WALL_M).abs().max()) < 1e-5, "in the world"
+    second = field.params[:, COLUMNS["log_variances"]].mean(1) == LOG_VARIANCES[1]
+    x = field.means[:, 0]
+    assert second[x > 0.5].all() and not second[x < -0.3].any(), "where there is one submap, all of it stays"
+    assert bool(second[(x > -0.05) & (x < 0.25)].all()) is uncertainty, "the steadier one, else the earlier"
+    assert len(field) < sum(len(s.field) for s in store.submaps) - 60
+    everything = torch.cat([wall(-1.4, 0.4).means, wall(-0.2, 1.6).means])
+    away = cKDTree(field.means.numpy()).query(everything.numpy())[0]
+    assert away.max() < SPACING_M * np.sqrt(3), "no hole"
+
+
+def test_no_voxel_keeps_two_submaps_and_none_is_emptied() -> None:
+    rng = np.random.default_rng(1)
+    means, owner, unsteady = rng.uniform(-1, 1, (3000, 3)), rng.integers(0, 4, 3000), rng.normal(size=3000)
+    for given in (unsteady, None):
+        keep = survivors(means, owner, given, 0.25)
+        stays: dict[tuple[int, ...], set[int]] = {}
+        for i in range(3000):
+            voxel = tuple(np.floor(means[i] / 0.25).astype(int))
+            here = [j for j in range(3000) if tuple(np.floor(means[j] / 0.25).astype(int)) == voxel] if i < 40 else None
+            if here is not None:  # by hand, for some
+                score = {o: (np.mean([unsteady[j] for j in here if owner[j] == o]) if given is not None else o)
+                         for o in {int(owner[j]) for j in here}}  # fmt: skip
+                assert keep[i] == (owner[i] == min(score, key=score.__getitem__))
+            stays.setdefault(voxel, set())
+            if keep[i]:
+                stays[voxel].add(int(owner[i]))
+        assert {len(owners) for owners in stays.values()} == {1}
+
+
+def test_one_submap_is_left_as_it_is() -> None:
+    store = MemoryStore()
+    whole = make_store()
+    store.save(whole.submaps[0], whole.pictures[0])
+    store.submaps[0].field.extras["harmonics"] = Rows(torch.ones(len(store.submaps[0].field), 45))
+    field = refined(store, config())
+    assert torch.equal(field.params, store.submaps[0].field.params) and set(field.extras) == {"harmonics"}
+    field.params += 1.0
+    assert float(store.submaps[0].field.means[:, 2].max()) < 2.0, "the submap's own memory is not touched"
+
+
+# ---- seeding on the surface ----
+
+
+@pytest.mark.parametrize("uncertainty", [True, False])
+def test_mesh_seeds_cover_the_surface(uncertainty: bool) -> None:
+    field = refined(make_store(), config(seed_from="mesh", uncertainty=uncertainty))
+    x, y, z = field.means.numpy().T
+    assert np.abs(z - WALL_M).max() < 0.02 and len(field) > 100
+    mesh = fuse(standpoints_of(make_store(), ANCHORS), 6, config(), voxel_m=0.01)
+    assert cKDTree(field.means.numpy()).query(mesh.vertices)[0].max() < SPACING_M * np.sqrt(3)
+    cells = np.floor(field.means.numpy() / SPACING_M).astype(int)
+    assert len(np.unique(cells, axis=0)) > 0.9 * len(field), "spacing apart"
+    inside = (np.abs(x) < 0.3) & (np.abs(y) < 0.3)
+    assert np.abs(field.colors.numpy()[inside] - color_at(x, y)[inside]).mean() < 0.08
+    torch.testing.assert_close(field.scales, torch.full_like(field.scales, SPACING_M))
+    torch.testing.assert_close(field.opacities, torch.full((len(field),), 0.5))
+    s = field.params[:, COLUMNS["log_variances"]]
+    if uncertainty:
+        assert (s[x < -0.3] == LOG_VARIANCES[0]).all() and (s[x > 0.5] == LOG_VARIANCES[1]).all()
+    else:
+        assert (s == -7.0).all()
+
+
+def test_standpoints_are_the_keyframes_in_field_and_world() -> None:
+    store = make_store()
+    found = list(standpoints_of(store, ANCHORS))
+    assert len(found) == count_keyframes(store) == 6
+    for at, pose in zip(found, poses(0) + poses(1), strict=True):
+        np.testing.assert_allclose(at.T_world_camera, pose, atol=1e-12)
+    T_camera_submap = se3.inverse(poses(1)[1]) @ ANCHORS[1]
+    np.testing.assert_allclose(found[4].T_camera_field, T_camera_submap, atol=1e-12)
+    assert found[4].field is store.submaps[1].field
+
+
+def test_weighing_by_variance_lets_the_steadier_map_say_where_the_wall_is() -> None:
+    """Two maps of a wall 4 cm apart, one very unsure on a third of it: there the weighted surface is the other's."""
+    near, far = wall(-1.4, 1.6), wall(-1.4, 1.6)
+    far.params[:, 2] += 0.04
+    far.params[far.means[:, 0] < -0.3, COLUMNS["log_variances"]] = 0.0
+    for field in (near, far):
+        field.params[:, COLUMNS["colors"]] = 0.5
+    at = [Standpoint(field, CAMERA, np.eye(4), np.eye(4)) for field in (near, far)]
+    settings = replace(CONFIG, tracking=replace(CONFIG.tracking, tau=1.0, weight_max=100.0))
+    left = {}
+    for weigh in (False, True):
+        mesh = fuse(at, 2, settings, voxel_m=0.02, weigh=weigh)
+        x, y, z = mesh.vertices.T
+        left[weigh] = float(np.median(z[(x < -0.5) & (np.abs(y) < 0.4)]))
+    assert left[False] == pytest.approx(WALL_M + 0.02, abs=6e-3)
+    assert left[True] == pytest.approx(WALL_M, abs=6e-3)
+
+
+# ---- refinement ----
+
+
+@pytest.mark.parametrize("uncertainty", [True, False])
+def test_refinement_mends_held_views(uncertainty: bool) -> None:
+    store, true, told = make_store(spoil=0.15), wall(-1.4, 1.6), list[tuple[int, int]]()
+    start = refined(store, config(uncertainty=uncertainty))
+    settings, view = config(uncertainty=uncertainty, iterations=30), ReferenceView(CAMERA, CONFIG.render)
+    settings = replace(settings, mapping=replace(settings.mapping, lr_colors=0.04, lr_pose_rotation=1.0))
+    field = final_map(store, ANCHORS, settings, view, np.random.default_rng(0), lambda *at: told.append(at))
+    assert psnr_of_held(field, true) > psnr_of_held(start, true) + 3.0
+    assert told == [(i, 30) for i in range(31)]
+    likelihood_trained = not torch.equal(field.params[:, 14:], start.params[:, 14:])
+    assert likelihood_trained is uncertainty, "σ² learns only where it is asked for"
+    again = final_map(store, ANCHORS, settings, view, np.random.default_rng(0))
+    assert torch.equal(again.params, field.params), "the same draw gives the same map"
+
+
+def test_degrees_grow_and_faded_splats_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    store = make_store()
+    store.submaps[0].field.params[:5, 10] = -8.0
+    store.submaps[1].field.params[-5:, 10] = -8.0
+    used = []
+
+    def fit(
+        field: GaussianField, view: object, order: object, mapping: MappingConfig, rates: object, degree: int
+    ) -> object:
+        steps = len(list(order))  # type: ignore[call-overload]
+        used.append((steps, degree, len(field)))
+        return type("Fit", (), {"losses": [0.0] * steps})()
+
+    monkeypatch.setattr("sigmasplat.slam.final.fit_field", fit)
+    full = len(refined(store, config()))
+    field = refined(store, config(iterations=25, sh_degree=2, sh_every=6, prune_every=10))
+    assert [(steps, degree) for steps, degree, _ in used] == [(6, 0), (4, 1), (2, 1), (6, 2), (2, 2), (4, 2), (1, 2)]
+    assert [n for *_, n in used] == [full] * 2 + [full - 10] * 5 and len(field) == full - 10
+
+
+def around(angle: float) -> np.ndarray:
+    """Return T_world_camera of a camera on an arc about the wall's middle, looking at it."""
+    middle = np.eye(4)
+    middle[2, 3] = WALL_M
+    return middle @ se3.exp(np.array([0, 0, 0, 0, angle, 0])) @ se3.inverse(middle)
+
+
+def test_view_dependent_colour_is_learned_in_refinement(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures of a wall that is brighter the more it is seen from the right: harmonic 3, −x, has to say so."""
+    shiny, plain, path = wall(-1.4, 1.6), wall(-1.4, 1.6), [around(a) for a in np.linspace(-0.8, 0.8, 5)]
+    shiny.extras["harmonics"] = Rows(torch.zeros(len(shiny), 45))
+    shiny.extras["harmonics"].params[:, 6:9] = 0.5
+    store = MemoryStore()
+    store.save(Submap(0, plain, (0, 1, 2, 3, 4), np.array(path), CAMERA), [look(pose, shiny) for pose in path])
+    monkeypatch.setitem(EXTRA_RATES, "harmonics", ("colors", 1.0))  # 40 steps are few at a twentieth
+    errors = []
+    for degree in (0, 1):
+        settings = config(iterations=40, sh_degree=degree, sh_every=1)
+        only_colors = replace(settings.mapping, lr_colors=0.02, lr_means=0.0, lr_opacity_logits=0.0)
+        field = refined(store, replace(settings, mapping=only_colors))
+        off = [look(around(a), field).color / 255.0 - look(around(a), shiny).color / 255.0 for a in (-0.6, 0.6)]
+        errors.append(np.abs(off).mean())
+    learned = field.extras["harmonics"].params[:, :9].reshape(-1, 3, 3).mean((0, 2))
+    assert errors[1] < 0.7 * errors[0], errors
+    assert learned[2] > 0.1 and learned[2] > 3 * learned[:2].abs().max(), learned
+
+
+def test_pictures_are_read_when_drawn_and_kept_while_there_is_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    store, read = make_store(), list[tuple[int, int]]()
+    monkeypatch.setattr(store, "picture", lambda s, k: read.append((s, k)) or store.pictures[s][k])
+    view = ReferenceView(CAMERA, CONFIG.render)
+    monkeypatch.setattr("sigmasplat.slam.final.CACHE_BYTES", 2 * 16 * 20 * 15)
+    keyframes = Keyframes(store, ANCHORS, view)
+    assert len(keyframes) == 6 and not read
+    for i in (0, 5, 0, 5, 3, 0):
+        found = keyframes[i]
+        assert found.fixed
+        np.testing.assert_allclose(found.T_world_camera, poses(i // 3)[i % 3], atol=1e-12)
+        np.testing.assert_array_equal(found.target.depth_image.numpy(), store.pictures[i // 3][i % 3].depth_m)
+    assert read == [(0, 0), (1, 2), (1, 0), (0, 0)], "two fit: the third drives out the one not asked for longest"
+
+
+# ---- bad input ----
+
+
+def test_what_no_map_can_be_made_of_is_refused() -> None:
+    for store, anchors in ((MemoryStore(), []), (make_store(), ANCHORS[:1])):
+        view = ReferenceView(CAMERA, CONFIG.render)
+        with pytest.raises(
+            SigmaSplatError, match=f"without submaps and their anchors: {len(store)} and {len(anchors)}"
+        ):
+            final_map(store, anchors, config(), view, np.random.default_rng(0))
+    other = ReferenceView(replace(CAMERA, fx=21.0), CONFIG.render)
+    with pytest.raises(SigmaSplatError, match="submap 0 was seen by"):
+        final_map(make_store(), ANCHORS, config(iterations=1), other, np.random.default_rng(0))
+    blind = deepcopy(make_store())
+    for submap in blind.submaps:
+        submap.field.params[:, 10] = -9.0
+    with pytest.raises(SigmaSplatError, match="show no surface"):
+        refined(blind, config(seed_from="mesh"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"sh_degree": 4}, "degrees 0 to 3, found 4"),
+        ({"spacing_m": 0.0}, r"final\.spacing_m must be above 0, found 0\.0"),
+        ({"sh_every": 0}, r"final\.sh_every must be above 0"),
+        ({"prune_every": -1}, r"final\.prune_every must be above 0"),
+    ],
+)
+def test_settings_out_of_range_are_refused(settings: dict[str, object], complaint: str) -> None:
+    with pytest.raises(ConfigError, match=complaint):
+        refined(make_store(), config(**settings))

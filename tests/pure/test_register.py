@@ -1,0 +1,157 @@
+"""Registration on small submaps of the built-in room, whose true places are known; and its arithmetic."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sigmasplat.config import Config, RegistrationConfig, RenderConfig, SeedConfig, TrackingConfig
+from sigmasplat.fit.target import Target
+from sigmasplat.model import se3
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.submap import MemoryStore, Submap
+from sigmasplat.render.view import make_view
+from sigmasplat.slam import register
+from sigmasplat.slam.places import Candidate, SubmapPair
+from sigmasplat.slam.register import Localisation, Registrar, Registration
+from sigmasplat.slam.seeding import make_splats
+from sigmasplat.sources import SyntheticRoom
+
+Matrix = NDArray[np.float64]
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+
+SEEDS = SeedConfig(scale_from="pixel", opacity=0.8, scale_factor=0.8)
+CONFIG = Config(
+    tracking=TrackingConfig(method="align", align_weight_color=0.1),
+    registration=RegistrationConfig(iterations=10, lr_translation=1e-3, lr_rotation=1e-3, tau=10.0),
+)
+
+
+@cache
+def walk() -> SyntheticRoom:
+    return SyntheticRoom(frames=200, width=160, height=120)
+
+
+def piece(store: MemoryStore, frames: Sequence[int], brighter: float = 1.0) -> Submap:
+    """Add a submap of some frames, every pixel a splat at its true place, and what those frames saw."""
+    truth = walk().truth().T_world_camera
+    T_submap_camera = np.stack([se3.inverse(truth[frames[0]]) @ truth[i] for i in frames])
+    field, pictures = GaussianField.empty(), []
+    for i, T in zip(frames, T_submap_camera, strict=True):
+        frame = walk().frame(i)
+        target = Target.of(replace(frame, color=np.clip(frame.color * brighter, 0, 1)), (120, 160))
+        field.append(make_splats(target, T, frame.depth_m > 0, 1.0, field, SEEDS))
+        pictures.append(target.picture())
+    submap = Submap(len(store), field, tuple(frames), T_submap_camera, walk().camera)
+    store.save(submap, pictures)
+    return submap
+
+
+def registered(a: Sequence[int], b: Sequence[int], error: Matrix, brighter: float = 1.0) -> tuple[Registration, Matrix]:
+    """Register submaps of frames a and b, told a T_a_b that is wrong by `error`; return the verdict and the truth."""
+    store = MemoryStore()
+    piece(store, a)
+    piece(store, b, brighter)
+    truth = walk().truth().T_world_camera
+    T_a_b = se3.inverse(truth[a[0]]) @ truth[b[0]]
+    pair = SubmapPair(Candidate(0, 0, 1, 0, 1.0, 1.0), (0, 1), (0, 1))
+    view = make_view("cpu", walk().camera, RenderConfig())
+    return Registrar(CONFIG, store, view).register(pair, error @ T_a_b), T_a_b
+
+
+def off(found: Matrix, truth: Matrix) -> tuple[float, float]:
+    E = se3.inverse(truth) @ found
+    return float(np.linalg.norm(E[:3, 3])), float(np.rad2deg(se3.rotation_angle(E[:3, :3])))
+
+
+@pytest.mark.parametrize("brighter", [1.0, 0.85])
+def test_submaps_of_one_place_find_each_other_from_afar_and_in_another_light(brighter: float) -> None:
+    error = se3.exp(np.array([0.1, -0.05, 0.05, 0.03, 0.06, -0.02]))
+    found, truth = registered((0, 5), (3, 8), error, brighter)
+    assert found.accepted, found.reason
+    assert found.localised == 4
+    metres, degrees = off(found.T_a_b, truth)
+    assert metres < 0.01
+    assert degrees < 0.3
+    assert found.overlap > 0.8
+    assert np.linalg.eigvalsh(found.information)[0] > 0.0
+
+
+def test_what_is_known_before_does_not_matter_where_the_views_are_alike() -> None:
+    found, truth = registered((0, 5), (2, 6), se3.exp(np.array([3.0, 1.0, 0.0, 0.0, 0.0, 2.0])))
+    assert found.accepted, found.reason
+    assert off(found.T_a_b, truth)[0] < 0.02
+
+
+def test_submaps_of_different_places_are_refused_and_left_where_they_are() -> None:
+    known = np.eye(4)
+    found, truth = registered((0, 5), (100, 105), known)
+    assert not found.accepted
+    assert found.reason
+    assert np.allclose(found.T_a_b, truth)
+
+
+def localisation(T_a_b: Matrix, residual: float = 0.1, covariance: Matrix | None = None) -> Localisation:
+    return Localisation(T_a_b, residual, np.eye(6) * 1e-6 if covariance is None else covariance, 1.0, 1.0)
+
+
+def test_one_stray_localisation_is_left_out() -> None:
+    near = [localisation(se3.exp(np.full(6, 0.01 * k))) for k in range(3)]
+    stray = localisation(se3.exp(np.array([1.0, 0, 0, 0, 0, 0.0])), residual=0.01)
+    agreed = register.consensus([stray, *near], np.zeros(3), 0.1, 0.1)
+    assert len(agreed) == 3
+    assert stray not in agreed
+
+
+def test_a_turn_counts_where_the_keyframe_is_not_at_the_origin() -> None:
+    turn = localisation(se3.exp(np.array([0.0, 0, 0, 0, 0, 0.05])))
+    point = np.array([4.0, 0.0, 0.0])
+    assert register.differs(turn.T_a_b, np.eye(4), point) == pytest.approx((0.2, 0.05), abs=1e-3)
+    assert len(register.consensus([turn, localisation(np.eye(4))], point, 0.1, 0.1)) == 1
+
+
+def test_the_mean_leans_towards_the_smaller_residual() -> None:
+    far = np.eye(4)
+    far[:3, 3] = [0.03, 0.0, 0.0]
+    mean = register.combined([localisation(np.eye(4), 0.1), localisation(far, 0.2)])
+    assert mean[0, 3] == pytest.approx(0.01)
+    turns = [localisation(se3.exp(np.array([0, 0, 0, 0, 0, angle])), 0.1) for angle in (0.1, 0.3)]
+    assert np.allclose(se3.log_rotation(register.combined(turns)[:3, :3]), [0, 0, 0.2])
+
+
+def test_turning_a_localisation_round_carries_its_covariance() -> None:
+    random = np.random.default_rng(0)
+    T = se3.exp(random.normal(0, 0.5, 6))
+    half = np.diag([3e-3, 1e-3, 2e-3, 1e-3, 2e-3, 3e-3])
+    draws = se3.exp_stack(random.standard_normal((20_000, 6)) @ half)
+    drawn = np.cov(se3.log_stack(se3.inverse(draws @ T) @ T).T)
+    turned = register.turned(localisation(T, covariance=half @ half.T))
+    scale = np.sqrt(np.diag(drawn))
+    assert np.allclose(turned.T_a_b, se3.inverse(T))
+    assert np.abs((turned.covariance - drawn) / np.outer(scale, scale)).max() < 0.04
+
+
+def test_disagreement_costs_information() -> None:
+    close = [localisation(np.eye(4)), localisation(np.eye(4))]
+    apart = [localisation(se3.exp(np.array([s * 0.03, 0, 0, 0, 0, 0.0]))) for s in (-1.0, 1.0)]
+    sure, unsure = (register.information(found, np.eye(4)) for found in (close, apart))
+    assert np.linalg.inv(unsure)[0, 0] == pytest.approx(np.linalg.inv(sure)[0, 0] + 0.03**2)
+    assert np.linalg.inv(sure)[0, 0] == pytest.approx(1e-6 + register.FLOOR_M**2)
+
+
+def test_overlap_is_the_larger_share_of_splats_with_a_neighbour() -> None:
+    store = MemoryStore()
+    whole, part = piece(store, (0,)), piece(store, (0,))
+    part.field.keep(part.field.means[:, 0] > 0)
+    assert register.shared(whole, part, np.eye(4), 0.02) == 1.0
+    away = np.eye(4)
+    away[:3, 3] = [0.0, 0.0, 9.0]
+    assert register.shared(whole, part, away, 0.02) == 0.0
+    assert (
+        register.shared(whole, Submap(2, GaussianField.empty(), (), np.zeros((0, 4, 4)), whole.camera), away, 1.0)
+        == 0.0
+    )

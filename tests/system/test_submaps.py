@@ -1,0 +1,164 @@
+"""Submaps as part of SLAM, on the beginning of a walk through the built-in room, small."""
+
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sigmasplat.config import Config
+from sigmasplat.config.text import override
+from sigmasplat.errors import ConfigError
+from sigmasplat.io.submaps import DiskStore
+from sigmasplat.metrics.trajectory import ate
+from sigmasplat.model import se3
+from sigmasplat.model.frame import Frame
+from sigmasplat.model.submap import SubmapStore
+from sigmasplat.presets import default_preset, preset
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources import SyntheticRoom
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+
+SMALL = {"input.width": "160", "mapping.first_iterations": "40", "mapping.iterations": "10"}
+ONE = {"submaps.distance_m": "0", "submaps.angle_deg": "0"}
+CUT = ONE | {"submaps.frames": "10", "loops.min_interval": "1", "loops.min_similarity": "0.3"}
+FRAMES = 26
+
+
+@cache
+def walk() -> SyntheticRoom:
+    return SyntheticRoom(frames=200, width=160, height=120)
+
+
+@cache
+def there_and_back() -> list[Frame]:
+    """Walk thirteen frames ahead and the same way back, so that the end sees the beginning's place."""
+    order = [*range(FRAMES // 2), *reversed(range(FRAMES // 2))]
+    frames = [walk().frame(i) for i in order]
+    return [Frame(n, n / 30.0, f.color, f.depth_m, f.camera) for n, f in enumerate(frames)]
+
+
+def settings(**changes: str) -> Config:
+    names = {name.replace("__", "."): value for name, value in changes.items()}
+    return override(preset(default_preset()), SMALL | CUT | names)
+
+
+def followed(config: Config, store: SubmapStore | None = None, finish: bool = True) -> Slam:
+    slam = Slam(config, store)
+    for frame in there_and_back():
+        slam.step(frame)
+    if finish:
+        slam.finish()
+    return slam
+
+
+@pytest.fixture(scope="module")
+def run() -> Slam:
+    return followed(settings())
+
+
+def error_m(slam: Slam) -> float:
+    truth = walk().truth()
+    order = [*range(FRAMES // 2), *reversed(range(FRAMES // 2))]
+    known = type(truth)(np.arange(FRAMES) / 30.0, truth.T_world_camera[order])
+    return ate(slam.trajectory(), known).rmse_m
+
+
+def contents(slam: Slam) -> dict[str, bytes]:
+    saved = {name: tensor.numpy().tobytes() for name, tensor in slam.checkpoint().items()}
+    return saved | {"map": slam.field.params.numpy().tobytes()}
+
+
+def test_the_map_is_cut_and_the_path_goes_on(run: Slam) -> None:
+    submaps = [step.submap for step in run.steps]
+    assert sorted(set(submaps)) == [0, 1, 2]
+    assert submaps == sorted(submaps)
+    assert not any(step.lost for step in run.steps)
+    assert error_m(run) < 0.01
+
+
+def test_each_submap_begins_at_its_own_origin_with_the_keyframe_that_ended_the_one_before(run: Slam) -> None:
+    pieces = [run.store.load(i) for i in range(len(run.store))]
+    assert len(pieces) == 3
+    for before, after in pairwise(pieces):
+        assert np.array_equal(after.T_submap_camera[0], np.eye(4))
+        assert before.frames[-1] == after.frames[0]
+        shared = [run.atlas.anchors[p.index] @ p.T_submap_camera[k] for p, k in ((before, -1), (after, 0))]
+        assert np.allclose(shared[0], shared[1], atol=5e-3)
+
+
+def test_a_submap_shows_what_its_keyframes_saw(run: Slam) -> None:
+    picture, frame = run.store.picture(1, 0), there_and_back()[run.store.load(1).frames[0]]
+    assert np.abs(picture.unit_color - frame.prepared(160, 0.1, 8.0).color).max() < 0.5 / 255 + 1e-6
+
+
+def test_coming_back_closes_a_true_loop(run: Slam) -> None:
+    accepted = [loop for loop in run.loops if loop.accepted]
+    assert accepted
+    for loop in accepted:
+        there, here = (walk().truth().T_world_camera[_seen(run, s)] for s in (loop.database, loop.query))
+        off = se3.inverse(se3.inverse(here) @ there) @ loop.T_query_database
+        assert np.linalg.norm(off[:3, 3]) < 0.02
+        assert loop.record()["T_query_database"][3] == [0.0, 0.0, 0.0, 1.0]
+
+
+def _seen(run: Slam, submap: int) -> int:
+    """Return which frame of the walk was the submap's first keyframe."""
+    first = run.store.load(submap).frames[0]
+    return min(first, FRAMES - 1 - first)
+
+
+def test_a_correction_moves_anchors_and_nothing_else(run: Slam) -> None:
+    steps, before = run.trajectory().T_world_camera.copy(), [p.T_keyframe_camera.copy() for p in run.atlas.places]
+    files = [run.store.load(i).field.params.clone() for i in range(3)]
+    correction, anchor = se3.exp(np.full(6, 0.1)), run.atlas.anchors[1]
+    run.atlas.anchors[1] = correction @ anchor
+    moved = run.trajectory().T_world_camera
+    run.atlas.anchors[1] = anchor
+    inside = np.array([place.submap == 1 for place in run.atlas.places])
+    assert np.allclose(moved[inside], correction @ steps[inside])
+    assert np.array_equal(moved[~inside], steps[~inside])
+    assert all(np.array_equal(a, p.T_keyframe_camera) for a, p in zip(before, run.atlas.places, strict=True))
+    assert all(torch.equal(a, run.store.load(i).field.params) for i, a in enumerate(files))
+
+
+def test_the_same_bytes_again_and_from_disk(run: Slam, tmp_path: Path) -> None:
+    assert contents(followed(settings(), DiskStore(tmp_path))) == contents(run)
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_no_rule_means_one_submap_and_an_empty_store() -> None:
+    slam = followed(override(settings(), {"submaps.frames": "0"}))
+    assert len(slam.store) == 0
+    assert {step.submap for step in slam.steps} == {0}
+    assert slam.field is slam.mapper.field
+    assert slam.loops == []
+
+
+def test_an_unfinished_run_shows_all_submaps_side_by_side() -> None:
+    slam = followed(settings(loops__close="false"), finish=False)
+    assert len(slam.store) == 2
+    splats = sum(len(slam.store.load(i).field) for i in range(2)) + len(slam.mapper.field)
+    assert len(slam.field) == splats
+    assert slam.loops == []
+
+
+def test_the_uncertainty_rule_fires_sooner_where_images_say_less() -> None:
+    """A blurred, coarse depth makes alignment less certain: the same limit is passed after fewer frames."""
+    limit = {"submaps__frames": "0", "loops__close": "false", "submaps__uncertainty_m": "0.0048"}
+    sure = followed(settings(**limit), finish=False)
+    slam = Slam(settings(**limit))
+    random = np.random.default_rng(0)
+    for frame in there_and_back():
+        noise = random.normal(0.0, 0.03, frame.depth_m.shape) * frame.depth_m
+        gray = np.full_like(frame.color, 0.5) + 0.02 * (frame.color - 0.5)
+        slam.step(Frame(frame.index, frame.timestamp_s, gray, (frame.depth_m + noise).astype(np.float32), frame.camera))
+    assert len(slam.atlas.anchors) > len(sure.atlas.anchors)
+
+
+def test_netvlad_without_weights_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"loops\.weights"):
+        Slam(settings(loops__descriptor="netvlad"))
