@@ -21,9 +21,10 @@ import tables
 import tyro
 
 import sigmasplat
+from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.options import Settings
-from sigmasplat.presets import default_preset, override, preset as preset_of, split_settings
+from sigmasplat.presets import default_preset, preset as preset_of
 
 arg = tyro.conf.arg
 SYNTHETIC = "synthetic:frames=200"

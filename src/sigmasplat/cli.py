@@ -1,16 +1,16 @@
-"""Offer the command line: sigmasplat demo | run | eval | mesh | export | doctor; torch loads where it is needed."""
+"""Offer the command line: sigmasplat demo | run | eval | mesh | export | bench | doctor; torch loads where needed."""
 
 import sys
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import tyro
 
 from sigmasplat import env, options
+from sigmasplat.benches import bench
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.options import absolute, configured, refuse_existing, source_of
+from sigmasplat.options import absolute, configured, prepare_torch, refuse_existing, source_of
 from sigmasplat.presets import default_preset
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def evaluate_run(run: options.RunPath, mesh: options.WithMesh = False, moved_to:
 
     folder = RunFolder.open(run)
     source = source_of(folder, moved_to)
-    _prepare_torch()
+    prepare_torch()
     _evaluate(Screen(), folder, source, mesh)
     return OK
 
@@ -111,7 +111,7 @@ def make_mesh(
     check_name(target)
     refuse_existing(out, overwrite)
     source = source_of(folder, moved_to)
-    _prepare_torch()
+    prepare_torch()
     with screen.counting("surface") as progress:
         surface = reconstruct(folder, source.camera, voxel_m=voxel_m, progress=progress)
     write_mesh(target, surface)
@@ -168,22 +168,21 @@ def _record(
     from sigmasplat.session import record
     from sigmasplat.slam.slam import Slam
 
-    _prepare_torch()
+    prepare_torch()
     with screen.steps(len(source)) as watch:
-        outcome = record(Slam(config), source, folder, watch)
+        outcome = record(Slam(config, folder.submaps), source, folder, watch)
     if profile:
         screen.profile(folder.read_profile())
     if source.skipped:
         images = "image" if len(source.skipped) == 1 else "images"
         screen.warn(f"{len(source.skipped)} unreadable {images} passed over (first: {source.skipped[0]})")
-    counts = f"{outcome.frames} frames, {outcome.lost} lost, {outcome.frames / outcome.wall_s:.1f} frames/s"
     if outcome.status == "interrupted":
-        screen.say(f"interrupted after {counts}; trajectory, map and checkpoint so far are in {folder.path}")
+        screen.say(f"interrupted after {outcome.counts()}; trajectory, map and checkpoint so far are in {folder.path}")
         return INTERRUPTED
     if evaluate:
         _evaluate(screen, folder, source)
     else:
-        screen.say(f"{counts}: {folder.path}")
+        screen.say(f"{outcome.counts()}: {folder.path}")
     return OK
 
 
@@ -193,7 +192,7 @@ def _evaluate(screen: "Screen", folder: "RunFolder", source: "Source", mesh: boo
 
     try:
         with screen.counting("evaluation") as progress:
-            metrics = (partial(evaluate, mesh=True) if mesh else evaluate)(folder, source, progress=progress)
+            metrics = evaluate(folder, source, mesh=mesh, progress=progress)
         screen.results(metrics)
     except Exception as problem:
         problem.add_note(f"the run is in {folder.path}")
@@ -204,20 +203,13 @@ def _evaluate(screen: "Screen", folder: "RunFolder", source: "Source", mesh: boo
             screen.say(f"report: {report.resolve()}")
 
 
-def _prepare_torch() -> None:
-    """Give torch as many threads as the kernels are given."""
-    import torch
-
-    if env.switches().threads:
-        torch.set_num_threads(env.switches().threads)
-
-
 COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo,
     "run": run,
     "eval": evaluate_run,
     "mesh": make_mesh,
     "export": export,
+    "bench": bench,
     "doctor": doctor,
 }
 

@@ -8,31 +8,25 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from sigmasplat import surface
-from sigmasplat.config import Config
+from sigmasplat.config import Config, FinalConfig, InputConfig
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.io.runs import RunFolder
-from sigmasplat.metrics import plot, views
-from sigmasplat.metrics.panels import COVERED_ALPHA, View, side_by_side
+from sigmasplat.metrics import charts, plot, views
+from sigmasplat.metrics.panels import View, side_by_side
 from sigmasplat.metrics.report import Contents, build_report
 from sigmasplat.metrics.trajectory import align_rigid, associate, ate, rpe
-from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.render import Render, render
+from sigmasplat.render import render
 from sigmasplat.sources.base import Source
 
 SAME_TIME_S = 1e-4
 """Log and trajectory hold the same timestamps up to printing."""
 
 Log = list[dict[str, Any]]
-
-
-Renderer = Callable[[GaussianField, Camera, NDArray[np.float64]], Render]
 Progress = Callable[[int, int], None]
 
 
@@ -40,7 +34,7 @@ def evaluate(
     run: RunFolder,
     source: Source,
     *,
-    renderer: Renderer | None = None,
+    renderer: views.Renderer | None = None,
     views_per_kind: int = 40,
     strips_per_kind: int = 6,
     mesh: bool = False,
@@ -50,7 +44,8 @@ def evaluate(
 
     Training views are the run's keyframes, held-out views the frames that no map was fitted to; of each at most
     `views_per_kind`, evenly spread. Both are rendered at the estimated poses, at the run's working resolution, with the
-    run's render settings unless a `renderer` is given. `progress` is told (views done, of how many).
+    run's render settings unless a `renderer` is given; and, where the run kept its submaps, in the submap that each
+    frame belongs to as well, as it was before the final map was made. `progress` is told (views done, of how many).
     With `mesh` the keyframes are fused into mesh.ply, which is scored where the source knows its true surface.
     Raises RunError if the run stopped before it had a map; SourceError if the truth shares no timestamps with the run,
     after everything else has been written.
@@ -63,19 +58,21 @@ def evaluate(
     truth = source.truth()
     path_scores, problem = _path_scores(path, truth)
     chosen = {kind: _spread(records, views_per_kind) for kind, records in _kinds(log).items()}
-    gallery, config = Gallery(run, strips_per_kind), run.config()
+    gallery, config, loops = Gallery(run, strips_per_kind), run.config(), run.read_loops()
     renderer = renderer or partial(render, options=config.render, backend=config.backend)
-    scores = _score_views(config, source, field, chosen, gallery, renderer, progress)
+    maps = views.Maps(field, run.submaps, _anchors(run, records, config.final))
+    scores = _score_views(config, source, maps, chosen, gallery, renderer, progress)
     metrics = _facts(run, source, log, field) | path_scores | scores | {"reconstruction": None}
     if mesh:
         known = None if problem else truth
         found = surface.fuse_and_score(run, source.camera, source.true_surface(), known, renderer, progress)
         metrics["reconstruction"] = found
     run.write_metrics(metrics)
-    plots = _draw_plots(run, log, None if problem else truth)
+    plots = _draw_plots(run, log, None if problem else truth, loops)
     warnings = [str(problem)] if problem else []
-    title, settings = f"SigmaSplat · {source.name}", json.dumps(run.config().to_dict(), indent=2)
-    run.write_report(build_report(Contents(title, _subtitle(run), metrics, gallery.strips, plots, settings, warnings)))
+    title, settings = f"SigmaSplat · {source.name}", json.dumps(config.to_dict(), indent=2)
+    contents = Contents(title, _subtitle(run), metrics, gallery.strips, plots, settings, warnings, loops)
+    run.write_report(build_report(contents))
     if problem:
         raise problem
     return metrics
@@ -91,20 +88,43 @@ class Gallery:
         for old in run.images.glob("view-*.png"):
             old.unlink()
 
-    def add(self, view: View) -> None:
-        """Draw one view."""
-        name = f"view-{view.kind.replace(' ', '-')}-{view.index:06d}.png"
+    def add(self, view: View, place: str = "") -> None:
+        """Draw one view; `place` says in which map it was seen if not in the final one."""
+        name = f"view-{view.kind.replace(' ', '-')}{place and '-submap'}-{view.index:06d}.png"
         self.run.write_image(name, side_by_side(view))
-        self.strips.setdefault(f"{view.kind} views", []).append(f"images/{name}")
+        self.strips.setdefault(f"{view.kind} views{place}", []).append(f"images/{name}")
+
+
+def _anchors(run: RunFolder, records: Log, final: FinalConfig) -> NDArray[np.float64] | None:
+    """Return T_world_submap [S, 4, 4] where the run kept all submaps that its frames belong to, else None.
+
+    None too where there is one and the final map is that one as it was.
+    """
+    count = _submaps(records)
+    if len(run.submaps) != count or (count == 1 and final.seed_from == "submaps" and not final.iterations):
+        return None
+    anchors = run.read_checkpoint()[0].get("T_world_submap")
+    return None if anchors is None or len(anchors) != count else np.asarray(anchors, np.float64)
+
+
+def _submaps(log: Log) -> int:
+    """Count submaps; runs of before there were any are in one piece."""
+    return 1 + max(int(record.get("submap", 0)) for record in log)
 
 
 def _posed(log: Log, path: Trajectory, run: RunFolder) -> Log:
-    """Return the log's records that have a pose, each with its `T_world_camera` [4, 4]. Raises RunError if none has."""
+    """Return the log's records that have a pose, each with its `T_world_camera` [4, 4] and its `row` in the log.
+
+    Raises RunError if none has.
+    """
     times = np.array([record["timestamp_s"] for record in log], np.float64)
     rows, poses = associate(times, path.timestamps_s, SAME_TIME_S)
     if not len(rows):
         raise RunError(f"run {run.path}: trajectory.txt and log.jsonl share no timestamps; are they of one run?")
-    return [log[row] | {"T_world_camera": path.T_world_camera[pose]} for row, pose in zip(rows, poses, strict=True)]
+    return [
+        log[row] | {"T_world_camera": path.T_world_camera[pose], "row": int(row)}
+        for row, pose in zip(rows, poses, strict=True)
+    ]
 
 
 def _kinds(log: Log) -> dict[str, Log]:
@@ -132,51 +152,48 @@ def _path_scores(path: Trajectory, truth: Trajectory | None) -> tuple[dict[str, 
 
 
 def _score_views(
-    config: Config, source: Source, field: GaussianField, chosen: dict[str, Log], gallery: Gallery,
-    renderer: Renderer, progress: Progress,
+    config: Config, source: Source, maps: views.Maps, chosen: dict[str, Log], gallery: Gallery,
+    renderer: views.Renderer, progress: Progress,
 ) -> dict[str, Any]:  # fmt: skip
-    """Render and score the chosen views; average the scores per kind; judge V on the held-out views."""
-    total, done = sum(len(records) for records in chosen.values()), 0
-    scores: dict[str, list[dict[str, float]]] = {kind: [] for kind in chosen}
-    samples: list[NDArray[np.float32]] = []
-    for kind, records in chosen.items():
-        shown = {record["index"] for record in _spread(records, gallery.per_kind)}
-        for record in records:
-            view = _view(config, source, field, record, kind, renderer)
-            scores[kind].append(view.scores())
-            if kind == "held-out":
-                samples.append(views.sample(view))
-            if view.index in shown:
-                gallery.add(view)
-            done += 1
-            progress(done, total)
-    averages = {kind.replace("-", "_"): views.average(rows) for kind, rows in scores.items()}
-    return averages | {"uncertainty": views.judge(samples)}
+    """Render and score the chosen views in the final map and in their submaps; average per kind and map; judge V."""
+    scores = {kind: views.Scores(judged=kind == "held-out") for kind in chosen}
+    before = {kind: views.Scores(judged=kind == "held-out") for kind in chosen}
+    shown = {(kind, r["index"]) for kind, records in chosen.items() for r in _spread(records, gallery.per_kind)}
+    total = sum(len(records) for records in chosen.values())
+    frame_of = partial(_prepared, source, config.input)
+    for done, (final, in_submap) in enumerate(views.seen(frame_of, maps, chosen, renderer), 1):
+        scores[final.kind].add(final)
+        if (final.kind, final.index) in shown:
+            gallery.add(final)
+        if in_submap:
+            before[final.kind].add(in_submap)
+            if final.kind == "held-out" and (final.kind, final.index) in shown:
+                gallery.add(in_submap, ", in their submaps")
+        progress(done, total)
+    kept = maps.T_world_submap is not None
+    judged, judged_before = (views.judge(found["held-out"].samples) for found in (scores, before))
+    return {
+        **{kind.replace("-", "_"): views.average(found.rows) for kind, found in scores.items()},
+        **{f"{kind.replace('-', '_')}_submaps": views.average(before[kind].rows) if kept else None for kind in chosen},
+        "uncertainty": judged_before if kept else judged,
+        "uncertainty_final": judged if kept and _keeps_variance(config.final) else None,
+    }
 
 
-def _view(
-    config: Config, source: Source, field: GaussianField, record: dict[str, Any], kind: str, renderer: Renderer
-) -> View:
-    """Render one frame's view at its estimated pose; depth is Σwz/Σw where the map covers the pixel, else 0."""
-    settings = config.input
-    frame: Frame = source.frame(record["index"]).prepared(settings.width, settings.min_depth_m, settings.max_depth_m)
-    rendered = renderer(field, frame.camera, se3.inverse(record["T_world_camera"]))
-    alpha = _array(rendered.alpha)
-    depth = np.where(alpha > COVERED_ALPHA, _array(rendered.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0)
-    return View(
-        record["index"], kind, frame.color, frame.depth_m, np.clip(_array(rendered.color), 0.0, 1.0),
-        depth.astype(np.float32), alpha, _array(rendered.variance), ("lost",) if record.get("lost") else (),
-    )  # fmt: skip
+def _prepared(source: Source, settings: InputConfig, index: int) -> Frame:
+    """Read a frame as the run worked on it."""
+    return source.frame(index).prepared(settings.width, settings.min_depth_m, settings.max_depth_m)
 
 
-def _array(values: Tensor) -> NDArray[np.float32]:
-    """Turn a tensor of any device into a numpy array."""
-    return np.asarray(values.detach().cpu(), np.float32)
+def _keeps_variance(final: FinalConfig) -> bool:
+    """Tell whether σ² of the final map means something: learnt on while it was refined, or the submaps' own."""
+    return final.uncertainty if final.iterations else final.seed_from == "submaps"
 
 
 def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField) -> dict[str, Any]:
     """Return what can be counted: frames, keyframes, lost frames, splats, speed."""
     lost = [record["index"] for record in log if record.get("lost")]
+    loops = run.read_loops()
     return {
         "source": source.name,
         "status": run.facts().get("status"),
@@ -187,37 +204,27 @@ def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField) -> di
         "skipped": run.facts().get("skipped", list(source.skipped)),
         "splats": len(field),
         "frames_per_s": _frames_per_s(run, log),
+        "submaps": _submaps(log),
+        "loops": {"tried": len(loops), "accepted": sum(bool(loop.get("accepted")) for loop in loops)},
+        "finish_s": run.facts().get("finish_s"),
     }
-
-
-def _seconds(record: dict[str, Any]) -> float:
-    """Return the time one frame took: its `total`, or the sum of its stages."""
-    stages: dict[str, float] = record.get("seconds") or {}
-    return float(stages.get("total", sum(stages.values())))
 
 
 def _frames_per_s(run: RunFolder, log: Log) -> float | None:
     """Return the speed end to end: by the wall clock (run.json, wall_s) if noted, else by the frames' own times."""
-    seconds = run.facts().get("wall_s") or sum(_seconds(record) for record in log)
+    seconds = run.facts().get("wall_s") or sum(charts.seconds_of(record) for record in log)
     return len(log) / seconds if seconds else None
 
 
-def _draw_plots(run: RunFolder, log: Log, truth: Trajectory | None) -> dict[str, str]:
-    """Draw path and times in both themes; return the captions by name."""
-    lost = np.array([bool(record.get("lost")) for record in log])
+def _draw_plots(run: RunFolder, log: Log, truth: Trajectory | None, loops: Log) -> dict[str, str]:
+    """Draw path, submaps and times in both themes; return the captions by name."""
     estimate = np.array([record["T_world_camera"][:3, 3] for record in log])
-    charts = {"trajectory": plot.trajectory_charts(estimate, _aligned_truth(log, estimate, truth), lost)}
-    captions = {"trajectory": "In the frame of the first camera." + (" The truth is rigidly aligned." if truth else "")}
-    if any(_seconds(record) for record in log):
-        stages = {name: np.array([(r.get("seconds") or {}).get(name, 0.0) for r in log]) for name in _stages(log)}
-        stages["total"] = np.array([_seconds(record) for record in log])
-        charts["seconds"] = [plot.seconds_chart(np.array([record["index"] for record in log]), stages)]
-        captions["seconds"] = "Seconds each frame took, end to end; keyframes carry the mapping."
-    for name, drawn in charts.items():
+    drawn = charts.of_run(log, estimate, _aligned_truth(log, estimate, truth), loops)
+    for name, (found, _) in drawn.items():
         for theme in (plot.LIGHT, plot.DARK):
-            size = plot.SIZE if len(drawn) > 1 else (plot.SIZE[0], 300)
-            run.write_image(f"{name}-{theme.name}.png", plot.draw_charts(drawn, theme, size))
-    return captions
+            size = plot.SIZE if name != "seconds" else (plot.SIZE[0], 300)
+            run.write_image(f"{name}-{theme.name}.png", plot.draw_charts(found, theme, size))
+    return {name: caption for name, (_, caption) in drawn.items()}
 
 
 def _aligned_truth(log: Log, estimate: NDArray[np.float64], truth: Trajectory | None) -> NDArray[np.float64] | None:
@@ -230,11 +237,6 @@ def _aligned_truth(log: Log, estimate: NDArray[np.float64], truth: Trajectory | 
     out = np.full_like(estimate, np.nan)
     out[rows] = theirs @ T_estimate_truth[:3, :3].T + T_estimate_truth[:3, 3]
     return out
-
-
-def _stages(log: Log) -> list[str]:
-    """Return the names of the first three stages timed."""
-    return [name for name in (log[0].get("seconds") or {}) if name != "total"][:3]
 
 
 def _subtitle(run: RunFolder) -> str:

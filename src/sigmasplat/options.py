@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from sigmasplat import env
 from sigmasplat.config import Config
+from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import RunError
-from sigmasplat.presets import list_presets, override, preset as preset_of, split_settings
+from sigmasplat.presets import list_presets, preset as preset_of
 
 if TYPE_CHECKING:
     from sigmasplat.io.runs import RunFolder
@@ -31,6 +33,27 @@ DemoFolder = Annotated[Path, arg(metavar="DIR", aliases=["--output"], help="run 
 Frames = Annotated[int, arg(metavar="N", help="length of the walk through the room")]
 SourcePath = Annotated[
     str, tyro.conf.Positional, arg(metavar="PATH", help="folder of a sequence, or synthetic[:frames=N]")
+]
+SourcePaths = Annotated[
+    tuple[str, ...],
+    tyro.conf.Positional,
+    arg(
+        metavar="SOURCE",
+        help="folders of sequences, or synthetic[:frames=N,…]; {seed} in one becomes the seed's number",
+        help_behavior_hint="(at least one)",
+    ),
+]
+Seeds = Annotated[int, arg(metavar="N", help="runs of each variant, with seeds 0, 1, … N − 1")]
+Tau = Annotated[float, arg(metavar="T", help="τ of every weight, one for all data")]
+WithoutVariance = Annotated[
+    bool, arg(help="run also without learning any variance, for reference", help_behavior_hint="")
+]
+AblationFile = Annotated[Path, arg(metavar="FILE", help="JSON file to write, and to go on with where it stopped")]
+DropRuns = Annotated[
+    bool, arg(name="overwrite", help="drop runs in FILE that were made otherwise", help_behavior_hint="")
+]
+Keep = Annotated[
+    Path | None, arg(metavar="DIR", help="keep the run folders here", help_behavior_hint="(default: removed)")
 ]
 Overwrite = Annotated[bool, arg(help="replace what is there", help_behavior_hint="")]
 Limit = Annotated[int | None, arg(metavar="N", help="take at most N frames", help_behavior_hint="(default: all)")]
@@ -95,3 +118,11 @@ def refuse_existing(target: Path | None, overwrite: bool) -> None:
 def absolute(path: str) -> str:
     """Return a path in full where there is something, else as it is: it may name a built-in sequence."""
     return str(Path(path).resolve()) if Path(path).exists() else path
+
+
+def prepare_torch() -> None:
+    """Give torch as many threads as the environment gives the kernels."""
+    import torch
+
+    if env.switches().threads:
+        torch.set_num_threads(env.switches().threads)

@@ -1,19 +1,24 @@
 """Show a run on a terminal, or as plain lines where there is none."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from sigmasplat.metrics.report import headline, number
+from sigmasplat.metrics.tables import headline, number
 from sigmasplat.profile import shares
-from sigmasplat.session import Stepped
+from sigmasplat.protocols import Stepped, Tried
 
 PLAIN_LINES_EVERY_S = 10.0
+Show = Callable[[int, int | None, str], None]
+"""Shows how much is done, of how many (None: as said at the beginning), and a text."""
+Begin = Callable[[str, int | None], Show]
+"""Begins to count something, of how many (None: not known yet)."""
 
 
 class Screen:
@@ -32,26 +37,27 @@ class Screen:
         self.err.print(f"warning: {line}")
 
     @contextmanager
-    def steps(self, total: int) -> Iterator[Callable[[Stepped], None]]:
-        """Show the steps of a run: a bar with frames/s, splats and lost frames; a line where tracking is lost."""
-        with self._bar("SLAM", total) as show:
-            yield _StepShow(self.say, show)
+    def steps(self, total: int) -> Iterator["_StepShow"]:
+        """Show a session: a bar with frames/s, splats and lost frames; a line where tracking is lost or a loop closed;
+        a bar for the final map."""
+        with self._counters() as begin:
+            yield _StepShow(self.say, begin, total)
 
     @contextmanager
     def counting(self, title: str) -> Iterator[Callable[[int, int], None]]:
         """Show a count (done, total)."""
-        with self._bar(title, None) as show:
+        with self._counters() as begin:
+            show = begin(title, None)
             yield lambda done, total: show(done, total, "")
 
     @contextmanager
-    def _bar(self, title: str, total: int | None) -> Iterator[Callable[[int, int | None, str], None]]:
+    def _counters(self) -> Iterator[Begin]:
         if not self.out.is_terminal:
-            yield _PlainShow(self.say, title, total)
+            yield partial(_PlainShow, self.say)
             return
-        columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[text]}"))
-        with Progress(*columns, TimeRemainingColumn(), console=self.out) as bar:
-            task = bar.add_task(title, total=total, text="")
-            yield lambda done, known, text: bar.update(task, completed=done, total=known or total, text=text)
+        columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[text]}"))
+        with Progress(*columns, TimeRemainingColumn(), console=self.out) as bars:
+            yield partial(_bar, bars)
 
     def results(self, metrics: dict[str, Any]) -> None:
         """Print the figures of first interest as a table, and plainly where tracking was lost."""
@@ -82,9 +88,12 @@ def _console(stderr: bool) -> Console:
 def _figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     """Return the report's headline with the training views' PSNR after that of the held-out ones."""
     rows = headline(metrics)
-    training = ("PSNR, training", number((metrics.get("training") or {}).get("psnr_db"), 2), "dB")
-    place = 1 + next((i for i, row in enumerate(rows) if row[0].startswith("PSNR")), len(rows) - 1)
-    return [*rows[:place], training, *rows[place:]]
+    kinds = {"PSNR, training": metrics.get("training") or {}}
+    if metrics.get("training_submaps"):
+        kinds["PSNR, training, in submaps"] = metrics["training_submaps"]
+    training = [(name, number(scores.get("psnr_db"), 2), "dB") for name, scores in kinds.items()]
+    place = 1 + max(i for i, row in enumerate(rows) if row[0].startswith("PSNR"))
+    return [*rows[:place], *training, *rows[place:]]
 
 
 def _ranges(indices: list[int], most: int = 4) -> str:
@@ -99,11 +108,18 @@ def _ranges(indices: list[int], most: int = 4) -> str:
     return ", ".join(words) + (", …" if len(runs) > most else "")
 
 
-class _StepShow:
-    """Turn steps into text for a bar, and losses into lines."""
+def _bar(bars: Progress, title: str, total: int | None) -> Show:
+    """Add a bar to those shown."""
+    task = bars.add_task(title, total=total, text="")
+    return lambda done, known, text: bars.update(task, completed=done, total=known or total, text=text)
 
-    def __init__(self, say: Callable[[str], None], show: Callable[[int, int | None, str], None]) -> None:
-        self.say, self.show = say, show
+
+class _StepShow:
+    """Turn steps into text for a bar, and losses and loops into lines."""
+
+    def __init__(self, say: Callable[[str], None], begin: Begin, total: int) -> None:
+        self.say, self.begin, self.show = say, begin, begin("SLAM", total)
+        self.show_final: Show | None = None
         self.started_s = time.perf_counter()
         self.done = self.lost = 0
         self.lost_since: int | None = None
@@ -112,8 +128,24 @@ class _StepShow:
         self.done += 1
         self.lost += step.lost
         self._tell_losses(step)
+        self._tell_loops(f"frame {step.index}", step.loops)
         speed = self.done / max(time.perf_counter() - self.started_s, 1e-9)
         self.show(self.done, None, f"{speed:.1f} frames/s  {step.splats:,} splats  {self.lost} lost")
+
+    def finishing(self, done: int, total: int) -> None:
+        """Show how far the final map is."""
+        self.show_final = self.show_final or self.begin("final map", total)
+        self.show_final(done, total, "")
+
+    def last_loops(self, loops: Sequence[Tried]) -> None:
+        """Tell the loops closed after the last frame."""
+        self._tell_loops("at the end", loops)
+
+    def _tell_loops(self, when: str, loops: Sequence[Tried]) -> None:
+        for loop in loops:
+            if loop.accepted:
+                figures = f"residual {loop.residual:.3f}, moved {100.0 * loop.translation_m:.1f} cm"
+                self.say(f"{when}: loop closed between submaps {loop.query} and {loop.database} ({figures})")
 
     def _tell_losses(self, step: Stepped) -> None:
         where = f"frame {step.index} (t = {step.timestamp_s:.3f} s)"

@@ -3,56 +3,18 @@
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol
-
-import numpy as np
-from numpy.typing import NDArray
-from torch import Tensor
+from typing import Any
 
 from sigmasplat.config import Config
 from sigmasplat.io.runs import RunFolder
-from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
-from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.profile import profile
+from sigmasplat.protocols import Stepped, Stepper, Unwatched, Watcher
 from sigmasplat.sources.base import Source
-
-
-class Stepped(Protocol):
-    """What a session reads of a step (slam.slam.Step)."""
-
-    @property
-    def index(self) -> int: ...
-    @property
-    def timestamp_s(self) -> float: ...
-    @property
-    def T_world_camera(self) -> NDArray[np.float64]: ...
-    @property
-    def is_keyframe(self) -> bool: ...
-    @property
-    def lost(self) -> bool: ...
-    @property
-    def tracking(self) -> Mapping[str, float]: ...
-    @property
-    def splats(self) -> int: ...
-    @property
-    def seconds(self) -> Mapping[str, float]: ...
-
-
-class Stepper(Protocol):
-    """What a session needs of a system (slam.slam.Slam)."""
-
-    @property
-    def field(self) -> GaussianField: ...
-    def step(self, frame: Frame) -> Stepped: ...
-    def trajectory(self) -> Trajectory: ...
-    def checkpoint(self) -> dict[str, Tensor]: ...
-
 
 RUNS = Path("runs")
 
@@ -80,88 +42,127 @@ def _free(wanted: Path) -> Path:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a session ended: status complete or interrupted; wall_s covers the frames, not the writing of the results."""
+    """How a session ended: status complete or interrupted; wall_s covers the frames, not what is done after them."""
 
     status: str
     frames: int
     lost: int
     wall_s: float
+    submaps: int = 1
+    loops_closed: int = 0
+    loops_refused: int = 0
+
+    def counts(self) -> str:
+        """Say in words what was done."""
+        line = f"{self.frames} frames, {self.lost} lost, {self.frames / self.wall_s:.1f} frames/s"
+        if self.submaps > 1:
+            line += f", {self.submaps} submaps, loops: {self.loops_closed} closed, {self.loops_refused} refused"
+        return line
 
 
-def record(
-    slam: Stepper, source: Source, run: RunFolder, watch: Callable[[Stepped], None] = lambda step: None
-) -> Outcome:
-    """Track and map every frame, a log line each; then write trajectory, map and checkpoint, also where cut short.
+def record(slam: Stepper, source: Source, run: RunFolder, watch: Watcher | None = None) -> Outcome:
+    """Track and map every frame, a log line each, and finish; then write trajectory, map, loops and checkpoint.
 
-    The first Ctrl-C ends the session after the frame in work, a second one at once; both end as "interrupted". Any
-    other exception leaves the same files, marks the run "failed", and carries the run folder's path in a note.
+    These are written also where the session is cut short. The first Ctrl-C ends it after the frame in work, or where
+    finishing next tells how far it is; a second one at once: all end as "interrupted", and frames cut short are not
+    finished. Any other exception leaves the same files, marks the run "failed", and carries the run folder's path in a
+    note.
     """
-    tally = _Tally(time.perf_counter())
+    tally, watch = _Tally(), watch or Unwatched()
     status = "failed"
     try:
         with interrupt_asked() as asked:
-            status = _follow(slam, source, run, watch, tally, asked)
+            complete = _follow(slam, source, run, watch, tally, asked)
+            if complete:
+                _finish(slam, run, watch, asked)
+            status = "complete" if complete else "interrupted"
     except KeyboardInterrupt:
         status = "interrupted"
     except Exception as problem:
         problem.add_note(f"the run up to frame {tally.frames} is in {run.path}")
         raise
     finally:
-        wall_s = time.perf_counter() - tally.started_s
-        _save(slam, run, tally.frames, wall_s)
-        run.note(status=status, wall_s=wall_s, skipped=source.skipped)
-    return Outcome(status, tally.frames, tally.lost, wall_s)
+        _save(slam, run, tally)
+        run.note(status=status, wall_s=tally.wall_s, skipped=source.skipped)
+    closed = sum(loop.accepted for loop in slam.loops)
+    return Outcome(
+        status, tally.frames, tally.lost, tally.wall_s, tally.submaps, closed, len(slam.loops) - closed
+    )  # fmt: skip
 
 
 @dataclass
 class _Tally:
-    started_s: float
     frames: int = 0
     lost: int = 0
+    submaps: int = 1
+    wall_s: float = 0.0
 
 
 def _follow(
-    slam: Stepper,
-    source: Source,
-    run: RunFolder,
-    watch: Callable[[Stepped], None],
-    tally: _Tally,
-    asked: threading.Event,
-) -> str:
-    """Step through the frames until they end or Ctrl-C asked to stop; return the status."""
-    for frame in source:
-        step = slam.step(frame)
-        run.log(log_line(step))
-        tally.frames += 1
-        tally.lost += step.lost
-        watch(step)
+    slam: Stepper, source: Source, run: RunFolder, watch: Watcher, tally: _Tally, asked: threading.Event
+) -> bool:
+    """Step through the frames until they end or Ctrl-C asked to stop; return whether it was the frames that ended."""
+    started_s = time.perf_counter()
+    try:
+        for frame in source:
+            step = slam.step(frame)
+            run.log(log_line(step))
+            if step.loops:
+                _write_loops(slam, run)
+            tally.frames += 1
+            tally.lost += step.lost
+            tally.submaps = step.submap + 1
+            watch(step)
+            if asked.is_set():
+                return False
+    finally:
+        tally.wall_s = time.perf_counter() - started_s
+    return True
+
+
+def _finish(slam: Stepper, run: RunFolder, watch: Watcher, asked: threading.Event) -> None:
+    """Make the final map and note how long it took. Raises KeyboardInterrupt if Ctrl-C asks to stop."""
+
+    def progress(done: int, total: int) -> None:
+        watch.finishing(done, total)
         if asked.is_set():
-            return "interrupted"
-    return "complete"
+            raise KeyboardInterrupt
+
+    before, started_s = len(slam.loops), time.perf_counter()
+    slam.finish(progress)
+    run.note(finish_s=time.perf_counter() - started_s)
+    watch.last_loops(slam.loops[before:])
 
 
 def log_line(step: Stepped) -> dict[str, Any]:
-    """Return a step as the record of log.jsonl: T_world_camera as 4 rows, times in seconds."""
-    return {
+    """Return a step as the record of log.jsonl: T_world_camera as 4 rows, times in seconds; loops if any were tried."""
+    line = {
         "index": step.index,
         "timestamp_s": step.timestamp_s,
         "is_keyframe": step.is_keyframe,
         "lost": step.lost,
         "splats": step.splats,
+        "submap": step.submap,
         "tracking": dict(step.tracking),
         "seconds": dict(step.seconds),
         "T_world_camera": step.T_world_camera,
     }
+    return line | {"loops": [loop.record() for loop in step.loops]} if step.loops else line
 
 
-def _save(slam: Stepper, run: RunFolder, frames: int, wall_s: float) -> None:
-    """Write what the frames so far have made."""
-    if frames == 0:
+def _save(slam: Stepper, run: RunFolder, tally: _Tally) -> None:
+    """Write what the frames so far have made, the map last: it takes longest."""
+    if tally.frames == 0:
         return
     run.write_trajectory(slam.trajectory())
+    _write_loops(slam, run)
+    run.write_checkpoint(slam.checkpoint(), {"frames": str(tally.frames)})
+    run.write_profile(profile(run.read_log(), tally.wall_s))
     run.write_map(slam.field)
-    run.write_checkpoint(slam.checkpoint(), {"frames": str(frames)})
-    run.write_profile(profile(run.read_log(), wall_s))
+
+
+def _write_loops(slam: Stepper, run: RunFolder) -> None:
+    run.write_loops([loop.record() for loop in slam.loops])
 
 
 @contextmanager

@@ -3,9 +3,12 @@
 from pathlib import Path
 
 import pytest
+import torch
+from safetensors import SafetensorError
 
 from sigmasplat.config import Config
 from sigmasplat.errors import ConfigError, RunError
+from sigmasplat.io import tensors
 from sigmasplat.io.runs import RunFolder
 
 
@@ -33,6 +36,15 @@ def test_a_folder_of_somebody_else_is_never_overwritten(tmp_path: Path, names: l
     assert "not a run folder of ours" in refused(tmp_path, overwrite=True)
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
     assert all((tmp_path / name).read_text() == '{"model": "theirs"}' for name in names)
+
+
+def test_a_run_without_settings_is_ours_to_overwrite(tmp_path: Path) -> None:
+    """As one leaves it that was killed before it wrote them."""
+    run = make(tmp_path / "run")
+    (run.path / "config.json").unlink()
+    assert "--overwrite" in refused(run.path)
+    again = RunFolder.create(run.path, Config(), "room", overwrite=True)
+    assert RunFolder.open(again.path).facts()["status"] == "running"
 
 
 def test_an_empty_folder_is_used(tmp_path: Path) -> None:
@@ -85,6 +97,10 @@ def test_damaged_files_are_named(tmp_path: Path) -> None:
     (run.path / "metrics.json").write_text("[1]")
     with pytest.raises(RunError, match="does not hold named values"):
         run.read_metrics()
+    for text, complaint in (("{", r"loops\.json is not JSON"), ("{}", "a list of loops"), ("[1]", "a list of loops")):
+        (run.path / "loops.json").write_text(text)
+        with pytest.raises(RunError, match=complaint):
+            run.read_loops()
     (run.path / "run.json").write_text("half a f")
     with pytest.raises(RunError, match=r"run\.json is not JSON"):
         RunFolder.open(run.path)
@@ -99,3 +115,18 @@ def test_a_folder_that_vanished_while_running(tmp_path: Path) -> None:
         run.log({"index": 0})
     with pytest.raises(RunError, match=r"cannot write .*metrics\.json"):
         run.write_metrics({})
+    with pytest.raises(RunError, match=r"cannot write .*checkpoint\.safetensors"):
+        run.write_checkpoint({"a": torch.ones(2)}, {})
+
+
+def test_a_full_disk_is_one_line_and_no_half_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = make(tmp_path / "run")
+
+    def full(tensors: object, path: Path, text: object) -> None:
+        path.write_text("half")
+        raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
+
+    monkeypatch.setattr(tensors, "save_file", full)
+    with pytest.raises(RunError, match=r"cannot write .*checkpoint\.safetensors: .*No space left") as caught:
+        run.write_checkpoint({"a": torch.ones(2)}, {})
+    assert "\n" not in str(caught.value) and not list(run.path.glob(".*"))

@@ -16,13 +16,14 @@ import torch
 
 from sigmasplat import cli
 from sigmasplat.config import Config, RenderConfig
+from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.native import _core
-from sigmasplat.presets import override, preset
+from sigmasplat.presets import preset
 from sigmasplat.render import reference, render
 from sigmasplat.slam.tracker import Tracker
 from sigmasplat.sources import open_source

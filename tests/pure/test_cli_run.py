@@ -1,5 +1,6 @@
 """The command line end to end with a make-believe SLAM: what is written, said and returned, also when cut short."""
 
+import io
 import json
 import os
 import signal
@@ -13,17 +14,21 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 
 from sigmasplat import cli, session
 from sigmasplat.config import Config
 from sigmasplat.errors import SourceError
 from sigmasplat.io.ply import read_field
 from sigmasplat.io.runs import RunFolder
+from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.trajectory import read_trajectory
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.screen import Screen
 from sigmasplat.sources.base import Source
 
 CAMERA = Camera(8, 6, 8.0, 8.0, 3.5, 2.5)
@@ -54,6 +59,20 @@ class Corridor(Source):
 
 
 @dataclass
+class MadeUpLoop:
+    """A pair of submaps tried, as slam.loops makes it."""
+
+    query: int
+    database: int
+    accepted: bool
+    residual: float = 0.02149
+    translation_m: float = 0.043
+
+    def record(self) -> dict[str, Any]:
+        return vars(self) | {"chi2": float("nan")}
+
+
+@dataclass
 class MadeUpStep:
     """A step as slam.slam makes it."""
 
@@ -63,19 +82,26 @@ class MadeUpStep:
     is_keyframe: bool
     lost: bool
     splats: int = 2
+    submap: int = 0
+    loops: tuple["MadeUpLoop", ...] = ()
     tracking: dict[str, float] = field(default_factory=lambda: {"loss": float("nan")})
     seconds: dict[str, float] = field(default_factory=lambda: {"total": 0.1})
 
 
 class MadeUpSlam:
-    """Walk 10 cm a frame; `at` runs something at a frame, `lost` names frames without tracking."""
+    """Walk 10 cm a frame; `at` runs something at a frame or step of finishing, `lost` names frames without tracking,
+    `tried` says which loops a frame or the end brings; `every` so many frames a submap begins."""
 
-    at: dict[int, Callable[[], None]]
+    at: dict[int | str, Callable[[], None]]
     lost: set[int]
+    tried: dict[int | str, list[MadeUpLoop]]
+    every: int
     latest: "MadeUpSlam"
 
-    def __init__(self, config: Config) -> None:
-        self.config = config
+    def __init__(self, config: Config, store: SubmapStore | None = None) -> None:
+        self.config, self.store = config, store
+        self.loops: list[MadeUpLoop] = []
+        self.finished = 0
         self.field = GaussianField.from_values(torch.rand(2, 3), torch.full((2,), 0.1), torch.rand(2, 3))
         self.steps: list[MadeUpStep] = []
         MadeUpSlam.latest = self
@@ -84,8 +110,20 @@ class MadeUpSlam:
         self.at.get(frame.index, lambda: None)()
         T = np.eye(4)
         T[0, 3] = 0.1 * frame.index
-        self.steps.append(MadeUpStep(frame.index, frame.timestamp_s, T, frame.index % 5 == 0, frame.index in self.lost))
-        return self.steps[-1]
+        i, tried = frame.index, tuple(self.tried.get(frame.index, ()))
+        self.loops += tried
+        step = MadeUpStep(i, frame.timestamp_s, T, i % 5 == 0, i in self.lost, submap=i // self.every, loops=tried)
+        self.steps.append(step)
+        return step
+
+    def finish(self, progress: Callable[[int, int], None]) -> None:
+        self.at.get("loops", lambda: None)()
+        self.loops += self.tried.get("end", [])
+        for done in (1, 2):
+            progress(done, 2)
+            self.at.get(f"finish {done}", lambda: None)()
+        self.finished += 1
+        self.field = GaussianField.from_values(torch.rand(3, 3), torch.full((3,), 0.1), torch.rand(3, 3))
 
     def trajectory(self) -> Trajectory:
         poses = np.array([step.T_world_camera for step in self.steps]).reshape(-1, 4, 4)
@@ -108,11 +146,13 @@ def corridor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Corridor:
     monkeypatch.setattr("sigmasplat.sources.open_source", lambda path, **options: source)
     monkeypatch.setattr(MadeUpSlam, "at", {}, raising=False)
     monkeypatch.setattr(MadeUpSlam, "lost", set(), raising=False)
+    monkeypatch.setattr(MadeUpSlam, "tried", {}, raising=False)
+    monkeypatch.setattr(MadeUpSlam, "every", 100, raising=False)
     monkeypatch.chdir(tmp_path)
     return source
 
 
-def evaluate(run: RunFolder, source: Source, *, progress: Callable[[int, int], None]) -> dict[str, Any]:
+def evaluate(run: RunFolder, source: Source, *, mesh: bool, progress: Callable[[int, int], None]) -> dict[str, Any]:
     """Stand in for the evaluation."""
     progress(1, 1)
     log = run.read_log()
@@ -147,6 +187,9 @@ def test_run_leaves_a_whole_run_folder(corridor: Corridor, capsys: pytest.Captur
     assert [record["is_keyframe"] for record in log] == [True, False, False, False, False, True]
     assert log[3]["T_world_camera"][0][3] == pytest.approx(0.3)
     assert log[3]["tracking"] == {"loss": None}
+    assert all(record["submap"] == 0 and "loops" not in record for record in log) and run.read_loops() == []
+    assert MadeUpSlam.latest.finished == 1 and len(run.read_map()) == 3, "the final map"
+    assert run.facts()["finish_s"] >= 0.0
     said = capsys.readouterr().out
     for figure in ("1.23", "27.31", "31.25", str(Path("runs/my-corridor-varsplat-fast/report.html").resolve())):
         assert figure in said
@@ -218,6 +261,128 @@ def test_a_crash_keeps_its_traceback_and_names_the_folder(corridor: Corridor) ->
     run = RunFolder.open(Path("crashed"))
     assert run.facts()["status"] == "failed"
     assert len(run.read_trajectory()) == 2
+
+
+CLOSED, REFUSED, LAST = MadeUpLoop(7, 0, True), MadeUpLoop(7, 2, False), MadeUpLoop(8, 1, True, 0.0149, 0.1206)
+
+
+def test_submaps_and_loops_are_kept_and_told(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
+    MadeUpSlam.every = 2
+    MadeUpSlam.tried = {4: [CLOSED, REFUSED], "end": [LAST]}
+    told_while_running: list[list[dict[str, Any]]] = []
+    MadeUpSlam.at = {5: lambda: told_while_running.append(RunFolder.open(Path("mine")).read_loops())}
+    assert sigmasplat("run", "corridor", "--no-eval", "--out", "mine") == 0
+    run, log = RunFolder.open(Path("mine")), RunFolder.open(Path("mine")).read_log()
+    assert [record["submap"] for record in log] == [0, 0, 1, 1, 2, 2]
+    assert [len(record.get("loops", [])) for record in log] == [0, 0, 0, 0, 2, 0]
+    assert log[4]["loops"][1] == {"query": 7, "database": 2, "accepted": False, "residual": 0.02149,
+                                  "translation_m": 0.043, "chi2": None}  # fmt: skip
+    assert [[loop["database"] for loop in loops] for loops in told_while_running] == [[0, 2]], "a killed run has them"
+    assert [loop["database"] for loop in run.read_loops()] == [0, 2, 1]
+    said = capsys.readouterr().out
+    assert "frame 4: loop closed between submaps 7 and 0 (residual 0.021, moved 4.3 cm)" in said
+    assert "at the end: loop closed between submaps 8 and 1 (residual 0.015, moved 12.1 cm)" in said
+    assert said.count("loop closed") == 2
+    assert "final map 2/2" in said
+    assert "3 submaps, loops: 2 closed, 1 refused" in said
+    store = MadeUpSlam.latest.store
+    assert isinstance(store, DiskStore) and store.folder == Path("mine/submaps")
+
+
+def test_loops_take_their_latest_verdict_to_the_end(corridor: Corridor) -> None:
+    loop = MadeUpLoop(7, 0, True)
+    MadeUpSlam.tried = {2: [loop]}
+    MadeUpSlam.at = {4: lambda: setattr(loop, "accepted", False)}
+    assert sigmasplat("run", "corridor", "--no-eval", "--out", "mine") == 0
+    assert not RunFolder.open(Path("mine")).read_loops()[0]["accepted"]
+    assert RunFolder.open(Path("mine")).read_log()[2]["loops"][0]["accepted"], "the log says what was known then"
+
+
+def test_the_time_of_finishing_is_not_that_of_the_frames(corridor: Corridor, monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = [0.0]
+
+    def pass_time(seconds: float) -> Callable[[], None]:
+        return lambda: now_s.__setitem__(0, now_s[0] + seconds)
+
+    monkeypatch.setattr("sigmasplat.session.time.perf_counter", lambda: now_s[0])
+    MadeUpSlam.at = {3: pass_time(5.0), "loops": pass_time(30.0), "finish 1": pass_time(70.0)}
+    assert sigmasplat("run", "corridor", "--no-eval", "--out", "mine") == 0
+    facts = RunFolder.open(Path("mine")).facts()
+    assert (facts["wall_s"], facts["finish_s"]) == (5.0, 100.0)
+    assert sum(RunFolder.open(Path("mine")).read_profile().values()) == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize("moment", ["loops", "finish 1"])
+def test_ctrl_c_while_finishing_keeps_everything(
+    corridor: Corridor, capsys: pytest.CaptureFixture[str], moment: str
+) -> None:
+    MadeUpSlam.at = {moment: lambda: signal.raise_signal(signal.SIGINT)}
+    MadeUpSlam.tried = {4: [CLOSED], "end": [LAST]}
+    assert sigmasplat("run", "corridor", "--out", "cut") == 130
+    assert MadeUpSlam.latest.finished == 0
+    run = RunFolder.open(Path("cut"))
+    assert run.facts()["status"] == "interrupted" and run.facts()["wall_s"] > 0 and "finish_s" not in run.facts()
+    assert len(run.read_log()) == len(run.read_trajectory()) == 6
+    assert len(run.read_map()) == 2 and len(run.read_loops()) == 2 and run.read_checkpoint()[0]
+    assert "interrupted after 6 frames" in capsys.readouterr().out
+    assert not (run.path / "metrics.json").exists()
+
+
+def test_ctrl_c_when_all_is_done_changes_nothing(corridor: Corridor) -> None:
+    MadeUpSlam.at = {"finish 2": lambda: signal.raise_signal(signal.SIGINT)}
+    assert sigmasplat("run", "corridor", "--no-eval", "--out", "mine") == 0
+    assert RunFolder.open(Path("mine")).facts()["status"] == "complete"
+
+
+def test_an_interrupted_run_is_not_finished(corridor: Corridor) -> None:
+    MadeUpSlam.at = {3: lambda: signal.raise_signal(signal.SIGINT)}
+    MadeUpSlam.tried = {2: [CLOSED]}
+    assert sigmasplat("run", "corridor", "--out", "cut") == 130
+    run = RunFolder.open(Path("cut"))
+    assert MadeUpSlam.latest.finished == 0 and "finish_s" not in run.facts() and len(run.read_loops()) == 1
+
+
+def test_a_crash_while_finishing_keeps_everything(corridor: Corridor) -> None:
+    def crash() -> None:
+        raise ZeroDivisionError("a bug")
+
+    MadeUpSlam.at = {"finish 1": crash}
+    with pytest.raises(ZeroDivisionError, match="a bug") as crashed:
+        cli.main(["run", "corridor", "--out", "crashed"])
+    assert "crashed" in "".join(crashed.value.__notes__)
+    run = RunFolder.open(Path("crashed"))
+    assert run.facts()["status"] == "failed" and "finish_s" not in run.facts()
+    assert len(run.read_trajectory()) == 6 and len(run.read_map()) == 2 and run.read_checkpoint()[0]
+
+
+def test_the_results_show_what_refinement_brought(
+    corridor: Corridor, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert sigmasplat("run", "corridor", "--out", "one") == 0
+    assert "submap" not in capsys.readouterr().out.lower()
+    before = {"held_out_submaps": {"psnr_db": 25.19}, "training_submaps": {"psnr_db": 28.84}}
+    counts = {"submaps": 4, "loops": {"tried": 7, "accepted": 3}}
+    monkeypatch.setitem(METRICS, "finish_s", 3.0)
+    for name, value in (before | counts).items():
+        monkeypatch.setitem(METRICS, name, value)
+    assert sigmasplat("run", "corridor", "--out", "several") == 0
+    rows = [" ".join(line.replace("│", " ").split()) for line in capsys.readouterr().out.splitlines()]
+    wanted = ["PSNR, held-out 27.31 dB", "PSNR, held-out, in submaps 25.19 dB", "PSNR, training 31.25 dB",
+              "PSNR, training, in submaps 28.84 dB"]  # fmt: skip
+    first = rows.index(wanted[0])
+    assert rows[first : first + 4] == wanted
+    assert "Submaps 4" in rows and "Loops closed 3 of 7 tried" in rows
+
+
+def test_a_terminal_gets_bars(corridor: Corridor) -> None:
+    out = io.StringIO()
+    screen = Screen(Console(file=out, force_terminal=True, width=120))
+    MadeUpSlam.tried = {4: [CLOSED]}
+    folder = RunFolder.create(Path("direct"), Config(), "corridor")
+    with screen.steps(6) as watch:
+        session.record(MadeUpSlam(Config()), corridor, folder, watch)
+    said = out.getvalue()
+    assert "SLAM" in said and "6/6" in said and "final map" in said and "2/2" in said and "loop closed" in said
 
 
 def test_unreadable_images_are_counted(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:

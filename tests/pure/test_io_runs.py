@@ -1,8 +1,10 @@
 """The run folder: everything comes back as it went in, and an interruption at any moment leaves it readable."""
 
 import json
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +14,8 @@ from PIL import Image
 from sigmasplat.config import Config, InputConfig
 from sigmasplat.errors import RunError
 from sigmasplat.io import atomic
-from sigmasplat.io.runs import RunFolder, plain
+from sigmasplat.io.json_files import plain
+from sigmasplat.io.runs import RunFolder
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 
@@ -50,7 +53,7 @@ def test_everything_comes_back(run: RunFolder) -> None:
 
 def test_checkpoints_keep_bits_even_of_views(run: RunFolder) -> None:
     base = torch.randn(6, 4)
-    tensors = {"params": base, "rows": base[:2], "turned": base.T, "ids": torch.arange(3)}
+    tensors = {"rows": base[2:4], "params": base, "again": base, "turned": base.T, "ids": torch.arange(3)}
     run.write_checkpoint(tensors, {"step": "12"})
     back, metadata = run.read_checkpoint()
     assert metadata == {"step": "12"} and all(torch.equal(back[name], tensors[name]) for name in tensors)
@@ -98,6 +101,73 @@ def test_overwriting_removes_our_files_and_no_others(run: RunFolder) -> None:
     again = RunFolder.create(run.path, Config(), "elsewhere", overwrite=True)
     assert again.facts()["source"] == "elsewhere" and (run.path / "notes.txt").read_text() == "mine"
     assert not (run.path / "log.jsonl").exists() and not list(run.images.iterdir())
+
+
+def leave_submaps(run: RunFolder) -> None:
+    """Put into submaps/ what a killed run leaves there, and two files of the user's."""
+    folder = run.submaps.folder
+    folder.mkdir()
+    for name in ("submap-00000.safetensors", ".submap-00001.safetensors.part", "submap-mine.safetensors", "a.txt"):
+        (folder / name).write_text("")
+
+
+def test_overwriting_removes_loops_and_our_submaps_and_no_others(run: RunFolder) -> None:
+    run.write_loops([{"query": 7}])
+    leave_submaps(run)
+    assert len(run.submaps) == 1
+    again = RunFolder.create(run.path, Config(), "elsewhere", overwrite=True)
+    assert again.read_loops() == [] and len(again.submaps) == 0
+    assert sorted(p.name for p in again.submaps.folder.iterdir()) == ["a.txt", "submap-mine.safetensors"]
+
+
+def test_loops_come_back_and_are_none_in_older_runs(run: RunFolder) -> None:
+    assert run.read_loops() == []
+    run.write_loops([{"query": 7, "database": 0, "chi2": float("nan"), "T": np.eye(2)}])
+    assert run.read_loops() == [{"query": 7, "database": 0, "chi2": None, "T": [[1.0, 0.0], [0.0, 1.0]]}]
+
+
+KILLED_AT = ["mkdir", "write_text", "replace", "unlink"]
+"""What a new run calls while it claims a folder, in one order or another."""
+
+
+@pytest.mark.parametrize("earlier", [False, True], ids=["fresh", "overwriting"])
+@pytest.mark.parametrize("call", KILLED_AT)
+@pytest.mark.parametrize("at", range(4))
+def test_a_run_killed_at_birth_leaves_a_folder_that_can_be_had(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, earlier: bool, call: str, at: int
+) -> None:
+    out = tmp_path / "run"
+    if earlier:
+        first = RunFolder.create(out, CONFIG, "first")
+        first.log({"index": 0})
+        leave_submaps(first)
+    kill_at_call(monkeypatch, call, at)
+    with suppress(SystemExit):
+        RunFolder.create(out, CONFIG, "killed", overwrite=True)
+    monkeypatch.undo()
+    again = RunFolder.create(out, CONFIG, "again", overwrite=True)
+    assert again.facts()["source"] == "again" and again.config() == CONFIG and again.images.is_dir()
+    assert not (out / "log.jsonl").exists() and len(again.submaps) == 0
+
+
+def kill_at_call(monkeypatch: pytest.MonkeyPatch, call: str, at: int) -> None:
+    """End the program as kill -9 does, cleaning nothing up, at the at-th call of a function of files."""
+    owner = atomic.os if call == "replace" else Path
+    real, calls = getattr(owner, call), iter(range(1000))
+
+    def counted(*arguments: Any, **options: Any) -> Any:
+        if next(calls) == at:
+            monkeypatch.setattr(Path, "unlink", lambda *_, **__: None)
+            raise SystemExit
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(owner, call, counted)
+
+
+def test_a_folder_with_half_a_run_json_counts_as_empty(tmp_path: Path) -> None:
+    (tmp_path / ".run.json.part").write_text('{"prog')
+    assert RunFolder.create(tmp_path, CONFIG, "room").facts()["status"] == "running"
+    assert not (tmp_path / ".run.json.part").exists()
 
 
 def test_plain_values_are_json() -> None:

@@ -18,7 +18,20 @@ FLOORS = [
     ["sources"],
     ["io"],
     ["metrics"],
-    ["evaluate", "profile", "session", "screen", "doctor", "options", "surface", "cli", "__init__"],
+    [
+        "evaluate",
+        "profile",
+        "session",
+        "protocols",
+        "screen",
+        "doctor",
+        "options",
+        "surface",
+        "ablation",
+        "benches",
+        "cli",
+        "__init__",
+    ],
 ]
 STOREY = {name: storey for storey, names in enumerate(FLOORS) for name in names}
 # Sources, results and scores know nothing of how SLAM decides, though they stand below it.

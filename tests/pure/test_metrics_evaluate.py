@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat.config import Config, InputConfig
+from sigmasplat.config import Config, FinalConfig, InputConfig
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.evaluate import evaluate
 from sigmasplat.io.runs import RunFolder
+from sigmasplat.io.submaps import DiskStore
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.submap import Picture, Submap
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
 
@@ -171,6 +173,159 @@ def test_truth_of_another_recording_is_said_after_the_rest_is_kept(run: RunFolde
         score(run, HandMade(late))
     assert run.read_metrics()["held_out"]["views"] == 15
     assert "share no timestamps" in (run.path / "report.html").read_text()
+
+
+CUTS = [0, 7, 12]
+"""First frames of the submaps."""
+
+
+def submap_of(frame: int) -> int:
+    return sum(frame >= cut for cut in CUTS) - 1
+
+
+def anchors() -> np.ndarray:
+    """Return T_world_submap [3, 4, 4] as loops might have left them: not the poses of the first frames."""
+    return np.stack([np.eye(4), se3.exp(np.array([0.5, -0.2, 1, 0.1, 0.7, 0])), se3.exp(np.arange(6) / 5.0)])
+
+
+class KnownInSubmaps:
+    """Render like `KnownErrors`, in a submap with other errors and where its frame must lie in that submap."""
+
+    def __init__(self) -> None:
+        self.final, self.before = KnownErrors(), KnownErrors(training=0.02, held_out=0.06)
+        self.check_submap = True
+
+    def __call__(self, field: GaussianField, camera: Camera, T_camera_map: np.ndarray) -> Any:
+        index = int(field.params[0, 0]) - 10
+        if index < 0:
+            return self.final(field, camera, T_camera_map)
+        rendered = self.before(field, camera, T_camera_map @ se3.inverse(anchors()[index]))
+        assert not self.check_submap or submap_of(self.before.seen[-1]) == index, "the submap that the log says"
+        return rendered
+
+
+LOOPS = [
+    {"query": 2, "database": 0, "query_frame": 14, "database_frame": 3, "similarity": 0.91, "residual": 0.0123,
+     "overlap": 0.55, "translation_m": 0.0433, "rotation_deg": 1.21, "accepted": True, "reason": "accepted"},
+    {"query": 2, "database": 1, "query_frame": 16, "database_frame": 8, "similarity": 0.84, "residual": None,
+     "overlap": 0.04, "translation_m": 0.0, "rotation_deg": 0.0, "accepted": False, "reason": "overlap <0.2"},
+]  # fmt: skip
+
+
+@pytest.fixture
+def cut_run(run: RunFolder) -> RunFolder:
+    """Cut the run into three submaps, kept in its folder, with two loops tried."""
+    lines = [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
+    lines = [line | {"submap": submap_of(line["index"])} for line in lines]
+    (run.path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    for index, cut in enumerate(CUTS):
+        shown = [Picture(np.zeros((36, 48, 3), np.uint8), np.zeros((36, 48), np.float32))]
+        field = GaussianField(torch.full((3, 17), 10.0 + index))
+        run.submaps.save(Submap(index, field, (cut,), np.eye(4)[None], CAMERA), shown)
+    run.write_checkpoint({"T_world_submap": torch.from_numpy(anchors())}, {})
+    run.write_loops(LOOPS)
+    run.note(finish_s=12.5)
+    return run
+
+
+def test_views_are_also_seen_in_their_submaps(cut_run: RunFolder) -> None:
+    metrics = score(cut_run, HandMade(None), renderer=KnownInSubmaps())
+    ramp = np.linspace(0.5, 1.5, 36)
+    for name, offset, views in (
+        ("training", 0.01, 5), ("held_out", 0.04, 15), ("training_submaps", 0.02, 5), ("held_out_submaps", 0.06, 15),
+    ):  # fmt: skip
+        assert metrics[name]["views"] == views
+        assert metrics[name]["psnr_db"] == pytest.approx(-10 * np.log10((ramp**2).mean() * offset**2), abs=1e-3)
+    assert metrics["submaps"] == 3 and metrics["loops"] == {"tried": 2, "accepted": 1} and metrics["finish_s"] == 12.5
+
+
+def test_each_submap_is_loaded_once_and_each_frame_read_once(
+    cut_run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loaded: list[int] = []
+    load = DiskStore.load
+    monkeypatch.setattr(DiskStore, "load", lambda store, index: (loaded.append(index), load(store, index))[1])
+    source, renderer, read = HandMade(None), KnownInSubmaps(), []
+    frame = source.frame
+    monkeypatch.setattr(source, "frame", lambda i: (read.append(i), frame(i))[1])
+    score(cut_run, source, renderer=renderer)
+    assert loaded == [0, 1, 2] and sorted(read) == list(range(FRAMES))
+    assert sorted(renderer.final.seen) == sorted(renderer.before.seen) == list(range(FRAMES))
+
+
+@pytest.mark.parametrize(
+    ("final", "keeps"),
+    [
+        (FinalConfig(iterations=0, uncertainty=False), True),
+        (FinalConfig(iterations=9, uncertainty=True), True),
+        (FinalConfig(iterations=9, uncertainty=False), False),
+        (FinalConfig(iterations=9, seed_from="mesh", uncertainty=True), True),
+        (FinalConfig(iterations=0, seed_from="mesh", uncertainty=True), False),
+    ],
+)
+def test_uncertainty_is_judged_where_it_was_learnt(cut_run: RunFolder, final: FinalConfig, keeps: bool) -> None:
+    (cut_run.path / "config.json").write_text(json.dumps(replace(CONFIG, final=final).to_dict()))
+    metrics = score(cut_run, HandMade(None), renderer=KnownInSubmaps())
+    square = (np.linspace(0.5, 1.5, 36) ** 2).mean()
+    assert metrics["uncertainty"]["mean_squared_error"] == pytest.approx(square * 0.06**2, rel=1e-3)
+    if keeps:
+        assert metrics["uncertainty_final"]["mean_squared_error"] == pytest.approx(square * 0.04**2, rel=1e-3)
+    else:
+        assert metrics["uncertainty_final"] is None
+
+
+def test_submaps_are_on_the_page(cut_run: RunFolder) -> None:
+    score(cut_run, HandMade(truth_of()), renderer=KnownInSubmaps(), strips_per_kind=1)
+    page = (cut_run.path / "report.html").read_text()
+    named = {name for name in (p.name for p in cut_run.images.iterdir()) if f"images/{name}" in page}
+    assert named == {p.name for p in cut_run.images.iterdir()}
+    assert {"submaps-light.png", "submaps-dark.png", "view-held-out-submap-000001.png"} <= named
+    assert "held-out views, in their submaps" in page and "overlap &lt;0.2" in page
+
+
+def test_a_run_in_one_piece_says_so(run: RunFolder) -> None:
+    metrics = score(run, HandMade(None))
+    assert metrics["submaps"] == 1 and metrics["loops"] == {"tried": 0, "accepted": 0} and metrics["finish_s"] is None
+    assert metrics["held_out_submaps"] is metrics["training_submaps"] is metrics["uncertainty_final"] is None
+    assert "Submaps" not in (run.path / "report.html").read_text()
+
+
+@pytest.mark.parametrize("iterations", [0, 50])
+def test_one_submap_is_scored_apart_where_it_was_refined(run: RunFolder, iterations: int) -> None:
+    config = replace(CONFIG, final=FinalConfig(iterations=iterations))
+    (run.path / "config.json").write_text(json.dumps(config.to_dict()))
+    shown = [Picture(np.zeros((36, 48, 3), np.uint8), np.zeros((36, 48), np.float32))]
+    run.submaps.save(Submap(0, GaussianField(torch.full((3, 17), 10.0)), (0,), np.eye(4)[None], CAMERA), shown)
+    run.write_checkpoint({"T_world_submap": torch.from_numpy(anchors()[:1])}, {})
+    renderer = KnownInSubmaps()
+    renderer.check_submap = False
+    metrics = score(run, HandMade(None), renderer=renderer)
+    assert metrics["submaps"] == 1
+    for name in ("held_out_submaps", "training_submaps", "uncertainty_final"):
+        assert (metrics[name] is not None) == bool(iterations)
+    assert "Submaps and loops" not in (run.path / "report.html").read_text()
+
+
+def lose_a_file(run: RunFolder) -> None:
+    run.submaps.path(1).unlink()
+
+
+def lose_the_anchors(run: RunFolder) -> None:
+    run.write_checkpoint({"params": torch.zeros(1, 17)}, {})
+
+
+def never_finish_the_last(run: RunFolder) -> None:
+    run.submaps.path(2).unlink()
+
+
+@pytest.mark.parametrize("lose", [lose_a_file, lose_the_anchors, never_finish_the_last])
+def test_submaps_that_were_not_all_kept_are_not_scored(cut_run: RunFolder, lose: Callable[[RunFolder], None]) -> None:
+    lose(cut_run)
+    metrics = score(cut_run, HandMade(None), renderer=KnownInSubmaps())
+    assert metrics["held_out"]["views"] == 15 and metrics["submaps"] == 3
+    assert metrics["held_out_submaps"] is metrics["training_submaps"] is metrics["uncertainty_final"] is None
+    square = (np.linspace(0.5, 1.5, 36) ** 2).mean()
+    assert metrics["uncertainty"]["mean_squared_error"] == pytest.approx(square * 0.04**2, rel=1e-3)
 
 
 def test_runs_without_frames_or_of_two_sessions_are_refused(run: RunFolder) -> None:

@@ -2,14 +2,16 @@
 
 import re
 from html.parser import HTMLParser
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from sigmasplat.metrics import palette, plot
+from sigmasplat.metrics import charts, palette, plot
 from sigmasplat.metrics.panels import GAP, HEAD, PANEL_WIDTH, View, panels_of, side_by_side
-from sigmasplat.metrics.report import Contents, build_report, headline, number
+from sigmasplat.metrics.report import Contents, build_report
+from sigmasplat.metrics.tables import headline, number
 
 VOID = {"meta", "img", "source", "br", "!doctype"}
 
@@ -84,8 +86,8 @@ def test_ticks_are_round_and_few(low: float, high: float) -> None:
 def test_a_path_is_drawn_to_one_scale_and_where_it_is() -> None:
     """A 2 m × 2 m square walked once: the curve's extent in pixels is square too, its colour the estimate's."""
     corners = np.array([[0, 0, 0], [2, 0, 0], [2, 0, 2], [0, 0, 2], [0, 0, 0.0]])
-    charts = plot.trajectory_charts(corners, None)
-    image = np.asarray(plot.draw_charts(charts[:1], plot.LIGHT, (600, 400))).astype(int)
+    laid_out = charts.trajectory_charts(corners, None)
+    image = np.asarray(plot.draw_charts(laid_out[:1], plot.LIGHT, (600, 400))).astype(int)
     orange = np.abs(image - plot.LIGHT.curves[0]).sum(-1) < 60
     rows, columns = np.nonzero(orange)
     assert np.ptp(rows) == pytest.approx(np.ptp(columns), abs=3) and np.ptp(rows) > 150
@@ -95,16 +97,76 @@ def test_height_is_up_and_truth_may_have_gaps() -> None:
     estimate = np.array([[0, 0, 0], [0, -1.5, 0], [0, -3, 0.0]])
     truth = estimate.copy()
     truth[1] = np.nan
-    charts = plot.trajectory_charts(estimate, truth, np.array([False, True, False]))
-    assert [curve.name for curve in charts[1].curves] == ["truth", "estimate", "lost"]
-    assert charts[1].curves[1].points[:, 1].tolist() == [0, 1.5, 3]
-    plot.draw_charts(charts, plot.DARK)
+    laid_out = charts.trajectory_charts(estimate, truth, np.array([False, True, False]))
+    assert [curve.name for curve in laid_out[1].curves] == ["truth", "estimate", "lost"]
+    assert laid_out[1].curves[1].points[:, 1].tolist() == [0, 1.5, 3]
+    plot.draw_charts(laid_out, plot.DARK)
 
 
 def test_a_standstill_and_a_single_frame_can_be_drawn() -> None:
     for n in (1, 5):
-        plot.draw_charts(plot.trajectory_charts(np.zeros((n, 3)), None), plot.LIGHT)
-        plot.draw_charts([plot.seconds_chart(np.arange(n), {"total": np.zeros(n)})], plot.LIGHT)
+        plot.draw_charts(charts.trajectory_charts(np.zeros((n, 3)), None), plot.LIGHT)
+        plot.draw_charts([charts.seconds_chart(np.arange(n), {"total": np.zeros(n)})], plot.LIGHT)
+
+
+def colours_near(image: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
+    """Return where a picture shows a colour, as (row, column) pairs."""
+    return np.argwhere(np.abs(image.astype(int) - colour).sum(-1) < 60)
+
+
+@pytest.mark.parametrize("theme", [plot.LIGHT, plot.DARK], ids=lambda theme: theme.name)
+def test_submaps_have_colours_and_loops_are_lines_across(theme: plot.Theme) -> None:
+    """Around a 4 m square, a submap a side: the first and the last meet, the accepted loop crosses the middle."""
+    side = np.linspace(0, 4, 11)[:-1]
+    nought = np.zeros(10)
+    x, z = np.concatenate([side, nought + 4, 4 - side, nought]), np.concatenate([nought, side, nought + 4, 4 - side])
+    estimate = np.stack([x, np.zeros(40), z], 1)
+    submaps = np.arange(40) // 10
+    chart = charts.submap_chart(estimate, submaps, [charts.Link(25, 5, True), charts.Link(35, 15, False)])
+    size = (600, 400)
+    image = np.asarray(plot.draw_charts([chart], theme, size))
+    blank = np.asarray(plot.draw_charts([charts.submap_chart(estimate, submaps, [])], theme, size))
+    for place in charts.SUBMAP_COLOURS:
+        assert len(colours_near(blank, theme.curves[place])) > 100
+    assert len(colours_near(blank, theme.curves[plot.ACCENT])) == 0
+    # The accepted one runs along x = 2 m, a column of the picture, the refused one along z = 2 m, a row.
+    changed = np.argwhere((image != blank).any(-1))
+    changed = changed[changed[:, 0] > 40]  # below the legend
+    accepted = colours_near(image[40:], theme.curves[plot.ACCENT])
+    middle = np.median(accepted[:, 1])
+    refused = changed[np.abs(changed[:, 1] - middle) > 6]
+    path = np.concatenate([colours_near(blank, theme.curves[place]) for place in charts.SUBMAP_COLOURS])
+    assert np.ptp(accepted[:, 1]) < 6 and np.ptp(accepted[:, 0]) > 200 and np.ptp(refused[:, 0]) < 6
+    for at, axis in ((accepted, 1), (refused, 0)):
+        assert np.median(at[:, axis]) == pytest.approx(0.5 * (path[:, axis].min() + path[:, axis].max()), abs=4)
+
+
+def test_neighbouring_submaps_differ_and_are_joined() -> None:
+    estimate = np.stack([np.arange(9.0), np.zeros(9), np.zeros(9)], 1)
+    chart = charts.submap_chart(estimate, np.array([0, 0, 0, 1, 1, 2, 3, 3, 3]), [])
+    colours = [curve.colour for curve in chart.curves]
+    assert len(colours) == 4 and all(a != b for a, b in pairwise(colours))
+    assert [curve.points[:, 0].tolist() for curve in chart.curves] == [[0, 1, 2, 3], [3, 4, 5], [5, 6], [6, 7, 8]]
+    assert chart.labels == {"0": (0, 0), "1": (3, 0), "2": (5, 0), "3": (6, 0)}
+
+
+def test_a_long_run_is_not_buried_under_numbers() -> None:
+    estimate = np.random.default_rng(0).normal(size=(500, 3))
+    chart = charts.submap_chart(estimate, np.arange(500) // 5, [])
+    assert len(chart.curves) == 100 and 5 < len(chart.labels) <= charts.MOST_LABELS
+    plot.draw_charts([chart], plot.DARK)
+
+
+def test_loops_are_drawn_where_their_frames_are() -> None:
+    """Frames of loops count from the run's start; some have no pose, so that rows and frames differ."""
+    log = [{"row": row, "index": 10 * row, "submap": row // 4} for row in (0, 1, 3, 4, 5, 7, 8)]
+    estimate = np.stack([[record["row"], 0.0, 0.0] for record in log])
+    loops = [{"query_frame": 8, "database_frame": 1, "accepted": True},
+             {"query_frame": 5, "database_frame": 2, "accepted": False}]  # fmt: skip
+    (chart,), caption = charts.of_run(log, estimate, None, loops)["submaps"]
+    lines = {curve.name: curve.points[:, 0].tolist() for curve in chart.curves if curve.name}
+    assert lines == {"loop accepted": [8, 1]} and "submap" in caption
+    assert set(charts.of_run([record | {"submap": 0} for record in log], estimate, None)) == {"trajectory"}
 
 
 class Balance(HTMLParser):
@@ -163,6 +225,47 @@ def test_figures_on_the_page_are_those_measured() -> None:
     text = re.sub("<[^>]+>", " ", page)
     for figure in ("1.23", "29.50", "31.25", "0.9500", "0.412", "123\u202f456", "3.21", "−2.500", "98.0"):
         assert figure in text, figure
+
+
+def loop(query: int, accepted: bool, **values: object) -> dict[str, object]:
+    """Make a record of loops.json."""
+    return {
+        "query": query, "database": 0, "query_frame": 412, "database_frame": 3, "similarity": 0.875, "residual": 0.0213,
+        "overlap": 0.61, "translation_m": 0.043, "rotation_deg": 1.5, "accepted": accepted,
+        "reason": "accepted" if accepted else "agreement < 0.8",
+    } | values  # fmt: skip
+
+
+BEFORE = {"views": 40, "psnr_db": 27.75, "ssim": 0.9, "depth_l1_m": 0.02, "depth_coverage": 0.97}
+IN_SUBMAPS = METRICS | {
+    "submaps": 8, "loops": {"tried": 3, "accepted": 1}, "finish_s": 12.5, "held_out_submaps": BEFORE,
+    "training_submaps": BEFORE | {"psnr_db": 26.5}, "uncertainty_final": METRICS["uncertainty"] | {"spearman": 0.222},
+}  # fmt: skip
+
+
+def test_submaps_and_loops_have_a_section() -> None:
+    loops = [loop(6, False, residual=None, reason="no overlap & <nothing>"), loop(7, True), loop(5, False)]
+    page = build_report(Contents("t", "s", IN_SUBMAPS, plots={"submaps": "a caption"}, loops=loops))
+    reader = Balance()
+    reader.feed(page)
+    assert not reader.wrong and not reader.open and "images/submaps-dark.png" in reader.addresses
+    text = " ".join(re.sub("<[^>]+>", " ", page).split())
+    assert "Submaps and loops" in text and "8 submaps" in text and "12.5 s" in text and "a caption" in text
+    assert "7 → 0 412 → 3 0.875 0.0213 61 4.3 1.50 accepted" in text
+    assert "6 → 0 412 → 3 0.875 – 61 4.3 1.50 refused no overlap &amp; &lt;nothing&gt;" in text
+    assert "2 loops tried and refused" in text and text.index("7 → 0") < text.index("6 → 0")
+    for figure in ("27.75", "26.50", "0.222", "Submaps", "1 of 3 tried"):
+        assert figure in text, figure
+
+
+def test_a_map_in_one_piece_has_no_such_section() -> None:
+    for metrics in (METRICS, METRICS | {"submaps": 1, "loops": {"tried": 0, "accepted": 0}, "held_out_submaps": None}):
+        assert "ubmap" not in build_report(Contents("t", "s", metrics))
+
+
+def test_several_submaps_without_loops_make_a_section_without_tables() -> None:
+    page = build_report(Contents("t", "s", METRICS | {"submaps": 2, "loops": {"tried": 0, "accepted": 0}}))
+    assert "2 submaps" in page and "refused" not in page and "verdict" not in page
 
 
 def test_absent_figures_are_dashes() -> None:

@@ -14,20 +14,23 @@ import torch
 
 from sigmasplat import cli
 from sigmasplat.errors import RunError
+from sigmasplat.evaluate import evaluate
 from sigmasplat.io.runs import RunFolder
+from sigmasplat.sources import open_source
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 ROOM = "synthetic:frames=200,width=80,height=60"
-QUICK = ["input.width=80", "mapping.first_iterations=5", "mapping.iterations=3"]
+QUICK = ["input.width=80", "mapping.first_iterations=5", "mapping.iterations=3", "submaps.distance_m=0",
+         "submaps.angle_deg=0"]  # fmt: skip
 PATIENCE_S = 90.0
 
 
 @contextmanager
-def running(out: Path) -> Iterator[subprocess.Popen[str]]:
-    """Start a run in a process of its own; never leave it behind."""
-    settings = [word for setting in QUICK for word in ("--set", setting)]
-    command = [sys.executable, "-m", "sigmasplat.cli", "run", ROOM, "--out", str(out), *settings]
+def running(out: Path, *more: str, room: str = ROOM) -> Iterator[subprocess.Popen[str]]:
+    """Start a run in a process of its own, with more settings; never leave it behind."""
+    settings = [word for setting in (*QUICK, *more) for word in ("--set", setting)]
+    command = [sys.executable, "-m", "sigmasplat.cli", "run", room, "--out", str(out), *settings]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ)
     try:
         yield process
@@ -75,6 +78,50 @@ def test_ctrl_c_leaves_a_run_to_work_with(tmp_path: Path, capsys: pytest.Capture
     capsys.readouterr()
 
 
+def test_ctrl_c_among_submaps_leaves_them_and_the_map_of_all(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with running(out, "submaps.frames=8", "loops.min_interval=1") as process:
+        wait_for(process, lambda: len(RunFolder(out).submaps) >= 2)
+        process.send_signal(signal.SIGINT)
+        said, errors = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 130, errors
+    assert "interrupted after" in said and "submaps, loops: " in said
+
+    run = RunFolder.open(out)
+    log, kept, (tensors, _) = run.read_log(), run.submaps, run.read_checkpoint()
+    assert run.facts()["status"] == "interrupted" and "finish_s" not in run.facts()
+    assert 2 <= len(kept) == log[-1]["submap"] and len(tensors["T_world_submap"]) == len(kept) + 1
+    assert tensors["frame_submap"].tolist() == [record["submap"] for record in log]
+    splats = sum(len(kept.load(index).field) for index in range(len(kept))) + len(tensors["params"])
+    assert len(run.read_map()) == splats and torch.isfinite(run.read_map().params).all()
+    tried = [loop for record in log for loop in record.get("loops", [])]
+    assert tried and [(loop["query"], loop["database"]) for loop in run.read_loops()] == [
+        (loop["query"], loop["database"]) for loop in tried
+    ]
+
+
+def test_ctrl_c_while_the_final_map_is_made_keeps_everything(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+
+    def all_frozen() -> bool:
+        return lines(out) == 20 and len(RunFolder(out).submaps) == RunFolder(out).read_log()[-1]["submap"] + 1
+
+    room = ROOM.replace("200", "20")
+    with running(out, "submaps.frames=8", "final.iterations=1000000", room=room) as process:
+        wait_for(process, all_frozen)
+        process.send_signal(signal.SIGINT)
+        said, errors = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 130, errors
+    assert "Traceback" not in said + errors and "interrupted after 20 frames" in said
+
+    run = RunFolder.open(out)
+    assert run.facts()["status"] == "interrupted" and run.facts()["wall_s"] > 0 and "finish_s" not in run.facts()
+    splats = sum(len(run.submaps.load(index).field) for index in range(len(run.submaps)))
+    assert len(run.read_trajectory()) == 20 and len(run.submaps) >= 2 and len(run.read_map()) == splats
+    metrics = evaluate(run, open_source(room), views_per_kind=4, strips_per_kind=0)
+    assert metrics["held_out_submaps"]["views"] == metrics["held_out"]["views"] == 4
+
+
 @pytest.mark.parametrize("moment", ["folder", "log"])
 def test_a_killed_run_is_read_or_refused_in_one_line(
     tmp_path: Path, moment: str, capsys: pytest.CaptureFixture[str]
@@ -104,10 +151,11 @@ def test_a_killed_run_is_read_or_refused_in_one_line(
         assert left.value.code == 2 and refusal.startswith("sigmasplat: ") and refusal.count("\n") == 1, refusal
 
 
-def test_a_killed_run_can_be_run_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize("moment", ["folder", "log"])
+def test_a_killed_run_can_be_run_again(tmp_path: Path, moment: str) -> None:
     out = tmp_path / "run"
     with running(out) as process:
-        wait_for(process, lambda: lines(out) >= 1)
+        wait_for(process, out.exists if moment == "folder" else lambda: lines(out) >= 1)
         process.kill()
         process.wait(timeout=PATIENCE_S)
     with pytest.raises(SystemExit) as left:

@@ -1,35 +1,39 @@
 """Page finished submaps to disk, one file each, read again in parts."""
 
 import json
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 
 from sigmasplat.errors import RunError
-from sigmasplat.io.atomic import replacing
+from sigmasplat.io.tensors import opened, write_tensors
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import EXTRAS, GaussianField, Rows
 from sigmasplat.model.submap import Picture, Submap, refuse_misfit
 
-PATTERN = "submap-*.safetensors"
+OURS = re.compile(r"submap-\d{5,}\.safetensors")
+UNFINISHED = re.compile(rf"\.{OURS.pattern}\.part")
+"""Left by a run that was killed while it wrote a submap."""
 
 
 class DiskStore:
     """Submaps as files in a folder (`model.submap.SubmapStore`): splats, keyframe poses, and the pictures beside them.
 
-    Pictures are read one at a time, so that memory does not grow with what is kept.
+    The folder is made with the first one. Pictures are read one at a time, so that memory does not grow with what is
+    kept. Adam's state is not kept: nothing trains a finished submap.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def __len__(self) -> int:
-        return len(list(self.folder.glob(PATTERN)))
+        return len(self._named(OURS))
 
     def path(self, index: int) -> Path:
         """Return where a submap is kept."""
@@ -40,20 +44,18 @@ class DiskStore:
         refuse_misfit(submap, pictures, len(self))
         tensors = {
             "params": submap.field.params,
-            "T_submap_camera": torch.from_numpy(np.ascontiguousarray(submap.T_submap_camera)),
+            "T_submap_camera": torch.tensor(submap.T_submap_camera, dtype=torch.float64),
             "frames": torch.tensor(submap.frames, dtype=torch.int64),
             **{f"extra.{name}": extra.params for name, extra in submap.field.extras.items()},
             "colors": torch.from_numpy(np.stack([picture.color for picture in pictures])),
             "depths_m": torch.from_numpy(np.stack([picture.depth_m for picture in pictures])),
         }
-        own = {name: tensor.detach().contiguous() for name, tensor in tensors.items()}
-        text = {"index": str(submap.index), "camera": json.dumps(asdict(submap.camera))}
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            with replacing(self.path(submap.index)) as temporary:
-                save_file(own, temporary, text)
         except OSError as problem:
-            raise RunError(f"cannot write {self.path(submap.index)}: {problem.strerror or problem}") from problem
+            raise RunError(f"cannot write {self.folder}: {problem.strerror or problem}") from problem
+        text = {"index": str(submap.index), "camera": json.dumps(asdict(submap.camera))}
+        write_tensors(self.path(submap.index), tensors, text)
 
     def load(self, index: int) -> Submap:
         """Read a submap without its pictures. Raises RunError if it is missing or damaged."""
@@ -73,11 +75,22 @@ class DiskStore:
             color, depth_m = (file.get_slice(name)[keyframe] for name in ("colors", "depths_m"))
             return Picture(color.numpy(), depth_m.numpy())
 
-    def _opened(self, index: int) -> Any:
+    def clear(self) -> None:
+        """Remove every submap, also one half written, and nothing else; the folder too where that leaves it empty."""
+        for path in self._named(OURS) + self._named(UNFINISHED):
+            path.unlink()
+        if self.folder.is_dir() and not any(self.folder.iterdir()):
+            self.folder.rmdir()
+
+    def _named(self, pattern: re.Pattern[str]) -> list[Path]:
+        """List the files whose names are of a pattern."""
+        entries = self.folder.iterdir() if self.folder.is_dir() else ()
+        return [path for path in entries if pattern.fullmatch(path.name)]
+
+    @contextmanager
+    def _opened(self, index: int) -> Iterator[Any]:
         path = self.path(index)
         if not path.is_file():
             raise RunError(f"no submap {index} in {self.folder}: there is no {path.name}; run it again")
-        try:
-            return safe_open(path, "pt")
-        except (SafetensorError, OSError) as problem:
-            raise RunError(f"submap {path} is damaged: {problem}") from problem
+        with opened(path, "submap") as file:
+            yield file

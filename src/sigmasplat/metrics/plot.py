@@ -1,6 +1,6 @@
-"""Draw curves with PIL: the path from above and its height, seconds per frame, the reliability of V."""
+"""Draw curves on axes with PIL, for a light and for a dark page."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ Box = tuple[float, float, float, float]
 DRAW_SCALE = 2
 """Pixels drawn per pixel kept: PIL's lines are smooth only when shrunk."""
 SIZE = (1040, 430)
+ACCENT, BLUE, GREEN, PURPLE, FAINT = range(5)
+"""Places in `Theme.curves`."""
 
 
 @dataclass(frozen=True)
@@ -28,27 +30,28 @@ class Theme:
 
 LIGHT = Theme(
     "light", (255, 255, 255), (70, 78, 88), (226, 229, 233),
-    ((214, 90, 30), (40, 110, 190), (60, 150, 90), (130, 90, 170)),
+    ((214, 90, 30), (40, 110, 190), (60, 150, 90), (130, 90, 170), (152, 160, 170)),
 )  # fmt: skip
 DARK = Theme(
     "dark", (24, 27, 32), (176, 184, 194), (52, 57, 65),
-    ((255, 140, 70), (100, 170, 250), (110, 200, 140), (190, 150, 230)),
+    ((255, 140, 70), (100, 170, 250), (110, 200, 140), (190, 150, 230), (112, 120, 130)),
 )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A named line through points [N, 2] (x, y), or dots."""
+    """A line through points [N, 2] (x, y), or dots; one without a name is left out of the legend."""
 
     name: str
     points: Matrix
     colour: int
     dots: bool = False
+    width: float = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """One pair of axes and the curves on it; `square` gives both axes one scale."""
+    """One pair of axes and the curves on it; `square` gives both axes one scale; labels are texts beside points."""
 
     title: str
     x_label: str
@@ -56,38 +59,7 @@ class Chart:
     curves: list[Curve]
     square: bool = False
     from_zero: bool = False
-
-
-def trajectory_charts(estimate: Matrix, truth: Matrix | None, lost: NDArray[np.bool_] | None = None) -> list[Chart]:
-    """Lay out a path from above (x right, z forward) and its height (−y) over frames.
-
-    estimate: positions [N, 3], metres, in the first camera's frame; truth: the same frames' [N, 3], aligned to it, nan
-    where unknown; lost: frames [N] to mark.
-    """
-    top, height = [], []
-    frames = np.arange(len(estimate))
-    if truth is not None:
-        top.append(Curve("truth", truth[:, [0, 2]], 1))
-        height.append(Curve("truth", np.stack([frames, -truth[:, 1]], 1), 1))
-    rise = np.stack([frames, -estimate[:, 1]], 1)
-    top.append(Curve("estimate", estimate[:, [0, 2]], 0))
-    height.append(Curve("estimate", rise, 0))
-    if lost is not None and lost.any():
-        top.append(Curve("lost", estimate[lost][:, [0, 2]], 3, dots=True))
-        height.append(Curve("lost", rise[lost], 3, dots=True))
-    return [
-        Chart("Path from above", "right, m", "forward, m", top, square=True),
-        Chart("Height", "frame", "up, m", height),
-    ]
-
-
-def seconds_chart(frames: NDArray[np.int_], stages: dict[str, Matrix]) -> Chart:
-    """Lay out the seconds each frame took, by stage: frames [N], seconds [N] per stage; "total" stands out."""
-    curves = [
-        Curve(name, np.stack([frames, seconds], 1).astype(np.float64), 0 if name == "total" else i % 3 + 1)
-        for i, (name, seconds) in enumerate(stages.items())
-    ]
-    return Chart("Seconds per frame", "frame", "", curves, from_zero=True)
+    labels: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def draw_charts(charts: list[Chart], theme: Theme, size: tuple[int, int] = SIZE) -> Image.Image:
@@ -139,14 +111,22 @@ def _draw_chart(draw: ImageDraw.ImageDraw, chart: Chart, theme: Theme, cell: Box
 
     _draw_grid(draw, chart, theme, box, (low, high))
     for curve in chart.curves:
-        places = place(curve.points[np.isfinite(curve.points).all(1)])
-        colour = theme.curves[curve.colour]
-        if curve.dots or len(places) == 1:
-            for x, y in places:
-                draw.ellipse((x - 3 * s, y - 3 * s, x + 3 * s, y + 3 * s), fill=colour)
-        elif places:
-            draw.line(places, colour, 2 * s, joint="curve")
+        _draw_curve(draw, curve, place(curve.points[np.isfinite(curve.points).all(1)]), theme)
+    font = ImageFont.load_default(13 * s)
+    for text, point in chart.labels.items():
+        x, y = place(np.array([point]))[0]
+        draw.text((x + 6 * s, y - 6 * s), text, theme.text, font, anchor="ls")
     _draw_head(draw, chart, theme, box, cell[1] + 24 * s)
+
+
+def _draw_curve(draw: ImageDraw.ImageDraw, curve: Curve, places: list[tuple[float, float]], theme: Theme) -> None:
+    """Draw one curve through places in pixels; a single point becomes a dot."""
+    s, colour = DRAW_SCALE, theme.curves[curve.colour]
+    if curve.dots or len(places) == 1:
+        for x, y in places:
+            draw.ellipse((x - 3 * s, y - 3 * s, x + 3 * s, y + 3 * s), fill=colour)
+    elif places:
+        draw.line(places, colour, round(curve.width * s), joint="curve")
 
 
 def _draw_grid(draw: ImageDraw.ImageDraw, chart: Chart, theme: Theme, box: Box, limits: tuple[Matrix, Matrix]) -> None:
@@ -172,7 +152,7 @@ def _draw_head(draw: ImageDraw.ImageDraw, chart: Chart, theme: Theme, box: Box, 
     after = box[0] + draw.textlength(chart.title, title) + 10 * s
     draw.text((after, middle), chart.y_label, theme.text, font, anchor="lm")
     right = box[2]
-    for curve in reversed(chart.curves if len(chart.curves) > 1 else []):
+    for curve in reversed([curve for curve in chart.curves if curve.name] if len(chart.curves) > 1 else []):
         draw.text((right, middle), curve.name, theme.text, font, anchor="rm")
         right -= draw.textlength(curve.name, font) + 8 * s
         draw.line((right - 16 * s, middle, right, middle), theme.curves[curve.colour], 3 * s)

@@ -1,15 +1,87 @@
-"""Sum up the scores of many views: averages per kind, and one judgement of V over all their pixels."""
+"""Look at many views and sum up their scores: averages per kind, and one judgement of V over all their pixels."""
 
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from sigmasplat.metrics import uncertainty
 from sigmasplat.metrics.panels import COVERED_ALPHA, View
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.frame import Frame
+from sigmasplat.model.submap import SubmapStore
+from sigmasplat.render import Render
 
+Renderer = Callable[[GaussianField, Camera, NDArray[np.float64]], Render]
+"""Shows a field from T_camera_world."""
 PIXELS_PER_VIEW = 20_000
 """Every k-th valid pixel of a view goes into the uncertainty scores, so that their sorts stay short."""
+
+
+@dataclass(eq=False)
+class Scores:
+    """What the views of one kind came to; samples of V are kept where it is to be judged."""
+
+    judged: bool
+    rows: list[dict[str, float]] = field(default_factory=list)
+    samples: list[NDArray[np.float32]] = field(default_factory=list)
+
+    def add(self, view: View) -> None:
+        """Score a view."""
+        self.rows.append(view.scores())
+        if self.judged:
+            self.samples.append(sample(view))
+
+
+@dataclass(frozen=True, eq=False)
+class Maps:
+    """Where views are looked at: the final map; and the submaps, where T_world_submap [S, 4, 4] says how they lie."""
+
+    final: GaussianField
+    store: SubmapStore
+    T_world_submap: NDArray[np.float64] | None
+
+    def submap(self, index: int) -> GaussianField | None:
+        """Return a submap's splats in its own frame, None where the run kept none."""
+        return None if self.T_world_submap is None else self.store.load(index).field
+
+
+def seen(
+    frame_of: Callable[[int], Frame], maps: Maps, chosen: Mapping[str, list[dict[str, Any]]], renderer: Renderer
+) -> Iterator[tuple[View, View | None]]:
+    """Render the chosen records of each kind at their `T_world_camera`: in the final map and, where kept, in the submap
+    of their frame (`submap`, 0 if it says none).
+
+    Submap by submap, so that each is loaded once and one at a time.
+    """
+    wanted = [(record.get("submap", 0), kind, record) for kind, records in chosen.items() for record in records]
+    for index, group in groupby(sorted(wanted, key=lambda view: view[0]), key=lambda view: view[0]):
+        submap = maps.submap(index)
+        for _, kind, record in group:
+            frame, T_camera_world = frame_of(record["index"]), se3.inverse(record["T_world_camera"])
+            notes = ("lost",) if record.get("lost") else ()
+            final = view_of(frame, renderer(maps.final, frame.camera, T_camera_world), kind, notes)
+            before = None
+            if submap is not None and maps.T_world_submap is not None:
+                rendered = renderer(submap, frame.camera, T_camera_world @ maps.T_world_submap[index])
+                before = view_of(frame, rendered, kind, (*notes, f"in submap {index}"))
+            yield final, before
+
+
+def view_of(frame: Frame, rendered: Render, kind: str, notes: tuple[str, ...] = ()) -> View:
+    """Put a frame beside its rendering; depth is Σwz/Σw where the map covers the pixel, else 0."""
+    alpha = _array(rendered.alpha)
+    depth = np.where(alpha > COVERED_ALPHA, _array(rendered.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0)
+    return View(
+        frame.index, kind, frame.color, frame.depth_m, np.clip(_array(rendered.color), 0.0, 1.0),
+        depth.astype(np.float32), alpha, _array(rendered.variance), notes,
+    )  # fmt: skip
 
 
 def sample(view: View) -> NDArray[np.float32]:
@@ -43,3 +115,8 @@ def _mean(values: NDArray[np.float64]) -> float | None:
     """Return the mean of the values that exist, None if none does."""
     existing = values[~np.isnan(values)]
     return float(existing.mean()) if len(existing) else None
+
+
+def _array(values: Tensor) -> NDArray[np.float32]:
+    """Turn a tensor of any device into a numpy array."""
+    return np.asarray(values.detach().cpu(), np.float32)

@@ -1,0 +1,55 @@
+"""Write and read named tensors with text beside them (safetensors), whole or not at all."""
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from sigmasplat.errors import RunError
+from sigmasplat.io.atomic import replacing
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: dict[str, str]) -> None:
+    """Write a file in one step. Raises RunError if the place cannot be written."""
+    with replacing(path) as temporary:
+        try:
+            save_file(_apart(tensors), temporary, text)
+        except SafetensorError as problem:  # also where the disk is full
+            raise RunError(f"cannot write {path}: {problem}; choose a writable place") from problem
+        temporary.chmod(0o666 & ~_umask())  # safetensors makes it private
+
+
+@contextmanager
+def opened(path: Path, what: str) -> Iterator[Any]:
+    """Open a file to read tensors or parts of them (`safe_open`); `what` names it in errors.
+
+    Raises RunError where it is damaged, also by what the block cannot find or use in it.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            yield file
+    except (SafetensorError, OSError, KeyError, IndexError, TypeError, ValueError) as problem:
+        raise RunError(f"{what} {path} is damaged: {problem}") from problem
+
+
+def _apart(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Copy what shares memory with another tensor, which safetensors refuses, and nothing else: pictures are large."""
+    out: dict[str, Tensor] = {}
+    taken: set[int] = set()
+    for name, tensor in tensors.items():
+        own = tensor.detach().cpu().contiguous()
+        memory = own.untyped_storage().data_ptr()
+        out[name] = own.clone() if memory in taken else own
+        taken.add(memory)
+    return out
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

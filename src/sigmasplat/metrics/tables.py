@@ -1,0 +1,142 @@
+"""Turn metrics into rows of text: the figures of first interest, and the report's tables. The first row is the head."""
+
+import math
+from typing import Any
+
+
+def number(value: float | None, digits: int, scale: float = 1.0) -> str:
+    """Write a figure with fixed digits and thin thousands, or a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    return f"{value * scale:,.{digits}f}".replace(",", "\u202f").replace("-", "−")
+
+
+def headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Return the figures of first interest as (name, value, unit), in order; for the page's top and the CLI's table."""
+    ate, held_out = metrics.get("ate") or {}, metrics.get("held_out") or {}
+    found = metrics.get("reconstruction")
+    surface = [("Surface F1 at 1 cm", number(found["f1"], 1, 100.0), "%")] if found else []
+    before = metrics.get("held_out_submaps")
+    in_submaps = [("PSNR, held-out, in submaps", number(before.get("psnr_db"), 2), "dB")] if before else []
+    return [
+        ("ATE RMSE", number(ate.get("rmse_m"), 2, 100.0), "cm"),
+        ("PSNR, held-out", number(held_out.get("psnr_db"), 2), "dB"),
+        *in_submaps,
+        ("Depth L1, held-out", number(held_out.get("depth_l1_m"), 2, 100.0), "cm"),
+        *surface,
+        ("Spearman V ~ error²", number((metrics.get("uncertainty") or {}).get("spearman"), 3), ""),
+        ("Speed", number(metrics.get("frames_per_s"), 2), "frames/s"),
+        ("Splats", number(metrics.get("splats"), 0), ""),
+        ("Lost frames", number(metrics.get("lost"), 0), f"of {metrics.get('frames', 0)}"),
+        *_submap_figures(metrics),
+    ]
+
+
+def _submap_figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Return how many submaps and loops there are, nothing for a map in one piece."""
+    if (metrics.get("submaps") or 1) < 2:
+        return []
+    loops = metrics.get("loops") or {}
+    closed = ("Loops closed", number(loops.get("accepted"), 0), f"of {loops.get('tried', 0)} tried")
+    return [("Submaps", number(metrics["submaps"], 0), ""), closed]
+
+
+def cards(metrics: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
+    """Return the tables of scores, each with its title; those without figures hold a head at most."""
+    seen = "held-out, in submaps" if metrics.get("held_out_submaps") else "held-out"
+    return [
+        ("Pictures", _picture_rows(metrics)),
+        ("Path", _path_rows(metrics)),
+        ("Surface", _surface_rows(metrics)),
+        (f"Uncertainty V, {seen}", _uncertainty_rows(metrics.get("uncertainty"))),
+        ("Uncertainty V, held-out, final map", _uncertainty_rows(metrics.get("uncertainty_final"))),
+        (f"Reliability of V, {seen}", _reliability_rows(metrics.get("uncertainty"))),
+    ]
+
+
+def submap_sentence(metrics: dict[str, Any]) -> str:
+    """Say how many submaps and loops there are, and what finishing cost."""
+    loops, finish_s = metrics.get("loops") or {}, metrics.get("finish_s")
+    tried = f"{loops.get('tried', 0)} pairs of them were tried as loops, {loops.get('accepted', 0)} accepted."
+    after = f" Finishing took {number(finish_s, 1)} s after the last frame." if finish_s is not None else ""
+    return f"The map was made in {metrics['submaps']} submaps. {tried}{after}"
+
+
+def loop_rows(loops: list[dict[str, Any]]) -> list[list[str]]:
+    """List loops: who, how alike, how well they fit, how far from where they were thought to be, the verdict."""
+    head = ["submaps", "frames", "similarity", "residual", "overlap, %", "moved, cm", "turned, °", "verdict", "reason"]
+    return [head, *(_loop_row(loop) for loop in loops)]
+
+
+def _loop_row(loop: dict[str, Any]) -> list[str]:
+    reason = loop.get("reason") or ""
+    return [
+        f"{loop.get('query')} → {loop.get('database')}",
+        f"{loop.get('query_frame')} → {loop.get('database_frame')}",
+        number(loop.get("similarity"), 3),
+        number(loop.get("residual"), 4),
+        number(loop.get("overlap"), 0, 100.0),
+        number(loop.get("translation_m"), 1, 100.0),
+        number(loop.get("rotation_deg"), 2),
+        "accepted" if loop.get("accepted") else "refused",
+        "" if reason == "accepted" else reason,
+    ]
+
+
+def _picture_rows(metrics: dict[str, Any]) -> list[list[str]]:
+    columns = {"training": "training", "held-out": "held_out"}
+    if metrics.get("training_submaps") or metrics.get("held_out_submaps"):
+        columns |= {"training, in submaps": "training_submaps", "held-out, in submaps": "held_out_submaps"}
+    kinds = [metrics.get(key) or {} for key in columns.values()]
+    lines = [("Views", "views", 0, 1.0), ("PSNR, dB", "psnr_db", 2, 1.0), ("SSIM", "ssim", 4, 1.0),
+             ("Depth L1, cm", "depth_l1_m", 2, 100.0), ("Readings covered, %", "depth_coverage", 1, 100.0)]  # fmt: skip
+    return [["", *columns]] + [
+        [label, *(number(kind.get(key), digits, scale) for kind in kinds)] for label, key, digits, scale in lines
+    ]
+
+
+def _path_rows(metrics: dict[str, Any]) -> list[list[str]]:
+    ate, rpe = metrics.get("ate"), metrics.get("rpe")
+    if not ate or not rpe:
+        return []
+    rows = [[f"ATE {name}, cm", number(ate[f"{name}_m"], 3, 100.0)] for name in ("rmse", "mean", "median", "max")]
+    return [
+        ["over all frames, rigidly aligned", f"{ate['pairs']} poses"],
+        *rows,
+        ["RPE translation, cm per frame", number(rpe["translation_rmse_m"], 3, 100.0)],
+        ["RPE rotation, ° per frame", number(rpe["rotation_rmse_deg"], 3)],
+    ]
+
+
+def _surface_rows(metrics: dict[str, Any]) -> list[list[str]]:
+    found = metrics.get("reconstruction")
+    if not found:
+        return []
+    lines = [("Accuracy, cm", "accuracy_m", 2), ("Completion, cm", "completion_m", 2),
+             ("Completion ratio (< 5 cm), %", "completion_ratio", 1), ("Precision (< 1 cm), %", "precision", 1),
+             ("Recall (< 1 cm), %", "recall", 1), ("F1 (1 cm), %", "f1", 1),
+             ("Depth L1, novel views, cm", "depth_l1_m", 2), ("… covered, %", "depth_coverage", 1)]  # fmt: skip
+    return [["of what a keyframe could see", "mesh.ply"]] + [
+        [label, number(found.get(key), digits, 100.0)] for label, key, digits in lines
+    ]
+
+
+def _uncertainty_rows(scores: dict[str, Any] | None) -> list[list[str]]:
+    if not scores:
+        return []
+    return [
+        ["on pixels with a reading", f"{number(scores['pixels'], 0)} pixels"],
+        ["Spearman of V and squared error", number(scores["spearman"], 3)],
+        ["… where the map covers the pixel", number(scores.get("spearman_covered"), 3)],
+        ["AUSE (0 = as good as knowing the error)", number(scores["ause"], 3)],
+        ["Gaussian NLL", number(scores["nll"], 3)],
+        ["mean V, 10⁻³", number(scores["mean_variance"], 3, 1e3)],
+        ["mean squared error, 10⁻³", number(scores["mean_squared_error"], 3, 1e3)],
+    ]
+
+
+def _reliability_rows(scores: dict[str, Any] | None) -> list[list[str]]:
+    rows = (scores or {}).get("reliability") or []
+    return [["tenth of pixels, by V", "mean V, 10⁻³", "squared error, 10⁻³"]] + [
+        [str(i), number(row["predicted"], 3, 1e3), number(row["empirical"], 3, 1e3)] for i, row in enumerate(rows, 1)
+    ]

@@ -1,0 +1,87 @@
+"""Say what a session asks of the system that it runs and of those who watch it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.frame import Frame
+from sigmasplat.model.trajectory import Trajectory
+
+
+class Tried(Protocol):
+    """What a session reads of a pair of submaps that may be a loop (slam.loops.Loop)."""
+
+    @property
+    def query(self) -> int: ...
+    @property
+    def database(self) -> int: ...
+    @property
+    def accepted(self) -> bool: ...
+    @property
+    def residual(self) -> float: ...
+    @property
+    def translation_m(self) -> float: ...
+    def record(self) -> dict[str, Any]: ...
+
+
+class Stepped(Protocol):
+    """What a session reads of a step (slam.slam.Step)."""
+
+    @property
+    def index(self) -> int: ...
+    @property
+    def timestamp_s(self) -> float: ...
+    @property
+    def T_world_camera(self) -> NDArray[np.float64]: ...
+    @property
+    def is_keyframe(self) -> bool: ...
+    @property
+    def lost(self) -> bool: ...
+    @property
+    def tracking(self) -> Mapping[str, float]: ...
+    @property
+    def splats(self) -> int: ...
+    @property
+    def submap(self) -> int: ...
+    @property
+    def loops(self) -> Sequence[Tried]: ...
+    @property
+    def seconds(self) -> Mapping[str, float]: ...
+
+
+class Stepper(Protocol):
+    """What a session needs of a system (slam.slam.Slam)."""
+
+    @property
+    def field(self) -> GaussianField: ...
+    @property
+    def loops(self) -> Sequence[Tried]: ...
+    def step(self, frame: Frame) -> Stepped: ...
+    def finish(self, progress: Callable[[int, int], None]) -> None: ...
+    def trajectory(self) -> Trajectory: ...
+    def checkpoint(self) -> dict[str, Tensor]: ...
+
+
+class Watcher(Protocol):
+    """Is told how a session goes."""
+
+    def __call__(self, step: Stepped) -> None:
+        """Take note of a step."""
+
+    def finishing(self, done: int, total: int) -> None:
+        """Take note of how far the final map is."""
+
+    def last_loops(self, loops: Sequence[Tried]) -> None:
+        """Take note of the loops tried after the last step."""
+
+
+class Unwatched:
+    """Takes note of nothing."""
+
+    def __call__(self, step: Stepped) -> None: ...
+    def finishing(self, done: int, total: int) -> None: ...
+    def last_loops(self, loops: Sequence[Tried]) -> None: ...

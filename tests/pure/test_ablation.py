@@ -1,0 +1,345 @@
+"""The ablation: variants differ by one weight, nothing is run twice or lost, and words follow from the numbers."""
+
+import importlib
+import json
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sigmasplat import ablation, cli
+from sigmasplat.ablation import COMPARED, NAMES, WITHOUT_VARIANCE, Job, Results, Study, carry_out, code_digest
+from sigmasplat.benches import Ablation
+from sigmasplat.config import Config
+from sigmasplat.config.text import override
+from sigmasplat.errors import ConfigError, RunError
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.metrics.effects import FIGURES, best, columns, effects, figures_of, passed_by_chance, sentence, spread
+from sigmasplat.presets import preset
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+bench_ablation, ablation_tables, record, tables = map(
+    importlib.import_module, ("ablation", "ablation_tables", "record", "tables")
+)
+BASE = preset("varsplat-fast")
+
+
+def flat(config: Config) -> dict[str, Any]:
+    """Return settings by full name."""
+    sections = config.to_dict()
+    inner = {f"{s}.{n}": v for s, vs in sections.items() if isinstance(vs, dict) for n, v in vs.items()}
+    return inner | {name: value for name, value in sections.items() if not isinstance(value, dict)}
+
+
+def metrics(
+    ate_m: float | None = 0.01, before: float | None = None, after: float = 25.0, **more: Any
+) -> dict[str, Any]:
+    """Return metrics as an evaluation leaves them."""
+    return {
+        "ate": None if ate_m is None else {"rmse_m": ate_m},
+        "held_out": {"psnr_db": after, "depth_l1_m": 0.02},
+        "held_out_submaps": None if before is None else {"psnr_db": before},
+        "lost": 0, "frames_per_s": 12.5, "loops": {"tried": 3, "accepted": 1}, **more,
+    }  # fmt: skip
+
+
+class MadeUpRuns:
+    """Stand in for SLAM: remember the jobs, score each by `ate_m`, stop by `stop_at`."""
+
+    def __init__(self, ate_m: Mapping[str, float] | None = None, stop_at: int | None = None) -> None:
+        self.ate_m, self.stop_at = ate_m or {}, stop_at
+        self.jobs: list[Job] = []
+        self.folders: list[Path] = []
+
+    def __call__(self, job: Job, folder: Path) -> dict[str, Any]:
+        if len(self.jobs) == self.stop_at:
+            raise KeyboardInterrupt
+        self.jobs.append(job)
+        self.folders.append(folder)
+        folder.mkdir(parents=True)
+        return metrics(self.ate_m.get(job.variant, 0.01) + 1e-4 * job.seed, before=24.0)
+
+
+def runs_of(**ate_m: list[float | None]) -> list[dict[str, Any]]:
+    """Return runs whose variants, named by letters, have these ATEs in metres at seeds 0, 1, …"""
+    return [
+        {"variant": variant, "seed": seed, "figures": figures_of(metrics(value)), "path": "x", "source": "x"}
+        for variant, values in ate_m.items()
+        for seed, value in enumerate(values)
+    ]
+
+
+def test_each_variant_switches_on_one_weight_more_and_nothing_else() -> None:
+    study = Study(("room",), BASE, seeds=1, without_variance=True)
+    settings = {job.variant: flat(job.config) for job in study.jobs("room")}
+    assert list(settings) == [WITHOUT_VARIANCE, *NAMES]
+    switched = ["tracking.uncertainty", "loops.uncertainty", "registration.uncertainty", "final.uncertainty"]
+    for before, after, weight in zip(NAMES, NAMES[1:], switched, strict=False):
+        differing = {name for name in flat(BASE) if settings[before][name] != settings[after][name]}
+        assert differing == {weight} and settings[after][weight] is True
+    assert not any(settings["none"][weight] for weight in switched)
+    assert {settings[name]["mapping.weight_nll_color"] for name in NAMES} == {BASE.mapping.weight_nll_color}
+    none, without = settings["none"], settings[WITHOUT_VARIANCE]
+    assert {name for name in none if none[name] != without[name]} == {"mapping.weight_nll_color"}
+    assert without["mapping.weight_nll_color"] == without["mapping.weight_nll_depth"] == 0
+    assert {name for pair in COMPARED for name in pair} == set(settings)
+
+
+def test_one_tau_for_every_weight_and_the_users_settings_for_all() -> None:
+    config = ablation.common_config("varsplat-tum", ("mapping.iterations=7",), 20.0)
+    assert (config.tracking.tau, config.loops.tau, config.registration.tau) == (20.0, 20.0, 20.0)
+    assert config.mapping.iterations == 7
+    same = {name for name, value in flat(preset("varsplat-tum")).items() if flat(config)[name] == value}
+    changed = {"tracking.tau", "loops.tau", "registration.tau", "mapping.iterations"}
+    assert flat(config).keys() - same <= changed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ([], "no SOURCE given"),
+        (["/no/such/place"], "/no/such/place"),
+        (["synthetic:seed={seed}", "/no/such/place"], "/no/such/place"),
+        (["synthetic", "--seeds", "0"], "--seeds must be at least 1, found 0"),
+        (["synthetic", "--limit", "0"], "--limit must be at least 1, found 0"),
+        (["synthetic", "--tau", "0"], "--tau must be above 0, found 0"),
+        (["synthetic", "--set", "loops.tau=5"], "the ablation sets loops.tau itself"),
+        (["synthetic", "--set", "tracking.uncertainty=off"], "the ablation sets tracking.uncertainty itself"),
+        (["synthetic", "--set", "seed=5"], "the ablation sets seed itself"),
+        (["synthetic", "--set", "mapping.weight_nll_color=0"], "learns no variance"),
+        (["synthetic", "--preset", "loopsplat-fast"], "loopsplat-fast learns no variance"),
+        (["synthetic", "--preset", "quick"], "no preset 'quick'"),
+    ],
+    ids=" ".join,
+)
+def test_refusals_are_one_line_and_leave_nothing(
+    arguments: list[str], says: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as left:
+        cli.main(["bench", "ablation", *arguments])
+    said = capsys.readouterr()
+    assert left.value.code == 2 and said.out == ""
+    assert says in said.err and said.err.startswith("sigmasplat: ") and said.err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["ablation", "--help"]], ids=" ".join)
+def test_help_has_an_example_and_loads_no_torch(arguments: list[str]) -> None:
+    code = "import sys, sigmasplat.cli as c\ntry: c.main(sys.argv[1:])\nfinally: assert 'torch' not in sys.modules"
+    command = [sys.executable, "-c", code, "bench", *arguments]
+    answer = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert answer.returncode == 0, answer.stderr
+    assert "example: sigmasplat bench ablation" in answer.stdout
+
+
+def test_seeds_make_worlds_and_are_the_same_for_all_variants(tmp_path: Path) -> None:
+    (tmp_path / "kitchen").mkdir()
+    study = Study(("synthetic:seed={seed}", str(tmp_path / "kitchen")), BASE, seeds=2)
+    made, real = (study.jobs(source) for source in study.sources)
+    assert [(job.path, job.seed) for job in made] == [
+        (f"synthetic:seed={seed}", seed) for seed in (0, 1) for _ in NAMES
+    ]
+    assert {job.path for job in real} == {str(tmp_path / "kitchen")}
+    assert all(job.config.seed == job.seed for job in [*made, *real])
+    assert len({job.folder for job in [*made, *real]}) == len({job.key for job in [*made, *real]}) == 20
+
+
+def test_what_is_said_and_written_is_what_was_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "ablation.json"
+    runner = MadeUpRuns({"+loop": 0.005, "+registration": 0.005, "+final": 0.006})
+    assert Ablation(("room", "hall"), out=out, without_variance=True).run(runner) == 0
+    assert len(runner.jobs) == 2 * 3 * 6 and not any(folder.exists() for folder in runner.folders)
+    said = capsys.readouterr().out
+    assert "[36/36] hall, +final, seed 2" in said
+    rows = [[cell.strip() for cell in line.strip("│").split("│")] for line in said.splitlines() if "│" in line]
+    laid_out = {row[0]: row[1:] for row in rows}
+    assert laid_out["none"] == ["1.01 ± 0.01", "24", "25", "2", "1", "0", "12.5 ± 0.0"]
+    assert laid_out["+loop"][0] == laid_out["+registration"][0] == "* 0.51 ± 0.01"
+    assert laid_out["+final"][0] == "0.61 ± 0.01"
+    assert "+tracking against none: no figure differs in any run\n" in said
+    on_the_rest = "no effect beyond the spread of the seeds on PSNR before, PSNR after and depth L1"
+    assert f"+loop against +tracking: helps ATE (−0.50 ± 0.00 cm); {on_the_rest}\n" in said
+    assert f"+final against +registration: harms ATE (+0.10 ± 0.00 cm); {on_the_rest}\n" in said
+    assert "23% of figures that nothing changed but chance pass that bar" in said
+
+    written = json.loads(out.read_text())
+    assert written["machine"]["cores"] and written["code"] == code_digest(Path(ablation.__file__).parent)
+    assert Config.from_dict(written["config"]) == ablation.common_config("varsplat-fast", (), 10.0)
+    run = next(r for r in written["runs"] if (r["source"], r["variant"], r["seed"]) == ("hall", "+loop", 2))
+    assert run["figures"]["ate_m"] == pytest.approx(0.0052)
+    assert run["metrics"] == metrics(0.0052, before=24.0)
+    job = next(j for j in runner.jobs if (j.source, j.variant, j.seed) == ("hall", "+loop", 2))
+    assert override(Config.from_dict(written["config"]), run["settings"] | {"seed": "2"}) == job.config
+
+
+def test_an_interrupted_ablation_goes_on_where_it_stopped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command, first, second = Ablation(("room",), out=tmp_path / "a.json"), MadeUpRuns(stop_at=4), MadeUpRuns()
+    with pytest.raises(KeyboardInterrupt):
+        command.run(first)
+    assert "4 of 15 runs are in" in capsys.readouterr().out
+    assert len(json.loads((tmp_path / "a.json").read_text())["runs"]) == 4
+    assert command.run(second) == 0
+    assert [job.key for job in first.jobs + second.jobs] == [job.key for job in command.study().jobs("room")]
+    assert Ablation(("room",), seeds=4, out=tmp_path / "a.json").run(more := MadeUpRuns()) == 0
+    assert [job.seed for job in more.jobs] == [3] * 5
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_runs_are_dropped_only_where_it_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "a.json"
+    Ablation(("room",), seeds=1, out=out).run(MadeUpRuns())
+    before = out.read_text()
+    for other in ({"tau": 20.0}, {"limit": 5}, {"settings": ("mapping.iterations=3",)}):
+        with pytest.raises(RunError, match=r"holds runs \(5\) with other settings or code.* --overwrite"):
+            Ablation(("room",), seeds=1, out=out, **other).run(MadeUpRuns())
+    with pytest.raises(RunError, match="that are not asked for now"):
+        Ablation(("hall",), seeds=1, out=out).run(MadeUpRuns())
+    monkeypatch.setattr(ablation, "code_digest", lambda folder: "another")
+    with pytest.raises(RunError, match="with other settings or code"):
+        Ablation(("room",), seeds=1, out=out).run(MadeUpRuns())
+    assert out.read_text() == before
+    assert Ablation(("room",), seeds=1, out=out, overwrite=True).run(again := MadeUpRuns()) == 0
+    assert len(again.jobs) == 5 and json.loads(out.read_text())["code"] == "another"
+
+
+@pytest.mark.parametrize("text", ["ten years of work", "[]", '{"runs": []}'])
+def test_another_programs_file_is_not_touched(text: str, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(RunError, match=r"a\.json.*give another --out"):
+        Ablation(("room",), out=tmp_path / "a.json", overwrite=True).run(MadeUpRuns())
+    assert (tmp_path / "a.json").read_text() == text
+
+
+def test_run_folders_stay_where_they_are_to_be_kept(tmp_path: Path) -> None:
+    study, runner = Study(("room",), BASE, seeds=2), MadeUpRuns()
+    carry_out(study.jobs("room"), Results(tmp_path / "a.json", study), runner, tmp_path / "kept", lambda job: None)
+    assert sorted(tmp_path.joinpath("kept").iterdir()) == sorted(runner.folders) and len(set(runner.folders)) == 10
+
+
+def test_code_is_told_apart_by_its_bytes(tmp_path: Path) -> None:
+    (tmp_path / "kernel.so").write_bytes(b"1")
+    first = code_digest(tmp_path)
+    (tmp_path / "notes.txt").write_text("no code")
+    assert code_digest(tmp_path) == first
+    (tmp_path / "kernel.so").write_bytes(b"2")
+    assert code_digest(tmp_path) != first
+
+
+def test_a_map_that_was_never_refined_has_one_psnr() -> None:
+    assert figures_of(metrics(None, before=None, after=24.5)) == {
+        "ate_m": None, "psnr_before_db": None, "psnr_db": 24.5, "depth_l1_m": 0.02, "loops": 1, "lost": 0,
+        "frames_per_s": 12.5,
+    }  # fmt: skip
+    assert [f.title for f in columns(runs_of(a=[0.01]))] == ["ATE", "PSNR", "depth L1", "loops", "lost", "frames/s"]
+    refined = [{"figures": figures_of(metrics(before=24.0))}]
+    assert [f.title for f in columns(refined)][1:3] == ["PSNR before", "PSNR after"]
+
+
+def test_an_effect_is_judged_seed_by_seed() -> None:
+    """Worlds differ by far more than the variants do; at equal seeds the same 1 mm is gained each time."""
+    runs = runs_of(a=[0.01, 0.05, 0.09], b=[0.009, 0.0491, 0.0889], c=[0.02, 0.03, 0.10], d=[0.011, 0.0511, 0.0911])
+    ate = {name: effects(runs, name, "a")[0] for name in "bcd"}
+    differences = 100 * np.subtract([0.009, 0.0491, 0.0889], [0.01, 0.05, 0.09])
+    assert ate["b"].mean == pytest.approx(differences.mean()) and ate["b"].deviation == pytest.approx(
+        differences.std(ddof=1)
+    )
+    assert [ate[name].verdict for name in "bcd"] == ["helps", "within the spread", "harms"]
+    assert ate["b"].written() == "−0.10 ± 0.01 cm"
+    assert sentence(effects(runs, "c", "a")) == "no effect beyond the spread of the seeds"
+    assert sentence(effects(runs, "a", "a")) == "no figure differs in any run"
+    assert sentence(effects(runs, "nobody", "a")) == "nothing to compare"
+
+
+def test_one_seed_and_missing_figures_are_not_judged() -> None:
+    runs = runs_of(a=[0.01], b=[0.02])
+    assert sentence(effects(runs, "b", "a")) == "one seed has no spread to judge by"
+    runs = runs_of(a=[0.01, None, 0.03], b=[0.02, 0.01, None])
+    assert effects(runs, "b", "a")[0].deviation is None and effects(runs, "b", "a")[0].mean == pytest.approx(1.0)
+
+
+def test_the_share_passed_by_chance_is_that_of_noise() -> None:
+    for seeds in (2, 3, 6):
+        noise = np.random.default_rng(seeds).normal(size=(100_000, seeds))
+        passed = np.abs(noise.mean(1)) > noise.std(1, ddof=1)
+        assert passed_by_chance(seeds) == pytest.approx(passed.mean(), abs=0.005)
+
+
+def test_the_best_is_marked_by_what_is_printed() -> None:
+    ate, loops, speed = FIGURES[0], FIGURES[4], FIGURES[6]
+    assert best({"a": 1.234, "b": 1.231, "c": 1.26}, ate) == {"a", "b"}
+    assert best({"a": 1.234, "b": 1.231}, ate) == set()
+    assert best({"a": 1.0, "b": 2.0}, loops) == set() and best({"a": 1.0, "b": 2.0}, speed) == {"b"}
+    assert (spread([], 2), spread([2.0, 2.0], 2), spread([1.0], 2), spread([1.5], 2)) == ("–", "2", "1", "1.50")
+    assert spread([1.0, 2.0], 2) == "1.50 ± 0.71"
+
+
+def test_real_runs_leave_figures_and_kept_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
+    room, out = "synthetic:frames=120,width=64,height=48,seed={seed}", tmp_path / "a.json"
+    settings = [
+        w for s in ("input.width=64", "mapping.first_iterations=6", "mapping.iterations=4") for w in ("--set", s)
+    ]
+    arguments = [room, "--seeds", "1", "--limit", "4", "--out", str(out), "--keep", str(tmp_path / "kept"), *settings]
+    with pytest.raises(SystemExit) as left:
+        cli.main(["bench", "ablation", *arguments])
+    assert left.value.code == 0
+    runs = json.loads(out.read_text())["runs"]
+    assert [run["variant"] for run in runs] == list(NAMES)
+    for run in runs:
+        assert 0 < run["figures"]["ate_m"] < 0.05 and run["figures"]["psnr_db"] > 10 and run["figures"]["loops"] == 0
+        assert run["metrics"]["frames"] == 4 and run["path"] == room.replace("{seed}", "0")
+    folders = [RunFolder.open(path) for path in sorted((tmp_path / "kept").iterdir())]
+    weights = sorted((c.tracking.uncertainty, c.loops.uncertainty) for c in (folder.config() for folder in folders))
+    assert weights == [(False, False), (True, False), (True, True), (True, True), (True, True)]
+    assert "one seed has no spread to judge by" in capsys.readouterr().out
+
+
+def test_committed_results_are_laid_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(record, "data_root", lambda: tmp_path)
+    (tmp_path / "livingroom").mkdir()
+    options = bench_ablation.Options(
+        sources=("synthetic", "livingroom"), seeds=3, runs=tmp_path, out=tmp_path / "results"
+    )
+    command = options.ablation()
+    assert command.sources == (bench_ablation.SYNTHETIC, str(tmp_path / "livingroom"))
+    monkeypatch.setattr(bench_ablation.Options, "ablation", lambda self: self)
+    monkeypatch.setattr(
+        bench_ablation.Options, "run", lambda self: command.run(MadeUpRuns({"+loop": 0.005})), raising=False
+    )
+    assert bench_ablation.main(options) == 0
+    measured = record.latest("ablation", tmp_path / "results")
+    assert (
+        measured["seeds"] == [0, 1, 2]
+        and len(measured["figures"]["runs"]) == 36
+        and str(tmp_path) not in json.dumps(measured["figures"])
+    )
+    made = {s.title: s for s in tables.sections(measured)}
+    assert list(made) == ["synthetic", "livingroom", "Effects", "Verdicts"]
+    assert [row[0] for row in made["livingroom"].rows] == [WITHOUT_VARIANCE, *NAMES]
+    assert made["livingroom"].rows[3][1] == "**0.51 ± 0.01**" and "3 worlds" in made["synthetic"].note
+    assert made["Effects"].rows[2][:3] == ["synthetic", "+loop against +tracking", "**−0.50 ± 0.00 cm**"]
+    verdicts = {row[0]: row[1:] for row in made["Verdicts"].rows}
+    assert verdicts["+loop against +tracking"] == ["synthetic: ATE, livingroom: ATE", "–", "–"]
+    assert verdicts["+registration against +loop"] == ["–", "synthetic: ATE, livingroom: ATE", "–"]
+    assert verdicts["+tracking against none"] == ["–", "–", "synthetic, livingroom"]
+    assert all(len(row) == len(section.columns) for section in made.values() for row in section.rows)
+    text, missing = tables.rewritten("<!-- bench:ablation/livingroom -->\n<!-- /bench -->", tmp_path / "results")
+    assert missing == [] and "| +loop | **0.51 ± 0.01** |" in text
+
+
+def test_the_benchmark_explains_itself_and_refuses_in_a_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    program = Path(bench_ablation.__file__)
+    answer = subprocess.run([sys.executable, program, "--help"], capture_output=True, text=True, timeout=60)
+    assert answer.returncode == 0 and "--no-reference" in answer.stdout, answer.stderr
+    options = bench_ablation.Options(sources=("/no/such/place",), runs=tmp_path, out=tmp_path)
+    assert bench_ablation.main(options) == 2
+    assert capsys.readouterr().err.startswith("ablation.py: no such folder") and not list(tmp_path.iterdir())
+    with pytest.raises(ConfigError):
+        bench_ablation.Options(tau=0.0).ablation().study()

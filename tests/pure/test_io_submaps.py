@@ -1,0 +1,252 @@
+"""Submaps on disk: they come back bit for bit, a part at a time, and damage is said in one line."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+
+from sigmasplat.errors import RunError, SigmaSplatError
+from sigmasplat.io import tensors
+from sigmasplat.io.submaps import DiskStore
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import EXTRAS, GaussianField, Rows
+from sigmasplat.model.submap import MemoryStore, Picture, Submap, SubmapStore
+
+CAMERA = Camera(8, 6, 7.25, 7.5, 3.5 + 1 / 3, 2.5)
+
+
+def some_submap(index: int = 0, keyframes: int = 3, extras: tuple[str, ...] = ()) -> tuple[Submap, list[Picture]]:
+    """Make a submap of values with all their digits; its pictures differ."""
+    rng = np.random.default_rng(index)
+    torch.manual_seed(index)
+    field = GaussianField(torch.randn(5, 17), extras={name: Rows(torch.randn(5, EXTRAS[name])) for name in extras})
+    poses = np.stack([se3.exp(rng.normal(size=6)) for _ in range(keyframes)])
+    pictures = [
+        Picture(rng.integers(0, 256, (6, 8, 3), dtype=np.uint8), rng.uniform(0, 4, (6, 8)).astype(np.float32))
+        for _ in range(keyframes)
+    ]
+    return Submap(index, field, tuple(range(10 * index, 10 * index + keyframes)), poses, CAMERA), pictures
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> DiskStore:
+    return DiskStore(tmp_path / "run" / "submaps")
+
+
+def assert_same(found: Submap, wanted: Submap) -> None:
+    assert (found.index, found.frames, found.camera) == (wanted.index, wanted.frames, wanted.camera)
+    assert found.T_submap_camera.dtype == np.float64 and np.array_equal(found.T_submap_camera, wanted.T_submap_camera)
+    assert found.field.params.dtype == torch.float32 and torch.equal(found.field.params, wanted.field.params)
+    assert set(found.field.extras) == set(wanted.field.extras)
+    for name, extra in wanted.field.extras.items():
+        assert torch.equal(found.field.extras[name].params, extra.params)
+
+
+@pytest.mark.parametrize("extras", [(), ("correlations",), tuple(EXTRAS)], ids=["plain", "one extra", "all extras"])
+def test_a_submap_comes_back_bit_for_bit(store: DiskStore, extras: tuple[str, ...]) -> None:
+    submap, pictures = some_submap(extras=extras)
+    store.save(submap, pictures)
+    assert_same(store.load(0), submap)
+    for k, picture in enumerate(pictures):
+        back = store.picture(0, k)
+        assert back.color.dtype == np.uint8 and np.array_equal(back.color, picture.color)
+        assert back.depth_m.dtype == np.float32 and np.array_equal(back.depth_m, picture.depth_m)
+
+
+def test_an_empty_submap_and_values_that_are_no_numbers_come_back(store: DiskStore) -> None:
+    submap, pictures = some_submap(keyframes=1)
+    params = torch.zeros(0, 17)
+    store.save(Submap(0, GaussianField(params), submap.frames, submap.T_submap_camera, CAMERA), pictures)
+    assert len(store.load(0).field) == 0
+    second, pictures = some_submap(1)
+    second.field.params[0, 0] = float("nan")
+    store.save(second, pictures)
+    assert torch.equal(store.load(1).field.params.isnan(), second.field.params.isnan())
+
+
+def test_disk_and_memory_answer_alike(store: DiskStore) -> None:
+    kept: list[SubmapStore] = [store, MemoryStore()]
+    for index in range(3):
+        for where in kept:
+            where.save(*some_submap(index, keyframes=index + 1))
+    assert [len(where) for where in kept] == [3, 3]
+    for index in (2, 0, 1):
+        assert_same(kept[0].load(index), kept[1].load(index))
+        assert np.array_equal(kept[0].picture(index, index).color, kept[1].picture(index, index).color)
+
+
+def test_another_store_of_the_same_folder_sees_what_is_kept(store: DiskStore) -> None:
+    assert len(store) == 0 and not store.folder.exists(), "nothing is made before there is something to keep"
+    store.save(*some_submap(0))
+    assert len(DiskStore(store.folder)) == 1
+    assert_same(DiskStore(store.folder).load(0), some_submap(0)[0])
+
+
+def test_what_is_loaded_is_memory_of_its_own(store: DiskStore) -> None:
+    submap, pictures = some_submap()
+    store.save(submap, pictures)
+    first = store.load(0)
+    first.field.params.zero_()
+    first.T_submap_camera[:] = 0.0
+    store.picture(0, 0).color[:] = 0
+    assert_same(store.load(0), submap)
+    assert np.array_equal(store.picture(0, 0).color, pictures[0].color)
+
+
+def test_splats_that_are_views_of_one_tensor_can_be_kept(store: DiskStore) -> None:
+    base, (submap, pictures) = torch.randn(9, 62), some_submap()
+    field = GaussianField(base[2:7, :17], extras={"harmonics": Rows(base[2:7, 17:])})
+    store.save(Submap(0, field, submap.frames, submap.T_submap_camera[:, :, :], CAMERA), pictures)
+    assert torch.equal(store.load(0).field.params, base[2:7, :17])
+    assert torch.equal(store.load(0).field.extras["harmonics"].params, base[2:7, 17:])
+
+
+@pytest.mark.parametrize("frozen", [True, False])
+def test_poses_that_may_not_be_written_can_be_kept(
+    store: DiskStore, frozen: bool, recwarn: pytest.WarningsRecorder
+) -> None:
+    submap, pictures = some_submap()
+    submap.T_submap_camera.flags.writeable = not frozen
+    store.save(submap, pictures)
+    assert_same(store.load(0), submap)
+    assert not recwarn.list
+
+
+def test_pictures_are_read_one_by_one(store: DiskStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A picture reads its own rows of the file and nothing else; a submap reads no picture."""
+    store.save(*some_submap())
+    asked: list[tuple[str, object]] = []
+    real = tensors.safe_open
+
+    class Watched:
+        def __init__(self, *arguments: object) -> None:
+            self.file = real(*arguments)
+
+        def __enter__(self) -> "Watched":
+            self.file.__enter__()
+            return self
+
+        def __exit__(self, *problem: object) -> None:
+            self.file.__exit__(*problem)
+
+        def get_tensor(self, name: str) -> torch.Tensor:
+            asked.append((name, "whole"))
+            return self.file.get_tensor(name)
+
+        def get_slice(self, name: str) -> object:
+            part = self.file.get_slice(name)
+
+            class Part:
+                def __getitem__(self, row: int) -> torch.Tensor:
+                    asked.append((name, row))
+                    return part[row]
+
+            return Part()
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self.file, name)
+
+    monkeypatch.setattr(tensors, "safe_open", Watched)
+    store.picture(0, 1)
+    assert asked == [("colors", 1), ("depths_m", 1)]
+    asked.clear()
+    store.load(0)
+    assert {name for name, _ in asked} == {"params", "frames", "T_submap_camera"}
+
+
+def test_submaps_are_kept_in_their_order_and_whole(store: DiskStore) -> None:
+    with pytest.raises(SigmaSplatError, match="submap 1 cannot be kept: the next one is 0"):
+        store.save(*some_submap(1))
+    store.save(*some_submap(0))
+    with pytest.raises(SigmaSplatError, match="submap 0 cannot be kept: the next one is 1"):
+        store.save(*some_submap(0))
+    submap, pictures = some_submap(1)
+    with pytest.raises(SigmaSplatError, match="3 frames, 3 poses, 2 pictures"):
+        store.save(submap, pictures[:2])
+    assert len(store) == 1 and not list(store.folder.glob(".*"))
+
+
+def test_a_missing_submap_is_named(store: DiskStore) -> None:
+    for read in (lambda: store.load(3), lambda: store.picture(3, 0)):
+        with pytest.raises(RunError, match=r"no submap 3 in .*submaps: there is no submap-00003\.safetensors"):
+            read()
+
+
+def refused(store: DiskStore) -> str:
+    with pytest.raises(RunError, match=r"submap .*submap-00000\.safetensors is damaged: ") as caught:
+        store.load(0)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("keep", [0, 5, 200, -1], ids=["empty", "five bytes", "half the head", "a byte short"])
+def test_a_file_cut_short_is_refused(store: DiskStore, keep: int) -> None:
+    store.save(*some_submap())
+    path = store.path(0)
+    path.write_bytes(path.read_bytes()[:keep])
+    refused(store)
+    with pytest.raises(RunError, match="is damaged"):
+        store.picture(0, 0)
+
+
+def test_a_file_that_lacks_something_is_refused(store: DiskStore) -> None:
+    """A safetensors file of another program: no splats, then no words, then words of another camera."""
+    store.save(*some_submap())
+    with tensors.opened(store.path(0), "submap") as file:
+        everything = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    for left_out, text in (
+        ("params", {"camera": json.dumps(vars(CAMERA))}),
+        ("frames", {"camera": json.dumps(vars(CAMERA))}),
+        ("", None),
+        ("", {"camera": "{"}),
+        ("", {"camera": '{"width": 8, "lens": "fisheye"}'}),
+    ):
+        some = {name: tensor for name, tensor in everything.items() if name != left_out}
+        safetensors.torch.save_file(some, store.path(0), text)
+        assert left_out in refused(store)
+
+
+def test_a_keyframe_that_is_not_there_is_refused(store: DiskStore) -> None:
+    store.save(*some_submap(keyframes=2))
+    with pytest.raises(RunError, match="is damaged"):
+        store.picture(0, 2)
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "submaps").write_text("a file")
+    with pytest.raises(RunError, match=r"cannot write .*submaps"):
+        DiskStore(tmp_path / "submaps").save(*some_submap())
+
+
+def test_half_a_submap_does_not_count(store: DiskStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    store.save(*some_submap(0))
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tensors, "save_file", stop)
+    with pytest.raises(KeyboardInterrupt):
+        store.save(*some_submap(1))
+    assert [path.name for path in store.folder.iterdir()] == ["submap-00000.safetensors"] and len(store) == 1
+
+
+def test_files_are_as_readable_as_others(store: DiskStore, tmp_path: Path) -> None:
+    store.save(*some_submap())
+    (tmp_path / "other").write_text("")
+    assert store.path(0).stat().st_mode == (tmp_path / "other").stat().st_mode
+
+
+def test_clearing_removes_what_is_ours(store: DiskStore) -> None:
+    store.clear()
+    store.save(*some_submap(0))
+    (store.folder / ".submap-00001.safetensors.part").write_text("")
+    (store.folder / "submap-best.safetensors").write_text("mine")
+    store.clear()
+    assert [path.name for path in store.folder.iterdir()] == ["submap-best.safetensors"] and len(store) == 0
+    (store.folder / "submap-best.safetensors").unlink()
+    store.clear()
+    assert not store.folder.exists()
