@@ -139,12 +139,21 @@ FAST = Config(
         weight_max=3.0,
     ),
     submaps=SubmapConfig(
-        distance_m=1.0,
-        angle_deg=60.0,
+        distance_m=0.5,
+        angle_deg=50.0,
         inherit=True,  # a new submap from nothing costs two seconds of first iterations
     ),
-    loops=LoopConfig(similarity_floor=0.8),  # what the built-in descriptor needs: it knows no places, only shapes
-    registration=RegistrationConfig(iterations=20, lr_translation=1e-3, lr_rotation=1e-3, tau=10.0),
+    loops=LoopConfig(
+        similarity_floor=0.8,  # what the built-in descriptor needs: it knows no places, only shapes
+        near_m=0.5,  # … and sees a revisit from another side too rarely
+    ),
+    registration=RegistrationConfig(
+        iterations=20,  # four keyframes a pair: each step is a render; Gauss–Newton has done most of it
+        lr_translation=1e-3,
+        lr_rotation=1e-3,
+        tau=10.0,
+    ),
+    final=FinalConfig(iterations=500),  # ten seconds; without any the seams between submaps show
 )
 
 DATASETS = {"replica": REPLICA, "tum": TUM, "scannet": SCANNET, "fast": FAST}

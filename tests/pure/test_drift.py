@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import SubmapConfig
 from sigmasplat.model import se3
-from sigmasplat.slam.drift import HOP_M, HOP_RAD, Drift
+from sigmasplat.slam.drift import BIAS, HOP_M, HOP_RAD, Drift
 from sigmasplat.slam.rules import ends_submap
 
 Matrix = NDArray[np.float64]
@@ -64,6 +64,20 @@ def test_a_hop_of_unknown_covariance_counts_as_a_usual_one(unknown: Matrix | Non
     drift.hop(np.eye(4), unknown)
     assert np.allclose(drift.covariance, OWN)
     assert np.allclose(drift.information @ OWN, np.eye(6))
+
+
+def test_what_is_bent_grows_with_the_way_not_with_its_root() -> None:
+    """Twice the way, twice the deviation: noise alone would give √2."""
+    deviations = []
+    for steps in (1, 2):
+        drift, T = Drift(), np.eye(4)
+        T[0, 3] = 2.0
+        for k in range(1, steps + 1):
+            T[0, 3] = 2.0 * k
+            drift.hop(T, None)
+        deviations.append(float(np.sqrt(np.linalg.inv(drift.information)[0, 0])))
+    assert deviations[1] == pytest.approx(2 * deviations[0], rel=0.01)
+    assert deviations[0] == pytest.approx(BIAS * 2.0, rel=0.01)
 
 
 @pytest.mark.parametrize(

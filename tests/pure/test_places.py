@@ -5,10 +5,12 @@ from itertools import permutations
 import numpy as np
 import pytest
 
+from sigmasplat.model import se3
 from sigmasplat.slam.places import (
     Candidate,
     Signature,
     find_candidates,
+    find_nearby,
     gate,
     opacity_ratio,
     pairs_to_register,
@@ -213,3 +215,25 @@ def test_equally_alike_keyframes_are_taken_in_order() -> None:
     query, other = Signature(5, at(0, 0, 0, 40, 40, 40)), Signature(1, at(10, 10, 10))
     (pair,) = pairs_to_register(find_candidates(query, [other], 0.7), query, [other])
     assert pair.query_keyframes == (0, 1) == pair.database_keyframes
+
+
+def standing(*places: tuple[float, float]) -> np.ndarray:
+    """Poses by x in metres and yaw in degrees."""
+    poses = np.stack([se3.exp(np.array([0, 0, 0, 0, yaw * DEGREE, 0.0])) for _, yaw in places])
+    poses[:, 0, 3] = [x for x, _ in places]
+    return poses
+
+
+def test_places_that_should_be_near_are_tried_whatever_they_look_like() -> None:
+    signatures = [Signature(k, at(90.0 * k, 90.0 * k)) for k in range(4)]
+    poses = [
+        standing((0.4, 0.0), (0.1, 5.0)),  # near, the second keyframe more so
+        standing((0.0, 40.0), (0.6, 0.0)),  # near but turned away, looking alike but far
+        standing((0.0, 0.0), (0.0, 0.0)),  # the neighbour before
+        standing((0.0, 0.0), (9.0, 0.0)),
+    ]
+    found = find_nearby(signatures[3], signatures[:3], poses, 0.5, 30 * DEGREE, 2)
+    assert [(c.query_keyframe, c.database_submap, c.database_keyframe) for c in found] == [(0, 0, 1)]
+    assert found[0].similarity == pytest.approx(0.0, abs=1e-6)
+    wider = find_nearby(signatures[3], signatures[:3], poses, 0.8, 30 * DEGREE, 1)
+    assert [c.database_submap for c in wider] == [2, 0, 1], "the nearest first"

@@ -5,10 +5,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources import SyntheticRoom, open_source
-from sigmasplat.sources.room.sensor import measured_depth, noise_sigma_m
+from sigmasplat.sources.room.sensor import WARMING_FRAMES, drifted_depth, measured_depth, noise_sigma_m
 from sigmasplat.sources.room.shapes import Rays, Shape, cast, image_windows, surface
 from sigmasplat.sources.room.textures import Material, noise, plain
 from sigmasplat.sources.room.view import picture, scene
@@ -16,6 +17,18 @@ from sigmasplat.sources.room.walk import path
 from view_agreement import agreement
 
 MATT = Material(plain((0.5, 0.5, 0.5)))
+# Options, frame; camera's position, m; depths of 9 pixels, m; colours of 3, in 255 steps.
+GOLDEN = [
+    ("noise=1,seed=3", 50, [0.516978, -0.515955, 1.376988],
+     [2.6355, 3.2914, 2.3862, 2.7866, 0.0, 2.5134, 2.6142, 0.0, 1.8751],
+     [161, 109, 90, 130, 65, 54, 182, 160, 178]),
+    ("frames=600,rooms=2", 400, [2.478756, 0.120664, 1.489477],
+     [3.2718, 3.2744, 3.2770, 3.4841, 4.9634, 4.7021, 2.7225, 1.8368, 1.3509],
+     [202, 197, 184, 154, 105, 87, 80, 54, 33]),
+    ("frames=400,loops=2,noise=1,exposure_change=0", 310, [0.806492, -0.205294, 1.263493],
+     [2.7702, 3.1680, 0.0, 2.8647, 3.3803, 0.0, 0.0, 0.9806, 0.0],
+     [141, 92, 76, 160, 108, 91, 70, 61, 52]),
+]  # fmt: skip
 
 
 def shape(kind, center, half, yaw_rad=0.0):
@@ -196,11 +209,80 @@ def test_noise_option_changes_depth_and_leaves_holes():
     assert 0.001 < np.median(np.abs(clean.depth_m - noisy.depth_m)[both]) < 0.03
 
 
+def drift_errors(indices, seed=0, deviation=0.01):
+    wall = np.full((30, 40), 2.0, np.float32)
+    return np.stack([drifted_depth(wall, i, seed, deviation) / 2.0 - 1.0 for i in indices])
+
+
+def test_drift_has_its_deviation_and_no_bias_over_walks():
+    errors = np.stack([drift_errors([1000], seed)[0] for seed in range(400)])
+    assert errors.std() == pytest.approx(0.01, rel=0.08)
+    assert np.abs(errors.mean(0)).max() < 0.004
+    other = np.stack([drift_errors([130], seed)[0] for seed in range(400)])
+    assert other.std() == pytest.approx(0.01, rel=0.08), "as large between knots as at them"
+
+
+def test_drift_is_smooth_over_frames_and_over_the_image():
+    errors = drift_errors(range(3 * WARMING_FRAMES))
+    assert np.abs(np.diff(errors, axis=0)).max() < 15 * 0.01 / WARMING_FRAMES
+    assert max(np.abs(np.diff(errors, axis=axis)).max() for axis in (1, 2)) < 0.01 / 2
+    assert np.abs(errors[-1] - errors[0]).max() > 0.005, "yet another one after a while"
+
+
+def test_drift_is_proportional_to_depth_and_leaves_holes():
+    depth_m = np.zeros((30, 40), np.float32)
+    depth_m[:, ::2] = np.linspace(1.0, 6.0, 20)
+    read = drifted_depth(depth_m, 77, 1, 0.02)
+    assert (read[depth_m == 0] == 0).all() and np.abs(read - depth_m).max() > 0.01
+    np.testing.assert_allclose(drifted_depth(2 * depth_m, 77, 1, 0.02), 2 * read, rtol=1e-6)
+
+
+def test_drift_changes_depth_alone_and_is_the_same_in_any_order():
+    options = {"frames": 12, "width": 64, "height": 48, "rooms": 2, "overrun": 20}
+    plain_room, room = SyntheticRoom(**options), SyntheticRoom(**options, drift=6)
+    for i in (7, 2):
+        without, drifting = plain_room.frame(i), SyntheticRoom(**options, drift=6).frame(i)
+        assert drifting.color.tobytes() == without.color.tobytes()
+        assert drifting.depth_m.tobytes() == drifted_depth(without.depth_m, i, 0, 0.006).tobytes()
+        assert drifting.depth_m.tobytes() == room.frame(i).depth_m.tobytes()
+    assert np.array_equal(room.truth().T_world_camera, plain_room.truth().T_world_camera)
+
+
+def test_what_is_seen_again_can_be_laid_onto_what_was_seen():
+    """Depths agree if they are within 5 cm or 5 %; else no registration would believe the loop."""
+    for seed in range(40):
+        first, last = drift_errors([60, 660], seed, 0.006)
+        assert (np.abs(first - last) < 0.05).mean() > 0.98
+
+
+@pytest.mark.parametrize(("rooms", "pace"), [(1, 200), (2, 600), (3, 900)])
+def test_an_overrun_repeats_the_walks_beginning(rooms, pace):
+    turn, walk = path(pace + 1, 1, rooms, 1), path(round(1.25 * pace) + 1, 1, rooms, 1, overrun=0.25)
+    np.testing.assert_allclose(walk[: pace + 1], turn, atol=1e-9)
+    np.testing.assert_allclose(walk[pace:], turn[: pace // 4 + 1], atol=1e-9)
+
+
+@pytest.mark.parametrize(("options", "frame", "position_m", "depth_m", "color"), GOLDEN)
+def test_sequences_stay_what_they_were(options, frame, position_m, depth_m, color):
+    """Figures of other runs are compared with these: a few pixels, read when the options were made."""
+    room = open_source(f"synthetic:width=64,height=48,{options}")
+    seen = room.frame(frame)
+    np.testing.assert_allclose(room.truth().T_world_camera[frame][:3, 3], position_m, atol=1e-6)
+    np.testing.assert_allclose(seen.depth_m[::20, ::25].ravel(), depth_m, atol=2e-4)
+    np.testing.assert_allclose(255 * seen.color[24, ::25].ravel(), color, atol=1.01)
+
+
 def test_texture_noise_is_smooth_and_fades_under_large_pixels():
     u = np.linspace(-2, 2, 4001, dtype=np.float32)
     fine = noise(u, 0.3 * u, np.full_like(u, 1e-4), 0.1, seed=1)
     assert np.abs(np.diff(fine)).max() < 0.05 and fine.std() > 0.2 and np.abs(fine).max() <= 1
     assert np.abs(noise(u, u, np.full_like(u, 0.1), 0.1, seed=1)).max() == 0
+
+
+@pytest.mark.parametrize("option", ["drift", "overrun", "seed"])
+def test_options_below_nought_are_refused(option):
+    with pytest.raises(SourceError, match=f"{option} must be at least 0, found -1"):
+        open_source(f"synthetic:frames=7,{option}=-1")
 
 
 def test_options_in_the_path():

@@ -36,6 +36,10 @@ class LoopConfig:
     """Submaps nearer than this in the sequence are neighbours, not loops."""
     similarity_floor: float = 0.0
     """No pair less alike than this is tried, however unlike a submap's own views are."""
+    near_m: float = 0.0
+    """Keyframes nearer than this by the poses known so far are tried too, however they look; 0 = off (paper)."""
+    near_deg: float = 30.0
+    """… and turned by less than this."""
     most: int = 4
     """At most so many pairs are registered per finished submap, the most alike first; 0 = no limit."""
     uncertainty: bool = True

@@ -15,7 +15,7 @@ from sigmasplat.model.field import COLUMNS
 from sigmasplat.model.submap import Submap, SubmapStore
 from sigmasplat.render.view import View
 from sigmasplat.slam.descriptors import Descriptor, OrientationGrid
-from sigmasplat.slam.places import Signature, SubmapPair, find_candidates, opacity_ratio, pairs_to_register
+from sigmasplat.slam.places import Signature, SubmapPair, find_candidates, find_nearby, opacity_ratio, pairs_to_register
 from sigmasplat.slam.pose_graph import Edge, LoopVerdict, optimise
 from sigmasplat.slam.register import Registrar, Registration
 
@@ -93,18 +93,22 @@ class LoopCloser:
         if not c.close:
             return []
         signature = Signature(submap.index, np.stack(descriptors), ratio)
-        pairs = self._pairs(signature)
+        pairs = self._pairs(signature, atlas)
         self.signatures.append(signature)
         tried = [self._try(pair, atlas) for pair in pairs]
         if any(loop.accepted for loop in tried):
             self._correct(atlas)
         return self.loops[len(self.loops) - len(tried) :]
 
-    def _pairs(self, query: Signature) -> list[SubmapPair]:
+    def _pairs(self, query: Signature, atlas: Atlas) -> list[SubmapPair]:
+        """Choose the earlier submaps to register with: those that look alike, then those that should be near."""
         c = self.config.loops
         candidates = find_candidates(
             query, self.signatures, c.min_similarity, c.min_interval, c.similarity_floor, c.uncertainty
         )
+        if c.near_m:
+            poses = [atlas.T_world_keyframe(index) for index in range(query.index + 1)]
+            candidates += find_nearby(query, self.signatures, poses, c.near_m, np.deg2rad(c.near_deg), c.min_interval)
         pairs = pairs_to_register(candidates, query, self.signatures, self.config.registration.keyframes)
         return pairs[: c.most] if c.most else pairs
 

@@ -11,6 +11,8 @@ Image = NDArray[np.float32]
 JITTER_PX = 0.6
 RANGE_M = (0.35, 7.0)
 COLOR_SIGMA = 0.008
+WARMING_FRAMES = 300
+"""The calibration is another one, by chance, each so many frames; between them it changes smoothly."""
 
 
 def noise_sigma_m(depth_m: Image) -> Image:
@@ -28,6 +30,31 @@ def measured_depth(depth_m: Image, camera: Camera, rng: np.random.Generator) -> 
     in_range = (noisy > RANGE_M[0]) & (noisy < RANGE_M[1])
     blind = _grazing(depth_m, camera) | _rims(depth_m, rng) | _patches(depth_m.shape, rng)
     return np.where(in_range & ~blind, noisy, 0.0).astype(np.float32)
+
+
+def drifted_depth(depth_m: Image, i: int, seed: int, deviation: float) -> Image:
+    """Return true depth [H, W] as read at frame i by a sensor whose calibration wanders as it warms up.
+
+    The relative error is a polynomial of second degree over the image: scale, tilts, bowl, saddle and twist, each a
+    smooth random process over the frames, independent of the others; `deviation` is the standard deviation of them
+    together, over image and time. It depends on seed and i alone, and is the same on equal surfaces seen soon after
+    each other: poses agree from frame to frame and go astray together, as they do with a real sensor.
+    """
+    height, width = depth_m.shape
+    v, u = np.linspace(-1.0, 1.0, height)[:, None], np.linspace(-1.0, 1.0, width)
+    # Legendre's polynomials: each of mean square 1, orthogonal, so that their variances add up.
+    one, tilt_u, tilt_v = np.ones((height, width)), np.sqrt(3.0) * u, np.sqrt(3.0) * v
+    shapes = (one, tilt_u, tilt_v, tilt_u * tilt_v, *(np.sqrt(1.25) * (3.0 * x**2 - 1.0) for x in (u, v)))
+    error = sum(_wandering_number(i, (seed, k, 8)) * shape for k, shape in enumerate(shapes)) / np.sqrt(len(shapes))
+    return np.asarray(depth_m * (1.0 + deviation * error), np.float32)
+
+
+def _wandering_number(i: int, seed: tuple[int, ...]) -> float:
+    """Return a random process of mean 0 and variance 1 at frame i: a cubic spline between normal numbers."""
+    knot, s = divmod(i / WARMING_FRAMES, 1.0)
+    weights = np.array([(1 - s) ** 3, 3 * s**3 - 6 * s**2 + 4, -3 * s**3 + 3 * s**2 + 3 * s + 1, s**3])
+    normals = [np.random.default_rng((*seed, int(knot) + k)).standard_normal() for k in range(4)]
+    return float(weights @ normals / np.linalg.norm(weights))
 
 
 def measured_color(color: Image, rng: np.random.Generator) -> Image:

@@ -15,17 +15,19 @@ CALM_M = 0.9
 """Standard deviation, along the way, of the average that smooths where the camera looks."""
 
 
-def path(frames: int, loops: int, rooms: int, seed: int) -> Matrix:
-    """Return T_world_camera [frames, 4, 4], camera x right, y down, z forward; the last pose is the first one again.
+def path(frames: int, loops: int, rooms: int, seed: int, overrun: float = 0.0) -> Matrix:
+    """Return T_world_camera [frames, 4, 4], camera x right, y down, z forward; the last pose is the first one again,
+    or `overrun` turns beyond it: what was seen at the start is then seen again from the same places.
 
     One room: an ellipse, looking across it, one turn per loop, each loop at another height: at 200 frames a loop 1.4 to
     2.8 cm and under 2° a frame. Several rooms: there and back through the doorways, looking ahead; 300 frames a room
-    keep that pace.
+    keep that pace, those of the overrun not counted.
     """
     u = np.arange(frames) / max(frames - 1, 1)
     phase = 2 * np.pi * np.random.default_rng((seed, 3)).uniform()
-    positions, yaw_rad = _ellipse(loops * u, phase) if rooms == 1 else _corridor((loops * u) % 1.0, rooms)
-    turns = 2 * np.pi * loops * u
+    all_turns = loops + overrun
+    positions, yaw_rad = _ellipse(all_turns * u, phase) if rooms == 1 else _corridor((all_turns * u) % 1.0, rooms)
+    turns = 2 * np.pi * all_turns * u
     positions[:, 2] = 1.42 + 0.07 * np.sin(2 * turns + phase) + 0.16 * np.sin(2 * np.pi * u) * (loops > 1)
     pitch_rad = np.deg2rad(-11.0 + 5.0 * np.sin(2 * turns))
     roll_rad = np.deg2rad(1.5) * np.sin(3 * turns)

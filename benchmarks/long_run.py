@@ -1,0 +1,185 @@
+"""Walk so long that submaps pile up, and ask whether frames get slower or memory grows (issue 4).
+
+The frames are drawn beforehand by all cores; then SLAM steps through them alone in a fresh process, finished submaps
+paged to disk and images read ahead by a thread, as `sigmasplat run` has it. Each frame's time is kept, and the resident
+memory of the process after it. Writes benchmarks/results/long-run-<machine>.json, prints tables. Linux only.
+
+example: python benchmarks/long_run.py --quick
+"""
+
+import os
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
+
+import accuracy
+import numpy as np
+import record
+import tables
+import tyro
+from cpu import alone
+
+from sigmasplat.config import Config
+from sigmasplat.config.text import override, split_settings
+from sigmasplat.errors import SigmaSplatError, SourceError
+from sigmasplat.io.machine import usable_cores
+from sigmasplat.io.submaps import DiskStore
+from sigmasplat.metrics.trajectory import ate
+from sigmasplat.model.frame import Frame
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.options import Settings
+from sigmasplat.presets import default_preset, preset as preset_of
+from sigmasplat.sources import open_source
+from sigmasplat.sources.base import Source
+from sigmasplat.sources.images import color_from_bytes
+
+arg = tyro.conf.arg
+SOURCE = "synthetic:frames=2400,rooms=2,loops=4,noise=1"
+"""Four turns, so that each quarter of the run sees all there is to see once."""
+QUICK_SOURCE, QUICK_SETTING = "synthetic:frames=240,loops=4,noise=1,width=160,height=120", "input.width=160"
+STATM = Path("/proc/self/statm")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Walk so long that submaps pile up, and ask whether frames get slower or memory grows."""
+
+    source: Annotated[str, arg(help="sequence, at least 2000 frames for a result")] = SOURCE
+    preset: Annotated[str, arg(help="settings to start from")] = default_preset()
+    settings: Settings = ()
+    seed: int = 0
+    finish: Annotated[bool, arg(help="make the final map too, after the frames")] = True
+    quick: Annotated[bool, arg(help="a minute or so: 240 small frames; nothing is written")] = False
+    name: Annotated[str, arg(help="name of the results")] = "long-run"
+    scratch: Annotated[Path, arg(help="folder for the frames and submaps, removed afterwards: 2 GB")] = accuracy.RUNS
+    out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
+
+    def config(self) -> Config:
+        """Return the run's settings. Raises ConfigError on an unknown preset or setting."""
+        return override(preset_of(self.preset), split_settings(self.settings) | {"seed": str(self.seed)})
+
+
+class Drawn(Source):
+    """Frames of another source that `draw` has kept in a folder."""
+
+    def __init__(self, whole: Source, folder: Path) -> None:
+        super().__init__(whole.name, whole.camera)
+        self._whole, self._folder = whole, folder
+
+    def __len__(self) -> int:
+        return len(self._whole)
+
+    def frame(self, i: int) -> Frame:
+        """Read frame i."""
+        with np.load(kept(self._folder, self._checked_index(i))) as file:
+            color = color_from_bytes(file["color"])
+            return Frame(i, float(file["timestamp_s"]), color, file["depth_m"], self.camera)
+
+    def truth(self) -> Trajectory | None:
+        """Return the true path of the source drawn."""
+        return self._whole.truth()
+
+
+def kept(folder: Path, i: int) -> Path:
+    """Return where frame i is kept."""
+    return folder / f"{i:06d}.npz"
+
+
+def draw(path: str, folder: Path, indices: range) -> None:
+    """Keep frames of a source, colour in the 255 steps that cameras deliver."""
+    source = open_source(path)
+    for i in indices:
+        frame = source.frame(i)
+        color = np.rint(255.0 * frame.color).astype(np.uint8)
+        np.savez(kept(folder, i), color=color, depth_m=frame.depth_m, timestamp_s=frame.timestamp_s)
+
+
+def draw_all(path: str, folder: Path) -> None:
+    """Keep all frames of a source, drawn by all cores."""
+    workers, frames = usable_cores(), len(open_source(path))
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        parts = [pool.submit(draw, path, folder, range(k, frames, workers)) for k in range(workers)]
+        for part in parts:
+            part.result()
+
+
+def resident_mib() -> float:
+    """Return the resident memory of this process, MiB. Raises SourceError where there is no /proc."""
+    try:
+        pages = int(STATM.read_text().split()[1])
+    except OSError as problem:
+        raise SourceError(f"resident memory is read from {STATM}, which this system has not ({problem})") from problem
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def follow(path: str, scratch: Path, config: Config, finish: bool) -> dict[str, Any]:
+    """Step through the frames drawn in scratch/frames; return time, memory and submap of each, and figures of the run.
+
+    seconds: `Step.seconds["total"]`, reading the frame not included; resident_mib: after the frame.
+    """
+    from sigmasplat.slam.slam import Slam
+
+    source, seconds, resident, submaps, lost = Drawn(open_source(path), scratch / "frames"), [], [], [], 0
+    slam = Slam(config, DiskStore(scratch / "submaps"))
+    for frame in source:
+        step = slam.step(frame)
+        seconds.append(round(step.seconds["total"], 6))
+        resident.append(round(resident_mib(), 2))
+        submaps.append(step.submap)
+        lost += step.lost
+    clock = time.perf_counter()
+    if finish:
+        slam.finish()
+    after = {"finish_s": round(time.perf_counter() - clock, 2), "resident_mib": round(resident_mib(), 2)}
+    truth = source.truth()
+    return {
+        "frames": len(seconds),
+        "lost": lost,
+        "submaps": submaps[-1] + 1,
+        "loops_tried": len(slam.loops),
+        "loops_accepted": sum(loop.accepted for loop in slam.loops),
+        "ate_m": None if truth is None else ate(slam.trajectory(), truth).rmse_m,
+        "finish": after if finish else None,
+        "each": {"seconds": seconds, "resident_mib": resident, "submap": submaps},
+    }
+
+
+def measure(options: Options) -> dict[str, Any]:
+    """Draw the frames, then walk through them in a fresh process; return the figures."""
+    options.scratch.mkdir(parents=True, exist_ok=True)
+    config = options.config()
+    with TemporaryDirectory(prefix="long-run-", dir=options.scratch) as folder:
+        scratch = Path(folder)
+        (scratch / "frames").mkdir()
+        clock = time.perf_counter()
+        draw_all(options.source, scratch / "frames")
+        print(f"frames drawn in {time.perf_counter() - clock:.0f} s", file=sys.stderr, flush=True)
+        found: dict[str, Any] = alone(follow, options.source, scratch, config, options.finish)
+    return {"source": Path(options.source).name, **found}
+
+
+def main(options: Options) -> int:
+    """Measure, write, print; return the exit code."""
+    if options.quick:
+        options = replace(options, source=QUICK_SOURCE, settings=(*options.settings, QUICK_SETTING))
+    try:
+        figures = measure(options)
+    except SigmaSplatError as problem:
+        print(f"long_run.py: {problem}", file=sys.stderr)
+        return 2
+    config = {n: v for n, v in asdict(options).items() if n not in ("scratch", "out", "quick")}
+    config["source"] = figures["source"]
+    measured = record.results("long_run", figures, name=options.name, seeds=[options.seed], config=config)
+    if not options.quick:
+        print(record.write(measured, options.out), file=sys.stderr)
+    print(tables.table(measured))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))

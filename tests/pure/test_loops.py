@@ -1,0 +1,117 @@
+"""Closing loops with the registration made up: who is tried, what is remembered, which anchors move."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sigmasplat.config import Config, LoopConfig
+from sigmasplat.model import se3
+from sigmasplat.model.atlas import Atlas
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.submap import MemoryStore, Picture, Submap
+from sigmasplat.slam import loops
+from sigmasplat.slam.descriptors import OrientationGrid
+from sigmasplat.slam.loops import LoopCloser, make_descriptor
+from sigmasplat.slam.places import SubmapPair
+from sigmasplat.slam.register import Registration
+
+CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
+STEP = se3.exp(np.array([1.0, 0, 0, 0, 0, 0.0]))
+SURE = np.diag([1e6] * 6)
+
+
+class Registered:
+    """Stands in the place of `Registrar`: submaps are where `truth` says, or where `lies` say."""
+
+    truth: list[np.ndarray]
+    lies: dict[tuple[int, int], np.ndarray]
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+    def register(self, pair: SubmapPair, known: np.ndarray) -> Registration:
+        a, b = pair.best.query_submap, pair.best.database_submap
+        T_a_b = self.lies.get((a, b), se3.inverse(self.truth[a]) @ self.truth[b])
+        return Registration(T_a_b, SURE, 0.1, 4, 0.9, True, "accepted")
+
+
+def closer(monkeypatch: pytest.MonkeyPatch, lies: dict[tuple[int, int], np.ndarray], **changes: object) -> LoopCloser:
+    """A closer whose registrations are made up; submaps lie a metre apart, each says odometry 2 cm too far."""
+    monkeypatch.setattr(loops, "Registrar", Registered)
+    Registered.truth = [np.linalg.matrix_power(STEP, k) for k in range(4)]
+    Registered.lies = lies
+    config = Config(loops=LoopConfig(**{"min_interval": 2, "min_similarity": 1.0, **changes}))
+    return LoopCloser(config, MemoryStore(), None)  # type: ignore[arg-type]
+
+
+def walked(closer: LoopCloser, alike: bool = True) -> Atlas:
+    """Finish four submaps with two keyframes each; the last looks like the first, and where asked it is tried."""
+    atlas, drift = Atlas(), se3.exp(np.array([1.02, 0, 0, 0, 0, 0.0]))
+    directions = [0.0, 60.0, 120.0, 0.0 if alike else 180.0]
+    for k, degrees in enumerate(directions):
+        if k:
+            closer.submap_begun(k, drift, np.diag([1e4] * 6))
+        atlas.begin_submap(atlas.anchors[-1] @ drift if k else np.eye(4))
+        atlas.keyframes[-1] = [np.eye(4), np.eye(4)]
+        field = GaussianField.from_values(torch.zeros(3, 3), torch.ones(3), torch.zeros(3, 3))
+        submap = Submap(k, field, (2 * k, 2 * k + 1), np.stack([np.eye(4)] * 2), CAMERA)
+        picture = Picture(np.zeros((3, 4, 3), np.uint8), np.ones((3, 4), np.float32))
+        closer.store.save(submap, [picture, picture])
+        looks = [np.array([np.cos(a), np.sin(a)], np.float32) for a in np.deg2rad([degrees, degrees + 20.0])]
+        closer.submap_finished(submap, looks, atlas)
+    return atlas
+
+
+def test_a_true_loop_takes_the_drift_out_and_leaves_the_first_anchor(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = closer(monkeypatch, {})
+    atlas = walked(made)
+    (loop,) = made.loops
+    assert (loop.query, loop.database, loop.query_frame, loop.database_frame) == (3, 0, 6, 0)
+    assert loop.accepted and loop.chi2 < 16.8 and loop.translation_m == pytest.approx(0.06)
+    assert np.array_equal(atlas.anchors[0], np.eye(4))
+    assert atlas.anchors[3][0, 3] == pytest.approx(3.0, abs=2e-3)
+    assert atlas.anchors[1][0, 3] == pytest.approx(1.0, abs=2e-3)
+
+
+def test_a_gross_lie_is_registered_refused_by_the_graph_and_moves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = closer(monkeypatch, {(3, 0): se3.exp(np.array([5.0, 2.0, 0, 0, 0, 1.0]))})
+    atlas = walked(made)
+    (loop,) = made.loops
+    assert not loop.accepted
+    assert "pose graph disagrees" in loop.reason
+    assert [T[0, 3] for T in atlas.anchors] == pytest.approx([0.0, 1.02, 2.04, 3.06])
+    assert loop.record()["accepted"] is False
+
+
+def test_places_that_do_not_look_alike_are_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = closer(monkeypatch, {}, similarity_floor=0.5)
+    atlas = walked(made, alike=False)
+    assert made.loops == []
+    assert atlas.anchors[3][0, 3] == pytest.approx(3.06)
+
+
+def test_switched_off_nothing_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = closer(monkeypatch, {}, close=False)
+    walked(made)
+    assert made.loops == []
+    assert len(made.odometry) == 3
+
+
+def test_a_refused_registration_makes_no_edge(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = closer(monkeypatch, {})
+    plain = Registered.register
+    monkeypatch.setattr(
+        Registered, "register", lambda *a: replace(plain(*a), accepted=False, reason="overlap 0.05 is below 0.2")
+    )
+    atlas = walked(made)
+    assert made.closed == []
+    assert [loop.reason for loop in made.loops] == ["overlap 0.05 is below 0.2"]
+    assert np.isnan(made.loops[0].chi2)
+    assert atlas.anchors[3][0, 3] == pytest.approx(3.06)
+
+
+def test_the_descriptor_by_its_name() -> None:
+    assert isinstance(make_descriptor(LoopConfig()), OrientationGrid)
