@@ -146,9 +146,10 @@ FAST = Config(
     loops=LoopConfig(
         similarity_floor=0.8,  # what the built-in descriptor needs: it knows no places, only shapes
         near_m=0.5,  # … and sees a revisit from another side too rarely
+        most=3,  # a pair costs as much as thirty frames
     ),
     registration=RegistrationConfig(
-        iterations=20,  # four keyframes a pair: each step is a render; Gauss–Newton has done most of it
+        iterations=10,  # four keyframes a pair: each step is a render; Gauss–Newton has done most of it
         lr_translation=1e-3,
         lr_rotation=1e-3,
         tau=10.0,

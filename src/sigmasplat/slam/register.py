@@ -24,6 +24,8 @@ Matrix = NDArray[np.float64]
 
 FLOOR_M, FLOOR_RAD = 0.005, 0.003
 """Deviation that every registration is given at least: two maps of one wall differ by about so much."""
+HOPELESS = 0.5
+"""A keyframe whose alignment explains less than this share of what counts is not descended any further."""
 OVERLAP_SAMPLE = 5000
 OPAQUE = 0.95
 """Pixels count where the other submap is this opaque (VarSplat §5 asks it of depth; here of colour as well)."""
@@ -83,8 +85,9 @@ class Registrar:
         target, live = self._laid_out(own, keyframe)
         expected = se3.inverse(T_own_camera) @ T_own_other
         guesses = [expected, *(se3.inverse(other.T_submap_camera[k]) for k in alike)]
-        T_camera_other = max((self._aligned(params, live, guess) for guess in guesses), key=score).T_camera_world
-        fit = fit_pose_adam(params, self.view, target, T_camera_other, self.tracking, self.config.iterations)
+        fit = max((self._aligned(params, live, guess) for guess in guesses), key=score)
+        if fit.alignment is None or score(fit) > HOPELESS * self.config.share_least:
+            fit = fit_pose_adam(params, self.view, target, fit.T_camera_world, self.tracking, self.config.iterations)
         A = se3.adjoint(T_own_camera)
         covariance = A @ self._covariance(params, live, fit.T_camera_world) @ A.T
         return Localisation(T_own_camera @ fit.T_camera_world, fit.loss, covariance, fit.agreement, fit.overlap)
