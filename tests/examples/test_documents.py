@@ -1,6 +1,7 @@
 """What the documents say is true: links lead somewhere; files, functions, tests, settings and messages exist."""
 
 import ast
+import dataclasses
 import re
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from sigmasplat.config import Config
 from sigmasplat.presets import list_presets, preset
 
 PACKAGE = ROOT / "src" / "sigmasplat"
+SECTIONS = [f.name for f in dataclasses.fields(Config) if dataclasses.is_dataclass(getattr(Config(), f.name))]
 each_document = pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
 
 
@@ -36,10 +38,10 @@ def test_named_tests_files_and_settings_exist(path: Path) -> None:
     text = prose(path)
     for file, name in re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text):
         assert f"def {name}(" in (ROOT / file).read_text(encoding="utf-8"), f"{path.name} names {file}::{name}"
-    for name in re.findall(r"`((?:native|model|render|fit|slam|sources|io|metrics)/\w+\.\w+)`", text):
+    for name in re.findall(r"`((?:config|native|model|render|fit|slam|sources|io|metrics)/\w+\.\w+)`", text):
         assert (PACKAGE / name).is_file(), f"{path.name} names {name}"
-    for section, name in re.findall(r"`(input|render|seeding|mapping|tracking)\.([a-z]\w+)`", text):
-        known = {*vars(getattr(Config(), section)), "py"}
+    for section, name in re.findall(rf"`({'|'.join(SECTIONS)})\.([a-z]\w+)`", text):
+        known = {*vars(getattr(Config(), section)), "py", "json"}
         logged = {"agreement", "overlap", "first_loss", "loss", "iterations"} if path.name == "runs.md" else set()
         assert name in known | logged or (PACKAGE / section / f"{name}.py").is_file(), f"{path.name}: {section}.{name}"
     for name in re.findall(r"`((?:varsplat|loopsplat)-(?!NAME|X)[a-z]+)`", text):
@@ -89,6 +91,11 @@ def test_documented_messages_are_those_of_the_source() -> None:
 
 
 def test_measured_tables_have_their_places() -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    for name in ("accuracy", "cpu"):
-        assert re.search(rf"<!-- bench:{name}[\w./-]* -->\n(.*\n)*?<!-- /bench -->", text)
+    places = {
+        "README.md": ("accuracy", "cpu"),
+        "docs/varsplat.md": ("accuracy", "loops", "long-run", "ablation", "color-covariance"),
+    }
+    for document, names in places.items():
+        text = (ROOT / document).read_text(encoding="utf-8")
+        for name in names:
+            assert re.search(rf"<!-- bench:{name}[\w./-]* -->\n(.*\n)*?<!-- /bench -->", text), f"{document}: {name}"

@@ -232,8 +232,10 @@ def test_places_that_should_be_near_are_tried_whatever_they_look_like() -> None:
         standing((0.0, 0.0), (0.0, 0.0)),  # the neighbour before
         standing((0.0, 0.0), (9.0, 0.0)),
     ]
-    found = find_nearby(signatures[3], signatures[:3], poses, 0.5, 30 * DEGREE, 2)
-    assert [(c.query_keyframe, c.database_submap, c.database_keyframe) for c in found] == [(0, 0, 1)]
-    assert found[0].similarity == pytest.approx(0.0, abs=1e-6)
-    wider = find_nearby(signatures[3], signatures[:3], poses, 0.8, 30 * DEGREE, 1)
-    assert [c.database_submap for c in wider] == [2, 0, 1], "the nearest first"
+    (pair,) = find_nearby(signatures[3], signatures[:3], poses, 0.5, 30 * DEGREE, 2)
+    assert (pair.best.query_keyframe, pair.best.database_submap, pair.best.database_keyframe) == (0, 0, 1)
+    assert pair.best.similarity == pytest.approx(0.0, abs=1e-6)
+    assert pair.query_keyframes == (0, 1) and pair.database_keyframes == (1, 0)
+    wider = find_nearby(signatures[3], signatures[:3], poses, 0.8, 30 * DEGREE, 1, keyframes=1)
+    assert [p.best.database_submap for p in wider] == [2, 0, 1], "the nearest first"
+    assert wider[2].database_keyframes == (1,)

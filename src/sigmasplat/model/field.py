@@ -18,9 +18,10 @@ COLUMNS: dict[str, slice] = {
 }
 WIDTH = 17
 EXTRAS = {"correlations": 3, "harmonics": 45}
-"""What splats may carry besides, and how many numbers of each: off-diagonals of the Cholesky factor of their colour
-covariance (red–green, red–blue, green–blue); spherical harmonics of degrees 1 to 3, harmonic by harmonic in the order
-of `model.harmonics.basis`, red, green and blue of each: columns 3·i + channel."""
+"""What splats may carry besides, and how many numbers of each. correlations: unbounded, 0 = none, their tanh are the
+partial correlations of the colour channels red–green, red–blue, green–blue (`model.color_covariance`). harmonics:
+spherical ones of degrees 1 to 3, one by one in the order of `model.harmonics.basis`, red, green and blue of each:
+columns 3·i + channel."""
 
 
 @dataclass(eq=False)

@@ -106,10 +106,13 @@ class LoopCloser:
         candidates = find_candidates(
             query, self.signatures, c.min_similarity, c.min_interval, c.similarity_floor, c.uncertainty
         )
+        keyframes = self.config.registration.keyframes
+        pairs = pairs_to_register(candidates, query, self.signatures, keyframes)
         if c.near_m:
             poses = [atlas.T_world_keyframe(index) for index in range(query.index + 1)]
-            candidates += find_nearby(query, self.signatures, poses, c.near_m, np.deg2rad(c.near_deg), c.min_interval)
-        pairs = pairs_to_register(candidates, query, self.signatures, self.config.registration.keyframes)
+            near_rad, known = np.deg2rad(c.near_deg), {pair.best.database_submap for pair in pairs}
+            near = find_nearby(query, self.signatures, poses, c.near_m, near_rad, c.min_interval, keyframes)
+            pairs += [pair for pair in near if pair.best.database_submap not in known]
         return pairs[: c.most] if c.most else pairs
 
     def _try(self, pair: SubmapPair, atlas: Atlas) -> Loop:

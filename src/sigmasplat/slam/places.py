@@ -130,14 +130,15 @@ def find_nearby(
     near_m: float,
     near_rad: float,
     min_interval: int = 2,
-) -> list[Candidate]:
-    """List keyframe pairs that by the poses known so far look at one place, whatever they look like; nearest first.
+    keyframes: int = 2,
+) -> list[SubmapPair]:
+    """List pairs of submaps that by the poses known so far see one place, whatever they look like; nearest first.
 
     Ours, beside the paper's: where drift is small, poses know of more revisits than descriptors do. T_world_keyframe:
-    per submap by its index, [K, 4, 4]. Pairs count that are nearer than near_m and turned by less than near_rad; of
-    each submap the nearest, in units of both limits.
+    per submap by its index, [K, 4, 4]. Pairs count with keyframes nearer than near_m and turned by less than near_rad;
+    the nearest `keyframes` of each side, in units of both limits, are to be localised.
     """
-    found: list[tuple[float, Candidate]] = []
+    found: list[tuple[float, SubmapPair]] = []
     ours = T_world_keyframe[query.index]
     for other in database:
         if abs(other.index - query.index) < max(min_interval, 1):
@@ -146,12 +147,15 @@ def find_nearby(
         apart_m = np.linalg.norm(ours[:, None, :3, 3] - theirs[None, :, :3, 3], axis=-1)
         cosine = (np.einsum("aij,bij->ab", ours[:, :3, :3], theirs[:, :3, :3]) - 1.0) / 2.0
         apart_rad = np.arccos(np.clip(cosine, -1.0, 1.0))
-        far = np.where((apart_m < near_m) & (apart_rad < near_rad), apart_m / near_m + apart_rad / near_rad, np.inf)
-        q, d = np.unravel_index(int(far.argmin()), far.shape)
-        if np.isfinite(far[q, d]):
+        far = apart_m / near_m + apart_rad / near_rad
+        within = np.where((apart_m < near_m) & (apart_rad < near_rad), far, np.inf)
+        q, d = (int(i) for i in np.unravel_index(int(within.argmin()), far.shape))
+        if np.isfinite(within[q, d]):
             alike = float(similarity(query.descriptors[q : q + 1], other.descriptors[d : d + 1])[0, 0])
-            found.append((float(far[q, d]), Candidate(query.index, int(q), other.index, int(d), alike, alike)))
-    return [candidate for _, candidate in sorted(found, key=lambda f: (f[0], f[1].database_submap))]
+            best = Candidate(query.index, q, other.index, d, alike, alike)
+            sides = _highest(-far.min(1), keyframes), _highest(-far.min(0), keyframes)
+            found.append((float(within[q, d]), SubmapPair(best, *sides)))
+    return [pair for _, pair in sorted(found, key=lambda f: (f[0], f[1].best.database_submap))]
 
 
 def pairs_to_register(

@@ -24,8 +24,9 @@ PRUNE_WEIGHT = 0.25
 """Below this weight a loop is rejected (VarSplat §6). At μ = 1 the weight is ¼ exactly where r² = c²: the χ² test."""
 GRADUATION = 1.4
 """Factor from one μ to the next (Yang et al. 2020, remark 5)."""
-STEPS_PER_MU = 2
-"""Ten give the same verdicts: the next weights move the minimum further than more steps towards this one."""
+STEPS_PER_MU = 10
+"""As many as settle it. With two, one loop that is false by half a turn bent the first solutions so far that thirteen
+true ones were rejected with it (half a metre of drift, 36 submaps)."""
 
 
 @dataclass(frozen=True, eq=False)
