@@ -20,8 +20,8 @@ from sigmasplat.benches import DEFAULT_PRESET, Ablation
 from sigmasplat.errors import SigmaSplatError
 
 arg = tyro.conf.arg
-SYNTHETIC = "synthetic:frames=600,rooms=2,noise=1,seed={seed}"
-"""A world of its own for each seed."""
+SYNTHETIC = "synthetic:frames=240,overrun=20,noise=1,drift=6,seed={seed}"
+"""A room of its own for each seed, a sensor that drifts, and a walk that ends on its own beginning."""
 SOURCES = ("synthetic", "livingroom", "redkitchen", "hololens")
 RUNS = record.ROOT / "runs" / "bench" / "ablation"
 

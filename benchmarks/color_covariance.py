@@ -14,14 +14,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import accuracy
+import color_covariance_tables
 import numpy as np
 import record
 import torch
 import tyro
-from accuracy_tables import spread
 from cpu import alone
 from numpy.typing import NDArray
-from tables import Section, headline
+from tables import headline
 from torch import Tensor
 
 from sigmasplat.config import Config
@@ -39,7 +39,7 @@ from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import open_source
 
 arg = tyro.conf.arg
-KINDS = ("diagonal", "full")
+KINDS = color_covariance_tables.KINDS
 CHANNELS = 3
 
 
@@ -149,23 +149,6 @@ def figures(run: Slam, field: GaussianField, sums: NDArray[np.float64], seen: li
     }
 
 
-def sections(measured: dict[str, Any]) -> list[Section]:
-    """Lay out the figures: one row for each sequence and map, means ± deviations over the seeds."""
-    rows = []
-    for source in measured["figures"]["sources"]:
-        for kind in KINDS:
-            found = [run[kind] for run in source["runs"]]
-            ratios = [run["mapping_time_ratio"] for run in source["runs"]] if kind == "full" else [1.0]
-            together = [float(np.mean(run["mean_correlation"])) for run in found]
-            names = ("nll_diagonal", "nll_full", "psnr_db", "spearman")
-            columns = [ratios, *([run[name] for run in found] for name in names[:2]), together]
-            columns += [[run[name] for run in found] for name in names[2:]]
-            rows.append([source["source"], kind, *(spread(values) for values in columns)])
-    columns_ = ("sequence", "map", "mapping time", "NLL, diagonal", "NLL, full", "mean |ρ|", "PSNR, dB", "Spearman")
-    note = "NLL in nats per pixel, 3 channels, on held-out frames, under V's diagonal and under all of V."
-    return [Section("colour covariance", columns_, rows, note)]
-
-
 def main(options: Options) -> int:
     """Measure, write, print; exit code 2 if the options mean nothing."""
     try:
@@ -185,7 +168,11 @@ def main(options: Options) -> int:
         "color_covariance", {"sources": found}, name=options.name, seeds=options.seeds, config=config
     )
     print(record.write(measured, options.out), file=sys.stderr)
-    print("\n".join([f"{headline(measured)}\n", *(section.markdown() for section in sections(measured))]))
+    print(
+        "\n".join(
+            [f"{headline(measured)}\n", *(section.markdown() for section in color_covariance_tables.sections(measured))]
+        )
+    )
     return 0
 
 

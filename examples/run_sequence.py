@@ -20,6 +20,7 @@ def main(path: str, out: str = "sequence-out") -> None:
         x, y, z = step.T_world_camera[:3, 3]
         remark = "lost" if step.lost else "mapped" if step.is_keyframe else ""
         print(f"{step.index:5d}  x={x:+.3f} y={y:+.3f} z={z:+.3f} m  {step.splats} splats  {remark}")
+    slam.finish()  # looks for the last submap's loops and makes one map of all
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     write_trajectory(folder / "trajectory.txt", slam.trajectory())

@@ -5,6 +5,7 @@ from sigmasplat import Slam, open_source, preset
 slam = Slam(preset("varsplat-fast"))
 for frame in open_source("path/to/sequence"):
     step = slam.step(frame)
+slam.finish()
 """
 
 from importlib import import_module, metadata

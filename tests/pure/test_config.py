@@ -38,6 +38,18 @@ def test_presets_hold_the_papers_numbers() -> None:
         assert config.mapping.weight_nll_color == 1e-4
         assert (config.mapping.weight_l1, config.mapping.weight_ssim) == (0.8, 0.2)
         assert config.mapping.newest_probability == 0.4
+        assert (config.loops.min_similarity, config.loops.tau, config.loops.near_m) == (0.5, 10.0, 0.0)
+        assert (config.registration.keyframes, config.registration.iterations) == (2, 100)
+        assert (config.registration.weight_color, config.registration.overlap_least) == (0.95, 0.2)
+        assert config.registration.lr_rotation == pytest.approx(3 * config.registration.lr_translation)
+        assert (config.final.seed_from, config.final.iterations, config.final.sh_degree) == ("mesh", 30_000, 3)
+        assert (config.final.spacing_m, config.final.sh_every, config.final.prune_every) == (0.02, 1000, 500)
+        assert config.final.prune_opacity == 0.005
+        assert not config.final.uncertainty
+    assert [(c.submaps.distance_m, c.submaps.angle_deg) for c in (replica, tum)] == [(0.5, 50.0)] * 2
+    assert scannet.submaps.frames == 50
+    assert [c.registration.lr_translation for c in (replica, tum, scannet)] == [1e-3, 5e-3, 5e-3]
+    assert [c.registration.tau for c in (replica, tum)] == [10.0, 50.0]
 
 
 @pytest.mark.parametrize("dataset", ["replica", "tum", "scannet", "fast"])

@@ -131,11 +131,34 @@ def test_the_same_bytes_again_and_from_disk(run: Slam, tmp_path: Path) -> None:
 
 
 def test_no_rule_means_one_submap_and_an_empty_store() -> None:
-    slam = followed(override(settings(), {"submaps.frames": "0"}))
+    slam = followed(override(settings(final__iterations="0"), {"submaps.frames": "0"}))
     assert len(slam.store) == 0
     assert {step.submap for step in slam.steps} == {0}
     assert slam.field is slam.mapper.field
     assert slam.loops == []
+
+
+def test_one_submap_is_refined_too() -> None:
+    slam = followed(override(settings(final__iterations="5"), {"submaps.frames": "0"}))
+    assert len(slam.store) == 1
+    assert slam.loops == []
+    assert len(slam.field) > 0.9 * len(slam.mapper.field)
+    assert slam.field is not slam.mapper.field
+
+
+def test_an_heir_knows_what_is_in_view_and_an_empty_one_nothing() -> None:
+    """Inherited splats are where they were in the world, and only those that the new submap's first view can feel."""
+    slam = followed(settings(loops__close="false", submaps__frames="0"), finish=False)
+    T_submap_camera, whole = slam.mapper.keyframes[-1].T_world_camera, slam.mapper.field
+    assert slam._view is not None
+    heir = slam.mapper.successor(slam._view, T_submap_camera).field
+    assert 0 < len(heir) < len(whole)
+    old = {tuple(row) for row in whole.params[:, 7:].tolist()}
+    assert all(tuple(row) in old for row in heir.params[:, 7:].tolist())
+    back = heir.moved(torch.from_numpy(T_submap_camera))
+    assert float(torch.cdist(back.means[:50], whole.means).min(1).values.max()) < 1e-4
+    slam.mapper.config = settings(submaps__inherit="false")
+    assert len(slam.mapper.successor(slam._view, T_submap_camera).field) == 0
 
 
 def test_an_unfinished_run_shows_all_submaps_side_by_side() -> None:

@@ -57,7 +57,7 @@ class SeedConfig:
     outlier_neighbours: int = 0
     """Statistical outlier removal over this many neighbours; 0 = off."""
     max_splats: int = 0
-    """Budget of the whole map; 0 = no limit."""
+    """Budget of a submap; 0 = no limit."""
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ class RegistrationConfig:
     """… and the other submap explains this share of the readings."""
     spread_m: float = 0.1
     spread_deg: float = 5.0
-    """Refused where localisations that count differ from their mean by more than this, or fewer than two count."""
+    """Refused unless two localisations that count, at least, lie within this of one of them."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from sigmasplat.model import se3
 
 Matrix = NDArray[np.float64]
 
-HOP_M, HOP_RAD = 0.002, 0.001
+HOP_M, HOP_RAD = 0.002, 0.002
 """What each hop adds to the deviation beyond its estimated covariance, which knows noise but not bias: on redkitchen a
 hundred such hops come to the three centimetres that are observed."""
 BIAS = 0.02

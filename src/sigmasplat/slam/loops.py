@@ -90,7 +90,7 @@ class LoopCloser:
         c, field = self.config.loops, submap.field
         log_variances = field.params[:, COLUMNS["log_variances"]].numpy()
         ratio = opacity_ratio(field.opacities.numpy(), log_variances, c.tau, c.weight_max)
-        if not c.close:
+        if not c.close or not descriptors:
             return []
         signature = Signature(submap.index, np.stack(descriptors), ratio)
         pairs = self._pairs(signature, atlas)
