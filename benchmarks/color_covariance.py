@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from tables import headline
 from torch import Tensor
 
-from sigmasplat.config import Config
+from sigmasplat.config import Config, SubmapConfig
 from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.fit import losses
 from sigmasplat.metrics import views
@@ -58,8 +58,8 @@ class Options:
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
     def config(self, seed: int, kind: str) -> Config:
-        """Return a run's settings. Raises ConfigError on an unknown preset."""
-        config = replace(preset_of(self.preset), seed=seed)
+        """Return a run's settings, one submap in all. Raises ConfigError on an unknown preset."""
+        config = replace(preset_of(self.preset), seed=seed, submaps=SubmapConfig())
         return replace(config, mapping=replace(config.mapping, color_covariance=kind))
 
 
@@ -168,11 +168,8 @@ def main(options: Options) -> int:
         "color_covariance", {"sources": found}, name=options.name, seeds=options.seeds, config=config
     )
     print(record.write(measured, options.out), file=sys.stderr)
-    print(
-        "\n".join(
-            [f"{headline(measured)}\n", *(section.markdown() for section in color_covariance_tables.sections(measured))]
-        )
-    )
+    tables = (section.markdown() for section in color_covariance_tables.sections(measured))
+    print("\n".join([f"{headline(measured)}\n", *tables]))
     return 0
 
 
