@@ -144,6 +144,7 @@ def figures_of(metrics: dict[str, Any]) -> dict[str, float | None]:
     ate, rpe = metrics.get("ate") or {}, metrics.get("rpe") or {}
     picked: dict[str, float | None] = {
         "ate_m": ate.get("rmse_m"),
+        "ate_odometry_m": (metrics.get("ate_odometry") or {}).get("rmse_m"),
         "rpe_m": rpe.get("translation_rmse_m"),
         "rpe_deg": rpe.get("rotation_rmse_deg"),
         **{name: metrics.get(name) for name in ("frames", "keyframes", "lost", "splats", "frames_per_s")},

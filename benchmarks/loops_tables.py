@@ -53,10 +53,19 @@ def runs(jobs: Rows) -> Section:
 
 
 def paired(jobs: Rows, experiment: str) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """Return with each run with loops the one of the same seed without."""
+    """Return with each run with loops the one without: of the drift the same run's path as tracking alone has it, which
+    is that of a run without loops to the last bit (tests/system/test_submaps.py); else the run of the same seed."""
     done = succeeded(jobs, experiment)
+    if experiment == "drift":
+        return [(job, job | {"figures": job["figures"] | {"ate_m": without_loops_m(job)}}) for job in done]
     without = {job["seed"]: job for job in done if job["way"] != "loops"}
     return [(job, without[job["seed"]]) for job in done if job["way"] == "loops" and job["seed"] in without]
+
+
+def without_loops_m(job: dict[str, Any]) -> float:
+    """Return the ATE of a run's path without loops, m; with none accepted that is the path."""
+    found: float | None = job["figures"].get("ate_odometry_m")
+    return job["figures"]["ate_m"] if found is None else found
 
 
 def seeds(jobs: Rows) -> Section:

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -11,12 +10,12 @@ from numpy.typing import NDArray
 
 from sigmasplat import surface
 from sigmasplat.config import Config, FinalConfig, InputConfig
-from sigmasplat.errors import RunError, SourceError
+from sigmasplat.errors import RunError
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.metrics import charts, plot, views
 from sigmasplat.metrics.panels import View, side_by_side
 from sigmasplat.metrics.report import Contents, build_report
-from sigmasplat.metrics.trajectory import align_rigid, associate, ate, rpe
+from sigmasplat.metrics.trajectory import align_rigid, associate, path_scores_of
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
@@ -56,7 +55,7 @@ def evaluate(
     path, field = run.read_trajectory(), run.read_map()
     log = _posed(records, path, run)
     truth = source.truth()
-    path_scores, problem = _path_scores(path, truth)
+    path_scores, problem = path_scores_of(path, run.read_odometry(), truth)
     chosen = {kind: _spread(records, views_per_kind) for kind, records in _kinds(log).items()}
     gallery, config, loops = Gallery(run, strips_per_kind), run.config(), run.read_loops()
     renderer = renderer or partial(render, options=config.render, backend=config.backend)
@@ -139,16 +138,6 @@ def _spread(records: Log, most: int) -> Log:
     """Choose at most `most` records, evenly spread, first and last among them."""
     rows = np.unique(np.linspace(0, len(records) - 1, min(most, len(records))).round().astype(int))
     return [records[row] for row in rows]
-
-
-def _path_scores(path: Trajectory, truth: Trajectory | None) -> tuple[dict[str, Any], SourceError | None]:
-    """Return ATE and RPE over all frames (None without truth), and the reason if the truth does not fit."""
-    if truth is None:
-        return {"ate": None, "rpe": None}, None
-    try:
-        return {"ate": asdict(ate(path, truth)), "rpe": asdict(rpe(path, truth))}, None
-    except SourceError as problem:
-        return {"ate": None, "rpe": None}, problem
 
 
 def _score_views(

@@ -184,6 +184,17 @@ class RunFolder:
         with opened(self._existing("checkpoint.safetensors"), "checkpoint") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
 
+    def read_odometry(self) -> Trajectory | None:
+        """Return the path as tracking alone has it, without loops; None where the run kept none or has no loop.
+
+        Raises RunError if the checkpoint is missing or damaged.
+        """
+        if not any(loop["accepted"] for loop in self.read_loops()):
+            return None
+        tensors, _ = self.read_checkpoint()
+        poses = tensors.get("T_world_camera_odometry")
+        return None if poses is None else Trajectory(tensors["timestamps_s"].numpy(), poses.numpy())
+
     def write_metrics(self, metrics: dict[str, Any]) -> None:
         """Write metrics.json; nan and inf become null."""
         write_json(self.path / "metrics.json", metrics)

@@ -100,6 +100,9 @@ def _path_rows(metrics: dict[str, Any]) -> list[list[str]]:
     if not ate or not rpe:
         return []
     rows = [[f"ATE {name}, cm", number(ate[f"{name}_m"], 3, 100.0)] for name in ("rmse", "mean", "median", "max")]
+    without = metrics.get("ate_odometry")
+    if without:
+        rows.append(["ATE rmse without the loops, cm", number(without["rmse_m"], 3, 100.0)])
     return [
         ["over all frames, rigidly aligned", f"{ate['pairs']} poses"],
         *rows,

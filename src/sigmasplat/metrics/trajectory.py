@@ -1,6 +1,7 @@
 """Score a path against the truth: absolute (ATE) and relative (RPE) error after a rigid fit."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,3 +135,20 @@ def rpe(
 def _root_mean_square(values: Matrix) -> float:
     """Return √mean(x²), nan for no values."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
+
+
+def path_scores_of(
+    path: Trajectory, odometry: Trajectory | None, truth: Trajectory | None
+) -> tuple[dict[str, Any], SourceError | None]:
+    """Return ATE and RPE over all frames, and the ATE of the path without loops (`odometry`) where one is given.
+
+    None without truth; where the truth does not fit, None and the reason.
+    """
+    unknown: dict[str, Any] = {"ate": None, "rpe": None, "ate_odometry": None}
+    if truth is None:
+        return unknown, None
+    try:
+        found = {"ate": asdict(ate(path, truth)), "rpe": asdict(rpe(path, truth))}
+        return unknown | found | ({"ate_odometry": asdict(ate(odometry, truth))} if odometry else {}), None
+    except SourceError as problem:
+        return unknown, problem

@@ -24,17 +24,20 @@ class Atlas:
     """Poses of submaps, keyframes and frames, each relative to the one before: world poses are worked out on reading.
 
     anchors: T_world_submap of each submap, the first one the identity; closing a loop changes these and nothing else.
+    odometry: the same as tracking alone has them, which no loop changes.
     keyframes: T_submap_camera of each submap's keyframes; those of the last submap change while it is mapped.
     places: of each frame.
     """
 
     anchors: list[Matrix] = field(default_factory=list)
+    odometry: list[Matrix] = field(default_factory=list)
     keyframes: list[list[Matrix]] = field(default_factory=list)
     places: list[Place] = field(default_factory=list)
 
-    def begin_submap(self, T_world_submap: Matrix) -> None:
-        """Take note of a new submap at the end."""
-        self.anchors.append(se3.orthonormalise(T_world_submap))
+    def begin_submap(self, T_before_submap: Matrix | None = None) -> None:
+        """Take note of a new submap at the end, where it lies in the one before; the first one is the world."""
+        for chain in (self.anchors, self.odometry):
+            chain.append(np.eye(4) if T_before_submap is None else se3.orthonormalise(chain[-1] @ T_before_submap))
         self.keyframes.append([])
 
     def place_frame(self, T_submap_camera: Matrix) -> None:
@@ -43,9 +46,10 @@ class Atlas:
         place = Place(len(self.anchors) - 1, len(self.keyframes[-1]) - 1, se3.orthonormalise(T_keyframe_camera))
         self.places.append(place)
 
-    def T_world_camera(self) -> Matrix:
-        """Return the poses of all frames [F, 4, 4]."""
-        poses = [self.anchors[s] @ self.keyframes[s][k] @ T_keyframe_camera for s, k, T_keyframe_camera in self.places]
+    def T_world_camera(self, loops: bool = True) -> Matrix:
+        """Return the poses of all frames [F, 4, 4]; without `loops` as tracking alone has them."""
+        anchors = self.anchors if loops else self.odometry
+        poses = [anchors[s] @ self.keyframes[s][k] @ T_keyframe_camera for s, k, T_keyframe_camera in self.places]
         return np.array(poses).reshape(-1, 4, 4)
 
     def T_world_keyframe(self, submap: int) -> Matrix:

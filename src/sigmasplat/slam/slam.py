@@ -146,6 +146,7 @@ class Slam:
             "adam_steps": torch.tensor(active.steps),
             "timestamps_s": torch.from_numpy(path.timestamps_s),
             "T_world_camera": torch.from_numpy(path.T_world_camera),
+            "T_world_camera_odometry": torch.from_numpy(self.atlas.T_world_camera(loops=False)),
             "keyframes": torch.tensor(self.keyframes, dtype=torch.int64),
             "T_world_submap": torch.from_numpy(np.array(self.atlas.anchors).reshape(-1, 4, 4)),
             "frame_submap": torch.tensor([place.submap for place in self.atlas.places], dtype=torch.int64),
@@ -171,7 +172,7 @@ class Slam:
         loops = self._freeze()
         assert self._closer is not None
         self._closer.submap_begun(len(self.store), T_submap_camera, self.drift.information)
-        self.atlas.begin_submap(self.atlas.anchors[-1] @ T_submap_camera)
+        self.atlas.begin_submap(T_submap_camera)
         self.mapper = self.mapper.successor(view, T_submap_camera)
         self.drift, self._descriptors = Drift(), []
         seconds["cut"] = time.perf_counter() - clock
@@ -202,7 +203,7 @@ class Slam:
                 f"{self.config.input.max_depth_m}] m to start a map from; check the depth scale or start at a later one"
             )
         self.tracker.start(live)
-        self.atlas.begin_submap(np.eye(4))
+        self.atlas.begin_submap()
         return np.eye(4)
 
     def _track(self, view: View, target: Target, live: Pyramid, seconds: dict[str, float]) -> tuple[Matrix, PoseFit]:
