@@ -102,16 +102,16 @@ def test_a_runs_loops_are_judged_by_the_first_frames_of_its_submaps(tmp_path: Pa
     assert loops.described(run_with(tmp_path / "other", tried), ROOM, False) == {"submaps": 4, "tried": 0, "loops": []}
 
 
-def test_each_seed_has_a_room_of_its_own_and_two_ways() -> None:
+def test_each_seed_has_a_room_of_its_own() -> None:
     listed = loops.jobs_of(loops.Options(seeds=(4, 7), real_seeds=(0,), settings=("mapping.iterations=5",)))
     assert [(experiment, way, job.seed) for experiment, way, job in listed] == [
-        ("drift", "loops", 4), ("drift", "no loops", 4), ("drift", "loops", 7), ("drift", "no loops", 7),
-        ("real", "loops", 0), ("real", "one submap", 0),
+        ("drift", "loops", 4), ("drift", "loops", 7), ("real", "loops", 0), ("real", "one submap", 0),
     ]  # fmt: skip
     configs = [job.key()["config"] for *_, job in listed]
-    assert [config["loops"]["close"] for config in configs] == [True, False, True, False, True, True]
-    assert not any(configs[5]["submaps"].values()) and {c["mapping"]["iterations"] for c in configs} == {5}
-    assert [job.path.rpartition(",")[2] for *_, job in listed[:4]] == ["seed=4", "seed=4", "seed=7", "seed=7"]
+    rules = ("distance_m", "angle_deg", "frames", "uncertainty_m")
+    assert [any(config["submaps"][rule] for rule in rules) for config in configs] == [True, True, True, False]
+    assert {c["mapping"]["iterations"] for c in configs} == {5}
+    assert [job.path.rpartition(",")[2] for *_, job in listed[:2]] == ["seed=4", "seed=7"]
     with pytest.raises(SourceError, match="give --seeds"):
         loops.checked(loops.Options(source=f"{ROOM},seed=1"))
     quick = loops.shortened(loops.Options())
@@ -119,23 +119,29 @@ def test_each_seed_has_a_room_of_its_own_and_two_ways() -> None:
     loops.checked(quick)
 
 
-def job(experiment: str, way: str, seed: int, ate_m: float, found: list[tuple[bool, bool]] = ()) -> dict[str, Any]:  # type: ignore[assignment]
+def job(
+    experiment: str,
+    way: str,
+    seed: int,
+    ate_m: float,
+    without_m: float | None = None,
+    found: list[tuple[bool, bool]] = (),  # type: ignore[assignment]
+) -> dict[str, Any]:
     """Make a run's result; `found` says of each registered loop whether it was accepted and whether it is true."""
     records = [
         {**loop(9, 2, np.eye(4), accepted), "true": true, "error_m": 0.04, "error_deg": 1.0} for accepted, true in found
     ]
     rest = {"problem": None, "wall_s": 1.0, "peak_mib": 500.0, "submaps": 12, "tried": 20, "loops": records}
     source = "drift" if experiment == "drift" else "redkitchen"
-    return {"experiment": experiment, "source": source, "way": way, "seed": seed, "figures": {"ate_m": ate_m}, **rest}
+    figures = {"ate_m": ate_m, "ate_odometry_m": without_m}
+    return {"experiment": experiment, "source": source, "way": way, "seed": seed, "figures": figures, **rest}
 
 
 def test_seeds_are_paired_and_loops_counted() -> None:
     jobs = [
-        job("drift", "loops", 0, 0.05, [(True, True), (True, True), (False, True), (False, False)]),
-        job("drift", "loops", 1, 0.10, [(True, True), (True, False)]),
-        job("drift", "no loops", 1, 0.40),
-        job("drift", "no loops", 0, 0.20),
-        job("real", "loops", 0, 0.03, [(True, True), (False, True)]),
+        job("drift", "loops", 0, 0.05, 0.20, [(True, True), (True, True), (False, True), (False, False)]),
+        job("drift", "loops", 1, 0.10, 0.40, [(True, True), (True, False)]),
+        job("real", "loops", 0, 0.03, 0.04, [(True, True), (False, True)]),
         job("real", "one submap", 0, 0.031),
         {**job("drift", "loops", 2, 0.0), "problem": "a | b"},
     ]
@@ -148,7 +154,7 @@ def test_seeds_are_paired_and_loops_counted() -> None:
         ["20", "2", "2", "0", "1", "1"],
         ["20", "2", "1", "1", "0", "0"],
     ]
-    assert len(made["Edges"].rows) == 1 and len(made["Runs"].rows) == 4 and len(made["Failed"].rows) == 1
+    assert len(made["Edges"].rows) == 1 and len(made["Runs"].rows) == 3 and len(made["Failed"].rows) == 1
     held = {row[0]: (row[1], row[3]) for row in made["Goals"].rows}
     assert list(held.values()) == [
         ("2, 1", "yes"), ("1", "**no**"), ("0.250", "yes"), ("0.250, 0.250", "yes"), ("3.00", "yes")
@@ -157,13 +163,13 @@ def test_seeds_are_paired_and_loops_counted() -> None:
 
 def test_goals_are_missed_without_loops_or_gain() -> None:
     jobs = [
-        job("drift", "loops", 0, 0.05, [(True, True)]), job("drift", "no loops", 0, 0.10),
-        job("drift", "loops", 1, 0.09), job("drift", "no loops", 1, 0.10),
+        job("drift", "loops", 0, 0.05, 0.10, [(True, True)]),
+        job("drift", "loops", 1, 0.09),
         job("real", "loops", 0, 0.04), job("real", "one submap", 0, 0.031),
     ]  # fmt: skip
     rows = laid_out("loops", {"jobs": jobs})["Goals"].rows
     assert [(row[1], row[3]) for row in rows] == [
-        ("1, 0", "**no**"), ("0", "yes"), ("0.700", "**no**"), ("0.500, 0.900", "**no**"), ("4.00", "**no**")
+        ("1, 0", "**no**"), ("0", "yes"), ("0.737", "**no**"), ("0.500, 1.00", "**no**"), ("4.00", "**no**")
     ]  # fmt: skip
 
 
@@ -175,9 +181,9 @@ def test_runs_are_made_and_described_seed_by_seed(tmp_path: Path, monkeypatch: p
         return [{"problem": "it broke" if made is jobs[1] else None, **rest} for made in jobs]
 
     monkeypatch.setattr(accuracy, "run_all", ran)
-    options = loops.Options(experiments=("drift",), source=ROOM, seeds=(0, 1), runs=tmp_path)
+    options = loops.Options(experiments=("drift",), source=ROOM, seeds=(0, 1, 2), runs=tmp_path)
     found = loops.measure(options)
-    assert [result["way"] for result in found] == ["loops", "no loops"] * 2
+    assert [result["way"] for result in found] == ["loops"] * 3
     assert found[0]["problem"] is None and found[0]["submaps"] == 4
     assert found[1]["problem"] == "it broke" and found[2]["problem"].startswith("RunError: no run folder")
 
