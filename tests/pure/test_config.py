@@ -64,7 +64,7 @@ def test_the_baseline_differs_by_uncertainty_alone(dataset: str) -> None:
     }
     switches = {"tracking.uncertainty", "loops.uncertainty", "registration.uncertainty"}
     optional = {"mapping.weight_nll_depth", "final.uncertainty"}
-    always = {*switches, "mapping.weight_nll_color"}
+    always = {*switches, "mapping.weight_nll_color", "submaps.uncertainty_m"}
     assert always <= differing <= always | optional
     assert not any(baseline[name.partition(".")[0]]["uncertainty"] for name in (*switches, "final.uncertainty"))
     assert baseline["mapping"]["weight_nll_color"] == baseline["mapping"]["weight_nll_depth"] == 0.0

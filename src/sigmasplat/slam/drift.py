@@ -10,8 +10,9 @@ from sigmasplat.model import se3
 Matrix = NDArray[np.float64]
 
 HOP_M, HOP_RAD = 0.002, 0.002
-"""What each hop adds to the deviation beyond its estimated covariance, which knows noise but not bias: on redkitchen a
-hundred such hops come to the three centimetres that are observed."""
+"""What each hop adds to odometry's deviation beyond its estimated covariance, which knows noise but not bias."""
+UNKNOWN = np.diag([1.0] * 6)
+"""Covariance of a hop between images that have nothing in common, m² and rad²."""
 BIAS = 0.02
 """Share of the way travelled and of the angle turned by which a whole submap may be bent: what is wrong with a
 calibration does not average out from hop to hop. On redkitchen rotations come out 3 to 11 % short of the truth's."""
@@ -22,10 +23,12 @@ class Drift:
     """Covariance [6, 6] of the left twist (ρ, φ) of T_submap_keyframe, metres and radians: zero at the first keyframe.
 
     Each frame is tracked against the newest keyframe, so errors add up from keyframe to keyframe and not from frame to
-    frame. First order: covariances of hops are independent and add, each carried into the submap's frame.
+    frame. First order: covariances of hops are independent and add, each carried into the submap's frame. `covariance`
+    is what alignment itself says of its hops, `usual` what they are off by beside that.
     """
 
     covariance: Matrix = field(default_factory=lambda: np.zeros((6, 6)))
+    usual: Matrix = field(default_factory=lambda: np.zeros((6, 6)))
     travelled_m: float = 0.0
     turned_rad: float = 0.0
     last: Matrix = field(default_factory=lambda: np.eye(4))
@@ -34,21 +37,21 @@ class Drift:
         """Add a hop to the keyframe at T_submap_camera, `covariance` [6, 6] of the left twist of T_camera_reference.
 
         T_reference_camera = exp(ξ)⁻¹ …: on the right of the chain, ξ is felt on the left as −Ad(T_submap_camera) ξ.
-        Without a covariance the usual deviation of a hop counts alone.
+        None: nothing is known of the hop, it counts as a usual one; infinite: the images have nothing in common.
         """
-        own = np.diag(np.repeat([HOP_M**2, HOP_RAD**2], 3))
-        if covariance is not None and np.isfinite(covariance).all():
-            own = own + covariance
         A = se3.adjoint(T_submap_camera)
-        total = self.covariance + A @ own @ A.T
-        self.covariance = 0.5 * (total + total.T)
+        self.usual = symmetric(self.usual + A @ np.diag(np.repeat([HOP_M**2, HOP_RAD**2], 3)) @ A.T)
+        if covariance is not None:
+            known = covariance if np.isfinite(covariance).all() else UNKNOWN
+            self.covariance = symmetric(self.covariance + A @ known @ A.T)
         moved = se3.inverse(self.last) @ T_submap_camera
         self.travelled_m += float(np.linalg.norm(moved[:3, 3]))
         self.turned_rad += se3.rotation_angle(moved[:3, :3])
         self.last = T_submap_camera.copy()
 
     def position_m(self, T_submap_camera: Matrix) -> float:
-        """Return the standard deviation of the camera's position in the submap, metres: √ of the sum over the axes.
+        """Return the accumulated tracking uncertainty: the standard deviation of the camera's position in the submap,
+        metres, √ of the sum over the axes, by what alignment says of itself.
 
         A twist moves the position p by ρ + φ × p.
         """
@@ -57,10 +60,14 @@ class Drift:
 
     @property
     def information(self) -> Matrix:
-        """Return what the chain says of its end [6, 6]: the inverse of its covariance and of `BIAS` together.
+        """Return what the chain says of its end [6, 6]: inverse covariance, usual errors and `BIAS` included.
 
         There must have been a hop.
         """
         bent = np.repeat([(BIAS * self.travelled_m) ** 2, (BIAS * self.turned_rad) ** 2], 3)
-        inverse = np.linalg.inv(self.covariance + np.diag(bent))
-        return np.asarray(0.5 * (inverse + inverse.T))
+        return symmetric(np.asarray(np.linalg.inv(self.covariance + self.usual + np.diag(bent)), np.float64))
+
+
+def symmetric(matrix: Matrix) -> Matrix:
+    """Return a matrix that is symmetric up to rounding as one that is."""
+    return np.asarray(0.5 * (matrix + matrix.T))
