@@ -17,11 +17,11 @@ import accuracy
 import color_covariance_tables
 import numpy as np
 import record
+import tables
 import torch
 import tyro
 from cpu import alone
 from numpy.typing import NDArray
-from tables import headline
 from torch import Tensor
 
 from sigmasplat.config import Config, SubmapConfig
@@ -168,8 +168,7 @@ def main(options: Options) -> int:
         "color_covariance", {"sources": found}, name=options.name, seeds=options.seeds, config=config
     )
     print(record.write(measured, options.out), file=sys.stderr)
-    tables = (section.markdown() for section in color_covariance_tables.sections(measured))
-    print("\n".join([f"{headline(measured)}\n", *tables]))
+    print(tables.table(measured))
     return 0
 
 

@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import accuracy
-import drift_rule_tables
 import numpy as np
 import record
+import tables
 import tyro
 from numpy.typing import NDArray
-from tables import headline
 
 from sigmasplat.config import SubmapConfig
 from sigmasplat.errors import SigmaSplatError
@@ -98,8 +97,7 @@ def main(options: Options) -> int:
     config = {name: value for name, value in asdict(options).items() if name != "out"}
     measured = record.results("drift_rule", {"sources": found}, name=options.name, seeds=[0], config=config)
     print(record.write(measured, options.out), file=sys.stderr)
-    tables = (section.markdown() for section in drift_rule_tables.sections(measured))
-    print("\n".join([f"{headline(measured)}\n", *tables]))
+    print(tables.table(measured))
     return 0
 
 
