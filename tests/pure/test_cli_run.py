@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -238,10 +239,12 @@ def test_ctrl_c_finishes_the_frame_and_leaves_a_valid_folder(
 
 def test_a_second_ctrl_c_stops_at_once(corridor: Corridor) -> None:
     def twice() -> None:
+        first = signal.getsignal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
-        for _ in range(1000):  # Python hears a signal between two steps of a loop; two at once would be one
-            pass
+        while signal.getsignal(signal.SIGINT) is first:  # not heard yet: two at once would be one
+            time.sleep(0.001)
         signal.raise_signal(signal.SIGINT)
+        time.sleep(1.0)
 
     MadeUpSlam.at = {3: twice}
     assert sigmasplat("run", "corridor", "--out", "cut") == 130

@@ -110,7 +110,7 @@ class Tracker:
     def keep_keyframe(self, field: GaussianField, view: View, live: Pyramid, T_world_camera: Matrix) -> None:
         """Take note of a freshly mapped keyframe: where mapping left its pose, and its image as the next reference."""
         self.previous = T_world_camera
-        if isinstance(view, CpuView):
+        if self.config.method == "align" or isinstance(view, CpuView):  # else nothing could align to it
             self.keyframe = keyframe_reference(field.params, view, live, se3.inverse(T_world_camera), self.config)
 
     def hop_covariance(self, fit: PoseFit, live: Pyramid) -> Matrix | None:
