@@ -21,6 +21,6 @@ def sections(measured: dict[str, Any]) -> list[Section]:
             columns = [ratios, *([run[name] for run in found] for name in names[:2]), together]
             columns += [[run[name] for run in found] for name in names[2:]]
             rows.append([source["source"], kind, *(spread(values) for values in columns)])
-    columns_ = ("sequence", "map", "mapping time", "NLL, diagonal", "NLL, full", "mean absolute ρ", "PSNR, dB", "Spearman")
+    head = ("sequence", "map", "mapping time", "NLL, diagonal", "NLL, full", "mean absolute ρ", "PSNR, dB", "Spearman")
     note = "NLL in nats per pixel, 3 channels, on held-out frames, under V's diagonal and under all of V."
-    return [Section("colour covariance", columns_, rows, note)]
+    return [Section("colour covariance", head, rows, note)]
