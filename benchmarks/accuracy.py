@@ -23,6 +23,7 @@ import tyro
 import sigmasplat
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import SigmaSplatError
+from sigmasplat.io.machine import RUNNING, code_digest
 from sigmasplat.options import Settings
 from sigmasplat.presets import default_preset, preset as preset_of
 
@@ -88,7 +89,7 @@ def located(name: str) -> str:
 
 def jobs_of(options: Options) -> list[Job]:
     """List the jobs, source by source. Raises ConfigError on an unknown preset or setting."""
-    code = record.code_digest(Path(sigmasplat.__file__).parent, record.RUNNING)
+    code = code_digest(Path(sigmasplat.__file__).parent, RUNNING)
     jobs = [
         Job(Path(source).name, located(source), preset, seed, options.settings, options.limit, code)
         for source in options.sources

@@ -1,6 +1,5 @@
 """Keep what a benchmark measured: one JSON per benchmark and machine, with all it takes to measure it again."""
 
-import hashlib
 import json
 import os
 import re
@@ -13,13 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from sigmasplat.io import machine
+from sigmasplat.io.machine import code_digest
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 MEASURED = ("src", "CMakeLists.txt", "benchmarks", ":!benchmarks/results", ":!benchmarks/*.md")
 """What the figures depend on, as git path specifications."""
-SOURCES, RUNNING = (".py", ".cpp", ".h"), (".py", ".h", ".so")
-"""Endings of what a checkout is made of, and of what runs where the package is installed."""
 LOAD_AVERAGE = round(os.getloadavg()[0], 2)
 """Of the minute before the program started: near 0 where the machine was left alone."""
 
@@ -56,14 +54,6 @@ def _git(*words: str) -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return answer.stdout.strip()
-
-
-def code_digest(folder: Path, endings: Sequence[str] = SOURCES) -> str:
-    """Digest the files of a folder with these endings, names and bytes: equal digests mean equal code."""
-    digest = hashlib.sha256()
-    for path in sorted(p for p in folder.rglob("*") if p.suffix in endings):
-        digest.update(str(path.relative_to(folder)).encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()[:16]
 
 
 def results(

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +20,7 @@ from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.io import machine
 from sigmasplat.io.atomic import write_text
+from sigmasplat.io.machine import RUNNING, code_digest
 from sigmasplat.options import absolute
 from sigmasplat.presets import preset as preset_of
 
@@ -44,7 +44,6 @@ COMPARED = (
 """Which variant is judged against which."""
 MADE_BY = "sigmasplat bench ablation"
 SEED = "{seed}"
-CODE = (".py", ".h", ".so")
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ class Study:
         return {
             "config": self.config.to_dict(),
             "limit": self.limit,
-            "code": code_digest(Path(__file__).parent),
+            "code": code_digest(Path(__file__).parent, RUNNING),
             "machine": machine.describe(),
         }
 
@@ -123,14 +122,6 @@ def common_config(preset: str, settings: Sequence[str], tau: float) -> Config:
     if not config.mapping.weight_nll_color:
         raise ConfigError(f"{preset} learns no variance: mapping.weight_nll_color is 0; give a preset where it is not")
     return config
-
-
-def code_digest(folder: Path) -> str:
-    """Digest the package's files, kernels included: equal digests mean that the same code runs."""
-    digest = sha256()
-    for path in sorted(p for p in folder.rglob("*") if p.suffix in CODE):
-        digest.update(str(path.relative_to(folder)).encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()[:16]
 
 
 class Results:

@@ -61,7 +61,7 @@ def evaluate(
     renderer = renderer or partial(render, options=config.render, backend=config.backend)
     maps = views.Maps(field, run.submaps, _anchors(run, records, config.final))
     scores = _score_views(config, source, maps, chosen, gallery, renderer, progress)
-    metrics = _facts(run, source, log, field) | path_scores | scores | {"reconstruction": None}
+    metrics = _facts(run, source, log, field, loops) | path_scores | scores | {"reconstruction": None}
     if mesh:
         known = None if problem else truth
         found = surface.fuse_and_score(run, source.camera, source.true_surface(), known, renderer, progress)
@@ -179,10 +179,9 @@ def _keeps_variance(final: FinalConfig) -> bool:
     return final.uncertainty if final.iterations else final.seed_from == "submaps"
 
 
-def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField) -> dict[str, Any]:
+def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField, loops: Log) -> dict[str, Any]:
     """Return what can be counted: frames, keyframes, lost frames, splats, speed."""
     lost = [record["index"] for record in log if record.get("lost")]
-    loops = run.read_loops()
     return {
         "source": source.name,
         "status": run.facts().get("status"),

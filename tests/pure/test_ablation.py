@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 from sigmasplat import ablation, cli
-from sigmasplat.ablation import COMPARED, NAMES, WITHOUT_VARIANCE, Job, Results, Study, carry_out, code_digest
+from sigmasplat.ablation import COMPARED, NAMES, WITHOUT_VARIANCE, Job, Results, Study, carry_out
 from sigmasplat.benches import Ablation
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError, RunError
+from sigmasplat.io.machine import RUNNING, code_digest
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.metrics.effects import FIGURES, best, columns, effects, figures_of, passed_by_chance, sentence, spread
 from sigmasplat.presets import preset
@@ -168,7 +169,7 @@ def test_what_is_said_and_written_is_what_was_measured(tmp_path: Path, capsys: p
     assert "23% of figures that nothing changed but chance pass that bar" in said
 
     written = json.loads(out.read_text())
-    assert written["machine"]["cores"] and written["code"] == code_digest(Path(ablation.__file__).parent)
+    assert written["machine"]["cores"] and written["code"] == code_digest(Path(ablation.__file__).parent, RUNNING)
     assert Config.from_dict(written["config"]) == ablation.common_config("varsplat-fast", (), 10.0)
     run = next(r for r in written["runs"] if (r["source"], r["variant"], r["seed"]) == ("hall", "+loop", 2))
     assert run["figures"]["ate_m"] == pytest.approx(0.0052)
@@ -199,7 +200,7 @@ def test_runs_are_dropped_only_where_it_is_asked_for(tmp_path: Path, monkeypatch
             Ablation(("room",), seeds=1, out=out, **other).run(MadeUpRuns())
     with pytest.raises(RunError, match="that are not asked for now"):
         Ablation(("hall",), seeds=1, out=out).run(MadeUpRuns())
-    monkeypatch.setattr(ablation, "code_digest", lambda folder: "another")
+    monkeypatch.setattr(ablation, "code_digest", lambda folder, endings: "another")
     with pytest.raises(RunError, match="with other settings or code"):
         Ablation(("room",), seeds=1, out=out).run(MadeUpRuns())
     assert out.read_text() == before
@@ -223,11 +224,11 @@ def test_run_folders_stay_where_they_are_to_be_kept(tmp_path: Path) -> None:
 
 def test_code_is_told_apart_by_its_bytes(tmp_path: Path) -> None:
     (tmp_path / "kernel.so").write_bytes(b"1")
-    first = code_digest(tmp_path)
+    first = code_digest(tmp_path, RUNNING)
     (tmp_path / "notes.txt").write_text("no code")
-    assert code_digest(tmp_path) == first
+    assert code_digest(tmp_path, RUNNING) == first
     (tmp_path / "kernel.so").write_bytes(b"2")
-    assert code_digest(tmp_path) != first
+    assert code_digest(tmp_path, RUNNING) != first
 
 
 def test_a_map_that_was_never_refined_has_one_psnr() -> None:

@@ -54,13 +54,12 @@ def piece(store: MemoryStore, frames: Sequence[int], brighter: float = 1.0) -> S
 def registered(a: Sequence[int], b: Sequence[int], error: Matrix, brighter: float = 1.0) -> tuple[Registration, Matrix]:
     """Register submaps of frames a and b, told a T_a_b that is wrong by `error`; return the verdict and the truth."""
     store = MemoryStore()
-    piece(store, a)
-    piece(store, b, brighter)
+    ours, theirs = piece(store, a), piece(store, b, brighter)
     truth = walk().truth().T_world_camera
     T_a_b = se3.inverse(truth[a[0]]) @ truth[b[0]]
     pair = SubmapPair(Candidate(0, 0, 1, 0, 1.0, 1.0), (0, 1), (0, 1))
     view = make_view("cpu", walk().camera, RenderConfig())
-    return Registrar(CONFIG, store, view).register(pair, error @ T_a_b), T_a_b
+    return Registrar(CONFIG, store, view).register(pair, ours, theirs, error @ T_a_b), T_a_b
 
 
 def off(found: Matrix, truth: Matrix) -> tuple[float, float]:

@@ -1,11 +1,16 @@
 """Say on what and with what a run was made, for run.json and `doctor`."""
 
+import hashlib
 import os
 import platform
 import subprocess
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+SOURCES, RUNNING = (".py", ".cpp", ".h"), (".py", ".h", ".so")
+"""Endings of what is written, and of what runs: compiled kernels with the headers that their text ships in."""
 
 
 def package_version() -> str:
@@ -14,6 +19,14 @@ def package_version() -> str:
         return metadata.version("sigmasplat")
     except metadata.PackageNotFoundError:
         return "unknown"
+
+
+def code_digest(folder: Path, endings: Sequence[str] = SOURCES) -> str:
+    """Digest the files of a folder with these endings, names and bytes: equal digests mean equal code."""
+    digest = hashlib.sha256()
+    for path in sorted(p for p in folder.rglob("*") if p.suffix in endings):
+        digest.update(str(path.relative_to(folder)).encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
 
 
 def cpu_model() -> str:

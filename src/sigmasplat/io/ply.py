@@ -14,13 +14,11 @@ from numpy.typing import NDArray
 
 from sigmasplat.errors import SourceError
 from sigmasplat.io.atomic import replacing
-from sigmasplat.model.field import COLUMNS, EXTRAS, GaussianField, Rows
+from sigmasplat.model.field import COLUMNS, EXTRAS, INITIAL_LOG_VARIANCE, GaussianField, Rows
 from sigmasplat.model.harmonics import DEGREES, count
 
 SH_C0 = 0.28209479177387814
 """Y₀₀ = 1/(2√π): the value of the constant spherical harmonic."""
-INITIAL_LOG_VARIANCE = -7.0
-"""VarSplat §1, for maps of other programs."""
 MAX_HEADER_BYTES = 1 << 20
 
 PLY_TYPES = {

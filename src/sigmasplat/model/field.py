@@ -17,6 +17,8 @@ COLUMNS: dict[str, slice] = {
     "log_variances": slice(14, 17),
 }
 WIDTH = 17
+INITIAL_LOG_VARIANCE = -7.0
+"""s₀ (VarSplat §1)."""
 EXTRAS = {"correlations": 3, "harmonics": 45}
 """What splats may carry besides, and how many numbers of each. correlations: unbounded, 0 = none, their tanh are the
 partial correlations of the colour channels red–green, red–blue, green–blue (`model.color_covariance`). harmonics:
@@ -92,7 +94,7 @@ class GaussianField(Rows):
         *,
         quats: Tensor | None = None,
         opacities: Tensor | float = 0.5,
-        log_variances: Tensor | float = -7.0,
+        log_variances: Tensor | float = INITIAL_LOG_VARIANCE,
     ) -> "GaussianField":
         """Build a field from activated values: means [N, 3] m, scales [N, 3] or [N] m, colors [N, 3].
 

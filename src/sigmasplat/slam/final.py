@@ -17,7 +17,7 @@ from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model.field import COLUMNS, GaussianField, Rows
+from sigmasplat.model.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField, Rows
 from sigmasplat.model.harmonics import count
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.submap import SubmapStore
@@ -30,8 +30,6 @@ Progress = Callable[[int, int], None]
 
 CACHE_BYTES = 64 << 20
 """Of pictures laid out for the fit; the others are read again when drawn."""
-INITIAL_LOG_VARIANCE = -7.0
-"""VarSplat §1."""
 
 
 def final_map(

@@ -15,7 +15,15 @@ from sigmasplat.model.field import COLUMNS
 from sigmasplat.model.submap import Submap, SubmapStore
 from sigmasplat.render.view import View
 from sigmasplat.slam.descriptors import Descriptor, OrientationGrid
-from sigmasplat.slam.places import Signature, SubmapPair, find_candidates, find_nearby, opacity_ratio, pairs_to_register
+from sigmasplat.slam.places import (
+    Candidate,
+    Signature,
+    SubmapPair,
+    find_candidates,
+    find_nearby,
+    opacity_ratio,
+    pairs_to_register,
+)
 from sigmasplat.slam.pose_graph import Edge, LoopVerdict, optimise
 from sigmasplat.slam.register import Registrar, Registration
 
@@ -88,14 +96,14 @@ class LoopCloser:
         Returns the pairs tried, the latest verdict on each.
         """
         c, field = self.config.loops, submap.field
-        log_variances = field.params[:, COLUMNS["log_variances"]].numpy()
-        ratio = opacity_ratio(field.opacities.numpy(), log_variances, c.tau, c.weight_max)
         if not c.close or not descriptors:
             return []
+        log_variances = field.params[:, COLUMNS["log_variances"]].numpy()
+        ratio = opacity_ratio(field.opacities.numpy(), log_variances, c.tau, c.weight_max)
         signature = Signature(submap.index, np.stack(descriptors), ratio)
         pairs = self._pairs(signature, atlas)
         self.signatures.append(signature)
-        tried = [self._try(pair, atlas) for pair in pairs]
+        tried = [self._try(pair, submap, atlas) for pair in pairs]
         if any(loop.accepted for loop in tried):
             self._correct(atlas)
         return self.loops[len(self.loops) - len(tried) :]
@@ -115,27 +123,16 @@ class LoopCloser:
             pairs += [pair for pair in near if pair.best.database_submap not in known]
         return pairs[: c.most] if c.most else pairs
 
-    def _try(self, pair: SubmapPair, atlas: Atlas) -> Loop:
-        """Register a pair and take note of it, accepted or not."""
-        best = pair.best
-        known = se3.inverse(atlas.anchors[best.query_submap]) @ atlas.anchors[best.database_submap]
-        found = Registrar(self.config, self.store, self.view).register(pair, known)
-        loop = self._described(pair, found, known)
+    def _try(self, pair: SubmapPair, a: Submap, atlas: Atlas) -> Loop:
+        """Register a pair, of which `a` is the query, and take note of it, accepted or not."""
+        b = self.store.load(pair.best.database_submap)
+        known = se3.inverse(atlas.anchors[a.index]) @ atlas.anchors[b.index]
+        found = Registrar(self.config, self.store, self.view).register(pair, a, b, known)
+        loop = described(pair.best, a, b, found, known)
         self.loops.append(loop)
         if found.accepted:
-            self.closed.append(Edge(best.query_submap, best.database_submap, found.T_a_b, found.information, loop=True))
+            self.closed.append(Edge(a.index, b.index, found.T_a_b, found.information, loop=True))
         return loop
-
-    def _described(self, pair: SubmapPair, found: Registration, known: Matrix) -> Loop:
-        best = pair.best
-        a, b = self.store.load(best.query_submap), self.store.load(best.database_submap)
-        seen_from = b.T_submap_camera[best.database_keyframe]
-        moved = se3.inverse(known @ seen_from) @ found.T_a_b @ seen_from
-        return Loop(
-            a.index, b.index, a.frames[best.query_keyframe], b.frames[best.database_keyframe], best.similarity,
-            best.gated, found.accepted, found.reason, found.residual, found.overlap, found.localised,
-            float(np.linalg.norm(moved[:3, 3])), float(np.rad2deg(se3.rotation_angle(moved[:3, :3]))), found.T_a_b,
-        )  # fmt: skip
 
     def _correct(self, atlas: Atlas) -> None:
         """Solve the pose graph, move the anchors, and note its verdict on every loop registered so far."""
@@ -145,6 +142,17 @@ class LoopCloser:
         registered = [i for i, loop in enumerate(self.loops) if np.isfinite(loop.chi2) or loop.accepted]
         for i in registered:
             self.loops[i] = judged(self.loops[i], next(verdicts))
+
+
+def described(best: Candidate, a: Submap, b: Submap, found: Registration, known: Matrix) -> Loop:
+    """Return what became of registering submaps a and b, whose most alike keyframes are `best`'s."""
+    seen_from = b.T_submap_camera[best.database_keyframe]
+    moved = se3.inverse(known @ seen_from) @ found.T_a_b @ seen_from
+    return Loop(
+        a.index, b.index, a.frames[best.query_keyframe], b.frames[best.database_keyframe], best.similarity,
+        best.gated, found.accepted, found.reason, found.residual, found.overlap, found.localised,
+        float(np.linalg.norm(moved[:3, 3])), float(np.rad2deg(se3.rotation_angle(moved[:3, :3]))), found.T_a_b,
+    )  # fmt: skip
 
 
 def judged(loop: Loop, verdict: LoopVerdict) -> Loop:

@@ -18,6 +18,7 @@ from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.submap import Submap, SubmapStore
 from sigmasplat.render.view import CpuView, View
+from sigmasplat.slam.drift import symmetric
 from sigmasplat.slam.places import SubmapPair
 
 Matrix = NDArray[np.float64]
@@ -67,9 +68,8 @@ class Registrar:
         self.config, self.store, self.view = config.registration, store, view
         self.tracking = tracking_of(config.registration, config.tracking)
 
-    def register(self, pair: SubmapPair, T_a_b: Matrix) -> Registration:
+    def register(self, pair: SubmapPair, a: Submap, b: Submap, T_a_b: Matrix) -> Registration:
         """Register the submaps a (query) and b (database) of a pair, T_a_b as known so far."""
-        a, b = self.store.load(pair.best.query_submap), self.store.load(pair.best.database_submap)
         found = [self._localise(a, k, b, pair.database_keyframes, T_a_b) for k in pair.query_keyframes]
         back = [self._localise(b, k, a, pair.query_keyframes, se3.inverse(T_a_b)) for k in pair.database_keyframes]
         found += [turned(localisation) for localisation in back]
@@ -188,9 +188,8 @@ def information(found: Sequence[Localisation], mean: Matrix) -> Matrix:
     """
     twists = np.stack([se3.log(f.T_a_b @ se3.inverse(mean)) for f in found])
     covariance = np.mean([f.covariance for f in found], 0) + twists.T @ twists / len(found)
-    covariance = 0.5 * (covariance + covariance.T) + np.diag(np.repeat([FLOOR_M**2, FLOOR_RAD**2], 3))
-    inverse = np.linalg.inv(covariance)
-    return np.asarray(0.5 * (inverse + inverse.T))
+    floor = np.diag(np.repeat([FLOOR_M**2, FLOOR_RAD**2], 3))
+    return symmetric(np.asarray(np.linalg.inv(symmetric(covariance) + floor), np.float64))
 
 
 def shared(a: Submap, b: Submap, T_a_b: Matrix, distance_m: float) -> float:
