@@ -133,3 +133,21 @@ def test_two_views_do_not_disturb_each_other() -> None:
     twist = first.backward(params, rows)
     assert torch.equal(rows, alone[1]) and np.array_equal(twist, alone[2].numpy())
     assert torch.equal(maps_of(first), alone[0])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_layers_say_which_splats_make_a_pixel(kind: str) -> None:
+    """Weights and median depth as the definition has them; the splats too, but where two are as good."""
+    s = scene(kind, 60)
+    params, T = params_of(s), s.T_camera_world.numpy()
+    views = CpuView(s.camera, OPTIONS), exact_view(s.camera, True)
+    for view, rows in zip(views, (params, params.double()), strict=True):
+        view.forward(rows, T, layers=True)
+    h, w = s.camera.height, s.camera.width
+    got, want = ([plane[:h, :w] for plane in view.layers] for view in views)
+    assert (want[0] >= 0).any(), "the scene has opaque pixels"
+    assert (got[0] == want[0]).float().mean() > 0.99 and (got[2] == want[2]).float().mean() > 0.99
+    same = got[0] == want[0]
+    assert torch.allclose(got[4][same].double(), want[4][same].double(), atol=1e-5)
+    assert (got[4] > 0).equal(got[0] >= 0)
+    assert torch.allclose(got[3].double(), want[3].double(), atol=1e-5)

@@ -114,7 +114,11 @@ def test_override_reaches_every_setting() -> None:
     ("name", "text", "says"),
     [
         ("tracking.iteratons", "3", r"did you mean iterations\?"),
-        ("trackng.iterations", "3", r"did you mean tracking\?.*sections: input, render, seeding, mapping, tracking"),
+        (
+            "trackng.iterations",
+            "3",
+            r"did you mean tracking\?.*sections: input, render, seeding, mapping, primitives, tracking",
+        ),
         ("tracking", "3", "unknown setting 'tracking'"),
         ("tracking.tau.x", "3", "unknown setting"),
         ("name.upper", "3", "unknown setting"),

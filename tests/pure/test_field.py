@@ -132,3 +132,15 @@ def test_moved_turns_adams_moments_with_the_splats() -> None:
     torch.testing.assert_close(stepped.moved(M).params[:, :7], again.params[:, :7], rtol=0, atol=1e-5)
     field.moment2 = torch.ones_like(field.params)
     torch.testing.assert_close(field.moved(M).moment2, field.moment2)
+
+
+def test_ids_name_splats_for_life() -> None:
+    field = GaussianField(torch.randn(4, 17))
+    field.keep(torch.tensor([True, False, True, True]))
+    assert field.ids.tolist() == [0, 2, 3]
+    field.append(GaussianField(torch.randn(2, 17)))
+    assert field.ids.tolist() == [0, 2, 3, 4, 5]
+    field.keep(torch.tensor([0, 4]))
+    field.append(GaussianField(torch.randn(1, 17)))
+    assert field.ids.tolist() == [0, 5, 6], "an id is never given twice"
+    assert field.moved(torch.eye(4)).ids.tolist() == [0, 5, 6]

@@ -13,6 +13,8 @@ class InputConfig:
     min_depth_m: float = 0.1
     max_depth_m: float = 8.0
     """Readings beyond are treated as no reading."""
+    crop_px: int = 0
+    """Pixels dropped at every edge, after resizing: where an undistorted image or a sensor's depth has none."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,8 @@ class RenderConfig:
     """Whether the pose gradient includes the path through the 2D covariance."""
     mean_pose_gradient: bool = True
     depth_pose_gradient: bool = True
+    color_pose_gradient: bool = True
+    """… and the path through colours that depend on the direction they are seen from."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,8 @@ class SeedConfig:
     """At most this many new splats per keyframe; 0 = no limit."""
     alpha_below: float = 0.6
     depth_error_factor: float = 40.0
-    """Seed where the rendered surface lies behind the measured one by this multiple of the median depth error."""
+    """Seed where the rendered surface lies behind the measured one by this multiple of the median depth error; 0 = off
+    (CG-SLAM)."""
     depth_error_least_m: float = 0.0
     """… and by at least this much."""
     min_distance_m: float = 0.01
@@ -52,6 +57,8 @@ class SeedConfig:
     scale_from: Literal["neighbours", "pixel"] = "neighbours"
     """neighbours: root mean squared distance to the 3 nearest (papers'); pixel: its size at that depth × spacing."""
     scale_factor: float = 1.0
+    push_back: float = 1.005
+    """Seeds lie at this multiple of the reading: blending near splats first pulls depth forward (VarSplat's code)."""
     density: float = 1.0
     """Share of the pixels chosen at a later keyframe that become splats."""
     outlier_neighbours: int = 0
@@ -62,7 +69,7 @@ class SeedConfig:
 
 @dataclass(frozen=True)
 class MappingConfig:
-    """fit_field: iterations, weights, learning rates (VarSplat §2)."""
+    """fit_field: iterations, weights, learning rates (VarSplat §2; CG-SLAM §3, 5, 7)."""
 
     every: int = 1
     """A keyframe is mapped every so many frames."""
@@ -75,9 +82,18 @@ class MappingConfig:
     weight_ssim: float = 0.2
     weight_depth: float = 1.0
     weight_isotropy: float = 1.0
+    """On |s − mean(s)|, metres (VarSplat §2)."""
+    weight_isotropy_ratio: float = 0.0
+    """On max(s) / min(s) − 1 (CG-SLAM eq. 17)."""
+    weight_alignment: float = 0.0
+    """On |D̂ − median depth| (CG-SLAM eq. 16)."""
+    weight_moment: float = 0.0
+    """On U, the variance of splats' depths about the sensor's (CG-SLAM eq. 10)."""
     weight_nll_color: float = 1e-4
     weight_nll_depth: float = 0.0
     lr_means: float = 1e-4
+    lr_means_first: float = 0.0
+    """The first keyframe's steps begin with this one and come down to `lr_means`, evenly in log; 0 = `lr_means`."""
     lr_quats: float = 1e-3
     lr_log_scales: float = 5e-3
     lr_opacity_logits: float = 0.05
@@ -86,17 +102,29 @@ class MappingConfig:
     lr_pose_translation: float = 0.0
     lr_pose_rotation: float = 0.0
     """Above 0, mapping moves its keyframes' poses too (metres, radians per step); the first stays."""
+    poses: Literal["all", "newest"] = "all"
+    """Whose poses it moves: of all keyframes it looks at (CG-SLAM eq. 21), or the newest alone (its code)."""
+    poses_from: Literal["start", "half"] = "start"
+    """Whether poses move in all of a keyframe's steps, or in the second half only (CG-SLAM)."""
     color_covariance: Literal["diagonal", "full"] = "diagonal"
     """Whether a splat's appearance variance is one number a channel (paper) or a full 3×3 covariance."""
     freeze_old_colors: bool = False
     prune_opacity: float = 0.5
     keyframe_history: int = 0
     """Older keyframes drawn from the latest so many; 0 = all."""
+    window: int = 0
+    """Look at so many keyframes only: the newest, the one before, and those that share most with the newest (CG-SLAM's
+    sliding bundle adjustment); 0 = all, drawn at random (VarSplat)."""
+    covisibility: Literal["splats", "frustum", "descriptor"] = "splats"
+    """What the window's keyframes share: splats that dominate pixels of both, readings of the one that the other sees
+    too, or looks, by the descriptor of `loops`."""
+    frames_per_step: int = 1
+    """A step descends the mean loss of so many keyframes of the window; 0 = of all of them (CG-SLAM)."""
 
 
 @dataclass(frozen=True)
 class TrackingConfig:
-    """fit_pose: method, iterations, masks, weights (VarSplat §3)."""
+    """fit_pose: method, iterations, masks, weights (VarSplat §3; CG-SLAM §6)."""
 
     method: Literal["adam", "align"] = "adam"
     """adam: gradient descent through the renderer, as in the papers; align: one render, then Gauss–Newton on it."""
@@ -111,6 +139,13 @@ class TrackingConfig:
     """A level is done when a step is below this (metres and radians)."""
     align_weight_color: float = 0.5
     """Share of the gray residual against depth when aligning."""
+    parametrisation: Literal["quaternion", "axis-angle"] = "quaternion"
+    """What Adam moves: a quaternion and a translation after the first guess (VarSplat's code), or the camera-to-world
+    rotation's axis-angle and the camera's position (CG-SLAM)."""
+    first_iterations: int = 0
+    """Adam's iterations for the second frame, which has no motion to go by; 0 = as for the others."""
+    first_lr_rotation: float = 0.0
+    """… and its rate of rotation; 0 = as for the others."""
     lr_rotation: float = 2e-3
     lr_translation: float = 1e-2
     weight_color: float = 0.6
@@ -124,6 +159,10 @@ class TrackingConfig:
     """Only pixels whose rendered alpha exceeds this; 0 = off."""
     outlier_factor: float = 50.0
     """Only pixels whose depth error is below this multiple of its median; 0 = off."""
+    outlier_factor_color: float = 0.0
+    """Colour counts only where its error, summed over the channels, is below this multiple of its median; 0 = off."""
+    average: Literal["image", "kept"] = "image"
+    """Whether colour's and depth's errors are averaged over all pixels, or over those each of them keeps (CG-SLAM)."""
     motion_model: bool = True
     reinit_factor: float = 5.0
     """When the first loss exceeds this multiple of its running median: odometry start and twice the iterations."""

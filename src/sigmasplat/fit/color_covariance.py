@@ -16,7 +16,7 @@ from sigmasplat.fit.view_dependent import isotropy
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.render import reference
 from sigmasplat.render.render import covariance_features, covariance_of
-from sigmasplat.render.view import CpuView, Matrix, ReferenceView, View, reaches, twist_matrix
+from sigmasplat.render.view import NO_LAYERS, CpuView, Layers, Matrix, ReferenceView, View, reaches, twist_matrix
 
 COLORS, SCALES = COLUMNS["colors"], COLUMNS["log_scales"]
 PLANES, SLOTS = 10, 11
@@ -43,8 +43,11 @@ class CovarianceView:
         self._slots = view.sums.new_zeros(SLOTS, *size)
         self.sums, self.g_sums = self._slots[:PLANES], view.sums.new_zeros(PLANES, *size)
         self.alpha, self.g_alpha, self.moment, self._depth = (view.sums.new_zeros(size) for _ in range(4))
+        self.layers = Layers.of(*size)
 
-    def forward(self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None) -> None:
+    def forward(
+        self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
+    ) -> None:
         parts = [params[:, columns] for columns in COLUMNS.values()]
         self._leaves = [x.detach().contiguous().requires_grad_() for x in (*parts, self.correlations.params)]
         means, quats, log_scales, logits, colors, log_variances, correlations = self._leaves
@@ -57,19 +60,22 @@ class CovarianceView:
         self._visible = reaches(p, opacities.detach(), self.camera, self.options)
         if depth_reference is not None:
             self._depth[: self.camera.height, : self.camera.width] = depth_reference
-        self._blend(p.radii, depth_reference is not None)
+        self._blend(p.radii, depth_reference is not None, layers)
 
-    def _blend(self, radii: Tensor, with_moment: bool) -> None:
+    def _blend(self, radii: Tensor, with_moment: bool, layers: bool) -> None:
         """Fill the planes; the kernels write them as they are."""
         camera, o = self.camera, self.options
         self._blended = [x.detach().contiguous().requires_grad_(self._raster is None) for x in self._splats]
         means2d, conics, z, opacities, features = self._blended
         depth, moment = (self._depth, self.moment) if with_moment else (None, None)
         if self._raster is not None:
+            planes = self.layers if layers else NO_LAYERS
             self._raster.blend_forward(
                 means2d, conics, z, radii, opacities, features, camera.width, camera.height, o.alpha_min,
-                o.transmittance_stop, depth, self._slots, moment, self.alpha, None, None, None, None,
+                o.transmittance_stop, depth, self._slots, moment, self.alpha, *planes[:4],
             )  # fmt: skip
+            if layers:
+                self.layers.fill_depth(z.detach())
             return
         b = reference.blend(means2d, conics, z, radii, opacities, features, depth, camera, o)
         self._maps = (b.sums.movedim(-1, 0), b.alpha)
@@ -77,6 +83,8 @@ class CovarianceView:
         self.alpha.copy_(b.alpha.detach())
         if b.moment is not None:
             self.moment.copy_(b.moment.detach())
+        if layers:
+            self.layers.fill(b, z.detach())
 
     def backward(self, params: Tensor, g_params: Tensor) -> Matrix:
         *gradients, self.g_correlations, g_twist = self._carry(self.g_sums, self.g_alpha)

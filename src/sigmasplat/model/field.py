@@ -71,15 +71,20 @@ class GaussianField(Rows):
 
     means: metres, world (or submap) frame; quats: wxyz, any positive norm; log_scales: log metres; opacity_logits:
     logit of opacity; colors: RGB in [0, 1]; log_variances: log σ² of observed colour about `colors` (VarSplat §3,
-    s_i). `extras` holds what only some maps need, by its name in `EXTRAS`, rows of the same splats.
+    s_i). `extras` holds what only some maps need, by its name in `EXTRAS`, rows of the same splats. `ids` [N] int64
+    name splats for as long as they live, whatever row they move to; `born` is the next one free.
     """
 
     extras: dict[str, Rows] = dataclass_field(default_factory=dict)
+    ids: Tensor = dataclass_field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
+    born: int = 0
 
     def __post_init__(self) -> None:
         if self.params.ndim != 2 or self.params.shape[1] != WIDTH:
             raise SigmaSplatError(f"a field needs params [N, {WIDTH}], found {tuple(self.params.shape)}")
         super().__post_init__()
+        if len(self.ids) != len(self.params):
+            self.ids, self.born = torch.arange(len(self.params)), len(self.params)
 
     @staticmethod
     def empty() -> "GaussianField":
@@ -150,15 +155,18 @@ class GaussianField(Rows):
         return self.extras[name]
 
     def append(self, other: "GaussianField") -> None:
-        """Add another field's splats at the end; extras that only one of them has are 0 for the other's."""
+        """Add another field's splats at the end, with new ids; extras that only one has are 0 for the other's."""
         for name in {**self.extras, **other.extras}:
             self.carry(name).join(other.carry(name))
+        self.ids = torch.cat([self.ids, torch.arange(self.born, self.born + len(other))])
+        self.born += len(other)
         self.join(other)
 
     def keep(self, rows: Tensor) -> None:
         """Keep the splats chosen by a bool mask [N] or an index tensor, drop the others."""
         for part in (self, *self.extras.values()):
             part.choose(rows)
+        self.ids = self.ids[rows]
 
     def moved(self, T_new_old: Tensor) -> "GaussianField":
         """Return the field carried by a rigid 4×4 transform: positions and rotations move, shapes and looks stay.
@@ -176,7 +184,7 @@ class GaussianField(Rows):
         extras = {name: Rows(*extra.state(), extra.steps) for name, extra in self.extras.items()}
         if "harmonics" in extras:
             extras["harmonics"].params = harmonics.turned(extras["harmonics"].params, T[:3, :3])
-        return GaussianField(params, moment1, moment2, last_step, self.steps, extras)
+        return GaussianField(params, moment1, moment2, last_step, self.steps, extras, self.ids.clone(), self.born)
 
 
 def quaternion_of(R: Tensor) -> Tensor:

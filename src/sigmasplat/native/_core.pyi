@@ -168,6 +168,7 @@ class Rasteriser:
         median_weight: Array | None,
         dominant_id: Array | None,
         dominant_weight: Array | None,
+        median_depth: Array | None,
         seconds: Array,
     ) -> None: ...
     def view_backward(

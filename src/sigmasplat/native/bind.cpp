@@ -123,8 +123,9 @@ public:
     }
     void view_forward(ConstFloats view, ConstFloats params, int k, float alpha_min, float stop, Maybe<ConstFloats> reference,
                       Floats sums, Maybe<Floats> moment, Floats alpha, Maybe<Ints> median_id, Maybe<Floats> median_weight,
-                      Maybe<Ints> dominant_id, Maybe<Floats> dominant_weight, Doubles seconds) {
-        const Outputs o = outputs(sums, moment, alpha, median_id, median_weight, dominant_id, dominant_weight);
+                      Maybe<Ints> dominant_id, Maybe<Floats> dominant_weight, Maybe<Floats> median_depth, Doubles seconds) {
+        Outputs o = outputs(sums, moment, alpha, median_id, median_weight, dominant_id, dominant_weight);
+        o.median_depth = pointer(median_depth);
         need(params.ndim() == 2 && params.shape(1) == 17, "params must be [N, 17]");
         need(k == 4 || k == 7, "a view has 4 features (colour, depth) or 7 (and variance)");
         need(!o.moment == !reference, "a moment needs a reference depth");
@@ -279,7 +280,7 @@ NB_MODULE(_core, m) {
              nb::arg("g_alpha").none(), nb::arg("g_means2d"), nb::arg("g_conics"), nb::arg("g_z"), nb::arg("g_opacities"), nb::arg("g_features"))
         .def("view_forward", &Rasteriser::view_forward, nb::arg("view"), nb::arg("params"), nb::arg("k"), nb::arg("alpha_min"), nb::arg("stop"), nb::arg("reference").none(),
              nb::arg("sums"), nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(), nb::arg("median_weight").none(), nb::arg("dominant_id").none(),
-             nb::arg("dominant_weight").none(), nb::arg("seconds"))
+             nb::arg("dominant_weight").none(), nb::arg("median_depth").none(), nb::arg("seconds"))
         .def("view_backward", &Rasteriser::view_backward, nb::arg("params"), nb::arg("sums"), nb::arg("moment").none(), nb::arg("alpha"), nb::arg("g_sums"),
              nb::arg("g_moment").none(), nb::arg("g_alpha").none(), nb::arg("g_params"), nb::arg("g_twist"), nb::arg("seconds"))
         .def("step", &Rasteriser::step)

@@ -142,7 +142,7 @@ template <int K, bool MOMENT, bool IDS> static void blend_tiles(Render& r, Outpu
                 const vf x = block_x(b), y = block_y(b);
                 const int* list = &s.lists[b * s.list_capacity];
                 const size_t at = (tile.y + size_t(b / BLOCKS_X) * BLOCK_HEIGHT) * stride + tile.x + b % BLOCKS_X * BLOCK_WIDTH;
-                vf sum[K], moment = zero, ref = zero, T = one, T_end = one, best = zero, median_w = zero;
+                vf sum[K], moment = zero, ref = zero, T = one, T_end = one, best = zero, median_w = zero, median_z = zero;
                 vi dominant = splat(-1), median = splat(-1);
                 for (auto& c : sum) c = zero;
                 if (MOMENT) ref = load_block(r.reference + at, stride);
@@ -169,6 +169,7 @@ template <int K, bool MOMENT, bool IDS> static void blend_tiles(Render& r, Outpu
                             dominant = select(more, id, dominant);
                             median = select(crossing, id, median);
                             median_w = select(crossing, w, median_w);
+                            median_z = select(crossing, splat(geometry.z), median_z);
                         }
                     }
                     if (!any(ge(T, stop))) break;
@@ -182,6 +183,7 @@ template <int K, bool MOMENT, bool IDS> static void blend_tiles(Render& r, Outpu
                     store_block(o.dominant_weight + at, stride, best);
                     store_block(o.median_id + at, stride, select(crossed, median, splat(-1)));
                     store_block(o.median_weight + at, stride, only(crossed, median_w));
+                    if (o.median_depth) store_block(o.median_depth + at, stride, only(crossed, median_z));
                 }
             }
         }

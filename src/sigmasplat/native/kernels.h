@@ -17,6 +17,7 @@ struct Outputs {                           // planes of Hp × Wp, padded to whol
     float* alpha;
     int* median_id; float* median_weight;  // all four or none
     int* dominant_id; float* dominant_weight;
+    float* median_depth = nullptr;         // with the ids, or null
 };
 
 struct OutputGradients { const float *sums, *moment, *alpha; };   // planes like Outputs; moment and alpha may be null

@@ -4,7 +4,7 @@ The loops of `fit` live on this. Planes are padded to whole tiles: [rows, column
 is defined but means nothing, and a loss masks it (targets have depth 0 there).
 """
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -21,6 +21,39 @@ from sigmasplat.render.render import features_of
 Matrix = NDArray[np.float64]
 
 
+class Layers(NamedTuple):
+    """Which splats make a pixel, planes [rows, columns]: int32 rows of the splat at median depth (CG-SLAM eq. 8) and of
+    the one of largest weight, −1 = none; their weights; median_depth in m, 0 = none."""
+
+    median_id: Tensor
+    median_weight: Tensor
+    dominant_id: Tensor
+    dominant_weight: Tensor
+    median_depth: Tensor
+
+    @staticmethod
+    def of(rows: int, columns: int) -> "Layers":
+        """Make empty planes."""
+        ids, floats = ([torch.zeros(rows, columns, dtype=t) for _ in range(3)] for t in (torch.int32, torch.float32))
+        return Layers(ids[0], floats[0], ids[1], floats[1], floats[2])
+
+    def fill(self, b: reference.Blended, z: Tensor) -> None:
+        """Copy what was blended of splats at depths z [N] m."""
+        found = (b.median_id, b.median_weight, b.dominant_id, b.dominant_weight)
+        for plane, image in zip(self[:4], found, strict=True):
+            plane.copy_(image)
+        self.fill_depth(z)
+
+    def fill_depth(self, z: Tensor) -> None:
+        """Read the median depth off depths z [N] m."""
+        nearest = z[self.median_id.clamp(min=0).long()] if len(z) else self.median_depth
+        self.median_depth.copy_(torch.where(self.median_id >= 0, nearest, 0.0))
+
+
+MaybeLayers = tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None, Tensor | None]
+NO_LAYERS: MaybeLayers = (None, None, None, None, None)
+
+
 class View(Protocol):
     """One camera with its planes: sums [K, rows, columns] of (r, g, b, z[, σ²+c² ×3]), alpha, and their gradients."""
 
@@ -31,11 +64,16 @@ class View(Protocol):
     g_alpha: Tensor
     moment: Tensor
     """U about the reference depth of the last forward pass that was given one, [rows, columns] m² (CG-SLAM eq. 10)."""
+    layers: "Layers"
+    """Of the last forward pass that was asked for them."""
     seconds: NDArray[np.float64]
     """Time spent so far in project, sort, blend, blend backward, project backward."""
 
-    def forward(self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None) -> None:
-        """Render parameter rows [N, 17] at a pose into `sums` and `alpha`; with a depth [H, W] m into `moment` too."""
+    def forward(
+        self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
+    ) -> None:
+        """Render parameter rows [N, 17] at a pose into `sums` and `alpha`; with a depth [H, W] m into `moment` too, and
+        if asked to into `layers`."""
 
     def backward(self, params: Tensor, g_params: Tensor) -> Matrix:
         """Carry `g_sums`, `g_alpha` to parameter rows, written to g_params [N, 17]; return the pose twist [6]."""
@@ -63,17 +101,20 @@ class CpuView:
         self.sums, self.g_sums = torch.zeros(self._k, *size), torch.zeros(self._k, *size)
         self.alpha, self.g_alpha = torch.zeros(size), torch.zeros(size)
         self.moment, self._reference = torch.zeros(size), torch.zeros(size)
+        self.layers = Layers.of(*size)
         self.seconds = np.zeros(5)
 
-    def forward(self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None) -> None:
+    def forward(
+        self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
+    ) -> None:
         o, reference_depth, moment = self.options, None, None
         if depth_reference is not None:
             self._reference[: self.camera.height, : self.camera.width] = depth_reference
             reference_depth, moment = self._reference, self.moment
-        view = self._numbers(self.camera, T_camera_world, o)
+        view, planes = self._numbers(self.camera, T_camera_world, o), self.layers if layers else NO_LAYERS
         self.raster.view_forward(
             view, params, self._k, o.alpha_min, o.transmittance_stop, reference_depth,
-            self.sums, moment, self.alpha, None, None, None, None, self.seconds[:3],
+            self.sums, moment, self.alpha, *planes, self.seconds[:3],
         )  # fmt: skip
 
     def backward(self, params: Tensor, g_params: Tensor) -> Matrix:
@@ -108,9 +149,12 @@ class ReferenceView:
         size = (camera.height, camera.width)
         self.sums, self.g_sums = torch.zeros(self._k, *size), torch.zeros(self._k, *size)
         self.alpha, self.g_alpha, self.moment = torch.zeros(size), torch.zeros(size), torch.zeros(size)
+        self.layers = Layers.of(*size)
         self.seconds = np.zeros(5)
 
-    def forward(self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None) -> None:
+    def forward(
+        self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
+    ) -> None:
         self._leaf = params.detach().clone().requires_grad_()
         self._twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
         T = torch.linalg.matrix_exp(twist_matrix(self._twist)) @ torch.as_tensor(T_camera_world)
@@ -124,6 +168,8 @@ class ReferenceView:
         self.alpha.copy_(b.alpha.detach())
         if b.moment is not None:
             self.moment.copy_(b.moment.detach())
+        if layers:
+            self.layers.fill(b, p.z.detach())
 
     def backward(self, params: Tensor, g_params: Tensor) -> Matrix:
         g_leaf, g_twist = torch.autograd.grad(self._maps, (self._leaf, self._twist), (self.g_sums, self.g_alpha))
