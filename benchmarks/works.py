@@ -121,10 +121,10 @@ class Works:
         """Fit a copy of the field; return the seconds of each iteration, from one keyframe asked for to the next."""
         field, keyframe, starts = GaussianField(self.params.clone()), Keyframe(0, self.target, np.eye(4)), []
 
-        def ticking() -> Iterator[Keyframe]:
+        def ticking() -> Iterator[list[Keyframe]]:
             for _ in range(count):
                 starts.append(time.perf_counter())
-                yield keyframe
+                yield [keyframe]
             starts.append(time.perf_counter())
 
         fit_field(field, self.view, ticking(), self.mapping)

@@ -12,7 +12,8 @@ from sigmasplat.config import MappingConfig
 from sigmasplat.fit import adam, losses
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.color_covariance import CovarianceView, FullCovarianceStep
-from sigmasplat.fit.field import CompiledImages, TorchStep, fit_field
+from sigmasplat.fit.field import fit_field
+from sigmasplat.fit.step import CompiledImages, TorchStep
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
@@ -225,7 +226,7 @@ def test_mapping_moves_correlations_only_where_it_is_asked_to(name: str) -> None
         target = target_of(s.camera, tuple(view.alpha.shape))
         seen = Keyframe(0, target, se3.inverse(s.T_camera_world.numpy()))
         config = MappingConfig(color_covariance=kind, weight_nll_color=1e-2, lr_pose_translation=1e-3)
-        fit_field(field, view, [seen] * 3, config)
+        fit_field(field, view, [[seen]] * 3, config)
         assert ("correlations" in field.extras) == (kind == "full")
         assert not torch.equal(field.params, before) and seen.T_world_camera[0, 3] != -s.T_camera_world[0, 3]
         if kind == "full":
@@ -242,7 +243,7 @@ def test_view_dependent_colour_is_fitted_under_it_too() -> None:
         field, view = GaussianField(params_of(s)), make_view("cpu", s.camera, OPTIONS)
         field.carry("correlations").params += correlated
         target = target_of(s.camera, tuple(view.alpha.shape))
-        fit_field(field, view, [Keyframe(0, target, se3.inverse(s.T_camera_world.numpy()))] * 3, config, degree=1)
+        fit_field(field, view, [[Keyframe(0, target, se3.inverse(s.T_camera_world.numpy()))]] * 3, config, degree=1)
         assert bool((field.extras["correlations"].params == correlated).all())
         assert bool(field.extras["harmonics"].params.any())
         fitted.append(field.params[:, COLUMNS["log_variances"]])
@@ -261,9 +262,10 @@ def test_frozen_colours_stay_and_the_others_move() -> None:
     field = field_of(s)
     view = CovarianceView(CpuView(s.camera, OPTIONS), field.extras["correlations"])
     step, before, field.steps = FullCovarianceStep(view, CompiledImages(view)), field.params.clone(), 1
-    step.forward(field, s.T_camera_world.numpy())
-    step.images(target_of(s.camera, tuple(view.alpha.shape)), WEIGHTS)
-    step.splats(field, RATES, 1.0, 30)
+    target = target_of(s.camera, tuple(view.alpha.shape))
+    step.forward(field, s.T_camera_world.numpy(), target, WEIGHTS)
+    step.images(target, WEIGHTS)
+    step.splats(field, RATES, WEIGHTS, 30)
     colors, moved = COLUMNS["colors"], view.visible(60)
     assert torch.equal(field.params[:30, colors], before[:30, colors])
     assert bool((field.params[30:, colors] != before[30:, colors]).any(1)[moved[30:]].all())
@@ -284,7 +286,7 @@ def test_it_finds_how_the_channels_of_noise_go_together(monkeypatch: pytest.Monk
     seen = [Keyframe(0, Target.of(frame, tuple(view.alpha.shape)), np.eye(4)) for frame in frames]
     off = dict.fromkeys(("means", "quats", "log_scales", "opacity_logits", "colors"), 0.0)
     config = replace(MappingConfig(color_covariance="full"), **{f"lr_{k}": v for k, v in off.items()})
-    fit_field(wall, view, seen * 30, replace(config, lr_log_variances=2e-2))
+    fit_field(wall, view, [[keyframe] for keyframe in seen] * 30, replace(config, lr_log_variances=2e-2))
     r, want = correlations_of(wall.extras["correlations"].params)[0], torch.tensor([0.8, -0.5, -0.6])
     assert float((r - want).abs().max()) < 0.04
     assert wall.variances[0].sqrt().tolist() == pytest.approx([0.05] * 3, rel=0.2)

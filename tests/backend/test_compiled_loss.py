@@ -9,7 +9,7 @@ import torch
 
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates, adam_step, settle
-from sigmasplat.fit.field import CompiledStep, TorchStep
+from sigmasplat.fit.step import CompiledStep, TorchStep
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
@@ -21,8 +21,11 @@ from splat_scenes import SMALL, WIDE, assert_same_vector
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
-WEIGHTS = {"l1": 0.8, "ssim": 0.2, "depth": 1.0, "nll_color": 1e-2, "nll_depth": 2e-2, "isotropy": 1.0}
-TERMS = ("l1", "ssim", "depth", "nll_color", "nll_depth")
+WEIGHTS = {
+    "l1": 0.8, "ssim": 0.2, "depth": 1.0, "nll_color": 1e-2, "nll_depth": 2e-2, "alignment": 0.3, "moment": 0.2,
+    "isotropy": 1.0, "isotropy_ratio": 0.1,
+}  # fmt: skip
+TERMS = ("l1", "ssim", "depth", "nll_color", "nll_depth", "alignment", "moment")
 
 
 def target_of(camera: Camera, size: tuple[int, int], valid_share: float = 0.8) -> Target:
@@ -40,6 +43,9 @@ def draw_planes(view: CpuView, target: Target) -> None:
     color = (target.color.double() + 0.2 * torch.as_tensor(rng.normal(size=target.color.shape))).clamp(0, 1)
     view.sums[:3] = color
     view.sums[3] = target.depth + 0.1 * torch.as_tensor(rng.normal(size=target.depth.shape))
+    view.layers.median_depth[:] = target.depth + 0.1 * torch.as_tensor(rng.normal(size=target.depth.shape))
+    view.layers.median_depth[torch.as_tensor(rng.random(target.depth.shape) < 0.2)] = 0.0
+    view.moment[:] = torch.as_tensor(rng.uniform(0.0, 0.1, target.depth.shape))
     if len(view.sums) == 7:
         variance = torch.as_tensor(rng.uniform(1e-3, 0.2, color.shape))
         variance[torch.as_tensor(rng.random(color.shape) < 0.1)] = -1e-4
@@ -51,14 +57,24 @@ def both_ways(camera: Camera, weights: dict[str, float], variance: bool, valid_s
     view = CpuView(camera, OPTIONS, variance)
     target = target_of(camera, tuple(view.alpha.shape), valid_share)
     draw_planes(view, target)
-    exact = SimpleNamespace(sums=view.sums.double(), g_sums=torch.zeros_like(view.sums).double())
-    view.g_sums.fill_(torch.nan)  # whatever was there must go
+    exact = SimpleNamespace(
+        sums=view.sums.double(), g_sums=torch.zeros_like(view.sums).double(), moment=view.moment.double(),
+        layers=SimpleNamespace(median_depth=view.layers.median_depth.double()),
+        g_moment=torch.zeros_like(view.moment).double(), g_median_depth=torch.zeros_like(view.moment).double(),
+    )  # fmt: skip
+    for plane, name in ((view.g_sums, ""), (view.g_median_depth, "alignment"), (view.g_moment, "moment")):
+        plane.fill_(torch.nan if weights.get(name, 1.0) else 0.0)  # whatever was there must go
     losses = CompiledStep(view).images(target, weights), TorchStep(exact).images(target, weights)
-    outside = view.g_sums.clone()
+    outside = gradients_of(view)
     outside[:, : camera.height, : camera.width] = 0.0
     assert torch.count_nonzero(outside) == 0, "padding must feel nothing"
     crop = (slice(None), slice(camera.height), slice(camera.width))
-    return (losses[0], view.g_sums[crop]), (losses[1], exact.g_sums[crop])
+    return (losses[0], gradients_of(view)[crop]), (losses[1], gradients_of(exact)[crop])
+
+
+def gradients_of(view: Any) -> torch.Tensor:
+    """Stack the gradient planes: of the sums, of the median depth, of U."""
+    return torch.cat([view.g_sums, view.g_median_depth[None], view.g_moment[None]])
 
 
 @pytest.mark.parametrize("variance", [False, True], ids=["K4", "K7"])
@@ -139,7 +155,7 @@ def test_a_step_follows_its_definition(isa: str, n: int) -> None:
             field.steps += 1
             v.forward(field.params, T)
             random_gradient(v, step)
-            results.append(mapping.splats(field, RATES, 0.7, frozen))
+            results.append(mapping.splats(field, RATES, {"isotropy": 0.7}, frozen))
         (twist, regulariser), (want_twist, want_regulariser) = results
         assert_same_vector(torch.as_tensor(twist), torch.as_tensor(want_twist), 1e-3, f"{isa} twist")
         assert regulariser == pytest.approx(want_regulariser, rel=1e-4)
@@ -217,6 +233,6 @@ def test_balls_feel_no_isotropy_and_nothing_needs_no_step(isa: str) -> None:
         field = GaussianField(params[:n].contiguous(), steps=1)
         view.forward(field.params, s.T_camera_world.numpy())
         view.g_sums.zero_()
-        twist, regulariser = CompiledStep(view).splats(field, RATES, 1.0, 0)
+        twist, regulariser = CompiledStep(view).splats(field, RATES, {"isotropy": 1.0, "isotropy_ratio": 1.0}, 0)
         assert regulariser < 1e-7 and not twist.any()
         assert float(field.moment1[:, :7].abs().sum()) == 0.0

@@ -14,8 +14,8 @@ from splat_scenes import KINDS, assert_same_vector, gradients, probe, render, sc
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.field import CompiledStep
 from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.step import CompiledStep
 from sigmasplat.model.field import GaussianField
 from sigmasplat.native import _core
 from sigmasplat.render import cpu
@@ -81,9 +81,14 @@ def losses() -> Outputs:
     """Run SSIM, the pixel losses of mapping, and tracking's loss and reference."""
     (sums, depth_seen), (target, depth) = images(1), images(2)
     target, size = target[:3], (BIG.width, BIG.height)
-    gradient, parts = torch.full_like(sums, torch.nan), np.zeros(4)
+    gradient, parts = torch.full_like(sums, torch.nan), np.zeros(6)
+    median, moment = depth_seen.roll(3, 0).contiguous(), (0.1 * depth_seen).contiguous()
+    g_median, g_moment = torch.full_like(median, torch.nan), torch.full_like(moment, torch.nan)
     valid = float((depth > 0).sum())
-    _core.mapping_losses(sums, target, depth, BIG.height, [0.8, 1.0, 1e-2, 1e-2], valid, gradient, parts)
+    weights = [0.8, 1.0, 1e-2, 1e-2, 0.3, 0.2]
+    _core.mapping_losses(
+        sums, median, moment, target, depth, BIG.height, weights, valid, gradient, g_median, g_moment, parts
+    )
     cache = torch.zeros(_core.ssim_cache_floats(*size))
     _core.ssim_target(target, depth, *size, cache)
     similarity = _core.ssim(sums[:3], target, cache, *size, depth, -0.2, gradient[:3])
@@ -110,7 +115,7 @@ def step() -> Outputs:
     for field.steps in (1, 2, 3):
         view.forward(field.params, s.T_camera_world.numpy())
         view.g_sums[:] = torch.as_tensor(np.random.default_rng(field.steps).normal(size=view.g_sums.shape))
-        twist, isotropy = CompiledStep(view).splats(field, Rates(torch.as_tensor(rates)), 0.7, 100)
+        twist, isotropy = CompiledStep(view).splats(field, Rates(torch.as_tensor(rates)), {"isotropy": 0.7}, 100)
         twists.append(torch.tensor([*twist, isotropy]))
         twists.append(torch.as_tensor(view.backward_pose(field.params)))
     return {"params": field.params, "moment1": field.moment1, "moment2": field.moment2, "twists": torch.cat(twists)}

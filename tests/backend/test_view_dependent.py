@@ -1,6 +1,7 @@
 """The step of view-dependent colour: its gradients against finite differences, kernels against the definition."""
 
 from copy import deepcopy
+from itertools import repeat
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ from torch import Tensor
 
 from sigmasplat.config import MappingConfig
 from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.field import TorchStep, _step_for, fit_field, loss_weights
+from sigmasplat.fit.field import _step_for, fit_field, loss_weights
+from sigmasplat.fit.step import TorchStep
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.fit.view_dependent import ViewDependentStep
 from sigmasplat.model import se3
@@ -41,12 +43,18 @@ def draw_gradients(view: View) -> None:
     view.g_sums[:, :h, :w] = g_sums
 
 
+def target_of(view: View) -> Target:
+    """Make a black image without depth: a first step of no weight needs one, and looks at nothing of it."""
+    size, c = view.alpha.shape, view.camera
+    return Target(c, torch.zeros(3, *size), torch.zeros(size), 0)
+
+
 def gradients(field: GaussianField, view: View, T: np.ndarray, degree: int) -> tuple[Tensor, Tensor, Tensor]:
     """Read the gradients [N, 17], [N, 45] of a first step off Adam's first moments (0.1 g), and the twist [6]."""
     step = ViewDependentStep(TorchStep(view), degree)
-    step.forward(field, T)
+    step.forward(field, T, target_of(view), {})
     draw_gradients(view)
-    twist, _ = step.splats(field, DESCENT, 0.0, 0)
+    twist, _ = step.splats(field, DESCENT, {}, 0)
     return field.moment1 * 10, field.extras["harmonics"].moment1 * 10, torch.as_tensor(twist)
 
 
@@ -140,7 +148,7 @@ def test_harmonics_learn_a_colour_that_depends_on_the_view() -> None:
     for degree in (0, 1, 2):
         field = GaussianField(true.params.clone())
         field.params[:, COLUMNS["colors"]] = 0.5
-        fit = fit_field(field, view, [keyframes[i % 6] for i in range(120)], config, rates, degree=degree)
+        fit = fit_field(field, view, [[keyframes[i % 6]] for i in range(120)], config, repeat(rates), degree=degree)
         losses.append(np.mean(fit.losses[-6:]))
         assert ("harmonics" in field.extras) == (degree > 0)
         assert torch.equal(field.params[:, :11], true.params[:, :11])
@@ -154,7 +162,7 @@ def test_fits_agree_on_both_backends() -> None:
     for view in views():
         field = GaussianField(true.params.clone())
         order = [seen_from(true, T, view) for T in (*walk(), *walk()[:4])]
-        fit = fit_field(field, view, order, MappingConfig(weight_nll_color=1e-2), degree=2)
+        fit = fit_field(field, view, [[k] for k in order], MappingConfig(weight_nll_color=1e-2), degree=2)
         fields.append((field, fit.losses))
     (a, losses_a), (b, losses_b) = fields
     np.testing.assert_allclose(losses_a, losses_b, rtol=2e-2)
@@ -171,7 +179,7 @@ def test_frozen_colours_keep_their_harmonics_too() -> None:
     field = deepcopy(true)
     field.params[:, COLUMNS["colors"]] += 0.1
     before = deepcopy(field)
-    fit_field(field, view, [seen_from(true, np.eye(4), view)], MappingConfig(), frozen_colors=60, degree=3)
+    fit_field(field, view, [[seen_from(true, np.eye(4), view)]], MappingConfig(), frozen_colors=60, degree=3)
     for now, then in (
         (field.colors, before.colors),
         (field.extras["harmonics"].params, before.extras["harmonics"].params),

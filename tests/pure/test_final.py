@@ -209,9 +209,7 @@ def test_degrees_grow_and_faded_splats_go(monkeypatch: pytest.MonkeyPatch) -> No
     store.submaps[1].field.params[-5:, 10] = -8.0
     used = []
 
-    def fit(
-        field: GaussianField, view: object, order: object, mapping: MappingConfig, rates: object, degree: int
-    ) -> object:
+    def fit(field: GaussianField, view: object, order: object, mapping: MappingConfig, degree: int) -> object:
         steps = len(list(order))  # type: ignore[call-overload]
         used.append((steps, degree, len(field)))
         return type("Fit", (), {"losses": [0.0] * steps})()

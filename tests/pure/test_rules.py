@@ -57,7 +57,8 @@ def test_a_loss_jumps_against_the_median_of_its_recent_past() -> None:
 
 
 def shares(keyframes: int, newest_probability: float, history: int = 0, draws: int = 20_000) -> dict[int, float]:
-    found = Counter(draw_keyframes(range(keyframes), draws, newest_probability, history, np.random.default_rng(0)))
+    drawn = draw_keyframes(range(keyframes), draws, newest_probability, history, np.random.default_rng(0))
+    found = Counter(keyframe for (keyframe,) in drawn)
     return {keyframe: count / draws for keyframe, count in found.items()}
 
 

@@ -101,7 +101,7 @@ def fitted(fixed: bool, **rates: float) -> Keyframe:
     frame = Frame(0, 0.0, color, np.full((6, 8), 2.0, np.float32), CAMERA)
     stands = se3.exp(np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0]))
     seen = Keyframe(0, Target.of(frame, (6, 8)), stands.copy(), fixed)
-    fit_field(field, view, [seen] * 3, MappingConfig(**rates))
+    fit_field(field, view, [[seen]] * 3, MappingConfig(**rates))
     return seen
 
 

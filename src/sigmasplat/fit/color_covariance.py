@@ -11,12 +11,22 @@ from torch import Tensor
 
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import ROWS_AT_ONCE, Rates, adam_rows
+from sigmasplat.fit.step import Weights, shape_pull
 from sigmasplat.fit.target import Target
-from sigmasplat.fit.view_dependent import isotropy
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.render import reference
 from sigmasplat.render.render import covariance_features, covariance_of
-from sigmasplat.render.view import NO_LAYERS, CpuView, Layers, Matrix, ReferenceView, View, reaches, twist_matrix
+from sigmasplat.render.view import (
+    NO_LAYERS,
+    CpuView,
+    Layers,
+    Matrix,
+    ReferenceView,
+    View,
+    pull_of,
+    reaches,
+    twist_matrix,
+)
 
 COLORS, SCALES = COLUMNS["colors"], COLUMNS["log_scales"]
 PLANES, SLOTS = 10, 11
@@ -43,6 +53,7 @@ class CovarianceView:
         self._slots = view.sums.new_zeros(SLOTS, *size)
         self.sums, self.g_sums = self._slots[:PLANES], view.sums.new_zeros(PLANES, *size)
         self.alpha, self.g_alpha, self.moment, self._depth = (view.sums.new_zeros(size) for _ in range(4))
+        self.g_moment, self.g_median_depth = (view.sums.new_zeros(size) for _ in range(2))
         self.layers = Layers.of(*size)
 
     def forward(
@@ -86,8 +97,10 @@ class CovarianceView:
         if layers:
             self.layers.fill(b, z.detach())
 
-    def backward(self, params: Tensor, g_params: Tensor) -> Matrix:
+    def backward(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Matrix:
         *gradients, self.g_correlations, g_twist = self._carry(self.g_sums, self.g_alpha)
+        if pull is not None:
+            pull.copy_(pull_of(self._g_means2d, self.camera))
         for columns, gradient in zip(COLUMNS.values(), gradients, strict=True):
             g_params[:, columns] = gradient
         return np.asarray(g_twist.numpy(), np.float64)
@@ -105,6 +118,7 @@ class CovarianceView:
             g_blended = tuple(torch.empty_like(x) for x in self._blended)
             g_slots = torch.cat([g_sums, torch.zeros_like(g_sums[:1])])
             self._raster.blend_backward(self._slots, None, self.alpha, g_slots, None, g_alpha, *g_blended)
+        self._g_means2d = g_blended[0]
         return torch.autograd.grad(self._splats, (*self._leaves, self._twist), g_blended)
 
     def visible(self, n: int) -> Tensor:
@@ -114,7 +128,7 @@ class CovarianceView:
 class ImageTerms(Protocol):
     """What is needed of another step: the gradient of the image terms that it knows."""
 
-    def images(self, target: Target, weights: dict[str, float]) -> float:
+    def images(self, target: Target, weights: Weights) -> float:
         """Write the gradient of the image terms to the first seven gradient planes; return the loss."""
         ...
 
@@ -134,14 +148,14 @@ class FullCovarianceStep:
         """Return the view it renders to."""
         return self._wide
 
-    def forward(self, field: GaussianField, T_camera_world: Matrix) -> None:
+    def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
         """Render the field to the view's planes."""
         self._wide.forward(field.params, T_camera_world)
 
-    def images(self, target: Target, weights: dict[str, float]) -> float:
+    def images(self, target: Target, weights: Weights) -> float:
         """Write the gradient of every image term to the view's gradient planes; return the loss."""
         v, name = self._wide, "nll_color_full"
-        loss = self._others.images(target, weights | {name: 0.0})
+        loss = self._others.images(target, {**weights, name: 0.0})
         v.g_sums[7:] = 0.0
         h, w = target.camera.height, target.camera.width
         color, second = (v.sums[part, :h, :w].detach().requires_grad_() for part in (slice(0, 3), slice(4, 10)))
@@ -158,22 +172,24 @@ class FullCovarianceStep:
         return loss + float(term.detach())
 
     def splats(
-        self, field: GaussianField, rates: Rates, weight_isotropy: float, frozen_colors: int
+        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, pull: Tensor | None = None
     ) -> tuple[Matrix, float]:
-        """Carry the planes to the splats in view, add the isotropy term's pull on them, and step, correlations too.
+        """Carry the planes to the splats in view, add the shape terms' pull on them, and step, correlations too.
 
-        Returns the pose twist [6] and what the splats in view add to the isotropy term, weighted.
+        Returns the pose twist [6] and what the shape terms cost. `pull` is filled as by `View.backward`.
         """
-        grad, regulariser = torch.zeros_like(field.params), 0.0
-        twist = self._wide.backward(field.params, grad)
+        grad, cost = torch.zeros_like(field.params), 0.0
+        twist = self._wide.backward(field.params, grad, pull)
         correlations, correlation_rates = self._wide.correlations, rates.of_extra("correlations")
         correlations.steps += 1
-        for rows in torch.split(self._wide.visible(len(field)).nonzero().squeeze(1), ROWS_AT_ONCE):
+        visible = self._wide.visible(len(field)).nonzero().squeeze(1)
+        for rows in torch.split(visible, ROWS_AT_ONCE):
             g = grad[rows]
             g[rows < frozen_colors, COLORS] = 0.0
-            pull, term = isotropy(field.params[rows][:, SCALES], weight_isotropy * len(rows) / len(field))
-            g[:, SCALES] += pull
-            regulariser += term
+            shares = len(rows) / len(field), len(rows) / len(visible)
+            g_scales, term = shape_pull(field.params[rows][:, SCALES], weights, *shares)
+            g[:, SCALES] += g_scales
+            cost += term
             adam_rows(field, rows, g, rates)
             adam_rows(correlations, rows, self._wide.g_correlations[rows], correlation_rates)
-        return twist, regulariser
+        return twist, cost

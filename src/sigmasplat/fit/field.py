@@ -1,22 +1,23 @@
 """fit_field: adjust the splats to keyframes, and the keyframes' poses too if asked. Mapping is this one function."""
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field as dataclass_field
+from itertools import repeat
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig
-from sigmasplat.fit import losses
-from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates, adam_step, settle
+from sigmasplat.errors import ConfigError
+from sigmasplat.fit.adam import Rates, settle
 from sigmasplat.fit.color_covariance import CovarianceView, FullCovarianceStep
-from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.fit.step import COMPILED_TERMS, CompiledImages, CompiledStep, Gathered, TorchStep
+from sigmasplat.fit.target import Keyframe
 from sigmasplat.fit.view_dependent import ViewDependentStep
 from sigmasplat.model import se3
-from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.render.render import variance_of
+from sigmasplat.model.field import GaussianField
 from sigmasplat.render.view import CpuView, Matrix, ReferenceView, View
 
 
@@ -35,7 +36,8 @@ class FieldFit:
 
 
 def loss_weights(config: MappingConfig) -> dict[str, float]:
-    """List the mapping loss as (term, weight), VarSplat §2: 0.8 L1 + 0.2 (1 − SSIM) + depth + L_reg + NLL."""
+    """List the mapping loss as (term, weight): VarSplat §2, 0.8 L1 + 0.2 (1 − SSIM) + depth + L_reg + NLL; CG-SLAM
+    eq. 18, with alignment, isotropy as a ratio, and U."""
     full = config.color_covariance == "full"
     return {
         "l1": config.weight_l1,
@@ -45,158 +47,121 @@ def loss_weights(config: MappingConfig) -> dict[str, float]:
         "nll_color_full": config.weight_nll_color if full else 0.0,
         "nll_depth": config.weight_nll_depth,
         "isotropy": config.weight_isotropy,
+        "isotropy_ratio": config.weight_isotropy_ratio,
+        "alignment": config.weight_alignment,
+        "moment": config.weight_moment,
     }
+
+
+Felt = Callable[[Keyframe, Tensor], None]
+
+
+def not_fixed(keyframe: Keyframe) -> bool:
+    """Tell whether a keyframe's pose may move."""
+    return not keyframe.fixed
 
 
 def fit_field(
     field: GaussianField,
     view: View,
-    keyframes: Iterable[Keyframe],
+    batches: Iterable[Sequence[Keyframe]],
     config: MappingConfig,
-    rates: Rates | None = None,
+    schedule: Iterable[Rates] | None = None,
     frozen_colors: int = 0,
     degree: int = 0,
+    may_move: Callable[[Keyframe], bool] = not_fixed,
+    felt: Felt | None = None,
 ) -> FieldFit:
-    """Take one Adam step on the field per keyframe drawn, in the order given; the first `frozen_colors` keep theirs.
+    """Take one Adam step on the field per batch of keyframes, against their mean loss, in the order given.
 
-    degree: of view-dependent colour, fitted too if above 0. Adam's moments live on from fit to fit. A new splat's start
-    from zero while the bias correction has run out, so its first steps are a few times longer: it has farther to go.
+    schedule: the rates of each step; by default those of the settings. The first `frozen_colors` splats keep their
+    colours. degree: of view-dependent colour, fitted too if above 0. may_move: which keyframes' poses follow, at the
+    settings' rates. felt: told how hard each splat's image mean was pulled [N] (3DGS), keyframe by keyframe.
+    Adam's moments live on from fit to fit. A new splat's start from zero while the bias correction has run out, so its
+    first steps are a few times longer: it has farther to go. Raises ConfigError where colour covariances or
+    view-dependent colours are to be fitted to several keyframes at once.
     """
-    fit, rates, weights = FieldFit(), rates or Rates.of(config), loss_weights(config)
+    fit, rates = FieldFit(), Rates.of(config)
     pose_rates = np.repeat([config.lr_pose_translation, config.lr_pose_rotation], 3)
-    step = _step_for(field, view, weights, degree)
-    for keyframe in keyframes:
-        field.steps += 1
-        t = time.perf_counter()
-        step.forward(field, se3.inverse(keyframe.T_world_camera))
-        t = fit.add("forward", t)
-        loss = step.images(keyframe.target, weights)
-        t = fit.add("loss", t)
-        twist, regulariser = step.splats(field, rates, weights["isotropy"], frozen_colors)
-        if pose_rates.any() and not keyframe.fixed:
-            keyframe.move(twist, pose_rates)
-        fit.add("backward", t)
-        fit.losses.append(loss + regulariser)
+    steps = _Steps(field, view, loss_weights(config), frozen_colors, degree, felt)
+    for batch, rates in zip(batches, schedule or repeat(rates), strict=False):  # noqa: B020 # the last ones settle the fit
+        loss, twists = steps.take(batch, rates, fit)
+        fit.losses.append(loss)
+        for keyframe, twist in zip(batch, twists, strict=True):
+            if pose_rates.any() and may_move(keyframe):
+                keyframe.move(twist, pose_rates)
     settle(field, rates, compiled=isinstance(view, CpuView))
     for name, extra in field.extras.items():
         settle(extra, rates.of_extra(name), compiled=False)
     return fit
 
 
+class _Steps:
+    """Adam's steps of one fit."""
+
+    def __init__(
+        self,
+        field: GaussianField,
+        view: View,
+        weights: dict[str, float],
+        frozen_colors: int,
+        degree: int,
+        felt: Felt | None,
+    ) -> None:
+        self.field, self.view, self.weights, self.frozen_colors, self.felt = field, view, weights, frozen_colors, felt
+        self.step = _step_for(field, view, weights, degree)
+        self.pull = None if felt is None else torch.zeros(len(field))
+
+    def take(self, batch: Sequence[Keyframe], rates: Rates, fit: FieldFit) -> tuple[float, list[Matrix]]:
+        """Step against the mean loss of a batch; return that loss, and of each image its own pose twist [6]."""
+        self.field.steps += 1
+        gathered = self._gathered(len(batch))
+        loss, shape, twists = 0.0, 0.0, list[Matrix]()
+        for keyframe in batch:
+            t = time.perf_counter()
+            self.step.forward(self.field, se3.inverse(keyframe.T_world_camera), keyframe.target, self.weights)
+            t = fit.add("forward", t)
+            loss += self.step.images(keyframe.target, self.weights) / len(batch)
+            t = fit.add("loss", t)
+            if gathered is None:
+                twist, shape = self.step.splats(self.field, rates, self.weights, self.frozen_colors, self.pull)
+            else:
+                twist = gathered.add(self.view, self.field, 1.0 / len(batch), self.pull)
+            twists.append(twist)
+            if self.felt is not None and self.pull is not None:
+                self.felt(keyframe, self.pull)
+            t = fit.add("backward", t)
+        if gathered is not None:
+            shape = gathered.step(self.field, rates, self.weights, self.frozen_colors)
+            fit.add("backward", t)
+        return loss + shape, twists
+
+    def _gathered(self, images: int) -> Gathered | None:
+        """Make room for the gradient of several images; None for one, whose step need not hold it."""
+        if images == 1:
+            return None
+        if isinstance(self.step, FullCovarianceStep | ViewDependentStep):
+            raise ConfigError("mapping.frames_per_step must be 1 with full colour covariance or view-dependent colour")
+        return Gathered(self.field)
+
+
 def _step_for(
     field: GaussianField, view: View, weights: dict[str, float], degree: int
-) -> "TorchStep | CompiledStep | FullCovarianceStep | ViewDependentStep":
-    """Take the fused kernels where they know every term that has weight, else the definition."""
+) -> TorchStep | CompiledStep | FullCovarianceStep | ViewDependentStep:
+    """Take the fused kernels where they know every term that has weight, else the definition.
+
+    Raises ConfigError where full colour covariance meets terms that its view does not make maps for.
+    """
     step: TorchStep | CompiledStep | FullCovarianceStep = TorchStep(view)
     compiled = {name for name, weight in weights.items() if weight} <= {*COMPILED_TERMS, "nll_color_full"}
     if weights["nll_color_full"] and isinstance(view, CpuView | ReferenceView):
+        if weights["alignment"] or weights["moment"]:
+            raise ConfigError(
+                "mapping.color_covariance full goes without weight_alignment and weight_moment; set both to 0"
+            )
         wide = CovarianceView(view, field.carry("correlations"))
         fused = compiled and isinstance(view, CpuView)
         step = FullCovarianceStep(wide, CompiledImages(wide) if fused else TorchStep(wide))
     elif compiled and isinstance(view, CpuView):
         step = CompiledStep(view)
     return ViewDependentStep(step, degree) if degree else step
-
-
-class TorchStep:
-    """One mapping step by its definition: terms of `losses`, gradients by autograd, `adam_step`."""
-
-    def __init__(self, view: View) -> None:
-        self.view = view
-
-    def forward(self, field: GaussianField, T_camera_world: Matrix) -> None:
-        """Render the field to the view's planes."""
-        self.view.forward(field.params, T_camera_world)
-
-    def images(self, target: Target, weights: dict[str, float]) -> float:
-        """Write the gradient of every image term to the view's gradient planes; return the loss."""
-        h, w = target.camera.height, target.camera.width
-        planes = self.view.sums.detach().clone().requires_grad_()
-        sums = planes[:, :h, :w].movedim(0, -1)
-        maps: dict[str, Tensor] = {
-            "color": sums[..., :3],
-            "depth": sums[..., 3],
-            "color_target": target.image,
-            "depth_target": target.depth_image,
-            "valid": target.depth_image > 0,
-        }
-        if len(planes) >= 7:
-            maps["variance"] = variance_of(sums)
-        used = {n: x for n, x in weights.items() if n != "isotropy" and (len(planes) >= 7 or not n.startswith("nll"))}
-        loss = losses.total(used, maps)
-        (self.view.g_sums[:],) = torch.autograd.grad(loss, (planes,))
-        return float(loss.detach())
-
-    def splats(
-        self, field: GaussianField, rates: Rates, weight_isotropy: float, frozen_colors: int
-    ) -> tuple[Matrix, float]:
-        """Carry the planes to the splats in view, add the isotropy term's pull on them, and step.
-
-        Returns the pose twist [6] and what the splats in view add to the isotropy term, weighted.
-        """
-        grad, visible = torch.zeros_like(field.params), self.view.visible(len(field))
-        twist = self.view.backward(field.params, grad)
-        leaf = field.params.detach()[visible].requires_grad_()
-        share = len(leaf) / max(len(field), 1)  # the term is a mean over all splats, in view or not
-        regulariser = weight_isotropy * share * losses.isotropy(GaussianField(leaf).scales)
-        grad[visible] += torch.autograd.grad(regulariser, (leaf,))[0]
-        grad[:frozen_colors, COLUMNS["colors"]] = 0.0
-        adam_step(field, grad, rates, visible)
-        return twist, float(regulariser.detach())
-
-
-COMPILED_TERMS = {"l1", "ssim", "depth", "nll_color", "nll_depth", "isotropy"}
-"""What `CompiledImages` knows; with any other term in play, but `nll_color_full`, every step is a `TorchStep`."""
-
-
-class CompiledImages:
-    """The image terms fused in the native kernels, on a view's planes (r, g, b, z[, σ²+c² ×3])."""
-
-    def __init__(self, planes: View) -> None:
-        from sigmasplat.native import _core
-
-        self.core, self.planes = _core, planes
-        self.cache = torch.zeros(_core.ssim_cache_floats(planes.camera.width, planes.camera.height))
-        self.parts = np.zeros(4)
-
-    def images(self, target: Target, weights: dict[str, float]) -> float:
-        """Write the gradient of every image term to the view's gradient planes; return the loss."""
-        width, height, sums, g_sums = target.camera.width, target.camera.height, self.planes.sums, self.planes.g_sums
-        local = [weights[name] for name in ("l1", "depth", "nll_color", "nll_depth")]
-        self.core.mapping_losses(
-            sums, target.color, target.depth, height, local, target.valid_pixels, g_sums, self.parts
-        )
-        if len(sums) < 7:
-            local[2:] = [0.0, 0.0]
-        loss = float(np.dot(local, self.parts))
-        if weights["ssim"]:
-            self.core.ssim_target(target.color, target.depth, width, height, self.cache)
-            similarity = self.core.ssim(
-                sums[:3], target.color, self.cache, width, height, target.depth, -weights["ssim"], g_sums[:3]
-            )
-            loss += weights["ssim"] * (1.0 - similarity)
-        return loss
-
-
-class CompiledStep(CompiledImages):
-    """The same step fused in the native kernels (tests hold it to `TorchStep`)."""
-
-    def __init__(self, view: CpuView) -> None:
-        super().__init__(view)
-        self.view = view
-
-    def forward(self, field: GaussianField, T_camera_world: Matrix) -> None:
-        """Render the field to the view's planes."""
-        self.view.forward(field.params, T_camera_world)
-
-    def splats(
-        self, field: GaussianField, rates: Rates, weight_isotropy: float, frozen_colors: int
-    ) -> tuple[Matrix, float]:
-        """Do what `TorchStep.splats` does in one pass, without a gradient row in memory."""
-        twist, v = np.zeros(6), self.view
-        isotropy = v.raster.step(
-            field.params, field.moment1, field.moment2, field.last_step, v.sums, v.alpha, v.g_sums,
-            rates.per_column.numpy(), BETA1, BETA2, EPSILON, field.steps, weight_isotropy, frozen_colors,
-            twist, v.seconds[3:],
-        )  # fmt: skip
-        return twist, weight_isotropy * isotropy

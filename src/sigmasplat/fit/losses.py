@@ -5,7 +5,8 @@ A term is a function registered by `@term`; its name is what a weight is given t
 
 Maps: color, color_target [H, W, 3] in [0, 1]; depth, depth_target [H, W] m; variance [H, W, 3] (V, VarSplat §1);
 covariance [H, W, 6] (V with what lies beside its diagonal: rr, gg, bb, rg, rb, gb); moment [H, W] m² (U, CG-SLAM
-eq. 10); valid [H, W] bool, pixels with a depth reading; scales [N, 3] m.
+eq. 10); median_depth [H, W] m, 0 = none (CG-SLAM eq. 8); valid [H, W] bool, pixels with a depth reading; scales
+[N, 3] m.
 Every image term is a mean over valid pixels (and channels), SSIM over all pixels of the masked images; without valid
 pixels it is 0 with zero gradient, never NaN.
 """
@@ -105,6 +106,12 @@ def isotropy(scales: Tensor) -> Tensor:
 
 
 @term
+def isotropy_ratio(scales: Tensor) -> Tensor:
+    """Take mean max(s_i) / min(s_i) − 1 over splats in view (CG-SLAM eq. 17, ε = 1); 0 without splats."""
+    return (scales.amax(1) / scales.amin(1) - 1.0).sum() / max(len(scales), 1)
+
+
+@term
 def nll_color(color: Tensor, color_target: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
     """Take the Gaussian NLL of the colour residual under V (VarSplat §2, L_var); trains variance only."""
     return gaussian_nll(color - color_target, variance, valid)
@@ -149,3 +156,12 @@ def nll_color_full(color: Tensor, color_target: Tensor, covariance: Tensor, vali
 def moment(moment: Tensor, valid: Tensor) -> Tensor:
     """Take mean |U| in m² over valid pixels (CG-SLAM, L_var)."""
     return mean_over(masked(moment, valid).abs(), valid)
+
+
+@term
+def alignment(depth: Tensor, median_depth: Tensor, valid: Tensor) -> Tensor:
+    """Take mean |D̂ − D̂m| in metres over valid pixels, 0 where no splat takes half the light (CG-SLAM eq. 16).
+
+    Both sides are pulled: surfaces come to lie where half the light is gone.
+    """
+    return masked((depth - median_depth).abs(), valid & (median_depth > 0)).sum() / valid.sum().clamp(min=1)

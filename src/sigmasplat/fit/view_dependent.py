@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from sigmasplat.fit import losses
 from sigmasplat.fit.adam import ROWS_AT_ONCE, Rates, adam_rows
+from sigmasplat.fit.step import Weights, render_for, shape_pull
 from sigmasplat.fit.target import Target
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.model.harmonics import basis, count, view_colors
@@ -22,7 +22,7 @@ class ImageStep(Protocol):
     @property
     def view(self) -> View: ...
 
-    def images(self, target: Target, weights: dict[str, float]) -> float:
+    def images(self, target: Target, weights: Weights) -> float:
         """Write the gradient of every image term to the view's gradient planes; return the loss."""
         ...
 
@@ -39,7 +39,7 @@ class ViewDependentStep:
         self.width = 3 * count(degree)
         self._rows, self._R, self._position = torch.empty(0), torch.empty(0), torch.empty(0)
 
-    def forward(self, field: GaussianField, T_camera_world: Matrix) -> None:
+    def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
         """Render the field, as it looks from there, to the view's planes."""
         self._R, t = (
             torch.as_tensor(part).to(field.params) for part in (T_camera_world[:3, :3], T_camera_world[:3, 3])
@@ -51,35 +51,36 @@ class ViewDependentStep:
             own, k = field.params.index_select(0, rows), harmonics.index_select(0, rows)
             own[:, COLORS] = view_colors(own[:, COLORS], k, own[:, MEANS], self._position, self.degree)
             self._rows.index_copy_(0, rows, own)
-        self.view.forward(self._rows, T_camera_world)
+        render_for(self.view, self._rows, T_camera_world, target, weights)
 
-    def images(self, target: Target, weights: dict[str, float]) -> float:
+    def images(self, target: Target, weights: Weights) -> float:
         """Write the gradient of every image term to the view's gradient planes; return the loss."""
         return self.base.images(target, weights)
 
     def splats(
-        self, field: GaussianField, rates: Rates, weight_isotropy: float, frozen_colors: int
+        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, pull: Tensor | None = None
     ) -> tuple[Matrix, float]:
-        """Carry the planes to the splats in view and their harmonics, add the isotropy term's pull on them, and step.
+        """Carry the planes to the splats in view and their harmonics, add the shape terms' pull on them, and step.
 
-        Returns the pose twist [6] and what the splats in view add to the isotropy term, weighted.
+        Returns the pose twist [6] and what the shape terms cost. `pull` is filled as by `View.backward`.
         """
-        grad, regulariser = torch.zeros_like(field.params), 0.0
-        twist = self.view.backward(self._rows, grad)
+        grad, cost = torch.zeros_like(field.params), 0.0
+        twist = self.view.backward(self._rows, grad, pull)
         harmonics = self._begin(field.carry("harmonics"))
         harmonic_rates = Rates(rates.of_extra("harmonics").per_column[: self.width])
-        for rows in torch.split(self.view.visible(len(field)).nonzero().squeeze(1), ROWS_AT_ONCE):
+        visible = self.view.visible(len(field)).nonzero().squeeze(1)
+        for rows in torch.split(visible, ROWS_AT_ONCE):
             g, own, k = (x.index_select(0, rows) for x in (grad, field.params, harmonics.params))
             g[rows < frozen_colors, COLORS] = 0.0
             g_harmonics, g_means = self._through_colors(own, k, g[:, COLORS])
-            pull, term = isotropy(own[:, SCALES], weight_isotropy * len(rows) / len(field))
+            g_scales, term = shape_pull(own[:, SCALES], weights, len(rows) / len(field), len(rows) / len(visible))
             g[:, MEANS] += g_means
-            g[:, SCALES] += pull
+            g[:, SCALES] += g_scales
             twist[:3] += (self._R @ g_means.sum(0)).numpy()  # a camera that moves by ρ leaves the directions to −ρ
-            regulariser += term
+            cost += term
             adam_rows(field, rows, g, rates)
             adam_rows(harmonics, rows, g_harmonics, harmonic_rates)
-        return twist, regulariser
+        return twist, cost
 
     def _begin(self, harmonics: Rows) -> Rows:
         """Begin a step of the harmonics; return those of the degrees in use, in the memory of all."""
@@ -97,10 +98,3 @@ class ViewDependentStep:
         g_values = (harmonics.reshape(-1, self.width // 3, 3) @ g_shown[:, :, None])[:, :, 0]
         (g_means,) = torch.autograd.grad(values, means, g_values)
         return g_harmonics.reshape(-1, self.width), g_means
-
-
-def isotropy(log_scales: Tensor, weight: float) -> tuple[Tensor, float]:
-    """Return the pull of the weighted isotropy term on log scales [n, 3], and its value."""
-    leaf = log_scales.clone().requires_grad_()
-    term = weight * losses.isotropy(leaf.exp())
-    return torch.autograd.grad(term, leaf)[0], float(term.detach())

@@ -64,6 +64,7 @@ struct Render {                                       // what one forward pass l
     Buffer<Box> boxes;
     Buffer<int> tiles_of, tile_begin, histogram, chunk_begin;   // chunk_begin: first slot of each chunk
     Buffer<uint64_t> items;
+    Buffer<float> median_gradient;
     Scratch* scratch = nullptr;
     int threads = 0;
 
@@ -84,7 +85,7 @@ struct Render {                                       // what one forward pass l
     size_t plane() const { return padded_width() * tiles_y * TILE_HEIGHT; }
     size_t bytes() const {
         size_t b = rows.bytes() + boxes.bytes() + partials.bytes() + tiles_of.bytes() + items.bytes() + histogram.bytes()
-                   + tile_begin.bytes();
+                   + tile_begin.bytes() + median_gradient.bytes();
         for (int t = 0; t < threads; t++) b += scratch[t].bytes();
         return b;
     }

@@ -20,13 +20,20 @@ struct Outputs {                           // planes of Hp × Wp, padded to whol
     float* median_depth = nullptr;         // with the ids, or null
 };
 
-struct OutputGradients { const float *sums, *moment, *alpha; };   // planes like Outputs; moment and alpha may be null
+struct OutputGradients {                   // planes like Outputs; all but sums may be null, median_id where median_depth is
+    const float *sums, *moment, *alpha;
+    const int* median_id = nullptr;
+    const float* median_depth = nullptr;
+};
 
 struct SplatGradients { float *means2d, *conics, *z, *opacities, *features; };
 
-struct LossWeights { float l1, depth, nll_color, nll_depth; };
+struct LossWeights { float l1, depth, nll_color, nll_depth, alignment, moment; };
+struct DepthMaps { const float *median_depth, *moment; };                              // null where their weight is 0
+struct DepthGradients { float *median_depth, *moment; };
 
 struct AdamOptions { const float* rates; float beta1, beta2, epsilon; int step; };   // rates: one per column
+struct StepOptions { float isotropy, isotropy_ratio; int64_t frozen_colors; };
 struct AdamState { float *moment1, *moment2; int* last_step; };                       // last_step: when a row last moved
 
 struct Plane { int width, height; size_t stride, plane; };   // image planes of rows `stride` floats long, `plane` floats apart
@@ -68,9 +75,11 @@ struct Kernels {
     // Fused: rows of raw parameters [n, 17] straight to images of (r, g, b, z[, q, q, q]) with q = σ² + c².
     void (*view_forward)(Context*, const float* view, const float* params, int64_t n, int k, const float* reference,
                          BlendOptions, Outputs, double* seconds);
-    void (*view_backward)(Context*, const float* params, Outputs, OutputGradients, float* g_params, double* g_twist, double* seconds);
-    double (*view_step)(Context*, float* params, Outputs, OutputGradients, AdamState, AdamOptions, float isotropy_weight,
-                        int64_t frozen_colors, double* g_twist, double* seconds);
+    // pull [n], or null: |∂L/∂mean| in the image, per half image size.
+    void (*view_backward)(Context*, const float* params, Outputs, OutputGradients, float* g_params, float* pull, double* g_twist,
+                          double* seconds);
+    double (*view_step)(Context*, float* params, Outputs, OutputGradients, AdamState, AdamOptions, StepOptions, float* pull,
+                        double* g_twist, double* seconds);
     void (*adam_settle)(float* params, int64_t n, AdamState, AdamOptions);
     void (*view_backward_pose)(Context*, const float* params, Outputs, OutputGradients, double* g_twist, double* seconds);
     void (*view_visible)(const Context*, uint8_t* visible);
@@ -78,8 +87,8 @@ struct Kernels {
     double (*ssim)(const float* image, const float* target, const float* cache, int width, int height, size_t stride,
                    size_t plane, const float* mask, float weight, float* gradient);
     void (*mapping_losses)(const float* sums, const float* target_color, const float* target_depth, int height,
-                           size_t stride, size_t plane, bool variance, LossWeights, double valid_pixels, float* g_sums,
-                           double* losses);
+                           size_t stride, size_t plane, bool variance, DepthMaps, LossWeights, double valid_pixels,
+                           float* g_sums, DepthGradients, double* losses);
     double (*tracking_loss)(const float* sums, const float* alpha, bool variance, const float* target_color,
                             const float* target_depth, Plane, TrackOptions, float gain, float offset, float* g_sums,
                             double* g_exposure);

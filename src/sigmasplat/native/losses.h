@@ -1,6 +1,6 @@
 // The mapping loss on image planes and its gradient, in one pass; fit/losses.py is the definition of every term.
 // `sums` are planes (r, g, b, z[, q, q, q]); a pixel counts where the target depth is above 0. The gradient planes are
-// written whole (0 where nothing counts).
+// written whole (0 where nothing counts), those of the median depth and of U only where these are given.
 constexpr float NLL_EPSILON = 1e-6f;
 
 SIGMA_INLINE vf signed_weight(vf error, float weight) {
@@ -8,14 +8,14 @@ SIGMA_INLINE vf signed_weight(vf error, float weight) {
 }
 
 static void mapping_losses(const float* sums, const float* target_color, const float* target_depth, int height,
-                           size_t stride, size_t plane, bool variance, LossWeights weights, double valid_pixels,
-                           float* g_sums, double* losses) {
+                           size_t stride, size_t plane, bool variance, DepthMaps maps, LossWeights weights, double valid_pixels,
+                           float* g_sums, DepthGradients gradients, double* losses) {
     const float per_pixel = float(1.0 / (valid_pixels > 1 ? valid_pixels : 1)), per_value = per_pixel / 3.f;
     Buffer<double> rows;
-    rows.reserve(size_t(height) * 4);
+    rows.reserve(size_t(height) * 6);
 #pragma omp parallel for schedule(static)
     for (int y = 0; y < height; y++) {
-        vf total[4];
+        vf total[6];
         for (auto& t : total) t = splat(0.f);
         for (size_t x = 0; x < stride; x += W) {
             const size_t at = size_t(y) * stride + x;
@@ -23,7 +23,21 @@ static void mapping_losses(const float* sums, const float* target_color, const f
             const Mask valid = gt(depth, zero);
             const vf depth_error = only(valid, load(sums + 3 * plane + at) - depth);
             total[1] += abs(depth_error);
-            store(g_sums + 3 * plane + at, signed_weight(depth_error, weights.depth * per_pixel));
+            vf g_depth = signed_weight(depth_error, weights.depth * per_pixel);
+            if (maps.median_depth) {                  // both sides are pulled; where no splat takes half the light there is none
+                const vf median = load(maps.median_depth + at);
+                const vf apart = only(both(valid, gt(median, zero)), load(sums + 3 * plane + at) - median);
+                const vf g = signed_weight(apart, weights.alignment * per_pixel);
+                total[4] += abs(apart);
+                g_depth += g;
+                store(gradients.median_depth + at, zero - g);
+            }
+            if (maps.moment) {
+                const vf U = only(valid, load(maps.moment + at));
+                total[5] += abs(U);
+                store(gradients.moment + at, signed_weight(U, weights.moment * per_pixel));
+            }
+            store(g_sums + 3 * plane + at, g_depth);
             for (int c = 0; c < 3; c++) {
                 const vf color = load(sums + c * plane + at), error = only(valid, color - load(target_color + c * plane + at));
                 vf g = signed_weight(error, weights.l1 * per_value);
@@ -43,16 +57,20 @@ static void mapping_losses(const float* sums, const float* target_color, const f
                 store(g_sums + c * plane + at, g);
             }
         }
-        for (int k = 0; k < 4; k++) rows[size_t(y) * 4 + k] = lane_sum(total[k]);
+        for (int k = 0; k < 6; k++) rows[size_t(y) * 6 + k] = lane_sum(total[k]);
     }
-    const double scale[4] = {1.0 / 3, 1.0, 1.0 / 3, 1.0 / 3};
-    for (int k = 0; k < 4; k++) {
+    const double scale[6] = {1.0 / 3, 1.0, 1.0 / 3, 1.0 / 3, 1.0, 1.0};
+    for (int k = 0; k < 6; k++) {
         losses[k] = 0;
-        for (int y = 0; y < height; y++) losses[k] += rows[size_t(y) * 4 + k];
+        for (int y = 0; y < height; y++) losses[k] += rows[size_t(y) * 6 + k];
         losses[k] *= scale[k] * per_pixel;
     }
-    for (int c = 0; c < (variance ? 7 : 4); c++)      // rows of padding below the image
-        memset(g_sums + c * plane + size_t(height) * stride, 0, (plane - size_t(height) * stride) * sizeof(float));
+    const auto clear_padding = [&](float* gradient) {   // the rows below the image
+        memset(gradient + size_t(height) * stride, 0, (plane - size_t(height) * stride) * sizeof(float));
+    };
+    for (int c = 0; c < (variance ? 7 : 4); c++) clear_padding(g_sums + c * plane);
+    if (maps.median_depth) clear_padding(gradients.median_depth);
+    if (maps.moment) clear_padding(gradients.moment);
 }
 
 // |s − mean(s)| summed over W splats' axes (losses.isotropy, to be divided by 3n): return it over those seen, add
@@ -67,4 +85,21 @@ SIGMA_INLINE double add_isotropy(const vf* s, Mask seen, float scale, float (*gr
     const vf shared = (sign[0] + sign[1] + sign[2]) * (1.f / 3.f);
     for (int k = 0; k < 3; k++) store(gradient[k], load(gradient[k]) + only(seen, scale * (sign[k] - shared) * s[k]));
     return lane_sum(total);
+}
+
+// max(s)/min(s) − 1 summed over W splats (losses.isotropy_ratio, to be divided by the number seen): as `add_isotropy`.
+SIGMA_INLINE double add_isotropy_ratio(const vf* s, Mask seen, float scale, float (*gradient)[W]) {
+    const vf most = max(max(s[0], s[1]), s[2]), least = min(min(s[0], s[1]), s[2]), ratio = most / least, one = splat(1.f);
+    vf is_most[3], is_least[3], mosts = splat(0.f), leasts = splat(0.f);
+    for (int k = 0; k < 3; k++) {                     // equals share the pull
+        is_most[k] = only(ge(s[k], most), one);
+        is_least[k] = only(ge(least, s[k]), one);
+        mosts += is_most[k];
+        leasts += is_least[k];
+    }
+    for (int k = 0; k < 3; k++) {
+        const vf pull = scale * ratio * (is_most[k] / mosts - is_least[k] / leasts);
+        store(gradient[k], load(gradient[k]) + only(seen, pull));
+    }
+    return lane_sum(only(seen, ratio - one));
 }

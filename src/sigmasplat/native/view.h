@@ -155,11 +155,29 @@ static void view_forward(Context* context, const float* view_numbers, const floa
     if (seconds) { seconds[0] += t1 - t0; seconds[1] += t2 - t1; seconds[2] += omp_get_wtime() - t2; }
 }
 
+// ∂L/∂(median depth) is felt by the depth of one splat a pixel; in the pixels' order, so that sums do not depend on threads.
+static const float* gather_median(Render& r, OutputGradients g) {
+    if (!g.median_depth) return nullptr;
+    float* sums = r.median_gradient.reserve(r.n + W);
+    memset(sums, 0, size_t(r.n + W) * sizeof(float));
+    const size_t stride = r.padded_width();
+    for (int y = 0; y < r.height; y++)
+        for (int x = 0; x < r.width; x++) {
+            const size_t at = size_t(y) * stride + x;
+            if (g.median_id[at] >= 0) sums[g.median_id[at]] += g.median_depth[at];
+        }
+    return sums;
+}
+
 // Chain the reduced records of all splats to the pose twist, and to rows of parameters: where any of W splats is seen,
 // `sink(i, seen, splats, gradient lanes)` takes what ∂L/∂params is; `unseen(i)` hears of the others.
+// g_median: of `gather_median`; pull [n], or null: |∂L/∂mean| in the image, per half image size, 0 where unseen.
 template <int K, bool MOMENT, class Sink, class Unseen>
-static void chain_to_params(const Render& r, const float* params, double* g_twist, Sink sink, Unseen unseen) {
+static void chain_to_params(const Render& r, const float* params, const float* g_median, float* pull, double* g_twist, Sink sink,
+                            Unseen unseen) {
     constexpr int RECORD = record_floats<K, MOMENT>;
+    const float half_width = 0.5f * float(r.width), half_height = 0.5f * float(r.height);
+    if (pull) memset(pull, 0, size_t(r.n) * sizeof(float));
     const int64_t chunks = (r.n + CHUNK - 1) / CHUNK;
     Buffer<double> partial;
     partial.reserve(chunks * 6 + 1);
@@ -181,6 +199,13 @@ static void chain_to_params(const Render& r, const float* params, double* g_twis
             FootprintGradient<vf> g = footprint_gradient(moments_of(sums), p.l1, p.l2, p.l3);
             g.z = weight_sum(sums, 3);
             if constexpr (MOMENT) g.z += fma(p.z, weight_sum(sums, K), weight_sum(sums, K + 1));
+            if (g_median) g.z += load(g_median + i);
+            if (pull) {
+                alignas(64) float lanes[W];
+                const vf u = half_width * g.u, v = half_height * g.v;
+                store(lanes, only(seen, sqrt(fma(u, u, v * v))));
+                for (int l = 0; l < W && i + l < r.n; l++) pull[i + l] = lanes[l];
+            }
             ShapeGradient<vf> out;
             project_backward(r.view, s.shape, splat(r.view.near_m), g, out);
             for (int q = 0; q < 6; q++) twist[q] += only(seen, out.twist[q]);
@@ -204,51 +229,57 @@ static void chain_to_params(const Render& r, const float* params, double* g_twis
     }
 }
 template <class Sink, class Unseen>
-static void chain_any(const Render& r, const float* params, bool moment, double* g_twist, Sink sink, Unseen unseen) {
+static void chain_any(Render& r, const float* params, OutputGradients g, float* pull, double* g_twist, Sink sink, Unseen unseen) {
+    const float* g_median = gather_median(r, g);
     const auto chain = [&](auto k) {
         constexpr int K = decltype(k)::value;
-        moment ? chain_to_params<K, true>(r, params, g_twist, sink, unseen)
-               : chain_to_params<K, false>(r, params, g_twist, sink, unseen);
+        g.moment ? chain_to_params<K, true>(r, params, g_median, pull, g_twist, sink, unseen)
+                 : chain_to_params<K, false>(r, params, g_median, pull, g_twist, sink, unseen);
     };
     r.k <= 4 ? chain(std_int<4>{}) : chain(std_int<7>{});
 }
 
-static void view_backward(Context* context, const float* params, Outputs o, OutputGradients g, float* g_params,
+static void view_backward(Context* context, const float* params, Outputs o, OutputGradients g, float* g_params, float* pull,
                           double* g_twist, double* seconds) {
     Render& r = *reinterpret_cast<Render*>(context);
     const double t0 = omp_get_wtime();
     blend_gradients(r, o, g);
     const double t1 = omp_get_wtime();
-    chain_any(r, params, g.moment, g_twist,
+    chain_any(r, params, g, pull, g_twist,
         [&](int64_t i, unsigned, const Splats&, const float (*gradient)[W]) { store_rows<ROW>(g_params, i, r.n, gradient); },
         [&](int64_t i) { memset(g_params + i * ROW, 0, size_t(r.n - i < W ? r.n - i : W) * ROW * sizeof(float)); });
     if (seconds) { seconds[0] += t1 - t0; seconds[1] += omp_get_wtime() - t1; }
 }
 
-// Backward and one Adam step in one go: no gradient row reaches memory. Splats out of view wait (adam.h), and feel no L_reg,
-// whose gradient is that of the mean over all splats. Returns its sum over those in view, over 3n.
+// Backward and one Adam step in one go: no gradient row reaches memory. Splats out of view wait (adam.h), and feel no isotropy
+// term: |s − mean(s)| is a mean over all splats, max(s)/min(s) − 1 over those in view. Returns what both cost, weighted.
 static double view_step(Context* context, float* params, Outputs o, OutputGradients g, AdamState state, AdamOptions options,
-                        float isotropy_weight, int64_t frozen_colors, double* g_twist, double* seconds) {
+                        StepOptions terms, float* pull, double* g_twist, double* seconds) {
     Render& r = *reinterpret_cast<Render*>(context);
     const double t0 = omp_get_wtime();
     blend_gradients(r, o, g);
     const double t1 = omp_get_wtime();
     const AdamRates adam(options);
-    const float scale = isotropy_weight / (3.f * float(r.n > 0 ? r.n : 1));
-    Buffer<double> isotropy;
-    isotropy.reserve(r.n / W + 1);                    // zero where nothing is seen
-    chain_any(r, params, g.moment, g_twist,
+    int64_t visible = 0;
+    if (terms.isotropy_ratio > 0.f)
+        for (int64_t i = 0; i < r.n; i++) visible += r.tiles_of[i] > 0;
+    const float scale = terms.isotropy / (3.f * float(r.n > 0 ? r.n : 1)), scale_ratio = terms.isotropy_ratio / float(visible > 0 ? visible : 1);
+    Buffer<double> cost;
+    cost.reserve(r.n / W + 1);                        // zero where nothing is seen
+    chain_any(r, params, g, pull, g_twist,
         [&](int64_t i, unsigned seen, const Splats& s, float (*gradient)[W]) {
-            isotropy[i / W] = add_isotropy(s.shape.scale, mask_of_bits(seen), scale, gradient + 7);
-            for (int64_t l = 0; l < W && i + l < frozen_colors; l++)
+            cost[i / W] = double(scale) * add_isotropy(s.shape.scale, mask_of_bits(seen), scale, gradient + 7);
+            if (terms.isotropy_ratio > 0.f)
+                cost[i / W] += double(scale_ratio) * add_isotropy_ratio(s.shape.scale, mask_of_bits(seen), scale_ratio, gradient + 7);
+            for (int64_t l = 0; l < W && i + l < terms.frozen_colors; l++)
                 for (int q = 11; q < 14; q++) gradient[q][l] = 0.f;
             adam_rows(adam, params, state, i, r.n, seen, gradient);
         },
         [](int64_t) {});
     double sum = 0;
-    for (int64_t i = 0; i * W < r.n; i++) sum += isotropy[i];
+    for (int64_t i = 0; i * W < r.n; i++) sum += cost[i];
     if (seconds) { seconds[0] += t1 - t0; seconds[1] += omp_get_wtime() - t1; }
-    return sum / (3.0 * double(r.n > 0 ? r.n : 1));
+    return sum;
 }
 
 // ∂L/∂pose alone, from gradients on colour and depth: chained tile by tile, no splat's gradient is ever formed.

@@ -66,6 +66,9 @@ class View(Protocol):
     """U about the reference depth of the last forward pass that was given one, [rows, columns] m² (CG-SLAM eq. 10)."""
     layers: "Layers"
     """Of the last forward pass that was asked for them."""
+    g_moment: Tensor
+    g_median_depth: Tensor
+    """Gradients of `moment` and of the layers' median depth: felt where the last forward pass made those."""
     seconds: NDArray[np.float64]
     """Time spent so far in project, sort, blend, blend backward, project backward."""
 
@@ -75,8 +78,11 @@ class View(Protocol):
         """Render parameter rows [N, 17] at a pose into `sums` and `alpha`; with a depth [H, W] m into `moment` too, and
         if asked to into `layers`."""
 
-    def backward(self, params: Tensor, g_params: Tensor) -> Matrix:
-        """Carry `g_sums`, `g_alpha` to parameter rows, written to g_params [N, 17]; return the pose twist [6]."""
+    def backward(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Matrix:
+        """Carry the gradient planes to parameter rows, written to g_params [N, 17]; return the pose twist [6].
+
+        Written to pull [N], where given, is how hard each splat's image mean is pulled, per half image size (3DGS).
+        """
 
     def backward_pose(self, params: Tensor) -> Matrix:
         """Carry the gradient planes of colour and depth to the pose alone; return the twist [6]."""
@@ -100,8 +106,9 @@ class CpuView:
         size = cpu.padded_size(camera)
         self.sums, self.g_sums = torch.zeros(self._k, *size), torch.zeros(self._k, *size)
         self.alpha, self.g_alpha = torch.zeros(size), torch.zeros(size)
-        self.moment, self._reference = torch.zeros(size), torch.zeros(size)
-        self.layers = Layers.of(*size)
+        self.moment, self.g_moment, self._reference = torch.zeros(size), torch.zeros(size), torch.zeros(size)
+        self.layers, self.g_median_depth = Layers.of(*size), torch.zeros(size)
+        self._made = (False, False)
         self.seconds = np.zeros(5)
 
     def forward(
@@ -111,17 +118,27 @@ class CpuView:
         if depth_reference is not None:
             self._reference[: self.camera.height, : self.camera.width] = depth_reference
             reference_depth, moment = self._reference, self.moment
+        self._made = (depth_reference is not None, layers)
         view, planes = self._numbers(self.camera, T_camera_world, o), self.layers if layers else NO_LAYERS
         self.raster.view_forward(
             view, params, self._k, o.alpha_min, o.transmittance_stop, reference_depth,
             self.sums, moment, self.alpha, *planes, self.seconds[:3],
         )  # fmt: skip
 
-    def backward(self, params: Tensor, g_params: Tensor) -> Matrix:
-        twist = np.zeros(6)
+    def depth_gradients(self) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
+        """Return moment and its gradient, median ids and their depths' gradient: None where not made."""
+        (moment, layers), ids = self._made, self.layers.median_id
+        return (
+            self.moment if moment else None, self.g_moment if moment else None,
+            ids if layers else None, self.g_median_depth if layers else None,
+        )  # fmt: skip
+
+    def backward(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Matrix:
+        twist, (moment, g_moment, median_id, g_median_depth) = np.zeros(6), self.depth_gradients()
         self.raster.view_backward(
-            params, self.sums, None, self.alpha, self.g_sums, None, self.g_alpha, g_params, twist, self.seconds[3:]
-        )
+            params, self.sums, moment, self.alpha, self.g_sums, g_moment, self.g_alpha, median_id, g_median_depth,
+            g_params, pull, twist, self.seconds[3:],
+        )  # fmt: skip
         return twist
 
     def backward_pose(self, params: Tensor) -> Matrix:
@@ -149,7 +166,7 @@ class ReferenceView:
         size = (camera.height, camera.width)
         self.sums, self.g_sums = torch.zeros(self._k, *size), torch.zeros(self._k, *size)
         self.alpha, self.g_alpha, self.moment = torch.zeros(size), torch.zeros(size), torch.zeros(size)
-        self.layers = Layers.of(*size)
+        self.layers, self.g_moment, self.g_median_depth = Layers.of(*size), torch.zeros(size), torch.zeros(size)
         self.seconds = np.zeros(5)
 
     def forward(
@@ -162,26 +179,39 @@ class ReferenceView:
         p = reference.project(f.means, f.quats, f.scales, T, self.camera, self.options)
         features = features_of(f.colors, p.z, f.variances)[:, : self._k]
         b = reference.blend(*p, f.opacities, features, depth_reference, self.camera, self.options)
-        self._maps = (b.sums.movedim(-1, 0), b.alpha)
+        self._maps, self._means2d = [(b.sums.movedim(-1, 0), self.g_sums), (b.alpha, self.g_alpha)], p.means2d
         self._visible = reaches(p, f.opacities.detach(), self.camera, self.options)
-        self.sums.copy_(self._maps[0].detach())
+        self.sums.copy_(b.sums.detach().movedim(-1, 0))
         self.alpha.copy_(b.alpha.detach())
         if b.moment is not None:
             self.moment.copy_(b.moment.detach())
+            self._maps.append((b.moment, self.g_moment))
         if layers:
             self.layers.fill(b, p.z.detach())
+            nearest = p.z[b.median_id.clamp(min=0).long()] if len(f) else torch.zeros_like(b.alpha)
+            self._maps.append((torch.where(b.median_id >= 0, nearest, 0.0), self.g_median_depth))
 
-    def backward(self, params: Tensor, g_params: Tensor) -> Matrix:
-        g_leaf, g_twist = torch.autograd.grad(self._maps, (self._leaf, self._twist), (self.g_sums, self.g_alpha))
+    def backward(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Matrix:
+        maps, gradients = zip(*self._maps, strict=True)
+        leaves = (self._leaf, self._twist, self._means2d)
+        g_leaf, g_twist, g_means2d = torch.autograd.grad(maps, leaves, gradients, materialize_grads=True)
         g_params.copy_(g_leaf)
+        if pull is not None:
+            pull.copy_(pull_of(g_means2d, self.camera))
         return np.asarray(g_twist.numpy(), np.float64)
 
     def backward_pose(self, params: Tensor) -> Matrix:
-        (g_twist,) = torch.autograd.grad(self._maps[0][:4], (self._twist,), (self.g_sums[:4],))
+        (g_twist,) = torch.autograd.grad(self._maps[0][0][:4], (self._twist,), (self.g_sums[:4],))
         return np.asarray(g_twist.numpy(), np.float64)
 
     def visible(self, n: int) -> Tensor:
         return self._visible
+
+
+def pull_of(g_means2d: Tensor, camera: Camera) -> Tensor:
+    """Return how hard image means are pulled, per half image size [N], of their gradients [N, 2] per px (3DGS)."""
+    half_image = g_means2d.new_tensor([camera.width / 2, camera.height / 2])
+    return (g_means2d * half_image).square().sum(1).sqrt()
 
 
 def reaches(p: reference.Projection, opacities: Tensor, camera: Camera, options: RenderConfig) -> Tensor:

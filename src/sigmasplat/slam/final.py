@@ -14,7 +14,6 @@ from torch import Tensor
 
 from sigmasplat.config import Config, FinalConfig, MappingConfig
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField, Rows
@@ -214,7 +213,7 @@ def refine(
     while (done := len(losses)) < final.iterations:
         until_event = min(every - done % every for every in (final.prune_every, final.sh_every))
         degree = min(final.sh_degree, done // final.sh_every)
-        fit = fit_field(field, view, islice(drawn, until_event), mapping, Rates.of(mapping), degree=degree)
+        fit = fit_field(field, view, islice(drawn, until_event), mapping, degree=degree)
         losses += fit.losses
         if len(losses) % final.prune_every == 0:
             field.keep(field.opacities > final.prune_opacity)
@@ -228,8 +227,10 @@ def refinement(config: Config) -> MappingConfig:
     return fixed if config.final.uncertainty else replace(fixed, weight_nll_color=0.0, weight_nll_depth=0.0)
 
 
-def _draw(keyframes: Keyframes, steps: int, random: np.random.Generator, progress: Progress) -> Iterator[Keyframe]:
-    """Draw keyframes evenly, telling before each how many were drawn."""
+def _draw(
+    keyframes: Keyframes, steps: int, random: np.random.Generator, progress: Progress
+) -> Iterator[Sequence[Keyframe]]:
+    """Draw keyframes evenly, one a step, telling before each how many were drawn."""
     for step in range(steps):
         progress(step, steps)
-        yield keyframes[int(random.integers(len(keyframes)))]
+        yield [keyframes[int(random.integers(len(keyframes)))]]

@@ -7,7 +7,6 @@ import torch
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config
-from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.field import FieldFit, fit_field
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.fit.tracking_loss import PoseMaps
@@ -39,7 +38,7 @@ class Mapper:
         fit = FieldFit()
         for half in (iterations // 2, iterations - iterations // 2):
             order = draw_keyframes(self.keyframes, half, c.newest_probability, c.keyframe_history, self.random)
-            done = fit_field(self.field, view, order, c, Rates.of(c), old if c.freeze_old_colors else 0)
+            done = fit_field(self.field, view, order, c, None, old if c.freeze_old_colors else 0)
             old -= self._prune(old)
             fit.losses += done.losses
             for stage, seconds in done.seconds.items():

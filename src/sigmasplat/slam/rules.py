@@ -47,7 +47,7 @@ def jumped(value: float, history: Sequence[float], factor: float) -> bool:
 
 def draw_keyframes(
     keyframes: Sequence[Item], iterations: int, newest_probability: float, history: int, random: np.random.Generator
-) -> Iterator[Item]:
+) -> Iterator[list[Item]]:
     """Draw one keyframe per iteration: the newest with the given probability, else any (VarSplat §2).
 
     history > 0 limits the others to the latest so many.
@@ -55,6 +55,6 @@ def draw_keyframes(
     older = list(keyframes[:-1])[-history:] if history else list(keyframes[:-1])
     for _ in range(iterations):
         if not older or random.random() < newest_probability:
-            yield keyframes[-1]
+            yield [keyframes[-1]]
         else:
-            yield older[int(random.integers(len(older)))]
+            yield [older[int(random.integers(len(older)))]]

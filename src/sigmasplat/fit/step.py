@@ -1,0 +1,173 @@
+"""One mapping step on a view: the image terms' gradient on its planes, from there to the splats, and Adam's step."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sigmasplat.fit import losses
+from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates, adam_step
+from sigmasplat.fit.target import Target
+from sigmasplat.model.field import COLUMNS, GaussianField
+from sigmasplat.render.render import variance_of
+from sigmasplat.render.view import CpuView, Matrix, View
+
+Weights = Mapping[str, float]
+SHAPE_TERMS = ("isotropy", "isotropy_ratio")
+"""Terms of the splats, not of an image."""
+COMPILED_TERMS = {"l1", "ssim", "depth", "nll_color", "nll_depth", "alignment", "moment", *SHAPE_TERMS}
+"""What `CompiledImages` and `CompiledStep` know; any other term, but `nll_color_full`, needs a `TorchStep`."""
+
+
+def render_for(view: View, params: Tensor, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
+    """Render rows to the view's planes, with what the terms that have weight need."""
+    reference = target.depth_image if weights.get("moment") else None
+    view.forward(params, T_camera_world, reference, layers=bool(weights.get("alignment")))
+
+
+def shape_pull(log_scales: Tensor, weights: Weights, of_all: float, of_visible: float) -> tuple[Tensor, float]:
+    """Return the pull of the weighted shape terms on some splats' log scales [n, 3], and what they cost.
+
+    of_all, of_visible: share of these splats among all and among those in view, which each term is a mean over.
+    """
+    leaf, shares = log_scales.clone().requires_grad_(), dict(zip(SHAPE_TERMS, (of_all, of_visible), strict=True))
+    cost = losses.total(
+        {name: weights.get(name, 0.0) * share for name, share in shares.items()}, {"scales": leaf.exp()}
+    )
+    if not cost.requires_grad:
+        return torch.zeros_like(log_scales), 0.0
+    return torch.autograd.grad(cost, leaf)[0], float(cost.detach())
+
+
+class Gathered:
+    """The gradient of several images' mean loss by the splats that any of them shows."""
+
+    def __init__(self, field: GaussianField) -> None:
+        self.grad, self._rows = torch.zeros_like(field.params), torch.zeros_like(field.params)
+        self.visible = torch.zeros(len(field), dtype=torch.bool)
+
+    def add(self, view: View, field: GaussianField, share: float = 1.0, pull: Tensor | None = None) -> Matrix:
+        """Add a view's gradient planes at their share of the mean; return the image's own pose twist [6]."""
+        twist = view.backward(field.params, self._rows, pull)
+        self.visible |= view.visible(len(field))
+        self.grad += share * self._rows
+        return twist
+
+    def step(self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int) -> float:
+        """Add the shape terms' pull, take Adam's step; return what those terms cost."""
+        scales = COLUMNS["log_scales"]
+        of_all = float(self.visible.sum()) / max(len(field), 1)
+        pull, cost = shape_pull(field.params[self.visible][:, scales], weights, of_all, 1.0)
+        rows = self.grad[self.visible]
+        rows[:, scales] += pull
+        self.grad[self.visible] = rows
+        self.grad[:frozen_colors, COLUMNS["colors"]] = 0.0
+        adam_step(field, self.grad, rates, self.visible)
+        return cost
+
+
+class TorchStep:
+    """One mapping step by its definition: terms of `losses`, gradients by autograd, `adam_step`."""
+
+    def __init__(self, view: View) -> None:
+        self.view = view
+
+    def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
+        """Render the field to the view's planes."""
+        render_for(self.view, field.params, T_camera_world, target, weights)
+
+    def images(self, target: Target, weights: Weights) -> float:
+        """Write the gradient of every image term to the view's gradient planes; return the loss."""
+        v, (h, w) = self.view, target.depth_image.shape
+        used = {n: x for n, x in weights.items() if n not in SHAPE_TERMS and (len(v.sums) >= 7 or "nll" not in n)}
+        planes = {"sums": (v.sums, v.g_sums)}
+        if used.get("moment"):
+            planes["moment"] = v.moment, v.g_moment
+        if used.get("alignment"):
+            planes["median_depth"] = v.layers.median_depth, v.g_median_depth
+        leaves = {name: values.detach().clone().requires_grad_() for name, (values, _) in planes.items()}
+        sums = leaves["sums"][:, :h, :w].movedim(0, -1)
+        maps: dict[str, Tensor] = {name: leaf[:h, :w] for name, leaf in leaves.items() if name != "sums"} | {
+            "color": sums[..., :3],
+            "depth": sums[..., 3],
+            "color_target": target.image,
+            "depth_target": target.depth_image,
+            "valid": target.depth_image > 0,
+        }
+        if len(v.sums) >= 7:
+            maps["variance"] = variance_of(sums)
+        loss = losses.total(used, maps)
+        found = torch.autograd.grad(loss, list(leaves.values()), materialize_grads=True)
+        for (_, gradient), value in zip(planes.values(), found, strict=True):
+            gradient.copy_(value)
+        return float(loss.detach())
+
+    def splats(
+        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, pull: Tensor | None = None
+    ) -> tuple[Matrix, float]:
+        """Carry the planes to the splats in view, add the shape terms' pull on them, and step.
+
+        Returns the pose twist [6] and what the shape terms cost. `pull` is filled as by `View.backward`.
+        """
+        gathered = Gathered(field)
+        twist = gathered.add(self.view, field, pull=pull)
+        return twist, gathered.step(field, rates, weights, frozen_colors)
+
+
+class CompiledImages:
+    """The image terms fused in the native kernels, on a view's planes (r, g, b, z[, σ²+c² ×3])."""
+
+    def __init__(self, planes: View) -> None:
+        from sigmasplat.native import _core
+
+        self.core, self.planes = _core, planes
+        self.cache = torch.zeros(_core.ssim_cache_floats(planes.camera.width, planes.camera.height))
+        self.parts = np.zeros(6)
+
+    def images(self, target: Target, weights: Weights) -> float:
+        """Write the gradient of every image term to the view's gradient planes; return the loss."""
+        width, height, v = target.camera.width, target.camera.height, self.planes
+        names = ("l1", "depth", "nll_color", "nll_depth", "alignment", "moment")
+        local = [weights.get(name, 0.0) for name in names]
+        median, g_median = (v.layers.median_depth, v.g_median_depth) if local[4] else (None, None)
+        moment, g_moment = (v.moment, v.g_moment) if local[5] else (None, None)
+        self.core.mapping_losses(
+            v.sums, median, moment, target.color, target.depth, height, local, target.valid_pixels,
+            v.g_sums, g_median, g_moment, self.parts,
+        )  # fmt: skip
+        if len(v.sums) < 7:
+            local[2:4] = [0.0, 0.0]
+        loss = float(np.dot(local, self.parts))
+        if weights["ssim"]:
+            self.core.ssim_target(target.color, target.depth, width, height, self.cache)
+            similarity = self.core.ssim(
+                v.sums[:3], target.color, self.cache, width, height, target.depth, -weights["ssim"], v.g_sums[:3]
+            )
+            loss += weights["ssim"] * (1.0 - similarity)
+        return loss
+
+
+class CompiledStep(CompiledImages):
+    """The same step fused in the native kernels (tests hold it to `TorchStep`)."""
+
+    def __init__(self, view: CpuView) -> None:
+        super().__init__(view)
+        self.view = view
+
+    def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
+        """Render the field to the view's planes."""
+        render_for(self.view, field.params, T_camera_world, target, weights)
+
+    def splats(
+        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, pull: Tensor | None = None
+    ) -> tuple[Matrix, float]:
+        """Do what `TorchStep.splats` does in one pass, without a gradient row in memory."""
+        twist, v = np.zeros(6), self.view
+        moment, g_moment, median_id, g_median_depth = v.depth_gradients()
+        cost = v.raster.step(
+            field.params, field.moment1, field.moment2, field.last_step, v.sums, moment, v.alpha, v.g_sums, g_moment,
+            median_id, g_median_depth, rates.per_column.numpy(), BETA1, BETA2, EPSILON, field.steps,
+            [weights.get(name, 0.0) for name in SHAPE_TERMS], frozen_colors, pull, twist, v.seconds[3:],
+        )  # fmt: skip
+        return twist, cost
