@@ -62,6 +62,8 @@ class Keyframe:
     T_world_camera: NDArray[np.float64]
     fixed: bool = False
     motion: VectorAdam = dataclass_field(default_factory=lambda: VectorAdam.of(6))
+    seen: NDArray[np.int64] | None = None
+    descriptor: NDArray[np.float32] | None = None
 
     def move(self, gradient: NDArray[np.float64], rates: NDArray[np.float64]) -> None:
         """Take an Adam step on the pose; gradient [6] by the left twist of T_camera_world, rates [6] in m and rad."""

@@ -1,0 +1,77 @@
+"""Judge single splats by the readings they are held against; uncertain ones get a second chance (CG-SLAM §4)."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.fit.target import Keyframe
+from sigmasplat.model import se3
+from sigmasplat.model.field import COLUMNS, GaussianField
+from sigmasplat.render.view import View
+
+Floats = NDArray[np.float64]
+
+
+def primitive_uncertainty(
+    field: GaussianField, view: View, keyframes: Sequence[Keyframe], owner: Literal["dominant", "median"]
+) -> tuple[Tensor, Tensor]:
+    """Return each splat's uncertainty ν [N] m², float64, and how many pixels n [N] it was judged on (CG-SLAM eq. 13).
+
+    ν = Σ w (D − z)² / n over the pixels with a reading D that a splat owns, in all keyframes; z is its centre's depth
+    there, w its weight. 0 where it owns none. Renders each keyframe once; the view's planes are then of the last one.
+    """
+    means = field.means.numpy().astype(np.float64)
+    spread, count = np.zeros(len(field)), np.zeros(len(field), np.int64)
+    for keyframe in keyframes:
+        T_camera_world = se3.inverse(keyframe.T_world_camera)
+        view.forward(field.params, T_camera_world, layers=True)
+        rows, weights, readings = _owned(view, keyframe, owner)
+        off = readings - depths(means, T_camera_world)[rows]
+        spread += np.bincount(rows, weights * off**2, len(field))
+        count += np.bincount(rows, minlength=len(field))
+    return torch.from_numpy(spread / np.maximum(count, 1)), torch.from_numpy(count)
+
+
+def depths(points: Floats, T_camera_world: Floats) -> Floats:
+    """Return the depths [N] m of points [N, 3] in a camera, summed in fixed order."""
+    a, b, c, d = T_camera_world[2]
+    return np.asarray(a * points[:, 0] + b * points[:, 1] + c * points[:, 2] + d)
+
+
+def _owned(view: View, keyframe: Keyframe, owner: str) -> tuple[NDArray[np.int32], Floats, Floats]:
+    """List the pixels that have an owner and a reading: the owner's row, its weight, the reading in m."""
+    camera, layers = view.camera, view.layers
+    ids, weights = {
+        "dominant": (layers.dominant_id, layers.dominant_weight),
+        "median": (layers.median_id, layers.median_weight),
+    }[owner]
+    rows, weight = (plane[: camera.height, : camera.width].numpy() for plane in (ids, weights))
+    reading = keyframe.target.depth_image.numpy()
+    judged = (rows >= 0) & (reading > 0)
+    return rows[judged], weight[judged].astype(np.float64), reading[judged].astype(np.float64)
+
+
+def fade(field: GaussianField, rows: Tensor, opacity: float) -> Tensor:
+    """Lower some splats (bool [N] or indices) to at most an opacity; their opacity is at rest then. Return their ids.
+
+    To be called between fits. Moments that go on would carry the opacity back, or on down, whatever the images say.
+    """
+    column = COLUMNS["opacity_logits"].start
+    limit = float(np.log(opacity / (1.0 - opacity)))
+    field.params[rows, column] = field.params[rows, column].clamp(max=limit)
+    field.moment1[rows, column] = 0.0
+    field.moment2[rows, column] = 0.0
+    return field.ids[rows]
+
+
+def still_uncertain(
+    field: GaussianField, faded: Tensor, uncertainty: Tensor, uncertain_m2: float, least_opacity: float
+) -> Tensor:
+    """Tell which splats [N] faded earlier (`faded`: ids) have not come back: still too uncertain, or fainter than
+    `least_opacity`. Ids that are gone meanwhile are passed over; uncertainty [N] m² is `primitive_uncertainty` now."""
+    faint = field.opacities < least_opacity
+    return torch.isin(field.ids, faded) & (faint | (uncertainty > uncertain_m2))

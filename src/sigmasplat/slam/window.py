@@ -1,0 +1,125 @@
+"""Choose which keyframes are looked at together: the newest, the one before, those that share most with the newest."""
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.fit.target import Keyframe
+from sigmasplat.model import se3
+from sigmasplat.model.field import GaussianField
+from sigmasplat.render.view import View
+from sigmasplat.slam.descriptors import similarity
+
+Ids = NDArray[np.int64]
+Scores = NDArray[np.float64]
+
+GRID = 40
+"""Readings are looked up on so many rows and columns of the newest keyframe (1600 pixels, as in CG-SLAM's code)."""
+HIDDEN_RELATIVE, HIDDEN_M = 0.05, 0.05
+"""A point farther than the other camera's reading by more than both together lies behind what that camera saw."""
+
+
+def choose_window(
+    keyframes: Sequence[Keyframe], size: int, by: Literal["splats", "frustum", "descriptor"]
+) -> list[Keyframe]:
+    """Return the newest keyframe, the one before it, then those of the others that share most, best first (CG-SLAM §7).
+
+    keyframes in the order of time; size ≥ 1, fewer while there are fewer; of equals the later one. Raises
+    SigmaSplatError where a keyframe holds nothing to go `by`.
+    """
+    latest, older = list(keyframes[-2:]), keyframes[:-2]
+    window = latest[::-1][:size]
+    if size <= 2 or not older:
+        return window
+    scores = SCORES[by](keyframes[-1], older)
+    best = np.lexsort((-np.arange(len(older)), -scores))[: size - 2]
+    return window + [older[k] for k in best]
+
+
+def dominating(view: View, field: GaussianField) -> Ids:
+    """Name the splats that dominate a pixel of a view's last forward pass with layers: sorted `field.ids`."""
+    rows = view.layers.dominant_id[: view.camera.height, : view.camera.width].numpy()
+    there = np.zeros(len(field), bool)
+    there[rows[rows >= 0]] = True
+    return np.sort(field.ids.numpy()[there])
+
+
+def covisible_splats(newest: Ids, others: Sequence[Ids]) -> Scores:
+    """Return the share of the newest's splats that each of the others has too; all are sorted sets of ids ≥ 0."""
+    scores = np.zeros(len(others))
+    if len(newest) == 0:
+        return scores
+    there = np.zeros(newest[-1] + 1, bool)
+    there[newest] = True
+    for k, ids in enumerate(others):
+        known = ids[: np.searchsorted(ids, newest[-1], side="right")]
+        scores[k] = np.count_nonzero(there.take(known))
+    return scores / len(newest)
+
+
+def _by_splats(newest: Keyframe, others: Sequence[Keyframe]) -> Scores:
+    return covisible_splats(_seen(newest), [_seen(keyframe) for keyframe in others])
+
+
+def _by_readings(newest: Keyframe, others: Sequence[Keyframe]) -> Scores:
+    points = _readings(newest)
+    return np.array([_share_seen(points, keyframe) for keyframe in others])
+
+
+def _by_descriptor(newest: Keyframe, others: Sequence[Keyframe]) -> Scores:
+    return similarity(np.stack([_descriptor(keyframe) for keyframe in others]), _descriptor(newest)[None]).ravel()
+
+
+SCORES: dict[str, Callable[[Keyframe, Sequence[Keyframe]], Scores]] = {
+    "splats": _by_splats,
+    "frustum": _by_readings,
+    "descriptor": _by_descriptor,
+}
+"""How much each of some keyframes shares with the newest, by what is compared."""
+
+
+def _readings(keyframe: Keyframe) -> NDArray[np.float64]:
+    """Return readings of a grid of pixels as points in the world [n, 3], metres."""
+    camera = keyframe.target.camera
+    rows, columns = (np.unique((np.arange(GRID) + 0.5) * n // GRID).astype(int) for n in (camera.height, camera.width))
+    grid = np.ix_(rows, columns)
+    depth = keyframe.target.depth_image.numpy()[grid].astype(np.float64)
+    points = (camera.rays()[grid] * depth[..., None])[depth > 0]
+    T = keyframe.T_world_camera
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+
+
+def _share_seen(points: NDArray[np.float64], keyframe: Keyframe) -> float:
+    """Return the share of points [n, 3], world, that lie in a keyframe's image and not behind what it saw there."""
+    T, camera, depth_m = se3.inverse(keyframe.T_world_camera), keyframe.target.camera, keyframe.target.depth_image
+    x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
+    ahead = z > 0
+    x, y, z = x[ahead], y[ahead], z[ahead]
+    u = np.floor(camera.fx * x / z + camera.cx + 0.5)
+    v = np.floor(camera.fy * y / z + camera.cy + 0.5)
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    reading = depth_m.numpy()[v[inside].astype(int), u[inside].astype(int)]
+    clear = (reading == 0) | (z[inside] <= reading * (1.0 + HIDDEN_RELATIVE) + HIDDEN_M)
+    return int(clear.sum()) / max(len(points), 1)
+
+
+def _seen(keyframe: Keyframe) -> Ids:
+    if keyframe.seen is None:
+        raise _nothing(keyframe, "a list of the splats it sees", "splats")
+    return keyframe.seen
+
+
+def _descriptor(keyframe: Keyframe) -> NDArray[np.float32]:
+    if keyframe.descriptor is None:
+        raise _nothing(keyframe, "a descriptor", "descriptor")
+    return keyframe.descriptor
+
+
+def _nothing(keyframe: Keyframe, missing: str, by: str) -> SigmaSplatError:
+    return SigmaSplatError(
+        f"keyframe {keyframe.index} has not been given {missing}, which mapping.covisibility={by} compares; "
+        "choose mapping.covisibility=frustum, which needs depth only"
+    )
