@@ -75,7 +75,8 @@ def measure(path: str, options: Options, seed: int) -> dict[str, Any]:
     if not held_out:
         raise SourceError(f"{path}: both maps were fitted to every frame; a preset that maps each frame leaves none")
     i = options.config(seed, "full").input
-    frames = [source.frame(steps[k][0].index).prepared(i.width, i.min_depth_m, i.max_depth_m) for k in held_out]
+    shown = [source.frame(steps[k][0].index) for k in held_out]
+    frames = [frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px) for frame in shown]
     return {"seed": seed, "held_out": len(held_out), **score(runs, held_out, frames)}
 
 

@@ -145,7 +145,8 @@ def measure_pairs(path: str, options: Options) -> dict[str, Any]:
             lost += 1
             continue
         i, T_start_world = slam.config.input, se3.inverse(slam.steps[-1].T_world_camera)
-        frames = [source.frame(start + n).prepared(i.width, i.min_depth_m, i.max_depth_m) for n in (0, *options.gaps)]
+        shown = [source.frame(start + n) for n in (0, *options.gaps)]
+        frames = [frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px) for frame in shown]
         fits = methods(slam, frames[0].camera, options.iterations)
         truth = true_poses(source, [frame.timestamp_s for frame in frames])
         for gap, frame, T_true in zip(options.gaps, frames[1:], se3.inverse(truth[0]) @ truth[1:], strict=True):

@@ -1,8 +1,8 @@
 """RGB-D SLAM on 3D Gaussians that knows how sure it is.
 
-from sigmasplat import Slam, open_source, preset
+from sigmasplat import Slam, open_source
 
-slam = Slam(preset("varsplat-fast"))
+slam = Slam()
 for frame in open_source("path/to/sequence"):
     step = slam.step(frame)
 slam.finish()

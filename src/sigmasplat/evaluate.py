@@ -171,7 +171,8 @@ def _score_views(
 
 def _prepared(source: Source, settings: InputConfig, index: int) -> Frame:
     """Read a frame as the run worked on it."""
-    return source.frame(index).prepared(settings.width, settings.min_depth_m, settings.max_depth_m)
+    s = settings
+    return source.frame(index).prepared(s.width, s.min_depth_m, s.max_depth_m, s.crop_px)
 
 
 def _keeps_variance(final: FinalConfig) -> bool:

@@ -38,7 +38,7 @@ class Recording:
         config, (checkpoint, _) = run.config(), run.read_checkpoint()
         if not {"keyframes", "T_world_camera"} <= set(checkpoint) or not len(checkpoint["keyframes"]):
             raise RunError(f"run {run.path} has no keyframes in its checkpoint; run it again")
-        return Recording(run, config, checkpoint, working_camera(config, camera))
+        return Recording(run, config, checkpoint, camera.prepared(config.input.width, config.input.crop_px))
 
     def standpoints(self) -> tuple[Iterable[Standpoint], int]:
         """Return the keyframes, each before its own submap, or before the map of a run in one piece, and their number.
@@ -112,9 +112,3 @@ def score(
     _, rows = associate(tensors["timestamps_s"][tensors["keyframes"]].numpy(), true_path.timestamps_s)
     views = true_path.T_world_camera[rows]
     return reconstruction.score(mesh.moved(T_truth_world), true_surface, recording.camera, views, progress=progress)
-
-
-def working_camera(config: Config, camera: Camera) -> Camera:
-    """Return the camera of the images that a run worked on, of the source's (as `Frame.prepared` makes it)."""
-    width = config.input.width
-    return camera.resized(width, round(camera.height * width / camera.width)) if width else camera

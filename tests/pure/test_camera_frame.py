@@ -38,6 +38,7 @@ def test_a_resized_camera_keeps_the_edges_of_the_image(size: tuple[int, int]) ->
 def test_half_the_size_looks_through_the_middle_of_four_pixels() -> None:
     cells = CAMERA.rays().reshape(3, 2, 4, 2, 3).mean((1, 3))
     np.testing.assert_allclose(CAMERA.resized(4, 3).rays(), cells, atol=1e-6)
+    assert CAMERA.resized(8, 6) is CAMERA
 
 
 @pytest.mark.parametrize(
@@ -116,3 +117,32 @@ def test_prepared_sets_the_width_and_keeps_the_proportion(width: int, height: in
     out = frame().prepared(width, 0.1, 8.0)
     assert (out.camera.width, out.camera.height) == (width, height) and out.depth_m.shape == (height, width)
     assert out.camera.fx == pytest.approx(7.0 * width / 8)
+
+
+@pytest.mark.parametrize("width", [0, 8, 16])
+@pytest.mark.parametrize("crop_px", [0, 1, 2])
+def test_cropping_drops_edges_and_moves_no_ray(width: int, crop_px: int) -> None:
+    """What is left is the inside of the resized image, seen along the same rays; readings out of range go as ever."""
+    whole, out = frame().prepared(width, 1.0, 4.0), frame().prepared(width, 1.0, 4.0, crop_px)
+    h, w = whole.depth_m.shape
+    inner = np.s_[crop_px : h - crop_px, crop_px : w - crop_px]
+    assert (out.camera.width, out.camera.height) == (w - 2 * crop_px, h - 2 * crop_px)
+    np.testing.assert_array_equal(out.color, whole.color[inner])
+    np.testing.assert_array_equal(out.depth_m, whole.depth_m[inner])
+    np.testing.assert_allclose(out.camera.rays(), whole.camera.rays()[inner], atol=1e-6)
+    assert out.camera == CAMERA.prepared(width, crop_px), "one rule for cameras and frames"
+    assert out.color.flags.c_contiguous and out.depth_m.flags.c_contiguous, "the kernels take planes as they lie"
+
+
+def test_half_size_is_cropped_after_resizing() -> None:
+    small = Camera(640, 480, 517.3, 516.5, 318.6, 255.3).prepared(320, 8)
+    assert (small.width, small.height) == (304, 224)
+    assert (small.fx, small.fy) == pytest.approx((517.3 / 2, 516.5 / 2))
+    assert (small.cx, small.cy) == pytest.approx((319.1 / 2 - 0.5 - 8, 255.8 / 2 - 0.5 - 8))
+
+
+@pytest.mark.parametrize(("width", "crop_px"), [(0, 3), (4, 2), (16, 6), (0, 100)])
+def test_a_crop_that_leaves_nothing_is_refused(width: int, crop_px: int) -> None:
+    with pytest.raises(ConfigError, match=rf"input\.crop_px is {crop_px}, which leaves nothing of \d+×\d+") as refused:
+        frame().prepared(width, 0.1, 8.0, crop_px)
+    assert "\n" not in str(refused.value)

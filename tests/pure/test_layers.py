@@ -37,9 +37,11 @@ STOREY = {name: storey for storey, names in enumerate(FLOORS) for name in names}
 # Sources, results and scores know nothing of how SLAM decides, though they stand below it.
 FORBIDDEN = {(user, "slam") for user in ("sources", "io", "metrics")} | {("metrics", "io"), ("metrics", "sources")}
 SYSTEM_NAMES = re.compile("varsplat|cg[-_ ]?slam|loopsplat", re.IGNORECASE)
+PRESET_NAMES = re.compile("varsplat|cg_?slam|loopsplat")
 GPL = {"evo", "plyfile"}
 NAMELESS = {"utils", "util", "helpers", "helper", "common", "misc"}
 FILES = sorted(PACKAGE.rglob("*.py"))
+TEXTS = sorted(file for ending in ("py", "pyi", "h", "cpp", "cu") for file in PACKAGE.rglob(f"*.{ending}"))
 each_file = pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
 
 
@@ -108,8 +110,15 @@ def test_only_evaluation_reads_ground_truth(path: Path) -> None:
 
 @each_file
 def test_systems_are_named_in_presets_only(path: Path) -> None:
-    if path.name != "presets.py":
+    if floor_of(path) != "presets":
         assert [word for word in words_in_code(parsed(path)) if SYSTEM_NAMES.search(word)] == []
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_no_text_but_presets_spells_a_system_as_code_would(path: Path) -> None:
+    """Citations are written as the papers write their names; in lower case a name is a preset, or about to decide."""
+    if floor_of(path) != "presets":
+        assert PRESET_NAMES.findall(path.read_text(encoding="utf-8")) == []
 
 
 @each_file
@@ -140,4 +149,6 @@ def test_the_checks_notice_what_they_are_for() -> None:
 
 
 def test_the_sources_were_found() -> None:
-    assert {"model", "config", "__init__"} <= {floor_of(path) for path in FILES}
+    assert {"model", "config", "presets", "__init__"} <= {floor_of(path) for path in FILES}
+    assert {".py", ".pyi", ".h", ".cpp"} <= {path.suffix for path in TEXTS}
+    assert PRESET_NAMES.search('if (name == "cgslam")') and not PRESET_NAMES.search("// (CG-SLAM eq. 10, VarSplat §3)")

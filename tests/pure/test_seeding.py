@@ -14,7 +14,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
-from sigmasplat.slam.seeding import PUSH_BACK, first_pixels, later_pixels, make_splats, thin_out
+from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats, thin_out
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -148,6 +148,16 @@ def test_the_bound_is_the_factor_times_the_median_error_but_at_least_so_many_met
     assert chosen(depth_error_least_m=0.5) == [False, False]
 
 
+def test_without_a_factor_only_thin_places_are_seeded() -> None:
+    alpha = np.ones(SIZE, np.float32)
+    alpha[:, :20] = 0.49
+    behind = maps(np.full(SIZE, 3.0, np.float32), alpha)
+    for least_m in (0.0, 0.1):
+        off = changed(alpha_below=0.5, depth_error_factor=0.0, depth_error_least_m=least_m)
+        np.testing.assert_array_equal(later_pixels(behind, target(np.full(SIZE, 2.0)), off), alpha < 0.5)
+    assert later_pixels(behind, target(np.full(SIZE, 2.0)), changed(depth_error_factor=0.5)).all(), "else all is new"
+
+
 def test_density_and_limit_thin_pixels_out() -> None:
     pixels = random(5).random(SIZE) < 0.5
     n = int(pixels.sum())
@@ -173,15 +183,16 @@ def made(pixels: Mask, depth_m: Array, spacing_px: float = 1.0, field: GaussianF
     return make_splats(seen, POSE, pixels, spacing_px, field or GaussianField.empty(), changed(**values)), seen
 
 
-def test_splats_lie_on_their_pixels_rays_half_a_percent_behind_the_reading() -> None:
+@pytest.mark.parametrize("push_back", [1.0, 1.005, 1.02])
+def test_splats_lie_on_their_pixels_rays_as_far_behind_the_reading_as_asked(push_back: float) -> None:
     depth = random(6).uniform(1.0, 4.0, SIZE).astype(np.float32)
-    field, seen = made(SOME, depth, opacity=0.8, scale_from="pixel")
+    field, seen = made(SOME, depth, opacity=0.8, scale_from="pixel", push_back=push_back)
     T = se3.inverse(POSE)
     x, y, z = T[:3, :3] @ field.means.numpy().T.astype(float) + T[:3, 3:]
     v, u = np.nonzero(SOME)
     np.testing.assert_allclose(CAMERA.fx * x / z + CAMERA.cx, u, atol=1e-3)
     np.testing.assert_allclose(CAMERA.fy * y / z + CAMERA.cy, v, atol=1e-3)
-    np.testing.assert_allclose(z, PUSH_BACK * depth[SOME], rtol=1e-5)
+    np.testing.assert_allclose(z, push_back * depth[SOME], rtol=1e-5)
     np.testing.assert_allclose(field.colors.numpy(), seen.image.numpy()[SOME], rtol=1e-6)
     np.testing.assert_allclose(field.opacities.numpy(), 0.8, rtol=1e-5)
     np.testing.assert_allclose(field.variances.numpy(), np.exp(-7.0), rtol=1e-5)
@@ -199,7 +210,7 @@ def test_a_splats_size_is_the_mean_distance_of_three_neighbours_old_and_new() ->
     """Four new points and one old, all distances by hand."""
     pixels, depth = np.zeros(SIZE, bool), np.full(SIZE, 2.0, np.float32)
     pixels[20, [10, 20, 30, 40]] = True
-    spread_m = 2.0 * PUSH_BACK * 10 / CAMERA.fx  # between neighbours in the row
+    spread_m = 2.0 * SETTINGS.push_back * 10 / CAMERA.fx  # between neighbours in the row
 
     def sizes(old: list[list[float]]) -> list[float]:
         field, _ = made(pixels, depth, field=field_at(np.array(old, np.float32)) if old else None)
@@ -207,7 +218,7 @@ def test_a_splats_size_is_the_mean_distance_of_three_neighbours_old_and_new() ->
 
     end, middle = np.sqrt((1 + 4 + 9) / 3), np.sqrt((1 + 1 + 4) / 3)
     np.testing.assert_allclose(sizes([]), [end, middle, middle, end], rtol=1e-5)
-    ray = CAMERA.rays()[20, 10].astype(float) * 2.0 * PUSH_BACK + [0.0, 0.5 * spread_m, 0.0]
+    ray = CAMERA.rays()[20, 10].astype(float) * 2.0 * SETTINGS.push_back + [0.0, 0.5 * spread_m, 0.0]
     beside_the_first = (POSE[:3, :3] @ ray + POSE[:3, 3]).tolist()
     found = sizes([beside_the_first])
     assert found[0] == pytest.approx(np.sqrt((0.25 + 1 + 4) / 3), rel=1e-4)

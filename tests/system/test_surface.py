@@ -185,6 +185,12 @@ def test_the_working_camera_is_that_of_prepared_frames(run: RunFolder) -> None:
     assert Recording.of(run, CAMERA).camera == frame.camera
 
 
+def test_a_cropped_run_has_the_cropped_camera(run: RunFolder) -> None:
+    replace(CONFIG, input=replace(CONFIG.input, crop_px=3)).save(run.path / "config.json")
+    frame = WallAhead().frame(0).prepared(48, 0.1, 4.0, 3)
+    assert Recording.of(run, CAMERA).camera == frame.camera and frame.camera.width == 42
+
+
 def sigmasplat(*arguments: str) -> int:
     with pytest.raises(SystemExit) as left:
         cli.main(arguments)

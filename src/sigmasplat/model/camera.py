@@ -26,8 +26,20 @@ class Camera:
 
     def resized(self, width: int, height: int) -> "Camera":
         """Return the camera of the same view sampled at another size (centres of corner pixels map half a pixel in)."""
+        if (width, height) == (self.width, self.height):
+            return self
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
+
+    def prepared(self, width: int, crop_px: int = 0) -> "Camera":
+        """Return the camera of the images that the system works on: `width` pixels wide (0 = as they are), height in
+        proportion, then without `crop_px` pixels at every edge. Raises ConfigError where nothing would remain."""
+        c = self.resized(width, round(self.height * width / self.width)) if width else self
+        if 2 * crop_px >= min(c.width, c.height):
+            raise ConfigError(
+                f"input.crop_px is {crop_px}, which leaves nothing of {c.width}×{c.height}; give a smaller one"
+            )
+        return Camera(c.width - 2 * crop_px, c.height - 2 * crop_px, c.fx, c.fy, c.cx - crop_px, c.cy - crop_px)
 
     def rays(self) -> NDArray[np.float32]:
         """Return the point at depth 1 m on each pixel's ray, camera frame, [H, W, 3]; times depth it is the surface."""

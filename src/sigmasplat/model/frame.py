@@ -62,11 +62,17 @@ class Frame:
             self.camera.resized(width, height),
         )
 
-    def prepared(self, width: int, min_depth_m: float, max_depth_m: float) -> "Frame":
-        """Return the frame as the system works on it: `width` pixels wide (0 = as it is), depth out of range 0."""
-        small = self.resized(width, round(self.camera.height * width / self.camera.width)) if width else self
-        depth = small.depth_m
+    def prepared(self, width: int, min_depth_m: float, max_depth_m: float, crop_px: int = 0) -> "Frame":
+        """Return the frame as the system works on it: its size that of `Camera.prepared`, depth out of range 0.
+
+        Raises ConfigError where the crop would leave nothing.
+        """
+        camera = self.camera.prepared(width, crop_px)
+        small = self.resized(camera.width + 2 * crop_px, camera.height + 2 * crop_px)
+        inner = np.s_[crop_px : crop_px + camera.height, crop_px : crop_px + camera.width]
+        depth = small.depth_m[inner]
         keep = (depth >= min_depth_m) & (depth <= max_depth_m)
-        if keep.all():
+        if keep.all() and not crop_px:
             return small
-        return Frame(self.index, self.timestamp_s, small.color, np.where(keep, depth, np.float32(0.0)), small.camera)
+        color = np.ascontiguousarray(small.color[inner])
+        return Frame(self.index, self.timestamp_s, color, np.where(keep, depth, np.float32(0.0)), camera)

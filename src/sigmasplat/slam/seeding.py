@@ -14,8 +14,6 @@ from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.model.field import GaussianField
 
 Mask = NDArray[np.bool_]
-PUSH_BACK = 1.005
-"""The released code seeds half a percent behind the reading: blending near splats first pulls depth forward."""
 
 
 def first_pixels(target: Target, config: SeedConfig, random: np.random.Generator) -> Mask:
@@ -31,14 +29,15 @@ def first_pixels(target: Target, config: SeedConfig, random: np.random.Generator
 
 
 def later_pixels(maps: PoseMaps, target: Target, config: SeedConfig) -> Mask:
-    """Find pixels [H, W] the map does not explain: thin (A < alpha_below), or a surface well behind the reading."""
+    """Find pixels [H, W] the map does not explain: thin (A < alpha_below), or a surface well behind the reading
+    (where `depth_error_factor` is above 0)."""
     measured = target.depth_image.numpy()
     valid = measured > 0
     alpha = maps.alpha.numpy()
     surface = maps.depth.numpy() / np.maximum(alpha, 0.5)
     seen = valid & (alpha >= config.alpha_below)
     chosen = valid & (alpha < config.alpha_below)
-    if seen.any():
+    if config.depth_error_factor > 0 and seen.any():
         error = np.abs(surface - measured)
         limit = max(config.depth_error_factor * float(np.median(error[seen])), config.depth_error_least_m)
         chosen |= seen & (surface - measured > limit)
@@ -79,7 +78,7 @@ def make_splats(
     are dropped.
     """
     depth = target.depth_image.numpy()[pixels].astype(np.float64)
-    points = target.camera.rays()[pixels] * depth[:, None] * PUSH_BACK
+    points = target.camera.rays()[pixels] * depth[:, None] * config.push_back
     colors = target.image.numpy()[pixels]
     world = points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
     if config.scale_from == "pixel":

@@ -88,7 +88,7 @@ class Slam:
         """Take in one frame. Raises SourceError if the first frame has no depth or a later one another camera."""
         clock = time.perf_counter()
         i = self.config.input
-        frame = frame.prepared(i.width, i.min_depth_m, i.max_depth_m)
+        frame = frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px)
         view = self._view_for(frame)
         before = view.seconds.copy()
         target = Target.of(frame, (view.sums.shape[1], view.sums.shape[2]))

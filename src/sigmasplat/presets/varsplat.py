@@ -1,4 +1,4 @@
-"""Give the settings of the published systems by name: values only, each from its paper unless marked as ours.
+"""Hold VarSplat's and LoopSplat's settings: values only, each from its paper unless marked as ours.
 
 `varsplat-*` follow VarSplat (arXiv 2603.09673) §2–3. `loopsplat-*` are the same with every uncertainty weight off,
 which is LoopSplat's front end (arXiv 2408.10154). `*-fast` are ours, sized for two CPU cores.
@@ -17,8 +17,6 @@ from sigmasplat.config import (
     SubmapConfig,
     TrackingConfig,
 )
-from sigmasplat.config.text import nearest
-from sigmasplat.errors import ConfigError
 
 PAPER_FINAL = FinalConfig(seed_from="mesh", iterations=30_000, sh_degree=3, uncertainty=False)
 """VarSplat §7: V is unused there."""
@@ -166,8 +164,8 @@ FAST = Config(
 DATASETS = {"replica": REPLICA, "tum": TUM, "scannet": SCANNET, "fast": FAST}
 
 
-def _without_uncertainty(config: Config) -> Config:
-    """Switch off every weight that uncertainty has: tracking's and the likelihoods that train it."""
+def without_variance(config: Config) -> Config:
+    """Switch off every weight that V has: tracking's, loops', registration's, and the likelihoods that train it."""
     return dataclasses.replace(
         config,
         tracking=dataclasses.replace(config.tracking, uncertainty=False),
@@ -179,25 +177,6 @@ def _without_uncertainty(config: Config) -> Config:
     )
 
 
-PRESETS = {
-    name: dataclasses.replace(config, name=name)
-    for dataset, base in DATASETS.items()
-    for name, config in ((f"varsplat-{dataset}", base), (f"loopsplat-{dataset}", _without_uncertainty(base)))
+PRESETS = {f"varsplat-{dataset}": config for dataset, config in DATASETS.items()} | {
+    f"loopsplat-{dataset}": without_variance(config) for dataset, config in DATASETS.items()
 }
-
-
-def default_preset() -> str:
-    """Name the preset used where none is asked for: the one sized for a machine without a GPU."""
-    return "varsplat-fast"
-
-
-def list_presets() -> list[str]:
-    """List every preset's name."""
-    return sorted(PRESETS)
-
-
-def preset(name: str) -> Config:
-    """Return a preset's settings. Raises ConfigError on an unknown name, saying which there are."""
-    if name not in PRESETS:
-        raise ConfigError(f"no preset {name!r}{nearest(name, PRESETS)}; there are {', '.join(list_presets())}")
-    return PRESETS[name]

@@ -1,0 +1,184 @@
+"""Hold CG-SLAM's settings: values only.
+
+`cgslam-*` follow the paper (ECCV 2024, arXiv 2403.16095), `cgslam-light-*` are its half-resolution variant.
+`cgslam-loops-*` are the paper's with VarSplat's submaps, loops and final map; `cgslam-fast` and `cgslam-loops-fast` are
+ours, sized for two CPU cores.
+
+The paper gives the loss weights, iterations, intervals, window, rates of poses, ψ and τ. Where it is silent the numbers
+are the code's: α_min, near plane, crops, masks, rates of splats, when they are split or dropped. Ours are
+`primitives.faded_opacity` and what happens at which step to splats that are uncertain.
+"""
+
+import dataclasses
+
+from sigmasplat.config import (
+    Config,
+    FinalConfig,
+    InputConfig,
+    LoopConfig,
+    MappingConfig,
+    PrimitiveConfig,
+    RegistrationConfig,
+    RenderConfig,
+    SeedConfig,
+    SubmapConfig,
+    TrackingConfig,
+)
+from sigmasplat.presets import varsplat
+
+PAPER = Config(
+    render=RenderConfig(alpha_min=15.0 / 255.0, near_m=0.2),
+    seeding=SeedConfig(
+        first_uniform=10_000_000,  # more than any image has: every pixel with a reading
+        first_gradient=0,
+        first_edges=False,
+        later_max=0,
+        alpha_below=0.5,
+        depth_error_factor=0.0,
+        min_distance_m=0.0,
+        opacity=0.5,
+        push_back=1.0,
+    ),
+    mapping=MappingConfig(
+        first_iterations=1500,
+        weight_ssim=0.1,
+        weight_isotropy=0.0,
+        weight_isotropy_ratio=0.1,
+        weight_nll_color=0.0,
+        weight_nll_depth=0.0,
+        lr_quats=1e-3,
+        lr_opacity_logits=0.05,
+        lr_colors=2.5e-3,
+        lr_pose_translation=2.15e-3,
+        lr_pose_rotation=1.5e-3,
+        poses="all",
+        poses_from="half",
+        prune_opacity=0.005,
+        window=4,
+        covisibility="splats",  # both take NetVLAD's, whose weights are a download, and the paper for its speed alone
+        frames_per_step=0,
+    ),
+    primitives=PrimitiveConfig(uncertain_m2=0.025, faded_opacity=0.07, split_gradient=0.002, clone=True),
+    tracking=TrackingConfig(
+        parametrisation="axis-angle",
+        lr_rotation=1.5e-3,
+        lr_translation=2.15e-3,
+        uncertainty=False,
+        alpha_power=0.0,
+        alpha_above=0.99,
+        outlier_factor=10.0,
+        outlier_factor_color=10.0,
+        average="kept",
+    ),
+    submaps=SubmapConfig(),
+    loops=LoopConfig(close=False, uncertainty=False),
+    registration=RegistrationConfig(uncertainty=False),
+    final=FinalConfig(uncertainty=False),
+)
+"""What is common to all of the paper's."""
+
+
+def sized(config: Config, extent: float, first: float = 3e-4, last: float = 2.5e-4, log_scales: float = 1e-4) -> Config:
+    """Multiply what the code gives in units of the scene's extent by it: rates of means and scales, sizes of splats."""
+    mapping = dataclasses.replace(
+        config.mapping, lr_means_first=first * extent, lr_means=last * extent, lr_log_scales=log_scales * extent
+    )
+    primitives = dataclasses.replace(config.primitives, split_scale_m=0.01 * extent, most_scale_m=0.1 * extent)
+    return dataclasses.replace(config, mapping=mapping, primitives=primitives)
+
+
+def color_share(color: float, depth: float) -> float:
+    """Return λ1 / (λ1 + λ2): Adam does not feel the scale of a loss."""
+    return color / (color + depth)
+
+
+# The extent is the code's for six of Replica's eight scenes; for TUM and ScanNet the median of its scenes'. No reading
+# is cut off as too far, as in the code: the PNGs end at 10, 13 and 66 m.
+REPLICA = sized(
+    dataclasses.replace(
+        PAPER,
+        input=InputConfig(max_depth_m=10.0),
+        mapping=dataclasses.replace(
+            PAPER.mapping,
+            every=30,
+            iterations=60,
+            weight_l1=0.7,
+            weight_depth=0.25,
+            weight_alignment=0.25,
+            weight_moment=0.15,
+        ),
+        tracking=dataclasses.replace(PAPER.tracking, iterations=15, weight_color=color_share(0.2, 1.0)),
+    ),
+    5.0,
+)
+TUM = sized(
+    dataclasses.replace(
+        PAPER,
+        input=InputConfig(max_depth_m=13.5, crop_px=8),
+        mapping=dataclasses.replace(
+            PAPER.mapping,
+            every=15,
+            iterations=50,  # the paper says 40 to 50
+            weight_l1=1.0,
+            weight_depth=0.8,
+            weight_alignment=0.5,
+            weight_moment=0.5,
+        ),
+        tracking=dataclasses.replace(PAPER.tracking, iterations=25, weight_color=color_share(1.0, 0.6)),
+    ),
+    3.0,
+)
+SCANNET = sized(dataclasses.replace(TUM, input=InputConfig(max_depth_m=66.0, crop_px=10)), 2.0)
+DATASETS = {"replica": REPLICA, "tum": TUM, "scannet": SCANNET}
+
+# Half of 1200 and of 640. The crop comes afterwards and takes as many pixels as before, as the code does on TUM.
+LIGHT_WIDTHS = {"replica": 600, "tum": 320, "scannet": 320}
+
+
+def _with_loops(config: Config, like: Config) -> Config:
+    """Take submaps, loops, registration and final map from settings of VarSplat's, with no weight of V."""
+    plain = varsplat.without_variance(like)
+    return dataclasses.replace(
+        config, submaps=like.submaps, loops=plain.loops, registration=plain.registration, final=plain.final
+    )
+
+
+# Two CPU cores: VarSplat's numbers for these, and of them other only what is CG-SLAM's. Loss weights: the paper's for
+# Replica, with its ν and window; but one keyframe of the window a step, and no splitting.
+FAST = dataclasses.replace(
+    varsplat.FAST,
+    mapping=dataclasses.replace(
+        varsplat.without_variance(varsplat.FAST).mapping,
+        weight_l1=0.7,
+        weight_ssim=0.1,
+        weight_depth=0.25,
+        weight_alignment=0.25,
+        weight_isotropy=0.0,
+        weight_isotropy_ratio=0.1,
+        weight_moment=0.15,
+        poses="all",
+        poses_from="half",
+        window=4,
+        covisibility="splats",
+        frames_per_step=1,
+    ),
+    primitives=PrimitiveConfig(uncertain_m2=0.025, faded_opacity=0.07),
+    tracking=dataclasses.replace(varsplat.FAST.tracking, align_depth_by="U"),
+    submaps=SubmapConfig(),
+    loops=PAPER.loops,
+    registration=PAPER.registration,
+    final=PAPER.final,
+)
+
+PRESETS = {
+    **{f"cgslam-{name}": config for name, config in DATASETS.items()},
+    **{
+        f"cgslam-light-{name}": dataclasses.replace(
+            config, input=dataclasses.replace(config.input, width=LIGHT_WIDTHS[name])
+        )
+        for name, config in DATASETS.items()
+    },
+    **{f"cgslam-loops-{name}": _with_loops(config, varsplat.DATASETS[name]) for name, config in DATASETS.items()},
+    "cgslam-fast": FAST,
+    "cgslam-loops-fast": _with_loops(FAST, varsplat.FAST),
+}
