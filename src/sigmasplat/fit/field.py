@@ -17,7 +17,7 @@ from sigmasplat.fit.step import COMPILED_TERMS, CompiledImages, CompiledStep, Ga
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.fit.view_dependent import ViewDependentStep
 from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
+from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.render.view import CpuView, Matrix, ReferenceView, View
 
 
@@ -115,6 +115,7 @@ class _Steps:
         felt: Felt | None,
     ) -> None:
         self.field, self.view, self.weights, self.frozen_colors, self.felt = field, view, weights, frozen_colors, felt
+        field.moment1[:frozen_colors, COLUMNS["colors"]] = 0.0  # or they would coast on
         self.step = _step_for(field, view, weights, degree)
         self.pull = None if felt is None else torch.zeros(len(field))
 

@@ -1,0 +1,186 @@
+"""The mapper's window, whose poses move and when, doubted and hot splats, the first keyframe's rates."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from sigmasplat.config import Config, MappingConfig, PrimitiveConfig, RenderConfig, SeedConfig
+from sigmasplat.fit.adam import Rates
+from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import COLUMNS, GaussianField
+from sigmasplat.model.frame import Frame
+from sigmasplat.render.view import ReferenceView
+from sigmasplat.slam import mapper as mapper_module
+from sigmasplat.slam.mapper import Mapper
+from sigmasplat.slam.rules import draw_keyframes
+
+CAMERA = Camera(24, 18, 22.0, 22.0, 11.5, 8.5)
+SEEDS = SeedConfig(
+    first_uniform=10_000, first_gradient=0, first_edges=False, scale_from="pixel", later_max=0, opacity=0.9,
+    push_back=1.0,
+)  # fmt: skip
+FITTED = MappingConfig(
+    iterations=6, first_iterations=6, weight_nll_color=0.0, prune_opacity=0.005, window=4, frames_per_step=0,
+    weight_alignment=0.25, weight_moment=0.15, lr_pose_translation=1e-3, lr_pose_rotation=1e-3,
+)  # fmt: skip
+
+
+def view() -> ReferenceView:
+    return ReferenceView(CAMERA, RenderConfig(), variance=False)
+
+
+def target(depth_m: float = 2.0) -> Target:
+    """Show a wall with a pattern."""
+    u, v = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+    color = 0.5 + 0.4 * np.stack([np.sin(u / 2.0), np.cos(v / 2.0), np.sin((u + v) / 3.0)], -1)
+    depth = np.full((CAMERA.height, CAMERA.width), depth_m)
+    return Target.of(
+        Frame(0, 0.0, color.astype(np.float32), depth.astype(np.float32), CAMERA), (CAMERA.height, CAMERA.width)
+    )
+
+
+def shifted(x_m: float) -> np.ndarray:
+    return se3.exp(np.array([x_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+
+def mapper(mapping: MappingConfig = FITTED, primitives: PrimitiveConfig | None = None, **seeding: Any) -> Mapper:
+    config = Config(mapping=mapping, primitives=primitives or PrimitiveConfig(), seeding=replace(SEEDS, **seeding))
+    return Mapper(config, np.random.default_rng(0))
+
+
+def mapped(made: Mapper, places_m: Sequence[float]) -> Mapper:
+    for index, x_m in enumerate(places_m):
+        made.map(view(), index, target(), shifted(x_m))
+    return made
+
+
+@pytest.fixture
+def looked_at(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
+    """Write down the keyframes of every batch a mapper fits to."""
+    batches: list[list[int]] = []
+    fit = mapper_module.fit_field
+
+    def watched(field: Any, view: Any, drawn: Iterator[list[Keyframe]], *rest: Any, **named: Any) -> Any:
+        kept = list(drawn)
+        batches.extend([keyframe.index for keyframe in batch] for batch in kept)
+        return fit(field, view, kept, *rest, **named)
+
+    monkeypatch.setattr(mapper_module, "fit_field", watched)
+    return batches
+
+
+@pytest.mark.parametrize("covisibility", ["splats", "frustum"])
+def test_only_the_window_is_looked_at_all_of_it_in_every_step(looked_at: list[list[int]], covisibility: Any) -> None:
+    """From the start one goes far away and comes back: then the first keyframe shares most, not the ones far off."""
+    mapped(mapper(replace(FITTED, window=3, covisibility=covisibility)), (0.0, 3.0, 3.2, 3.1, 0.05))
+    last = looked_at[-FITTED.iterations :]
+    assert all(sorted(batch) == [0, 3, 4] for batch in last), "the newest, the one before it, the one that shares most"
+
+
+def test_one_of_the_window_a_step(looked_at: list[list[int]]) -> None:
+    mapped(mapper(replace(FITTED, window=2, frames_per_step=1, iterations=30)), (0.0, 0.1, 0.2))
+    assert {len(batch) for batch in looked_at} == {1}
+    assert {batch[0] for batch in looked_at[-30:]} == {1, 2}
+
+
+def test_several_drawn_together_are_different_ones() -> None:
+    drawn = list(draw_keyframes(range(6), 200, 0.3, 0, np.random.default_rng(0), together=3))
+    assert all(len(set(batch)) == 3 for batch in drawn) and {k for batch in drawn for k in batch} == set(range(6))
+    led = sum(batch[0] == 5 for batch in drawn) / 200
+    assert 0.2 < led < 0.4, "the newest leads with its probability"
+    everything = list(draw_keyframes(range(3), 4, 0.3, 0, np.random.default_rng(0), together=9))
+    assert everything == [[0, 1, 2]] * 4
+
+
+@pytest.mark.parametrize(("poses", "moving"), [("all", {1, 2}), ("newest", {2})])
+def test_whose_poses_move(poses: Any, moving: set[int]) -> None:
+    made = mapped(mapper(replace(FITTED, poses=poses)), (0.0, 0.1))
+    before = [k.T_world_camera.copy() for k in made.keyframes] + [shifted(0.2)]
+    made.map(view(), 2, target(), shifted(0.2))
+    moved = {k.index for k, T in zip(made.keyframes, before, strict=True) if not np.array_equal(k.T_world_camera, T)}
+    assert moved == moving, "the first keyframe holds the gauge"
+
+
+def test_poses_move_in_the_second_half_only() -> None:
+    """Of two steps the first leaves poses alone: after it the pose has had one step of Adam, not two."""
+    steps = {}
+    for start in ("start", "half"):
+        made = mapper(replace(FITTED, iterations=2, poses_from=start))  # type: ignore[arg-type]
+        mapped(made, (0.0, 0.1))
+        steps[start] = made.keyframes[1].motion.steps
+    assert steps == {"start": 2, "half": 1}
+
+
+def floater(made: Mapper) -> int:
+    """Put an opaque splat half way before the wall; return its id."""
+    made.field.append(
+        GaussianField.from_values(
+            torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([0.05]), torch.full((1, 3), 0.9), opacities=0.95
+        )
+    )
+    return int(made.field.ids[-1])
+
+
+@pytest.mark.parametrize("owner", ["dominant", "median"])
+def test_a_floater_is_doubted_and_goes_the_wall_stays(owner: Any) -> None:
+    made = mapped(mapper(replace(FITTED, iterations=20), PrimitiveConfig(uncertain_m2=0.025, owner=owner)), (0.0,))
+    made.config = replace(made.config, seeding=replace(SEEDS, depth_error_factor=0.0))
+    wall, floating = set(made.field.ids.tolist()), floater(made)
+    made.map(view(), 1, target(), shifted(0.02))
+    left = set(made.field.ids.tolist())
+    assert floating not in left
+    assert len(wall - left) < 0.02 * len(wall)
+
+
+def test_without_doubt_the_floater_stays() -> None:
+    made = mapped(mapper(), (0.0,))
+    floating = floater(made)
+    made.map(view(), 1, target(), shifted(0.02))
+    assert floating in made.field.ids.tolist()
+
+
+def test_hot_splats_are_split_within_the_budget() -> None:
+    hot = PrimitiveConfig(split_gradient=1e-7, split_scale_m=1e-3)
+    free, count = mapped(mapper(), (0.0,)), CAMERA.width * CAMERA.height
+    assert len(free.field) == count
+    assert len(mapped(mapper(primitives=hot), (0.0,)).field) > 1.5 * count
+    tight = mapped(mapper(primitives=hot, max_splats=count + 50), (0.0,))
+    assert count < len(tight.field) <= count + 50
+
+
+def test_old_colours_stay_frozen_when_rows_move() -> None:
+    """Splits of old splats shift rows between the halves: frozen are those that are old, wherever they stand."""
+    mapping = replace(FITTED, freeze_old_colors=True, lr_colors=0.05)
+    made = mapped(mapper(mapping, PrimitiveConfig(split_gradient=1e-7, split_scale_m=0.2), opacity=0.5), (0.0,))
+    made.field.params[:40, COLUMNS["log_scales"]] = float(np.log(0.3))
+    old = dict(zip(made.field.ids.tolist(), made.field.colors.clone(), strict=True))
+    made.map(view(), 1, target(), shifted(0.4))
+    kept = [k for k, i in enumerate(made.field.ids.tolist()) if i in old]
+    assert 0 < len(kept) < len(old), "some were split"
+    for k in kept:
+        assert torch.equal(made.field.colors[k], old[int(made.field.ids[k])])
+
+
+def test_too_large_splats_go() -> None:
+    made = mapped(mapper(primitives=PrimitiveConfig(most_scale_m=0.5)), (0.0,))
+    made.field.params[3, COLUMNS["log_scales"]] = float(np.log(0.8))
+    large = int(made.field.ids[3])
+    made.map(view(), 1, target(), shifted(0.02))
+    assert large not in made.field.ids.tolist()
+
+
+def test_the_first_keyframes_rates_fall_evenly_in_log() -> None:
+    config = MappingConfig(lr_means=1e-3, lr_means_first=4e-3)
+    means = [float(rates.per_column[0]) for rates in Rates.falling(config, 5)]
+    assert means == pytest.approx([4e-3, 4e-3 * 0.25**0.25, 2e-3, 4e-3 * 0.25**0.75, 1e-3], rel=1e-5)
+    others = [rates.per_column[3:] for rates in Rates.falling(config, 5)]
+    assert all(torch.equal(rates, Rates.of(config).per_column[3:]) for rates in others)
+    assert [float(r.per_column[0]) for r in Rates.falling(replace(config, lr_means_first=0.0), 2)] == pytest.approx(
+        [1e-3] * 2
+    )
