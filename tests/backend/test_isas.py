@@ -93,8 +93,8 @@ def losses() -> Outputs:
     _core.ssim_target(target, depth, *size, cache)
     similarity = _core.ssim(sums[:3], target, cache, *size, depth, -0.2, gradient[:3])
     alpha, pull, g_exposure = (depth_seen / 4.0).contiguous(), torch.full_like(sums, torch.nan), np.zeros(2)
-    numbers = [0.1, 3.0, 5.0, 0.6, 2.0, 3.0]
-    loss = _core.tracking_loss(sums, alpha, target, depth, *size, numbers, True, 1.1, 0.02, pull, g_exposure)
+    numbers = [0.1, 3.0, 5.0, 4.0, 0.6, 2.0, 3.0]
+    loss = _core.tracking_loss(sums, alpha, target, depth, *size, numbers, True, True, 1.1, 0.02, pull, g_exposure)
     maps = [np.zeros((BIG.height, BIG.width), np.float32) for _ in range(4)]
     _core.reference_maps(sums, alpha, depth, *size, numbers, True, *maps)
     crop = (slice(4), slice(BIG.height), slice(BIG.width))

@@ -101,6 +101,29 @@ def test_depth_is_weighed_by_the_maps_depth_variance_where_asked(view: View, kin
     assert plain.pyramid.weight_depth[0] is plain.pyramid.weight[0]
 
 
+@pytest.mark.parametrize("kind", ["keyframe", "map"])
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_depth_is_weighed_by_u_where_the_system_has_no_colour_variance(backend: str, kind: str) -> None:
+    """U needs no σ²: the weight of depth is the one a view with V finds, and gray has none."""
+    config, found = TrackingConfig(tau=3.0, weight_max=2.0, align_depth_by="U"), []
+    thick = wall().clone()
+    thick[::2, 2] += 0.05
+    for variance in (True, False):
+        view = make_view(backend, CAMERA, OPTIONS, variance)
+        image = pyramid(seen_from(view, TRUTH))
+        if kind == "keyframe":
+            found.append(keyframe_reference(thick, view, image, TRUTH, config).pyramid)
+        else:
+            found.append(map_reference(thick, view, TRUTH, config).pyramid)
+    both, without = found
+    assert both.weight[0] is not None and without.weight == [None] * len(without.cameras)
+    assert both.weight_depth[0] is not None and without.weight_depth[0] is not None
+    assert float(without.weight_depth[0].std()) > 0.1
+    np.testing.assert_allclose(without.weight_depth[0], both.weight_depth[0], rtol=1e-5)
+    off = dataclasses.replace(config, uncertainty=False)
+    assert map_reference(thick, make_view(backend, CAMERA, OPTIONS, False), TRUTH, off).pyramid.weight_depth[0] is None
+
+
 def test_without_uncertainty_a_keyframe_is_its_image_alone(view: View) -> None:
     image = pyramid(seen_from(view, TRUTH))
     config = TrackingConfig(uncertainty=False)

@@ -20,14 +20,14 @@ def uncertainty_weights(variance: Tensor, mask: Tensor, tau: float, weight_max: 
 
 
 @torch.no_grad()
-def outlier_mask(depth_error_m: Tensor, valid: Tensor, factor: float) -> Tensor:
-    """Tell which valid pixels agree in depth: |error| ≤ factor × its median over them, bool [H, W] (VarSplat §3).
+def outlier_mask(error: Tensor, valid: Tensor, factor: float) -> Tensor:
+    """Tell which valid pixels agree: |error| ≤ factor × its median over them, bool [H, W] (VarSplat §3, CG-SLAM §6).
 
-    depth_error_m [H, W] metres, any sign; factor 0 = off. The bound itself passes, so that a perfect render (median 0)
-    keeps its perfect pixels; NaN never passes.
+    error [H, W] of depth or colour, any sign; factor 0 = off. The bound itself passes, so that a perfect render
+    (median 0) keeps its perfect pixels; NaN never passes.
     """
     if factor <= 0.0 or not valid.any():
         return valid.clone()
-    error = depth_error_m.abs()
+    error = error.abs()
     known = error[valid].nan_to_num(nan=torch.inf)
     return valid & (error <= factor * known.median())

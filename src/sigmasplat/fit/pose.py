@@ -10,6 +10,7 @@ from torch import Tensor
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.fit.align import Alignment, align
+from sigmasplat.fit.motion import parametrisation
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
@@ -46,26 +47,28 @@ class PoseFit:
 def fit_pose_adam(
     params: Tensor, view: View, target: Target, T_camera_world: Matrix, config: TrackingConfig, iterations: int
 ) -> PoseFit:
-    """Descend L_track by Adam over a unit quaternion and a translation after the first guess; the best iterate wins.
+    """Descend L_track by Adam over the numbers that `parametrisation` makes of the pose; the best iterate wins.
 
     params [N, 17] and σ² are frozen (VarSplat §3). Ends early when a step is below `update_stop`, or when it changed
     the loss by less than `plateau_stop` of it. Raises nothing: without common pixels the guess comes back.
     """
-    motion, exposure = np.array([1.0, 0, 0, 0, 0, 0, 0]), np.zeros(2)
-    adam, adam_exposure = VectorAdam.of(7), VectorAdam.of(2)
-    rates = np.array([config.lr_rotation] * 4 + [config.lr_translation] * 3)
+    way = parametrisation(config, T_camera_world)
+    numbers, exposure = way.start, np.zeros(2)
+    adam, adam_exposure = VectorAdam.of(len(numbers)), VectorAdam.of(2)
+    rates = np.array([config.lr_rotation] * way.rotations + [config.lr_translation] * 3)
     rate_exposure = np.full(2, config.lr_exposure if config.exposure else 0.0)
     best, best_T, best_exposure, first, previous = np.inf, T_camera_world, np.zeros(2), np.inf, np.inf
     steps = 0
     for steps in range(1, iterations + 1):
-        T = _motion(motion) @ T_camera_world
+        T = way.pose(numbers)
         view.forward(params, T)
         loss, g_exposure = tracking_gradient(view, target, config, torch.as_tensor(exposure).float())
         first = loss if steps == 1 else first
-        if loss < best:
+        blind = loss == 0.0 and config.average == "kept"  # a mean over no pixel may not win over one over some
+        if loss < best and not (blind and steps > 1):
             best, best_T, best_exposure = loss, T, exposure.copy()
-        moved = adam.step(_motion_gradient(motion, view.backward_pose(params)), rates)
-        motion += moved
+        moved = adam.step(way.gradient(numbers, view.backward_pose(params)), rates)
+        numbers += moved
         exposure += adam_exposure.step(g_exposure.double().numpy(), rate_exposure)
         if np.abs(moved).max() < config.update_stop or abs(loss - previous) < config.plateau_stop * loss:
             break
@@ -74,27 +77,6 @@ def fit_pose_adam(
     agree, overlap = agreement(PoseMaps.of(view), target)
     T_best, (a, b) = se3.orthonormalise(best_T), best_exposure.tolist()
     return PoseFit(T_best, agree, overlap, first, best, steps, exposure=(a, b))
-
-
-def _motion(quaternion_translation: NDArray[np.float64]) -> Matrix:
-    """Build the 4×4 motion of (w, x, y, z, tx, ty, tz), the quaternion of any norm."""
-    T = np.eye(4)
-    T[:3, :3] = se3.rotation_from_quaternion(quaternion_translation[:4])
-    T[:3, 3] = quaternion_translation[4:]
-    return T
-
-
-def _motion_gradient(quaternion_translation: NDArray[np.float64], twist: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Turn the gradient by the left twist (ρ, φ) of motion · guess into that by the motion's seven numbers.
-
-    The motion's rotation turns the pose about the motion's translation t, so it feels g = g_φ − t × g_ρ; a quaternion q
-    feels that as 2 (0, g) ⊗ q / |q|².
-    """
-    q, t = quaternion_translation[:4], quaternion_translation[4:]
-    g = twist[3:] - np.cross(t, twist[:3])
-    w, v = q[0], q[1:]
-    g_q = 2.0 * np.concatenate([[-g @ v], w * g + np.cross(g, v)]) / (q @ q)
-    return np.concatenate([g_q, twist[:3]])
 
 
 def fit_pose_align(reference: Reference, live: Pyramid, T_camera_world: Matrix, config: TrackingConfig) -> PoseFit:

@@ -67,10 +67,11 @@ class ReferenceMaps(NamedTuple):
 def _reference_maps(view: View, config: TrackingConfig, moment: Tensor | None) -> ReferenceMaps:
     """Read a reference off a view: w̃ averaged over the channels, and the same form of U where its moment is given.
 
-    Where the map is thin V says nothing and the weight is 1, as for depth where there is no U.
+    Where the map is thin V says nothing and the weight is 1, as for depth where there is no U. A view without variance
+    gives no w̃: then gray has no weight.
     """
     weighed = config.uncertainty and len(view.sums) == 7
-    by_U = weighed and moment is not None
+    by_U = config.uncertainty and moment is not None
     if isinstance(view, CpuView):
         from sigmasplat.native import _core
 
@@ -87,7 +88,7 @@ def _reference_maps(view: View, config: TrackingConfig, moment: Tensor | None) -
     surface = torch.where(opaque, maps.depth / divisor, 0.0).numpy()
     weights: list[Image | None] = [None, None]
     for k, (variance, known) in enumerate(((maps.variance, opaque), (moment, opaque & (view.moment > 0)))):
-        if weighed and variance is not None:
+        if config.uncertainty and variance is not None:
             w = uncertainty_weights(variance.reshape(*opaque.shape, -1), known, config.tau, config.weight_max).mean(-1)
             weights[k] = torch.where(known, w, 1.0).numpy()
     return ReferenceMaps(gray, surface, (weights[0], weights[1]))

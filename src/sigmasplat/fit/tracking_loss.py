@@ -1,6 +1,7 @@
 """The papers' tracking loss: which pixels count and how much, the loss and its gradient on a view's planes."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -40,38 +41,61 @@ def agreement(maps: PoseMaps, target: Target) -> tuple[float, float]:
     return float((close & common).sum()) / max(n, 1), n / max(target.valid_pixels, 1)
 
 
-def pixel_weights(maps: PoseMaps, target: Target, config: TrackingConfig) -> tuple[Tensor, Tensor]:
-    """Return (A³·M [H, W], w̃ [H, W, 3]) of VarSplat §3, both stop-gradient."""
+class PixelWeights(NamedTuple):
+    """Which pixels count in colour and in depth, bool [H, W]; how much, A^p [H, W] and w̃ of colour [H, W, 3]."""
+
+    in_color: Tensor
+    in_depth: Tensor
+    opacity: Tensor
+    confidence: Tensor
+
+
+@torch.no_grad()
+def pixel_weights(maps: PoseMaps, target: Target, color_error: Tensor, config: TrackingConfig) -> PixelWeights:
+    """Choose and weigh pixels (VarSplat §3; CG-SLAM §6), stop-gradient; color_error [H, W, 3] of any sign."""
     valid = target.depth_image > 0
     if config.alpha_above > 0:
         valid = valid & (maps.alpha > config.alpha_above)
-    mask = outlier_mask(maps.depth - target.depth_image, valid, config.outlier_factor)
-    soft = maps.alpha.clamp(min=0.0) ** config.alpha_power * mask
-    if not config.uncertainty or maps.variance is None:
-        return soft, torch.ones_like(maps.color)
-    return soft, uncertainty_weights(maps.variance, mask, config.tau, config.weight_max)
+    in_depth = outlier_mask(maps.depth - target.depth_image, valid, config.outlier_factor)
+    in_color = in_depth
+    if config.outlier_factor_color > 0:
+        in_color = outlier_mask(color_error.abs().sum(-1), valid, config.outlier_factor_color)
+    opacity, confidence = maps.alpha.clamp(min=0.0) ** config.alpha_power, torch.ones_like(maps.color)
+    if config.uncertainty and maps.variance is not None:
+        confidence = uncertainty_weights(maps.variance, in_color, config.tau, config.weight_max)
+    return PixelWeights(in_color, in_depth, opacity, confidence)
+
+
+def per_value(weight: float, mask: Tensor, channels: int, average: str) -> float:
+    """Return what an error counts in the mean: of an image's pixels all channels together, of those kept each alone.
+
+    Without a kept pixel it counts nothing.
+    """
+    n = mask.numel() if average == "image" else channels * int(mask.sum())
+    return weight / n if n else 0.0
 
 
 def tracking_gradient(view: View, target: Target, config: TrackingConfig, exposure: Tensor) -> tuple[float, Tensor]:
     """Write ∂L_track/∂(color, depth) to the view's planes; return the loss and its gradient by exposure (a, b).
 
-    L_track = Σ A³ M (λ_c w̃ |exp(a) Ĉ + b − C| + (1 − λ_c) |D̂ − D|), here a mean over pixels (VarSplat §3).
+    L_track = Σ A³ M (λ_c w̃ |exp(a) Ĉ + b − C| + (1 − λ_c) |D̂ − D|), here a mean over pixels (VarSplat §3), or over
+    those that colour and depth each keep (CG-SLAM §6).
     """
     if isinstance(view, CpuView):
         return _compiled(view, target, config, exposure)
-    maps = PoseMaps.of(view)
-    soft, weights = pixel_weights(maps, target, config)
-    count = soft.numel()
+    maps, c = PoseMaps.of(view), config
     gain, offset = exposure[0].exp(), exposure[1]
     color_error = gain * maps.color + offset - target.image
     depth_error = maps.depth - target.depth_image
-    on_color = config.weight_color / count * soft[..., None] * weights
-    on_depth = (1.0 - config.weight_color) / count * soft
+    w = pixel_weights(maps, target, color_error, config)
+    each_color = per_value(c.weight_color, w.in_color, 3, c.average)
+    on_color = each_color * (w.opacity * w.in_color)[..., None] * w.confidence
+    on_depth = per_value(1.0 - c.weight_color, w.in_depth, 1, c.average) * (w.opacity * w.in_depth)
     g_color = on_color * color_error.sign()
-    h, w = soft.shape
+    rows, columns = depth_error.shape
     view.g_sums.zero_()
-    view.g_sums[:3, :h, :w] = (gain * g_color).movedim(-1, 0)
-    view.g_sums[3, :h, :w] = on_depth * depth_error.sign()
+    view.g_sums[:3, :rows, :columns] = (gain * g_color).movedim(-1, 0)
+    view.g_sums[3, :rows, :columns] = on_depth * depth_error.sign()
     loss = (on_color * color_error.abs()).sum() + (on_depth * depth_error.abs()).sum()
     g_exposure = torch.stack([(g_color * gain * maps.color).sum(), g_color.sum()])
     return float(loss), g_exposure
@@ -84,7 +108,7 @@ def _compiled(view: CpuView, target: Target, config: TrackingConfig, exposure: T
     g_exposure, camera = np.zeros(2), view.camera
     loss = _core.tracking_loss(
         view.sums, view.alpha, target.color, target.depth, camera.width, camera.height,
-        tracking_numbers(config, config.alpha_above), config.uncertainty,
+        tracking_numbers(config, config.alpha_above), config.uncertainty, config.average == "kept",
         float(exposure[0].exp()), float(exposure[1]), view.g_sums, g_exposure,
     )  # fmt: skip
     return loss, torch.as_tensor(g_exposure, dtype=exposure.dtype)
@@ -93,4 +117,6 @@ def _compiled(view: CpuView, target: Target, config: TrackingConfig, exposure: T
 def tracking_numbers(config: TrackingConfig, alpha_above: float) -> list[float]:
     """Lay settings out as the kernels' `TrackOptions`."""
     c = config
-    return [alpha_above, c.alpha_power, c.outlier_factor, c.weight_color, c.tau, c.weight_max]
+    return [
+        alpha_above, c.alpha_power, c.outlier_factor, c.outlier_factor_color, c.weight_color, c.tau, c.weight_max,
+    ]  # fmt: skip

@@ -74,6 +74,7 @@ def tracking_loss(
     height: int,
     options: list[float],
     uncertainty: bool,
+    kept: bool,
     gain: float,
     offset: float,
     g_sums: Array,

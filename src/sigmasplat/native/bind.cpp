@@ -88,9 +88,9 @@ struct Level {
     }
 };
 
-static TrackOptions track_options(const std::vector<float>& v, bool uncertainty) {
-    need(v.size() == 6, "tracking has six numbers");
-    return {v[0], v[1], v[2], v[3], v[4], v[5], uncertainty};
+static TrackOptions track_options(const std::vector<float>& v, bool uncertainty, bool kept = false) {
+    need(v.size() == 7, "tracking has seven numbers");
+    return {v[0], v[1], v[2], v[3], v[4], v[5], v[6], uncertainty, kept};
 }
 
 // The buffers of one render, bound to the instruction set that was active when it was made.
@@ -241,10 +241,10 @@ NB_MODULE(_core, m) {
     }, nb::arg("sums"), nb::arg("median_depth").none(), nb::arg("moment").none(), nb::arg("target_color"), nb::arg("target_depth"), nb::arg("height"),
        nb::arg("weights"), nb::arg("valid_pixels"), nb::arg("g_sums"), nb::arg("g_median_depth").none(), nb::arg("g_moment").none(), nb::arg("losses"));
     m.def("tracking_loss", [](ConstFloats sums, ConstFloats alpha, ConstFloats target_color, ConstFloats target_depth, int width, int height,
-                              std::vector<float> options, bool uncertainty, float gain, float offset, Floats g_sums, Doubles g_exposure) {
+                              std::vector<float> options, bool uncertainty, bool kept, float gain, float offset, Floats g_sums, Doubles g_exposure) {
         need(g_exposure.size() == 2, "g_exposure has 2 numbers");
         const Plane plane{width, height, sums.shape(2), sums.shape(1) * sums.shape(2)};
-        const TrackOptions o = track_options(options, uncertainty);
+        const TrackOptions o = track_options(options, uncertainty, kept);
         nb::gil_scoped_release unlocked;
         return active->tracking_loss(sums.data(), alpha.data(), sums.shape(0) >= 7, target_color.data(), target_depth.data(), plane, o, gain, offset,
                                      g_sums.data(), g_exposure.data());

@@ -39,8 +39,9 @@ struct AdamState { float *moment1, *moment2; int* last_step; };                 
 struct Plane { int width, height; size_t stride, plane; };   // image planes of rows `stride` floats long, `plane` floats apart
 
 struct TrackOptions {                      // settings of TrackingConfig
-    float alpha_above, alpha_power, outlier_factor, weight_color, tau, weight_max;
+    float alpha_above, alpha_power, outlier_factor, outlier_factor_color, weight_color, tau, weight_max;
     bool uncertainty;
+    bool kept = false;                     // errors are averaged over the pixels they keep, not over the image
 };
 
 struct AlignLevel {                        // one pyramid level, planes of width × height

@@ -94,8 +94,28 @@ SIGMA_INLINE vf uncertainty_weight(const float* sums, const Plane& p, size_t at,
     return confidence(variance_of(sums, p, at, c), log_median, o);
 }
 
-// L_track (VarSplat §3) as a mean over pixels: write its gradient by colour and depth to planes, return the loss;
-// g_exposure [2] is its gradient by (a, b) of exp(a)·Ĉ + b. The mask needs the median depth error, the weights that of V.
+// factor × the median of an error over the pixels chosen; infinite where the factor is 0 or none is chosen.
+template <class Error, class Chosen>
+static float outlier_limit(const Plane& p, Selection& s, float factor, Error error, Chosen chosen) {
+    float median;
+    const bool found = factor > 0.f && lower_median(p, s, error, [&](size_t at, vf) { return chosen(at); }, &median);
+    return found ? factor * median : __builtin_inff();
+}
+
+// What an error counts in a mean: over the image's pixels (all channels together), or over each channel of those kept.
+template <class Chosen>
+static float per_value(const Plane& p, bool kept, float weight, int channels, Chosen chosen) {
+    if (!kept) return weight / (float(p.width) * float(p.height));
+    int64_t n = 0;
+#pragma omp parallel for schedule(static) reduction(+ : n)
+    for (int y = 0; y < p.height; y++)
+        for (int x = 0; x < p.width; x += W)
+            n += __builtin_popcount(bits(both(first_lanes(p.width - x), chosen(size_t(y) * p.stride + x))));
+    return n ? weight / float(channels * n) : 0.f;
+}
+
+// L_track (VarSplat §3; CG-SLAM §6) as a mean over pixels: write its gradient by colour and depth to planes, return the
+// loss; g_exposure [2] is its gradient by (a, b) of exp(a)·Ĉ + b. The masks need the errors' medians, the weights that of V.
 static double tracking_loss(const float* sums, const float* alpha, bool variance, const float* target_color,
                             const float* target_depth, Plane p, TrackOptions o, float gain, float offset, float* g_sums,
                             double* g_exposure) {
@@ -106,13 +126,20 @@ static double tracking_loss(const float* sums, const float* alpha, bool variance
         const Mask read = gt(load(target_depth + at), splat(0.f));
         return o.alpha_above > 0.f ? both(read, gt(load(alpha + at), splat(o.alpha_above))) : read;
     };
-    float limit = __builtin_inff(), median;
-    if (o.outlier_factor > 0.f && lower_median(p, scratch, error_at, [&](size_t at, vf) { return counts(at); }, &median))
-        limit = o.outlier_factor * median;
+    const auto color_error_at = [&](size_t at) {
+        vf total = splat(0.f);
+        for (int c = 0; c < 3; c++)
+            total += abs(fma(splat(gain), load(sums + c * p.plane + at), offset - load(target_color + c * p.plane + at)));
+        return total;
+    };
+    const float limit = outlier_limit(p, scratch, o.outlier_factor, error_at, counts);
+    const float limit_color = outlier_limit(p, scratch, o.outlier_factor_color, color_error_at, counts);
+    const bool own = o.outlier_factor_color > 0.f;    // colour has a mask of its own, else depth's
+    const auto in_depth = [&](size_t at) { return both(counts(at), ge(splat(limit), error_at(at))); };
+    const auto in_color = [&](size_t at) { return own ? both(counts(at), ge(splat(limit_color), color_error_at(at))) : in_depth(at); };
     float log_median[3];
-    const auto used = [&](size_t at) { return both(counts(at), ge(splat(limit), error_at(at))); };
-    const bool weigh = o.uncertainty && variance && median_log_variance(sums, p, scratch, used, log_median);
-    const float count = float(p.width) * float(p.height), per_color = o.weight_color / count, per_depth = (1.f - o.weight_color) / count;
+    const bool weigh = o.uncertainty && variance && median_log_variance(sums, p, scratch, in_color, log_median);
+    const float per_color = per_value(p, o.kept, o.weight_color, 3, in_color), per_depth = per_value(p, o.kept, 1.f - o.weight_color, 1, in_depth);
     Buffer<double> rows;
     rows.reserve(size_t(p.height) * 3);
 #pragma omp parallel for schedule(static)
@@ -121,9 +148,9 @@ static double tracking_loss(const float* sums, const float* alpha, bool variance
         for (int x = 0; x < int(p.stride); x += W) {
             const size_t at = size_t(y) * p.stride + x;
             const vf A = max(load(alpha + at), splat(0.f)), error = load(depth + at) - load(target_depth + at);
-            const Mask valid = both(first_lanes(p.width - x), used(at));
+            const Mask inside = first_lanes(p.width - x);
             const vf power = o.alpha_power == 0.f ? splat(1.f) : exp2(o.alpha_power * log2(max(A, splat(1e-30f))));
-            const vf soft = only(valid, power), on_depth = per_depth * soft;
+            const vf soft = only(both(inside, in_color(at)), power), on_depth = per_depth * only(both(inside, in_depth(at)), power);
             store(g_sums + 3 * p.plane + at, signed_weight(error, 1.f) * on_depth);
             total[0] += on_depth * abs(error);
             for (int c = 0; c < 3; c++) {

@@ -1,5 +1,6 @@
 """Follow the camera: guess, fit the pose against the frozen map, judge, and try again from elsewhere if it failed."""
 
+import dataclasses
 from dataclasses import dataclass, field as dataclass_field
 
 import numpy as np
@@ -33,6 +34,8 @@ class Tracker:
     agreements: list[float] = dataclass_field(default_factory=list)
     first_losses: list[float] = dataclass_field(default_factory=list)
     lost: bool = False
+    started: bool = False
+    """Whether a frame has been tracked yet."""
 
     def start(self, live: Pyramid) -> None:
         """Fix the gauge: the first camera is the world."""
@@ -44,7 +47,7 @@ class Tracker:
         A lost frame keeps the best guess there is (odometry, else the last pose), and the velocity is forgotten.
         """
         predicted = self.previous @ self.velocity if self.config.motion_model else self.previous
-        fit = self._fit(field, view, target, live, predicted, self.config.iterations)
+        fit = self._fit(field, view, target, live, predicted)
         if self._doubtful(fit):
             fit = self._retry(field, view, target, live, fit)
         self.lost = is_lost(fit, self.config.lost_agreement, self.config.lost_share)
@@ -57,15 +60,17 @@ class Tracker:
             self.agreements.append(fit.agreement * fit.overlap)
             self.first_losses.append(fit.first_loss)
         self.previous = T_world_camera
-        self.last_image = live
+        self.last_image, self.started = live, True
         return fit
 
     def _fit(
-        self, field: GaussianField, view: View, target: Target, live: Pyramid, guess: Matrix, iterations: int
+        self, field: GaussianField, view: View, target: Target, live: Pyramid, guess: Matrix, patience: int = 1
     ) -> PoseFit:
+        """Fit from a guess of T_world_camera; patience: how many times the usual iterations descent may take."""
         T_camera_world = se3.inverse(guess)
         if self.config.method == "adam":
-            return fit_pose_adam(field.params, view, target, T_camera_world, self.config, iterations)
+            config = self.config if self.started else _without_motion(self.config)
+            return fit_pose_adam(field.params, view, target, T_camera_world, config, patience * config.iterations)
         if self.config.align_to == "keyframe" and self.keyframe is not None:
             return fit_pose_align(self.keyframe, live, T_camera_world, self.config)
         reference = map_reference(field.params, view, T_camera_world, self.config)
@@ -83,7 +88,7 @@ class Tracker:
         """
         odometry = self._odometry(view, live)
         starts = [self.previous] if odometry is None else [odometry, self.previous]
-        fits = [fit] + [self._fit(field, view, target, live, s, 2 * self.config.iterations) for s in starts]
+        fits = [fit] + [self._fit(field, view, target, live, s, 2) for s in starts]
         if self.config.method == "align" and self.config.align_to == "keyframe":  # with "map", `_fit` has tried it
             for start in starts:
                 reference = map_reference(field.params, view, se3.inverse(start), self.config)
@@ -122,3 +127,12 @@ class Tracker:
             return fit.covariance
         T_live_keyframe = fit.T_camera_world @ se3.inverse(self.keyframe.T_camera_world)
         return align(self.keyframe.pyramid, live, T_live_keyframe, 0, self.config.align_weight_color).covariance
+
+
+def _without_motion(config: TrackingConfig) -> TrackingConfig:
+    """Return the settings for a sequence's second frame: there is no motion to guess it by (CG-SLAM's code)."""
+    return dataclasses.replace(
+        config,
+        iterations=config.first_iterations or config.iterations,
+        lr_rotation=config.first_lr_rotation or config.lr_rotation,
+    )
