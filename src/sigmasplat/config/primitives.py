@@ -16,6 +16,8 @@ class PrimitiveConfig:
     (CG-SLAM's code)."""
     faded_opacity: float = 0.07
     """The opacity of a faded splat: above `render.alpha_min`, so that it is still seen and may come back (ours)."""
+    least_opacity: float = 15.0 / 255.0
+    """… and has come back when it is no longer uncertain, and not fainter than this (CG-SLAM's α_min)."""
     split_gradient: float = 0.0
     """A splat is hot when the loss pulls at its mean by more than this, in the newest keyframe's images, per half image
     size (3DGS); 0 = off: nothing is split or cloned."""

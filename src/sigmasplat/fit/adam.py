@@ -1,5 +1,6 @@
 """Step every splat by Adam (Kingma & Ba 2015), a learning rate per column of the field."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +32,16 @@ class Rates:
         for name, columns in COLUMNS.items():
             rates[columns] = getattr(config, f"lr_{name}")
         return Rates(rates)
+
+    @staticmethod
+    def falling(config: MappingConfig, steps: int) -> "Iterator[Rates]":
+        """Yield the rates of a first keyframe's steps: of means from `lr_means_first` down to `lr_means`, by log."""
+        for step in range(steps):
+            rates = Rates.of(config)
+            if config.lr_means_first and config.lr_means:
+                left = 1.0 - step / max(steps - 1, 1)
+                rates.per_column[COLUMNS["means"]] *= (config.lr_means_first / config.lr_means) ** left
+            yield rates
 
     def of_extra(self, name: str) -> "Rates":
         """Return the rates of an extra of a field that has these ones."""

@@ -28,6 +28,12 @@ class FieldFit:
     losses: list[float] = dataclass_field(default_factory=list)
     seconds: dict[str, float] = dataclass_field(default_factory=dict)
 
+    def join(self, later: "FieldFit") -> None:
+        """Take in what a later fit did."""
+        self.losses += later.losses
+        for stage, seconds in later.seconds.items():
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
+
     def add(self, stage: str, since: float) -> float:
         """Book the time since then under a stage; return now."""
         now = time.perf_counter()

@@ -1,12 +1,16 @@
-"""Grow and adjust the map at keyframes: seed what is new, fit the field, prune what has faded (VarSplat §2)."""
+"""Grow and adjust the map at keyframes: seed what is new, fit the field in two halves, drop, fade and multiply splats
+between them (VarSplat §2; CG-SLAM §4, 5, 7)."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field as dataclass_field
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from sigmasplat.config import Config
+from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.field import FieldFit, fit_field
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.fit.tracking_loss import PoseMaps
@@ -14,8 +18,14 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.submap import Picture, Submap
 from sigmasplat.render.view import View
+from sigmasplat.slam.densify import Heat, hot_splats, multiply, too_large
+from sigmasplat.slam.primitives import fade, primitive_uncertainty, still_uncertain
 from sigmasplat.slam.rules import draw_keyframes
 from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats, thin_out
+from sigmasplat.slam.window import choose_window, dominating
+
+JUDGES = 8
+"""Splats are judged by so many keyframes at most, the newest ones where there is no window."""
 
 
 @dataclass(eq=False)
@@ -27,23 +37,66 @@ class Mapper:
     field: GaussianField = dataclass_field(default_factory=GaussianField.empty)
     keyframes: list[Keyframe] = dataclass_field(default_factory=list)
 
-    def map(self, view: View, index: int, target: Target, T_world_camera: NDArray[np.float64]) -> FieldFit:
-        """Take in one keyframe: seed, then fit in two halves with a pruning after each."""
-        first, empty = not self.keyframes, len(self.field) == 0
-        old = len(self.field)
-        self.keyframes.append(Keyframe(index, target, T_world_camera, fixed=first))
+    def map(
+        self,
+        view: View,
+        index: int,
+        target: Target,
+        T_world_camera: NDArray[np.float64],
+        descriptor: NDArray[np.float32] | None = None,
+    ) -> FieldFit:
+        """Take in one keyframe: seed, choose which ones to look at, fit in two halves with a clearing after each."""
+        c, born, begun = self.config.mapping, self.field.born, len(self.field) > 0
+        self.keyframes.append(Keyframe(index, target, T_world_camera, not self.keyframes, descriptor=descriptor))
         self._seed(view, target, T_world_camera)
-        c = self.config.mapping
-        iterations = c.first_iterations if empty else c.iterations
-        fit = FieldFit()
-        for half in (iterations // 2, iterations - iterations // 2):
-            order = draw_keyframes(self.keyframes, half, c.newest_probability, c.keyframe_history, self.random)
-            done = fit_field(self.field, view, order, c, None, old if c.freeze_old_colors else 0)
-            old -= self._prune(old)
-            fit.losses += done.losses
-            for stage, seconds in done.seconds.items():
-                fit.seconds[stage] = fit.seconds.get(stage, 0.0) + seconds
+        steps = c.iterations if begun else c.first_iterations
+        rates = iter([Rates.of(c)] * steps if begun else Rates.falling(c, steps))
+        window, heat = self._window(view), Heat.of(len(self.field))
+        fit = self._fit(view, window, steps // 2, rates, born, c.poses_from == "start", heat)
+        self._multiply(heat)
+        self._prune(view)
+        doubted = self._doubt(view, window)
+        fit.join(self._fit(view, window, steps - steps // 2, rates, born, True, None))
+        self._drop_doubted(view, window, doubted)
+        self._prune(view)
         return fit
+
+    def _window(self, view: View) -> list[Keyframe]:
+        """Choose the keyframes to look at, the newest first; without a window all of them."""
+        c = self.config.mapping
+        if not c.window:
+            return self.keyframes[::-1]
+        if c.covisibility == "splats":
+            newest = self.keyframes[-1]
+            view.forward(self.field.params, se3.inverse(newest.T_world_camera), layers=True)
+            newest.seen = dominating(view, self.field)
+        return choose_window(self.keyframes, c.window, c.covisibility)
+
+    def _fit(
+        self,
+        view: View,
+        window: list[Keyframe],
+        steps: int,
+        rates: Iterator[Rates],
+        born: int,
+        poses: bool,
+        heat: Heat | None,
+    ) -> FieldFit:
+        """Fit the field to the window; splats with ids below `born` are the old ones."""
+        c, newest = self.config.mapping, self.keyframes[-1]
+        together, history = c.frames_per_step or len(window), c.keyframe_history
+        batches = draw_keyframes(window[::-1], steps, c.newest_probability, history, self.random, together)
+        frozen = int((self.field.ids < born).sum()) if c.freeze_old_colors else 0
+
+        def may_move(keyframe: Keyframe) -> bool:
+            return poses and not keyframe.fixed and (c.poses == "all" or keyframe is newest)
+
+        def felt(keyframe: Keyframe, pull: Tensor) -> None:
+            if heat is not None and keyframe is newest:
+                heat.add(pull)
+
+        pulled = felt if heat is not None and self.config.primitives.split_gradient > 0 else None
+        return fit_field(self.field, view, batches, c, rates, frozen, may_move=may_move, felt=pulled)
 
     def finished(self, index: int) -> tuple[Submap, list[Picture]]:
         """Return what has been mapped as a finished submap, and what its keyframes saw."""
@@ -82,8 +135,30 @@ class Mapper:
             new.keep(torch.from_numpy(self.random.permutation(len(new))[: max(room, 0)].copy()).sort().values)
         self.field.append(new)
 
-    def _prune(self, old: int) -> int:
-        """Drop splats that have faded; return how many of the first `old` went."""
+    def _multiply(self, heat: Heat) -> None:
+        """Split and clone the splats that the newest keyframe pulled at hardest, as far as the budget goes."""
+        p, most = self.config.primitives, self.config.seeding.max_splats
+        room = max(most - len(self.field), 0) if most else None
+        multiply(self.field, hot_splats(heat.pull, heat.times, p.split_gradient, room), p, self.random)
+
+    def _doubt(self, view: View, window: list[Keyframe]) -> Tensor:
+        """Fade the splats that the window's readings contradict; return their ids."""
+        p = self.config.primitives
+        if not p.uncertain_m2:
+            return self.field.ids[:0]
+        nu, _ = primitive_uncertainty(self.field, view, window[:JUDGES], p.owner)
+        return fade(self.field, nu > p.uncertain_m2, p.faded_opacity)
+
+    def _drop_doubted(self, view: View, window: list[Keyframe], doubted: Tensor) -> None:
+        """Drop the splats faded before that have not come back."""
+        if len(doubted):
+            p = self.config.primitives
+            nu, _ = primitive_uncertainty(self.field, view, window[:JUDGES], p.owner)
+            self.field.keep(~still_uncertain(self.field, doubted, nu, p.uncertain_m2, p.least_opacity))
+
+    def _prune(self, view: View) -> None:
+        """Drop splats that have faded or grown too large."""
+        p, T_camera_world = self.config.primitives, se3.inverse(self.keyframes[-1].T_world_camera)
         keep = self.field.opacities > self.config.mapping.prune_opacity
+        keep &= ~too_large(self.field, T_camera_world, view.camera, p.most_scale_m, p.most_radius_px)
         self.field.keep(keep)
-        return int((~keep[:old]).sum())

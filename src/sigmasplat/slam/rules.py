@@ -46,15 +46,27 @@ def jumped(value: float, history: Sequence[float], factor: float) -> bool:
 
 
 def draw_keyframes(
-    keyframes: Sequence[Item], iterations: int, newest_probability: float, history: int, random: np.random.Generator
+    keyframes: Sequence[Item],
+    iterations: int,
+    newest_probability: float,
+    history: int,
+    random: np.random.Generator,
+    together: int = 1,
 ) -> Iterator[list[Item]]:
-    """Draw one keyframe per iteration: the newest with the given probability, else any (VarSplat §2).
+    """Draw keyframes per iteration: the newest with the given probability, else any (VarSplat §2).
 
-    history > 0 limits the others to the latest so many.
+    history > 0 limits the others to the latest so many. Several `together` are different ones, all where there are no
+    more (CG-SLAM §7).
     """
     older = list(keyframes[:-1])[-history:] if history else list(keyframes[:-1])
+    everything = [*older, keyframes[-1]]
     for _ in range(iterations):
-        if not older or random.random() < newest_probability:
-            yield [keyframes[-1]]
-        else:
-            yield [older[int(random.integers(len(older)))]]
+        if together >= len(everything) > 1:
+            yield everything
+            continue
+        newest = not older or random.random() < newest_probability
+        drawn = [len(older)] if newest else [int(random.integers(len(older)))]
+        if together > 1:
+            others = [i for i in range(len(everything)) if i != drawn[0]]
+            drawn += [int(i) for i in random.choice(others, min(together - 1, len(others)), replace=False)]
+        yield [everything[i] for i in drawn]

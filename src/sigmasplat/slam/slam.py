@@ -51,7 +51,6 @@ class Slam:
         self.descriptor = make_descriptor(self.config.loops)
         self.steps: list[Step] = []
         self.keyframes: list[int] = []
-        self._descriptors: list[NDArray[np.float32]] = []
         self._view: View | None = None
         self._closer: LoopCloser | None = None
         self._final: GaussianField | None = None
@@ -158,12 +157,19 @@ class Slam:
         s = self.config.submaps
         return bool(s.distance_m or s.angle_deg or s.frames or s.uncertainty_m)
 
+    @property
+    def _describes(self) -> bool:
+        """Tell whether anything compares keyframes by their looks."""
+        m = self.config.mapping
+        return (self._cuts and self.config.loops.close) or (m.window > 2 and m.covisibility == "descriptor")
+
     def _freeze(self) -> list[Loop]:
         """Hand the active submap to the store and look for its loops, which may move anchors."""
         assert self._closer is not None
         submap, pictures = self.mapper.finished(len(self.store))
         self.store.save(submap, pictures)
-        return self._closer.submap_finished(submap, self._descriptors, self.atlas)
+        descriptors = [keyframe.descriptor for keyframe in self.mapper.keyframes]
+        return self._closer.submap_finished(submap, [d for d in descriptors if d is not None], self.atlas)
 
     def _cut(self, view: View, T_submap_camera: Matrix, seconds: dict[str, float]) -> list[Loop]:
         """Finish the active submap and begin the next one at its newest keyframe, which both share; return the loops
@@ -174,15 +180,16 @@ class Slam:
         self._closer.submap_begun(len(self.store), T_submap_camera, self.drift.information)
         self.atlas.begin_submap(T_submap_camera)
         self.mapper = self.mapper.successor(view, T_submap_camera)
-        self.drift, self._descriptors = Drift(), []
+        self.drift = Drift()
         seconds["cut"] = time.perf_counter() - clock
         return loops
 
     def _view_for(self, frame: Frame) -> View:
         c = self.config
         if self._view is None:
-            weights = c.mapping.weight_nll_color or c.mapping.weight_nll_depth
-            self._view = make_view(c.backend, frame.camera, c.render, variance=bool(weights or c.tracking.uncertainty))
+            learned = bool(c.mapping.weight_nll_color or c.mapping.weight_nll_depth)
+            read = c.tracking.uncertainty and c.tracking.align_depth_by == "V"
+            self._view = make_view(c.backend, frame.camera, c.render, variance=learned or read)
             self._closer = LoopCloser(c, self.store, self._view)
         if frame.camera != self._view.camera:
             raise SourceError(f"frame {frame.index} comes from another camera ({frame.camera}) than the first")
@@ -220,7 +227,9 @@ class Slam:
     ) -> Matrix:  # fmt: skip
         """Map a keyframe; return its pose, which mapping may have moved."""
         clock = time.perf_counter()
-        fit = self.mapper.map(view, len(self.steps), target, T_submap_camera)
+        descriptor = self.descriptor.describe(frame.color, frame.depth_m) if self._describes else None
+        seconds["describe"], clock = seconds.get("describe", 0.0) + time.perf_counter() - clock, time.perf_counter()
+        fit = self.mapper.map(view, len(self.steps), target, T_submap_camera, descriptor)
         for stage, spent in {
             "map": time.perf_counter() - clock,
             **{f"map_{n}": s for n, s in fit.seconds.items()},
@@ -229,8 +238,4 @@ class Slam:
         self.keyframes += [len(self.steps)] * (self.keyframes[-1:] != [len(self.steps)])  # a shared one counts once
         self.atlas.keyframes[-1] = [keyframe.T_world_camera for keyframe in self.mapper.keyframes]
         self.tracker.keep_keyframe(self.mapper.field, view, live, self.atlas.keyframes[-1][-1])
-        if self._cuts and self.config.loops.close:
-            clock = time.perf_counter()
-            self._descriptors.append(self.descriptor.describe(frame.color, frame.depth_m))
-            seconds["describe"] = time.perf_counter() - clock
         return self.atlas.keyframes[-1][-1]
