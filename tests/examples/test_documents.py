@@ -44,19 +44,20 @@ def test_named_tests_files_and_settings_exist(path: Path) -> None:
         known = {*vars(getattr(Config(), section)), "py", "json"}
         logged = {"agreement", "overlap", "first_loss", "loss", "iterations"} if path.name == "runs.md" else set()
         assert name in known | logged or (PACKAGE / section / f"{name}.py").is_file(), f"{path.name}: {section}.{name}"
-    for name in re.findall(r"`((?:varsplat|loopsplat)-(?!NAME|X)[a-z]+)`", text):
-        assert name in list_presets()
+    for name in re.findall(r"`((?:varsplat|loopsplat|cgslam)-[a-z0-9-]*[a-z0-9])`", text):
+        assert name in list_presets(), f"{path.name} names {name}"
 
 
-def test_the_equations_functions_exist() -> None:
-    """Every function beside a file in varsplat.md is defined there."""
-    text = (ROOT / "docs" / "varsplat.md").read_text(encoding="utf-8")
+@pytest.mark.parametrize("document", ["varsplat.md", "cgslam.md"])
+def test_the_equations_functions_exist(document: str) -> None:
+    """Every function beside a file in the papers' documents is defined there."""
+    text = (ROOT / "docs" / document).read_text(encoding="utf-8")
     pairs = re.findall(r"`(\w+/\w+\.py)` ((?:`\w+`(?:, )?)+)", text)
     assert len(pairs) > 15
     for file, names in pairs:
         tree = ast.parse((PACKAGE / file).read_text(encoding="utf-8"))
         defined = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
-        assert set(re.findall(r"\w+", names)) <= defined, f"varsplat.md: {file} {names}"
+        assert set(re.findall(r"\w+", names)) <= defined, f"{document}: {file} {names}"
 
 
 def test_the_fast_presets_table_is_whole() -> None:

@@ -90,6 +90,7 @@ COMMON: dict[str, Any] = {
     "primitives.uncertain_m2": 0.025,
     "primitives.owner": "dominant",
     "primitives.faded_opacity": 0.07,
+    "primitives.least_opacity": 15 / 255,
     "primitives.split_gradient": 0.002,
     "primitives.clone": True,
     "primitives.most_radius_px": 0.0,
@@ -138,7 +139,7 @@ def test_a_faded_splat_is_still_seen() -> None:
     for config in map(preset, list_presets()):
         if config.primitives.uncertain_m2:
             assert config.render.alpha_min < config.primitives.faded_opacity
-            assert config.mapping.prune_opacity < config.primitives.faded_opacity
+            assert config.mapping.prune_opacity < config.primitives.least_opacity < config.primitives.faded_opacity
 
 
 def test_light_is_half_the_width_and_nothing_else() -> None:

@@ -58,7 +58,9 @@ PAPER = Config(
         covisibility="splats",  # both take NetVLAD's, whose weights are a download, and the paper for its speed alone
         frames_per_step=0,
     ),
-    primitives=PrimitiveConfig(uncertain_m2=0.025, faded_opacity=0.07, split_gradient=0.002, clone=True),
+    primitives=PrimitiveConfig(
+        uncertain_m2=0.025, faded_opacity=0.07, least_opacity=15.0 / 255.0, split_gradient=0.002, clone=True
+    ),
     tracking=TrackingConfig(
         parametrisation="axis-angle",
         lr_rotation=1.5e-3,
