@@ -105,7 +105,7 @@ class CovarianceView:
             g_blended = tuple(torch.empty_like(x) for x in self._blended)
             g_slots = torch.cat([g_sums, torch.zeros_like(g_sums[:1])])
             self._raster.blend_backward(self._slots, None, self.alpha, g_slots, None, g_alpha, *g_blended)
-        return torch.autograd.grad(self._splats, (*self._leaves, self._twist), g_blended)
+        return torch.autograd.grad(self._splats, (*self._leaves, self._twist), g_blended, materialize_grads=True)
 
     def visible(self, n: int) -> Tensor:
         return self._visible

@@ -75,7 +75,8 @@ class ViewDependentStep:
             pull, term = isotropy(own[:, SCALES], weight_isotropy * len(rows) / len(field))
             g[:, MEANS] += g_means
             g[:, SCALES] += pull
-            twist[:3] += (self._R @ g_means.sum(0)).numpy()  # a camera that moves by ρ leaves the directions to −ρ
+            if self.view.options.color_pose_gradient:  # a camera that moves by ρ leaves the directions to −ρ
+                twist[:3] += (self._R @ g_means.sum(0)).numpy()
             regulariser += term
             adam_rows(field, rows, g, rates)
             adam_rows(harmonics, rows, g_harmonics, harmonic_rates)

@@ -58,6 +58,7 @@ class View(Protocol):
     """One camera with its planes: sums [K, rows, columns] of (r, g, b, z[, σ²+c² ×3]), alpha, and their gradients."""
 
     camera: Camera
+    options: RenderConfig
     sums: Tensor
     alpha: Tensor
     g_sums: Tensor
@@ -172,12 +173,14 @@ class ReferenceView:
             self.layers.fill(b, p.z.detach())
 
     def backward(self, params: Tensor, g_params: Tensor) -> Matrix:
-        g_leaf, g_twist = torch.autograd.grad(self._maps, (self._leaf, self._twist), (self.g_sums, self.g_alpha))
+        leaves = (self._leaf, self._twist)
+        g_leaf, g_twist = torch.autograd.grad(self._maps, leaves, (self.g_sums, self.g_alpha), materialize_grads=True)
         g_params.copy_(g_leaf)
         return np.asarray(g_twist.numpy(), np.float64)
 
     def backward_pose(self, params: Tensor) -> Matrix:
-        (g_twist,) = torch.autograd.grad(self._maps[0][:4], (self._twist,), (self.g_sums[:4],))
+        maps, on_maps = self._maps[0][:4], (self.g_sums[:4],)
+        (g_twist,) = torch.autograd.grad(maps, (self._twist,), on_maps, materialize_grads=True)
         return np.asarray(g_twist.numpy(), np.float64)
 
     def visible(self, n: int) -> Tensor:
