@@ -23,6 +23,7 @@ WAYS = {
     "+ harmonics": RenderConfig(),
 }
 """Each has all paths of those before it."""
+PATHS = ("mean", "depth", "covariance", "color")
 COVERED_ALPHA = 0.95
 
 
@@ -54,20 +55,44 @@ def localise(
     About the camera a turn and a shift look alike, and descent creeps along the valley between them. Rates fall evenly
     to 0; all steps together reach four times as far as the start is off.
     """
-    adam, n, target = VectorAdam.of(6), search.steps, (torch.tensor(frame.color), torch.tensor(frame.depth_m))
+    adam, n, middle = VectorAdam.of(6), search.steps, middle_of(frame)
     rates = np.repeat([search.off_m, np.radians(search.off_deg)], 3) * 8.0 / n
-    middle = np.eye(4)
-    middle[2, 3] = np.median(frame.depth_m[frame.depth_m > 0])
-    there, back = torch.as_tensor(middle), torch.as_tensor(se3.inverse(middle))
     clock = time.perf_counter()
     for step in range(n):
-        twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-        T = there @ torch.linalg.matrix_exp(twist_matrix(twist)) @ back @ torch.as_tensor(T_camera_world)
-        loss = pose_loss(render(field, frame.camera, T, options=switches), *target, search.weight_color)
-        (gradient,) = torch.autograd.grad(loss, twist)
-        motion = se3.exp(adam.step(gradient.numpy(), rates * (1.0 - step / n)))
+        twist = gradient(field, frame, T_camera_world, switches, search)
+        motion = se3.exp(adam.step(twist, rates * (1.0 - step / n)))
         T_camera_world = middle @ motion @ se3.inverse(middle) @ T_camera_world
     return se3.orthonormalise(T_camera_world), 1e3 * (time.perf_counter() - clock) / n
+
+
+def middle_of(frame: Frame) -> Matrix:
+    """Return T_camera_middle: on the optical axis, as far as the median reading."""
+    middle = np.eye(4)
+    middle[2, 3] = np.median(frame.depth_m[frame.depth_m > 0])
+    return middle
+
+
+def gradient(
+    field: GaussianField, frame: Frame, T_camera_world: Matrix, switches: RenderConfig, search: Search
+) -> Matrix:
+    """Return the gradient [6] of the loss by the left twist of T_middle_world."""
+    twist, middle = torch.zeros(6, dtype=torch.float64, requires_grad=True), middle_of(frame)
+    T_middle_world = torch.as_tensor(se3.inverse(middle) @ T_camera_world)
+    T = torch.as_tensor(middle) @ torch.linalg.matrix_exp(twist_matrix(twist)) @ T_middle_world
+    seen = render(field, frame.camera, T, options=switches)
+    loss = pose_loss(seen, torch.tensor(frame.color), torch.tensor(frame.depth_m), search.weight_color)
+    return np.asarray(torch.autograd.grad(loss, twist)[0].numpy())
+
+
+def shares(field: GaussianField, frame: Frame, T_camera_world: Matrix, search: Search) -> dict[str, list[float]]:
+    """Return how large each path's gradient is beside that of all, by ρ and by φ: |∂L| of the path over |∂L|."""
+    whole = gradient(field, frame, T_camera_world, RenderConfig(), search)
+    found = {}
+    for path in PATHS:
+        alone = RenderConfig(**{f"{other}_pose_gradient": other == path for other in PATHS})
+        part = gradient(field, frame, T_camera_world, alone, search)
+        found[path] = [float(np.linalg.norm(part[k]) / np.linalg.norm(whole[k])) for k in (slice(0, 3), slice(3, 6))]
+    return found
 
 
 def pose_loss(seen: Render, color: Tensor, depth_m: Tensor, weight_color: float) -> Tensor:

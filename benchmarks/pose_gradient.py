@@ -21,7 +21,7 @@ import tables
 import tracking
 import tyro
 from cpu import alone
-from localise import WAYS, Search, disturbed, localise, view_dependence
+from localise import WAYS, Search, disturbed, localise, shares, view_dependence
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config
@@ -59,7 +59,7 @@ class Options:
     preset: Annotated[str, arg(help="settings to start from")] = "varsplat-fast"
     seeds: Annotated[tuple[int, ...], arg(help="starts of the random numbers, a run or a map each")] = (0, 1)
     iterations: Annotated[int, arg(help="of Adam, per tracked frame")] = 30
-    refinement: Annotated[int, arg(help="steps that refine the map, harmonics included")] = 400
+    refinement: Annotated[int, arg(help="steps that refine the map, harmonics included")] = 1000
     degree: Annotated[int, arg(help="of the harmonics, 1 to 3")] = 2
     frames: Annotated[int, arg(help="held-out frames to be found, per map")] = 8
     steps: Annotated[int, arg(help="of Adam, per frame to be found; rates fall to 0 meanwhile")] = 60
@@ -92,7 +92,7 @@ class Options:
         """Return the settings of a map with harmonics. Raises ConfigError on an unknown preset or degree."""
         if not 1 <= self.degree <= DEGREES:
             raise ConfigError(f"--degree of the harmonics is 1 to {DEGREES}, found {self.degree}")
-        every = max(1, self.refinement // (self.degree + 1))
+        every = max(1, self.refinement // 10)
         final = (f"final.iterations={self.refinement}", f"final.sh_degree={self.degree}", f"final.sh_every={every}")
         settings = split_settings((*self.map_settings(), *final)) | {"seed": str(seed)}
         return override(preset_of(self.preset), settings)
@@ -153,16 +153,20 @@ def measure_localise(path: str, options: Options, seed: int) -> dict[str, Any]:
     truth = tracking.true_poses(source, [step.timestamp_s for step in slam.steps])
     if not views:
         raise SourceError(f"{path}: no frame is tracked that the map was not fitted to; give a longer --limit")
-    random, found, changes = np.random.default_rng(seed), list[dict[str, Any]](), list[float]()
+    random, found = np.random.default_rng(seed), list[dict[str, Any]]()
+    changes, parts = list[float](), list[dict[str, list[float]]]()
     for row, keyframe in views:
         i, tracked = slam.config.input, se3.inverse(estimated[row])
         frame = source.frame(slam.steps[row].index).prepared(i.width, i.min_depth_m, i.max_depth_m)
         changes.append(view_dependence(slam.field, frame, tracked))
-        for way, (T, ms) in found_poses(slam.field, frame, tracked, options.search(), random).items():
+        poses = found_poses(slam.field, frame, tracked, options.search(), random)
+        parts.append(shares(slam.field, frame, poses["start"][0], options.search()))
+        for way, (T, ms) in poses.items():
             motion = se3.inverse(estimated[keyframe]) @ se3.inverse(T)
             error = tracking.relative_error(motion, se3.inverse(truth[keyframe]) @ truth[row])
             found.append({"frame": frame.index, "way": way, "ms": round(ms, 3), **error})
-    return {"seed": seed, "splats": len(slam.field), "view_dependence": float(np.mean(changes)), "found": found}
+    figures = {"splats": len(slam.field), "view_dependence": float(np.mean(changes))}
+    return {"seed": seed, **figures, "shares": parts, "found": found}
 
 
 def found_poses(

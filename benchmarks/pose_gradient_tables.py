@@ -52,6 +52,18 @@ def localisation(measured: Rows) -> Section:
     return Section("Localisation", head, rows, note + harmonics_of(measured))
 
 
+def paths(measured: Rows) -> Section:
+    """Lay out how large each path's gradient is where the search begins."""
+    rows = []
+    for source in measured:
+        found = [part for m in source["maps"] for part in m["shares"]]
+        for path in found[0]:
+            medians = np.median([part[path] for part in found], 0)
+            rows.append([source["source"], path, *(significant(100.0 * float(share)) for share in medians)])
+    head = ["sequence", "path alone", "of the gradient by ρ, %", "… by φ, %"]
+    return Section("Paths", head, rows, "Length over that of all paths together, median; paths may pull apart.")
+
+
 def harmonics_of(measured: Rows) -> str:
     """Say how much the maps' colours depend on the direction."""
     shares = [f"{s['source']} {np.mean([m['view_dependence'] for m in s['maps']]):.4f}" for s in measured]
@@ -67,6 +79,6 @@ def failures(jobs: Rows) -> Section:
 
 def sections(measured: dict[str, Any]) -> list[Section]:
     """Return the tables of results written by pose_gradient.py."""
-    figures, jobs = measured["figures"], measured["figures"].get("sequence", [])
-    made = [sequences(jobs), localisation(figures.get("localise", [])), failures(jobs)]
+    jobs, found = (measured["figures"].get(name, []) for name in ("sequence", "localise"))
+    made = [sequences(jobs), localisation(found), paths(found), failures(jobs)]
     return [section for section in made if section.rows]

@@ -68,6 +68,8 @@ def test_frames_are_found_by_every_way() -> None:
         error = T @ se3.inverse(T_true)
         assert np.linalg.norm(error[:3, 3]) < 0.2 * SEARCH.off_m and ms > 0
         assert np.degrees(se3.rotation_angle(error[:3, :3])) < 0.2 * SEARCH.off_deg
+    found = localise.shares(field, frame, start, SEARCH)
+    assert tuple(found) == localise.PATHS and all(min(part) > 0 for part in found.values())
     assert localise.view_dependence(field, frame, T_true) > 0.01
     assert localise.view_dependence(GaussianField(field.params), frame, T_true) == 0
 
@@ -85,6 +87,18 @@ def test_each_way_has_one_path_more() -> None:
     paths = ("mean", "depth", "covariance", "color")
     on = [[getattr(way, f"{path}_pose_gradient") for path in paths] for way in localise.WAYS.values()]
     assert on == [[True, True, False, False], [True, True, True, False], [True] * 4]
+
+
+def test_shares_of_a_plain_map_that_is_off_in_depth_alone() -> None:
+    """Of one colour, without harmonics, seen from too far away: colour's path has no share, depth's is most."""
+    params = shiny_corner().params
+    params[:, 11:14] = 0.5
+    field = GaussianField(params)
+    seen = render(field, CAMERA, np.eye(4))
+    frame = Frame(0, 0.0, seen.color.clamp(0, 1).numpy().copy(), seen.depth.numpy() - np.float32(0.1), CAMERA)
+    found = localise.shares(field, frame, np.eye(4), replace(SEARCH, weight_color=0.0))
+    assert found["color"] == [0.0, 0.0] and 0.7 < found["depth"][0] < 1.1
+    assert max(found["mean"][0], found["covariance"][0]) < 0.4
 
 
 def test_pixels_without_reading_or_map_have_no_part_in_the_loss() -> None:
@@ -142,7 +156,7 @@ def test_runs_differ_by_the_switch_alone(tmp_path: Path, monkeypatch: pytest.Mon
 def test_a_map_gains_its_harmonics_in_time() -> None:
     options = pose_gradient.Options(degree=3, refinement=80)
     final = options.map_config(7).final
-    assert (final.iterations, final.sh_degree, final.sh_every) == (80, 3, 20) and options.map_config(7).seed == 7
+    assert (final.iterations, final.sh_degree, final.sh_every) == (80, 3, 8) and options.map_config(7).seed == 7
     with pytest.raises(ConfigError, match="1 to 3, found 0"):
         replace(options, degree=0).map_config(7)
 
@@ -162,6 +176,7 @@ def test_frames_are_found_and_held_against_the_truth(monkeypatch: pytest.MonkeyP
         assert (f["ms"] > 0) == (f["way"] in localise.WAYS)
     made = laid_out({"localise": [{"source": "room", "maps": [found]}]})
     assert [row[1] for row in made["Localisation"].rows] == ways
+    assert [row[1] for row in made["Paths"].rows] == list(localise.PATHS) and len(found["shares"]) == 2
 
 
 def test_medians_and_how_many_are_nearer() -> None:
@@ -171,8 +186,11 @@ def test_medians_and_how_many_are_nearer() -> None:
         for way, all_errors in errors.items()
         for i, e in enumerate(all_errors)
     ]
-    maps = [{"seed": 0, "splats": 9, "view_dependence": 0.01, "found": found}]
-    section = laid_out({"localise": [{"source": "room", "maps": maps}]})["Localisation"]
+    parts = [{"mean": [0.5, share], "depth": [0.9, 0.8]} for share in (0.1, 0.2, 0.4)]
+    maps = [{"seed": 0, "splats": 9, "view_dependence": 0.01, "shares": parts, "found": found}]
+    made = laid_out({"localise": [{"source": "room", "maps": maps}]})
+    assert made["Paths"].rows == [["room", "mean", "50.0", "20.0"], ["room", "depth", "90.0", "80.0"]]
+    section = made["Localisation"]
     assert section.rows == [
         ["room", "start", "3", "2.00", "–", "0.200", "–", "–"],
         ["room", "mean + depth", "3", "0.200", "–", "0.0200", "–", "5.00"],
