@@ -119,7 +119,7 @@ class CovarianceView:
             g_slots = torch.cat([g_sums, torch.zeros_like(g_sums[:1])])
             self._raster.blend_backward(self._slots, None, self.alpha, g_slots, None, g_alpha, *g_blended)
         self._g_means2d = g_blended[0]
-        return torch.autograd.grad(self._splats, (*self._leaves, self._twist), g_blended)
+        return torch.autograd.grad(self._splats, (*self._leaves, self._twist), g_blended, materialize_grads=True)
 
     def visible(self, n: int) -> Tensor:
         return self._visible

@@ -76,7 +76,8 @@ class ViewDependentStep:
             g_scales, term = shape_pull(own[:, SCALES], weights, len(rows) / len(field), len(rows) / len(visible))
             g[:, MEANS] += g_means
             g[:, SCALES] += g_scales
-            twist[:3] += (self._R @ g_means.sum(0)).numpy()  # a camera that moves by ρ leaves the directions to −ρ
+            if self.view.options.color_pose_gradient:  # a camera that moves by ρ leaves the directions to −ρ
+                twist[:3] += (self._R @ g_means.sum(0)).numpy()
             cost += term
             adam_rows(field, rows, g, rates)
             adam_rows(harmonics, rows, g_harmonics, harmonic_rates)

@@ -85,12 +85,13 @@ def render(
 ) -> Render:
     """Render a field at a pose (4×4, world to camera); differentiable in `field.params` and in a tensor pose.
 
-    Raises BackendError if the backend is not available.
+    The pose's gradient is the sum of the paths that `options` has on: through 2D means, 2D covariances, depths, and the
+    directions from which `harmonics` are seen. Raises BackendError if the backend is not available.
     """
     kernels, options = backend_module(backend), options or RenderConfig()
     T = torch.as_tensor(T_camera_world)
     p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
-    features = _features_from(field, p.z, T)
+    features = _features_from(field, p.z, T if options.color_pose_gradient else T.detach())
     b = kernels.blend(*p, field.opacities, features, depth_reference, camera, options)
     crossed = b.median_id >= 0
     nearest = p.z[b.median_id.clamp(min=0).long()] if len(field) else torch.zeros_like(b.alpha)

@@ -58,6 +58,7 @@ class View(Protocol):
     """One camera with its planes: sums [K, rows, columns] of (r, g, b, z[, σ²+c² ×3]), alpha, and their gradients."""
 
     camera: Camera
+    options: RenderConfig
     sums: Tensor
     alpha: Tensor
     g_sums: Tensor
@@ -201,7 +202,8 @@ class ReferenceView:
         return np.asarray(g_twist.numpy(), np.float64)
 
     def backward_pose(self, params: Tensor) -> Matrix:
-        (g_twist,) = torch.autograd.grad(self._maps[0][0][:4], (self._twist,), (self.g_sums[:4],))
+        maps, on_maps = self._maps[0][0][:4], (self.g_sums[:4],)
+        (g_twist,) = torch.autograd.grad(maps, (self._twist,), on_maps, materialize_grads=True)
         return np.asarray(g_twist.numpy(), np.float64)
 
     def visible(self, n: int) -> Tensor:

@@ -1,0 +1,237 @@
+"""Switch paths of the pose's gradient off and on: what does each do to the pose, and what does it cost (CG-SLAM §2.1)?
+
+sequence: whole sequences tracked by Adam through the renderer, without and with the path through the 2D covariance.
+localise: single frames found again in a map with spherical harmonics, without and with that path, and with the path
+through the direction from which colours are seen.
+Writes benchmarks/results/pose-gradient-<machine>.json, prints tables; benchmarks/README.md says what each figure means.
+
+example: python benchmarks/pose_gradient.py --experiments localise --sources livingroom
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import accuracy
+import numpy as np
+import record
+import tables
+import tracking
+import tyro
+from cpu import alone
+from localise import WAYS, Search, disturbed, localise, shares, view_dependence
+from numpy.typing import NDArray
+
+from sigmasplat.config import Config
+from sigmasplat.config.text import override, split_settings
+from sigmasplat.errors import ConfigError, SigmaSplatError, SourceError
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.model import se3
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.frame import Frame
+from sigmasplat.model.harmonics import DEGREES
+from sigmasplat.presets import preset as preset_of
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources import open_source
+
+arg = tyro.conf.arg
+Matrix = NDArray[np.float64]
+Experiment = Literal["sequence", "localise"]
+ONE_MAP = ("submaps.distance_m=0", "submaps.angle_deg=0", "submaps.frames=0", "submaps.uncertainty_m=0")
+SEEDS_PER_PIXEL = (0.5, 0.2)
+"""Of the first frame: drawn evenly, and by gradient; what varsplat-fast takes at its own width."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Measure what each path of the pose's gradient does to poses, and what it costs."""
+
+    experiments: Annotated[tuple[Experiment, ...], arg(help="which of them")] = ("sequence", "localise")
+    sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = (
+        "synthetic:frames=400",
+        "livingroom",
+        "redkitchen",
+    )
+    limit: Annotated[int, arg(help="frames of each, from its start")] = 100
+    width: Annotated[int, arg(help="working width, pixels")] = 160
+    preset: Annotated[str, arg(help="settings to start from")] = "varsplat-fast"
+    seeds: Annotated[tuple[int, ...], arg(help="starts of the random numbers, a run or a map each")] = (0, 1)
+    iterations: Annotated[int, arg(help="of Adam, per tracked frame")] = 30
+    refinement: Annotated[int, arg(help="steps that refine the map, harmonics included")] = 1000
+    degree: Annotated[int, arg(help="of the harmonics, 1 to 3")] = 2
+    frames: Annotated[int, arg(help="held-out frames to be found, per map")] = 8
+    steps: Annotated[int, arg(help="of Adam, per frame to be found; rates fall to 0 meanwhile")] = 60
+    off_m: Annotated[float, arg(help="how far off each begins, metres")] = 0.02
+    off_deg: Annotated[float, arg(help="… and degrees")] = 1.0
+    weight_color: Annotated[float, arg(help="share of colour in the loss")] = 0.6
+    quick: Annotated[bool, arg(help="a minute: one short sequence, one seed; nothing is written")] = False
+    name: Annotated[str, arg(help="name of the results")] = "pose-gradient"
+    fresh: Annotated[bool, arg(help="run also the sequences that have been run before")] = False
+    runs: Annotated[Path, arg(help="folder of the run folders")] = accuracy.RUNS
+    out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
+
+    def map_settings(self) -> tuple[str, ...]:
+        """Return what makes maps of this width: one of all frames, as dense as the preset's."""
+        uniform, gradient = (int(share * self.width**2 * 0.75) for share in SEEDS_PER_PIXEL)
+        seeds = (f"seeding.first_uniform={uniform}", f"seeding.first_gradient={gradient}")
+        return (f"input.width={self.width}", *seeds, *ONE_MAP, "loops.close=false")
+
+    def tracking_settings(self, way: str) -> tuple[str, ...]:
+        """Return the settings of a whole sequence tracked by Adam with the paper's rates for Replica."""
+        rotation, translation = tracking.RATES["Replica"]
+        return (
+            *self.map_settings(), "final.iterations=0", "tracking.method=adam",
+            f"tracking.iterations={self.iterations}", f"tracking.lr_rotation={rotation}",
+            f"tracking.lr_translation={translation}",
+            f"render.covariance_pose_gradient={str(WAYS[way].covariance_pose_gradient).lower()}",
+        )  # fmt: skip
+
+    def map_config(self, seed: int) -> Config:
+        """Return the settings of a map with harmonics. Raises ConfigError on an unknown preset or degree."""
+        if not 1 <= self.degree <= DEGREES:
+            raise ConfigError(f"--degree of the harmonics is 1 to {DEGREES}, found {self.degree}")
+        every = max(1, self.refinement // 10)
+        final = (f"final.iterations={self.refinement}", f"final.sh_degree={self.degree}", f"final.sh_every={every}")
+        settings = split_settings((*self.map_settings(), *final)) | {"seed": str(seed)}
+        return override(preset_of(self.preset), settings)
+
+    def search(self) -> Search:
+        """Return how single frames are found."""
+        return Search(self.off_m, self.off_deg, self.steps, self.weight_color)
+
+
+# ---- whole sequences ----
+
+
+def measure_sequences(options: Options) -> list[dict[str, Any]]:
+    """Run whole sequences without and with the covariance's path; a run that failed has its `problem`.
+
+    No map is tracked on that has harmonics, so that there is no third way.
+    """
+    found = []
+    for way in tuple(WAYS)[:2]:
+        wanted = accuracy.Options(
+            options.sources, (options.preset,), options.seeds, options.tracking_settings(way), options.limit,
+            fresh=options.fresh, runs=options.runs,
+        )  # fmt: skip
+        jobs = accuracy.jobs_of(wanted)
+        for job, result in zip(jobs, accuracy.run_all(jobs, wanted), strict=True):
+            made = {"source": job.source, "seed": job.seed, "way": way}
+            made |= {name: result[name] for name in ("problem", "wall_s", "figures")}
+            if result["problem"] is None:
+                log = RunFolder.open(job.folder(options.runs) / "run").read_log()
+                made["figures"] = result["figures"] | {"ms_per_iteration": iteration_ms(log)}
+            found.append(made)
+    return found
+
+
+def iteration_ms(log: Sequence[dict[str, Any]]) -> float | None:
+    """Return the median over a run's frames of tracking time by iteration, ms; None if no frame was tracked.
+
+    A frame that was tried again has the time of all tries and the iterations of one: the median passes it over.
+    """
+    tracked = [line for line in log if (line.get("tracking") or {}).get("iterations")]
+    times = [1e3 * line["seconds"]["track"] / line["tracking"]["iterations"] for line in tracked]
+    return float(np.median(times)) if times else None
+
+
+# ---- single frames ----
+
+
+def measure_localise(path: str, options: Options, seed: int) -> dict[str, Any]:
+    """Map a sequence, harmonics and all; find held-out frames in it by every way from the same start.
+
+    Raises SourceError if there is no frame to be found, or no truth to judge by.
+    """
+    source, slam = open_source(path, limit=options.limit), Slam(options.map_config(seed))
+    for frame in source:
+        slam.step(frame)
+    slam.finish()
+    estimated, views = slam.trajectory().T_world_camera, held_out(slam, options.frames)
+    truth = tracking.true_poses(source, [step.timestamp_s for step in slam.steps])
+    if not views:
+        raise SourceError(f"{path}: no frame is tracked that the map was not fitted to; give a longer --limit")
+    random, found = np.random.default_rng(seed), list[dict[str, Any]]()
+    changes, parts = list[float](), list[dict[str, list[float]]]()
+    for row, keyframe in views:
+        i, tracked = slam.config.input, se3.inverse(estimated[row])
+        frame = source.frame(slam.steps[row].index).prepared(i.width, i.min_depth_m, i.max_depth_m)
+        changes.append(view_dependence(slam.field, frame, tracked))
+        poses = found_poses(slam.field, frame, tracked, options.search(), random)
+        parts.append(shares(slam.field, frame, poses["start"][0], options.search()))
+        for way, (T, ms) in poses.items():
+            motion = se3.inverse(estimated[keyframe]) @ se3.inverse(T)
+            error = tracking.relative_error(motion, se3.inverse(truth[keyframe]) @ truth[row])
+            found.append({"frame": frame.index, "way": way, "ms": round(ms, 3), **error})
+    figures = {"splats": len(slam.field), "view_dependence": float(np.mean(changes))}
+    return {"seed": seed, **figures, "shares": parts, "found": found}
+
+
+def found_poses(
+    field: GaussianField, frame: Frame, tracked: Matrix, search: Search, random: np.random.Generator
+) -> dict[str, tuple[Matrix, float]]:
+    """Return T_camera_world as tracked, as disturbed, and as each way finds it from there, with its ms per step."""
+    start = disturbed(tracked, search, random)
+    poses = {"as tracked": (tracked, 0.0), "start": (start, 0.0)}
+    return poses | {way: localise(field, frame, start, switches, search) for way, switches in WAYS.items()}
+
+
+def held_out(slam: Slam, count: int) -> list[tuple[int, int]]:
+    """Choose frames that no map was fitted to, evenly spread: (row, row of the newest keyframe before it)."""
+    pairs, keyframe = list[tuple[int, int]](), -1
+    for row, step in enumerate(slam.steps):
+        if step.is_keyframe:
+            keyframe = row
+        elif keyframe >= 0 and not step.lost:
+            pairs.append((row, keyframe))
+    chosen = np.unique(np.linspace(0, len(pairs) - 1, min(count, len(pairs))).round().astype(int))
+    return [pairs[i] for i in chosen]
+
+
+# ---- program ----
+
+
+def shortened(options: Options) -> Options:
+    """Return what --quick does of it."""
+    few = {"limit": min(options.limit, 24), "refinement": min(options.refinement, 60), "frames": min(options.frames, 3)}
+    return replace(options, sources=options.sources[:1], seeds=options.seeds[:1], **few)
+
+
+def measure(options: Options) -> dict[str, Any]:
+    """Carry out the experiments asked for; maps are made in fresh processes. Raises SigmaSplatError."""
+    options.map_config(0)
+    figures: dict[str, Any] = {}
+    if "sequence" in options.experiments:
+        figures["sequence"] = measure_sequences(options)
+    if "localise" in options.experiments:
+        figures["localise"] = []
+        for source in options.sources:
+            maps = []
+            for seed in options.seeds:
+                maps.append(alone(measure_localise, accuracy.located(source), options, seed))
+                print(f"{Path(source).name}, seed {seed}: frames found in a map", file=sys.stderr, flush=True)
+            figures["localise"].append({"source": Path(source).name, "maps": maps})
+    return figures
+
+
+def main(options: Options) -> int:
+    """Measure, write, print; exit code 1 if a run failed, 2 if the options mean nothing."""
+    if options.quick:
+        options = shortened(options)
+    try:
+        figures = measure(options)
+    except SigmaSplatError as problem:
+        print(f"pose_gradient.py: {problem}", file=sys.stderr)
+        return 2
+    config = {n: v for n, v in asdict(options).items() if n not in ("runs", "out", "fresh", "quick")}
+    measured = record.results("pose_gradient", figures, name=options.name, seeds=options.seeds, config=config)
+    if not options.quick:
+        print(record.write(measured, options.out), file=sys.stderr)
+    print(tables.table(measured))
+    return int(any(job["problem"] for job in figures.get("sequence", [])))
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))

@@ -1,0 +1,239 @@
+"""Hold every choice of pose paths against finite differences of a loss in which the other paths stay (CG-SLAM §2.1)."""
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from sigmasplat.config import RenderConfig
+from sigmasplat.fit.adam import Rates
+from sigmasplat.fit.field import TorchStep
+from sigmasplat.fit.view_dependent import ViewDependentStep
+from sigmasplat.model import se3
+from sigmasplat.model.field import GaussianField, Rows
+from sigmasplat.model.harmonics import view_colors
+from sigmasplat.render import Render, reference, render
+from sigmasplat.render.render import features_of
+from splat_fields import exact_view, params_of, plane_gradients
+from splat_scenes import SMALL, Scene, assert_same_vector, probe, scene, twist_gradient
+
+PATHS = ("mean", "covariance", "depth", "color")
+Moves = tuple[bool, ...]
+CHOICES: tuple[Moves, ...] = tuple(product((True, False), repeat=len(PATHS)))
+ALL, NONE = CHOICES[0], CHOICES[-1]
+SINGLE = [tuple(path == name for path in PATHS) for name in PATHS]
+STEP = 3e-7
+
+
+def named(moves: Moves) -> str:
+    return "+".join(path for path, on in zip(PATHS, moves, strict=True) if on) or "none"
+
+
+def options_of(moves: Moves) -> RenderConfig:
+    return RenderConfig(**{f"{path}_pose_gradient": on for path, on in zip(PATHS, moves, strict=True)})
+
+
+def shiny(s: Scene, dtype: torch.dtype = torch.float64) -> GaussianField:
+    """Make a scene's field with harmonics."""
+    params = params_of(s)
+    k = torch.as_tensor(np.random.default_rng(8).normal(0, 0.2, (len(params), 45))).float()
+    return GaussianField(params.to(dtype), steps=1, extras={"harmonics": Rows(k.to(dtype))})
+
+
+def loss_of(seen: Render) -> Tensor:
+    """Reduce all that a loss of a pose may read: colour, depth, alpha, V, U, median depth."""
+    assert seen.uncertainty is not None
+    return probe(seen.color, seen.depth, seen.alpha, seen.variance, seen.uncertainty, seen.median_depth)
+
+
+def gradient(s: Scene, moves: Moves, dtype: torch.dtype = torch.float64, backend: str = "reference") -> Tensor:
+    """Differentiate the loss of a render by the twist [6], with some paths on."""
+    T = s.T_camera_world.to(dtype).clone().requires_grad_()
+    loss = loss_of(render(shiny(s, dtype), s.camera, T, s.ref_depth.to(dtype), options_of(moves), backend))
+    return twist_of(loss, T)
+
+
+def twist_of(loss: Tensor, T: Tensor) -> Tensor:
+    """Differentiate by the twist [6] of a pose; 0 where the loss does not feel it."""
+    if not loss.requires_grad:
+        return torch.zeros(6, dtype=torch.float64)
+    (on_matrix,) = torch.autograd.grad(loss, T)
+    return twist_gradient(on_matrix, T.detach())
+
+
+def composed(s: Scene, T_mean: Tensor, T_covariance: Tensor, T_depth: Tensor, T_color: Tensor) -> float:
+    """Evaluate the same loss with each path fed by a pose of its own, out of the two operators."""
+    f = shiny(s)
+    means2d, conics, z = (
+        reference.project(f.means, f.quats, f.scales, T, s.camera, s.options)[k]
+        for k, T in enumerate((T_mean, T_covariance, T_depth))
+    )
+    radii = reference.project(f.means, f.quats, f.scales, s.T_camera_world, s.camera, s.options).radii
+    position = torch.as_tensor(se3.inverse(T_color.numpy())[:3, 3])
+    colors = view_colors(f.colors, f.extras["harmonics"].params, f.means, position)
+    features = features_of(colors, z, f.variances)
+    b = reference.blend(means2d, conics, z, radii, f.opacities, features, s.ref_depth, s.camera, s.options)
+    median = torch.where(b.median_id >= 0, z[b.median_id.clamp(min=0).long()], 0.0)
+    variance = b.sums[..., 4:7] - b.sums[..., :3] ** 2
+    assert b.moment is not None
+    return float(probe(b.sums[..., :3], b.sums[..., 3], b.alpha, variance, b.moment, median))
+
+
+def differences(s: Scene, moves: Moves) -> Tensor:
+    """Differentiate by the twist of exp(ξ)·T, moving the chosen paths only."""
+    out = []
+    for e in np.eye(6):
+        ahead, behind = (torch.as_tensor(se3.exp(sign * STEP * e)) @ s.T_camera_world for sign in (1, -1))
+        ends = [composed(s, *(T if on else s.T_camera_world for on in moves)) for T in (ahead, behind)]
+        out.append((ends[0] - ends[1]) / (2 * STEP))
+    return torch.tensor(out, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("kind", ["random", "off_screen"])
+def test_the_whole_gradient_equals_differences_of_the_render(kind: str) -> None:
+    """Nothing is composed here: the render itself is asked at poses ahead and behind."""
+    s, out = scene(kind, 7, SMALL, 1e-3), []
+    for e in np.eye(6):
+        poses = (torch.as_tensor(se3.exp(sign * STEP * e)) @ s.T_camera_world for sign in (1, -1))
+        ends = [loss_of(render(shiny(s), s.camera, T, s.ref_depth, backend="reference")) for T in poses]
+        out.append(float(ends[0] - ends[1]) / (2 * STEP))
+    assert_same_vector(gradient(s, ALL), torch.tensor(out).double(), 1e-6, kind)
+
+
+@pytest.mark.parametrize("moves", CHOICES, ids=named)
+@pytest.mark.parametrize("kind", ["random", "off_screen"])
+def test_a_path_that_is_off_is_frozen(kind: str, moves: Moves) -> None:
+    s = scene(kind, 7, SMALL, 1e-3)
+    got = gradient(s, moves)
+    if moves == NONE:
+        assert torch.count_nonzero(got) == 0
+        return
+    assert_same_vector(got, differences(s, moves), 1e-6, f"{kind} {named(moves)}")
+
+
+@pytest.mark.parametrize("moves", CHOICES, ids=named)
+def test_paths_add_up(moves: Moves) -> None:
+    s = scene("random", 40)
+    parts = [gradient(s, alone) for alone, on in zip(SINGLE, moves, strict=True) if on]
+    whole = gradient(s, moves)
+    size = max(float(part.norm()) for part in (*parts, torch.ones(1)))
+    assert float((whole - sum(parts, torch.zeros(6).double())).norm()) < 1e-12 * size
+    assert moves != ALL or min(float(part.norm()) for part in parts) > 1e-3 * float(whole.norm()), "all paths matter"
+
+
+@pytest.mark.parametrize("moves", CHOICES[:-1], ids=named)
+@pytest.mark.parametrize("kind", ["random", "needles"])
+def test_kernels_agree(kind: str, moves: Moves) -> None:
+    pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+    s = scene(kind, 40)
+    assert_same_vector(gradient(s, moves, torch.float32, "cpu"), gradient(s, moves), 2e-4, f"{kind} {named(moves)}")
+
+
+def test_a_direction_that_is_off_leaves_the_fields_gradient_complete() -> None:
+    s, found = scene("random", 12, SMALL), []
+    for moves in (ALL, (True, True, True, False)):
+        field = shiny(s)
+        leaves = [field.params.requires_grad_(), field.extras["harmonics"].params.requires_grad_()]
+        T = s.T_camera_world.clone().requires_grad_()
+        seen = render(field, s.camera, T, s.ref_depth, options_of(moves), "reference")
+        found.append(torch.autograd.grad(loss_of(seen), leaves))
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+
+
+@pytest.mark.parametrize("moves", CHOICES, ids=named)
+def test_a_mapping_step_honours_the_switches(moves: Moves) -> None:
+    """The step that adds the direction's path by hand returns the twist that autograd finds through `render`."""
+    s, view = scene("random", 12, SMALL), exact_view(SMALL, True)
+    view.options = options_of(moves)
+    step, field = ViewDependentStep(TorchStep(view), 3), shiny(s)
+    step.forward(field, s.T_camera_world.numpy())
+    view.g_sums[:] = plane_gradients(SMALL, len(view.sums))[0]
+    twist, _ = step.splats(field, Rates(torch.full((17,), 1e-3, dtype=torch.float64)), 0.0, 0)
+
+    T = s.T_camera_world.clone().requires_grad_()
+    seen = render(shiny(s), SMALL, T, options=options_of(moves), backend="reference")
+    sums = torch.cat([seen.color, seen.depth[..., None], seen.variance + seen.color**2], -1)
+    want = twist_of((sums * view.g_sums.movedim(0, -1)).sum(), T)
+    if moves == NONE:
+        assert not twist.any() and not want.any()
+        return
+    assert_same_vector(torch.as_tensor(twist), want, 1e-9, named(moves))
+
+
+# ---- round splats ----
+
+
+def round_ones(s: Scene) -> Scene:
+    return replace(s, scales=s.scales[:, :1].expand(-1, 3).contiguous())
+
+
+def in_front(s: Scene) -> tuple[Scene, Tensor]:
+    """Keep the splats before the camera, its rotation exact in double; return them and their positions there [N, 3]."""
+    s = replace(s, T_camera_world=torch.as_tensor(se3.orthonormalise(s.T_camera_world.numpy())))
+    p = s.means @ s.T_camera_world[:3, :3].T + s.T_camera_world[:3, 3]
+    front = p[:, 2] > 1.05 * s.options.near_m
+    return replace(s, **{name: getattr(s, name)[front] for name in ("means", "quats", "scales")}), p[front]
+
+
+def turns_by_reference(s: Scene, p: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
+    """Split each splat's ∂(g·conics)/∂φ [N, 3] through the covariance: what turns R with J held, and what moves J.
+
+    Moving the camera by ρ moves p alone, ∂/∂ρ = h; turning it by φ moves p by φ × p and R besides: the rest is R's.
+    """
+    twists = []
+    for i in range(len(s.means)):
+        T = s.T_camera_world.clone().requires_grad_()
+        one = (x[i : i + 1] for x in (s.means, s.quats, s.scales))
+        conics = reference.project(*one, T, s.camera, options_of(SINGLE[1])).conics
+        twists.append(twist_of((g[i] * conics).sum(), T))
+    twist = torch.stack(twists)
+    by_position = torch.linalg.cross(p, twist[:, :3])
+    return twist[:, 3:] - by_position, by_position
+
+
+def turns_by_kernels(s: Scene, p: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
+    """Do the same by the kernels' own arithmetic, compiled in double."""
+    pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+    from sigmasplat.native import _core
+    from sigmasplat.render.cpu import view_numbers
+
+    numbers = view_numbers(s.camera, s.T_camera_world.numpy(), options_of(SINGLE[1]), np.float64)
+    footprint, out = np.empty((len(p), 6)), np.empty((len(p), 16))
+    on_conics = np.concatenate([np.zeros((len(p), 3)), g.numpy()], 1)
+    shape = [np.ascontiguousarray(x.numpy()) for x in (s.means, s.quats, s.scales)]
+    _core.project_double(numbers, *shape, on_conics, footprint, out)
+    twist = torch.as_tensor(out[:, 10:])
+    by_position = torch.linalg.cross(p, twist[:, :3])
+    return twist[:, 3:] - by_position, by_position
+
+
+@pytest.mark.parametrize("turns", [turns_by_reference, turns_by_kernels], ids=["reference", "kernels"])
+@pytest.mark.parametrize("kind", ["random", "huge", "off_screen"])
+def test_a_round_splats_covariance_feels_no_rotation(kind: str, turns: object) -> None:
+    """The isotropic identity: for Σ = s²I, X is symmetric and the covariance-rotation term 0, splat by splat."""
+    assert callable(turns)
+    s, p = in_front(scene(kind, 30))
+    g = torch.as_tensor(np.random.default_rng(4).normal(size=(len(p), 3)))
+    turn, by_position = turns(round_ones(s), p, g)
+    assert float((turn.norm(dim=1) / by_position.norm(dim=1)).max()) < 1e-12
+    turn, by_position = turns(s, p, g)
+    assert float((turn.norm(dim=1) / by_position.norm(dim=1)).min()) > 1e-3, "every stretched splat feels it"
+
+
+def test_a_round_splats_image_stays_when_its_axes_turn() -> None:
+    """The same without a gradient: J held, any rotation in place of R leaves J R Σ Rᵀ Jᵀ of a round splat as it is."""
+    s, p = in_front(scene("random", 30))
+    J = torch.as_tensor(np.random.default_rng(5).normal(size=(len(p), 2, 3)))
+    turn = torch.as_tensor(se3.exp(np.array([0, 0, 0, 0.7, -0.4, 1.1]))[:3, :3]) @ s.T_camera_world[:3, :3]
+
+    def image(scales: Tensor, R: Tensor) -> Tensor:
+        A = J @ R @ (reference.rotations(s.quats) * scales[:, None, :])
+        return A @ A.mT
+
+    for scales, least, most in ((round_ones(s).scales, 0.0, 1e-14), (s.scales, 1e-3, np.inf)):
+        before, after = image(scales, s.T_camera_world[:3, :3]), image(scales, turn)
+        change = (after - before).flatten(1).norm(dim=1) / before.flatten(1).norm(dim=1)
+        assert float(change.min()) >= least and float(change.max()) < most
