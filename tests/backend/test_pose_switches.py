@@ -10,7 +10,8 @@ from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.field import TorchStep
+from sigmasplat.fit.step import TorchStep
+from sigmasplat.fit.target import Target
 from sigmasplat.fit.view_dependent import ViewDependentStep
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField, Rows
@@ -149,9 +150,10 @@ def test_a_mapping_step_honours_the_switches(moves: Moves) -> None:
     s, view = scene("random", 12, SMALL), exact_view(SMALL, True)
     view.options = options_of(moves)
     step, field = ViewDependentStep(TorchStep(view), 3), shiny(s)
-    step.forward(field, s.T_camera_world.numpy())
+    nothing = Target(SMALL, torch.zeros(3, *view.alpha.shape), torch.zeros(view.alpha.shape), 0)
+    step.forward(field, s.T_camera_world.numpy(), nothing, {})
     view.g_sums[:] = plane_gradients(SMALL, len(view.sums))[0]
-    twist, _ = step.splats(field, Rates(torch.full((17,), 1e-3, dtype=torch.float64)), 0.0, 0)
+    twist, _ = step.splats(field, Rates(torch.full((17,), 1e-3, dtype=torch.float64)), {}, 0)
 
     T = s.T_camera_world.clone().requires_grad_()
     seen = render(shiny(s), SMALL, T, options=options_of(moves), backend="reference")
