@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -111,25 +112,33 @@ def finished(job: Job, runs: Path) -> dict[str, Any] | None:
     return result if same and result["problem"] is None else None
 
 
-def perform(job: Job, runs: Path) -> dict[str, Any]:
-    """Run a job to its end and write result.json; a run that fails has its last line as `problem`."""
+def call(command: Sequence[str], output: Path) -> tuple[str | None, float]:
+    """Run a command, what it says in a file; return its last words if it failed, and its peak memory, MiB."""
+    with output.open("w") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+        _, status, usage = os.wait4(process.pid, 0)  # wait4: the peak memory of this child alone
+        process.returncode = os.waitstatus_to_exitcode(status)
+    return _last_line(output) if process.returncode else None, usage.ru_maxrss / 1024
+
+
+def perform(job: Job, runs: Path, before: Sequence[str] = ()) -> dict[str, Any]:
+    """Run a job to its end and write result.json; a run that fails has its last line as `problem`.
+
+    Words `before` its command line may say on which cores it runs.
+    """
     folder = job.folder(runs)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "result.json").unlink(missing_ok=True)
-    start, output = time.perf_counter(), folder / "output.txt"
-    with output.open("w") as log:
-        process = subprocess.Popen(job.command(folder / "run"), stdout=log, stderr=subprocess.STDOUT)
-        _, status, usage = os.wait4(process.pid, 0)  # wait4: the peak memory of this child alone
-        process.returncode = os.waitstatus_to_exitcode(status)
-    failed = process.returncode != 0
+    start = time.perf_counter()
+    problem, peak_mib = call([*before, *job.command(folder / "run")], folder / "output.txt")
     result = {
         "job": asdict(job),
         "key": job.key(),
         **record.commit(),
-        "problem": _last_line(output) if failed else None,
+        "problem": problem,
         "wall_s": round(time.perf_counter() - start, 2),
-        "peak_mib": round(usage.ru_maxrss / 1024, 1),
-        "figures": {} if failed else figures_of(json.loads((folder / "run" / "metrics.json").read_text())),
+        "peak_mib": round(peak_mib, 1),
+        "figures": {} if problem else figures_of(json.loads((folder / "run" / "metrics.json").read_text())),
     }
     (folder / "result.json").write_text(json.dumps(result, indent=1) + "\n")
     return result
@@ -159,15 +168,17 @@ def figures_of(metrics: dict[str, Any]) -> dict[str, float | None]:
 
 def run_all(jobs: list[Job], options: Options) -> list[dict[str, Any]]:
     """Run or read every job, one after the other, a line each on standard error."""
-    done = []
-    for number, job in enumerate(jobs, 1):
-        earlier = None if options.fresh else finished(job, options.runs)
-        result = earlier or perform(job, options.runs)
-        done.append(result)
-        how = "run before" if earlier else result["problem"] or f"{result['wall_s']:.0f} s"
-        told = f"[{number}/{len(jobs)}] {job.source}, {job.preset}, seed {job.seed}: {how}"
-        print(told, file=sys.stderr, flush=True)
-    return done
+    total = len(jobs)
+    return [run_one(job, f"{number}/{total}", options.runs, options.fresh) for number, job in enumerate(jobs, 1)]
+
+
+def run_one(job: Job, number: str, runs: Path, fresh: bool, before: Sequence[str] = ()) -> dict[str, Any]:
+    """Run a job (see `perform`), or read it if it was run before and not to be `fresh`; a line on standard error."""
+    earlier = None if fresh else finished(job, runs)
+    result = earlier or perform(job, runs, before)
+    how = "run before" if earlier else result["problem"] or f"{result['wall_s']:.0f} s"
+    print(f"[{number}] {job.source}, {job.preset}, seed {job.seed}: {how}", file=sys.stderr, flush=True)
+    return result
 
 
 def main(options: Options) -> int:
@@ -177,12 +188,19 @@ def main(options: Options) -> int:
     except SigmaSplatError as problem:
         print(f"accuracy.py: {problem}", file=sys.stderr)
         return 2
-    results = run_all(jobs, options)
+    return publish("accuracy", run_all(jobs, options), options)
+
+
+def publish(benchmark: str, results: list[dict[str, Any]], options: Any) -> int:
+    """Write the results of jobs and print their tables; return 1 if one failed.
+
+    `options` are a program's, with its results' name, its seeds and the folder `out`.
+    """
     kept = [{name: value for name, value in result.items() if name != "key"} for result in results]
     for result in kept:
         result["job"] |= {"path": Path(result["job"]["path"]).name}
     config = {n: v for n, v in asdict(options).items() if n not in ("runs", "out", "fresh")}
-    measured = record.results("accuracy", {"jobs": kept}, name=options.name, seeds=options.seeds, config=config)
+    measured = record.results(benchmark, {"jobs": kept}, name=options.name, seeds=options.seeds, config=config)
     print(record.write(measured, options.out), file=sys.stderr)
     print(tables.table(measured))
     return int(any(result["problem"] for result in results))

@@ -181,7 +181,7 @@ def _keeps_variance(final: FinalConfig) -> bool:
 
 
 def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField, loops: Log) -> dict[str, Any]:
-    """Return what can be counted: frames, keyframes, lost frames, splats, speed."""
+    """Return what can be counted: frames, keyframes, lost frames, splats, size, speed."""
     lost = [record["index"] for record in log if record.get("lost")]
     return {
         "source": source.name,
@@ -192,7 +192,9 @@ def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField, loops
         "lost_frames": lost,
         "skipped": run.facts().get("skipped", list(source.skipped)),
         "splats": len(field),
+        "map_bytes": run.map_bytes(),
         "frames_per_s": _frames_per_s(run, log),
+        "worst_frame_s": _worst_frame_s(log),
         "submaps": _submaps(log),
         "loops": {"tried": len(loops), "accepted": sum(bool(loop.get("accepted")) for loop in loops)},
         "finish_s": run.facts().get("finish_s"),
@@ -203,6 +205,11 @@ def _frames_per_s(run: RunFolder, log: Log) -> float | None:
     """Return the speed end to end: by the wall clock (run.json, wall_s) if noted, else by the frames' own times."""
     seconds = run.facts().get("wall_s") or sum(charts.seconds_of(record) for record in log)
     return len(log) / seconds if seconds else None
+
+
+def _worst_frame_s(log: Log) -> float | None:
+    """Return the longest time of a frame after the run's first, which makes the map; None where none was timed."""
+    return max((charts.seconds_of(record) for record in log if record["row"]), default=0.0) or None
 
 
 def _draw_plots(run: RunFolder, log: Log, truth: Trajectory | None, loops: Log) -> dict[str, str]:

@@ -15,6 +15,7 @@ from sigmasplat.errors import RunError
 from sigmasplat.io.mesh import write_mesh
 from sigmasplat.io.runs import MESH, RunFolder
 from sigmasplat.metrics import reconstruction
+from sigmasplat.metrics.splats import splats_to_surface
 from sigmasplat.metrics.trajectory import align_rigid, associate, paired
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
@@ -92,7 +93,7 @@ def fuse_and_score(
     write_mesh(run.path / MESH, mesh)
     if true_surface is None or true_path is None:
         return None
-    return asdict(score(recording, mesh, true_surface, true_path, progress))
+    return score(recording, mesh, true_surface, true_path, progress)
 
 
 def score(
@@ -101,8 +102,8 @@ def score(
     true_surface: Mesh,
     true_path: Trajectory,
     progress: Progress = lambda done, total: None,
-) -> reconstruction.Reconstruction:
-    """Score a run's mesh against the true surface (`metrics.reconstruction`), aligned as its path is for the ATE.
+) -> dict[str, float]:
+    """Score a run's mesh and its splats against the true surface, aligned as its path is for the ATE.
 
     Training views are the true poses of the keyframes. Raises SourceError if path and truth share no timestamps.
     """
@@ -111,4 +112,9 @@ def score(
     T_truth_world = align_rigid(ours[:, :3, 3], theirs[:, :3, 3])
     _, rows = associate(tensors["timestamps_s"][tensors["keyframes"]].numpy(), true_path.timestamps_s)
     views = true_path.T_world_camera[rows]
-    return reconstruction.score(mesh.moved(T_truth_world), true_surface, recording.camera, views, progress=progress)
+    seen = (true_surface, recording.camera, views)
+    of_mesh = reconstruction.score(mesh.moved(T_truth_world), *seen, progress=progress)
+    field = recording.run.read_map()
+    centers = field.means.numpy().astype(np.float64) @ T_truth_world[:3, :3].T + T_truth_world[:3, 3]
+    of_splats = splats_to_surface(centers, field.opacities.numpy().astype(np.float64), *seen)
+    return asdict(of_mesh) | asdict(of_splats)

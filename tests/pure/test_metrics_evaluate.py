@@ -137,6 +137,19 @@ def test_path_and_facts(run: RunFolder) -> None:
     assert score(run, HandMade(None))["frames_per_s"] == 2.0
 
 
+def test_the_worst_frame_is_not_the_first_and_the_map_has_a_size(run: RunFolder) -> None:
+    lines = [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
+    lines[0]["seconds"], lines[7]["seconds"] = {"total": 9.0}, {"tracking": 0.1, "total": 0.7}
+    (run.path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    metrics = score(run, HandMade(None))
+    assert metrics["worst_frame_s"] == 0.7 and metrics["map_bytes"] == len((run.path / "map.ply").read_bytes()) > 100
+    page = (run.path / "report.html").read_text()
+    assert "700 <span class=unit>ms" in page and "Map file" in page
+    untimed = [line | {"seconds": {}} for line in lines]
+    (run.path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in untimed))
+    assert score(run, HandMade(None))["worst_frame_s"] is None
+
+
 def test_everything_is_written(run: RunFolder) -> None:
     metrics = score(run, HandMade(truth_of()), strips_per_kind=2)
     assert json.loads((run.path / "metrics.json").read_text())["held_out"] == metrics["held_out"]

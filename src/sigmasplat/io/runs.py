@@ -175,6 +175,10 @@ class RunFolder:
         """Read map.ply. Raises RunError if it is missing, SourceError if it is damaged."""
         return ply.read_field(self._existing("map.ply"))
 
+    def map_bytes(self) -> int:
+        """Return the size of map.ply. Raises RunError if it is missing."""
+        return self._existing("map.ply").stat().st_size
+
     def write_checkpoint(self, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
         """Write checkpoint.safetensors: named tensors and text."""
         write_tensors(self.path / "checkpoint.safetensors", tensors, metadata)

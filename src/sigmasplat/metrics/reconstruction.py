@@ -77,14 +77,9 @@ def score(
     than `BEHIND_M` behind the truth. `progress` is told (views done, of how many). Values that do not exist are nan.
     """
     total = len(T_world_camera) + novel_views
-    seen_true, seen_found = np.zeros(len(truth.faces), bool), np.zeros(len(found.faces), bool)
-    centers, true_centers = found.corners.mean(1), truth.corners.mean(1)
-    for done, T in enumerate(T_world_camera, 1):
-        depth_m, face = mesh_depth(truth, camera, se3.inverse(T))
-        seen_true[face[face >= 0]] = True
-        seen_true |= in_front(true_centers, depth_m, camera, T, SLACK_M)
-        seen_found |= in_front(centers, depth_m, camera, T, BEHIND_M)
-        progress(done, total)
+    seen_true, seen_found = seen(
+        truth, found.corners.mean(1), camera, T_world_camera, lambda at, _: progress(at, total)
+    )
     ours, theirs = found.with_faces(seen_found), truth.with_faces(seen_true)
     to_truth = distances(ours.sampled(points, seed), theirs)
     to_found = distances(theirs.sampled(points, seed + 1), ours)
@@ -100,6 +95,31 @@ def score(
         _mean(to_truth), _mean(to_found), _share(to_found, COMPLETE_M), precision, recall, f1(precision, recall),
         _mean(np.abs(both[0] - both[1])[has]), _mean(has.astype(np.float64)),
     )  # fmt: skip
+
+
+def seen(
+    truth: Mesh,
+    points: Doubles,
+    camera: Camera,
+    T_world_camera: Doubles,
+    progress: Progress = lambda done, total: None,
+) -> tuple[Mask, Mask]:
+    """Tell which faces [F] of the truth, and which points [N] made beside it, count as seen from poses [K, 4, 4].
+
+    `score` has the rules; `progress` is told (views done, of how many).
+    """
+    seen_true, seen_points, centers = (
+        np.zeros(len(truth.faces), bool),
+        np.zeros(len(points), bool),
+        truth.corners.mean(1),
+    )
+    for done, T in enumerate(T_world_camera, 1):
+        depth_m, face = mesh_depth(truth, camera, se3.inverse(T))
+        seen_true[face[face >= 0]] = True
+        seen_true |= in_front(centers, depth_m, camera, T, SLACK_M)
+        seen_points |= in_front(points, depth_m, camera, T, BEHIND_M)
+        progress(done, len(T_world_camera))
+    return seen_true, seen_points
 
 
 def f1(precision: float, recall: float) -> float:

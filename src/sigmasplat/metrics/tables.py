@@ -26,7 +26,9 @@ def headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
         *surface,
         ("Spearman V ~ error²", number((metrics.get("uncertainty") or {}).get("spearman"), 3), ""),
         ("Speed", number(metrics.get("frames_per_s"), 2), "frames/s"),
+        ("Longest frame after the first", number(metrics.get("worst_frame_s"), 0, 1e3), "ms"),
         ("Splats", number(metrics.get("splats"), 0), ""),
+        ("Map file", number(metrics.get("map_bytes"), 1, 1e-6), "MB"),
         ("Lost frames", number(metrics.get("lost"), 0), f"of {metrics.get('frames', 0)}"),
         *_submap_figures(metrics),
     ]
@@ -118,8 +120,11 @@ def _surface_rows(metrics: dict[str, Any]) -> list[list[str]]:
     lines = [("Accuracy, cm", "accuracy_m", 2), ("Completion, cm", "completion_m", 2),
              ("Completion ratio (< 5 cm), %", "completion_ratio", 1), ("Precision (< 1 cm), %", "precision", 1),
              ("Recall (< 1 cm), %", "recall", 1), ("F1 (1 cm), %", "f1", 1),
-             ("Depth L1, novel views, cm", "depth_l1_m", 2), ("… covered, %", "depth_coverage", 1)]  # fmt: skip
-    return [["of what a keyframe could see", "mesh.ply"]] + [
+             ("Depth L1, novel views, cm", "depth_l1_m", 2), ("… covered, %", "depth_coverage", 1),
+             ("Splats to surface, cm", "splats_accuracy_m", 2), ("Surface to splats, cm", "splats_completion_m", 2),
+             ("Their mean (Chamfer), cm", "splats_chamfer_m", 2),
+             ("Floaters (> 10 cm) among opaque splats, %", "floaters", 2)]  # fmt: skip
+    return [["of what a keyframe could see", "mesh.ply, map.ply"]] + [
         [label, number(found.get(key), digits, 100.0)] for label, key, digits in lines
     ]
 

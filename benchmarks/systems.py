@@ -1,0 +1,98 @@
+"""Lay the systems side by side: sequences × presets × seeds, each run alone on all threads (issue 5).
+
+Runs are made by `accuracy.py`, which reads what has been run before. Where the true surface is known, the run's own is
+then scored by `sigmasplat eval --mesh`. Writes benchmarks/results/systems-<machine>.json, prints a table a sequence.
+
+example: python benchmarks/systems.py --sources synthetic --presets varsplat-fast sigma --seeds 0 1
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import accuracy
+import tyro
+
+from sigmasplat.config.text import override, split_settings
+from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.presets import preset as preset_of
+from sigmasplat.sources import open_source
+
+arg = tyro.conf.arg
+SOURCES = ("synthetic", "livingroom", "redkitchen")
+PRESETS = ("varsplat-fast", "loopsplat-fast", "cgslam-fast", "cgslam-loops-fast", "sigma")
+COSTS = ("finish_s", "worst_frame_s", "map_bytes")
+SURFACE = (
+    "accuracy_m", "completion_m", "completion_ratio",
+    "splats_accuracy_m", "splats_completion_m", "splats_chamfer_m", "floaters",
+)  # fmt: skip
+"""Figures taken from metrics.json beside those of `accuracy.figures_of`: its own, and those of `reconstruction`."""
+
+
+@dataclass(frozen=True)
+class Options(accuracy.Options):
+    """Lay the systems side by side: sequences × presets × seeds, each run alone on all threads."""
+
+    sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = SOURCES
+    presets: Annotated[tuple[str, ...], arg(help="the systems, by their settings")] = PRESETS
+    name: Annotated[str, arg(help="name of the results; another one for other --set")] = "systems"
+
+
+def refuse_unequal_input(presets: Sequence[str], settings: Sequence[str]) -> None:
+    """Raise ConfigError unless all presets, with the settings over them, take the frames in alike."""
+    changes = split_settings(settings)
+    taken = {name: override(preset_of(name), changes).to_dict()["input"] for name in presets}
+    first = presets[0]
+    for name, values in taken.items():
+        for key, value in values.items():
+            if value != taken[first][key]:
+                unequal = f"input.{key} is {taken[first][key]} in {first} and {value} in {name}"
+                raise ConfigError(f"{unequal}; give one for all: --set input.{key}={value}")
+
+
+def figures_of(metrics: dict[str, Any]) -> dict[str, float | None]:
+    """Pick a run's figures from its metrics.json; None where there is none."""
+    surface = metrics.get("reconstruction") or {}
+    picked = {name: metrics.get(name) for name in COSTS} | {name: surface.get(name) for name in SURFACE}
+    return accuracy.figures_of(metrics) | picked
+
+
+def with_surface(job: accuracy.Job, result: dict[str, Any], runs: Path, before: Sequence[str] = ()) -> dict[str, Any]:
+    """Return a job's result with all figures of its run, the surface scored first where that is due and possible.
+
+    A surface that cannot be scored is the result's `problem`. Words `before` the command may say where it runs.
+    """
+    if result["problem"]:
+        return result
+    run = job.folder(runs) / "run"
+    try:
+        metrics = RunFolder.open(run).read_metrics()
+        if metrics["reconstruction"] is None and open_source(job.path).true_surface() is not None:
+            command = [*before, sys.executable, "-m", "sigmasplat.cli", "eval", str(run), "--mesh"]
+            problem, _ = accuracy.call(command, run.parent / "surface.txt")
+            if problem:
+                return result | {"problem": f"eval --mesh: {problem}"}
+            metrics = RunFolder.open(run).read_metrics()
+    except SigmaSplatError as problem:
+        return result | {"problem": str(problem)}
+    return result | {"figures": figures_of(metrics)}
+
+
+def main(options: Options) -> int:
+    """Run, score, write, print; exit code 1 if a job failed, 2 if the options mean nothing."""
+    try:
+        refuse_unequal_input(options.presets, options.settings)
+        jobs = accuracy.jobs_of(options)
+    except SigmaSplatError as problem:
+        print(f"systems.py: {problem}", file=sys.stderr)
+        return 2
+    results = accuracy.run_all(jobs, options)
+    scored = [with_surface(job, result, options.runs) for job, result in zip(jobs, results, strict=True)]
+    return accuracy.publish("systems", scored, options)
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Options, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,))))
