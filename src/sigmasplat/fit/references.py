@@ -51,7 +51,7 @@ def keyframe_reference(
     if not config.uncertainty:
         return Reference(image, T_camera_world)
     by_U = config.align_depth_by == "U"
-    view.forward(params, T_camera_world, torch.from_numpy(image.depth[0]) if by_U else None)
+    view.forward(params, T_camera_world, torch.tensor(image.depth[0]) if by_U else None)
     maps = _reference_maps(view, config, view.moment if by_U else None)
     return Reference(image.weighed(*maps.weights), T_camera_world)
 

@@ -1,0 +1,90 @@
+"""CG-SLAM's ways through the whole of SLAM, on a few small frames: accuracy, bytes, a window of several keyframes."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from sigmasplat.config import Config
+from sigmasplat.config.text import override
+from sigmasplat.metrics.image import psnr
+from sigmasplat.metrics.trajectory import ate
+from sigmasplat.model.frame import Frame
+from sigmasplat.presets import preset
+from sigmasplat.render import render
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources import SyntheticRoom
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+
+FRAMES = 16
+SMALL = {"input.width": "160", "mapping.first_iterations": "60", "mapping.iterations": "20"}
+PAPER = SMALL | {"mapping.every": "5", "tracking.iterations": "40", "mapping.first_iterations": "100"}
+
+
+@cache
+def walk() -> SyntheticRoom:
+    return SyntheticRoom(frames=200, width=160, height=120)
+
+
+@cache
+def frames() -> list[Frame]:
+    return [walk().frame(i) for i in range(FRAMES)]
+
+
+def followed(name: str, changes: dict[str, str]) -> Slam:
+    slam = Slam(settings(name, changes))
+    for frame in frames():
+        slam.step(frame)
+    return slam
+
+
+def settings(name: str, changes: dict[str, str]) -> Config:
+    return override(preset(name), changes)
+
+
+def shown_db(slam: Slam) -> float:
+    """Compare a frame that was not mapped with the map seen from where it was tracked."""
+    step = next(s for s in reversed(slam.steps) if not s.is_keyframe)
+    frame = frames()[step.index]
+    T_camera_world = np.linalg.inv(slam.trajectory().T_world_camera[step.index])
+    seen = render(slam.field, frame.camera, T_camera_world, options=slam.config.render).color.detach().numpy()
+    return float(psnr(seen, frame.color, frame.depth_m > 0))
+
+
+RUNS: list[Any] = [
+    pytest.param("cgslam-fast", SMALL, 0.004, 26.0, id="fast"),
+    pytest.param("sigma", SMALL, 0.004, 26.0, id="sigma"),
+    pytest.param("cgslam-replica", PAPER, 0.02, 24.0, id="paper"),
+    pytest.param("cgslam-replica", PAPER | {"mapping.covisibility": "frustum"}, 0.02, 24.0, id="by-frustum"),
+    pytest.param("cgslam-fast", SMALL | {"mapping.covisibility": "descriptor"}, 0.004, 26.0, id="by-descriptor"),
+    pytest.param("cgslam-released-replica", PAPER | {"tracking.first_iterations": "60"}, 0.02, 24.0, id="released"),
+]
+
+
+@pytest.mark.parametrize(("name", "changes", "ate_m", "least_db"), RUNS)
+def test_the_path_is_followed_and_the_room_shown(
+    name: str, changes: dict[str, str], ate_m: float, least_db: float
+) -> None:
+    slam = followed(name, changes)
+    assert not any(step.lost for step in slam.steps)
+    assert ate(slam.trajectory(), walk().truth()).rmse_m < ate_m
+    assert shown_db(slam) > least_db
+    assert torch.isfinite(slam.field.params).all()
+
+
+@pytest.mark.parametrize(("name", "changes"), [("cgslam-replica", PAPER), ("sigma", SMALL)])
+def test_same_input_same_bytes(name: str, changes: dict[str, str]) -> None:
+    first, second = (followed(name, changes).checkpoint() for _ in range(2))
+    assert all(first[key].numpy().tobytes() == second[key].numpy().tobytes() for key in first)
+
+
+def test_loops_and_submaps_go_with_a_consistent_field() -> None:
+    """Cut often: poses and splats go on from submap to submap, and the final map is refined by the same terms."""
+    slam = followed("cgslam-loops-fast", SMALL | {"submaps.frames": "5", "final.iterations": "40"})
+    slam.finish()
+    assert len(slam.store) >= 3 and not any(step.lost for step in slam.steps)
+    assert ate(slam.trajectory(), walk().truth()).rmse_m < 0.005
+    assert shown_db(slam) > 22.0
