@@ -50,11 +50,11 @@ class Options:
 
     experiments: Annotated[tuple[Experiment, ...], arg(help="which of them")] = ("sequence", "localise")
     sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = (
-        "synthetic:frames=400",
+        "synthetic:frames=400,width=160,height=120",
         "livingroom",
         "redkitchen",
     )
-    limit: Annotated[int, arg(help="frames of each, from its start")] = 100
+    limit: Annotated[int, arg(help="frames of each, from its start")] = 80
     width: Annotated[int, arg(help="working width, pixels")] = 160
     preset: Annotated[str, arg(help="settings to start from")] = "varsplat-fast"
     seeds: Annotated[tuple[int, ...], arg(help="starts of the random numbers, a run or a map each")] = (0, 1)
