@@ -40,7 +40,7 @@ arg = tyro.conf.arg
 Matrix = NDArray[np.float64]
 Experiment = Literal["sequence", "localise"]
 RATES = {**tracking.RATES, "CG-SLAM": (7.5e-4, 2.15e-3)}
-"""Of tracking by Adam: a quaternion's, which turns by twice as much, and translation's. CG-SLAM gives 1.5e-3 to turns."""
+"""Of tracking by Adam: of a quaternion, which turns by twice as much, and of translation. CG-SLAM turns by 1.5e-3."""
 ONE_MAP = ("submaps.distance_m=0", "submaps.angle_deg=0", "submaps.frames=0", "submaps.uncertainty_m=0")
 SEEDS_PER_PIXEL = (0.5, 0.2)
 """Of the first frame: drawn evenly, and by gradient; what varsplat-fast takes at its own width."""
