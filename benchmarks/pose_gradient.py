@@ -39,6 +39,8 @@ from sigmasplat.sources import open_source
 arg = tyro.conf.arg
 Matrix = NDArray[np.float64]
 Experiment = Literal["sequence", "localise"]
+RATES = {**tracking.RATES, "CG-SLAM": (7.5e-4, 2.15e-3)}
+"""Of tracking by Adam: of a quaternion, which turns by twice as much, and of translation. CG-SLAM turns by 1.5e-3."""
 ONE_MAP = ("submaps.distance_m=0", "submaps.angle_deg=0", "submaps.frames=0", "submaps.uncertainty_m=0")
 SEEDS_PER_PIXEL = (0.5, 0.2)
 """Of the first frame: drawn evenly, and by gradient; what varsplat-fast takes at its own width."""
@@ -50,15 +52,18 @@ class Options:
 
     experiments: Annotated[tuple[Experiment, ...], arg(help="which of them")] = ("sequence", "localise")
     sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = (
-        "synthetic:frames=400",
+        "synthetic:frames=400,width=160,height=120",
         "livingroom",
         "redkitchen",
     )
-    limit: Annotated[int, arg(help="frames of each, from its start")] = 100
+    limit: Annotated[int, arg(help="frames of each, from its start")] = 80
     width: Annotated[int, arg(help="working width, pixels")] = 160
     preset: Annotated[str, arg(help="settings to start from")] = "varsplat-fast"
     seeds: Annotated[tuple[int, ...], arg(help="starts of the random numbers, a run or a map each")] = (0, 1)
     iterations: Annotated[int, arg(help="of Adam, per tracked frame")] = 30
+    rates: Annotated[Literal["Replica", "TUM", "CG-SLAM"], arg(help="whose learning rates Adam tracks with")] = (
+        "Replica"
+    )
     refinement: Annotated[int, arg(help="steps that refine the map, harmonics included")] = 1000
     degree: Annotated[int, arg(help="of the harmonics, 1 to 3")] = 2
     frames: Annotated[int, arg(help="held-out frames to be found, per map")] = 8
@@ -79,8 +84,8 @@ class Options:
         return (f"input.width={self.width}", *seeds, *ONE_MAP, "loops.close=false")
 
     def tracking_settings(self, way: str) -> tuple[str, ...]:
-        """Return the settings of a whole sequence tracked by Adam with the paper's rates for Replica."""
-        rotation, translation = tracking.RATES["Replica"]
+        """Return the settings of a whole sequence tracked by Adam."""
+        rotation, translation = RATES[self.rates]
         return (
             *self.map_settings(), "final.iterations=0", "tracking.method=adam",
             f"tracking.iterations={self.iterations}", f"tracking.lr_rotation={rotation}",

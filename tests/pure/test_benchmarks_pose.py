@@ -144,6 +144,8 @@ def test_runs_differ_by_the_switch_alone(tmp_path: Path, monkeypatch: pytest.Mon
     configs = [job.key()["config"] for job in asked]
     switches = [config["render"].pop("covariance_pose_gradient") for config in configs]
     assert switches == [False] * 4 + [True] * 4 and configs[:4] == configs[4:]
+    rates = [pose_gradient.Options(rates=name).tracking_settings("+ covariance")[-3] for name in pose_gradient.RATES]
+    assert rates == ["tracking.lr_rotation=0.002", "tracking.lr_rotation=0.0002", "tracking.lr_rotation=0.00075"]
     assert configs[0]["tracking"]["method"] == "adam" and configs[0]["tracking"]["iterations"] == 30
     rules = [value for name, value in configs[0]["submaps"].items() if name != "inherit"]
     assert configs[0]["final"]["iterations"] == 0 and not any(rules)
