@@ -64,7 +64,7 @@ def fit_pose_adam(
         view.forward(params, T)
         loss, g_exposure = tracking_gradient(view, target, config, torch.as_tensor(exposure).float())
         first = loss if steps == 1 else first
-        blind = loss == 0.0 and config.average == "kept"  # a mean over no pixel may not win over one over some
+        blind = loss == 0.0  # where no pixel counts: that may not win over one where some do
         if loss < best and not (blind and steps > 1):
             best, best_T, best_exposure = loss, T, exposure.copy()
         moved = adam.step(way.gradient(numbers, view.backward_pose(params)), rates)
