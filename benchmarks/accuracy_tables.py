@@ -56,7 +56,7 @@ GOALS = (
     Goal("livingroom", "held_out_psnr_db", "held-out PSNR ≥ 27 dB", lambda x: x >= 27.0),
     Goal("livingroom", "spearman", "Spearman > 0", lambda x: x > 0.0),
 )
-GOAL_PRESET = "varsplat-fast"
+GOAL_PRESET = "sigma"
 FACTORS = {figure: factor for _, figure, factor in (*PLACE, *PICTURES)}
 
 

@@ -228,7 +228,7 @@ def test_without_out_a_taken_name_is_numbered(tiny_tum: Path, monkeypatch: pytes
     monkeypatch.chdir(tiny_tum.parent)
     for _ in range(2):
         assert sigmasplat("run", str(tiny_tum), "--limit", "1", "--no-eval", *QUICK) == 0
-    assert sorted(path.name for path in Path("runs").iterdir()) == ["tiny-varsplat-fast", "tiny-varsplat-fast-2"]
+    assert sorted(path.name for path in Path("runs").iterdir()) == ["tiny-sigma", "tiny-sigma-2"]
 
 
 @pytest.mark.parametrize("place", ["file", "below a file", "below proc"])

@@ -55,7 +55,7 @@ def results(benchmark: str, figures: dict[str, Any], **changes: Any) -> dict[str
 
 
 def job_result(source: str, seed: int, problem: str | None = None, **figures: float | None) -> dict[str, Any]:
-    job = {"source": source, "preset": "varsplat-fast", "seed": seed}
+    job = {"source": source, "preset": accuracy_tables.GOAL_PRESET, "seed": seed}
     return {"job": job, "problem": problem, "peak_mib": 512.0, "figures": figures}
 
 
@@ -116,7 +116,7 @@ def test_blocks_are_rewritten_and_nothing_else(tmp_path: Path) -> None:
     assert missing == []
     assert new.startswith("before\n<!-- bench:accuracy/path-and-speed -->\n")
     assert new.endswith("<!-- /bench -->\nafter <!-- bench -->\n")
-    assert "old" not in new and "| synthetic | varsplat-fast | 1 | 0.512 |" in new and "31.4" not in new
+    assert "old" not in new and "| synthetic | sigma | 1 | 0.512 |" in new and "31.4" not in new
     assert "commit 012345678 with changes" in new
     assert tables.rewritten(new, tmp_path) == (new, [])
     unmeasured = "<!-- bench:gpu/times-ms -->\nold\n<!-- /bench -->"
@@ -192,7 +192,7 @@ def test_a_goal_is_held_by_every_seed_of_a_whole_run_or_not_at_all() -> None:
     assert held["livingroom: ATE ≤ 1 cm"] == ["0.500, 2.00", "**no**"]
     assert held["livingroom: Spearman > 0"] == ["0.400, 0.300", "yes"]
     assert made["Path and speed"].rows[0][2:4] == ["2", "1.25 ± 1.1"]
-    assert list(made["Failed"].rows) == [["livingroom, varsplat-fast, seed 2", "sigmasplat: a / b"]]
+    assert list(made["Failed"].rows) == [["livingroom, sigma, seed 2", "sigmasplat: a / b"]]
     for config in ({"limit": 5}, {"settings": ["mapping.iterations=5"]}):
         assert "Goals" not in {s.title for s in tables.sections(results("accuracy", {"jobs": jobs}, config=config))}
 

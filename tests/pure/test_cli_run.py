@@ -174,7 +174,7 @@ def sigmasplat(*arguments: str) -> int:
 
 def test_run_leaves_a_whole_run_folder(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     assert sigmasplat("run", "corridor", "--set", "tracking.tau=7", "--set", "mapping.every=2", "--seed", "4") == 0
-    run = RunFolder.open(Path("runs/my-corridor-varsplat-fast"))
+    run = RunFolder.open(Path("runs/my-corridor-sigma"))
     config = run.config()
     assert (config.tracking.tau, config.mapping.every, config.seed) == (7.0, 2, 4)
     assert MadeUpSlam.latest.config == config
@@ -192,7 +192,7 @@ def test_run_leaves_a_whole_run_folder(corridor: Corridor, capsys: pytest.Captur
     assert MadeUpSlam.latest.finished == 1 and len(run.read_map()) == 3, "the final map"
     assert run.facts()["finish_s"] >= 0.0
     said = capsys.readouterr().out
-    for figure in ("1.23", "27.31", "31.25", str(Path("runs/my-corridor-varsplat-fast/report.html").resolve())):
+    for figure in ("1.23", "27.31", "31.25", str(Path("runs/my-corridor-sigma/report.html").resolve())):
         assert figure in said
     assert "LOST" not in said
 
@@ -201,14 +201,14 @@ def test_a_second_run_takes_another_folder(corridor: Corridor) -> None:
     for _ in range(3):
         assert sigmasplat("run", "corridor", "--no-eval") == 0
     names = sorted(path.name for path in Path("runs").iterdir())
-    assert names == [f"my-corridor-varsplat-fast{ending}" for ending in ("", "-2", "-3")]
+    assert names == [f"my-corridor-sigma{ending}" for ending in ("", "-2", "-3")]
 
 
 def test_overwrite_replaces_the_default_folder(corridor: Corridor) -> None:
     assert sigmasplat("run", "corridor", "--no-eval") == 0
-    assert sigmasplat("run", "corridor", "--no-eval", "--overwrite", "--preset", "varsplat-fast") == 0
-    assert [path.name for path in Path("runs").iterdir()] == ["my-corridor-varsplat-fast"]
-    assert len(RunFolder.open(Path("runs/my-corridor-varsplat-fast")).read_log()) == 6
+    assert sigmasplat("run", "corridor", "--no-eval", "--overwrite", "--preset", "sigma") == 0
+    assert [path.name for path in Path("runs").iterdir()] == ["my-corridor-sigma"]
+    assert len(RunFolder.open(Path("runs/my-corridor-sigma")).read_log()) == 6
 
 
 def test_lost_frames_are_said_plainly(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:

@@ -184,3 +184,15 @@ def test_the_first_keyframes_rates_fall_evenly_in_log() -> None:
     assert [float(r.per_column[0]) for r in Rates.falling(replace(config, lr_means_first=0.0), 2)] == pytest.approx(
         [1e-3] * 2
     )
+
+
+def test_what_the_camera_comes_close_to_is_split_as_far_as_the_budget_goes() -> None:
+    """From a third of the distance seeds span three times as many pixels, and there are hardly any new ones."""
+    close = {}
+    for split_px, budget in ((0.0, 0), (6.0, 0), (6.0, 500)):
+        made = mapped(mapper(primitives=PrimitiveConfig(split_radius_px=split_px), max_splats=budget), (0.0,))
+        made.map(view(), 1, target(2.0 / 3.0), se3.exp(np.array([0.0, 0.0, 4.0 / 3.0, 0.0, 0.0, 0.0])))
+        close[split_px, budget] = len(made.field)
+    count = CAMERA.width * CAMERA.height
+    assert close[0.0, 0] < 1.1 * count and close[6.0, 0] > close[0.0, 0] + 0.08 * count
+    assert count < close[6.0, 500] <= 500

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig, RenderConfig
-from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model import se3
@@ -223,7 +222,7 @@ def test_a_faded_splat_of_the_wall_comes_back_and_a_floater_does_not(view: View)
     frame.target.color[:, : CAMERA.height, : CAMERA.width] = 0.9
     faded = fade(field, torch.tensor([lonely, PIXELS]), 0.07)
     still = replace(MappingConfig(), weight_nll_color=0.0, lr_means=0.0, lr_log_scales=0.0, lr_quats=0.0, lr_colors=0.0)
-    fit_field(field, view, [frame] * 15, still, Rates.of(still))
+    fit_field(field, view, [[frame]] * 15, still)
     uncertainty, _ = primitive_uncertainty(field, view, [frame], "dominant")
     opacity = field.opacities
     assert float(opacity[lonely]) > 0.07 > float(opacity[-1]), "the images decide"

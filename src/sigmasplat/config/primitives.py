@@ -23,6 +23,9 @@ class PrimitiveConfig:
     size (3DGS); 0 = off: nothing is split or cloned."""
     split_scale_m: float = 0.05
     """A hot splat larger than this is split in two …"""
+    split_radius_px: float = 0.0
+    """Also split is what spans more than this (three standard deviations) in the newest keyframe's image: splats that a
+    camera comes close to were made for a view from afar (ours); 0 = off."""
     clone: bool = False
     """… a smaller one is doubled (3DGS; CG-SLAM's code does not)."""
     most_scale_m: float = 0.0

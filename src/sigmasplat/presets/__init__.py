@@ -13,7 +13,7 @@ PRESETS = {name: dataclasses.replace(config, name=name) for presets in SYSTEMS f
 
 def default_preset() -> str:
     """Name the preset used where none is asked for: the one sized for a machine without a GPU."""
-    return "varsplat-fast"
+    return "sigma"
 
 
 def list_presets() -> list[str]:

@@ -164,7 +164,7 @@ FAST = dataclasses.replace(
         covisibility="splats",
         frames_per_step=1,
     ),
-    primitives=PrimitiveConfig(uncertain_m2=0.025, faded_opacity=0.07),
+    primitives=dataclasses.replace(varsplat.FAST.primitives, uncertain_m2=0.025, faded_opacity=0.07),
     tracking=dataclasses.replace(varsplat.FAST.tracking, align_depth_by="U"),
     submaps=SubmapConfig(),
     loops=PAPER.loops,

@@ -12,6 +12,7 @@ from sigmasplat.config import (
     InputConfig,
     LoopConfig,
     MappingConfig,
+    PrimitiveConfig,
     RegistrationConfig,
     SeedConfig,
     SubmapConfig,
@@ -122,7 +123,7 @@ FAST = Config(
     mapping=MappingConfig(
         every=5,  # Replica's; on every frame mapping would take five times as long
         overlap_below=0.7,  # … sooner when the camera moves fast
-        iterations=20,  # what two cores can do beside the camera (docs/kernels.md: what 5, 10 and 30 buy)
+        iterations=18,  # what two cores can do beside the camera (docs/kernels.md: what 5, 10 and 30 buy)
         newest_probability=0.2,  # with so few, older keyframes would be forgotten at 0.4: 1 dB on redkitchen
         first_iterations=150,  # a raw map renders a centimetre too near until about then
         weight_nll_color=1e-2,  # ×100: V then follows the errors better; it pulls at shapes and poses a little too
@@ -134,6 +135,7 @@ FAST = Config(
         lr_pose_rotation=1e-4,
         prune_opacity=0.05,
     ),
+    primitives=PrimitiveConfig(split_radius_px=13.0),  # or a map that submaps inherit coarsens as the camera walks on
     tracking=TrackingConfig(
         method="align",  # Gauss–Newton on images instead of 200 renders a frame
         align_to="keyframe",
@@ -153,7 +155,7 @@ FAST = Config(
         most=3,  # a pair costs as much as thirty frames
     ),
     registration=RegistrationConfig(
-        iterations=10,  # four keyframes a pair: each step is a render; Gauss–Newton has done most of it
+        iterations=6,  # four keyframes a pair: each step is a render; Gauss–Newton has done most of it
         lr_translation=1e-3,
         lr_rotation=1e-3,
         tau=10.0,

@@ -90,6 +90,8 @@ def too_large(
 
     In the image are those before the camera whose centres the image shows.
     """
+    if not (most_scale_m > 0 or most_radius_px > 0):
+        return torch.zeros(len(field), dtype=torch.bool)
     widest, T = field.scales.amax(1), torch.from_numpy(T_camera_world).to(field.params)
     large = (widest > most_scale_m) & (most_scale_m > 0)
     if most_radius_px > 0:

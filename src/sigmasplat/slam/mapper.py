@@ -18,14 +18,11 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.submap import Picture, Submap
 from sigmasplat.render.view import View
-from sigmasplat.slam.densify import Heat, hot_splats, multiply, too_large
+from sigmasplat.slam.densify import Heat, hot_splats, multiply, split, too_large
 from sigmasplat.slam.primitives import fade, primitive_uncertainty, still_uncertain
 from sigmasplat.slam.rules import draw_keyframes
 from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats, thin_out
 from sigmasplat.slam.window import choose_window, dominating
-
-JUDGES = 8
-"""Splats are judged by so many keyframes at most, the newest ones where there is no window."""
 
 
 @dataclass(eq=False)
@@ -45,20 +42,24 @@ class Mapper:
         T_world_camera: NDArray[np.float64],
         descriptor: NDArray[np.float32] | None = None,
     ) -> FieldFit:
-        """Take in one keyframe: seed, choose which ones to look at, fit in two halves with a clearing after each."""
+        """Take in one keyframe: seed, choose which ones to look at, fit in two halves with a clearing after each.
+
+        What begins with splats inherited knows its first keyframe from before, and only takes note of it.
+        """
         c, born, begun = self.config.mapping, self.field.born, len(self.field) > 0
         self.keyframes.append(Keyframe(index, target, T_world_camera, not self.keyframes, descriptor=descriptor))
+        if begun and len(self.keyframes) == 1:
+            return FieldFit()
         self._seed(view, target, T_world_camera)
         steps = c.iterations if begun else c.first_iterations
         rates = iter([Rates.of(c)] * steps if begun else Rates.falling(c, steps))
         window, heat = self._window(view), Heat.of(len(self.field))
         fit = self._fit(view, window, steps // 2, rates, born, c.poses_from == "start", heat)
-        self._multiply(heat)
+        self._multiply(view, heat)
         self._prune(view)
         doubted = self._doubt(view, window)
         fit.join(self._fit(view, window, steps - steps // 2, rates, born, True, None))
-        self._drop_doubted(view, window, doubted)
-        self._prune(view)
+        self._prune(view, self._unconvinced(view, window, doubted))
         return fit
 
     def _window(self, view: View) -> list[Keyframe]:
@@ -135,30 +136,41 @@ class Mapper:
             new.keep(torch.from_numpy(self.random.permutation(len(new))[: max(room, 0)].copy()).sort().values)
         self.field.append(new)
 
-    def _multiply(self, heat: Heat) -> None:
-        """Split and clone the splats that the newest keyframe pulled at hardest, as far as the budget goes."""
+    def _multiply(self, view: View, heat: Heat) -> None:
+        """Split and clone the splats that the newest keyframe pulled at hardest, and those it sees too large, as far as
+        the budget goes."""
         p, most = self.config.primitives, self.config.seeding.max_splats
-        room = max(most - len(self.field), 0) if most else None
+        room = max(most - len(self.field), 0) if most else len(self.field)
         multiply(self.field, hot_splats(heat.pull, heat.times, p.split_gradient, room), p, self.random)
+        if p.split_radius_px:
+            T_camera_world = se3.inverse(self.keyframes[-1].T_world_camera)
+            coarse = too_large(self.field, T_camera_world, view.camera, 0.0, p.split_radius_px)
+            coarse[coarse.nonzero()[max(most - len(self.field), 0) if most else len(coarse) :]] = False
+            split(self.field, coarse, self.random)
+
+    def _judges(self, window: list[Keyframe]) -> list[Keyframe]:
+        """Return the keyframes that splats are held against: the window's; without one the newest."""
+        return window if self.config.mapping.window else window[:1]
 
     def _doubt(self, view: View, window: list[Keyframe]) -> Tensor:
         """Fade the splats that the window's readings contradict; return their ids."""
         p = self.config.primitives
         if not p.uncertain_m2:
             return self.field.ids[:0]
-        nu, _ = primitive_uncertainty(self.field, view, window[:JUDGES], p.owner)
+        nu, _ = primitive_uncertainty(self.field, view, self._judges(window), p.owner)
         return fade(self.field, nu > p.uncertain_m2, p.faded_opacity)
 
-    def _drop_doubted(self, view: View, window: list[Keyframe], doubted: Tensor) -> None:
-        """Drop the splats faded before that have not come back."""
-        if len(doubted):
-            p = self.config.primitives
-            nu, _ = primitive_uncertainty(self.field, view, window[:JUDGES], p.owner)
-            self.field.keep(~still_uncertain(self.field, doubted, nu, p.uncertain_m2, p.least_opacity))
+    def _unconvinced(self, view: View, window: list[Keyframe], doubted: Tensor) -> Tensor:
+        """Tell which splats [N] were faded before and have not come back."""
+        p = self.config.primitives
+        if not len(doubted):
+            return torch.zeros(len(self.field), dtype=torch.bool)
+        nu, _ = primitive_uncertainty(self.field, view, self._judges(window), p.owner)
+        return still_uncertain(self.field, doubted, nu, p.uncertain_m2, p.least_opacity)
 
-    def _prune(self, view: View) -> None:
-        """Drop splats that have faded or grown too large."""
+    def _prune(self, view: View, also: Tensor | None = None) -> None:
+        """Drop splats that have faded or grown too large, and those of `also` [N]."""
         p, T_camera_world = self.config.primitives, se3.inverse(self.keyframes[-1].T_world_camera)
-        keep = self.field.opacities > self.config.mapping.prune_opacity
-        keep &= ~too_large(self.field, T_camera_world, view.camera, p.most_scale_m, p.most_radius_px)
-        self.field.keep(keep)
+        gone = self.field.opacities <= self.config.mapping.prune_opacity
+        gone |= too_large(self.field, T_camera_world, view.camera, p.most_scale_m, p.most_radius_px)
+        self.field.keep(~(gone if also is None else gone | also))

@@ -76,5 +76,7 @@ def still_uncertain(
 
     A faded splat seldom owns a pixel, so opacity decides; and in a few dozen steps it does not fall from 0.07 to 1/255.
     """
+    named = torch.zeros(field.born, dtype=torch.bool)
+    named[faded] = True
     faint = field.opacities < least_opacity
-    return torch.isin(field.ids, faded) & (faint | (uncertainty > uncertain_m2))
+    return named[field.ids] & (faint | (uncertainty > uncertain_m2))
