@@ -284,5 +284,5 @@ def test_the_earlier_systems_use_nothing_of_this_one(system: str, dataset: str) 
     """Their runs stay what they were: every setting that came with CG-SLAM is at its default, which is off."""
     config, default = preset(f"{system}-{dataset}"), Config()
     assert {name: value_of(config, name) for name in NEW} == {name: value_of(default, name) for name in NEW}
-    assert replace(config.primitives, split_radius_px=0.0) == default.primitives, "ours, not CG-SLAM's"
+    assert dataclasses.replace(config.primitives, split_radius_px=0.0) == default.primitives, "ours, not CG-SLAM's"
     assert (default.primitives.uncertain_m2, default.primitives.split_gradient, default.mapping.window) == (0, 0, 0)
