@@ -170,7 +170,7 @@ def test_what_is_said_and_written_is_what_was_measured(tmp_path: Path, capsys: p
 
     written = json.loads(out.read_text())
     assert written["machine"]["cores"] and written["code"] == code_digest(Path(ablation.__file__).parent, RUNNING)
-    assert Config.from_dict(written["config"]) == ablation.common_config("varsplat-fast", (), 10.0)
+    assert Config.from_dict(written["config"]) == ablation.common_config("sigma", (), 10.0)
     run = next(r for r in written["runs"] if (r["source"], r["variant"], r["seed"]) == ("hall", "+loop", 2))
     assert run["figures"]["ate_m"] == pytest.approx(0.0052)
     assert run["metrics"] == metrics(0.0052, before=24.0)
