@@ -62,7 +62,7 @@ class Options:
     seeds: Annotated[tuple[int, ...], arg(help="starts of the random numbers, a run or a map each")] = (0, 1)
     iterations: Annotated[int, arg(help="of Adam, per tracked frame")] = 30
     rates: Annotated[Literal["Replica", "TUM", "CG-SLAM"], arg(help="whose learning rates Adam tracks with")] = (
-        "Replica"
+        "CG-SLAM"
     )
     refinement: Annotated[int, arg(help="steps that refine the map, harmonics included")] = 1000
     degree: Annotated[int, arg(help="of the harmonics, 1 to 3")] = 2
