@@ -103,6 +103,7 @@ def test_measured_tables_have_their_places() -> None:
             "ablation",
             "color-covariance",
         ),
+        "docs/cgslam.md": ("systems", "consistency", "pose-gradient"),
     }
     for document, names in places.items():
         text = (ROOT / document).read_text(encoding="utf-8")
