@@ -15,8 +15,8 @@ import record
 import tables
 import tyro
 
-from sigmasplat import options as described
-from sigmasplat.benches import DEFAULT_PRESET, Ablation
+from sigmasplat.commands import options as described
+from sigmasplat.commands.bench import DEFAULT_PRESET, Ablation
 from sigmasplat.errors import SigmaSplatError
 
 arg = tyro.conf.arg

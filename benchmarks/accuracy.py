@@ -22,10 +22,10 @@ import tables
 import tyro
 
 import sigmasplat
+from sigmasplat.commands.options import Settings
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.io.machine import RUNNING, code_digest
-from sigmasplat.options import Settings
 from sigmasplat.presets import default_preset, preset as preset_of
 
 arg = tyro.conf.arg

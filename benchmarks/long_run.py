@@ -24,6 +24,7 @@ import tables
 import tyro
 from cpu import alone
 
+from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import SigmaSplatError, SourceError
@@ -32,7 +33,6 @@ from sigmasplat.io.submaps import DiskStore
 from sigmasplat.metrics.trajectory import ate
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.options import Settings
 from sigmasplat.presets import default_preset, preset as preset_of
 from sigmasplat.sources import open_source
 from sigmasplat.sources.base import Source

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
@@ -33,11 +34,11 @@ def read(path: Path) -> dict[str, Any]:
 class NpzFrames(Source):
     """One frame per file, in the order of the names."""
 
-    def __init__(self, folder: Path, strict: bool = False) -> None:
+    def __init__(self, folder: Path, settings: InputConfig) -> None:
         """Open a folder. Raises SourceError if the camera cannot be read or there are no frames."""
         c = read(folder / "camera.npz")
         camera = Camera(int(c["width"]), int(c["height"]), *(float(c[name]) for name in ("fx", "fy", "cx", "cy")))
-        super().__init__(folder.resolve().name, camera, strict)
+        super().__init__(folder.resolve().name, camera, settings.strict)
         self._paths = sorted(path for path in folder.glob("*.npz") if path.stem.isdigit())
         if not self._paths:
             raise SourceError(f"no frames in {folder} (looked for 000000.npz and so on)")
@@ -64,5 +65,5 @@ FORMAT = Format(
     "npz frames",
     "camera.npz and 000000.npz",
     lambda path: (Path(path) / "camera.npz").is_file(),
-    lambda path, strict: NpzFrames(Path(path), strict),
+    lambda path, settings: NpzFrames(Path(path), settings),
 )

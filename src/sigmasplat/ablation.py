@@ -15,13 +15,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sigmasplat.commands.options import absolute
 from sigmasplat.config import Config
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.io import machine
 from sigmasplat.io.atomic import write_text
 from sigmasplat.io.machine import RUNNING, code_digest
-from sigmasplat.options import absolute
 from sigmasplat.presets import preset as preset_of
 
 if TYPE_CHECKING:
@@ -55,7 +55,6 @@ class Job:
     variant: str
     seed: int
     config: Config
-    limit: int | None
 
     @property
     def key(self) -> tuple[str, str, int]:
@@ -92,7 +91,7 @@ class Study:
         return [
             Job(
                 source, absolute(source.replace(SEED, str(seed))), variant, seed,
-                override(self.config, VARIANTS[variant] | {"seed": str(seed)}), self.limit,
+                override(self.config, VARIANTS[variant] | {"seed": str(seed), "input.limit": str(self.limit or 0)}),
             )
             for seed in range(self.seeds)
             for variant in self.variants
@@ -217,8 +216,8 @@ def perform(job: Job, folder: Path, screen: "Screen") -> dict[str, Any]:
     from sigmasplat.slam.slam import Slam
     from sigmasplat.sources import open_source
 
-    source = open_source(job.path, limit=job.limit)
-    run = new_folder(folder, job.config, source, True, source_path=job.path, stride=1, limit=job.limit)
+    source = open_source(job.path, job.config.input)
+    run = new_folder(folder, job.config, source, True, source_path=job.path)
     with screen.steps(len(source)) as watch:
         outcome = record(Slam(job.config, run.submaps), source, run, watch)
     if outcome.status == "interrupted":

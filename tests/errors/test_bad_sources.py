@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sigmasplat.errors import SourceError
+from sigmasplat.errors import SigmaSplatError
 from sigmasplat.sources import open_source
 
 
 def refusal(path, **options) -> str:
     """Open and read a bad sequence; return the one line it is refused with."""
-    with pytest.raises(SourceError) as caught:
+    with pytest.raises(SigmaSplatError) as caught:
         list(open_source(path, **options))
     message = str(caught.value)
     assert "\n" not in message and len(message) < 600
@@ -216,6 +216,6 @@ def test_a_bad_option_of_the_synthetic_room(option):
     assert "synthetic room" in refusal(f"synthetic:{option}")
 
 
-@pytest.mark.parametrize("options", [{"stride": 0}, {"limit": 0}, {"stride": -1}])
+@pytest.mark.parametrize("options", [{"stride": 0}, {"limit": -1}, {"stride": -1}])
 def test_a_bad_stride_or_limit(tiny_tum, options):
     assert "stride and limit" in refusal(tiny_tum, **options)

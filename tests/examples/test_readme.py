@@ -16,9 +16,10 @@ import sigmasplat
 import sigmasplat.sources
 from documents import DOCUMENTS, ROOT, blocks
 from sigmasplat import cli
+from sigmasplat.commands import options
 from sigmasplat.config.text import override
 from sigmasplat.io.runs import FILES, RunFolder
-from sigmasplat.presets import preset
+from sigmasplat.presets import default_preset, preset
 from sigmasplat.sources import open_source
 from sigmasplat.sources.opening import formats
 
@@ -157,7 +158,7 @@ def test_documented_commands_parse(line: str, monkeypatch: pytest.MonkeyPatch) -
         @functools.wraps(command)
         def stand_in(*args, **named):
             settings, seed = named.get("settings", ()), named.get("seed")
-            cli.configured(named.get("preset", cli.DEFAULT_PRESET), settings, seed)  # names and values exist
+            options.configured(named.get("preset", default_preset()), settings, seed)  # names and values exist
             return 0
 
         return stand_in

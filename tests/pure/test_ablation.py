@@ -13,7 +13,7 @@ import pytest
 
 from sigmasplat import ablation, cli
 from sigmasplat.ablation import COMPARED, NAMES, WITHOUT_VARIANCE, Job, Results, Study, carry_out
-from sigmasplat.benches import Ablation
+from sigmasplat.commands.bench import Ablation
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError, RunError

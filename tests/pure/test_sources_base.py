@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from sigmasplat.errors import SourceError
+from sigmasplat.config import InputConfig
+from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
@@ -108,14 +109,23 @@ def test_a_source_without_a_readable_frame_is_an_error():
 
 
 def test_subset_strides_limits_and_renumbers():
-    part = Subset(Counting(), stride=3, limit=3)
+    part = Subset(Counting(), InputConfig(stride=3, limit=3))
     frames = list(part)
     assert [f.index for f in frames] == [0, 1, 2]
     assert [f.timestamp_s for f in frames] == [0.0, 0.3, 0.6]
     with pytest.raises(IndexError):
         part.frame(3)
-    with pytest.raises(SourceError, match="stride"):
-        Subset(Counting(), 0, None)
+
+
+def test_subset_takes_a_span_of_time_then_strides():
+    part = Subset(Counting(), InputConfig(start_s=0.15, end_s=0.75, stride=2))
+    assert [f.timestamp_s for f in part] == [0.2, 0.4, 0.6]
+    assert part.timestamp_s(1) == 0.4
+    assert len(Subset(Counting(), InputConfig(start_s=0.5))) == 5
+    with pytest.raises(SourceError, match="no frame between"):
+        Subset(Counting(), InputConfig(start_s=3.0))
+    with pytest.raises(ConfigError, match="span some time"):
+        InputConfig(start_s=3.0, end_s=2.0)
 
 
 def test_association_of_known_lists():

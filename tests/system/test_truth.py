@@ -72,7 +72,7 @@ def test_slam_and_session_never_ask_for_the_truth(tmp_path: Path) -> None:
 
 
 def test_the_command_line_asks_only_to_evaluate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sigmasplat.sources.open_source", lambda path, **options: Secretive())
+    monkeypatch.setattr("sigmasplat.sources.open_source", lambda path, settings=None: Secretive())
     assert sigmasplat("run", "room", "--out", str(tmp_path / "run"), "--no-eval", *OPTIONS) == 0
     assert sigmasplat("mesh", str(tmp_path / "run"), "--voxel-m", "0.1") == 0
     with pytest.raises(Asked):

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from sigmasplat.config.frames import InputConfig, MappingConfig, RenderConfig, SeedConfig, TrackingConfig
+from sigmasplat.config.frames import MappingConfig, RenderConfig, SeedConfig, TrackingConfig
+from sigmasplat.config.input import InputConfig
 from sigmasplat.config.primitives import PrimitiveConfig
 from sigmasplat.config.submaps import FinalConfig, LoopConfig, RegistrationConfig, SubmapConfig
 from sigmasplat.errors import ConfigError

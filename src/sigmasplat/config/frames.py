@@ -1,20 +1,7 @@
-"""Settings of what is done frame by frame: input, render, seeding, mapping, tracking."""
+"""Settings of what is done frame by frame: render, seeding, mapping, tracking."""
 
 from dataclasses import dataclass
 from typing import Literal
-
-
-@dataclass(frozen=True)
-class InputConfig:
-    """What is taken from the source."""
-
-    width: int = 0
-    """Working image width in pixels, height in proportion; 0 keeps the source's size."""
-    min_depth_m: float = 0.1
-    max_depth_m: float = 8.0
-    """Readings beyond are treated as no reading."""
-    crop_px: int = 0
-    """Pixels dropped at every edge, after resizing: where an undistorted image or a sensor's depth has none."""
 
 
 @dataclass(frozen=True)

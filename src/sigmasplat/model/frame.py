@@ -47,17 +47,11 @@ class Frame:
         """
         if (width, height) == (self.camera.width, self.camera.height):
             return self
-        planes = [
-            np.asarray(
-                Image.fromarray(np.ascontiguousarray(self.color[..., c])).resize((width, height), Image.Resampling.BOX)
-            )
-            for c in range(3)
-        ]
         depth = Image.fromarray(self.depth_m).resize((width, height), Image.Resampling.NEAREST)
         return Frame(
             self.index,
             self.timestamp_s,
-            np.clip(np.stack(planes, -1), 0.0, 1.0).astype(np.float32),
+            resized_color(self.color, width, height),
             np.array(depth, np.float32),
             self.camera.resized(width, height),
         )
@@ -76,3 +70,12 @@ class Frame:
             return small
         color = np.ascontiguousarray(small.color[inner])
         return Frame(self.index, self.timestamp_s, color, np.where(keep, depth, np.float32(0.0)), camera)
+
+
+def resized_color(color: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
+    """Return colour [height, width, 3], each pixel the mean over its area."""
+    if color.shape[:2] == (height, width):
+        return color
+    planes = [np.ascontiguousarray(color[..., c]) for c in range(3)]
+    small = [np.asarray(Image.fromarray(plane).resize((width, height), Image.Resampling.BOX)) for plane in planes]
+    return np.asarray(np.clip(np.stack(small, -1), 0.0, 1.0), np.float32)

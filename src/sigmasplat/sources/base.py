@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import replace
 
+from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
@@ -17,13 +18,15 @@ class Source(ABC):
 
     name: for titles; camera: the pinhole of every frame; skipped: files left out, each with the reason;
     strict: whether an unreadable image ends the sequence instead of being passed over;
-    depth_units_per_metre: what whole-number depth was divided by, None where depth is metres already.
+    depth_units_per_metre: what whole-number depth was divided by, None where depth is metres already;
+    depth_registered: whether depth was moved into the colour camera here, instead of coming so.
     """
 
     name: str
     camera: Camera
     strict: bool = False
     depth_units_per_metre: float | None = None
+    depth_registered: bool = False
 
     def __init__(self, name: str, camera: Camera, strict: bool = False) -> None:
         self.name = name
@@ -38,6 +41,10 @@ class Source(ABC):
     @abstractmethod
     def frame(self, i: int) -> Frame:
         """Read frame i, 0 ≤ i < len. Raises SourceError if its files cannot be read, IndexError past the end."""
+
+    def timestamp_s(self, i: int) -> float:
+        """Return the time of frame i; formats that know it without reading the frame say so here. Raises as `frame`."""
+        return self.frame(i).timestamp_s
 
     @abstractmethod
     def truth(self) -> Trajectory | None:
@@ -81,16 +88,21 @@ class Source(ABC):
 
 
 class Subset(Source):
-    """Every `stride`-th frame of another source, at most `limit` of them; indices count the frames kept."""
+    """Frames of another source: of a span of time, every `stride`-th, at most `limit`; indices count those kept."""
 
-    def __init__(self, whole: Source, stride: int, limit: int | None) -> None:
-        if stride < 1 or (limit is not None and limit < 1):
-            raise SourceError(f"stride and limit must be at least 1, found stride={stride}, limit={limit}")
+    def __init__(self, whole: Source, settings: InputConfig) -> None:
+        """Raises SourceError if no frame is left."""
         super().__init__(whole.name, whole.camera, whole.strict)
         self.skipped = whole.skipped
         self.depth_units_per_metre = whole.depth_units_per_metre
+        self.depth_registered = whole.depth_registered
         self._whole = whole
-        self._indices = range(0, len(whole), stride)[:limit]
+        self._indices = _within(whole, settings)[:: settings.stride][: settings.limit or None]
+        if not len(self._indices):
+            raise SourceError(
+                f"{whole.name}: no frame between input.start_s={settings.start_s:g} and end_s={settings.end_s:g}; "
+                f"its {len(whole)} frames take {whole.timestamp_s(len(whole) - 1) - whole.timestamp_s(0):.1f} s"
+            )
 
     def __len__(self) -> int:
         return len(self._indices)
@@ -99,6 +111,10 @@ class Subset(Source):
         """Read the i-th frame kept."""
         return replace(self._whole.frame(self._indices[self._checked_index(i)]), index=i)
 
+    def timestamp_s(self, i: int) -> float:
+        """Return the time of the i-th frame kept."""
+        return self._whole.timestamp_s(self._indices[self._checked_index(i)])
+
     def truth(self) -> Trajectory | None:
         """Return the true path of the whole source: it is kept by time, not by frame."""
         return self._whole.truth()
@@ -106,3 +122,13 @@ class Subset(Source):
     def true_surface(self) -> Mesh | None:
         """Return the true surface of the whole source."""
         return self._whole.true_surface()
+
+
+def _within(whole: Source, settings: InputConfig) -> range:
+    """Return the frames of the span of time that the settings ask for, counted from the first frame's time."""
+    if not settings.start_s and not settings.end_s:
+        return range(len(whole))
+    begin_s = whole.timestamp_s(0)
+    elapsed_s = [whole.timestamp_s(i) - begin_s for i in range(len(whole))]
+    first = sum(t < settings.start_s for t in elapsed_s)
+    return range(first, sum(t < settings.end_s for t in elapsed_s) if settings.end_s else len(whole))

@@ -2,23 +2,39 @@
 
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sigmasplat.config import InputConfig
 from sigmasplat.errors import ConfigError, SourceError
+from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 
+Lens = tuple[float, ...]
+"""Radial and tangential distortion k1, k2, p1, p2, k3."""
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Calibration:
-    """A camera, its PNG depth units per metre, and its lens (k1, k2, p1, p2, k3), None for none."""
+    """What is known of a recording's cameras.
+
+    camera, distortion: of the colour image, None for no lens; depth_units_per_metre: of whole-number depth;
+    depth_camera, depth_distortion: of depth images that are not registered to colour, None where they are;
+    T_color_depth [4, 4]: takes points of the depth camera to the colour camera, metres;
+    registers: whether such depth is moved to colour unless the settings say otherwise.
+    """
 
     camera: Camera
     depth_units_per_metre: float
-    distortion: tuple[float, ...] | None = None
+    distortion: Lens | None = None
+    depth_camera: Camera | None = None
+    depth_distortion: Lens | None = None
+    T_color_depth: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    registers: bool = True
 
 
 TUM_UNITS_PER_METRE = 5000.0
@@ -49,16 +65,43 @@ def freiburg_calibration(folder: Path) -> Calibration | None:
 def read_calibration(path: Path, size: tuple[int, int], default_units_per_metre: float) -> Calibration:
     """Read `calibration.json`: fx, fy, cx, cy; optional width, height, depth_scale (PNG units per metre), distortion.
 
+    Where depth is not registered to colour: depth_camera, an object of the same fields, and T_color_depth, 4 rows.
     `size` (width, height) in pixels stands in where the file gives none. Raises SourceError naming file and field.
     """
     fields = read_object(path)
-    width = number(path, fields, "width", size[0])
-    height = number(path, fields, "height", size[1])
-    focal = [number(path, fields, key) for key in ("fx", "fy", "cx", "cy")]
     units = number(path, fields, "depth_scale", default_units_per_metre)
-    return Calibration(
-        camera_of(path, int(width), int(height), focal), positive(path, "depth_scale", units), _distortion(path, fields)
+    calibration = Calibration(
+        _camera(path, fields, size), positive(path, "depth_scale", units), _distortion(path, fields)
     )
+    inner = fields.get("depth_camera")
+    if inner is None:
+        return calibration
+    if not isinstance(inner, dict):
+        raise SourceError(f'{path}: field "depth_camera" is {inner!r}, an object with fx, fy, cx, cy is wanted')
+    camera, lens = _camera(path, inner, size), _distortion(path, inner)
+    return replace(calibration, depth_camera=camera, depth_distortion=lens, T_color_depth=_rigid(path, fields))
+
+
+def calibrated(
+    folder: Path, recorded: Calibration | None, size: tuple[int, int], settings: InputConfig, default_units: float
+) -> Calibration:
+    """Return what is known of the cameras, with the settings' words in place of the recording's.
+
+    `size` (width, height) is the colour image's. Raises SourceError if no focal length is known.
+    """
+    if settings.calibration:
+        recorded = read_calibration(Path(settings.calibration), size, default_units)
+    if recorded is None and not settings.fx:
+        raise SourceError(
+            f"camera unknown: {folder} says nothing of it; write {folder}/calibration.json with fx, fy, cx, cy, "
+            "depth_scale (PNG units per metre), or give --fx PIXELS (and --fy, --cx, --cy, --depth-scale)"
+        )
+    if recorded is None:
+        centred = Camera(*size, settings.fx, settings.fy or settings.fx, (size[0] - 1) / 2, (size[1] - 1) / 2)
+        recorded = Calibration(centred, default_units)
+    given = {key: value for key in ("fx", "fy", "cx", "cy") if (value := getattr(settings, key))}
+    units = settings.depth_scale or recorded.depth_units_per_metre
+    return replace(recorded, camera=replace(recorded.camera, **given), depth_units_per_metre=units)
 
 
 def read_replica_calibration(path: Path) -> Calibration:
@@ -104,6 +147,24 @@ def camera_of(path: Path, width: int, height: int, focal: list[float]) -> Camera
         return Camera(width, height, *focal)
     except ConfigError as error:
         raise SourceError(f"{path}: {error}") from error
+
+
+def _camera(path: Path, fields: dict[str, Any], size: tuple[int, int]) -> Camera:
+    width, height = number(path, fields, "width", size[0]), number(path, fields, "height", size[1])
+    return camera_of(
+        path, int(width), int(height), [number(path, fields, key) for key in ("fx", "fy", "cx", "cy")]
+    )  # fmt: skip
+
+
+def _rigid(path: Path, fields: dict[str, Any]) -> NDArray[np.float64]:
+    """Read T_color_depth, identity where absent. Raises SourceError unless it is a rigid 4×4."""
+    try:
+        T = np.array(fields.get("T_color_depth", np.eye(4)), np.float64)
+    except (ValueError, TypeError):
+        T = np.zeros(0)
+    if T.shape != (4, 4) or not se3.is_rigid(T):
+        raise SourceError(f'{path}: field "T_color_depth" is no rigid 4×4 matrix in rows, metres')
+    return T
 
 
 def _distortion(path: Path, fields: dict[str, Any]) -> tuple[float, ...] | None:

@@ -2,13 +2,16 @@
 
 import importlib
 import pkgutil
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import sigmasplat.sources
-from sigmasplat.errors import SourceError
+from sigmasplat.config import InputConfig
+from sigmasplat.config.text import nearest
+from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.sources.base import Source, Subset
 
 
@@ -17,13 +20,13 @@ class Format:
     """One way a sequence can be laid out. A module of this folder that defines `FORMAT` is found by itself.
 
     recognises(path): looks at the content only; looked_for: what it looked for, for the error message;
-    open(path, strict): builds the source.
+    open(path, settings): builds the source of all its frames.
     """
 
     name: str
     looked_for: str
     recognises: Callable[[str], bool]
-    open: Callable[[str, bool], Source]
+    open: Callable[[str, InputConfig], Source]
 
 
 @cache
@@ -34,19 +37,30 @@ def formats() -> tuple[Format, ...]:
     return tuple(module.FORMAT for module in modules if hasattr(module, "FORMAT"))
 
 
-def open_source(path: str | Path, strict: bool = False, stride: int = 1, limit: int | None = None) -> Source:
+def open_source(path: str | Path, settings: InputConfig | None = None, **changes: Any) -> Source:
     """Open a recorded or synthetic sequence, its format guessed from what lies at `path`.
 
-    `path` is a folder, or "synthetic" with options as in "synthetic:frames=200,seed=1,noise=1". `strict` makes an
-    unreadable image an error instead of a skip; every `stride`-th frame is taken, at most `limit` of them.
-    Raises SourceError if there is nothing at the path, no format knows it, or what is there cannot be used.
+    `path` is a folder or file, or "synthetic" with options as in "synthetic:frames=200,seed=1,noise=1". Which frames
+    are taken, and what is done to them, say the settings; any of them may be given by name: stride=2, limit=100.
+    Raises SourceError if there is nothing at the path, no format knows it, or what is there cannot be used;
+    ConfigError on a setting that is none.
     """
-    text = str(path)
+    text, asked = str(path), changed(settings or InputConfig(), changes)
     for format_ in formats():
         if format_.recognises(text):
-            source = format_.open(text, strict)
-            return source if stride == 1 and limit is None else Subset(source, stride, limit)
+            source = format_.open(text, asked)
+            part = asked.stride > 1 or asked.limit or asked.start_s or asked.end_s
+            return Subset(source, asked) if part else source
     raise SourceError(_nothing_fits(Path(text)))
+
+
+def changed(settings: InputConfig, changes: Mapping[str, Any]) -> InputConfig:
+    """Return the settings with some given by name. Raises ConfigError on an unknown name."""
+    known = [field.name for field in fields(InputConfig)]
+    for name in changes:
+        if name not in known:
+            raise ConfigError(f"unknown setting input.{name}{nearest(name, known)}; there are {', '.join(known)}")
+    return replace(settings, **changes)
 
 
 def _nothing_fits(path: Path) -> str:

@@ -9,79 +9,37 @@ from pathlib import Path
 
 import numpy as np
 
+from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
-from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.base import Source
-from sigmasplat.sources.calibration import REPLICA, Calibration, read_replica_calibration
-from sigmasplat.sources.depth_check import refuse_without_depth
-from sigmasplat.sources.images import color_from_bytes, read_color, read_depth
+from sigmasplat.sources.calibration import REPLICA, Calibration, calibrated, read_replica_calibration
 from sigmasplat.sources.opening import Format
+from sigmasplat.sources.recorded import Images, RecordedSource
 
 FRAMES_PER_SECOND = 30.0
 """Replica's renderings carry no time; this rate is a convention."""
 
 
-class ReplicaSource(Source):
-    """Colour and depth images paired by the number in their names."""
-
-    def __init__(self, folder: Path, strict: bool = False) -> None:
-        """Open a folder; raises SourceError if images, calibration or true poses cannot be used."""
-        calibration = _calibration(folder)
-        super().__init__(folder.resolve().name, calibration.camera, strict)
-        self.depth_units_per_metre: float = calibration.depth_units_per_metre
-        colors, depths = _numbered(folder, "frame"), _numbered(folder, "depth")
-        if not depths:
-            raise SourceError(
-                f"no depth images in {folder} (looked for results/depth*.png); is this the RGB-only download?"
-            )
-        if not colors:
-            raise SourceError(f"no colour images in {folder} (looked for results/frame*.jpg, results/frame*.png)")
-        self._images = [(n, colors[n], depths[n]) for n in sorted(colors.keys() & depths.keys())]
-        if not self._images:
-            raise SourceError(
-                f"{folder}/results: no number is shared by frame* and depth*; are both from one recording?"
-            )
-        self.skipped = [f"{colors[n]}: no depth{n:06d}.png beside it" for n in sorted(colors.keys() - depths.keys())]
-        self._truth = _truth(folder / "traj.txt", [n for n, _, _ in self._images])
-        self._refuse_size_of_first()
-        refuse_without_depth(self)
-
-    def __len__(self) -> int:
-        return len(self._images)
-
-    def frame(self, i: int) -> Frame:
-        """Read frame i; its time is its number at 30 frames per second."""
-        number, color_path, depth_path = self._images[self._checked_index(i)]
-        color = color_from_bytes(read_color(color_path))
-        depth_m = read_depth(depth_path, self.depth_units_per_metre)
-        self._refuse_sizes(color_path, color.shape[:2], depth_path, depth_m.shape)
-        return Frame(i, number / FRAMES_PER_SECOND, color, depth_m, self.camera)
-
-    def truth(self) -> Trajectory | None:
-        """Return the poses of traj.txt for the frames that have images; None without the file."""
-        return self._truth
-
-    def _refuse_sizes(
-        self, color: Path, color_shape: tuple[int, ...], depth: Path, depth_shape: tuple[int, ...]
-    ) -> None:
-        wanted = (self.camera.height, self.camera.width)
-        for path, shape in ((color, color_shape), (depth, depth_shape)):
-            if shape != wanted:
-                raise SourceError(
-                    f"{path} is {shape[1]}×{shape[0]} but the calibration is for {wanted[1]}×{wanted[0]}; "
-                    "give colour and depth one size and put it into cam_params.json"
-                )
-
-    def _refuse_size_of_first(self) -> None:
-        """Stop before the run where every frame would be refused for its size."""
-        _, color_path, depth_path = self._images[0]
-        try:
-            color_shape, depth_shape = read_color(color_path).shape[:2], read_depth(depth_path, 1.0).shape
-        except SourceError:
-            return  # damaged: iterating the source reports it
-        self._refuse_sizes(color_path, color_shape, depth_path, depth_shape)
+def open_replica(folder: Path, settings: InputConfig) -> RecordedSource:
+    """Open a folder; raises SourceError if images, calibration or true poses cannot be used."""
+    colors, depths = _numbered(folder, "frame"), _numbered(folder, "depth")
+    if not depths:
+        raise SourceError(
+            f"no depth images in {folder} (looked for results/depth*.png); is this the RGB-only download?"
+        )
+    if not colors:
+        raise SourceError(f"no colour images in {folder} (looked for results/frame*.jpg, results/frame*.png)")
+    numbers = sorted(colors.keys() & depths.keys())
+    if not numbers:
+        raise SourceError(f"{folder}/results: no number is shared by frame* and depth*; are both from one recording?")
+    images = [Images(n / FRAMES_PER_SECOND, colors[n], depths[n]) for n in numbers]
+    skipped = [f"{colors[n]}: no depth{n:06d}.png beside it" for n in sorted(colors.keys() - depths.keys())]
+    recorded = _calibration(folder)
+    size = (recorded.camera.width, recorded.camera.height)
+    calibration = calibrated(folder, recorded, size, settings, recorded.depth_units_per_metre)
+    truth = _truth(folder / "traj.txt", numbers)
+    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
 
 
 def _numbered(folder: Path, stem: str) -> dict[int, Path]:
@@ -132,5 +90,5 @@ FORMAT = Format(
     "Replica",
     "results/frame*.jpg and results/depth*.png",
     lambda path: bool(_numbered(Path(path), "frame") or _numbered(Path(path), "depth")),
-    lambda path, strict: ReplicaSource(Path(path), strict),
+    lambda path, settings: open_replica(Path(path), settings),
 )

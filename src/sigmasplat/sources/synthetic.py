@@ -120,5 +120,5 @@ FORMAT = Format(
     "synthetic",
     "the word 'synthetic'",
     lambda path: path.partition(":")[0] == "synthetic",
-    lambda path, strict: parse(path),
+    lambda path, settings: parse(path),
 )

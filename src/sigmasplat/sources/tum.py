@@ -5,7 +5,6 @@ calibration.json                        ours: fx fy cx cy width height depth_sca
 """
 
 import json
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -13,72 +12,44 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from sigmasplat.config import InputConfig
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.association import associate
 from sigmasplat.sources.base import Source
-from sigmasplat.sources.calibration import TUM_UNITS_PER_METRE, Calibration, freiburg_calibration, read_calibration
-from sigmasplat.sources.depth_check import refuse_without_depth
-from sigmasplat.sources.images import OVERFLOW, color_from_bytes, image_size, read_color, read_depth
-from sigmasplat.sources.lens import Undistortion
+from sigmasplat.sources.calibration import (
+    TUM_UNITS_PER_METRE,
+    Calibration,
+    calibrated,
+    freiburg_calibration,
+    read_calibration,
+)
+from sigmasplat.sources.images import OVERFLOW
 from sigmasplat.sources.opening import Format
+from sigmasplat.sources.recorded import Images, RecordedSource, first_size
 from sigmasplat.sources.tum_lists import read_list, read_poses
 
 MAX_GAP_S = 0.02
 """Colour and depth of a Kinect at 30 Hz are never further apart; TUM's own tool uses the same number."""
 
 
-class TumSource(Source):
-    """Colour and depth images paired by time; colour and depth undistorted where the lens is known."""
-
-    def __init__(self, folder: Path, strict: bool = False, max_gap_s: float = MAX_GAP_S) -> None:
-        """Open a folder; raises SourceError if its lists, images, calibration or true poses cannot be used."""
-        color_times_s, self._color_paths = read_list(folder / "rgb.txt")
-        depth_times_s, self._depth_paths = _depth_list(folder)
-        self._pairs = associate(color_times_s, depth_times_s, max_gap_s)
-        if not len(self._pairs):
-            raise SourceError(_no_overlap(folder, color_times_s, depth_times_s, max_gap_s))
-        self._times_s = color_times_s[self._pairs[:, 0]]
-        calibration = _calibration(folder, _agreed_size(self._image_pairs()))
-        super().__init__(folder.resolve().name, calibration.camera, strict)
-        self.depth_units_per_metre: float = calibration.depth_units_per_metre
-        lens = calibration.distortion
-        self._undistortion = Undistortion(self.camera, np.array(lens)) if lens else None
-        paired = set(self._pairs[:, 0].tolist())
-        self.skipped = [
-            f"{p}: no depth within {max_gap_s:g} s" for i, p in enumerate(self._color_paths) if i not in paired
-        ]
-        truth_path = folder / "groundtruth.txt"
-        # Read at once: a broken truth should stop the run before it starts, not its evaluation an hour later.
-        self._truth = read_poses(truth_path) if truth_path.is_file() else None
-        refuse_without_depth(self)
-
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def frame(self, i: int) -> Frame:
-        """Read frame i: colour and depth of one camera, lens taken out."""
-        color_path, depth_path = self._image_pair(self._checked_index(i))
-        color = color_from_bytes(read_color(color_path))
-        depth_m = read_depth(depth_path, self.depth_units_per_metre)
-        _refuse_sizes(color_path, color.shape[1::-1], depth_path, depth_m.shape[::-1], self.camera)
-        if self._undistortion:
-            color, depth_m = self._undistortion.color(color), self._undistortion.depth(depth_m)
-        return Frame(i, float(self._times_s[i]), color, depth_m, self.camera)
-
-    def truth(self) -> Trajectory | None:
-        """Return the recorded path, all of it, on its own timestamps."""
-        return self._truth
-
-    def _image_pair(self, i: int) -> tuple[Path, Path]:
-        color, depth = self._pairs[i]
-        return self._color_paths[color], self._depth_paths[depth]
-
-    def _image_pairs(self) -> Iterator[tuple[Path, Path]]:
-        return (self._image_pair(i) for i in range(len(self._pairs)))
+def open_tum(folder: Path, settings: InputConfig, max_gap_s: float = MAX_GAP_S) -> RecordedSource:
+    """Open a folder; raises SourceError if its lists, images, calibration or true poses cannot be used."""
+    color_times_s, colors = read_list(folder / "rgb.txt")
+    depth_times_s, depths = _depth_list(folder)
+    pairs = associate(color_times_s, depth_times_s, max_gap_s)
+    if not len(pairs):
+        raise SourceError(_no_overlap(folder, color_times_s, depth_times_s, max_gap_s))
+    images = [Images(float(color_times_s[i]), colors[i], depths[j]) for i, j in pairs]
+    paired = set(pairs[:, 0].tolist())
+    skipped = [f"{path}: no depth within {max_gap_s:g} s" for i, path in enumerate(colors) if i not in paired]
+    truth_path = folder / "groundtruth.txt"
+    # Read at once: a broken truth should stop the run before it starts, not its evaluation an hour later.
+    truth = read_poses(truth_path) if truth_path.is_file() else None
+    calibration = _calibration(folder, first_size([pair.color for pair in images]), settings)
+    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
 
 
 def write_tum(source: Source, folder: str | Path) -> None:
@@ -138,59 +109,17 @@ def _no_overlap(folder: Path, color_s: NDArray[np.float64], depth_s: NDArray[np.
     return f"no colour image of {folder} has depth within {max_gap_s:g} s ({', '.join(spans)}); one recording?"
 
 
-def _agreed_size(pairs: Iterator[tuple[Path, Path]]) -> tuple[int, int]:
-    """Return (width, height) of the first pair whose headers can be read."""
-    problem: SourceError | None = None
-    for color_path, depth_path in pairs:
-        try:
-            size, depth_size = image_size(color_path), image_size(depth_path)
-        except SourceError as error:
-            problem = problem or error
-            continue
-        _refuse_sizes(color_path, size, depth_path, depth_size, None)
-        return size
-    raise SourceError(f"no pair of colour and depth can be read (first: {problem})")
-
-
-def _refuse_sizes(
-    color: Path, color_size: tuple[int, ...], depth: Path, depth_size: tuple[int, ...], camera: Camera | None
-) -> None:
-    """Raise SourceError if sizes (width, height) disagree among colour, depth and calibration."""
-    if color_size != depth_size:
-        raise SourceError(
-            f"{color} is {color_size[0]}×{color_size[1]} but {depth} is {depth_size[0]}×{depth_size[1]}; "
-            "register depth to colour and give both one size"
-        )
-    if camera is not None and color_size != (camera.width, camera.height):
-        raise SourceError(
-            f"{color} is {color_size[0]}×{color_size[1]} but the calibration is for {camera.width}×{camera.height}; "
-            "mend calibration.json"
-        )
-
-
-def _calibration(folder: Path, size: tuple[int, int]) -> Calibration:
+def _calibration(folder: Path, size: tuple[int, int], settings: InputConfig) -> Calibration:
     path = folder / "calibration.json"
-    known = freiburg_calibration(folder)
+    recorded = freiburg_calibration(folder)
     if path.is_file():
-        found = read_calibration(path, size, TUM_UNITS_PER_METRE)
-    elif known is not None:
-        found = known
-    else:
-        raise SourceError(
-            f"camera unknown: no calibration.json in {folder} and no freiburg1, 2 or 3 in its name; "
-            "write calibration.json with fx, fy, cx, cy, width, height, depth_scale (PNG units per metre)"
-        )
-    if size != (found.camera.width, found.camera.height):
-        raise SourceError(
-            f"{folder}: images are {size[0]}×{size[1]} but the calibration is for "
-            f"{found.camera.width}×{found.camera.height}; put the right one into calibration.json"
-        )
-    return found
+        recorded = read_calibration(path, size, TUM_UNITS_PER_METRE)
+    return calibrated(folder, recorded, size, settings, TUM_UNITS_PER_METRE)
 
 
 FORMAT = Format(
     "TUM",
     "rgb.txt and depth.txt",
     lambda path: (Path(path) / "rgb.txt").is_file() or (Path(path) / "depth.txt").is_file(),
-    lambda path, strict: TumSource(Path(path), strict),
+    lambda path, settings: open_tum(Path(path), settings),
 )

@@ -1,6 +1,7 @@
 """Describe the options of the command line: type, placeholder, one line of help each; and turn them into values."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -9,7 +10,7 @@ import tyro
 from sigmasplat import env
 from sigmasplat.config import Config
 from sigmasplat.config.text import override, split_settings
-from sigmasplat.errors import RunError
+from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.presets import list_presets, preset as preset_of
 
 if TYPE_CHECKING:
@@ -57,8 +58,6 @@ Keep = Annotated[
 ]
 Overwrite = Annotated[bool, arg(help="replace what is there", help_behavior_hint="")]
 Limit = Annotated[int | None, arg(metavar="N", help="take at most N frames", help_behavior_hint="(default: all)")]
-Stride = Annotated[int, arg(metavar="N", help="take every N-th frame")]
-Strict = Annotated[bool, arg(help="stop at an unreadable image, do not pass it over", help_behavior_hint="")]
 Profile = Annotated[bool, arg(help="print where the time went", help_behavior_hint="")]
 Evaluate = Annotated[bool, arg(name="eval", help="make no metrics and no report", help_behavior_hint="")]
 MovedSource = Annotated[
@@ -92,9 +91,52 @@ Format = Annotated[
 ]
 
 
-def configured(preset: str, settings: Sequence[str], seed: int | None) -> Config:
-    """Return a preset's settings with those of --set and --seed in place. Raises ConfigError."""
-    config = override(preset_of(preset), split_settings(settings))
+@dataclass(frozen=True)
+class Taken:
+    """What is taken of a sequence: shorthands of the settings input.*, which --set reaches too."""
+
+    limit: Limit = None
+    stride: Annotated[int | None, arg(metavar="N", help="take every N-th frame", help_behavior_hint="")] = None
+    start: Annotated[float | None, arg(metavar="S", help="begin S seconds in", help_behavior_hint="")] = None
+    end: Annotated[float | None, arg(metavar="S", help="stop S seconds in", help_behavior_hint="")] = None
+    strict: Annotated[bool, arg(help="stop at an unreadable image, do not pass it over", help_behavior_hint="")] = False
+    calibration: Annotated[
+        Path | None, arg(metavar="FILE", help="calibration.json in place of the recorded one", help_behavior_hint="")
+    ] = None
+    fx: Annotated[float | None, arg(metavar="PX", help="focal length; fy too, if not given", help_behavior_hint="")] = (
+        None
+    )
+    fy: Annotated[float | None, arg(metavar="PX", help="focal length, vertical", help_behavior_hint="")] = None
+    cx: Annotated[float | None, arg(metavar="PX", help="principal point", help_behavior_hint="")] = None
+    cy: Annotated[float | None, arg(metavar="PX", help="principal point", help_behavior_hint="")] = None
+    depth_scale: Annotated[
+        float | None, arg(metavar="UNITS", help="PNG units of depth per metre", help_behavior_hint="")
+    ] = None
+    register_depth: Annotated[
+        Literal["auto", "on", "off"] | None, arg(help="move depth into the colour camera", help_behavior_hint="")
+    ] = None
+
+    def settings(self) -> dict[str, str]:
+        """Return what was given, by the settings' names. Raises ConfigError on numbers that mean nothing."""
+        for name in ("limit", "stride"):
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise ConfigError(f"--{name} must be at least 1, found {value}")
+        names = {"start": "start_s", "end": "end_s"}
+        given = {field.name: getattr(self, field.name) for field in fields(self)}
+        given["calibration"] = self.calibration and self.calibration.resolve()  # a later eval may start elsewhere
+        return {
+            f"input.{names.get(name, name)}": str(value) for name, value in given.items() if value not in (None, False)
+        }
+
+
+AS_RECORDED = Taken()
+TakenFlat = Annotated[Taken, arg(name=""), tyro.conf.OmitArgPrefixes]
+
+
+def configured(preset: str, settings: Sequence[str], seed: int | None, taken: Taken = AS_RECORDED) -> Config:
+    """Return a preset's settings with those of --set, the shorthands and --seed in place. Raises ConfigError."""
+    given = split_settings(settings) | taken.settings()
+    config = override(preset_of(preset), given)
     return config if seed is None else override(config, {"seed": str(seed)})
 
 
@@ -106,7 +148,7 @@ def source_of(folder: "RunFolder", moved_to: str | None) -> "Source":
     path = moved_to or facts.get("source_path")
     if not path:
         raise RunError(f"run {folder.path} does not say where its sequence was; give --source PATH")
-    return open_source(path, stride=facts.get("stride") or 1, limit=facts.get("limit"))
+    return open_source(path, folder.config().input)
 
 
 def refuse_existing(target: Path | None, overwrite: bool) -> None:

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from sigmasplat import options
 from sigmasplat.ablation import COMPARED, Job, Results, Runner, Study, carry_out, common_config, perform
+from sigmasplat.commands import options
+from sigmasplat.commands.options import prepare_torch
 from sigmasplat.errors import ConfigError
-from sigmasplat.options import prepare_torch
 from sigmasplat.presets import default_preset
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ def check_sources(study: Study, screen: "Screen") -> None:
 
     for source in study.sources:
         paths = dict.fromkeys(job.path for job in study.jobs(source))
-        opened = [open_source(path, limit=study.limit) for path in paths]
+        opened = [open_source(path, limit=study.limit or 0) for path in paths]
         warning = depth_warning(opened[0])
         if warning:
             screen.warn(f"{source}: {warning}")

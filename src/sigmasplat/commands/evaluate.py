@@ -1,0 +1,43 @@
+"""Score a run: sigmasplat eval."""
+
+from typing import TYPE_CHECKING
+
+from sigmasplat.commands import options
+from sigmasplat.commands.options import prepare_torch, source_of
+
+if TYPE_CHECKING:
+    from sigmasplat.io.runs import RunFolder
+    from sigmasplat.screen import Screen
+    from sigmasplat.sources.base import Source
+
+
+def evaluate_run(run: options.RunPath, mesh: options.WithMesh = False, moved_to: options.MovedSource = None) -> int:
+    """Score an earlier run again; replaces its metrics, pictures and report.
+
+    example: sigmasplat eval runs/kitchen
+    """
+    from sigmasplat.io.runs import RunFolder
+    from sigmasplat.screen import Screen
+
+    folder = RunFolder.open(run)
+    source = source_of(folder, moved_to)
+    prepare_torch()
+    score(Screen(), folder, source, mesh)
+    return 0
+
+
+def score(screen: "Screen", folder: "RunFolder", source: "Source", mesh: bool = False) -> None:
+    """Score the run, print the table, and where the report is: it exists even where the truth does not fit."""
+    from sigmasplat.evaluate import evaluate
+
+    try:
+        with screen.counting("evaluation") as progress:
+            metrics = evaluate(folder, source, mesh=mesh, progress=progress)
+        screen.results(metrics)
+    except Exception as problem:
+        problem.add_note(f"the run is in {folder.path}")
+        raise
+    finally:
+        report = folder.path / "report.html"
+        if report.exists():
+            screen.say(f"report: {report.resolve()}")

@@ -1,0 +1,32 @@
+"""Make a surface of a run's map: sigmasplat mesh."""
+
+from sigmasplat.commands import options
+from sigmasplat.commands.options import prepare_torch, refuse_existing, source_of
+
+
+def make_mesh(
+    run: options.RunPath,
+    voxel_m: options.VoxelM = 0.01,
+    out: options.MeshFile = None,
+    overwrite: options.Overwrite = False,
+    moved_to: options.MovedSource = None,
+) -> int:
+    """Make a surface of a run's map, coloured triangles, from what it shows at its keyframes.
+
+    example: sigmasplat mesh runs/kitchen --out kitchen.glb
+    """
+    from sigmasplat.io.mesh import check_name, write_mesh
+    from sigmasplat.io.runs import MESH, RunFolder
+    from sigmasplat.screen import Screen
+    from sigmasplat.surface import reconstruct
+
+    screen, folder, target = Screen(), RunFolder.open(run), out or run / MESH
+    check_name(target)
+    refuse_existing(out, overwrite)
+    source = source_of(folder, moved_to)
+    prepare_torch()
+    with screen.counting("surface") as progress:
+        surface = reconstruct(folder, source.camera, voxel_m=voxel_m, progress=progress)
+    write_mesh(target, surface)
+    screen.say(f"{len(surface.vertices):,} vertices, {len(surface.faces):,} triangles: {target}")
+    return 0

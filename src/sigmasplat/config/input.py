@@ -1,0 +1,53 @@
+"""Settings of what is taken from a recording, whatever its format: which frames, whose cameras, which pixels."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from sigmasplat.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class InputConfig:
+    """What is taken from the source. Raises ConfigError on values that mean nothing."""
+
+    stride: int = 1
+    """Every so many frames one is taken."""
+    limit: int = 0
+    """At most so many frames; 0 = all."""
+    start_s: float = 0.0
+    """Seconds after the recording's first frame at which to begin."""
+    end_s: float = 0.0
+    """… and to stop; 0 = at its end."""
+    strict: bool = False
+    """Whether an unreadable image ends the sequence instead of being passed over."""
+
+    calibration: str = ""
+    """A calibration.json to use in place of what the recording says of its cameras."""
+    fx: float = 0.0
+    fy: float = 0.0
+    cx: float = 0.0
+    cy: float = 0.0
+    """The colour camera, pixels, in place of the recording's; 0 = as recorded. Where nothing is recorded, fy = fx,
+    and cx and cy are at the centre."""
+    depth_scale: float = 0.0
+    """PNG units per metre, in place of the recording's; 0 = as recorded."""
+
+    register_depth: Literal["auto", "on", "off"] = "auto"
+    """Whether depth is moved into the colour camera's pixels; auto: where the recording says that cameras differ."""
+    undistort: bool = True
+    """Whether lenses are taken out, where they are known."""
+    width: int = 0
+    """Working image width in pixels, height in proportion; 0 keeps the source's size."""
+    crop_px: int = 0
+    """Pixels dropped at every edge, after resizing: where an undistorted image or a sensor's depth has none."""
+    min_depth_m: float = 0.1
+    max_depth_m: float = 8.0
+    """Readings beyond are treated as no reading."""
+
+    def __post_init__(self) -> None:
+        if self.stride < 1 or self.limit < 0:
+            raise ConfigError(f"stride and limit must be at least 1, found stride={self.stride}, limit={self.limit}")
+        if self.start_s < 0 or (self.end_s and self.end_s <= self.start_s):
+            raise ConfigError(
+                f"input.start_s and input.end_s must span some time, found {self.start_s:g} to {self.end_s:g} s"
+            )

@@ -1,0 +1,95 @@
+"""Read sequences that lie as image files on disk: a format says which files belong together, this reads them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sigmasplat.config import InputConfig
+from sigmasplat.errors import SourceError
+from sigmasplat.model.frame import Frame, resized_color
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.sources.base import Source
+from sigmasplat.sources.calibration import Calibration
+from sigmasplat.sources.depth_check import refuse_without_depth
+from sigmasplat.sources.images import color_from_bytes, image_size, read_color, read_depth
+from sigmasplat.sources.rectification import Rectification, refuse_sizes
+
+
+@dataclass(frozen=True)
+class Images:
+    """The colour and the depth file of one frame, and its time in seconds."""
+
+    timestamp_s: float
+    color: Path
+    depth: Path
+
+
+class RecordedSource(Source):
+    """Pairs of image files, brought into one pinhole camera."""
+
+    def __init__(
+        self,
+        name: str,
+        images: Sequence[Images],
+        calibration: Calibration,
+        settings: InputConfig,
+        truth: Trajectory | None = None,
+        skipped: Sequence[str] = (),
+    ) -> None:
+        """Take the files in order of time; `truth` is of the colour camera; `skipped` are files left out, with reasons.
+
+        Raises SourceError if the first images do not fit the calibration, or none has a depth reading.
+        """
+        self._rectified = Rectification(name, calibration, settings)
+        super().__init__(name, self._rectified.camera, settings.strict)
+        self.depth_units_per_metre: float = calibration.depth_units_per_metre
+        self.depth_registered = self._rectified.registers
+        self.skipped = list(skipped)
+        self._images, self._truth = images, truth
+        self._refuse_sizes_of_first()
+        refuse_without_depth(self)
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def timestamp_s(self, i: int) -> float:
+        """Return the time of frame i without reading it."""
+        return self._images[self._checked_index(i)].timestamp_s
+
+    def frame(self, i: int) -> Frame:
+        """Read frame i: colour and depth of one camera, lens taken out."""
+        files = self._images[self._checked_index(i)]
+        color = color_from_bytes(read_color(files.color))
+        depth_m = read_depth(files.depth, self.depth_units_per_metre)
+        refuse_sizes(self._rectified, files.color, color.shape[1::-1], files.depth, depth_m.shape[::-1])
+        color, depth_m = self._rectified(color, depth_m)
+        color = resized_color(color, self.camera.width, self.camera.height)
+        return Frame(i, files.timestamp_s, color, depth_m, self.camera)
+
+    def truth(self) -> Trajectory | None:
+        """Return the recorded path, all of it, on its own timestamps."""
+        return self._truth
+
+    def _refuse_sizes_of_first(self) -> None:
+        """Stop before the run where every frame would be refused for its size."""
+        problem: SourceError | None = None
+        for files in self._images:
+            try:
+                size, depth_size = image_size(files.color), image_size(files.depth)
+            except SourceError as error:
+                problem = problem or error
+                continue
+            refuse_sizes(self._rectified, files.color, size, files.depth, depth_size)
+            return
+        raise SourceError(f"no pair of colour and depth can be read (first: {problem})")
+
+
+def first_size(paths: Sequence[Path]) -> tuple[int, int]:
+    """Return (width, height) of the first image whose header can be read. Raises SourceError if none can."""
+    problem: SourceError | None = None
+    for path in paths:
+        try:
+            return image_size(path)
+        except SourceError as error:
+            problem = problem or error
+    raise SourceError(f"no pair of colour and depth can be read (first: {problem})")

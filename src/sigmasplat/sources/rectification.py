@@ -1,0 +1,102 @@
+"""Bring the images of a recording into one pinhole camera: lenses out, depth registered to colour."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.config import InputConfig
+from sigmasplat.errors import SourceError
+from sigmasplat.model.camera import Camera
+from sigmasplat.sources.calibration import Calibration
+from sigmasplat.sources.lens import Undistortion
+from sigmasplat.sources.registration import Registration
+
+Image = NDArray[np.float32]
+
+
+class Rectification:
+    """Turn recorded colour and depth into images of `camera`, as the settings ask.
+
+    Registered depth has the colour image's pixels and lens. Depth of a camera of its own is taken out of its lens,
+    then moved to the colour camera, which is made no finer than the depth camera is.
+    """
+
+    def __init__(self, name: str, calibration: Calibration, settings: InputConfig) -> None:
+        """Raises SourceError where depth is to be registered and the calibration does not say how."""
+        self.calibration = calibration
+        lens = calibration.distortion if settings.undistort else None
+        depth_lens = calibration.depth_distortion if settings.undistort else None
+        depth_camera = self._depth_camera(name, settings)
+        self.camera = calibration.camera
+        self._color_lens = _undistortion(calibration.camera, lens)
+        self._depth_lens = self._color_lens
+        self._registration: Registration | None = None
+        if depth_camera is not None:
+            self.camera = _no_finer(calibration.camera, depth_camera)
+            self._depth_lens = _undistortion(depth_camera, depth_lens)
+            self._registration = Registration(depth_camera, self.camera, calibration.T_color_depth)
+
+    def _depth_camera(self, name: str, settings: InputConfig) -> Camera | None:
+        """Return the camera that depth is to be moved from, None where it stays as it is."""
+        known = self.calibration.depth_camera
+        if settings.register_depth == "on" and known is None:
+            raise SourceError(
+                f"{name}: depth cannot be registered, the depth camera is unknown; "
+                "give depth_camera and T_color_depth in calibration.json"
+            )
+        wanted = self.calibration.registers if settings.register_depth == "auto" else settings.register_depth == "on"
+        return known if wanted else None
+
+    @property
+    def registers(self) -> bool:
+        """Tell whether depth is moved to the colour camera."""
+        return self._registration is not None
+
+    @property
+    def depth_size(self) -> tuple[int, int]:
+        """Return (width, height) that depth images must have."""
+        camera = self._registration.depth_camera if self._registration else self.calibration.camera
+        return camera.width, camera.height
+
+    def __call__(self, color: Image, depth_m: Image) -> tuple[Image, Image]:
+        """Return colour [H, W, 3] and depth [H, W] of `camera` from the recorded ones."""
+        if self._color_lens:
+            color = self._color_lens.color(color)
+        if self._depth_lens:
+            depth_m = self._depth_lens.depth(depth_m)
+        if self._registration:
+            depth_m = self._registration(depth_m)
+        return color, depth_m
+
+
+def refuse_sizes(
+    rectification: Rectification, color: Path, color_size: tuple[int, ...], depth: Path, depth_size: tuple[int, ...]
+) -> None:
+    """Raise SourceError where an image's (width, height) is not that of its camera."""
+    c = rectification.calibration.camera
+    if tuple(color_size) != tuple(depth_size) and not rectification.registers:
+        raise SourceError(
+            f"{color} is {color_size[0]}×{color_size[1]} but {depth} is {depth_size[0]}×{depth_size[1]}; "
+            "register depth to colour and give both one size"
+        )
+    for what, path, size, wanted in (
+        ("colour", color, color_size, (c.width, c.height)),
+        ("depth", depth, depth_size, rectification.depth_size),
+    ):
+        if tuple(size) != wanted:
+            raise SourceError(
+                f"{path} is {size[0]}×{size[1]} but the calibration is for {wanted[0]}×{wanted[1]}; "
+                f"mend the {what} camera's calibration"
+            )
+
+
+def _undistortion(camera: Camera, coefficients: tuple[float, ...] | None) -> Undistortion | None:
+    return Undistortion(camera, np.array(coefficients)) if coefficients else None
+
+
+def _no_finer(color: Camera, depth: Camera) -> Camera:
+    """Return the colour camera at no more pixels across than the depth camera has."""
+    if color.width <= depth.width:
+        return color
+    return color.resized(depth.width, round(color.height * depth.width / color.width))

@@ -1,0 +1,119 @@
+"""Depth of another camera, moved into the colour camera's pixels."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sigmasplat.errors import ConfigError, SourceError
+from sigmasplat.model.camera import Camera
+from sigmasplat.sources import open_source
+from sigmasplat.sources.registration import Registration
+
+DEPTH = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+COLOR = Camera(80, 60, 70.0, 72.0, 40.0, 29.0)
+
+
+def shifted(x_m: float, y_m: float = 0.0, degrees: float = 0.0) -> np.ndarray:
+    T, angle = np.eye(4), np.radians(degrees)
+    T[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    T[:3, 3] = x_m, y_m, 0.0
+    return T
+
+
+def plane_depth(camera: Camera, T_plane_camera: np.ndarray, normal: np.ndarray, distance_m: float) -> np.ndarray:
+    """Return exact depth [H, W] of the plane normal·p = distance, given in another camera's frame."""
+    rays = camera.rays().astype(np.float64) @ T_plane_camera[:3, :3].T
+    return (distance_m - normal @ T_plane_camera[:3, 3]) / (rays @ normal)
+
+
+def test_the_same_camera_changes_nothing():
+    depth = np.random.default_rng(0).uniform(1, 3, (48, 64)).astype(np.float32)
+    depth[10:20, 5:9] = 0
+    moved = Registration(DEPTH, DEPTH, np.eye(4))(depth)
+    nearest = np.minimum.reduce([depth])
+    assert np.array_equal(moved, nearest)
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.3, -0.2, 0.93)])
+def test_a_plane_stays_the_plane_it_was(normal):
+    T_color_depth, n = shifted(0.05, 0.02, 3.0), np.array(normal)
+    measured = plane_depth(DEPTH, np.eye(4), n, 2.0).astype(np.float32)
+    moved = Registration(DEPTH, COLOR, T_color_depth)(measured)
+    exact = plane_depth(COLOR, np.linalg.inv(T_color_depth), n, 2.0)
+    seen = moved > 0
+    assert seen[8:-8, 12:-12].all(), "no cracks inside"
+    slope_m = 2.0 / 60.0  # half a depth pixel on a plane tilted by up to 45°
+    assert np.abs(moved - exact)[seen].max() < slope_m
+
+
+def test_the_nearer_surface_hides_the_farther_one():
+    depth = np.full((48, 64), 4.0, np.float32)
+    depth[:, 20:40] = 1.0
+    moved = Registration(DEPTH, DEPTH, shifted(-0.1))(depth)  # the near wall moves by 6 px, the far one by 1.5
+    row = moved[24]
+    assert (row[14:34] == 1.0).all(), "nothing shines through"
+    assert (row[:13] == 4.0).all() and (row[40:61] == 4.0).all()
+    assert (row[35:38] == 0.0).all(), "what the depth camera could not see stays unknown"
+
+
+def test_no_reading_and_points_behind_give_none():
+    back = np.diag([1.0, 1.0, 1.0, 1.0])
+    back[2, 3] = -3.0
+    assert not Registration(DEPTH, COLOR, np.eye(4))(np.zeros((48, 64), np.float32)).any()
+    assert not Registration(DEPTH, COLOR, back)(np.full((48, 64), 2.0, np.float32)).any()
+
+
+def with_depth_camera(folder, **changes):
+    fields = json.loads((folder / "calibration.json").read_text())
+    fields["depth_camera"] = {"fx": 15.0, "fy": 15.0, "cx": 7.5, "cy": 5.5, "width": 16, "height": 12}
+    fields["T_color_depth"] = np.eye(4).tolist()
+    (folder / "calibration.json").write_text(json.dumps(fields | changes))
+    for i in range(4):
+        Image.fromarray(np.full((12, 16), 2000, np.uint16)).save(folder / f"depth/{i}.png")
+
+
+def test_a_calibration_with_a_depth_camera_registers_and_keeps_no_more_pixels_than_depth_has(tiny_tum):
+    with_depth_camera(tiny_tum)
+    source = open_source(tiny_tum)
+    assert source.depth_registered and (source.camera.width, source.camera.height) == (16, 12)
+    frame = source.frame(0)
+    assert frame.color.shape == (12, 16, 3) and (frame.depth_m[1:-1, 1:-1] == 2.0).all()
+
+
+def test_registration_can_be_refused_and_asked_for(tiny_tum):
+    with pytest.raises(SourceError, match="depth camera is unknown; give depth_camera"):
+        open_source(tiny_tum, register_depth="on")
+    with_depth_camera(tiny_tum)
+    with pytest.raises(SourceError, match="register depth to colour"):
+        open_source(tiny_tum, register_depth="off")
+
+
+@pytest.mark.parametrize("matrix", [[[1, 2], [3, 4]], np.diag([2.0, 1, 1, 1]).tolist(), "none", [[1, "x"]]])
+def test_a_transform_that_is_none_is_refused(tiny_tum, matrix):
+    with_depth_camera(tiny_tum, T_color_depth=matrix)
+    with pytest.raises(SourceError, match=r"calibration.json: field \"T_color_depth\" is no rigid 4×4"):
+        open_source(tiny_tum)
+
+
+def test_the_users_words_count_before_the_recordings(tiny_tum, tmp_path):
+    source = open_source(tiny_tum, fx=40.0, cx=16.0, depth_scale=500.0)
+    assert (source.camera.fx, source.camera.fy, source.camera.cx, source.camera.cy) == (40.0, 30.0, 16.0, 11.5)
+    assert (source.frame(0).depth_m == 4.0).all()
+    other = tmp_path / "other.json"
+    other.write_text(json.dumps({"fx": 20, "fy": 21, "cx": 15, "cy": 11}))
+    assert open_source(tiny_tum, calibration=str(other)).camera.fy == 21.0
+
+
+def test_a_focal_length_is_enough_where_nothing_is_recorded(tiny_tum):
+    (tiny_tum / "calibration.json").unlink()
+    with pytest.raises(SourceError, match=r"camera unknown: .* or give --fx"):
+        open_source(tiny_tum)
+    camera = open_source(tiny_tum, fx=33.0, depth_scale=1000.0).camera
+    assert (camera.fy, camera.cx, camera.cy) == (33.0, 15.5, 11.5)
+
+
+def test_a_misspelt_setting_is_answered_with_the_nearest(tiny_tum):
+    with pytest.raises(ConfigError, match="did you mean stride"):
+        open_source(tiny_tum, strid=2)
