@@ -1,4 +1,4 @@
-"""Offer the command line: sigmasplat demo | run | eval | mesh | export | bench | doctor."""
+"""Offer the command line: sigmasplat demo | inspect | run | eval | mesh | export | bench | doctor."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -10,6 +10,7 @@ from sigmasplat.commands.bench import bench
 from sigmasplat.commands.doctor import doctor
 from sigmasplat.commands.evaluate import evaluate_run
 from sigmasplat.commands.export import export
+from sigmasplat.commands.inspect import inspect
 from sigmasplat.commands.mesh import make_mesh
 from sigmasplat.commands.run import demo, run
 from sigmasplat.errors import SigmaSplatError
@@ -21,6 +22,7 @@ Start with: sigmasplat demo, then: sigmasplat run PATH"""
 
 COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo,
+    "inspect": inspect,
     "run": run,
     "eval": evaluate_run,
     "mesh": make_mesh,

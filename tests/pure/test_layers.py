@@ -27,6 +27,7 @@ FLOORS = [
         "doctor",
         "surface",
         "ablation",
+        "inspection",
         "commands",
         "cli",
         "__init__",

@@ -4,6 +4,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import replace
 
+import numpy as np
+
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.camera import Camera
@@ -19,7 +21,8 @@ class Source(ABC):
     name: for titles; camera: the pinhole of every frame; skipped: files left out, each with the reason;
     strict: whether an unreadable image ends the sequence instead of being passed over;
     depth_units_per_metre: what whole-number depth was divided by, None where depth is metres already;
-    depth_registered: whether depth was moved into the colour camera here, instead of coming so.
+    depth_registered: whether depth was moved into the colour camera here, instead of coming so; registrable: whether it
+    could be, its camera being known.
     """
 
     name: str
@@ -27,6 +30,7 @@ class Source(ABC):
     strict: bool = False
     depth_units_per_metre: float | None = None
     depth_registered: bool = False
+    registrable: bool = False
 
     def __init__(self, name: str, camera: Camera, strict: bool = False) -> None:
         self.name = name
@@ -49,6 +53,14 @@ class Source(ABC):
     @abstractmethod
     def truth(self) -> Trajectory | None:
         """Return the true path as recorded, on its own timestamps and in its own world frame; None if there is none."""
+
+    def described_truth(self) -> str | None:
+        """Say in words how much true path there is, without giving it away; None if there is none."""
+        path = self.truth()
+        if path is None:
+            return None
+        length_m = float(np.linalg.norm(np.diff(path.T_world_camera[:, :3, 3], axis=0), axis=1).sum())
+        return f"{len(path)} true poses, {length_m:.1f} m long"
 
     def true_surface(self) -> Mesh | None:
         """Return the true surface in `truth`'s world frame, hidden parts too, faces of a few cm; None if not known."""
@@ -95,7 +107,7 @@ class Subset(Source):
         super().__init__(whole.name, whole.camera, whole.strict)
         self.skipped = whole.skipped
         self.depth_units_per_metre = whole.depth_units_per_metre
-        self.depth_registered = whole.depth_registered
+        self.depth_registered, self.registrable = whole.depth_registered, whole.registrable
         self._whole = whole
         self._indices = _within(whole, settings)[:: settings.stride][: settings.limit or None]
         if not len(self._indices):

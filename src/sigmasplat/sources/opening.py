@@ -45,13 +45,18 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
     Raises SourceError if there is nothing at the path, no format knows it, or what is there cannot be used;
     ConfigError on a setting that is none.
     """
-    text, asked = str(path), changed(settings or InputConfig(), changes)
+    asked = changed(settings or InputConfig(), changes)
+    source = format_of(path).open(str(path), asked)
+    part = asked.stride > 1 or asked.limit or asked.start_s or asked.end_s
+    return Subset(source, asked) if part else source
+
+
+def format_of(path: str | Path) -> Format:
+    """Return the first format that knows what lies at the path. Raises SourceError if none does."""
     for format_ in formats():
-        if format_.recognises(text):
-            source = format_.open(text, asked)
-            part = asked.stride > 1 or asked.limit or asked.start_s or asked.end_s
-            return Subset(source, asked) if part else source
-    raise SourceError(_nothing_fits(Path(text)))
+        if format_.recognises(str(path)):
+            return format_
+    raise SourceError(_nothing_fits(Path(path)))
 
 
 def changed(settings: InputConfig, changes: Mapping[str, Any]) -> InputConfig:

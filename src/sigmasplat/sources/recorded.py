@@ -44,6 +44,7 @@ class RecordedSource(Source):
         super().__init__(name, self._rectified.camera, settings.strict)
         self.depth_units_per_metre: float = calibration.depth_units_per_metre
         self.depth_registered = self._rectified.registers
+        self.registrable = calibration.depth_camera is not None
         self.skipped = list(skipped)
         self._images, self._truth = images, truth
         self._refuse_sizes_of_first()

@@ -1,0 +1,49 @@
+"""Look a sequence over before a run: sigmasplat inspect."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from sigmasplat.commands import options
+from sigmasplat.commands.options import configured
+from sigmasplat.presets import default_preset
+
+OK, WARNED = 0, 1
+SHEETS = Path("runs/inspect")
+SheetFile = Annotated[
+    Path | None,
+    tyro.conf.arg(metavar="FILE", help="contact sheet, PNG", help_behavior_hint="(default: runs/inspect/NAME.png)"),
+]
+
+
+def inspect(
+    path: options.SourcePath,
+    taken: options.TakenFlat = options.AS_RECORDED,
+    settings: options.Settings = (),
+    out: SheetFile = None,
+) -> int:
+    """Say what a sequence is and what in it would spoil a map; draw a contact sheet.
+
+    exit code 1 if it warns; example: sigmasplat inspect data/kitchen
+    """
+    from rich.table import Table
+
+    from sigmasplat.inspection import inspect_source
+    from sigmasplat.io.atomic import replacing
+    from sigmasplat.screen import Screen
+
+    screen = Screen()
+    found = inspect_source(path, configured(default_preset(), settings, None, taken).input)
+    table = Table(title=found.title, show_header=False)
+    for name, value in found.rows:
+        table.add_row(name, value)
+    screen.out.print(table)
+    for warning in found.warnings:
+        screen.warn(warning)
+    target = out or SHEETS / f"{found.title}.png"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(target) as temporary:
+        found.sheet.save(temporary, "PNG")
+    screen.say(f"contact sheet: {target}")
+    return WARNED if found.warnings else OK
