@@ -1,4 +1,4 @@
-"""Offer the command line: sigmasplat demo | inspect | run | eval | mesh | export | bench | doctor."""
+"""Offer the command line: sigmasplat demo | inspect | run | resume | eval | mesh | export | bench | doctor."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -12,7 +12,7 @@ from sigmasplat.commands.evaluate import evaluate_run
 from sigmasplat.commands.export import export
 from sigmasplat.commands.inspect import inspect
 from sigmasplat.commands.mesh import make_mesh
-from sigmasplat.commands.run import demo, run
+from sigmasplat.commands.run import demo, resume, run
 from sigmasplat.errors import SigmaSplatError
 
 REFUSED, INTERRUPTED = 2, 130
@@ -24,6 +24,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo,
     "inspect": inspect,
     "run": run,
+    "resume": resume,
     "eval": evaluate_run,
     "mesh": make_mesh,
     "export": export,

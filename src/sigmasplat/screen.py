@@ -37,11 +37,11 @@ class Screen:
         self.err.print(f"warning: {line}")
 
     @contextmanager
-    def steps(self, total: int) -> Iterator["_StepShow"]:
+    def steps(self, total: int, done: int = 0) -> Iterator["_StepShow"]:
         """Show a session: a bar with frames/s, splats and lost frames; a line where tracking is lost or a loop closed;
         a bar for the final map."""
         with self._counters() as begin:
-            yield _StepShow(self.say, begin, total)
+            yield _StepShow(self.say, begin, total, done)
 
     @contextmanager
     def counting(self, title: str) -> Iterator[Callable[[int, int], None]]:
@@ -117,11 +117,11 @@ def _bar(bars: Progress, title: str, total: int | None) -> Show:
 class _StepShow:
     """Turn steps into text for a bar, and losses and loops into lines."""
 
-    def __init__(self, say: Callable[[str], None], begin: Begin, total: int) -> None:
+    def __init__(self, say: Callable[[str], None], begin: Begin, total: int, done: int = 0) -> None:
         self.say, self.begin, self.show = say, begin, begin("SLAM", total)
         self.show_final: Show | None = None
         self.started_s = time.perf_counter()
-        self.done = self.lost = 0
+        self.done, self.lost, self.before = done, 0, done
         self.lost_since: int | None = None
 
     def __call__(self, step: Stepped) -> None:
@@ -129,7 +129,7 @@ class _StepShow:
         self.lost += step.lost
         self._tell_losses(step)
         self._tell_loops(f"frame {step.index}", step.loops)
-        speed = self.done / max(time.perf_counter() - self.started_s, 1e-9)
+        speed = (self.done - self.before) / max(time.perf_counter() - self.started_s, 1e-9)
         self.show(self.done, None, f"{speed:.1f} frames/s  {step.splats:,} splats  {self.lost} lost")
 
     def finishing(self, done: int, total: int) -> None:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, Protocol
 
 from sigmasplat.config import Config
 from sigmasplat.io.runs import RunFolder
@@ -60,19 +60,37 @@ class Outcome:
         return line
 
 
-def record(slam: Stepper, source: Source, run: RunFolder, watch: Watcher | None = None) -> Outcome:
+class Keeper(Protocol):
+    """Keeps what a run needs to go on after a stop (snapshots.Snapshots)."""
+
+    def after_frame(self, index: int, wall_s: float) -> None: ...
+    def keep(self, index: int, wall_s: float) -> None: ...
+    def drop(self) -> None: ...
+
+
+def record(
+    slam: Stepper,
+    source: Source,
+    run: RunFolder,
+    watch: Watcher | None = None,
+    keeper: Keeper | None = None,
+    first: int = 0,
+    spent_s: float = 0.0,
+) -> Outcome:
     """Track and map every frame, a log line each, and finish; then write trajectory, map, loops and checkpoint.
+
+    A session that goes on begins at the source's frame `first`, `spent_s` seconds having been spent before.
 
     These are written also where the session is cut short. The first Ctrl-C ends it after the frame in work, or where
     finishing next tells how far it is; a second one at once: all end as "interrupted", and frames cut short are not
     finished. Any other exception leaves the same files, marks the run "failed", and carries the run folder's path in a
     note.
     """
-    tally, watch = _Tally(), watch or Unwatched()
+    tally, watch, keeper = _Tally.of(run, first, spent_s), watch or Unwatched(), keeper or _Unkept()
     status = "failed"
     try:
         with interrupt_asked() as asked:
-            complete = _follow(slam, source, run, watch, tally, asked)
+            complete = _follow(slam, source, run, watch, keeper, tally, asked)
             if complete:
                 _finish(slam, run, watch, asked)
             status = "complete" if complete else "interrupted"
@@ -84,6 +102,8 @@ def record(slam: Stepper, source: Source, run: RunFolder, watch: Watcher | None 
     finally:
         _save(slam, run, tally)
         run.note(status=status, wall_s=tally.wall_s, skipped=source.skipped)
+    if status == "complete":
+        keeper.drop()
     closed = sum(loop.accepted for loop in slam.loops)
     return Outcome(
         status, tally.frames, tally.lost, tally.wall_s, tally.submaps, closed, len(slam.loops) - closed
@@ -96,15 +116,35 @@ class _Tally:
     lost: int = 0
     submaps: int = 1
     wall_s: float = 0.0
+    first: int = 0
+
+    @staticmethod
+    def of(run: RunFolder, first: int, spent_s: float) -> "_Tally":
+        """Begin where an earlier session of the run stopped."""
+        log = run.read_log() if first else []
+        lost, submaps = sum(line["lost"] for line in log), 1 + (log[-1]["submap"] if log else 0)
+        return _Tally(len(log), lost, submaps, spent_s, first)
+
+
+class _Unkept:
+    def after_frame(self, index: int, wall_s: float) -> None: ...
+    def keep(self, index: int, wall_s: float) -> None: ...
+    def drop(self) -> None: ...
 
 
 def _follow(
-    slam: Stepper, source: Source, run: RunFolder, watch: Watcher, tally: _Tally, asked: threading.Event
+    slam: Stepper,
+    source: Source,
+    run: RunFolder,
+    watch: Watcher,
+    keeper: Keeper,
+    tally: _Tally,
+    asked: threading.Event,
 ) -> bool:
     """Step through the frames until they end or Ctrl-C asked to stop; return whether it was the frames that ended."""
-    started_s = time.perf_counter()
+    started_s, spent_s, frame = time.perf_counter(), tally.wall_s, None
     try:
-        for frame in source:
+        for frame in source.frames_from(tally.first):
             step = slam.step(frame)
             run.log(log_line(step))
             if step.loops:
@@ -112,12 +152,16 @@ def _follow(
             tally.frames += 1
             tally.lost += step.lost
             tally.submaps = step.submap + 1
+            tally.wall_s = spent_s + time.perf_counter() - started_s
             watch(step)
+            keeper.after_frame(frame.index, tally.wall_s)
             if asked.is_set():
-                return False
+                break
     finally:
-        tally.wall_s = time.perf_counter() - started_s
-    return True
+        tally.wall_s = spent_s + time.perf_counter() - started_s
+    if frame is not None:
+        keeper.keep(frame.index, tally.wall_s)
+    return not asked.is_set()
 
 
 def _finish(slam: Stepper, run: RunFolder, watch: Watcher, asked: threading.Event) -> None:

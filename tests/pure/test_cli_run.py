@@ -145,6 +145,7 @@ def corridor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Corridor:
     monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.setitem(sys.modules, scores.__name__, scores)
     monkeypatch.setattr("sigmasplat.sources.open_source", lambda path, settings=None: source)
+    monkeypatch.setattr("sigmasplat.snapshots.Snapshots.keep", lambda *ignored: None)  # of made-up SLAM there is none
     monkeypatch.setattr(MadeUpSlam, "at", {}, raising=False)
     monkeypatch.setattr(MadeUpSlam, "lost", set(), raising=False)
     monkeypatch.setattr(MadeUpSlam, "tried", {}, raising=False)

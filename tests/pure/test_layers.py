@@ -28,6 +28,7 @@ FLOORS = [
         "surface",
         "ablation",
         "inspection",
+        "snapshots",
         "commands",
         "cli",
         "__init__",

@@ -59,6 +59,9 @@ Keep = Annotated[
 Overwrite = Annotated[bool, arg(help="replace what is there", help_behavior_hint="")]
 Limit = Annotated[int | None, arg(metavar="N", help="take at most N frames", help_behavior_hint="(default: all)")]
 Profile = Annotated[bool, arg(help="print where the time went", help_behavior_hint="")]
+SaveEvery = Annotated[
+    float, arg(metavar="S", help="seconds between savings of the state that `resume` goes on from; 0 = at the end only")
+]
 Evaluate = Annotated[bool, arg(name="eval", help="make no metrics and no report", help_behavior_hint="")]
 MovedSource = Annotated[
     str | None,

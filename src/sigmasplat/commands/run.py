@@ -1,22 +1,23 @@
-"""Run SLAM on a sequence, or on the built-in room: sigmasplat run | demo."""
+"""Run SLAM on a sequence, or on the built-in room: sigmasplat demo | run | resume."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sigmasplat.commands import options
 from sigmasplat.commands.evaluate import score
-from sigmasplat.commands.options import absolute, configured, prepare_torch
+from sigmasplat.commands.options import absolute, configured, prepare_torch, source_of
 from sigmasplat.errors import ConfigError
 from sigmasplat.presets import default_preset
 
 if TYPE_CHECKING:
-    from sigmasplat.config import Config
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.screen import Screen
+    from sigmasplat.snapshots import Begun
     from sigmasplat.sources.base import Source
 
 OK, INTERRUPTED = 0, 130
 DEFAULT_PRESET = default_preset()
+SAVE_EVERY_S = 60.0
 DEMO_FOLDER, DEMO_FRAMES = Path("runs/demo"), 120
 
 
@@ -48,6 +49,7 @@ def run(
     seed: options.Seed = None,
     evaluate: options.Evaluate = True,
     profile: options.Profile = False,
+    save_every: options.SaveEvery = SAVE_EVERY_S,
 ) -> int:
     """Run SLAM on a sequence: trajectory, map, uncertainty, report.
 
@@ -55,6 +57,8 @@ def run(
     """
     from sigmasplat.screen import Screen
     from sigmasplat.session import new_folder
+    from sigmasplat.slam.slam import Slam
+    from sigmasplat.snapshots import Begun
     from sigmasplat.sources import open_source
     from sigmasplat.sources.depth_check import depth_warning
 
@@ -65,26 +69,60 @@ def run(
         screen.warn(warning)
     folder = new_folder(out, config, source, overwrite, source_path=absolute(path))
     screen.say(f"{source.name}: {len(source)} frames, {config.name} → {folder.path}")
-    return _record(screen, config, source, folder, evaluate, profile)
+    prepare_torch()
+    return _record(screen, Begun(Slam(config, folder.submaps)), source, folder, evaluate, profile, save_every)
+
+
+def resume(
+    run: options.RunPath,
+    evaluate: options.Evaluate = True,
+    profile: options.Profile = False,
+    save_every: options.SaveEvery = SAVE_EVERY_S,
+    moved_to: options.MovedSource = None,
+) -> int:
+    """Go on with a run that was stopped or killed, where its state was last kept.
+
+    The result is the same, byte for byte, as if it had not been stopped. example: sigmasplat resume runs/kitchen-sigma
+    """
+    from sigmasplat.io.runs import RunFolder
+    from sigmasplat.screen import Screen
+    from sigmasplat.snapshots import resume as resumed
+
+    screen, folder = Screen(), RunFolder.open(run)
+    source = source_of(folder, moved_to)
+    prepare_torch()
+    begun = resumed(folder, source)
+    folder.note(status="running")
+    screen.say(f"{source.name}: going on at frame {begun.next_index} of {len(source)} → {folder.path}")
+    return _record(screen, begun, source, folder, evaluate, profile, save_every)
 
 
 def _record(
-    screen: "Screen", config: "Config", source: "Source", folder: "RunFolder", evaluate: bool, profile: bool
+    screen: "Screen",
+    begun: "Begun",
+    source: "Source",
+    folder: "RunFolder",
+    evaluate: bool,
+    profile: bool,
+    save_every_s: float,
 ) -> int:
     """Run SLAM into the folder, then score it; return the exit code."""
     from sigmasplat.session import record
-    from sigmasplat.slam.slam import Slam
+    from sigmasplat.snapshots import Snapshots
 
-    prepare_torch()
-    with screen.steps(len(source)) as watch:
-        outcome = record(Slam(config, folder.submaps), source, folder, watch)
+    keeper = Snapshots(begun.slam, folder, save_every_s)
+    with screen.steps(len(source), begun.next_index) as watch:
+        outcome = record(begun.slam, source, folder, watch, keeper, begun.next_index, begun.wall_s)
     if profile:
         screen.profile(folder.read_profile())
     if source.skipped:
         images = "image" if len(source.skipped) == 1 else "images"
         screen.warn(f"{len(source.skipped)} unreadable {images} passed over (first: {source.skipped[0]})")
     if outcome.status == "interrupted":
-        screen.say(f"interrupted after {outcome.counts()}; trajectory, map and checkpoint so far are in {folder.path}")
+        screen.say(
+            f"interrupted after {outcome.counts()}; trajectory, map and checkpoint so far are in {folder.path}, "
+            f"`sigmasplat resume {folder.path}` goes on"
+        )
         return INTERRUPTED
     if evaluate:
         score(screen, folder, source)

@@ -11,7 +11,7 @@ from sigmasplat.config import Config
 from sigmasplat.errors import RunError
 from sigmasplat.io import machine, ply, trajectory as tum
 from sigmasplat.io.atomic import replacing, write_text
-from sigmasplat.io.json_files import append_line, read_json, read_lines, write_json
+from sigmasplat.io.json_files import append_line, read_json, read_lines, read_text, write_json
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.tensors import opened, write_tensors
 from sigmasplat.model.field import GaussianField
@@ -22,7 +22,7 @@ MESH = "mesh.ply"
 """What `sigmasplat mesh` adds."""
 FILES = (
     "config.json", "trajectory.txt", "map.ply", "checkpoint.safetensors", "log.jsonl", "loops.json", "metrics.json",
-    "profile.json", "report.html",
+    "profile.json", "report.html", "state.safetensors",
 )  # fmt: skip
 """What a run may hold besides run.json, which says that the folder is ours and is never absent."""
 HALF_BORN = ".run.json.part"
@@ -123,6 +123,20 @@ class RunFolder:
     def submaps(self) -> DiskStore:
         """Return the store of finished submaps, submaps/; a run in one piece leaves it empty."""
         return DiskStore(self.path / "submaps")
+
+    @property
+    def state(self) -> Path:
+        """Return where an unfinished run's state is, to go on from."""
+        return self.path / "state.safetensors"
+
+    def take_back(self, frames: int, submaps: int) -> None:
+        """Drop what was written after the first so many frames and submaps. Raises RunError if there are fewer."""
+        lines = read_text(self.path / "log.jsonl").splitlines(keepends=True)
+        if len(lines) < frames or len(self.submaps) < submaps:
+            found = f"{len(lines)} frames in log.jsonl, {len(self.submaps)} submaps"
+            raise RunError(f"{self.path}: {found}, the state speaks of {frames} and {submaps}; run it again")
+        write_text(self.path / "log.jsonl", "".join(lines[:frames]))
+        self.submaps.keep(submaps)
 
     def config(self) -> Config:
         """Read the settings of the run. Raises ConfigError if they cannot be read."""

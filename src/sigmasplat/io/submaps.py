@@ -75,6 +75,11 @@ class DiskStore:
             color, depth_m = (file.get_slice(name)[keyframe] for name in ("colors", "depths_m"))
             return Picture(color.numpy(), depth_m.numpy())
 
+    def keep(self, count: int) -> None:
+        """Remove all but the first `count` submaps, also one half written."""
+        for path in [self.path(index) for index in range(count, len(self))] + self._named(UNFINISHED):
+            path.unlink(missing_ok=True)
+
     def clear(self) -> None:
         """Remove every submap, also one half written, and nothing else; the folder too where that leaves it empty."""
         for path in self._named(OURS) + self._named(UNFINISHED):

@@ -15,6 +15,7 @@ from sigmasplat.fit.pyramid import Pyramid, gray_of
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import Atlas
+from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import MemoryStore, SubmapStore
@@ -51,8 +52,8 @@ class Slam:
         self.descriptor = make_descriptor(self.config.loops)
         self.steps: list[Step] = []
         self.keyframes: list[int] = []
-        self._view: View | None = None
-        self._closer: LoopCloser | None = None
+        self.view: View | None = None
+        self.closer: LoopCloser | None = None
         self._final: GaussianField | None = None
 
     @property
@@ -73,7 +74,7 @@ class Slam:
     @property
     def loops(self) -> list[Loop]:
         """Return every pair of submaps tried, with the latest verdict."""
-        return list(self._closer.loops) if self._closer else []
+        return list(self.closer.loops) if self.closer else []
 
     def trajectory(self) -> Trajectory:
         """Return the poses of all frames so far, lost ones included (their log lines say so).
@@ -129,7 +130,7 @@ class Slam:
         if not self.steps or not (len(self.store) or self._cuts or self.config.final.iterations):
             return
         self._freeze()
-        view = self._view
+        view = self.view
         assert view is not None
         self._final = final_map(self.store, self.atlas.anchors, self.config, view, self.random, progress)
 
@@ -165,35 +166,39 @@ class Slam:
 
     def _freeze(self) -> list[Loop]:
         """Hand the active submap to the store and look for its loops, which may move anchors."""
-        assert self._closer is not None
+        assert self.closer is not None
         submap, pictures = self.mapper.finished(len(self.store))
         self.store.save(submap, pictures)
         descriptors = [keyframe.descriptor for keyframe in self.mapper.keyframes]
-        return self._closer.submap_finished(submap, [d for d in descriptors if d is not None], self.atlas)
+        return self.closer.submap_finished(submap, [d for d in descriptors if d is not None], self.atlas)
 
     def _cut(self, view: View, T_submap_camera: Matrix, seconds: dict[str, float]) -> list[Loop]:
         """Finish the active submap and begin the next one at its newest keyframe, which both share; return the loops
         tried."""
         clock = time.perf_counter()
         loops = self._freeze()
-        assert self._closer is not None
-        self._closer.submap_begun(len(self.store), T_submap_camera, self.drift.information)
+        assert self.closer is not None
+        self.closer.submap_begun(len(self.store), T_submap_camera, self.drift.information)
         self.atlas.begin_submap(T_submap_camera)
         self.mapper = self.mapper.successor(view, T_submap_camera)
         self.drift = Drift()
         seconds["cut"] = time.perf_counter() - clock
         return loops
 
-    def _view_for(self, frame: Frame) -> View:
+    def prepare(self, camera: Camera) -> View:
+        """Make what renders for the images of a camera, as `Frame.prepared` leaves it; the first frame does it too."""
         c = self.config
-        if self._view is None:
-            learned = bool(c.mapping.weight_nll_color or c.mapping.weight_nll_depth)
-            read = c.tracking.uncertainty and c.tracking.align_depth_by == "V"
-            self._view = make_view(c.backend, frame.camera, c.render, variance=learned or read)
-            self._closer = LoopCloser(c, self.store, self._view)
-        if frame.camera != self._view.camera:
+        learned = bool(c.mapping.weight_nll_color or c.mapping.weight_nll_depth)
+        read = c.tracking.uncertainty and c.tracking.align_depth_by == "V"
+        self.view = make_view(c.backend, camera, c.render, variance=learned or read)
+        self.closer = LoopCloser(c, self.store, self.view)
+        return self.view
+
+    def _view_for(self, frame: Frame) -> View:
+        view = self.view or self.prepare(frame.camera)
+        if frame.camera != view.camera:
             raise SourceError(f"frame {frame.index} comes from another camera ({frame.camera}) than the first")
-        return self._view
+        return view
 
     def _is_keyframe(self, overlap: float) -> bool:
         c = self.config.mapping

@@ -72,11 +72,15 @@ class Source(ABC):
         An unreadable frame is noted in `skipped` and passed over, or raised where `strict`. Raises SourceError if not
         one frame can be read.
         """
-        return read_ahead(self._readable())
+        return self.frames_from(0)
 
-    def _readable(self) -> Iterator[Frame]:
-        found = False
-        for i in range(len(self)):
+    def frames_from(self, first: int) -> Iterator[Frame]:
+        """Yield the frames from index `first` on, as iteration does."""
+        return read_ahead(self._readable(first))
+
+    def _readable(self, first: int) -> Iterator[Frame]:
+        found = first > 0  # then there were some before
+        for i in range(first, len(self)):
             try:
                 frame = self.frame(i)
             except SourceError as error:

@@ -1,0 +1,120 @@
+"""Write a tree of living objects and read it back, every bit as it was: what a run needs to go on after a stop.
+
+Plain data only, no pickles: a file can make nothing but numbers, text and the classes that its reader names.
+"""
+
+import dataclasses
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sigmasplat.errors import RunError
+from sigmasplat.io.tensors import opened, write_tensors
+
+INLINE = 64
+"""Arrays of at most so many numbers stand in the text: poses are many, and each tensor of a file costs a header."""
+VERSION = "1"
+
+
+def write_state(path: Path, tree: Any, classes: Iterable[type], fixed: Mapping[str, Any]) -> None:
+    """Write a tree of dataclasses, named tuples, lists, tuples, dicts, arrays, tensors, numbers, text and None.
+
+    `fixed` are objects that the reader has already, by name: they are referred to, not written. Raises RunError if the
+    place cannot be written, TypeError on anything else in the tree.
+    """
+    encoder = _Encoder({c.__name__: c for c in classes}, {id(value): name for name, value in fixed.items()})
+    text = json.dumps(encoder.encode(tree))
+    write_tensors(path, encoder.tensors, {"state": text, "version": VERSION})
+
+
+def read_state(path: Path, classes: Iterable[type], fixed: Mapping[str, Any]) -> Any:
+    """Read what `write_state` wrote. Raises RunError if it is missing, damaged, or of another version."""
+    if not path.is_file():
+        raise RunError(f"there is nothing to go on from: no {path}")
+    with opened(path, "state") as file:
+        facts = file.metadata() or {}
+        if facts.get("version") != VERSION:
+            raise RunError(f"{path} was written by another version ({facts.get('version')}); run it again")
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        return _Decoder(tensors, {c.__name__: c for c in classes}, fixed).decode(json.loads(facts["state"]))
+
+
+class _Encoder:
+    """Turns objects into JSON values; large arrays go beside them, each once, so that what is shared stays shared."""
+
+    def __init__(self, classes: Mapping[str, type], fixed: Mapping[int, str]) -> None:
+        self.classes, self.fixed = classes, fixed
+        self.tensors: dict[str, Tensor] = {}
+        self.seen: dict[int, tuple[str, Any]] = {}
+
+    def encode(self, value: Any) -> Any:
+        if id(value) in self.fixed:
+            return {"fixed": self.fixed[id(value)]}
+        if value is None or isinstance(value, bool | int | float | str):
+            return value
+        if isinstance(value, np.generic):
+            return value.item()
+        if isinstance(value, Tensor | np.ndarray):
+            return self._array(value)
+        if isinstance(value, list):
+            return [self.encode(item) for item in value]
+        if isinstance(value, dict):
+            return {"dict": [[self.encode(key), self.encode(item)] for key, item in value.items()]}
+        name = type(value).__name__
+        if self.classes.get(name) is type(value):
+            return {"object": name, "fields": {n: self.encode(v) for n, v in _fields(value).items()}}
+        if type(value) is tuple:
+            return {"tuple": [self.encode(item) for item in value]}
+        raise TypeError(f"a state cannot hold {type(value)}")
+
+    def _array(self, value: Tensor | np.ndarray[Any, Any]) -> Any:
+        kind = "tensor" if isinstance(value, Tensor) else "array"
+        array = value.detach().numpy() if isinstance(value, Tensor) else value
+        if array.size <= INLINE:
+            return {kind: array.tolist(), "type": str(array.dtype), "shape": list(array.shape)}
+        if id(value) not in self.seen:
+            name = str(len(self.tensors))
+            self.tensors[name] = torch.from_numpy(np.ascontiguousarray(array))
+            self.seen[id(value)] = name, value  # kept, so that its id is not given to another
+        return {kind: self.seen[id(value)][0]}
+
+
+class _Decoder:
+    def __init__(self, tensors: Mapping[str, Tensor], classes: Mapping[str, type], fixed: Mapping[str, Any]) -> None:
+        self.tensors, self.classes, self.fixed = tensors, classes, fixed
+        self.arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
+
+    def decode(self, value: Any) -> Any:
+        if isinstance(value, list):
+            return [self.decode(item) for item in value]
+        if not isinstance(value, dict):
+            return value
+        if "fixed" in value:
+            return self.fixed[value["fixed"]]
+        if "dict" in value:
+            return {self.decode(key): self.decode(item) for key, item in value["dict"]}
+        if "tuple" in value:
+            return tuple(self.decode(item) for item in value["tuple"])
+        if "object" in value:
+            return self.classes[value["object"]](**{n: self.decode(v) for n, v in value["fields"].items()})
+        return self._array(value)
+
+    def _array(self, value: dict[str, Any]) -> Any:
+        kind = "tensor" if "tensor" in value else "array"
+        if isinstance(value[kind], str):
+            return (self.tensors if kind == "tensor" else self.arrays)[value[kind]]
+        array = np.array(value[kind], value["type"]).reshape(value["shape"])
+        return torch.from_numpy(array) if kind == "tensor" else array
+
+
+def _fields(value: Any) -> dict[str, Any]:
+    """Return what an object is made of: a dataclass's fields, or a named tuple's."""
+    if dataclasses.is_dataclass(value):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    named: dict[str, Any] = value._asdict()
+    return named

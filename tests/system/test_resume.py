@@ -1,0 +1,129 @@
+"""A run that was stopped or killed goes on where it was, and ends as if nothing had happened: the same bytes."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sigmasplat import cli
+from sigmasplat.config import Config
+from sigmasplat.config.text import override
+from sigmasplat.errors import RunError
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.io.state import read_state, write_state
+from sigmasplat.presets import preset
+from sigmasplat.slam.slam import Slam
+from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
+from sigmasplat.sources import open_source
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+
+ROOM = "synthetic:frames=120,width=80,height=60,noise=1"
+FRAMES = 24
+SETTINGS = {
+    "input.width": "80", "input.limit": str(FRAMES), "mapping.first_iterations": "8", "mapping.iterations": "4",
+    "mapping.every": "3", "submaps.frames": "9", "final.iterations": "6", "registration.iterations": "2",
+}  # fmt: skip
+SAME = ("trajectory.txt", "map.ply", "loops.json")
+
+
+def arguments(out: Path, name: str) -> list[str]:
+    settings = [word for key, value in SETTINGS.items() for word in ("--set", f"{key}={value}")]
+    return ["run", ROOM, "--preset", name, "--out", str(out), "--no-eval", "--save-every", "0.001", *settings]
+
+
+def obey(*words: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(list(words))
+    code = ended.value.code
+    assert isinstance(code, int)
+    return code
+
+
+def killed(out: Path, name: str, after: int) -> int:
+    """Run in a process of its own and kill it without warning once so many frames are logged; return how many were."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sigmasplat.cli", *arguments(out, name)], env=os.environ, stdout=subprocess.DEVNULL
+    )
+    log, deadline_s = out / "log.jsonl", time.monotonic() + 90
+    while not log.exists() or log.read_text().count("\n") < after:
+        assert process.poll() is None and time.monotonic() < deadline_s
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    return log.read_text().count("\n")
+
+
+def without_times(run: Path) -> list[dict]:
+    return [{key: value for key, value in line.items() if key != "seconds"} for line in RunFolder(run).read_log()]
+
+
+@pytest.mark.parametrize("name, after", [("sigma", 13), ("cgslam-fast", 7)])
+def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path: Path, name: str, after: int) -> None:
+    assert obey(*arguments(tmp_path / "whole", name)) == 0
+    assert killed(tmp_path / "cut", name, after) < FRAMES
+    assert RunFolder(tmp_path / "cut").facts()["status"] == "running"
+    assert obey("resume", str(tmp_path / "cut"), "--no-eval") == 0
+    for file in SAME:
+        assert (tmp_path / "cut" / file).read_bytes() == (tmp_path / "whole" / file).read_bytes(), file
+    assert without_times(tmp_path / "cut") == without_times(tmp_path / "whole")
+    facts = RunFolder(tmp_path / "cut").facts()
+    assert facts["status"] == "complete" and facts["wall_s"] > 0
+    assert not (tmp_path / "cut/state.safetensors").exists()
+
+
+def tiny() -> Config:
+    return override(preset("sigma"), SETTINGS)
+
+
+def test_every_frame_is_a_place_to_go_on_from(tmp_path: Path) -> None:
+    """Also right after a cut, where the next submap has one keyframe."""
+    source, config = open_source(ROOM, tiny().input), tiny()
+    whole = Slam(config)
+    seen = []
+    for frame in source:
+        whole.step(frame)
+        write_state(tmp_path / f"{frame.index}.st", state_of(whole), CLASSES, fixed(whole))
+        seen.append(whole.mapper.field.params.clone())
+    for begun in (0, 4, 8, 9, 15):
+        slam = Slam(config, whole.store)  # finished submaps never change; there are more than there were
+        slam.prepare(whole.view.camera)
+        restore(slam, read_state(tmp_path / f"{begun}.st", CLASSES, fixed(slam)))
+        assert torch.equal(slam.mapper.field.params, seen[begun])
+        if len(slam.atlas.anchors) == len(whole.atlas.anchors):  # else the store has the submaps to come
+            for frame in list(source)[begun + 1 :]:
+                slam.step(frame)
+            assert torch.equal(slam.mapper.field.params, seen[-1])
+            assert np.array_equal(slam.trajectory().T_world_camera, whole.trajectory().T_world_camera)
+
+
+def test_what_cannot_be_gone_on_with_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    assert obey(*arguments(out, "sigma")) == 0
+    assert obey("resume", str(out)) == 2
+    assert "is complete" in capsys.readouterr().err
+    RunFolder(out).note(status="interrupted")
+    assert obey("resume", str(out)) == 2
+    assert "nothing to go on from" in capsys.readouterr().err
+    (out / "state.safetensors").write_bytes(b"damaged")
+    assert obey("resume", str(out)) == 2
+    assert "is damaged" in capsys.readouterr().err
+
+
+def test_a_state_holds_plain_data_only(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="cannot hold"):
+        write_state(tmp_path / "s", {"a": object()}, (), {})
+    shared = np.arange(100.0)
+    tree = {"a": [1, None, "x", float("inf")], "b": (shared, shared), 3: torch.ones(2, 2, dtype=torch.float64)}
+    write_state(tmp_path / "s", tree, (), {})
+    back = read_state(tmp_path / "s", (), {})
+    assert back["a"] == tree["a"] and np.array_equal(back["b"][0], shared) and torch.equal(back[3], tree[3])
+    assert np.shares_memory(*back["b"]), "what was shared stays shared"
+    with pytest.raises(RunError, match="nothing to go on from"):
+        read_state(tmp_path / "none", (), {})
