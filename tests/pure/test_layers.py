@@ -28,6 +28,7 @@ FLOORS = [
         "surface",
         "ablation",
         "inspection",
+        "download",
         "commands",
         "cli",
         "__init__",
