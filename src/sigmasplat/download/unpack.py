@@ -97,7 +97,7 @@ def _unpack_tar(archive: Path, folder: Path, budget: Budget, progress: Progress)
                     _write(source, place, member.size)
                 else:
                     raise BadArchive(f"holds {member.name!r}, which is no plain file or folder")
-                progress(packed.tell(), size_bytes)
+                progress(min(packed.tell(), size_bytes - 1), size_bytes)
         while stream.read(CHUNK_BYTES):  # to the end, where the checksum of the whole stream is
             pass
     progress(size_bytes, size_bytes)
@@ -132,8 +132,9 @@ def _unpack_zip(archive: Path, folder: Path, budget: Budget, progress: Progress)
             else:
                 with zipped.open(entry) as source:
                     _write(source, place, entry.file_size)
-            done += entry.compress_size
             progress(done, total)
+            done += entry.compress_size
+        progress(total, total)
 
 
 def _refuse_strange(entry: zipfile.ZipInfo) -> None:
