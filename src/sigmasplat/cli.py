@@ -1,4 +1,4 @@
-"""Offer the command line: sigmasplat demo | inspect | run | resume | eval | mesh | export | bench | doctor."""
+"""Offer the command line: a table of commands, and how each ends."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -8,6 +8,7 @@ import tyro
 from sigmasplat import env
 from sigmasplat.commands.bench import bench
 from sigmasplat.commands.doctor import doctor
+from sigmasplat.commands.download import download
 from sigmasplat.commands.evaluate import evaluate_run
 from sigmasplat.commands.export import export
 from sigmasplat.commands.inspect import inspect
@@ -28,6 +29,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "eval": evaluate_run,
     "mesh": make_mesh,
     "export": export,
+    "download": download,
     "bench": bench,
     "doctor": doctor,
 }

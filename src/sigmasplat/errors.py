@@ -19,3 +19,7 @@ class RunError(SigmaSplatError):
 
 class BackendError(SigmaSplatError):
     """Refuse a compute backend that this machine or this build does not have."""
+
+
+class DownloadError(SigmaSplatError):
+    """Refuse or give up a download: no such set, no connection, damaged, unsafe to unpack, no room."""

@@ -7,7 +7,8 @@ from functools import partial
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.filesize import decimal
+from rich.progress import BarColumn, DownloadColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from sigmasplat.metrics.tables import headline, number
@@ -51,11 +52,25 @@ class Screen:
             yield lambda done, total: show(done, total, "")
 
     @contextmanager
-    def _counters(self) -> Iterator[Begin]:
+    def transfers(self) -> Iterator[Callable[[str, int, int], None]]:
+        """Show what is copied, a bar each: (title, bytes done, bytes in all; 0 where not known)."""
+        shows: dict[str, Show] = {}
+        with self._counters(of_bytes=True) as begin:
+
+            def show(title: str, done: int, total: int) -> None:
+                if title not in shows:
+                    shows[title] = begin(title, total or None)
+                shows[title](done, total or None, "")
+
+            yield show
+
+    @contextmanager
+    def _counters(self, of_bytes: bool = False) -> Iterator[Begin]:
         if not self.out.is_terminal:
-            yield partial(_PlainShow, self.say)
+            yield partial(_PlainShow, self.say, decimal if of_bytes else str)
             return
-        columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[text]}"))
+        count = DownloadColumn() if of_bytes else MofNCompleteColumn()
+        columns = ("{task.description}", BarColumn(), count, TextColumn("{task.fields[text]}"))
         with Progress(*columns, TimeRemainingColumn(), console=self.out) as bars:
             yield partial(_bar, bars)
 
@@ -160,8 +175,10 @@ class _StepShow:
 class _PlainShow:
     """Print a line now and then, and at the end."""
 
-    def __init__(self, say: Callable[[str], None], title: str, total: int | None) -> None:
-        self.say, self.title, self.total = say, title, total
+    def __init__(
+        self, say: Callable[[str], None], written: Callable[[int], str], title: str, total: int | None
+    ) -> None:
+        self.say, self.written, self.title, self.total = say, written, title, total
         self.last_s = time.perf_counter()
 
     def __call__(self, done: int, known: int | None, text: str) -> None:
@@ -169,4 +186,5 @@ class _PlainShow:
         now_s = time.perf_counter()
         if done == total or now_s - self.last_s >= PLAIN_LINES_EVERY_S:
             self.last_s = now_s
-            self.say(f"{self.title} {done}/{total}  {text}".rstrip())
+            whole = "?" if total is None else self.written(total)
+            self.say(f"{self.title} {self.written(done)}/{whole}  {text}".rstrip())

@@ -4,6 +4,8 @@ import time
 from dataclasses import dataclass, field
 
 from sigmasplat.errors import RunError
+from sigmasplat.io.atomic import write_text
+from sigmasplat.io.json_files import read_text
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.state import read_state, write_state
 from sigmasplat.slam.slam import Slam
@@ -59,6 +61,19 @@ def resume(run: RunFolder, source: Source) -> Begun:
     slam = Slam(config, run.submaps)
     slam.prepare(source.camera.prepared(config.input.width, config.input.crop_px))
     tree = read_state(run.state, CLASSES, fixed(slam))
-    run.take_back(frames=len(tree["steps"]), submaps=tree["submaps"])
+    _take_back(run, frames=len(tree["steps"]), submaps=tree["submaps"])
     restore(slam, tree)
     return Begun(slam, tree["index"] + 1, tree["wall_s"])
+
+
+def _take_back(run: RunFolder, frames: int, submaps: int) -> None:
+    """Drop what a run wrote after its first so many frames and submaps. Raises RunError if there are fewer."""
+    log = run.path / "log.jsonl"
+    lines = read_text(log).splitlines(keepends=True)
+    if len(lines) < frames or len(run.submaps) < submaps:
+        raise RunError(
+            f"{run.path}: {len(lines)} frames in log.jsonl, {len(run.submaps)} submaps, "
+            f"the state speaks of {frames} and {submaps}; run it again"
+        )
+    write_text(log, "".join(lines[:frames]))
+    run.submaps.keep(submaps)

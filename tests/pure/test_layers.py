@@ -29,6 +29,7 @@ FLOORS = [
         "ablation",
         "inspection",
         "snapshots",
+        "download",
         "commands",
         "cli",
         "__init__",

@@ -11,7 +11,7 @@ from sigmasplat.config import Config
 from sigmasplat.errors import RunError
 from sigmasplat.io import machine, ply, trajectory as tum
 from sigmasplat.io.atomic import replacing, write_text
-from sigmasplat.io.json_files import append_line, read_json, read_lines, read_text, write_json
+from sigmasplat.io.json_files import append_line, read_json, read_lines, write_json
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.tensors import opened, write_tensors
 from sigmasplat.model.field import GaussianField
@@ -20,9 +20,11 @@ from sigmasplat.model.trajectory import Trajectory
 PROGRAM = "sigmasplat"
 MESH = "mesh.ply"
 """What `sigmasplat mesh` adds."""
+STATE = "state.safetensors"
+"""What an unfinished run goes on from."""
 FILES = (
     "config.json", "trajectory.txt", "map.ply", "checkpoint.safetensors", "log.jsonl", "loops.json", "metrics.json",
-    "profile.json", "report.html", "state.safetensors",
+    "profile.json", "report.html",
 )  # fmt: skip
 """What a run may hold besides run.json, which says that the folder is ours and is never absent."""
 HALF_BORN = ".run.json.part"
@@ -108,7 +110,7 @@ class RunFolder:
 
     def _clear(self) -> None:
         """Remove an earlier run's files, and no others: what the user put beside them stays."""
-        for name in (*FILES, MESH):
+        for name in (*FILES, MESH, STATE):
             (self.path / name).unlink(missing_ok=True)
         for picture in self.images.glob("*.png"):
             picture.unlink()
@@ -127,16 +129,7 @@ class RunFolder:
     @property
     def state(self) -> Path:
         """Return where an unfinished run's state is, to go on from."""
-        return self.path / "state.safetensors"
-
-    def take_back(self, frames: int, submaps: int) -> None:
-        """Drop what was written after the first so many frames and submaps. Raises RunError if there are fewer."""
-        lines = read_text(self.path / "log.jsonl").splitlines(keepends=True)
-        if len(lines) < frames or len(self.submaps) < submaps:
-            found = f"{len(lines)} frames in log.jsonl, {len(self.submaps)} submaps"
-            raise RunError(f"{self.path}: {found}, the state speaks of {frames} and {submaps}; run it again")
-        write_text(self.path / "log.jsonl", "".join(lines[:frames]))
-        self.submaps.keep(submaps)
+        return self.path / STATE
 
     def config(self) -> Config:
         """Read the settings of the run. Raises ConfigError if they cannot be read."""

@@ -79,7 +79,7 @@ class _Encoder:
             return {kind: array.tolist(), "type": str(array.dtype), "shape": list(array.shape)}
         if id(value) not in self.seen:
             name = str(len(self.tensors))
-            self.tensors[name] = torch.from_numpy(np.ascontiguousarray(array))
+            self.tensors[name] = torch.tensor(array)
             self.seen[id(value)] = name, value  # kept, so that its id is not given to another
         return {kind: self.seen[id(value)][0]}
 

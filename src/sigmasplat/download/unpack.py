@@ -1,0 +1,189 @@
+"""Unpack an archive that nobody vouches for: files and folders below one folder, and no more of them than expected.
+
+Links, devices, absolute names, names that lead out, and archives that grow without end are refused.
+"""
+
+import gzip
+import io
+import stat
+import tarfile
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from sigmasplat.errors import DownloadError
+
+CHUNK_BYTES = 2**20
+MOST_RATIO, SMALL_BYTES = 200, 2**20
+"""No file of more than a MiB in a zip shrinks that much: images are compressed already, text to a fifth."""
+LITTER = {"__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini"}
+Progress = Callable[[int, int], None]
+
+
+class BadArchive(DownloadError):
+    """Refuse an archive that is damaged or unsafe."""
+
+
+@dataclass
+class Budget:
+    """What may still be written: bytes and files."""
+
+    bytes: int
+    files: int
+
+    def spend_bytes(self, count: int) -> None:
+        """Take note of bytes to be written. Raises BadArchive if they are too many."""
+        self.bytes -= count
+        if self.bytes < 0:
+            raise BadArchive("holds more bytes than such a recording can have")
+
+    def spend_file(self) -> None:
+        """Take note of a file or folder to be made. Raises BadArchive if they are too many."""
+        self.files -= 1
+        if self.files < 0:
+            raise BadArchive("holds more files than such a recording can have")
+
+
+def is_archive(name: str) -> bool:
+    """Tell archives from other files by their name."""
+    return name.lower().endswith((".zip", ".tgz", ".tar.gz"))
+
+
+def unpack(archive: Path, folder: Path, budget: Budget, progress: Progress) -> None:
+    """Unpack a .tar.gz or .zip below `folder`, which is made; progress(done, total) counts the archive's bytes.
+
+    Raises BadArchive if it is damaged, unsafe or beyond the budget, DownloadError if the disk is full; what was written
+    until then stays, so give a folder to throw away.
+    """
+    with _explained(archive):
+        folder.mkdir(parents=True, exist_ok=True)
+        if archive.name.lower().endswith(".zip"):
+            _unpack_zip(archive, folder, budget, progress)
+        else:
+            _unpack_tar(archive, folder, budget, progress)
+
+
+@contextmanager
+def _explained(archive: Path) -> Iterator[None]:
+    try:
+        yield
+    except BadArchive as problem:
+        raise BadArchive(f"{archive.name} {problem}; refused, nothing of it is kept") from problem
+    except (tarfile.TarError, zipfile.BadZipFile, gzip.BadGzipFile, zlib.error, EOFError) as problem:
+        raise BadArchive(f"{archive.name} is damaged ({problem}); nothing of it is kept") from problem
+    except (NotImplementedError, RuntimeError) as problem:  # a way to compress that Python lacks; encrypted
+        raise BadArchive(f"{archive.name} cannot be read ({problem}); nothing of it is kept") from problem
+    except OSError as problem:
+        raise DownloadError(f"cannot unpack {archive}: {problem.strerror or problem}; is the disk full?") from problem
+
+
+def _unpack_tar(archive: Path, folder: Path, budget: Budget, progress: Progress) -> None:
+    size_bytes = archive.stat().st_size
+    with archive.open("rb") as packed, gzip.GzipFile(fileobj=packed) as inflated:
+        stream = _Metered(inflated, budget)
+        with tarfile.open(fileobj=stream, mode="r|") as tar:
+            for member in tar:
+                budget.spend_file()
+                place = _place(folder, member.name)
+                if member.isdir():
+                    _make_folder(place)
+                elif member.isreg() and not member.issparse():
+                    source = tar.extractfile(member)
+                    assert source is not None
+                    _write(source, place, member.size)
+                else:
+                    raise BadArchive(f"holds {member.name!r}, which is no plain file or folder")
+                progress(min(packed.tell(), size_bytes - 1), size_bytes)
+        while stream.read(CHUNK_BYTES):  # to the end, where the checksum of the whole stream is
+            pass
+    progress(size_bytes, size_bytes)
+
+
+class _Metered(io.RawIOBase):
+    """Read a stream on account of a budget."""
+
+    def __init__(self, stream: gzip.GzipFile, budget: Budget) -> None:
+        self._stream, self._budget = stream, budget
+
+    def read(self, size: int = -1) -> bytes:
+        """Read at most `size` bytes."""
+        chunk = self._stream.read(size)
+        self._budget.spend_bytes(len(chunk))
+        return chunk
+
+
+def _unpack_zip(archive: Path, folder: Path, budget: Budget, progress: Progress) -> None:
+    with zipfile.ZipFile(archive) as zipped:
+        entries = zipped.infolist()
+        for entry in entries:  # what it says of itself, before a byte is written
+            budget.spend_file()
+            budget.spend_bytes(entry.file_size)
+            _refuse_strange(entry)
+            _place(folder, entry.filename)
+        done, total = 0, sum(entry.compress_size for entry in entries)
+        for entry in entries:
+            place = _place(folder, entry.filename)
+            if entry.is_dir():
+                _make_folder(place)
+            else:
+                with zipped.open(entry) as source:
+                    _write(source, place, entry.file_size)
+            progress(done, total)
+            done += entry.compress_size
+        progress(total, total)
+
+
+def _refuse_strange(entry: zipfile.ZipInfo) -> None:
+    kind = stat.S_IFMT(entry.external_attr >> 16)
+    if kind not in {0, stat.S_IFREG, stat.S_IFDIR}:
+        raise BadArchive(f"holds {entry.filename!r}, which is no plain file or folder")
+    if entry.file_size > SMALL_BYTES and entry.file_size > MOST_RATIO * entry.compress_size:
+        raise BadArchive(f"holds {entry.filename!r}, which grows {entry.file_size // max(entry.compress_size, 1)}-fold")
+
+
+def _place(folder: Path, name: str) -> Path | None:
+    """Return where an entry goes, None where it is litter of a desktop. Raises BadArchive if that is out of `folder`.
+
+    Windows' separators are understood.
+    """
+    parts = name.replace("\\", "/").split("/")
+    if name.startswith(("/", "\\")) or ".." in parts or "\0" in name or parts[0].endswith(":"):
+        raise BadArchive(f"holds {name!r}, a name that leads out of its folder")
+    kept = [part for part in parts if part not in {"", "."}]
+    if not kept:
+        return folder
+    litter = LITTER & set(kept) or kept[-1].startswith("._")
+    return None if litter else folder.joinpath(*kept)
+
+
+def _make_folder(place: Path | None) -> None:
+    if place is not None:
+        with _no_clash(place):
+            place.mkdir(parents=True, exist_ok=True)
+
+
+def _write(source: IO[bytes], place: Path | None, size_bytes: int) -> None:
+    """Copy as many bytes as are announced. Raises BadArchive if there are others, or something is there already."""
+    if place is None:
+        return
+    with _no_clash(place):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with place.open("xb") as file:
+            left = size_bytes
+            while chunk := source.read(CHUNK_BYTES):
+                left -= len(chunk)
+                file.write(chunk)
+    if left:
+        raise BadArchive(f"is damaged: {place.name} is not as long as it says")
+
+
+@contextmanager
+def _no_clash(place: Path) -> Iterator[None]:
+    try:
+        yield
+    except (FileExistsError, NotADirectoryError, IsADirectoryError) as problem:
+        raise BadArchive(f"holds {place.name!r} twice") from problem

@@ -1,0 +1,52 @@
+"""Compare a downloaded file with its checksum: the published one, or the one it had when it first came."""
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+from sigmasplat.errors import DownloadError
+from sigmasplat.io.atomic import write_text
+
+CHUNK_BYTES = 2**20
+Progress = Callable[[int, int], None]
+
+
+def verify(path: Path, published: str, progress: Progress) -> str:
+    """Return "algorithm:digest" of a file that is as it should be.
+
+    `published` is such a text, or "": then the digest is compared with that in `path`.sha256, which is written if there
+    is none yet. Raises DownloadError, the file removed, if they differ.
+    """
+    algorithm = published.partition(":")[0] or "sha256"
+    found = f"{algorithm}:{_digest(path, algorithm, progress)}"
+    record = path.with_name(f"{path.name}.sha256")
+    wanted = published or _recorded(record)
+    if wanted and found != wanted:
+        path.unlink()
+        raise DownloadError(f"{path} was damaged and is removed; {_what_now(record, published, found, wanted)}")
+    if not wanted:
+        write_text(record, f"{found.partition(':')[2]}  {path.name}\n")
+    return found
+
+
+def _digest(path: Path, algorithm: str, progress: Progress) -> str:
+    digest = hashlib.new(algorithm, usedforsecurity=False)  # MD5 is all that some publish: against damage, not malice
+    done, total = 0, path.stat().st_size
+    with path.open("rb") as file:
+        while chunk := file.read(CHUNK_BYTES):
+            digest.update(chunk)
+            done += len(chunk)
+            progress(done, total)
+    return digest.hexdigest()
+
+
+def _recorded(record: Path) -> str:
+    """Read a line as sha256sum writes it; "" if there is none."""
+    words = record.read_text(encoding="utf-8").split() if record.is_file() else []
+    return f"sha256:{words[0]}" if words else ""
+
+
+def _what_now(record: Path, published: str, found: str, wanted: str) -> str:
+    if published:
+        return f"its checksum is {found}, not {wanted}; run it again"
+    return f"it was another one last time (then {wanted}, now {found}); run it again, or delete {record} to accept it"

@@ -1,0 +1,156 @@
+"""sigmasplat download: what can go wrong is one line, exit code 2; at the end stands the command to run next."""
+
+import hashlib
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import file_server as acts
+from archives import folder_content, tar_gz
+from file_server import Act, FileServer, serving
+from sigmasplat import cli
+from sigmasplat.download.entries import Archive, PublicSet, Recording
+from sigmasplat.download.fetch import Patience
+
+DESK = "rgbd_dataset_freiburg1_desk"
+
+
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch, tiny_tum: Path) -> Iterator[FileServer]:
+    """Serve a tiny recording as the catalogue's set `tiny`, recording `desk`."""
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    monkeypatch.chdir(tiny_tum.parent)
+    with serving() as server:
+        server.files["/desk.tgz"] = tar_gz(folder_content(tiny_tum, f"{DESK}/"))
+        server.files["/bare.tgz"] = tar_gz({"bare/readme": b"nothing else"})
+        recordings = {
+            name: Recording(name, (Archive(server.url(f"/{name}.tgz")),)) for name in ("desk", "bare", "gone")
+        }
+        tiny = PublicSet("Tiny", "http://page", "free", "tiny", recordings, 2**20, 99)
+        monkeypatch.setattr("sigmasplat.download.lookup.SETS", {"tiny": tiny})
+        wait(monkeypatch, Patience(attempts=2, first_wait_s=0.001))
+        yield server
+
+
+def wait(monkeypatch: pytest.MonkeyPatch, patience: Patience) -> None:
+    monkeypatch.setattr("sigmasplat.download.obtaining.Patience", lambda: patience)
+
+
+def said(capsys: pytest.CaptureFixture[str], code: int, *arguments: str) -> tuple[str, str]:
+    """Run sigmasplat download; return what it said on standard output and standard error."""
+    with pytest.raises(SystemExit) as left:
+        cli.main(["download", *arguments])
+    spoken = capsys.readouterr()
+    assert left.value.code == code, spoken
+    return spoken.out, spoken.err
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Run a command that must be refused; return its one line."""
+    line = said(capsys, 2, *arguments)[1]
+    assert line.startswith("sigmasplat: ") and line.count("\n") == 1
+    return line
+
+
+def test_a_recording_can_be_run_afterwards(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
+    out, err = said(capsys, 0, "tiny", "desk")
+    lines = out.splitlines()
+    assert lines[0] == "Tiny desk: size not published → data/tiny/desk"
+    assert lines[1].startswith("terms: free (http://page)")
+    assert any(line.startswith("download desk.tgz ") and line.endswith("kB") for line in lines), lines
+    assert lines[-1] == "next: sigmasplat run data/tiny/desk" and err == ""
+    again, _ = said(capsys, 0, "tiny", "desk")
+    assert again.splitlines() == ["data/tiny/desk is there already; --overwrite downloads it again", lines[-1]]
+    assert len(server.ranges) == 1
+
+
+def test_options(server: FileServer, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    out, _ = said(capsys, 0, "tiny", "desk", "--out", str(tmp_path / "here"), "--keep-archive")
+    assert (tmp_path / "here/tiny/desk.tgz").is_file() and f"run {tmp_path / 'here/tiny/desk'}" in out
+    said(capsys, 0, "tiny", "desk", "--out", str(tmp_path / "here"), "--overwrite")
+    assert not (tmp_path / "here/tiny/desk.tgz").exists()
+
+
+@pytest.mark.parametrize("arguments", [[], ["list"], ["--list"]])
+def test_the_list_needs_no_network(
+    arguments: list[str], server: FileServer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert said(capsys, 0, *arguments) == ("tiny       Tiny · 3 recordings · free\n", "")
+    assert [line.split()[0] for line in said(capsys, 0, "list", "tiny")[0].splitlines()] == ["desk", "bare", "gone"]
+    assert said(capsys, 0, "tiny", "--list") == said(capsys, 0, "list", "tiny")
+    assert server.ranges == []
+
+
+def test_offline(server: FileServer, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown(*arguments: object, **options: object) -> None:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    line = refused(capsys, "tiny", "desk")
+    assert "cannot find 127.0.0.1 (Name or service not known); is this machine online?" in line
+    assert folder_content(Path("data")) == {}
+
+
+@pytest.mark.parametrize(
+    ("first", "says"),
+    [
+        ([acts.status(404)], "/desk.tgz cannot be had (HTTP 404 Not Found); it may have moved or want a login"),
+        ([acts.status(403)], "(HTTP 403 Forbidden)"),
+        ([acts.status(503)] * 2, "is busy or out of order (HTTP 503 Service Unavailable); try later"),
+        ([acts.drop_after(700), acts.drop_after(0)], "broke off after 700 of "),
+        ([acts.web_page], "answers with a web page, not the file; is there a login page in between?"),
+        ([acts.says_length(-50)], "desk.tgz is damaged ("),
+    ],
+    ids=["404", "403", "503", "drops", "login page", "cut short"],
+)
+def test_servers_that_fail(first: list[Act], says: str, server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
+    server.acts = list(first)
+    assert says in refused(capsys, "tiny", "desk")
+    assert not Path("data/tiny/desk").exists() and not Path("data/tiny/desk.tgz").exists()
+
+
+def test_a_server_that_sends_hardly_anything(
+    server: FileServer, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wait(monkeypatch, Patience(timeout_s=0.5, attempts=1))
+    server.acts = [acts.trickle(2.0)]
+    assert "hardly anything comes from 127.0.0.1" in refused(capsys, "tiny", "desk")
+
+
+def test_damaged_on_the_disk(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
+    said(capsys, 0, "tiny", "desk", "--keep-archive")
+    Path("data/tiny/desk.tgz").write_bytes(b"rotten")
+    line = refused(capsys, "tiny", "desk", "--overwrite")
+    assert "data/tiny/desk.tgz was damaged and is removed" in line and hashlib.sha256(b"rotten").hexdigest() in line
+    assert Path("data/tiny/desk/rgb.txt").is_file() and not Path("data/tiny/desk.tgz").exists()
+
+
+def test_what_cannot_be_run_is_said(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "downloaded, but not to be run as it is: unknown format: data/tiny/bare" in refused(capsys, "tiny", "bare")
+
+
+def test_somebody_elses_folder(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("data/tiny/desk").mkdir(parents=True)
+    assert "data/tiny/desk exists and was not made by this command" in refused(capsys, "tiny", "desk", "--overwrite")
+
+
+def test_an_out_that_is_a_file(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("data").write_text("")
+    assert "cannot make data/tiny: " in refused(capsys, "tiny", "desk")
+
+
+def test_all_names_are_looked_up_first(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "no recording 'dsk' in tiny; did you mean desk?" in refused(capsys, "tiny", "desk", "dsk")
+    assert server.ranges == []
+
+
+def test_ctrl_c(server: FileServer, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*arguments: object, **options: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sigmasplat.download.obtaining.fetch", interrupted)
+    out, err = said(capsys, 130, "tiny", "desk")
+    assert out.splitlines()[-1] == "what has come is kept; the same command goes on with it"
+    assert err == "sigmasplat: interrupted\n"

@@ -1,0 +1,216 @@
+"""Whatever the server does, the file is whole in the end or not there; what came is not asked for again."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import file_server as acts
+from file_server import Act, FileServer, serving
+from sigmasplat.download.fetch import Patience, fetch
+from sigmasplat.download.partial import partial
+from sigmasplat.errors import DownloadError
+
+BODY = bytes(range(256)) * 40
+HASTY = Patience(attempts=3, progress_bytes=1000, first_wait_s=0.001)
+IMPATIENT = replace(HASTY, timeout_s=0.5, least_bytes_per_s=1000.0, attempts=9)
+
+
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[FileServer]:
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    with serving() as server:
+        server.files["/a.tgz"] = BODY
+        yield server
+
+
+def fetched(server: FileServer, target: Path, patience: Patience = HASTY) -> list[tuple[int, int]]:
+    """Fetch /a.tgz; return what the progress was told."""
+    told: list[tuple[int, int]] = []
+    fetch(server.url("/a.tgz"), target, lambda *counts: told.append(counts), lambda *sizes: None, patience)
+    return told
+
+
+def left_in(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_a_file_comes_whole_and_alone(server: FileServer, tmp_path: Path) -> None:
+    told = fetched(server, tmp_path / "a.tgz")
+    assert (tmp_path / "a.tgz").read_bytes() == BODY
+    assert left_in(tmp_path) == {"a.tgz"}
+    assert told[-1] == (len(BODY), len(BODY)) and told == sorted(told)
+
+
+@pytest.mark.parametrize(
+    "first",
+    [
+        [acts.drop_after(3000)],
+        [acts.drop_after(3000), acts.drop_after(2000), acts.drop_after(1), acts.drop_after(0)],
+        [acts.drop_after(3000), acts.without_ranges],
+        [acts.drop_after(3000), acts.wrong_range],
+        [acts.drop_after(3000), acts.status(416)],
+        [acts.status(503), acts.status(500, Retry_After=0)],
+        [acts.says_length(+50)],
+        [acts.chunked(broken=True)],
+        [acts.chunked(broken=True), acts.chunked(broken=False)],
+        [acts.drop_after(5000), acts.status(302, Location="/moved.tgz")],
+    ],
+    ids=lambda first: str(len(first)),
+)
+def test_it_is_whole_in_spite_of(first: list[Act], server: FileServer, tmp_path: Path) -> None:
+    server.acts = list(first)
+    server.files["/moved.tgz"] = BODY
+    fetched(server, tmp_path / "a.tgz")
+    assert (tmp_path / "a.tgz").read_bytes() == BODY
+    assert left_in(tmp_path) == {"a.tgz"}
+
+
+@pytest.mark.parametrize("slow", [acts.trickle(5.0), acts.silence(0.8)], ids=["trickle", "silence"])
+def test_it_is_whole_though_one_try_was_slow(slow: Act, server: FileServer, tmp_path: Path) -> None:
+    server.acts = [acts.drop_after(3000), slow]
+    fetched(server, tmp_path / "a.tgz", IMPATIENT)
+    assert (tmp_path / "a.tgz").read_bytes() == BODY
+    assert len(server.ranges) >= 3 and server.ranges[1] == "bytes=3000-"
+
+
+def test_it_goes_on_where_it_broke(server: FileServer, tmp_path: Path) -> None:
+    server.acts = [acts.drop_after(3000), acts.drop_after(2500)]
+    fetched(server, tmp_path / "a.tgz")
+    assert server.ranges == ["", "bytes=3000-", "bytes=5500-"]
+
+
+def test_a_later_call_goes_on_too(server: FileServer, tmp_path: Path) -> None:
+    server.acts = [acts.drop_after(3000), acts.status(503), acts.status(503), acts.status(503)]
+    with pytest.raises(DownloadError, match=r"3,000 bytes are kept"):
+        fetched(server, tmp_path / "a.tgz")
+    assert not (tmp_path / "a.tgz").exists()
+    told = fetched(server, tmp_path / "a.tgz")
+    assert (tmp_path / "a.tgz").read_bytes() == BODY
+    assert server.ranges[-1] == "bytes=3000-" and told[0][0] > 3000
+
+
+def test_ctrl_c_keeps_what_came(server: FileServer, tmp_path: Path) -> None:
+    def interrupt(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    server.acts = [acts.drop_after(4000)]
+    with pytest.raises(KeyboardInterrupt):
+        fetch(server.url("/a.tgz"), tmp_path / "a.tgz", interrupt, lambda *sizes: None, HASTY)
+    assert left_in(tmp_path) == {"a.tgz.part", "a.tgz.part.json"}
+    fetched(server, tmp_path / "a.tgz")
+    assert (tmp_path / "a.tgz").read_bytes() == BODY
+    assert server.ranges[-1].startswith("bytes=")
+
+
+def test_two_versions_are_never_joined(server: FileServer, tmp_path: Path) -> None:
+    server.acts = [acts.drop_after(3000), acts.status(404)]
+    with pytest.raises(DownloadError):
+        fetched(server, tmp_path / "a.tgz")
+    server.files["/a.tgz"] = BODY[::-1]
+    server.acts = [acts.other_version]
+    fetched(server, tmp_path / "a.tgz")
+    assert server.ranges[-1] == "bytes=3000-"
+    assert (tmp_path / "a.tgz").read_bytes() == BODY[::-1]
+
+
+@pytest.mark.parametrize("note", [None, "{", "[]", '{"url": "http://elsewhere/", "version": "", "size_bytes": null}'])
+def test_a_part_of_unknown_origin_is_not_used(note: str | None, server: FileServer, tmp_path: Path) -> None:
+    (tmp_path / "a.tgz.part").write_bytes(b"something else")
+    if note is not None:
+        (tmp_path / "a.tgz.part.json").write_text(note)
+    fetched(server, tmp_path / "a.tgz")
+    assert server.ranges == [""]
+    assert (tmp_path / "a.tgz").read_bytes() == BODY
+
+
+def test_a_part_that_is_whole_is_not_asked_for_again(server: FileServer, tmp_path: Path) -> None:
+    url = server.url("/a.tgz")
+    (tmp_path / "a.tgz.part").write_bytes(BODY)
+    (tmp_path / "a.tgz.part.json").write_text(f'{{"url": "{url}", "version": "", "size_bytes": {len(BODY)}}}')
+    fetched(server, tmp_path / "a.tgz")
+    assert server.ranges == [] and (tmp_path / "a.tgz").read_bytes() == BODY
+
+
+@pytest.mark.parametrize(
+    ("act", "says"),
+    [
+        (acts.drop_after(500), r"broke off after 500 of 10,240 bytes; 500 bytes are kept"),
+        (acts.status(503), r"busy or out of order \(HTTP 503 Service Unavailable\)"),
+        (acts.chunked(broken=True), r"the connection to 127.0.0.1 broke \(IncompleteRead"),
+    ],
+    ids=["drops", "503", "chunks"],
+)
+def test_patience_ends(act: Act, says: str, server: FileServer, tmp_path: Path) -> None:
+    server.acts = [act, act, act] if "broke off" not in says else [act, acts.drop_after(0), acts.drop_after(0)]
+    with pytest.raises(DownloadError, match=says):
+        fetched(server, tmp_path / "a.tgz", replace(HASTY, progress_bytes=2**20))
+    assert server.acts == [] and not (tmp_path / "a.tgz").exists()
+
+
+@pytest.mark.parametrize(
+    ("act", "says"),
+    [
+        (acts.trickle(5.0), r"hardly anything comes from 127.0.0.1; \d+ bytes are kept"),
+        (acts.silence(0.8), r"127.0.0.1 does not answer properly \(TimeoutError"),
+    ],
+    ids=["trickle", "silence"],
+)
+def test_slowness_is_noticed(act: Act, says: str, server: FileServer, tmp_path: Path) -> None:
+    server.acts = [act]
+    with pytest.raises(DownloadError, match=says):
+        fetched(server, tmp_path / "a.tgz", replace(IMPATIENT, attempts=1))
+
+
+@pytest.mark.parametrize(
+    ("act", "says"),
+    [
+        (acts.status(404), r"/a.tgz cannot be had \(HTTP 404 Not Found\)"),
+        (acts.status(403), r"HTTP 403 Forbidden"),
+        (acts.web_page, r"answers with a web page"),
+        (acts.endless, r"does not say how long the file is"),
+        (acts.sends_on("ftp://127.0.0.1/a.tgz"), r"sends on to ftp://127.0.0.1/a.tgz, which is not https"),
+    ],
+    ids=["404", "403", "html", "no length", "ftp"],
+)
+def test_some_answers_are_final(act: Act, says: str, server: FileServer, tmp_path: Path) -> None:
+    server.acts = [act]
+    with pytest.raises(DownloadError, match=says):
+        fetched(server, tmp_path / "a.tgz")
+    assert len(server.ranges) == 1
+    assert left_in(tmp_path) == set()
+
+
+def test_a_size_may_be_refused_before_a_byte_is_written(server: FileServer, tmp_path: Path) -> None:
+    def accept(size_bytes: int | None, here_bytes: int) -> None:
+        assert (size_bytes, here_bytes) == (len(BODY), 0)
+        raise DownloadError("too large")
+
+    with pytest.raises(DownloadError, match="too large"):
+        fetch(server.url("/a.tgz"), tmp_path / "a.tgz", lambda *counts: None, accept, HASTY)
+    assert not (tmp_path / "a.tgz.part").exists()
+
+
+def test_two_processes_do_not_write_one_file(server: FileServer, tmp_path: Path) -> None:
+    with partial(tmp_path / "a.tgz") as part:
+        part.add(b"mine")
+        with pytest.raises(DownloadError, match="another process"):
+            fetched(server, tmp_path / "a.tgz")
+    assert (tmp_path / "a.tgz.part").read_bytes() == b"mine"
+
+
+def test_a_full_disk_is_said(server: FileServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(file: object, chunk: memoryview) -> int:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("sigmasplat.download.partial._write_some", full)
+    with pytest.raises(DownloadError, match="No space left on device"):
+        fetched(server, tmp_path / "a.tgz")
+    assert not (tmp_path / "a.tgz").exists()
+
+
+def test_nobody_listens(tmp_path: Path, server: FileServer) -> None:
+    with pytest.raises(DownloadError, match=r"cannot connect to 127.0.0.1 .*refused"):
+        fetch("http://127.0.0.1:1/a.tgz", tmp_path / "a.tgz", lambda *c: None, lambda *s: None, Patience())
+    assert left_in(tmp_path) == set()
