@@ -53,7 +53,8 @@ def kernels() -> Finding:
     try:
         core: Any = import_module("sigmasplat.render.cpu") and import_module("sigmasplat.native._core")
     except ImportError as problem:
-        return Finding("kernels", f"not built ({problem}); install with pip install .", False)
+        remedy = "sudo apt install libgomp1" if "libgomp" in str(problem) else "install with pip install ."
+        return Finding("kernels", f"not built, or not loadable ({problem}); {remedy}", False)
     offered = ", ".join(core.supported_isas())
     return Finding("kernels", f"{core.isa_name()} (this processor runs {offered}), {core.threads()} threads", True)
 
