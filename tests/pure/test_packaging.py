@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import sigmasplat
+from sigmasplat import doctor
 from sigmasplat.cli import COMMANDS
 from sigmasplat.presets import list_presets
 
@@ -209,6 +210,26 @@ def test_the_kernels_compute_without_torch() -> None:
     pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
     answer = python("-c", SSIM_WITHOUT_TORCH)
     assert (answer.returncode, answer.stdout) == (0, "agree\n"), answer.stderr
+
+
+@pytest.mark.parametrize(
+    ("problem", "remedy"),
+    [
+        (ModuleNotFoundError("No module named 'torch'", name="torch"), "pip install torch"),
+        (ImportError("libgomp.so.1: cannot open shared object file"), "apt install libgomp1"),
+        (ImportError("cannot import name '_core' from 'sigmasplat.native'"), "pip install ."),
+    ],
+    ids=["torch", "libgomp", "not built"],
+)
+def test_doctor_says_why_the_kernels_do_not_load(
+    problem: ImportError, remedy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(name: str) -> None:
+        raise problem
+
+    monkeypatch.setattr(doctor, "import_module", refuse)
+    finding = doctor.kernels()
+    assert finding.ok is False and str(problem) in finding.value and finding.value.endswith(remedy)
 
 
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="needs Linux's /proc")
