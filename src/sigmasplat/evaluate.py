@@ -1,6 +1,5 @@
 """Score a finished run: the only place that reads ground truth. Writes metrics.json, images/ and report.html."""
 
-import json
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -14,11 +13,11 @@ from sigmasplat.errors import RunError
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.metrics import charts, plot, views
 from sigmasplat.metrics.panels import View, side_by_side
-from sigmasplat.metrics.report import Contents, build_report
 from sigmasplat.metrics.trajectory import align_rigid, associate, path_scores_of
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.page import write_page
 from sigmasplat.render import render
 from sigmasplat.sources.base import Source
 
@@ -69,9 +68,7 @@ def evaluate(
     run.write_metrics(metrics)
     plots = _draw_plots(run, log, None if problem else truth, loops)
     warnings = [str(problem)] if problem else []
-    title, settings = f"SigmaSplat · {source.name}", json.dumps(config.to_dict(), indent=2)
-    contents = Contents(title, _subtitle(run), metrics, gallery.strips, plots, settings, warnings, loops)
-    run.write_report(build_report(contents))
+    write_page(run, metrics, gallery.strips, plots, warnings)
     if problem:
         raise problem
     return metrics
@@ -233,11 +230,3 @@ def _aligned_truth(log: Log, estimate: NDArray[np.float64], truth: Trajectory | 
     out = np.full_like(estimate, np.nan)
     out[rows] = theirs @ T_estimate_truth[:3, :3].T + T_estimate_truth[:3, 3]
     return out
-
-
-def _subtitle(run: RunFolder) -> str:
-    """Say what made the run: settings, version, machine, status."""
-    facts = run.facts()
-    made_on = facts.get("machine") or {}
-    machine = f"{made_on.get('cpu')}, {made_on.get('cores')} cores"
-    return " · ".join([run.config().name, f"version {facts.get('version')}", machine, str(facts.get("status"))])

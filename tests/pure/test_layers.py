@@ -28,6 +28,7 @@ FLOORS = [
         "surface",
         "ablation",
         "inspection",
+        "page",
         "snapshots",
         "download",
         "commands",

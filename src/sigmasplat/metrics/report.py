@@ -1,10 +1,12 @@
-"""Write report.html: figures, strips of views, path, times, settings. One file, no scripts, pictures beside it."""
+"""Write report.html: the run in words, figures, views, path, times, advice, settings. One file, no scripts."""
 
 import html
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 from sigmasplat.metrics import tables
+from sigmasplat.metrics.story import Advice
 from sigmasplat.metrics.tables import headline
 
 STYLE = """
@@ -36,6 +38,9 @@ tr:last-child td { border-bottom: 0; }
 figure { margin: 0 0 14px; }
 figure img { display: block; width: 100%; height: auto; border-radius: 10px; border: 1px solid var(--line); }
 figcaption { font-size: 14px; margin-top: 6px; }
+ul { max-width: 74ch; padding-left: 20px; } li { margin-bottom: 10px; }
+li pre { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 8px 12px;
+  margin-top: 4px; }
 details { margin-top: 12px; } summary { cursor: pointer; }
 pre { overflow-x: auto; font: 13px/1.5 ui-monospace, "SF Mono", Menlo, Consolas, monospace; margin: 0; }
 """
@@ -43,9 +48,11 @@ pre { overflow-x: auto; font: 13px/1.5 ui-monospace, "SF Mono", Menlo, Consolas,
 
 @dataclass(frozen=True)
 class Contents:
-    """What a report shows. Pictures are file names relative to report.html; `plots` come as <name>-light/-dark.png.
+    """What a report shows. Pictures are file names, of which `picture` makes what a page can show; `plots` come as
+    <name>-light/-dark.png, with their captions.
 
-    loops: the records of loops.json.
+    story: sentences; advice: what to try next, with a command or without; unsure: a picture of where, and sentences;
+    seconds: where the time went, by stage; loops: the records of loops.json.
     """
 
     title: str
@@ -56,6 +63,11 @@ class Contents:
     config: str = ""
     warnings: list[str] = field(default_factory=list)
     loops: list[dict[str, Any]] = field(default_factory=list)
+    story: list[str] = field(default_factory=list)
+    advice: list[Advice] = field(default_factory=list)
+    unsure: list[str] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+    picture: Callable[[str], str] = str
 
 
 def build_report(contents: Contents) -> str:
@@ -63,12 +75,15 @@ def build_report(contents: Contents) -> str:
     parts = [
         f"<h1>{html.escape(contents.title)}</h1><p class=soft>{html.escape(contents.subtitle)}</p>",
         "".join(f"<p class=alarm>{html.escape(warning)}</p>" for warning in contents.warnings),
+        _story(contents.story),
         _tiles(contents.metrics),
-        _strips(contents.strips),
+        _unsure(contents),
+        _strips(contents),
         _plot(contents, "trajectory", "Trajectory"),
         _submaps(contents),
         _tables(contents.metrics),
-        _plot(contents, "seconds", "Time"),
+        _time(contents),
+        _advice(contents.advice),
         _settings(contents),
     ]
     head = "<meta charset=utf-8><meta name=viewport content='width=device-width'>"
@@ -88,8 +103,44 @@ def _tiles(metrics: dict[str, Any]) -> str:
     return f"<div class=tiles>{''.join(tiles)}</div>"
 
 
-def _strips(strips: dict[str, list[str]]) -> str:
+def _story(sentences: list[str]) -> str:
+    """Say the whole run in words."""
+    return f"<h2>In short</h2><p>{html.escape(' '.join(sentences))}</p>" if sentences else ""
+
+
+def _unsure(contents: Contents) -> str:
+    """Show where the map is unsure: what a second visit should look at."""
+    if not contents.unsure:
+        return ""
+    words = "".join(f"<p>{html.escape(sentence)}</p>" for sentence in contents.unsure)
+    return f"<h2>Where it was unsure</h2>{words}{_figure(contents, 'plan', 'Floor plan of uncertainty')}"
+
+
+def _time(contents: Contents) -> str:
+    """Show where the time went: by frame, and by stage in all."""
+    if "seconds" not in contents.plots and not contents.seconds:
+        return ""
+    whole = sum(contents.seconds.values()) or 1.0
+    largest = sorted(contents.seconds.items(), key=lambda item: -item[1])
+    rows = [[stage, tables.number(spent, 1), tables.number(spent / whole, 0, 100.0)] for stage, spent in largest]
+    table = _table([["stage", "seconds", "%"], *rows]) if rows else ""
+    return f"<h2>Time</h2>{_figure(contents, 'seconds', 'Time')}<div class=card>{table}</div>"
+
+
+def _advice(advice: list[Advice]) -> str:
+    """Say what to try next, with the commands."""
+    if not advice:
+        return ""
+    items = [
+        f"<li>{html.escape(words)}{f'<pre>{html.escape(command)}</pre>' if command else ''}</li>"
+        for words, command in advice
+    ]
+    return f"<h2>What to try next</h2><ul>{''.join(items)}</ul>"
+
+
+def _strips(contents: Contents) -> str:
     """Show the strips of each kind of view under a heading."""
+    strips = contents.strips
     if not any(strips.values()):
         return ""
     explanation = (
@@ -101,7 +152,9 @@ def _strips(strips: dict[str, list[str]]) -> str:
     for kind, names in strips.items():
         if names:
             parts.append(f"<h3>{html.escape(kind)}</h3>")
-            parts += [f"<figure><img loading=lazy src='{html.escape(name)}' alt='view'></figure>" for name in names]
+            parts += [
+                f"<figure><img src='{html.escape(contents.picture(name))}' alt='view'></figure>" for name in names
+            ]
     return "".join(parts)
 
 
@@ -114,10 +167,10 @@ def _figure(contents: Contents, name: str, title: str) -> str:
     """Show a plot in the version that fits the reader's page."""
     if name not in contents.plots:
         return ""
-    stem = f"images/{name}"
+    light, dark = (html.escape(contents.picture(f"images/{name}-{theme}.png")) for theme in ("light", "dark"))
     return (
-        f"<figure><picture><source media='(prefers-color-scheme: dark)' srcset='{stem}-dark.png'>"
-        f"<img loading=lazy src='{stem}-light.png' alt='{title}'></picture>"
+        f"<figure><picture><source media='(prefers-color-scheme: dark)' srcset='{dark}'>"
+        f"<img src='{light}' alt='{title}'></picture>"
         f"<figcaption>{html.escape(contents.plots[name])}</figcaption></figure>"
     )
 

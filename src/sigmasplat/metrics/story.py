@@ -1,0 +1,152 @@
+"""Say what scores mean, to somebody who was not there: what was made, how good it is, what to try next."""
+
+from typing import Any
+
+from sigmasplat.metrics.tables import number
+
+Metrics = dict[str, Any]
+Advice = tuple[str, str]
+"""What was noticed and what it means, and a command to try; the command may be empty."""
+
+PICTURES = ((30.0, "hard to tell from the camera's"), (25.0, "good"), (20.0, "recognisable, fine detail blurred"))
+RANKS = ((0.5, "well"), (0.3, "fairly well"), (0.1, "roughly"))
+FEW_DB = 3.0
+"""Views the map was fitted to that look this much better than others say that there were too few of them."""
+
+
+def in_short(metrics: Metrics, machine: str = "") -> list[str]:
+    """Return sentences about the whole run, the most important first."""
+    return [
+        _made(metrics, machine),
+        _path(metrics),
+        *_pictures(metrics),
+        *_depth(metrics),
+        *_uncertainty(metrics),
+    ]
+
+
+def _made(metrics: Metrics, machine: str) -> str:
+    speed = metrics.get("frames_per_s")
+    how = f", {number(speed, 1)} images a second" if speed else ""
+    status = metrics.get("status")
+    unfinished = (
+        "" if status in (None, "complete") else f" The run is {status}: what follows is what there was by then."
+    )
+    return (
+        f"{number(metrics.get('frames'), 0)} colour + depth images of {metrics.get('source')} became a path and "
+        f"a map of {number(metrics.get('splats'), 0)} splats{how}{f' on {machine}' if machine else ''}.{unfinished}"
+    )
+
+
+def _path(metrics: Metrics) -> str:
+    lost, ate = metrics.get("lost") or 0, metrics.get("ate") or {}
+    followed = (
+        f"The camera was lost on {lost} of {metrics.get('frames')} images; poses there are guesses."
+        if lost
+        else "The camera was followed all the way."
+    )
+    if ate.get("rmse_m") is None:
+        return f"{followed} No true path is known, so that the path's error is not known either."
+    before = (metrics.get("ate_odometry") or {}).get("rmse_m")
+    loops = f" Without its closed loops it would be off by {number(before, 1, 100.0)} cm." if before else ""
+    error, worst = number(ate["rmse_m"], 1, 100.0), number(ate.get("max_m"), 1, 100.0)
+    return f"{followed} Its path is off by {error} cm (root mean square), at worst by {worst} cm.{loops}"
+
+
+def _pictures(metrics: Metrics) -> list[str]:
+    psnr_db = (metrics.get("held_out") or {}).get("psnr_db")
+    if psnr_db is None:
+        return []
+    said = next((words for least, words in PICTURES if psnr_db >= least), "poor")
+    return [f"Pictures from places that the map was not fitted to come out at {number(psnr_db, 1)} dB PSNR: {said}."]
+
+
+def _depth(metrics: Metrics) -> list[str]:
+    held_out = metrics.get("held_out") or {}
+    if held_out.get("depth_l1_m") is None:
+        return []
+    holes = 1.0 - (held_out.get("depth_coverage") or 0.0)
+    missing = f" {number(holes, 0, 100.0)} % of what the camera measured is missing in the map." if holes > 0.02 else ""
+    return [f"Its surfaces lie {number(held_out['depth_l1_m'], 1, 100.0)} cm from the measured ones.{missing}"]
+
+
+def _uncertainty(metrics: Metrics) -> list[str]:
+    rank = (metrics.get("uncertainty") or {}).get("spearman")
+    if rank is None:
+        return []
+    said = next((words for least, words in RANKS if rank >= least), "hardly")
+    return [
+        f"The map's own uncertainty V tells right pixels from wrong ones {said} (rank correlation {number(rank, 2)})."
+    ]
+
+
+def advice(metrics: Metrics, run: str, path: str, settings: dict[str, Any]) -> list[Advice]:
+    """Return what to try next; `run` and `path` are the run's folder and its sequence, `settings` its config.json."""
+    again = f"sigmasplat run {path}"
+    found = [rule(metrics, again, settings) for rule in (_lost, _few_keyframes, _blurred, _holes, _slow, _no_loop)]
+    use = ("Look at it from all sides, hide what is doubtful:", f"sigmasplat view {run}")
+    surface = ("Make a surface for other programs:", f"sigmasplat mesh {run} --out room.glb")
+    return [*filter(None, found), use, surface]
+
+
+def _lost(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
+    if not metrics.get("lost"):
+        return None
+    stride = (settings.get("input") or {}).get("stride", 1)
+    if stride > 1:
+        return f"The camera was lost, and only every {stride}th image was used: use them all.", f"{again} --stride 1"
+    every = max((settings.get("mapping") or {}).get("every", 1) // 2, 1)
+    return (
+        "The camera was lost: it moved too fast, or looked at a bare wall. Map more often; if that does not help, "
+        "record that part again, slower.",
+        f"{again} --set mapping.every={every}",
+    )
+
+
+def _few_keyframes(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
+    training, held_out = (((metrics.get(kind) or {}).get("psnr_db")) for kind in ("training", "held_out"))
+    every = (settings.get("mapping") or {}).get("every", 1)
+    if training is None or held_out is None or training - held_out < FEW_DB or every < 2:
+        return None
+    return (
+        f"Views that the map was fitted to look {number(training - held_out, 1)} dB better than others: use more.",
+        f"{again} --set mapping.every={every // 2}",
+    )
+
+
+def _blurred(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
+    psnr_db = (metrics.get("held_out") or {}).get("psnr_db")
+    width = (settings.get("input") or {}).get("width", 0)
+    if psnr_db is None or psnr_db >= PICTURES[1][0] or not width:
+        return None
+    return (
+        f"Pictures are blurred; the map was made from images {width} pixels wide. Larger ones are slower and sharper.",
+        f"{again} --set input.width={2 * width}",
+    )
+
+
+def _holes(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
+    covered = (metrics.get("held_out") or {}).get("depth_coverage")
+    if covered is None or covered > 0.9:
+        return None
+    return (
+        f"{number(1 - covered, 0, 100.0)} % of what was measured is missing in the map: pass there again, slower.",
+        "",
+    )
+
+
+def _slow(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
+    speed, width = metrics.get("frames_per_s"), (settings.get("input") or {}).get("width", 0)
+    if not speed or speed >= 5.0:
+        return None
+    smaller = max((width or 640) * 3 // 4 // 16 * 16, 160)
+    return (
+        f"{number(speed, 1)} images a second is slow; smaller images are faster.",
+        f"{again} --set input.width={smaller}",
+    )
+
+
+def _no_loop(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
+    if (metrics.get("submaps") or 1) < 3 or (metrics.get("loops") or {}).get("accepted"):
+        return None
+    return "No place was seen twice, so that drift could not be taken out: end a scan where it began.", ""

@@ -1,0 +1,112 @@
+"""What the report says in words follows from the figures, and its commands can be given."""
+
+import json
+import shlex
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+from PIL import Image
+
+from sigmasplat.config import Config
+from sigmasplat.config.text import override, split_settings
+from sigmasplat.errors import RunError
+from sigmasplat.io.embedded import data_uri
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.metrics.story import advice, in_short
+from sigmasplat.page import write_page
+from sigmasplat.presets import preset
+
+GOOD = {
+    "source": "kitchen", "status": "complete", "frames": 500, "splats": 1000, "frames_per_s": 13.5, "lost": 0,
+    "ate": {"rmse_m": 0.026, "max_m": 0.09}, "ate_odometry": {"rmse_m": 0.035},
+    "held_out": {"psnr_db": 31.0, "depth_l1_m": 0.019, "depth_coverage": 0.999},
+    "training": {"psnr_db": 31.5}, "uncertainty": {"spearman": 0.55}, "submaps": 1, "loops": {"accepted": 0},
+}  # fmt: skip
+SETTINGS = preset("sigma").to_dict()
+
+
+def said(**changes) -> str:
+    return " ".join(in_short(GOOD | changes, "a laptop"))
+
+
+def test_a_good_run_in_words() -> None:
+    text = said()
+    for words in (
+        "500 colour + depth images of kitchen", "13.5 images a second on a laptop", "followed all the way",
+        "off by 2.6 cm", "at worst by 9.0 cm", "Without its closed loops it would be off by 3.5 cm",
+        "31.0 dB PSNR: hard to tell", "1.9 cm from the measured", "wrong ones well",
+    ):  # fmt: skip
+        assert words in text, words
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"lost": 52}, "lost on 52 of 500 images"),
+        ({"ate": None}, "No true path is known"),
+        ({"status": "interrupted"}, "The run is interrupted"),
+        ({"held_out": {"psnr_db": 17.0}}, "17.0 dB PSNR: poor"),
+        (
+            {"held_out": {"psnr_db": 24.0, "depth_l1_m": 0.01, "depth_coverage": 0.7}},
+            "30 % of what the",
+        ),
+        ({"uncertainty": {"spearman": 0.02}}, "hardly"),
+    ],
+)
+def test_what_is_wrong_is_said(changes: dict, words: str) -> None:
+    assert words in said(**changes)
+
+
+def test_nothing_is_said_of_what_is_not_known() -> None:
+    text = " ".join(in_short({"source": "x", "frames": 1, "splats": 0, "lost": 0}))
+    assert "dB" not in text and "V tells" not in text and "None" not in text
+
+
+@pytest.mark.parametrize(
+    "changes, settings, words, command",
+    [
+        ({"lost": 3}, {"input.stride": "3"}, "every 3th image", "--stride 1"),
+        ({"lost": 3}, {}, "record that part again", "mapping.every=2"),
+        ({"training": {"psnr_db": 36.0}}, {}, "5.0 dB better", "mapping.every=2"),
+        ({"held_out": {"psnr_db": 22.0}}, {}, "320 pixels wide", "input.width=640"),
+        ({"held_out": {"psnr_db": 31.0, "depth_coverage": 0.6}}, {}, "40 % of what was measured", ""),
+        ({"frames_per_s": 1.2}, {}, "1.2 images a second is slow", "input.width=240"),
+        ({"submaps": 5}, {}, "end a scan where it began", ""),
+    ],
+)
+def test_advice_names_a_command_that_can_be_given(changes: dict, settings: dict, words: str, command: str) -> None:
+    config = override(preset("sigma"), settings)
+    found = [item for item in advice(GOOD | changes, "runs/k", "data/k", config.to_dict()) if words in item[0]]
+    assert len(found) == 1 and command in found[0][1]
+    given = shlex.split(found[0][1])
+    override(config, split_settings(value for flag, value in pairwise(given) if flag == "--set"))
+
+
+def test_a_good_run_is_only_told_what_to_do_with_it() -> None:
+    assert [command.split()[1] for _, command in advice(GOOD, "runs/k", "data/k", SETTINGS)] == ["view", "mesh"]
+
+
+def test_the_page_is_one_file(tmp_path) -> None:
+    run = RunFolder.create(tmp_path / "run", replace(Config(), name="made-up"), "kitchen")
+    run.note(status="complete", source_path="data/kitchen")
+    for name in ("view-held-out-000001", "trajectory-light", "trajectory-dark"):
+        run.write_image(f"{name}.png", Image.new("RGB", (40, 30), (200, 60, 20)))
+    run.write_profile({"blend": 6.0, "io": 2.0})
+    write_page(
+        run,
+        GOOD | {"uncertainty": None},
+        {"held-out": ["images/view-held-out-000001.png"]},
+        {"trajectory": "a path"},
+        ["careful"],
+    )
+    page = (run.path / "report.html").read_text()
+    for words in ("In short", "What to try next", "careful", "sigmasplat view", "75", "config.json, as used"):
+        assert words in page
+    assert page.count("data:image/webp;base64,") == 3 and "images/" not in page and "http" not in page
+
+
+def test_a_picture_that_is_missing_is_named(tmp_path) -> None:
+    with pytest.raises(RunError, match=r"view\.png"):
+        data_uri(tmp_path / "view.png")
+    assert json.dumps(SETTINGS)
