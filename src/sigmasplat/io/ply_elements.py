@@ -21,7 +21,7 @@ BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 @dataclass(frozen=True)
 class Element:
-    """One kind of row: its name, how many there are (−1 where the header does not say), byte order, properties' words."""
+    """One kind of row: name, how many there are (−1 where the header does not say), byte order, properties' words."""
 
     name: str
     count: int
@@ -62,7 +62,7 @@ def read_header(file: BinaryIO, path: Path) -> list[Element]:
     starts = [i for i, line in enumerate(lines) if line[0] == "element"]
     elements = []
     for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
-        name, count = (lines[start][1:] + ["", ""])[:2]
+        name, count = (*lines[start][1:], "", "")[:2]
         properties = tuple(tuple(line[1:]) for line in lines[start + 1 : end] if line[0] == "property")
         elements.append(Element(name, int(count) if count.isdecimal() else -1, order, properties))
     return elements

@@ -22,8 +22,8 @@ class SplatValues:
     """N splats as float64 arrays; what has no place in other programs' formats (σ², correlations) is not among them.
 
     means [N, 3] metres; quats [N, 4] unit length, wxyz; log_scales [N, 3] log metres; opacities [N] in [0, 1]; colors
-    [N, 3]; harmonics [N, 3·k] of the lowest degree that holds them all, k = 0, 3, 8 or 15 of each channel, columns 3·i +
-    channel.
+    [N, 3]; harmonics [N, 3·k] of the lowest degree that holds them all, k = 0, 3, 8 or 15 of each channel, columns
+    3·i + channel.
     """
 
     means: Doubles
@@ -38,9 +38,10 @@ class SplatValues:
         """Take the values out of a field."""
         params = field.params.detach().cpu().double()
         part = {name: params[:, columns].numpy() for name, columns in COLUMNS.items()}
-        quats = part["quats"] / np.linalg.norm(part["quats"], axis=1, keepdims=True)
         opacities = torch.sigmoid(params[:, 10]).numpy()
-        return SplatValues(part["means"], quats, part["log_scales"], opacities, part["colors"], _harmonics(field))
+        return SplatValues(
+            part["means"], unit(part["quats"]), part["log_scales"], opacities, part["colors"], _harmonics(field)
+        )
 
     def __len__(self) -> int:
         return len(self.means)
@@ -115,10 +116,16 @@ def smallest_three(quats: Doubles) -> tuple[NDArray[np.intp], Doubles]:
 
 def from_smallest_three(which: NDArray[np.intp], others: Doubles) -> Doubles:
     """Put unit quaternions [N, 4] together again."""
-    quats = np.empty((len(which), 4))
+    quats: Doubles = np.empty((len(which), 4))
     quats[np.arange(4) != which[:, None]] = others.ravel()
     quats[np.arange(len(which)), which] = np.sqrt(np.maximum(1.0 - (others**2).sum(1), 0.0))
-    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    return unit(quats)
+
+
+def unit(quats: Doubles) -> Doubles:
+    """Return quaternions [N, 4] of length 1."""
+    lengths: Doubles = np.linalg.norm(quats, axis=1, keepdims=True)
+    return quats / lengths
 
 
 def check_values(params: NDArray[np.float32], path: Path) -> None:
