@@ -1,8 +1,8 @@
 """Draw a map's colour and uncertainty, side by side, as seen from one pose of its path.
 
 python examples/render_map.py RUN [PICTURE.png] [ROW]      RUN a run folder, ROW a row of its trajectory (default: 0)
-python examples/render_map.py MAP [PICTURE.png]            MAP a file: .ply, .compressed.ply, .splat or .spz; the pose is the
-                                                           world's own
+python examples/render_map.py MAP [PICTURE.png]            MAP a file: .ply, .compressed.ply, .splat, .spz; seen from
+                                                           where its world begins
 
 Right is √V, V averaged over the channels: black = sure, bright = unsure. Where the map is empty (A < ½) V says nothing;
 those pixels are slate.

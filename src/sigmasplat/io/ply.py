@@ -3,9 +3,9 @@
 Columns: x y z, nx ny nz (0), f_dc_0..2 = (colour − ½)/C0, f_rest_0..44 where colours depend on the direction (all
 harmonics of red, of green, of blue), opacity (logit), scale_0..2 (log metres), rot_0..3 (wxyz), and ours at the end:
 log_variance_0..2. Readers that look columns up by name pass over extra ones: SuperSplat and splat-transform
-(PlayCanvas), antimatter15/splat, gsplat, Spark, SPZ's converter. Readers that know one record of 62 floats by heart and
-no names take ours for garbage: the viewer that came with 3DGS (SIBR), 3DGS.cpp, older Unity importers. For these there
-is `plain`: those 62 columns, f_rest 0 where a map has none. No comments either way: SIBR expects `element` in line 3.
+(PlayCanvas), antimatter15/splat, nianticlabs/spz. Readers that know one record of 62 floats by heart and no names take
+ours for garbage: the viewer that came with 3DGS (SIBR), 3DGS.cpp, older Unity importers. For these there is `plain`:
+those 62 columns, f_rest 0 where a map has none. No comments either way: SIBR counts the splats from line 3.
 """
 
 from pathlib import Path

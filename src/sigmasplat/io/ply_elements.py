@@ -1,7 +1,9 @@
 """Read the elements of a binary PLY file: its header, then the rows of one element after the other."""
 
 import os
+import re
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO
 
@@ -16,6 +18,7 @@ PLY_TYPES = {
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
+COUNT = re.compile("[0-9]{1,15}")
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -32,8 +35,8 @@ class Element:
         """Return the type of a row. Raises SourceError if it holds lists, unknown types or a name twice."""
         unknown = [" ".join(words) for words in self.properties if len(words) != 2 or words[0] not in PLY_TYPES]
         names = [words[-1] for words in self.properties]
-        if unknown or len(set(names)) < len(names):
-            found = ", ".join(unknown) or "a name occurs twice"
+        if unknown or not names or len(set(names)) < len(names):
+            found = ", ".join(unknown) or ("a name occurs twice" if names else f"'{self.name}' has none")
             raise SourceError(f"{path}: cannot read the PLY's properties ({found})")
         return np.dtype([(name, self.order + PLY_TYPES[kind]) for kind, name in self.properties])
 
@@ -61,10 +64,10 @@ def read_header(file: BinaryIO, path: Path) -> list[Element]:
         raise SourceError(f"{path}: the PLY is not binary ({found}); save it as binary")
     starts = [i for i, line in enumerate(lines) if line[0] == "element"]
     elements = []
-    for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
+    for start, end in pairwise([*starts, len(lines)]):
         name, count = (*lines[start][1:], "", "")[:2]
         properties = tuple(tuple(line[1:]) for line in lines[start + 1 : end] if line[0] == "property")
-        elements.append(Element(name, int(count) if count.isdecimal() else -1, order, properties))
+        elements.append(Element(name, int(count) if COUNT.fullmatch(count) else -1, order, properties))
     return elements
 
 

@@ -14,7 +14,7 @@ from sigmasplat.model.harmonics import DEGREES, count
 SH_C0 = 0.28209479177387814
 """Y₀₀ = 1/(2√π): the value of the constant spherical harmonic."""
 Doubles = NDArray[np.float64]
-MORTON_BITS = 20
+MORTON_BITS, ROUNDING = 20, 1e-6
 
 
 @dataclass(frozen=True)
@@ -71,11 +71,11 @@ class SplatValues:
 
 
 def _harmonics(field: GaussianField) -> Doubles:
-    """Return a field's harmonics without the degrees that are 0 throughout."""
+    """Return a field's harmonics without the degrees that are 0 throughout, or no more than rounding left there."""
     if "harmonics" not in field.extras:
         return np.empty((len(field), 0))
     values = field.extras["harmonics"].params.detach().cpu().double().numpy()
-    needed = int(np.flatnonzero(values.any(0)).max(initial=-1)) + 1
+    needed = int(np.flatnonzero((np.abs(values) > ROUNDING).any(0)).max(initial=-1)) + 1
     return values[:, : next(n for n in (3 * count(degree) for degree in range(DEGREES + 1)) if n >= needed)]
 
 

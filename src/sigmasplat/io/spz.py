@@ -49,6 +49,8 @@ LOG_SCALE_START, LOG_SCALE_STEPS = -10.0, 16.0
 MAGNITUDES = (1 << 9) - 1
 DEFLATE_RATIO = 1032
 """Deflate makes nothing smaller than by this factor."""
+MOST_BEHIND = 1 << 20
+"""Bytes read behind the splats, where extensions lie."""
 R_RUB_RDF = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
 """Takes our axes to the format's, and back."""
 
@@ -82,8 +84,11 @@ def read_field(path: Path) -> GaussianField:
             version, size, degree, bits, body = _unzipped(file, path)
     except OSError as problem:
         raise SourceError(f"cannot read map {path}: {problem.strerror or problem}") from problem
-    parts = np.split(np.frombuffer(body, "u1"), np.cumsum([size * width for width in _widths(version, degree)])[:-1])
-    positions, opacities, colors, scales, rotations, harmonics = (part.reshape(size, -1) for part in parts)
+    widths = _widths(version, degree)
+    parts = np.split(np.frombuffer(body, "u1"), np.cumsum([size * width for width in widths])[:-1])
+    positions, opacities, colors, scales, rotations, harmonics = (
+        part.reshape(size, width) for part, width in zip(parts, widths, strict=True)
+    )
     values = SplatValues(
         _fixed(positions) / 2.0**bits,
         _smallest_three(rotations) if version == 3 else _first_three(rotations),
@@ -125,6 +130,7 @@ def _unzipped(file: BinaryIO, path: Path) -> tuple[int, int, int, int, bytes]:
             )
         needed = size * sum(_widths(version, degree))
         body = stream.read(needed) if needed <= packed_size * DEFLATE_RATIO else b""
+        stream.read(MOST_BEHIND)  # on to the end of the stream, whose checksum tells of damage
     except (EOFError, gzip.BadGzipFile, zlib.error) as problem:
         raise SourceError(f"{path} is damaged or truncated: {problem}; copy or download it again") from problem
     if len(body) < needed:
