@@ -203,6 +203,13 @@ def test_splat_as_its_layout_says(tmp_path: Path) -> None:
     assert first[6:] == (255, 128, 255, 204, 192, 192, 64, 192)
 
 
+@pytest.mark.parametrize("start", [b"<", b"{", b" \n<", b"\x1f\x8b"])
+def test_splat_files_may_begin_with_any_bytes(tmp_path: Path, start: bytes) -> None:
+    splat.write_field(tmp_path / "a.splat", some(3))
+    (tmp_path / "b").write_bytes(start + (tmp_path / "a.splat").read_bytes()[len(start) :])
+    assert len(splats.read_any(tmp_path / "b")) == 3
+
+
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_spz_as_its_layout_says(tmp_path: Path, degree: int) -> None:
     """Decode a file splat by splat; it holds the map turned by 180° about x, as `GaussianField.moved` turns maps."""

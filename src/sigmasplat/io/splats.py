@@ -1,6 +1,5 @@
 """Read a map in whichever format it is, recognised by content: the name may be anything."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 from sigmasplat.errors import SourceError
@@ -10,13 +9,13 @@ from sigmasplat.model.field import GaussianField
 
 READABLE = ".ply, .compressed.ply, .splat or .spz"
 FOREIGN = {
-    b"NGSP": "SPZ of version 4 or without gzip; save it as SPZ version 3, or as PLY",
-    b"PK\x03\x04": "a zip archive, perhaps SuperSplat's SOG; unpack it, or save the map as PLY",
-    b"glTF": "a GLB model; save the map as PLY",
-    b"version https://git-lfs": "a pointer of Git LFS, not the map itself; run: git lfs pull",
-    b"<": "a web page or XML, not the map itself; download the map again",
-    b"{": "JSON; give the file that holds the splats",
-    b"\x89PNG": "a picture; give the file that holds the splats",
+    b"NGSP": "is SPZ of version 4 or without gzip; save it as SPZ version 3, or as PLY",
+    b"PK\x03\x04": "is a zip archive, perhaps SuperSplat's SOG; unpack it, or save the map as PLY",
+    b"glTF": "is a GLB model; save the map as PLY",
+    b"version https://git-lfs": "is a pointer of Git LFS, not the map itself; run: git lfs pull",
+    b"<": "is a web page or XML, not the map itself; download the map again",
+    b"{": "is JSON; give the file that holds the splats",
+    b"\x89PNG": "is a picture; give the file that holds the splats",
 }
 """What else people give, by how it begins, and what to do then."""
 
@@ -33,19 +32,23 @@ def read_any(path: Path) -> GaussianField:
             start = file.read(32)
     except OSError as problem:
         raise SourceError(f"cannot read map {path}: {problem.strerror or problem}") from problem
-    return _reader(path, start)(path)
+    if start.startswith(b"\x1f\x8b\x08"):
+        return spz.read_field(path)
+    return _read_ply(path) if start[:3] == b"ply" and start[3:4].isspace() else _read_bare(path, start)
 
 
-def _reader(path: Path, start: bytes) -> Callable[[Path], GaussianField]:
-    """Choose the reader by the first bytes of a file. Raises SourceError where none reads it."""
-    if start[:3] == b"ply" and start[3:4].isspace():
-        with path.open("rb") as file:
-            return (
-                compressed_ply.read_field if compressed_ply.is_compressed(read_header(file, path)) else ply.read_field
-            )
-    if start.startswith(b"\x1f\x8b"):
-        return spz.read_field
-    for magic, what in FOREIGN.items():
-        if start.lstrip().startswith(magic):
-            raise SourceError(f"{path} is {what}")
-    return splat.read_field
+def _read_ply(path: Path) -> GaussianField:
+    with path.open("rb") as file:
+        compressed = compressed_ply.is_compressed(read_header(file, path))
+    return compressed_ply.read_field(path) if compressed else ply.read_field(path)
+
+
+def _read_bare(path: Path, start: bytes) -> GaussianField:
+    """Read what begins like no other format: .splat files begin with any bytes. Raises SourceError if it is none."""
+    try:
+        return splat.read_field(path)
+    except SourceError as problem:
+        for magic, what in FOREIGN.items():
+            if start.lstrip().startswith(magic):
+                raise SourceError(f"{path} {what}") from problem
+        raise
