@@ -1,6 +1,8 @@
 """Draw a map's colour and uncertainty, side by side, as seen from one pose of its path.
 
 python examples/render_map.py RUN [PICTURE.png] [ROW]      RUN a run folder, ROW a row of its trajectory (default: 0)
+python examples/render_map.py MAP [PICTURE.png]            MAP a file: .ply, .compressed.ply, .splat, .spz; seen from
+                                                           where its world begins
 
 Right is √V, V averaged over the channels: black = sure, bright = unsure. Where the map is empty (A < ½) V says nothing;
 those pixels are slate.
@@ -15,6 +17,7 @@ from PIL import Image
 
 from sigmasplat import Camera, SigmaSplatError
 from sigmasplat.io.runs import RunFolder
+from sigmasplat.io.splats import read_any
 from sigmasplat.metrics import palette
 from sigmasplat.model import se3
 from sigmasplat.render import render
@@ -24,11 +27,14 @@ CAMERA = Camera(width=320, height=240, fx=260.0, fy=260.0, cx=159.5, cy=119.5)
 
 
 def main(run: str, picture: str = "view.png", row: str = "0") -> None:
-    """Render the run's map from a pose of its trajectory and save colour and uncertainty as one PNG."""
-    folder = RunFolder.open(Path(run))
-    T_world_camera = folder.read_trajectory().T_world_camera[int(row)]
+    """Render a map from a pose of its run's trajectory and save colour and uncertainty as one PNG."""
+    if Path(run).is_file():
+        field, T_world_camera = read_any(Path(run)), np.eye(4)
+    else:
+        folder = RunFolder.open(Path(run))
+        field, T_world_camera = folder.read_map(), folder.read_trajectory().T_world_camera[int(row)]
     with torch.no_grad():
-        view = render(folder.read_map(), CAMERA, se3.inverse(T_world_camera))
+        view = render(field, CAMERA, se3.inverse(T_world_camera))
     covered = view.alpha.numpy() > 0.5
     color = (view.color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
     deviation = view.variance.mean(-1).clamp(min=0.0).sqrt().numpy()

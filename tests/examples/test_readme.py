@@ -106,6 +106,8 @@ def test_example_render_map(demo: Path, tmp_path: Path, capsys: pytest.CaptureFi
     pixels = np.asarray(Image.open(picture))
     assert pixels.shape == (240, 640, 3) and pixels.std() > 10
     assert "of the view is mapped" in capsys.readouterr().out
+    example("render_map").main(str(demo / "runs" / "demo" / "map.ply"), str(picture))
+    assert "of the view is mapped" in capsys.readouterr().out
 
 
 def test_example_own_loss(monkeypatch: pytest.MonkeyPatch) -> None:

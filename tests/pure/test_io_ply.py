@@ -1,5 +1,6 @@
 """The map file: round trip, the columns other programs look for, and maps of other programs."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,50 @@ def test_layout_is_that_of_3dgs(tmp_path: Path) -> None:
     assert values["f_dc_0"] == pytest.approx(0.5 * 2 * np.sqrt(np.pi)) and values["f_dc_1"] == 0.0
     assert values["opacity"] == pytest.approx(np.log(3.0)) and values["scale_2"] == pytest.approx(np.log(0.3))
     assert [values[f"rot_{i}"] for i in range(4)] == [0.5, 0.5, -0.5, 0.5]
+
+
+@pytest.mark.parametrize("harmonics", [False, True])
+def test_columns_are_found_by_a_reader_of_names(tmp_path: Path, harmonics: bool) -> None:
+    """As viewers read: offsets added up property by property, each value fetched by its name, others passed over."""
+    field = random_field(4)
+    if harmonics:
+        field.carry("harmonics").params[:] = torch.arange(180.0).reshape(4, 45)
+    write_field(tmp_path / "map.ply", field)
+    header, _, data = (tmp_path / "map.ply").read_bytes().partition(b"end_header\n")
+    names = [line.split()[2] for line in header.decode().splitlines() if line.startswith("property float ")]
+    assert len(data) == 4 * 4 * len(names), "float32 alone, nothing behind them"
+    for i in range(4):
+        row = dict(zip(names, struct.unpack_from(f"<{len(names)}f", data, 4 * len(names) * i), strict=True))
+        params = field.params[i].tolist()
+        assert [row[name] for name in ("x", "y", "z")] == params[0:3]
+        assert [row[f"rot_{k}"] for k in range(4)] == params[3:7] and [row[f"scale_{k}"] for k in range(3)] == params[
+            7:10
+        ]
+        assert row["opacity"] == params[10]
+        assert [0.5 + 0.28209479 * row[f"f_dc_{k}"] for k in range(3)] == pytest.approx(params[11:14], abs=1e-6)
+        assert [row["nx"], row["ny"], row["nz"]] == [0.0] * 3
+        if harmonics:
+            assert [row[f"f_rest_{k}"] for k in (0, 1, 15, 30, 44)] == [45.0 * i + k for k in (0, 3, 1, 2, 44)]
+
+
+@pytest.mark.parametrize("harmonics", [False, True])
+def test_plain_files_are_the_record_that_3dgs_knows_by_heart(tmp_path: Path, harmonics: bool) -> None:
+    """As its own viewer reads: the number of splats from line 3, then records of 62 floats, names unseen."""
+    field = random_field(3)
+    if harmonics:
+        field.carry("harmonics").params[:] = torch.arange(135.0).reshape(3, 45)
+    write_field(tmp_path / "map.ply", field, plain=True)
+    lines, _, data = (tmp_path / "map.ply").read_bytes().partition(b"end_header\n")
+    assert lines.splitlines()[2] == b"element vertex 3" and len(data) == 3 * 62 * 4
+    for i, params in enumerate(field.params.tolist()):
+        record = struct.unpack_from("<62f", data, 62 * 4 * i)
+        assert list(record[0:3]) == params[0:3] and record[3:6] == (0.0, 0.0, 0.0)
+        assert [0.5 + 0.28209479 * k for k in record[6:9]] == pytest.approx(params[11:14], abs=1e-6)
+        red = [45.0 * i + 3 * k for k in range(15)] if harmonics else [0.0] * 15
+        assert list(record[9:24]) == red
+        assert record[54] == params[10] and list(record[55:58]) == params[7:10] and list(record[58:62]) == params[3:7]
+    back = read_field(tmp_path / "map.ply")
+    assert (back.params[:, 14:] == -7.0).all() and torch.allclose(back.params[:, :14], field.params[:, :14], atol=1e-6)
 
 
 def test_harmonics_are_written_as_3dgs_does_and_read_back(tmp_path: Path) -> None:

@@ -3,29 +3,49 @@
 from pathlib import Path
 
 from sigmasplat.commands import options
+from sigmasplat.commands.export_formats import ExportOptions, Format, Origin, choose, listed, refuse_unobeyed
+from sigmasplat.commands.export_splats import SPLATS
 from sigmasplat.commands.options import refuse_existing
 
 
+def _trajectory(origin: Origin, target: Path, _: ExportOptions) -> str:
+    from sigmasplat.io import trajectory
+
+    path = origin.run().read_trajectory()
+    trajectory.write_trajectory(target, path)
+    return f"{len(path):,} poses"
+
+
+FORMATS = (*SPLATS, Format("trajectory", (".txt",), "the path as TUM text", _trajectory))
+"""What can be written, the first by default. A new one: a row here, or a module of rows beside `export_splats`."""
+
+
 def export(
-    run: options.RunPath,
+    run: options.RunOrMap,
     out: options.OutFile = None,
     format: options.Format = None,
     overwrite: options.Overwrite = False,
+    sigma_below: options.SigmaBelow = None,
+    opacity_above: options.OpacityAbove = None,
+    plain: options.Plain = False,
 ) -> int:
-    """Write a run's map as 3DGS PLY for SuperSplat and other viewers, or its path as TUM text.
+    """Write a run's map, or a map from a file, for viewers and other programs; or a run's path.
 
-    example: sigmasplat export runs/kitchen --out kitchen.ply
+    {formats}
+
+    example: sigmasplat export runs/kitchen --out kitchen.spz --sigma-below 0.1
     """
-    from sigmasplat.io import ply, trajectory
-    from sigmasplat.io.runs import RunFolder
-
-    folder = RunFolder.open(run)
-    chosen = format or ("trajectory" if out and out.suffix == ".txt" else "ply")
-    target = out or Path(folder.path.resolve().name + {"ply": ".ply", "trajectory": ".txt"}[chosen])
+    origin, asked = Origin(run), ExportOptions(sigma_below, opacity_above, plain)
+    chosen = choose(FORMATS, format, out)
+    refuse_unobeyed(chosen, FORMATS, asked)
+    target = out or Path(origin.name + chosen.endings[0])
     refuse_existing(target, overwrite)
-    if chosen == "ply":
-        ply.write_field(target, folder.read_map())
-    else:
-        trajectory.write_trajectory(target, folder.read_trajectory())
-    print(target)
+    print(f"{target}: {chosen.write(origin, target, asked)}{_size(target)}")
     return 0
+
+
+def _size(target: Path) -> str:
+    return f", {target.stat().st_size / 1e6:.1f} MB" if target.is_file() else ""
+
+
+export.__doc__ = (export.__doc__ or "").format(formats="\n    ".join(listed(FORMATS)))

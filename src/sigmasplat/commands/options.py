@@ -85,13 +85,23 @@ WithMesh = Annotated[
     bool,
     arg(name="mesh", help="make mesh.ply too, and score it where the true surface is known", help_behavior_hint=""),
 ]
+RunOrMap = Annotated[Path, tyro.conf.Positional, arg(metavar="RUN", help="run folder, or a file that holds a map")]
 Format = Annotated[
-    Literal["ply", "trajectory"] | None,
+    str | None,
+    arg(metavar="NAME", help="what to write", help_behavior_hint="(default: by the ending of FILE, else ply)"),
+]
+SigmaBelow = Annotated[
+    float | None,
     arg(
-        metavar="{ply,trajectory}",
-        help="what to write",
-        help_behavior_hint="(default: by the ending of FILE, else ply)",
+        metavar="S", help="keep splats whose σ is below this, colours being 0 to 1", help_behavior_hint="(default: all)"
     ),
+]
+OpacityAbove = Annotated[
+    float | None,
+    arg(metavar="A", help="keep splats whose opacity is above this", help_behavior_hint="(default: all)"),
+]
+Plain = Annotated[
+    bool, arg(help="PLY in 3DGS's own 62 columns, without σ², for readers that know no others", help_behavior_hint="")
 ]
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.io.atomic import replacing
-from sigmasplat.io.ply import BYTE_ORDERS, MAX_HEADER_BYTES, PLY_TYPES
+from sigmasplat.io.ply_elements import BYTE_ORDERS, MAX_HEADER_BYTES, PLY_TYPES
 from sigmasplat.model.mesh import Mesh
 
 Element = tuple[str, int, list[list[str]]]

@@ -2,11 +2,13 @@
 
 Columns: x y z, nx ny nz (0), f_dc_0..2 = (colour − ½)/C0, f_rest_0..44 where colours depend on the direction (all
 harmonics of red, of green, of blue), opacity (logit), scale_0..2 (log metres), rot_0..3 (wxyz), and ours at the end:
-log_variance_0..2. Readers look columns up by name, so extra ones do no harm.
+log_variance_0..2. Readers that look columns up by name pass over extra ones: SuperSplat and splat-transform
+(PlayCanvas), antimatter15/splat, nianticlabs/spz. Readers that know one record of 62 floats by heart and no names take
+ours for garbage: the viewer that came with 3DGS (SIBR), 3DGS.cpp, older Unity importers. For these there is `plain`:
+those 62 columns, f_rest 0 where a map has none. No comments either way: SIBR counts the splats from line 3.
 """
 
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import torch
@@ -14,19 +16,10 @@ from numpy.typing import NDArray
 
 from sigmasplat.errors import SourceError
 from sigmasplat.io.atomic import replacing
+from sigmasplat.io.ply_elements import read_header
+from sigmasplat.io.splat_values import SH_C0, check_values, refuse_not_finite
 from sigmasplat.model.field import COLUMNS, EXTRAS, INITIAL_LOG_VARIANCE, GaussianField, Rows
 from sigmasplat.model.harmonics import DEGREES, count
-
-SH_C0 = 0.28209479177387814
-"""Y₀₀ = 1/(2√π): the value of the constant spherical harmonic."""
-MAX_HEADER_BYTES = 1 << 20
-
-PLY_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
-    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
-}  # fmt: skip
-BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 PLY_COLUMNS: dict[str, list[str]] = {
     "means": ["x", "y", "z"],
@@ -37,24 +30,28 @@ PLY_COLUMNS: dict[str, list[str]] = {
     "log_variances": [f"log_variance_{i}" for i in range(3)],
 }
 BEFORE_HARMONICS = [*PLY_COLUMNS["means"], "nx", "ny", "nz", *PLY_COLUMNS["colors"]]
-AFTER_HARMONICS = ["opacity", *PLY_COLUMNS["log_scales"], *PLY_COLUMNS["quats"], *PLY_COLUMNS["log_variances"]]
+AFTER_HARMONICS = ["opacity", *PLY_COLUMNS["log_scales"], *PLY_COLUMNS["quats"]]
 REST = "f_rest_"
 
 
-def write_field(path: Path, field: GaussianField) -> None:
-    """Write the splats as binary little-endian 3DGS PLY, in one step. Raises RunError if the place is not writable."""
+def write_field(path: Path, field: GaussianField, *, plain: bool = False) -> None:
+    """Write the splats as binary little-endian 3DGS PLY, in one step; `plain`: in 3DGS's own 62 columns, without σ².
+
+    Raises RunError if the place is not writable.
+    """
     params = field.params.detach().cpu().numpy().astype(np.float32)
     harmonics = _by_channel(field)
-    rest = [f"{REST}{i}" for i in range(harmonics.shape[1])]
-    names_in_file = [*BEFORE_HARMONICS, *rest, *AFTER_HARMONICS]
+    rest = [f"{REST}{i}" for i in range(EXTRAS["harmonics"] if plain else harmonics.shape[1])]
+    ours = [] if plain else PLY_COLUMNS["log_variances"]
+    names_in_file = [*BEFORE_HARMONICS, *rest, *AFTER_HARMONICS, *ours]
     rows = np.zeros(len(params), np.dtype([(name, "<f4") for name in names_in_file]))
-    for group, names in PLY_COLUMNS.items():
-        values = params[:, COLUMNS[group]]
+    for group in (group for group, names in PLY_COLUMNS.items() if names[0] in names_in_file):
+        names, values = PLY_COLUMNS[group], params[:, COLUMNS[group]]
         if group == "colors":
             values = ((values.astype(np.float64) - 0.5) / SH_C0).astype(np.float32)
         for i, name in enumerate(names):
             rows[name] = values[:, i]
-    for i, name in enumerate(rest):
+    for i, name in enumerate(rest[: harmonics.shape[1]]):
         rows[name] = harmonics[:, i]
     properties = "".join(f"property float {name}\n" for name in names_in_file)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
@@ -79,14 +76,12 @@ def read_field(path: Path) -> GaussianField:
     """
     try:
         with path.open("rb") as file:
-            row_type, count = _read_header(file, path)
-            data = file.read(count * row_type.itemsize)
+            elements = read_header(file, path)
+            if not elements or elements[0].name != "vertex" or elements[0].count < 0:
+                raise SourceError(f"{path}: the PLY's first element is not 'vertex', so it is not a map of splats")
+            rows = elements[0].read(file, path)
     except OSError as problem:
         raise SourceError(f"cannot read map {path}: {problem.strerror or problem}") from problem
-    if len(data) < count * row_type.itemsize:
-        size = count * row_type.itemsize
-        raise SourceError(f"{path} is truncated: its header promises {count} splats = {size} bytes, found {len(data)}")
-    rows = np.frombuffer(data, row_type)
     field, harmonics = GaussianField(torch.from_numpy(_params(rows, path))), _harmonics(rows, path)
     if harmonics is not None:
         field.extras["harmonics"] = Rows(torch.from_numpy(harmonics))
@@ -105,7 +100,7 @@ def _harmonics(rows: NDArray[np.void], path: Path) -> NDArray[np.float32] | None
     harmonics = np.zeros((len(rows), EXTRAS["harmonics"]), np.float32)
     for i, name in enumerate(names):
         harmonics[:, 3 * (i % each) + i // each] = rows[name]
-    _refuse_not_finite(harmonics, path)
+    refuse_not_finite(harmonics, path)
     return harmonics
 
 
@@ -122,53 +117,5 @@ def _params(rows: NDArray[np.void], path: Path) -> NDArray[np.float32]:
             if name in present:
                 params[:, column] = rows[name]
     params[:, COLUMNS["colors"]] = params[:, COLUMNS["colors"]] * SH_C0 + 0.5
-    _check_values(params, path)
+    check_values(params, path)
     return params
-
-
-def _check_values(params: NDArray[np.float32], path: Path) -> None:
-    """Raise SourceError at the first splat with nan, inf or a zero quaternion."""
-    _refuse_not_finite(params, path)
-    zero = np.flatnonzero(np.linalg.norm(params[:, COLUMNS["quats"]], axis=1) == 0)
-    if len(zero):
-        raise SourceError(f"{path}: splat {zero[0]} has a zero quaternion, which is no rotation")
-
-
-def _refuse_not_finite(values: NDArray[np.float32], path: Path) -> None:
-    bad = np.flatnonzero(~np.isfinite(values).all(1))
-    if len(bad):
-        raise SourceError(f"{path}: splat {bad[0]} holds nan or inf ({len(bad)} of {len(values)} splats do)")
-
-
-def _read_header(file: BinaryIO, path: Path) -> tuple[np.dtype[np.void], int]:
-    """Read up to end_header: the type of a row and the number of rows. Raises SourceError if it is no such PLY."""
-    if file.readline(8).strip() != b"ply":
-        raise SourceError(f"{path} is not a PLY file (its first line is not 'ply')")
-    lines = _header_lines(file, path)
-    order = BYTE_ORDERS.get(lines[0][1]) if lines and lines[0][0] == "format" and len(lines[0]) > 1 else None
-    if order is None:
-        found = " ".join(lines[0]) if lines else "no format"
-        raise SourceError(f"{path}: the PLY is not binary ({found}); save it as binary")
-    elements = [line for line in lines if line[0] == "element"]
-    if not elements or elements[0][1:2] != ["vertex"] or not elements[0][-1].isdigit():
-        raise SourceError(f"{path}: the PLY's first element is not 'vertex', so it is not a map of splats")
-    first = lines.index(elements[0])
-    end = lines.index(elements[1]) if len(elements) > 1 else len(lines)
-    fields = [line[1:] for line in lines[first:end] if line[0] == "property"]
-    unknown = [" ".join(words) for words in fields if len(words) != 2 or words[0] not in PLY_TYPES]
-    names = [words[-1] for words in fields]
-    if unknown or len(set(names)) < len(names):
-        raise SourceError(f"{path}: cannot read the PLY's properties ({', '.join(unknown) or 'a name occurs twice'})")
-    return np.dtype([(name, order + PLY_TYPES[kind]) for kind, name in fields]), int(elements[0][-1])
-
-
-def _header_lines(file: BinaryIO, path: Path) -> list[list[str]]:
-    """Return the words of each header line but comments. Raises SourceError if end_header does not come."""
-    lines: list[list[str]] = []
-    while file.tell() < MAX_HEADER_BYTES and (raw := file.readline(MAX_HEADER_BYTES)):
-        words = raw.decode("ascii", "replace").split()
-        if words == ["end_header"]:
-            return lines
-        if words and words[0] not in ("comment", "obj_info"):
-            lines.append(words)
-    raise SourceError(f"{path} is truncated: the PLY's header has no 'end_header'")

@@ -1,0 +1,83 @@
+"""Read the elements of a binary PLY file: its header, then the rows of one element after the other."""
+
+import os
+import re
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.errors import SourceError
+
+MAX_HEADER_BYTES = 1 << 20
+PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+COUNT = re.compile("[0-9]{1,15}")
+BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass(frozen=True)
+class Element:
+    """One kind of row: name, how many there are (−1 where the header does not say), byte order, properties' words."""
+
+    name: str
+    count: int
+    order: str
+    properties: tuple[tuple[str, ...], ...]
+
+    def row_type(self, path: Path) -> np.dtype[np.void]:
+        """Return the type of a row. Raises SourceError if it holds lists, unknown types or a name twice."""
+        unknown = [" ".join(words) for words in self.properties if len(words) != 2 or words[0] not in PLY_TYPES]
+        names = [words[-1] for words in self.properties]
+        if unknown or not names or len(set(names)) < len(names):
+            found = ", ".join(unknown) or ("a name occurs twice" if names else f"'{self.name}' has none")
+            raise SourceError(f"{path}: cannot read the PLY's properties ({found})")
+        return np.dtype([(name, self.order + PLY_TYPES[kind]) for kind, name in self.properties])
+
+    def read(self, file: BinaryIO, path: Path) -> NDArray[np.void]:
+        """Read the rows, which come next in the file. Raises SourceError if the file ends before they do."""
+        row_type = self.row_type(path)
+        size = self.count * row_type.itemsize
+        left = os.fstat(file.fileno()).st_size - file.tell()
+        if left < size:
+            what = "splats" if self.name == "vertex" else f"rows of '{self.name}'"
+            raise SourceError(
+                f"{path} is truncated: its header promises {self.count} {what} = {size} bytes, found {left}"
+            )
+        return np.frombuffer(file.read(size), row_type)
+
+
+def read_header(file: BinaryIO, path: Path) -> list[Element]:
+    """Read up to end_header: the elements in the order of their rows. Raises SourceError if it is no binary PLY."""
+    if file.readline(8).strip() != b"ply":
+        raise SourceError(f"{path} is not a PLY file (its first line is not 'ply')")
+    lines = _header_lines(file, path)
+    order = BYTE_ORDERS.get(lines[0][1]) if lines and lines[0][0] == "format" and len(lines[0]) > 1 else None
+    if order is None:
+        found = " ".join(lines[0]) if lines else "no format"
+        raise SourceError(f"{path}: the PLY is not binary ({found}); save it as binary")
+    starts = [i for i, line in enumerate(lines) if line[0] == "element"]
+    elements = []
+    for start, end in pairwise([*starts, len(lines)]):
+        name, count = (*lines[start][1:], "", "")[:2]
+        properties = tuple(tuple(line[1:]) for line in lines[start + 1 : end] if line[0] == "property")
+        elements.append(Element(name, int(count) if COUNT.fullmatch(count) else -1, order, properties))
+    return elements
+
+
+def _header_lines(file: BinaryIO, path: Path) -> list[list[str]]:
+    """Return the words of each header line but comments. Raises SourceError if end_header does not come."""
+    lines: list[list[str]] = []
+    while file.tell() < MAX_HEADER_BYTES and (raw := file.readline(MAX_HEADER_BYTES)):
+        words = raw.decode("ascii", "replace").split()
+        if words == ["end_header"]:
+            return lines
+        if words and words[0] not in ("comment", "obj_info"):
+            lines.append(words)
+    raise SourceError(f"{path} is truncated: the PLY's header has no 'end_header'")

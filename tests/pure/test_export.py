@@ -1,0 +1,113 @@
+"""sigmasplat export: formats by ending or name, from runs and from maps, without doubtful splats where asked."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sigmasplat import cli
+from sigmasplat.commands.export import FORMATS
+from sigmasplat.commands.export_formats import ExportOptions, Format, Origin, choose, listed, owners
+from sigmasplat.config import Config
+from sigmasplat.io import ply
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.io.splats import read_any
+from sigmasplat.io.trajectory import read_trajectory
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.trajectory import Trajectory
+
+
+@pytest.fixture
+def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Run `sigmasplat export` beside a run, walk/, of ten splats and two poses; return what it prints."""
+    monkeypatch.chdir(tmp_path)
+    run = RunFolder.create(Path("walk"), Config(), "room")
+    field = GaussianField.from_values(
+        torch.rand(10, 3, generator=torch.Generator().manual_seed(0)),
+        torch.full((10,), 0.1),
+        torch.rand(10, 3, generator=torch.Generator().manual_seed(1)),
+        opacities=torch.linspace(0.05, 0.95, 10),
+        log_variances=torch.linspace(0.01, 0.1, 10).square().log()[:, None],
+    )
+    run.write_map(field)
+    run.write_trajectory(Trajectory(np.array([0.0, 1.0]), np.stack([np.eye(4)] * 2)))
+
+    def run_it(*arguments: str) -> str:
+        with pytest.raises(SystemExit) as left:
+            cli.main(["export", *arguments])
+        said = capsys.readouterr()
+        assert left.value.code == 0, said.err
+        return said.out
+
+    return run_it
+
+
+@pytest.mark.parametrize("name", ["out.ply", "OUT.PLY", "out.compressed.ply", "out.splat", "out.spz"])
+def test_the_ending_says_what_is_written(export: Callable[..., str], name: str) -> None:
+    assert export("walk", "--out", name).startswith(f"{name}: 10 splats, 0.0 MB")
+    assert len(read_any(Path(name))) == 10
+    assert (Path(name).read_bytes().find(b"packed_position") > 0) == ("compressed" in name)
+
+
+def test_a_map_is_exported_like_a_run(export: Callable[..., str]) -> None:
+    export("walk", "--out", "a.spz")
+    export("a.spz", "--out", "b.compressed.ply")
+    assert export("b.compressed.ply").startswith("b.ply: 10 splats")
+    first, last = read_any(Path("a.spz")), read_any(Path("b.ply"))
+    assert sorted(first.means[:, 0].tolist()) == pytest.approx(sorted(last.means[:, 0].tolist()), abs=1e-3)
+
+
+def test_names_say_what_the_ending_does_not(export: Callable[..., str]) -> None:
+    export("walk", "--out", "map.backup", "--format", "splat")
+    assert Path("map.backup").stat().st_size == 320
+    assert export("walk", "--format", "trajectory").startswith("walk.txt: 2 poses")
+    assert len(read_trajectory(Path("walk.txt"))) == 2
+    assert export("walk").startswith("walk.ply: 10 splats")
+
+
+def test_doubtful_splats_are_dropped_and_counted(export: Callable[..., str]) -> None:
+    said = export("walk", "--out", "a.ply", "--sigma-below", "0.055", "--opacity-above", "0.1")
+    assert said.startswith("a.ply: 4 splats; dropped 6 of 10: 5 for σ, 1 for opacity")
+    kept = ply.read_field(Path("a.ply"))
+    assert kept.variances.max() < 0.055**2 and kept.opacities.min() > 0.1
+    assert "dropped 0 of 10" in export("walk", "--out", "b.ply", "--opacity-above", "0")
+
+
+def test_plain_leaves_out_what_3dgs_does_not_know(export: Callable[..., str]) -> None:
+    export("walk", "--out", "a.ply", "--plain")
+    header = Path("a.ply").read_bytes().partition(b"end_header")[0]
+    assert header.count(b"property float ") == 62 and b"log_variance" not in header
+
+
+def test_every_format_can_be_told_from_the_others() -> None:
+    names = [row.name for row in FORMATS]
+    assert len(set(names)) == len(names)
+    for row in FORMATS:
+        assert row.endings and row.help and choose(FORMATS, row.name, None) is row
+        assert set(row.obeys) <= set(ExportOptions.__dataclass_fields__)
+    for ending, row in owners(FORMATS).items():
+        assert choose(FORMATS, None, Path(f"a{ending}")) is row
+    assert len(listed(FORMATS)) == len(FORMATS)
+
+
+def test_the_first_format_with_an_ending_owns_it_and_longer_endings_win() -> None:
+    def nothing(origin: Origin, target: Path, options: ExportOptions) -> str:
+        return ""
+
+    first, second, longer = (Format(name, ends, "", nothing) for name, ends in
+                             (("one", (".x",)), ("two", (".x",)), ("three", (".y.x",))))  # fmt: skip
+    rows = (first, second, longer)
+    assert choose(rows, None, Path("a.x")) is first and choose(rows, None, Path("a.y.x")) is longer
+    assert choose(rows, "two", Path("a.x")) is second and choose(rows, None, None) is first
+    assert listed(rows)[1].startswith("--format")
+
+
+def test_names_of_exports_without_out(tmp_path: Path) -> None:
+    for name in ("room.compressed.ply", "room.v2.spz"):
+        (tmp_path / name).touch()
+    assert (
+        Origin(tmp_path / "room.compressed.ply").name == "room" and Origin(tmp_path / "room.v2.spz").name == "room.v2"
+    )
+    assert Origin(tmp_path / "walk.1").name == "walk.1"

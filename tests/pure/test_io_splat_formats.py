@@ -1,0 +1,283 @@
+"""Compressed maps: how much of the picture is left at what size, and every byte where the formats' layouts say."""
+
+import gzip
+import math
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from room_map import psnr_db, room_map
+from sigmasplat.errors import RunError
+from sigmasplat.io import compressed_ply, ply, splat, splats, spz
+from sigmasplat.io.splat_values import SplatValues, from_smallest_three, morton_order, smallest_three
+from sigmasplat.model.field import GaussianField, Rows
+from sigmasplat.model.harmonics import count
+
+Writer = Callable[[Path, GaussianField], None]
+WRITERS: dict[str, Writer] = {
+    ".ply": ply.write_field,
+    ".compressed.ply": compressed_ply.write_field,
+    ".splat": splat.write_field,
+    ".spz": spz.write_field,
+}
+COMPRESSED = [".compressed.ply", ".splat", ".spz"]
+
+
+def again(path: Path, field: GaussianField) -> GaussianField:
+    """Write a field as the path's ending says, and read it by content from a file without an ending."""
+    ending = max((ending for ending in WRITERS if path.name.endswith(ending)), key=len)
+    WRITERS[ending](path, field)
+    return splats.read_any(path.rename(path.with_name("map")))
+
+
+def some(n: int = 300, degree: int = 0, seed: int = 0) -> GaussianField:
+    random = torch.Generator().manual_seed(seed)
+    params = torch.randn(n, 17, generator=random)
+    params[:, 7:10] -= 4.0
+    params[:, 11:14] = torch.rand(n, 3, generator=random)
+    field = GaussianField(params)
+    if degree:
+        k = torch.zeros(n, 45)
+        k[:, : 3 * count(degree)] = (0.3 * torch.randn(n, 3 * count(degree), generator=random)).clamp(-0.99, 0.99)
+        field.extras["harmonics"] = Rows(k)
+    return field
+
+
+def nearest(values: SplatValues, to: SplatValues) -> SplatValues:
+    """Bring values into the order of others, by position."""
+    distances = np.linalg.norm(values.means[None] - to.means[:, None], axis=2)
+    return values.ordered(distances.argmin(1))
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_ply_gives_the_same_render(tmp_path: Path, degree: int) -> None:
+    field = room_map(degree)
+    assert psnr_db(again(tmp_path / "a.ply", field), field) > 60.0
+    ply.write_field(tmp_path / "plain.ply", field, plain=True)
+    assert psnr_db(splats.read_any(tmp_path / "plain.ply"), field) > 60.0
+
+
+@pytest.mark.parametrize(
+    ("ending", "degree"), [(".compressed.ply", 0), (".compressed.ply", 3), (".spz", 0), (".spz", 3)]
+)
+def test_a_quarter_of_the_size_gives_nearly_the_same_render(tmp_path: Path, ending: str, degree: int) -> None:
+    field = room_map(degree)
+    back = again(tmp_path / f"a{ending}", field)
+    ply.write_field(tmp_path / "a.ply", field)
+    assert (tmp_path / "map").stat().st_size <= (tmp_path / "a.ply").stat().st_size / 4
+    assert len(back) == len(field) and psnr_db(back, field) > 35.0
+
+
+def test_splat_files_give_nearly_the_same_render_where_colours_are_plain(tmp_path: Path) -> None:
+    """32 bytes a splat are what they are: 0.4 of a PLY without harmonics, an eighth of one with; harmonics are lost."""
+    field = room_map()
+    assert psnr_db(again(tmp_path / "a.splat", field), field) > 35.0
+    assert (tmp_path / "map").stat().st_size == 32 * len(field)
+    shiny = room_map(3)
+    dull = again(tmp_path / "b.splat", shiny)
+    del shiny.extras["harmonics"]
+    assert not dull.extras and psnr_db(dull, shiny) > 35.0
+
+
+@pytest.mark.parametrize("ending", COMPRESSED)
+def test_what_has_no_place_in_a_format_is_as_in_a_new_map(tmp_path: Path, ending: str) -> None:
+    field = some()
+    field.carry("correlations").params += 1.0
+    back = again(tmp_path / f"a{ending}", field)
+    assert (back.params[:, 14:17] == -7.0).all() and not back.extras
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize(("ending", "step"), [(".compressed.ply", 8 / 256), (".spz", 1 / 128)])
+def test_harmonics_come_back_to_half_a_step(tmp_path: Path, ending: str, step: float, degree: int) -> None:
+    field = some(40, degree)
+    back, was = SplatValues.of(again(tmp_path / f"a{ending}", field)), SplatValues.of(field)
+    assert back.degree == degree == was.degree
+    assert np.abs(nearest(back, was).harmonics - was.harmonics).max() <= step / 2 + 1e-6
+
+
+@pytest.mark.parametrize("ending", list(WRITERS))
+def test_the_same_map_gives_the_same_bytes_and_no_more_files(tmp_path: Path, ending: str) -> None:
+    for name in ("a", "b"):
+        WRITERS[ending](tmp_path / f"{name}{ending}", some(300, 1))
+    assert (tmp_path / f"a{ending}").read_bytes() == (tmp_path / f"b{ending}").read_bytes()
+    assert len(list(tmp_path.iterdir())) == 2
+    with pytest.raises(RunError, match="cannot write"):
+        WRITERS[ending](tmp_path / "none" / "a", some())
+
+
+@pytest.mark.parametrize("ending", [".ply", ".compressed.ply", ".spz"])
+@pytest.mark.parametrize("n", [0, 1, 256, 257])
+def test_maps_of_any_number_of_splats(tmp_path: Path, ending: str, n: int) -> None:
+    assert len(again(tmp_path / f"a{ending}", some(n))) == n
+
+
+def test_extremes_stay_finite(tmp_path: Path) -> None:
+    """Opacities of 0 and 1, colours beyond 0 … 1, needles, splats all alike: nothing that a render could not take."""
+    field = some(8)
+    field.params[0, 10], field.params[1, 10] = 60.0, -60.0
+    field.params[2, 11:14] = torch.tensor([-3.0, 0.0, 4.0])
+    field.params[3, 7:10] = torch.tensor([-90.0, 3.0, -90.0])
+    field.params[4:, :10] = field.params[4, :10].clone()
+    for ending in COMPRESSED:
+        back = again(tmp_path / f"a{ending}", field)
+        assert torch.isfinite(back.params).all() and torch.isfinite(back.scales).all()
+        assert back.opacities.max() > 0.998 and back.opacities.min() < 0.002
+
+
+def test_compressed_ply_as_its_layout_says(tmp_path: Path) -> None:
+    """Decode a file splat by splat, bit by bit, from the layout alone; more than one chunk, the last one not full."""
+    field = some(300, 1)
+    compressed_ply.write_field(tmp_path / "a.ply", field)
+    header, _, data = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
+    lines = header.decode().splitlines()
+    assert [line for line in lines if line.startswith("element")] == [
+        "element chunk 2",
+        "element vertex 300",
+        "element sh 300",
+    ]
+    assert sum(line.startswith("property uchar f_rest_") for line in lines) == 9
+    was = SplatValues.of(field)
+    chunks = [struct.unpack_from("<18f", data, 72 * i) for i in range(2)]
+    for i in range(300):
+        position, rotation, scale, color = struct.unpack_from("<4I", data, 144 + 16 * i)
+        limits = chunks[i // 256]
+        mean = [a + (b - a) * t for a, b, t in zip(limits[0:3], limits[3:6], parts_11_10_11(position), strict=True)]
+        row = int(np.linalg.norm(was.means - mean, axis=1).argmin())
+        assert (
+            np.abs(was.means[row] - mean).max()
+            < max(b - a for a, b in zip(limits[0:3], limits[3:6], strict=True)) / 1023
+        )
+        scales = [a + (b - a) * t for a, b, t in zip(limits[6:9], limits[9:12], parts_11_10_11(scale), strict=True)]
+        assert np.abs(was.log_scales[row] - scales).max() < 6 / 1023
+        rgb = [
+            a + (b - a) * (color >> s & 255) / 255
+            for a, b, s in zip(limits[12:15], limits[15:], (24, 16, 8), strict=True)
+        ]
+        assert np.abs(was.colors[row] - rgb).max() < 1 / 255 and abs(was.opacities[row] - (color & 255) / 255) < 1 / 255
+        others = [((rotation >> s & 1023) / 1023 - 0.5) * math.sqrt(2) for s in (20, 10, 0)]
+        others.insert(rotation >> 30, math.sqrt(1 - sum(q * q for q in others)))
+        assert abs(np.dot(others, was.quats[row])) > 1 - 1e-5
+        sh = struct.unpack_from("<9B", data, 144 + 16 * 300 + 9 * i)
+        by_channel = was.harmonics[row].reshape(3, 3).T.ravel()
+        assert np.abs([((b + 0.5) / 256 - 0.5) * 8 for b in sh] - by_channel).max() <= 4 / 256
+
+
+def parts_11_10_11(word: int) -> tuple[float, float, float]:
+    return (word >> 21) / 2047, (word >> 11 & 1023) / 1023, (word & 2047) / 2047
+
+
+def test_compressed_ply_without_colour_limits_is_read(tmp_path: Path) -> None:
+    """As SuperSplat 1 wrote it: 12 limits a chunk, colours in 0 … 1; comments and another order of columns besides."""
+    names = [n for n in compressed_ply.LIMITS if n[-2:] not in ("_r", "_g", "_b")]
+    words = ["packed_color", "packed_scale", "packed_rotation", "packed_position"]
+    header = ["ply", "format binary_little_endian 1.0", "comment Generated by another", "element chunk 1"]
+    header += [f"property float {n}" for n in names] + ["element vertex 1", *(f"property uint {n}" for n in words)]
+    limits = struct.pack("<12f", 0, 0, 0, 1, 2, 4, -6, -6, -6, -4, -4, -4)
+    full = 2047 << 21 | 1023 << 11 | 2047
+    splats_ = struct.pack("<4I", 0xFF_80_00_33, full, 2 << 30 | 512 << 20 | 512 << 10 | 512, full)
+    (tmp_path / "a.ply").write_bytes("\n".join([*header, "end_header", ""]).encode() + limits + splats_)
+    back = splats.read_any(tmp_path / "a.ply")
+    assert back.means[0].tolist() == [1.0, 2.0, 4.0] and back.params[0, 7:10].tolist() == [-4.0] * 3
+    assert back.colors[0].tolist() == pytest.approx([1.0, 128 / 255, 0.0]) and float(back.opacities) == pytest.approx(
+        0.2
+    )
+    assert back.quats[0].tolist() == pytest.approx([0.0, 0.0, 1.0, 0.0], abs=1e-3)
+
+
+def test_splat_as_its_layout_says(tmp_path: Path) -> None:
+    field = GaussianField.from_values(
+        torch.tensor([[9.0, 9.0, 9.0], [1.0, 2.0, 3.0]]), torch.tensor([[0.01] * 3, [0.1, 0.2, 0.3]]),
+        torch.tensor([[0.0] * 3, [1.0, 0.5, 1.2]]), 
+        quats=torch.tensor([[1.0, 0, 0, 0], [1.0, 1.0, -1.0, 1.0]]), opacities=0.8,
+    )  # fmt: skip
+    splat.write_field(tmp_path / "a.splat", field)
+    data = (tmp_path / "a.splat").read_bytes()
+    assert len(data) == 64
+    first = struct.unpack("<6f8B", data[:32])
+    assert first[:6] == pytest.approx((1.0, 2.0, 3.0, 0.1, 0.2, 0.3)), "what covers most comes first"
+    assert first[6:] == (255, 128, 255, 204, 192, 192, 64, 192)
+
+
+@pytest.mark.parametrize("start", [b"<", b"{", b" \n<", b"\x1f\x8b"])
+def test_splat_files_may_begin_with_any_bytes(tmp_path: Path, start: bytes) -> None:
+    splat.write_field(tmp_path / "a.splat", some(3))
+    (tmp_path / "b").write_bytes(start + (tmp_path / "a.splat").read_bytes()[len(start) :])
+    assert len(splats.read_any(tmp_path / "b")) == 3
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_spz_as_its_layout_says(tmp_path: Path, degree: int) -> None:
+    """Decode a file splat by splat; it holds the map turned by 180° about x, as `GaussianField.moved` turns maps."""
+    field = some(50, degree)
+    spz.write_field(tmp_path / "a.spz", field)
+    data = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    each = 3 * count(degree)
+    assert struct.unpack_from("<IIIBBBB", data) == (0x5053474E, 3, 50, degree, 12, 0, 0)
+    assert len(data) == 16 + 50 * (20 + each)
+    was = SplatValues.of(field.moved(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))))
+    at = [16 + 50 * offset for offset in (0, 9, 10, 13, 16, 20)]
+    for i in range(50):
+        mean = [int.from_bytes(data[at[0] + 9 * i + 3 * k :][:3], "little", signed=True) / 4096 for k in range(3)]
+        row = int(np.linalg.norm(was.means - mean, axis=1).argmin())
+        assert np.abs(was.means[row] - mean).max() <= 0.5 / 4096 + 1e-6
+        assert abs(data[at[1] + i] / 255 - was.opacities[row]) < 0.5 / 255 + 1e-6
+        colors = [(b / 255 - 0.5) / 0.15 * 0.28209479 + 0.5 for b in data[at[2] + 3 * i :][:3]]
+        assert np.abs(was.colors[row] - colors).max() < 0.5 / 255 / 0.15 * 0.2821 + 1e-6
+        assert np.abs(was.log_scales[row] - [b / 16 - 10 for b in data[at[3] + 3 * i :][:3]]).max() <= 1 / 32 + 1e-6
+        (word,) = struct.unpack_from("<I", data, at[4] + 4 * i)
+        xyzw = [(-1) ** (word >> s + 9 & 1) * (word >> s & 511) / 511 * math.sqrt(0.5) for s in (20, 10, 0)]
+        xyzw.insert(word >> 30, math.sqrt(1 - sum(q * q for q in xyzw)))
+        w, x, y, z = was.quats[row]
+        assert abs(np.dot(xyzw, (w, z, -y, -x))) > 1 - 1e-5, (
+            "turned axes, not a turned splat: half a turn about its x less"
+        )
+        k = [(b - 128) / 128 for b in data[at[5] + each * i :][:each]]
+        assert np.abs(np.array(k) - was.harmonics[row]).max(initial=0) <= 0.5 / 128 + 1e-5
+
+
+def test_spz_of_version_2_is_read(tmp_path: Path) -> None:
+    """Written by hand: rotations as three bytes, w left out; something behind the splats that we do not know."""
+    body = b"".join(
+        [
+            struct.pack("<IIIBBBB", 0x5053474E, 2, 1, 0, 8, 2, 0),
+            *((value & 0xFFFFFF).to_bytes(3, "little") for value in (256, -512, 128)),
+            bytes([204, 128, 128, 166, 96, 112, 128]),
+            bytes([191, 128, 64]),
+            b"an extension",
+        ]
+    )
+    (tmp_path / "a.spz").write_bytes(gzip.compress(body))
+    back = splats.read_any(tmp_path / "a.spz")
+    assert back.means[0].tolist() == [1.0, 2.0, -0.5] and back.params[0, 7:10].tolist() == [-4.0, -3.0, -2.0]
+    assert float(back.opacities) == pytest.approx(0.8)
+    assert back.colors[0].tolist() == pytest.approx([0.5 + 0.0036878, 0.5 + 0.0036878, 0.5 + 0.283935], abs=1e-5)
+    w = math.sqrt(1 - (191 / 127.5 - 1) ** 2 - (128 / 127.5 - 1) ** 2 - (64 / 127.5 - 1) ** 2)
+    assert back.quats[0].tolist() == pytest.approx([w, 191 / 127.5 - 1, 1 - 128 / 127.5, 1 - 64 / 127.5], abs=1e-6)
+
+
+def test_spz_of_a_town_has_coarser_positions_not_wrong_ones(tmp_path: Path) -> None:
+    field = some(100)
+    field.params[:, :3] *= 20_000.0
+    back, was = SplatValues.of(again(tmp_path / "a.spz", field)), SplatValues.of(field)
+    assert np.abs(nearest(back, was).means - was.means).max() < 0.01
+
+
+def test_morton_order_keeps_neighbours_together() -> None:
+    points = np.stack(np.meshgrid(*[np.arange(8.0)] * 3), -1).reshape(-1, 3)[np.random.default_rng(0).permutation(512)]
+    order = morton_order(points)
+    assert sorted(order) == list(range(512))
+    assert all(np.ptp(points[order[i : i + 8]], axis=0).max() <= 1.0 for i in range(0, 512, 8)), "eights are cubes"
+    assert morton_order(np.zeros((3, 3))).tolist() == [0, 1, 2] and len(morton_order(np.empty((0, 3)))) == 0
+
+
+def test_smallest_three_say_the_rotation() -> None:
+    quats = np.random.default_rng(0).normal(size=(200, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    which, others = smallest_three(quats)
+    assert np.abs(others).max() <= math.sqrt(0.5) and set(which) == {0, 1, 2, 3}
+    np.testing.assert_allclose(np.abs((from_smallest_three(which, others) * quats).sum(1)), 1.0)
