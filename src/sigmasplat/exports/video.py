@@ -107,7 +107,7 @@ def from_above(
     cut_m = float(np.median(path.T_world_camera[:, :3, 3] @ T[2, :3] + T[2, 3])) + CUT_M
     middle = np.append((low + high)[:2] / 2.0, min(cut_m, 0.8) / 2.0)
     half_view = np.arctan(min(camera.width / camera.fx, camera.height / camera.fy) / 2.0)
-    radius_m = 0.9 * float(np.linalg.norm((high - low)[:2]) / 2.0 / np.sin(half_view))
+    radius_m = 0.85 * float(np.linalg.norm((high - low)[:2]) / 2.0 / np.sin(half_view))
     T_world_floor = se3.inverse(T)
     center = T_world_floor[:3, :3] @ middle + T_world_floor[:3, 3]
     kept = field.moved(torch.eye(4))  # a copy

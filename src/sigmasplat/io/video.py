@@ -5,7 +5,9 @@ when used.
 """
 
 import os
+import sys
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +70,8 @@ def _write_vp9(path: Path, images: Iterable[Rgb], fps: float, codec: str) -> Non
         for image in images:
             if writer is None:
                 size = (image.shape[1] // 2 * 2, image.shape[0] // 2 * 2)
-                writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*codec), fps, size)
+                with _quiet():
+                    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*codec), fps, size)
                 if not writer.isOpened():
                     raise RunError(
                         f"cannot write {path.name} with this OpenCV; write .gif or .webp, or a writable place"
@@ -79,6 +82,20 @@ def _write_vp9(path: Path, images: Iterable[Rgb], fps: float, codec: str) -> Non
             writer.release()
     if writer is None:
         raise RunError(NO_IMAGES)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep the process's standard error silent: OpenCV warns there of a tag in .webm that it mends itself."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def _write_pictures(path: Path, images: Iterator[Rgb], fps: float, kind: str) -> None:
