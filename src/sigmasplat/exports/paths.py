@@ -19,15 +19,20 @@ LEAST_OPACITY = 0.5
 Floats = NDArray[np.float64]
 
 
-def export_kitti(recorded: Recorded, target: Path) -> None:
-    """Write the poses of all frames, lost ones too, since a line's number is its frame. Raises RunError."""
+def export_kitti(recorded: Recorded, target: Path) -> int:
+    """Write the poses of all frames, lost ones too, since a line's number is its frame; return how many.
+
+    Raises RunError.
+    """
     kitti.write_poses(target, recorded.path)
+    return len(recorded.path)
 
 
-def export_transforms(recorded: Recorded, target: Path, pictures: bool = False) -> None:
+def export_transforms(recorded: Recorded, target: Path, pictures: bool = False) -> int:
     """Write transforms.json; with `pictures` of the keyframes alone, and images/, depths/ and points.ply beside it.
 
-    Without, of all frames that were not lost, their names those that `pictures` would give. Raises RunError.
+    Without, of all frames that were not lost, their names those that `pictures` would give. Returns how many. Raises
+    RunError.
     """
     frames = write_pictures(recorded, target.parent, depth=True) if pictures else recorded.frames()
     if pictures:
@@ -41,12 +46,13 @@ def export_transforms(recorded: Recorded, target: Path, pictures: bool = False) 
         depth_names=[f"{DEPTHS}/{picture_name(frame)}" for frame in frames] if pictures else None,
         points_name=POINTS if pictures else None,
     )
+    return len(frames)
 
 
-def export_colmap(recorded: Recorded, target: Path, pictures: bool = False) -> None:
+def export_colmap(recorded: Recorded, target: Path, pictures: bool = False) -> int:
     """Write a sparse model to sparse/0 in a folder; with `pictures` of the keyframes, which go to images/.
 
-    Without, of all frames that were not lost. Raises RunError.
+    Without, of all frames that were not lost. Returns how many. Raises RunError.
     """
     model = target / SPARSE
     try:
@@ -57,6 +63,7 @@ def export_colmap(recorded: Recorded, target: Path, pictures: bool = False) -> N
     names = [picture_name(frame) for frame in frames]
     poses = recorded.path.T_world_camera[frames]
     colmap.write_model(model, recorded.camera, names, poses, *map_points(recorded))
+    return len(frames)
 
 
 def picture_name(frame: int) -> str:

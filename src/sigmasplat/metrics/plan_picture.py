@@ -203,8 +203,6 @@ class _Sheet:
             y += LINE
             self.numbered(GAP + DOT, y, number, self.theme.curves[REASONS[region.why]])
             x_m, y_m = region.center_m
-            aside, along = "right" if x_m > 0 else "left", "ahead" if y_m > 0 else "behind"
+            aside, along = "right" if x_m > 0 else "left", "ahead of" if y_m > 0 else "behind"
             where = f"{abs(x_m):.1f} m {aside}, {abs(y_m):.1f} m {along}"
-            self.text(
-                GAP + 28, y, f"{region.why}: {region.found} · {region.area_m2:.2f} sq m · {where} of the start", 14
-            )
+            self.text(GAP + 28, y, f"{region.why}: {region.found} · {region.area_m2:.2f} sq m · {where} the start", 14)
