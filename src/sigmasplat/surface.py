@@ -36,10 +36,16 @@ class Recording:
     @staticmethod
     def of(run: RunFolder, camera: Camera) -> "Recording":
         """Read a run; `camera` is the source's. Raises RunError if it has no checkpoint or no keyframe."""
+        settings = run.config().input
+        return Recording.at(run, camera.prepared(settings.width, settings.crop_px))
+
+    @staticmethod
+    def at(run: RunFolder, camera: Camera) -> "Recording":
+        """Read a run; `camera` is of the images it worked on. Raises RunError as `of` does."""
         config, (checkpoint, _) = run.config(), run.read_checkpoint()
         if not {"keyframes", "T_world_camera"} <= set(checkpoint) or not len(checkpoint["keyframes"]):
             raise RunError(f"run {run.path} has no keyframes in its checkpoint; run it again")
-        return Recording(run, config, checkpoint, camera.prepared(config.input.width, config.input.crop_px))
+        return Recording(run, config, checkpoint, camera)
 
     def standpoints(self) -> tuple[Iterable[Standpoint], int]:
         """Return the keyframes, each before its own submap, or before the map of a run in one piece, and their number.

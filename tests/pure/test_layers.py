@@ -26,6 +26,7 @@ FLOORS = [
         "screen",
         "doctor",
         "surface",
+        "exports",
         "ablation",
         "inspection",
         "page",

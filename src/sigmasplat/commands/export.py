@@ -1,9 +1,13 @@
 """Write what a run made in other programs' formats: sigmasplat export."""
 
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from sigmasplat.commands import options
 from sigmasplat.commands.export_formats import ExportOptions, Format, Origin, choose, listed, refuse_unobeyed
+from sigmasplat.commands.export_scene import SCENE
 from sigmasplat.commands.export_splats import SPLATS
 from sigmasplat.commands.options import refuse_existing
 
@@ -16,8 +20,12 @@ def _trajectory(origin: Origin, target: Path, _: ExportOptions) -> str:
     return f"{len(path):,} poses"
 
 
-FORMATS = (*SPLATS, Format("trajectory", (".txt",), "the path as TUM text", _trajectory))
+FORMATS = (*SPLATS, Format("trajectory", (".txt",), "the path as TUM text", _trajectory), *SCENE)
 """What can be written, the first by default. A new one: a row here, or a module of rows beside `export_splats`."""
+
+
+AS_USUAL = ExportOptions()
+AskedFlat = Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
 
 
 def export(
@@ -25,9 +33,7 @@ def export(
     out: options.OutFile = None,
     format: options.Format = None,
     overwrite: options.Overwrite = False,
-    sigma_below: options.SigmaBelow = None,
-    opacity_above: options.OpacityAbove = None,
-    plain: options.Plain = False,
+    asked: AskedFlat = AS_USUAL,
 ) -> int:
     """Write a run's map, or a map from a file, for viewers and other programs; or a run's path.
 
@@ -35,7 +41,7 @@ def export(
 
     example: sigmasplat export runs/kitchen --out kitchen.spz --sigma-below 0.1
     """
-    origin, asked = Origin(run), ExportOptions(sigma_below, opacity_above, plain)
+    origin = Origin(run)
     chosen = choose(FORMATS, format, out)
     refuse_unobeyed(chosen, FORMATS, asked)
     target = out or Path(origin.name + chosen.endings[0])

@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sigmasplat.commands import options
 from sigmasplat.errors import ConfigError, RunError
 
 if TYPE_CHECKING:
@@ -46,9 +47,17 @@ class Origin:
 class ExportOptions:
     """Options that only some formats obey (`Format.obeys`), by their names on the command line."""
 
-    sigma_below: float | None = None
-    opacity_above: float | None = None
-    plain: bool = False
+    sigma_below: options.SigmaBelow = None
+    opacity_above: options.OpacityAbove = None
+    plain: options.Plain = False
+    pictures: options.Pictures = False
+    voxel_m: options.VoxelM = 0.01
+    size: options.FilmSize = 0
+    fps: options.FilmRate = 25.0
+    seconds: options.FilmSeconds = None
+    path: options.FilmPath = "run"
+    cell_m: options.CellM = 0.05
+    source: options.MovedSource = None
 
     def given(self) -> list[str]:
         """Name the options that are not as they are by default."""

@@ -103,6 +103,19 @@ OpacityAbove = Annotated[
 Plain = Annotated[
     bool, arg(help="PLY in 3DGS's own 62 columns, without σ², for readers that know no others", help_behavior_hint="")
 ]
+Pictures = Annotated[
+    bool, arg(help="write the keyframes' pictures too, and take only these as views", help_behavior_hint="")
+]
+CellM = Annotated[float, arg(metavar="M", help="edge of the floor plan's cells in metres")]
+FilmSize = Annotated[
+    int, arg(metavar="PX", help="width of each of a film's panels", help_behavior_hint="(default: the run's images')")
+]
+FilmRate = Annotated[float, arg(metavar="N", help="images per second of a film")]
+FilmSeconds = Annotated[
+    float | None,
+    arg(metavar="S", help="length of a film", help_behavior_hint="(default: the path's, 4 to 60; orbit 12)"),
+]
+FilmPath = Annotated[Literal["run", "orbit"], arg(help="a film goes along the run's path, or round the room above it")]
 
 
 @dataclass(frozen=True)

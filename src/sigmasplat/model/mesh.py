@@ -53,6 +53,16 @@ class Mesh:
         a, b, c = np.moveaxis(self.corners, 1, 0)
         return 0.5 * np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
+    def normals(self) -> NDArray[np.float64]:
+        """Return unit normals of the vertices [V, 3], outwards: the mean of their faces' by area; 0 without a face."""
+        a, b, c = np.moveaxis(self.corners, 1, 0)
+        across = np.cross(b - a, c - a)
+        sums = np.stack(
+            [np.bincount(self.faces.ravel(), np.repeat(across[:, k], 3), len(self.vertices)) for k in range(3)]
+        )
+        length = np.linalg.norm(sums, axis=0)
+        return np.asarray(np.divide(sums, length, out=np.zeros_like(sums), where=length > 0).T)
+
     def sampled(self, points: int, seed: int) -> NDArray[np.float64]:
         """Draw points [points, 3] evenly over the area; none where there is no area."""
         rng, areas = np.random.default_rng(seed), self.areas()

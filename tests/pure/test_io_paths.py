@@ -1,0 +1,124 @@
+"""Paths in other programs' formats, read back here by readers that know nothing of ours; COLMAP's by its own too."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sigmasplat.errors import RunError
+from sigmasplat.io import colmap, kitti, nerfstudio
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.trajectory import Trajectory
+
+CAMERA = Camera(64, 48, 50.0, 51.0, 30.25, 24.75)
+NAMES = [f"frame-{i:06d}.png" for i in range(7)]
+
+
+def some_path(n: int = 7) -> Trajectory:
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    poses[:, :3, :3] = Rotation.random(n, random_state=2).as_matrix()
+    poses[:, :3, 3] = np.random.default_rng(2).normal(0, 3, (n, 3))
+    return Trajectory(100.0 + np.arange(n) / 30.0, poses)
+
+
+def seen_by_colmap(points: np.ndarray, line: list[str], camera: list[str]) -> np.ndarray:
+    """Project points as COLMAP's documents say: R, t to the camera, PINHOLE, the first pixel's centre at (½, ½)."""
+    w, x, y, z, *t = (float(word) for word in line[1:8])
+    fx, fy, cx, cy = (float(word) for word in camera[4:])
+    p = Rotation.from_quat([x, y, z, w]).apply(points) + t
+    return np.stack([fx * p[:, 0] / p[:, 2] + cx, fy * p[:, 1] / p[:, 2] + cy], 1)
+
+
+def seen_by_us(points: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
+    p = (points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+    return np.stack([CAMERA.fx * p[:, 0] / p[:, 2] + CAMERA.cx, CAMERA.fy * p[:, 1] / p[:, 2] + CAMERA.cy], 1)
+
+
+def ahead(T_world_camera: np.ndarray) -> np.ndarray:
+    """Return points before a camera, in the world."""
+    points = np.random.default_rng(3).uniform([-1, -1, 1], [1, 1, 4], (20, 3))
+    return points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+
+
+def test_kitti_rows_are_the_matrices(tmp_path: Path) -> None:
+    path = some_path()
+    kitti.write_poses(tmp_path / "poses.txt", path)
+    rows = np.loadtxt(tmp_path / "poses.txt")
+    assert rows.shape == (7, 12)
+    np.testing.assert_allclose(rows.reshape(-1, 3, 4), path.T_world_camera[:, :3], atol=1e-11)
+    with pytest.raises(RunError, match="cannot write"):
+        kitti.write_poses(tmp_path / "no" / "poses.txt", path)
+
+
+def test_transforms_are_opengl_cameras(tmp_path: Path) -> None:
+    """Points project as nerfstudio does it: x right, y up, looking along −z, pixels counted from the corner."""
+    path, file = some_path(), tmp_path / "transforms.json"
+    nerfstudio.write_transforms(
+        file,
+        CAMERA,
+        NAMES,
+        path.T_world_camera,
+        path.timestamps_s.tolist(),
+        depth_names=NAMES,
+        points_name="points.ply",
+    )
+    read = json.loads(file.read_text())
+    assert (read["w"], read["h"], read["camera_model"]) == (64, 48, "OPENCV") and read["ply_file_path"] == "points.ply"
+    assert read["depth_unit_scale_factor"] == 1e-3 and all(read[name] == 0 for name in ("k1", "k2", "p1", "p2"))
+    assert [f["file_path"] for f in read["frames"]] == [f["depth_file_path"] for f in read["frames"]] == NAMES
+    for frame, T, t in zip(read["frames"], path.T_world_camera, path.timestamps_s, strict=True):
+        points = ahead(T)
+        x, y, z = (np.linalg.inv(frame["transform_matrix"]) @ np.c_[points, np.ones(20)].T)[:3]
+        assert (z < 0).all() and frame["timestamp_s"] == t
+        pixels = np.stack([read["cx"] + read["fl_x"] * x / -z, read["cy"] - read["fl_y"] * y / -z], 1)
+        np.testing.assert_allclose(pixels - 0.5, seen_by_us(points, T), atol=1e-6)
+
+
+def test_transforms_without_pictures_name_none_of_depth(tmp_path: Path) -> None:
+    path = some_path()
+    nerfstudio.write_transforms(tmp_path / "t.json", CAMERA, NAMES, path.T_world_camera, path.timestamps_s.tolist())
+    read = json.loads((tmp_path / "t.json").read_text())
+    assert "depth_file_path" not in read["frames"][0] and not {"ply_file_path", "depth_unit_scale_factor"} & set(read)
+
+
+def write_colmap(folder: Path) -> tuple[Trajectory, np.ndarray, np.ndarray]:
+    path, rng = some_path(), np.random.default_rng(4)
+    points, colors = rng.normal(size=(30, 3)), rng.uniform(-0.1, 1.1, (30, 3))
+    colmap.write_model(folder, CAMERA, NAMES, path.T_world_camera, points, colors)
+    return path, points, colors
+
+
+def test_colmap_text_is_as_its_documents_say(tmp_path: Path) -> None:
+    path, points, colors = write_colmap(tmp_path)
+    lines = {
+        name: [line for line in (tmp_path / f"{name}.txt").read_text().split("\n") if not line.startswith("#")]
+        for name in ("cameras", "images", "points3D")
+    }
+    (camera, end), images = lines["cameras"], lines["images"]
+    assert camera.split()[:4] == ["1", "PINHOLE", "64", "48"] and end == ""
+    assert images[1:-1:2] == [""] * 7, "an empty line of features after each image"
+    for i, (line, T) in enumerate(zip(images[:-1:2], path.T_world_camera, strict=True)):
+        words, there = line.split(), ahead(T)
+        assert (words[0], words[8], words[9]) == (str(i + 1), "1", NAMES[i]) and len(words) == 10
+        np.testing.assert_allclose(seen_by_colmap(there, words, camera.split()) - 0.5, seen_by_us(there, T), atol=1e-6)
+    rows = np.array([line.split() for line in lines["points3D"][:-1]], float)
+    np.testing.assert_allclose(rows[:, 1:4], points, atol=1e-6)
+    np.testing.assert_array_equal(rows[:, 4:7], np.rint(np.clip(colors, 0, 1) * 255))
+    assert rows.shape == (30, 8) and rows[:, 0].tolist() == list(range(1, 31)), "no tracks"
+
+
+def test_colmap_reads_it(tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap", reason="COLMAP's own reader is 38 MB: pip install pycolmap")
+    path, points, colors = write_colmap(tmp_path)
+    model = pycolmap.Reconstruction(str(tmp_path))
+    assert (len(model.cameras), len(model.images), len(model.points3D)) == (1, 7, 30)
+    for image in model.images.values():
+        T = path.T_world_camera[NAMES.index(image.name)]
+        there = ahead(T)
+        pixels = np.array([image.project_point(point) for point in there])
+        np.testing.assert_allclose(pixels - 0.5, seen_by_us(there, T), atol=1e-6)
+    for number, point in model.points3D.items():
+        np.testing.assert_allclose(point.xyz, points[number - 1], atol=1e-6)
+        np.testing.assert_array_equal(point.color, np.rint(np.clip(colors[number - 1], 0, 1) * 255))

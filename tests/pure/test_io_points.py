@@ -1,0 +1,63 @@
+"""Points and meshes in files, as trimesh, which is not ours, loads them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sigmasplat.io.mesh import write_mesh
+from sigmasplat.io.points import write_points
+from sigmasplat.model.mesh import Mesh
+
+trimesh = pytest.importorskip("trimesh", reason="the [dev] extra is not installed")
+
+
+def ball() -> Mesh:
+    """Return a coloured ball of radius 0.5 m about (1, 2, 3)."""
+    made = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
+    colors = np.random.default_rng(0).integers(0, 256, made.vertices.shape) / np.float32(255.0)
+    return Mesh(
+        np.add(made.vertices, [1, 2, 3]).astype(np.float32), made.faces.astype(np.int32), colors.astype(np.float32)
+    )
+
+
+@pytest.mark.parametrize("normals", [True, False])
+def test_points_are_loaded_with_normals_and_colours(tmp_path: Path, normals: bool) -> None:
+    mesh = ball()
+    write_points(tmp_path / "a.ply", mesh.vertices, mesh.colors, mesh.normals() if normals else None)
+    cloud = trimesh.load(tmp_path / "a.ply")
+    assert isinstance(cloud, trimesh.PointCloud)
+    np.testing.assert_array_equal(cloud.vertices.astype(np.float32), mesh.vertices)
+    np.testing.assert_array_equal(cloud.colors[:, :3], np.rint(mesh.colors * 255))
+    rows = cloud.metadata["_ply_raw"]["vertex"]["data"]
+    assert ("nx" in rows.dtype.names) is normals
+    if normals:
+        found = np.stack([rows[name].ravel() for name in ("nx", "ny", "nz")], 1)
+        np.testing.assert_allclose(found, mesh.normals(), atol=1e-6)
+
+
+def test_no_points_are_written_as_none(tmp_path: Path) -> None:
+    write_points(tmp_path / "a.ply", np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)))
+    assert b"element vertex 0\n" in (tmp_path / "a.ply").read_bytes()
+
+
+def test_normals_of_a_ball_point_outwards_and_stray_vertices_have_none() -> None:
+    mesh = ball()
+    outwards = (mesh.vertices - np.array([1, 2, 3])) / 0.5
+    assert (mesh.normals() * outwards).sum(1).min() > 0.995
+    theirs = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    triangle = Mesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [9, 9, 9]], np.float32), np.array([[0, 1, 2]], np.int32))
+    np.testing.assert_array_equal(triangle.normals(), [[0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 0]])
+    assert (mesh.normals() * theirs.vertex_normals).sum(1).min() > 0.999
+
+
+@pytest.mark.parametrize("ending", ["ply", "obj", "glb"])
+def test_meshes_are_loaded_by_a_standard_loader(tmp_path: Path, ending: str) -> None:
+    mesh = ball()
+    write_mesh(tmp_path / f"a.{ending}", mesh)
+    loaded = trimesh.load(tmp_path / f"a.{ending}", process=False, maintain_order=True, force="mesh")
+    upright = mesh.vertices * ([1, -1, -1] if ending == "glb" else [1, 1, 1])  # glTF is y up
+    np.testing.assert_allclose(loaded.vertices, upright, atol=1e-5)
+    np.testing.assert_array_equal(loaded.faces, mesh.faces)
+    np.testing.assert_allclose(loaded.visual.vertex_colors[:, :3], np.rint(mesh.colors * 255), atol=1)
+    assert loaded.is_watertight and loaded.volume == pytest.approx(4 / 3 * np.pi * 0.125, rel=0.07)

@@ -1,0 +1,87 @@
+"""Films in files: as many images, of that size, rate and look, as were put in; nothing half-written is left."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sigmasplat.errors import BackendError, RunError
+from sigmasplat.io.video import write_video
+
+SIZE = (48, 96)
+
+
+def images(count: int = 9, size: tuple[int, int] = SIZE) -> list[np.ndarray]:
+    """Return pictures that grow brighter, red on the left and blue on the right."""
+    out = np.zeros((count, *size, 3), np.uint8)
+    for i in range(count):
+        out[i, :, : size[1] // 2, 0] = out[i, :, size[1] // 2 :, 2] = 60 + 15 * i
+    return list(out)
+
+
+def read(path: Path) -> tuple[list[np.ndarray], float]:
+    """Return the images, RGB, and the rate of a film, as OpenCV or Pillow read them."""
+    if path.suffix in (".gif", ".webp"):
+        with Image.open(path) as film:
+            frames, duration_ms = [], film.info.get("duration", 0)
+            for i in range(film.n_frames):
+                film.seek(i)
+                frames.append(np.asarray(film.convert("RGB")))
+                duration_ms = film.info["duration"]
+        return frames, 1000.0 / duration_ms
+    cv2 = pytest.importorskip("cv2", reason="the [video] extra is not installed")
+    film, frames = cv2.VideoCapture(str(path)), []
+    while (got := film.read())[0]:
+        frames.append(got[1][..., ::-1])
+    return frames, film.get(cv2.CAP_PROP_FPS)
+
+
+@pytest.mark.parametrize("ending", ["webm", "mp4", "gif", "webp"])
+def test_films_come_back_as_they_went_in(tmp_path: Path, ending: str, capfd: pytest.CaptureFixture[str]) -> None:
+    if ending in ("webm", "mp4"):
+        pytest.importorskip("cv2", reason="the [video] extra is not installed")
+    write_video(tmp_path / f"a.{ending}", iter(images()), 20.0)
+    frames, fps = read(tmp_path / f"a.{ending}")
+    assert len(frames) == 9 and fps == pytest.approx(20.0)
+    for found, wanted in zip(frames, images(), strict=True):
+        assert found.shape == wanted.shape and np.abs(found.astype(int) - wanted)[:, 8:40].mean() < 6
+        assert found[:, :40, 0].mean() > found[:, :40, 2].mean(), "red is not blue"
+    assert [path.name for path in tmp_path.iterdir()] == [f"a.{ending}"]
+    assert capfd.readouterr().err == ""
+
+
+def test_webm_and_mp4_hold_vp9(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2", reason="the [video] extra is not installed")
+    for ending in ("webm", "mp4"):
+        write_video(tmp_path / f"a.{ending}", images(3, (49, 97)), 25.0)
+        film = cv2.VideoCapture(str(tmp_path / f"a.{ending}"))
+        assert int(film.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").upper() in (b"VP90", b"VP09")
+        assert (film.get(cv2.CAP_PROP_FRAME_WIDTH), film.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (96, 48), "odd ones are cut"
+
+
+@pytest.mark.parametrize("ending", ["mp4", "gif"])
+def test_a_film_that_breaks_off_leaves_nothing(tmp_path: Path, ending: str) -> None:
+    if ending == "mp4":
+        pytest.importorskip("cv2", reason="the [video] extra is not installed")
+
+    def breaking() -> Iterator[np.ndarray]:
+        yield from images(2)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_video(tmp_path / f"a.{ending}", breaking(), 20.0)
+    with pytest.raises(RunError, match="at least one image"):
+        write_video(tmp_path / f"a.{ending}", [], 20.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_other_names_and_a_missing_opencv_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(RunError, match=r"as a\.avi; give a name that ends in \.webm, \.mp4, \.gif, \.webp"):
+        write_video(tmp_path / "a.avi", images(), 20.0)
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(BackendError, match=r"pip install 'sigmasplat\[video\]', or write \.gif or \.webp"):
+        write_video(tmp_path / "a.webm", images(), 20.0)
+    write_video(tmp_path / "a.gif", images(), 20.0)
