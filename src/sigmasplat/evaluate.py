@@ -17,7 +17,7 @@ from sigmasplat.metrics.trajectory import align_rigid, associate, path_scores_of
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.page import write_page
+from sigmasplat.page import plan_of, write_page
 from sigmasplat.render import render
 from sigmasplat.sources.base import Source
 
@@ -57,6 +57,7 @@ def evaluate(
     path_scores, problem = path_scores_of(path, run.read_odometry(), truth)
     chosen = {kind: _spread(records, views_per_kind) for kind, records in _kinds(log).items()}
     gallery, config, loops = Gallery(run, strips_per_kind), run.config(), run.read_loops()
+    standard = renderer is None
     renderer = renderer or partial(render, options=config.render, backend=config.backend)
     maps = views.Maps(field, run.submaps, _anchors(run, records, config.final))
     scores = _score_views(config, source, maps, chosen, gallery, renderer, progress)
@@ -68,7 +69,8 @@ def evaluate(
     run.write_metrics(metrics)
     plots = _draw_plots(run, log, None if problem else truth, loops)
     warnings = [str(problem)] if problem else []
-    write_page(run, metrics, gallery.strips, plots, warnings)
+    plan = plan_of(run, field, log, source.camera) if standard else None
+    write_page(run, metrics, gallery.strips, plots, warnings, plan)
     if problem:
         raise problem
     return metrics

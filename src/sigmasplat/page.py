@@ -4,11 +4,23 @@ import json
 from functools import partial
 from typing import Any
 
-from sigmasplat.errors import RunError
+import numpy as np
+
+from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.io.embedded import data_uri
 from sigmasplat.io.runs import RunFolder
+from sigmasplat.metrics.floor_plan import FloorPlan, floor_plan
+from sigmasplat.metrics.plan_picture import draw_floor_plan
+from sigmasplat.metrics.plot import DARK, LIGHT
 from sigmasplat.metrics.report import Contents, build_report
-from sigmasplat.metrics.story import advice, in_short
+from sigmasplat.metrics.story import advice, in_short, unsure
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.render import render
+
+LOOKS = 24
+"""Enough for a picture on a page; `export` looks from more places."""
 
 
 def write_page(
@@ -17,12 +29,17 @@ def write_page(
     strips: dict[str, list[str]],
     plots: dict[str, str],
     warnings: list[str],
+    plan: FloorPlan | None = None,
 ) -> None:
     """Write report.html from metrics and the pictures in images/; `strips` names views by kind, `plots` holds captions.
 
     Raises RunError if a picture cannot be read or the page not be written.
     """
     config, facts = run.config(), run.facts()
+    if plan is not None:
+        for theme in (LIGHT, DARK):
+            run.write_image(f"plan-{theme.name}.png", draw_floor_plan(plan, theme))
+        plots = plots | {"plan": "The map from above. Circles are worth another visit, the largest first."}
     contents = Contents(
         title=f"SigmaSplat · {metrics.get('source')}",
         subtitle=" · ".join([config.name, f"version {facts.get('version')}", _machine(run), str(facts.get("status"))]),
@@ -34,10 +51,29 @@ def write_page(
         loops=run.read_loops(),
         story=in_short(metrics, _machine(run)),
         advice=advice(metrics, str(run.path), str(facts.get("source_path") or "PATH"), config.to_dict()),
+        unsure=unsure(metrics, plan),
         seconds=_seconds(run),
         picture=partial(_shown, run),
     )
     run.write_report(build_report(contents))
+
+
+def plan_of(run: RunFolder, field: GaussianField, log: list[dict[str, Any]], camera: Camera) -> FloorPlan | None:
+    """Draw up the plan of a run's map, looked at from its path but for lost frames; None where nothing is seen.
+
+    log: records with their `T_world_camera`; `camera` is the source's.
+    """
+    config, known = run.config(), [record for record in log if not record["lost"]]
+    path = Trajectory(
+        np.array([record["timestamp_s"] for record in known]),
+        np.array([record["T_world_camera"] for record in known]).reshape(-1, 4, 4),
+    )
+    seen_by = camera.prepared(config.input.width, config.input.crop_px)
+    renderer = partial(render, options=config.render, backend=config.backend)
+    try:
+        return floor_plan(field, path, seen_by, most=LOOKS, renderer=renderer)
+    except SigmaSplatError:
+        return None
 
 
 def _machine(run: RunFolder) -> str:

@@ -11,6 +11,7 @@ from rich.filesize import decimal
 from rich.progress import BarColumn, DownloadColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from sigmasplat.metrics.story import ranges
 from sigmasplat.metrics.tables import headline, number
 from sigmasplat.profile import shares
 from sigmasplat.protocols import Stepped, Tried
@@ -84,7 +85,7 @@ class Screen:
         lost = metrics.get("lost_frames") or []
         if lost:
             frames = metrics.get("frames")
-            self.say(f"tracking was LOST on {len(lost)} of {frames} frames: {_ranges(lost)}; do not trust those poses")
+            self.say(f"tracking was LOST on {len(lost)} of {frames} frames: {ranges(lost)}; do not trust those poses")
 
     def profile(self, seconds: Mapping[str, float]) -> None:
         """Print where the time went, a stage a line."""
@@ -109,18 +110,6 @@ def _figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     training = [(name, number(scores.get("psnr_db"), 2), "dB") for name, scores in kinds.items()]
     place = 1 + max(i for i, row in enumerate(rows) if row[0].startswith("PSNR"))
     return [*rows[:place], *training, *rows[place:]]
-
-
-def _ranges(indices: list[int], most: int = 4) -> str:
-    """Write increasing indices as ranges: 3–5, 9."""
-    runs: list[list[int]] = []
-    for i in indices:
-        if runs and i == runs[-1][-1] + 1:
-            runs[-1].append(i)
-        else:
-            runs.append([i])
-    words = [str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs[:most]]
-    return ", ".join(words) + (", …" if len(runs) > most else "")
 
 
 def _bar(bars: Progress, title: str, total: int | None) -> Show:

@@ -4,6 +4,7 @@ import json
 import shlex
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 from PIL import Image
@@ -13,7 +14,8 @@ from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import RunError
 from sigmasplat.io.embedded import data_uri
 from sigmasplat.io.runs import RunFolder
-from sigmasplat.metrics.story import advice, in_short
+from sigmasplat.metrics.doubtful import Region
+from sigmasplat.metrics.story import advice, in_short, unsure
 from sigmasplat.page import write_page
 from sigmasplat.presets import preset
 
@@ -85,6 +87,16 @@ def test_advice_names_a_command_that_can_be_given(changes: dict, settings: dict,
 
 def test_a_good_run_is_only_told_what_to_do_with_it() -> None:
     assert [command.split()[1] for _, command in advice(GOOD, "runs/k", "data/k", SETTINGS)] == ["view", "mesh"]
+
+
+def test_where_it_was_unsure() -> None:
+    plan = SimpleNamespace(regions=[Region((0, 0), 0.3, area, why, "") for area, why in
+                                    ((2.0, "unseen"), (1.5, "unseen"), (0.4, "unsure"))])  # fmt: skip
+    assert unsure(GOOD, None) == []
+    (sentence,) = unsure(GOOD, plan)
+    assert "2 never seen (3.5 m²), 1 mapped, but unsure (0.4 m²)" in sentence
+    lost = unsure(GOOD | {"lost_frames": [3, 4, 5, 9]}, SimpleNamespace(regions=[]))
+    assert len(lost) == 1 and "3–5, 9" in lost[0]
 
 
 def test_the_page_is_one_file(tmp_path) -> None:

@@ -87,17 +87,18 @@ def floor_plan(
     camera: Camera,
     *,
     cell_m: float = CELL_M,
+    most: int = sights.MOST,
     renderer: sights.Renderer = render,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> FloorPlan:
-    """Look at a map from its path and draw up its plan; `camera` gives the field of view.
+    """Look at a map from its path and draw up its plan; `camera` gives the field of view, `most` poses are looked from.
 
     `progress` is told (looks done, of how many). Raises ConfigError unless 1 mm ≤ cell_m ≤ 1 m; SigmaSplatError if
     nothing is seen.
     """
     if not 0.001 <= cell_m <= 1.0:
         raise ConfigError(f"a cell of the floor plan must be 0.001 to 1 m wide, found {cell_m}")
-    seen = list(sights.looks(field, trajectory, camera, renderer, progress=progress))
+    seen = list(sights.looks(field, trajectory, camera, renderer, most, progress))
     T_floor_world = floor_frame(seen)
     moved = partial(_moved, T_floor_world)
     grid = _Cells.around([moved(sight.points) for sight in seen], moved(trajectory.T_world_camera[:, :3, 3]), cell_m)

@@ -1,8 +1,11 @@
 """Say what scores mean, to somebody who was not there: what was made, how good it is, what to try next."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sigmasplat.metrics.tables import number
+
+if TYPE_CHECKING:
+    from sigmasplat.metrics.floor_plan import FloorPlan
 
 Metrics = dict[str, Any]
 Advice = tuple[str, str]
@@ -78,6 +81,34 @@ def _uncertainty(metrics: Metrics) -> list[str]:
     return [
         f"The map's own uncertainty V tells right pixels from wrong ones {said} (rank correlation {number(rank, 2)})."
     ]
+
+
+def unsure(metrics: Metrics, plan: "FloorPlan | None") -> list[str]:
+    """Return sentences about where the map should not be trusted: frames that were lost, and what a plan shows."""
+    sentences = []
+    lost = metrics.get("lost_frames") or []
+    if lost:
+        sentences.append(f"Do not trust what was seen around images {ranges(lost)}: the camera was lost there.")
+    if plan is None:
+        return sentences
+    said = {"unseen": "never seen", "thin": "mapped thinly", "unsure": "mapped, but unsure"}
+    areas = {why: [region.area_m2 for region in plan.regions if region.why == why] for why in said}
+    parts = [f"{len(found)} {said[why]} ({number(sum(found), 1)} m²)" for why, found in areas.items() if found]
+    if parts:
+        sentences.append(f"Worth another visit, of the places that the path passes: {', '.join(parts)}.")
+    return sentences
+
+
+def ranges(indices: list[int], most: int = 4) -> str:
+    """Write increasing indices as ranges: 3–5, 9."""
+    runs: list[list[int]] = []
+    for i in indices:
+        if runs and i == runs[-1][-1] + 1:
+            runs[-1].append(i)
+        else:
+            runs.append([i])
+    words = [str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs[:most]]
+    return ", ".join(words) + (", …" if len(runs) > most else "")
 
 
 def advice(metrics: Metrics, run: str, path: str, settings: dict[str, Any]) -> list[Advice]:
