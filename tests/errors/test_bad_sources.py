@@ -15,7 +15,7 @@ def refusal(path, **options) -> str:
     with pytest.raises(SigmaSplatError) as caught:
         list(open_source(path, **options))
     message = str(caught.value)
-    assert "\n" not in message and len(message) < 600
+    assert "\n" not in message and len(message) < 900
     return message
 
 

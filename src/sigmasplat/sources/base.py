@@ -62,6 +62,10 @@ class Source(ABC):
         length_m = float(np.linalg.norm(np.diff(path.T_world_camera[:, :3, 3], axis=0), axis=1).sum())
         return f"{len(path)} true poses, {length_m:.1f} m long"
 
+    def test_views(self) -> "Source | None":
+        """Return views kept apart for scoring, off the path; their truth is in `truth`'s world. None if none are."""
+        return None
+
     def true_surface(self) -> Mesh | None:
         """Return the true surface in `truth`'s world frame, hidden parts too, faces of a few cm; None if not known."""
         return None
@@ -134,6 +138,10 @@ class Subset(Source):
     def truth(self) -> Trajectory | None:
         """Return the true path of the whole source: it is kept by time, not by frame."""
         return self._whole.truth()
+
+    def test_views(self) -> Source | None:
+        """Return the views kept apart of the whole source."""
+        return self._whole.test_views()
 
     def true_surface(self) -> Mesh | None:
         """Return the true surface of the whole source."""

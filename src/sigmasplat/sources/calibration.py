@@ -52,6 +52,39 @@ FREIBURG = {
 
 REPLICA = Calibration(Camera(1200, 680, 600.0, 600.0, 599.5, 339.5), 6553.5)
 
+MILLIMETRES = 1000.0
+
+# 585, 320, 240 are the numbers of the 7-Scenes page; they are the depth camera's, and so are the published poses. The
+# colour camera and where it sits were fitted to the RedKitchen sequence, by maximising the agreement of neighbouring
+# images (andyzeng/tsdf-fusion-python, data/; the fit is that of shared/data/redkitchen/calibration.json).
+SEVEN_SCENES = Calibration(Camera(640, 480, 585.0, 585.0, 320.0, 240.0), MILLIMETRES)
+SEVEN_SCENES_COLOR = Calibration(
+    Camera(640, 480, 528.12, 528.12, 318.96, 232.91),
+    MILLIMETRES,
+    depth_camera=SEVEN_SCENES.camera,
+    T_color_depth=np.array(
+        [
+            [0.999969, -0.007635, 0.001694, -0.02421],
+            [0.007625, 0.999954, 0.005732, 0.005946],
+            [-0.001738, -0.005719, 0.999982, 0.006997],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    ),
+)
+
+# Published as fy = −480, for a camera whose y points up; ours points down (`sources/icl_nuim.py`).
+ICL_NUIM = Calibration(Camera(640, 480, 481.2, 480.0, 319.5, 239.5), TUM_UNITS_PER_METRE)
+
+# The numbers of the page of the Bonn RGB-D Dynamic Dataset.
+BONN = Calibration(
+    Camera(640, 480, 542.822841, 542.57687, 315.59352, 237.756098),
+    TUM_UNITS_PER_METRE,
+    (0.039903, -0.099343, -0.00073, -0.000144, 0.0),
+)
+
+# Factory numbers of the PrimeSense cameras, which the Redwood recordings were made with (Open3D's PrimeSenseDefault).
+PRIMESENSE = Calibration(Camera(640, 480, 525.0, 525.0, 319.5, 239.5), MILLIMETRES)
+
 
 def freiburg_calibration(folder: Path) -> Calibration | None:
     """Return the TUM camera that a folder's name gives away (`freiburg1` or `fr1` in it or a parent), else None."""
@@ -85,12 +118,13 @@ def read_calibration(path: Path, size: tuple[int, int], default_units_per_metre:
 def calibrated(
     folder: Path, recorded: Calibration | None, size: tuple[int, int], settings: InputConfig, default_units: float
 ) -> Calibration:
-    """Return what is known of the cameras, with the settings' words in place of the recording's.
+    """Return what is known of the cameras: the settings' words, else calibration.json's, else the recording's.
 
     `size` (width, height) is the colour image's. Raises SourceError if no focal length is known.
     """
-    if settings.calibration:
-        recorded = read_calibration(Path(settings.calibration), size, default_units)
+    beside = folder / "calibration.json"
+    if settings.calibration or beside.is_file():
+        recorded = read_calibration(Path(settings.calibration or beside), size, default_units)
     if recorded is None and not settings.fx:
         raise SourceError(
             f"camera unknown: {folder} says nothing of it; write {folder}/calibration.json with fx, fy, cx, cy, "

@@ -20,21 +20,24 @@ class Format:
     """One way a sequence can be laid out. A module of this folder that defines `FORMAT` is found by itself.
 
     recognises(path): looks at the content only; looked_for: what it looked for, for the error message;
-    open(path, settings): builds the source of all its frames.
+    open(path, settings): builds the source of all its frames; priority: formats of a higher one are asked first, so
+    that what is special wins over what is general (above 0: more than its lists; below: a guess for want of better).
     """
 
     name: str
     looked_for: str
     recognises: Callable[[str], bool]
     open: Callable[[str, InputConfig], Source]
+    priority: int = 0
 
 
 @cache
 def formats() -> tuple[Format, ...]:
-    """Find the formats: every module directly in `sigmasplat.sources` that defines FORMAT, in order of name."""
+    """Find the formats: every module directly in `sigmasplat.sources` that defines FORMAT, by priority and name."""
     names = sorted(module.name for module in pkgutil.iter_modules(sigmasplat.sources.__path__) if not module.ispkg)
     modules = [importlib.import_module(f"sigmasplat.sources.{name}") for name in names]
-    return tuple(module.FORMAT for module in modules if hasattr(module, "FORMAT"))
+    found = [module.FORMAT for module in modules if hasattr(module, "FORMAT")]
+    return tuple(sorted(found, key=lambda known: -known.priority))
 
 
 def open_source(path: str | Path, settings: InputConfig | None = None, **changes: Any) -> Source:
@@ -53,10 +56,14 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
 
 def format_of(path: str | Path) -> Format:
     """Return the first format that knows what lies at the path. Raises SourceError if none does."""
-    for format_ in formats():
-        if format_.recognises(str(path)):
-            return format_
-    raise SourceError(_nothing_fits(Path(path)))
+    known = _knowing(path)
+    if known is None:
+        raise SourceError(_nothing_fits(Path(path)))
+    return known
+
+
+def _knowing(path: str | Path) -> Format | None:
+    return next((known for known in formats() if known.recognises(str(path))), None)
 
 
 def changed(settings: InputConfig, changes: Mapping[str, Any]) -> InputConfig:
@@ -73,7 +80,12 @@ def _nothing_fits(path: Path) -> str:
         return f"no such folder: {path}; give the folder of a sequence, or 'synthetic' for the built-in room"
     if not path.is_dir():
         return f"{path} is a file; give the folder that holds the sequence"
+    entries = sorted(path.iterdir())
+    inner = [(entry.name, known.name) for entry in entries if entry.is_dir() and (known := _knowing(entry))]
+    if inner:
+        names = ", ".join(f"{name} ({known})" for name, known in inner[:4]) + ", …" * (len(inner) > 4)
+        return f"{path} holds sequences: {names}; give the path of one of them, as {path / inner[0][0]}"
     wanted = "; ".join(f"{f.name}: {f.looked_for}" for f in formats())
-    found = sorted(entry.name + "/" * entry.is_dir() for entry in path.iterdir())
+    found = [entry.name + "/" * entry.is_dir() for entry in entries]
     listing = ", ".join(found[:8]) + (f", … {len(found)} entries" if len(found) > 8 else "") or "an empty folder"
     return f"unknown format: {path} (looked for {wanted}; found {listing})"

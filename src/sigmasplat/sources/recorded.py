@@ -35,9 +35,11 @@ class RecordedSource(Source):
         settings: InputConfig,
         truth: Trajectory | None = None,
         skipped: Sequence[str] = (),
+        test: Source | None = None,
     ) -> None:
         """Take the files in order of time; `truth` is of the colour camera; `skipped` are files left out, with reasons.
 
+        test: views kept apart for scoring.
         Raises SourceError if the first images do not fit the calibration, or none has a depth reading.
         """
         self._rectified = Rectification(name, calibration, settings)
@@ -46,7 +48,7 @@ class RecordedSource(Source):
         self.depth_registered = self._rectified.registers
         self.registrable = calibration.depth_camera is not None
         self.skipped = list(skipped)
-        self._images, self._truth = images, truth
+        self._images, self._truth, self._test = images, truth, test
         self._refuse_sizes_of_first()
         refuse_without_depth(self)
 
@@ -70,6 +72,10 @@ class RecordedSource(Source):
     def truth(self) -> Trajectory | None:
         """Return the recorded path, all of it, on its own timestamps."""
         return self._truth
+
+    def test_views(self) -> Source | None:
+        """Return the views kept apart, None if there are none."""
+        return self._test
 
     def _refuse_sizes_of_first(self) -> None:
         """Stop before the run where every frame would be refused for its size."""

@@ -15,6 +15,12 @@ from sigmasplat.sources.registration import Registration
 Image = NDArray[np.float32]
 
 
+def registers(calibration: Calibration, settings: InputConfig) -> bool:
+    """Tell whether depth is moved to the colour camera: where the cameras are known, and unless the settings say no."""
+    wanted = calibration.registers if settings.register_depth == "auto" else settings.register_depth == "on"
+    return wanted and calibration.depth_camera is not None
+
+
 class Rectification:
     """Turn recorded colour and depth into images of `camera`, as the settings ask.
 
@@ -45,8 +51,7 @@ class Rectification:
                 f"{name}: depth cannot be registered, the depth camera is unknown; "
                 "give depth_camera and T_color_depth in calibration.json"
             )
-        wanted = self.calibration.registers if settings.register_depth == "auto" else settings.register_depth == "on"
-        return known if wanted else None
+        return known if registers(self.calibration, settings) else None
 
     @property
     def registers(self) -> bool:
@@ -78,7 +83,7 @@ def refuse_sizes(
     if tuple(color_size) != tuple(depth_size) and not rectification.registers:
         raise SourceError(
             f"{color} is {color_size[0]}×{color_size[1]} but {depth} is {depth_size[0]}×{depth_size[1]}; "
-            "register depth to colour and give both one size"
+            "register depth to colour and give both one size, or name depth_camera in calibration.json"
         )
     for what, path, size, wanted in (
         ("colour", color, color_size, (c.width, c.height)),

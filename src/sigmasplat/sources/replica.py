@@ -14,27 +14,16 @@ from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.calibration import REPLICA, Calibration, calibrated, read_replica_calibration
+from sigmasplat.sources.folders import FRAMES_PER_SECOND, paired
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import Images, RecordedSource
-
-FRAMES_PER_SECOND = 30.0
-"""Replica's renderings carry no time; this rate is a convention."""
 
 
 def open_replica(folder: Path, settings: InputConfig) -> RecordedSource:
     """Open a folder; raises SourceError if images, calibration or true poses cannot be used."""
     colors, depths = _numbered(folder, "frame"), _numbered(folder, "depth")
-    if not depths:
-        raise SourceError(
-            f"no depth images in {folder} (looked for results/depth*.png); is this the RGB-only download?"
-        )
-    if not colors:
-        raise SourceError(f"no colour images in {folder} (looked for results/frame*.jpg, results/frame*.png)")
-    numbers = sorted(colors.keys() & depths.keys())
-    if not numbers:
-        raise SourceError(f"{folder}/results: no number is shared by frame* and depth*; are both from one recording?")
+    numbers, skipped = paired(folder, colors, depths, "results/frame*.jpg", "results/depth*.png")
     images = [Images(n / FRAMES_PER_SECOND, colors[n], depths[n]) for n in numbers]
-    skipped = [f"{colors[n]}: no depth{n:06d}.png beside it" for n in sorted(colors.keys() - depths.keys())]
     recorded = _calibration(folder)
     size = (recorded.camera.width, recorded.camera.height)
     calibration = calibrated(folder, recorded, size, settings, recorded.depth_units_per_metre)
@@ -49,7 +38,7 @@ def _numbered(folder: Path, stem: str) -> dict[int, Path]:
         match = re.fullmatch(rf"{stem}(\d+)\.(jpg|jpeg|png|npy|tiff?)", path.name.lower())
         if match:
             found[int(match.group(1))] = path
-    return found
+    return dict(sorted(found.items()))
 
 
 def _calibration(folder: Path) -> Calibration:

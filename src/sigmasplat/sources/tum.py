@@ -5,6 +5,7 @@ calibration.json                        ours: fx fy cx cy width height depth_sca
 """
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -24,7 +25,6 @@ from sigmasplat.sources.calibration import (
     Calibration,
     calibrated,
     freiburg_calibration,
-    read_calibration,
 )
 from sigmasplat.sources.images import OVERFLOW
 from sigmasplat.sources.opening import Format
@@ -35,8 +35,15 @@ MAX_GAP_S = 0.02
 """Colour and depth of a Kinect at 30 Hz are never further apart; TUM's own tool uses the same number."""
 
 
-def open_tum(folder: Path, settings: InputConfig, max_gap_s: float = MAX_GAP_S) -> RecordedSource:
-    """Open a folder; raises SourceError if its lists, images, calibration or true poses cannot be used."""
+def open_tum(
+    folder: Path, settings: InputConfig, max_gap_s: float = MAX_GAP_S, camera: Calibration | None = None,
+    camera_path: Callable[[Trajectory], Trajectory] | None = None,
+) -> RecordedSource:  # fmt: skip
+    """Open a folder; raises SourceError if its lists, images, calibration or true poses cannot be used.
+
+    camera: the recording's, where it is known otherwise than by the folder's name;
+    camera_path: turns the recorded path into the camera's, where it is another body's.
+    """
     color_times_s, colors = read_list(folder / "rgb.txt")
     depth_times_s, depths = _depth_list(folder)
     pairs = associate(color_times_s, depth_times_s, max_gap_s)
@@ -48,7 +55,10 @@ def open_tum(folder: Path, settings: InputConfig, max_gap_s: float = MAX_GAP_S) 
     truth_path = folder / "groundtruth.txt"
     # Read at once: a broken truth should stop the run before it starts, not its evaluation an hour later.
     truth = read_poses(truth_path) if truth_path.is_file() else None
-    calibration = _calibration(folder, first_size([pair.color for pair in images]), settings)
+    if truth and camera_path:
+        truth = camera_path(truth)
+    size = first_size([pair.color for pair in images])
+    calibration = calibrated(folder, camera or freiburg_calibration(folder), size, settings, TUM_UNITS_PER_METRE)
     return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
 
 
@@ -109,17 +119,10 @@ def _no_overlap(folder: Path, color_s: NDArray[np.float64], depth_s: NDArray[np.
     return f"no colour image of {folder} has depth within {max_gap_s:g} s ({', '.join(spans)}); one recording?"
 
 
-def _calibration(folder: Path, size: tuple[int, int], settings: InputConfig) -> Calibration:
-    path = folder / "calibration.json"
-    recorded = freiburg_calibration(folder)
-    if path.is_file():
-        recorded = read_calibration(path, size, TUM_UNITS_PER_METRE)
-    return calibrated(folder, recorded, size, settings, TUM_UNITS_PER_METRE)
-
-
 FORMAT = Format(
     "TUM",
     "rgb.txt and depth.txt",
     lambda path: (Path(path) / "rgb.txt").is_file() or (Path(path) / "depth.txt").is_file(),
     lambda path, settings: open_tum(Path(path), settings),
+    priority=1,
 )

@@ -14,10 +14,10 @@ from sigmasplat.model.trajectory import Trajectory
 def read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
     """Read "t path" lines: timestamps [N] seconds and image paths. Raises SourceError naming file and line."""
     times, paths = [], []
-    for line, words in _lines(path):
+    for line, words in lines(path):
         if len(words) < 2:
             raise SourceError(f"{path}:{line}: 'timestamp path' wanted, found {' '.join(words)!r}")
-        times.append(_numbers(path, line, words[:1])[0])
+        times.append(numbers(path, line, words[:1])[0])
         paths.append(path.parent / " ".join(words[1:]))
     if not paths:
         raise SourceError(f"{path}: lists no images")
@@ -27,10 +27,10 @@ def read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
 def read_poses(path: Path) -> Trajectory:
     """Read "t tx ty tz qx qy qz qw" lines. Raises SourceError naming the line whose pose is not finite or not rigid."""
     times, poses = [], []
-    for line, words in _lines(path):
+    for line, words in lines(path):
         if len(words) != 8:
             raise SourceError(f"{path}:{line}: 't tx ty tz qx qy qz qw' wanted, found {len(words)} values")
-        t, *translation_quaternion = _numbers(path, line, words)
+        t, *translation_quaternion = numbers(path, line, words)
         times.append(t)
         poses.append(_pose(path, line, np.array(translation_quaternion)))
     if not poses:
@@ -38,7 +38,7 @@ def read_poses(path: Path) -> Trajectory:
     return Trajectory(np.array(times), np.stack(poses))
 
 
-def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+def lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield (line number from 1, words) of every line that says something."""
     try:
         text = path.read_text(encoding="utf-8")
@@ -50,7 +50,8 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
             yield number, words
 
 
-def _numbers(path: Path, line: int, words: list[str]) -> list[float]:
+def numbers(path: Path, line: int, words: list[str]) -> list[float]:
+    """Read finite numbers. Raises SourceError naming file and line."""
     try:
         values = [float(word) for word in words]
     except ValueError as error:

@@ -1,0 +1,58 @@
+"""Read the Bonn RGB-D Dynamic Dataset: TUM's lists, a camera of its own, a true path of the markers on it.
+
+rgbd_bonn_NAME/rgb.txt  depth.txt  groundtruth.txt  rgb/  depth/        recognised by `bonn` in the folder's path
+
+The data set's page gives the camera's numbers and how its motion-capture poses T become those of the camera:
+T_world_camera = T_ROS · T · T_ROS · T_m (there used for the first pose of a run, to bring a model to the laser scan).
+The T_m there is no rigid motion, its axes are 1.059 long; here its rotation is taken, and its offset as it is.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from sigmasplat.config import InputConfig
+from sigmasplat.model import se3
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.sources.calibration import BONN
+from sigmasplat.sources.opening import Format
+from sigmasplat.sources.recorded import RecordedSource
+from sigmasplat.sources.tum import open_tum
+
+T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+T_MARKERS_CAMERA = se3.orthonormalise(
+    np.array(
+        [
+            [1.0157, 0.1828, -0.2389, 0.0113],
+            [0.0009, -0.8431, -0.6413, -0.0098],
+            [-0.3009, 0.6147, -0.8085, 0.0111],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+)
+
+
+def of_camera(markers: Trajectory) -> Trajectory:
+    """Turn the recorded path of the markers into that of the camera."""
+    return Trajectory(markers.timestamps_s, T_ROS @ markers.T_world_camera @ T_ROS @ T_MARKERS_CAMERA)
+
+
+def open_bonn(folder: Path, settings: InputConfig) -> RecordedSource:
+    """Open a folder; raises SourceError as a TUM folder does."""
+    return open_tum(folder, settings, camera=BONN, camera_path=of_camera)
+
+
+def recognises(path: str) -> bool:
+    """Tell whether it is a TUM folder under a name of Bonn's."""
+    folder = Path(path)
+    lists = (folder / "rgb.txt").is_file() or (folder / "depth.txt").is_file()
+    return lists and any("bonn" in part.lower() for part in folder.resolve().parts[-3:])
+
+
+FORMAT = Format(
+    "Bonn dynamic",
+    "rgb.txt and depth.txt in a folder named rgbd_bonn_…",
+    recognises,
+    lambda path, settings: open_bonn(Path(path), settings),
+    priority=2,
+)

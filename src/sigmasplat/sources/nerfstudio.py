@@ -1,0 +1,66 @@
+"""Read a nerfstudio folder with depth: transforms.json whose frames name colour and depth images.
+
+transforms.json        `sources/transforms.py`; depth_unit_scale_factor, metres per unit, 0.001 where absent
+images/…  depths/…     where file_path and depth_file_path say, from the folder; in the order of the names' numbers
+
+Depth of another size than colour (as phones have it) is taken to be seen by the same camera, at its size.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+from sigmasplat.config import InputConfig
+from sigmasplat.errors import SourceError
+from sigmasplat.sources.calibration import Calibration, calibrated, number, positive, read_object
+from sigmasplat.sources.folders import FRAMES_PER_SECOND, natural
+from sigmasplat.sources.opening import Format
+from sigmasplat.sources.poses import known_path
+from sigmasplat.sources.recorded import Images, RecordedSource, first_size
+from sigmasplat.sources.transforms import Fields, camera_in, frames_of, pose_in
+
+NAME = "transforms.json"
+METRES_PER_UNIT = 0.001
+"""nerfstudio's own default of depth_unit_scale_factor."""
+
+
+def open_nerfstudio(folder: Path, settings: InputConfig) -> RecordedSource:
+    """Open a folder; raises SourceError if its file, images or camera cannot be used."""
+    path = folder / NAME
+    fields = read_object(path)
+    named = sorted(frames_of(path, fields), key=lambda frame: natural(frame["file_path"]))
+    frames = [frame for frame in named if isinstance(frame.get("depth_file_path"), str)]
+    if not frames:
+        raise SourceError(f'{path}: no frame has a "depth_file_path"; depth is needed, export it with the images')
+    skipped = [f"{path}: {frame['file_path']} has no depth_file_path" for frame in named if frame not in frames]
+    images = [Images(i / FRAMES_PER_SECOND, *_files(folder, frame)) for i, frame in enumerate(frames)]
+    calibration = _calibration(path, fields, frames, images, settings)
+    truth = known_path((i.timestamp_s, pose_in(path, frame)) for i, frame in zip(images, frames, strict=True))
+    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
+
+
+def _files(folder: Path, frame: Fields) -> tuple[Path, Path]:
+    """Return the frame's colour and depth file; instant-ngp leaves the ending of colour out."""
+    color, depth = folder / frame["file_path"], folder / frame["depth_file_path"]
+    bare = not color.suffix and not color.is_file()
+    return (color.with_suffix(".png") if bare else color), depth
+
+
+def _calibration(
+    path: Path, fields: Fields, frames: list[Fields], images: list[Images], settings: InputConfig
+) -> Calibration:
+    size, depth_size = first_size([i.color for i in images]), first_size([i.depth for i in images])
+    per_unit = number(path, fields, "depth_unit_scale_factor", METRES_PER_UNIT)
+    units = round(1.0 / positive(path, "depth_unit_scale_factor", per_unit), 6)
+    known = camera_in(path, fields, frames, size, units)
+    if depth_size != size:
+        depth_camera = known.camera.resized(*depth_size)
+        known = replace(known, depth_camera=depth_camera, depth_distortion=known.distortion)
+    return calibrated(path.parent, known, size, settings, units)
+
+
+FORMAT = Format(
+    "nerfstudio",
+    "transforms.json with depth_file_path",
+    lambda path: (Path(path) / NAME).is_file(),
+    lambda path, settings: open_nerfstudio(Path(path), settings),
+)

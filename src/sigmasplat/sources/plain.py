@@ -1,0 +1,83 @@
+"""Read a plain folder of colour and depth images, asked last: what somebody's own camera left behind.
+
+color|colour|rgb|image|images/   depth|depths/     paired by the same name, else by the number in it, else by order
+calibration.json                                   fx fy cx cy [width height depth_scale …], or --fx on the command line
+groundtruth.txt                                    optional: "t tx ty tz qx qy qz qw" on the images' times
+
+Names that are times in seconds, as 12.033333.png, are taken so; else frames are 1/30 s apart. Depth in mm unless said.
+"""
+
+from itertools import pairwise
+from pathlib import Path
+
+from sigmasplat.config import InputConfig
+from sigmasplat.errors import SourceError
+from sigmasplat.sources.calibration import MILLIMETRES, calibrated
+from sigmasplat.sources.folders import (
+    COLOR_ENDINGS,
+    COLOR_FOLDERS,
+    DEPTH_ENDINGS,
+    DEPTH_FOLDERS,
+    FRAMES_PER_SECOND,
+    images_in,
+    numbered,
+    paired,
+    subfolder,
+)
+from sigmasplat.sources.opening import Format
+from sigmasplat.sources.recorded import Images, RecordedSource, first_size
+from sigmasplat.sources.tum_lists import read_poses
+
+COLOR_NAME, DEPTH_NAME = "color|rgb|images/*", "depth/*"
+
+
+def open_plain(folder: Path, settings: InputConfig) -> RecordedSource:
+    """Open a folder; raises SourceError if images cannot be paired or the camera is not known."""
+    colors = images_in(subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
+    depths = images_in(subfolder(folder, DEPTH_FOLDERS), DEPTH_ENDINGS)
+    pairs, skipped = _pairs(folder, colors, depths)
+    times_s = _times_s([color for color, _ in pairs])
+    images = [Images(t, *pair) for t, pair in zip(times_s, pairs, strict=True)]
+    calibration = calibrated(folder, None, first_size([i.color for i in images]), settings, MILLIMETRES)
+    truth_path = folder / "groundtruth.txt"
+    truth = read_poses(truth_path) if truth_path.is_file() else None
+    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
+
+
+def _pairs(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[tuple[Path, Path]], list[str]]:
+    """Pair by name, else by number, else by order where there are as many of both."""
+    stems, depth_stems = {path.stem: path for path in colors}, {path.stem: path for path in depths}
+    if stems.keys() & depth_stems.keys():
+        names, skipped = paired(folder, stems, depth_stems, COLOR_NAME, DEPTH_NAME)
+        return [(stems[name], depth_stems[name]) for name in names], skipped
+    by_number, depth_by_number = numbered(colors), numbered(depths)
+    if colors and len(colors) == len(depths) and not by_number.keys() & depth_by_number.keys():
+        return list(zip(colors, depths, strict=True)), []
+    if colors and depths and (len(by_number), len(depth_by_number)) != (len(colors), len(depths)):
+        raise SourceError(
+            f"{folder}: {len(colors)} colour and {len(depths)} depth images share no names, and their numbers are not "
+            "all different; name both alike"
+        )
+    keys, skipped = paired(folder, by_number, depth_by_number, COLOR_NAME, DEPTH_NAME)
+    return [(by_number[n], depth_by_number[n]) for n in keys], skipped
+
+
+def _times_s(paths: list[Path]) -> list[float]:
+    """Return the times that the names are, where all have a decimal point and rise; else the convention's."""
+    try:
+        times = [float(path.stem) for path in paths]
+    except ValueError:
+        times = []
+    rising = all(a < b for a, b in pairwise(times))
+    if times and rising and all("." in path.stem for path in paths):
+        return times
+    return [i / FRAMES_PER_SECOND for i in range(len(paths))]
+
+
+FORMAT = Format(
+    "plain folder",
+    "color/ (or rgb/, images/) and depth/",
+    lambda path: subfolder(Path(path), (*COLOR_FOLDERS, *DEPTH_FOLDERS)) is not None,
+    lambda path, settings: open_plain(Path(path), settings),
+    priority=-1,
+)

@@ -1,0 +1,140 @@
+"""Read folders in the layout of Open3D's reconstruction system, and the Redwood recordings.
+
+color|rgb|image/000000.jpg  depth/000000.png              paired by the number in the name
+rgb/0000001-000000033000.jpg  depth/0000001-0000….png     Redwood: number and time in µs; paired by time
+intrinsic.json | camera_intrinsic.json                    width, height, intrinsic_matrix (9 numbers, by columns);
+                                                          depth_scale and fps where Open3D's recorders wrote them
+trajectory.log | NAME.log                                 per pose "number number number" and 4 rows, camera to world
+
+Without an intrinsic file the camera is the PrimeSense's factory one, which Redwood's were recorded with; depth in mm.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from sigmasplat.config import InputConfig
+from sigmasplat.errors import SourceError
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.sources.association import associate
+from sigmasplat.sources.calibration import (
+    MILLIMETRES,
+    PRIMESENSE,
+    Calibration,
+    calibrated,
+    camera_of,
+    number,
+    positive,
+    read_object,
+)
+from sigmasplat.sources.folders import (
+    COLOR_ENDINGS,
+    COLOR_FOLDERS,
+    DEPTH_ENDINGS,
+    FRAMES_PER_SECOND,
+    images_in,
+    numbered,
+    paired,
+    subfolder,
+)
+from sigmasplat.sources.opening import Format
+from sigmasplat.sources.poses import known_path, matrix, pose
+from sigmasplat.sources.recorded import Images, RecordedSource, first_size
+from sigmasplat.sources.tum_lists import lines, numbers
+
+INTRINSIC_NAMES = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
+MAX_GAP_S = 0.02
+
+_TIMED = re.compile(r"([0-9]+)-([0-9]{9,})")
+
+
+def open_redwood(folder: Path, settings: InputConfig) -> RecordedSource:
+    """Open a folder; raises SourceError if images, camera or trajectory cannot be used."""
+    path = _intrinsic_file(folder)
+    fields = read_object(path) if path else {}
+    rate = positive(path or folder, "fps", number(path or folder, fields, "fps", FRAMES_PER_SECOND))
+    colors = images_in(subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
+    depths = images_in(folder / "depth", DEPTH_ENDINGS)
+    images, skipped = _timed(folder, colors, depths) or _numbered(folder, colors, depths, rate)
+    recorded = _recorded(path, fields) if path else PRIMESENSE
+    size = first_size([i.color for i in images])
+    calibration = calibrated(folder, recorded, size, settings, recorded.depth_units_per_metre)
+    return RecordedSource(folder.resolve().name, images, calibration, settings, _truth(folder, images), skipped)
+
+
+def _timed(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[Images], list[str]] | None:
+    """Pair images that carry their time in the name, None if they do not."""
+    if not (colors and depths and all(_TIMED.fullmatch(path.stem) for path in colors + depths)):
+        return None
+    times_s = [np.array([int(path.stem.split("-")[1]) * 1e-6 for path in paths]) for paths in (colors, depths)]
+    pairs = associate(times_s[0], times_s[1], MAX_GAP_S)
+    if not len(pairs):
+        raise SourceError(f"{folder}: no colour image has depth within {MAX_GAP_S:g} s; are both from one recording?")
+    skipped = [f"{path}: no depth within {MAX_GAP_S:g} s" for i, path in enumerate(colors) if i not in pairs[:, 0]]
+    return [Images(float(times_s[1][j]), colors[i], depths[j]) for i, j in pairs], skipped
+
+
+def _numbered(folder: Path, colors: list[Path], depths: list[Path], rate: float) -> tuple[list[Images], list[str]]:
+    of_color, of_depth = numbered(colors), numbered(depths)
+    keys, skipped = paired(folder, of_color, of_depth, f"{'|'.join(COLOR_FOLDERS)}/*.jpg", "depth/*.png")
+    return [Images(n / rate, of_color[n], of_depth[n]) for n in keys], skipped
+
+
+def _recorded(path: Path, fields: dict[str, object]) -> Calibration:
+    """Build the camera from Open3D's JSON. Raises SourceError naming file and field."""
+    values = fields.get("intrinsic_matrix")
+    if not isinstance(values, list) or len(values) != 9:
+        raise SourceError(f'{path}: field "intrinsic_matrix" is {values!r}, 9 numbers by columns are wanted')
+    fx, fy, cx, cy = (number(path, {"intrinsic_matrix": values[i]}, "intrinsic_matrix") for i in (0, 4, 6, 7))
+    width, height = (int(number(path, fields, key)) for key in ("width", "height"))
+    units = positive(path, "depth_scale", number(path, fields, "depth_scale", MILLIMETRES))
+    return Calibration(camera_of(path, width, height, [fx, fy, cx, cy]), units)
+
+
+def _truth(folder: Path, images: list[Images]) -> Trajectory | None:
+    """Read the log: its first number counts the depth images in order, from 0."""
+    path = _log_in(folder)
+    if path is None:
+        return None
+    rows = [(line, numbers(path, line, words)) for line, words in lines(path)]
+    if len(rows) % 5 or any(len(row) != (3 if i % 5 == 0 else 4) for i, (_, row) in enumerate(rows)):
+        raise SourceError(f"{path}: each pose takes 5 lines, three numbers and 4 rows of 4; is the file cut short?")
+    depths = images_in(folder / "depth", DEPTH_ENDINGS)
+    times = {image.depth: image.timestamp_s for image in images}
+    timed = []
+    for start in range(0, len(rows), 5):
+        line, (index, *_) = rows[start]
+        time = times.get(depths[int(index)]) if 0 <= index < len(depths) else None
+        if time is not None:
+            where = f"{path}:{line}"
+            timed.append((time, pose(where, matrix(where, [row for _, row in rows[start + 1 : start + 5]]))))
+    return known_path(timed)
+
+
+def _log_in(folder: Path) -> Path | None:
+    """Return trajectory.log, else the one log that is not of somebody's odometry."""
+    logs = [path for path in sorted(folder.glob("*.log")) if "odom" not in path.name]
+    return next((path for path in logs if path.name == "trajectory.log"), logs[0] if len(logs) == 1 else None)
+
+
+def _intrinsic_file(folder: Path) -> Path | None:
+    return next((folder / name for name in INTRINSIC_NAMES if (folder / name).is_file()), None)
+
+
+def recognises(path: str) -> bool:
+    """Tell whether there are image folders, and a camera, a trajectory or names as Open3D and Redwood write them."""
+    folder = Path(path)
+    colors = subfolder(folder, COLOR_FOLDERS)
+    if colors is None and not (folder / "depth").is_dir():
+        return False
+    timed = colors is not None and any(_TIMED.fullmatch(entry.stem) for entry in colors.iterdir())
+    return timed or _intrinsic_file(folder) is not None or _log_in(folder) is not None
+
+
+FORMAT = Format(
+    "Redwood / Open3D",
+    "color/ and depth/ with camera_intrinsic.json or trajectory.log",
+    recognises,
+    lambda path, settings: open_redwood(Path(path), settings),
+)

@@ -1,0 +1,132 @@
+"""Read ScanNet scenes after extraction from their .sens files, in either layout that its SensReader writes.
+
+color/0.jpg  depth/0.png  pose/0.txt                         SensReader/python; names are numbers, padded or not
+intrinsic/intrinsic_color.txt  intrinsic_depth.txt  extrinsic_color.txt  extrinsic_depth.txt
+intrinsics_color.txt  intrinsics_depth.txt                   … in the scene's folder, as in scannet_frames_25k
+frame-000000.color.jpg  .depth.pgm  .pose.txt  _info.txt     SensReader/c++; also 3RScan's, BundleFusion's (info.txt)
+
+Depth (640×480, mm) has a camera of its own and is registered to colour (1296×968), which is worked on at depth's width.
+Extrinsics take a common frame to each camera, so T_color_depth = E_color · E_depth⁻¹ (as BundleFusion uses them).
+Poses are camera to world; where tracking was lost they are −inf: such a frame stays, without truth.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from sigmasplat.config import InputConfig
+from sigmasplat.errors import SourceError
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.sources.calibration import MILLIMETRES, Calibration, calibrated, camera_of
+from sigmasplat.sources.folders import (
+    COLOR_ENDINGS,
+    DEPTH_ENDINGS,
+    FRAMES_PER_SECOND,
+    images_in,
+    numbered,
+    paired,
+    subfolder,
+)
+from sigmasplat.sources.frame_files import Found, frame_files, has_frame_files
+from sigmasplat.sources.opening import Format
+from sigmasplat.sources.poses import Matrix, matrix, pose_files, read_matrix
+from sigmasplat.sources.recorded import Images, RecordedSource, first_size
+
+COLOR_SIZE, DEPTH_SIZE = (1296, 968), (640, 480)
+"""Width and height of ScanNet's recordings; the published matrices are for these, whatever was done to the images."""
+
+INFO_NAMES = ("_info.txt", "info.txt")
+
+
+def open_scannet(folder: Path, settings: InputConfig) -> RecordedSource:
+    """Open a scene's folder; raises SourceError if images, cameras or poses cannot be used."""
+    files = _files(folder)
+    if not files["color"] and not files["depth"] and (packed := sorted(folder.glob("*.sens"))):
+        raise SourceError(
+            f"{packed[0]} is still packed; extract color, depth, pose and intrinsic from it with ScanNet's SensReader"
+        )
+    numbers, skipped = paired(folder, files["color"], files["depth"], "color/*.jpg", "depth/*.png")
+    images = [Images(n / FRAMES_PER_SECOND, files["color"][n], files["depth"][n]) for n in numbers]
+    size, depth_size = first_size([i.color for i in images]), first_size([i.depth for i in images])
+    recorded = _recorded(folder, size, depth_size)
+    calibration = calibrated(folder, recorded, size, settings, MILLIMETRES)
+    truth = pose_files((n / FRAMES_PER_SECOND, files["pose"][n]) for n in numbers if n in files["pose"])
+    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
+
+
+def _files(folder: Path) -> Found:
+    if has_frame_files(folder):
+        return frame_files(folder)
+    return {
+        "color": numbered(images_in(subfolder(folder, ("color", "rgb")), COLOR_ENDINGS)),
+        "depth": numbered(images_in(folder / "depth", DEPTH_ENDINGS)),
+        "pose": numbered(images_in(folder / "pose", (".txt",))),
+    }
+
+
+def _recorded(folder: Path, size: tuple[int, int], depth_size: tuple[int, int]) -> Calibration | None:
+    """Build the two cameras from the scene's matrices, None where there are none. Raises SourceError if one is bad."""
+    where, found, units = _matrices(folder)
+    if "color_intrinsic" not in found:
+        return None
+    camera = _camera(where["color_intrinsic"], found["color_intrinsic"], size, COLOR_SIZE)
+    if "depth_intrinsic" not in found:
+        raise SourceError(f"{where['color_intrinsic']}: the depth camera's matrix is missing beside it; extract it too")
+    depth_camera = _camera(where["depth_intrinsic"], found["depth_intrinsic"], depth_size, DEPTH_SIZE)
+    ends = [found.get(f"{kind}_extrinsic", np.eye(4)) for kind in ("color", "depth")]
+    if not all(se3.is_rigid(T) for T in ends):
+        raise SourceError(f"{folder}: extrinsics of colour or depth are no rigid motions; delete or mend them")
+    T_color_depth = ends[0] @ se3.inverse(ends[1])
+    return Calibration(camera, units, depth_camera=depth_camera, T_color_depth=T_color_depth)
+
+
+def _matrices(folder: Path) -> tuple[dict[str, Path], dict[str, Matrix], float]:
+    """Return each matrix's file and value by `{color|depth}_{intrinsic|extrinsic}`, and depth units per metre."""
+    where, found, units = {}, {}, MILLIMETRES
+    for info in (folder / name for name in INFO_NAMES if (folder / name).is_file()):
+        entries = dict(_entry(line) for line in info.read_text(encoding="utf-8").splitlines() if "=" in line)
+        units = float(entries.get("m_depthShift", units))
+        for key, kind in (("Color", "color"), ("Depth", "depth")):
+            for part in ("Intrinsic", "Extrinsic"):
+                if text := entries.get(f"m_calibration{key}{part}"):
+                    name = f"{kind}_{part.lower()}"
+                    where[name], found[name] = info, matrix(f"{info} {key}{part}", text.split())
+        return where, found, units
+    for kind in ("color", "depth"):
+        for part in ("intrinsic", "extrinsic"):
+            names = (f"intrinsic/{part}_{kind}.txt", f"{part}s_{kind}.txt", f"{part}_{kind}.txt")
+            path = next((folder / name for name in names if (folder / name).is_file()), None)
+            if path:
+                where[f"{kind}_{part}"], found[f"{kind}_{part}"] = path, read_matrix(path)
+    return where, found, units
+
+
+def _entry(line: str) -> tuple[str, str]:
+    key, _, value = line.partition("=")
+    return key.strip(), value.strip()
+
+
+def _camera(path: Path, K: Matrix, size: tuple[int, int], published: tuple[int, int]) -> Camera:
+    """Build the camera of images of `size`: the matrix's own if its centre fits, else resized as they were."""
+    own = size if abs(2 * K[0, 2] - size[0]) < 0.2 * size[0] else published
+    return camera_of(path, *own, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]).resized(*size)
+
+
+def recognises(path: str) -> bool:
+    """Tell whether it is an extracted scene, or one that should have been."""
+    folder = Path(path)
+    has_info = any((folder / name).is_file() for name in INFO_NAMES)
+    if any(folder.glob("*.sens")) or (has_info and has_frame_files(folder)):
+        return True
+    images = subfolder(folder, ("color", "rgb", "depth"))
+    camera = (folder / "intrinsic").is_dir() or any(folder.glob("intrinsic*_*.txt"))
+    return images is not None and (camera or (folder / "pose").is_dir())
+
+
+FORMAT = Format(
+    "ScanNet",
+    "color/, depth/, pose/ and intrinsic/ as SensReader extracts them",
+    recognises,
+    lambda path, settings: open_scannet(Path(path), settings),
+)

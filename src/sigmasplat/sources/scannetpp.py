@@ -1,0 +1,78 @@
+"""Read ScanNet++ scenes: the undistorted photographs of the DSLR, depth rendered from the laser scan.
+
+dslr/nerfstudio/transforms_undistorted.json     one pinhole; `frames` and `test_frames` (`sources/transforms.py`)
+dslr/undistorted_images/DSC00001.JPG            from the data set's toolbox, `dslr.undistort`
+dslr/undistorted_depths/DSC00001.png            16 bits, mm: rendered and undistorted (Nik-V9/scannetpp, for SplaTAM)
+dslr/train_test_lists.json                      optional {"train": […], "test": […]}: which photographs, in which order
+
+The sequence is the training photographs. The test ones were taken apart from the walk, not along it, so they are no
+frames to be tracked: `test_views()` gives them with their poses. SplaTAM's and LoopSplat's loaders read this layout.
+"""
+
+from pathlib import Path
+
+from sigmasplat.config import InputConfig
+from sigmasplat.errors import SourceError
+from sigmasplat.sources.calibration import MILLIMETRES, calibrated, read_object
+from sigmasplat.sources.folders import FRAMES_PER_SECOND
+from sigmasplat.sources.opening import Format
+from sigmasplat.sources.poses import known_path
+from sigmasplat.sources.recorded import Images, RecordedSource, first_size
+from sigmasplat.sources.transforms import Fields, camera_in, frames_of, pose_in
+
+TRANSFORMS = Path("nerfstudio") / "transforms_undistorted.json"
+IMAGES, DEPTHS, LISTS = "undistorted_images", "undistorted_depths", "train_test_lists.json"
+
+
+def open_scannetpp(scene: Path, settings: InputConfig) -> RecordedSource:
+    """Open a scene's folder or its `dslr`; raises SourceError if its file, images or camera cannot be used."""
+    dslr = _dslr(scene)
+    fields = read_object(dslr / TRANSFORMS)
+    _refuse_missing_folders(dslr)
+    views = _chosen(dslr, fields, "test", "test_frames") if fields.get("test_frames") else []
+    views = [view for view in views if (dslr / IMAGES / view["file_path"]).is_file()]
+    test = _source(dslr, fields, views, settings) if views else None
+    return _source(dslr, fields, _chosen(dslr, fields, "train", "frames"), settings, test)
+
+
+def _source(
+    dslr: Path, fields: Fields, frames: list[Fields], settings: InputConfig, test: RecordedSource | None = None
+) -> RecordedSource:
+    path, scene = dslr / TRANSFORMS, dslr.resolve().parent
+    files = [(dslr / IMAGES / f["file_path"], (dslr / DEPTHS / f["file_path"]).with_suffix(".png")) for f in frames]
+    images = [Images(i / FRAMES_PER_SECOND, *pair) for i, pair in enumerate(files)]
+    size = first_size([color for color, _ in files])
+    camera = camera_in(path, fields, frames, size, MILLIMETRES)
+    calibration = calibrated(scene, camera, size, settings, MILLIMETRES)
+    truth = known_path((i.timestamp_s, pose_in(path, frame)) for i, frame in zip(images, frames, strict=True))
+    return RecordedSource(scene.name, images, calibration, settings, truth, test=test)
+
+
+def _chosen(dslr: Path, fields: Fields, split: str, key: str) -> list[Fields]:
+    """Return a split's frames in the order of the list where there is one, else of their names."""
+    frames = {frame["file_path"]: frame for frame in frames_of(dslr / TRANSFORMS, fields, key)}
+    lists = read_object(dslr / LISTS) if (dslr / LISTS).is_file() else {}
+    names = lists.get(split, sorted(frames))
+    absent = [name for name in names if name not in frames]
+    if absent:
+        raise SourceError(f"{dslr / LISTS}: {absent[0]} of {split!r} is not among the {key} of {TRANSFORMS.name}")
+    return [frames[name] for name in names]
+
+
+def _refuse_missing_folders(dslr: Path) -> None:
+    for part, made_by in ((IMAGES, "the toolbox's `python -m dslr.undistort`"), (DEPTHS, "a depth renderer")):
+        if not (dslr / part).is_dir():
+            there = ", ".join(sorted(entry.name for entry in dslr.iterdir() if entry.is_dir()))
+            raise SourceError(f"{dslr}: no {part}/ (found {there}); make it with {made_by}, for the undistorted camera")
+
+
+def _dslr(scene: Path) -> Path:
+    return scene if (scene / TRANSFORMS).is_file() else scene / "dslr"
+
+
+FORMAT = Format(
+    "ScanNet++",
+    f"dslr/{TRANSFORMS}",
+    lambda path: (_dslr(Path(path)) / TRANSFORMS).is_file(),
+    lambda path, settings: open_scannetpp(Path(path), settings),
+)

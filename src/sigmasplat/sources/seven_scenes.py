@@ -1,0 +1,74 @@
+"""Read the 7-Scenes sequences as published: three files a frame, depth not registered to colour.
+
+seq-01/frame-000000.color.png  .depth.png  .pose.txt      (also .color.jpg); depth in mm, 0 and 65535 = no reading
+SCENE/seq-01/ seq-02/ …                                   the scene's folder, if it holds one sequence
+
+The poses are those of the depth camera. As published, colour is taken to be seen by it too, which is off by up to some
+centimetres near by: so do those who report numbers on this data. With register_depth=on depth is moved to the colour
+camera, and so is the true path: T_world_color = T_world_depth · T_depth_color.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+from sigmasplat.config import InputConfig
+from sigmasplat.errors import SourceError
+from sigmasplat.model import se3
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.sources.calibration import MILLIMETRES, SEVEN_SCENES, SEVEN_SCENES_COLOR, Calibration, calibrated
+from sigmasplat.sources.folders import FRAMES_PER_SECOND, paired
+from sigmasplat.sources.frame_files import frame_files, has_frame_files
+from sigmasplat.sources.opening import Format
+from sigmasplat.sources.poses import pose_files
+from sigmasplat.sources.recorded import Images, RecordedSource, first_size
+from sigmasplat.sources.rectification import registers
+
+
+def open_seven_scenes(folder: Path, settings: InputConfig) -> RecordedSource:
+    """Open a sequence's folder, or a scene's with one sequence; raises SourceError if it cannot be used."""
+    if not has_frame_files(folder):
+        folder = _only_sequence(folder)
+    files = frame_files(folder)
+    numbers, skipped = paired(folder, files["color"], files["depth"], "frame-*.color.png", "frame-*.depth.png")
+    images = [Images(n / FRAMES_PER_SECOND, files["color"][n], files["depth"][n]) for n in numbers]
+    calibration = _calibration(folder, images, settings)
+    truth = pose_files((n / FRAMES_PER_SECOND, files["pose"][n]) for n in numbers if n in files["pose"])
+    if truth and registers(calibration, settings):
+        truth = Trajectory(truth.timestamps_s, truth.T_world_camera @ se3.inverse(calibration.T_color_depth))
+    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
+
+
+def _calibration(folder: Path, images: list[Images], settings: InputConfig) -> Calibration:
+    known = SEVEN_SCENES_COLOR if settings.register_depth == "on" else SEVEN_SCENES
+    size = first_size([files.color for files in images])
+    calibration = calibrated(folder, known, size, settings, MILLIMETRES)
+    T = calibration.T_color_depth
+    return replace(calibration, T_color_depth=se3.orthonormalise(T))
+
+
+def _only_sequence(scene: Path) -> Path:
+    """Return the one sequence of a scene. Raises SourceError unless there is one."""
+    sequences = [path for path in sorted(scene.glob("seq-*")) if path.is_dir() and has_frame_files(path)]
+    packed = [path.name for path in sorted(scene.glob("seq-*.zip"))]
+    if not sequences and packed:
+        raise SourceError(f"{scene}: the sequences are still packed ({', '.join(packed[:3])}); unzip them first")
+    if len(sequences) != 1:
+        names = ", ".join(path.name for path in sequences)
+        raise SourceError(f"{scene} holds {len(sequences)} sequences ({names}); give one, as {sequences[0]}")
+    return sequences[0]
+
+
+def recognises(path: str) -> bool:
+    """Tell whether it is a sequence without a camera file of its own, or a scene of such."""
+    folder = Path(path)
+    if has_frame_files(folder):
+        return not any((folder / name).is_file() for name in ("_info.txt", "info.txt"))
+    return any(has_frame_files(entry) or entry.suffix == ".zip" for entry in folder.glob("seq-*"))
+
+
+FORMAT = Format(
+    "7-Scenes",
+    "frame-*.color.png and frame-*.depth.png",
+    recognises,
+    lambda path, settings: open_seven_scenes(Path(path), settings),
+)
