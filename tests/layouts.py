@@ -18,7 +18,7 @@ SMALL_CAMERA = Camera(32, 24, 30.0, 31.0, 15.25, 11.75)
 
 @dataclass(frozen=True)
 class Sample:
-    """What a layout is written from: color uint8 [N, H, W, 3], depth in mm uint16 [N, H, W], T_world_camera [N, 4, 4]."""
+    """What is written: color uint8 [N, H, W, 3], depth in mm uint16 [N, H, W], T_world_camera [N, 4, 4]."""
 
     color: np.ndarray
     depth_mm: np.ndarray

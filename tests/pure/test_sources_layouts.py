@@ -81,7 +81,7 @@ def test_a_colour_image_as_scannet_has_it_is_worked_on_at_depths_width(tmp_path)
     source = open_source(folder)
     assert source.depth_registered and source.camera == color.resized(640, 478)
     assert (source.frame(1).depth_m[20:-20, 20:-20] == 2.0).all()
-    for n in range(FRAMES):  # … and where the exporter made colour as small as depth, its matrix is still the large one's
+    for n in range(FRAMES):  # an exporter may have made colour small; its matrix is the large one's
         layouts.save(folder / f"color/{n * 7}.jpg", np.full((480, 640, 3), 99, np.uint8))
     assert open_source(folder).camera == color.resized(640, 480)
 

@@ -171,7 +171,7 @@ def number(path: Path, fields: dict[str, Any], key: str, default: float | None =
 def positive(path: Path, key: str, value: float) -> float:
     """Return a number that must be above 0. Raises SourceError naming file and field."""
     if value <= 0:
-        raise SourceError(f'{path}: field "{key}" is {value:g}, it must be above 0 (depth units per metre)')
+        raise SourceError(f'{path}: field "{key}" is {value:g}, it must be above 0')
     return value
 
 

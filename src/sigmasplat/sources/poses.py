@@ -36,8 +36,12 @@ def matrix(where: str, values: Any) -> Matrix:
     except (ValueError, TypeError):
         flat = np.zeros(0)
     if len(flat) not in (12, 16):
-        raise SourceError(f"{where}: a 4×4 matrix in rows is wanted, found {str(values)[:60]!r}")
+        raise SourceError(f"{where}: a 4×4 matrix in rows is wanted, found {_described(values)}")
     return np.vstack([flat[:12].reshape(3, 4), flat[12:].reshape(-1, 4) if len(flat) == 16 else [[0, 0, 0, 1]]])
+
+
+def _described(values: Any) -> str:
+    return f"{len(values)} values" if isinstance(values, list) else repr(values)[:60]
 
 
 def pose(where: str, T: Matrix) -> Matrix | None:

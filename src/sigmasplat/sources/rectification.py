@@ -92,7 +92,7 @@ def refuse_sizes(
         if tuple(size) != wanted:
             raise SourceError(
                 f"{path} is {size[0]}×{size[1]} but the calibration is for {wanted[0]}×{wanted[1]}; "
-                f"mend the {what} camera's calibration"
+                f"take images of that size, or mend the {what} camera's calibration"
             )
 
 

@@ -18,7 +18,7 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.sources.calibration import MILLIMETRES, Calibration, calibrated, camera_of
+from sigmasplat.sources.calibration import MILLIMETRES, Calibration, calibrated, camera_of, positive
 from sigmasplat.sources.folders import (
     COLOR_ENDINGS,
     DEPTH_ENDINGS,
@@ -32,6 +32,7 @@ from sigmasplat.sources.frame_files import Found, frame_files, has_frame_files
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.poses import Matrix, matrix, pose_files, read_matrix
 from sigmasplat.sources.recorded import Images, RecordedSource, first_size
+from sigmasplat.sources.tum_lists import numbers
 
 COLOR_SIZE, DEPTH_SIZE = (1296, 968), (640, 480)
 """Width and height of ScanNet's recordings; the published matrices are for these, whatever was done to the images."""
@@ -46,12 +47,12 @@ def open_scannet(folder: Path, settings: InputConfig) -> RecordedSource:
         raise SourceError(
             f"{packed[0]} is still packed; extract color, depth, pose and intrinsic from it with ScanNet's SensReader"
         )
-    numbers, skipped = paired(folder, files["color"], files["depth"], "color/*.jpg", "depth/*.png")
-    images = [Images(n / FRAMES_PER_SECOND, files["color"][n], files["depth"][n]) for n in numbers]
+    keys, skipped = paired(folder, files["color"], files["depth"], "color/*.jpg", "depth/*.png")
+    images = [Images(n / FRAMES_PER_SECOND, files["color"][n], files["depth"][n]) for n in keys]
     size, depth_size = first_size([i.color for i in images]), first_size([i.depth for i in images])
     recorded = _recorded(folder, size, depth_size)
     calibration = calibrated(folder, recorded, size, settings, MILLIMETRES)
-    truth = pose_files((n / FRAMES_PER_SECOND, files["pose"][n]) for n in numbers if n in files["pose"])
+    truth = pose_files((n / FRAMES_PER_SECOND, files["pose"][n]) for n in keys if n in files["pose"])
     return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
 
 
@@ -85,8 +86,9 @@ def _matrices(folder: Path) -> tuple[dict[str, Path], dict[str, Matrix], float]:
     """Return each matrix's file and value by `{color|depth}_{intrinsic|extrinsic}`, and depth units per metre."""
     where, found, units = {}, {}, MILLIMETRES
     for info in (folder / name for name in INFO_NAMES if (folder / name).is_file()):
-        entries = dict(_entry(line) for line in info.read_text(encoding="utf-8").splitlines() if "=" in line)
-        units = float(entries.get("m_depthShift", units))
+        entries = dict(_entry(line) for line in info.read_text("utf-8", "replace").splitlines() if "=" in line)
+        if shift := entries.get("m_depthShift"):
+            units = positive(info, "m_depthShift", numbers(info, 1, [shift])[0])
         for key, kind in (("Color", "color"), ("Depth", "depth")):
             for part in ("Intrinsic", "Extrinsic"):
                 if text := entries.get(f"m_calibration{key}{part}"):

@@ -53,7 +53,9 @@ def _chosen(dslr: Path, fields: Fields, split: str, key: str) -> list[Fields]:
     frames = {frame["file_path"]: frame for frame in frames_of(dslr / TRANSFORMS, fields, key)}
     lists = read_object(dslr / LISTS) if (dslr / LISTS).is_file() else {}
     names = lists.get(split, sorted(frames))
-    absent = [name for name in names if name not in frames]
+    if not isinstance(names, list) or not names:
+        raise SourceError(f"{dslr / LISTS}: {split!r} is {str(names)[:60]}, a list of file names is wanted")
+    absent = [str(name) for name in names if str(name) not in frames]
     if absent:
         raise SourceError(f"{dslr / LISTS}: {absent[0]} of {split!r} is not among the {key} of {TRANSFORMS.name}")
     return [frames[name] for name in names]

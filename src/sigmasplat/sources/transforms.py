@@ -45,8 +45,10 @@ def camera_in(path: Path, fields: Fields, frames: Sequence[Fields], size: tuple[
         raise SourceError(f"{path}: camera_model is {model}; only pinholes are read, undistort the images first")
     for frame in frames[1:]:
         for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
-            a, b = first.get(key), frame.get(key, fields.get(key))
-            if a is not None and b is not None and abs(float(a) - float(b)) > SAME_PX:
+            if key not in first:
+                continue
+            a, b = number(path, first, key), number(path, {**first, **frame}, key)
+            if abs(a - b) > SAME_PX:
                 raise SourceError(
                     f"{path}: the frames have several cameras ({key} {a:g} and {b:g}, {frame['file_path']}); "
                     "one pinhole for all is wanted: undistort to one, or leave the others out"

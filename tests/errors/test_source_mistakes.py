@@ -1,0 +1,271 @@
+"""The likeliest mistakes with each data set: one line each that says what was wrong and what to do."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from layouts import LAYOUTS, sample
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.sources import open_source
+
+Damage = Callable[[Path], Path | None]
+
+
+def without(*patterns: str) -> Damage:
+    """Delete files and folders."""
+
+    def damage(folder: Path) -> None:
+        for path in [path for pattern in patterns for path in folder.glob(pattern)]:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    return damage
+
+
+def with_text(name: str, text: str) -> Damage:
+    """Put another text into a file."""
+
+    def damage(folder: Path) -> None:
+        path = next(iter(folder.glob(name)), folder / name)
+        path.write_text(text)
+
+    return damage
+
+
+def resized(pattern: str, size: tuple[int, int] = (20, 14)) -> Damage:
+    """Make images another size, as a viewer or an exporter might have."""
+
+    def damage(folder: Path) -> None:
+        for path in folder.glob(pattern):
+            with Image.open(path) as image:
+                pixels = image.resize(size, Image.Resampling.NEAREST)
+            pixels.save(path)
+
+    return damage
+
+
+def painted(pattern: str) -> Damage:
+    """Put 8-bit colour pictures where depth should be."""
+
+    def damage(folder: Path) -> None:
+        for path in folder.glob(pattern):
+            with Image.open(path) as image:
+                size = image.size
+            Image.new("RGB", size, (90, 40, 10)).save(path.with_suffix(".png"))
+
+    return damage
+
+
+def blank(pattern: str) -> Damage:
+    """Make every depth pixel 0."""
+
+    def damage(folder: Path) -> None:
+        for path in folder.glob(pattern):
+            with Image.open(path) as image:
+                size = image.size
+            Image.fromarray(np.zeros(size[::-1], np.uint16)).save(path)
+
+    return damage
+
+
+def renumbered(pattern: str) -> Damage:
+    """Give the images numbers of another recording."""
+
+    def damage(folder: Path) -> None:
+        for path in sorted(folder.glob(pattern)):
+            name = re.sub(r"[0-9]+", lambda found: str(int(found[0]) + 500).zfill(len(found[0])), path.name, count=1)
+            path.rename(path.with_name(name))
+
+    return damage
+
+
+def fields(name: str, change: Callable[[dict], object]) -> Damage:
+    """Change the object in a JSON file."""
+
+    def damage(folder: Path) -> None:
+        content = json.loads((folder / name).read_text())
+        change(content)
+        (folder / name).write_text(json.dumps(content))
+
+    return damage
+
+
+def packed(pattern: str, archive: str) -> Damage:
+    """Leave an archive where its content should be."""
+
+    def damage(folder: Path) -> None:
+        without(pattern)(folder)
+        (folder / archive).write_bytes(b"PK")
+
+    return damage
+
+
+def sequence_packed(folder: Path) -> Path:
+    scene = folder.parent
+    packed("seq-01", "seq-01.zip")(scene)
+    return scene
+
+
+def second_sequence(folder: Path) -> Path:
+    shutil.copytree(folder, folder.parent / "seq-02")
+    return folder.parent
+
+
+def rendered_elsewhere(folder: Path) -> None:
+    (folder / "dslr/undistorted_depths").rename(folder / "dslr/render_depth")
+
+
+def text_depth(folder: Path) -> None:
+    without("*")(folder)
+    (folder / "scene_00_0000.depth").write_text("231.5 231.6")
+
+
+def one_lost(folder: Path) -> None:
+    renumbered("depth/*")(folder)
+    (folder / "depth/508.png").unlink()
+
+
+def another_time(folder: Path) -> None:
+    for path in list(folder.glob("depth/*")):
+        path.rename(path.with_name(f"{path.stem}999999.png"))
+
+
+def scaled(frame: dict) -> None:
+    frame["transform_matrix"] = (2 * np.eye(4)).tolist()
+
+
+SCALED_ROWS = "2 0 0 0\n0 2 0 0\n0 0 2 0\n0 0 0 1\n"
+LISTS = ("RGB-only download", "no depth images in")
+MISTAKES: dict[str, dict[str, tuple[Damage, tuple[str, ...]]]] = {
+    "scannet": {
+        "not extracted": (packed("*", "scene0000_00.sens"), ("still packed", "SensReader")),
+        "colour alone": (without("depth"), (*LISTS, "depth/*.png")),
+        "no matrices": (without("intrinsic"), ("camera unknown", "calibration.json", "--fx")),
+        "depth's matrix left out": (without("intrinsic/*_depth.txt"), ("depth camera's matrix is missing",)),
+        "a matrix cut short": (with_text("intrinsic/i*_color.txt", "1170 0 647"), ("intrinsic_color.txt", "4×4")),
+        "other frames in depth": (renumbered("depth/*"), ("no number is shared", "one recording")),
+        "a pose that is none": (with_text("pose/7.txt", SCALED_ROWS), ("7.txt", "not a rigid")),
+        "depth as a picture": (painted("depth/*"), ("not a depth image",)),
+    },
+    "scannet_frames": {
+        "colour alone": (without("*.depth.pgm"), LISTS),
+        "depth alone": (without("*.color.jpg"), ("no colour images in",)),
+        "a matrix damaged": (with_text("_info.txt", "m_calibrationColorIntrinsic = 1 2 3"), ("_info.txt", "4×4")),
+        "an empty information file": (with_text("_info.txt", ""), ("camera unknown",)),
+        "a pose cut short": (with_text("frame-000001.pose.txt", "1 0 0"), ("frame-000001.pose.txt", "4×4")),
+    },
+    "scannetpp": {
+        "images not undistorted": (without("dslr/undistorted_images"), ("no undistorted_images/", "dslr.undistort")),
+        "depth of the fisheye": (rendered_elsewhere, ("no undistorted_depths/", "render_depth")),
+        "a list of another scene": (
+            with_text("dslr/train_test_lists.json", '{"train": ["DSC09999.JPG"]}'), ("DSC09999.JPG", "not among"),
+        ),
+        "images downscaled": (resized("dslr/undistorted_*/*"), ("20×14", "32×24", "calibration")),
+        "the fisheye's transforms": (
+            fields("dslr/nerfstudio/transforms_undistorted.json", lambda f: f.update(camera_model="OPENCV_FISHEYE")),
+            ("OPENCV_FISHEYE", "undistort"),
+        ),
+        "transforms damaged": (with_text("dslr/nerfstudio/transforms_undistorted.json", "{"), ("JSON",)),
+    },
+    "seven_scenes": {
+        "not unzipped": (sequence_packed, ("seq-01.zip", "unzip")),
+        "a scene of several": (second_sequence, ("holds 2 sequences", "seq-01, seq-02", "give one")),
+        "colour alone": (without("*.depth.png"), LISTS),
+        "a pose cut short": (with_text("frame-000001.pose.txt", "1 0 0"), ("frame-000001.pose.txt", "4×4")),
+        "images made smaller": (resized("*.png", (320, 240)), ("320×240", "640×480", "calibration")),
+        "depth as a picture": (painted("*.depth.png"), ("not a depth image",)),
+    },
+    "icl_nuim": {
+        "text depth": (text_depth, ("text depth", "frei_png")),
+        "depth not downloaded": (without("depth"), ("no pair of colour and depth", "is missing")),
+        "a list that is none": (with_text("associations.txt", "1 rgb/1.png\n"), ("associations.txt:1", "wanted")),
+        "an empty list": (with_text("associations.txt", "# nothing\n"), ("lists no images",)),
+        "a pose cut short": (with_text("*.gt.freiburg", "1 0 0 0\n"), ("gt.freiburg:1", "tx ty tz")),
+        "depth blank": (blank("depth/*"), ("depth is zero",)),
+    },
+    "open3d": {
+        "colour alone": (without("depth"), LISTS),
+        "depth alone": (without("color"), ("no colour images in",)),
+        "intrinsics of nobody": (
+            fields("camera_intrinsic.json", lambda f: f.pop("intrinsic_matrix")), ("intrinsic_matrix", "9 numbers"),
+        ),
+        "intrinsics of another size": (
+            fields("camera_intrinsic.json", lambda f: f.update(width=640, height=480)), ("32×24", "640×480"),
+        ),
+        "the log cut short": (with_text("trajectory.log", "0 0 1\n1 0 0 0\n"), ("trajectory.log", "cut short")),
+        "the log is no motion": (with_text("trajectory.log", "0 0 1\n" + SCALED_ROWS), ("log:1", "not a rigid")),
+        "other frames in depth": (renumbered("depth/*"), ("no number is shared",)),
+    },
+    "redwood": {
+        "colour alone": (without("depth"), LISTS),
+        "another recording's depth": (
+            another_time,
+            ("no colour image has depth within",),
+        ),
+        "images made smaller": (resized("*/*.[jp][pn]g", (320, 240)), ("320×240", "640×480")),
+        "a log of words": (with_text("00021.log", "pose 0\n"), ("00021.log:1", "numbers wanted")),
+        "depth as a picture": (painted("depth/*"), ("not a depth image",)),
+    },
+    "bonn": {
+        "colour alone": (without("depth", "depth.txt"), LISTS),
+        "depth's list empty": (with_text("depth.txt", "# none\n"), ("depth.txt", "lists no images")),
+        "truth cut short": (with_text("groundtruth.txt", "1 2 3\n"), ("groundtruth.txt:1", "tx ty tz")),
+        "truth empty": (with_text("groundtruth.txt", "# none\n"), ("holds no poses",)),
+        "images made smaller": (resized("*/*.png", (320, 240)), ("320×240", "640×480")),
+    },
+    "nerfstudio": {
+        "colour alone": (
+            fields("transforms.json", lambda f: [frame.pop("depth_file_path") for frame in f["frames"]]),
+            ("depth_file_path", "export"),
+        ),
+        "several cameras": (
+            fields("transforms.json", lambda f: f["frames"][1].update(fl_x=55.0)), ("several cameras", "fl_x"),
+        ),
+        "a fisheye": (fields("transforms.json", lambda f: f.update(camera_model="OPENCV_FISHEYE")), ("undistort",)),
+        "no focal length": (fields("transforms.json", lambda f: f.pop("fl_x")), ("fl_x", "missing")),
+        "a scaled world": (fields("transforms.json", lambda f: scaled(f["frames"][0])), ("not a rigid", "frame_10")),
+        "no frames": (fields("transforms.json", lambda f: f.pop("frames")), ('no list "frames"',)),
+        "images moved": (without("images"), ("no pair of colour and depth", "is missing")),
+        "not JSON": (with_text("transforms.json", "frames: []"), ("transforms.json", "JSON")),
+    },
+    "plain": {
+        "no camera": (without("calibration.json"), ("camera unknown", "--fx")),
+        "colour alone": (without("depth"), LISTS),
+        "depth alone": (without("color"), ("no colour images in",)),
+        "sizes differ": (resized("depth/*"), ("20×14", "32×24", "depth_camera")),
+        "a frame lost and names that differ": (
+            one_lost,
+            ("no number is shared",),
+        ),
+        "depth as a picture": (painted("depth/*"), ("not a depth image",)),
+        "depth blank": (blank("depth/*"), ("depth is zero",)),
+    },
+}  # fmt: skip
+TABLE = [
+    pytest.param(name, damage, words, id=f"{name}: {mistake}")
+    for name, mistakes in MISTAKES.items()
+    for mistake, (damage, words) in mistakes.items()
+]
+
+
+@pytest.mark.parametrize(("name", "damage", "words"), TABLE)
+def test_a_mistake_gives_one_clear_line(name, damage, words, tmp_path):
+    layout = LAYOUTS[name]
+    folder = layout.write(tmp_path, sample(layout.size))
+    given = damage(folder) or folder
+    with pytest.raises(SigmaSplatError) as caught:
+        list(open_source(given, strict=True))
+    message = str(caught.value)
+    assert "\n" not in message and len(message.replace(str(tmp_path), "")) < 350
+    for word in words:
+        assert word in message
+
+
+def test_every_format_has_its_five():
+    assert all(len(mistakes) >= 5 for mistakes in MISTAKES.values())
+    assert {"tum", "replica"} == LAYOUTS.keys() - MISTAKES.keys(), "theirs are in test_bad_sources.py"
