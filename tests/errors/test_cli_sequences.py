@@ -77,8 +77,9 @@ def pose_line(line: str) -> Callable[[Path], object]:
 
 
 def no_lists(folder: Path) -> None:
-    (folder / "rgb.txt").unlink()
-    (folder / "depth.txt").unlink()
+    for part in ("rgb", "depth"):
+        (folder / f"{part}.txt").unlink()
+        (folder / part).rename(folder / f"my_{part}")
 
 
 DAMAGE: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {

@@ -208,7 +208,7 @@ MISTAKES: dict[str, dict[str, tuple[Damage, tuple[str, ...]]]] = {
             ("no colour image has depth within",),
         ),
         "images made smaller": (resized("*/*.[jp][pn]g", (320, 240)), ("320×240", "640×480")),
-        "a log of words": (with_text("00021.log", "pose 0\n"), ("00021.log:1", "numbers wanted")),
+        "a log of words": (with_text("00021.log", "0 0 1\n1 0 0 x\n"), ("00021.log:2", "numbers wanted")),
         "depth as a picture": (painted("depth/*"), ("not a depth image",)),
     },
     "bonn": {

@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 import layouts
+from documents import ROOT
 from layouts import FRAMES, LAYOUTS, SMALL_CAMERA, sample
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources import open_source
@@ -65,6 +66,11 @@ def test_the_users_camera_wins_in_every_format(layout, tmp_path):
     own = open_source(folder, **layout.options)
     scale = 2 if known.depth_registered else 1
     assert (own.camera.fx * scale, own.camera.fy * scale) == (77.0, 78.0) and own.depth_units_per_metre == 250.0
+
+
+def test_the_documents_show_every_format():
+    rows = (ROOT / "docs" / "data.md").read_text(encoding="utf-8")
+    assert [known.name for known in formats() if f"| {known.name} |" not in rows] == []
 
 
 # ScanNet
@@ -295,6 +301,16 @@ def test_a_plain_folder_with_a_focal_length_alone(tmp_path):
     (folder / "calibration.json").unlink()
     source = open_source(folder, fx=30.0)
     assert source.camera == Camera(32, 24, 30.0, 30.0, 15.5, 11.5) and source.depth_units_per_metre == 1000.0
+
+
+@pytest.mark.parametrize("text", ["started recording\n", ""])
+def test_a_log_that_holds_no_poses_is_not_taken_for_a_path(text, tmp_path):
+    folder = layouts.open3d(tmp_path, sample())
+    (folder / "trajectory.log").unlink()
+    (folder / "capture.log").write_text(text)
+    assert open_source(folder).truth() is None
+    (folder / "camera_intrinsic.json").unlink()
+    assert format_of(folder).name == "plain folder"
 
 
 def test_a_log_of_odometry_is_no_truth(tmp_path):

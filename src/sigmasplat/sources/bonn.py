@@ -51,7 +51,7 @@ def recognises(path: str) -> bool:
 
 FORMAT = Format(
     "Bonn dynamic",
-    "rgb.txt and depth.txt in a folder named rgbd_bonn_…",
+    "TUM's lists under rgbd_bonn_…",
     recognises,
     lambda path, settings: open_bonn(Path(path), settings),
     priority=2,

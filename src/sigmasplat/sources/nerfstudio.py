@@ -60,7 +60,7 @@ def _calibration(
 
 FORMAT = Format(
     "nerfstudio",
-    "transforms.json with depth_file_path",
+    "transforms.json",
     lambda path: (Path(path) / NAME).is_file(),
     lambda path, settings: open_nerfstudio(Path(path), settings),
 )

@@ -88,4 +88,4 @@ def _nothing_fits(path: Path) -> str:
     wanted = "; ".join(f"{f.name}: {f.looked_for}" for f in formats())
     found = [entry.name + "/" * entry.is_dir() for entry in entries]
     listing = ", ".join(found[:8]) + (f", … {len(found)} entries" if len(found) > 8 else "") or "an empty folder"
-    return f"unknown format: {path} (looked for {wanted}; found {listing})"
+    return f"unknown format: {path} (looked for {wanted}; found {listing}); docs/data.md shows the layouts"

@@ -113,9 +113,17 @@ def _truth(folder: Path, images: list[Images]) -> Trajectory | None:
 
 
 def _log_in(folder: Path) -> Path | None:
-    """Return trajectory.log, else the one log that is not of somebody's odometry."""
-    logs = [path for path in sorted(folder.glob("*.log")) if "odom" not in path.name]
-    return next((path for path in logs if path.name == "trajectory.log"), logs[0] if len(logs) == 1 else None)
+    """Return trajectory.log, else the one log that begins as a trajectory does and is not of somebody's odometry."""
+    if (folder / "trajectory.log").is_file():
+        return folder / "trajectory.log"
+    logs = [path for path in folder.glob("*.log") if "odom" not in path.name and _begins_as_trajectory(path)]
+    return logs[0] if len(logs) == 1 else None
+
+
+def _begins_as_trajectory(path: Path) -> bool:
+    with path.open(encoding="utf-8", errors="replace") as file:
+        words = file.readline(200).split()
+    return len(words) == 3 and all(word.isdigit() for word in words)
 
 
 def _intrinsic_file(folder: Path) -> Path | None:
@@ -134,7 +142,7 @@ def recognises(path: str) -> bool:
 
 FORMAT = Format(
     "Redwood / Open3D",
-    "color/ and depth/ with camera_intrinsic.json or trajectory.log",
+    "color/, depth/ and camera_intrinsic.json or trajectory.log",
     recognises,
     lambda path, settings: open_redwood(Path(path), settings),
 )

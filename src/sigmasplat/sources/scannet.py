@@ -128,7 +128,7 @@ def recognises(path: str) -> bool:
 
 FORMAT = Format(
     "ScanNet",
-    "color/, depth/, pose/ and intrinsic/ as SensReader extracts them",
+    "color/, depth/ and pose/",
     recognises,
     lambda path, settings: open_scannet(Path(path), settings),
 )

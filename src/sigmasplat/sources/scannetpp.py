@@ -74,7 +74,7 @@ def _dslr(scene: Path) -> Path:
 
 FORMAT = Format(
     "ScanNet++",
-    f"dslr/{TRANSFORMS}",
+    "dslr/nerfstudio/",
     lambda path: (_dslr(Path(path)) / TRANSFORMS).is_file(),
     lambda path, settings: open_scannetpp(Path(path), settings),
 )

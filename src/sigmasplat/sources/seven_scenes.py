@@ -68,7 +68,7 @@ def recognises(path: str) -> bool:
 
 FORMAT = Format(
     "7-Scenes",
-    "frame-*.color.png and frame-*.depth.png",
+    "frame-*.color.png",
     recognises,
     lambda path, settings: open_seven_scenes(Path(path), settings),
 )

@@ -121,4 +121,5 @@ FORMAT = Format(
     "the word 'synthetic'",
     lambda path: path.partition(":")[0] == "synthetic",
     lambda path, settings: parse(path),
+    priority=3,
 )
