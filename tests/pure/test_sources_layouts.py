@@ -153,6 +153,7 @@ def test_registering_seven_scenes_moves_depth_and_the_true_path_to_the_colour_ca
         layouts.save(folder / f"frame-{n:06d}.depth.png", np.full((480, 640), 2000, np.uint16))
     raw, moved = open_source(folder), open_source(folder, register_depth="on")
     assert not raw.depth_registered and moved.depth_registered and moved.camera.fx == 528.12
+    assert raw.registrable and moved.registrable, "so that whoever finds depth beside its colour knows what mends it"
     # Where the depth camera's middle pixel lies in the world, seen from the registered frame at the true path.
     point = written.T_world_camera[1] @ [0.0, 0.0, 2.0, 1.0]
     x, y, z, _ = np.linalg.inv(moved.truth().T_world_camera[1]) @ point

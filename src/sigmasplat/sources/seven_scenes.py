@@ -35,7 +35,9 @@ def open_seven_scenes(folder: Path, settings: InputConfig) -> RecordedSource:
     truth = pose_files((n / FRAMES_PER_SECOND, files["pose"][n]) for n in numbers if n in files["pose"])
     if truth and registers(calibration, settings):
         truth = Trajectory(truth.timestamps_s, truth.T_world_camera @ se3.inverse(calibration.T_color_depth))
-    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
+    source = RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
+    source.registrable = source.registrable or calibration.camera == SEVEN_SCENES.camera
+    return source
 
 
 def _calibration(folder: Path, images: list[Images], settings: InputConfig) -> Calibration:
