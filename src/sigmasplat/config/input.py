@@ -21,6 +21,10 @@ class InputConfig:
     strict: bool = False
     """Whether an unreadable image ends the sequence instead of being passed over."""
 
+    color_topic: str = ""
+    depth_topic: str = ""
+    """The topics of a ROS bag to take; empty = found by what they hold."""
+
     calibration: str = ""
     """A calibration.json to use in place of what the recording says of its cameras."""
     fx: float = 0.0

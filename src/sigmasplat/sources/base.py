@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
@@ -22,7 +23,8 @@ class Source(ABC):
     strict: whether an unreadable image ends the sequence instead of being passed over;
     depth_units_per_metre: what whole-number depth was divided by, None where depth is metres already;
     depth_registered: whether depth was moved into the colour camera here, instead of coming so; registrable: whether it
-    could be, its camera being known.
+    could be, its camera being known;
+    live: whether frames come from a camera as they are taken, once, and nobody knows how many (LiveSource).
     """
 
     name: str
@@ -31,6 +33,7 @@ class Source(ABC):
     depth_units_per_metre: float | None = None
     depth_registered: bool = False
     registrable: bool = False
+    live: bool = False
 
     def __init__(self, name: str, camera: Camera, strict: bool = False) -> None:
         self.name = name
@@ -49,6 +52,10 @@ class Source(ABC):
     def timestamp_s(self, i: int) -> float:
         """Return the time of frame i; formats that know it without reading the frame say so here. Raises as `frame`."""
         return self.frame(i).timestamp_s
+
+    def depth_m(self, i: int) -> NDArray[np.float32]:
+        """Read the depth of frame i, m [H, W]; formats that need no colour for it do without. Raises as `frame`."""
+        return self.frame(i).depth_m
 
     @abstractmethod
     def truth(self) -> Trajectory | None:
@@ -134,6 +141,10 @@ class Subset(Source):
     def timestamp_s(self, i: int) -> float:
         """Return the time of the i-th frame kept."""
         return self._whole.timestamp_s(self._indices[self._checked_index(i)])
+
+    def depth_m(self, i: int) -> NDArray[np.float32]:
+        """Read the depth of the i-th frame kept."""
+        return self._whole.depth_m(self._indices[self._checked_index(i)])
 
     def truth(self) -> Trajectory | None:
         """Return the true path of the whole source: it is kept by time, not by frame."""

@@ -15,7 +15,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 
 Lens = tuple[float, ...]
-"""Radial and tangential distortion k1, k2, p1, p2, k3."""
+"""Radial and tangential distortion k1, k2, p1, p2, k3 [, k4, k5, k6 of the rational model's denominator]."""
 
 
 @dataclass(frozen=True, eq=False)

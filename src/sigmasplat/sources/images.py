@@ -1,5 +1,6 @@
 """Read colour and depth images; whatever a file does wrong becomes one line that names it."""
 
+import io
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -29,6 +30,11 @@ def read_color(path: Path) -> NDArray[np.uint8]:
     return _guarded(path, lambda: _decode(path, "RGB"))
 
 
+def color_of(path: Path, data: bytes) -> NDArray[np.uint8]:
+    """Decode an image in memory as 8-bit RGB [H, W, 3]; `path` names it. Raises SourceError if it is damaged."""
+    return understood(path, lambda: np.asarray(Image.open(io.BytesIO(data)).convert("RGB")))
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) in pixels from the header alone. Raises SourceError if the file is no image."""
     if path.suffix == ".npy":
@@ -43,7 +49,13 @@ def read_depth(path: Path, units_per_metre: float) -> NDArray[np.float32]:
     Whole numbers (16-bit PNG, integer .npy) are divided by `units_per_metre`; floats (.tiff, .npy) are metres already.
     Raises SourceError if the file is unreadable, not a single-channel depth image, negative, or holds NaN or inf.
     """
-    raw = _guarded(path, lambda: np.load(path) if path.suffix == ".npy" else _decode(path))
+    return metres(
+        path, _guarded(path, lambda: np.load(path) if path.suffix == ".npy" else _decode(path)), units_per_metre
+    )
+
+
+def metres(path: Path, raw: NDArray[Any], units_per_metre: float) -> NDArray[np.float32]:
+    """Turn a depth image as stored into float32 metres, as `read_depth` says; `path` names it. Raises SourceError."""
     if raw.ndim != 2 or raw.dtype == np.uint8 or raw.dtype.kind not in "iuf":
         raise SourceError(
             f"{path}: not a depth image (found {raw.dtype} {raw.shape}); 16-bit PNG or float metres wanted"
@@ -74,9 +86,14 @@ def _header_size(path: Path) -> tuple[int, int]:
 
 
 def _guarded(path: Path, read: Callable[[], Value]) -> Value:
-    """Run a reader; decoders fail in many ways on damaged bytes, and all of them mean: this file is unreadable."""
+    """Run a reader of a file. Raises SourceError if the file is missing or unreadable."""
     if not path.is_file():
         raise SourceError(f"{path}: the image is missing; download it again or drop it from the list")
+    return understood(path, read)
+
+
+def understood(path: Path, read: Callable[[], Value]) -> Value:
+    """Run a decoder; those fail in many ways on damaged bytes, and all become a SourceError that names `path`."""
     try:
         return read()
     except (OSError, ValueError, SyntaxError, EOFError, IndexError, KeyError, TypeError, struct.error) as error:

@@ -11,11 +11,14 @@ Points = NDArray[np.float64]
 
 
 def distort(points: Points, coefficients: Points) -> Points:
-    """Map ideal image points [..., 2] (x/z, y/z) to where the lens puts them; coefficients k1, k2, p1, p2, k3."""
-    k1, k2, p1, p2, k3 = coefficients
+    """Map ideal image points [..., 2] (x/z, y/z) to where the lens puts them.
+
+    Coefficients k1, k2, p1, p2, k3 [, k4, k5, k6], the last three of the rational model's denominator (OpenCV's order).
+    """
+    k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(coefficients, (0, 8 - len(coefficients)))
     x, y = points[..., 0], points[..., 1]
     r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
     return np.stack(
         [
             x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),

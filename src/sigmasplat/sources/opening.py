@@ -14,6 +14,9 @@ from sigmasplat.config.text import nearest
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.sources.base import Source, Subset
 
+PACKED = (".bag", ".mcap", ".db3", ".r3d")
+"""Endings of files that may be whole sequences; only for the message that names those of a folder."""
+
 
 @dataclass(frozen=True)
 class Format:
@@ -51,7 +54,7 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
     asked = changed(settings or InputConfig(), changes)
     source = format_of(path).open(str(path), asked)
     part = asked.stride > 1 or asked.limit or asked.start_s or asked.end_s
-    return Subset(source, asked) if part else source
+    return Subset(source, asked) if part and not source.live else source
 
 
 def format_of(path: str | Path) -> Format:
@@ -77,15 +80,19 @@ def changed(settings: InputConfig, changes: Mapping[str, Any]) -> InputConfig:
 
 def _nothing_fits(path: Path) -> str:
     if not path.exists():
-        return f"no such folder: {path}; give the folder of a sequence, or 'synthetic' for the built-in room"
+        return (
+            f"no such folder or file: {path}; give a recording, or 'synthetic' for the built-in room, "
+            "or 'realsense' for the camera"
+        )
+    wanted = "; ".join(f"{f.name}: {f.looked_for}" for f in formats())
     if not path.is_dir():
-        return f"{path} is a file; give the folder that holds the sequence"
+        return f"{path} is a file of unknown format; give the folder that holds the sequence (looked for {wanted})"
     entries = sorted(path.iterdir())
-    inner = [(entry.name, known.name) for entry in entries if entry.is_dir() and (known := _knowing(entry))]
+    likely = (entry for entry in entries if entry.is_dir() or entry.suffix in PACKED)
+    inner = [(entry.name, known.name) for entry in likely if (known := _knowing(entry))]
     if inner:
         names = ", ".join(f"{name} ({known})" for name, known in inner[:4]) + ", …" * (len(inner) > 4)
         return f"{path} holds sequences: {names}; give the path of one of them, as {path / inner[0][0]}"
-    wanted = "; ".join(f"{f.name}: {f.looked_for}" for f in formats())
     found = [entry.name + "/" * entry.is_dir() for entry in entries]
     listing = ", ".join(found[:8]) + (f", … {len(found)} entries" if len(found) > 8 else "") or "an empty folder"
     return f"unknown format: {path} (looked for {wanted}; found {listing}); docs/data.md shows the layouts"

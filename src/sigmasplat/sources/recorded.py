@@ -4,6 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.frame import Frame, resized_color
@@ -14,14 +17,32 @@ from sigmasplat.sources.depth_check import refuse_without_depth
 from sigmasplat.sources.images import color_from_bytes, image_size, read_color, read_depth
 from sigmasplat.sources.rectification import Rectification, refuse_sizes
 
+Size = tuple[int, int]
+
 
 @dataclass(frozen=True)
 class Images:
-    """The colour and the depth file of one frame, and its time in seconds."""
+    """The colour and the depth file of one frame, and its time in seconds.
+
+    Formats whose images are no files by themselves (members of an archive, frames of a video, messages of a bag) derive
+    from this and read in their own way; the paths then only name the images in messages.
+    """
 
     timestamp_s: float
     color: Path
     depth: Path
+
+    def read_color(self) -> NDArray[np.uint8]:
+        """Read 8-bit RGB [H, W, 3]. Raises SourceError naming `color`."""
+        return read_color(self.color)
+
+    def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
+        """Read depth in metres [H, W], 0 = no reading; whole numbers are divided. Raises SourceError naming `depth`."""
+        return read_depth(self.depth, units_per_metre)
+
+    def sizes(self) -> tuple[Size, Size]:
+        """Return (width, height) of colour and of depth in pixels. Raises SourceError naming the one unreadable."""
+        return image_size(self.color), image_size(self.depth)
 
 
 class RecordedSource(Source):
@@ -62,12 +83,19 @@ class RecordedSource(Source):
     def frame(self, i: int) -> Frame:
         """Read frame i: colour and depth of one camera, lens taken out."""
         files = self._images[self._checked_index(i)]
-        color = color_from_bytes(read_color(files.color))
-        depth_m = read_depth(files.depth, self.depth_units_per_metre)
+        color = color_from_bytes(files.read_color())
+        depth_m = files.read_depth(self.depth_units_per_metre)
         refuse_sizes(self._rectified, files.color, color.shape[1::-1], files.depth, depth_m.shape[::-1])
         color, depth_m = self._rectified(color, depth_m)
         color = resized_color(color, self.camera.width, self.camera.height)
         return Frame(i, files.timestamp_s, color, depth_m, self.camera)
+
+    def depth_m(self, i: int) -> NDArray[np.float32]:
+        """Read the depth of frame i without its colour, as `frame` does."""
+        files = self._images[self._checked_index(i)]
+        depth_m, camera = files.read_depth(self.depth_units_per_metre), self._rectified.calibration.camera
+        refuse_sizes(self._rectified, files.color, (camera.width, camera.height), files.depth, depth_m.shape[::-1])
+        return self._rectified.depth(depth_m)
 
     def truth(self) -> Trajectory | None:
         """Return the recorded path, all of it, on its own timestamps."""
@@ -82,7 +110,7 @@ class RecordedSource(Source):
         problem: SourceError | None = None
         for files in self._images:
             try:
-                size, depth_size = image_size(files.color), image_size(files.depth)
+                size, depth_size = files.sizes()
             except SourceError as error:
                 problem = problem or error
                 continue

@@ -66,13 +66,13 @@ class Rectification:
 
     def __call__(self, color: Image, depth_m: Image) -> tuple[Image, Image]:
         """Return colour [H, W, 3] and depth [H, W] of `camera` from the recorded ones."""
-        if self._color_lens:
-            color = self._color_lens.color(color)
+        return self._color_lens.color(color) if self._color_lens else color, self.depth(depth_m)
+
+    def depth(self, depth_m: Image) -> Image:
+        """Return depth [H, W] of `camera` from the recorded one."""
         if self._depth_lens:
             depth_m = self._depth_lens.depth(depth_m)
-        if self._registration:
-            depth_m = self._registration(depth_m)
-        return color, depth_m
+        return self._registration(depth_m) if self._registration else depth_m
 
 
 def refuse_sizes(

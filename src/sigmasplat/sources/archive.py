@@ -1,0 +1,39 @@
+"""Read the files of a recording that lies packed in a zip, or unpacked in a folder."""
+
+import re
+import zipfile
+import zlib
+from pathlib import Path
+
+from sigmasplat.errors import SourceError
+
+
+class Archive:
+    """The recording's files by their names below its top; nothing is unpacked to disk."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises SourceError if a file is no whole zip."""
+        self.path, self._zip = path, None
+        if path.is_dir():
+            self.names = [str(entry.relative_to(path)) for part in ("*", "*/*") for entry in path.glob(part)]
+            return
+        try:
+            self._zip = zipfile.ZipFile(path)
+        except (OSError, zipfile.BadZipFile) as error:
+            raise SourceError(f"{path}: not a whole archive ({error}); copy it again") from error
+        self.names = self._zip.namelist()
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.names
+
+    def read(self, name: str) -> bytes:
+        """Return a file's bytes. Raises SourceError naming it if it is missing or damaged."""
+        try:
+            return (self.path / name).read_bytes() if self._zip is None else self._zip.read(name)
+        except (OSError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+            raise SourceError(f"{self.path / name}: unreadable in its archive ({error}); copy it again") from error
+
+    def numbered(self, folder: str, endings: str) -> dict[int, str]:
+        """Map the number in each name folder/N.ending to the name, in order of number; endings as a|b."""
+        found = [(re.fullmatch(rf"{folder}/(\d+)\.({endings})", name), name) for name in self.names]
+        return dict(sorted((int(match.group(1)), name) for match, name in found if match))

@@ -1,0 +1,14 @@
+"""Load packages that only some formats need."""
+
+import importlib
+from typing import Any
+
+from sigmasplat.errors import SourceError
+
+
+def needed(module: str, extra: str, what: str) -> Any:
+    """Import a module. Raises SourceError that says for what it is needed and which extra of ours brings it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise SourceError(f"{what} needs {module} ({error}): pip install 'sigmasplat[{extra}]'") from error

@@ -1,0 +1,175 @@
+"""Read what the app Stray Scanner records with an iPhone's LiDAR (layout: strayrobots/scanner, docs/format.md).
+
+rgb.mp4                       depth/000000.png    16-bit millimetres, coarser than colour, same camera
+camera_matrix.csv   3×3       confidence/000000.png   0, 1, 2: readings of 0 are left out
+odometry.csv        timestamp, frame, x, y, z, qx, qy, qz, qw [, fx, fy, cx, cy]
+
+The app turns ARKit's camera axes into ours before it writes a pose (OdometryEncoder.swift), and numbers frame, depth
+and pose alike. Files of 2021, whose odometry.csv has no header, are not read.
+"""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sigmasplat.config import InputConfig
+from sigmasplat.errors import SourceError
+from sigmasplat.model import se3
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.sources.calibration import Calibration, calibrated, camera_of
+from sigmasplat.sources.images import image_size, read_depth, understood
+from sigmasplat.sources.opening import Format
+from sigmasplat.sources.recorded import Images, RecordedSource, Size, first_size
+from sigmasplat.sources.video import Video
+
+UNITS_PER_METRE = 1000.0
+POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
+INTRINSICS = ("fx", "fy", "cx", "cy")
+Rows = dict[int, dict[str, float]]
+
+
+@dataclass(frozen=True)
+class ScannedImages(Images):
+    """A frame of the video, a depth image, and how sure the phone was of each reading."""
+
+    video: Video
+    number: int
+    confidence: Path
+
+    def read_color(self) -> NDArray[np.uint8]:
+        """Read 8-bit RGB [H, W, 3]. Raises SourceError naming the video."""
+        return self.video.frame(self.number)
+
+    def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
+        """Read depth in metres [H, W], 0 where the phone had no confidence. Raises SourceError naming the file."""
+        depth_m = read_depth(self.depth, units_per_metre)
+        if not self.confidence.is_file():
+            return depth_m
+        confidence = understood(self.confidence, lambda: np.asarray(Image.open(self.confidence)))
+        if confidence.shape != depth_m.shape:
+            raise SourceError(
+                f"{self.confidence}: {confidence.shape} values for depth of {depth_m.shape}; copy it again"
+            )
+        return np.where(confidence > 0, depth_m, np.float32(0.0))
+
+    def sizes(self) -> tuple[Size, Size]:
+        """Return (width, height) of colour and depth. Raises SourceError naming the depth file."""
+        return self.video.size, image_size(self.depth)
+
+
+def open_stray(folder: Path, settings: InputConfig) -> RecordedSource:
+    """Open a folder; raises SourceError if video, depth, camera or poses cannot be used."""
+    video_path, depths = folder / "rgb.mp4", _numbered(folder / "depth")
+    if not video_path.is_file():
+        raise SourceError(f"no video in {folder} (looked for rgb.mp4); copy the whole folder from the phone")
+    if not depths:
+        raise SourceError(f"no depth images in {folder} (looked for depth/000000.png, …); has the phone a LiDAR?")
+    rows, video = _odometry(folder / "odometry.csv"), Video(video_path)
+    numbers = [n for n in sorted(depths) if n in rows and n < video.count]
+    if not numbers:
+        raise SourceError(
+            f"{folder}: no frame has video ({video.count} frames), depth and a line of odometry.csv "
+            f"({len(rows)} lines); copy the whole folder again"
+        )
+    images = [
+        ScannedImages(rows[n]["timestamp"], folder / f"rgb.mp4 frame {n}", depths[n], video, n,
+                      folder / "confidence" / depths[n].name)
+        for n in numbers
+    ]  # fmt: skip
+    kept = set(numbers)
+    skipped = [f"{depths[n]}: no frame {n} in rgb.mp4 or odometry.csv" for n in sorted(depths) if n not in kept]
+    calibration = _calibration(folder, rows, video.size, first_size([depths[n] for n in numbers]), settings)
+    return RecordedSource(folder.resolve().name, images, calibration, settings, _truth(rows, numbers), skipped)
+
+
+def shared_axis(calibration: Calibration, depth_size: Size) -> Calibration:
+    """Return the calibration of a phone, whose depth is the colour camera's view on a coarser grid."""
+    if depth_size == (calibration.camera.width, calibration.camera.height) or calibration.depth_camera:
+        return calibration
+    camera, lens = calibration.camera.resized(*depth_size), calibration.distortion
+    return Calibration(calibration.camera, calibration.depth_units_per_metre, lens, camera, lens)
+
+
+def _numbered(folder: Path) -> dict[int, Path]:
+    return {int(path.stem): path for path in sorted(folder.glob("*.png")) if path.stem.isdigit()}
+
+
+def _odometry(path: Path) -> Rows:
+    """Read the lines of odometry.csv by frame. Raises SourceError naming file and line."""
+    if not path.is_file():
+        raise SourceError(f"{path} is missing: it holds the times of the frames; copy the whole folder from the phone")
+    with path.open(newline="", encoding="utf-8") as file:
+        lines = [[word.strip() for word in line] for line in csv.reader(file) if line]
+    if not lines or not set(POSE) <= set(lines[0]):
+        raise SourceError(
+            f"{path}: columns {', '.join(POSE)} wanted in the first line, "
+            f"found {', '.join(lines[0] if lines else [])}; "
+            "record with a Stray Scanner of 2022 or later"
+        )
+    rows = {}
+    for number, line in enumerate(lines[1:], 2):
+        row = _row(f"{path}:{number}", lines[0], line)
+        rows[int(row["frame"])] = row
+    return rows
+
+
+def _row(where: str, names: list[str], words: list[str]) -> dict[str, float]:
+    try:
+        row = {name: float(word) for name, word in zip(names, words, strict=True)}
+    except ValueError as error:
+        raise SourceError(f"{where}: {len(names)} numbers wanted, found {','.join(words)[:80]!r}") from error
+    if not np.isfinite(list(row.values())).all():
+        raise SourceError(f"{where}: not finite: {','.join(words)[:80]!r}; drop the line")
+    return row
+
+
+def _calibration(folder: Path, rows: Rows, size: Size, depth_size: Size, settings: InputConfig) -> Calibration:
+    """Read the camera: the middle of the values of all frames where they are there, since focus moves them a little."""
+    path = folder / "camera_matrix.csv"
+    recorded = None
+    if rows and set(INTRINSICS) <= set(next(iter(rows.values()))):
+        focal = np.median([[row[name] for name in INTRINSICS] for row in rows.values()], 0)
+        recorded = Calibration(camera_of(folder / "odometry.csv", *size, focal.tolist()), UNITS_PER_METRE)
+    elif path.is_file():
+        recorded = Calibration(camera_of(path, *size, _matrix(path)), UNITS_PER_METRE)
+    return shared_axis(calibrated(folder, recorded, size, settings, UNITS_PER_METRE), depth_size)
+
+
+def _matrix(path: Path) -> list[float]:
+    """Read fx, fy, cx, cy. Raises SourceError naming the file."""
+    try:
+        rows = np.array(
+            [[float(word) for word in line.split(",")] for line in path.read_text().split("\n") if line.strip()]
+        )
+    except (OSError, ValueError) as error:
+        raise SourceError(f"{path}: a 3×3 matrix of numbers wanted ({error}); copy it again") from error
+    if rows.shape != (3, 3):
+        raise SourceError(f"{path}: a 3×3 matrix wanted, found {rows.shape}; copy it again")
+    return [float(v) for v in (rows[0, 0], rows[1, 1], rows[0, 2], rows[1, 2])]
+
+
+def _truth(rows: Rows, numbers: list[int]) -> Trajectory | None:
+    """Return ARKit's path: not the truth, but what the phone believed of itself."""
+    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
+    for T, n in zip(poses, numbers, strict=True):
+        row = rows[n]
+        T[:3, :3] = se3.rotation_from_quaternion(np.array([row["qw"], row["qx"], row["qy"], row["qz"]]))
+        T[:3, 3] = row["x"], row["y"], row["z"]
+    return Trajectory(np.array([rows[n]["timestamp"] for n in numbers]), poses)
+
+
+def _recognises(path: str) -> bool:
+    folder = Path(path)
+    return (folder / "odometry.csv").is_file() or ((folder / "rgb.mp4").is_file() and (folder / "depth").is_dir())
+
+
+FORMAT = Format(
+    "Stray Scanner",
+    "rgb.mp4, depth/ and odometry.csv",
+    _recognises,
+    lambda path, settings: open_stray(Path(path), settings),
+)
