@@ -39,9 +39,9 @@ class Screen:
         self.err.print(f"warning: {line}")
 
     @contextmanager
-    def steps(self, total: int, done: int = 0) -> Iterator["_StepShow"]:
-        """Show a session: a bar with frames/s, splats and lost frames; a line where tracking is lost or a loop closed;
-        a bar for the final map."""
+    def steps(self, total: int | None, done: int = 0) -> Iterator["_StepShow"]:
+        """Show a session, total None where its length is not known: a bar with frames/s, splats and lost frames; a line
+        where tracking is lost or a loop closed; a bar for the final map."""
         with self._counters() as begin:
             yield _StepShow(self.say, begin, total, done)
 
@@ -121,7 +121,7 @@ def _bar(bars: Progress, title: str, total: int | None) -> Show:
 class _StepShow:
     """Turn steps into text for a bar, and losses and loops into lines."""
 
-    def __init__(self, say: Callable[[str], None], begin: Begin, total: int, done: int = 0) -> None:
+    def __init__(self, say: Callable[[str], None], begin: Begin, total: int | None, done: int = 0) -> None:
         self.say, self.begin, self.show = say, begin, begin("SLAM", total)
         self.show_final: Show | None = None
         self.started_s = time.perf_counter()

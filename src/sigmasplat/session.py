@@ -26,12 +26,12 @@ def new_folder(out: Path | None, config: Config, source: Source, overwrite: bool
     """
     plain_name = "".join(c if c.isalnum() or c in "._-" else "-" for c in source.name).strip("-.") or "run"
     default = RUNS / f"{plain_name}-{config.name}"
-    folder = RunFolder.create(out or (default if overwrite else _free(default)), config, source.name, overwrite)
+    folder = RunFolder.create(out or (default if overwrite else free(default)), config, source.name, overwrite)
     folder.note(**facts)
     return folder
 
 
-def _free(wanted: Path) -> Path:
+def free(wanted: Path) -> Path:
     """Return the path itself, or with -2, -3, … the first that holds nothing."""
     taken, number = wanted, 1
     while taken.exists() and not (taken.is_dir() and not any(taken.iterdir())):
@@ -83,8 +83,8 @@ def record(
 
     These are written also where the session is cut short. The first Ctrl-C ends it after the frame in work, or where
     finishing next tells how far it is; a second one at once: all end as "interrupted", and frames cut short are not
-    finished. Any other exception leaves the same files, marks the run "failed", and carries the run folder's path in a
-    note.
+    finished. A live sequence has no other end: there the first Ctrl-C ends the frames, and they are finished. Any other
+    exception leaves the same files, marks the run "failed", and carries the run folder's path in a note.
     """
     tally, watch, keeper = _Tally.of(run, first, spent_s), watch or Unwatched(), keeper or _Unkept()
     status = "failed"
@@ -161,6 +161,8 @@ def _follow(
         tally.wall_s = spent_s + time.perf_counter() - started_s
     if frame is not None:
         keeper.keep(frame.index, tally.wall_s)
+    if source.live:
+        asked.clear()  # Ctrl-C is how a live sequence ends; the next one cuts its finishing short
     return not asked.is_set()
 
 

@@ -34,7 +34,7 @@ OutFolder = Annotated[
 DemoFolder = Annotated[Path, arg(metavar="DIR", aliases=["--output"], help="run folder")]
 Frames = Annotated[int, arg(metavar="N", help="length of the walk through the room")]
 SourcePath = Annotated[
-    str, tyro.conf.Positional, arg(metavar="PATH", help="folder of a sequence, or synthetic[:frames=N]")
+    str, tyro.conf.Positional, arg(metavar="PATH", help="a recording, synthetic[:frames=N], or realsense: the camera")
 ]
 SourcePaths = Annotated[
     tuple[str, ...],
@@ -75,6 +75,14 @@ MovedSource = Annotated[
 ]
 OutFile = Annotated[
     Path | None, arg(metavar="FILE", help="file to write", help_behavior_hint="(default: RUN's name, here)")
+]
+Record = Annotated[
+    Path | None,
+    arg(
+        metavar="DIR",
+        help="where to record what a live camera sees",
+        help_behavior_hint="(default: recording/ in the run folder)",
+    ),
 ]
 MeshFile = Annotated[
     Path | None,
@@ -139,6 +147,8 @@ class Taken:
     depth_scale: Annotated[
         float | None, arg(metavar="UNITS", help="PNG units of depth per metre", help_behavior_hint="")
     ] = None
+    color_topic: Annotated[str | None, arg(metavar="NAME", help="topic of a ROS bag", help_behavior_hint="")] = None
+    depth_topic: Annotated[str | None, arg(metavar="NAME", help="topic of a ROS bag", help_behavior_hint="")] = None
     register_depth: Annotated[
         Literal["auto", "on", "off"] | None, arg(help="move depth into the colour camera", help_behavior_hint="")
     ] = None

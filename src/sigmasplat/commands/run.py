@@ -1,5 +1,6 @@
 """Run SLAM on a sequence, or on the built-in room: sigmasplat demo | run | resume."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from sigmasplat.screen import Screen
     from sigmasplat.snapshots import Begun
     from sigmasplat.sources.base import Source
+    from sigmasplat.sources.live import LiveSource
 
 OK, INTERRUPTED = 0, 130
 DEFAULT_PRESET = default_preset()
@@ -50,25 +52,36 @@ def run(
     evaluate: options.Evaluate = True,
     profile: options.Profile = False,
     save_every: options.SaveEvery = SAVE_EVERY_S,
+    record: options.Record = None,
 ) -> int:
-    """Run SLAM on a sequence: trajectory, map, uncertainty, report.
+    """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
     example: sigmasplat run data/kitchen --limit 200 --set input.width=480
     """
     from sigmasplat.screen import Screen
-    from sigmasplat.session import new_folder
+    from sigmasplat.session import free, new_folder
     from sigmasplat.slam.slam import Slam
     from sigmasplat.snapshots import Begun
     from sigmasplat.sources import open_source
     from sigmasplat.sources.depth_check import depth_warning
+    from sigmasplat.sources.live import LiveSource, as_recorded
 
     screen, config = Screen(), configured(preset, settings, seed, taken)
     source = open_source(path, config.input)
-    warning = depth_warning(source)
-    if warning:
+    if isinstance(source, LiveSource):
+        config = replace(config, input=as_recorded(config.input))
+    elif record:
+        raise ConfigError("--record is for a live camera; the sequence is recorded already")
+    elif warning := depth_warning(source):
         screen.warn(warning)
     folder = new_folder(out, config, source, overwrite, source_path=absolute(path))
-    screen.say(f"{source.name}: {len(source)} frames, {config.name} → {folder.path}")
+    if isinstance(source, LiveSource):
+        place = record or free(folder.path / "recording")
+        source.record_to(place)
+        folder.note(source_path=str(place.resolve()))
+        screen.say(f"{source.name}: until Ctrl-C, {config.name} → {folder.path}, recorded to {place}")
+    else:
+        screen.say(f"{source.name}: {len(source)} frames, {config.name} → {folder.path}")
     prepare_torch()
     return _record(screen, Begun(Slam(config, folder.submaps)), source, folder, evaluate, profile, save_every)
 
@@ -109,9 +122,10 @@ def _record(
     """Run SLAM into the folder, then score it; return the exit code."""
     from sigmasplat.session import record
     from sigmasplat.snapshots import Snapshots
+    from sigmasplat.sources.live import LiveSource
 
     keeper = Snapshots(begun.slam, folder, save_every_s)
-    with screen.steps(len(source), begun.next_index) as watch:
+    with screen.steps(None if source.live else len(source), begun.next_index) as watch:
         outcome = record(begun.slam, source, folder, watch, keeper, begun.next_index, begun.wall_s)
     if profile:
         screen.profile(folder.read_profile())
@@ -124,8 +138,19 @@ def _record(
             f"`sigmasplat resume {folder.path}` goes on"
         )
         return INTERRUPTED
+    if isinstance(source, LiveSource):
+        _tell_ending(screen, source)
+        source = source_of(folder, None)
     if evaluate:
         score(screen, folder, source)
     else:
         screen.say(f"{outcome.counts()}: {folder.path}")
     return OK
+
+
+def _tell_ending(screen: "Screen", source: "LiveSource") -> None:
+    """Say why the camera ended, and what was left out because SLAM was slower."""
+    if source.ending:
+        screen.warn(source.ending)
+    if source.dropped:
+        screen.say(f"{source.dropped} frames of the camera were left out while SLAM was busy")

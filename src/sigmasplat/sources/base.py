@@ -53,7 +53,7 @@ class Source(ABC):
         """Return the time of frame i; formats that know it without reading the frame say so here. Raises as `frame`."""
         return self.frame(i).timestamp_s
 
-    def depth_m(self, i: int) -> NDArray[np.float32]:
+    def depth_of(self, i: int) -> NDArray[np.float32]:
         """Read the depth of frame i, m [H, W]; formats that need no colour for it do without. Raises as `frame`."""
         return self.frame(i).depth_m
 
@@ -142,9 +142,9 @@ class Subset(Source):
         """Return the time of the i-th frame kept."""
         return self._whole.timestamp_s(self._indices[self._checked_index(i)])
 
-    def depth_m(self, i: int) -> NDArray[np.float32]:
+    def depth_of(self, i: int) -> NDArray[np.float32]:
         """Read the depth of the i-th frame kept."""
-        return self._whole.depth_m(self._indices[self._checked_index(i)])
+        return self._whole.depth_of(self._indices[self._checked_index(i)])
 
     def truth(self) -> Trajectory | None:
         """Return the true path of the whole source: it is kept by time, not by frame."""

@@ -116,7 +116,7 @@ def read_calibration(path: Path, size: tuple[int, int], default_units_per_metre:
 
 
 def calibrated(
-    folder: Path, recorded: Calibration | None, size: tuple[int, int], settings: InputConfig, default_units: float
+    folder: Path | str, recorded: Calibration | None, size: tuple[int, int], settings: InputConfig, default_units: float
 ) -> Calibration:
     """Return what is known of the cameras: the settings' words, else calibration.json's, else the recording's.
 

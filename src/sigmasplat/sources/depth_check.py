@@ -44,7 +44,7 @@ def refuse_without_depth(source: Source, samples: int = 5) -> None:
 
 def _first_problem(source: Source) -> str:
     try:
-        source.depth_m(0)
+        source.depth_of(0)
     except SourceError as error:
         return str(error)
     return "frame 0 has no pixel above 0"
@@ -61,7 +61,7 @@ def _frame_medians_m(source: Source, indices: Iterable[int], stop_at: int | None
         if stop_at is not None and len(medians) >= stop_at:
             break
         try:
-            depth_m = source.depth_m(i)
+            depth_m = source.depth_of(i)
         except SourceError:
             continue  # iterating the source reports it; here only the readable frames matter
         if (depth_m > 0).any():

@@ -90,7 +90,7 @@ class RecordedSource(Source):
         color = resized_color(color, self.camera.width, self.camera.height)
         return Frame(i, files.timestamp_s, color, depth_m, self.camera)
 
-    def depth_m(self, i: int) -> NDArray[np.float32]:
+    def depth_of(self, i: int) -> NDArray[np.float32]:
         """Read the depth of frame i without its colour, as `frame` does."""
         files = self._images[self._checked_index(i)]
         depth_m, camera = files.read_depth(self.depth_units_per_metre), self._rectified.calibration.camera

@@ -11,12 +11,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.model import se3
-from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.association import associate
 from sigmasplat.sources.base import Source
@@ -26,10 +24,10 @@ from sigmasplat.sources.calibration import (
     calibrated,
     freiburg_calibration,
 )
-from sigmasplat.sources.images import OVERFLOW
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import Images, RecordedSource, first_size
 from sigmasplat.sources.tum_lists import read_list, read_poses
+from sigmasplat.sources.tum_writing import write_images
 
 MAX_GAP_S = 0.02
 """Colour and depth of a Kinect at 30 Hz are never further apart; TUM's own tool uses the same number."""
@@ -77,21 +75,11 @@ def write_tum(source: Source, folder: str | Path) -> None:
         calibration = asdict(source.camera) | {"depth_scale": TUM_UNITS_PER_METRE}
         (folder / "calibration.json").write_text(json.dumps(calibration, indent=1) + "\n")
         _write_truth(source.truth(), folder / "groundtruth.txt")
-        stems = [_write_images(frame, folder) for frame in source]
+        stems = [write_images(frame, folder) for frame in source]
         for part in ("depth", "rgb"):  # rgb.txt last: a folder that has it is complete
             (folder / f"{part}.txt").write_text("# timestamp path\n" + "".join(f"{s} {part}/{s}.png\n" for s in stems))
     except OSError as error:
         raise RunError(f"cannot write the sequence to {folder} ({error})") from error
-
-
-def _write_images(frame: Frame, folder: Path) -> str:
-    stem = f"{frame.timestamp_s:.6f}"
-    units = np.rint(frame.depth_m * TUM_UNITS_PER_METRE)
-    depth = np.where(units < OVERFLOW, units, 0).astype(np.uint16)
-    color = np.rint(frame.color * 255.0).astype(np.uint8)
-    Image.fromarray(color).save(folder / "rgb" / f"{stem}.png", compress_level=1)
-    Image.fromarray(depth).save(folder / "depth" / f"{stem}.png", compress_level=1)
-    return stem
 
 
 def _write_truth(truth: Trajectory | None, path: Path) -> None:

@@ -1,0 +1,143 @@
+"""Take frames from an Intel RealSense camera through its SDK, pyrealsense2 (Apache-2.0).
+
+"realsense" or "realsense:width=848,height=480,fps=30,serial=012345678901". The SDK moves depth into the colour camera's
+pixels; intrinsics, lens and depth unit are the device's.
+"""
+
+import weakref
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from sigmasplat.config import InputConfig
+from sigmasplat.errors import SourceError
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.frame import Frame, resized_color
+from sigmasplat.sources.calibration import Calibration, Lens, calibrated
+from sigmasplat.sources.images import color_from_bytes
+from sigmasplat.sources.live import LiveSource
+from sigmasplat.sources.opening import Format
+from sigmasplat.sources.optional import needed
+from sigmasplat.sources.rectification import Rectification
+
+OPTIONS = {"width": 640, "height": 480, "fps": 30}
+PATIENCE_MS = 5000
+WARM_UP = 15
+"""So many frames are let go by at first, while the exposure settles."""
+
+
+class RealSense(LiveSource):
+    """A camera that has been started."""
+
+    def __init__(self, sdk: Any, pipeline: Any, profile: Any, settings: InputConfig) -> None:
+        """Raises SourceError if the settings ask for what the camera does not tell."""
+        scale_m = float(profile.get_device().first_depth_sensor().get_depth_scale())
+        color = profile.get_stream(sdk.stream.color).as_video_stream_profile().get_intrinsics()
+        camera = Camera(color.width, color.height, color.fx, color.fy, color.ppx, color.ppy)
+        recorded = Calibration(camera, 1.0 / scale_m, _lens(sdk, color))
+        size = (camera.width, camera.height)
+        calibration = calibrated("realsense", recorded, size, settings, recorded.depth_units_per_metre)
+        self._rectified = Rectification("realsense", calibration, settings)
+        super().__init__("realsense", self._rectified.camera, settings)
+        self.depth_units_per_metre: float = calibration.depth_units_per_metre
+        self._sdk, self._pipeline = sdk, pipeline
+        self._stop = weakref.finalize(self, pipeline.stop)
+
+    def captured(self) -> Iterator[Frame]:
+        """Yield the newest frame again and again. Raises SourceError if none comes at all."""
+        align = self._sdk.align(self._sdk.stream.color)
+        last, index = None, 0
+        try:
+            for number, frames in self._delivered():
+                aligned = align.process(frames)
+                color, depth = aligned.get_color_frame(), aligned.get_depth_frame()
+                if not color or not depth:
+                    continue
+                self.dropped += number - last - 1 if last is not None and number > last else 0
+                last = number
+                yield self._framed(index, color, depth)
+                index += 1
+        finally:
+            self._stop()
+
+    def _delivered(self) -> Iterator[tuple[int, Any]]:
+        """Yield sets of frames with the camera's count, until none comes any more."""
+        count = 0
+        while True:
+            try:
+                frames = self._pipeline.wait_for_frames(PATIENCE_MS)
+            except RuntimeError as error:
+                problem = (
+                    f"{self.name}: no frame came for {PATIENCE_MS / 1000:g} s ({error}); is the camera plugged in?"
+                )
+                if count <= WARM_UP:
+                    raise SourceError(problem) from error
+                self.ending = problem
+                return
+            count += 1
+            if count > WARM_UP:
+                yield int(frames.get_frame_number()), frames
+
+    def _framed(self, index: int, color: Any, depth: Any) -> Frame:
+        pixels = color_from_bytes(np.array(color.get_data(), np.uint8))
+        units = np.asarray(depth.get_data()).astype(np.float32)
+        rgb, depth_m = self._rectified(pixels, units / np.float32(self.depth_units_per_metre))
+        rgb = resized_color(rgb, self.camera.width, self.camera.height)
+        return Frame(index, float(color.get_timestamp()) / 1000.0, rgb, depth_m, self.camera)
+
+
+def open_realsense(text: str, settings: InputConfig) -> RealSense:
+    """Start the camera. Raises SourceError if the SDK or the camera is missing, or cannot do what is asked."""
+    options = _parsed(text)
+    sdk = needed("pyrealsense2", "realsense", "the RealSense camera")
+    pipeline, wanted = sdk.pipeline(), sdk.config()
+    if options["serial"]:
+        wanted.enable_device(options["serial"])
+    width, height, fps = (options[key] for key in OPTIONS)
+    wanted.enable_stream(sdk.stream.depth, width, height, sdk.format.z16, fps)
+    wanted.enable_stream(sdk.stream.color, width, height, sdk.format.rgb8, fps)
+    try:
+        profile = pipeline.start(wanted)
+    except RuntimeError as error:
+        raise SourceError(
+            f"no RealSense camera gives {width}×{height} at {fps} frames/s ({error}); plug it into a USB 3 port, close "
+            "other programs that use it, or try realsense:width=848,height=480,fps=30"
+        ) from error
+    try:
+        return RealSense(sdk, pipeline, profile, settings)
+    except BaseException:
+        pipeline.stop()
+        raise
+
+
+def _parsed(text: str) -> dict[str, Any]:
+    """Read the options after the colon. Raises SourceError on any that is none."""
+    options: dict[str, Any] = {**OPTIONS, "serial": ""}
+    for part in filter(None, text.partition(":")[2].split(",")):
+        key, _, value = (word.strip() for word in part.partition("="))
+        if key not in options or not value or (key in OPTIONS and not (value.isdigit() and int(value))):
+            raise SourceError(f"realsense: option {part!r} not understood; there are {', '.join(options)}")
+        options[key] = int(value) if key in OPTIONS else value
+    return options
+
+
+def _lens(sdk: Any, intrinsics: Any) -> Lens | None:
+    """Return the lens in OpenCV's order; Brown–Conrady of the SDK's three kinds projects alike (rsutil.h)."""
+    values = tuple(float(v) for v in intrinsics.coeffs)
+    known = (sdk.distortion.brown_conrady, sdk.distortion.inverse_brown_conrady, sdk.distortion.modified_brown_conrady)
+    if not any(values):
+        return None
+    if intrinsics.model not in known:
+        raise SourceError(
+            f"realsense: lens model {intrinsics.model} of the colour camera is not known; give --calibration FILE"
+        )
+    return values
+
+
+FORMAT = Format(
+    "RealSense",
+    "the word 'realsense', for the camera",
+    lambda path: path.partition(":")[0] == "realsense",
+    open_realsense,
+)
