@@ -107,7 +107,7 @@ def test_a_bad_sequence_is_refused_before_anything_is_written(
 
 def test_a_missing_folder_is_refused(refused: Callable[..., str], tiny_tum: Path) -> None:
     assert f"no such folder or file: {tiny_tum}x; give a recording" in refused(f"{tiny_tum}x")
-    assert "is a file; give the folder" in refused(str(tiny_tum / "rgb.txt"))
+    assert "is a file of unknown format" in refused(str(tiny_tum / "rgb.txt"))
 
 
 def test_a_replica_pose_that_is_no_motion_is_refused(refused: Callable[..., str], tiny_tum: Path) -> None:

@@ -18,6 +18,7 @@ from sigmasplat.sources.optional import needed
 Message = Any
 Value = TypeVar("Value")
 
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0", b"\x89MCAP0", b"SQLite format 3\0"
 
 
@@ -50,6 +51,9 @@ class Bag:
         typesys = needed("rosbags.typesys", "ros", f"{path}: a ROS bag")
         # Messages of the common types never changed; what a bag says of its own types is not needed, and may be wrong.
         self._types = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if self.ros1 else typesys.Stores.LATEST)
+        if TRANSFORMS not in self._types.fielddefs:
+            fields = "geometry_msgs/TransformStamped[] transforms"
+            self._types.register(typesys.get_types_from_msg(fields, TRANSFORMS))
         self._reader = self._guarded(lambda: reader(path))
         self._guarded(self._reader.open)
         weakref.finalize(self, self._reader.close)
@@ -100,7 +104,7 @@ class Bag:
         kind = self.topics[name].kind
         if not self.ros1:
             return self._guarded(lambda: self._types.deserialize_cdr(raw, kind))
-        kind = "tf2_msgs/msg/TFMessage" if kind == "tf/msg/tfMessage" else kind  # its name before ROS Hydro
+        kind = TRANSFORMS if kind == "tf/msg/tfMessage" else kind  # its name before ROS Hydro
         try:
             return self._types.deserialize_ros1(raw, kind)
         except Exception:  # RealSense's SDK appends the depth unit to images, four bytes that the type does not have

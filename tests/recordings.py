@@ -1,0 +1,255 @@
+"""Write small recordings in the layouts of phones and robots, by hand and through other libraries' writers."""
+
+import json
+import struct
+import zipfile
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+FRAMES = 4
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Turns camera axes from ours to OpenGL's, and back."""
+
+
+@dataclass
+class Scene:
+    """What a camera saw: colours [N, H, W, 3] bytes, depths [N, h, w] mm, poses [N, 4, 4], times [N] s."""
+
+    colors: np.ndarray
+    depths_mm: np.ndarray
+    poses: np.ndarray
+    times_s: np.ndarray
+
+
+def scene(size: tuple[int, int] = (32, 24), depth_size: tuple[int, int] | None = None, seed: int = 0) -> Scene:
+    """Make frames of smooth colour (videos and JPEG can carry it) and depth of 1 to 3 m with holes."""
+    rng = np.random.default_rng(seed)
+    (width, height), (w, h) = size, depth_size or size
+    coarse = rng.integers(30, 220, (FRAMES, 3, 4, 3), np.uint8)
+    colors = np.stack(
+        [np.asarray(Image.fromarray(c).resize((width, height), Image.Resampling.BILINEAR)) for c in coarse]
+    )
+    depths = rng.integers(1000, 3000, (FRAMES, h, w)).astype(np.uint16)
+    depths[:, :2, :3] = 0
+    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(rng.normal(0, 0.5, (FRAMES, 3))).as_matrix()
+    poses[:, :3, 3] = rng.normal(0, 1, (FRAMES, 3))
+    return Scene(colors, depths, poses, 1000.0 + np.arange(FRAMES) / 30.0)
+
+
+def xyzw(T: np.ndarray) -> np.ndarray:
+    return Rotation.from_matrix(T[:3, :3]).as_quat()
+
+
+def encoded(array: np.ndarray, kind: str, **options: Any) -> bytes:
+    file = BytesIO()
+    Image.fromarray(array).save(file, kind, **options)
+    return file.getvalue()
+
+
+def write_stray(folder: Path, seen: Scene, fx: float = 40.0, per_frame: bool = False) -> Path:
+    """Write a Stray Scanner folder; the upper left reading of every frame has confidence 0."""
+    import cv2
+
+    for part in ("depth", "confidence"):
+        (folder / part).mkdir(parents=True)
+    height, width = seen.colors.shape[1:3]
+    video = cv2.VideoWriter(str(folder / "rgb.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 30.0, (width, height))
+    assert video.isOpened()
+    names = "timestamp, frame, x, y, z, qx, qy, qz, qw" + (", fx, fy, cx, cy" if per_frame else "")
+    lines = [names]
+    for i, (color, depth, T) in enumerate(zip(seen.colors, seen.depths_mm, seen.poses, strict=True)):
+        video.write(np.ascontiguousarray(color[..., ::-1]))
+        Image.fromarray(depth).save(folder / f"depth/{i:06d}.png")
+        sure = np.full(depth.shape, 2, np.uint8)
+        sure[-1, -1], sure[-1, -2] = 0, 1
+        Image.fromarray(sure).save(folder / f"confidence/{i:06d}.png")
+        values = [*T[:3, 3], *xyzw(T), *([fx + i, fx, width / 2, height / 2] if per_frame else [])]
+        lines.append(f"{seen.times_s[i]:.6f}, {i:06d}, " + ", ".join(f"{v:.9f}" for v in values))
+    video.release()
+    (folder / "odometry.csv").write_text("\n".join(lines))
+    (folder / "camera_matrix.csv").write_text(f"{fx}, 0.0, {width / 2}\n0.0, {fx}, {height / 2}\n0.0, 0.0, 1.0")
+    return folder
+
+
+def metadata(seen: Scene, **changes: Any) -> dict[str, Any]:
+    """Make Record3D's metadata: K by columns, poses as qx qy qz qw x y z in OpenGL's axes."""
+    height, width = seen.colors.shape[1:3]
+    poses = seen.poses @ OPENGL
+    return {
+        "w": width, "h": height, "dw": seen.depths_mm.shape[2], "dh": seen.depths_mm.shape[1], "fps": 30,
+        "K": [40.0, 0, 0, 0, 41.0, 0, width / 2 - 1, height / 2, 1],
+        "poses": [[*map(float, xyzw(T)), *map(float, T[:3, 3])] for T in poses],
+        "frameTimestamps": [float(t) for t in seen.times_s],
+    } | changes  # fmt: skip
+
+
+def r3d_members(seen: Scene, **changes: Any) -> dict[str, bytes]:
+    """Make the files of a .r3d: LZFSE of float metres with NaN for no reading, and of confidence."""
+    import lzfse
+
+    members = {"metadata": json.dumps(metadata(seen, **changes)).encode()}
+    for i, (color, depth) in enumerate(zip(seen.colors, seen.depths_mm, strict=True)):
+        metres = (depth / 1000.0).astype(np.float32)
+        metres[depth == 0] = np.nan
+        sure = np.full(depth.shape, 2, np.uint8)
+        sure[-1, -1], sure[-1, -2] = 0, 1
+        members[f"rgbd/{i}.jpg"] = encoded(color, "JPEG", quality=97, subsampling=0)
+        members[f"rgbd/{i}.depth"] = lzfse.compress(metres.tobytes())
+        members[f"rgbd/{i}.conf"] = lzfse.compress(sure.tobytes())
+    return members
+
+
+def write_zip(path: Path, members: dict[str, bytes]) -> Path:
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    return path
+
+
+def write_exr_export(folder: Path, seen: Scene, **changes: Any) -> Path:
+    """Write Record3D's export of pictures and EXR files."""
+    import OpenEXR
+
+    for part in ("rgb", "depth"):
+        (folder / part).mkdir(parents=True)
+    (folder / "metadata.json").write_text(json.dumps(metadata(seen, **changes)))
+    for i, (color, depth) in enumerate(zip(seen.colors, seen.depths_mm, strict=True)):
+        (folder / f"rgb/{i}.jpg").write_bytes(encoded(color, "JPEG", quality=97, subsampling=0))
+        pixels = {"R": (depth / 1000.0).astype(np.float32)}
+        OpenEXR.File({"type": OpenEXR.scanlineimage}, pixels).write(str(folder / f"depth/{i}.exr"))
+    return folder
+
+
+@dataclass
+class Recorder:
+    """Collects messages of a bag, then writes them: ROS 1, ROS 2 with SQLite, or ROS 2 with MCAP."""
+
+    ros1: bool = False
+    messages: list[tuple[str, str, int, Any]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        self.store = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.ROS2_HUMBLE)
+        if self.ros1:
+            fields = "geometry_msgs/TransformStamped[] transforms"
+            self.store.register(get_types_from_msg(fields, "tf2_msgs/msg/TFMessage"))
+
+    def make(self, kind: str, **fields: Any) -> Any:
+        """Make a message; what is not given is zero or empty."""
+        return self.store.types[kind](**fields)
+
+    def header(self, time_s: float, frame: str) -> Any:
+        nanoseconds = round(time_s * 1e9)
+        stamp = self.make("builtin_interfaces/msg/Time", sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame, **({"seq": 0} if self.ros1 else {}))
+
+    def add(self, topic: str, time_s: float, message: Any) -> None:
+        self.messages.append((topic, message.__msgtype__, round(time_s * 1e9), message))
+
+    def image(self, topic: str, time_s: float, array: np.ndarray, encoding: str, frame: str, late_s: float = 0.0,
+              pad: int = 0, big: bool = False) -> None:  # fmt: skip
+        """Add an image, recorded `late_s` after its header's time, its rows padded, its numbers of either order."""
+        height, width = array.shape[:2]
+        rows = np.ascontiguousarray(array.byteswap() if big else array).reshape(height, -1).view(np.uint8)
+        data = np.pad(rows, ((0, 0), (0, pad)), constant_values=7)
+        message = self.make(
+            "sensor_msgs/msg/Image", header=self.header(time_s, frame), height=height, width=width, encoding=encoding,
+            is_bigendian=int(big), step=data.shape[1], data=data.reshape(-1),
+        )  # fmt: skip
+        self.add(topic, time_s + late_s, message)
+
+    def compressed(self, topic: str, time_s: float, data: bytes, kind: str, frame: str) -> None:
+        message = self.make(
+            "sensor_msgs/msg/CompressedImage", header=self.header(time_s, frame), format=kind,
+            data=np.frombuffer(data, np.uint8),
+        )  # fmt: skip
+        self.add(topic, time_s, message)
+
+    def info(self, topic: str, time_s: float, size: tuple[int, int], focal: tuple[float, ...], frame: str,
+             lens: tuple[float, ...] = (0.0,) * 5, model: str = "plumb_bob") -> None:  # fmt: skip
+        fx, fy, cx, cy = focal
+        values = {"d": np.array(lens), "k": np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0]), "r": np.eye(3).reshape(-1),
+                  "p": np.array([fx + 1, 0, cx, 0, 0, fy + 1, cy, 0, 0, 0, 1.0, 0])}  # fmt: skip
+        roi = self.make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+        message = self.make(
+            "sensor_msgs/msg/CameraInfo", header=self.header(time_s, frame), height=size[1], width=size[0],
+            distortion_model=model, binning_x=0, binning_y=0, roi=roi,
+            **{(key.upper() if self.ros1 else key): value for key, value in values.items()},
+        )  # fmt: skip
+        self.add(topic, time_s, message)
+
+    def moved(self, T: np.ndarray) -> Any:
+        """Make a geometry_msgs/Transform."""
+        x, y, z, w = xyzw(T)
+        return self.make(
+            "geometry_msgs/msg/Transform",
+            translation=self.make("geometry_msgs/msg/Vector3", **dict(zip("xyz", map(float, T[:3, 3]), strict=True))),
+            rotation=self.make("geometry_msgs/msg/Quaternion", x=float(x), y=float(y), z=float(z), w=float(w)),
+        )
+
+    def transform(self, topic: str, time_s: float, parent: str, child: str, T: np.ndarray) -> Any:
+        stamped = self.make(
+            "geometry_msgs/msg/TransformStamped", header=self.header(time_s, parent), child_frame_id=child,
+            transform=self.moved(T),
+        )  # fmt: skip
+        self.add(topic, time_s, self.make("tf2_msgs/msg/TFMessage", transforms=[stamped]))
+        return stamped
+
+    def pose(self, time_s: float, T: np.ndarray, norm: float = 1.0) -> Any:
+        """Make a PoseStamped."""
+        x, y, z, w = xyzw(T) * norm
+        pose = self.make(
+            "geometry_msgs/msg/Pose",
+            position=self.make("geometry_msgs/msg/Point", **dict(zip("xyz", map(float, T[:3, 3]), strict=True))),
+            orientation=self.make("geometry_msgs/msg/Quaternion", x=float(x), y=float(y), z=float(z), w=float(w)),
+        )
+        return self.make("geometry_msgs/msg/PoseStamped", header=self.header(time_s, "world"), pose=pose)
+
+    def write(self, path: Path, storage: str = "sqlite3") -> Path:
+        """Write a .bag, or a ROS 2 folder; return the path."""
+        from rosbags.rosbag1 import Writer as Writer1
+        from rosbags.rosbag2 import StoragePlugin, Writer as Writer2
+
+        plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+        with Writer1(path) if self.ros1 else Writer2(path, version=9, storage_plugin=plugin) as writer:
+            connections: dict[str, Any] = {}
+            for topic, kind, time_ns, message in self.messages:
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, kind, typestore=self.store)
+                serialise = self.store.serialize_ros1 if self.ros1 else self.store.serialize_cdr
+                writer.write(connections[topic], time_ns, serialise(message, kind))
+        return path
+
+
+def compressed_depth(depth_mm: np.ndarray) -> bytes:
+    """Make compressed_depth_image_transport's bytes of 16UC1: 12 bytes that mean nothing, then a PNG."""
+    return struct.pack("<iff", 0, 100.0, 10.0) + encoded(depth_mm, "PNG")
+
+
+def quantised_depth(depth_m: np.ndarray, a: float = 10_000.0, b: float = -90.0) -> bytes:
+    """Make its bytes of 32FC1: the PNG holds a / depth + b."""
+    with np.errstate(divide="ignore"):
+        levels = np.where(depth_m > 0, a / depth_m + b, 0.0)
+    return struct.pack("<iff", 0, a, b) + encoded(np.rint(levels).astype(np.uint16), "PNG")
+
+
+FOCAL = (40.0, 41.0, 15.0, 12.0)
+CAMERA_TOPICS = ("/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw")
+
+
+def aligned(recorder: Recorder, seen: Scene) -> Recorder:
+    """Add what a RealSense gives with aligned depth: colour 4 ms before depth, recorded later than the headers say."""
+    size = seen.colors.shape[2], seen.colors.shape[1]
+    for color, depth, t in zip(seen.colors, seen.depths_mm, seen.times_s, strict=True):
+        recorder.image(CAMERA_TOPICS[0], t, color, "rgb8", "camera_color_optical_frame", late_s=0.05)
+        recorder.image(CAMERA_TOPICS[1], t + 0.004, depth, "16UC1", "camera_color_optical_frame", late_s=0.012)
+    recorder.info("/camera/color/camera_info", seen.times_s[0], size, FOCAL, "camera_color_optical_frame")
+    return recorder
