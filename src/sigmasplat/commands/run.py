@@ -70,6 +70,8 @@ def run(
     source = open_source(path, config.input)
     if isinstance(source, LiveSource):
         config = replace(config, input=as_recorded(config.input))
+        if record:
+            source.record_to(record)
     elif record:
         raise ConfigError("--record is for a live camera; the sequence is recorded already")
     elif warning := depth_warning(source):
@@ -77,7 +79,8 @@ def run(
     folder = new_folder(out, config, source, overwrite, source_path=absolute(path))
     if isinstance(source, LiveSource):
         place = record or free(folder.path / "recording")
-        source.record_to(place)
+        if not record:
+            source.record_to(place)
         folder.note(source_path=str(place.resolve()))
         screen.say(f"{source.name}: until Ctrl-C, {config.name} → {folder.path}, recorded to {place}")
     else:

@@ -15,6 +15,10 @@ from sigmasplat.sources.read_ahead import read_ahead
 from sigmasplat.sources.tum_writing import TumWriter
 
 
+class _NoLength(SourceError, TypeError):
+    """Say that there is no length: list() asks for one, and goes on without where a TypeError says no."""
+
+
 class LiveSource(Source):
     """A camera: its frames come once, and end when whoever iterates stops, the limit is reached, or the camera goes.
 
@@ -26,17 +30,18 @@ class LiveSource(Source):
 
     def __init__(self, name: str, camera: Camera, settings: InputConfig) -> None:
         super().__init__(name, camera, settings.strict)
-        self._settings, self._folder = settings, None  # type: tuple[InputConfig, Path | None]
+        self._settings = settings
+        self._writer: TumWriter | None = None
         self.dropped = 0
         self.ending = ""
 
     def record_to(self, folder: Path) -> None:
-        """Write every frame taken to a new TUM folder."""
-        self._folder = folder
+        """Write every frame taken to a new TUM folder. Raises RunError if it holds a sequence or cannot be written."""
+        self._writer = TumWriter(folder, self.camera)
 
     def __len__(self) -> int:
         """Raises SourceError: nobody knows."""
-        raise SourceError(self._once())
+        raise _NoLength(self._once())
 
     def frame(self, i: int) -> Frame:
         """Raises SourceError: frames come once."""
@@ -57,11 +62,10 @@ class LiveSource(Source):
         """Yield the camera's newest frame again and again, with its index among them; stop the camera in the end."""
 
     def _recorded(self) -> Iterator[Frame]:
-        writer = TumWriter(self._folder, self.camera) if self._folder else None
         for index, frame in enumerate(self._wanted()):
             numbered = replace(frame, index=index)
-            if writer:
-                writer.add(numbered)
+            if self._writer:
+                self._writer.add(numbered)
             yield numbered
             if index + 1 == self._settings.limit:
                 return
@@ -78,9 +82,7 @@ class LiveSource(Source):
                 yield frame
 
     def _once(self) -> str:
-        return (
-            f"{self.name}: a live camera gives its frames once; run it first, then read the folder it was recorded to"
-        )
+        return f"{self.name}: a live camera gives its frames once; run it, then read the folder it was recorded to"
 
 
 def as_recorded(settings: InputConfig) -> InputConfig:

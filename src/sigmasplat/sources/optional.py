@@ -10,5 +10,9 @@ def needed(module: str, extra: str, what: str) -> Any:
     """Import a module. Raises SourceError that says for what it is needed and which extra of ours brings it."""
     try:
         return importlib.import_module(module)
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise SourceError(f"{what} needs {module} ({error}): pip install 'sigmasplat[{extra}]'") from error
+    except ImportError as error:
+        raise SourceError(
+            f"{what} needs {module}, which is there but does not load ({error}); install the system library it names"
+        ) from error

@@ -1,14 +1,17 @@
 """Take frames from an Intel RealSense camera through its SDK, pyrealsense2 (Apache-2.0).
 
-"realsense" or "realsense:width=848,height=480,fps=30,serial=012345678901". The SDK moves depth into the colour camera's
-pixels; intrinsics, lens and depth unit are the device's.
+"realsense" or "realsense:width=848,height=480,fps=30,serial=012345678901". Intrinsics, lens and depth unit are the
+device's. The SDK moves depth into the colour camera's pixels, but leaves the numbers as they are: distances along the
+depth camera's axis, some millimetres off. With input.register_depth=on it is done here, exactly and more slowly.
 """
 
 import weakref
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
@@ -33,11 +36,17 @@ class RealSense(LiveSource):
     def __init__(self, sdk: Any, pipeline: Any, profile: Any, settings: InputConfig) -> None:
         """Raises SourceError if the settings ask for what the camera does not tell."""
         scale_m = float(profile.get_device().first_depth_sensor().get_depth_scale())
-        color = profile.get_stream(sdk.stream.color).as_video_stream_profile().get_intrinsics()
-        camera = Camera(color.width, color.height, color.fx, color.fy, color.ppx, color.ppy)
-        recorded = Calibration(camera, 1.0 / scale_m, _lens(sdk, color))
+        color, depth = (
+            profile.get_stream(kind).as_video_stream_profile() for kind in (sdk.stream.color, sdk.stream.depth)
+        )
+        camera, lens = _optics(sdk, color.get_intrinsics())
+        recorded = Calibration(camera, round(1.0 / scale_m, 3), lens)
         size = (camera.width, camera.height)
         calibration = calibrated("realsense", recorded, size, settings, recorded.depth_units_per_metre)
+        if settings.register_depth == "on" and not settings.calibration:
+            depth_camera, depth_lens = _optics(sdk, depth.get_intrinsics())
+            T = _transform(depth.get_extrinsics_to(color))
+            calibration = replace(calibration, depth_camera=depth_camera, depth_distortion=depth_lens, T_color_depth=T)
         self._rectified = Rectification("realsense", calibration, settings)
         super().__init__("realsense", self._rectified.camera, settings)
         self.depth_units_per_metre: float = calibration.depth_units_per_metre
@@ -47,22 +56,25 @@ class RealSense(LiveSource):
     def captured(self) -> Iterator[Frame]:
         """Yield the newest frame again and again. Raises SourceError if none comes at all."""
         align = self._sdk.align(self._sdk.stream.color)
-        last, index = None, 0
+        last: int | None = None
+        index = 0
         try:
-            for number, frames in self._delivered():
-                aligned = align.process(frames)
-                color, depth = aligned.get_color_frame(), aligned.get_depth_frame()
-                if not color or not depth:
+            for frames in self._delivered():
+                pair = frames if self._rectified.registers else align.process(frames)
+                color, depth = pair.get_color_frame(), pair.get_depth_frame()
+                # Where only depth is new the SDK gives the last colour image again.
+                if not color or not depth or color.get_frame_number() == last:
                     continue
-                self.dropped += number - last - 1 if last is not None and number > last else 0
+                number = color.get_frame_number()
+                self.dropped += max(number - last - 1, 0) if last is not None else 0
                 last = number
                 yield self._framed(index, color, depth)
                 index += 1
         finally:
             self._stop()
 
-    def _delivered(self) -> Iterator[tuple[int, Any]]:
-        """Yield sets of frames with the camera's count, until none comes any more."""
+    def _delivered(self) -> Iterator[Any]:
+        """Yield sets of frames until none comes any more."""
         count = 0
         while True:
             try:
@@ -77,7 +89,7 @@ class RealSense(LiveSource):
                 return
             count += 1
             if count > WARM_UP:
-                yield int(frames.get_frame_number()), frames
+                yield frames
 
     def _framed(self, index: int, color: Any, depth: Any) -> Frame:
         pixels = color_from_bytes(np.array(color.get_data(), np.uint8))
@@ -122,17 +134,27 @@ def _parsed(text: str) -> dict[str, Any]:
     return options
 
 
-def _lens(sdk: Any, intrinsics: Any) -> Lens | None:
-    """Return the lens in OpenCV's order; Brown–Conrady of the SDK's three kinds projects alike (rsutil.h)."""
+def _optics(sdk: Any, intrinsics: Any) -> tuple[Camera, Lens | None]:
+    """Return camera and lens, in OpenCV's order; Brown–Conrady of the SDK's three kinds projects alike (rsutil.h)."""
+    i = intrinsics
+    camera = Camera(i.width, i.height, i.fx, i.fy, i.ppx, i.ppy)
     values = tuple(float(v) for v in intrinsics.coeffs)
     known = (sdk.distortion.brown_conrady, sdk.distortion.inverse_brown_conrady, sdk.distortion.modified_brown_conrady)
     if not any(values):
-        return None
+        return camera, None
     if intrinsics.model not in known:
         raise SourceError(
             f"realsense: lens model {intrinsics.model} of the colour camera is not known; give --calibration FILE"
         )
-    return values
+    return camera, values
+
+
+def _transform(extrinsics: Any) -> NDArray[np.float64]:
+    """Return the 4×4 of the SDK's extrinsics, whose rotation goes by columns."""
+    T = np.eye(4)
+    T[:3, :3] = np.array(extrinsics.rotation, np.float64).reshape(3, 3).T
+    T[:3, 3] = extrinsics.translation
+    return T
 
 
 FORMAT = Format(

@@ -67,7 +67,7 @@ class PhoneImages(Images):
         where, data = self.archive.path / name, self.archive.read(name)
         try:
             return np.frombuffer(self.lzfse.decompress(data), kind).reshape(height, width)
-        except (self.lzfse.error, ValueError) as error:
+        except (self.lzfse.error, ValueError, MemoryError) as error:  # it asks for memory without end where cut short
             raise SourceError(f"{where}: not {width}×{height} values in LZFSE ({error}); export it again") from error
 
 
@@ -211,9 +211,11 @@ def _rows(where: Path, metadata: dict[str, Any], key: str, count: int) -> NDArra
 def _recognises(path: str) -> bool:
     place = Path(path)
     if place.is_file():
-        if place.suffix.lower() == ".r3d":
-            return True
-        return zipfile.is_zipfile(place) and "metadata" in zipfile.ZipFile(place).namelist()
+        try:
+            with zipfile.ZipFile(place) as archive:
+                return any(name.startswith("rgbd/") for name in archive.namelist())
+        except (OSError, zipfile.BadZipFile):
+            return place.suffix.lower() == ".r3d"
     return any((place / "rgbd").glob("*.depth")) or (
         (place / "metadata.json").is_file() and any((place / "depth").glob("*.exr"))
     )

@@ -1,0 +1,139 @@
+"""The live camera, through a stand-in for its SDK: what is taken, recorded, left out, and how it ends."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fake_realsense import Device, distortion
+from sigmasplat.config import InputConfig
+from sigmasplat.errors import RunError, SourceError
+from sigmasplat.sources import open_source
+from sigmasplat.sources.depth_check import depth_warning
+from sigmasplat.sources.live import LiveSource, as_recorded
+from sigmasplat.sources.realsense import WARM_UP
+
+
+@pytest.fixture
+def device(monkeypatch: pytest.MonkeyPatch) -> Device:
+    made = Device()
+    monkeypatch.setitem(sys.modules, "pyrealsense2", made.module())
+    return made
+
+
+def opened(**settings: object) -> LiveSource:
+    source = open_source("realsense", **settings)
+    assert isinstance(source, LiveSource)
+    return source
+
+
+def test_frames_are_the_cameras(device: Device) -> None:
+    source = opened(limit=3)
+    frames = list(source)
+    assert source.camera == device.room.camera and source.depth_units_per_metre == 2000.0
+    assert device.asked == [("depth", 640, 480, "z16", 30), ("color", 640, 480, "rgb8", 30)]
+    for i, frame in enumerate(frames):
+        seen = device.room.frame(WARM_UP + 1 + i)
+        assert (frame.index, frame.timestamp_s) == (i, pytest.approx((WARM_UP + 1 + i) / 30))
+        assert np.array_equal(frame.color, seen.color)
+        assert np.abs(frame.depth_m - seen.depth_m).max() <= 0.5 * 0.0005 + 1e-6
+    assert (device.started, device.stopped) == (1, 1) and source.dropped == 0
+
+
+def test_options_reach_the_camera(device: Device) -> None:
+    open_source("realsense:width=848,height=480,fps=60,serial=0123")
+    assert device.asked[0] == ("depth", 848, 480, "z16", 60) and device.serial == "0123"
+
+
+def test_a_camera_nobody_iterates_is_stopped(device: Device) -> None:
+    source = opened()
+    del source
+    assert (device.started, device.stopped) == (1, 1)
+
+
+def test_every_frame_taken_is_recorded_at_once(device: Device, tmp_path: Path) -> None:
+    source = opened(limit=5)
+    source.record_to(tmp_path / "recording")
+    live = []
+    for frame in source:
+        live.append(frame)
+        assert len(open_source(tmp_path / "recording")) >= len(live)  # readable at any moment
+    again = open_source(tmp_path / "recording")
+    assert len(again) == 5 and again.camera == source.camera and again.truth() is None
+    for one, other in zip(live, again, strict=True):
+        assert one.timestamp_s == pytest.approx(other.timestamp_s, abs=1e-6)
+        assert np.array_equal(one.color, other.color)
+        assert np.abs(one.depth_m - other.depth_m).max() <= 0.5 / 5000 + 1e-6  # TUM's unit
+
+
+def test_a_recording_is_not_written_over(device: Device, tmp_path: Path) -> None:
+    (tmp_path / "rgb.txt").write_text("")
+    with pytest.raises(RunError, match="already holds a sequence"):
+        opened(limit=1).record_to(tmp_path)
+
+
+def test_frames_missed_are_counted_and_the_newest_wins(device: Device) -> None:
+    device.missed_between = 2
+    source = opened(limit=4)
+    times = [frame.timestamp_s for frame in source]
+    assert np.diff(times) == pytest.approx([3 / 30] * 3)
+    assert source.dropped >= 2 * 3  # one more set may have been taken ahead
+
+
+def test_a_colour_image_given_twice_is_taken_once(device: Device) -> None:
+    device.repeats = 2
+    assert np.diff([frame.timestamp_s for frame in opened(limit=4)]) == pytest.approx([1 / 30] * 3)
+
+
+def test_depth_is_registered_here_on_demand(device: Device) -> None:
+    device.must_align = False
+    source = opened(limit=1, register_depth="on")
+    frame = next(iter(source))
+    seen = device.room.frame(WARM_UP + 1)
+    inner = np.s_[2:-2, 2:-2]
+    assert source.camera == device.room.camera
+    assert np.median(np.abs(frame.depth_m - seen.depth_m)[inner]) < 0.001
+
+
+def test_stride_and_time_count_from_the_first_frame(device: Device) -> None:
+    times = [frame.timestamp_s for frame in opened(stride=2, start_s=0.12, end_s=0.3)]
+    begin_s = (WARM_UP + 1) / 30
+    assert times == pytest.approx([begin_s + i / 30 for i in (4, 6, 8)])
+
+
+def test_unplugging_ends_the_sequence_with_a_reason(device: Device, tmp_path: Path) -> None:
+    device.frames_until_unplugged = WARM_UP + 4
+    source = opened()
+    source.record_to(tmp_path / "recording")
+    assert len(list(source)) == 4
+    assert "no frame came for 5 s (Frame didn't arrive within 5000)" in source.ending and "\n" not in source.ending
+    assert len(open_source(tmp_path / "recording")) == 4 and device.stopped == 1
+
+
+def test_a_camera_that_delivers_nothing_is_an_error(device: Device) -> None:
+    device.frames_until_unplugged = 0
+    with pytest.raises(SourceError, match="is the camera plugged in"):
+        list(opened())
+
+
+def test_its_lens_is_taken_out(device: Device) -> None:
+    device.coefficients = [0.1, -0.05, 0.001, -0.002, 0.01]
+    with_lens = next(iter(opened(limit=1)))
+    plain = next(iter(opened(limit=1, undistort=False)))
+    assert not np.array_equal(with_lens.color, plain.color)
+    device.model = distortion.kannala_brandt4
+    with pytest.raises(SourceError, match="lens model"):
+        opened()
+    assert device.started == device.stopped
+
+
+@pytest.mark.parametrize("ask", [len, lambda s: s.frame(0), lambda s: s.timestamp_s(0), depth_warning])
+def test_what_only_a_recording_can_do_says_so(device: Device, ask: object) -> None:
+    with pytest.raises(SourceError, match="run it, then read the folder"):
+        ask(opened())  # type: ignore[operator]
+
+
+def test_what_was_done_before_recording_is_not_done_again() -> None:
+    given = InputConfig(stride=3, limit=9, start_s=1.0, fx=5.0, depth_scale=9.0, crop_px=4, width=320, strict=True)
+    assert as_recorded(given) == InputConfig(crop_px=4, width=320, strict=True)
