@@ -72,27 +72,31 @@ class Bag:
 
     def messages(self, name: str) -> Iterator[Message]:
         """Read a topic's messages in order of recording. Raises SourceError if one is damaged."""
-        return (self._decoded(name, raw) for _, raw in self._raw(name))
+        return (self._decoded(name, raw) for _, _, raw in self._raw([name]))
 
-    def entries(self, name: str) -> list[Entry]:
-        """Go once through a topic whose messages have headers. Raises SourceError if the bag is damaged."""
-        entries: list[Entry] = []
-        for recorded_ns, raw in self._raw(name):
-            place = entries[-1].place + 1 if entries and entries[-1].recorded_ns == recorded_ns else 0
-            entries.append(Entry(recorded_ns, place, self._stamp_ns(raw)))
-        return entries
+    def entries(self, *names: str) -> dict[str, list[Entry]]:
+        """Go once through topics whose messages have headers. Raises SourceError if the bag is damaged."""
+        found: dict[str, list[Entry]] = {name: [] for name in names}
+        for name, recorded_ns, raw in self._raw(names):
+            earlier = found[name]
+            place = earlier[-1].place + 1 if earlier and earlier[-1].recorded_ns == recorded_ns else 0
+            earlier.append(Entry(recorded_ns, place, self._stamp_ns(raw)))
+        return found
 
     def at(self, name: str, entry: Entry) -> Message:
         """Read one message. Raises SourceError if it is damaged."""
         with self._lock:
-            found = [raw for _, raw in self._raw(name, entry.recorded_ns, entry.recorded_ns + 1)]
+            found = [raw for _, _, raw in self._raw([name], entry.recorded_ns, entry.recorded_ns + 1)]
         return self._decoded(name, found[entry.place])
 
-    def _raw(self, name: str, start_ns: int | None = None, stop_ns: int | None = None) -> Iterator[tuple[int, bytes]]:
-        connections = [connection for connection in self._reader.connections if connection.topic == name]
+    def _raw(
+        self, names: Sequence[str], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[tuple[str, int, bytes]]:
+        """Yield name, time of recording and bytes of the messages of some topics."""
+        connections = [connection for connection in self._reader.connections if connection.topic in names]
         items = self._guarded(lambda: self._reader.messages(connections, start_ns, stop_ns))
         while (item := self._guarded(lambda: next(items, None))) is not None:
-            yield item[1], item[2]
+            yield item[0].topic, item[1], item[2]
 
     def _stamp_ns(self, raw: bytes) -> int:
         """Read the time of a header: ROS 1 begins with a sequence number, CDR with four bytes that tell the order."""

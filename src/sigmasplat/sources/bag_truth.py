@@ -26,7 +26,7 @@ def truth_of(bag: Bag, camera_frame: str, recorded_time: bool) -> Trajectory | N
     if len(topics) != 1 or topics[0].count < 2:
         return None
     name = topics[0].name
-    entries, messages = bag.entries(name), list(bag.messages(name))
+    entries, messages = bag.entries(name)[name], list(bag.messages(name))
     body = getattr(messages[0], "child_frame_id", "").lstrip("/")
     T_body_camera = np.eye(4)
     if body and camera_frame and body != camera_frame:

@@ -56,7 +56,8 @@ def open_bag(path: Path, settings: InputConfig) -> RecordedSource:
     bag = Bag(path)
     color, depth = color_topic(bag, settings.color_topic), depth_topic(bag, settings.depth_topic)
     calibration = calibration_of(bag, color, depth, settings)
-    entries = bag.entries(color.name), bag.entries(depth.name)
+    found = bag.entries(color.name, depth.name)
+    entries = found[color.name], found[depth.name]
     pairs, recorded_time = _paired(entries)
     if not len(pairs):
         raise SourceError(_no_overlap(path, (color.name, depth.name), entries))
