@@ -1,0 +1,209 @@
+"""Bring what is known of a run and what the controls ask for onto the screen: one thread, at a bounded rate."""
+
+import sys
+import threading
+from typing import Any
+
+import viser
+
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.viewer import lines
+from sigmasplat.viewer.panel import Panel, Wanted
+from sigmasplat.viewer.pictures import Legend, Picture, legend_picture, picture_of, viewpoint
+from sigmasplat.viewer.scene import Scene, look, look_first, pose_of
+from sigmasplat.viewer.snapshot import Piece, Snapshot
+from sigmasplat.viewer.splats import Cut, Floats, cut_of, joined, sigma_span, sigmas, splats_of
+from sigmasplat.metrics.palette import INFERNO
+
+REST_S, LIVE_REST_S = 0.05, 0.5
+"""After each drawing, so that neither SLAM nor the machine is kept busy by a mouse."""
+ROWS, LIVE_ROWS = 480, 240
+"""Height of the pictures that are rendered here."""
+BACK_M, UP_M = 0.7, 0.25
+"""Where the camera that follows another is, behind and above it."""
+
+
+class Stage:
+    """Shows snapshots. `show` and the controls only leave word; a thread of its own does the work, the newest only."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self.server = server
+        self.panel = Panel(server, self.changed, self._look_from)
+        self.scene = Scene(server, self._clicked)
+        self._snapshot: Snapshot | None = None
+        self._drawn: dict[Any, Any] = {}
+        self._sigmas: tuple[tuple[Piece, ...], Floats] = ((), sigmas(()))
+        self._joined: tuple[Any, Any] = (None, None)
+        self._word, self._stop = threading.Event(), threading.Event()
+        server.on_client_connect(self._welcome)
+        server.on_client_disconnect(lambda client: self._drawn.pop(("picture", client.client_id), None))
+        self._thread = threading.Thread(target=self._work, name="viewer", daemon=True)
+        self._thread.start()
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Show this from now on; returns at once."""
+        self._snapshot = snapshot
+        self.changed()
+
+    def changed(self) -> None:
+        """Draw again what has changed."""
+        self._word.set()
+
+    def stop(self) -> None:
+        """End the thread; the server goes on."""
+        self._stop.set()
+        self._word.set()
+        self._thread.join()
+
+    def _work(self) -> None:
+        while True:
+            self._word.wait()
+            if self._stop.is_set():
+                return
+            self._word.clear()
+            snapshot = self._snapshot
+            if snapshot is not None:
+                try:
+                    self._draw(snapshot)
+                except Exception as problem:  # a viewer that fails must not end the run that it shows
+                    print(f"viewer: {type(problem).__name__}: {problem}", file=sys.stderr)
+                self._stop.wait(LIVE_REST_S if snapshot.live else REST_S)
+
+    def _draw(self, snapshot: Snapshot) -> None:
+        path = snapshot.path
+        whole, parts = snapshot.final is not None, bool(snapshot.pieces)
+        self.panel.offer(len(path), snapshot.live, snapshot.true_positions is not None, whole, parts)
+        wanted = self.panel.wanted()
+        pieces = snapshot.shown(wanted.whole, wanted.row)
+        ordered = self._sigmas_of(pieces)
+        cut = cut_of(ordered, wanted.hidden_share, wanted.least_opacity)
+        span = sigma_span(ordered)
+        with self.server.atomic():
+            self._draw_path(snapshot, wanted)
+            self._draw_splats(pieces, wanted, span, cut)
+        self._draw_keyframes(snapshot, wanted)
+        self._say(snapshot, wanted, pieces, cut)
+        self._follow(snapshot, wanted)
+        legend = Legend(INFERNO, *span, "") if wanted.kind == "splats" and wanted.colouring == "σ" else None
+        for client in self.server.get_clients().values():
+            legend = self._draw_picture(client, snapshot, wanted, pieces, cut) or legend
+        if self._is_new("legend", legend and legend[1:]):
+            self.panel.show_legend(None if legend is None else legend_picture(legend))
+
+    def _is_new(self, what: Any, state: Any) -> bool:
+        """Tell whether something is not drawn in this state yet, and take note that it is now."""
+        if what in self._drawn and self._drawn[what] == state:
+            return False
+        self._drawn[what] = state
+        return True
+
+    def _sigmas_of(self, pieces: tuple[Piece, ...]) -> Floats:
+        if [id(p.field) for p in self._sigmas[0]] != [id(p.field) for p in pieces]:
+            self._sigmas = (pieces, sigmas(pieces))
+        return self._sigmas[1]
+
+    def _draw_path(self, snapshot: Snapshot, wanted: Wanted) -> None:
+        path, row = snapshot.path, wanted.row
+        if self._is_new("first look", len(path) > 0) and len(path):
+            look_first(self.server, path.T_world_camera[0], BACK_M, UP_M)
+        if self._is_new("path", (id(path), row, wanted.path)):
+            self.scene.show_lines("path", lines.path_segments(path, row) if wanted.path else None)
+            self.scene.show_lost(lines.lost_points(path, row if wanted.path else -1))
+            here = path.T_world_camera[min(row, len(path) - 1)] if len(path) else None
+            self.scene.show_here(snapshot.camera, here)
+        known = snapshot.true_positions
+        if self._is_new("true path", (id(known), wanted.true_path)):
+            shown = known is not None and wanted.true_path
+            self.scene.show_lines("truth", lines.true_segments(known) if shown and known is not None else None)
+
+    def _draw_splats(self, pieces: tuple[Piece, ...], wanted: Wanted, span: tuple[float, float], cut: Cut) -> None:
+        if wanted.layer is not None:
+            pieces = ()
+        ends = span if wanted.colouring == "σ" else None
+        state = ([(p.name, id(p.field)) for p in pieces], wanted.colouring, ends, cut)
+        if self._is_new("splats", state):
+            drawn = {p.name: (splats_of(p.field, wanted.colouring, span, cut), p.T_world_piece) for p in pieces}
+            self.scene.show_splats(drawn)
+        else:
+            self.scene.place_splats({piece.name: piece.T_world_piece for piece in pieces})
+
+    def _draw_keyframes(self, snapshot: Snapshot, wanted: Wanted) -> None:
+        path = snapshot.path
+        if self._is_new("keyframes", (id(path), wanted.row, wanted.keyframes)):
+            rows = lines.shown_keyframes(path, wanted.row) if wanted.keyframes else ()
+            poses = {row: path.T_world_camera[row] for row in rows}
+            self.scene.show_keyframes(snapshot.camera, poses, snapshot.picture)
+
+    def _draw_picture(
+        self, client: viser.ClientHandle, snapshot: Snapshot, wanted: Wanted, pieces: tuple[Piece, ...], cut: Cut
+    ) -> Legend | None:
+        """Render the layer asked for from where a browser looks, and put it behind its scene; return its legend."""
+        key, c = ("picture", client.client_id), client.camera
+        if wanted.layer is None:
+            if self._drawn.pop(key, None) is not None:
+                client.scene.set_background_image(None)
+            return None
+        pose, splats = pose_of(c), ([(id(p.field), p.T_world_piece.tobytes()) for p in pieces], cut)
+        state = (wanted.layer, pose.tobytes(), c.fov, c.aspect, splats)
+        drawn = self._drawn.get(key)
+        if drawn is None or drawn[0] != state:
+            if self._joined[0] != splats:
+                self._joined = (splats, joined(pieces, cut))
+            camera = viewpoint(c.fov, c.aspect, LIVE_ROWS if snapshot.live else ROWS)
+            made: Picture = picture_of(
+                self._joined[1], camera, pose, wanted.layer, snapshot.options, snapshot.backend
+            )
+            client.scene.set_background_image(made.pixels, "jpeg", jpeg_quality=85)
+            drawn = self._drawn[key] = (state, made.legend)
+        legend: Legend | None = drawn[1]
+        return legend
+
+    def _say(self, snapshot: Snapshot, wanted: Wanted, pieces: tuple[Piece, ...], cut: Cut) -> None:
+        path = snapshot.path
+        splats, kept = sum(len(p.field) for p in pieces), sum(int(cut.keeps(p.field).sum()) for p in pieces)
+        submaps = int(path.submaps[-1]) + 1 if len(path) else 0
+        facts = (
+            f"**{snapshot.title}** ({snapshot.status})  \n{len(path)} frames, {len(path.keyframes)} keyframes, "
+            f"{int(path.lost.sum())} lost, {submaps} submap{'s' * (submaps != 1)}  \n{kept:,} of {splats:,} splats shown"
+        )
+        cut_text = "" if cut.most_sigma == float("inf") else f"hidden: σ above {cut.most_sigma:.3f} colour steps"
+        self.panel.say(facts, cut_text, _frame_text(snapshot, wanted.row))
+
+    def _follow(self, snapshot: Snapshot, wanted: Wanted) -> None:
+        path = snapshot.path
+        if wanted.follow and snapshot.live and len(path) and self._is_new("followed", id(path)):
+            for client in self.server.get_clients().values():
+                look(client, path.T_world_camera[-1], BACK_M, UP_M)
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        client.camera.on_update(lambda _: self.changed())
+        self.changed()
+
+    def _clicked(self, row: int, client: viser.ClientHandle) -> None:
+        snapshot = self._snapshot
+        if snapshot is None or row >= len(snapshot.path):
+            return
+        look(client, snapshot.path.T_world_camera[row])
+        try:
+            picture = snapshot.picture(row)
+        except SigmaSplatError as problem:
+            self.panel.show_picture(f"frame {row}: {problem}", None)
+            return
+        nothing = "" if picture is not None else ": nobody kept what it saw"
+        self.panel.show_picture(f"frame {row}{nothing}", picture)
+
+    def _look_from(self, client: viser.ClientHandle) -> None:
+        snapshot = self._snapshot
+        if snapshot is not None and len(snapshot.path):
+            row = min(self.panel.wanted().row, len(snapshot.path) - 1)
+            look(client, snapshot.path.T_world_camera[row])
+
+
+def _frame_text(snapshot: Snapshot, row: int) -> str:
+    """Say what the timeline's frame is."""
+    path = snapshot.path
+    if not len(path):
+        return "no frame yet"
+    row = min(row, len(path) - 1)
+    kind = "lost" if path.lost[row] else "keyframe" if row in set(path.keyframes) else "tracked"
+    return f"frame {row}: {kind}, submap {path.submaps[row]}"
