@@ -215,11 +215,13 @@ def _draw_plots(run: RunFolder, log: Log, truth: Trajectory | None, loops: Log) 
     """Draw path, submaps and times in both themes, and write truth.txt; return the captions by name."""
     times = np.array([record["timestamp_s"] for record in log])
     estimate = np.array([record["T_world_camera"][:3, 3] for record in log])
-    rows, aligned = ([], None) if truth is None else aligned_truth(times, estimate, truth)
-    run.write_truth(aligned)
-    known = None if aligned is None else np.full_like(estimate, np.nan)
-    if known is not None and aligned is not None:
+    known: NDArray[np.float64] | None = None
+    aligned: Trajectory | None = None
+    if truth is not None:
+        rows, aligned = aligned_truth(times, estimate, truth)
+        known = np.full_like(estimate, np.nan)
         known[rows] = aligned.T_world_camera[:, :3, 3]
+    run.write_truth(aligned)
     drawn = charts.of_run(log, estimate, known, loops)
     for name, (found, _) in drawn.items():
         for theme in (plot.LIGHT, plot.DARK):

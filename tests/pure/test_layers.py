@@ -28,10 +28,14 @@ FLOORS = [
         "surface",
         "exports",
         "ablation",
+<<<<<<< HEAD
         "inspection",
         "page",
         "snapshots",
         "download",
+=======
+        "viewer",
+>>>>>>> 3e6c6c0 (sigmasplat view, run --view; extra viewer)
         "commands",
         "cli",
         "__init__",

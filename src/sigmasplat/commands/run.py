@@ -1,19 +1,23 @@
 """Run SLAM on a sequence, or on the built-in room: sigmasplat demo | run | resume."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sigmasplat.commands import options
 from sigmasplat.commands.evaluate import score
 from sigmasplat.commands.options import absolute, configured, prepare_torch, source_of
+from sigmasplat.commands.view import on_stage, stay
 from sigmasplat.errors import ConfigError
 from sigmasplat.presets import default_preset
+from sigmasplat.viewer.address import HOST, PORT
 
 if TYPE_CHECKING:
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.screen import Screen
     from sigmasplat.snapshots import Begun
     from sigmasplat.sources.base import Source
+    from sigmasplat.viewer.stage import Stage
 
 OK, INTERRUPTED = 0, 130
 DEFAULT_PRESET = default_preset()
@@ -50,6 +54,9 @@ def run(
     evaluate: options.Evaluate = True,
     profile: options.Profile = False,
     save_every: options.SaveEvery = SAVE_EVERY_S,
+    view: options.View = False,
+    host: options.Host = HOST,
+    port: options.Port = PORT,
 ) -> int:
     """Run SLAM on a sequence: trajectory, map, uncertainty, report.
 
@@ -67,10 +74,12 @@ def run(
     warning = depth_warning(source)
     if warning:
         screen.warn(warning)
-    folder = new_folder(out, config, source, overwrite, source_path=absolute(path))
-    screen.say(f"{source.name}: {len(source)} frames, {config.name} → {folder.path}")
-    prepare_torch()
-    return _record(screen, Begun(Slam(config, folder.submaps)), source, folder, evaluate, profile, save_every)
+    with on_stage(screen, host, port) if view else nullcontext() as stage:
+        folder = new_folder(out, config, source, overwrite, source_path=absolute(path))
+        screen.say(f"{source.name}: {len(source)} frames, {config.name} → {folder.path}")
+        prepare_torch()
+        begun = Begun(Slam(config, folder.submaps))
+        return _record(screen, begun, source, folder, evaluate, profile, save_every, stage)
 
 
 def resume(
@@ -79,6 +88,9 @@ def resume(
     profile: options.Profile = False,
     save_every: options.SaveEvery = SAVE_EVERY_S,
     moved_to: options.MovedSource = None,
+    view: options.View = False,
+    host: options.Host = HOST,
+    port: options.Port = PORT,
 ) -> int:
     """Go on with a run that was stopped or killed, where its state was last kept.
 
@@ -91,10 +103,11 @@ def resume(
     screen, folder = Screen(), RunFolder.open(run)
     source = source_of(folder, moved_to)
     prepare_torch()
-    begun = resumed(folder, source)
-    folder.note(status="running")
-    screen.say(f"{source.name}: going on at frame {begun.next_index} of {len(source)} → {folder.path}")
-    return _record(screen, begun, source, folder, evaluate, profile, save_every)
+    with on_stage(screen, host, port) if view else nullcontext() as stage:
+        begun = resumed(folder, source)
+        folder.note(status="running")
+        screen.say(f"{source.name}: going on at frame {begun.next_index} of {len(source)} → {folder.path}")
+        return _record(screen, begun, source, folder, evaluate, profile, save_every, stage)
 
 
 def _record(
@@ -105,13 +118,20 @@ def _record(
     evaluate: bool,
     profile: bool,
     save_every_s: float,
+    stage: "Stage | None",
 ) -> int:
-    """Run SLAM into the folder, then score it; return the exit code."""
+    """Run SLAM into the folder, live on the stage if there is one, then score it; return the exit code."""
+    from sigmasplat.protocols import Together, Watcher
     from sigmasplat.session import record
     from sigmasplat.snapshots import Snapshots
 
     keeper = Snapshots(begun.slam, folder, save_every_s)
-    with screen.steps(len(source), begun.next_index) as watch:
+    with screen.steps(len(source), begun.next_index) as steps:
+        watch: Watcher = steps
+        if stage:
+            from sigmasplat.viewer.live import LiveView
+
+            watch = Together(steps, LiveView(begun.slam, stage.show, source.name))
         outcome = record(begun.slam, source, folder, watch, keeper, begun.next_index, begun.wall_s)
     if profile:
         screen.profile(folder.read_profile())
@@ -128,4 +148,6 @@ def _record(
         score(screen, folder, source)
     else:
         screen.say(f"{outcome.counts()}: {folder.path}")
+    if stage:
+        stay(screen, stage, folder, source)
     return OK

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import io
+import logging
 import socket
 from typing import TYPE_CHECKING
 
@@ -32,6 +33,7 @@ def open_server(host: str, port: int, title: str) -> "ViserServer":
             return None
 
     found = free_port(host, port)
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # a browser that hangs up is no news
     with contextlib.redirect_stdout(io.StringIO()):  # its banner: our own line says where to look
         return LocalServer(host=host, port=found, label=title, verbose=False)
 
@@ -70,3 +72,8 @@ def url_of(host: str, port: int) -> str:
     """Return what to open in a browser on this machine."""
     reached = {"0.0.0.0": HOST, "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
     return f"http://{reached}:{port}"
+
+
+def is_private(host: str) -> bool:
+    """Tell whether an address is one that other machines do not reach."""
+    return host in ("localhost", "::1") or host.startswith("127.")

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.metrics.palette import Rgb
-from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.sources.base import Source

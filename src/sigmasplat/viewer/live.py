@@ -93,4 +93,3 @@ class LiveView:
             self._places |= {row: (index, k) for k, row in enumerate(submap.frames)}
         placed = [Piece(p.submap, p.field, slam.atlas.anchors[i].copy()) for i, p in enumerate(self._finished)]
         self._finished = within_budget(placed, most)
-

@@ -36,6 +36,7 @@ class Wanted:
     row: int
     path: bool
     keyframes: bool
+    thumbnails: bool
     true_path: bool
     follow: bool
 
@@ -55,11 +56,10 @@ class Panel:
         gui = server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(214, 90, 30))
         self.facts = gui.add_markdown("waiting for the first frame")
+        self.caption = gui.add_markdown("Click on a keyframe to go there and see what it saw.")
+        self.picture = gui.add_image(np.full((3, 4, 3), NO_READING, np.uint8), visible=False, jpeg_quality=90)
         self._map(gui)
         self._path(gui)
-        with gui.add_folder("Keyframe"):
-            self.caption = gui.add_markdown("Click on a keyframe to go there and see what it saw.")
-            self.picture = gui.add_image(np.full((3, 4, 3), NO_READING, np.uint8), visible=False, jpeg_quality=90)
         self.look.on_click(lambda event: look_from(event.client) if event.client else None)
         for control in self._controls():
             control.on_update(lambda _: changed())
@@ -81,19 +81,20 @@ class Panel:
             self.cut = gui.add_markdown("")
 
     def _path(self, gui: viser.GuiApi) -> None:
-        with gui.add_folder("Path"):
-            self.row = gui.add_slider("frame", 0, 1, 1, 1, hint="the path up to here, the submaps begun by then")
+        with gui.add_folder("Path"):  # Any: mypy takes `value` for read-only
+            self.row: Any = gui.add_slider("frame", 0, 1, 1, 1, hint="the path up to here, the submaps begun by then")
             self.frame = gui.add_markdown("")
             self.look = gui.add_button("look from here")
             self.follow = gui.add_checkbox("follow the camera", False, visible=False)
             self.path = gui.add_checkbox("path", True)
             self.keyframes = gui.add_checkbox("keyframes", True)
+            self.thumbnails: Any = gui.add_checkbox("what they saw", True)
             self.true_path = gui.add_checkbox("truth", True, visible=False)
 
     def _controls(self) -> tuple[Any, ...]:
         return (
             self.kind, self.colouring, self.part, self.hidden, self.faint, self.row, self.follow, self.path,
-            self.keyframes, self.true_path,
+            self.keyframes, self.thumbnails, self.true_path,
         )  # fmt: skip
 
     def wanted(self) -> Wanted:
@@ -107,6 +108,7 @@ class Panel:
             int(self.row.value),
             self.path.value,
             self.keyframes.value,
+            self.thumbnails.value,
             self.true_path.value,
             self.follow.value,
         )

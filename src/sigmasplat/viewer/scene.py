@@ -1,6 +1,7 @@
 """Keep viser's scene as it should be: nodes are replaced or changed in place under fixed names, never heaped up."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ class Scene:
         self.server, self.clicked = server, clicked
         self._splats: dict[str, viser.GaussianSplatHandle] = {}
         self._keyframes: dict[int, viser.CameraFrustumHandle] = {}
+        self._pictured = True
         self._marks: dict[str, Any] = {}
         server.scene.set_up_direction("-y")
 
@@ -39,15 +41,12 @@ class Scene:
         drawn = {name: part for name, part in splats.items() if len(part[0])}
         for name in self._splats.keys() - drawn.keys():
             self._splats.pop(name).remove()
-        for name, (part, T) in drawn.items():
-            arrays = {"centers": part.centers, "covariances": part.covariances, "rgbs": part.colors}
-            opacities = part.opacities[:, None]
+        for name, (part, _) in drawn.items():
+            arrays = (part.centers, part.covariances, part.colors, part.opacities[:, None])
             if name in self._splats:
-                self._splats[name].set_gaussians(**arrays, opacities=opacities)
+                self._splats[name].set_gaussians(*arrays)
             else:
-                self._splats[name] = self.server.scene.add_gaussian_splats(
-                    f"/splats/{name}", **arrays, opacities=opacities
-                )
+                self._splats[name] = self.server.scene.add_gaussian_splats(f"/splats/{name}", *arrays)
         self.place_splats({name: T for name, (_, T) in drawn.items()})
 
     def place_splats(self, T_world_piece: Mapping[str, Matrix]) -> None:
@@ -84,16 +83,19 @@ class Scene:
         _place(self._marks["here"], T_world_camera)
 
     def show_keyframes(
-        self, camera: Camera, T_world_camera: Mapping[int, Matrix], picture: Callable[[int], Rgb | None]
+        self, camera: Camera, T_world_camera: Mapping[int, Matrix], picture: Callable[[int], Rgb | None] | None
     ) -> None:
-        """Show the frusta of these keyframes, by row, with what they saw, and no others."""
-        for row in self._keyframes.keys() - T_world_camera.keys():
+        """Show the frusta of these keyframes, by row, and no others; what they saw in them where it is given."""
+        pictured = picture is not None
+        gone = self._keyframes.keys() if pictured != self._pictured else self._keyframes.keys() - T_world_camera.keys()
+        for row in tuple(gone):
             self._keyframes.pop(row).remove()
+        self._pictured = pictured
         for row, T in T_world_camera.items():
             if row not in self._keyframes:
-                small = thumbnail(picture(row))
+                small = thumbnail(picture(row)) if picture else None
                 frustum = self._frustum(f"/keyframes/{row}", camera, FRUSTUM_M, KEYFRAME_COLOUR, small)
-                frustum.on_click(lambda event, row=row: self.clicked(row, event.client))
+                frustum.on_click(partial(self._pass_on, row))
                 self._keyframes[row] = frustum
             _place(self._keyframes[row], T)
 
@@ -105,6 +107,9 @@ class Scene:
             name, fov, camera.width / camera.height, scale=scale, thickness=1.5, thickness_units="screen", color=color,
             image=image, format="jpeg", jpeg_quality=80, cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
+
+    def _pass_on(self, row: int, event: viser.SceneNodePointerEvent[viser.CameraFrustumHandle]) -> None:
+        self.clicked(row, event.client)
 
     def _drop(self, name: str) -> None:
         if name in self._marks:

@@ -1,7 +1,7 @@
 """Hold what is shown of a run at one moment: path, keyframes, map. Data alone: no browser, no file."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field as dataclass_field, replace
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ class Piece:
 
     submap: int | None
     field: GaussianField
-    T_world_piece: Matrix = field(default_factory=lambda: np.eye(4))
+    T_world_piece: Matrix = dataclass_field(default_factory=lambda: np.eye(4))
 
     @property
     def name(self) -> str:
@@ -65,7 +65,7 @@ class Snapshot:
     true_positions: Matrix | None = None
     camera: Camera = CAMERA
     picture: Callable[[int], Rgb | None] = lambda row: None
-    options: RenderConfig = field(default_factory=RenderConfig)
+    options: RenderConfig = dataclass_field(default_factory=RenderConfig)
     backend: str = "auto"
     live: bool = False
     status: str = ""

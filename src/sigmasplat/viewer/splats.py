@@ -68,8 +68,8 @@ def cut_of(ordered: Floats, hidden_share: float, least_opacity: float) -> Cut:
 
 
 def sigma_span(ordered: Floats) -> tuple[float, float]:
-    """Return the range of σ that the palette is spread over: all but the extremes."""
-    return palette.span(ordered, np.ones(len(ordered), bool))
+    """Return the range of σ that the palette is spread over: from 0 to all but the extremes."""
+    return 0.0, palette.span(ordered, np.ones(len(ordered), bool))[1]
 
 
 def splats_of(field: GaussianField, colouring: Colouring, span: tuple[float, float], cut: Cut) -> Splats:

@@ -7,13 +7,13 @@ from typing import Any
 import viser
 
 from sigmasplat.errors import SigmaSplatError
+from sigmasplat.metrics.palette import INFERNO
 from sigmasplat.viewer import lines
 from sigmasplat.viewer.panel import Panel, Wanted
 from sigmasplat.viewer.pictures import Legend, Picture, legend_picture, picture_of, viewpoint
 from sigmasplat.viewer.scene import Scene, look, look_first, pose_of
 from sigmasplat.viewer.snapshot import Piece, Snapshot
 from sigmasplat.viewer.splats import Cut, Floats, cut_of, joined, sigma_span, sigmas, splats_of
-from sigmasplat.metrics.palette import INFERNO
 
 REST_S, LIVE_REST_S = 0.05, 0.5
 """After each drawing, so that neither SLAM nor the machine is kept busy by a mouse."""
@@ -119,7 +119,7 @@ class Stage:
     def _draw_splats(self, pieces: tuple[Piece, ...], wanted: Wanted, span: tuple[float, float], cut: Cut) -> None:
         if wanted.layer is not None:
             pieces = ()
-        ends = span if wanted.colouring == "σ" else None
+        ends = span if wanted.colouring == "σ" else None  # its own colours do not depend on the range
         state = ([(p.name, id(p.field)) for p in pieces], wanted.colouring, ends, cut)
         if self._is_new("splats", state):
             drawn = {p.name: (splats_of(p.field, wanted.colouring, span, cut), p.T_world_piece) for p in pieces}
@@ -129,10 +129,10 @@ class Stage:
 
     def _draw_keyframes(self, snapshot: Snapshot, wanted: Wanted) -> None:
         path = snapshot.path
-        if self._is_new("keyframes", (id(path), wanted.row, wanted.keyframes)):
+        if self._is_new("keyframes", (id(path), wanted.row, wanted.keyframes, wanted.thumbnails)):
             rows = lines.shown_keyframes(path, wanted.row) if wanted.keyframes else ()
             poses = {row: path.T_world_camera[row] for row in rows}
-            self.scene.show_keyframes(snapshot.camera, poses, snapshot.picture)
+            self.scene.show_keyframes(snapshot.camera, poses, snapshot.picture if wanted.thumbnails else None)
 
     def _draw_picture(
         self, client: viser.ClientHandle, snapshot: Snapshot, wanted: Wanted, pieces: tuple[Piece, ...], cut: Cut
@@ -150,9 +150,7 @@ class Stage:
             if self._joined[0] != splats:
                 self._joined = (splats, joined(pieces, cut))
             camera = viewpoint(c.fov, c.aspect, LIVE_ROWS if snapshot.live else ROWS)
-            made: Picture = picture_of(
-                self._joined[1], camera, pose, wanted.layer, snapshot.options, snapshot.backend
-            )
+            made: Picture = picture_of(self._joined[1], camera, pose, wanted.layer, snapshot.options, snapshot.backend)
             client.scene.set_background_image(made.pixels, "jpeg", jpeg_quality=85)
             drawn = self._drawn[key] = (state, made.legend)
         legend: Legend | None = drawn[1]
@@ -164,7 +162,8 @@ class Stage:
         submaps = int(path.submaps[-1]) + 1 if len(path) else 0
         facts = (
             f"**{snapshot.title}** ({snapshot.status})  \n{len(path)} frames, {len(path.keyframes)} keyframes, "
-            f"{int(path.lost.sum())} lost, {submaps} submap{'s' * (submaps != 1)}  \n{kept:,} of {splats:,} splats shown"
+            f"{int(path.lost.sum())} lost, {submaps} submap{'s' * (submaps != 1)}  \n"
+            f"{kept:,} of {splats:,} splats shown"
         )
         cut_text = "" if cut.most_sigma == float("inf") else f"hidden: σ above {cut.most_sigma:.3f} colour steps"
         self.panel.say(facts, cut_text, _frame_text(snapshot, wanted.row))
@@ -183,7 +182,7 @@ class Stage:
         snapshot = self._snapshot
         if snapshot is None or row >= len(snapshot.path):
             return
-        look(client, snapshot.path.T_world_camera[row])
+        self._go(client, row)
         try:
             picture = snapshot.picture(row)
         except SigmaSplatError as problem:
@@ -195,8 +194,15 @@ class Stage:
     def _look_from(self, client: viser.ClientHandle) -> None:
         snapshot = self._snapshot
         if snapshot is not None and len(snapshot.path):
-            row = min(self.panel.wanted().row, len(snapshot.path) - 1)
-            look(client, snapshot.path.T_world_camera[row])
+            self._go(client, min(self.panel.wanted().row, len(snapshot.path) - 1))
+
+    def _go(self, client: viser.ClientHandle, row: int) -> None:
+        """Send a browser where a frame was seen from, and clear the pictures before it out of the way."""
+        snapshot = self._snapshot
+        assert snapshot is not None
+        self.panel.thumbnails.value = False
+        look(client, snapshot.path.T_world_camera[row])
+        self.changed()
 
 
 def _frame_text(snapshot: Snapshot, row: int) -> str:
