@@ -37,11 +37,12 @@ from sigmasplat.slam.step import Step
 from sigmasplat.viewer.address import HOST, close, open_server
 from sigmasplat.viewer.live import LiveView
 from sigmasplat.viewer.panel import KINDS, SAYS
+from sigmasplat.viewer.snapshot import to_look_at
 from sigmasplat.viewer.stage import Stage
 
 arg = tyro.conf.arg
 STATM = Path("/proc/self/statm")
-CAMERA = Camera(320, 240, 262.0, 262.0, 159.5, 119.5)
+CAMERA = Camera(160, 120, 131.0, 131.0, 79.5, 59.5)
 KEYFRAME_EVERY, SUBMAP_EVERY, CHANGE_S, SAMPLE_S = 5, 200, 20.0, 5.0
 CLIENT = """
 import itertools, math, sys, time
@@ -81,6 +82,12 @@ class Growing:
         self.slam, self.splats = Slam(store=DiskStore(folder)), splats
         self.random = np.random.default_rng(0)
         self.frames = 0
+        random = torch.from_numpy(self.random.random((splats, 9), np.float32))
+        means = torch.cat([4.0 * random[:, :2] - 2.0, 2.0 + random[:, 2:3]], 1)
+        scales, log_variances = 0.005 + 0.02 * random[:, 3:6], -9.0 + 6.0 * random[:, 6:9]
+        self.field = GaussianField.from_values(
+            means, scales, random[:, 6:9], opacities=0.9, log_variances=log_variances
+        )
         self.slam.atlas.begin_submap()
         self._begin()
 
@@ -102,10 +109,10 @@ class Growing:
                     len(slam.atlas.anchors) - 1)  # fmt: skip
 
     def _begin(self) -> None:
-        self.slam.mapper = Mapper(self.slam.config, self.random)
+        self.slam.mapper = Mapper(self.slam.config, self.random, to_look_at(self.field.params[:0], {}))
 
     def _map(self, frame: int, pose: Any) -> None:
-        """Take note of a keyframe, and move, recolour and add splats as mapping would."""
+        """Take note of a keyframe; move the splats, and show more of them, as mapping would."""
         slam, grown = self.slam, int(self.splats * (0.5 + 0.5 * (frame % SUBMAP_EVERY) / SUBMAP_EVERY))
         color = self.random.random((CAMERA.height, CAMERA.width, 3), np.float32)
         seen = Frame(frame, 0.05 * frame, color, np.full((CAMERA.height, CAMERA.width), 2.0, np.float32), CAMERA)
@@ -113,12 +120,8 @@ class Growing:
         slam.mapper.keyframes.append(Keyframe(frame, target, pose, not slam.mapper.keyframes))
         slam.atlas.keyframes[-1].append(pose)
         slam.keyframes.append(frame)
-        random = torch.from_numpy(self.random.random((grown, 9), np.float32))
-        means = torch.cat([4.0 * random[:, :2] - 2.0, 2.0 + random[:, 2:3]], 1)
-        scales, log_variances = 0.005 + 0.02 * random[:, 3:6], -9.0 + 6.0 * random[:, 6:9]
-        slam.mapper.field = GaussianField.from_values(
-            means, scales, random[:, 6:9], opacities=0.9, log_variances=log_variances
-        )
+        self.field.params[:, :3] += 1e-3 * torch.sin(torch.tensor(frame))
+        slam.mapper.field = to_look_at(self.field.params[:grown], {})
 
     def _pose(self, frames: int) -> Any:
         """Return where the camera is after so many frames of a submap."""

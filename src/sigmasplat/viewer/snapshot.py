@@ -1,11 +1,12 @@
 """Hold what is shown of a run at one moment: path, keyframes, map. Data alone: no browser, no file."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field as dataclass_field, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.metrics.palette import Rgb
@@ -81,9 +82,17 @@ class Snapshot:
         return tuple(piece for piece in self.pieces if piece.submap is None or piece.submap <= until)
 
 
+def to_look_at(params: Tensor, extras: Mapping[str, Tensor]) -> GaussianField:
+    """Return parameter rows [N, 17] with extras as a field that nothing will fit: its moments are one shared zero, not
+    three times the memory."""
+    moments = [values.new_zeros(()).expand_as(values) for values in (params, *extras.values())]
+    rows = {n: Rows(values, zero, zero) for (n, values), zero in zip(extras.items(), moments[1:], strict=True)}
+    return GaussianField(params, moments[0], moments[0], extras=rows)
+
+
 def bare(splats: GaussianField) -> GaussianField:
     """Return the splats without what only a fit needs; parameters are shared, not copied."""
-    return GaussianField(splats.params, extras={name: Rows(rows.params) for name, rows in splats.extras.items()})
+    return to_look_at(splats.params, {name: rows.params for name, rows in splats.extras.items()})
 
 
 def thinned(splats: GaussianField, most: int) -> GaussianField:
@@ -91,8 +100,7 @@ def thinned(splats: GaussianField, most: int) -> GaussianField:
     the area covered."""
     n = len(splats)
     rows = torch.arange(n) if n <= most else (torch.arange(max(most, 0)) * n).div(most, rounding_mode="floor")
-    extras = {name: Rows(extra.params[rows]) for name, extra in splats.extras.items()}
-    few = GaussianField(splats.params[rows], extras=extras)
+    few = to_look_at(splats.params[rows], {name: extra.params[rows] for name, extra in splats.extras.items()})
     if len(few):
         few.params[:, COLUMNS["log_scales"]] += 0.5 * float(np.log(n / len(few)))
     return few

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.metrics import palette
-from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
-from sigmasplat.viewer.snapshot import Piece, bare
+from sigmasplat.model import harmonics, se3
+from sigmasplat.model.field import COLUMNS, EXTRAS, GaussianField, left_factor, quaternion_of, transformed
+from sigmasplat.viewer.snapshot import Piece, to_look_at
 
 Colouring = Literal["colour", "σ"]
 Floats = NDArray[np.float32]
@@ -75,7 +75,7 @@ def sigma_span(ordered: Floats) -> tuple[float, float]:
 def splats_of(field: GaussianField, colouring: Colouring, span: tuple[float, float], cut: Cut) -> Splats:
     """Return the splats that the cut keeps, in their own colours or in those of σ over `span`."""
     kept = cut.keeps(field)
-    chosen = GaussianField(field.params[kept])
+    chosen = to_look_at(field.params[kept], {})
     if colouring == "σ":
         colors = palette.colour(sigma_of(chosen), *span, palette.INFERNO)
     else:
@@ -93,9 +93,28 @@ def covariances(quats_wxyz: Floats, scales: Floats) -> Floats:
 
 def joined(pieces: Sequence[Piece], cut: Cut) -> GaussianField:
     """Return the splats of all pieces that the cut keeps, in the world."""
-    whole = GaussianField.empty()
-    for piece in pieces:
-        part = bare(piece.field)
-        part.keep(cut.keeps(part))
-        whole.append(part.moved(torch.from_numpy(piece.T_world_piece)))
-    return whole
+    parts = [(piece, cut.keeps(piece.field)) for piece in pieces]
+    params = [piece.field.params[kept] for piece, kept in parts] or [GaussianField.empty().params]
+    names = {name for piece, _ in parts for name in piece.field.extras}
+    extras: dict[str, list[Tensor]] = {name: [] for name in sorted(names)}
+    for (piece, kept), rows in zip(parts, params, strict=False):
+        T = torch.from_numpy(piece.T_world_piece).to(rows)
+        _move(rows, T)
+        for name, all_rows in extras.items():
+            all_rows.append(_moved_extra(piece.field, name, T)[kept])
+    return to_look_at(torch.cat(params), {name: torch.cat(all_rows) for name, all_rows in extras.items()})
+
+
+def _move(params: Tensor, T_world_piece: Tensor) -> None:
+    """Carry parameter rows to the world, in place: `GaussianField.moved` without the optimiser's state."""
+    means, quats, R = params[:, COLUMNS["means"]], params[:, COLUMNS["quats"]], T_world_piece[:3, :3]
+    params[:, COLUMNS["means"]] = transformed(means, R) + T_world_piece[:3, 3]
+    params[:, COLUMNS["quats"]] = transformed(quats, left_factor(quaternion_of(R)))
+
+
+def _moved_extra(field: GaussianField, name: str, T_world_piece: Tensor) -> Tensor:
+    """Return what splats carry besides in the world, 0 where this piece has none of it."""
+    if name not in field.extras:
+        return field.params.new_zeros(len(field), EXTRAS[name])
+    values = field.extras[name].params
+    return harmonics.turned(values, T_world_piece[:3, :3]) if name == "harmonics" else values
