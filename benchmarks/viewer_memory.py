@@ -36,8 +36,8 @@ from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step import Step
 from sigmasplat.viewer.address import HOST, close, open_server
 from sigmasplat.viewer.live import LiveView
+from sigmasplat.viewer.moment import to_look_at
 from sigmasplat.viewer.panel import KINDS, SAYS
-from sigmasplat.viewer.snapshot import to_look_at
 from sigmasplat.viewer.stage import Stage
 
 arg = tyro.conf.arg
@@ -104,9 +104,11 @@ class Growing:
             self._map(frame, pose)
         slam.atlas.place_frame(pose)
         self.frames += 1
-        T_world_camera = slam.atlas.anchors[-1] @ pose
-        return Step(frame, 0.05 * frame, T_world_camera, is_keyframe, frame % 97 == 0, {}, len(slam.mapper.field),
-                    len(slam.atlas.anchors) - 1)  # fmt: skip
+        T_world_camera, lost = slam.atlas.anchors[-1] @ pose, frame % 97 == 0
+        submap = len(slam.atlas.anchors) - 1
+        step = Step(frame, 0.05 * frame, T_world_camera, is_keyframe, lost, {}, len(slam.mapper.field), submap)
+        slam.steps.append(step)
+        return step
 
     def _begin(self) -> None:
         self.slam.mapper = Mapper(self.slam.config, self.random, to_look_at(self.field.params[:0], {}))
@@ -154,10 +156,10 @@ def watch(growing: Growing, stage: Stage, options: Options) -> dict[str, Any]:
     """Step, and sample the memory; return what was found."""
     shown = 0
 
-    def show(snapshot: Any) -> None:
+    def show(moment: Any) -> None:
         nonlocal shown
         shown += 1
-        stage.show(snapshot)
+        stage.show(moment)
 
     live, begun_s = LiveView(growing.slam, show, "growing"), time.monotonic()
     samples: list[dict[str, float]] = []

@@ -28,14 +28,11 @@ FLOORS = [
         "surface",
         "exports",
         "ablation",
-<<<<<<< HEAD
         "inspection",
         "page",
         "snapshots",
         "download",
-=======
         "viewer",
->>>>>>> 3e6c6c0 (sigmasplat view, run --view; extra viewer)
         "commands",
         "cli",
         "__init__",

@@ -11,8 +11,8 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render import render
 from sigmasplat.viewer import lines
+from sigmasplat.viewer.moment import Moment, Path, Piece, thinned, within_budget
 from sigmasplat.viewer.pictures import Legend, legend_picture, picture_of, viewpoint
-from sigmasplat.viewer.snapshot import Path, Piece, Snapshot, thinned, within_budget
 from sigmasplat.viewer.splats import Cut, covariances, cut_of, joined, sigma_of, sigma_span, sigmas, splats_of
 
 OPTIONS = RenderConfig()
@@ -108,11 +108,11 @@ def test_what_is_rendered_is_what_is_shown_where_it_lies() -> None:
 def test_the_timeline_shows_the_submaps_begun_by_then_and_the_final_map_whole() -> None:
     pieces = tuple(Piece(i, field_of(3, seed=i)) for i in range(3))
     final = Piece(None, field_of(9))
-    snapshot = Snapshot("run", path_of(30), final, pieces)
-    assert snapshot.shown(True, 0) == (final,) and snapshot.shown(False, 29) == pieces
-    assert snapshot.shown(False, 9) == pieces[:1] and snapshot.shown(False, 10) == pieces[:2]
-    assert Snapshot("run", path_of(30), final).shown(False, 0) == (final,)
-    assert Snapshot("run", pieces=pieces).shown(True, 0) == pieces
+    moment = Moment("run", path_of(30), final, pieces)
+    assert moment.shown(True, 0) == (final,) and moment.shown(False, 29) == pieces
+    assert moment.shown(False, 9) == pieces[:1] and moment.shown(False, 10) == pieces[:2]
+    assert Moment("run", path_of(30), final).shown(False, 0) == (final,)
+    assert Moment("run", pieces=pieces).shown(True, 0) == pieces
 
 
 def test_the_path_is_drawn_up_to_a_frame_in_the_colours_of_its_submaps_lost_frames_red() -> None:

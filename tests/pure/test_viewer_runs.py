@@ -23,7 +23,7 @@ from sigmasplat.sources import open_source
 from sigmasplat.viewer.address import free_port, is_private, open_server, url_of
 from sigmasplat.viewer.finished import Shelf, ended, refuse_mapless, running
 from sigmasplat.viewer.live import ACTIVE_SHARE, LiveView
-from sigmasplat.viewer.snapshot import Snapshot
+from sigmasplat.viewer.moment import Moment
 from sigmasplat.viewer.splats import Cut, joined
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -41,24 +41,12 @@ def settings(**more: str) -> Config:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """Run a few frames in three submaps and evaluate them."""
-    config, source = settings(), open_source(ROOM)
+    config = settings()
+    source = open_source(ROOM, override(config, {"input.limit": str(FRAMES)}).input)
     run = RunFolder.create(tmp_path_factory.mktemp("view") / "run", config, "room")
-
-    frames = [source.frame(i) for i in range(FRAMES)]
-    slam = Slam(config, run.submaps)
-    session.record(slam, Few(source, frames), run)
+    session.record(Slam(config, run.submaps), source, run)
     evaluate(run, source, views_per_kind=1, strips_per_kind=0)
     return run
-
-
-class Few:
-    """The first frames of a source, as `record` reads one."""
-
-    def __init__(self, source, frames) -> None:  # type: ignore[no-untyped-def]
-        self.name, self.camera, self.skipped, self.frames = source.name, source.camera, list[str](), frames
-
-    def __iter__(self):  # type: ignore[no-untyped-def]
-        return iter(self.frames)
 
 
 def test_a_run_that_has_ended_is_shown_as_it_was_written(finished: RunFolder) -> None:
@@ -145,8 +133,8 @@ class Clock:
         return self.now_s
 
 
-def live_run(tmp_path: Path, clock: Clock, budget: int = 300_000) -> tuple[list[Snapshot], Slam]:
-    config, source, shown = settings(), open_source(ROOM), list[Snapshot]()
+def live_run(tmp_path: Path, clock: Clock, budget: int = 300_000) -> tuple[list[Moment], Slam]:
+    config, source, shown = settings(), open_source(ROOM), list[Moment]()
     slam = Slam(config, DiskStore(tmp_path / "submaps"))
     view = LiveView(slam, shown.append, "room", budget, every_s=2.0, clock=clock)
     watch = Together(session.Unwatched(), view)
@@ -188,10 +176,10 @@ def test_the_live_map_is_the_systems_own_and_its_pictures_what_keyframes_saw(tmp
 def test_a_live_map_keeps_to_its_budget_and_a_slow_copy_comes_less_often(tmp_path: Path) -> None:
     shown, _ = live_run(tmp_path / "a", Clock(10.0), budget=600)
     assert len(shown) == FRAMES + 2
-    for snapshot in shown[:-1]:
-        assert sum(len(p.field) for p in snapshot.pieces) <= 600
-        if len(snapshot.pieces) == 1:
-            assert len(snapshot.pieces[0].field) <= 600 * ACTIVE_SHARE
+    for moment in shown[:-1]:
+        assert sum(len(p.field) for p in moment.pieces) <= 600
+        if len(moment.pieces) == 1:
+            assert len(moment.pieces[0].field) <= 600 * ACTIVE_SHARE
     assert shown[-1].final is not None and len(shown[-1].final.field) <= 600
     slow, _ = live_run(tmp_path / "b", Clock(1.0, look_s=0.1))  # a tenth of a second: once in 5 s
     assert [len(s.path) for s in slow[:-2]] == [1, 6, 11]

@@ -14,14 +14,14 @@ from sigmasplat.metrics.palette import Rgb
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.sources.base import Source
-from sigmasplat.viewer.snapshot import BUDGET, CAMERA, Matrix, Path, Piece, Snapshot, bare, thinned, within_budget
+from sigmasplat.viewer.moment import BUDGET, CAMERA, Matrix, Moment, Path, Piece, bare, thinned, within_budget
 
 EVERY_S = 2.0
 Log = list[dict[str, Any]]
-Show = Callable[[Snapshot], None]
+Show = Callable[[Moment], None]
 
 
-def ended(run: RunFolder, source: Source | None = None, budget: int = BUDGET) -> Snapshot:
+def ended(run: RunFolder, source: Source | None = None, budget: int = BUDGET) -> Moment:
     """Return what there is of a run that has ended; `source` gives pictures of keyframes that the run did not keep.
 
     Raises RunError if it stopped before it had a map.
@@ -36,7 +36,7 @@ def ended(run: RunFolder, source: Source | None = None, budget: int = BUDGET) ->
     if pieces and len(pieces) < len(tensors["T_world_submap"]):
         active = GaussianField(tensors["params"])
         pieces.append(Piece(len(pieces), thinned(active, budget), np.asarray(tensors["T_world_submap"][-1])))
-    return Snapshot(
+    return Moment(
         run.path.resolve().name,
         Path(path.T_world_camera[:kept], *_marks(log[:kept]), keyframes),
         Piece(None, bare(final)),
@@ -50,7 +50,7 @@ def ended(run: RunFolder, source: Source | None = None, budget: int = BUDGET) ->
     )
 
 
-def running(run: RunFolder, shelf: "Shelf") -> Snapshot:
+def running(run: RunFolder, shelf: "Shelf") -> Moment:
     """Return what a run has written so far: the log's path, and the submaps finished, which lie where the log has
     their first keyframes. `shelf` keeps what has been read before."""
     log = run.read_log() if (run.path / "log.jsonl").is_file() else []
@@ -59,7 +59,7 @@ def running(run: RunFolder, shelf: "Shelf") -> Snapshot:
     path = Path(
         np.array(poses).reshape(-1, 4, 4), *_marks(log), tuple(r for r, x in enumerate(log) if x["is_keyframe"])
     )
-    return Snapshot(
+    return Moment(
         run.path.resolve().name, path, None, tuple(shelf.pieces.values()), None, shelf.camera or CAMERA, shelf.picture,
         config.render, config.backend, live=True, status="running",
     )  # fmt: skip

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.metrics.plot import ACCENT, BLUE, DARK, GREEN
-from sigmasplat.viewer.snapshot import Matrix, Path
+from sigmasplat.viewer.moment import Matrix, Path
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]

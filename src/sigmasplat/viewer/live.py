@@ -9,7 +9,7 @@ from sigmasplat.metrics.palette import Rgb
 from sigmasplat.protocols import Stepped, Tried
 from sigmasplat.slam.slam import Slam
 from sigmasplat.viewer.finished import Show
-from sigmasplat.viewer.snapshot import BUDGET, CAMERA, Path, Piece, Snapshot, bare, thinned, within_budget
+from sigmasplat.viewer.moment import BUDGET, CAMERA, Moment, Path, Piece, bare, thinned, within_budget
 
 EVERY_S = 2.0
 MOST_SHARE = 0.02
@@ -19,7 +19,7 @@ ACTIVE_SHARE = 1 / 3
 
 
 class LiveView:
-    """A watcher (`protocols.Watcher`) that shows snapshots of a system. It copies in the run's own thread, between two
+    """A watcher (`protocols.Watcher`) that shows moments of a system. It copies in the run's own thread, between two
     frames, so that nothing is read while it changes; all else is left to who shows them."""
 
     def __init__(
@@ -28,40 +28,36 @@ class LiveView:
     ) -> None:  # fmt: skip
         self.slam, self.show, self.title, self.budget, self.every_s = slam, show, title, budget, every_s
         self._clock, self._due_s = clock, 0.0
-        self._lost: list[bool] = []
-        self._submaps: list[int] = []
         self._finished: tuple[Piece, ...] = ()
         self._places: dict[int, tuple[int, int]] = {}
 
     def __call__(self, step: Stepped) -> None:
-        """Take note of a step, and show how things are now if it is time."""
-        self._lost.append(step.lost)
-        self._submaps.append(step.submap)
+        """Show how things are after a step, if it is time."""
         started_s = self._clock()
         if started_s >= self._due_s:
-            self.show(self.snapshot())
+            self.show(self.moment())
             ended_s = self._clock()
             self._due_s = ended_s + max(self.every_s, (ended_s - started_s) / MOST_SHARE)
 
     def finishing(self, done: int, total: int) -> None:
         """Show the path and map that refinement starts from."""
         if done == 0:
-            self.show(self.snapshot())
+            self.show(self.moment())
 
     def last_loops(self, loops: Sequence[Tried]) -> None:
         """Show the map as it is in the end."""
-        self.show(self.snapshot(finished=True))
+        self.show(self.moment(finished=True))
 
-    def snapshot(self, finished: bool = False) -> Snapshot:
+    def moment(self, finished: bool = False) -> Moment:
         """Copy what is shown of the system as it is now; once it is finished, the final map too."""
         slam = self.slam
-        path = Path(
-            slam.atlas.T_world_camera(), np.array(self._lost, bool), np.array(self._submaps, int), tuple(slam.keyframes)
-        )
+        lost = np.array([step.lost for step in slam.steps], np.bool_)
+        submaps = np.array([step.submap for step in slam.steps], np.int64)
+        path = Path(slam.atlas.T_world_camera(), lost, submaps, tuple(slam.keyframes))
         self._take_finished()
         final = Piece(None, thinned(bare(slam.field), self.budget)) if finished else None
         keyframes = slam.mapper.keyframes
-        return Snapshot(
+        return Moment(
             self.title, path, final, (*self._finished, *self._active()), None,
             keyframes[0].target.camera if keyframes else CAMERA, self.picture, slam.config.render, slam.config.backend,
             live=True, status="running",

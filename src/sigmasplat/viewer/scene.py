@@ -12,7 +12,7 @@ from sigmasplat.metrics.palette import Rgb
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.viewer.lines import LOST_COLOUR, Floats, Segments
-from sigmasplat.viewer.snapshot import Matrix
+from sigmasplat.viewer.moment import Matrix
 from sigmasplat.viewer.splats import Splats
 
 FRUSTUM_M, THUMBNAIL_PX = 0.08, 160

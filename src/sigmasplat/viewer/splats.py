@@ -12,7 +12,7 @@ from torch import Tensor
 from sigmasplat.metrics import palette
 from sigmasplat.model import harmonics, se3
 from sigmasplat.model.field import COLUMNS, EXTRAS, GaussianField, left_factor, quaternion_of, transformed
-from sigmasplat.viewer.snapshot import Piece, to_look_at
+from sigmasplat.viewer.moment import Piece, to_look_at
 
 Colouring = Literal["colour", "σ"]
 Floats = NDArray[np.float32]

@@ -9,10 +9,10 @@ import viser
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.metrics.palette import INFERNO
 from sigmasplat.viewer import lines
+from sigmasplat.viewer.moment import Moment, Piece
 from sigmasplat.viewer.panel import Panel, Wanted
 from sigmasplat.viewer.pictures import Legend, Picture, legend_picture, picture_of, viewpoint
 from sigmasplat.viewer.scene import Scene, look, look_first, pose_of
-from sigmasplat.viewer.snapshot import Piece, Snapshot
 from sigmasplat.viewer.splats import Cut, Floats, cut_of, joined, sigma_span, sigmas, splats_of
 
 REST_S, LIVE_REST_S = 0.05, 0.5
@@ -23,16 +23,28 @@ BACK_M, UP_M = 0.7, 0.25
 """Where the camera that follows another is, behind and above it."""
 
 
+class Same:
+    """A thing that equals nothing but itself, kept until it is compared: an id alone may be another's by then."""
+
+    def __init__(self, thing: object) -> None:
+        self.thing = thing
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Same) and self.thing is other.thing
+
+    __hash__ = None  # type: ignore[assignment]
+
+
 class Stage:
-    """Shows snapshots. `show` and the controls only leave word; a thread of its own does the work, the newest only."""
+    """Shows moments. `show` and the controls only leave word; a thread of its own does the work, the newest only."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self.server = server
         self.panel = Panel(server, self.changed, self._look_from)
         self.scene = Scene(server, self._clicked)
-        self._snapshot: Snapshot | None = None
+        self._moment: Moment | None = None
         self._drawn: dict[Any, Any] = {}
-        self._sigmas: tuple[tuple[Piece, ...], Floats] = ((), sigmas(()))
+        self._sigmas: tuple[list[Same], Floats] = ([], sigmas(()))
         self._joined: tuple[Any, Any] = (None, None)
         self._word, self._stop = threading.Event(), threading.Event()
         server.on_client_connect(self._welcome)
@@ -40,9 +52,9 @@ class Stage:
         self._thread = threading.Thread(target=self._work, name="viewer", daemon=True)
         self._thread.start()
 
-    def show(self, snapshot: Snapshot) -> None:
+    def show(self, moment: Moment) -> None:
         """Show this from now on; returns at once."""
-        self._snapshot = snapshot
+        self._moment = moment
         self.changed()
 
     def changed(self) -> None:
@@ -61,32 +73,32 @@ class Stage:
             if self._stop.is_set():
                 return
             self._word.clear()
-            snapshot = self._snapshot
-            if snapshot is not None:
+            moment = self._moment
+            if moment is not None:
                 try:
-                    self._draw(snapshot)
+                    self._draw(moment)
                 except Exception as problem:  # a viewer that fails must not end the run that it shows
                     print(f"viewer: {type(problem).__name__}: {problem}", file=sys.stderr)
-                self._stop.wait(LIVE_REST_S if snapshot.live else REST_S)
+                self._stop.wait(LIVE_REST_S if moment.live else REST_S)
 
-    def _draw(self, snapshot: Snapshot) -> None:
-        path = snapshot.path
-        whole, parts = snapshot.final is not None, bool(snapshot.pieces)
-        self.panel.offer(len(path), snapshot.live, snapshot.true_positions is not None, whole, parts)
+    def _draw(self, moment: Moment) -> None:
+        path = moment.path
+        whole, parts = moment.final is not None, bool(moment.pieces)
+        self.panel.offer(len(path), moment.live, moment.true_positions is not None, whole, parts)
         wanted = self.panel.wanted()
-        pieces = snapshot.shown(wanted.whole, wanted.row)
+        pieces = moment.shown(wanted.whole, wanted.row)
         ordered = self._sigmas_of(pieces)
         cut = cut_of(ordered, wanted.hidden_share, wanted.least_opacity)
         span = sigma_span(ordered)
         with self.server.atomic():
-            self._draw_path(snapshot, wanted)
+            self._draw_path(moment, wanted)
             self._draw_splats(pieces, wanted, span, cut)
-        self._draw_keyframes(snapshot, wanted)
-        self._say(snapshot, wanted, pieces, cut)
-        self._follow(snapshot, wanted)
+        self._draw_keyframes(moment, wanted)
+        self._say(moment, wanted, pieces, cut)
+        self._follow(moment, wanted)
         legend = Legend(INFERNO, *span, "") if wanted.kind == "splats" and wanted.colouring == "σ" else None
         for client in self.server.get_clients().values():
-            legend = self._draw_picture(client, snapshot, wanted, pieces, cut) or legend
+            legend = self._draw_picture(client, moment, wanted, pieces, cut) or legend
         if self._is_new("legend", legend and legend[1:]):
             self.panel.show_legend(None if legend is None else legend_picture(legend))
 
@@ -98,21 +110,22 @@ class Stage:
         return True
 
     def _sigmas_of(self, pieces: tuple[Piece, ...]) -> Floats:
-        if [id(p.field) for p in self._sigmas[0]] != [id(p.field) for p in pieces]:
-            self._sigmas = (pieces, sigmas(pieces))
+        fields = [Same(piece.field) for piece in pieces]
+        if self._sigmas[0] != fields:
+            self._sigmas = (fields, sigmas(pieces))
         return self._sigmas[1]
 
-    def _draw_path(self, snapshot: Snapshot, wanted: Wanted) -> None:
-        path, row = snapshot.path, wanted.row
+    def _draw_path(self, moment: Moment, wanted: Wanted) -> None:
+        path, row = moment.path, wanted.row
         if self._is_new("first look", len(path) > 0) and len(path):
             look_first(self.server, path.T_world_camera[0], BACK_M, UP_M)
-        if self._is_new("path", (id(path), row, wanted.path)):
+        if self._is_new("path", (Same(path), row, wanted.path)):
             self.scene.show_lines("path", lines.path_segments(path, row) if wanted.path else None)
             self.scene.show_lost(lines.lost_points(path, row if wanted.path else -1))
             here = path.T_world_camera[min(row, len(path) - 1)] if len(path) else None
-            self.scene.show_here(snapshot.camera, here)
-        known = snapshot.true_positions
-        if self._is_new("true path", (id(known), wanted.true_path)):
+            self.scene.show_here(moment.camera, here)
+        known = moment.true_positions
+        if self._is_new("true path", (Same(known), wanted.true_path)):
             shown = known is not None and wanted.true_path
             self.scene.show_lines("truth", lines.true_segments(known) if shown and known is not None else None)
 
@@ -120,22 +133,22 @@ class Stage:
         if wanted.layer is not None:
             pieces = ()
         ends = span if wanted.colouring == "σ" else None  # its own colours do not depend on the range
-        state = ([(p.name, id(p.field)) for p in pieces], wanted.colouring, ends, cut)
+        state = ([(p.name, Same(p.field)) for p in pieces], wanted.colouring, ends, cut)
         if self._is_new("splats", state):
             drawn = {p.name: (splats_of(p.field, wanted.colouring, span, cut), p.T_world_piece) for p in pieces}
             self.scene.show_splats(drawn)
         else:
             self.scene.place_splats({piece.name: piece.T_world_piece for piece in pieces})
 
-    def _draw_keyframes(self, snapshot: Snapshot, wanted: Wanted) -> None:
-        path = snapshot.path
-        if self._is_new("keyframes", (id(path), wanted.row, wanted.keyframes, wanted.thumbnails)):
+    def _draw_keyframes(self, moment: Moment, wanted: Wanted) -> None:
+        path = moment.path
+        if self._is_new("keyframes", (Same(path), wanted.row, wanted.keyframes, wanted.thumbnails)):
             rows = lines.shown_keyframes(path, wanted.row) if wanted.keyframes else ()
             poses = {row: path.T_world_camera[row] for row in rows}
-            self.scene.show_keyframes(snapshot.camera, poses, snapshot.picture if wanted.thumbnails else None)
+            self.scene.show_keyframes(moment.camera, poses, moment.picture if wanted.thumbnails else None)
 
     def _draw_picture(
-        self, client: viser.ClientHandle, snapshot: Snapshot, wanted: Wanted, pieces: tuple[Piece, ...], cut: Cut
+        self, client: viser.ClientHandle, moment: Moment, wanted: Wanted, pieces: tuple[Piece, ...], cut: Cut
     ) -> Legend | None:
         """Render the layer asked for from where a browser looks, and put it behind its scene; return its legend."""
         key, c = ("picture", client.client_id), client.camera
@@ -143,34 +156,34 @@ class Stage:
             if self._drawn.pop(key, None) is not None:
                 client.scene.set_background_image(None)
             return None
-        pose, splats = pose_of(c), ([(id(p.field), p.T_world_piece.tobytes()) for p in pieces], cut)
+        pose, splats = pose_of(c), ([(Same(p.field), p.T_world_piece.tobytes()) for p in pieces], cut)
         state = (wanted.layer, pose.tobytes(), c.fov, c.aspect, splats)
         drawn = self._drawn.get(key)
         if drawn is None or drawn[0] != state:
             if self._joined[0] != splats:
                 self._joined = (splats, joined(pieces, cut))
-            camera = viewpoint(c.fov, c.aspect, LIVE_ROWS if snapshot.live else ROWS)
-            made: Picture = picture_of(self._joined[1], camera, pose, wanted.layer, snapshot.options, snapshot.backend)
+            camera = viewpoint(c.fov, c.aspect, LIVE_ROWS if moment.live else ROWS)
+            made: Picture = picture_of(self._joined[1], camera, pose, wanted.layer, moment.options, moment.backend)
             client.scene.set_background_image(made.pixels, "jpeg", jpeg_quality=85)
             drawn = self._drawn[key] = (state, made.legend)
         legend: Legend | None = drawn[1]
         return legend
 
-    def _say(self, snapshot: Snapshot, wanted: Wanted, pieces: tuple[Piece, ...], cut: Cut) -> None:
-        path = snapshot.path
+    def _say(self, moment: Moment, wanted: Wanted, pieces: tuple[Piece, ...], cut: Cut) -> None:
+        path = moment.path
         splats, kept = sum(len(p.field) for p in pieces), sum(int(cut.keeps(p.field).sum()) for p in pieces)
         submaps = int(path.submaps[-1]) + 1 if len(path) else 0
         facts = (
-            f"**{snapshot.title}** ({snapshot.status})  \n{len(path)} frames, {len(path.keyframes)} keyframes, "
+            f"**{moment.title}** ({moment.status})  \n{len(path)} frames, {len(path.keyframes)} keyframes, "
             f"{int(path.lost.sum())} lost, {submaps} submap{'s' * (submaps != 1)}  \n"
             f"{kept:,} of {splats:,} splats shown"
         )
         cut_text = "" if cut.most_sigma == float("inf") else f"hidden: σ above {cut.most_sigma:.3f} colour steps"
-        self.panel.say(facts, cut_text, _frame_text(snapshot, wanted.row))
+        self.panel.say(facts, cut_text, _frame_text(moment, wanted.row))
 
-    def _follow(self, snapshot: Snapshot, wanted: Wanted) -> None:
-        path = snapshot.path
-        if wanted.follow and snapshot.live and len(path) and self._is_new("followed", id(path)):
+    def _follow(self, moment: Moment, wanted: Wanted) -> None:
+        path = moment.path
+        if wanted.follow and moment.live and len(path) and self._is_new("followed", Same(path)):
             for client in self.server.get_clients().values():
                 look(client, path.T_world_camera[-1], BACK_M, UP_M)
 
@@ -179,12 +192,12 @@ class Stage:
         self.changed()
 
     def _clicked(self, row: int, client: viser.ClientHandle) -> None:
-        snapshot = self._snapshot
-        if snapshot is None or row >= len(snapshot.path):
+        moment = self._moment
+        if moment is None or row >= len(moment.path):
             return
         self._go(client, row)
         try:
-            picture = snapshot.picture(row)
+            picture = moment.picture(row)
         except SigmaSplatError as problem:
             self.panel.show_picture(f"frame {row}: {problem}", None)
             return
@@ -192,22 +205,22 @@ class Stage:
         self.panel.show_picture(f"frame {row}{nothing}", picture)
 
     def _look_from(self, client: viser.ClientHandle) -> None:
-        snapshot = self._snapshot
-        if snapshot is not None and len(snapshot.path):
-            self._go(client, min(self.panel.wanted().row, len(snapshot.path) - 1))
+        moment = self._moment
+        if moment is not None and len(moment.path):
+            self._go(client, min(self.panel.wanted().row, len(moment.path) - 1))
 
     def _go(self, client: viser.ClientHandle, row: int) -> None:
         """Send a browser where a frame was seen from, and clear the pictures before it out of the way."""
-        snapshot = self._snapshot
-        assert snapshot is not None
+        moment = self._moment
+        assert moment is not None
         self.panel.thumbnails.value = False
-        look(client, snapshot.path.T_world_camera[row])
+        look(client, moment.path.T_world_camera[row])
         self.changed()
 
 
-def _frame_text(snapshot: Snapshot, row: int) -> str:
+def _frame_text(moment: Moment, row: int) -> str:
     """Say what the timeline's frame is."""
-    path = snapshot.path
+    path = moment.path
     if not len(path):
         return "no frame yet"
     row = min(row, len(path) - 1)

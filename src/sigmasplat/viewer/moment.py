@@ -54,7 +54,7 @@ NO_PATH = Path(np.empty((0, 4, 4)), np.empty(0, np.bool_), np.empty(0, np.int64)
 
 
 @dataclass(frozen=True, eq=False)
-class Snapshot:
+class Moment:
     """A run at one moment. final: the map in one piece once it is made; pieces: the submaps side by side; together with
     final they may be absent. true_positions [M, 3] m, in the run's world, where an evaluation has stored them.
     picture: gives what the keyframe at a row of the path saw, None where nobody kept it."""
