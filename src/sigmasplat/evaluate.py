@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from sigmasplat import surface
 from sigmasplat.config import Config, FinalConfig, InputConfig
 from sigmasplat.errors import RunError
-from sigmasplat.io.runs import RunFolder
+from sigmasplat.io.runs import TRUTH, RunFolder
+from sigmasplat.io.trajectory import write_trajectory
 from sigmasplat.metrics import charts, plot, views
 from sigmasplat.metrics.panels import View, side_by_side
 from sigmasplat.metrics.trajectory import aligned_truth, associate, path_scores_of
@@ -221,10 +222,18 @@ def _draw_plots(run: RunFolder, log: Log, truth: Trajectory | None, loops: Log) 
         rows, aligned = aligned_truth(times, estimate, truth)
         known = np.full_like(estimate, np.nan)
         known[rows] = aligned.T_world_camera[:, :3, 3]
-    run.write_truth(aligned)
+    _keep_truth(run, aligned)
     drawn = charts.of_run(log, estimate, known, loops)
     for name, (found, _) in drawn.items():
         for theme in (plot.LIGHT, plot.DARK):
             size = plot.SIZE if name != "seconds" else (plot.SIZE[0], 300)
             run.write_image(f"{name}-{theme.name}.png", plot.draw_charts(found, theme, size))
     return {name: caption for name, (_, caption) in drawn.items()}
+
+
+def _keep_truth(run: RunFolder, aligned: Trajectory | None) -> None:
+    """Write truth.txt for those who show a run; remove an earlier one where no truth is known."""
+    if aligned is None:
+        (run.path / TRUTH).unlink(missing_ok=True)
+    else:
+        write_trajectory(run.path / TRUTH, aligned)

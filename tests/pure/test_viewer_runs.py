@@ -1,5 +1,6 @@
 """What the viewer reads of run folders and of a run in work: the same map, path and pictures; a bounded rate."""
 
+import shutil
 import socket
 import sys
 from pathlib import Path
@@ -13,13 +14,14 @@ from sigmasplat.config import Config
 from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError, RunError, SigmaSplatError
 from sigmasplat.evaluate import evaluate
-from sigmasplat.io.runs import RunFolder
+from sigmasplat.io.runs import TRUTH, RunFolder
 from sigmasplat.io.submaps import DiskStore
+from sigmasplat.io.trajectory import read_trajectory
 from sigmasplat.model import se3
 from sigmasplat.presets import default_preset, preset
 from sigmasplat.protocols import Together
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import open_source
+from sigmasplat.sources import SyntheticRoom, open_source
 from sigmasplat.viewer.address import free_port, is_private, open_server, url_of
 from sigmasplat.viewer.finished import Shelf, ended, refuse_mapless, running
 from sigmasplat.viewer.live import ACTIVE_SHARE, LiveView
@@ -101,8 +103,8 @@ def test_a_run_just_begun_shows_nothing_yet_and_one_without_a_map_is_refused(tmp
 
 
 def test_the_true_path_is_stored_aligned_and_gives_the_same_ate(finished: RunFolder) -> None:
-    aligned, path = finished.read_truth(), finished.read_trajectory()
-    assert aligned is not None and len(aligned) == FRAMES
+    aligned, path = read_trajectory(finished.path / TRUTH), finished.read_trajectory()
+    assert len(aligned) == FRAMES
     np.testing.assert_allclose(aligned.timestamps_s, path.timestamps_s, atol=1e-8)
     away_m = np.linalg.norm(aligned.T_world_camera[:, :3, 3] - path.T_world_camera[:, :3, 3], axis=1)
     assert np.sqrt((away_m**2).mean()) == pytest.approx(finished.read_metrics()["ate"]["rmse_m"], rel=1e-6)
@@ -113,13 +115,19 @@ def test_the_true_path_is_stored_aligned_and_gives_the_same_ate(finished: RunFol
     np.testing.assert_array_equal(shown, aligned.T_world_camera[:, :3, 3])  # type: ignore[arg-type]
 
 
+class Unknown(SyntheticRoom):
+    """The room without its truth."""
+
+    def truth(self) -> None:
+        return None
+
+
 def test_a_truth_that_is_known_no_longer_is_removed(finished: RunFolder, tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path / "run", settings(), "room")
-    assert run.read_truth() is None
-    run.write_truth(finished.read_trajectory())
-    assert run.read_truth() is not None
-    run.write_truth(None)
-    assert run.read_truth() is None and not (run.path / "truth.txt").exists()
+    copied = RunFolder(tmp_path / "run")
+    shutil.copytree(finished.path, copied.path)
+    assert (copied.path / TRUTH).is_file()
+    evaluate(copied, Unknown(frames=120, width=64, height=48), views_per_kind=1, strips_per_kind=0)
+    assert not (copied.path / TRUTH).exists() and ended(copied).true_positions is None
 
 
 class Clock:

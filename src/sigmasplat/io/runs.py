@@ -18,13 +18,15 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 
 PROGRAM = "sigmasplat"
+TRUTH = "truth.txt"
+"""What an evaluation adds where the truth is known: the true path in the run's world."""
 MESH = "mesh.ply"
 """What `sigmasplat mesh` adds."""
 STATE = "state.safetensors"
 """What an unfinished run goes on from."""
 FILES = (
     "config.json", "trajectory.txt", "map.ply", "checkpoint.safetensors", "log.jsonl", "loops.json", "metrics.json",
-    "profile.json", "report.html", "truth.txt",
+    "profile.json", "report.html", TRUTH,
 )  # fmt: skip
 """What a run may hold besides run.json, which says that the folder is ours and is never absent."""
 HALF_BORN = ".run.json.part"
@@ -194,18 +196,6 @@ class RunFolder:
         """Read checkpoint.safetensors: tensors and text. Raises RunError if it is missing or damaged."""
         with opened(self._existing("checkpoint.safetensors"), "checkpoint") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
-
-    def write_truth(self, aligned: Trajectory | None) -> None:
-        """Write truth.txt (TUM text, in the run's world), or remove an earlier one where no truth is known."""
-        if aligned is None:
-            (self.path / "truth.txt").unlink(missing_ok=True)
-        else:
-            tum.write_trajectory(self.path / "truth.txt", aligned)
-
-    def read_truth(self) -> Trajectory | None:
-        """Read truth.txt, None where no evaluation has written one. Raises SourceError if it is damaged."""
-        path = self.path / "truth.txt"
-        return tum.read_trajectory(path) if path.is_file() else None
 
     def read_odometry(self) -> Trajectory | None:
         """Return the path as tracking alone has it, without loops; None where the run kept none or has no loop.

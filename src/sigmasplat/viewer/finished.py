@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.errors import RunError, SigmaSplatError
-from sigmasplat.io.runs import RunFolder
+from sigmasplat.io.runs import TRUTH, RunFolder
+from sigmasplat.io.trajectory import read_trajectory
 from sigmasplat.metrics.palette import Rgb
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
@@ -27,7 +28,7 @@ def ended(run: RunFolder, source: Source | None = None, budget: int = BUDGET) ->
     Raises RunError if it stopped before it had a map.
     """
     path, final, tensors = run.read_trajectory(), run.read_map(), run.read_checkpoint()[0]
-    log, config, true_path = run.read_log(), run.config(), run.read_truth()
+    log, config, true_file = run.read_log(), run.config(), run.path / TRUTH
     kept = min(len(path), len(log))
     keyframes = tuple(row for row in tensors["keyframes"].tolist() if row < kept)
     shelf = Shelf(run, budget)
@@ -41,7 +42,7 @@ def ended(run: RunFolder, source: Source | None = None, budget: int = BUDGET) ->
         Path(path.T_world_camera[:kept], *_marks(log[:kept]), keyframes),
         Piece(None, bare(final)),
         within_budget(pieces, budget),
-        None if true_path is None else true_path.T_world_camera[:, :3, 3],
+        read_trajectory(true_file).T_world_camera[:, :3, 3] if true_file.is_file() else None,
         _camera(run, shelf, source),
         partial(_picture, shelf, log, run, source),
         config.render,
