@@ -2,7 +2,7 @@
 
 A system is made up that grows as a real one does, without its work: frames, keyframes with pictures, submaps that are
 finished to disk, an active map that changes all the time. It is shown through the very watcher and stage of `sigmasplat
-run --view`, to one client in another process, which looks from ever new places; what is shown is changed every 20 s.
+run --view`, to one client in another process, which looks from ever new places; what is shown is changed every 5 s.
 Kept is the resident memory of the server's process. Writes benchmarks/results/viewer-memory-<machine>.json, prints
 tables. Linux only.
 
@@ -43,7 +43,7 @@ from sigmasplat.viewer.stage import Stage
 arg = tyro.conf.arg
 STATM = Path("/proc/self/statm")
 CAMERA = Camera(160, 120, 131.0, 131.0, 79.5, 59.5)
-KEYFRAME_EVERY, SUBMAP_EVERY, CHANGE_S, SAMPLE_S = 5, 200, 20.0, 5.0
+KEYFRAME_EVERY, SUBMAP_EVERY, CHANGE_S, SAMPLE_S = 5, 200, 5.0, 5.0
 CLIENT = """
 import itertools, math, sys, time
 import msgspec, viser

@@ -105,6 +105,20 @@ def test_what_is_rendered_is_what_is_shown_where_it_lies() -> None:
     assert len(whole) == 30 and len(pieces[0].field) == 30
 
 
+def test_pieces_are_joined_as_fields_are_moved_and_appended() -> None:
+    """Also where one of them carries harmonics, which turn with it, and the other does not."""
+    T = se3.exp(np.array([1.0, 2.0, 3.0, 0.4, -0.5, 0.6]))
+    first, second = field_of(30), field_of(20, seed=1)
+    second.carry("harmonics").params += torch.randn(20, 45, generator=torch.Generator().manual_seed(0))
+    found = joined((Piece(0, first), Piece(1, second, T)), Cut())
+    expected = first.moved(torch.eye(4))
+    expected.append(second.moved(torch.from_numpy(T)))
+    torch.testing.assert_close(found.params, expected.params)
+    torch.testing.assert_close(found.extras["harmonics"].params, expected.extras["harmonics"].params)
+    few = thinned(second, 10)
+    assert torch.equal(few.extras["harmonics"].params, second.extras["harmonics"].params[::2])
+
+
 def test_the_timeline_shows_the_submaps_begun_by_then_and_the_final_map_whole() -> None:
     pieces = tuple(Piece(i, field_of(3, seed=i)) for i in range(3))
     final = Piece(None, field_of(9))

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import viser
@@ -11,13 +11,13 @@ from PIL import Image
 from sigmasplat.metrics.palette import Rgb
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.viewer.lines import LOST_COLOUR, Floats, Segments
+from sigmasplat.viewer.lines import LOST_COLOUR, Bytes, Floats, Segments
 from sigmasplat.viewer.moment import Matrix
 from sigmasplat.viewer.splats import Splats
 
 FRUSTUM_M, THUMBNAIL_PX = 0.08, 160
-LINE_PX, DOT_M = 2.5, 0.02
-KEYFRAME_COLOUR, HERE_COLOUR = (150, 158, 168), (255, 210, 60)
+LINE_PX, FRUSTUM_PX, DOT_M = {"path": 4.0, "truth": 2.0}, 1.0, 0.03
+KEYFRAME_COLOUR, HERE_COLOUR = (112, 120, 130), (255, 210, 60)
 AHEAD_M = 1.0
 """A camera that is sent somewhere turns about the point so far before it."""
 
@@ -55,13 +55,13 @@ class Scene:
             if name in self._splats:
                 _place(self._splats[name], T)
 
-    def show_lines(self, name: str, segments: Segments | None) -> None:
+    def show_lines(self, name: Literal["path", "truth"], segments: Segments | None) -> None:
         """Show line segments under a name, None for none."""
         if segments is None or not len(segments.points):
             self._drop(name)
             return
         self._marks[name] = self.server.scene.add_line_segments(
-            f"/{name}", segments.points, segments.colors, thickness=LINE_PX, thickness_units="screen"
+            f"/{name}", segments.points, linear(segments.colors), thickness=LINE_PX[name], thickness_units="screen"
         )
 
     def show_lost(self, points: Floats) -> None:
@@ -104,8 +104,8 @@ class Scene:
     ) -> viser.CameraFrustumHandle:
         fov = 2.0 * float(np.arctan(0.5 * camera.height / camera.fy))
         return self.server.scene.add_camera_frustum(
-            name, fov, camera.width / camera.height, scale=scale, thickness=1.5, thickness_units="screen", color=color,
-            image=image, format="jpeg", jpeg_quality=80, cast_shadow=False, receive_shadow=False,
+            name, fov, camera.width / camera.height, scale=scale, thickness=FRUSTUM_PX, thickness_units="screen",
+            color=color, image=image, format="jpeg", jpeg_quality=80, cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
 
     def _pass_on(self, row: int, event: viser.SceneNodePointerEvent[viser.CameraFrustumHandle]) -> None:
@@ -136,6 +136,11 @@ def pose_of(camera: viser.CameraHandle) -> Matrix:
     T[:3, :3] = se3.rotation_from_quaternion(camera.wxyz)
     T[:3, 3] = camera.position
     return T
+
+
+def linear(colors: Bytes) -> Bytes:
+    """Return sRGB colours as shares of light, 0 … 255: viser takes the colours of a line's ends for that."""
+    return (255.0 * (colors / 255.0) ** 2.2).round().astype(np.uint8)
 
 
 def thumbnail(picture: Rgb | None) -> Rgb | None:

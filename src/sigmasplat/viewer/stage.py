@@ -178,7 +178,7 @@ class Stage:
             f"{int(path.lost.sum())} lost, {submaps} submap{'s' * (submaps != 1)}  \n"
             f"{kept:,} of {splats:,} splats shown"
         )
-        cut_text = "" if cut.most_sigma == float("inf") else f"hidden: σ above {cut.most_sigma:.3f} colour steps"
+        cut_text = "" if cut.most_sigma == float("inf") else f"hidden: σ above {cut.most_sigma:.3g}"
         self.panel.say(facts, cut_text, _frame_text(moment, wanted.row))
 
     def _follow(self, moment: Moment, wanted: Wanted) -> None:
