@@ -16,6 +16,7 @@ from sigmasplat.commands.export import export
 from sigmasplat.commands.inspect import inspect
 from sigmasplat.commands.mesh import make_mesh
 from sigmasplat.commands.run import demo, resume, run
+from sigmasplat.commands.view import view
 from sigmasplat.errors import SigmaSplatError
 
 REFUSED, INTERRUPTED = 2, 130
@@ -28,6 +29,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "inspect": inspect,
     "run": run,
     "resume": resume,
+    "view": view,
     "eval": evaluate_run,
     "mesh": make_mesh,
     "export": export,

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from sigmasplat import surface
 from sigmasplat.config import Config, FinalConfig, InputConfig
 from sigmasplat.errors import RunError
-from sigmasplat.io.runs import RunFolder
+from sigmasplat.io.runs import TRUTH, RunFolder
+from sigmasplat.io.trajectory import write_trajectory
 from sigmasplat.metrics import charts, plot, views
 from sigmasplat.metrics.panels import View, side_by_side
-from sigmasplat.metrics.trajectory import align_rigid, associate, path_scores_of
+from sigmasplat.metrics.trajectory import aligned_truth, associate, path_scores_of
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
@@ -212,9 +213,17 @@ def _worst_frame_s(log: Log) -> float | None:
 
 
 def _draw_plots(run: RunFolder, log: Log, truth: Trajectory | None, loops: Log) -> dict[str, str]:
-    """Draw path, submaps and times in both themes; return the captions by name."""
+    """Draw path, submaps and times in both themes, and write truth.txt; return the captions by name."""
+    times = np.array([record["timestamp_s"] for record in log])
     estimate = np.array([record["T_world_camera"][:3, 3] for record in log])
-    drawn = charts.of_run(log, estimate, _aligned_truth(log, estimate, truth), loops)
+    known: NDArray[np.float64] | None = None
+    aligned: Trajectory | None = None
+    if truth is not None:
+        rows, aligned = aligned_truth(times, estimate, truth)
+        known = np.full_like(estimate, np.nan)
+        known[rows] = aligned.T_world_camera[:, :3, 3]
+    _keep_truth(run, aligned)
+    drawn = charts.of_run(log, estimate, known, loops)
     for name, (found, _) in drawn.items():
         for theme in (plot.LIGHT, plot.DARK):
             size = plot.SIZE if name != "seconds" else (plot.SIZE[0], 300)
@@ -222,13 +231,9 @@ def _draw_plots(run: RunFolder, log: Log, truth: Trajectory | None, loops: Log) 
     return {name: caption for name, (_, caption) in drawn.items()}
 
 
-def _aligned_truth(log: Log, estimate: NDArray[np.float64], truth: Trajectory | None) -> NDArray[np.float64] | None:
-    """Return the true positions of the logged frames [N, 3], m, in the estimate's world; nan where none is known."""
-    if truth is None:
-        return None
-    rows, truth_rows = associate(np.array([record["timestamp_s"] for record in log]), truth.timestamps_s)
-    theirs = truth.T_world_camera[truth_rows, :3, 3]
-    T_estimate_truth = align_rigid(theirs, estimate[rows])
-    out = np.full_like(estimate, np.nan)
-    out[rows] = theirs @ T_estimate_truth[:3, :3].T + T_estimate_truth[:3, 3]
-    return out
+def _keep_truth(run: RunFolder, aligned: Trajectory | None) -> None:
+    """Write truth.txt for those who show a run; remove an earlier one where no truth is known."""
+    if aligned is None:
+        (run.path / TRUTH).unlink(missing_ok=True)
+    else:
+        write_trajectory(run.path / TRUTH, aligned)

@@ -85,3 +85,25 @@ class Unwatched:
     def __call__(self, step: Stepped) -> None: ...
     def finishing(self, done: int, total: int) -> None: ...
     def last_loops(self, loops: Sequence[Tried]) -> None: ...
+
+
+class Together:
+    """Several watchers, told one after the other."""
+
+    def __init__(self, *watchers: Watcher) -> None:
+        self.watchers = watchers
+
+    def __call__(self, step: Stepped) -> None:
+        """Take note of a step."""
+        for watcher in self.watchers:
+            watcher(step)
+
+    def finishing(self, done: int, total: int) -> None:
+        """Take note of how far the final map is."""
+        for watcher in self.watchers:
+            watcher.finishing(done, total)
+
+    def last_loops(self, loops: Sequence[Tried]) -> None:
+        """Take note of the loops tried after the last step."""
+        for watcher in self.watchers:
+            watcher.last_loops(loops)

@@ -32,6 +32,7 @@ FLOORS = [
         "page",
         "snapshots",
         "download",
+        "viewer",
         "commands",
         "cli",
         "__init__",

@@ -63,6 +63,11 @@ Profile = Annotated[bool, arg(help="print where the time went", help_behavior_hi
 SaveEvery = Annotated[
     float, arg(metavar="S", help="seconds between savings of the state that `resume` goes on from; 0 = at the end only")
 ]
+View = Annotated[
+    bool, arg(help="show the run in the browser while it goes on, and until Ctrl-C", help_behavior_hint="")
+]
+Host = Annotated[str, arg(metavar="ADDRESS", help="where the viewer listens; by default only this machine reaches it")]
+Port = Annotated[int, arg(metavar="N", help="port of the viewer, or the next free one; 0 = any")]
 Evaluate = Annotated[bool, arg(name="eval", help="make no metrics and no report", help_behavior_hint="")]
 MovedSource = Annotated[
     str | None,

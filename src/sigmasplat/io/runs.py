@@ -18,13 +18,15 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 
 PROGRAM = "sigmasplat"
+TRUTH = "truth.txt"
+"""What an evaluation adds where the truth is known: the true path in the run's world."""
 MESH = "mesh.ply"
 """What `sigmasplat mesh` adds."""
 STATE = "state.safetensors"
 """What an unfinished run goes on from."""
 FILES = (
     "config.json", "trajectory.txt", "map.ply", "checkpoint.safetensors", "log.jsonl", "loops.json", "metrics.json",
-    "profile.json", "report.html",
+    "profile.json", "report.html", TRUTH,
 )  # fmt: skip
 """What a run may hold besides run.json, which says that the folder is ours and is never absent."""
 HALF_BORN = ".run.json.part"

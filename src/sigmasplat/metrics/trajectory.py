@@ -50,6 +50,16 @@ def align_rigid(estimate: Matrix, truth: Matrix) -> Matrix:
     return T
 
 
+def aligned_truth(times_s: Matrix, estimate: Matrix, truth: Trajectory) -> tuple[Rows, Trajectory]:
+    """Return the true poses in the estimate's world, after the rigid fit of the ATE, and which frames they are of.
+
+    times_s [N], estimate [N, 3]: of all frames, m. Frames without a true pose in time are left out.
+    """
+    rows, truth_rows = associate(times_s, truth.timestamps_s)
+    T_estimate_truth = align_rigid(truth.T_world_camera[truth_rows, :3, 3], estimate[rows])
+    return rows, Trajectory(times_s[rows], T_estimate_truth @ truth.T_world_camera[truth_rows])
+
+
 def associate(times_a_s: Matrix, times_b_s: Matrix, max_difference_s: float = 0.02) -> tuple[Rows, Rows]:
     """Pair timestamps that are each other's nearest and at most `max_difference_s` apart: rows of a, rows of b.
 

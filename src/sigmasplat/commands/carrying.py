@@ -1,0 +1,91 @@
+"""Carry a run through to its end: watched on the terminal and in the browser, kept now and then, scored."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sigmasplat.commands.evaluate import score
+from sigmasplat.commands.options import source_of
+from sigmasplat.commands.view import stay
+
+if TYPE_CHECKING:
+    from sigmasplat.io.runs import RunFolder
+    from sigmasplat.screen import Screen
+    from sigmasplat.snapshots import Begun
+    from sigmasplat.sources.base import Source
+    from sigmasplat.sources.live import LiveSource
+    from sigmasplat.viewer.stage import Stage
+
+OK, INTERRUPTED = 0, 130
+
+
+@dataclass(frozen=True)
+class Ways:
+    """How a run is carried through: whether it is scored and its profile printed, how often its state is kept, seconds
+    (0 = at the end only), and where it is shown live."""
+
+    evaluate: bool
+    profile: bool
+    save_every_s: float
+    stage: "Stage | None"
+
+
+def announce(screen: "Screen", preset: str, source: "Source", folder: "RunFolder", record: Path | None) -> None:
+    """Say what is run where; a live camera is recorded to `record`, or into the run folder, to be read again later."""
+    from sigmasplat.session import free
+    from sigmasplat.sources.live import LiveSource
+
+    if not isinstance(source, LiveSource):
+        screen.say(f"{source.name}: {len(source)} frames, {preset} → {folder.path}")
+        return
+    place = record or free(folder.path / "recording")
+    if not record:
+        source.record_to(place)
+    folder.note(source_path=str(place.resolve()))
+    screen.say(f"{source.name}: until Ctrl-C, {preset} → {folder.path}, recorded to {place}")
+
+
+def carry_through(screen: "Screen", begun: "Begun", source: "Source", folder: "RunFolder", ways: Ways) -> int:
+    """Run SLAM into the folder, live on the stage if there is one, then score it; return the exit code."""
+    from sigmasplat.protocols import Together, Watcher
+    from sigmasplat.session import record
+    from sigmasplat.snapshots import Snapshots
+    from sigmasplat.sources.live import LiveSource
+
+    keeper = Snapshots(begun.slam, folder, ways.save_every_s)
+    with screen.steps(None if source.live else len(source), begun.next_index) as steps:
+        watch: Watcher = steps
+        if ways.stage:
+            from sigmasplat.viewer.live import LiveView
+
+            watch = Together(steps, LiveView(begun.slam, ways.stage.show, source.name))
+        outcome = record(begun.slam, source, folder, watch, keeper, begun.next_index, begun.wall_s)
+    if ways.profile:
+        screen.profile(folder.read_profile())
+    if source.skipped:
+        images = "image" if len(source.skipped) == 1 else "images"
+        screen.warn(f"{len(source.skipped)} unreadable {images} passed over (first: {source.skipped[0]})")
+    if outcome.status == "interrupted":
+        screen.say(
+            f"interrupted after {outcome.counts()}; trajectory, map and checkpoint so far are in {folder.path}, "
+            f"`sigmasplat resume {folder.path}` goes on"
+        )
+        return INTERRUPTED
+    if isinstance(source, LiveSource):
+        _tell_ending(screen, source)
+        source = source_of(folder, None)
+    if ways.evaluate:
+        score(screen, folder, source)
+    else:
+        screen.say(f"{outcome.counts()}: {folder.path}")
+    if ways.stage:
+        stay(screen, ways.stage, folder, source)
+    return OK
+
+
+def _tell_ending(screen: "Screen", source: "LiveSource") -> None:
+    """Say why the camera ended, and what was left out because SLAM was slower."""
+    if source.ending:
+        screen.warn(source.ending)
+    if source.dropped:
+        screen.say(f"{source.dropped} frames of the camera were left out while SLAM was busy")

@@ -1,0 +1,202 @@
+"""What the viewer shows, without a browser: splats within a budget, cuts by σ, paths, rendered layers."""
+
+import numpy as np
+import pytest
+import torch
+
+from sigmasplat.config import RenderConfig
+from sigmasplat.metrics import palette
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import GaussianField
+from sigmasplat.render import render
+from sigmasplat.viewer import lines
+from sigmasplat.viewer.moment import Moment, Path, Piece, thinned, within_budget
+from sigmasplat.viewer.pictures import Legend, legend_picture, picture_of, viewpoint
+from sigmasplat.viewer.splats import Cut, covariances, cut_of, joined, sigma_of, sigma_span, sigmas, splats_of
+
+OPTIONS = RenderConfig()
+
+
+def field_of(count: int, seed: int = 0) -> GaussianField:
+    """Return splats before a camera at the origin, of random shapes, colours and σ²."""
+    random = np.random.default_rng(seed)
+    tensor = lambda *shape, low=0.0, high=1.0: torch.tensor(random.uniform(low, high, shape), dtype=torch.float32)  # noqa: E731
+    return GaussianField.from_values(
+        tensor(count, 3, low=-1.0) + torch.tensor([0.0, 0.0, 3.0]),
+        tensor(count, 3, low=0.01, high=0.1),
+        tensor(count, 3),
+        quats=tensor(count, 4, low=-1.0),
+        opacities=tensor(count, low=0.2, high=0.9),
+        log_variances=tensor(count, 3, low=-9.0, high=-2.0),
+    )
+
+
+def path_of(frames: int, every: int = 5, lost: tuple[int, ...] = (), per_submap: int = 10) -> Path:
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, 0, 3] = np.arange(frames)
+    marks = np.isin(np.arange(frames), lost)
+    return Path(poses, marks, np.arange(frames) // per_submap, tuple(range(0, frames, every)))
+
+
+def test_a_thinned_map_is_spread_over_the_whole_and_covers_as_much() -> None:
+    field = field_of(1000)
+    few = thinned(field, 300)
+    area = lambda f: float(f.scales[:, :2].prod(1).sum())  # noqa: E731
+    assert len(few) == 300 and area(few) == pytest.approx(area(field), rel=0.1)
+    rows = [int((field.means == mean).all(1).nonzero()[0]) for mean in few.means]
+    assert rows == sorted(set(rows)) and max(np.diff(rows)) <= 4 and rows[0] == 0 and rows[-1] >= 996
+    same = thinned(field, 1000)
+    assert torch.equal(same.params, field.params) and same.params.data_ptr() != field.params.data_ptr()
+    assert len(thinned(field, 0)) == len(thinned(GaussianField.empty(), 5)) == 0
+
+
+def test_pieces_within_the_budget_stay_the_same_objects_and_others_are_thinned_alike() -> None:
+    pieces = [Piece(0, field_of(300)), Piece(1, field_of(100))]
+    assert [p.field for p in within_budget(pieces, 400)] == [p.field for p in pieces]
+    found = within_budget(pieces, 200)
+    assert [len(p.field) for p in found] == [112, 37] and [p.submap for p in found] == [0, 1]
+
+
+def test_covariances_are_those_of_rotated_axes() -> None:
+    field = field_of(20)
+    found = covariances(field.quats.numpy(), field.scales.numpy())
+    for covariance, quat, scale in zip(found, field.quats.numpy(), field.scales.numpy(), strict=True):
+        R = se3.rotation_from_quaternion(quat)
+        np.testing.assert_allclose(covariance, R @ np.diag(scale.astype(float) ** 2) @ R.T, rtol=1e-4, atol=1e-8)
+
+
+def test_the_cut_hides_the_share_asked_for_and_the_faint() -> None:
+    pieces = [Piece(0, field_of(600)), Piece(1, field_of(400, seed=1))]
+    ordered = sigmas(pieces)
+    assert len(ordered) == 1000 and (np.diff(ordered) >= 0).all()
+    cut = cut_of(ordered, 0.25, 0.0)
+    kept = [cut.keeps(piece.field) for piece in pieces]
+    assert sum(int(k.sum()) for k in kept) == pytest.approx(750, abs=1)
+    hidden = torch.cat([~k for k in kept])
+    σ = torch.cat([p.field.variances.mean(1).sqrt() for p in pieces])
+    assert σ[hidden].min() >= σ[~hidden].max()
+    faint = Cut(least_opacity=0.5).keeps(pieces[0].field)
+    assert torch.equal(faint, pieces[0].field.opacities >= 0.5) and 0 < faint.sum() < 600
+    assert cut_of(ordered, 0.0, 0.0).keeps(pieces[0].field).all()
+    assert len(sigmas(())) == 0 and cut_of(sigmas(()), 0.5, 0.0) == Cut() and sigma_span(sigmas(())) == (0.0, 1.0)
+
+
+def test_splats_are_drawn_in_their_colours_or_in_those_of_sigma() -> None:
+    field = field_of(50)
+    plain = splats_of(field, "colour", (0.0, 1.0), Cut())
+    np.testing.assert_array_equal(plain.colors, (field.colors.numpy() * 255).round().astype(np.uint8))
+    tinted = splats_of(field, "σ", (0.0, 0.3), Cut())
+    np.testing.assert_array_equal(tinted.colors, palette.colour(sigma_of(field), 0.0, 0.3, palette.INFERNO))
+    np.testing.assert_array_equal(tinted.centers, field.means.numpy())
+    doubtful, sure = int(sigma_of(field).argmax()), int(sigma_of(field).argmin())
+    assert tinted.colors[doubtful].sum() > tinted.colors[sure].sum() + 200
+    half = splats_of(field, "σ", (0.0, 0.3), Cut(float(np.median(sigma_of(field)))))
+    assert len(half) == len(half.covariances) == len(half.colors) == 25
+
+
+def test_what_is_rendered_is_what_is_shown_where_it_lies() -> None:
+    T = se3.exp(np.array([1.0, 2.0, 3.0, 0.1, -0.2, 0.3]))
+    pieces = (Piece(0, field_of(30)), Piece(1, field_of(20, seed=1), T))
+    cut = cut_of(sigmas(pieces), 0.4, 0.0)
+    whole = joined(pieces, cut)
+    moved = pieces[1].field.moved(torch.from_numpy(T)).means[cut.keeps(pieces[1].field)]
+    torch.testing.assert_close(whole.means[-len(moved) :], moved)
+    assert len(whole) == 30 and len(pieces[0].field) == 30
+
+
+def test_pieces_are_joined_as_fields_are_moved_and_appended() -> None:
+    """Also where one of them carries harmonics, which turn with it, and the other does not."""
+    T = se3.exp(np.array([1.0, 2.0, 3.0, 0.4, -0.5, 0.6]))
+    first, second = field_of(30), field_of(20, seed=1)
+    second.carry("harmonics").params += torch.randn(20, 45, generator=torch.Generator().manual_seed(0))
+    found = joined((Piece(0, first), Piece(1, second, T)), Cut())
+    expected = first.moved(torch.eye(4))
+    expected.append(second.moved(torch.from_numpy(T)))
+    torch.testing.assert_close(found.params, expected.params)
+    torch.testing.assert_close(found.extras["harmonics"].params, expected.extras["harmonics"].params)
+    few = thinned(second, 10)
+    assert torch.equal(few.extras["harmonics"].params, second.extras["harmonics"].params[::2])
+
+
+def test_the_timeline_shows_the_submaps_begun_by_then_and_the_final_map_whole() -> None:
+    pieces = tuple(Piece(i, field_of(3, seed=i)) for i in range(3))
+    final = Piece(None, field_of(9))
+    moment = Moment("run", path_of(30), final, pieces)
+    assert moment.shown(True, 0) == (final,) and moment.shown(False, 29) == pieces
+    assert moment.shown(False, 9) == pieces[:1] and moment.shown(False, 10) == pieces[:2]
+    assert Moment("run", path_of(30), final).shown(False, 0) == (final,)
+    assert Moment("run", pieces=pieces).shown(True, 0) == pieces
+
+
+def test_the_path_is_drawn_up_to_a_frame_in_the_colours_of_its_submaps_lost_frames_red() -> None:
+    path = path_of(30, lost=(5, 6))
+    drawn = lines.path_segments(path, 12)
+    np.testing.assert_array_equal(drawn.points[:, 0, 0], np.arange(12))
+    np.testing.assert_array_equal(drawn.points[:, 1, 0], np.arange(1, 13))
+    first, second = lines.SUBMAP_COLOURS
+    expected = [lines.LOST_COLOUR if i in (5, 6) else first if i < 10 else second for i in range(13)]
+    np.testing.assert_array_equal(drawn.colors[:, 0], expected[:-1])
+    np.testing.assert_array_equal(drawn.colors[:, 1], expected[1:])
+    np.testing.assert_array_equal(lines.lost_points(path, 5)[:, 0], [5])
+    assert len(lines.lost_points(path, 29)) == 2 and len(lines.lost_points(path, -1)) == 0
+    assert len(lines.path_segments(path_of(0), 0).points) == 0 == len(lines.path_segments(path_of(1), 0).points)
+
+
+def test_long_paths_and_many_keyframes_stay_bounded_and_steady() -> None:
+    drawn = lines.path_segments(path_of(10_000), 9_999, most=500)
+    assert len(drawn.points) == 500 and drawn.points[-1, 1, 0] == 9_999
+    np.testing.assert_array_equal(drawn.points[1:, 0], drawn.points[:-1, 1])
+    path, before = path_of(3000, every=3), set[int]()
+    for row in range(0, 3000, 30):
+        shown = set(lines.shown_keyframes(path, row, most=20))
+        assert len(shown) <= 20 and max(shown) == row and min(shown) == 0
+        newest_before = max(before, default=0)
+        assert shown >= before - {newest_before} or len(shown) <= len(before)
+        before = shown
+    assert lines.shown_keyframes(path_of(20), 12) == (0, 5, 10)
+
+
+def test_a_browsers_viewpoint_sees_as_far_up_as_it_says() -> None:
+    camera = viewpoint(np.radians(60.0), 1.5, 200)
+    assert (camera.width, camera.height) == (300, 200)
+    assert np.degrees(2 * np.arctan(100 / camera.fy)) == pytest.approx(60.0) and camera.fx == camera.fy
+    assert (camera.cx, camera.cy) == (149.5, 99.5)
+
+
+def test_layers_show_what_the_renderer_gives() -> None:
+    field, camera, T = field_of(400), Camera(40, 30, 30.0, 30.0, 19.5, 14.5), np.eye(4)
+    T[2, 3] = -0.5
+    seen = render(field, camera, se3.inverse(T))
+    shown = {n: picture_of(field, camera, T, n, OPTIONS, "auto") for n in ("colour", "depth", "V", "U", "opacity")}
+    np.testing.assert_array_equal(shown["colour"].pixels, (seen.color.clamp(0, 1) * 255).round().numpy())
+    assert shown["colour"].legend is None
+    np.testing.assert_array_equal(shown["opacity"].pixels[..., 0], (seen.alpha * 255).double().round().numpy())
+    covered = (seen.alpha > 0.5).numpy()
+    for name in ("depth", "V", "U"):
+        bare = (shown[name].pixels == palette.NO_READING).all(-1)
+        np.testing.assert_array_equal(bare, ~covered)
+    root = seen.variance.mean(2).clamp(min=0).sqrt().numpy()
+    legend = shown["V"].legend
+    assert legend is not None and legend.high == pytest.approx(np.percentile(root[covered], 99), rel=1e-5)
+    depth = shown["depth"].legend
+    assert depth is not None and 2.0 < depth.low < depth.high < 4.5 and depth.unit == " m"
+
+
+def test_u_is_the_spread_of_depth_about_the_maps_own() -> None:
+    """Two sheets behind one another: w₁ = a, w₂ = (1 − a) a at depths 1 and 2."""
+    a, z = 0.7, torch.tensor([1.0, 2.0])
+    means = torch.stack([torch.zeros(2), torch.zeros(2), z], 1)
+    scales = torch.tensor([[5.0, 5.0, 1e-4]] * 2)
+    field = GaussianField.from_values(means, scales, torch.zeros(2, 3), opacities=a)
+    made = picture_of(field, Camera(8, 8, 100.0, 100.0, 3.5, 3.5), np.eye(4), "U", OPTIONS, "auto")
+    w1, w2 = a, (1 - a) * a
+    about = (w1 * 1 + w2 * 2) / (w1 + w2)
+    expected = np.sqrt((w1 * (1 - about) ** 2 + w2 * (2 - about) ** 2) / (w1 + w2))
+    assert made.legend is not None and made.legend.high == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_legend_runs_from_end_to_end() -> None:
+    drawn = legend_picture(Legend(palette.INFERNO, 0.0, 0.25, " m"))
+    np.testing.assert_array_equal(drawn[0, [0, -1]], palette.INFERNO[[0, -1]])
+    assert len(np.unique(drawn[20:].reshape(-1, 3), axis=0)) > 2

@@ -1,0 +1,233 @@
+"""What the viewer reads of run folders and of a run in work: the same map, path and pictures; a bounded rate."""
+
+import shutil
+import socket
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sigmasplat import cli, session
+from sigmasplat.config import Config
+from sigmasplat.config.text import override
+from sigmasplat.errors import ConfigError, RunError, SigmaSplatError
+from sigmasplat.evaluate import evaluate
+from sigmasplat.io.runs import TRUTH, RunFolder
+from sigmasplat.io.submaps import DiskStore
+from sigmasplat.io.trajectory import read_trajectory
+from sigmasplat.model import se3
+from sigmasplat.presets import default_preset, preset
+from sigmasplat.protocols import Together
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources import SyntheticRoom, open_source
+from sigmasplat.viewer.address import free_port, is_private, open_server, url_of
+from sigmasplat.viewer.finished import Shelf, ended, refuse_mapless, running
+from sigmasplat.viewer.live import ACTIVE_SHARE, LiveView
+from sigmasplat.viewer.moment import Moment
+from sigmasplat.viewer.splats import Cut, joined
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+
+ROOM, FRAMES = "synthetic:frames=120,width=64,height=48", 14
+
+
+def settings(**more: str) -> Config:
+    quick = {"input.width": "64", "mapping.first_iterations": "4", "mapping.iterations": "2", "submaps.distance_m": "0",
+             "submaps.angle_deg": "0", "submaps.uncertainty_m": "0", "submaps.frames": "5", "loops.close": "no",
+             "final.iterations": "3"}  # fmt: skip
+    return override(preset(default_preset()), quick | more)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """Run a few frames in three submaps and evaluate them."""
+    config = settings()
+    source = open_source(ROOM, override(config, {"input.limit": str(FRAMES)}).input)
+    run = RunFolder.create(tmp_path_factory.mktemp("view") / "run", config, "room")
+    session.record(Slam(config, run.submaps), source, run)
+    evaluate(run, source, views_per_kind=1, strips_per_kind=0)
+    return run
+
+
+def test_a_run_that_has_ended_is_shown_as_it_was_written(finished: RunFolder) -> None:
+    shown = ended(finished)
+    assert shown.final is not None and torch.equal(shown.final.field.params, finished.read_map().params)
+    np.testing.assert_array_equal(shown.path.T_world_camera, finished.read_trajectory().T_world_camera)
+    log = finished.read_log()
+    assert shown.path.submaps.tolist() == [r["submap"] for r in log] and shown.path.submaps[-1] == 2
+    assert list(shown.path.keyframes) == [i for i, r in enumerate(log) if r["is_keyframe"]]
+    assert [piece.submap for piece in shown.pieces] == [0, 1, 2] and not shown.live and shown.status == "complete"
+    anchors = finished.read_checkpoint()[0]["T_world_submap"].numpy()
+    for index, piece in enumerate(shown.pieces):
+        assert torch.equal(piece.field.params, finished.submaps.load(index).field.params)
+        np.testing.assert_array_equal(piece.T_world_piece, anchors[index])
+    assert shown.camera == finished.submaps.load(0).camera
+
+
+def test_pictures_of_keyframes_come_from_the_submaps_or_from_the_sequence(finished: RunFolder) -> None:
+    shown, source = ended(finished), open_source(ROOM)
+    for row in shown.path.keyframes:
+        picture = shown.picture(row)
+        assert picture is not None
+        np.testing.assert_allclose(picture / 255.0, source.frame(row).color, atol=0.003)
+    other = next(row for row in range(FRAMES) if row not in shown.path.keyframes)
+    assert shown.picture(other) is None
+    read = ended(finished, source).picture(other)
+    assert read is not None
+    np.testing.assert_allclose(read / 255.0, source.frame(other).color, atol=0.003)
+
+
+def test_a_run_that_goes_on_is_shown_by_its_log_and_finished_submaps(finished: RunFolder) -> None:
+    shelf = Shelf(finished)
+    shown = running(finished, shelf)
+    whole = joined(shown.pieces, Cut())
+    torch.testing.assert_close(whole.params, joined(ended(finished).pieces, Cut()).params, rtol=1e-5, atol=1e-5)
+    assert shown.live and shown.final is None and len(shown.path) == FRAMES
+    again = running(finished, shelf)
+    assert [a.field for a in again.pieces] == [b.field for b in shown.pieces]  # the very same: nothing is sent again
+    row = shown.path.keyframes[1]
+    np.testing.assert_array_equal(shown.picture(row), ended(finished).picture(row))  # type: ignore[arg-type]
+    assert sum(len(p.field) for p in running(finished, Shelf(finished, budget=500)).pieces) <= 500
+
+
+def test_a_run_just_begun_shows_nothing_yet_and_one_without_a_map_is_refused(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run", settings(), "room")
+    shown = running(run, Shelf(run))
+    assert len(shown.path) == 0 and shown.pieces == () and shown.shown(True, 0) == ()
+    refuse_mapless(run)
+    run.note(status="failed")
+    with pytest.raises(RunError, match="has no map to show"):
+        refuse_mapless(run)
+
+
+def test_the_true_path_is_stored_aligned_and_gives_the_same_ate(finished: RunFolder) -> None:
+    aligned, path = read_trajectory(finished.path / TRUTH), finished.read_trajectory()
+    assert len(aligned) == FRAMES
+    np.testing.assert_allclose(aligned.timestamps_s, path.timestamps_s, atol=1e-8)
+    away_m = np.linalg.norm(aligned.T_world_camera[:, :3, 3] - path.T_world_camera[:, :3, 3], axis=1)
+    assert np.sqrt((away_m**2).mean()) == pytest.approx(finished.read_metrics()["ate"]["rmse_m"], rel=1e-6)
+    T = open_source(ROOM).truth().T_world_camera  # type: ignore[union-attr]
+    motion = se3.inverse(aligned.T_world_camera[0]) @ aligned.T_world_camera[5]
+    np.testing.assert_allclose(motion, se3.inverse(T[0]) @ T[5], atol=1e-9)
+    shown = ended(finished).true_positions
+    np.testing.assert_array_equal(shown, aligned.T_world_camera[:, :3, 3])  # type: ignore[arg-type]
+
+
+class Unknown(SyntheticRoom):
+    """The room without its truth."""
+
+    def truth(self) -> None:
+        return None
+
+
+def test_a_truth_that_is_known_no_longer_is_removed(finished: RunFolder, tmp_path: Path) -> None:
+    copied = RunFolder(tmp_path / "run")
+    shutil.copytree(finished.path, copied.path)
+    assert (copied.path / TRUTH).is_file()
+    evaluate(copied, Unknown(frames=120, width=64, height=48), views_per_kind=1, strips_per_kind=0)
+    assert not (copied.path / TRUTH).exists() and ended(copied).true_positions is None
+
+
+class Clock:
+    """A frame takes so long, and so does each look at the clock (the copy lies between two)."""
+
+    def __init__(self, frame_s: float, look_s: float = 0.0) -> None:
+        self.now_s, self.frame_s, self.look_s = 0.0, frame_s, look_s
+
+    def __call__(self) -> float:
+        self.now_s += self.look_s
+        return self.now_s
+
+
+def live_run(tmp_path: Path, clock: Clock, budget: int = 300_000) -> tuple[list[Moment], Slam]:
+    config, source, shown = settings(), open_source(ROOM), list[Moment]()
+    slam = Slam(config, DiskStore(tmp_path / "submaps"))
+    view = LiveView(slam, shown.append, "room", budget, every_s=2.0, clock=clock)
+    watch = Together(session.Unwatched(), view)
+    for i in range(FRAMES):
+        clock.now_s += clock.frame_s
+        watch(slam.step(source.frame(i)))
+    slam.finish(watch.finishing)
+    watch.last_loops([])
+    return shown, slam
+
+
+def test_a_run_in_work_is_shown_at_a_bounded_rate_from_copies(tmp_path: Path) -> None:
+    shown, slam = live_run(tmp_path, Clock(0.5))
+    steps = shown[:-2]  # then the beginning of refinement, and the end
+    assert [len(s.path) for s in steps] == [1, 5, 9, 13]  # each 2 s, at half a second a frame
+    assert [p.submap for p in steps[-1].pieces] == list(range(len(steps[-1].pieces)))
+    assert len(steps[-1].pieces) == int(steps[-1].path.submaps[-1]) + 1
+    first = steps[0].pieces[0].field.params
+    assert first.data_ptr() != slam.mapper.field.params.data_ptr() and torch.isfinite(first).all()
+    final = shown[-1].final
+    assert final is not None and torch.equal(final.field.params, slam.field.params)
+    np.testing.assert_array_equal(shown[-1].path.T_world_camera, slam.trajectory().T_world_camera)
+    assert all(s.live and s.true_positions is None for s in shown)
+
+
+def test_the_live_map_is_the_systems_own_and_its_pictures_what_keyframes_saw(tmp_path: Path) -> None:
+    shown, slam = live_run(tmp_path, Clock(10.0))  # due at each frame
+    assert len(shown) == FRAMES + 2
+    source = open_source(ROOM)
+    before_final = shown[-2]
+    kept = [slam.store.load(i).field.moved(torch.from_numpy(slam.atlas.anchors[i])).params for i in range(3)]
+    torch.testing.assert_close(joined(before_final.pieces, Cut()).params, torch.cat(kept))
+    for row in slam.keyframes:
+        picture = shown[-1].picture(row)
+        assert picture is not None
+        np.testing.assert_allclose(picture / 255.0, source.frame(row).color, atol=0.003)
+
+
+def test_a_live_map_keeps_to_its_budget_and_a_slow_copy_comes_less_often(tmp_path: Path) -> None:
+    shown, _ = live_run(tmp_path / "a", Clock(10.0), budget=600)
+    assert len(shown) == FRAMES + 2
+    for moment in shown[:-1]:
+        assert sum(len(p.field) for p in moment.pieces) <= 600
+        if len(moment.pieces) == 1:
+            assert len(moment.pieces[0].field) <= 600 * ACTIVE_SHARE
+    assert shown[-1].final is not None and len(shown[-1].final.field) <= 600
+    slow, _ = live_run(tmp_path / "b", Clock(1.0, look_s=0.1))  # a tenth of a second: once in 5 s
+    assert [len(s.path) for s in slow[:-2]] == [1, 6, 11]
+
+
+def test_the_next_free_port_is_taken_and_nonsense_is_refused() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert port < free_port("127.0.0.1", port) <= port + 100
+    assert free_port("127.0.0.1", port) == port
+    with pytest.raises(ConfigError, match="--port must be from 0 to 65535, found 70000"):
+        free_port("127.0.0.1", 70000)
+    with pytest.raises(SigmaSplatError, match=r"cannot listen on 203\.0\.113\.7"):
+        free_port("203.0.113.7", 0)
+    assert url_of("127.0.0.1", 80) == url_of("0.0.0.0", 80) == "http://127.0.0.1:80"
+    assert url_of("::1", 81) == "http://[::1]:81" and url_of("box.local", 82) == "http://box.local:82"
+    assert [is_private(h) for h in ("127.0.0.1", "localhost", "0.0.0.0", "10.0.0.2")] == [True, True, False, False]
+
+
+def test_without_viser_one_line_says_what_to_install(
+    finished: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(SigmaSplatError, match=r"pip install 'sigmasplat\[viewer\]'"):
+        open_server("127.0.0.1", 0, "x")
+    for command in (["view", str(finished.path)], ["run", ROOM, "--out", str(tmp_path / "run"), "--view"]):
+        with pytest.raises(SystemExit) as left:
+            cli.main(command)
+        said = capsys.readouterr()
+        assert left.value.code == 2 and said.err.count("\n") == 1 and "sigmasplat[viewer]" in said.err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_without_a_map_cannot_be_viewed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = RunFolder.create(tmp_path / "run", settings(), "room")
+    run.note(status="failed")
+    for folder, says in ((run.path, "has no map to show"), (tmp_path / "none", "no run folder")):
+        with pytest.raises(SystemExit) as left:
+            cli.main(["view", str(folder)])
+        said = capsys.readouterr().err
+        assert left.value.code == 2 and said.count("\n") == 1 and says in said

@@ -1,0 +1,216 @@
+"""The viewer in a real browser: headless Chromium, software WebGL. A finished run and a live one, by their pictures."""
+
+import base64
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from sigmasplat.config.text import override
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.metrics import palette
+from sigmasplat.presets import default_preset, preset
+from sigmasplat.session import record
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources import open_source
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+pytest.importorskip("viser", reason="viser is not installed (pip install 'sigmasplat[viewer]')")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium (apt-get install chromium)")
+
+WIDTH, HEIGHT, PANEL = 800, 600, 340
+"""The window, and how much of its right side the panel covers."""
+FLAGS = [
+    "--headless=new", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--disable-dev-shm-usage", "--no-proxy-server",
+    "--remote-debugging-port=0", f"--window-size={WIDTH},{HEIGHT}",
+]  # fmt: skip
+PATIENCE_S = 120.0
+QUICK = {"input.width": "64", "mapping.first_iterations": "20", "mapping.iterations": "5", "submaps.distance_m": "0",
+         "submaps.angle_deg": "0", "submaps.uncertainty_m": "0", "submaps.frames": "6", "loops.close": "no",
+         "final.iterations": "5"}  # fmt: skip
+Pixels = NDArray[np.uint8]
+
+
+class Browser:
+    """A page in headless Chromium, driven over its DevTools protocol."""
+
+    def __init__(self, process: subprocess.Popen[bytes], port: int) -> None:
+        from websockets.sync.client import connect
+
+        self.process, self.calls = process, 0
+        pages: list[dict[str, str]] = []
+        wait_for(lambda: pages.extend(p for p in _pages(port) if p["type"] == "page") or bool(pages))
+        self.socket = connect(pages[0]["webSocketDebuggerUrl"], max_size=None)
+
+    def call(self, method: str, **params: Any) -> dict[str, Any]:
+        self.calls += 1
+        self.socket.send(json.dumps({"id": self.calls, "method": method, "params": params}))
+        while True:
+            answer = json.loads(self.socket.recv(timeout=PATIENCE_S))
+            if answer.get("id") == self.calls:
+                assert "error" not in answer, answer
+                return dict(answer["result"])
+
+    def screenshot(self) -> Pixels:
+        """Return what the window shows [H, W, 3]."""
+        data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
+        return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+
+    def scene(self) -> Pixels:
+        """Return what shows beside the panel, without the notice of software WebGL above."""
+        return self.screenshot()[200:, : WIDTH - PANEL]
+
+    def text(self) -> str:
+        """Return the page's words."""
+        found = self.call("Runtime.evaluate", expression="document.body.innerText", returnByValue=True)
+        return str(found["result"]["value"])
+
+    def choose(self, label: str, option: str) -> None:
+        """Choose an option of the dropdown beside a label, by mouse."""
+        beside = f"[...document.querySelectorAll('label')].find(l => l.innerText.trim() == {json.dumps(label)})"
+        self._click(f"document.getElementById({beside}.htmlFor)")
+        spoken = "[...document.querySelectorAll('[role=option]')].find(o => o.offsetParent && o.innerText.trim() == "
+        wait_for(lambda: self._there(f"{spoken}{json.dumps(option)})"))
+        self._click(f"{spoken}{json.dumps(option)})")
+
+    def _there(self, expression: str) -> bool:
+        return bool(self.call("Runtime.evaluate", expression=f"!!{expression}", returnByValue=True)["result"]["value"])
+
+    def _click(self, expression: str) -> None:
+        wait_for(lambda: self._there(expression))
+        middle = f"(b => [b.x + b.width / 2, b.y + b.height / 2])(({expression}).getBoundingClientRect())"
+        x, y = self.call("Runtime.evaluate", expression=middle, returnByValue=True)["result"]["value"]
+        for kind in ("mousePressed", "mouseReleased"):
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
+
+def _pages(port: int) -> list[dict[str, str]]:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=10) as answer:
+        return list(json.load(answer))
+
+
+@contextmanager
+def browser(url: str, profile: Path) -> Iterator[Browser]:
+    """Open a page in a Chromium of its own with an empty profile; never leave it behind."""
+    assert CHROMIUM is not None
+    process = subprocess.Popen(
+        [CHROMIUM, *FLAGS, f"--user-data-dir={profile}", url], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )  # fmt: skip
+    try:
+        told = profile / "DevToolsActivePort"
+        wait_for(lambda: told.is_file() and "\n" in told.read_text())
+        yield Browser(process, int(told.read_text().split()[0]))
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+@contextmanager
+def sigmasplat(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Run a command that shows something; give it and the address it printed."""
+    command = [sys.executable, "-u", "-m", "sigmasplat.cli", *arguments, "--port", "0"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        assert process.stdout is not None
+        said = ""
+        while not said.startswith("viewer: "):
+            said = process.stdout.readline()
+            assert said or process.poll() is None, f"ended with {process.poll()}"
+        yield process, said.split()[1]
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def wait_for(happened: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not happened():
+        assert time.monotonic() < deadline_s, "nothing happened"
+        time.sleep(0.3)
+
+
+def colours(pixels: Pixels) -> int:
+    """Count the colours, eight levels a channel."""
+    return len(np.unique((pixels // 32).reshape(-1, 3), axis=0))
+
+
+def likeness(pixels: Pixels, map_colours: NDArray[np.float64]) -> float:
+    """Return the share of the pixels that are not background and lie near a colour map."""
+    ramp = palette.colour(np.linspace(0, 1, 64), 0.0, 1.0, map_colours).astype(int)
+    lit = pixels.reshape(-1, 3).astype(int)
+    lit = lit[lit.max(1) > 60]
+    away = np.abs(lit[:, None] - ramp).max(2).min(1)
+    return float((away < 24).mean()) if len(lit) else 0.0
+
+
+def keep(pixels: Pixels, name: str) -> None:
+    """Write a screenshot where $SIGMASPLAT_SCREENSHOTS says, to be looked at."""
+    if folder := os.environ.get("SIGMASPLAT_SCREENSHOTS"):
+        Image.fromarray(pixels).save(Path(folder) / f"{name}.png")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """Record a tiny run."""
+    config = override(preset(default_preset()), QUICK)
+    source = open_source("synthetic:frames=120,width=64,height=48", override(config, {"input.limit": "14"}).input)
+    run = RunFolder.create(tmp_path_factory.mktemp("viewer") / "tiny", config, "room")
+    record(Slam(config, run.submaps), source, run)
+    return run
+
+
+def test_a_finished_run_shows_its_map_and_the_uncertainty_in_it(finished: RunFolder, tmp_path: Path) -> None:
+    with sigmasplat("view", str(finished.path)) as (process, url), browser(url, tmp_path / "profile") as page:
+        assert url.startswith("http://127.0.0.1:")
+        wait_for(lambda: "14 frames" in page.text() and colours(page.scene()) > 40)
+        plain = page.screenshot()
+        keep(plain, "finished")
+        page.choose("splats in", "σ")
+        wait_for(lambda: likeness(page.scene(), palette.INFERNO) > 2 * likeness(scene_of(plain), palette.INFERNO))
+        keep(page.screenshot(), "sigma")
+        by_sigma = page.scene()
+        assert np.abs(by_sigma.astype(int) - scene_of(plain)).mean() > 10
+        page.choose("show", "depth")
+        wait_for(lambda: likeness(page.scene(), palette.VIRIDIS) > 0.3)
+        keep(page.screenshot(), "depth")
+        process.send_signal(signal.SIGINT)
+        said, _ = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == 0 and "Traceback" not in said
+
+
+def scene_of(screenshot: Pixels) -> Pixels:
+    return screenshot[200:, : WIDTH - PANEL]
+
+
+def test_a_live_run_shows_its_map_while_it_grows_and_stays_until_ctrl_c(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    options = [word for pair in QUICK.items() for word in ("--set", "=".join(pair))]
+    room = ["synthetic:frames=4000,width=64,height=48", "--out", str(out), "--no-eval", "--view"]
+    with sigmasplat("run", *room, *options) as (process, url), browser(url, tmp_path / "profile") as page:
+        wait_for(lambda: "(running)" in page.text() and colours(page.scene()) > 40)
+        before = len(RunFolder(out).read_log())
+        keep(page.screenshot(), "live")
+        wait_for(lambda: len(RunFolder(out).read_log()) > before + 20)
+        assert process.poll() is None and "(running)" in page.text()
+        process.send_signal(signal.SIGINT)
+        said, _ = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == 130 and "Traceback" not in said and "viewer: Error" not in said
+    assert RunFolder.open(out).facts()["status"] == "interrupted"
