@@ -43,7 +43,8 @@ def calibration_of(bag: Bag, color: ImageTopic, depth: ImageTopic, settings: Inp
     units = depth_units(bag, depth)
     recorded = Calibration(optics.camera, units, optics.lens) if optics else None
     calibration = calibrated(bag.path, recorded, color.size, settings, units)
-    if settings.calibration or settings.register_depth == "off" or is_registered(color, depth):
+    told = settings.calibration or calibration.depth_camera or settings.register_depth == "off"
+    if told or is_registered(color, depth):
         return calibration
     depth_optics = optics_of(bag, depth)
     if depth_optics is None and depth.size == color.size:

@@ -116,18 +116,20 @@ def read_calibration(path: Path, size: tuple[int, int], default_units_per_metre:
 
 
 def calibrated(
-    folder: Path | str, recorded: Calibration | None, size: tuple[int, int], settings: InputConfig, default_units: float
+    folder: Path, recorded: Calibration | None, size: tuple[int, int], settings: InputConfig, default_units: float
 ) -> Calibration:
     """Return what is known of the cameras: the settings' words, else calibration.json's, else the recording's.
 
-    `size` (width, height) is the colour image's. Raises SourceError if no focal length is known.
+    `folder` is the recording, which may be a file too; `size` (width, height) is the colour image's. Raises SourceError
+    if no focal length is known.
     """
     beside = folder / "calibration.json"
     if settings.calibration or beside.is_file():
         recorded = read_calibration(Path(settings.calibration or beside), size, default_units)
     if recorded is None and not settings.fx:
+        place = "a file for --calibration" if folder.is_file() else beside
         raise SourceError(
-            f"camera unknown: {folder} says nothing of it; write {folder}/calibration.json with fx, fy, cx, cy, "
+            f"camera unknown: {folder} says nothing of it; write {place} with fx, fy, cx, cy, "
             "depth_scale (PNG units per metre), or give --fx PIXELS (and --fy, --cx, --cy, --depth-scale)"
         )
     if recorded is None:

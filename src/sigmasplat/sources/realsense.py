@@ -8,6 +8,7 @@ depth camera's axis, some millimetres off. With input.register_depth=on it is do
 import weakref
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,7 @@ class RealSense(LiveSource):
         camera, lens = _optics(sdk, color.get_intrinsics())
         recorded = Calibration(camera, round(1.0 / scale_m, 3), lens)
         size = (camera.width, camera.height)
-        calibration = calibrated("realsense", recorded, size, settings, recorded.depth_units_per_metre)
+        calibration = calibrated(Path("realsense"), recorded, size, settings, recorded.depth_units_per_metre)
         if settings.register_depth == "on" and not settings.calibration:
             depth_camera, depth_lens = _optics(sdk, depth.get_intrinsics())
             T = _transform(depth.get_extrinsics_to(color))
