@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat import surface
+from sigmasplat.apart import score_apart
 from sigmasplat.config import Config, FinalConfig, InputConfig
 from sigmasplat.errors import RunError
+from sigmasplat.gallery import Gallery
 from sigmasplat.io.runs import TRUTH, RunFolder
 from sigmasplat.io.trajectory import write_trajectory
 from sigmasplat.metrics import charts, plot, views
-from sigmasplat.metrics.panels import View, side_by_side
-from sigmasplat.metrics.trajectory import aligned_truth, associate, path_scores_of
+from sigmasplat.metrics.trajectory import aligned_truth, associate, path_scores_of, truth_in_estimate
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
@@ -67,6 +68,11 @@ def evaluate(
         known = None if problem else truth
         found = surface.fuse_and_score(run, source.camera, source.true_surface(), known, renderer, progress)
         metrics["reconstruction"] = found
+    metrics["test_views"] = None
+    apart = source.test_views()
+    if apart is not None and truth is not None and problem is None:
+        world = apart.truth(), truth_in_estimate(*_positions(log), truth)
+        metrics["test_views"] = score_apart(apart, *world, field, config.input, renderer, gallery, views_per_kind)
     run.write_metrics(metrics)
     plots = _draw_plots(run, log, None if problem else truth, loops)
     warnings = [str(problem)] if problem else []
@@ -75,23 +81,6 @@ def evaluate(
     if problem:
         raise problem
     return metrics
-
-
-class Gallery:
-    """Draw the strips of a few views of each kind into images/ and remember their names for the report."""
-
-    def __init__(self, run: RunFolder, per_kind: int) -> None:
-        """Start empty; strips of an earlier evaluation are removed, since the views may differ."""
-        self.run, self.per_kind = run, per_kind
-        self.strips: dict[str, list[str]] = {}
-        for old in run.images.glob("view-*.png"):
-            old.unlink()
-
-    def add(self, view: View, place: str = "") -> None:
-        """Draw one view; `place` says in which map it was seen if not in the final one."""
-        name = f"view-{view.kind.replace(' ', '-')}{place and '-submap'}-{view.index:06d}.png"
-        self.run.write_image(name, side_by_side(view))
-        self.strips.setdefault(f"{view.kind} views{place}", []).append(f"images/{name}")
 
 
 def _anchors(run: RunFolder, records: Log, final: FinalConfig) -> NDArray[np.float64] | None:
@@ -212,10 +201,15 @@ def _worst_frame_s(log: Log) -> float | None:
     return max((charts.seconds_of(record) for record in log if record["row"]), default=0.0) or None
 
 
+def _positions(log: Log) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the times [N], s, and the estimated positions [N, 3], m, of the logged frames."""
+    times_s = np.array([record["timestamp_s"] for record in log])
+    return times_s, np.array([record["T_world_camera"][:3, 3] for record in log])
+
+
 def _draw_plots(run: RunFolder, log: Log, truth: Trajectory | None, loops: Log) -> dict[str, str]:
     """Draw path, submaps and times in both themes, and write truth.txt; return the captions by name."""
-    times = np.array([record["timestamp_s"] for record in log])
-    estimate = np.array([record["T_world_camera"][:3, 3] for record in log])
+    times, estimate = _positions(log)
     known: NDArray[np.float64] | None = None
     aligned: Trajectory | None = None
     if truth is not None:

@@ -29,6 +29,8 @@ FLOORS = [
         "exports",
         "ablation",
         "inspection",
+        "apart",
+        "gallery",
         "page",
         "snapshots",
         "download",

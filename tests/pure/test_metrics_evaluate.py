@@ -355,3 +355,43 @@ def test_runs_without_frames_or_of_two_sessions_are_refused(run: RunFolder) -> N
     (run.path / "log.jsonl").write_text("")
     with pytest.raises(RunError, match=r"empty log\.jsonl"):
         score(run, HandMade(None))
+
+
+class Apart(HandMade):
+    """The same frames as views kept apart, of which one cannot be read and one has no pose."""
+
+    def __init__(self, poses: Trajectory | None) -> None:
+        super().__init__(poses)
+
+    def frame(self, i: int) -> Frame:
+        if i == 3:
+            raise SourceError("3.png: unreadable image")
+        return super().frame(i)
+
+
+class WithViews(HandMade):
+    def __init__(self, truth: Trajectory | None, apart: Source) -> None:
+        super().__init__(truth)
+        self.apart = apart
+
+    def test_views(self) -> Source:
+        return self.apart
+
+
+def test_views_kept_apart_are_scored_at_their_true_poses(run: RunFolder) -> None:
+    """The run's path is exact, so the fit of the truth is the world's and each view is recognised by its pose."""
+    truth = truth_of()
+    known = Trajectory(truth.timestamps_s[:-1], truth.T_world_camera[:-1])
+    renderer = KnownErrors(training=0.02, held_out=0.02)
+    metrics = score(run, WithViews(truth, Apart(known)), renderer=renderer, strips_per_kind=2)
+    assert metrics["test_views"]["views"] == FRAMES - 2
+    assert metrics["test_views"]["psnr_db"] == pytest.approx(metrics["held_out"]["psnr_db"], abs=0.3)
+    assert len(list(run.images.glob("view-test-*.png"))) == 2
+    page = (run.path / "report.html").read_text()
+    assert "PSNR, views kept apart" in page and "kept apart" in page
+
+
+def test_views_kept_apart_need_the_truth(run: RunFolder) -> None:
+    assert score(run, HandMade(truth_of()))["test_views"] is None
+    assert score(run, WithViews(None, Apart(truth_of())))["test_views"] is None
+    assert score(run, WithViews(truth_of(), Apart(None)))["test_views"] is None

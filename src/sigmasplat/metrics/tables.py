@@ -18,9 +18,12 @@ def headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     surface = [("Surface F1 at 1 cm", number(found["f1"], 1, 100.0), "%")] if found else []
     before = metrics.get("held_out_submaps")
     in_submaps = [("PSNR, held-out, in submaps", number(before.get("psnr_db"), 2), "dB")] if before else []
+    test = metrics.get("test_views")
+    apart = [("PSNR, views kept apart", number(test.get("psnr_db"), 2), "dB")] if test else []
     return [
         ("ATE RMSE", number(ate.get("rmse_m"), 2, 100.0), "cm"),
         ("PSNR, held-out", number(held_out.get("psnr_db"), 2), "dB"),
+        *apart,
         *in_submaps,
         ("Depth L1, held-out", number(held_out.get("depth_l1_m"), 2, 100.0), "cm"),
         *surface,
@@ -87,6 +90,8 @@ def _loop_row(loop: dict[str, Any]) -> list[str]:
 
 def _picture_rows(metrics: dict[str, Any]) -> list[list[str]]:
     columns = {"training": "training", "held-out": "held_out"}
+    if metrics.get("test_views"):
+        columns |= {"kept apart": "test_views"}
     if metrics.get("training_submaps") or metrics.get("held_out_submaps"):
         columns |= {"training, in submaps": "training_submaps", "held-out, in submaps": "held_out_submaps"}
     kinds = [metrics.get(key) or {} for key in columns.values()]

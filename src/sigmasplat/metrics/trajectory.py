@@ -56,8 +56,14 @@ def aligned_truth(times_s: Matrix, estimate: Matrix, truth: Trajectory) -> tuple
     times_s [N], estimate [N, 3]: of all frames, m. Frames without a true pose in time are left out.
     """
     rows, truth_rows = associate(times_s, truth.timestamps_s)
-    T_estimate_truth = align_rigid(truth.T_world_camera[truth_rows, :3, 3], estimate[rows])
+    T_estimate_truth = truth_in_estimate(times_s, estimate, truth)
     return rows, Trajectory(times_s[rows], T_estimate_truth @ truth.T_world_camera[truth_rows])
+
+
+def truth_in_estimate(times_s: Matrix, estimate: Matrix, truth: Trajectory) -> Matrix:
+    """Return T_estimate_truth [4, 4], the ATE's rigid fit of true positions to estimated ones [N, 3], m."""
+    rows, truth_rows = associate(times_s, truth.timestamps_s)
+    return align_rigid(truth.T_world_camera[truth_rows, :3, 3], estimate[rows])
 
 
 def associate(times_a_s: Matrix, times_b_s: Matrix, max_difference_s: float = 0.02) -> tuple[Rows, Rows]:

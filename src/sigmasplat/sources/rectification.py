@@ -25,7 +25,7 @@ class Rectification:
     """Turn recorded colour and depth into images of `camera`, as the settings ask.
 
     Registered depth has the colour image's pixels and lens. Depth of a camera of its own is taken out of its lens,
-    then moved to the colour camera, which is made no finer than the depth camera is.
+    then moved to the colour camera, which is made no finer than the depth camera is, or the images worked on.
     """
 
     def __init__(self, name: str, calibration: Calibration, settings: InputConfig) -> None:
@@ -39,7 +39,7 @@ class Rectification:
         self._depth_lens = self._color_lens
         self._registration: Registration | None = None
         if depth_camera is not None:
-            self.camera = _no_finer(calibration.camera, depth_camera)
+            self.camera = _no_finer(calibration.camera, max(depth_camera.width, settings.width))
             self._depth_lens = _undistortion(depth_camera, depth_lens)
             self._registration = Registration(depth_camera, self.camera, calibration.T_color_depth)
 
@@ -100,8 +100,6 @@ def _undistortion(camera: Camera, coefficients: tuple[float, ...] | None) -> Und
     return Undistortion(camera, np.array(coefficients)) if coefficients else None
 
 
-def _no_finer(color: Camera, depth: Camera) -> Camera:
-    """Return the colour camera at no more pixels across than the depth camera has."""
-    if color.width <= depth.width:
-        return color
-    return color.resized(depth.width, round(color.height * depth.width / color.width))
+def _no_finer(color: Camera, width: int) -> Camera:
+    """Return the colour camera at no more than so many pixels across."""
+    return color if color.width <= width else color.resized(width, round(color.height * width / color.width))
