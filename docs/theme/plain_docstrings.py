@@ -11,7 +11,7 @@ MARKS = re.compile(r"(`+[^`]*`+)|([\\*_<\[\]])")
 def escaped(text: str) -> str:
     """Return a docstring as Markdown that shows it; code between backticks and blocks set in by four are left."""
     return "\n".join(
-        line if line.startswith("    ") else MARKS.sub(lambda m: m[1] or f"\\{m[2]}", line)
+        line if line.startswith("    ") else MARKS.sub(lambda m: m[1] or ("&lt;" if m[2] == "<" else f"\\{m[2]}"), line)
         for line in text.splitlines()
     )
 
