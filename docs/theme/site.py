@@ -78,7 +78,7 @@ def overview(readme: str) -> str:
 def source_page(path: Path) -> str:
     """Write a page that shows a file as it is, or what a folder holds; search leaves it out."""
     place = path.relative_to(ROOT).as_posix()
-    head = f"---\ntitle: {path.name}\nsearch:\n  exclude: true\n---\n\n# {place}\n\n"
+    head = f"---\ntitle: {path.name}\nhide: [navigation, toc]\nsearch:\n  exclude: true\n---\n\n# {place}\n\n"
     if path.is_dir():
         return head + "".join(f"- [{file.name}]({path.name}/{file.name}.md)\n" for file in shown_files(path))
     return f"{head}````{LANGUAGES.get(path.suffix, 'text')}\n{path.read_text(encoding='utf-8').rstrip()}\n````\n"

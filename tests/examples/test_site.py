@@ -3,8 +3,8 @@
 import importlib
 import importlib.util
 import re
-from pathlib import Path
-from types import ModuleType
+import sys
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
@@ -17,14 +17,18 @@ NOT_DOCUMENTED = {"native", "commands", "cli", "screen", "doctor", "page", "view
 """Kernels, and what is used from the command line only."""
 
 
-@pytest.fixture(scope="module")
-def site() -> ModuleType:
-    """Load docs/theme/site.py."""
-    spec = importlib.util.spec_from_file_location("docs_site", DOCS / "theme" / "site.py")
+def theme(name: str) -> ModuleType:
+    """Load docs/theme/NAME.py."""
+    spec = importlib.util.spec_from_file_location(f"docs_{name}", DOCS / "theme" / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def site() -> ModuleType:
+    return theme("site")
 
 
 def test_every_page_is_in_the_navigation(site: ModuleType) -> None:
@@ -85,6 +89,15 @@ def test_what_pages_load_from_elsewhere_is_noticed(site: ModuleType) -> None:
     assert site.fetched('<a href="https://x.y/">there</a><script src="theme/a.js"></script><img src="a//b.png">') == []
 
 
+def test_docstrings_are_shown_as_they_are_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    griffe = SimpleNamespace(Extension=object, Object=object)
+    monkeypatch.setitem(sys.modules, "griffe", griffe)  # the site's tools need not be here
+    escaped = theme("plain_docstrings").escaped
+    assert escaped("E[c] [H, W], a * b * c, T_a_b, <name>") == r"E\[c\] \[H, W\], a \* b \* c, T\_a\_b, &lt;name>"
+    assert escaped("`a_b[0]` and ``c*d``") == "`a_b[0]` and ``c*d``"
+    assert escaped("layout:\n\n    x[0] * y_z\n\nend_") == "layout:\n\n    x[0] * y_z\n\nend\\_"
+
+
 def test_the_api_pages_hold_every_module_and_every_public_name() -> None:
     shown = {
         name
@@ -101,4 +114,4 @@ def test_the_api_pages_hold_every_module_and_every_public_name() -> None:
 
 
 def test_the_page_of_results_holds_all_of_them() -> None:
-    assert "<!-- bench:* -->" in Path(DOCS / "benchmarks.md").read_text(encoding="utf-8")
+    assert "<!-- bench:* -->" in (DOCS / "benchmarks.md").read_text(encoding="utf-8")
