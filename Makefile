@@ -1,6 +1,7 @@
 # make demo   install into .venv and run SLAM on the built-in synthetic room
 # make test   install with the development tools, then lint, types, tests
 # make native compile the kernels beside their sources, for work with PYTHONPATH=src
+# make docs   the documentation as a site in site/, to be read from the disk
 # make wheel  a wheel in dist/ that runs where no compiler is; PYTHON=python3.12 for another Python
 # make sdist  the sources as one archive in dist/
 # make clean  remove .venv and everything built
@@ -28,7 +29,7 @@ version_of = $(shell $(1) -c 'import sys; print("%d.%d" % sys.version_info[:2])'
 same_python = $(filter $(call version_of,$(PYTHON)),$(or $(call version_of,$(BIN)/python),$(call version_of,$(PYTHON))))
 WHEEL_VENV = $(if $(same_python),$(VENV),build/venv-$(or $(call version_of,$(PYTHON)),missing))
 
-.PHONY: demo test lint types pytest install install-dev native wheel sdist wheel-here clean
+.PHONY: demo test lint types pytest install install-dev native docs wheel sdist wheel-here clean
 .DELETE_ON_ERROR:
 
 demo: install
@@ -82,6 +83,17 @@ native: $(VENV)/build-tools
 		-DPython_EXECUTABLE=$(abspath $(BIN)/python) -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN)/ninja)
 	$(BIN)/cmake --build build/inplace
 
+docs: $(VENV)/installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "documentation: site/index.html"
+
+# The tools alone: the API is read from the sources, so nothing is compiled and no torch is needed.
+$(VENV)/installed-docs: pyproject.toml constraints.txt | $(VENV)/created
+	@echo "installing the documentation's tools into $(VENV)"
+	$(INSTALL) $$($(BIN)/python -c 'import tomllib; project = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
+		print(*project["optional-dependencies"]["docs"])')
+	@touch $@
+
 wheel:
 	@$(MAKE) --no-print-directory wheel-here VENV=$(WHEEL_VENV)
 
@@ -100,6 +112,6 @@ $(VENV)/wheel-tools: $(VENV)/build-tools
 	@touch $@
 
 clean:
-	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) build dist site .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find src -name '*.so' -delete
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +

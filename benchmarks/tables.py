@@ -3,8 +3,10 @@
 A document holds <!-- bench:NAME --> … <!-- /bench -->, or bench:NAME/SECTION for one table of several;
 `python benchmarks/tables.py` rewrites what stands between, in README.md and docs/*.md. NAME is that of the results
 (the newest of any machine) or the whole file name without .json; SECTION is a table's title, as in path-and-speed.
+bench:* is all there is, each result under a heading of its own.
 """
 
+import ast
 import importlib
 import math
 import re
@@ -17,7 +19,7 @@ from typing import Annotated, Any
 import record
 import tyro
 
-BLOCK = re.compile(r"(<!-- bench:(?P<what>[\w./+-]+) -->\n)(?P<body>.*?)(<!-- /bench -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- bench:(?P<what>[\w./+-]+|\*) -->\n)(?P<body>.*?)(<!-- /bench -->)", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -75,14 +77,37 @@ def compared(measured: Sequence[dict[str, Any]], source: str) -> str:
     return f"{head}\n\n{section.markdown()}"
 
 
+def everything(folder: Path = record.RESULTS) -> str:
+    """Write every result of a folder: a heading, what its benchmark asks, every table. By benchmark, then by name."""
+    found = [(record.read(path), path.stem) for path in folder.glob("*.json")]
+    ordered = sorted(found, key=lambda pair: (pair[0]["benchmark"], pair[0]["name"] != pair[0]["benchmark"], pair[1]))
+    names = [m["name"] for m, _ in ordered]
+    titles = [m["name"] if names.count(m["name"]) == 1 else stem for m, stem in ordered]
+    written = (
+        f"## {title}\n\n{question(m['benchmark'])}\n\n{table(m)}" for title, (m, _) in zip(titles, ordered, strict=True)
+    )
+    return "\n" + "\n".join(written)
+
+
+def question(benchmark: str) -> str:
+    """Say what a benchmark asks, by the first line of its program, and link to what its figures mean."""
+    program = f"{benchmark}.py"
+    source = (record.ROOT / "benchmarks" / program).read_text(encoding="utf-8")
+    asked = (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
+    return f"{asked} Figures: [{program}](../benchmarks/README.md#{program.replace('.', '')})."
+
+
 def rewritten(text: str, folder: Path = record.RESULTS) -> tuple[str, list[str]]:
     """Return a document with every block replaced by its table, and the names of blocks left as they were: no results.
 
-    `bench:NAME+NAME/SOURCE` compares several results. Raises KeyError for a table that the results do not have.
+    `bench:NAME+NAME/SOURCE` compares several results; `bench:*` is all there are.
+    Raises KeyError for a table that the results do not have.
     """
     missing: list[str] = []
 
     def block(match: re.Match[str]) -> str:
+        if match["what"] == "*":
+            return f"{match[1]}{everything(folder)}{match[4]}"
         name, _, section = match["what"].partition("/")
         found = {part: record.latest(part, folder) for part in name.split("+")}
         missing.extend(part for part, results in found.items() if results is None)

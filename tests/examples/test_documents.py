@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import importlib
 import re
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from sigmasplat.presets import list_presets, preset
 
 PACKAGE = ROOT / "src" / "sigmasplat"
 SECTIONS = [f.name for f in dataclasses.fields(Config) if dataclasses.is_dataclass(getattr(Config(), f.name))]
-each_document = pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+each_document = pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
 
 
 def anchors(path: Path) -> set[str]:
@@ -89,6 +90,17 @@ def test_documented_messages_are_those_of_the_source() -> None:
     for message in re.findall(r"`([^`]+)`", "\n".join(rows)):
         for words in filter(None, (part.strip() for part in message.split("…"))):
             assert any(words in constant for constant in constants), f"errors.md: no message says {words!r}"
+
+
+def test_measured_tables_are_those_of_the_results(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    tables, record = map(importlib.import_module, ("tables", "record"))
+    for path in DOCUMENTS:
+        text = path.read_text(encoding="utf-8")
+        assert tables.rewritten(text)[0] == text, f"{path.name}: run python benchmarks/tables.py"
+    shown = tables.everything()
+    for results in record.RESULTS.glob("*.json"):
+        assert record.read(results)["commit"][:9] in shown
 
 
 def test_measured_tables_have_their_places() -> None:

@@ -11,6 +11,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+import torch
 
 import sigmasplat
 import sigmasplat.sources
@@ -20,6 +21,7 @@ from sigmasplat.commands import options
 from sigmasplat.config.text import override
 from sigmasplat.io.runs import FILES, RunFolder
 from sigmasplat.presets import default_preset, preset
+from sigmasplat.render import render
 from sigmasplat.sources import open_source
 from sigmasplat.sources.opening import formats
 
@@ -117,6 +119,28 @@ def test_example_own_loss(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(losses, "TERMS", dict(losses.TERMS))
     found = example("own_loss").main("15")
     assert found[-1] < 0.7 * found[0]
+
+
+def test_example_own_uncertainty(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
+    found = example("own_uncertainty").main("8")
+    assert found["ours"] > 0.15 and found["ours"] > found["V, which is of colour"]
+    assert found["apart_m"] < 0.005 and found["agreement"] > 0.8
+    assert capsys.readouterr().out.count("Spearman") == 2
+
+
+def test_example_own_channel() -> None:
+    pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
+    module = example("own_channel")
+    assert module.main("20") > 0.85
+    source = open_source("synthetic:frames=240,width=64,height=48")
+    field, camera = module.seeded(source.frame(0)), source.camera
+    features = torch.stack([torch.ones(len(field)), field.colors[:, 0], field.means[:, 2]], 1)
+    sums, alpha = module.blended(field, features, camera, np.eye(4))
+    seen = render(field, camera, np.eye(4))
+    assert torch.allclose(sums[..., 0], alpha, atol=1e-5)  # a channel that is 1 everywhere gathers alpha
+    assert torch.allclose(sums[..., 1], seen.color[..., 0], atol=1e-5)
+    assert torch.allclose(sums[..., 2], seen.depth, atol=1e-4)
 
 
 def test_a_format_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

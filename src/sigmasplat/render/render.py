@@ -54,7 +54,7 @@ def covariance_features(colors: Tensor, z: Tensor, variances: Tensor, correlatio
 
 
 def covariance_of(color: Tensor, second: Tensor) -> Tensor:
-    """Apply the law of total covariance to E[c] [H, W, 3] and E[Σ + c cᵀ] [H, W, 6]: V = E[Σ + c cᵀ] − E[c] E[c]ᵀ."""
+    """Apply the law of total covariance: V = E[Σ + c cᵀ] − E[c] E[c]ᵀ [H, W, 6] of E[c] [H, W, 3] and E[Σ + c cᵀ]."""
     return second - outer(color)
 
 
