@@ -13,7 +13,7 @@ from documents import DOCUMENTS, ROOT
 
 DOCS = ROOT / "docs"
 PACKAGE = ROOT / "src" / "sigmasplat"
-NOT_DOCUMENTED = {"native", "commands", "cli", "screen", "doctor", "page", "viewer", "__init__", "__main__"}
+NOT_DOCUMENTED = {"native", "commands", "cli", "screen", "doctor", "page", "gallery", "viewer", "__init__", "__main__"}
 """Kernels, and what is used from the command line only."""
 
 

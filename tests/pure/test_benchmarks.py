@@ -249,7 +249,7 @@ def test_a_job_is_what_the_command_line_runs(tmp_path: Path, capsys: pytest.Capt
     assert (python, module, command) == (sys.executable, ["-m", "sigmasplat.cli"], "run")
     with pytest.raises(SystemExit):
         cli.main(job.command(tmp_path / "run")[3:])
-    assert f"no such folder: {nowhere}" in capsys.readouterr().err  # every option was understood
+    assert f"no such folder or file: {nowhere}" in capsys.readouterr().err  # every option was understood
     assert job.key()["config"]["mapping"]["iterations"] == 5 and job.key()["config"]["seed"] == 1
 
 
