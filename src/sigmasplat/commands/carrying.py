@@ -1,12 +1,12 @@
 """Carry a run through to its end: watched on the terminal and in the browser, kept now and then, scored."""
 
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sigmasplat.commands.evaluate import score
-from sigmasplat.commands.options import source_of
-from sigmasplat.commands.view import stay
+from sigmasplat.commands.options import Ways, source_of
+from sigmasplat.commands.view import on_stage, stay
 
 if TYPE_CHECKING:
     from sigmasplat.io.runs import RunFolder
@@ -19,15 +19,9 @@ if TYPE_CHECKING:
 OK, INTERRUPTED = 0, 130
 
 
-@dataclass(frozen=True)
-class Ways:
-    """How a run is carried through: whether it is scored and its profile printed, how often its state is kept, seconds
-    (0 = at the end only), and where it is shown live."""
-
-    evaluate: bool
-    profile: bool
-    save_every_s: float
-    stage: "Stage | None"
+def stage_for(screen: "Screen", ways: Ways) -> AbstractContextManager["Stage | None"]:
+    """Open the viewer's stage where one is asked for. Raises as `on_stage`."""
+    return on_stage(screen, ways.host, ways.port) if ways.view else nullcontext()
 
 
 def announce(screen: "Screen", preset: str, source: "Source", folder: "RunFolder", record: Path | None) -> None:
@@ -45,20 +39,22 @@ def announce(screen: "Screen", preset: str, source: "Source", folder: "RunFolder
     screen.say(f"{source.name}: until Ctrl-C, {preset} → {folder.path}, recorded to {place}")
 
 
-def carry_through(screen: "Screen", begun: "Begun", source: "Source", folder: "RunFolder", ways: Ways) -> int:
+def carry_through(
+    screen: "Screen", begun: "Begun", source: "Source", folder: "RunFolder", ways: Ways, stage: "Stage | None"
+) -> int:
     """Run SLAM into the folder, live on the stage if there is one, then score it; return the exit code."""
     from sigmasplat.protocols import Together, Watcher
     from sigmasplat.session import record
     from sigmasplat.snapshots import Snapshots
     from sigmasplat.sources.live import LiveSource
 
-    keeper = Snapshots(begun.slam, folder, ways.save_every_s)
+    keeper = Snapshots(begun.slam, folder, ways.save_every)
     with screen.steps(None if source.live else len(source), begun.next_index) as steps:
         watch: Watcher = steps
-        if ways.stage:
+        if stage:
             from sigmasplat.viewer.live import LiveView
 
-            watch = Together(steps, LiveView(begun.slam, ways.stage.show, source.name))
+            watch = Together(steps, LiveView(begun.slam, stage.show, source.name))
         outcome = record(begun.slam, source, folder, watch, keeper, begun.next_index, begun.wall_s)
     if ways.profile:
         screen.profile(folder.read_profile())
@@ -78,8 +74,8 @@ def carry_through(screen: "Screen", begun: "Begun", source: "Source", folder: "R
         score(screen, folder, source)
     else:
         screen.say(f"{outcome.counts()}: {folder.path}")
-    if ways.stage:
-        stay(screen, ways.stage, folder, source)
+    if stage:
+        stay(screen, stage, folder, source)
     return OK
 
 

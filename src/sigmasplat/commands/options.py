@@ -12,6 +12,7 @@ from sigmasplat.config import Config
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.presets import list_presets, preset as preset_of
+from sigmasplat.viewer.address import HOST, PORT
 
 if TYPE_CHECKING:
     from sigmasplat.io.runs import RunFolder
@@ -173,6 +174,22 @@ class Taken:
 
 AS_RECORDED = Taken()
 TakenFlat = Annotated[Taken, arg(name=""), tyro.conf.OmitArgPrefixes]
+
+
+@dataclass(frozen=True)
+class Ways:
+    """How a run is carried through: scored or not, kept how often, shown where."""
+
+    evaluate: Evaluate = True
+    profile: Profile = False
+    save_every: SaveEvery = 60.0
+    view: View = False
+    host: Host = HOST
+    port: Port = PORT
+
+
+AS_USUAL = Ways()
+WaysFlat = Annotated[Ways, arg(name=""), tyro.conf.OmitArgPrefixes]
 
 
 def configured(preset: str, settings: Sequence[str], seed: int | None, taken: Taken = AS_RECORDED) -> Config:

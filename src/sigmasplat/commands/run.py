@@ -1,19 +1,15 @@
 """Run SLAM on a sequence, on a camera, or on the built-in room: sigmasplat demo | run | resume."""
 
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 from sigmasplat.commands import options
-from sigmasplat.commands.carrying import Ways, announce, carry_through
+from sigmasplat.commands.carrying import announce, carry_through, stage_for
 from sigmasplat.commands.options import absolute, configured, prepare_torch, source_of
-from sigmasplat.commands.view import on_stage
 from sigmasplat.errors import ConfigError
 from sigmasplat.presets import default_preset
-from sigmasplat.viewer.address import HOST, PORT
 
 DEFAULT_PRESET = default_preset()
-SAVE_EVERY_S = 60.0
 DEMO_FOLDER, DEMO_FRAMES = Path("runs/demo"), 120
 
 
@@ -43,13 +39,8 @@ def run(
     overwrite: options.Overwrite = False,
     taken: options.TakenFlat = options.AS_RECORDED,
     seed: options.Seed = None,
-    evaluate: options.Evaluate = True,
-    profile: options.Profile = False,
-    save_every: options.SaveEvery = SAVE_EVERY_S,
     record: options.Record = None,
-    view: options.View = False,
-    host: options.Host = HOST,
-    port: options.Port = PORT,
+    ways: options.WaysFlat = options.AS_USUAL,
 ) -> int:
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
@@ -73,23 +64,18 @@ def run(
         raise ConfigError("--record is for a live camera; the sequence is recorded already")
     elif warning := depth_warning(source):
         screen.warn(warning)
-    with on_stage(screen, host, port) if view else nullcontext() as stage:
+    with stage_for(screen, ways) as stage:
         folder = new_folder(out, config, source, overwrite, source_path=absolute(path))
         announce(screen, config.name, source, folder, record)
         prepare_torch()
         begun = Begun(Slam(config, folder.submaps))
-        return carry_through(screen, begun, source, folder, Ways(evaluate, profile, save_every, stage))
+        return carry_through(screen, begun, source, folder, ways, stage)
 
 
 def resume(
     run: options.RunPath,
-    evaluate: options.Evaluate = True,
-    profile: options.Profile = False,
-    save_every: options.SaveEvery = SAVE_EVERY_S,
     moved_to: options.MovedSource = None,
-    view: options.View = False,
-    host: options.Host = HOST,
-    port: options.Port = PORT,
+    ways: options.WaysFlat = options.AS_USUAL,
 ) -> int:
     """Go on with a run that was stopped or killed, where its state was last kept.
 
@@ -102,8 +88,8 @@ def resume(
     screen, folder = Screen(), RunFolder.open(run)
     source = source_of(folder, moved_to)
     prepare_torch()
-    with on_stage(screen, host, port) if view else nullcontext() as stage:
+    with stage_for(screen, ways) as stage:
         begun = resumed(folder, source)
         folder.note(status="running")
         screen.say(f"{source.name}: going on at frame {begun.next_index} of {len(source)} → {folder.path}")
-        return carry_through(screen, begun, source, folder, Ways(evaluate, profile, save_every, stage))
+        return carry_through(screen, begun, source, folder, ways, stage)
