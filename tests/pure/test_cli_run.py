@@ -138,6 +138,8 @@ class MadeUpSlam:
 def corridor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Corridor:
     """Put a made-up source, SLAM and evaluation in place of the real ones, and work in an empty folder."""
     source = Corridor()
+    # First: it imports the real SLAM, and would keep the made-up one for good. A made-up one has no state to keep.
+    monkeypatch.setattr("sigmasplat.snapshots.Snapshots.keep", lambda *ignored: None)
     module = ModuleType("sigmasplat.slam.slam")
     module.Slam = MadeUpSlam  # type: ignore[attr-defined]
     scores = ModuleType("sigmasplat.evaluate")
@@ -145,7 +147,6 @@ def corridor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Corridor:
     monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.setitem(sys.modules, scores.__name__, scores)
     monkeypatch.setattr("sigmasplat.sources.open_source", lambda path, settings=None: source)
-    monkeypatch.setattr("sigmasplat.snapshots.Snapshots.keep", lambda *ignored: None)  # of made-up SLAM there is none
     monkeypatch.setattr(MadeUpSlam, "at", {}, raising=False)
     monkeypatch.setattr(MadeUpSlam, "lost", set(), raising=False)
     monkeypatch.setattr(MadeUpSlam, "tried", {}, raising=False)
