@@ -1,13 +1,14 @@
 """Give every backend test the same two operators, `.project` and `.blend`, with the reference's signatures."""
 
-import importlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import wraps
 from typing import Any
 
 import pytest
+import torch
 
-MODULES = {"reference": "sigmasplat.render.reference", "cpu": "sigmasplat.render.cpu"}
+from emulated_cuda import Emulator, why_not
 
 
 @dataclass(frozen=True)
@@ -19,15 +20,70 @@ class Backend:
     blend: Callable[..., Any]
 
 
-@pytest.fixture(scope="session", params=list(MODULES))
+@pytest.fixture(scope="session")
+def emulator(tmp_path_factory: pytest.TempPathFactory) -> Emulator:
+    """Run the CUDA kernels' text on the CPU; each program is compiled when it is first needed."""
+    reason = why_not()
+    if reason:
+        pytest.skip(reason)
+    return Emulator(tmp_path_factory.mktemp("emulated"))
+
+
+@pytest.fixture(scope="session", params=["reference", "cpu", "emulated", "cuda"])
 def backend(request: pytest.FixtureRequest) -> Backend:
-    """Load a backend; the compiled one is skipped only where its extension module is not built."""
-    if request.param == "cpu":
-        pytest.importorskip(
-            "sigmasplat.native._core", reason="sigmasplat.native._core is not built (make test builds it)"
-        )
-    module = importlib.import_module(MODULES[request.param])
-    return Backend(request.param, module.project, module.blend)
+    """Load a backend: the definition, the CPU's kernels, the CUDA kernels emulated on the CPU and on a device."""
+    return MAKERS[request.param](request)
+
+
+def _reference(request: pytest.FixtureRequest) -> Backend:
+    from sigmasplat.render import reference
+
+    return Backend("reference", reference.project, reference.blend)
+
+
+def _cpu(request: pytest.FixtureRequest) -> Backend:
+    pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built (make test builds it)")
+    from sigmasplat.render import cpu
+
+    return Backend("cpu", cpu.project, cpu.blend)
+
+
+def _emulated(request: pytest.FixtureRequest) -> Backend:
+    from sigmasplat.render import cuda
+
+    emulator: Emulator = request.getfixturevalue("emulator")
+
+    def stand_in(operator: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(operator)
+        def run(*inputs: Any) -> Any:
+            with emulator.standing_in():
+                return operator(*inputs)
+
+        return run
+
+    return Backend("emulated", stand_in(cuda.project), stand_in(cuda.blend))
+
+
+def _cuda(request: pytest.FixtureRequest) -> Backend:
+    from sigmasplat.render import cuda, cuda_launch
+
+    reason = cuda_launch.missing()
+    if reason:
+        pytest.skip(reason)
+
+    def on_device(operator: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(operator)
+        def run(*inputs: Any) -> Any:
+            there = [x.cuda() if isinstance(x, torch.Tensor) else x for x in inputs]
+            found = operator(*there)
+            return type(found)(*(x if x is None else x.cpu() for x in found))
+
+        return run
+
+    return Backend("cuda", on_device(cuda.project), on_device(cuda.blend))
+
+
+MAKERS = {"reference": _reference, "cpu": _cpu, "emulated": _emulated, "cuda": _cuda}
 
 
 @pytest.fixture(params=["avx512", "avx2", "baseline"])

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat import env
@@ -12,8 +11,9 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.errors import BackendError
 from sigmasplat.model.camera import Camera
 from sigmasplat.native import _core
+from sigmasplat.render.numbers import view_numbers as view_numbers
 from sigmasplat.render.pose_gradient import pose_gradient
-from sigmasplat.render.reference import FRUSTUM_MARGIN, Blended, Projection
+from sigmasplat.render.reference import Blended, Projection
 
 FEATURES_AT_ONCE = 16
 
@@ -42,24 +42,6 @@ def padded_size(camera: Camera) -> tuple[int, int]:
     """Return (rows, columns) of an image plane padded to whole tiles of the active instruction set."""
     tile_width, tile_height = _core.tile_size()
     return -(-camera.height // tile_height) * tile_height, -(-camera.width // tile_width) * tile_width
-
-
-def view_numbers(
-    camera: Camera, T_camera_world: NDArray[np.floating], options: RenderConfig, dtype: type = np.float32
-) -> NDArray[np.floating]:
-    """Lay out camera, pose and switches as the kernels' `View` (native/splat.h)."""
-    T = np.asarray(T_camera_world, np.float64)
-    margin_u, margin_v = FRUSTUM_MARGIN * camera.width, FRUSTUM_MARGIN * camera.height
-    limits = [
-        -(camera.cx + margin_u) / camera.fx,
-        (camera.width - camera.cx + margin_u) / camera.fx,
-        -(camera.cy + margin_v) / camera.fy,
-        (camera.height - camera.cy + margin_v) / camera.fy,
-    ]
-    switches = [options.mean_pose_gradient, options.covariance_pose_gradient, options.depth_pose_gradient]
-    numbers = [camera.fx, camera.fy, camera.cx, camera.cy, *T[:3, :3].ravel(), *T[:3, 3]]
-    numbers += [options.near_m, options.low_pass_px2, *limits, camera.width, camera.height, *map(float, switches)]
-    return np.array(numbers, dtype)
 
 
 def _float32(name: str, value: Tensor) -> Tensor:

@@ -6,15 +6,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 
-def pose_gradient(T_camera_world: Tensor, twist: NDArray[np.float64]) -> Tensor:
+def pose_gradient(T_camera_world: Tensor, twist: NDArray[np.float64] | Tensor) -> Tensor:
     """Express a left-twist gradient (ρ, φ) as a [4, 4] matrix gradient with the same value along every rigid motion.
 
-    <G, [φ]× R | φ×t + ρ> = ρ·g_ρ + φ·g_φ for G = (½ [g_φ − t × g_ρ]× R | g_ρ).
+    <G, [φ]× R | φ×t + ρ> = ρ·g_ρ + φ·g_φ for G = (½ [g_φ − t × g_ρ]× R | g_ρ). It lies where T_camera_world does.
     """
-    T = T_camera_world.detach().double().numpy()
-    g_rho, g_phi = twist[:3], twist[3:]
-    a = 0.5 * (g_phi - np.cross(T[:3, 3], g_rho))
-    G = np.zeros((4, 4))
-    G[:3, :3] = np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]]) @ T[:3, :3]
-    G[:3, 3] = g_rho
-    return torch.as_tensor(G, dtype=T_camera_world.dtype)
+    T = T_camera_world.detach().double()
+    g_rho, g_phi = torch.as_tensor(twist).to(T).split(3)
+    a = 0.5 * (g_phi - torch.linalg.cross(T[:3, 3], g_rho))
+    turned = torch.linalg.cross(a[:, None].expand(3, 3), T[:3, :3], dim=0)  # [a]× R
+    bottom = torch.zeros_like(T[:1])
+    return torch.cat([torch.cat([turned, g_rho[:, None]], 1), bottom]).to(T_camera_world.dtype)

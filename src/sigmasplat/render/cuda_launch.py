@@ -1,0 +1,133 @@
+"""Launch the CUDA kernels: arguments laid out as their parameters, machine code loaded once for each device."""
+
+import struct
+from functools import cache
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.errors import BackendError
+from sigmasplat.native import cubins
+
+THREADS = 256
+"""Of every block (native/device.cuh)."""
+Struct = tuple["Tensor | int | None", ...]
+Argument = Tensor | NDArray[Any] | Struct | int | float | None
+"""A tensor is a pointer, None a null one; an array is a struct passed by value, a tuple one of pointers and 64-bit
+numbers; int is 32 bits, float single precision."""
+
+
+class Launcher(Protocol):
+    """What runs a kernel: a device, or in tests its emulation."""
+
+    def __call__(self, features: int, kernel: str, blocks: int, *arguments: Argument) -> None:
+        """Run blocks of `THREADS` threads of a kernel of the program of that many features, on torch's stream."""
+
+
+def blocks_for(threads: int) -> int:
+    """Return how many blocks hold so many threads."""
+    return -(-threads // THREADS)
+
+
+def laid_out(arguments: tuple[Argument, ...]) -> tuple[bytearray, NDArray[np.uint64]]:
+    """Lay arguments out in memory; return that memory, to be kept alive, and the address of each argument [n]."""
+    memory, offsets = bytearray(), []
+    for argument in arguments:
+        offsets.append(len(memory))
+        memory += _bytes_of(argument)
+        memory += bytes(-len(memory) % 8)
+    base = np.frombuffer(memory, np.uint8).ctypes.data
+    return memory, base + np.array(offsets, np.uint64)
+
+
+def _bytes_of(argument: Argument) -> bytes:
+    if argument is None or isinstance(argument, Tensor):
+        return struct.pack("<Q", _address(argument))
+    if isinstance(argument, tuple):
+        return b"".join(struct.pack("<q", a if isinstance(a, int) else _address(a)) for a in argument)
+    if isinstance(argument, np.ndarray):
+        return argument.tobytes()
+    return struct.pack("<f" if isinstance(argument, float) else "<i", argument)
+
+
+def _address(tensor: Tensor | None) -> int:
+    if tensor is None:
+        return 0
+    assert tensor.is_contiguous(), "kernels read whole arrays"
+    return tensor.data_ptr()
+
+
+class Device:
+    """The kernels on one CUDA device, compiled at first use, a program at a time."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._kernels: dict[tuple[int, str], Any] = {}
+        self._programs: dict[int, Any] = {}
+        self.architecture = cubins.architecture_of(torch.cuda.get_device_capability(device))
+
+    def __call__(self, features: int, kernel: str, blocks: int, *arguments: Argument) -> None:
+        """Run a kernel on the device's current stream. Raises BackendError if the driver refuses."""
+        from cuda.bindings import driver
+
+        if blocks == 0:
+            return
+        _memory, addresses = laid_out(arguments)
+        with torch.cuda.device(self._device):
+            stream = torch.cuda.current_stream(self._device).cuda_stream
+            function = self._kernel(features, kernel)
+            (result,) = driver.cuLaunchKernel(
+                function, blocks, 1, 1, THREADS, 1, 1, 0, stream, addresses.ctypes.data, 0
+            )
+        if result != driver.CUresult.CUDA_SUCCESS:
+            raise BackendError(
+                f"the CUDA kernel {kernel} cannot be launched: {result.name}; `sigmasplat doctor` tells more"
+            )
+
+    def _kernel(self, features: int, name: str) -> Any:
+        if (features, name) not in self._kernels:
+            from cuda.bindings import driver
+
+            handle = self._program(features).get_kernel(name).handle
+            self._kernels[features, name] = driver.CUfunction(int(handle))
+        return self._kernels[features, name]
+
+    def _program(self, features: int) -> Any:
+        if features not in self._programs:
+            code = cubins.cubin(features, self.architecture)
+            from cuda.core import ObjectCode
+
+            self._programs[features] = ObjectCode.from_cubin(code, name=f"sigmasplat-{features}")
+        return self._programs[features]
+
+
+def missing() -> str | None:
+    """Say in one line what keeps the CUDA backend from running here, and what to do; None where nothing does."""
+    if torch.version.cuda is None:
+        return f"torch {torch.__version__} is built without CUDA; install one that is (https://pytorch.org)"
+    if not torch.cuda.is_available():
+        return "torch finds no CUDA device; is there one, and its driver?"
+    try:
+        cubins.compiler_version()
+        from cuda.core import ObjectCode  # noqa: F401
+    except (ImportError, BackendError) as problem:
+        return f"{problem}" if isinstance(problem, BackendError) else f"cuda-core is missing: {cubins.INSTALL}"
+    return None
+
+
+@cache
+def _device(index: int) -> Device:
+    reason = missing()
+    if reason:
+        raise BackendError(f"the CUDA backend cannot run: {reason}")
+    return Device(torch.device("cuda", index))
+
+
+def launcher_for(device: torch.device) -> Launcher:
+    """Return what runs kernels on tensors of a device. Raises BackendError where nothing can."""
+    if device.type != "cuda":
+        raise BackendError(f"the cuda backend takes tensors on a CUDA device; these are on {device}")
+    return _device(torch.cuda.current_device() if device.index is None else device.index)

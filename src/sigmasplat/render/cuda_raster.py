@@ -1,0 +1,190 @@
+"""Bin and blend on CUDA: what one render leaves for its backward pass. torch supplies memory, sorts and sums.
+
+No host waits for the device between a forward and its backward pass once a first image has said how many (tile, splat)
+pairs to expect. Where there are more than was expected, `blend` goes through all splats instead of lists: slowly, to the
+same image; the backward pass, which learns of it by then, lists them anew.
+"""
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.config import RenderConfig
+from sigmasplat.errors import BackendError
+from sigmasplat.model.camera import Camera
+from sigmasplat.native.cubins import FEATURE_COUNTS
+from sigmasplat.render.cuda_launch import Argument, Launcher, Struct, blocks_for
+
+TILE = 16
+GEOMETRY = 8
+"""Floats of a splat's row before its features (native/device.cuh)."""
+MOMENTS = 6
+"""Sums of a record before those of the features (native/gradients.cuh)."""
+SPARE = 1.25
+"""Room is made for so many times the pairs seen."""
+MOST_PAIRS = 2**31 - 1
+
+Planes = tuple[Tensor, Tensor | None, Tensor, *tuple[Tensor | None, ...]]
+"""sums [K, H, W], moment [H, W] or None, alpha, then median id, weight, dominant id, weight, median depth or None."""
+
+
+def program_for(features: int) -> int:
+    """Return the feature count of the program that blends so many."""
+    return next(count for count in FEATURE_COUNTS if count >= features)
+
+
+class Raster:
+    """The buffers of one render of n splats on a device, kept from its forward to its backward pass."""
+
+    def __init__(self, launch: Launcher, device: torch.device, capacity: int | None = None) -> None:
+        """capacity: pairs to make room for at first; by default the first image is waited for."""
+        self._launch, self.device, self.capacity = launch, device, capacity
+        self._arrived: torch.cuda.Event | None = None
+        self.n = 0
+
+    def prepare(self, n: int, used: int, camera: Camera, options: RenderConfig) -> None:
+        """Make room for n splats with so many features."""
+        self.n, self.used, self.features = n, used, program_for(used)
+        self.tiles_x, self.tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
+        self.frame = _frame(camera, options, self.tiles_x, self.tiles_y)
+        self.rows = self.empty(n, GEOMETRY + -(-self.features // 4) * 4)
+        self.boxes, self.counts = self.empty(n, 4, dtype=torch.int16), self.empty(n, dtype=torch.int32)
+        self.depths, self.visible = self.empty(n), self.empty(n, dtype=torch.uint8)
+
+    @property
+    def packed(self) -> Struct:
+        """Return where splats are packed to, as the kernels' `Packed`."""
+        return self.rows, self.boxes, self.counts, self.depths, self.visible
+
+    def empty(self, *size: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Make room on the device."""
+        return torch.empty(size, dtype=dtype, device=self.device)
+
+    def launch(self, kernel: str, blocks: int, *arguments: Argument) -> None:
+        """Run a kernel of the program for this render's features."""
+        self._launch(self.features, kernel, blocks, *arguments)
+
+    def each_splat(self, kernel: str, *arguments: Argument) -> None:
+        """Run a kernel with a thread for each splat."""
+        self.launch(kernel, blocks_for(self.n), *arguments)
+
+    def bin(self) -> None:
+        """List, tile by tile, the packed splats that reach it, near to far."""
+        self._order = torch.sort(self.depths, stable=True).indices
+        self._ends = self.counts[self._order].cumsum(0)
+        self._total = self._ends[-1:] if self.n else torch.zeros(1, dtype=torch.int64, device=self.device)
+        self._send_total()
+        if self.capacity is None:
+            self.make_room()
+        else:
+            self._list()
+
+    def _send_total(self) -> None:
+        """Let the number of pairs travel to the host, without waiting for it."""
+        on_cuda = self.device.type == "cuda"
+        self._host_total = torch.empty(1, dtype=torch.int64, pin_memory=on_cuda)
+        self._host_total.copy_(self._total, non_blocking=on_cuda)
+        if on_cuda:
+            self._arrived = torch.cuda.Event()
+            self._arrived.record(torch.cuda.current_stream(self.device))
+
+    def make_room(self) -> None:
+        """List the pairs anew if there was not room for all. Waits for their number alone, which comes before the image.
+
+        Raises BackendError where there are more than can be numbered.
+        """
+        if self._arrived is not None:
+            self._arrived.synchronize()
+        total = int(self._host_total)
+        if total > MOST_PAIRS // SPARE:
+            raise BackendError(f"{total} pairs of splats and tiles are too many; use fewer or smaller splats")
+        if self.capacity is None or total > self.capacity:
+            self.capacity = int(SPARE * total)
+            self._list()
+
+    def _list(self) -> None:
+        tiles, capacity = self.tiles_x * self.tiles_y, max(self.capacity or 0, 1)
+        short = tiles < torch.iinfo(torch.int16).max
+        number = torch.int16 if short else torch.int32
+        tile_of = torch.full((capacity,), tiles, dtype=number, device=self.device)
+        owners = torch.zeros(capacity, dtype=torch.int32, device=self.device)
+        self.first_slots = self.empty(self.n, dtype=torch.int32)
+        self.each_splat(
+            "list_pairs_short" if short else "list_pairs_int", self._order, self._ends, self.counts, self.boxes, self.rows,
+            self.n, capacity, self.frame, self.first_slots, tile_of, owners,
+        )  # fmt: skip
+        tile_of, self.slots = torch.sort(tile_of, stable=True)
+        self._items = owners[self.slots]
+        bounds = torch.arange(tiles + 1, dtype=number, device=self.device)
+        self._tile_begin = torch.searchsorted(tile_of, bounds, out_int32=True)
+        self._room = capacity
+
+    @property
+    def _lists(self) -> Struct:
+        return self._items, self._tile_begin, self._order, self._total, self.counts, self.n, self._room
+
+    def blend(self, planes: Planes, reference: Tensor | None) -> None:
+        """Blend the listed splats to planes; the depth reference [H, W] goes with a moment plane."""
+        kernel = "blend" + ("_moment" if planes[1] is not None else "") + ("_ids" if planes[3] is not None else "")
+        self.launch(
+            kernel, self.tiles_x * self.tiles_y, self.frame, self.rows, self._lists, reference, self.used, planes
+        )
+
+    def gradients(
+        self,
+        planes: Planes,
+        reference: Tensor | None,
+        on_sums: Tensor,
+        on_moment: Tensor | None,
+        on_alpha: Tensor | None,
+    ) -> tuple[Tensor, int]:
+        """Sum the planes' gradients over pixels, splat by splat: records [n, R], and where the moment's two sums lie in
+        one (0 = nowhere)."""
+        self.make_room()
+        moment = MOMENTS + self.features if on_moment is not None else 0
+        floats = _rounded(moment + 2 if moment else MOMENTS + self.features)
+        kernel = "blend_backward_moment" if moment else "blend_backward"
+        outputs = (planes[0], planes[1] if moment else None, planes[2], None, None, None, None, None)
+        records = self.empty(self._room, floats)
+        self.launch(
+            kernel, self.tiles_x * self.tiles_y, self.frame, self.rows, self._lists, self.slots, reference, self.used,
+            outputs, (on_sums, on_moment, on_alpha), records,
+        )  # fmt: skip
+        return self._summed(records), moment
+
+    def pose_gradients(self, planes: Planes, on_sums: Tensor) -> Tensor:
+        """Do the same for colour and depth alone, the first four planes."""
+        self.make_room()
+        records = self.empty(self._room, _rounded(MOMENTS + 4))
+        outputs = (planes[0], None, planes[2], None, None, None, None, None)
+        self.launch(
+            "blend_backward_pose", self.tiles_x * self.tiles_y, self.frame, self.rows, self._lists, self.slots, self.used,
+            outputs, (on_sums, None, None), records,
+        )  # fmt: skip
+        return self._summed(records)
+
+    def _summed(self, records: Tensor) -> Tensor:
+        floats = records.shape[1]
+        sums = self.empty(self.n, floats)
+        blocks = blocks_for(self.n * floats)
+        self.launch("sum_records", blocks, records, self.first_slots, self.counts, self.n, floats, sums)
+        return sums
+
+    def twists(self) -> Tensor:
+        """Make room for the pose twist [blocks, 6] that each block of a chain adds up."""
+        return self.empty(blocks_for(self.n), 6, dtype=torch.float64)
+
+
+def _rounded(floats: int) -> int:
+    return -(-floats // 4) * 4
+
+
+def _frame(camera: Camera, options: RenderConfig, tiles_x: int, tiles_y: int) -> NDArray[np.void]:
+    """Lay out the kernels' `Frame` (native/device.cuh)."""
+    numbers = (
+        camera.width, camera.height, tiles_x, tiles_y, math.log2(options.alpha_min), options.transmittance_stop,
+    )  # fmt: skip
+    return np.array(numbers, dtype="i4,i4,i4,i4,f4,f4")

@@ -1,0 +1,83 @@
+"""A view on the CUDA kernels: raw parameter rows to image planes and back, without autograd."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sigmasplat.config import RenderConfig
+from sigmasplat.model.camera import Camera
+from sigmasplat.render import cuda_launch
+from sigmasplat.render.cuda_raster import Planes, Raster
+from sigmasplat.render.numbers import view_numbers
+from sigmasplat.render.view import Layers, Matrix
+
+
+class CudaView:
+    """A view on the CUDA kernels: `View` with planes of exactly the image's size, on a device.
+
+    A backward pass ends by reading the twist, the one moment that the host waits for the device. Its `seconds` stay 0:
+    to measure stages would be to wait for each.
+    """
+
+    def __init__(
+        self, camera: Camera, options: RenderConfig, variance: bool = True, device: torch.device | None = None
+    ) -> None:
+        device = device or torch.device("cuda", torch.cuda.current_device())
+        self.camera, self.options = camera, options
+        self.raster = Raster(cuda_launch.launcher_for(device), device)
+        size = (camera.height, camera.width)
+        zeros = [torch.zeros(7 if variance else 4, *size, device=device) for _ in range(2)]
+        self.sums, self.g_sums = zeros
+        self.alpha, self.g_alpha, self.moment, self.g_moment, self._reference, self.g_median_depth = (
+            torch.zeros(size, device=device) for _ in range(6)
+        )
+        self.layers = Layers(*(plane.to(device) for plane in Layers.of(*size)))
+        self._made = (False, False)
+        self._numbers = view_numbers(camera, np.eye(4), options)
+        self.seconds = np.zeros(5)
+
+    def forward(
+        self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
+    ) -> None:
+        r, n = self.raster, len(params)
+        self._numbers = view_numbers(self.camera, T_camera_world, self.options)
+        if depth_reference is not None:
+            self._reference.copy_(depth_reference)
+        self._made = (depth_reference is not None, layers)
+        r.prepare(n, len(self.sums), self.camera, self.options)
+        r.each_splat("pack_view", self._numbers, None, params, n, r.frame, r.packed)
+        r.bin()
+        r.blend(self._planes, self._reference if depth_reference is not None else None)
+
+    @property
+    def _planes(self) -> Planes:
+        moment, layers = self._made
+        ids = tuple(self.layers) if layers else (None,) * 5
+        return self.sums, self.moment if moment else None, self.alpha, *ids
+
+    def backward(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Matrix:
+        (moment, layers), r = self._made, self.raster
+        on_moment, reference = (self.g_moment, self._reference) if moment else (None, None)
+        sums, at = r.gradients(self._planes, reference, self.g_sums, on_moment, self.g_alpha)
+        on_median, twists = self._on_median() if layers else None, r.twists()
+        r.each_splat(
+            "chain_params", self._numbers, None, params, r.counts, sums, on_median, r.n, sums.shape[1], at, g_params, pull,
+            twists,
+        )  # fmt: skip
+        return twists.sum(0).cpu().numpy()
+
+    def _on_median(self) -> Tensor:
+        """Gather ∂L/∂(median depth) of all pixels by the splats whose depths they are, [n]."""
+        ids, found = self.layers.median_id.flatten().long(), torch.zeros(self.raster.n + 1, device=self.raster.device)
+        # Pixels without one (−1) add to the last row. Sorted by torch, so that the sums are the same every time.
+        found.index_put_((ids,), self.g_median_depth.flatten(), accumulate=True)
+        return found[:-1]
+
+    def backward_pose(self, params: Tensor) -> Matrix:
+        r, sums = self.raster, self.raster.pose_gradients(self._planes, self.g_sums)
+        twists = r.twists()
+        r.each_splat("chain_pose", self._numbers, None, params, r.counts, sums, r.n, sums.shape[1], twists)
+        return twists.sum(0).cpu().numpy()
+
+    def visible(self, n: int) -> Tensor:
+        return self.raster.visible[:n].bool()

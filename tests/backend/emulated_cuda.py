@@ -1,0 +1,81 @@
+"""Run the CUDA backend's kernels on the CPU: the same text compiled as C++ against emulation/emulation.h."""
+
+import ctypes
+import os
+import platform
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from sigmasplat.native import cubins
+from sigmasplat.render import cuda_launch
+from sigmasplat.render.cuda_launch import THREADS, Argument, laid_out
+
+HERE = Path(__file__).parent / "emulation"
+FLAGS = [
+    "-std=c++20",
+    "-O2",
+    "-fPIC",
+    "-shared",
+    "-U_FORTIFY_SOURCE",
+    "-ffp-contract=off",
+    "-Wall",
+    "-Wextra",
+    "-Werror",
+]
+
+
+class Emulator:
+    """A `Launcher` for tensors on the CPU; `order` is that of the threads between two barriers (emulation.h)."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.order, self.launches = folder, 0, list[str]()
+        self._libraries: dict[int, ctypes.CDLL] = {}
+
+    def __call__(self, features: int, kernel: str, blocks: int, *arguments: Argument) -> None:
+        memory, addresses = laid_out(arguments)
+        self.launches.append(kernel)
+        run = self._library(features).emulate
+        problem = run(kernel.encode(), blocks, THREADS, ctypes.c_void_p(addresses.ctypes.data), self.order)
+        del memory
+        assert problem is None, f"{kernel}: {problem.decode()}"
+
+    @contextmanager
+    def standing_in(self) -> Iterator[None]:
+        """Let the CUDA backend take tensors on the CPU, those of renders begun inside."""
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(cuda_launch, "launcher_for", lambda device: self)
+            yield
+
+    def _library(self, features: int) -> ctypes.CDLL:
+        if features not in self._libraries:
+            path = self.folder / f"emulated-{features}.so"
+            library = ctypes.CDLL(str(_built(path, features)))
+            library.emulate.restype = ctypes.c_char_p
+            self._libraries[features] = library
+        return self._libraries[features]
+
+
+def _built(path: Path, features: int) -> Path:
+    flags = FLAGS + ["-mfma"] * (platform.machine() == "x86_64")
+    sources = [f"-DFEATURES={features}", f"-I{cubins.FOLDER}", str(HERE / "kernels.cpp"), "-o", str(path)]
+    made = subprocess.run([_compiler(), *flags, *sources], capture_output=True, text=True)
+    assert made.returncode == 0, made.stderr
+    return path
+
+
+def _compiler() -> str:
+    return os.environ.get("CXX") or "g++"
+
+
+def why_not() -> str | None:
+    """Say why the emulation cannot be built here; None where it can."""
+    if shutil.which(_compiler()) is None:
+        return f"no C++ compiler to emulate CUDA with ({_compiler()}); set CXX"
+    if platform.system() != "Linux":
+        return "CUDA is emulated on Linux only"
+    return None

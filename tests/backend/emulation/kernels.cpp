@@ -1,0 +1,21 @@
+// The kernels of raster.cu as a library that tests call by name.
+#include "emulation.h"
+
+#include "raster.cu"
+
+using namespace sigmasplat;
+#define ENTRY(kernel) {#kernel, emulation::Call<kernel>::run}
+static const emulation::Entry ENTRIES[] = {
+    ENTRY(project_splats), ENTRY(project_splats_backward), ENTRY(pack_given), ENTRY(list_pairs_short), ENTRY(list_pairs_int),
+    ENTRY(blend), ENTRY(blend_moment), ENTRY(blend_ids), ENTRY(blend_moment_ids), ENTRY(blend_backward),
+    ENTRY(blend_backward_moment), ENTRY(sum_records), ENTRY(chain_given),
+#if FEATURES <= 7
+    ENTRY(pack_view), ENTRY(blend_backward_pose), ENTRY(chain_params), ENTRY(chain_pose),
+#endif
+};
+
+extern "C" const char* emulate(const char* name, int blocks, int threads, void** parameters, unsigned order) {
+    for (const emulation::Entry& entry : ENTRIES)
+        if (!strcmp(entry.name, name)) return emulation::run(entry.run, blocks, threads, parameters, order);
+    return "no such kernel";
+}
