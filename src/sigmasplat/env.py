@@ -4,7 +4,7 @@
 |---|---|---|
 | SIGMASPLAT_THREADS | whole number ≥ 0 | threads of the kernels and of torch; 0 or unset = all cores |
 | SIGMASPLAT_ISA | auto, avx512, avx2, baseline | instruction set of the CPU kernels; auto = the widest there is |
-| SIGMASPLAT_BACKEND | auto, cpu, reference | renderer where the settings say auto |
+| SIGMASPLAT_BACKEND | auto, cpu, cuda, reference | renderer where the settings say auto |
 """
 
 import os
@@ -16,7 +16,7 @@ from typing import Literal, cast, get_args
 from sigmasplat.errors import ConfigError
 
 Isa = Literal["auto", "avx512", "avx2", "baseline"]
-Backend = Literal["auto", "cpu", "reference"]
+Backend = Literal["auto", "cpu", "cuda", "reference"]
 
 # libgomp reads this when it is loaded: idle threads then sleep instead of spinning, on a busy machine 5× faster.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")

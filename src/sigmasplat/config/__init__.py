@@ -24,7 +24,7 @@ class Config:
 
     name: str = "custom"
     seed: int = 0
-    backend: Literal["auto", "cpu", "reference"] = "auto"
+    backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
     input: InputConfig = field(default_factory=InputConfig)
     render: RenderConfig = field(default_factory=RenderConfig)
     seeding: SeedConfig = field(default_factory=SeedConfig)

@@ -88,7 +88,7 @@ def render(
     The pose's gradient is the sum of the paths that `options` has on: through 2D means, 2D covariances, depths, and the
     directions from which `harmonics` are seen. Raises BackendError if the backend is not available.
     """
-    kernels, options = backend_module(backend), options or RenderConfig()
+    kernels, options = backend_module(backend, field.params.device), options or RenderConfig()
     T = torch.as_tensor(T_camera_world)
     p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
     features = _features_from(field, p.z, T if options.color_pose_gradient else T.detach())

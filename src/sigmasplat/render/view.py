@@ -16,6 +16,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render import reference
 from sigmasplat.render.backend import backend_module
+from sigmasplat.render.numbers import view_numbers
 from sigmasplat.render.render import features_of
 
 Matrix = NDArray[np.float64]
@@ -100,7 +101,6 @@ class CpuView:
         from sigmasplat.render import cpu
 
         self.camera, self.options = camera, options
-        self._numbers = cpu.view_numbers
         self.raster = _core.Rasteriser()
         """The kernels' own buffers of this view; `fit` steps a field through it (`Rasteriser.step`)."""
         self._k = 7 if variance else 4
@@ -120,7 +120,7 @@ class CpuView:
             self._reference[: self.camera.height, : self.camera.width] = depth_reference
             reference_depth, moment = self._reference, self.moment
         self._made = (depth_reference is not None, layers)
-        view, planes = self._numbers(self.camera, T_camera_world, o), self.layers if layers else NO_LAYERS
+        view, planes = view_numbers(self.camera, T_camera_world, o), self.layers if layers else NO_LAYERS
         self.raster.view_forward(
             view, params, self._k, o.alpha_min, o.transmittance_stop, reference_depth,
             self.sums, moment, self.alpha, *planes, self.seconds[:3],
@@ -234,7 +234,12 @@ def twist_matrix(xi: Tensor) -> Tensor:
 
 
 def make_view(backend: str, camera: Camera, options: RenderConfig, variance: bool = True) -> View:
-    """Make a view on a backend by name ("auto", "cpu", "reference"). Raises BackendError as `backend_module` does."""
-    if backend_module(backend) is reference:
+    """Make a view on a backend by name (one of `BACKENDS`). Raises BackendError as `backend_module` does."""
+    kernels = backend_module(backend)
+    if kernels is reference:
         return ReferenceView(camera, options, variance)
+    if kernels.__name__.endswith(".cuda"):
+        from sigmasplat.render.cuda_view import CudaView
+
+        return CudaView(camera, options, variance)
     return CpuView(camera, options, variance)
