@@ -1,4 +1,4 @@
-"""Compile the CUDA kernels' text for one GPU architecture with NVRTC, which needs no driver, and keep the result on disk."""
+"""Compile the CUDA kernels' text for a GPU architecture by NVRTC, which needs no driver, and keep the result."""
 
 import hashlib
 import io
@@ -79,7 +79,7 @@ def compiled(features: int, architecture: str) -> Compiled:
         code = bytes(program.compile("cubin", logs=log).code)
     except Exception as problem:  # cuda-core's own family of errors is private; its text is the compiler's log
         raise BackendError(
-            f"the CUDA kernels do not compile for {architecture} with NVRTC {compiler_version()}; update the driver and "
+            f"the CUDA kernels do not compile for {architecture} with NVRTC {compiler_version()}; try "
             f"{INSTALL}, or report this:\n{problem}"
         ) from problem
     return Compiled(code, log.getvalue())

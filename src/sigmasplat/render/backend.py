@@ -14,8 +14,8 @@ BACKENDS = ("auto", "cpu", "cuda", "reference")
 def backend_module(name: str, device: torch.device | None = None) -> ModuleType:
     """Return the module whose `project` and `blend` do the work; "auto" is SIGMASPLAT_BACKEND's, else the kernels.
 
-    device: where the tensors lie; those of a CUDA device are for `cuda` unless another is named. Raises BackendError if it
-    is unknown or not built.
+    device: where the tensors lie; those of a CUDA device are for `cuda` unless another is named. Raises BackendError if
+    it is unknown or not built.
     """
     if name == "auto":
         name = env.switches().backend

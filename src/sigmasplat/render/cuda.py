@@ -92,15 +92,14 @@ class _Blend(torch.autograd.Function):
         ref = None if ref_depth is None else ref_depth.detach().to(depth).contiguous()
         moment = None if ref is None else raster.empty(*size)
         ids, weights = raster.empty(2, *size, dtype=torch.int32), raster.empty(2, *size)
-        planes: Planes = (
-            raster.empty(k, *size), moment, raster.empty(*size), ids[0], weights[0], ids[1], weights[1], None
-        )  # fmt: skip
+        sums, alpha = raster.empty(k, *size), raster.empty(*size)
+        planes = Planes(sums, moment, alpha, ids[0], weights[0], ids[1], weights[1])
         raster.blend(planes, ref)
-        ctx.given, ctx.planes, ctx.ref = (c, depth, o), planes[:3], ref
+        ctx.given, ctx.planes, ctx.ref = (c, depth, o), planes, ref
         detached = [ids[0], weights[0], ids[1], weights[1]]
         ctx.mark_non_differentiable(*detached)
         # What backward reads is kept from a caller who writes to the maps.
-        maps = [planes[0].movedim(0, -1), *planes[1:3]]
+        maps = (sums.movedim(0, -1), moment, alpha)
         return (*(x.clone() if x is not None else None for x in maps), *detached)
 
     @staticmethod

@@ -1,11 +1,12 @@
 """Bin and blend on CUDA: what one render leaves for its backward pass. torch supplies memory, sorts and sums.
 
-No host waits for the device between a forward and its backward pass once a first image has said how many (tile, splat)
-pairs to expect. Where there are more than was expected, `blend` goes through all splats instead of lists: slowly, to the
-same image; the backward pass, which learns of it by then, lists them anew.
+No host waits for the device between a forward and its backward pass once a first image has said how many pairs of tile
+and splat to expect. Where there are more than was expected, `blend` goes through all splats instead of lists: slowly, to
+the same image; the backward pass, which learns of it by then, lists them anew.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,8 +28,18 @@ SPARE = 1.25
 """Room is made for so many times the pairs seen."""
 MOST_PAIRS = 2**31 - 1
 
-Planes = tuple[Tensor, Tensor | None, Tensor, *tuple[Tensor | None, ...]]
-"""sums [K, H, W], moment [H, W] or None, alpha, then median id, weight, dominant id, weight, median depth or None."""
+
+class Planes(NamedTuple):
+    """What is blended to, as the kernels' `Planes`: sums [K, H, W], the others [H, W], None where not asked for."""
+
+    sums: Tensor
+    moment: Tensor | None
+    alpha: Tensor
+    median_id: Tensor | None = None
+    median_weight: Tensor | None = None
+    dominant_id: Tensor | None = None
+    dominant_weight: Tensor | None = None
+    median_depth: Tensor | None = None
 
 
 def program_for(features: int) -> int:
@@ -88,11 +99,11 @@ class Raster:
         self._host_total = torch.empty(1, dtype=torch.int64, pin_memory=on_cuda)
         self._host_total.copy_(self._total, non_blocking=on_cuda)
         if on_cuda:
-            self._arrived = torch.cuda.Event()
+            self._arrived = torch.cuda.Event()  # type: ignore[no-untyped-call]
             self._arrived.record(torch.cuda.current_stream(self.device))
 
     def make_room(self) -> None:
-        """List the pairs anew if there was not room for all. Waits for their number alone, which comes before the image.
+        """List the pairs anew if there was not room for all. Waits for their number alone, known before the image.
 
         Raises BackendError where there are more than can be numbered.
         """
@@ -113,8 +124,8 @@ class Raster:
         owners = torch.zeros(capacity, dtype=torch.int32, device=self.device)
         self.first_slots = self.empty(self.n, dtype=torch.int32)
         self.each_splat(
-            "list_pairs_short" if short else "list_pairs_int", self._order, self._ends, self.counts, self.boxes, self.rows,
-            self.n, capacity, self.frame, self.first_slots, tile_of, owners,
+            "list_pairs_short" if short else "list_pairs_int", self._order, self._ends, self.counts, self.boxes,
+            self.rows, self.n, capacity, self.frame, self.first_slots, tile_of, owners,
         )  # fmt: skip
         tile_of, self.slots = torch.sort(tile_of, stable=True)
         self._items = owners[self.slots]
@@ -128,7 +139,7 @@ class Raster:
 
     def blend(self, planes: Planes, reference: Tensor | None) -> None:
         """Blend the listed splats to planes; the depth reference [H, W] goes with a moment plane."""
-        kernel = "blend" + ("_moment" if planes[1] is not None else "") + ("_ids" if planes[3] is not None else "")
+        kernel = "blend" + "_moment" * (planes.moment is not None) + "_ids" * (planes.median_id is not None)
         self.launch(
             kernel, self.tiles_x * self.tiles_y, self.frame, self.rows, self._lists, reference, self.used, planes
         )
@@ -147,7 +158,7 @@ class Raster:
         moment = MOMENTS + self.features if on_moment is not None else 0
         floats = _rounded(moment + 2 if moment else MOMENTS + self.features)
         kernel = "blend_backward_moment" if moment else "blend_backward"
-        outputs = (planes[0], planes[1] if moment else None, planes[2], None, None, None, None, None)
+        outputs = Planes(planes.sums, planes.moment if moment else None, planes.alpha)
         records = self.empty(self._room, floats)
         self.launch(
             kernel, self.tiles_x * self.tiles_y, self.frame, self.rows, self._lists, self.slots, reference, self.used,
@@ -159,10 +170,10 @@ class Raster:
         """Do the same for colour and depth alone, the first four planes."""
         self.make_room()
         records = self.empty(self._room, _rounded(MOMENTS + 4))
-        outputs = (planes[0], None, planes[2], None, None, None, None, None)
+        outputs = Planes(planes.sums, None, planes.alpha)
         self.launch(
-            "blend_backward_pose", self.tiles_x * self.tiles_y, self.frame, self.rows, self._lists, self.slots, self.used,
-            outputs, (on_sums, None, None), records,
+            "blend_backward_pose", self.tiles_x * self.tiles_y, self.frame, self.rows, self._lists, self.slots,
+            self.used, outputs, (on_sums, None, None), records,
         )  # fmt: skip
         return self._summed(records)
 

@@ -52,8 +52,8 @@ class CudaView:
     @property
     def _planes(self) -> Planes:
         moment, layers = self._made
-        ids = tuple(self.layers) if layers else (None,) * 5
-        return self.sums, self.moment if moment else None, self.alpha, *ids
+        ids = tuple(self.layers) if layers else ()
+        return Planes(self.sums, self.moment if moment else None, self.alpha, *ids)
 
     def backward(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Matrix:
         (moment, layers), r = self._made, self.raster
@@ -61,8 +61,8 @@ class CudaView:
         sums, at = r.gradients(self._planes, reference, self.g_sums, on_moment, self.g_alpha)
         on_median, twists = self._on_median() if layers else None, r.twists()
         r.each_splat(
-            "chain_params", self._numbers, None, params, r.counts, sums, on_median, r.n, sums.shape[1], at, g_params, pull,
-            twists,
+            "chain_params", self._numbers, None, params, r.counts, sums, on_median, r.n, sums.shape[1], at, g_params,
+            pull, twists,
         )  # fmt: skip
         return twists.sum(0).cpu().numpy()
 

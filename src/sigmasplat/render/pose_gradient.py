@@ -12,7 +12,8 @@ def pose_gradient(T_camera_world: Tensor, twist: NDArray[np.float64] | Tensor) -
     <G, [φ]× R | φ×t + ρ> = ρ·g_ρ + φ·g_φ for G = (½ [g_φ − t × g_ρ]× R | g_ρ). It lies where T_camera_world does.
     """
     T = T_camera_world.detach().double()
-    g_rho, g_phi = torch.as_tensor(twist).to(T).split(3)
+    g = torch.as_tensor(twist).to(T)
+    g_rho, g_phi = g[:3], g[3:]
     a = 0.5 * (g_phi - torch.linalg.cross(T[:3, 3], g_rho))
     turned = torch.linalg.cross(a[:, None].expand(3, 3), T[:3, :3], dim=0)  # [a]× R
     bottom = torch.zeros_like(T[:1])
