@@ -1,8 +1,8 @@
 """Bin and blend on CUDA: what one render leaves for its backward pass. torch supplies memory, sorts and sums.
 
 No host waits for the device between a forward and its backward pass once a first image has said how many pairs of tile
-and splat to expect. Where there are more than was expected, `blend` goes through all splats instead of lists: slowly, to
-the same image; the backward pass, which learns of it by then, lists them anew.
+and splat to expect. Where there are more than expected, `blend` goes through all splats instead of lists: slowly,
+to the same image; the backward pass, which learns of it by then, lists them anew.
 """
 
 import math

@@ -41,6 +41,7 @@ enum Back { FIRST, HANDED_OVER, FAILED };
 Fiber fibers[MOST_THREADS];
 std::vector<char> stacks;
 int turn[MOST_THREADS];                    // the order in which threads run
+int at_once;                               // so many of them in turns until all of these wait, then the next
 int current;                               // the thread that runs
 unsigned events;                           // grows when a thread begins or ends and when a meeting is complete
 Meeting whole_block, warps[MOST_THREADS / WARP];
@@ -126,9 +127,15 @@ bool run_block(int threads) {
     unsigned seen;                         // a round in which nothing happens is the last
     do {
         seen = events;
-        for (int at = 0; at < threads; at++) {
-            current = turn[at];
-            if (!fibers[current].ended && step() == FAILED) return false;
+        for (int begin = 0; begin < threads; begin += at_once) {
+            unsigned seen_here;
+            do {
+                seen_here = events;
+                for (int at = begin; at < begin + at_once && at < threads; at++) {
+                    current = turn[at];
+                    if (!fibers[current].ended && step() == FAILED) return false;
+                }
+            } while (seen_here != events);
         }
     } while (seen != events);
     for (int i = 0; i < threads; i++)
@@ -147,11 +154,20 @@ template <class... A, void (*FUNCTION)(A...)> struct Call<FUNCTION> {
 };
 struct Entry { const char* name; void (*run)(void*); };
 
-// Run a kernel; null, or what went wrong. order: 0 = threads in their order, 1 = backwards, else shuffled from that seed.
+// Run a kernel; null, or what went wrong. order: 0 = all threads in turns; 1 = warp by warp, each as far as it comes alone;
+// 2 = the same backwards; else warps, and threads in each, shuffled from that seed.
 const char* run(void (*kernel)(void*), int blocks, int threads, void** parameters, unsigned order) {
     if (stacks.empty()) stacks.resize(MOST_THREADS * STACK);
-    for (int i = 0; i < threads; i++) turn[i] = order == 1 ? threads - 1 - i : i;
-    if (order > 1) std::shuffle(turn, turn + threads, std::mt19937(order));
+    at_once = order ? WARP : threads;
+    for (int i = 0; i < threads; i++) turn[i] = order == 2 ? threads - 1 - i : i;
+    if (order > 2 && threads % WARP == 0) {
+        std::mt19937 random(order);
+        int warp[MOST_THREADS / WARP];
+        for (int w = 0; w < threads / WARP; w++) warp[w] = w;
+        std::shuffle(warp, warp + threads / WARP, random);
+        for (int i = 0; i < threads; i++) turn[i] = warp[i / WARP] * WARP + i % WARP;
+        for (int w = 0; w < threads / WARP; w++) std::shuffle(turn + w * WARP, turn + (w + 1) * WARP, random);
+    }
     body = kernel;
     arguments = parameters;
     block = Index{};
