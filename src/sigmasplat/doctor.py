@@ -38,6 +38,7 @@ def examine() -> Iterator[Finding]:
     yield native
     if native.ok:
         yield self_test()
+    yield from cuda()
 
 
 def verdict(findings: list[Finding]) -> tuple[bool, str]:
@@ -67,15 +68,68 @@ def _remedy(problem: ImportError) -> str:
     return "install a wheel, or the sources with pip install ."
 
 
-def self_test() -> Finding:
-    """Render a few hundred splats with the kernels and with their definition, and compare."""
+def cuda() -> Iterator[Finding]:
+    """Say what there is of CUDA, and in one line each what is missing; a machine without a GPU is not unhealthy."""
     import torch
 
-    from sigmasplat.render import cpu, reference
+    from sigmasplat.errors import BackendError
+    from sigmasplat.native import cubins
+    from sigmasplat.render import cuda_launch
+
+    try:
+        compiler = cubins.compiler_version()
+        cached = len(list(cubins.cache_folder().glob("*.cubin")))
+        yield Finding("NVRTC", f"{compiler}, {cached} programs compiled in {cubins.cache_folder()}")
+    except BackendError as problem:
+        yield Finding("NVRTC", f"missing: {problem}")
+    missing = cuda_launch.missing()
+    if missing:
+        yield Finding("CUDA", f"not available: {missing}")
+        return
+    yield from _drivers(cubins.compiler_version())
+    for index in range(torch.cuda.device_count()):
+        yield from _device(torch.device("cuda", index))
+
+
+def _drivers(compiler: str) -> Iterator[Finding]:
+    """Compare driver and compiler: a driver runs what compilers of its own major version make, or older ones."""
+    from cuda.bindings import driver
+
+    from sigmasplat.native import cubins
+
+    version = driver.cuDriverGetVersion()[1]
+    enough = version // 1000 >= int(compiler.split(".")[0])
+    advice = "" if enough else f"; too old for NVRTC {compiler}: update it, or {cubins.INSTALL_OLDER}"
+    yield Finding("CUDA driver", f"for CUDA {version // 1000}.{version % 1000 // 10}{advice}", enough)
+
+
+def _device(device: Any) -> Iterator[Finding]:
+    """Describe a GPU and render on it."""
+    import torch
+
+    from sigmasplat.errors import BackendError
+    from sigmasplat.native import cubins
+
+    about = torch.cuda.get_device_properties(device)
+    architecture = cubins.architecture_of((about.major, about.minor))
+    yield Finding(str(device), f"{about.name}, {architecture}, {about.total_memory / 2**30:.0f} GiB")
+    try:
+        yield self_test(device)
+    except BackendError as problem:
+        yield Finding("self-test", str(problem), False)
+
+
+def self_test(device: Any = "cpu") -> Finding:
+    """Render a few hundred splats with a device's kernels and with their definition, and compare."""
+    import torch
+
+    from sigmasplat.render import reference
+    from sigmasplat.render.backend import backend_module
 
     started_s = time.perf_counter()
+    name = "cpu" if str(device) == "cpu" else "cuda"
     with torch.no_grad():
-        ours, definition = _picture(cpu), _picture(reference)
+        ours, definition = _picture(backend_module(name), device).cpu(), _picture(reference)
     difference = (ours - definition).abs()
     largest, mean = float(difference.max()), float(difference.mean())
     ok = bool(torch.isfinite(ours).all()) and largest < MAX_DIFFERENCE and mean < MEAN_DIFFERENCE
@@ -83,7 +137,7 @@ def self_test() -> Finding:
     return Finding("self-test", f"largest difference {largest:.1e}, mean {mean:.1e} ({seconds:.2f} s)", ok)
 
 
-def _picture(backend: Any) -> Any:
+def _picture(backend: Any, device: Any = "cpu") -> Any:
     """Render a fixed cloud of splats: colour and alpha, [H, W, 4]."""
     import torch
 
@@ -91,9 +145,9 @@ def _picture(backend: Any) -> Any:
     from sigmasplat.model.camera import Camera
 
     random = torch.Generator().manual_seed(0)
-    means, shapes, quats, colors = (torch.rand(300, n, generator=random) for n in (3, 3, 4, 3))
+    means, shapes, quats, colors = (torch.rand(300, n, generator=random).to(device) for n in (3, 3, 4, 3))
     camera, options = Camera(64, 48, 60.0, 60.0, 31.5, 23.5), RenderConfig()
-    means = (means - 0.5) * torch.tensor([3.0, 2.0, 2.0]) + torch.tensor([0.0, 0.0, 2.0])
+    means = (means - 0.5) * means.new_tensor([3.0, 2.0, 2.0]) + means.new_tensor([0.0, 0.0, 2.0])
     seen = backend.project(means, quats - 0.5, 0.01 + 0.1 * shapes, torch.eye(4), camera, options)
     blended = backend.blend(*seen[:4], 0.2 + 0.7 * colors[:, 0], colors, None, camera, options)
     return torch.cat([blended.sums, blended.alpha[..., None]], -1)

@@ -208,7 +208,7 @@ def test_a_crowd_agrees(kind: str) -> None:
         params[nearest, 7:10], params[nearest, 10] = torch.tensor([0.7, 0.4, 0.0]), 6.0
     maps, rows, twist = there_and_back(view_of(s), params, T)
     want_maps, want_rows, want_twist = there_and_back(exact_view(s.camera, True), params.double(), T)
-    assert float((maps - want_maps).abs().max()) < 2.0 / 255 and float((maps - want_maps).abs().mean()) < 1e-5
+    assert float((maps - want_maps).abs().max()) < 2.0 / 255 and float((maps - want_maps).abs().mean()) < 5e-5
     for name, columns in COLUMNS.items():
         assert_same_vector(rows[:, columns], want_rows[:, columns], 4e-3, what=name)
     assert_same_vector(twist, want_twist, 1e-3, what="twist")

@@ -20,6 +20,8 @@ FEATURE_COUNTS = (4, 7, 11, 16)
 ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
 """What the tests compile for; any other that NVRTC knows is compiled when a device asks for it."""
 INSTALL = "pip install 'sigmasplat[gpu]'"
+INSTALL_OLDER = "pip install 'cuda-bindings<13' nvidia-cuda-nvrtc-cu12"
+"""For drivers that know CUDA 12 only."""
 
 
 class Compiled(NamedTuple):
