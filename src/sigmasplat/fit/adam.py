@@ -111,7 +111,7 @@ def _move(
 ) -> None:
     """Take Adam's step on rows in place; unbias1, unbias2: what corrects moment1 and the root of moment2."""
     spread = moment2.sqrt().mul_(unbias2).add_(EPSILON)
-    params.addcmul_((moment1 * unbias1).div_(spread), rates.per_column, value=-1.0)
+    params.addcmul_((moment1 * unbias1).div_(spread), rates.per_column.to(params.device), value=-1.0)
 
 
 @dataclass(eq=False)

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field as dataclass_field
 from itertools import repeat
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig
@@ -87,6 +86,8 @@ def fit_field(
     first steps are a few times longer: it has farther to go. Raises ConfigError where colour covariances or
     view-dependent colours are to be fitted to several keyframes at once.
     """
+    if field.params.device != view.sums.device:
+        return _fit_there(field, view, batches, config, schedule, frozen_colors, degree, may_move, felt)
     fit, rates = FieldFit(), Rates.of(config)
     pose_rates = np.repeat([config.lr_pose_translation, config.lr_pose_rotation], 3)
     steps = _Steps(field, view, loss_weights(config), frozen_colors, degree, felt)
@@ -99,6 +100,27 @@ def fit_field(
     settle(field, rates, compiled=isinstance(view, CpuView))
     for name, extra in field.extras.items():
         settle(extra, rates.of_extra(name), compiled=False)
+    return fit
+
+
+def _fit_there(
+    field: GaussianField,
+    view: View,
+    batches: Iterable[Sequence[Keyframe]],
+    config: MappingConfig,
+    schedule: Iterable[Rates] | None,
+    frozen_colors: int,
+    degree: int,
+    may_move: Callable[[Keyframe], bool],
+    felt: Felt | None,
+) -> FieldFit:
+    """Fit on the view's device, and bring the field back to where it lies."""
+    there, here = field.on(view.sums.device), field.params.device
+    told = None if felt is None else lambda keyframe, pull: felt(keyframe, pull.to(here))
+    fit = fit_field(there, view, batches, config, schedule, frozen_colors, degree, may_move, told)
+    for name, extra in there.extras.items():
+        field.carry(name).take(extra)
+    field.take(there)
     return fit
 
 
@@ -117,7 +139,7 @@ class _Steps:
         self.field, self.view, self.weights, self.frozen_colors, self.felt = field, view, weights, frozen_colors, felt
         field.moment1[:frozen_colors, COLUMNS["colors"]] = 0.0  # or they would coast on
         self.step = _step_for(field, view, weights, degree)
-        self.pull = None if felt is None else torch.zeros(len(field))
+        self.pull = None if felt is None else field.params.new_zeros(len(field))
 
     def take(self, batch: Sequence[Keyframe], rates: Rates, fit: FieldFit) -> tuple[float, list[Matrix]]:
         """Step against the mean loss of a batch; return that loss, and of each image its own pose twist [6]."""
@@ -125,10 +147,10 @@ class _Steps:
         gathered = self._gathered(len(batch))
         loss, shape, twists = 0.0, 0.0, list[Matrix]()
         for keyframe in batch:
-            t = time.perf_counter()
-            self.step.forward(self.field, se3.inverse(keyframe.T_world_camera), keyframe.target, self.weights)
+            t, target = time.perf_counter(), keyframe.target.on(self.field.params.device)
+            self.step.forward(self.field, se3.inverse(keyframe.T_world_camera), target, self.weights)
             t = fit.add("forward", t)
-            loss += self.step.images(keyframe.target, self.weights) / len(batch)
+            loss += self.step.images(target, self.weights) / len(batch)
             t = fit.add("loss", t)
             if gathered is None:
                 twist, shape = self.step.splats(self.field, rates, self.weights, self.frozen_colors, self.pull)
@@ -160,6 +182,10 @@ def _step_for(
     Raises ConfigError where full colour covariance meets terms that its view does not make maps for.
     """
     step: TorchStep | CompiledStep | FullCovarianceStep = TorchStep(view)
+    if weights["nll_color_full"] and not isinstance(view, CpuView | ReferenceView):
+        raise ConfigError(
+            "mapping.color_covariance full is not made for CUDA; take --set backend=cpu or leave it diagonal"
+        )
     compiled = {name for name, weight in weights.items() if weight} <= {*COMPILED_TERMS, "nll_color_full"}
     if weights["nll_color_full"] and isinstance(view, CpuView | ReferenceView):
         if weights["alignment"] or weights["moment"]:

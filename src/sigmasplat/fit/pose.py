@@ -52,6 +52,7 @@ def fit_pose_adam(
     params [N, 17] and σ² are frozen (VarSplat §3). Ends early when a step is below `update_stop`, or when it changed
     the loss by less than `plateau_stop` of it. Raises nothing: without common pixels the guess comes back.
     """
+    params, target = params.to(view.sums.device), target.on(view.sums.device)
     way = parametrisation(config, T_camera_world)
     numbers, exposure = way.start, np.zeros(2)
     adam, adam_exposure = VectorAdam.of(len(numbers)), VectorAdam.of(2)
@@ -69,7 +70,7 @@ def fit_pose_adam(
             best, best_T, best_exposure = loss, T, exposure.copy()
         moved = adam.step(way.gradient(numbers, view.backward_pose(params)), rates)
         numbers += moved
-        exposure += adam_exposure.step(g_exposure.double().numpy(), rate_exposure)
+        exposure += adam_exposure.step(g_exposure.double().cpu().numpy(), rate_exposure)
         if np.abs(moved).max() < config.update_stop or abs(loss - previous) < config.plateau_stop * loss:
             break
         previous = loss

@@ -84,11 +84,11 @@ def _reference_maps(view: View, config: TrackingConfig, moment: Tensor | None) -
         return ReferenceMaps(gray, surface, (weight if weighed else None, weight_depth if by_U else None))
     maps = PoseMaps.of(view)
     opaque, divisor = maps.alpha > ALIGN_ALPHA, maps.alpha.clamp(min=0.5)
-    gray = ((maps.color @ torch.from_numpy(LUMA)) / divisor).numpy()
-    surface = torch.where(opaque, maps.depth / divisor, 0.0).numpy()
+    gray = ((maps.color @ torch.from_numpy(LUMA).to(maps.color)) / divisor).cpu().numpy()
+    surface = torch.where(opaque, maps.depth / divisor, 0.0).cpu().numpy()
     weights: list[Image | None] = [None, None]
     for k, (variance, known) in enumerate(((maps.variance, opaque), (moment, opaque & (view.moment > 0)))):
         if config.uncertainty and variance is not None:
             w = uncertainty_weights(variance.reshape(*opaque.shape, -1), known, config.tau, config.weight_max).mean(-1)
-            weights[k] = torch.where(known, w, 1.0).numpy()
+            weights[k] = torch.where(known, w, 1.0).cpu().numpy()
     return ReferenceMaps(gray, surface, (weights[0], weights[1]))

@@ -45,7 +45,7 @@ class Gathered:
 
     def __init__(self, field: GaussianField) -> None:
         self.grad, self._rows = torch.zeros_like(field.params), torch.zeros_like(field.params)
-        self.visible = torch.zeros(len(field), dtype=torch.bool)
+        self.visible = torch.zeros(len(field), dtype=torch.bool, device=field.params.device)
 
     def add(self, view: View, field: GaussianField, share: float = 1.0, pull: Tensor | None = None) -> Matrix:
         """Add a view's gradient planes at their share of the mean; return the image's own pose twist [6]."""

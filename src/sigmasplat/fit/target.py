@@ -22,6 +22,15 @@ class Target:
     color: Tensor
     depth: Tensor
     valid_pixels: int
+    _there: "Target | None" = None
+
+    def on(self, device: torch.device) -> "Target":
+        """Return the target on a device; one such copy is kept."""
+        if self.depth.device == device:
+            return self
+        if self._there is None or self._there.depth.device != device:
+            self._there = Target(self.camera, self.color.to(device), self.depth.to(device), self.valid_pixels)
+        return self._there
 
     @staticmethod
     def of(frame: Frame, size: tuple[int, int]) -> "Target":

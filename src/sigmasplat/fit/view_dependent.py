@@ -77,7 +77,7 @@ class ViewDependentStep:
             g[:, MEANS] += g_means
             g[:, SCALES] += g_scales
             if self.view.options.color_pose_gradient:  # a camera that moves by ρ leaves the directions to −ρ
-                twist[:3] += (self._R @ g_means.sum(0)).numpy()
+                twist[:3] += (self._R @ g_means.sum(0)).cpu().numpy()
             cost += term
             adam_rows(field, rows, g, rates)
             adam_rows(harmonics, rows, g_harmonics, harmonic_rates)

@@ -43,7 +43,7 @@ class Rows:
         if self.moment2.shape != self.params.shape:
             self.moment2 = torch.zeros_like(self.params)
         if len(self.last_step) != len(self.params):
-            self.last_step = torch.zeros(len(self.params), dtype=torch.int32)
+            self.last_step = torch.zeros(len(self.params), dtype=torch.int32, device=self.params.device)
 
     def __len__(self) -> int:
         return len(self.params)
@@ -51,6 +51,21 @@ class Rows:
     def state(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return copies of params, both moments and last_step."""
         return self.params.clone(), self.moment1.clone(), self.moment2.clone(), self.last_step.clone()
+
+    def on(self, device: torch.device) -> "Rows":
+        """Return copies of these rows on a device."""
+        params, moment1, moment2, last_step = (x.to(device, copy=True) for x in self._tensors)
+        return Rows(params, moment1, moment2, last_step, self.steps)
+
+    def take(self, other: "Rows") -> None:
+        """Take the state of the same rows over, from whatever device they lie on."""
+        for mine, theirs in zip(self._tensors, other._tensors, strict=True):
+            mine.copy_(theirs)
+        self.steps = other.steps
+
+    @property
+    def _tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.params, self.moment1, self.moment2, self.last_step
 
     def join(self, other: "Rows") -> None:
         """Add another's rows at the end, their optimiser state with them."""
@@ -84,7 +99,7 @@ class GaussianField(Rows):
             raise SigmaSplatError(f"a field needs params [N, {WIDTH}], found {tuple(self.params.shape)}")
         super().__post_init__()
         if len(self.ids) != len(self.params):
-            self.ids, self.born = torch.arange(len(self.params)), len(self.params)
+            self.ids, self.born = torch.arange(len(self.params), device=self.params.device), len(self.params)
 
     @staticmethod
     def empty() -> "GaussianField":
@@ -106,13 +121,13 @@ class GaussianField(Rows):
         log_variances defaults to s₀ = −7 (VarSplat §1).
         """
         n = len(means)
-        params = torch.zeros(n, WIDTH, dtype=means.dtype)
+        params = means.new_zeros(n, WIDTH)
         params[:, COLUMNS["means"]] = means
         params[:, 3] = 1.0
         if quats is not None:
             params[:, COLUMNS["quats"]] = quats
         params[:, COLUMNS["log_scales"]] = (scales if scales.ndim == 2 else scales[:, None]).log()
-        opacity = torch.as_tensor(opacities, dtype=means.dtype).reshape(-1, 1)
+        opacity = torch.as_tensor(opacities, dtype=means.dtype, device=means.device).reshape(-1, 1)
         params[:, COLUMNS["opacity_logits"]] = torch.logit(opacity)
         params[:, COLUMNS["colors"]] = colors
         params[:, COLUMNS["log_variances"]] = torch.as_tensor(log_variances, dtype=means.dtype)
@@ -158,9 +173,17 @@ class GaussianField(Rows):
         """Add another field's splats at the end, with new ids; extras that only one has are 0 for the other's."""
         for name in {**self.extras, **other.extras}:
             self.carry(name).join(other.carry(name))
-        self.ids = torch.cat([self.ids, torch.arange(self.born, self.born + len(other))])
+        self.ids = torch.cat([self.ids, torch.arange(self.born, self.born + len(other), device=self.ids.device)])
         self.born += len(other)
         self.join(other)
+
+    def on(self, device: torch.device) -> "GaussianField":
+        """Return a copy of the field on a device, its extras and ids with it."""
+        extras = {name: extra.on(device) for name, extra in self.extras.items()}
+        params, moment1, moment2, last_step = (x.to(device, copy=True) for x in self._tensors)
+        return GaussianField(
+            params, moment1, moment2, last_step, self.steps, extras, self.ids.to(device), self.born
+        )  # fmt: skip
 
     def keep(self, rows: Tensor) -> None:
         """Keep the splats chosen by a bool mask [N] or an index tensor, drop the others."""

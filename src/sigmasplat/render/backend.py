@@ -11,6 +11,11 @@ from sigmasplat.render import reference
 BACKENDS = ("auto", "cpu", "cuda", "reference")
 
 
+def is_cuda(kernels: ModuleType) -> bool:
+    """Tell whether `backend_module` returned the kernels that want tensors on a CUDA device."""
+    return kernels.__name__ == "sigmasplat.render.cuda"
+
+
 def backend_module(name: str, device: torch.device | None = None) -> ModuleType:
     """Return the module whose `project` and `blend` do the work; "auto" is SIGMASPLAT_BACKEND's, else the kernels.
 

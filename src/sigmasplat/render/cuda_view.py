@@ -39,6 +39,7 @@ class CudaView:
     def forward(
         self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
     ) -> None:
+        params = self._here(params)
         r, n = self.raster, len(params)
         self._numbers = view_numbers(self.camera, T_camera_world, self.options)
         if depth_reference is not None:
@@ -48,6 +49,10 @@ class CudaView:
         r.each_splat("pack_view", self._numbers, None, params, n, r.frame, r.packed)
         r.bin()
         r.blend(self._planes, self._reference if depth_reference is not None else None)
+
+    def _here(self, params: Tensor) -> Tensor:
+        """Return rows as the kernels read them, brought here from wherever they lie."""
+        return params.detach().to(self.raster.device).contiguous()
 
     @property
     def _planes(self) -> Planes:
@@ -61,8 +66,8 @@ class CudaView:
         sums, at = r.gradients(self._planes, reference, self.g_sums, on_moment, self.g_alpha)
         on_median, twists = self._on_median() if layers else None, r.twists()
         r.each_splat(
-            "chain_params", self._numbers, None, params, r.counts, sums, on_median, r.n, sums.shape[1], at, g_params,
-            pull, twists,
+            "chain_params", self._numbers, None, self._here(params), r.counts, sums, on_median, r.n, sums.shape[1], at,
+            g_params, pull, twists,
         )  # fmt: skip
         return twists.sum(0).cpu().numpy()
 
@@ -76,7 +81,7 @@ class CudaView:
     def backward_pose(self, params: Tensor) -> Matrix:
         r, sums = self.raster, self.raster.pose_gradients(self._planes, self.g_sums)
         twists = r.twists()
-        r.each_splat("chain_pose", self._numbers, None, params, r.counts, sums, r.n, sums.shape[1], twists)
+        r.each_splat("chain_pose", self._numbers, None, self._here(params), r.counts, sums, r.n, sums.shape[1], twists)
         return twists.sum(0).cpu().numpy()
 
     def visible(self, n: int) -> Tensor:

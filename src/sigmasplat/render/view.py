@@ -15,7 +15,7 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render import reference
-from sigmasplat.render.backend import backend_module
+from sigmasplat.render.backend import backend_module, is_cuda
 from sigmasplat.render.numbers import view_numbers
 from sigmasplat.render.render import features_of
 
@@ -238,7 +238,7 @@ def make_view(backend: str, camera: Camera, options: RenderConfig, variance: boo
     kernels = backend_module(backend)
     if kernels is reference:
         return ReferenceView(camera, options, variance)
-    if kernels.__name__.endswith(".cuda"):
+    if is_cuda(kernels):
         from sigmasplat.render.cuda_view import CudaView
 
         return CudaView(camera, options, variance)

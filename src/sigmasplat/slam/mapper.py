@@ -117,7 +117,7 @@ class Mapper:
             T_new_old = se3.inverse(T_submap_camera)
             view.forward(self.field.params, T_new_old)
             field = self.field.moved(torch.from_numpy(T_new_old))
-            field.keep(view.visible(len(field)))
+            field.keep(view.visible(len(field)).to(field.params.device))
         return Mapper(self.config, self.random, field)
 
     def _seed(self, view: View, target: Target, T_world_camera: NDArray[np.float64]) -> None:

@@ -49,7 +49,7 @@ def _owned(view: View, keyframe: Keyframe, owner: str) -> tuple[NDArray[np.int32
         "dominant": (layers.dominant_id, layers.dominant_weight),
         "median": (layers.median_id, layers.median_weight),
     }[owner]
-    rows, weight = (plane[: camera.height, : camera.width].numpy() for plane in (ids, weights))
+    rows, weight = (plane[: camera.height, : camera.width].cpu().numpy() for plane in (ids, weights))
     reading = keyframe.target.depth_image.numpy()
     judged = (rows >= 0) & (reading > 0)
     return rows[judged], weight[judged].astype(np.float64), reading[judged].astype(np.float64)

@@ -33,8 +33,8 @@ def later_pixels(maps: PoseMaps, target: Target, config: SeedConfig) -> Mask:
     (where `depth_error_factor` is above 0)."""
     measured = target.depth_image.numpy()
     valid = measured > 0
-    alpha = maps.alpha.numpy()
-    surface = maps.depth.numpy() / np.maximum(alpha, 0.5)
+    alpha = maps.alpha.cpu().numpy()
+    surface = maps.depth.cpu().numpy() / np.maximum(alpha, 0.5)
     seen = valid & (alpha >= config.alpha_below)
     chosen = valid & (alpha < config.alpha_below)
     if config.depth_error_factor > 0 and seen.any():

@@ -41,7 +41,7 @@ def choose_window(
 
 def dominating(view: View, field: GaussianField) -> Ids:
     """Name the splats that dominate a pixel of a view's last forward pass with layers: sorted `field.ids`."""
-    rows = view.layers.dominant_id[: view.camera.height, : view.camera.width].numpy()
+    rows = view.layers.dominant_id[: view.camera.height, : view.camera.width].cpu().numpy()
     there = np.zeros(len(field), bool)
     there[rows[rows >= 0]] = True
     return np.sort(field.ids.numpy()[there])
