@@ -1,0 +1,189 @@
+"""Name the pieces of work the GPU benchmark times, each as the product does it, and time them on a device."""
+
+import importlib.util
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from scenes import Scene, make_scene
+from torch import Tensor
+from works import RENDER, Timing
+
+from sigmasplat.config import TrackingConfig
+from sigmasplat.config.text import override
+from sigmasplat.errors import BackendError
+from sigmasplat.fit.field import fit_field
+from sigmasplat.fit.pose import fit_pose_adam
+from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.metrics.trajectory import ate
+from sigmasplat.presets import default_preset, preset
+from sigmasplat.render import cuda_launch
+from sigmasplat.render.cuda_view import CudaView
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources import SyntheticRoom
+
+FRAME = 100
+WARMUPS, ITERATIONS = 3, 10
+"""Fits are timed by so many iterations at once, and said by one."""
+
+
+def refuse_without_device() -> None:
+    """Raise BackendError, one line, where the CUDA backend cannot run."""
+    reason = cuda_launch.missing()
+    if reason:
+        raise BackendError(f"nothing to time: {reason}")
+
+
+def describe_device() -> dict[str, Any]:
+    """Name the device and what it runs."""
+    about = torch.cuda.get_device_properties(0)
+    memory_gib = round(about.total_memory / 2**30, 1)
+    return {
+        "name": about.name,
+        "capability": [about.major, about.minor],
+        "memory_gib": memory_gib,
+        "torch": torch.__version__,
+    }
+
+
+def timed(work: Callable[[], object], runs: int, device: torch.device) -> Timing:
+    """Time a piece of work by the wall clock until the device has done it, after a few runs that do not count."""
+    seconds = []
+    for run in range(WARMUPS + runs):
+        _wait(device)
+        start = time.perf_counter()
+        work()
+        _wait(device)
+        if run >= WARMUPS:
+            seconds.append(time.perf_counter() - start)
+    return Timing.of(seconds)
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+class GpuWorks:
+    """Everything a frame costs on one scene; the world is its camera. Each method is one piece of work, run once."""
+
+    def __init__(self, scene: Scene, device: torch.device) -> None:
+        self.scene, self.device = scene, device
+        self.field = scene.field.on(device)
+        self.params, self.grad = self.field.params, torch.zeros_like(self.field.params)
+        self.all, self.color_depth = (CudaView(scene.camera, RENDER, on, device) for on in (True, False))
+        size = (scene.camera.height, scene.camera.width)
+        self.target, self.later = (Target.of(frame, size).on(device) for frame in (scene.frame, scene.later))
+        for view in (self.all, self.color_depth):
+            for plane in (view.g_sums, view.g_alpha, view.g_moment):
+                plane.fill_(1e-3)
+        self.mapping = preset(default_preset()).mapping
+        self.tracking = TrackingConfig(method="adam", update_stop=0.0, plateau_stop=0.0)
+
+    def forward_all(self) -> None:
+        """Render all: colour, depth, σ² + c², moment about the sensor's depth, alpha, median and dominant splat."""
+        self.all.forward(self.params, np.eye(4), self.target.depth, layers=True)
+
+    def forward_color_depth(self) -> None:
+        """Render colour, depth and alpha only."""
+        self.color_depth.forward(self.params, np.eye(4))
+
+    def both_all(self) -> None:
+        """Render all, and carry gradients on all of it to every parameter and the pose."""
+        self.forward_all()
+        self.all.backward(self.params, self.grad)
+
+    def both_color_depth(self) -> None:
+        """Do the same with colour, depth and alpha only."""
+        self.forward_color_depth()
+        self.color_depth.backward(self.params, self.grad)
+
+    def both_pose(self) -> None:
+        """Render colour and depth, and carry their gradients to the pose alone."""
+        self.forward_color_depth()
+        self.color_depth.backward_pose(self.params)
+
+    def mapping_iterations(self) -> None:
+        """Fit the field to one keyframe for `ITERATIONS`."""
+        fit_field(self.field, self.all, [[Keyframe(0, self.target, np.eye(4))]] * ITERATIONS, self.mapping)
+
+    def tracking_iterations(self) -> None:
+        """Descend the tracking loss for `ITERATIONS`."""
+        fit_pose_adam(self.params, self.all, self.later, np.eye(4), self.tracking, ITERATIONS)
+
+
+SINGLE = ("forward_all", "forward_color_depth", "both_all", "both_color_depth", "both_pose")
+MANY = ("tracking_iterations", "mapping_iterations")
+
+
+def measure(width: int, height: int, splats: int, runs: int, seed: int) -> dict[str, Any]:
+    """Time all works on one scene, and gsplat on the same splats."""
+    device = torch.device("cuda", torch.cuda.current_device())
+    scene = make_scene(f"synthetic:frames=200,width={width},height={height}", FRAME, splats, width, seed)
+    torch.cuda.reset_peak_memory_stats(device)
+    peer = time_gsplat(scene, runs, device)
+    torch.cuda.empty_cache()
+    torch.cuda.reset_peak_memory_stats(device)
+    return {
+        "splats": splats, "width": width, "height": height, "works": time_works(GpuWorks(scene, device), runs),
+        "peak_mib": round(torch.cuda.max_memory_allocated(device) / 2**20, 1), "gsplat": peer,
+    }  # fmt: skip
+
+
+def time_works(works: GpuWorks, runs: int) -> dict[str, dict[str, float]]:
+    """Time every piece of work; of fits, one iteration."""
+    found = {name: timed(getattr(works, name), runs, works.device).plain() for name in SINGLE}
+    for name in MANY:
+        taken = timed(getattr(works, name), max(runs // ITERATIONS, 1), works.device)
+        found[name[:-1]] = Timing(taken.median_ms / ITERATIONS, taken.min_ms / ITERATIONS, taken.runs).plain()
+    return found
+
+
+def time_gsplat(scene: Scene, runs: int, device: torch.device) -> dict[str, Any] | None:
+    """Time gsplat's colour and depth on the same splats and camera; None where it is not installed."""
+    if importlib.util.find_spec("gsplat") is None:
+        return None
+    import gsplat
+
+    f, c = scene.field.on(device), scene.camera
+    leaves = [x.detach().clone().requires_grad_() for x in (f.means, f.quats, f.scales, f.opacities, f.colors)]
+    K = torch.tensor([[[c.fx, 0.0, c.cx + 0.5], [0.0, c.fy, c.cy + 0.5], [0.0, 0.0, 1.0]]], device=device)
+    at = torch.eye(4, device=device)[None]
+
+    def forward() -> tuple[Tensor, Tensor]:
+        image, alpha, _ = gsplat.rasterization(
+            *leaves, at, K, c.width, c.height, near_plane=RENDER.near_m, eps2d=RENDER.low_pass_px2, render_mode="RGB+D"
+        )  # fmt: skip
+        return image, alpha
+
+    def both() -> None:
+        image, alpha = forward()
+        torch.autograd.grad(1e-3 * (image.sum() + alpha.sum()), leaves)
+
+    with torch.no_grad():
+        forward_ms = timed(forward, runs, device).plain()
+        image = forward()[0][0, ..., :3]
+    ours = CudaView(c, RENDER, False, device)
+    ours.forward(f.params, np.eye(4))
+    difference = float((ours.sums[:3].movedim(0, -1) - image).abs().mean())
+    return {
+        "version": gsplat.__version__, "forward": forward_ms, "both": timed(both, runs, device).plain(),
+        "mean_color_difference": difference,
+    }  # fmt: skip
+
+
+def time_slam(frames: int, seed: int) -> dict[str, Any]:
+    """Follow the built-in room at 640×480 with the default preset on CUDA; return frames/s, ATE and peak memory."""
+    room = SyntheticRoom(frames=200, width=640, height=480)
+    frames, device = min(frames, len(room)), torch.device("cuda", torch.cuda.current_device())
+    torch.cuda.reset_peak_memory_stats(device)
+    slam = Slam(override(preset(default_preset()), {"backend": "cuda", "seed": str(seed), "input.width": "640"}))
+    start = time.perf_counter()
+    for index in range(frames):
+        slam.step(room.frame(index))
+    seconds = time.perf_counter() - start
+    error = ate(slam.trajectory(), room.truth())
+    peak_mib = round(torch.cuda.max_memory_allocated(device) / 2**20, 1)
+    return {"frames": frames, "frames_per_s": frames / seconds, "ate_m": float(error.rmse_m), "peak_mib": peak_mib}

@@ -1,0 +1,61 @@
+"""Run the GPU benchmark's pieces of work on the emulation, lay out its figures, and see it refuse without a device."""
+
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from emulated_cuda import Emulator
+from sigmasplat.render import cuda_launch
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+sys.path.append(str(BENCHMARKS))
+gpu_tables, gpu_works, scenes, tables = map(importlib.import_module, ("gpu_tables", "gpu_works", "scenes", "tables"))
+
+
+@pytest.fixture
+def works(emulator: Emulator) -> Any:
+    with emulator.standing_in():
+        emulator.order = 0
+        scene = scenes.make_scene("synthetic:frames=200,width=64,height=48", 100, 100, 32, 0)
+        yield gpu_works.GpuWorks(scene, torch.device("cpu"))
+
+
+def test_every_piece_of_work_runs(works: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gpu_works, "WARMUPS", 0)
+    monkeypatch.setattr(gpu_works, "ITERATIONS", 2)
+    found = gpu_works.time_works(works, 2)
+    assert set(found) == {work for _, work in gpu_tables.COLUMNS}
+    assert all(time["median_ms"] > 0 for time in found.values()) and float(works.all.alpha.max()) > 0.1
+    assert works.field.steps == 2, "mapping took its iterations"
+
+
+def figures(tracking_ms: float, peer: bool) -> dict[str, Any]:
+    works = {work: {"median_ms": 1.0} for _, work in gpu_tables.COLUMNS} | {"both_all": {"median_ms": 1.2}}
+    works["tracking_iteration"] = {"median_ms": tracking_ms}
+    times = {"forward": {"median_ms": 0.5}, "both": {"median_ms": 3.0}, "mean_color_difference": 1e-4}
+    scene = {"splats": 300_000, "width": 1200, "height": 680, "peak_mib": 9.0, "gsplat": times if peer else None}
+    slam = {"frames_per_s": 31.0}
+    return {"device": {"name": "GPU", "torch": "2"}, "scenes": [scene | {"works": works}], "slam": slam}
+
+
+def test_goals_are_judged() -> None:
+    made = gpu_tables.sections({"figures": figures(2.5, peer=True)})
+    assert [section.title for section in made] == ["Times, ms", "Beside gsplat, colour and depth, ms", "Goals"]
+    assert [row[3] for row in made[-1].rows] == ["**no**", "**no**", "yes", "yes", "yes"]
+    assert all(len(row) == len(section.columns) for section in made for row in section.rows)
+    alone = gpu_tables.sections({"figures": figures(1.0, peer=False)})
+    assert [row[3] for row in alone[-1].rows] == ["**no**", "yes", "yes", "yes"] and len(alone) == 2
+
+
+@pytest.mark.skipif(cuda_launch.missing() is None, reason="there is a CUDA device")
+def test_without_a_device_it_refuses_in_one_line() -> None:
+    made = subprocess.run([sys.executable, BENCHMARKS / "gpu.py"], capture_output=True, text=True, timeout=120)
+    assert made.returncode == 2 and made.stdout == ""
+    assert made.stderr.startswith("gpu.py: nothing to time: ") and len(made.stderr.splitlines()) == 1

@@ -1,0 +1,48 @@
+"""What doctor says of CUDA on machines that lack one thing or another."""
+
+import pytest
+
+from sigmasplat import doctor
+from sigmasplat.errors import BackendError
+from sigmasplat.native import cubins
+from sigmasplat.render import cuda_launch
+
+
+def said() -> dict[str, doctor.Finding]:
+    return {finding.name: finding for finding in doctor.cuda()}
+
+
+def test_each_thing_that_is_missing_has_its_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none() -> str:
+        raise BackendError("no NVRTC here")
+
+    monkeypatch.setattr(cubins, "compiler_version", none)
+    monkeypatch.setattr(cuda_launch, "missing", lambda: "torch finds no CUDA device")
+    found = said()
+    assert found["NVRTC"].value == "missing: no NVRTC here"
+    assert found["CUDA"].value == "not available: torch finds no CUDA device"
+    assert all(finding.ok is None for finding in found.values()), "a machine without a GPU is healthy"
+
+
+@pytest.mark.parametrize(("version", "enough"), [(13020, True), (12080, False)])
+def test_a_driver_older_than_the_compiler_is_told_of(
+    monkeypatch: pytest.MonkeyPatch, version: int, enough: bool
+) -> None:
+    driver = pytest.importorskip("cuda.bindings.driver", reason="needs pip install 'sigmasplat[gpu]'")
+    monkeypatch.setattr(driver, "cuDriverGetVersion", lambda: (0, version))
+    (finding,) = doctor._drivers("13.5")
+    assert finding.ok is enough and (cubins.INSTALL_OLDER in finding.value) is not enough
+
+
+def test_the_cache_follows_the_users_choice(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
+    assert str(cubins.cache_folder()) == "/somewhere/sigmasplat/kernels"
+    monkeypatch.setenv("XDG_CACHE_HOME", "")
+    assert str(cubins.cache_folder()).endswith("/.cache/sigmasplat/kernels")
+
+
+def test_tensors_elsewhere_are_refused() -> None:
+    import torch
+
+    with pytest.raises(BackendError, match="takes tensors on a CUDA device; these are on cpu"):
+        cuda_launch.launcher_for(torch.device("cpu"))
