@@ -46,3 +46,23 @@ def test_tensors_elsewhere_are_refused() -> None:
 
     with pytest.raises(BackendError, match="takes tensors on a CUDA device; these are on cpu"):
         cuda_launch.launcher_for(torch.device("cpu"))
+
+
+@pytest.mark.skipif(cuda_launch.missing() is None, reason="there is a CUDA device")
+def test_asking_for_cuda_without_a_device_is_refused_in_one_line() -> None:
+    import numpy as np
+
+    from sigmasplat.config import RenderConfig
+    from sigmasplat.model.camera import Camera
+    from sigmasplat.model.field import GaussianField
+    from sigmasplat.render import render
+    from sigmasplat.render.view import make_view
+
+    camera = Camera(8, 6, 7.0, 7.0, 3.5, 2.5)
+    for ask in (
+        lambda: make_view("cuda", camera, RenderConfig()),
+        lambda: render(GaussianField.empty(), camera, np.eye(4), backend="cuda"),
+    ):
+        with pytest.raises(BackendError, match="the CUDA backend cannot run: ") as refused:
+            ask()
+        assert "\n" not in str(refused.value)

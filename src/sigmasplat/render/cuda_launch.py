@@ -118,16 +118,20 @@ def missing() -> str | None:
     return None
 
 
-@cache
-def _device(index: int) -> Device:
+_device = cache(Device)
+
+
+def this_device() -> torch.device:
+    """Return torch's current CUDA device. Raises BackendError, which says why, where the CUDA backend cannot run."""
     reason = missing()
     if reason:
         raise BackendError(f"the CUDA backend cannot run: {reason}")
-    return Device(torch.device("cuda", index))
+    return torch.device("cuda", torch.cuda.current_device())
 
 
 def launcher_for(device: torch.device) -> Launcher:
     """Return what runs kernels on tensors of a device. Raises BackendError where nothing can."""
     if device.type != "cuda":
         raise BackendError(f"the cuda backend takes tensors on a CUDA device; these are on {device}")
-    return _device(torch.cuda.current_device() if device.index is None else device.index)
+    current = this_device()
+    return _device(current if device.index is None else device)

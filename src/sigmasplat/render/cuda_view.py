@@ -22,7 +22,7 @@ class CudaView:
     def __init__(
         self, camera: Camera, options: RenderConfig, variance: bool = True, device: torch.device | None = None
     ) -> None:
-        device = device or torch.device("cuda", torch.cuda.current_device())
+        device = device or cuda_launch.this_device()
         self.camera, self.options = camera, options
         self.raster = Raster(cuda_launch.launcher_for(device), device)
         size = (camera.height, camera.width)

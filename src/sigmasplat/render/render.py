@@ -13,6 +13,7 @@ from sigmasplat.model.color_covariance import covariances_of, outer
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.harmonics import view_colors
 from sigmasplat.render.backend import backend_module, is_cuda
+from sigmasplat.render.cuda_launch import this_device
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +90,8 @@ def render(
     directions from which `harmonics` are seen. Raises BackendError if the backend is not available.
     """
     kernels, options = backend_module(backend, field.params.device), options or RenderConfig()
-    if is_cuda(kernels) and field.params.device.type == "cpu" and torch.cuda.is_available():
-        field = field.on(torch.device("cuda", torch.cuda.current_device()))
+    if is_cuda(kernels) and field.params.device.type == "cpu":  # asked for by name
+        field = field.on(this_device())
     T = torch.as_tensor(T_camera_world)
     p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
     features = _features_from(field, p.z, T if options.color_pose_gradient else T.detach())
