@@ -15,10 +15,11 @@ pytest.importorskip("cuda.bindings.nvrtc", reason="cuda-bindings is not installe
 @pytest.mark.parametrize("architecture", cubins.ARCHITECTURES)
 def test_every_kernel_compiles_without_a_warning(architecture: str) -> None:
     with ThreadPoolExecutor(2) as pool:
-        made = list(pool.map(lambda features: cubins.compiled(features, architecture), cubins.FEATURE_COUNTS))
-    for features, program in zip(cubins.FEATURE_COUNTS, made, strict=True):
+        made = list(pool.map(lambda features: cubins.compiled(features, architecture), cubins.PROGRAMS))
+    for features, program in zip(cubins.PROGRAMS, made, strict=True):
         assert program.log == "", f"{features} features: {program.log}"
-        for name in cubins.kernel_names():
+        assert len(cubins.kernel_names(features)) >= 5
+        for name in cubins.kernel_names(features):
             of_views = name in ("pack_view", "blend_backward_pose", "chain_params", "chain_pose")
             assert (f".text.{name}\0".encode() in program.code) == (features <= 7 or not of_views), name
 
@@ -26,9 +27,9 @@ def test_every_kernel_compiles_without_a_warning(architecture: str) -> None:
 @pytest.fixture
 def text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Put a small program in the kernels' place."""
-    for name in cubins.TEXTS:
+    for name in {*cubins.TEXTS[cubins.RASTER], *cubins.TEXTS[cubins.FIT]}:
         (tmp_path / name).write_text("#pragma once\n")
-    program = tmp_path / cubins.PROGRAM
+    program = tmp_path / cubins.RASTER
     program.write_text('extern "C" __global__ void nothing() {}\n')
     monkeypatch.setattr(cubins, "FOLDER", tmp_path)
     return program
@@ -44,7 +45,7 @@ def test_a_program_is_compiled_once(text: Path, tmp_path: Path, monkeypatch: pyt
 
 def test_what_decides_on_the_code_decides_on_its_place(text: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     keys = [cubins.key_of(4, "sm_80"), cubins.key_of(7, "sm_80"), cubins.key_of(4, "sm_90")]
-    (text.parent / cubins.TEXTS[-1]).write_text("#pragma once\n// another\n")
+    (text.parent / cubins.TEXTS[cubins.RASTER][-1]).write_text("#pragma once\n// another\n")
     keys.append(cubins.key_of(4, "sm_80"))
     monkeypatch.setattr(cubins, "compiler_version", lambda: "99.9")
     keys.append(cubins.key_of(4, "sm_80"))

@@ -12,11 +12,13 @@ from sigmasplat.config import MappingConfig
 from sigmasplat.errors import ConfigError
 from sigmasplat.fit.adam import Rates, settle
 from sigmasplat.fit.color_covariance import CovarianceView, FullCovarianceStep
+from sigmasplat.fit.cuda_step import CudaStep
 from sigmasplat.fit.step import COMPILED_TERMS, CompiledImages, CompiledStep, Gathered, TorchStep
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.fit.view_dependent import ViewDependentStep
 from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField
+from sigmasplat.render.cuda_view import CudaView
 from sigmasplat.render.view import CpuView, Matrix, ReferenceView, View
 
 
@@ -150,13 +152,14 @@ class _Steps:
             t, target = time.perf_counter(), keyframe.target.on(self.field.params.device)
             self.step.forward(self.field, se3.inverse(keyframe.T_world_camera), target, self.weights)
             t = fit.add("forward", t)
-            loss += self.step.images(target, self.weights) / len(batch)
+            cost = self.step.images(target, self.weights)
             t = fit.add("loss", t)
             if gathered is None:
                 twist, shape = self.step.splats(self.field, rates, self.weights, self.frozen_colors, self.pull)
             else:
                 twist = gathered.add(self.view, self.field, 1.0 / len(batch), self.pull)
             twists.append(twist)
+            loss += float(cost) / len(batch)  # read last: it may still be on its way from a device
             if self.felt is not None and self.pull is not None:
                 self.felt(keyframe, self.pull)
             t = fit.add("backward", t)
@@ -176,7 +179,7 @@ class _Steps:
 
 def _step_for(
     field: GaussianField, view: View, weights: dict[str, float], degree: int
-) -> TorchStep | CompiledStep | FullCovarianceStep | ViewDependentStep:
+) -> TorchStep | CompiledStep | CudaStep | FullCovarianceStep | ViewDependentStep:
     """Take the fused kernels where they know every term that has weight, else the definition.
 
     Raises ConfigError where full colour covariance meets terms that its view does not make maps for.
@@ -197,4 +200,6 @@ def _step_for(
         step = FullCovarianceStep(wide, CompiledImages(wide) if fused else TorchStep(wide))
     elif compiled and isinstance(view, CpuView):
         step = CompiledStep(view)
+    elif compiled and isinstance(view, CudaView) and not degree:
+        return CudaStep(view)
     return ViewDependentStep(step, degree) if degree else step

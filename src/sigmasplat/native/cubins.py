@@ -13,10 +13,13 @@ from typing import NamedTuple
 from sigmasplat.errors import BackendError
 
 FOLDER = Path(__file__).parent
-PROGRAM = "raster.cu"
-TEXTS = (PROGRAM, "gradients.cuh", "tiles.cuh", "device.cuh", "splat.h")
+RASTER, FIT = "raster.cu", "fit.cu"
+TEXTS = {RASTER: (RASTER, "gradients.cuh", "tiles.cuh", "device.cuh", "sums.cuh", "splat.h"), FIT: (FIT, "sums.cuh")}
 FEATURE_COUNTS = (4, 7, 11, 16)
 """The feature counts compiled, a program each; a count between them is padded with zeros."""
+FITTING = 0
+"""In a feature count's place: the program of the fits' loops, which does without one."""
+PROGRAMS = (FITTING, *FEATURE_COUNTS)
 ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
 """What the tests compile for; any other that NVRTC knows is compiled when a device asks for it."""
 INSTALL = "pip install 'sigmasplat[gpu]'"
@@ -47,6 +50,11 @@ def compiler_version() -> str:
     return f"{major}.{minor}"
 
 
+def text_of(features: int) -> str:
+    """Name the text that a program is made of."""
+    return FIT if features == FITTING else RASTER
+
+
 def cubin(features: int, architecture: str, folder: Path | None = None) -> bytes:
     """Return the program of one feature count as machine code, from the cache where it is there, else compiled.
 
@@ -65,7 +73,7 @@ def cubin(features: int, architecture: str, folder: Path | None = None) -> bytes
 def key_of(features: int, architecture: str) -> str:
     """Hash all that decides on the machine code: texts, options, architecture, the compiler's version."""
     said = [compiler_version(), _core_version(), str(_options(features, architecture))]
-    texts = [(FOLDER / name).read_text(encoding="utf-8") for name in TEXTS]
+    texts = [(FOLDER / name).read_text(encoding="utf-8") for name in TEXTS[text_of(features)]]
     return hashlib.sha256("\0".join(said + texts).encode()).hexdigest()[:32]
 
 
@@ -75,9 +83,10 @@ def compiled(features: int, architecture: str) -> Compiled:
     from cuda.core import Program, ProgramOptions
 
     log = io.StringIO()
-    options = ProgramOptions(name=PROGRAM, include_path=str(FOLDER), **_options(features, architecture))
+    name = text_of(features)
+    options = ProgramOptions(name=name, include_path=str(FOLDER), **_options(features, architecture))
     try:
-        program = Program((FOLDER / PROGRAM).read_text(encoding="utf-8"), "c++", options)
+        program = Program((FOLDER / name).read_text(encoding="utf-8"), "c++", options)
         code = bytes(program.compile("cubin", logs=log).code)
     except Exception as problem:  # cuda-core's own family of errors is private; its text is the compiler's log
         raise BackendError(
@@ -108,9 +117,9 @@ def architecture_of(capability: tuple[int, int]) -> str:
     return f"sm_{capability[0]}{capability[1]}"
 
 
-def kernel_names() -> list[str]:
-    """List the kernels that the texts define, whatever the feature count."""
-    texts = ((FOLDER / name).read_text(encoding="utf-8") for name in TEXTS)
+def kernel_names(features: int) -> list[str]:
+    """List the kernels that a program's texts define, whatever the feature count."""
+    texts = ((FOLDER / name).read_text(encoding="utf-8") for name in TEXTS[text_of(features)])
     return [name for text in texts for name in re.findall(r"^KERNEL (\w+)\(", text, re.MULTILINE)]
 
 

@@ -1,6 +1,7 @@
 // What splat.h asks of its number type, for one float of a GPU thread, and the layouts that the CUDA kernels share.
 // One program per feature count: FEATURES is defined when the text is compiled (render/cuda_raster.py lists the counts).
 #pragma once
+#include "sums.cuh"
 
 namespace sigmasplat {
 
@@ -14,10 +15,8 @@ inline float only(bool condition, float a) { return condition ? a : 0.f; }
 
 #include "splat.h"
 
-constexpr int THREADS = 256;               // of every block
 constexpr int TILE = 16;                   // pixels each way, one thread a pixel: a warp is a patch of 8×4 of them
 constexpr int PATCH_WIDTH = 8, PATCH_HEIGHT = 4, PATCHES = 8;
-constexpr unsigned ALL_LANES = 0xffffffffu;
 
 constexpr float ALPHA_MAX = 0.99f;
 constexpr float LOG2_E = 1.4426950408889634f;
@@ -47,7 +46,5 @@ inline View<float> posed(View<float> view, const float* pose) {
         }
     return view;
 }
-
-inline int thread_number() { return int(blockIdx.x) * THREADS + int(threadIdx.x); }
 
 }  // namespace sigmasplat

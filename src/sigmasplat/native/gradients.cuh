@@ -224,23 +224,6 @@ KERNEL chain_given(const float* conics, const float* z, const float* opacities, 
     for (int c = 0; c < used; c++) on_features[size_t(i) * used + c] = only(seen, m[MOMENTS + c]);
 }
 
-// Add six numbers of all threads of a block, in a fixed order, and store them as the block's.
-inline void store_twist(const float* twist, double* partial) {
-    __shared__ double of_warps[6 * THREADS / 32];
-    const int lane = int(threadIdx.x) % 32, warp = int(threadIdx.x) / 32;
-    for (int q = 0; q < 6; q++) {
-        double sum = twist[q];
-        for (int apart = 16; apart > 0; apart /= 2) sum += __shfl_xor_sync(ALL_LANES, sum, apart);
-        if (lane == 0) of_warps[q * (THREADS / 32) + warp] = sum;
-    }
-    __syncthreads();
-    if (threadIdx.x < 6) {
-        double sum = 0.0;
-        for (int w = 0; w < THREADS / 32; w++) sum += of_warps[threadIdx.x * (THREADS / 32) + w];
-        partial[size_t(blockIdx.x) * 6 + threadIdx.x] = sum;
-    }
-}
-
 KERNEL project_splats_backward(View<float> view, const float* pose, const float* means, const float* quats, const float* scales,
                                const float* radii, const float* on_means2d, const float* on_conics, const float* on_z, int n,
                                float* on_means, float* on_quats, float* on_scales, double* twists) {
@@ -258,7 +241,7 @@ KERNEL project_splats_backward(View<float> view, const float* pose, const float*
         for (int k = 0; k < 4; k++) on_quats[4 * size_t(i) + k] = only(seen, out.quat[k]);
         for (int k = 0; k < 3; k++) on_scales[3 * size_t(i) + k] = only(seen, out.scale[k]);
     }
-    store_twist(twist, twists);
+    store_sums<6>(twist, twists);
 }
 
 #if FEATURES <= 7
@@ -308,7 +291,7 @@ KERNEL chain_params(View<float> view, const float* pose, const float* params, co
             if (pull) pull[i] = 0.f;
         }
     }
-    store_twist(twist, twists);
+    store_sums<6>(twist, twists);
 }
 
 KERNEL chain_pose(View<float> view, const float* pose, const float* params, const int* counts, const float* sums, int n, int record,
@@ -321,7 +304,7 @@ KERNEL chain_pose(View<float> view, const float* pose, const float* params, cons
         chain(posed(view, pose), activated(params, i), sums + size_t(i) * record, 0, 0.f, g, out);
         for (int q = 0; q < 6; q++) twist[q] = out.twist[q];
     }
-    store_twist(twist, twists);
+    store_sums<6>(twist, twists);
 }
 #endif
 

@@ -1,8 +1,6 @@
 // Splats to pixels on a GPU: project, list for every tile the splats that reach it, blend. docs/kernels.md says how.
 #include "tiles.cuh"
 
-#define KERNEL extern "C" __global__ void __launch_bounds__(256)
-
 namespace sigmasplat {
 
 inline Shape<float> shape_at(const float* means, const float* quats, const float* scales, int i) {

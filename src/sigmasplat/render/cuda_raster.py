@@ -16,7 +16,7 @@ from torch import Tensor
 from sigmasplat.config import RenderConfig
 from sigmasplat.errors import BackendError
 from sigmasplat.model.camera import Camera
-from sigmasplat.native.cubins import FEATURE_COUNTS
+from sigmasplat.native.cubins import FEATURE_COUNTS, FITTING
 from sigmasplat.render.cuda_launch import Argument, Launcher, Struct, blocks_for
 
 TILE = 16
@@ -77,6 +77,10 @@ class Raster:
     def launch(self, kernel: str, blocks: int, *arguments: Argument) -> None:
         """Run a kernel of the program for this render's features."""
         self._launch(self.features, kernel, blocks, *arguments)
+
+    def launch_fit(self, kernel: str, blocks: int, *arguments: Argument) -> None:
+        """Run a kernel of the fits' loops (native/fit.cu)."""
+        self._launch(FITTING, kernel, blocks, *arguments)
 
     def each_splat(self, kernel: str, *arguments: Argument) -> None:
         """Run a kernel with a thread for each splat."""

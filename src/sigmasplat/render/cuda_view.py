@@ -61,6 +61,10 @@ class CudaView:
         return Planes(self.sums, self.moment if moment else None, self.alpha, *ids)
 
     def backward(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Matrix:
+        return self.backward_there(params, g_params, pull).cpu().numpy()
+
+    def backward_there(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Tensor:
+        """Do the same, and leave the twist on the device: no host waits."""
         (moment, layers), r = self._made, self.raster
         on_moment, reference = (self.g_moment, self._reference) if moment else (None, None)
         sums, at = r.gradients(self._planes, reference, self.g_sums, on_moment, self.g_alpha)
@@ -69,7 +73,7 @@ class CudaView:
             "chain_params", self._numbers, None, self._here(params), r.counts, sums, on_median, r.n, sums.shape[1], at,
             g_params, pull, twists,
         )  # fmt: skip
-        return twists.sum(0).cpu().numpy()
+        return twists.sum(0)
 
     def _on_median(self) -> Tensor:
         """Gather ∂L/∂(median depth) of all pixels by the splats whose depths they are, [n]."""

@@ -3,6 +3,7 @@
 // (shuffle), or the run stops and names the line; shared memory is filled with NaNs before each block; the order in which threads
 // run between two barriers is the caller's choice, and may not change a bit of the result.
 #pragma once
+#include <link.h>
 #include <csetjmp>
 #include <cmath>
 #include <cstdint>
@@ -21,9 +22,6 @@ struct alignas(16) float4 { float x, y, z, w; };
 inline float2 make_float2(float x, float y) { return {x, y}; }
 inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
 inline float __int_as_float(int bits) { float x; memcpy(&x, &bits, 4); return x; }
-
-// The linker names the ends of the section that all shared memory lies in.
-extern "C" char __start_shared_memory[], __stop_shared_memory[];
 
 namespace emulation {
 
@@ -87,6 +85,25 @@ template <class T> T from_lane(T value, int lane, int line) {
     return other;
 }
 
+// Shared memory is thread-local memory of this library, which has no other: that alone lies together (a section of their own is
+// not given to variables of templates). The loader says where.
+struct Memory { char* begin; size_t bytes; };
+thread_local char landmark;
+int find_landmark(dl_phdr_info* library, size_t, void* found) {
+    for (int i = 0; i < library->dlpi_phnum; i++) {
+        const auto& part = library->dlpi_phdr[i];
+        char* begin = static_cast<char*>(library->dlpi_tls_data);
+        if (part.p_type == PT_TLS && begin && &landmark >= begin && &landmark < begin + part.p_memsz)
+            *static_cast<Memory*>(found) = {begin, part.p_memsz};
+    }
+    return 0;
+}
+Memory shared_memory() {
+    Memory found{&landmark, 0};
+    dl_iterate_phdr(find_landmark, &found);
+    return found;
+}
+
 void live() {
     body(arguments);
     fibers[current].ended = true;
@@ -116,7 +133,12 @@ Back step() {
 
 // Returns false where threads cannot go on; `message` says why.
 bool run_block(int threads) {
-    memset(__start_shared_memory, 0xff, size_t(__stop_shared_memory - __start_shared_memory));   // NaN, −1, true
+    static const Memory shared = shared_memory();
+    if (!shared.bytes) {
+        snprintf(message, sizeof message, "shared memory is not where it was looked for");
+        return false;
+    }
+    memset(shared.begin, 0xff, shared.bytes);   // NaN, −1, true
     whole_block = Meeting();
     whole_block.members = threads;
     for (int w = 0; w * WARP < threads; w++) {
@@ -183,8 +205,8 @@ const char* run(void (*kernel)(void*), int blocks, int threads, void** parameter
 #define __global__
 #define __launch_bounds__(n)
 #define __align__(n) __attribute__((aligned(n)))
-#define __shared__ static __attribute__((section("shared_memory")))
-#define inline static inline               // so that a function's shared memory has internal linkage, as the section asks
+#define __shared__ static thread_local
+#define inline static inline               // a function's shared memory is then this library's own
 #define threadIdx (Index{unsigned(emulation::current), 0, 0})
 #define blockIdx emulation::block
 #define __syncthreads() emulation::meet(emulation::whole_block, __LINE__)

@@ -1,16 +1,24 @@
-// The kernels of raster.cu as a library that tests call by name.
+// The kernels of a program as a library that tests call by name.
 #include "emulation.h"
 
+#if FEATURES
 #include "raster.cu"
+#else
+#include "fit.cu"
+#endif
 
 using namespace sigmasplat;
 #define ENTRY(kernel) {#kernel, emulation::Call<kernel>::run}
 static const emulation::Entry ENTRIES[] = {
+#if !FEATURES
+    ENTRY(mapping_losses), ENTRY(ssim), ENTRY(ssim_backward), ENTRY(shape_terms), ENTRY(adam),
+#else
     ENTRY(project_splats), ENTRY(project_splats_backward), ENTRY(pack_given), ENTRY(list_pairs_short), ENTRY(list_pairs_int),
     ENTRY(blend), ENTRY(blend_moment), ENTRY(blend_ids), ENTRY(blend_moment_ids), ENTRY(blend_backward),
     ENTRY(blend_backward_moment), ENTRY(sum_records), ENTRY(chain_given),
 #if FEATURES <= 7
     ENTRY(pack_view), ENTRY(blend_backward_pose), ENTRY(chain_params), ENTRY(chain_pose),
+#endif
 #endif
 };
 
