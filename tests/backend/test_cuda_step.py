@@ -1,12 +1,16 @@
 """Hold the fused CUDA mapping step, emulated, to its definitions in torch, float64."""
 
 from collections.abc import Iterator
+from pathlib import Path
+from traceback import extract_stack
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from emulated_cuda import Emulator
 from sigmasplat.fit.cuda_step import CudaStep
@@ -15,10 +19,12 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.render.cuda_raster import Raster
 from sigmasplat.render.cuda_view import CudaView
-from splat_fields import OPTIONS, crowd, exact_view
-from splat_scenes import SMALL, WIDE, assert_same_vector
+from splat_fields import OPTIONS, crowd, exact_view, params_of
+from splat_scenes import SMALL, WIDE, assert_same_vector, scene
 from test_compiled_loss import RATES, TERMS, WEIGHTS, draw_planes, fields, random_gradient, target_of
 from test_cuda_view import CPU, rubbish
+
+Reads = list[tuple[str, str]]
 
 SIZES = (SMALL, WIDE, Camera(33, 17, 30.0, 30.0, 15.5, 8.2), Camera(16, 16, 20.0, 20.0, 7.5, 7.5))
 
@@ -115,3 +121,43 @@ def test_the_order_of_threads_between_barriers_means_nothing(on_the_cpu: Emulato
     on_the_cpu.order = order
     (again, got), _ = both_ways(WIDE, WEIGHTS, True)
     assert loss == again and torch.equal(got, want)
+
+
+WAITS = {
+    Tensor.item, Tensor.tolist, Tensor.numpy, Tensor.cpu, Tensor.nonzero, Tensor.__float__, Tensor.__int__,
+    Tensor.__bool__, Tensor.__array__,
+}  # fmt: skip
+"""What makes the host wait for a tensor of a device."""
+
+
+class Watch(TorchFunctionMode):
+    """Note where a tensor is read by the host."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reads: Reads = []
+
+    def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if function in WAITS:
+            reader = next(x for x in reversed(extract_stack()) if "sigmasplat" in x.filename)
+            self.reads.append((Path(reader.filename).name, function.__name__))
+        return function(*args, **(kwargs or {}))
+
+
+def test_the_host_waits_at_the_end_of_an_iteration_only() -> None:
+    s = scene("random", 60)
+    field, view = fields(60)[0], CudaView(s.camera, OPTIONS, True, CPU)
+    field.params.copy_(params_of(s))
+    target, step = target_of(s.camera, (s.camera.height, s.camera.width)), CudaStep(view)
+    T = s.T_camera_world.double().numpy()
+    view.forward(field.params, T)  # says how many pairs to expect
+    with Watch() as watch:
+        field.steps += 1
+        step.forward(field, T, target, WEIGHTS)
+        assert watch.reads == []
+        loss = step.images(target, WEIGHTS)
+        assert watch.reads == []
+        step.splats(field, RATES, WEIGHTS, 3)
+    of_the_host = [("cuda_raster.py", "__int__"), ("cuda_step.py", "numpy")]  # the pairs, which had arrived; the rates
+    assert watch.reads == [*of_the_host, ("cuda_step.py", "cpu"), ("cuda_step.py", "numpy")]
+    assert float(loss) > 0

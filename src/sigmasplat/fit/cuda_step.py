@@ -41,17 +41,12 @@ class CudaStep:
         moment, on_moment = (v.moment, v.g_moment) if local[5] else (None, None)
         planes = (v.sums, target.color, target.depth, median, moment, v.g_sums, on_median, on_moment)
         blocks = blocks_for(self._pixels)
-        sums = v.raster.empty(blocks, len(LOCAL_TERMS), dtype=torch.float64)
+        sums = v.raster.empty(blocks, 1, dtype=torch.float64)
         v.raster.launch_fit(
             "mapping_losses", blocks, planes, self._pixels, int(len(v.sums) >= 7), per_pixel, local.astype(np.float32),
             sums,
         )  # fmt: skip
-        shares = (
-            torch.tensor([1 / 3, 1.0, 1 / 3, 1 / 3, 1.0, 1.0], dtype=torch.float64)
-            * torch.from_numpy(local)
-            * per_pixel
-        )
-        loss = sums.sum(0) @ shares.to(sums.device, non_blocking=True)
+        loss = sums.sum()
         return loss + self._ssim(target, weights["ssim"]) if weights["ssim"] else loss
 
     def _ssim(self, target: Target, weight: float) -> Tensor:

@@ -42,7 +42,7 @@ class Rows:
             self.moment1 = torch.zeros_like(self.params)
         if self.moment2.shape != self.params.shape:
             self.moment2 = torch.zeros_like(self.params)
-        if len(self.last_step) != len(self.params):
+        if len(self.last_step) != len(self.params) or self.last_step.device != self.params.device:
             self.last_step = torch.zeros(len(self.params), dtype=torch.int32, device=self.params.device)
 
     def __len__(self) -> int:
@@ -98,7 +98,7 @@ class GaussianField(Rows):
         if self.params.ndim != 2 or self.params.shape[1] != WIDTH:
             raise SigmaSplatError(f"a field needs params [N, {WIDTH}], found {tuple(self.params.shape)}")
         super().__post_init__()
-        if len(self.ids) != len(self.params):
+        if len(self.ids) != len(self.params) or self.ids.device != self.params.device:
             self.ids, self.born = torch.arange(len(self.params), device=self.params.device), len(self.params)
 
     @staticmethod

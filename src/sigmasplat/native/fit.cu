@@ -17,40 +17,39 @@ struct LossPlanes {                        // median_depth and moment, and their
 };
 struct LossWeights { float l1, depth, nll_color, nll_depth, alignment, moment; };
 
-// Store, block by block, what each of the six terms sums up to over valid pixels; write every gradient plane whole.
+// Store, block by block, what the weighted terms sum up to over valid pixels; write every gradient plane whole.
 KERNEL mapping_losses(LossPlanes p, int pixels, int variance, float per_pixel, LossWeights weights, double* sums) {
     const int at = thread_number();
-    float terms[6] = {};
+    float cost = 0.f;
     if (at < pixels) {
         const float reading = p.depth[at], per_value = per_pixel / 3.f;
         const bool valid = reading > 0.f;
         const float depth = p.sums[3 * size_t(pixels) + at], depth_error = valid ? depth - reading : 0.f;
-        terms[1] = fabsf(depth_error);
+        cost = weights.depth * per_pixel * fabsf(depth_error);
         float on_depth = signed_weight(depth_error, weights.depth * per_pixel);
         if (p.median_depth) {              // both sides are pulled; where no splat takes half the light there is none
             const float median = p.median_depth[at], apart = valid && median > 0.f ? depth - median : 0.f;
             const float pull = signed_weight(apart, weights.alignment * per_pixel);
-            terms[4] = fabsf(apart);
+            cost += weights.alignment * per_pixel * fabsf(apart);
             on_depth += pull;
             p.on_median_depth[at] = -pull;
         }
         if (p.moment) {
             const float U = valid ? p.moment[at] : 0.f;
-            terms[5] = fabsf(U);
+            cost += weights.moment * per_pixel * fabsf(U);
             p.on_moment[at] = signed_weight(U, weights.moment * per_pixel);
         }
         p.on_sums[3 * size_t(pixels) + at] = on_depth;
         for (int c = 0; c < 3; c++) {
             const float color = p.sums[c * size_t(pixels) + at], error = valid ? color - p.color[c * size_t(pixels) + at] : 0.f;
             float on_color = signed_weight(error, weights.l1 * per_value);
-            terms[0] += fabsf(error);
+            cost += weights.l1 * per_value * fabsf(error);
             if (variance) {                // ½ r²/(V+ε) + ½ log(V+ε), r detached, V clamped at 0 here only
                 const float raw = p.sums[(4 + c) * size_t(pixels) + at] - color * color, v = fmaxf(raw, 0.f) + NLL_EPSILON;
                 const float inverse = 1.f / v, log_v = logf(v), color2 = error * error, depth2 = depth_error * depth_error;
-                if (valid) {
-                    terms[2] += 0.5f * (color2 * inverse + log_v);
-                    terms[3] += 0.5f * (depth2 * inverse + log_v);
-                }
+                if (valid)
+                    cost += 0.5f * per_value * (weights.nll_color * fmaf(color2, inverse, log_v)
+                                                + weights.nll_depth * fmaf(depth2, inverse, log_v));
                 const float on_v = valid && raw >= 0.f
                     ? 0.5f * per_value * (weights.nll_color * (inverse - color2 * inverse * inverse)
                                           + weights.nll_depth * (inverse - depth2 * inverse * inverse))
@@ -61,7 +60,7 @@ KERNEL mapping_losses(LossPlanes p, int pixels, int variance, float per_pixel, L
             p.on_sums[c * size_t(pixels) + at] = on_color;
         }
     }
-    store_sums<6>(terms, sums);
+    store_sums<1>(&cost, sums);
 }
 
 // ---- SSIM: 11×11 Gaussian, zero beyond the border and where there is no reading ---------------------------------------
