@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import wraps
+from functools import partial, wraps
 from typing import Any
 
 import pytest
 import torch
 
 from emulated_cuda import Emulator, why_not
+from sigmasplat.render import Render, render
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,8 @@ class Backend:
     name: str
     project: Callable[..., Any]
     blend: Callable[..., Any]
+    render: Callable[..., Any]
+    """Of a whole field, as `sigmasplat.render.render`; the maps come back to the CPU."""
 
 
 @pytest.fixture(scope="session")
@@ -38,14 +41,14 @@ def backend(request: pytest.FixtureRequest) -> Backend:
 def _reference(request: pytest.FixtureRequest) -> Backend:
     from sigmasplat.render import reference
 
-    return Backend("reference", reference.project, reference.blend)
+    return Backend("reference", reference.project, reference.blend, partial(render, backend="reference"))
 
 
 def _cpu(request: pytest.FixtureRequest) -> Backend:
     pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built (make test builds it)")
     from sigmasplat.render import cpu
 
-    return Backend("cpu", cpu.project, cpu.blend)
+    return Backend("cpu", cpu.project, cpu.blend, partial(render, backend="cpu"))
 
 
 def _emulated(request: pytest.FixtureRequest) -> Backend:
@@ -54,14 +57,14 @@ def _emulated(request: pytest.FixtureRequest) -> Backend:
     emulator: Emulator = request.getfixturevalue("emulator")
 
     def stand_in(operator: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(operator)
-        def run(*inputs: Any) -> Any:
+        def run(*inputs: Any, **named: Any) -> Any:
             with emulator.standing_in():
-                return operator(*inputs)
+                return operator(*inputs, **named)
 
         return run
 
-    return Backend("emulated", stand_in(cuda.project), stand_in(cuda.blend))
+    whole = partial(render, backend="cuda")
+    return Backend("emulated", stand_in(cuda.project), stand_in(cuda.blend), stand_in(whole))
 
 
 def _cuda(request: pytest.FixtureRequest) -> Backend:
@@ -80,7 +83,11 @@ def _cuda(request: pytest.FixtureRequest) -> Backend:
 
         return run
 
-    return Backend("cuda", on_device(cuda.project), on_device(cuda.blend))
+    def whole(*inputs: Any, **named: Any) -> Render:
+        maps = vars(render(*inputs, **named, backend="cuda"))
+        return Render(**{name: None if plane is None else plane.cpu() for name, plane in maps.items()})
+
+    return Backend("cuda", on_device(cuda.project), on_device(cuda.blend), whole)
 
 
 MAKERS = {"reference": _reference, "cpu": _cpu, "emulated": _emulated, "cuda": _cuda}

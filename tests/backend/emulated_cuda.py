@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+import torch
 
 from sigmasplat.native import cubins
 from sigmasplat.render import cuda_launch
@@ -49,6 +50,7 @@ class Emulator:
         """Let the CUDA backend take tensors on the CPU, those of renders begun inside."""
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(cuda_launch, "launcher_for", lambda device: self)
+            patch.setattr(cuda_launch, "this_device", lambda: torch.device("cpu"))
             yield
 
     def _library(self, features: int) -> ctypes.CDLL:

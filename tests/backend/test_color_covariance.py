@@ -88,7 +88,7 @@ def test_law_of_total_covariance(backend: Any, kind: str) -> None:
     own = matrices(covariances_of(exact.variances, exact.extras["correlations"].params))
     mean = w @ c
     want = np.einsum("hwn,nij->hwij", w, own + c[:, :, None] * c[:, None]) - mean[..., None] * mean[..., None, :]
-    got = render(field, s.camera, T, options=OPTIONS, backend=backend.name)
+    got = backend.render(field, s.camera, T, options=OPTIONS)
     assert got.covariance is not None and np.abs(want[..., 0, 1]).max() > 1e-2
     np.testing.assert_allclose(matrices(got.covariance), want, atol=2e-5)
     assert np.linalg.eigvalsh(matrices(got.covariance).astype(np.float64)).min() > -2e-6
@@ -97,8 +97,8 @@ def test_law_of_total_covariance(backend: Any, kind: str) -> None:
 def test_diagonal_of_it_is_the_variance_that_a_field_without_correlations_shows(backend: Any) -> None:
     s = scene("random", 40)
     field = field_of(s)
-    with_them = render(field, s.camera, s.T_camera_world, options=OPTIONS, backend=backend.name)
-    without = render(GaussianField(field.params), s.camera, s.T_camera_world, options=OPTIONS, backend=backend.name)
+    with_them = backend.render(field, s.camera, s.T_camera_world, options=OPTIONS)
+    without = backend.render(GaussianField(field.params), s.camera, s.T_camera_world, options=OPTIONS)
     assert without.covariance is None and with_them.covariance is not None
     assert torch.equal(with_them.covariance[..., :3], with_them.variance)
     for name in ("color", "depth", "alpha", "variance"):
@@ -111,7 +111,7 @@ def test_moving_field_and_camera_together_changes_nothing(backend: Any) -> None:
     moved = field.moved(move)
     moved.extras = field.extras
     T = s.T_camera_world @ torch.as_tensor(se3.inverse(move.numpy()))
-    a, b = (render(f, s.camera, pose, backend=backend.name) for f, pose in ((field, s.T_camera_world), (moved, T)))
+    a, b = (backend.render(f, s.camera, pose) for f, pose in ((field, s.T_camera_world), (moved, T)))
     assert a.covariance is not None and b.covariance is not None
     torch.testing.assert_close(a.covariance, b.covariance, rtol=1e-4, atol=2e-5)
 

@@ -12,8 +12,8 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.color_covariance import covariances_of, outer
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.harmonics import view_colors
+from sigmasplat.render import cuda_launch
 from sigmasplat.render.backend import backend_module, is_cuda
-from sigmasplat.render.cuda_launch import this_device
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ def render(
     """
     kernels, options = backend_module(backend, field.params.device), options or RenderConfig()
     if is_cuda(kernels) and field.params.device.type == "cpu":  # asked for by name
-        field = field.on(this_device())
+        field = field.on(cuda_launch.this_device())
     T = torch.as_tensor(T_camera_world)
     p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
     features = _features_from(field, p.z, T if options.color_pose_gradient else T.detach())
