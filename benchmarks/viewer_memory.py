@@ -2,13 +2,15 @@
 
 A system is made up that grows as a real one does, without its work: frames, keyframes with pictures, submaps that are
 finished to disk, an active map that changes all the time. It is shown through the very watcher and stage of `sigmasplat
-run --view`, to one client in another process, which looks from ever new places; what is shown is changed every 5 s.
-Kept is the resident memory of the server's process. Writes benchmarks/results/viewer-memory-<machine>.json, prints
-tables. Linux only.
+run --view`, to one client in another process, which looks from ever new places; what is shown is changed every 4 s.
+Kept is the resident memory of the server's process at rest: every 15 s splats are shown in their colours and nothing
+new comes for 3 s, so that like is compared with like; and how much of it is in use, by glibc's own count. Writes
+benchmarks/results/viewer-memory-<machine>.json, prints tables. Linux only.
 
 example: python benchmarks/viewer_memory.py --minutes 1
 """
 
+import ctypes
 import os
 import subprocess
 import sys
@@ -43,7 +45,7 @@ from sigmasplat.viewer.stage import Stage
 arg = tyro.conf.arg
 STATM = Path("/proc/self/statm")
 CAMERA = Camera(160, 120, 131.0, 131.0, 79.5, 59.5)
-KEYFRAME_EVERY, SUBMAP_EVERY, CHANGE_S, SAMPLE_S = 5, 200, 5.0, 5.0
+KEYFRAME_EVERY, SUBMAP_EVERY, CHANGE_S, SAMPLE_S, REST_S = 5, 200, 4.0, 15.0, 3.0
 CLIENT = """
 import itertools, math, sys, time
 import msgspec, viser
@@ -135,6 +137,23 @@ def resident_mib() -> float:
     return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
+class Counts(ctypes.Structure):
+    """What glibc counts of its heap (mallinfo2, malloc.h), bytes; uordblks and hblkhd are in use."""
+
+    _fields_ = [
+        *((name, ctypes.c_size_t) for name in ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks")),
+        *((name, ctypes.c_size_t) for name in ("fsmblks", "uordblks", "fordblks", "keepcost")),
+    ]
+
+
+def in_use_mib() -> float:
+    """Return the memory that is allocated in this process; the rest of the resident one is code and holes."""
+    mallinfo2 = ctypes.CDLL(None).mallinfo2
+    mallinfo2.restype = Counts
+    counts = mallinfo2()
+    return float(counts.uordblks + counts.hblkhd) / 2**20
+
+
 def measure(options: Options) -> dict[str, Any]:
     """Show the growing system for as long as asked; return the figures."""
     server = open_server(HOST, 8780, "viewer memory")
@@ -165,8 +184,12 @@ def watch(growing: Growing, stage: Stage, options: Options) -> dict[str, Any]:
     samples: list[dict[str, float]] = []
     while (now_s := time.monotonic() - begun_s) < 60.0 * options.minutes:
         live(growing())
-        if now_s >= SAMPLE_S * len(samples):
-            samples.append({"s": now_s, "resident_mib": resident_mib(), "clients": len(stage.server.get_clients())})
+        if now_s >= SAMPLE_S * (len(samples) + 1):
+            stage.panel.kind.value, stage.panel.colouring.value = SAYS["splats"], "colour"
+            show(live.moment())
+            time.sleep(REST_S)
+            memory = {"resident_mib": resident_mib(), "in_use_mib": in_use_mib()}
+            samples.append({"s": now_s, **memory, "clients": len(stage.server.get_clients())})
         stage.panel.kind.value = SAYS[KINDS[int(now_s / CHANGE_S) % len(KINDS)]]
         stage.panel.colouring.value = ("colour", "σ")[int(now_s / CHANGE_S / len(KINDS)) % 2]
         time.sleep(max(0.0, growing.frames / options.frames_per_s - (time.monotonic() - begun_s)))
