@@ -177,6 +177,8 @@ class Stage:
                 self._joined = (splats, joined(pieces, cut))
             camera = viewpoint(c.fov, c.aspect, LIVE_ROWS if moment.live else ROWS)
             made: Picture = picture_of(self._joined[1], camera, pose, wanted.layer, moment.options, moment.backend)
+            if client.client_id not in self.server.get_clients():
+                return None  # it hung up meanwhile
             client.scene.set_background_image(made.pixels, "jpeg", jpeg_quality=85)
             drawn = self._drawn[key] = (state, made.legend)
         legend: Legend | None = drawn[1]
