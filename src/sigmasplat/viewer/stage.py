@@ -11,7 +11,7 @@ import viser
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.metrics.palette import INFERNO
 from sigmasplat.viewer import lines
-from sigmasplat.viewer.moment import Moment, Piece
+from sigmasplat.viewer.moment import BUDGET, Moment, Piece, within_budget
 from sigmasplat.viewer.panel import Panel, Wanted
 from sigmasplat.viewer.pictures import Legend, Picture, legend_picture, picture_of, viewpoint
 from sigmasplat.viewer.scene import Scene, look, look_first, pose_of
@@ -148,7 +148,8 @@ class Stage:
         ends = span if wanted.colouring == "σ" else None  # its own colours do not depend on the range
         state = ([(p.name, Same(p.field)) for p in pieces], wanted.colouring, ends, cut)
         if self._is_new("splats", state):
-            drawn = {p.name: (splats_of(p.field, wanted.colouring, span, cut), p.T_world_piece) for p in pieces}
+            few = within_budget(pieces, BUDGET)  # a final map may be larger; it is rendered whole, but sent thinned
+            drawn = {p.name: (splats_of(p.field, wanted.colouring, span, cut), p.T_world_piece) for p in few}
             self.scene.show_splats(drawn)
         else:
             self.scene.place_splats({piece.name: piece.T_world_piece for piece in pieces})
