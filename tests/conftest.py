@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +11,10 @@ import pytest
 from PIL import Image
 
 import sigmasplat  # noqa: F401 - before any test imports torch: idle OpenMP threads then sleep (sigmasplat.env), 5× faster
+
+# A shell that starts tests in the background has them ignore Ctrl-C, which some of them are about.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 TINY_SIZE = (32, 24)  # width, height
 TINY_DEPTH_M = 2.0

@@ -157,8 +157,8 @@ def test_an_heir_knows_what_is_in_view_and_an_empty_one_nothing() -> None:
     """Inherited splats are where they were in the world, and only those that the new submap's first view can feel."""
     slam = followed(settings(loops__close="false", submaps__frames="0"), finish=False)
     T_submap_camera, whole = slam.mapper.keyframes[-1].T_world_camera, slam.mapper.field
-    assert slam._view is not None
-    heir = slam.mapper.successor(slam._view, T_submap_camera).field
+    assert slam.view is not None
+    heir = slam.mapper.successor(slam.view, T_submap_camera).field
     assert 0 < len(heir) < len(whole)
     old = {tuple(row) for row in whole.params[:, 7:].tolist()}
     assert all(tuple(row) in old for row in heir.params[:, 7:].tolist())
@@ -166,7 +166,7 @@ def test_an_heir_knows_what_is_in_view_and_an_empty_one_nothing() -> None:
     apart = (back.means[:50, None] - whole.means).norm(dim=2)
     assert float(apart.min(1).values.max()) < 1e-5
     slam.mapper.config = settings(submaps__inherit="false")
-    assert len(slam.mapper.successor(slam._view, T_submap_camera).field) == 0
+    assert len(slam.mapper.successor(slam.view, T_submap_camera).field) == 0
 
 
 def test_an_unfinished_run_shows_all_submaps_side_by_side() -> None:
