@@ -7,10 +7,12 @@
 # make clean  remove .venv and everything built
 #
 # PYTHON=python3.12    another interpreter
-# PIP_ARGS="…"         extra pip options, for instance --extra-index-url https://download.pytorch.org/whl/cpu
+# TORCH_INDEX=URL      where torch comes from if it answers; PyTorch's own index has the build without gigabytes of CUDA
+# PIP_ARGS="…"         extra pip options
 # PYTEST_ARGS="…"      extra pytest options, for instance -k trajectory -x
 
 PYTHON ?= python3
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 PIP_ARGS ?=
 PYTEST_ARGS ?=
 VENV := .venv
@@ -51,13 +53,13 @@ pytest: lint types
 install: $(VENV)/installed
 install-dev: $(VENV)/installed-dev
 
-$(VENV)/installed: $(VENV)/build-tools $(PACKAGED)
+$(VENV)/installed: $(VENV)/build-tools $(VENV)/torch $(PACKAGED)
 	@echo "installing sigmasplat into $(VENV) (the first time a few minutes)"
 	$(INSTALL) --no-build-isolation .
 	@touch $@
 
 # The development install is a full install too: it spares `make demo` its own.
-$(VENV)/installed-dev: $(VENV)/build-tools $(PACKAGED)
+$(VENV)/installed-dev: $(VENV)/build-tools $(VENV)/torch $(PACKAGED)
 	@echo "installing sigmasplat[dev] into $(VENV) (the first time a few minutes)"
 	$(INSTALL) --no-build-isolation '.[dev]'
 	@touch $@ $(VENV)/installed
@@ -70,6 +72,18 @@ $(VENV)/created:
 	@command -v $(CXX) >/dev/null || $(call refuse,no C++ compiler: sudo apt install g++)
 	@$(PYTHON) -m venv $(VENV) >/dev/null 2>&1 || $(venv_without_ensurepip) \
 		|| $(call refuse,cannot make $(VENV): sudo apt install python3-venv)
+	@touch $@
+
+# PyPI's torch for Linux brings CUDA. An index that does not answer is left out: pip would try again for minutes.
+answers = $(PYTHON) -c 'import sys, urllib.request as u; u.urlopen(sys.argv[1], timeout=5)' $(1)/torch/ >/dev/null 2>&1
+
+$(VENV)/torch: $(VENV)/created
+	@if $(call answers,$(TORCH_INDEX)); then \
+		echo "installing torch from $(TORCH_INDEX)"; $(INSTALL) torch --extra-index-url $(TORCH_INDEX); \
+	else \
+		echo "installing torch from pip's own index (no answer from $(TORCH_INDEX)); it may bring gigabytes of CUDA"; \
+		$(INSTALL) torch; \
+	fi
 	@touch $@
 
 # In the environment itself, not in pip's throw-away one: then a later install compiles only what changed.

@@ -8,6 +8,7 @@
 """
 
 import os
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -59,3 +60,8 @@ def _choice(environment: Mapping[str, str], name: str, allowed: tuple[str, ...])
     if text not in allowed:
         raise ConfigError(f"{name} is {text!r}; give one of {', '.join(allowed)}")
     return text
+
+
+def install_extra(extra: str) -> str:
+    """Return the command that installs an optional dependency into the Python that runs."""
+    return f"{sys.executable} -m pip install 'sigmasplat[{extra}]'"

@@ -1,11 +1,14 @@
 """Put a scored run onto its page, report.html: one file that can be sent, readable by somebody who was not there."""
 
 import json
+import shlex
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from sigmasplat.config import Config
+from sigmasplat.config.text import differences
 from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.io.embedded import data_uri
 from sigmasplat.io.runs import RunFolder
@@ -17,6 +20,7 @@ from sigmasplat.metrics.story import advice, in_short, unsure
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.presets import default_preset, list_presets, preset
 from sigmasplat.render import render
 
 LOOKS = 24
@@ -50,7 +54,7 @@ def write_page(
         warnings=warnings,
         loops=run.read_loops(),
         story=in_short(metrics, _machine(run)),
-        advice=advice(metrics, str(run.path), str(facts.get("source_path") or "PATH"), config.to_dict()),
+        advice=advice(metrics, str(run.path), _again(config, facts), config.to_dict()),
         unsure=unsure(metrics, plan),
         seconds=_seconds(run),
         picture=partial(_shown, run),
@@ -79,6 +83,18 @@ def plan_of(run: RunFolder, field: GaussianField, log: list[dict[str, Any]], cam
 def _machine(run: RunFolder) -> str:
     made_on = run.facts().get("machine") or {}
     return f"{made_on.get('cpu')}, {made_on.get('cores')} cores"
+
+
+def _again(config: Config, facts: dict[str, Any]) -> str:
+    """Return the command that makes the run again: its preset, and every setting that differs from it."""
+    words = ["sigmasplat", "run", str(facts.get("source_path") or "PATH")]
+    if config.name not in list_presets():
+        return shlex.join(words)
+    if config.name != default_preset():
+        words += ["--preset", config.name]
+    return shlex.join(
+        [*words, *(word for pair in differences(config, preset(config.name)) for word in ("--set", pair))]
+    )
 
 
 def _seconds(run: RunFolder) -> dict[str, float]:

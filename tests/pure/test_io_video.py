@@ -82,6 +82,6 @@ def test_other_names_and_a_missing_opencv_are_refused(tmp_path: Path, monkeypatc
     with pytest.raises(RunError, match=r"as a\.avi; give a name that ends in \.webm, \.mp4, \.gif, \.webp"):
         write_video(tmp_path / "a.avi", images(), 20.0)
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(BackendError, match=r"pip install 'sigmasplat\[video\]', or write \.gif or \.webp"):
+    with pytest.raises(BackendError, match=r"pip install 'sigmasplat\[video\]'; or write \.gif or \.webp"):
         write_video(tmp_path / "a.webm", images(), 20.0)
     write_video(tmp_path / "a.gif", images(), 20.0)

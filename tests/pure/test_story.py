@@ -16,7 +16,7 @@ from sigmasplat.io.embedded import data_uri
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.metrics.doubtful import Region
 from sigmasplat.metrics.story import advice, in_short, unsure
-from sigmasplat.page import write_page
+from sigmasplat.page import _again, write_page
 from sigmasplat.presets import preset
 
 GOOD = {
@@ -26,6 +26,7 @@ GOOD = {
     "training": {"psnr_db": 31.5}, "uncertainty": {"spearman": 0.55}, "submaps": 1, "loops": {"accepted": 0},
 }  # fmt: skip
 SETTINGS = preset("sigma").to_dict()
+RUN = "sigmasplat run data/k"
 
 
 def said(**changes) -> str:
@@ -79,14 +80,30 @@ def test_nothing_is_said_of_what_is_not_known() -> None:
 )
 def test_advice_names_a_command_that_can_be_given(changes: dict, settings: dict, words: str, command: str) -> None:
     config = override(preset("sigma"), settings)
-    found = [item for item in advice(GOOD | changes, "runs/k", "data/k", config.to_dict()) if words in item[0]]
+    found = [item for item in advice(GOOD | changes, "runs/k", RUN, config.to_dict()) if words in item[0]]
     assert len(found) == 1 and command in found[0][1]
     given = shlex.split(found[0][1])
     override(config, split_settings(value for flag, value in pairwise(given) if flag == "--set"))
 
 
 def test_a_good_run_is_only_told_what_to_do_with_it() -> None:
-    assert [command.split()[1] for _, command in advice(GOOD, "runs/k", "data/k", SETTINGS)] == ["view", "mesh"]
+    assert [command.split()[1] for _, command in advice(GOOD, "runs/k", RUN, SETTINGS)] == [
+        "view",
+        "mesh",
+    ]
+
+
+def test_the_command_that_is_advised_keeps_what_the_run_was_made_with() -> None:
+    config = override(
+        preset("sigma"), {"input.fx": "570", "input.register_depth": "on", "input.limit": "7", "seed": "3"}
+    )
+    again = _again(config, {"source_path": "data/my room"})
+    words = shlex.split(again)
+    assert words[:3] == ["sigmasplat", "run", "data/my room"]
+    made = override(preset("sigma"), split_settings(value for flag, value in pairwise(words) if flag == "--set"))
+    assert made == config
+    assert shlex.split(_again(preset("varsplat-fast"), {}))[3:] == ["--preset", "varsplat-fast"]
+    assert _again(replace(config, name="mine"), {}) == "sigmasplat run PATH"
 
 
 def test_where_it_was_unsure() -> None:

@@ -64,6 +64,8 @@ def run(
         raise ConfigError("--record is for a live camera; the sequence is recorded already")
     elif warning := depth_warning(source):
         screen.warn(warning)
+    if source.registrable and not source.depth_registered:
+        screen.warn("depth stays in its own camera's pixels; --register-depth on moves it to colour (see inspect)")
     with stage_for(screen, ways) as stage:
         folder = new_folder(out, config, source, overwrite, source_path=absolute(path))
         announce(screen, config.name, source, folder, record)

@@ -37,6 +37,19 @@ def split_settings(settings: Iterable[str]) -> dict[str, str]:
     return {name.strip(): value for name, _, value in pairs}
 
 
+def differences(config: Config, base: Config) -> list[str]:
+    """Return the settings of one configuration that differ from another's, but for its name, as SECTION.NAME=VALUE."""
+    ours, theirs = _flat(dataclasses.asdict(config)), _flat(dataclasses.asdict(base))
+    return [f"{name}={value}" for name, value in ours.items() if value != theirs[name] and name != "name"]
+
+
+def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Name nested values SECTION.NAME."""
+    inner = {key: value if isinstance(value, Mapping) else None for key, value in values.items()}
+    flat = {key: value for key, value in values.items() if inner[key] is None}
+    return flat | {f"{key}.{name}": item for key, section in inner.items() if section for name, item in section.items()}
+
+
 def _replaced(section: Any, field: str, name: str, text: str) -> Any:
     """Return a section with one value replaced; `name` is how the user called it."""
     types = {known: kind for known, kind in get_type_hints(type(section)).items() if not dataclasses.is_dataclass(kind)}

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from sigmasplat.env import install_extra
 from sigmasplat.errors import BackendError, RunError
 from sigmasplat.io.atomic import replacing
 
@@ -58,7 +59,7 @@ def _opencv() -> Any:
         import cv2
     except ImportError as problem:
         raise BackendError(
-            "films as .webm and .mp4 need OpenCV: pip install 'sigmasplat[video]', or write .gif or .webp"
+            f"films as .webm and .mp4 need OpenCV: {install_extra('video')}; or write .gif or .webp"
         ) from problem
     return cv2
 

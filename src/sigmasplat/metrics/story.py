@@ -111,9 +111,8 @@ def ranges(indices: list[int], most: int = 4) -> str:
     return ", ".join(words) + (", …" if len(runs) > most else "")
 
 
-def advice(metrics: Metrics, run: str, path: str, settings: dict[str, Any]) -> list[Advice]:
-    """Return what to try next; `run` and `path` are the run's folder and its sequence, `settings` its config.json."""
-    again = f"sigmasplat run {path}"
+def advice(metrics: Metrics, run: str, again: str, settings: dict[str, Any]) -> list[Advice]:
+    """Return what to try next; `run` is its folder, `again` the command that made it, `settings` its config.json."""
     found = [rule(metrics, again, settings) for rule in (_lost, _few_keyframes, _blurred, _holes, _slow, _no_loop)]
     use = ("Look at it from all sides, hide what is doubtful:", f"sigmasplat view {run}")
     surface = ("Make a surface for other programs:", f"sigmasplat mesh {run} --out room.glb")

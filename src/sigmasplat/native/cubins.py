@@ -10,6 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
+from sigmasplat.env import install_extra
 from sigmasplat.errors import BackendError
 
 FOLDER = Path(__file__).parent
@@ -22,7 +23,7 @@ FITTING = 0
 PROGRAMS = (FITTING, *FEATURE_COUNTS)
 ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
 """What the tests compile for; any other that NVRTC knows is compiled when a device asks for it."""
-INSTALL = "pip install 'sigmasplat[gpu]'"
+INSTALL = install_extra("gpu")
 INSTALL_OLDER = "pip install 'cuda-bindings<13' nvidia-cuda-nvrtc-cu12"
 """For drivers that know CUDA 12 only."""
 

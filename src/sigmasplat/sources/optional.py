@@ -3,6 +3,7 @@
 import importlib
 from typing import Any
 
+from sigmasplat.env import install_extra
 from sigmasplat.errors import SourceError
 
 
@@ -11,7 +12,7 @@ def needed(module: str, extra: str, what: str) -> Any:
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        raise SourceError(f"{what} needs {module} ({error}): pip install 'sigmasplat[{extra}]'") from error
+        raise SourceError(f"{what} needs {module} ({error}): {install_extra(extra)}") from error
     except ImportError as error:
         raise SourceError(
             f"{what} needs {module}, which is there but does not load ({error}); install the system library it names"

@@ -7,6 +7,7 @@ import logging
 import socket
 from typing import TYPE_CHECKING
 
+from sigmasplat.env import install_extra
 from sigmasplat.errors import ConfigError, SigmaSplatError
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ def open_server(host: str, port: int, title: str) -> "ViserServer":
         import viser
     except ImportError as problem:
         raise SigmaSplatError(
-            f"the viewer needs viser ({problem}); install it with: pip install 'sigmasplat[viewer]'"
+            f"the viewer needs viser ({problem}); install it with: {install_extra('viewer')}"
         ) from problem
 
     class LocalServer(viser.ViserServer):
