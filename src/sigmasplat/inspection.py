@@ -13,12 +13,15 @@ from sigmasplat.model.frame import Frame
 from sigmasplat.presets import default_preset, list_presets
 from sigmasplat.sources import open_source
 from sigmasplat.sources.base import Source
+from sigmasplat.sources.calibration import CameraUnknown
 from sigmasplat.sources.depth_check import depth_warning
 from sigmasplat.sources.edge_agreement import EdgeAgreement, edge_agreement, overlay
 from sigmasplat.sources.opening import format_of
 
 SAMPLES = 16
 SHOWN = 6
+USUAL_FOCAL = 0.9
+"""Focal length of many depth cameras, in image widths: a field of view of 58°. Good enough to look, not to map."""
 MANY_HOLES = 0.6
 """A map starves where more of the pixels than this have no reading."""
 UNEVEN = 0.2
@@ -38,12 +41,13 @@ class Inspection:
 
 def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPLES) -> Inspection:
     """Open a sequence and look at `samples` frames spread over it. Raises SourceError if it cannot be opened."""
-    format_, source = format_of(path), open_source(path, settings)
+    format_, (source, guessed) = format_of(path), _opened(path, settings)
     frames = _sampled(source, samples)
     if not frames:
         raise SourceError(f"{source.name}: none of {samples} frames sampled can be read; look at the image files")
     agreement = edge_agreement(frames)
     warnings = [
+        *guessed,
         *_depth_warnings(source, frames, settings),
         *_registration_warnings(source, agreement),
         *_brightness_warnings(frames),
@@ -58,6 +62,15 @@ def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPL
         ("suggested preset", _suggested(format_.name)),
     ]
     return Inspection(source.name, rows, warnings, _sheet(frames), agreement)
+
+
+def _opened(path: str | Path, settings: InputConfig) -> tuple[Source, list[str]]:
+    """Open a sequence, with a usual camera and a warning where nothing is known of its own."""
+    try:
+        return open_source(path, settings), []
+    except CameraUnknown as problem:
+        fx = round(USUAL_FOCAL * problem.size[0])
+        return open_source(path, settings, fx=float(fx)), [f"{problem}; here looked at as if fx were {fx} pixels"]
 
 
 def _sampled(source: Source, samples: int) -> list[Frame]:

@@ -98,6 +98,13 @@ def test_changing_brightness_is_warned_of(tiny_tum):
     assert any("tracking.exposure" in warning for warning in inspect_source(tiny_tum, InputConfig()).warnings)
 
 
+def test_a_recording_without_a_camera_is_looked_at_all_the_same(tiny_tum):
+    (tiny_tum / "calibration.json").unlink()
+    found = inspect_source(tiny_tum, InputConfig(depth_scale=1000.0))
+    assert any("camera unknown" in warning and "as if fx were 29 pixels" in warning for warning in found.warnings)
+    assert dict(found.rows)["size"] == "32×24 pixels"
+
+
 def test_an_unreadable_frame_is_counted_not_fatal(tiny_tum):
     (tiny_tum / "rgb/2.png").write_bytes(b"x")
     assert "1 files" in dict(inspect_source(tiny_tum, InputConfig()).rows)["left out"]

@@ -37,6 +37,14 @@ class Calibration:
     registers: bool = True
 
 
+class CameraUnknown(SourceError):
+    """A recording that says nothing of its camera, nor does the user; `size` is (width, height) of its images."""
+
+    def __init__(self, size: tuple[int, int], message: str) -> None:
+        super().__init__(message)
+        self.size = size
+
+
 TUM_UNITS_PER_METRE = 5000.0
 
 # The numbers published with the TUM RGB-D benchmark (repeated in CG-SLAM's loaders), 640×480.
@@ -128,9 +136,10 @@ def calibrated(
         recorded = read_calibration(Path(settings.calibration or beside), size, default_units)
     if recorded is None and not settings.fx:
         place = "a file for --calibration" if folder.is_file() else beside
-        raise SourceError(
+        raise CameraUnknown(
+            size,
             f"camera unknown: {folder} says nothing of it; write {place} with fx, fy, cx, cy, "
-            "depth_scale (PNG units per metre), or give --fx PIXELS (and --fy, --cx, --cy, --depth-scale)"
+            "depth_scale (PNG units per metre), or give --fx PIXELS (and --fy, --cx, --cy, --depth-scale)",
         )
     if recorded is None:
         centred = Camera(*size, settings.fx, settings.fy or settings.fx, (size[0] - 1) / 2, (size[1] - 1) / 2)
