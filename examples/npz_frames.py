@@ -3,7 +3,8 @@
 camera.npz      width, height, fx, fy, cx, cy
 000000.npz …    t (seconds), color (uint8 [H, W, 3]), depth_m (float [H, W], 0 = no reading); T_world_camera if known
 
-Copy this file into src/sigmasplat/sources/ and `sigmasplat run FOLDER` knows the format; nothing else is to be told.
+Copy this file into src/sigmasplat/sources/, then `make install`, since .venv holds an installed copy; from then on
+`sigmasplat run FOLDER` knows the format, and nothing else is to be told.
 """
 
 import zipfile

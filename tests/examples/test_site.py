@@ -1,5 +1,6 @@
 """The documentation's site holds every page, every name and every source that pages link to; `make docs` builds it."""
 
+import ast
 import importlib
 import importlib.util
 import re
@@ -10,6 +11,7 @@ import pytest
 
 import sigmasplat
 from documents import DOCUMENTS, ROOT
+from sigmasplat.config import Config
 
 DOCS = ROOT / "docs"
 PACKAGE = ROOT / "src" / "sigmasplat"
@@ -115,3 +117,21 @@ def test_the_api_pages_hold_every_module_and_every_public_name() -> None:
 
 def test_the_page_of_results_holds_all_of_them() -> None:
     assert "<!-- bench:* -->" in (DOCS / "benchmarks.md").read_text(encoding="utf-8")
+
+
+def test_the_page_of_settings_is_that_of_the_sources() -> None:
+    settings = theme("settings")
+    page = settings.page()
+    assert (DOCS / "settings.md").read_text(encoding="utf-8") == page, "run python docs/theme/settings.py"
+    rows = re.findall(r"^\| `([\w.]+)` \|(?:[^|]|\\\|)+(?:\|(?:[^|]|\\\|)*){4}$", page, re.MULTILINE)
+    flat = {
+        f"{name}.{inner}" for name, value in Config().to_dict().items() if isinstance(value, dict) for inner in value
+    }
+    assert sorted(rows) == sorted({*flat, "name", "seed", "backend"})
+
+
+def test_a_setting_is_said_by_the_text_below_it() -> None:
+    fields = ("x: int = 1", "y: int = 2", '"""Two\n    lines."""', "z = 3", '"""Not a field."""')
+    source = "\n    ".join(("class A:", '"""Of all."""', *fields))
+    (found,) = ast.parse(source).body
+    assert isinstance(found, ast.ClassDef) and theme("settings").sentences(found.body) == {"y": "Two lines."}

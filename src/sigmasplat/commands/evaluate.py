@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def evaluate_run(run: options.RunPath, mesh: options.WithMesh = False, moved_to: options.MovedSource = None) -> int:
     """Score an earlier run again; replaces its metrics, pictures and report.
 
-    example: sigmasplat eval runs/kitchen
+    example: sigmasplat eval runs/kitchen-sigma
     """
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.screen import Screen

@@ -39,7 +39,7 @@ def export(
 
     {formats}
 
-    example: sigmasplat export runs/kitchen --out kitchen.spz --sigma-below 0.1
+    example: sigmasplat export runs/kitchen-sigma --out kitchen.spz --sigma-below 0.02
     """
     origin = Origin(run)
     chosen = choose(FORMATS, format, out)

@@ -13,7 +13,7 @@ def make_mesh(
 ) -> int:
     """Make a surface of a run's map, coloured triangles, from what it shows at its keyframes.
 
-    example: sigmasplat mesh runs/kitchen --out kitchen.glb
+    example: sigmasplat mesh runs/kitchen-sigma --out kitchen.glb
     """
     from sigmasplat.io.mesh import check_name, write_mesh
     from sigmasplat.io.runs import MESH, RunFolder

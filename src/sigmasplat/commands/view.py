@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def view(run: options.RunPath, host: options.Host = HOST, port: options.Port = PORT) -> int:
     """Look at a run in the browser: map, path, uncertainty. A run that goes on is followed.
 
-    example: sigmasplat view runs/kitchen
+    example: sigmasplat view runs/kitchen-sigma
     """
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.screen import Screen

@@ -1,0 +1,95 @@
+"""Write docs/settings.md, every setting with what its source says of it: PYTHONPATH=src python docs/theme/settings.py.
+
+Sentences are read from the sources of `config`, types and values are those that the program has. A test holds the page
+to what this makes.
+"""
+
+import ast
+import dataclasses
+import itertools
+import sys
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "settings.md"
+HEAD = """# Settings
+
+Every setting that `--set SECTION.NAME=VALUE` changes, on the command line of `demo`, `run`, `inspect` and `bench`.
+A run's `config.json` says which it used. *Default* holds where a preset says nothing; *`{preset}`* is the default
+preset's value where it differs, which a run without `--preset` gets. A row without a sentence is said by its name, or
+shares the sentence of the next row, as `fx`, `fy` and `cx` do; … goes on from the row above. Units are in the names:
+`_m` metres, `_deg` degrees, `_px` pixels, `_s` seconds. `lr_` is a learning rate, `weight_` a weight of the loss.
+
+Made from [`config/`](../src/sigmasplat/config/) by `docs/theme/settings.py`. Back to the [README](../README.md).
+"""
+
+
+def sentences(body: list[ast.stmt]) -> dict[str, str]:
+    """Return the text that stands below a field, as the literal after it, by the field's name."""
+    said = {_field(node): _text(below) for node, below in itertools.pairwise(body)}
+    return {name: " ".join(text.split()) for name, text in said.items() if name and text}
+
+
+def classes() -> dict[str, ast.ClassDef]:
+    """Return the classes that the modules of `config` define, by name."""
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "src/sigmasplat/config").glob("*.py")]
+    return {node.name: node for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)}
+
+
+def table(defaults: Any, chosen: Any, preset_name: str, prefix: str = "") -> str:
+    """Write one section: a row per field of a dataclass that is no section itself."""
+    said, kinds = sentences(classes()[type(defaults).__name__].body), get_type_hints(type(defaults))
+    rows = [f"| setting | takes | default | `{preset_name}` | does |", "|---|---|---|---|---|"]
+    for name in (field.name for field in dataclasses.fields(defaults)):
+        value, other = getattr(defaults, name), getattr(chosen, name)
+        if not dataclasses.is_dataclass(value):
+            differing = "" if other == value else _written(other)
+            sentence = said.get(name, "").replace("|", "\\|")
+            rows.append(f"| `{prefix}{name}` | {_words(kinds[name])} | {_written(value)} | {differing} | {sentence} |")
+    return "\n".join(rows) + "\n"
+
+
+def page() -> str:
+    """Return the whole document."""
+    from sigmasplat.config import Config
+    from sigmasplat.presets import default_preset, preset
+
+    defaults, chosen = Config(), preset(default_preset())
+    parts = [HEAD.format(preset=default_preset()), f"## Whole run\n\n{table(defaults, chosen, default_preset())}"]
+    for field in dataclasses.fields(defaults):
+        section = getattr(defaults, field.name)
+        if dataclasses.is_dataclass(section):
+            said = " ".join((ast.get_docstring(classes()[type(section).__name__]) or "").split())
+            rows = table(section, getattr(chosen, field.name), default_preset(), f"{field.name}.")
+            parts.append(f"## {field.name}\n\n{said.partition(' Raises ')[0]}\n\n{rows}")
+    return "\n".join(parts)
+
+
+def _field(node: ast.stmt) -> str:
+    return node.target.id if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) else ""
+
+
+def _text(node: ast.stmt) -> str:
+    """Return a statement that is a text and nothing else; "" for any other."""
+    match node:
+        case ast.Expr(value=ast.Constant(value=str(text))):
+            return text
+    return ""
+
+
+def _words(kind: Any) -> str:
+    if choices := get_args(kind):  # Literal["a", "b"]
+        return ", ".join(f"`{choice}`" for choice in choices)
+    return {int: "whole number", float: "number", bool: "`true`, `false`", str: "text"}[kind]
+
+
+def _written(value: Any) -> str:
+    if isinstance(value, str):
+        return f"`{value}`" if value else "empty"
+    return str(value).lower() if isinstance(value, bool) else f"{value:.6g}"
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(ROOT / "src"))
+    PAGE.write_text(page(), encoding="utf-8")
