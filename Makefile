@@ -1,5 +1,5 @@
 # make demo   install into .venv and run SLAM on the built-in synthetic room
-# make install  install into .venv; again after a change to the sources
+# make install install into .venv; again after a change to the sources
 # make test   install with the development tools, then lint, types, tests
 # make native compile the kernels beside their sources, for work with PYTHONPATH=src
 # make docs   the documentation as a site in site/, to be read from the disk
