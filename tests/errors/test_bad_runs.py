@@ -58,8 +58,8 @@ def test_output_that_is_a_file(tmp_path: Path) -> None:
 
 def test_output_that_cannot_be_made(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    assert "choose a writable --output" in refused(tmp_path / "file" / "run")
-    assert "choose a writable --output" in refused(Path("/proc/sigmasplat-run"))
+    assert "choose a writable --out" in refused(tmp_path / "file" / "run")
+    assert "choose a writable --out" in refused(Path("/proc/sigmasplat-run"))
 
 
 def test_opening_says_what_is_missing(tmp_path: Path) -> None:

@@ -63,7 +63,7 @@ class RunFolder:
             run._claim(overwrite, facts)
         except OSError as problem:
             reason = problem.strerror or problem
-            raise RunError(f"cannot write output {path}: {reason}; choose a writable --output") from problem
+            raise RunError(f"cannot write output {path}: {reason}; choose a writable --out") from problem
         write_json(run.path / "config.json", config.to_dict())
         return run
 
@@ -97,14 +97,14 @@ class RunFolder:
         """Raise RunError unless the folder is an earlier run's of ours that may be overwritten."""
         if not overwrite:
             raise RunError(
-                f"output {self.path} exists and is not empty; give another --output, or --overwrite to replace its run"
+                f"output {self.path} exists and is not empty; give another --out, or --overwrite to replace its run"
             )
         try:
             if not (self.path / "run.json").is_file():
                 raise RunError(f"{self.path} is not a run folder of ours: no run.json")
             self._refuse_unless_ours()
         except RunError as problem:
-            raise RunError(f"not overwriting {self.path}: {problem}; give another --output") from problem
+            raise RunError(f"not overwriting {self.path}: {problem}; give another --out") from problem
 
     def _refuse_unless_ours(self) -> None:
         if self.facts().get("program") != PROGRAM:
