@@ -36,7 +36,7 @@ def evaluate(
     *,
     renderer: views.Renderer | None = None,
     views_per_kind: int = 40,
-    strips_per_kind: int = 6,
+    strips_per_kind: int = 3,
     mesh: bool = False,
     progress: Progress = lambda done, total: None,
 ) -> dict[str, Any]:
@@ -187,6 +187,7 @@ def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField, loops
         "submaps": _submaps(log),
         "loops": {"tried": len(loops), "accepted": sum(bool(loop.get("accepted")) for loop in loops)},
         "finish_s": run.facts().get("finish_s"),
+        "total_s": _total_s(run),
     }
 
 
@@ -194,6 +195,12 @@ def _frames_per_s(run: RunFolder, log: Log) -> float | None:
     """Return the speed end to end: by the wall clock (run.json, wall_s) if noted, else by the frames' own times."""
     seconds = run.facts().get("wall_s") or sum(charts.seconds_of(record) for record in log)
     return len(log) / seconds if seconds else None
+
+
+def _total_s(run: RunFolder) -> float | None:
+    """Return the seconds of all frames and of finishing together, None where run.json does not note both."""
+    frames_s, finish_s = (run.facts().get(key) for key in ("wall_s", "finish_s"))
+    return None if frames_s is None or finish_s is None else float(frames_s + finish_s)
 
 
 def _worst_frame_s(log: Log) -> float | None:

@@ -106,8 +106,25 @@ def _depth_rows(source: Source, frames: list[Frame], settings: InputConfig) -> l
         ("depth unit", f"{units:g} per metre" if units else "metres"),
         ("depth", f"{low:.2f} to {high:.2f} m, half below {middle:.2f} m; {used:.0%} within the run's limits"),
         ("without reading", f"{_holes(frames):.0%} of the pixels"),
-        ("registered here", "yes" if source.depth_registered else "no: depth is taken to be the colour camera's"),
+        ("depth's camera", _depth_camera(source, settings)),
+        *_question(middle, settings),
     ]
+
+
+def _depth_camera(source: Source, settings: InputConfig) -> str:
+    """Say whose pixels depth is in."""
+    if source.depth_registered:
+        return "its own: moved to the colour camera here"
+    if source.registrable and settings.register_depth == "off":
+        return "its own: not moved, as --register-depth off asks"
+    return "the colour camera's, as recorded"
+
+
+def _question(middle_m: float, settings: InputConfig) -> list[tuple[str, str]]:
+    """Ask who gave a depth scale whether the distances that it makes are true; nothing where none was given."""
+    if not settings.depth_scale:
+        return []
+    return [("your depth scale", f"half of what is seen is nearer than {middle_m:.2f} m: is that so?")]
 
 
 def _holes(frames: list[Frame]) -> float:

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from sigmasplat import cli
+from sigmasplat.commands.options import Taken
+from sigmasplat.errors import ConfigError
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -83,6 +85,37 @@ def test_help_has_an_example_and_loads_no_torch(arguments: list[str]) -> None:
     answer = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, timeout=60)
     assert answer.returncode == 0, answer.stderr
     assert "example: sigmasplat" in answer.stdout
+
+
+@pytest.mark.parametrize(
+    "mistyped",
+    ["run x --fx 57O", "run x --limit many", "run x --stride 1.5", "run x --seed None", "run x --register-depth None",
+     "inspect x --depth-scale 1OOO", "export x --sigma-below small"],
+)  # fmt: skip
+def test_a_mistyped_number_is_told_without_the_parsers_types(mistyped: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(mistyped.split())
+    told = capsys.readouterr().err
+    assert f"'{mistyped.split()[-1]}'" in told and mistyped.split()[-2] in told and told.count("\n") <= 12
+    for internal in ("NoneType", "{None}", "type matching", "'None',"):
+        assert internal not in told
+
+
+@pytest.mark.parametrize("command", ["run", "inspect", "export", "bench", "mesh", "eval", "resume", "demo"])
+def test_help_names_no_none(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main([command, "--help"])
+    assert "None" not in capsys.readouterr().out
+
+
+def test_what_is_taken_is_what_was_given() -> None:
+    assert Taken().settings() == Taken(register_depth="auto").settings() == {}
+    given = Taken(limit=3, start=1.5, fx=570.5, strict=True, register_depth="off").settings()
+    assert given == {"input.limit": "3", "input.start_s": "1.5", "input.fx": "570.5", "input.strict": "True",
+                     "input.register_depth": "off"}  # fmt: skip
+    for name in ("limit", "stride"):
+        with pytest.raises(ConfigError, match=f"--{name} must be at least 1, found 0"):
+            Taken(**{name: 0}).settings()
 
 
 @pytest.mark.parametrize("arguments", [["fly"], ["run"], ["run", "x", "--limit", "many"], ["run", "x", "--no-such"]])

@@ -72,8 +72,15 @@ def test_rows_tell_what_is_there(tiny_tum):
     assert rows["depth"].startswith("2.00 to 2.00 m") and rows["without reading"] == "0% of the pixels"
     assert rows["poses"] == "4 true poses, 3.0 m long"
     assert rows["suggested preset"].startswith("sigma") and "-tum" in rows["suggested preset"]
+    assert rows["depth's camera"] == "the colour camera's, as recorded" and "your depth scale" not in rows
     assert found.warnings == []
     assert np.asarray(found.sheet).std() > 10
+
+
+def test_a_depth_scale_that_was_given_is_asked_about(tiny_tum):
+    rows = dict(inspect_source(tiny_tum, InputConfig(depth_scale=2500.0)).rows)
+    assert rows["depth unit"] == "2500 per metre"
+    assert rows["your depth scale"] == "half of what is seen is nearer than 0.80 m: is that so?"
 
 
 def damage(folder, value, share):
@@ -153,8 +160,10 @@ def test_a_recording_of_two_cameras_is_noticed_and_mended_by_the_option_that_is_
     (tmp_path / "two/calibration.json").write_text(json.dumps(fields | {"T_color_depth": T_color_depth.tolist()}))
     mended = inspect_source(tmp_path / "two", InputConfig())
     assert mended.warnings == [] and mended.agreement.score > 0.9
+    assert dict(mended.rows)["depth's camera"] == "its own: moved to the colour camera here"
     refused = inspect_source(tmp_path / "two", InputConfig(register_depth="off"))
     assert any("--register-depth on" in warning for warning in refused.warnings)
+    assert dict(refused.rows)["depth's camera"] == "its own: not moved, as --register-depth off asks"
 
 
 @pytest.mark.parametrize("name", ["redkitchen", "cubicles", "hololens", "livingroom"])

@@ -135,7 +135,10 @@ def test_path_and_facts(run: RunFolder) -> None:
     assert metrics["lost_frames"] == [6, 7] and metrics["lost"] == 2 and metrics["splats"] == 3
     assert metrics["frames"] == 20 and metrics["keyframes"] == 5 and metrics["frames_per_s"] == pytest.approx(4.0)
     run.note(wall_s=10.0)
-    assert score(run, HandMade(None))["frames_per_s"] == 2.0
+    metrics = score(run, HandMade(None))
+    assert metrics["frames_per_s"] == 2.0 and metrics["total_s"] is None
+    run.note(finish_s=2.5)
+    assert score(run, HandMade(None))["total_s"] == 12.5
 
 
 def test_the_worst_frame_is_not_the_first_and_the_map_has_a_size(run: RunFolder) -> None:
@@ -158,6 +161,12 @@ def test_everything_is_written(run: RunFolder) -> None:
     names = shown(run, page)
     assert names == {p.name for p in run.images.iterdir()} and len(names) == 8
     assert {"view-training-000000.png", "view-held-out-000019.png"} <= names
+
+
+def test_a_page_holds_three_views_of_each_kind(run: RunFolder) -> None:
+    evaluate(run, HandMade(None), renderer=KnownErrors())
+    names = [path.name.rpartition("-")[0] for path in run.images.glob("view-*.png")]
+    assert sorted(names) == ["view-held-out"] * 3 + ["view-training"] * 3
 
 
 def shown(run: RunFolder, page: str) -> set[str]:

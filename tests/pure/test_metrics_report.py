@@ -270,4 +270,26 @@ def test_several_submaps_without_loops_make_a_section_without_tables() -> None:
 
 def test_absent_figures_are_dashes() -> None:
     assert number(None, 2) == number(float("nan"), 1) == "–" and number(-1234.5, 1) == "−1\u202f234.5"
-    assert dict((name, value) for name, value, _ in headline({"ate": None}))["ATE RMSE"] == "–"
+    assert dict((name, value) for name, value, _ in headline({"held_out": None}))["PSNR, held-out"] == "–"
+
+
+def test_the_path_has_no_figure_where_no_true_one_is_known() -> None:
+    assert "ATE RMSE" in {name for name, _, _ in headline(METRICS)}
+    assert not [name for name, _, _ in headline(METRICS | {"ate": None}) if name.startswith("ATE")]
+
+
+def test_waiting_for_the_final_map_is_told() -> None:
+    """It is among the figures, and a stage of its own, with its share: 30 of 40 s."""
+    waited = {"Final map": ("30.0", "s"), "Frames and final map": ("40.0", "s")}
+    told = headline(METRICS | {"finish_s": 30.0, "total_s": 40.0})
+    assert waited.items() <= {name: (value, unit) for name, value, unit in told}.items()
+    assert not waited.keys() & {name for name, _, _ in headline(METRICS | {"finish_s": None})}
+    page = build_report(Contents("t", "s", METRICS | {"finish_s": 30.0}, seconds={"align": 8.0, "io": 2.0}))
+    text = " ".join(re.sub("<[^>]+>", " ", page).split())
+    assert "final map 30.0 75 align 8.0 20 io 2.0 5" in text
+    assert "final map" not in build_report(Contents("t", "s", METRICS, seconds={"align": 8.0}))
+
+
+def test_the_path_comes_before_the_views() -> None:
+    page = build_report(Contents("t", "s", METRICS, {"held-out views": ["a.png"]}, {"trajectory": "a path"}))
+    assert page.index("<h2>Trajectory") < page.index("<h2>Views")

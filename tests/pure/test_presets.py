@@ -1,6 +1,7 @@
 """Presets: the constants of CG-SLAM's paper and code, row by row, written here from them and from no other file."""
 
 import dataclasses
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,8 @@ import pytest
 
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
-from sigmasplat.presets import list_presets, preset
+from sigmasplat.errors import ConfigError
+from sigmasplat.presets import default_preset, families, list_presets, preset
 
 DATASETS = ("replica", "tum", "scannet")
 PAPER = [f"cgslam-{dataset}" for dataset in DATASETS]
@@ -257,6 +259,29 @@ def test_a_preset_is_plain_values_that_come_back(name: str, tmp_path: Path) -> N
             text = f"{section.name}.{field.name}", str(getattr(values, field.name))
             assert override(config, dict([text])) == config
             assert type(getattr(values, field.name)) is type(getattr(getattr(Config(), section.name), field.name)), text
+
+
+def test_families_are_few_and_leave_no_preset_out() -> None:
+    assert families()[0] == default_preset() and len(families()) == 4
+    for name in list_presets():
+        assert sum(fnmatchcase(name, family) for family in families()) == 1, name
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("fast", "no preset 'fast'; there are cgslam-fast, cgslam-loops-fast, loopsplat-fast, varsplat-fast (and "),
+        ("fr1-desk", "no preset 'fr1-desk'; there are cgslam-released-fr1-desk (and "),
+        ("cgslam-loops", "no preset 'cgslam-loops'; there are cgslam-loops-fast, cgslam-loops-replica, "),
+        ("varsplat-fst", "no preset 'varsplat-fst' (did you mean varsplat-fast?); there are cgslam-fast, "),
+        ("quick", f"no preset 'quick'; there are {', '.join(list_presets())}"),
+    ],
+)
+def test_an_unknown_name_is_answered_with_those_like_it(name: str, told: str) -> None:
+    with pytest.raises(ConfigError) as problem:
+        preset(name)
+    assert str(problem.value).startswith(told)
+    assert ("varsplat-tum" in str(problem.value)) == (name in ("varsplat-fst", "quick"))
 
 
 NEW = [

@@ -38,7 +38,7 @@ def test_a_good_run_in_words() -> None:
     for words in (
         "500 colour + depth images of kitchen", "13.5 images a second on a laptop", "followed all the way",
         "off by 2.6 cm", "at worst by 9.0 cm", "Without its closed loops it would be off by 3.5 cm",
-        "31.0 dB PSNR: hard to tell", "1.9 cm from the measured", "wrong ones well",
+        "31.0 dB PSNR: hard to tell", "1.9 cm from the measured ones: good", "wrong ones well",
     ):  # fmt: skip
         assert words in text, words
 
@@ -54,11 +54,19 @@ def test_a_good_run_in_words() -> None:
             {"held_out": {"psnr_db": 24.0, "depth_l1_m": 0.01, "depth_coverage": 0.7}},
             "30 % of what the",
         ),
+        ({"held_out": {"depth_l1_m": 0.009, "depth_coverage": 1.0}}, "0.9 cm from the measured ones: close."),
+        ({"held_out": {"depth_l1_m": 0.031, "depth_coverage": 1.0}}, "3.1 cm from the measured ones: coarse."),
+        ({"ate_odometry": {"rmse_m": 0.020}}, "Without its closed loops it would be off by 2.0 cm"),
         ({"uncertainty": {"spearman": 0.02}}, "hardly"),
     ],
 )
 def test_what_is_wrong_is_said(changes: dict, words: str) -> None:
     assert words in said(**changes)
+
+
+@pytest.mark.parametrize(("off_m", "without_m"), [(0.026, 0.028), (0.002, 0.0028), (0.026, None)])
+def test_loops_that_moved_next_to_nothing_are_not_told(off_m: float, without_m: float | None) -> None:
+    assert "Without its closed loops" not in said(ate={"rmse_m": off_m}, ate_odometry={"rmse_m": without_m})
 
 
 def test_nothing_is_said_of_what_is_not_known() -> None:
@@ -75,6 +83,9 @@ def test_nothing_is_said_of_what_is_not_known() -> None:
         ({"held_out": {"psnr_db": 22.0}}, {}, "320 pixels wide", "input.width=640"),
         ({"held_out": {"psnr_db": 31.0, "depth_coverage": 0.6}}, {}, "40 % of what was measured", ""),
         ({"frames_per_s": 1.2}, {}, "1.2 images a second is slow", "input.width=240"),
+        ({"frames_per_s": 1.2, "finish_s": 400.0}, {}, "1.2 images a second is slow", "input.width=240"),
+        ({"frames_per_s": 1.2, "finish_s": 430.0}, {}, "took 430 s after 417 s of frames", "final.iterations=750"),
+        ({"finish_s": 80.0}, {"final.iterations": "300"}, "took 80 s after 37 s of frames", "final.iterations=150"),
         ({"submaps": 5}, {}, "end a scan where it began", ""),
     ],
 )
@@ -104,6 +115,13 @@ def test_the_command_that_is_advised_keeps_what_the_run_was_made_with() -> None:
     assert made == config
     assert shlex.split(_again(preset("varsplat-fast"), {}))[3:] == ["--preset", "varsplat-fast"]
     assert _again(replace(config, name="mine"), {}) == "sigmasplat run PATH"
+
+
+@pytest.mark.parametrize("finish_s, iterations", [(50.0, "1500"), (900.0, "0")])
+def test_a_final_map_that_was_quick_or_had_no_steps_is_not_shortened(finish_s: float, iterations: str) -> None:
+    config = override(preset("sigma"), {"final.iterations": iterations})
+    found = advice(GOOD | {"finish_s": finish_s}, "runs/k", "data/k", config.to_dict())
+    assert [command.split()[1] for _, command in found] == ["view", "mesh"]
 
 
 def test_where_it_was_unsure() -> None:

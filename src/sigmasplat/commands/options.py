@@ -1,6 +1,6 @@
 """Describe the options of the command line: type, placeholder, one line of help each; and turn them into values."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -11,7 +11,7 @@ from sigmasplat import env
 from sigmasplat.config import Config
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError, RunError
-from sigmasplat.presets import list_presets, preset as preset_of
+from sigmasplat.presets import families, preset as preset_of
 from sigmasplat.viewer.address import HOST, PORT
 
 if TYPE_CHECKING:
@@ -19,14 +19,29 @@ if TYPE_CHECKING:
     from sigmasplat.sources.base import Source
 
 arg = tyro.conf.arg
-PresetName = Annotated[str, arg(metavar="NAME", help=f"settings to start from: {', '.join(list_presets())}")]
+
+
+def _number(read: Callable[[str], float]) -> tyro.constructors.PrimitiveConstructorSpec[float | None]:
+    """Describe a number that may be left out, None then: what is given is read as a number, and never as None."""
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="NUMBER",
+        instance_from_str=lambda given: read(given[0]),
+        is_instance=lambda value: value is None or isinstance(value, int | float),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+Whole = Annotated[int | None, _number(int)]
+Number = Annotated[float | None, _number(float)]
+PresetName = Annotated[str, arg(metavar="NAME", help=f"settings to start from: {', '.join(families())}")]
 Shell = Annotated[Literal["bash", "zsh"], tyro.conf.Positional, arg(metavar="{bash,zsh}", help="the shell you type in")]
 Settings = Annotated[
     tuple[str, ...],
     tyro.conf.UseAppendAction,
     arg(name="set", metavar="SECTION.NAME=VALUE", help="change one setting"),
 ]
-Seed = Annotated[int | None, arg(metavar="N", help="start of all random numbers", help_behavior_hint="(default: 0)")]
+Seed = Annotated[Whole, arg(metavar="N", help="start of all random numbers", help_behavior_hint="(default: 0)")]
 RunPath = Annotated[Path, tyro.conf.Positional, arg(metavar="RUN", help="run folder")]
 OutFolder = Annotated[
     Path | None,
@@ -59,7 +74,7 @@ Keep = Annotated[
     Path | None, arg(metavar="DIR", help="keep the run folders here", help_behavior_hint="(default: removed)")
 ]
 Overwrite = Annotated[bool, arg(help="replace what is there", help_behavior_hint="")]
-Limit = Annotated[int | None, arg(metavar="N", help="take at most N frames", help_behavior_hint="(default: all)")]
+Limit = Annotated[Whole, arg(metavar="N", help="take at most N frames", help_behavior_hint="(default: all)")]
 Profile = Annotated[bool, arg(help="print where the time went", help_behavior_hint="")]
 SaveEvery = Annotated[
     float, arg(metavar="S", help="seconds between savings of the state that `resume` goes on from; 0 = at the end only")
@@ -105,13 +120,13 @@ Format = Annotated[
     arg(metavar="NAME", help="what to write", help_behavior_hint="(default: by the ending of FILE, else ply)"),
 ]
 SigmaBelow = Annotated[
-    float | None,
+    Number,
     arg(
         metavar="S", help="keep splats whose σ is below this, colours being 0 to 1", help_behavior_hint="(default: all)"
     ),
 ]
 OpacityAbove = Annotated[
-    float | None,
+    Number,
     arg(metavar="A", help="keep splats whose opacity is above this", help_behavior_hint="(default: all)"),
 ]
 Plain = Annotated[
@@ -126,7 +141,7 @@ FilmSize = Annotated[
 ]
 FilmRate = Annotated[float, arg(metavar="N", help="images per second of a film")]
 FilmSeconds = Annotated[
-    float | None,
+    Number,
     arg(metavar="S", help="length of a film", help_behavior_hint="(default: the path's, 4 to 60; orbit 12)"),
 ]
 FilmPath = Annotated[Literal["run", "orbit"], arg(help="a film goes along the run's path, or round the room above it")]
@@ -137,27 +152,26 @@ class Taken:
     """What is taken of a sequence: shorthands of the settings input.*, which --set reaches too."""
 
     limit: Limit = None
-    stride: Annotated[int | None, arg(metavar="N", help="take every N-th frame", help_behavior_hint="")] = None
-    start: Annotated[float | None, arg(metavar="S", help="begin S seconds in", help_behavior_hint="")] = None
-    end: Annotated[float | None, arg(metavar="S", help="stop S seconds in", help_behavior_hint="")] = None
+    stride: Annotated[Whole, arg(metavar="N", help="take every N-th frame", help_behavior_hint="")] = None
+    start: Annotated[Number, arg(metavar="S", help="begin S seconds in", help_behavior_hint="")] = None
+    end: Annotated[Number, arg(metavar="S", help="stop S seconds in", help_behavior_hint="")] = None
     strict: Annotated[bool, arg(help="stop at an unreadable image, do not pass it over", help_behavior_hint="")] = False
     calibration: Annotated[
         Path | None, arg(metavar="FILE", help="calibration.json in place of the recorded one", help_behavior_hint="")
     ] = None
-    fx: Annotated[float | None, arg(metavar="PX", help="focal length; fy too, if not given", help_behavior_hint="")] = (
+    fx: Annotated[Number, arg(metavar="PX", help="focal length; fy too, if not given", help_behavior_hint="")] = None
+    fy: Annotated[Number, arg(metavar="PX", help="focal length, vertical", help_behavior_hint="")] = None
+    cx: Annotated[Number, arg(metavar="PX", help="principal point", help_behavior_hint="")] = None
+    cy: Annotated[Number, arg(metavar="PX", help="principal point", help_behavior_hint="")] = None
+    depth_scale: Annotated[Number, arg(metavar="UNITS", help="PNG units of depth per metre", help_behavior_hint="")] = (
         None
     )
-    fy: Annotated[float | None, arg(metavar="PX", help="focal length, vertical", help_behavior_hint="")] = None
-    cx: Annotated[float | None, arg(metavar="PX", help="principal point", help_behavior_hint="")] = None
-    cy: Annotated[float | None, arg(metavar="PX", help="principal point", help_behavior_hint="")] = None
-    depth_scale: Annotated[
-        float | None, arg(metavar="UNITS", help="PNG units of depth per metre", help_behavior_hint="")
-    ] = None
     color_topic: Annotated[str | None, arg(metavar="NAME", help="topic of a ROS bag", help_behavior_hint="")] = None
     depth_topic: Annotated[str | None, arg(metavar="NAME", help="topic of a ROS bag", help_behavior_hint="")] = None
     register_depth: Annotated[
-        Literal["auto", "on", "off"] | None, arg(help="move depth into the colour camera", help_behavior_hint="")
-    ] = None
+        Literal["auto", "on", "off"],
+        arg(help="move depth into the colour camera; auto: where the recording says that it has one of its own"),
+    ] = "auto"
 
     def settings(self) -> dict[str, str]:
         """Return what was given, by the settings' names. Raises ConfigError on numbers that mean nothing."""
@@ -166,6 +180,7 @@ class Taken:
                 raise ConfigError(f"--{name} must be at least 1, found {value}")
         names = {"start": "start_s", "end": "end_s"}
         given = {field.name: getattr(self, field.name) for field in fields(self)}
+        given["register_depth"] = None if self.register_depth == "auto" else self.register_depth
         given["calibration"] = self.calibration and self.calibration.resolve()  # a later eval may start elsewhere
         return {
             f"input.{names.get(name, name)}": str(value) for name, value in given.items() if value not in (None, False)

@@ -93,5 +93,12 @@ def resume(
     with stage_for(screen, ways) as stage:
         begun = resumed(folder, source)
         folder.note(status="running")
-        screen.say(f"{source.name}: going on at frame {begun.next_index} of {len(source)} → {folder.path}")
+        screen.say(f"{source.name}: {where(begun.next_index, len(source))} → {folder.path}")
         return carry_through(screen, begun, source, folder, ways, stage)
+
+
+def where(next_index: int, frames: int) -> str:
+    """Say where a run goes on."""
+    if next_index >= frames:
+        return f"all {frames} frames are done: making the final map again"
+    return f"going on at frame {next_index} of {frames}"

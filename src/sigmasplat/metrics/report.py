@@ -78,8 +78,8 @@ def build_report(contents: Contents) -> str:
         _story(contents.story),
         _tiles(contents.metrics),
         _unsure(contents),
-        _strips(contents),
         _plot(contents, "trajectory", "Trajectory"),
+        _strips(contents),
         _submaps(contents),
         _tables(contents.metrics),
         _time(contents),
@@ -117,11 +117,13 @@ def _unsure(contents: Contents) -> str:
 
 
 def _time(contents: Contents) -> str:
-    """Show where the time went: by frame, and by stage in all."""
+    """Show where the time went: by frame, and by stage in all, the final map among them."""
     if "seconds" not in contents.plots and not contents.seconds:
         return ""
-    whole = sum(contents.seconds.values()) or 1.0
-    largest = sorted(contents.seconds.items(), key=lambda item: -item[1])
+    finish_s = contents.metrics.get("finish_s")
+    seconds = contents.seconds | ({} if finish_s is None else {"final map": finish_s})
+    whole = sum(seconds.values()) or 1.0
+    largest = sorted(seconds.items(), key=lambda item: -item[1])
     rows = [[stage, tables.number(spent, 1), tables.number(spent / whole, 0, 100.0)] for stage, spent in largest]
     table = _table([["stage", "seconds", "%"], *rows]) if rows else ""
     return f"<h2>Time</h2>{_figure(contents, 'seconds', 'Time')}<div class=card>{table}</div>"

@@ -13,8 +13,11 @@ Advice = tuple[str, str]
 
 PICTURES = ((30.0, "hard to tell from the camera's"), (25.0, "good"), (20.0, "recognisable, fine detail blurred"))
 RANKS = ((0.5, "well"), (0.3, "fairly well"), (0.1, "roughly"))
+DEPTHS = ((0.01, "close"), (0.03, "good"))
 FEW_DB = 3.0
 """Views the map was fitted to that look this much better than others say that there were too few of them."""
+SLOW_PER_S = 5.0
+"""Fewer images a second than this are slow."""
 
 
 def in_short(metrics: Metrics, machine: str = "") -> list[str]:
@@ -51,7 +54,8 @@ def _path(metrics: Metrics) -> str:
     if ate.get("rmse_m") is None:
         return f"{followed} No true path is known, so that the path's error is not known either."
     before = (metrics.get("ate_odometry") or {}).get("rmse_m")
-    loops = f" Without its closed loops it would be off by {number(before, 1, 100.0)} cm." if before else ""
+    told = before is not None and abs(before - ate["rmse_m"]) > max(0.1 * ate["rmse_m"], 1e-3)
+    loops = f" Without its closed loops it would be off by {number(before, 1, 100.0)} cm." if told else ""
     error, worst = number(ate["rmse_m"], 1, 100.0), number(ate.get("max_m"), 1, 100.0)
     return f"{followed} Its path is off by {error} cm (root mean square), at worst by {worst} cm.{loops}"
 
@@ -70,7 +74,9 @@ def _depth(metrics: Metrics) -> list[str]:
         return []
     holes = 1.0 - (held_out.get("depth_coverage") or 0.0)
     missing = f" {number(holes, 0, 100.0)} % of what the camera measured is missing in the map." if holes > 0.02 else ""
-    return [f"Its surfaces lie {number(held_out['depth_l1_m'], 1, 100.0)} cm from the measured ones.{missing}"]
+    off_m = held_out["depth_l1_m"]
+    said = next((words for most, words in DEPTHS if off_m <= most), "coarse")
+    return [f"Its surfaces lie {number(off_m, 1, 100.0)} cm from the measured ones: {said}.{missing}"]
 
 
 def _uncertainty(metrics: Metrics) -> list[str]:
@@ -167,12 +173,28 @@ def _holes(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | N
 
 def _slow(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
     speed, width = metrics.get("frames_per_s"), (settings.get("input") or {}).get("width", 0)
-    if not speed or speed >= 5.0:
+    finish_s = metrics.get("finish_s") or 0.0
+    if speed and finish_s > (frames_s := metrics["frames"] / speed):
+        return _slow_to_finish(metrics["frames"], frames_s, finish_s, again, settings)
+    if not speed or speed >= SLOW_PER_S:
         return None
     smaller = max((width or 640) * 3 // 4 // 16 * 16, 160)
     return (
         f"{number(speed, 1)} images a second is slow; smaller images are faster.",
         f"{again} --set input.width={smaller}",
+    )
+
+
+def _slow_to_finish(
+    frames: int, frames_s: float, finish_s: float, again: str, settings: dict[str, Any]
+) -> Advice | None:
+    """Advise fewer steps of the final map where it took longer than the frames, and both together long."""
+    steps = (settings.get("final") or {}).get("iterations", 0)
+    if steps < 2 or frames / (frames_s + finish_s) >= SLOW_PER_S:
+        return None
+    return (
+        f"The final map took {number(finish_s, 0)} s after {number(frames_s, 0)} s of frames; fewer steps are faster.",
+        f"{again} --set final.iterations={steps // 2}",
     )
 
 

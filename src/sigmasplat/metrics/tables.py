@@ -13,7 +13,8 @@ def number(value: float | None, digits: int, scale: float = 1.0) -> str:
 
 def headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     """Return the figures of first interest as (name, value, unit), in order; for the page's top and the CLI's table."""
-    ate, held_out = metrics.get("ate") or {}, metrics.get("held_out") or {}
+    held_out = metrics.get("held_out") or {}
+    path = [("ATE RMSE", number(metrics["ate"]["rmse_m"], 2, 100.0), "cm")] if metrics.get("ate") else []
     found = metrics.get("reconstruction")
     surface = [("Surface F1 at 1 cm", number(found["f1"], 1, 100.0), "%")] if found else []
     before = metrics.get("held_out_submaps")
@@ -21,7 +22,7 @@ def headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     test = metrics.get("test_views")
     apart = [("PSNR, views kept apart", number(test.get("psnr_db"), 2), "dB")] if test else []
     return [
-        ("ATE RMSE", number(ate.get("rmse_m"), 2, 100.0), "cm"),
+        *path,
         ("PSNR, held-out", number(held_out.get("psnr_db"), 2), "dB"),
         *apart,
         *in_submaps,
@@ -30,11 +31,18 @@ def headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
         ("Spearman V ~ error²", number((metrics.get("uncertainty") or {}).get("spearman"), 3), ""),
         ("Speed", number(metrics.get("frames_per_s"), 2), "frames/s"),
         ("Longest frame after the first", number(metrics.get("worst_frame_s"), 0, 1e3), "ms"),
+        *_after_the_frames(metrics),
         ("Splats", number(metrics.get("splats"), 0), ""),
         ("Map file", number(metrics.get("map_bytes"), 1, 1e-6), "MB"),
         ("Lost frames", number(metrics.get("lost"), 0), f"of {metrics.get('frames', 0)}"),
         *_submap_figures(metrics),
     ]
+
+
+def _after_the_frames(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Return what was waited for after the last frame and in all, nothing where it is not known."""
+    known = {"Final map": metrics.get("finish_s"), "Frames and final map": metrics.get("total_s")}
+    return [(name, number(seconds, 1), "s") for name, seconds in known.items() if seconds is not None]
 
 
 def _submap_figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
