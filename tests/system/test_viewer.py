@@ -79,7 +79,8 @@ class Browser:
 
     def text(self) -> str:
         """Return the page's words."""
-        found = self.call("Runtime.evaluate", expression="document.body.innerText", returnByValue=True)
+        words = "document.body ? document.body.innerText : ''"  # a page that has just been opened has no body yet
+        found = self.call("Runtime.evaluate", expression=words, returnByValue=True)
         return str(found["result"]["value"])
 
     def choose(self, label: str, option: str) -> None:
@@ -91,7 +92,8 @@ class Browser:
         self._click(f"{spoken}{json.dumps(option)})")
 
     def _there(self, expression: str) -> bool:
-        return bool(self.call("Runtime.evaluate", expression=f"!!{expression}", returnByValue=True)["result"]["value"])
+        found = self.call("Runtime.evaluate", expression=f"!!{expression}", returnByValue=True)
+        return bool(found["result"].get("value"))  # none where a part of the expression is not there yet
 
     def _click(self, expression: str) -> None:
         wait_for(lambda: self._there(expression))
