@@ -8,7 +8,6 @@ import pytest
 from sigmasplat.errors import BackendError
 from sigmasplat.native import cubins
 
-pytest.importorskip("cuda.core", reason="cuda-core is not installed: pip install 'sigmasplat[gpu]'")
 pytest.importorskip("cuda.bindings.nvrtc", reason="cuda-bindings is not installed: pip install 'sigmasplat[gpu]'")
 
 
@@ -63,6 +62,19 @@ def test_an_error_shows_the_compilers_log(text: Path) -> None:
         BackendError, match=r'sm_90 with NVRTC [\d.]+(?s:.)*identifier "there_is_no_such_name" is undefined'
     ):
         cubins.compiled(4, "sm_90")
+
+
+def test_a_device_newer_than_the_compiler_gets_ptx(text: Path) -> None:
+    assert cubins.target_of((9, 0)) == "sm_90" and cubins.target_of((8, 6)) == "sm_86"
+    newest = cubins.target_of((99, 9))
+    assert newest.startswith("compute_") and int(newest.removeprefix("compute_")) >= 120
+    code = cubins.compiled(4, newest).code
+    assert b".visible .entry nothing" in code and code.endswith(b"\0"), "the driver reads PTX up to a zero"
+
+
+def test_a_device_older_than_the_compiler_is_named(text: Path) -> None:
+    with pytest.raises(BackendError, match=r"do not compile for sm_50 with NVRTC(?s:.*)gpu-architecture"):
+        cubins.compiled(4, cubins.target_of((5, 0)))
 
 
 def test_a_warning_is_reported(text: Path) -> None:

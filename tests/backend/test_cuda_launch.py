@@ -1,7 +1,7 @@
 """Launch through the driver's interface, with a driver that emulates: what the real one would be handed."""
 
 import ctypes
-from contextlib import nullcontext
+import threading
 from enum import Enum
 from types import SimpleNamespace
 from typing import Any
@@ -18,36 +18,59 @@ from sigmasplat.render.cuda_launch import THREADS, Device
 from splat_scenes import gradients, scene
 
 bindings = pytest.importorskip("cuda.bindings", reason="needs pip install 'sigmasplat[gpu]'")
-core = pytest.importorskip("cuda.core", reason="needs pip install 'sigmasplat[gpu]'")
+CONTEXT, ORDINAL, STREAM = "the context of device 3", 3, 5
 
 
 class Result(Enum):
     CUDA_SUCCESS = 0
+    CUDA_ERROR_INVALID_CONTEXT = 201
     CUDA_ERROR_ILLEGAL_ADDRESS = 700
 
 
 class Driver:
-    """Stands in for cuda.bindings.driver and for a loaded program: functions are numbers, memory is the host's."""
-
-    CUresult, CUfunction = Result, int
+    """Stands in for cuda.bindings.driver: functions are numbers, memory is the host's, every thread begins without a
+    context."""
 
     def __init__(self, emulator: Emulator) -> None:
         self.emulator, self.kernels = emulator, list[tuple[int, str]]()
         self.answer = Result.CUDA_SUCCESS
+        self.thread = threading.local()
 
-    def from_cubin(self, code: bytes, name: str) -> SimpleNamespace:
-        features = int(code)
-        assert name == f"sigmasplat-{features}"
-        return SimpleNamespace(get_kernel=lambda kernel: SimpleNamespace(handle=self.number_of(features, kernel)))
+    def cuInit(self, flags: int) -> tuple[Result]:
+        return (Result.CUDA_SUCCESS,)
 
-    def number_of(self, features: int, kernel: str) -> int:
-        assert kernel in cubins.kernel_names(features)
-        self.kernels.append((features, kernel))
-        return len(self.kernels) - 1
+    def cuDeviceGet(self, index: int) -> tuple[Result, int]:
+        return Result.CUDA_SUCCESS, index
+
+    def cuDevicePrimaryCtxRetain(self, ordinal: int) -> tuple[Result, str]:
+        return Result.CUDA_SUCCESS, f"the context of device {ordinal}"
+
+    def cuCtxPushCurrent(self, context: str) -> tuple[Result]:
+        self.thread.contexts = [*self.contexts, context]
+        return (Result.CUDA_SUCCESS,)
+
+    def cuCtxPopCurrent(self) -> tuple[Result, str]:
+        *self.thread.contexts, last = self.contexts
+        return Result.CUDA_SUCCESS, last
+
+    @property
+    def contexts(self) -> list[str]:
+        return getattr(self.thread, "contexts", [])
+
+    def cuModuleLoadData(self, code: bytes) -> tuple[Result, int]:
+        assert self.contexts[-1:] == [CONTEXT], "a module is loaded into the current context"
+        return Result.CUDA_SUCCESS, int(code)
+
+    def cuModuleGetFunction(self, module: int, name: bytes) -> tuple[Result, int]:
+        assert name.decode() in cubins.kernel_names(module)
+        self.kernels.append((module, name.decode()))
+        return Result.CUDA_SUCCESS, len(self.kernels) - 1
 
     def cuLaunchKernel(self, function: int, *given: int) -> tuple[Result]:
-        blocks, one, again, threads, _, _, shared, _stream, parameters, extra = given
-        assert (one, again, threads, shared, extra) == (1, 1, THREADS, 0, 0) and blocks > 0
+        blocks, one, again, threads, _, _, shared, stream, parameters, extra = given
+        assert (one, again, threads, shared, stream, extra) == (1, 1, THREADS, 0, STREAM, 0) and blocks > 0
+        if self.contexts[-1:] != [CONTEXT]:
+            return (Result.CUDA_ERROR_INVALID_CONTEXT,)
         features, kernel = self.kernels[function]
         run = self.emulator._library(features).emulate
         assert run(kernel.encode(), blocks, threads, ctypes.c_void_p(parameters), 0) is None
@@ -58,35 +81,61 @@ class Driver:
 def driver(emulator: Emulator, monkeypatch: pytest.MonkeyPatch) -> Driver:
     fake = Driver(emulator)
     monkeypatch.setattr(bindings, "driver", fake, raising=False)
-    monkeypatch.setattr(core, "ObjectCode", fake)
+    monkeypatch.setattr(cuda_launch, "missing", lambda: None)
     monkeypatch.setattr(cubins, "cubin", lambda features, architecture: str(features).encode())
-    monkeypatch.setattr(torch.cuda, "device", nullcontext)
-    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: SimpleNamespace(cuda_stream=5))
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: SimpleNamespace(cuda_stream=STREAM))
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (9, 0))
     return fake
 
 
-def test_kernels_are_handed_what_they_ask_for(
-    driver: Driver, emulator: Emulator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def device(driver: Driver, monkeypatch: pytest.MonkeyPatch) -> Device:
+    made = Device(torch.device("cuda", ORDINAL))
+    monkeypatch.setattr(cuda_launch, "launcher_for", lambda _: made)
+    return made
+
+
+def test_kernels_are_handed_what_they_ask_for(driver: Driver, device: Device, emulator: Emulator) -> None:
     s = scene("random", 60).to(torch.float32)
     with emulator.standing_in():
         want = gradients(cuda, s)
-    device = Device(torch.device("cpu"))
     assert device.architecture == "sm_90"
-    monkeypatch.setattr(cuda_launch, "launcher_for", lambda _: device)
     got = gradients(cuda, s)
     assert all(torch.equal(got[name], want[name]) for name in want)
     assert len(driver.kernels) == len(set(driver.kernels)), "each kernel is looked up once"
+    assert driver.contexts == [], "what was current before is so again"
 
 
-def test_a_kernel_that_cannot_be_launched_says_why(driver: Driver, monkeypatch: pytest.MonkeyPatch) -> None:
+def projected(s: Any) -> Any:
+    return cuda.project(s.means, s.quats, s.scales, s.T_camera_world, s.camera, s.options)
+
+
+def test_a_thread_without_a_context_is_given_one(driver: Driver, device: Device) -> None:
+    """Autograd calls a backward pass from a thread of its own, in which torch may have made no context current."""
+    s, found = scene("random", 60).to(torch.float32), list[Any]()
+    other = threading.Thread(target=lambda: found.append(projected(s)))
+    other.start()
+    other.join()
+    assert torch.equal(found[0].means2d, projected(s).means2d)
+
+
+def test_another_devices_context_is_put_back(driver: Driver, device: Device) -> None:
+    driver.cuCtxPushCurrent("the context of device 0")
+    projected(scene("random", 60).to(torch.float32))
+    assert driver.contexts == ["the context of device 0"]
+
+
+def test_a_kernel_that_cannot_be_launched_says_why(driver: Driver, device: Device) -> None:
     driver.answer = Result.CUDA_ERROR_ILLEGAL_ADDRESS
-    device: Any = Device(torch.device("cpu"))
-    monkeypatch.setattr(cuda_launch, "launcher_for", lambda _: device)
-    s = scene("random", 60).to(torch.float32)
     with pytest.raises(BackendError, match="project_splats cannot be launched: CUDA_ERROR_ILLEGAL_ADDRESS"):
-        cuda.project(s.means, s.quats, s.scales, s.T_camera_world, s.camera, s.options)
+        projected(scene("random", 60).to(torch.float32))
+    assert driver.contexts == []
+
+
+def test_a_missing_device_is_refused_before_the_driver_is_asked(driver: Driver, monkeypatch: Any) -> None:
+    monkeypatch.setattr(cuda_launch, "missing", lambda: "there is none")
+    with pytest.raises(BackendError, match="the CUDA backend cannot run: there is none"):
+        Device(torch.device("cuda", 0))
 
 
 def test_arguments_are_laid_out_as_parameters() -> None:
