@@ -1,7 +1,7 @@
 """Pretend that there is a device: tensors that say they lie on it, kept on the CPU.
 
-torch refuses to mix them with the CPU's as it does on a real device, numpy cannot read them, and kernels launched on them are
-emulated. So everything above the kernels runs here as it would there.
+They cannot be mixed with the CPU's, as on a real device, numpy cannot read them, and their kernels are emulated.
+So everything above the kernels runs here as it would there.
 """
 
 from collections.abc import Iterator
@@ -78,13 +78,12 @@ def run(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
 
 
 def refuse_mixing(function: Any, args: Any, given: list[Tensor]) -> None:
-    """Raise RuntimeError where an operation is given tensors of both devices; numbers (of no dimension) may come along."""
-    checked = [args[0], *given[len(given) :]] if function in INDEXING else given
+    """Raise RuntimeError where an operation is given tensors of both devices; numbers, of no dimension, may."""
     if function in INDEXING:
-        checked = [args[0], *tree_leaves(args[2:3])]
+        given = [args[0], *tree_leaves(args[2:3])]
         if not isinstance(args[0], There) and any(isinstance(x, There) for x in tree_leaves(args[1])):
             raise RuntimeError("indices should be either on cpu or on the same device as the indexed tensor (cpu)")
-    places = {x.device.type for x in checked if isinstance(x, Tensor) and x.dim()}
+    places = {x.device.type for x in given if isinstance(x, Tensor) and x.dim()}
     if function not in MIXING and len(places) > 1:
         raise RuntimeError(f"Expected all tensors to be on the same device, but {function} was given {sorted(places)}")
 
