@@ -3,6 +3,7 @@
 import ctypes
 import threading
 from enum import Enum
+from struct import error as StructError
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,7 +18,10 @@ from sigmasplat.render import cuda, cuda_launch
 from sigmasplat.render.cuda_launch import THREADS, Device
 from splat_scenes import gradients, scene
 
-bindings = pytest.importorskip("cuda.bindings", reason="needs pip install 'sigmasplat[gpu]'")
+# Both before a test puts another driver in its place, or the import of one would put it back.
+pytest.importorskip("cuda.bindings.driver", reason="needs pip install 'sigmasplat[gpu]'")
+pytest.importorskip("cuda.bindings.nvrtc", reason="needs pip install 'sigmasplat[gpu]'")
+bindings = pytest.importorskip("cuda.bindings")
 CONTEXT, ORDINAL, STREAM = "the context of device 3", 3, 5
 
 
@@ -139,15 +143,21 @@ def test_a_missing_device_is_refused_before_the_driver_is_asked(driver: Driver, 
 
 
 def test_arguments_are_laid_out_as_parameters() -> None:
-    values, struct = torch.arange(3.0), np.array((1, 2.5), dtype="i4,f4")
-    memory, addresses = cuda_launch.laid_out((values, None, 7, 0.5, struct, (values, None, -1)))
+    values, struct = torch.arange(3.0), np.array((1, 2.5, 3), dtype="i4,f4,i4")
+    memory = cuda_launch.laid_out((values, None, -7, 0.5, struct, (values, None, -1), 9))
 
     def at(index: int, kind: Any) -> Any:
-        return kind.from_address(int(addresses[index])).value
+        return kind.from_address(memory[index]).value
 
     assert at(0, ctypes.c_uint64) == values.data_ptr() and at(1, ctypes.c_uint64) == 0
-    assert at(2, ctypes.c_int32) == 7 and at(3, ctypes.c_float) == 0.5
-    assert bytes(memory)[32:40] == struct.tobytes()
-    pointers = (ctypes.c_int64 * 3).from_address(int(addresses[5]))
+    assert at(2, ctypes.c_int32) == -7 and at(3, ctypes.c_float) == 0.5 and at(6, ctypes.c_int32) == 9
+    assert bytes((ctypes.c_char * 12).from_address(memory[4])) == struct.tobytes()
+    pointers = (ctypes.c_int64 * 3).from_address(memory[5])
     assert list(pointers) == [values.data_ptr(), 0, -1]
-    assert all(int(address) % 8 == 0 for address in addresses)
+    assert all(address % 8 == 0 for address in memory[:7]) and memory.buffer_info()[0] + 7 * 8 == memory[0]
+    assert memory[6] + 8 == memory.buffer_info()[0] + 8 * len(memory), "nothing lies behind the last"
+
+
+def test_a_number_too_large_for_its_parameter_is_refused() -> None:
+    with pytest.raises(StructError):
+        cuda_launch.laid_out((2**31,))

@@ -1,7 +1,8 @@
 """Launch the CUDA kernels: arguments laid out as their parameters, machine code loaded once for each device."""
 
 import struct
-from collections.abc import Iterator
+from array import array
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from typing import Any, Protocol
@@ -34,25 +35,28 @@ def blocks_for(threads: int) -> int:
     return -(-threads // THREADS)
 
 
-def laid_out(arguments: tuple[Argument, ...]) -> tuple[bytearray, NDArray[np.uint64]]:
-    """Lay arguments out in memory; return that memory, to be kept alive, and the address of each argument [n]."""
-    memory, offsets = bytearray(), []
+def laid_out(arguments: tuple[Argument, ...]) -> "array[int]":
+    """Lay arguments out in memory, 64 bits at a time: the address of each argument, then the arguments."""
+    begins, words = list[int](), list[int]()
     for argument in arguments:
-        offsets.append(len(memory))
-        memory += _bytes_of(argument)
-        memory += bytes(-len(memory) % 8)
-    base = np.frombuffer(memory, np.uint8).ctypes.data
-    return memory, base + np.array(offsets, np.uint64)
+        begins.append(len(words))
+        words += _words_of(argument)
+    memory = array("Q", begins + words)
+    address = memory.buffer_info()[0] + 8 * len(begins)
+    for i, begin in enumerate(begins):
+        memory[i] = address + 8 * begin
+    return memory
 
 
-def _bytes_of(argument: Argument) -> bytes:
+def _words_of(argument: Argument) -> Iterable[int]:
     if argument is None or isinstance(argument, Tensor):
-        return struct.pack("<Q", _address(argument))
+        return (_address(argument),)
     if isinstance(argument, tuple):
-        return b"".join(struct.pack("<q", a if isinstance(a, int) else _address(a)) for a in argument)
+        return [a % 2**64 if isinstance(a, int) else _address(a) for a in argument]
     if isinstance(argument, np.ndarray):
-        return argument.tobytes()
-    return struct.pack("<f" if isinstance(argument, float) else "<i", argument)
+        given = argument.tobytes()
+        return array("Q", given + bytes(-len(given) % 8))
+    return (int.from_bytes(struct.pack("<f" if isinstance(argument, float) else "<i", argument), "little"),)
 
 
 def _address(tensor: Tensor | None) -> int:
@@ -78,11 +82,11 @@ class Device:
         """Run a kernel on the device's current stream. Raises BackendError if the driver refuses."""
         if blocks == 0:
             return
-        _memory, addresses = laid_out(arguments)
+        memory = laid_out(arguments)
         stream = torch.cuda.current_stream(self._device).cuda_stream
         with self._current() as driver:
             function = self._kernel(features, kernel)
-            found = driver.cuLaunchKernel(function, blocks, 1, 1, THREADS, 1, 1, 0, stream, addresses.ctypes.data, 0)
+            found = driver.cuLaunchKernel(function, blocks, 1, 1, THREADS, 1, 1, 0, stream, memory.buffer_info()[0], 0)
         _checked(found, f"the CUDA kernel {kernel} cannot be launched")
 
     @contextmanager
