@@ -25,7 +25,7 @@ if setup is None:
 setup(rename=NAME)
 DEVICE = torch.device(NAME, 0)
 aten = torch.ops.aten
-MIXING = {aten.copy_.default, aten._to_copy.default}
+MIXING = {aten.copy_.default, aten._to_copy.default, aten.to.other}
 """What takes tensors of two devices; indices, too, may lie on the CPU."""
 INDEXING = {aten.index.Tensor, aten.index_put_.default, aten.index_put.default, aten._index_put_impl_.default}
 
@@ -61,13 +61,13 @@ def run(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     """Run an operation of torch on the values, its result on the device that torch would leave it on."""
     given = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
     refuse_mixing(function, args, given)
-    there = any(isinstance(x, There) for x in given)
-    if kwargs.get("device") is not None:
-        there = torch.device(kwargs["device"]).type == NAME
-        kwargs["device"] = torch.device("cpu")
+    there = any(isinstance(x, There) for x in (given[1:] if function is aten.to.other else given))
+    devices = [x for x in tree_leaves((args, kwargs)) if isinstance(x, torch.device)]
+    if devices:
+        there = devices[0].type == NAME
     if "pin_memory" in kwargs:
         kwargs["pin_memory"] = False
-    inner = tree_map(lambda x: x.here if isinstance(x, There) else x, (args, kwargs))
+    inner = tree_map(_here, (args, kwargs))
     found = function(*inner[0], **inner[1])
     if function is aten._local_scalar_dense.default:
         return found
@@ -75,6 +75,13 @@ def run(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         return args[0]  # changed in place
     known = {id(x.here): x for x in given if isinstance(x, There)}
     return tree_map(lambda x: known.get(id(x), There(x)) if isinstance(x, Tensor) and there else x, found)
+
+
+def _here(x: Any) -> Any:
+    """Return what an argument is on the CPU."""
+    if isinstance(x, torch.device):
+        return torch.device("cpu")
+    return x.here if isinstance(x, There) else x
 
 
 def refuse_mixing(function: Any, args: Any, given: list[Tensor]) -> None:
@@ -89,12 +96,11 @@ def refuse_mixing(function: Any, args: Any, given: list[Tensor]) -> None:
 
 
 class Factories(TorchDispatchMode):
-    """Make tensors asked for on a CUDA device on the pretended one."""
+    """Make the tensors that are asked for on the device."""
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
-        device = kwargs.get("device")
-        if device is not None and torch.device(device).type == NAME:
+        if any(isinstance(x, torch.device) and x.type == NAME for x in tree_leaves((args, kwargs))):
             return run(function, args, kwargs)
         return function(*args, **kwargs)
 
@@ -104,15 +110,12 @@ def pretended(emulator: Emulator) -> Iterator[torch.device]:
     """Pretend inside that there is a device, whose kernels `emulator` runs; yield it."""
 
     def launch(features: int, kernel: str, blocks: int, *arguments: Any) -> None:
-        tensors = [x for x in tree_leaves([list(a) if isinstance(a, tuple) else a for a in arguments])]
+        tensors = tree_leaves([list(a) if isinstance(a, tuple) else a for a in arguments])
         outside = [x.shape for x in tensors if isinstance(x, Tensor) and not isinstance(x, There)]
         assert not outside, f"{kernel} was given the address of tensors in the host's memory: {outside}"
         emulator(
-            features, kernel, blocks, *(tuple(map(inner, a)) if isinstance(a, tuple) else inner(a) for a in arguments)
+            features, kernel, blocks, *(tuple(map(_here, a)) if isinstance(a, tuple) else _here(a) for a in arguments)
         )
-
-    def inner(x: Any) -> Any:
-        return x.here if isinstance(x, There) else x
 
     with pytest.MonkeyPatch.context() as patch, Factories():
         patch.setattr(cuda_launch, "launcher_for", lambda device: launch)

@@ -1,6 +1,7 @@
 """Run views, fits, tracking and SLAM on a pretended CUDA device, where mixing devices is refused as on a real one."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import torch
 
 from emulated_cuda import Emulator
 from pretended_device import DEVICE, NAME, pretended
+from sigmasplat import cli
 from sigmasplat.config import MappingConfig, TrackingConfig
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.pose import fit_pose_adam
@@ -37,6 +39,8 @@ def test_it_behaves_as_a_device() -> None:
     assert torch.zeros(3, device=NAME).device == DEVICE and x.cpu().device.type == "cpu"
     x[1:3] = torch.tensor([5.0, 7.0])
     assert x.cpu().tolist() == [0, 5, 7, 3, 4, 5]
+    with torch.inference_mode():
+        assert torch.zeros(2).to(x).device == DEVICE and x.to("cpu").device.type == "cpu"
     with pytest.raises(RuntimeError, match="same device"):
         x + torch.arange(6.0)
     with pytest.raises(RuntimeError, match="indices should be"):
@@ -100,3 +104,13 @@ def test_slam_runs_on_it(method: str) -> None:
         slam.step(room.frame(i))
     slam.finish()
     assert len(slam.field) > 100 and torch.isfinite(slam.field.params).all()
+
+
+def test_a_run_is_written_and_evaluated(tmp_path: Path) -> None:
+    changes = {"backend": "cuda", "input.width": "48", "mapping.first_iterations": "4", "mapping.iterations": "2"}
+    changes |= {"seeding.first_uniform": "200", "seeding.first_gradient": "200", "final.iterations": "2"}
+    words = [word for name, value in changes.items() for word in ("--set", f"{name}={value}")]
+    out = tmp_path / "run"
+    with pytest.raises(SystemExit, match="0"):
+        cli.main(["run", "synthetic:frames=6,width=48,height=36", "--out", str(out), *words])
+    assert {"metrics.json", "map.ply", "checkpoint.safetensors"} <= {path.name for path in out.iterdir()}
