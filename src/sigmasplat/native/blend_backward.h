@@ -57,7 +57,7 @@ static void blend_tiles_backward(Render& r, Outputs o, OutputGradients g, Finish
     constexpr int RECORD = record_floats<K, MOMENT>, EXTRA = extra_floats<K, MOMENT>;
     constexpr int ROW_FLOATS = row_floats<ROW_K>;
     const size_t plane = r.plane(), stride = r.padded_width();
-    const float log_alpha_min = __builtin_log2f(r.options.alpha_min) * 0.125f;
+    const float log_alpha_min = __builtin_log2f(r.options.alpha_min);
     const vf stop = splat(r.options.transmittance_stop), zero = splat(0.f), one = splat(1.f), top = splat(ALPHA_MAX);
 #pragma omp parallel
     {
@@ -65,7 +65,7 @@ static void blend_tiles_backward(Render& r, Outputs o, OutputGradients g, Finish
         alignas(64) float basis[W][16 + EXTRA];
 #pragma omp for schedule(dynamic, 1)
         for (int index = 0; index < r.tiles_x * r.tiles_y; index++) {
-            const Tile tile = gather_tile<true>(r, s, index);
+            const Tile tile = gather_tile<ROW_FLOATS, true>(r, s, index);
             memset(s.records.reserve(size_t(tile.count + W) * RECORD), 0, size_t(tile.count + W) * RECORD * sizeof(float));
             const float* rows = s.rows.data;
             for (int b = 0; b < BLOCKS; b++) {

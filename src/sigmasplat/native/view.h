@@ -79,7 +79,7 @@ static void blend_backward(Context* context, Outputs o, OutputGradients g, Splat
                     const bool seen = i + q < r.n && r.tiles_of[i + q];
                     const Geometry g0 = seen ? r.geometry(i + q) : Geometry{1, 0, 1, 0, 0, 0, 1, 0};
                     l[0][q] = g0.l1 / CONIC_SCALE; l[1][q] = g0.l2 / CONIC_SCALE; l[2][q] = g0.l3 / CONIC_SCALE;
-                    l[3][q] = g0.z; l[4][q] = seen ? exp2f(8.f * g0.log_opacity) : 1.f;
+                    l[3][q] = g0.z; l[4][q] = seen ? exp2f(g0.log_opacity) : 1.f;
                 }
                 FootprintGradient<vf> f = footprint_gradient(moments_of(sums), load(l[0]), load(l[1]), load(l[2]));
                 if constexpr (decltype(moment)::value) f.z = fma(load(l[3]), weight_sum(sums, K), weight_sum(sums, K + 1));
@@ -126,14 +126,13 @@ template <int K> static void pack_view(Render& r, const float* params) {
         for (int64_t i = c * CHUNK; i < n && i < (c + 1) * CHUNK; i += W) {
             alignas(64) float row[ROW][W], f[8][W];
             load_rows<ROW>(params, i, n, row);
+            for (int l = 0; l <= W; l++) __builtin_prefetch(params + (i + 2 * W + l) * ROW);
             const Splats s = activate<(K > 4)>(row);
             const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
             for (int q = 0; q < 3; q++) store(f[q], s.color[q]);
             store(f[3], p.z);
-            if (K > 4) {
-                for (int q = 0; q < 3; q++) store(f[4 + q], fma(s.color[q], s.color[q], s.variance[q]));
-                store(f[7], splat(0.f));
-            }
+            for (int q = 0; q < 3; q++) store(f[4 + q], K > 4 ? fma(s.color[q], s.color[q], s.variance[q]) : splat(0.f));
+            store(f[7], splat(0.f));
             total += pack<row_floats<K>>(r, p, s.opacity, gt(p.z, splat(r.view.near_m)), i, total, f);
         }
         r.chunk_begin[c] = total;
