@@ -22,7 +22,7 @@ class ImageStep(Protocol):
     @property
     def view(self) -> View: ...
 
-    def images(self, target: Target, weights: Weights) -> float:
+    def images(self, target: Target, weights: Weights) -> float | Tensor:
         """Write the gradient of every image term to the view's gradient planes; return the loss."""
         ...
 
@@ -53,7 +53,7 @@ class ViewDependentStep:
             self._rows.index_copy_(0, rows, own)
         render_for(self.view, self._rows, T_camera_world, target, weights)
 
-    def images(self, target: Target, weights: Weights) -> float:
+    def images(self, target: Target, weights: Weights) -> float | Tensor:
         """Write the gradient of every image term to the view's gradient planes; return the loss."""
         return self.base.images(target, weights)
 
