@@ -81,7 +81,7 @@ class FullCovarianceStep:
         for rows in torch.split(visible, ROWS_AT_ONCE):
             g = grad[rows]
             g[rows < frozen_colors, COLORS] = 0.0
-            shares = len(rows) / len(field), len(rows) / len(visible)
+            shares = len(rows) / max(len(field), 1), len(rows) / max(len(visible), 1)
             g_scales, term = shape_pull(field.params[rows][:, SCALES], weights, *shares)
             g[:, SCALES] += g_scales
             cost += term

@@ -77,15 +77,13 @@ class CudaStep:
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, pull: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Do what `TorchStep.splats` does, or `FullCovarianceStep.splats`; twist and cost stay on the device."""
-        view, raster, gradient = self.view, self.view.raster, torch.empty_like(field.params)
-        twist = view.backward_there(field.params, gradient, pull)
-        cost = pull_shapes(raster, raster.visible, field, gradient, weights, frozen_colors)
-        step_rows(raster, raster.visible, field, gradient, rates)
+        view, gradient = self.view, torch.empty_like(field.params)
+        twist, visible = view.backward_there(field.params, gradient, pull), view.raster.visible
+        cost = pull_shapes(view, visible, field, gradient, weights, frozen_colors)
+        step_rows(view, visible, field, gradient, rates)
         if isinstance(view, CudaCovarianceView):
             view.correlations.steps += 1
-            step_rows(
-                raster, raster.visible, view.correlations, view.g_correlations, rates.of_extra("correlations")
-            )  # fmt: skip
+            step_rows(view, visible, view.correlations, view.g_correlations, rates.of_extra("correlations"))
         return twist, cost
 
 

@@ -28,9 +28,10 @@ class CudaViewDependentStep:
         """Render the field, as it looks from there, to the view's planes."""
         harmonics, n = field.carry("harmonics").params, len(field)
         self._rows, self._eye = field.params.clone(), _eye(T_camera_world)
-        self.view.raster.launch_fit(
-            "show_colors", blocks_for(n), self._rows, harmonics, n, self.degree, harmonics.shape[1], self._eye
-        )
+        with self.view.stages.of("project"):
+            self.view.raster.launch_fit(
+                "show_colors", blocks_for(n), self._rows, harmonics, n, self.degree, harmonics.shape[1], self._eye
+            )
         render_for(self.view, self._rows, T_camera_world, target, weights)
 
     def images(self, target: Target, weights: Weights) -> Tensor:
@@ -41,21 +42,29 @@ class CudaViewDependentStep:
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, pull: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Do what `ViewDependentStep.splats` does; twist and cost stay on the device."""
-        raster, n, gradient = self.view.raster, len(field), torch.empty_like(field.params)
-        twist, harmonics = self.view.backward_there(self._rows, gradient, pull), field.carry("harmonics")
-        cost = pull_shapes(raster, raster.visible, field, gradient, weights, frozen_colors)
-        on_harmonics, on_position = raster.empty(n, self.width), raster.empty(blocks_for(n), 3, dtype=torch.float64)
-        raster.launch_fit(
-            "carry_colors", blocks_for(n), field.params, harmonics.params, raster.visible, n, self.degree,
-            harmonics.params.shape[1], self.width, self._eye, gradient, on_harmonics, on_position,
-        )  # fmt: skip
-        if self.view.options.color_pose_gradient:
-            twist[:3] += on_position.sum(0)
-        step_rows(raster, raster.visible, field, gradient, rates)
+        view, gradient, harmonics = self.view, torch.empty_like(field.params), field.carry("harmonics")
+        twist, visible = view.backward_there(self._rows, gradient, pull), view.raster.visible
+        cost = pull_shapes(view, visible, field, gradient, weights, frozen_colors)
+        on_harmonics, on_camera = self._through_colors(field, visible, gradient)
+        if view.options.color_pose_gradient:
+            twist[:3] += on_camera
+        step_rows(view, visible, field, gradient, rates)
         harmonics.steps += 1
         of_harmonics = Rates(rates.of_extra("harmonics").per_column[: self.width])
-        step_rows(raster, raster.visible, harmonics, on_harmonics, of_harmonics)
+        step_rows(view, visible, harmonics, on_harmonics, of_harmonics)
         return twist, cost
+
+    def _through_colors(self, field: GaussianField, visible: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        """Carry the gradient of shown colours, in rows [N, 17], to the harmonics [N, width], returned, and by the
+        directions to the means, in the same rows, and to the camera's translation, returned [3]."""
+        raster, n, harmonics = self.view.raster, len(field), field.carry("harmonics").params
+        found, partial = raster.empty(n, self.width), raster.empty(blocks_for(n), 3, dtype=torch.float64)
+        with self.view.stages.of("project_backward"):
+            raster.launch_fit(
+                "carry_colors", blocks_for(n), field.params, harmonics, visible, n, self.degree, harmonics.shape[1],
+                self.width, self._eye, gradient, found, partial,
+            )  # fmt: skip
+        return found, partial.sum(0)
 
 
 def _eye(T_camera_world: Matrix) -> NDArray[np.float32]:

@@ -75,7 +75,7 @@ KERNEL nll_color_full(const float* sums, const float* target, const float* depth
         if (depth[at] > 0.f) {
             float r[3], v[6];
             const int row[6] = {0, 1, 2, 0, 0, 1}, column[6] = {0, 1, 2, 1, 2, 2};
-            for (int q = 0; q < 6; q++) v[q] = sums[(4 + q) * plane + at] - color[row[q]] * color[column[q]];
+            for (int q = 0; q < 6; q++) v[q] = fmaf(-color[row[q]], color[column[q]], sums[(4 + q) * plane + at]);
             for (int c = 0; c < 3; c++) r[c] = color[c] - target[c * plane + at];
             const float d1 = fmaxf(v[0], 0.f) + NLL_EPSILON, v2 = fmaxf(v[1], 0.f) + NLL_EPSILON, v3 = fmaxf(v[2], 0.f) + NLL_EPSILON;
             const float l21 = v[3] / d1, l31 = v[4] / d1, raw2 = v2 - l21 * v[3], d2 = fmaxf(raw2, NLL_EPSILON);

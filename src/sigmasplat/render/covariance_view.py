@@ -183,7 +183,9 @@ class CudaCovarianceView(CudaView):
                 "chain_given", conics, z, self._looks[0], r.counts, sums, r.n, PLANES, sums.shape[1], at,
                 *on_image, *on_looks,
             )  # fmt: skip
-            *looks, on_z = torch.autograd.grad(self._looks, self._leaves, on_looks, materialize_grads=True)
+            *looks, on_z = torch.autograd.grad(
+                self._looks, self._leaves, on_looks, retain_graph=True, materialize_grads=True
+            )
             on_image[2].add_(on_z + self._on_median() if layers else on_z)
             on_shapes, twists = [torch.empty_like(x) for x in self._shapes], r.twists()
             r.each_splat(
