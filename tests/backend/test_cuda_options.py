@@ -119,9 +119,11 @@ def test_gathered_images_step_as_by_definition(n: int) -> None:
 # ---- the full colour covariance
 
 
-def wide_views(s: Scene, field: GaussianField, double: GaussianField) -> tuple[CudaCovarianceView, CovarianceView]:
+def wide_views(
+    s: Scene, field: GaussianField, double: GaussianField, device: torch.device = CPU
+) -> tuple[CudaCovarianceView, CovarianceView]:
     exact = CovarianceView(exact_view(s.camera, True), double.extras["correlations"])
-    return CudaCovarianceView(CudaView(s.camera, OPTIONS, True, CPU), field.extras["correlations"]), exact
+    return CudaCovarianceView(CudaView(s.camera, OPTIONS, True, device), field.extras["correlations"]), exact
 
 
 def correlated(s: Scene) -> tuple[GaussianField, GaussianField]:

@@ -85,7 +85,7 @@ KERNEL carry_colors(const float* params, const float* harmonics, const unsigned 
         const float along = unit[0] * on_unit[0] + unit[1] * on_unit[1] + unit[2] * on_unit[2];
         float on_mean[3];
         for (int d = 0; d < 3; d++) {
-            on_mean[d] = length > 1e-12f ? (on_unit[d] - along * unit[d]) / length : 0.f;
+            on_mean[d] = (on_unit[d] - along * unit[d]) / length;
             on_row[d] += on_mean[d];
         }
         for (int d = 0; d < 3; d++)
