@@ -21,6 +21,11 @@ def measure(asked: bool = True) -> None:
     _asked = asked
 
 
+def measured() -> bool:
+    """Tell whether anybody asked to measure."""
+    return _asked
+
+
 class Event(Protocol):
     """A mark on a stream, as `torch.cuda.Event(enable_timing=True)`."""
 
