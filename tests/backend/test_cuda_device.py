@@ -1,21 +1,28 @@
-"""On a CUDA device: the view and the fused step held to the definition, the same bytes twice, five million splats.
+"""On a CUDA device: views and fused steps held to the definition, the same bytes twice, five million splats.
 
 Skipped without a device. For memory errors run this file under compute-sanitizer.
 """
+
+import time
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from sigmasplat.config import MappingConfig
+from sigmasplat.fit.cuda_rows import CudaGathered
 from sigmasplat.fit.cuda_step import CudaStep
+from sigmasplat.fit.steps import step_for
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.render import cuda_launch, render
+from sigmasplat.render import cuda_launch, cuda_stages, render
 from sigmasplat.render.cuda_view import CudaView
+from sigmasplat.render.view import CpuView
 from splat_fields import OPTIONS, crowd, exact_view, params_of, there_and_back
-from splat_scenes import KINDS, assert_same_vector, scene
+from splat_scenes import KINDS, WIDE, assert_same_vector, scene
 from test_compiled_loss import RATES, WEIGHTS, target_of
+from test_cuda_options import FULL, correlated, fitted, wide_views
 
 REASON = cuda_launch.missing()
 pytestmark = pytest.mark.skipif(REASON is not None, reason=str(REASON))
@@ -66,6 +73,74 @@ def test_a_step_is_taken() -> None:
         losses.append(float(step.images(target, WEIGHTS)))
         step.splats(field, RATES, WEIGHTS, 0)
     assert losses[-1] < losses[0] and torch.isfinite(field.params).all() and not torch.equal(field.params, before)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_ten_planes_agree(kind: str) -> None:
+    s = scene(kind, 60)
+    (field, double), T = correlated(s), s.T_camera_world.numpy()
+    field = field.on(cuda_launch.this_device())
+    got, want = wide_views(s, field, double, cuda_launch.this_device())
+    _, rows, twist = there_and_back(got, field.params, T)
+    _, want_rows, want_twist = there_and_back(want, double.params, T)
+    assert_same_vector(rows.cpu(), want_rows, 1e-3, "rows")
+    assert_same_vector(got.g_correlations.cpu(), want.g_correlations, what="correlations")
+    assert_same_vector(twist, want_twist, 1e-3, "twist")
+
+
+OF_FITS = [(1, 0, False), (3, 0, False), (1, 0, True), (1, 3, False), (1, 2, True)]
+"""Keyframes a step, degree of view-dependent colour, full colour covariance."""
+
+
+@pytest.mark.parametrize(("images", "degree", "full"), OF_FITS)
+def test_fits_are_those_of_the_cpu(images: int, degree: int, full: bool) -> None:
+    config = MappingConfig(color_covariance="full" if full else "diagonal", weight_nll_color=1e-2)
+    start = params_of(scene("random", 60))
+    ours, losses, _ = fitted(CudaView(WIDE, OPTIONS), config, images, degree)
+    theirs, wanted, _ = fitted(CpuView(WIDE, OPTIONS), config, images, degree)
+    np.testing.assert_allclose(losses, wanted, rtol=1e-3)
+    assert_same_vector(ours.params.cpu() - start, theirs.params - start, 3e-2, "what Adam moved")
+
+
+@pytest.mark.parametrize(("images", "degree", "full"), OF_FITS)
+def test_torch_waits_for_no_part_of_an_iteration(images: int, degree: int, full: bool) -> None:
+    s, device = crowd(), cuda_launch.this_device()
+    field, view = GaussianField(params_of(s)).on(device), CudaView(s.camera, OPTIONS)
+    target = target_of(s.camera, (s.camera.height, s.camera.width)).on(device)
+    weights = {**FULL, "nll_color_full": 1e-2 * full, "alignment": 0.0 if full else 0.3}
+    step, T = step_for(field, view, weights, degree), s.T_camera_world.numpy()
+    for watched in (False, True):  # the first one compiles, makes room, and counts pairs
+        torch.cuda.set_sync_debug_mode("error" if watched else "default")
+        try:
+            gathered, field.steps = CudaGathered(view, field), field.steps + 1
+            for _ in range(images):
+                step.forward(field, T, target, weights)
+                step.images(target, weights)
+                if images > 1:
+                    gathered.add(field, 1.0 / images)
+                else:
+                    step.splats(field, RATES, weights, 3)
+            if images > 1:
+                gathered.step(field, RATES, weights, 3)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+    assert torch.isfinite(field.params).all()
+
+
+def test_stages_are_measured_where_they_are_asked_for() -> None:
+    s, view = crowd(), CudaView(crowd().camera, OPTIONS)
+    params, T = params_of(s).cuda(), s.T_camera_world.numpy()
+    there_and_back(view, params, T)
+    assert not view.seconds.any()
+    cuda_stages.measure()
+    try:
+        began_s = time.perf_counter()
+        for _ in range(20):
+            there_and_back(view, params, T)
+        spent, wall_s = view.seconds, time.perf_counter() - began_s
+    finally:
+        cuda_stages.measure(False)
+    assert (spent > 0.0).all() and float(spent.sum()) < wall_s
 
 
 @pytest.mark.parametrize("n", [0, 5_000_000])

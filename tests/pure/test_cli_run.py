@@ -29,6 +29,7 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.render import cuda_stages
 from sigmasplat.screen import Screen
 from sigmasplat.sources.base import Source
 
@@ -315,6 +316,15 @@ def test_the_time_of_finishing_is_not_that_of_the_frames(corridor: Corridor, mon
     facts = RunFolder.open(Path("mine")).facts()
     assert (facts["wall_s"], facts["finish_s"]) == (5.0, 100.0)
     assert sum(RunFolder.open(Path("mine")).read_profile().values()) == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_stages_on_a_device_are_measured_where_a_profile_is_asked_for(corridor: Corridor, asked: bool) -> None:
+    seen = []
+    MadeUpSlam.at = {1: lambda: seen.append(cuda_stages.measured())}
+    assert sigmasplat("run", "corridor", "--no-eval", "--out", "mine", *["--profile"] * asked) == 0
+    cuda_stages.measure(False)
+    assert seen == [asked]
 
 
 @pytest.mark.parametrize("moment", ["loops", "finish 1"])

@@ -44,10 +44,12 @@ def carry_through(
 ) -> int:
     """Run SLAM into the folder, live on the stage if there is one, then score it; return the exit code."""
     from sigmasplat.protocols import Together, Watcher
+    from sigmasplat.render import cuda_stages
     from sigmasplat.session import record
     from sigmasplat.snapshots import Snapshots
     from sigmasplat.sources.live import LiveSource
 
+    cuda_stages.measure(ways.profile)
     keeper = Snapshots(begun.slam, folder, ways.save_every)
     with screen.steps(None if source.live else len(source), begun.next_index) as steps:
         watch: Watcher = steps

@@ -71,8 +71,10 @@ class View(Protocol):
     g_moment: Tensor
     g_median_depth: Tensor
     """Gradients of `moment` and of the layers' median depth: felt where the last forward pass made those."""
-    seconds: NDArray[np.float64]
-    """Time spent so far in project, sort, blend, blend backward, project backward."""
+
+    @property
+    def seconds(self) -> NDArray[np.float64]:
+        """Return the time spent so far in project, sort, blend, blend backward, project backward."""
 
     def forward(
         self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
