@@ -88,5 +88,24 @@ class CudaView:
         r.each_splat("chain_pose", self._numbers, None, self._here(params), r.counts, sums, r.n, sums.shape[1], twists)
         return twists.sum(0).cpu().numpy()
 
+    def follow(self, params: Tensor, pose: Tensor) -> None:
+        """Render rows [N, 17] to `sums` and `alpha` from T_camera_world float32 [4, 4] on the device; no host waits."""
+        params = self._here(params)
+        r, n, self._made = self.raster, len(params), (False, False)
+        r.prepare(n, len(self.sums), self.camera, self.options)
+        r.each_splat("pack_view", self._numbers, pose, params, n, r.frame, r.packed)
+        r.bin_within()
+        r.blend(self._planes, None)
+
+    def follow_back(self, params: Tensor, pose: Tensor) -> Tensor:
+        """Carry the gradient planes of colour and depth to that pose: twists [blocks, 6], to be added up on the device.
+
+        They are 0 where `raster.pairs` were more than there was room for.
+        """
+        r, sums = self.raster, self.raster.pose_gradients_within(self._planes, self.g_sums)
+        twists = r.twists()
+        r.each_splat("chain_pose", self._numbers, pose, self._here(params), r.counts, sums, r.n, sums.shape[1], twists)
+        return twists
+
     def visible(self, n: int) -> Tensor:
         return self.raster.visible[:n].bool()
