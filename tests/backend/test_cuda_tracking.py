@@ -347,6 +347,18 @@ def test_too_little_room_changes_no_bit(on_the_cpu: Emulator, iterations: int) -
         assert ((view.raster.capacity or 0) > room) == again
 
 
+def test_without_room_for_all_the_way_back_reads_no_record() -> None:
+    view, pose = view_of(), torch.eye(4)
+    view.raster.capacity = 7
+    view.follow(wall(), pose)
+    view.g_sums.fill_(1.0)
+    assert int(view.raster._total) > view.raster._room == 7
+    assert torch.count_nonzero(view.follow_back(wall(), pose)) == 0  # NaN is not zero
+    view.raster.expect(int(view.raster._total))
+    view.follow(wall(), pose)
+    assert torch.count_nonzero(view.follow_back(wall(), pose)) > 0
+
+
 def pairs_at(T_camera_world: Array) -> int:
     view = view_of()
     view.forward(wall(), T_camera_world)
