@@ -163,3 +163,5 @@ class TrackingConfig:
     """Adam stops when a step is below this (metres and radians); 0 = run every iteration."""
     plateau_stop: float = 0.0
     """Either method stops (aligning: a level) when a step changes the loss by less than this share of it; 0 = off."""
+    cuda_graphs: bool = True
+    """On a CUDA device, launch many iterations of descent each as one CUDA graph; off = kernel by kernel."""

@@ -17,7 +17,7 @@ FOLDER = Path(__file__).parent
 RASTER, FIT = "raster.cu", "fit.cu"
 TEXTS = {
     RASTER: (RASTER, "gradients.cuh", "tiles.cuh", "device.cuh", "sums.cuh", "splat.h"),
-    FIT: (FIT, "harmonics.cuh", "sums.cuh"),
+    FIT: (FIT, "harmonics.cuh", "track.cuh", "descend.cuh", "sums.cuh"),
 }
 FEATURE_COUNTS = (4, 7, 11, 16)
 """The feature counts compiled, a program each; a count between them is padded with zeros."""

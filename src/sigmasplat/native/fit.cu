@@ -257,3 +257,5 @@ KERNEL adam(float* params, float* moment1, float* moment2, const int* last_step,
 }
 
 }  // namespace sigmasplat
+
+#include "track.cuh"

@@ -103,5 +103,30 @@ class CudaView:
             )
         return twists.sum(0).cpu().numpy()
 
+    def follow(self, params: Tensor, pose: Tensor) -> None:
+        """Render rows [N, 17] to `sums` and `alpha` from T_camera_world float32 [4, 4] on the device; no host waits."""
+        params = self._here(params)
+        r, n, self._made = self.raster, len(params), (False, False)
+        with self.stages.of("project"):
+            r.prepare(n, len(self.sums), self.camera, self.options)
+            r.each_splat("pack_view", self._numbers, pose, params, n, r.frame, r.packed)
+        with self.stages.of("sort"):
+            r.bin_within()
+        with self.stages.of("blend"):
+            r.blend(self._planes, None)
+
+    def follow_back(self, params: Tensor, pose: Tensor) -> Tensor:
+        """Carry the gradient planes of colour and depth to that pose: twists [blocks, 6], to be added up on the device.
+
+        They are 0 where `raster.pairs` were more than there was room for.
+        """
+        r = self.raster
+        with self.stages.of("blend_backward"):
+            sums = r.pose_gradients_within(self._planes, self.g_sums)
+        with self.stages.of("project_backward"):
+            twists, rows = r.twists(), self._here(params)
+            r.each_splat("chain_pose", self._numbers, pose, rows, r.counts, sums, r.n, sums.shape[1], twists)
+        return twists
+
     def visible(self, n: int) -> Tensor:
         return self.raster.visible[:n].bool()

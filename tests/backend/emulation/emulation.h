@@ -22,6 +22,8 @@ struct alignas(16) float4 { float x, y, z, w; };
 inline float2 make_float2(float x, float y) { return {x, y}; }
 inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
 inline float __int_as_float(int bits) { float x; memcpy(&x, &bits, 4); return x; }
+inline int __float_as_int(float x) { int bits; memcpy(&bits, &x, 4); return bits; }
+inline int atomicAdd(int* to, int value) { return std::exchange(*to, *to + value); }   // one thread runs at a time
 
 namespace emulation {
 
