@@ -118,6 +118,7 @@ class MadeUpSlam:
         return step
 
     def finish(self, progress: Callable[[int, int], None]) -> None:
+        progress(0, 2)
         self.at.get("loops", lambda: None)()
         self.loops += self.tried.get("end", [])
         for done in (1, 2):
@@ -288,7 +289,7 @@ def test_submaps_and_loops_are_kept_and_told(corridor: Corridor, capsys: pytest.
     assert "frame 4: loop closed between submaps 7 and 0 (residual 0.021, moved 4.3 cm)" in said
     assert "at the end: loop closed between submaps 8 and 1 (residual 0.015, moved 12.1 cm)" in said
     assert said.count("loop closed") == 2
-    assert "final map 2/2" in said
+    assert "\nfinal map 0/2\n" in said and "\nfinal map 2/2\n" in said
     assert "3 submaps, loops: 2 closed, 1 refused" in said
     store = MadeUpSlam.latest.store
     assert isinstance(store, DiskStore) and store.folder == Path("mine/submaps")
