@@ -19,7 +19,7 @@ from rich.console import Console
 
 from sigmasplat import cli, session
 from sigmasplat.config import Config
-from sigmasplat.errors import SourceError
+from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.io.ply import read_field
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.submaps import DiskStore
@@ -267,6 +267,28 @@ def test_a_crash_keeps_its_traceback_and_names_the_folder(corridor: Corridor) ->
     run = RunFolder.open(Path("crashed"))
     assert run.facts()["status"] == "failed"
     assert len(run.read_trajectory()) == 2
+
+
+@pytest.mark.parametrize("problem", [ZeroDivisionError("a bug"), SigmaSplatError("no depth"), KeyboardInterrupt()])
+def test_a_run_that_fails_before_its_first_frame_leaves_nothing(corridor: Corridor, problem: BaseException) -> None:
+    def fail() -> None:
+        raise problem
+
+    MadeUpSlam.at = {0: fail}
+    with pytest.raises((SystemExit, ZeroDivisionError)) as left:
+        cli.main(["run", "corridor"])
+    assert not getattr(left.value, "__notes__", []), "there is no folder to name"
+    assert not any(Path().iterdir()), "not even runs/"
+
+
+def test_what_is_in_the_folder_keeps_it(corridor: Corridor) -> None:
+    def fail() -> None:
+        Path("mine/notes.txt").write_text("the user's")
+        raise SigmaSplatError("no depth")
+
+    MadeUpSlam.at = {0: fail}
+    assert sigmasplat("run", "corridor", "--out", "mine") == 2
+    assert Path("mine/notes.txt").read_text() == "the user's" and Path("mine/run.json").is_file()
 
 
 CLOSED, REFUSED, LAST = MadeUpLoop(7, 0, True), MadeUpLoop(7, 2, False), MadeUpLoop(8, 1, True, 0.0149, 0.1206)
