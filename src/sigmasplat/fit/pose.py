@@ -65,7 +65,10 @@ def fit_pose_adam(
 
 
 def fit_pose_align(reference: Reference, live: Pyramid, T_camera_world: Matrix, config: TrackingConfig) -> PoseFit:
-    """Align the live image to a reference by Gauss–Newton (`fit.align`), from a first guess."""
+    """Align the live image, a gray and depth (m) pyramid, to a reference by Gauss–Newton (`fit.align`), from a guess.
+
+    T_camera_world [4, 4]: the guess for the live camera. The fit's `loss` is the cost it ended with, `first_loss` NaN.
+    """
     guess = T_camera_world @ se3.inverse(reference.T_camera_world)
     found = align(
         reference.pyramid, live, guess, config.align_iterations, config.align_weight_color, config.align_stop,

@@ -28,9 +28,10 @@ class Reference:
 
 
 def map_reference(params: Tensor, view: View, T_camera_world: Matrix, config: TrackingConfig) -> Reference:
-    """Render the map as a reference: gray C/A and depth D/A where it is opaque, weighed by w̃ (VarSplat §3).
+    """Render the map as a reference: gray C/A and depth D/A m where it is opaque, weighed by w̃ (VarSplat §3).
 
-    With depth weighed by U it is rendered twice: U is about the surface that the first render finds.
+    params: rows [N, 17]; T_camera_world [4, 4]: where it is seen from. With depth weighed by U it is rendered twice: U
+    is about the surface that the first render finds.
     """
     view.forward(params, T_camera_world)
     maps = _reference_maps(view, config, None)
@@ -45,8 +46,9 @@ def keyframe_reference(
 ) -> Reference:
     """Take a keyframe's own image as a reference, each pixel weighed by w̃ of the map seen from there (VarSplat §3).
 
-    The sensor's surface is unbiased where a young map still renders too near; the map says which pixels to trust. Depth
-    may be weighed by U about the sensor's depth instead (CG-SLAM eq. 10).
+    params: rows [N, 17]; image: its gray and depth (m) pyramid; T_camera_world [4, 4]: its pose. The sensor's surface
+    is unbiased where a young map still renders too near; the map says which pixels to trust. Depth may be weighed by U
+    about the sensor's depth instead (CG-SLAM eq. 10).
     """
     if not config.uncertainty:
         return Reference(image, T_camera_world)
@@ -57,7 +59,7 @@ def keyframe_reference(
 
 
 class ReferenceMaps(NamedTuple):
-    """Gray, surface (0 where the map is thin) and the weights of gray and depth, each [H, W]; a weight may be None."""
+    """Gray in [0, 1], surface in m (0 where the map is thin), weights of gray and depth or None, each [H, W]."""
 
     gray: Image
     depth: Image

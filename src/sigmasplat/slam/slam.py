@@ -125,14 +125,18 @@ class Slam:
     def finish(self, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
         """Finish the last submap, look for its loops, and make the final map (VarSplat §7); once, after all frames.
 
-        `progress` is told (steps of refinement done, of how many). With one submap and no refinement nothing is done.
+        `progress` is told (steps of refinement done, of how many), from the beginning to the end; one step where
+        there are none. With one submap and no refinement nothing is done.
         """
         if not self.steps or not (len(self.store) or self._cuts or self.config.final.iterations):
             return
+        total = self.config.final.iterations or 1
+        progress(0, total)
         self._freeze()
         view = self.view
         assert view is not None
         self._final = final_map(self.store, self.atlas.anchors, self.config, view, self.random, progress)
+        progress(total, total)
 
     def checkpoint(self) -> dict[str, Tensor]:
         """Return what a run needs to be read back: the active submap's field with its optimiser state, poses, times,
