@@ -19,11 +19,18 @@ struct Geometry { float l1, l2, l3, u, v, log_opacity, z; int tag; };
 constexpr int GEOMETRY = sizeof(Geometry) / sizeof(float);
 struct Box { uint16_t x0, y0, x1, y1; };              // in blocks, inclusive
 
-constexpr int ALPHA_CHUNK = 32;
+constexpr int ALPHA_CHUNK = 32;                       // entries of a block's list dealt with together
+typedef float Pixels[W];                              // a number of each of a block's pixels
 struct AlphaBuffer {                                  // one chunk of a block's splats that survive the alpha test
-    alignas(64) float alpha[ALPHA_CHUNK + 4][W];
-    alignas(64) float pairs[ALPHA_CHUNK + 4][2 * W];
+    alignas(64) Pixels alpha[ALPHA_CHUNK + 4];
     int entry[ALPHA_CHUNK + 4];
+};
+struct Walk {                                         // all of a block's splats that survive it, near to far: for the way back
+    Buffer<Pixels> alpha, weight, gain;
+    Buffer<int> entry;
+    alignas(64) float pairs[ALPHA_CHUNK][2 * W];
+    void reserve(size_t n) { alpha.reserve(n); weight.reserve(n); gain.reserve(n); entry.reserve(n); }
+    size_t bytes() const { return alpha.bytes() + weight.bytes() + gain.bytes() + entry.bytes(); }
 };
 struct Center { float u, v; };
 struct Scratch {                                      // one thread's tile
@@ -33,10 +40,12 @@ struct Scratch {                                      // one thread's tile
     Buffer<int> lists;
     Buffer<uint64_t> sorted;
     AlphaBuffer alphas;
+    Walk walk;
     int counts[BLOCKS];
     size_t list_capacity = 0;
     size_t bytes() const {
-        return rows.bytes() + records.bytes() + centers.bytes() + masks.bytes() + lists.bytes() + sorted.bytes() + sizeof(*this);
+        return rows.bytes() + records.bytes() + centers.bytes() + masks.bytes() + lists.bytes() + sorted.bytes() + walk.bytes()
+               + sizeof(*this);
     }
 };
 

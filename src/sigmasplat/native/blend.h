@@ -103,7 +103,7 @@ template <int ROW_FLOATS> SIGMA_INLINE const Geometry& geometry_of(const float* 
 
 // Alphas of up to ALPHA_CHUNK entries of a block's list; entries that reach no live pixel are dropped, without a branch.
 template <int ROW_FLOATS> SIGMA_INLINE int live_alphas(const float* rows, const int* list, int begin, int end, vf x, vf y, Mask alive,
-                             float log_alpha_min, AlphaBuffer& out) {
+                             float log_alpha_min, Pixels* alpha, int* entry) {
     const vf floor_ = splat(log_alpha_min), top = splat(ALPHA_MAX);
     int n = 0;
     for (int j = begin; j < end; j += 4) {
@@ -118,8 +118,8 @@ template <int ROW_FLOATS> SIGMA_INLINE int live_alphas(const float* rows, const 
         }
 #pragma GCC unroll 4
         for (int e = 0; e < 4; e++) {
-            store(out.alpha[n], only(live[e], min(exp2_eighth(t[e]), top)));
-            out.entry[n] = list[j + e];
+            store(alpha[n], only(live[e], min(exp2_eighth(t[e]), top)));
+            entry[n] = list[j + e];
             n += any(live[e]);
         }
     }
@@ -149,7 +149,8 @@ template <int K, bool MOMENT, bool IDS> static void blend_tiles(Render& r, Outpu
                 const int count = s.counts[b];
                 for (int j = 0; j < count; j += ALPHA_CHUNK) {
                     const int end = count < j + ALPHA_CHUNK ? count : j + ALPHA_CHUNK;
-                    const int n = live_alphas<ROW_FLOATS>(rows, list, j, end, x, y, ge(T, stop), log_alpha_min, s.alphas);
+                    const int n = live_alphas<ROW_FLOATS>(rows, list, j, end, x, y, ge(T, stop), log_alpha_min,
+                                                          s.alphas.alpha, s.alphas.entry);
                     for (int e = 0; e < n; e++) {
                         const int entry = s.alphas.entry[e];
                         const Geometry& geometry = geometry_of<ROW_FLOATS>(rows, entry);
