@@ -97,6 +97,11 @@ SIGMA_INLINE vf block_y(int b) {
     return y;
 }
 
+// Where the planes hold block b of a tile.
+SIGMA_INLINE size_t block_at(const Tile& tile, int b, size_t stride) {
+    return (tile.y + size_t(b / BLOCKS_X) * BLOCK_HEIGHT) * stride + tile.x + b % BLOCKS_X * BLOCK_WIDTH;
+}
+
 template <int ROW_FLOATS> SIGMA_INLINE const Geometry& geometry_of(const float* rows, int entry) {
     return *reinterpret_cast<const Geometry*>(rows + size_t(entry) * ROW_FLOATS);
 }
@@ -141,7 +146,7 @@ template <int K, bool MOMENT, bool IDS> static void blend_tiles(Render& r, Outpu
             for (int b = 0; b < BLOCKS; b++) {
                 const vf x = block_x(b), y = block_y(b);
                 const int* list = &s.lists[b * s.list_capacity];
-                const size_t at = (tile.y + size_t(b / BLOCKS_X) * BLOCK_HEIGHT) * stride + tile.x + b % BLOCKS_X * BLOCK_WIDTH;
+                const size_t at = block_at(tile, b, stride);
                 vf sum[K], moment = zero, ref = zero, T = one, T_end = one, best = zero, median_w = zero, median_z = zero;
                 vi dominant = splat(-1), median = splat(-1);
                 for (auto& c : sum) c = zero;

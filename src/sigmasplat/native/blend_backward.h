@@ -28,28 +28,6 @@ constexpr int pixel_of_pair(int m) { return m < W / 2 ? m / 2 * 4 + m % 2 : (m -
 typedef long long vpair __attribute__((vector_size(W * 4)));
 SIGMA_INLINE vf splat_pair(const float* p) { long long bits; memcpy(&bits, p, 8); return (vf)(bits - vpair{}); }
 
-// Move a record's moments from the tile's centre to the splat's mean at (u, v) from there.
-template <class T> SIGMA_INLINE void shift_moments(T m0, T& mx, T& my, T& mxx, T& mxy, T& myy, T u, T v) {
-    mxx += u * (u * m0 - 2.f * mx);
-    mxy += u * (v * m0 - my) - v * mx;
-    myy += v * (v * m0 - 2.f * my);
-    mx -= u * m0;
-    my -= v * m0;
-}
-
-// Move a tile's records to each splat's own slots, moments now about the splat's mean.
-template <int RECORD> static void flush_records(Render& r, Scratch& s, const Tile& tile) {
-    for (int k = 0; k < tile.count; k++) {
-        float* m = &s.records[size_t(k) * RECORD];
-        shift_moments(m[0], m[2], m[4], m[6], m[8], m[10], s.centers[k].u, s.centers[k].v);
-    }
-    for (int k = 0; k < tile.count; k++) {
-        const Geometry& g = *reinterpret_cast<const Geometry*>(&s.rows[size_t(k) * r.row]);
-        float* to = &r.partials[size_t(g.tag) * RECORD];
-        for (int c = 0; c < RECORD; c += W) stream(to + c, load(&s.records[size_t(k) * RECORD + c]));
-    }
-}
-
 // ∂L/∂(outputs) at a block's pixels.
 template <int K> struct PixelGradients { vf sums[K], alpha, moment, ref; };
 
@@ -171,8 +149,7 @@ static void blend_tiles_backward(Render& r, OutputGradients g, Finish finish) {
             for (int b = 0; b < BLOCKS; b++) {
                 if (!s.counts[b]) continue;
                 const vf x = block_x(b), y = block_y(b);
-                const size_t at = (tile.y + size_t(b / BLOCKS_X) * BLOCK_HEIGHT) * r.padded_width() + tile.x + b % BLOCKS_X * BLOCK_WIDTH;
-                const PixelGradients<K> on_pixels = gradients_at<K, MOMENT>(r, g, at);
+                const PixelGradients<K> on_pixels = gradients_at<K, MOMENT>(r, g, block_at(tile, b, r.padded_width()));
                 store_basis<K, MOMENT>(on_pixels, x, y, basis);
                 const int n = walk_out<row_floats<ROW_K>, K, MOMENT>(s.rows.data, &s.lists[b * s.list_capacity], s.counts[b], x, y,
                                                                      on_pixels, log_alpha_min, stop, s.walk);
@@ -181,6 +158,28 @@ static void blend_tiles_backward(Render& r, OutputGradients g, Finish finish) {
             finish(s, tile);
         }
         fence();                                      // records may have been streamed
+    }
+}
+
+// Move a record's moments from the tile's centre to the splat's mean at (u, v) from there.
+template <class T> SIGMA_INLINE void shift_moments(T m0, T& mx, T& my, T& mxx, T& mxy, T& myy, T u, T v) {
+    mxx += u * (u * m0 - 2.f * mx);
+    mxy += u * (v * m0 - my) - v * mx;
+    myy += v * (v * m0 - 2.f * my);
+    mx -= u * m0;
+    my -= v * m0;
+}
+
+// Move a tile's records to each splat's own slots, moments now about the splat's mean.
+template <int RECORD> static void flush_records(Render& r, Scratch& s, const Tile& tile) {
+    for (int k = 0; k < tile.count; k++) {
+        float* m = &s.records[size_t(k) * RECORD];
+        shift_moments(m[0], m[2], m[4], m[6], m[8], m[10], s.centers[k].u, s.centers[k].v);
+    }
+    for (int k = 0; k < tile.count; k++) {
+        const Geometry& g = *reinterpret_cast<const Geometry*>(&s.rows[size_t(k) * r.row]);
+        float* to = &r.partials[size_t(g.tag) * RECORD];
+        for (int c = 0; c < RECORD; c += W) stream(to + c, load(&s.records[size_t(k) * RECORD + c]));
     }
 }
 
