@@ -20,11 +20,18 @@ struct Geometry { float l1, l2, l3, u, v, log_opacity, z; int tag; };
 constexpr int GEOMETRY = sizeof(Geometry) / sizeof(float);
 struct Box { uint16_t x0, y0, x1, y1; };              // in blocks, inclusive
 
-constexpr int ALPHA_CHUNK = 32;
+constexpr int ALPHA_CHUNK = 32;                       // entries of a block's list dealt with together
+typedef float Pixels[W];                              // a number of each of a block's pixels
 struct AlphaBuffer {                                  // one chunk of a block's splats that survive the alpha test
-    alignas(64) float alpha[ALPHA_CHUNK + 4][W];
-    alignas(64) float pairs[ALPHA_CHUNK + 4][2 * W];
+    alignas(64) Pixels alpha[ALPHA_CHUNK + 4];
     int entry[ALPHA_CHUNK + 4];
+};
+struct Walk {                                         // all of a block's splats that survive it, near to far: for the way back
+    Buffer<Pixels> alpha, weight, gain;
+    Buffer<int> entry;
+    alignas(64) float pairs[ALPHA_CHUNK][2 * W];
+    void reserve(size_t n) { alpha.reserve(n); weight.reserve(n); gain.reserve(n); entry.reserve(n); }
+    size_t bytes() const { return alpha.bytes() + weight.bytes() + gain.bytes() + entry.bytes(); }
 };
 struct Center { float u, v; };
 struct Scratch {                                      // one thread's tile
@@ -34,10 +41,12 @@ struct Scratch {                                      // one thread's tile
     Buffer<int> lists;
     Buffer<uint64_t> sorted;
     AlphaBuffer alphas;
+    Walk walk;
     int counts[BLOCKS];
     size_t list_capacity = 0;
     size_t bytes() const {
-        return rows.bytes() + records.bytes() + centers.bytes() + masks.bytes() + lists.bytes() + sorted.bytes() + sizeof(*this);
+        return rows.bytes() + records.bytes() + centers.bytes() + masks.bytes() + lists.bytes() + sorted.bytes() + walk.bytes()
+               + sizeof(*this);
     }
 };
 
@@ -150,56 +159,7 @@ SIGMA_INLINE int pack(Render& r, const Footprint<vf>& f, vf opacity, Mask seen, 
     return used - before;
 }
 
-constexpr int DIGIT = 8, LINE = 8;                    // bits a pass sorts by; items in a cache line
-
-// Sort n ≤ `limit` moves away from order; say whether that was enough.
-SIGMA_INLINE bool insertion_sort(uint64_t* a, int n, int limit) {
-    for (int i = 1; i < n; i++) {
-        const uint64_t x = a[i];
-        int j = i - 1;
-        for (; j >= 0 && a[j] > x; j--) a[j + 1] = a[j];
-        a[j + 1] = x;
-        limit -= i - 1 - j;
-        if (limit < 0) return false;
-    }
-    return true;
-}
-// Sort by `bits` bits of the depth above `low`, from bit `shift` on, keeping the order of equals: PASSES digits, the least first.
-template <int PASSES> static void radix_sort(uint64_t* a, uint64_t* spare, int n, uint32_t low, int shift, int bits) {
-    const int digit = (bits + PASSES - 1) / PASSES;
-    const uint32_t mask = (1u << digit) - 1;
-    uint32_t counts[PASSES][1 << DIGIT];
-    memset(counts, 0, sizeof(counts));
-    for (int i = 0; i < n; i++) {
-        const uint32_t key = (uint32_t(a[i] >> 32) - low) >> shift;
-        for (int p = 0; p < PASSES; p++) counts[p][key >> (p * digit) & mask]++;
-    }
-    uint64_t *from = a, *to = spare;
-    for (int p = 0; p < PASSES; p++) {
-        uint32_t sum = 0;
-        for (uint32_t d = 0; d <= mask; d++) { const uint32_t c = counts[p][d]; counts[p][d] = sum; sum += c; }
-        for (int i = 0; i < n; i++) to[counts[p][(uint32_t(from[i] >> 32) - low) >> (shift + p * digit) & mask]++] = from[i];
-        uint64_t* t = from; from = to; to = t;
-    }
-    if (from != a) memcpy(a, from, size_t(n) * sizeof *a);
-}
-// Sort (depth bits << 32 | splat) by depth, keeping the order of equals.
-static void sort_tile(uint64_t* a, uint64_t* spare, int n) {
-    if (n <= 24) {
-        insertion_sort(a, n, 24 * 24);
-        return;
-    }
-    uint32_t low = ~0u, high = 0;
-    for (int i = 0; i < n; i++) {
-        const uint32_t key = a[i] >> 32;
-        low = key < low ? key : low;
-        high = key > high ? key : high;
-    }
-    const int bits = high > low ? 32 - __builtin_clz(high - low) : 1, below = bits > 2 * DIGIT ? bits - 2 * DIGIT : 0;
-    radix_sort<2>(a, spare, n, low, below, bits - below);
-    // By its upper two digits a tile is nearly sorted, unless most of its depths are alike.
-    if (below && !insertion_sort(a, n, 4 * n)) radix_sort<4>(a, spare, n, low, 0, bits);
-}
+constexpr int LINE = 8;                               // items in a cache line
 
 // Visit the tiles of a splat. Most have one or two each way: those are visited without a branch, `spare` and the two after it
 // standing for tiles that it does not have.

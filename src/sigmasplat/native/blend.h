@@ -99,13 +99,18 @@ SIGMA_INLINE vf block_y(int b) {
     return y;
 }
 
+// Where the planes hold block b of a tile.
+SIGMA_INLINE size_t block_at(const Tile& tile, int b, size_t stride) {
+    return (tile.y + size_t(b / BLOCKS_X) * BLOCK_HEIGHT) * stride + tile.x + b % BLOCKS_X * BLOCK_WIDTH;
+}
+
 template <int ROW_FLOATS> SIGMA_INLINE const Geometry& geometry_of(const float* rows, int entry) {
     return *reinterpret_cast<const Geometry*>(rows + size_t(entry) * ROW_FLOATS);
 }
 
 // Alphas of up to ALPHA_CHUNK entries of a block's list; entries that reach no live pixel are dropped, without a branch.
 template <int ROW_FLOATS> SIGMA_INLINE int live_alphas(const float* rows, const int* list, int begin, int end, vf x, vf y, Mask alive,
-                             float log_alpha_min, AlphaBuffer& out) {
+                             float log_alpha_min, Pixels* alpha, int* entry) {
     const vf floor_ = splat(log_alpha_min), top = splat(ALPHA_MAX);
     int n = 0;
     for (int j = begin; j < end; j += 4) {
@@ -120,8 +125,8 @@ template <int ROW_FLOATS> SIGMA_INLINE int live_alphas(const float* rows, const 
         }
 #pragma GCC unroll 4
         for (int e = 0; e < 4; e++) {
-            store(out.alpha[n], only(live[e], min(exp2_alpha(t[e]), top)));
-            out.entry[n] = list[j + e];
+            store(alpha[n], only(live[e], min(exp2_alpha(t[e]), top)));
+            entry[n] = list[j + e];
             n += any(live[e]);
         }
     }
@@ -143,7 +148,7 @@ template <int K, bool MOMENT, bool IDS> static void blend_tiles(Render& r, Outpu
             for (int b = 0; b < BLOCKS; b++) {
                 const vf x = block_x(b), y = block_y(b);
                 const int* list = &s.lists[b * s.list_capacity];
-                const size_t at = (tile.y + size_t(b / BLOCKS_X) * BLOCK_HEIGHT) * stride + tile.x + b % BLOCKS_X * BLOCK_WIDTH;
+                const size_t at = block_at(tile, b, stride);
                 vf sum[K], moment = zero, ref = zero, T = one, T_end = one, best = zero, median_w = zero, median_z = zero;
                 vi dominant = splat(-1), median = splat(-1);
                 for (auto& c : sum) c = zero;
@@ -151,7 +156,8 @@ template <int K, bool MOMENT, bool IDS> static void blend_tiles(Render& r, Outpu
                 const int count = s.counts[b];
                 for (int j = 0; j < count; j += ALPHA_CHUNK) {
                     const int end = count < j + ALPHA_CHUNK ? count : j + ALPHA_CHUNK;
-                    const int n = live_alphas<ROW_FLOATS>(rows, list, j, end, x, y, ge(T, stop), log_alpha_min, s.alphas);
+                    const int n = live_alphas<ROW_FLOATS>(rows, list, j, end, x, y, ge(T, stop), log_alpha_min,
+                                                          s.alphas.alpha, s.alphas.entry);
                     for (int e = 0; e < n; e++) {
                         const int entry = s.alphas.entry[e];
                         const Geometry& geometry = geometry_of<ROW_FLOATS>(rows, entry);

@@ -180,13 +180,6 @@ SIGMA_INLINE void fence() { _mm_sfence(); }
 SIGMA_INLINE void fence() {}
 #endif
 
-// 1/x of positive normal numbers (relative error 1e-7): Newton from a guess on the bits. Four times the division's rate.
-SIGMA_INLINE vf reciprocal(vf x) {
-    vf y = float_of_bits(0x7ef311c7 - bits_of(x));
-    for (int i = 0; i < 3; i++) y *= fnma(x, y, splat(2.f));
-    return y;
-}
-
 // A (BLOCK_WIDTH × BLOCK_HEIGHT) block of an image plane whose rows are `stride` floats apart.
 typedef float row_of_block __attribute__((vector_size(BLOCK_WIDTH * 4)));
 SIGMA_INLINE row_of_block load_row(const float* p) { row_of_block r; memcpy(&r, p, sizeof r); return r; }
