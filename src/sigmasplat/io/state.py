@@ -74,7 +74,7 @@ class _Encoder:
 
     def _array(self, value: Tensor | np.ndarray[Any, Any]) -> Any:
         kind = "tensor" if isinstance(value, Tensor) else "array"
-        array = value.detach().numpy() if isinstance(value, Tensor) else value
+        array = value.detach().cpu().numpy() if isinstance(value, Tensor) else value
         if array.size <= INLINE:
             return {kind: array.tolist(), "type": str(array.dtype), "shape": list(array.shape)}
         if id(value) not in self.seen:

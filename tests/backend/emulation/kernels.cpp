@@ -1,8 +1,10 @@
 // The kernels of a program as a library that tests call by name.
 #include "emulation.h"
 
-#if FEATURES
+#if FEATURES > 0
 #include "raster.cu"
+#elif FEATURES == -1
+#include "align.cu"
 #else
 #include "fit.cu"
 #endif
@@ -10,7 +12,9 @@
 using namespace sigmasplat;
 #define ENTRY(kernel) {#kernel, emulation::Call<kernel>::run}
 static const emulation::Entry ENTRIES[] = {
-#if !FEATURES
+#if FEATURES == -1
+    ENTRY(halve_images), ENTRY(normal_equations), ENTRY(begin_alignment), ENTRY(take_align_step),
+#elif !FEATURES
     ENTRY(mapping_losses), ENTRY(ssim), ENTRY(ssim_backward), ENTRY(shape_terms), ENTRY(adam),
 #else
     ENTRY(project_splats), ENTRY(project_splats_backward), ENTRY(pack_given), ENTRY(list_pairs_short), ENTRY(list_pairs_int),
