@@ -51,10 +51,10 @@ def seen(i: int, width: int = 80, height: int = 60, weighed: bool = False) -> Py
     return image.weighed(*weights) if weighed else image
 
 
-def there(image: Pyramid) -> Pyramid:
-    """Lay the finest images out for a device, and halve them there."""
+def there(image: Pyramid, device: str = "cpu") -> Pyramid:
+    """Lay the finest images out on a device, and halve them there."""
     gray, depth, *weights = (
-        None if planes[0] is None else torch.tensor(planes[0])
+        None if planes[0] is None else torch.tensor(planes[0], device=device)
         for planes in (image.gray, image.depth, image.weight, image.weight_depth)
     )
     assert gray is not None and depth is not None
@@ -84,11 +84,11 @@ def test_one_weight_is_for_both() -> None:
     assert all(one is other for one, other in zip(image.weight, image.weight_depth, strict=True))
 
 
-def level_of(p: Pair, kind: Any, weighed: bool = True) -> Any:
+def level_of(p: Pair, kind: Any, weighed: bool = True, device: str = "cpu") -> Any:
     planes = (p.gray, p.depth, p.weight if weighed else None, p.weight_depth if weighed else None)
     images = [None if x is None else np.ascontiguousarray(x, np.float32) for x in (*planes, p.live_gray, p.live_depth)]
     if kind is CudaLevel:
-        images = [None if x is None else torch.from_numpy(x) for x in images]
+        images = [None if x is None else torch.from_numpy(x).to(device) for x in images]
     c = CAMERA
     return kind(*images, [c.fx, c.fy, c.cx, c.cy], [p.colors, p.depths, p.huber_gray, p.huber_depth, p.gate])
 
