@@ -11,6 +11,7 @@ from torch import Tensor
 
 from align_oracle import CAMERA, HUGE, Pair, oracle, pair
 from emulated_cuda import Emulator
+from sigmasplat.errors import BackendError
 from sigmasplat.fit import align as aligning
 from sigmasplat.fit.align import Alignment, align
 from sigmasplat.fit.cuda_align import MOTIONS, CudaLevel
@@ -133,6 +134,11 @@ def test_planes_of_a_level_are_alike() -> None:
         CudaLevel(*images[:5], torch.zeros(40, 31), [1.0] * 4, [1.0] * 5)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="float32"):
         CudaLevel(*(image.double() for image in images), [1.0] * 4, [1.0] * 5)  # type: ignore[arg-type]
+
+
+def test_images_in_two_places_are_refused_in_one_line() -> None:
+    with pytest.raises(BackendError, match="make both for the same view"):
+        align(there(seen(10)), seen(12), np.eye(4))
 
 
 def assert_same(ours: Alignment, theirs: Alignment, atol: float = 1e-6) -> None:

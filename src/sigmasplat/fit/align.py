@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sigmasplat.errors import BackendError
 from sigmasplat.fit import cuda_align
 from sigmasplat.fit.cuda_align import CudaLevel, Descent, Rules
 from sigmasplat.fit.pyramid import LEVELS, Pyramid
@@ -134,8 +135,10 @@ def align(
     when the cost has changed by less than `plateau_stop` of it (0 = off). If the finest does neither its best iterate
     stands. Directions the images say nothing about keep the guess.
     weight_color in [0, 1] balances gray against depth, each in units of its Huber width.
-    Raises BackendError without the compiled kernels.
+    Raises BackendError without the compiled kernels, or where one image lies on a device and the other does not.
     """
+    if reference.on_device != live.on_device:
+        raise BackendError("one image to align lies on a device, the other does not; make both for the same view")
     rules, readings = Rules(iterations, update_stop, plateau_stop, DEGENERATE, MIN_PIXELS), reference.readings
     levels = [_laid_out(reference, live, weight_color, k) for k in range(len(reference.cameras))]
     if isinstance(readings, Tensor):

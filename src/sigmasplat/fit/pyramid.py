@@ -48,7 +48,7 @@ class Pyramid:
 
     def weighed(self, weight: Plane | None, weight_depth: Plane | None = None) -> "Pyramid":
         """Return the same images with other weights [H, W] of gray and depth; depth's is gray's where none is given."""
-        gray_weights, depth_weights = [weight], [weight_depth]
+        gray_weights, depth_weights = ([None if w is None else _whole(w)] for w in (weight, weight_depth))
         for _ in self.cameras[1:]:
             halves = _averaged(gray_weights[-1], depth_weights[-1])
             gray_weights.append(halves[0])
