@@ -19,7 +19,7 @@ NORMAL_TERMS = 52
 """H 21, b 6, sums 4, S 21 (native/align_pixel.h)."""
 MOTIONS = 13
 """At most so many motions are linearised in one launch."""
-LEVEL = np.dtype([("planes", "u8", 6), ("size", "i4", 2), ("intrinsics", "f4", 4)], align=True)
+PINHOLE = np.dtype([("size", "i4", 2), ("intrinsics", "f4", 4)])
 LOOP = np.dtype(
     [
         ("iterations", "i4"), ("update_stop", "f8"), ("plateau_stop", "f8"), ("depth_m", "f8"),
@@ -77,9 +77,7 @@ class CudaLevel:
         if len({(p.shape, p.dtype, p.device) for p in given}) > 1 or reference_gray.dtype != torch.float32:
             raise ValueError("the planes of a level are float32, of one size, on one device")
         height, width = reference_gray.shape
-        assert all(plane.is_contiguous() for plane in given), "kernels read whole arrays"
-        pointers = [0 if plane is None else plane.data_ptr() for plane in self.planes]
-        self.numbers = np.array((pointers, (width, height), intrinsics), LEVEL)
+        self.pinhole = np.array(((width, height), intrinsics), PINHOLE)
         self.options = np.array(options, np.float32)
         self.cells = -(-width // CELL) * -(-height // CELL)
         self.device = reference_gray.device
@@ -91,8 +89,9 @@ class CudaLevel:
         of_cells, arrived = _workspace(n, self.cells, self.device)
         found = torch.empty(n, NORMAL_TERMS, dtype=torch.float64, device=self.device)
         cuda_launch.launcher_for(self.device)(
-            ALIGNING, "normal_equations", n * self.cells, self.numbers, self.options, given, of_cells, arrived, found
-        )
+            ALIGNING, "normal_equations", n * self.cells, self.planes, self.pinhole, self.options, given, of_cells,
+            arrived, found,
+        )  # fmt: skip
         return np.asarray(found.cpu().numpy())
 
 
@@ -114,7 +113,7 @@ def descend(levels: Sequence[CudaLevel], readings: Tensor, T_live_reference: Mat
     of_cells, arrived = _workspace(1, max(level.cells for level in levels), device)
     launch(ALIGNING, "begin_alignment", 1, state, np.array(loop, LOOP), guess, len(levels), readings)
     for number, level in reversed(list(enumerate(levels))):
-        given = (level.numbers, level.options, number, state, of_cells, arrived)
+        given = (level.planes, level.pinhole, level.options, number, state, of_cells, arrived)
         for _ in range(r.iterations):
             launch(ALIGNING, "take_align_step", level.cells, *given)
     return _descent_of(state.cpu().numpy().view(STATE)[0])

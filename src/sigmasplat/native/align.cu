@@ -140,8 +140,10 @@ struct Motions { double T[MOTIONS][12]; };
 
 // Linearise a level at several motions, as many blocks for each as there are cells: found [motions, NORMAL_TERMS],
 // of_cells [motions, cells, NORMAL_TERMS], arrived [motions].
-KERNEL normal_equations(AlignLevel level, AlignOptions options, Motions motions, double* of_cells, unsigned* arrived, double* found) {
+KERNEL normal_equations(AlignPlanes planes, AlignPinhole pinhole, AlignOptions options, Motions motions, double* of_cells,
+                        unsigned* arrived, double* found) {
     __shared__ double total[NORMAL_TERMS];
+    const AlignLevel level = {planes, pinhole};
     const int cells = cells_of(level), motion = int(blockIdx.x) / cells;
     double* stored = of_cells + size_t(motion) * cells * NORMAL_TERMS;
     if (add_cells(level, options, motions.T[motion], int(blockIdx.x) % cells, stored, arrived + motion, total) && threadIdx.x < NORMAL_TERMS)
@@ -165,10 +167,11 @@ KERNEL begin_alignment(AlignState* state, AlignLoop loop, Guess guess, int level
 }
 
 // Take a step on a level, unless it is settled. of_cells [cells, NORMAL_TERMS], arrived [1].
-KERNEL take_align_step(AlignLevel level, AlignOptions options, int number, AlignState* state, double* of_cells, unsigned* arrived) {
+KERNEL take_align_step(AlignPlanes planes, AlignPinhole pinhole, AlignOptions options, int number, AlignState* state,
+                       double* of_cells, unsigned* arrived) {
     __shared__ double total[NORMAL_TERMS];
     if (state->descent.level != number) return;
-    if (add_cells(level, options, state->descent.T, int(blockIdx.x), of_cells, arrived, total) && threadIdx.x == 0)
+    if (add_cells({planes, pinhole}, options, state->descent.T, int(blockIdx.x), of_cells, arrived, total) && threadIdx.x == 0)
         take_step(state->descent, state->loop, total);
 }
 
