@@ -12,12 +12,12 @@ from torch import Tensor
 from sigmasplat.config import Config, RegistrationConfig, TrackingConfig
 from sigmasplat.fit.align import align
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
-from sigmasplat.fit.pyramid import Pyramid, gray_of
-from sigmasplat.fit.references import map_reference
+from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.references import live_image, map_reference
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.submap import Submap, SubmapStore
-from sigmasplat.render.view import CpuView, View
+from sigmasplat.render.view import ReferenceView, View
 from sigmasplat.slam.drift import symmetric
 from sigmasplat.slam.places import SubmapPair
 
@@ -95,11 +95,11 @@ class Registrar:
     def _laid_out(self, submap: Submap, keyframe: int) -> tuple[Target, Pyramid]:
         picture = self.store.picture(submap.index, keyframe)
         target = Target.of_picture(picture, submap.camera, (self.view.sums.shape[1], self.view.sums.shape[2]))
-        return target, Pyramid.of(gray_of(picture.unit_color), picture.depth_m, submap.camera)
+        return target, live_image(self.view, picture.unit_color, picture.depth_m, target)
 
     def _aligned(self, params: Tensor, live: Pyramid, guess: Matrix) -> PoseFit:
         """Align a keyframe to the map seen from a guess, and once more to the map seen from there."""
-        if not isinstance(self.view, CpuView):
+        if isinstance(self.view, ReferenceView):
             return PoseFit(guess, 0.0, 0.0, np.nan, np.nan, 0)  # alignment needs the compiled kernels
         for _ in range(2):
             fit = fit_pose_align(map_reference(params, self.view, guess, self.tracking), live, guess, self.tracking)
@@ -108,7 +108,7 @@ class Registrar:
 
     def _covariance(self, params: Tensor, live: Pyramid, T_camera_map: Matrix) -> Matrix:
         """Return the covariance [6, 6] of T_camera_map's left twist, as alignment to the map there sees it."""
-        if not isinstance(self.view, CpuView):
+        if isinstance(self.view, ReferenceView):
             return np.zeros((6, 6))
         reference = map_reference(params, self.view, T_camera_map, self.tracking)
         covariance = align(reference.pyramid, live, np.eye(4), 0, self.tracking.align_weight_color).covariance

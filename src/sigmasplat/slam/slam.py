@@ -11,7 +11,8 @@ from torch import Tensor
 from sigmasplat.config import Config
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.fit.pyramid import Pyramid, gray_of
+from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.references import live_image
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import Atlas
@@ -92,7 +93,7 @@ class Slam:
         view = self._view_for(frame)
         before = view.seconds.copy()
         target = Target.of(frame, (view.sums.shape[1], view.sums.shape[2]))
-        live = Pyramid.of(gray_of(frame.color), frame.depth_m, frame.camera)
+        live = live_image(view, frame.color, frame.depth_m, target)
         seconds = {"prepare": time.perf_counter() - clock}
 
         tracking: dict[str, float] = {}

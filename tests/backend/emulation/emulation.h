@@ -216,3 +216,5 @@ const char* run(void (*kernel)(void*), int blocks, int threads, void** parameter
 #define __any_sync(mask, p) (emulation::votes(emulation::my_warp(), p, __LINE__) > 0)
 #define __shfl_sync(mask, value, lane) emulation::from_lane(value, lane, __LINE__)
 #define __shfl_xor_sync(mask, value, apart) emulation::from_lane(value, (emulation::current % 32) ^ (apart), __LINE__)
+#define __threadfence() ((void)0)          // one OS thread: what is written is seen
+inline unsigned atomicAdd(unsigned* counter, unsigned more) { return std::exchange(*counter, *counter + more); }
