@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from emulated_cuda import Emulator, why_not
-from sigmasplat.render import Render, render
+from sigmasplat.errors import BackendError
+from sigmasplat.render import Render, cuda_launch, render
 from stand_in import StandIn, library_in, standing_in
 
 LIBRARY = pytest.StashKey[Any]()
@@ -19,7 +20,7 @@ LIBRARY = pytest.StashKey[Any]()
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Load what the stand-in device needs before any test differentiates: autograd looks for devices once."""
-    wanted = any("stand_in" in getattr(item, "fixturenames", ()) for item in session.items)
+    wanted = any({"stand_in", "device"} & set(getattr(item, "fixturenames", ())) for item in session.items)
     if wanted and why_not() is None and torch.version.cuda is None:
         with TemporaryDirectory() as folder:
             session.config.stash[LIBRARY] = library_in(Path(folder))
@@ -52,6 +53,18 @@ def stand_in(request: pytest.FixtureRequest, emulator: Emulator) -> Iterator[Sta
         pytest.skip("this torch is built with CUDA: tests of a device run on a true one")
     with standing_in(emulator, request.config.stash[LIBRARY]) as device:
         yield device
+
+
+@pytest.fixture
+def device(request: pytest.FixtureRequest) -> torch.device:
+    """Return a CUDA device, the stand-in where torch is built without CUDA."""
+    if torch.version.cuda is None:
+        request.getfixturevalue("stand_in")
+        return torch.device("cuda", 0)
+    try:
+        return cuda_launch.this_device()
+    except BackendError as problem:
+        pytest.skip(str(problem))
 
 
 @pytest.fixture(scope="session", params=["reference", "cpu", "emulated", "cuda"])
@@ -90,7 +103,7 @@ def _emulated(request: pytest.FixtureRequest) -> Backend:
 
 
 def _cuda(request: pytest.FixtureRequest) -> Backend:
-    from sigmasplat.render import cuda, cuda_launch
+    from sigmasplat.render import cuda
 
     reason = cuda_launch.missing()
     if reason:

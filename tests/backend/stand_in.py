@@ -1,18 +1,18 @@
 """Stand in for a CUDA device: tensors that say they lie on cuda:0 while their memory is the host's.
 
-What mixes devices fails as it would on a GPU, what makes the host wait is counted, memory that nobody wrote is not zero,
-and what travels without anyone waiting arrives when its event is waited for. Kernels are the emulator's.
+What mixes devices fails as it would on a GPU, what makes the host wait is counted, memory that nobody wrote is not
+zero, and what travels without anyone waiting arrives when its event is waited for. Kernels are the emulator's.
 """
 
 import ctypes
 import os
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from traceback import extract_stack
-from types import SimpleNamespace
+from types import FrameType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -26,10 +26,11 @@ from sigmasplat.render import cuda_launch
 from sigmasplat.render.cuda_launch import Argument
 
 DEVICE, HOST = torch.device("cuda", 0), torch.device("cpu")
-SCALARS = set(
-    "add sub rsub mul div true_divide floor_divide remainder pow atan2 maximum minimum fmax fmin eq ne lt le gt ge "
-    "bitwise_and bitwise_or bitwise_xor logical_and logical_or logical_xor where fill masked_fill copy lerp".split()
-)
+SCALARS = {
+    "add", "sub", "rsub", "mul", "div", "true_divide", "floor_divide", "remainder", "pow", "atan2", "maximum",
+    "minimum", "fmax", "fmin", "eq", "ne", "lt", "le", "gt", "ge", "bitwise_and", "bitwise_or", "bitwise_xor",
+    "logical_and", "logical_or", "logical_xor", "where", "fill", "masked_fill", "copy",
+}  # fmt: skip
 """Operators that take a number that lies on the host (no dimension) beside tensors of the device."""
 INDEXING = {"index", "index_put", "_index_put_impl", "_unsafe_index"}
 """Operators that take indices from the host too: they are sent over, and the host waits."""
@@ -257,8 +258,10 @@ def _spoil(tensor: Tensor) -> None:
 
 def _who() -> str:
     """Return the file of this package that torch was called from, autograd's thread having none."""
-    frames = [x.filename for x in extract_stack() if f"{os.sep}sigmasplat{os.sep}" in x.filename]
-    return Path(frames[-1]).name if frames else "autograd or a test"
+    frame: FrameType | None = sys._getframe()
+    while frame is not None and f"{os.sep}sigmasplat{os.sep}" not in frame.f_code.co_filename:
+        frame = frame.f_back
+    return Path(frame.f_code.co_filename).name if frame else "autograd or a test"
 
 
 def library_in(folder: Path) -> Any:

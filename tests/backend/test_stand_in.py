@@ -1,4 +1,4 @@
-"""What stands in for a CUDA device keeps CUDA's rules: who may meet whom, who waits, what is there before it is written."""
+"""What stands in for a CUDA device keeps CUDA's rules: who may meet whom, who waits, what unwritten memory holds."""
 
 import numpy as np
 import pytest
@@ -29,9 +29,9 @@ def test_host_and_device_do_not_mix(stand_in: StandIn) -> None:
     ):  # fmt: skip
         with pytest.raises(RuntimeError, match=MIXED):
             mix()
-    with pytest.raises(TypeError, match="Tensor.cpu"):
+    with pytest.raises(TypeError, match=r"Tensor\.cpu"):
         there.numpy()
-    with pytest.raises(TypeError, match="Tensor.cpu"):
+    with pytest.raises(TypeError, match=r"Tensor\.cpu"):
         np.asarray(there)
 
 

@@ -18,22 +18,35 @@ TILE = 16
 CHANNELS = 3
 
 
+class Loss:
+    """A loss on a device; the host waits for it when it is first read, unless it came with something else before."""
+
+    def __init__(self, there: Tensor) -> None:
+        self.there, self.here = there, np.nan
+
+    def __float__(self) -> float:
+        if np.isnan(self.here):
+            self.here = float(self.there)
+        return self.here
+
+
 class CudaStep:
-    """The image terms, the way back and Adam's step on a device. The host waits once, for the twist at its end."""
+    """The image terms, the way back and Adam's step on a device. The host waits once, at its end, for twist and loss
+    together."""
 
     def __init__(self, view: CudaView) -> None:
         self.view = view
         (height, width), device = view.alpha.shape, view.alpha.device
         self._size, self._pixels = (width, height), width * height
         self._derivatives = torch.empty(3 * CHANNELS, height, width, device=device)
-        self._taps = _gaussian_taps()
+        self._taps, self._loss = _gaussian_taps(), Loss(torch.zeros((), dtype=torch.float64, device=device))
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
         """Render the field to the view's planes."""
         render_for(self.view, field.params, T_camera_world, target, weights)
 
-    def images(self, target: Target, weights: Weights) -> Tensor:
-        """Write the gradient of every image term to the view's gradient planes; return the loss, on the device."""
+    def images(self, target: Target, weights: Weights) -> Loss:
+        """Write the gradient of every image term to the view's gradient planes; return the loss, on its way."""
         v, per_pixel = self.view, 1.0 / max(target.valid_pixels, 1)
         local = np.array([weights.get(name, 0.0) for name in LOCAL_TERMS])
         local[2:4] *= len(v.sums) >= 7
@@ -47,7 +60,8 @@ class CudaStep:
             sums,
         )  # fmt: skip
         loss = sums.sum()
-        return loss + self._ssim(target, weights["ssim"]) if weights["ssim"] else loss
+        self._loss = Loss(loss + self._ssim(target, weights["ssim"]) if weights["ssim"] else loss)
+        return self._loss
 
     def _ssim(self, target: Target, weight: float) -> Tensor:
         v, (width, height) = self.view, self._size
@@ -77,7 +91,8 @@ class CudaStep:
             gradient, gradient.numel(), rates.per_column.numpy(), np.array(numbers, np.float32), field.steps,
         )  # fmt: skip
         field.last_step.masked_fill_(visible.bool(), field.steps)
-        found = torch.cat([twist, costs.sum(0)]).cpu().numpy()
+        found = torch.cat([twist, costs.sum(0), self._loss.there[None]]).cpu().numpy()
+        self._loss.here = float(found[7])
         return found[:6], float(found[6])
 
 

@@ -159,7 +159,7 @@ class _Steps:
             else:
                 twist = gathered.add(self.view, self.field, 1.0 / len(batch), self.pull)
             twists.append(twist)
-            loss += float(cost) / len(batch)  # read last: it may still be on its way from a device
+            loss += float(cost) / len(batch)  # read last: from a device it comes with the twist
             if self.felt is not None and self.pull is not None:
                 self.felt(keyframe, self.pull)
             t = fit.add("backward", t)

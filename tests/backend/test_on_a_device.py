@@ -1,0 +1,161 @@
+"""Run what stands on a CUDA device: nothing mixes devices, results are the CPU's, the host waits where it is said to.
+
+On a true device where there is one, else on what stands in for it (stand_in.py).
+"""
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from sigmasplat import doctor
+from sigmasplat.config import Config, MappingConfig, TrackingConfig
+from sigmasplat.config.text import override
+from sigmasplat.fit.field import fit_field
+from sigmasplat.fit.pose import fit_pose_adam
+from sigmasplat.fit.target import Keyframe
+from sigmasplat.model import se3
+from sigmasplat.model.field import GaussianField
+from sigmasplat.presets import preset
+from sigmasplat.render import render
+from sigmasplat.render.cuda_view import CudaView
+from sigmasplat.render.view import CpuView
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources import SyntheticRoom
+from splat_fields import OPTIONS, exact_view, params_of, there_and_back
+from splat_scenes import assert_same_vector, scene
+from stand_in import StandIn
+from test_compiled_loss import target_of
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+
+MAPPING = MappingConfig(weight_alignment=0.3, weight_moment=0.2, weight_isotropy_ratio=0.1)
+ROOM = SyntheticRoom(frames=200, width=48, height=36)
+
+
+def test_the_view_agrees(device: torch.device) -> None:
+    s = scene("random", 60)
+    params, T = params_of(s), s.T_camera_world.numpy()
+    maps, rows, twist = there_and_back(CudaView(s.camera, OPTIONS), params.to(device), T)
+    want_maps, want_rows, want_twist = there_and_back(exact_view(s.camera, True), params.double(), T)
+    assert maps.device.type == rows.device.type == "cuda"
+    assert_same_vector(maps.cpu(), want_maps, 2e-5, "maps")
+    assert_same_vector(rows.cpu(), want_rows, 1e-3, "rows")
+    assert_same_vector(twist.cpu(), want_twist, what="twist")
+
+
+def test_render_and_its_gradient_lie_on_the_device(device: torch.device) -> None:
+    s = scene("random", 60)
+    field, T = GaussianField(params_of(s)), s.T_camera_world.float()
+    found = []
+    for where, backend in ((device, "auto"), (torch.device("cpu"), "cpu")):
+        there = field.on(where)
+        there.params.requires_grad_()
+        pose = T.to(where, copy=True).requires_grad_()
+        seen = render(there, s.camera, pose, s.ref_depth.float().to(where), backend=backend)
+        assert seen.uncertainty is not None
+        (seen.color.square().sum() + seen.uncertainty.sum() + seen.median_depth.sum()).backward()
+        assert there.params.grad is not None and pose.grad is not None
+        assert {x.device.type for x in (*vars(seen).values(), pose.grad) if x is not None} == {where.type}
+        found.append([seen.color, seen.variance, seen.uncertainty, there.params.grad, pose.grad])
+    for got, want in zip(*found, strict=True):
+        torch.testing.assert_close(got.cpu(), want, rtol=2e-3, atol=2e-4)
+
+
+@pytest.mark.parametrize("images", [1, 2])
+@pytest.mark.parametrize("degree", [0, 1])
+def test_a_field_is_fitted(device: torch.device, images: int, degree: int) -> None:
+    if images > 1 and degree:
+        pytest.skip("view-dependent colour is fitted to one keyframe a step")
+    s, found = scene("random", 60), []
+    start = params_of(s)
+    for view in (CudaView(s.camera, OPTIONS), CpuView(s.camera, OPTIONS)):
+        field = GaussianField(params_of(s).to(view.sums.device))
+        target = target_of(s.camera, tuple(view.alpha.shape))
+        pose = se3.inverse(s.T_camera_world.double().numpy())
+        keyframes = [Keyframe(k, target, pose @ se3.exp(0.01 * k * np.ones(6))) for k in range(images)]
+        pulls = list[torch.Tensor]()
+        fit = fit_field(
+            field, view, [keyframes] * 3, MAPPING, degree=degree, felt=lambda _, pull, pulls=pulls: pulls.append(pull)
+        )
+        assert {x.device.type for x in (*pulls, *field.state())} == {view.sums.device.type}
+        found.append((field.params.cpu() - start, fit.losses, keyframes[-1].T_world_camera))
+    assert_same_vector(found[0][0], found[1][0], 2e-2, "what Adam moved")
+    np.testing.assert_allclose(found[0][1], found[1][1], rtol=1e-4)
+    np.testing.assert_allclose(found[0][2], found[1][2], atol=1e-5)
+
+
+def test_a_pose_is_found(device: torch.device) -> None:
+    s, found = scene("random", 60), []
+    T = s.T_camera_world.double().numpy()
+    for view in (CudaView(s.camera, OPTIONS), CpuView(s.camera, OPTIONS)):
+        params, target = params_of(s).to(view.sums.device), target_of(s.camera, tuple(view.alpha.shape))
+        config = TrackingConfig(exposure=True, outlier_factor=10.0, alpha_above=0.1)
+        found.append(fit_pose_adam(params, view, target, T, config, 5))
+    np.testing.assert_allclose(found[0].T_camera_world, found[1].T_camera_world, atol=1e-5)
+    np.testing.assert_allclose(found[0].loss, found[1].loss, rtol=1e-4)
+
+
+def test_doctor_finds_it_healthy(device: torch.device) -> None:
+    found = doctor.self_test(device)
+    assert found.ok, found.value
+
+
+def waits_of(stand_in: StandIn, do: Any) -> list[tuple[str, str]]:
+    """Return what makes the host wait in one round more."""
+    counts = []
+    for rounds in (2, 3):
+        stand_in.forget()
+        do(rounds)
+        counts.append(Counter(stand_in.waits))
+    return sorted((counts[1] - counts[0]).elements())
+
+
+def test_a_mapping_iteration_waits_once(stand_in: StandIn) -> None:
+    s = scene("random", 60)
+    view, field = CudaView(s.camera, OPTIONS), GaussianField(params_of(s).to("cuda"))
+    keyframe = Keyframe(0, target_of(s.camera, tuple(view.alpha.shape)), se3.inverse(s.T_camera_world.double().numpy()))
+    waits = waits_of(stand_in, lambda n: fit_field(field, view, [[keyframe]] * n, MAPPING))
+    assert waits == [("cuda_step.py", "fetching")]
+
+
+QUICK = {
+    "input.width": "48", "mapping.first_iterations": "10", "mapping.iterations": "2", "mapping.every": "2",
+    "seeding.first_uniform": "200", "seeding.first_gradient": "200", "submaps.frames": "3", "loops.min_interval": "1",
+    "loops.min_similarity": "0.0", "loops.similarity_floor": "0.0", "registration.iterations": "2",
+    "submaps.uncertainty_m": "0", "final.iterations": "3",
+}  # fmt: skip
+RUNS = {
+    "sigma": {},
+    "sigma by descent": {"tracking.method": "adam", "tracking.iterations": "4", "loops.close": "no"},
+    "cgslam-loops-fast": {
+        "mapping.frames_per_step": "2", "primitives.split_gradient": "1e-6", "primitives.clone": "yes",
+    },
+    "varsplat-fast": {"final.sh_degree": "1", "final.sh_every": "2", "seeding.scale_from": "neighbours"},
+    "varsplat-fast from a mesh": {"final.seed_from": "mesh", "final.spacing_m": "0.1"},
+}  # fmt: skip
+FRAMES = 5
+
+
+def settings(run: str, backend: str) -> Config:
+    return override(preset(run.split()[0]), QUICK | {"backend": backend} | RUNS[run])
+
+
+def followed(config: Config) -> Slam:
+    slam = Slam(config)
+    for i in range(FRAMES):
+        slam.step(ROOM.frame(i))
+    slam.finish()
+    return slam
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_slam_runs(device: torch.device, run: str) -> None:
+    ours, theirs = (followed(settings(run, backend)) for backend in ("cuda", "cpu"))
+    few_steps_m = 3e-2 if "descent" in run else 5e-3  # which the last digits decide
+    paths = [slam.trajectory().T_world_camera for slam in (ours, theirs)]
+    np.testing.assert_allclose(*paths, atol=few_steps_m)
+    assert len(ours.store) == len(theirs.store) > 1 and len(ours.field) > 100
+    assert [loop.accepted for loop in ours.loops] == [loop.accepted for loop in theirs.loops]
