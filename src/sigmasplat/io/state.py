@@ -74,7 +74,7 @@ class _Encoder:
 
     def _array(self, value: Tensor | np.ndarray[Any, Any]) -> Any:
         kind = "tensor" if isinstance(value, Tensor) else "array"
-        array = value.detach().numpy() if isinstance(value, Tensor) else value
+        array = value.detach().cpu().numpy() if isinstance(value, Tensor) else value
         if array.size <= INLINE:
             return {kind: array.tolist(), "type": str(array.dtype), "shape": list(array.shape)}
         if id(value) not in self.seen:
@@ -113,8 +113,8 @@ class _Decoder:
 
 
 def _fields(value: Any) -> dict[str, Any]:
-    """Return what an object is made of: a dataclass's fields, or a named tuple's."""
+    """Return what an object is made of: a dataclass's fields, those that it is made with, or a named tuple's."""
     if dataclasses.is_dataclass(value):
-        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value) if field.init}
     named: dict[str, Any] = value._asdict()
     return named

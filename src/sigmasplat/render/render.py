@@ -10,7 +10,7 @@ from torch import Tensor
 from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.color_covariance import covariances_of, outer
-from sigmasplat.model.field import GaussianField
+from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.harmonics import view_colors
 from sigmasplat.render import cuda_launch
 from sigmasplat.render.backend import backend_module, is_cuda
@@ -76,6 +76,12 @@ def _features_from(field: GaussianField, z: Tensor, T_camera_world: Tensor) -> T
     return covariance_features(colors, z, field.variances, field.extras["correlations"].params)
 
 
+def _shown_on(field: GaussianField, device: torch.device) -> GaussianField:
+    """Return what a render needs of a field on a device: no optimiser state travels."""
+    extras = {name: Rows(extra.params.to(device)) for name, extra in field.extras.items()}
+    return GaussianField(field.params.to(device), extras=extras)
+
+
 def render(
     field: GaussianField,
     camera: Camera,
@@ -91,7 +97,7 @@ def render(
     """
     kernels, options = backend_module(backend, field.params.device), options or RenderConfig()
     if is_cuda(kernels) and field.params.device.type == "cpu":  # asked for by name
-        field = field.on(cuda_launch.this_device())
+        field = _shown_on(field, cuda_launch.this_device())
     T = torch.as_tensor(T_camera_world)
     p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
     features = _features_from(field, p.z, T if options.color_pose_gradient else T.detach())

@@ -17,7 +17,7 @@ from sigmasplat.fit.references import map_reference
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.submap import Submap, SubmapStore
-from sigmasplat.render.view import CpuView, View
+from sigmasplat.render.view import ReferenceView, View
 from sigmasplat.slam.drift import symmetric
 from sigmasplat.slam.places import SubmapPair
 
@@ -81,7 +81,7 @@ class Registrar:
     ) -> Localisation:
         """Find a keyframe of `own` in `other`: aligned from where it should be and from the keyframes it is like, then
         by descent of the uncertainty-weighted loss with exposure, from the best of them."""
-        T_own_camera, params = own.T_submap_camera[keyframe], other.field.params
+        T_own_camera, params = own.T_submap_camera[keyframe], other.field.params.to(self.view.sums.device)
         target, live = self._laid_out(own, keyframe)
         expected = se3.inverse(T_own_camera) @ T_own_other
         guesses = [expected, *(se3.inverse(other.T_submap_camera[k]) for k in alike)]
@@ -99,7 +99,7 @@ class Registrar:
 
     def _aligned(self, params: Tensor, live: Pyramid, guess: Matrix) -> PoseFit:
         """Align a keyframe to the map seen from a guess, and once more to the map seen from there."""
-        if not isinstance(self.view, CpuView):
+        if isinstance(self.view, ReferenceView):
             return PoseFit(guess, 0.0, 0.0, np.nan, np.nan, 0)  # alignment needs the compiled kernels
         for _ in range(2):
             fit = fit_pose_align(map_reference(params, self.view, guess, self.tracking), live, guess, self.tracking)
@@ -108,7 +108,7 @@ class Registrar:
 
     def _covariance(self, params: Tensor, live: Pyramid, T_camera_map: Matrix) -> Matrix:
         """Return the covariance [6, 6] of T_camera_map's left twist, as alignment to the map there sees it."""
-        if not isinstance(self.view, CpuView):
+        if isinstance(self.view, ReferenceView):
             return np.zeros((6, 6))
         reference = map_reference(params, self.view, T_camera_map, self.tracking)
         covariance = align(reference.pyramid, live, np.eye(4), 0, self.tracking.align_weight_color).covariance
