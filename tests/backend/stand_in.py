@@ -114,6 +114,9 @@ class StandIn(TorchDispatchMode):
     # ---- what operators do ----
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if function._can_decompose():  # in inference mode operators made of others come whole
+            with self:
+                return function.decompose(*args, **(kwargs or {}))
         name, kwargs = function.overloadpacket.__name__.removesuffix("_"), dict(kwargs or {})
         tensors = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
         there = any(isinstance(x, DeviceTensor) for x in tensors)

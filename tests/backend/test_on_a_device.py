@@ -21,7 +21,7 @@ from sigmasplat.io.state import read_state, write_state
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.presets import preset
-from sigmasplat.render import render
+from sigmasplat.render import FieldRenderer, render
 from sigmasplat.render.cuda_view import CudaView
 from sigmasplat.render.view import CpuView
 from sigmasplat.slam.slam import Slam
@@ -68,6 +68,18 @@ def test_render_and_its_gradient_lie_on_the_device(device: torch.device) -> None
         found.append([seen.color, seen.variance, seen.uncertainty, there.params.grad, pose.grad])
     for got, want in zip(*found, strict=True):
         torch.testing.assert_close(got.cpu(), want, rtol=2e-3, atol=2e-4)
+
+
+def test_a_renderer_brings_a_field_once(stand_in: StandIn) -> None:
+    s = scene("random", 60)
+    one, other = GaussianField(params_of(s)), GaussianField(params_of(s))
+    other.carry("harmonics").params.fill_(0.01)
+    show, T = FieldRenderer(OPTIONS, "cuda"), s.T_camera_world.numpy()
+    seen = [show(field, s.camera, T) for field in (one, other) * 3]
+    sent = [copy.numbers for copy in stand_in.copies if copy.to_device and copy.numbers > 16]
+    assert sent == [60 * 17, 60 * 45, 60 * 17] and torch.equal(seen[0].color.cpu(), seen[4].color.cpu())
+    want = render(other, s.camera, T, backend="cpu")
+    torch.testing.assert_close(seen[1].color.cpu(), want.color, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("images", [1, 2])

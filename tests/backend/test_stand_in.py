@@ -44,6 +44,14 @@ def test_a_number_of_the_host_meets_the_device(stand_in: StandIn) -> None:
     assert there.tolist() == [1, 7, 1]
 
 
+def test_inference_mode_changes_nothing(stand_in: StandIn) -> None:
+    with torch.inference_mode():
+        x = torch.ones(2, 3).to(torch.zeros(1, device="cuda"))
+        assert x.reshape(3, 2).device == DEVICE and (x @ x.T).sum().item() == 12
+        with pytest.raises(RuntimeError, match=MIXED):
+            x @ torch.ones(3)
+
+
 def test_views_and_writing_in_place(stand_in: StandIn) -> None:
     x = torch.zeros(3, 4, device="cuda")
     row, before = x[1], x

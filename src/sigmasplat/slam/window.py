@@ -43,9 +43,9 @@ def choose_window(
 def dominating(view: View, field: GaussianField) -> Ids:
     """Name the splats that dominate a pixel of a view's last forward pass with layers: sorted `field.ids`."""
     rows = view.layers.dominant_id[: view.camera.height, : view.camera.width]
-    there = torch.zeros(len(field), dtype=torch.bool, device=field.params.device)
+    there = torch.zeros(len(field), dtype=torch.bool, device=rows.device)
     there[rows[rows >= 0].long()] = True
-    return np.sort(field.ids[there].cpu().numpy())
+    return np.sort(field.ids[there.to(field.ids.device)].cpu().numpy())
 
 
 def covisible_splats(newest: Ids, others: Sequence[Ids]) -> Scores:
