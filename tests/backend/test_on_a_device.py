@@ -192,6 +192,9 @@ def test_a_field_does_not_travel(stand_in: StandIn) -> None:
         slam.step(ROOM.frame(i))
         size = 2 * len(slam.mapper.field)
         large.append([copy.by for copy in stand_in.copies if copy.numbers > size and copy.by != "target.py"])
+        assert bool(stand_in.waits) == slam.steps[-1].is_keyframe, (
+            "a frame that is aligned to a keyframe needs no device"
+        )
     assert len(slam.keyframes) == 3 and len(slam.field) > 1500 and len(slam.store) == 0
     assert large[0] == ["field.py"] * 3, "what a seed is, and Adam's moments"
     assert not any(large[1:])

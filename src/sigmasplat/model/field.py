@@ -192,6 +192,8 @@ class GaussianField(Rows):
 
     def keep(self, rows: Tensor) -> None:
         """Keep the splats chosen by a bool mask [N] or an index tensor, drop the others."""
+        if rows.dtype == torch.bool:
+            rows = rows.nonzero().squeeze(1)  # once for all: where rows lie on a device the host waits for their number
         for part in (self, *self.extras.values()):
             part.choose(rows)
         self.ids = self.ids[rows]

@@ -52,7 +52,7 @@ def _owned(view: View, keyframe: Keyframe, owner: str) -> tuple[Tensor, Tensor, 
     }[owner]
     rows, weight = (plane[: camera.height, : camera.width] for plane in (ids, weights))
     reading = keyframe.target.on(rows.device).depth_image
-    judged = (rows >= 0) & (reading > 0)
+    judged = ((rows >= 0) & (reading > 0)).nonzero(as_tuple=True)
     return rows[judged].long(), weight[judged].double(), reading[judged].double()
 
 
@@ -63,6 +63,7 @@ def fade(field: GaussianField, rows: Tensor, opacity: float) -> Tensor:
     """
     column = COLUMNS["opacity_logits"].start
     limit = float(np.log(opacity / (1.0 - opacity)))
+    rows = rows.nonzero().squeeze(1) if rows.dtype == torch.bool else rows
     field.params[rows, column] = field.params[rows, column].clamp(max=limit)
     field.moment1[rows, column] = 0.0
     field.moment2[rows, column] = 0.0
