@@ -22,7 +22,7 @@ class Target:
     color: Tensor
     depth: Tensor
     valid_pixels: int
-    _there: "Target | None" = None
+    _there: "Target | None" = dataclass_field(default=None, init=False, repr=False)
 
     def on(self, device: torch.device) -> "Target":
         """Return the target on a device; one such copy is kept."""

@@ -115,8 +115,8 @@ class _Decoder:
 
 
 def _fields(value: Any) -> dict[str, Any]:
-    """Return what an object is made of: a dataclass's fields, or a named tuple's."""
+    """Return what an object is made of: a dataclass's fields, those that it is made with, or a named tuple's."""
     if dataclasses.is_dataclass(value):
-        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value) if field.init}
     named: dict[str, Any] = value._asdict()
     return named

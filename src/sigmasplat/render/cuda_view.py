@@ -32,7 +32,7 @@ class CudaView:
         self.alpha, self.g_alpha, self.moment, self.g_moment, self._reference, self.g_median_depth = (
             torch.zeros(size, device=device) for _ in range(6)
         )
-        self.layers = Layers(*(plane.to(device) for plane in Layers.of(*size)))
+        self.layers = Layers.of(*size, device)
         self._made = (False, False)
         self._numbers = view_numbers(camera, np.eye(4), options)
         self.stages = Stages()

@@ -33,9 +33,10 @@ class Layers(NamedTuple):
     median_depth: Tensor
 
     @staticmethod
-    def of(rows: int, columns: int) -> "Layers":
-        """Make empty planes."""
-        ids, floats = ([torch.zeros(rows, columns, dtype=t) for _ in range(3)] for t in (torch.int32, torch.float32))
+    def of(rows: int, columns: int, device: torch.device | None = None) -> "Layers":
+        """Make empty planes, by default in the host's memory."""
+        kinds, size = (torch.int32, torch.float32), (rows, columns)
+        ids, floats = ([torch.zeros(size, dtype=kind, device=device) for _ in range(3)] for kind in kinds)
         return Layers(ids[0], floats[0], ids[1], floats[1], floats[2])
 
     def fill(self, b: reference.Blended, z: Tensor) -> None:

@@ -48,9 +48,11 @@ def final_map(
     _refuse_misfits(store, anchors, config.final)
     seed = seeded_on_surface if config.final.seed_from == "mesh" else merged
     field = seed(store, anchors, config)
-    if config.final.iterations:
-        refine(field, Keyframes(store, anchors, view), config, view, random, progress)
-    return field
+    if not config.final.iterations:
+        return field
+    there = field.at(view.sums.device)
+    refine(there, Keyframes(store, anchors, view), config, view, random, progress)
+    return there.at(field.params.device)
 
 
 def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix], final: FinalConfig) -> None:

@@ -81,7 +81,7 @@ class Registrar:
     ) -> Localisation:
         """Find a keyframe of `own` in `other`: aligned from where it should be and from the keyframes it is like, then
         by descent of the uncertainty-weighted loss with exposure, from the best of them."""
-        T_own_camera, params = own.T_submap_camera[keyframe], other.field.params
+        T_own_camera, params = own.T_submap_camera[keyframe], other.field.params.to(self.view.sums.device)
         target, live = self._laid_out(own, keyframe)
         expected = se3.inverse(T_own_camera) @ T_own_other
         guesses = [expected, *(se3.inverse(other.T_submap_camera[k]) for k in alike)]

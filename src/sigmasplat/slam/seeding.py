@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 from skimage.feature import canny
+from torch import Tensor
 
 from sigmasplat.config import SeedConfig
 from sigmasplat.fit.pyramid import gradient_magnitude, gray_of
@@ -86,7 +87,7 @@ def make_splats(
         spread = depth / target.camera.fx * spacing_px
         keep = np.ones(len(world), bool)
     else:
-        keep, spread = _neighbour_spread(world, field.means.numpy(), config)
+        keep, spread = _neighbour_spread(world, field.means, config)
     scales = np.maximum(spread * config.scale_factor, 1e-4)[keep]
     return GaussianField.from_values(
         torch.as_tensor(world[keep], dtype=torch.float32),
@@ -97,13 +98,15 @@ def make_splats(
 
 
 def _neighbour_spread(
-    points: NDArray[np.float64], old: NDArray[np.float32], config: SeedConfig
+    points: NDArray[np.float64], means: Tensor, config: SeedConfig
 ) -> tuple[Mask, NDArray[np.float64]]:
-    """Return which new points to keep, and every point's root mean squared distance to its 3 nearest neighbours."""
+    """Return which new points to keep, and every point's root mean squared distance to its 3 nearest neighbours, old
+    ones (means [N, 3]) and new."""
     keep = np.ones(len(points), bool)
     if len(points) == 0:
         return keep, np.zeros(0)
-    near = old[((old > points.min(0) - 0.1) & (old < points.max(0) + 0.1)).all(1)] if len(old) else old
+    low, high = (torch.from_numpy(corner).to(means.device) for corner in (points.min(0) - 0.1, points.max(0) + 0.1))
+    near = means[((means > low) & (means < high)).all(1)].cpu().numpy()
     if len(near) and config.min_distance_m > 0:
         nearest = cKDTree(near).query(points, distance_upper_bound=config.min_distance_m)[0]
         keep = np.asarray(nearest) > config.min_distance_m

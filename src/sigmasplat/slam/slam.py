@@ -32,6 +32,7 @@ from sigmasplat.slam.step import KERNELS, Step, numbers_of
 from sigmasplat.slam.tracker import Tracker
 
 Matrix = NDArray[np.float64]
+HOST = torch.device("cpu")
 
 
 class Slam:
@@ -59,12 +60,13 @@ class Slam:
 
     @property
     def field(self) -> GaussianField:
-        """Return the map in the world: the final one once finished, till then all submaps side by side."""
+        """Return the map in the world, in the host's memory: the final one once finished, till then all submaps side by
+        side."""
         if self._final is not None:
             return self._final
         active = self.mapper.field
         if not len(self.store):
-            return active
+            return active.at(HOST)
         merged = GaussianField.empty()
         for index in range(len(self.store)):
             merged.append(self.store.load(index).field.moved(torch.from_numpy(self.atlas.anchors[index])))
@@ -140,14 +142,14 @@ class Slam:
         progress(total, total)
 
     def checkpoint(self) -> dict[str, Tensor]:
-        """Return what a run needs to be read back: the active submap's field with its optimiser state, poses, times,
-        keyframes, anchors, and which submap each frame belongs to."""
+        """Return what a run needs to be read back, in the host's memory: the active submap's field with its optimiser
+        state, poses, times, keyframes, anchors, and which submap each frame belongs to."""
         path, active = self.trajectory(), self.mapper.field
         return {
-            "params": active.params,
-            "moment1": active.moment1,
-            "moment2": active.moment2,
-            "last_step": active.last_step,
+            "params": active.params.cpu(),
+            "moment1": active.moment1.cpu(),
+            "moment2": active.moment2.cpu(),
+            "last_step": active.last_step.cpu(),
             "adam_steps": torch.tensor(active.steps),
             "timestamps_s": torch.from_numpy(path.timestamps_s),
             "T_world_camera": torch.from_numpy(path.T_world_camera),
