@@ -58,7 +58,7 @@ pytest() { step "$1" "$2" "$PYTHON" -m pytest -p no:cacheprovider "${@:3}"; }
 sigmasplat=("$PYTHON" -c 'import sys; from sigmasplat.cli import main; sys.exit(main())')
 sanitizer() { # NAME SECONDS TOOL TESTS; without torch's cache every tensor is memory of its own, whose bounds are watched
   PYTORCH_NO_CUDA_MEMORY_CACHING=1 step "$1" "$2" "$SANITIZER" --tool "$3" --error-exitcode 9 --print-limit 20 \
-    "$PYTHON" -m pytest -p no:cacheprovider -q tests/backend/test_cuda_device.py -k "$4"
+    "$PYTHON" -m pytest -p no:cacheprovider -q tests/backend/test_cuda*_device.py -k "$4"
 }
 SANITIZER=$(command -v compute-sanitizer || ls /usr/local/cuda*/bin/compute-sanitizer 2>/dev/null | head -n 1)
 NCU=$(command -v ncu || ls /opt/nvidia/nsight-compute/*/ncu /usr/local/cuda*/bin/ncu 2>/dev/null | head -n 1)
@@ -69,11 +69,11 @@ run_doctor() {
   cat "$OUT/machine.txt"
   TAIL=20 step doctor 180 "${sigmasplat[@]}" doctor
 }
-run_device() { TAIL=40 pytest device 240 -q tests/backend/test_cuda_device.py; }
+run_device() { TAIL=40 pytest device 300 -q tests/backend/test_cuda*_device.py tests/backend/test_on_a_device.py; }
 run_tests() {
   local many=()
   "$PYTHON" -c 'import xdist' 2>/dev/null && many=(-n 6)
-  TAIL=40 pytest tests 330 -q "${many[@]}" tests/backend -k "cuda or device or emulated"
+  TAIL=40 pytest tests 240 -q "${many[@]}" tests/backend -k "cuda or device or emulated"
 }
 run_memcheck() { sanitizer memcheck 240 memcheck "not very_many"; }
 run_racecheck() { sanitizer racecheck 150 racecheck "identical"; }

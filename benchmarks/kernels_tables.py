@@ -35,5 +35,5 @@ def _merged(rows: Rows) -> Rows:
 
 
 def _cells(row: dict[str, Any]) -> list[str]:
-    counts = ", ".join(str(count) for count in row["counts"] if count)
+    counts = ", ".join(str(count) for count in row["counts"] if count > 0)
     return [row["kernel"], counts or "–", *(str(row[name]) for name in ("registers", "spilled", "shared", "blocks"))]

@@ -20,7 +20,7 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.page import plan_of, write_page
-from sigmasplat.render import render
+from sigmasplat.render import FieldRenderer
 from sigmasplat.sources.base import Source
 
 SAME_TIME_S = 1e-4
@@ -60,7 +60,7 @@ def evaluate(
     chosen = {kind: _spread(records, views_per_kind) for kind, records in _kinds(log).items()}
     gallery, config, loops = Gallery(run, strips_per_kind), run.config(), run.read_loops()
     standard = renderer is None
-    renderer = renderer or partial(render, options=config.render, backend=config.backend)
+    renderer = renderer or FieldRenderer(config.render, config.backend)
     maps = views.Maps(field, run.submaps, _anchors(run, records, config.final))
     scores = _score_views(config, source, maps, chosen, gallery, renderer, progress)
     metrics = _facts(run, source, log, field, loops) | path_scores | scores | {"reconstruction": None}

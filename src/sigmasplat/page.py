@@ -21,7 +21,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, list_presets, preset
-from sigmasplat.render import render
+from sigmasplat.render import FieldRenderer
 
 LOOKS = 24
 """Enough for a picture on a page; `export` looks from more places."""
@@ -73,7 +73,7 @@ def plan_of(run: RunFolder, field: GaussianField, log: list[dict[str, Any]], cam
         np.array([record["T_world_camera"] for record in known]).reshape(-1, 4, 4),
     )
     seen_by = camera.prepared(config.input.width, config.input.crop_px)
-    renderer = partial(render, options=config.render, backend=config.backend)
+    renderer = FieldRenderer(config.render, config.backend)
     try:
         return floor_plan(field, path, seen_by, most=LOOKS, renderer=renderer)
     except SigmaSplatError:

@@ -3,13 +3,27 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial, wraps
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
 import torch
 
 from emulated_cuda import Emulator, why_not
-from sigmasplat.render import Render, render
+from sigmasplat.errors import BackendError
+from sigmasplat.render import Render, cuda_launch, render
+from stand_in import StandIn, library_in, standing_in
+
+LIBRARY = pytest.StashKey[Any]()
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Load what the stand-in device needs before any test differentiates: autograd looks for devices once."""
+    wanted = any({"stand_in", "device"} & set(getattr(item, "fixturenames", ())) for item in session.items)
+    if wanted and why_not() is None and torch.version.cuda is None:
+        with TemporaryDirectory() as folder:
+            session.config.stash[LIBRARY] = library_in(Path(folder))
 
 
 @dataclass(frozen=True)
@@ -30,6 +44,27 @@ def emulator(tmp_path_factory: pytest.TempPathFactory) -> Emulator:
     if reason:
         pytest.skip(reason)
     return Emulator(tmp_path_factory.mktemp("emulated"))
+
+
+@pytest.fixture
+def stand_in(request: pytest.FixtureRequest, emulator: Emulator) -> Iterator[StandIn]:
+    """Let there be a CUDA device that is none (stand_in.py), where torch knows of no true one."""
+    if LIBRARY not in request.config.stash:
+        pytest.skip("this torch is built with CUDA: tests of a device run on a true one")
+    with standing_in(emulator, request.config.stash[LIBRARY]) as device:
+        yield device
+
+
+@pytest.fixture
+def device(request: pytest.FixtureRequest) -> torch.device:
+    """Return a CUDA device, the stand-in where torch is built without CUDA."""
+    if torch.version.cuda is None:
+        request.getfixturevalue("stand_in")
+        return torch.device("cuda", 0)
+    try:
+        return cuda_launch.this_device()
+    except BackendError as problem:
+        pytest.skip(str(problem))
 
 
 @pytest.fixture(scope="session", params=["reference", "cpu", "emulated", "cuda"])
@@ -68,7 +103,7 @@ def _emulated(request: pytest.FixtureRequest) -> Backend:
 
 
 def _cuda(request: pytest.FixtureRequest) -> Backend:
-    from sigmasplat.render import cuda, cuda_launch
+    from sigmasplat.render import cuda
 
     reason = cuda_launch.missing()
     if reason:

@@ -30,7 +30,7 @@ def test_every_kernel_compiles_without_a_warning_and_keeps_to_its_registers(arch
         for usage in used.values():
             assert usage.spilled <= MOST_SPILLED.get(features, 0), usage
             assert usage.shared <= 48 << 10 and kernels.blocks_held(usage, architecture) >= 1, usage
-        assert len(cubins.kernel_names(features)) >= 5
+        assert len(cubins.kernel_names(features)) >= 4
         for name in cubins.kernel_names(features):
             of_views = name in ("pack_view", "blend_backward_pose", "chain_params", "chain_pose")
             there = f".text.{name}\0".encode() in program.code

@@ -1,7 +1,6 @@
 """Write a run's floor plan: a picture, and the same in numbers beside it."""
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 from sigmasplat.errors import RunError
@@ -11,7 +10,7 @@ from sigmasplat.io.json_files import write_json
 from sigmasplat.metrics.floor_plan import CELL_M, FloorPlan, floor_plan
 from sigmasplat.metrics.plan_picture import draw_floor_plan
 from sigmasplat.metrics.sights import Renderer
-from sigmasplat.render import render
+from sigmasplat.render import FieldRenderer
 
 
 def export_plan(
@@ -30,7 +29,7 @@ def export_plan(
     if target.suffix.lower() != ".png":
         raise RunError(f"cannot write a floor plan as {target.name}; give a name that ends in .png")
     config = recorded.config
-    renderer = renderer or partial(render, options=config.render, backend=config.backend)
+    renderer = renderer or FieldRenderer(config.render, config.backend)
     field, path = recorded.run.read_map(), recorded.trusted_path()
     plan = floor_plan(field, path, recorded.camera, cell_m=cell_m, renderer=renderer, progress=progress)
     picture = draw_floor_plan(plan)

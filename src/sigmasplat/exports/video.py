@@ -22,7 +22,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.camera_path import orbit, resampled
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.render import render
+from sigmasplat.render import FieldRenderer
 
 SHORTEST_S, LONGEST_S, ORBIT_S = 4.0, 60.0, 12.0
 SAMPLES = 12
@@ -78,7 +78,7 @@ def export_video(
     options = options or VideoOptions()
     check_name(target)
     config, path = recorded.config, recorded.trusted_path()
-    renderer = renderer or partial(render, options=config.render, backend=config.backend)
+    renderer = renderer or FieldRenderer(config.render, config.backend)
     field, camera = recorded.run.read_map(), sized(recorded.camera, options.width_px)
     count = options.images(float(path.timestamps_s[-1] - path.timestamps_s[0]))
     if options.path == "orbit":

@@ -34,7 +34,7 @@ def knows_variance(field: GaussianField) -> bool:
 
 def sure(field: GaussianField, *, sigma_below: float | None = None, opacity_above: float | None = None) -> Kept:
     """Choose splats with σ < `sigma_below` and opacity > `opacity_above`; None asks for nothing."""
-    every = torch.ones(len(field), dtype=torch.bool)
+    every = torch.ones(len(field), dtype=torch.bool, device=field.params.device)
     known = every if sigma_below is None else sigmas(field) < sigma_below
     there = every if opacity_above is None else field.opacities > opacity_above
     return Kept(known & there, int((~known).sum()), int((known & ~there).sum()))

@@ -68,11 +68,11 @@ class Rows:
         return self.params, self.moment1, self.moment2, self.last_step
 
     def join(self, other: "Rows") -> None:
-        """Add another's rows at the end, their optimiser state with them."""
-        self.params = torch.cat([self.params, other.params])
-        self.moment1 = torch.cat([self.moment1, other.moment1])
-        self.moment2 = torch.cat([self.moment2, other.moment2])
-        self.last_step = torch.cat([self.last_step, other.last_step])
+        """Add another's rows, wherever they lie, at the end, their optimiser state with them."""
+        more = zip(self._tensors, other._tensors, strict=True)
+        self.params, self.moment1, self.moment2, self.last_step = (
+            torch.cat([mine, theirs.to(mine.device)]) for mine, theirs in more
+        )
 
     def choose(self, rows: Tensor) -> None:
         """Keep the rows chosen by a bool mask [N] or an index tensor."""
@@ -170,7 +170,8 @@ class GaussianField(Rows):
         return self.extras[name]
 
     def append(self, other: "GaussianField") -> None:
-        """Add another field's splats at the end, with new ids; extras that only one has are 0 for the other's."""
+        """Add another field's splats, wherever they lie, at the end, with new ids; extras that only one has are 0 for
+        the other's."""
         for name in {**self.extras, **other.extras}:
             self.carry(name).join(other.carry(name))
         self.ids = torch.cat([self.ids, torch.arange(self.born, self.born + len(other), device=self.ids.device)])
@@ -185,8 +186,14 @@ class GaussianField(Rows):
             params, moment1, moment2, last_step, self.steps, extras, self.ids.to(device), self.born
         )  # fmt: skip
 
+    def at(self, device: torch.device) -> "GaussianField":
+        """Return the field itself where it lies on a device, else a copy of it there."""
+        return self if self.params.device == device else self.on(device)
+
     def keep(self, rows: Tensor) -> None:
         """Keep the splats chosen by a bool mask [N] or an index tensor, drop the others."""
+        if rows.dtype == torch.bool:
+            rows = rows.nonzero().squeeze(1)  # once for all: where rows lie on a device the host waits for their number
         for part in (self, *self.extras.values()):
             part.choose(rows)
         self.ids = self.ids[rows]
@@ -212,7 +219,7 @@ class GaussianField(Rows):
 
 def quaternion_of(R: Tensor) -> Tensor:
     """Turn a 3×3 rotation tensor into a unit quaternion wxyz."""
-    return torch.as_tensor(se3.quaternion_from_rotation(R.detach().double().numpy()), dtype=R.dtype)
+    return torch.as_tensor(se3.quaternion_from_rotation(R.detach().cpu().double().numpy())).to(R)
 
 
 def left_factor(quaternion: Tensor) -> Tensor:

@@ -70,7 +70,7 @@ def turned(harmonics: Tensor, R_new_old: Tensor) -> Tensor:
     rounds as memory happens to lie.
     """
     directions, weights = sphere_rule()
-    new = basis((directions[:, None, :] * R_new_old.double()).sum(-1))
+    new = basis((directions[:, None, :] * R_new_old.cpu().double()).sum(-1))
     mix = ((weights[:, None] * new)[:, :, None] * basis(directions)[:, None, :]).sum(0).to(harmonics)
     old = harmonics.reshape(-1, FUNCTIONS, 3)
     parts = (mix[:, j, None] * old[:, j, None] for j in range(FUNCTIONS))

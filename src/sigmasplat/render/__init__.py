@@ -1,5 +1,5 @@
 """See: project splats, blend them, and read maps off what was gathered."""
 
-from sigmasplat.render.render import Render, render
+from sigmasplat.render.render import FieldRenderer, Render, render
 
-__all__ = ["Render", "render"]
+__all__ = ["FieldRenderer", "Render", "render"]

@@ -1,6 +1,8 @@
 """See a field from a camera: two kernels, and algebra on what they gather (DESIGN §3)."""
 
+from collections import deque
 from dataclasses import dataclass
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -10,7 +12,7 @@ from torch import Tensor
 from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.color_covariance import covariances_of, outer
-from sigmasplat.model.field import GaussianField
+from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.harmonics import view_colors
 from sigmasplat.render import cuda_launch
 from sigmasplat.render.backend import backend_module, is_cuda
@@ -76,6 +78,15 @@ def _features_from(field: GaussianField, z: Tensor, T_camera_world: Tensor) -> T
     return covariance_features(colors, z, field.variances, field.extras["correlations"].params)
 
 
+def _brought(field: GaussianField, kernels: ModuleType) -> GaussianField:
+    """Return what a render needs of a field where the kernels want it; no optimiser state travels."""
+    if not is_cuda(kernels) or field.params.device.type != "cpu":
+        return field
+    device = cuda_launch.this_device()
+    extras = {name: Rows(extra.params.to(device)) for name, extra in field.extras.items()}
+    return GaussianField(field.params.to(device), extras=extras)
+
+
 def render(
     field: GaussianField,
     camera: Camera,
@@ -90,8 +101,7 @@ def render(
     directions from which `harmonics` are seen. Raises BackendError if the backend is not available.
     """
     kernels, options = backend_module(backend, field.params.device), options or RenderConfig()
-    if is_cuda(kernels) and field.params.device.type == "cpu":  # asked for by name
-        field = field.on(cuda_launch.this_device())
+    field = _brought(field, kernels)
     T = torch.as_tensor(T_camera_world)
     p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
     features = _features_from(field, p.z, T if options.color_pose_gradient else T.detach())
@@ -110,3 +120,26 @@ def render(
         b.dominant_weight,
         covariance_of(b.sums[..., :3], b.sums[..., 4:]) if "correlations" in field.extras else None,
     )
+
+
+class FieldRenderer:
+    """Renders with the same settings again and again. The two fields shown last, which may not change meanwhile, are
+    brought to a device once."""
+
+    def __init__(self, options: RenderConfig, backend: str) -> None:
+        self.options, self.backend = options, backend
+        self._kept: deque[tuple[GaussianField, GaussianField]] = deque(maxlen=2)
+
+    def __call__(
+        self,
+        field: GaussianField,
+        camera: Camera,
+        T_camera_world: Tensor | NDArray[np.floating],
+        depth_reference: Tensor | None = None,
+    ) -> Render:
+        """Render a field as `render` does."""
+        there = next((there for one, there in self._kept if one is field), None)
+        if there is None:
+            there = _brought(field, backend_module(self.backend, field.params.device))
+            self._kept.append((field, there))
+        return render(there, camera, T_camera_world, depth_reference, self.options, self.backend)

@@ -27,9 +27,9 @@ class Heat:
     times: Tensor
 
     @staticmethod
-    def of(n: int) -> "Heat":
-        """Start cold."""
-        return Heat(torch.zeros(n), torch.zeros(n))
+    def of(n: int, device: torch.device | None = None) -> "Heat":
+        """Start cold, on a device; by default in the host's memory."""
+        return Heat(torch.zeros(n, device=device), torch.zeros(n, device=device))
 
     def add(self, pull: Tensor) -> None:
         """Take in one step's pulls [N] ≥ 0, 0 where a splat was not seen."""
@@ -91,7 +91,7 @@ def too_large(
     In the image are those before the camera whose centres the image shows.
     """
     if not (most_scale_m > 0 or most_radius_px > 0):
-        return torch.zeros(len(field), dtype=torch.bool)
+        return torch.zeros(len(field), dtype=torch.bool, device=field.params.device)
     widest, T = field.scales.amax(1), torch.from_numpy(T_camera_world).to(field.params)
     large = (widest > most_scale_m) & (most_scale_m > 0)
     if most_radius_px > 0:
@@ -110,7 +110,7 @@ def _copies(field: GaussianField, rows: Tensor) -> GaussianField:
 
 def _scatter(field: GaussianField, random: np.random.Generator) -> None:
     """Move every splat to a point drawn from its own Gaussian, and make it smaller."""
-    R = torch.from_numpy(se3.rotation_from_quaternion(field.quats.numpy())).to(field.params)
+    R = torch.from_numpy(se3.rotation_from_quaternion(field.quats.cpu().numpy())).to(field.params)
     drawn = field.scales * torch.from_numpy(random.standard_normal((len(field), 3))).to(field.params)
     field.params[:, MEANS] += (R * drawn[:, None, :]).sum(2)
     field.params[:, SCALES] -= float(np.log(CHILD_SCALE))

@@ -5,7 +5,6 @@ What is fused is the map's own view, never a recorded image.
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
@@ -20,7 +19,7 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.tsdf import Tsdf
-from sigmasplat.render import Render, render
+from sigmasplat.render import FieldRenderer, Render
 
 VOXEL_M = 0.01
 TRUNCATION_VOXELS = 4
@@ -79,7 +78,7 @@ def fuse(
     τ of tracking (VarSplat §3). `progress` is told (standpoints done, total). Raises ConfigError unless voxel_m > 0.
     """
     volume = Tsdf(voxel_m, TRUNCATION_VOXELS * voxel_m)
-    renderer = renderer or partial(render, options=config.render, backend=config.backend)
+    renderer = renderer or FieldRenderer(config.render, config.backend)
     for done, at in enumerate(standpoints, 1):
         with torch.inference_mode():
             seen = renderer(at.field, at.camera, at.T_camera_field)

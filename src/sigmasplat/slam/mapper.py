@@ -46,6 +46,7 @@ class Mapper:
 
         What begins with splats inherited knows its first keyframe from before, and only takes note of it.
         """
+        self.field = self.field.at(view.sums.device)  # the one place that says where the active field lies
         c, born, begun = self.config.mapping, self.field.born, len(self.field) > 0
         self.keyframes.append(Keyframe(index, target, T_world_camera, not self.keyframes, descriptor=descriptor))
         if begun and len(self.keyframes) == 1:
@@ -53,7 +54,7 @@ class Mapper:
         self._seed(view, target, T_world_camera)
         steps = c.iterations if begun else c.first_iterations
         rates = iter([Rates.of(c)] * steps if begun else Rates.falling(c, steps))
-        window, heat = self._window(view), Heat.of(len(self.field))
+        window, heat = self._window(view), Heat.of(len(self.field), self.field.params.device)
         fit = self._fit(view, window, steps // 2, rates, born, c.poses_from == "start", heat)
         self._multiply(view, heat)
         self._prune(view)
@@ -100,13 +101,14 @@ class Mapper:
         return fit_field(self.field, view, batches, c, rates, frozen, may_move=may_move, felt=pulled)
 
     def finished(self, index: int) -> tuple[Submap, list[Picture]]:
-        """Return what has been mapped as a finished submap, and what its keyframes saw."""
+        """Return what has been mapped as a finished submap, which rests in the host's memory, and what its keyframes
+        saw."""
         poses = np.stack([keyframe.T_world_camera for keyframe in self.keyframes])
         frames = tuple(keyframe.index for keyframe in self.keyframes)
         pictures = [keyframe.target.picture() for keyframe in self.keyframes]
-        field = GaussianField(
-            self.field.params.clone(), extras={n: Rows(e.params.clone()) for n, e in self.field.extras.items()}
-        )
+        here = torch.device("cpu")
+        params, *extras = (rows.params.to(here, copy=True) for rows in (self.field, *self.field.extras.values()))
+        field = GaussianField(params, extras=dict(zip(self.field.extras, map(Rows, extras), strict=True)))
         return Submap(index, field, frames, poses, self.keyframes[0].target.camera), pictures
 
     def successor(self, view: View, T_submap_camera: NDArray[np.float64]) -> "Mapper":
@@ -164,7 +166,7 @@ class Mapper:
         """Tell which splats [N] were faded before and have not come back."""
         p = self.config.primitives
         if not len(doubted):
-            return torch.zeros(len(self.field), dtype=torch.bool)
+            return torch.zeros_like(self.field.ids, dtype=torch.bool)
         nu, _ = primitive_uncertainty(self.field, view, self._judges(window), p.owner)
         return still_uncertain(self.field, doubted, nu, p.uncertain_m2, p.least_opacity)
 

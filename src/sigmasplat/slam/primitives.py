@@ -13,7 +13,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.render.view import View
 
-Floats = NDArray[np.float64]
+Matrix = NDArray[np.float64]
 
 
 def primitive_uncertainty(
@@ -24,35 +24,36 @@ def primitive_uncertainty(
     ν = Σ w (D − z)² / n over the pixels with a reading D that a splat owns, in all keyframes; z is its centre's depth
     there, w its weight. 0 where it owns none. Renders each keyframe once; the view's planes are then of the last one.
     """
-    means = field.means.numpy().astype(np.float64)
-    spread, count = np.zeros(len(field)), np.zeros(len(field), np.int64)
+    spread = torch.zeros(len(field), dtype=torch.float64, device=field.params.device)
+    count = torch.zeros_like(spread, dtype=torch.int64)
     for keyframe in keyframes:
         T_camera_world = se3.inverse(keyframe.T_world_camera)
         view.forward(field.params, T_camera_world, layers=True)
-        rows, weights, readings = _owned(view, keyframe, owner)
-        off = readings - depths(means, T_camera_world)[rows]
-        spread += np.bincount(rows, weights * off**2, len(field))
-        count += np.bincount(rows, minlength=len(field))
-    return torch.from_numpy(spread / np.maximum(count, 1)), torch.from_numpy(count)
+        rows, weights, readings = (x.to(field.params.device) for x in _owned(view, keyframe, owner))
+        off = readings - depths(field.means[rows].double(), T_camera_world)
+        # Sorted by torch where that runs in parallel, so that the sums are the same every time.
+        spread += torch.zeros_like(spread).index_put_((rows,), weights * (off * off), accumulate=True)
+        count.index_put_((rows,), torch.ones_like(rows), accumulate=True)
+    return spread / count.clamp(min=1), count
 
 
-def depths(points: Floats, T_camera_world: Floats) -> Floats:
+def depths(points: Tensor, T_camera_world: Matrix) -> Tensor:
     """Return the depths [N] m of points [N, 3] in a camera, summed in fixed order."""
-    a, b, c, d = T_camera_world[2]
-    return np.asarray(a * points[:, 0] + b * points[:, 1] + c * points[:, 2] + d)
+    a, b, c, d = map(float, T_camera_world[2])
+    return a * points[:, 0] + b * points[:, 1] + c * points[:, 2] + d
 
 
-def _owned(view: View, keyframe: Keyframe, owner: str) -> tuple[NDArray[np.int32], Floats, Floats]:
+def _owned(view: View, keyframe: Keyframe, owner: str) -> tuple[Tensor, Tensor, Tensor]:
     """List the pixels that have an owner and a reading: the owner's row, its weight, the reading in m."""
     camera, layers = view.camera, view.layers
     ids, weights = {
         "dominant": (layers.dominant_id, layers.dominant_weight),
         "median": (layers.median_id, layers.median_weight),
     }[owner]
-    rows, weight = (plane[: camera.height, : camera.width].cpu().numpy() for plane in (ids, weights))
-    reading = keyframe.target.depth_image.numpy()
-    judged = (rows >= 0) & (reading > 0)
-    return rows[judged], weight[judged].astype(np.float64), reading[judged].astype(np.float64)
+    rows, weight = (plane[: camera.height, : camera.width] for plane in (ids, weights))
+    reading = keyframe.target.on(rows.device).depth_image
+    judged = ((rows >= 0) & (reading > 0)).nonzero(as_tuple=True)
+    return rows[judged].long(), weight[judged].double(), reading[judged].double()
 
 
 def fade(field: GaussianField, rows: Tensor, opacity: float) -> Tensor:
@@ -62,6 +63,7 @@ def fade(field: GaussianField, rows: Tensor, opacity: float) -> Tensor:
     """
     column = COLUMNS["opacity_logits"].start
     limit = float(np.log(opacity / (1.0 - opacity)))
+    rows = rows.nonzero().squeeze(1) if rows.dtype == torch.bool else rows
     field.params[rows, column] = field.params[rows, column].clamp(max=limit)
     field.moment1[rows, column] = 0.0
     field.moment2[rows, column] = 0.0
@@ -76,7 +78,7 @@ def still_uncertain(
 
     A faded splat seldom owns a pixel, so opacity decides; and in a few dozen steps it does not fall from 0.07 to 1/255.
     """
-    named = torch.zeros(field.born, dtype=torch.bool)
+    named = torch.zeros(field.born, dtype=torch.bool, device=field.ids.device)
     named[faded] = True
     faint = field.opacities < least_opacity
     return named[field.ids] & (faint | (uncertainty > uncertain_m2))

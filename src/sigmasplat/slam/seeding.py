@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 from skimage.feature import canny
+from torch import Tensor
 
 from sigmasplat.config import SeedConfig
 from sigmasplat.fit.pyramid import gradient_magnitude, gray_of
@@ -17,7 +18,7 @@ Mask = NDArray[np.bool_]
 
 
 def first_pixels(target: Target, config: SeedConfig, random: np.random.Generator) -> Mask:
-    """Pick pixels [H, W] for an empty map: uniform ∪ drawn by gradient magnitude ∪ Canny edges; only with depth."""
+    """Pick pixels, bool [H, W], for an empty map: uniform ∪ drawn by gradient ∪ Canny edges; only with depth."""
     valid = target.depth_image.numpy() > 0
     gray = gray_of(target.image.numpy())
     chosen = _draw(valid.astype(float), config.first_uniform, random)
@@ -29,7 +30,7 @@ def first_pixels(target: Target, config: SeedConfig, random: np.random.Generator
 
 
 def later_pixels(maps: PoseMaps, target: Target, config: SeedConfig) -> Mask:
-    """Find pixels [H, W] the map does not explain: thin (A < alpha_below), or a surface well behind the reading
+    """Find pixels, bool [H, W], the map does not explain: thin (A < alpha_below), or a surface well behind the reading
     (where `depth_error_factor` is above 0)."""
     measured = target.depth_image.numpy()
     valid = measured > 0
@@ -45,7 +46,7 @@ def later_pixels(maps: PoseMaps, target: Target, config: SeedConfig) -> Mask:
 
 
 def thin_out(pixels: Mask, config: SeedConfig, random: np.random.Generator) -> Mask:
-    """Keep a random share of the pixels [H, W]: `density` of them, at most `later_max`."""
+    """Keep a random share of the pixels, bool [H, W]: `density` of them, at most `later_max`."""
     count = round(config.density * int(pixels.sum()))
     return _draw(pixels.astype(float), min(count, config.later_max) if config.later_max else count, random)
 
@@ -73,9 +74,10 @@ def make_splats(
 ) -> GaussianField:
     """Unproject the chosen pixels to splats: opacity and colour from settings and image, isotropic scale, σ² = e⁻⁷.
 
-    Scale follows the distance to the 3 nearest neighbours, old and new; or, with `scale_from` "pixel", a pixel's size
-    at that depth times `spacing_px`, how far seeds lie apart. New points closer than `min_distance_m` to an old splat
-    are dropped.
+    T_world_camera [4, 4] takes them to where `field`, the old splats, lies; pixels: bool [H, W], all with depth. Scale
+    follows the distance to the 3 nearest neighbours, old and new; or, with `scale_from` "pixel", a pixel's size at that
+    depth times `spacing_px`, how far seeds lie apart. New points closer than `min_distance_m` to an old splat are
+    dropped.
     """
     depth = target.depth_image.numpy()[pixels].astype(np.float64)
     points = target.camera.rays()[pixels] * depth[:, None] * config.push_back
@@ -85,7 +87,7 @@ def make_splats(
         spread = depth / target.camera.fx * spacing_px
         keep = np.ones(len(world), bool)
     else:
-        keep, spread = _neighbour_spread(world, field.means.numpy(), config)
+        keep, spread = _neighbour_spread(world, field.means, config)
     scales = np.maximum(spread * config.scale_factor, 1e-4)[keep]
     return GaussianField.from_values(
         torch.as_tensor(world[keep], dtype=torch.float32),
@@ -96,13 +98,15 @@ def make_splats(
 
 
 def _neighbour_spread(
-    points: NDArray[np.float64], old: NDArray[np.float32], config: SeedConfig
+    points: NDArray[np.float64], means: Tensor, config: SeedConfig
 ) -> tuple[Mask, NDArray[np.float64]]:
-    """Return which new points to keep, and every point's root mean squared distance to its 3 nearest neighbours."""
+    """Return which new points to keep, and every point's root mean squared distance to its 3 nearest neighbours, old
+    ones (means [N, 3]) and new."""
     keep = np.ones(len(points), bool)
     if len(points) == 0:
         return keep, np.zeros(0)
-    near = old[((old > points.min(0) - 0.1) & (old < points.max(0) + 0.1)).all(1)] if len(old) else old
+    low, high = (torch.from_numpy(corner).to(means.device) for corner in (points.min(0) - 0.1, points.max(0) + 0.1))
+    near = means[((means > low) & (means < high)).all(1)].cpu().numpy()
     if len(near) and config.min_distance_m > 0:
         nearest = cKDTree(near).query(points, distance_upper_bound=config.min_distance_m)[0]
         keep = np.asarray(nearest) > config.min_distance_m

@@ -11,7 +11,8 @@ from torch import Tensor
 from sigmasplat.config import Config
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.fit.pyramid import Pyramid, gray_of
+from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.references import live_image
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import Atlas
@@ -31,6 +32,7 @@ from sigmasplat.slam.step import KERNELS, Step, numbers_of
 from sigmasplat.slam.tracker import Tracker
 
 Matrix = NDArray[np.float64]
+HOST = torch.device("cpu")
 
 
 class Slam:
@@ -58,12 +60,13 @@ class Slam:
 
     @property
     def field(self) -> GaussianField:
-        """Return the map in the world: the final one once finished, till then all submaps side by side."""
+        """Return the map in the world, in the host's memory: the final one once finished, till then all submaps side by
+        side."""
         if self._final is not None:
             return self._final
         active = self.mapper.field
         if not len(self.store):
-            return active
+            return active.at(HOST)
         merged = GaussianField.empty()
         for index in range(len(self.store)):
             merged.append(self.store.load(index).field.moved(torch.from_numpy(self.atlas.anchors[index])))
@@ -92,7 +95,7 @@ class Slam:
         view = self._view_for(frame)
         before = view.seconds.copy()
         target = Target.of(frame, (view.sums.shape[1], view.sums.shape[2]))
-        live = Pyramid.of(gray_of(frame.color), frame.depth_m, frame.camera)
+        live = live_image(view, frame.color, frame.depth_m, target)
         seconds = {"prepare": time.perf_counter() - clock}
 
         tracking: dict[str, float] = {}
@@ -125,24 +128,28 @@ class Slam:
     def finish(self, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
         """Finish the last submap, look for its loops, and make the final map (VarSplat §7); once, after all frames.
 
-        `progress` is told (steps of refinement done, of how many). With one submap and no refinement nothing is done.
+        `progress` is told (steps of refinement done, of how many), from the beginning to the end; one step where
+        there are none. With one submap and no refinement nothing is done.
         """
         if not self.steps or not (len(self.store) or self._cuts or self.config.final.iterations):
             return
+        total = self.config.final.iterations or 1
+        progress(0, total)
         self._freeze()
         view = self.view
         assert view is not None
         self._final = final_map(self.store, self.atlas.anchors, self.config, view, self.random, progress)
+        progress(total, total)
 
     def checkpoint(self) -> dict[str, Tensor]:
-        """Return what a run needs to be read back: the active submap's field with its optimiser state, poses, times,
-        keyframes, anchors, and which submap each frame belongs to."""
+        """Return what a run needs to be read back, in the host's memory: the active submap's field with its optimiser
+        state, poses, times, keyframes, anchors, and which submap each frame belongs to."""
         path, active = self.trajectory(), self.mapper.field
         return {
-            "params": active.params,
-            "moment1": active.moment1,
-            "moment2": active.moment2,
-            "last_step": active.last_step,
+            "params": active.params.cpu(),
+            "moment1": active.moment1.cpu(),
+            "moment2": active.moment2.cpu(),
+            "last_step": active.last_step.cpu(),
             "adam_steps": torch.tensor(active.steps),
             "timestamps_s": torch.from_numpy(path.timestamps_s),
             "T_world_camera": torch.from_numpy(path.T_world_camera),

@@ -14,7 +14,7 @@ from sigmasplat.fit.references import Reference, keyframe_reference, map_referen
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
-from sigmasplat.render.view import CpuView, ReferenceView, View
+from sigmasplat.render.view import ReferenceView, View
 from sigmasplat.slam.rules import is_lost, jumped
 
 Matrix = NDArray[np.float64]
@@ -115,7 +115,7 @@ class Tracker:
     def keep_keyframe(self, field: GaussianField, view: View, live: Pyramid, T_world_camera: Matrix) -> None:
         """Take note of a freshly mapped keyframe: where mapping left its pose, and its image as the next reference."""
         self.previous = T_world_camera
-        if self.config.method == "align" or isinstance(view, CpuView):  # else nothing could align to it
+        if self.config.method == "align" or not isinstance(view, ReferenceView):  # else nothing could align to it
             self.keyframe = keyframe_reference(field.params, view, live, se3.inverse(T_world_camera), self.config)
 
     def hop_covariance(self, fit: PoseFit, live: Pyramid) -> Matrix | None:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from sigmasplat.errors import SigmaSplatError
@@ -41,10 +42,10 @@ def choose_window(
 
 def dominating(view: View, field: GaussianField) -> Ids:
     """Name the splats that dominate a pixel of a view's last forward pass with layers: sorted `field.ids`."""
-    rows = view.layers.dominant_id[: view.camera.height, : view.camera.width].cpu().numpy()
-    there = np.zeros(len(field), bool)
-    there[rows[rows >= 0]] = True
-    return np.sort(field.ids.numpy()[there])
+    rows = view.layers.dominant_id[: view.camera.height, : view.camera.width]
+    there = torch.zeros(len(field), dtype=torch.bool, device=rows.device)
+    there[rows[rows >= 0].long()] = True
+    return np.sort(field.ids[there.to(field.ids.device)].cpu().numpy())
 
 
 def covisible_splats(newest: Ids, others: Sequence[Ids]) -> Scores:

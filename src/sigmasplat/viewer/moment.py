@@ -96,11 +96,14 @@ def bare(splats: GaussianField) -> GaussianField:
 
 
 def thinned(splats: GaussianField, most: int) -> GaussianField:
-    """Return at most so many splats in memory of their own, evenly spread over the rows, each as much wider as keeps
-    the area covered."""
+    """Return at most so many splats in memory of their own, the host's, evenly spread over the rows, each as much wider
+    as keeps the area covered."""
     n = len(splats)
     rows = torch.arange(n) if n <= most else (torch.arange(max(most, 0)) * n).div(most, rounding_mode="floor")
-    few = to_look_at(splats.params[rows], {name: extra.params[rows] for name, extra in splats.extras.items()})
+    rows = rows.to(splats.params.device)
+    few = to_look_at(
+        splats.params[rows].cpu(), {name: extra.params[rows].cpu() for name, extra in splats.extras.items()}
+    )
     if len(few):
         few.params[:, COLUMNS["log_scales"]] += 0.5 * float(np.log(n / len(few)))
     return few

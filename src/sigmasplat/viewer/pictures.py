@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.metrics import palette
@@ -55,20 +56,20 @@ def picture_of(
     T_camera_world = se3.inverse(T_world_camera)
     with torch.no_grad():
         seen = render(field, camera, T_camera_world, None, options, backend)
-        alpha = np.asarray(seen.alpha)
+        alpha = _array(seen.alpha)
         covered = alpha > COVERED_ALPHA
-        depth_m = np.where(covered, np.asarray(seen.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0).astype(np.float32)
+        depth_m = np.where(covered, _array(seen.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0).astype(np.float32)
         if layer == "colour":
-            return Picture((seen.color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy())
+            return Picture((seen.color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy())
         if layer == "opacity":
             return Picture(palette.colour(alpha, 0.0, 1.0, GREY), Legend(GREY, 0.0, 1.0, ""))
         if layer == "depth":
             return _mapped(depth_m, covered, palette.span(depth_m, covered), palette.VIRIDIS, " m")
         if layer == "V":
-            return _from_zero(np.asarray(seen.variance.mean(2).clamp(min=0.0).sqrt()), covered, "")
+            return _from_zero(_array(seen.variance.mean(2).clamp(min=0.0).sqrt()), covered, "")
         spread = render(field, camera, T_camera_world, torch.from_numpy(depth_m), options, backend).uncertainty
         assert spread is not None
-        about = np.sqrt(np.maximum(np.asarray(spread), 0.0) / np.maximum(alpha, COVERED_ALPHA))
+        about = np.sqrt(np.maximum(_array(spread), 0.0) / np.maximum(alpha, COVERED_ALPHA))
         return _from_zero(about, covered, " m")
 
 
@@ -83,6 +84,10 @@ def legend_picture(legend: Legend) -> palette.Rgb:
     draw.text((1, middle), f"{legend.low:.3g}{legend.unit}", INK, font, anchor="lm")
     draw.text((width - 1, middle), f"{legend.high:.3g}{legend.unit}", INK, font, anchor="rm")
     return np.asarray(image)
+
+
+def _array(values: Tensor) -> Floats:
+    return np.asarray(values.cpu(), np.float32)
 
 
 def _from_zero(values: Floats, valid: NDArray[np.bool_], unit: str) -> Picture:
