@@ -125,7 +125,7 @@ def test_a_keyframe_is_aligned_to_a_submap_as_on_the_cpu() -> None:
         fit = registrar._aligned(thick(), live(view), TRUTH)
         found.append((fit, registrar._covariance(thick(), live(view), fit.T_camera_world)))
     assert all(fit.alignment is not None for fit, _ in found)
-    np.testing.assert_allclose(found[0][0].T_camera_world, found[1][0].T_camera_world, atol=1e-4)
+    np.testing.assert_allclose(found[0][0].T_camera_world, found[1][0].T_camera_world, atol=5e-4)
     deviations = [np.sqrt(np.diag(covariance)) for _, covariance in found]
     np.testing.assert_allclose(*deviations, rtol=0.1)
 
