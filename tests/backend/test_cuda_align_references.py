@@ -118,8 +118,8 @@ def test_a_pose_is_aligned_to_the_map_as_on_the_cpu() -> None:
 def test_a_keyframe_is_aligned_to_a_submap_as_on_the_cpu() -> None:
     """Registration's localisation, which needs no CPU's planes.
 
-    On so small an image a pixel more or less within the gates moves a pose by a tenth of a millimetre and its deviation by a
-    sixth, so deviations are compared at one pose.
+    On so small an image a pixel more or less within the gates moves a pose by a tenth of a millimetre and its
+    deviation by a sixth, so deviations are compared at one pose.
     """
     from sigmasplat.model.submap import MemoryStore
 

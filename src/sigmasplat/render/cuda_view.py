@@ -88,8 +88,9 @@ class CudaView:
     def _on_median(self) -> Tensor:
         """Gather ∂L/∂(median depth) of all pixels by the splats whose depths they are, [n]."""
         ids, found = self.layers.median_id.flatten().long(), torch.zeros(self.raster.n + 1, device=self.raster.device)
-        # Pixels without one (−1) add to the last row. Sorted by torch, so that the sums are the same every time.
-        found.index_put_((ids,), self.g_median_depth.flatten(), accumulate=True)
+        # Pixels without one (−1) add to the last row. Sorted by torch, so that the sums are the same every time; told
+        # that the rows exist (the last argument), it does not make the host wait to look.
+        torch.ops.aten._index_put_impl_(found, [ids], self.g_median_depth.flatten(), True, True)
         return found[:-1]
 
     def backward_pose(self, params: Tensor) -> Matrix:
