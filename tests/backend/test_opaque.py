@@ -30,8 +30,8 @@ OPTIONS = RenderConfig(depth_pose_gradient=False)
 WALLS, BEHIND = 2, 200
 FAINT = 0.01
 """Of depth, moment and alpha: colour, in which the walls outshine the crowd, is what counts."""
-ROUNDING = 2e-4
-"""Two walls that let 1/70 pass magnify α's rounding, 6e-7, to 1e-4 of the light behind them; then some room."""
+ROUNDING = 1e-4
+"""Two walls that let 1/70 pass each magnify α's rounding to 2e-5 of the light behind them; then some room."""
 
 
 @cache
