@@ -22,7 +22,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
 import sigmasplat
-from emulated_cuda import HERE, Emulator
+from emulated_cuda import FLAGS, HERE, Emulator
 from sigmasplat.render import cuda_launch
 from sigmasplat.render.cuda_launch import Argument
 
@@ -278,9 +278,7 @@ def library_in(folder: Path) -> Any:
     """
     torch_folder, made = Path(torch.__file__).parent, folder / "device.so"
     libraries = [f"-L{torch_folder / 'lib'}", "-lc10", "-ltorch_cpu", f"-Wl,-rpath,{torch_folder / 'lib'}"]
-    flags = ["-std=c++20", "-O1", "-fPIC", "-shared", "-Wall", "-Wextra", "-Werror"] + [
-        f"-isystem{torch_folder / 'include'}"
-    ]
+    flags = [*FLAGS, f"-isystem{torch_folder / 'include'}"]
     line = [os.environ.get("CXX") or "g++", *flags, str(HERE / "device.cpp"), "-o", str(made), *libraries]
     done = subprocess.run(line, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
