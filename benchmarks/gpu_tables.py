@@ -12,6 +12,7 @@ COLUMNS = (
     ("colour + depth", "both_color_depth"),
     ("pose only", "both_pose"),
     ("tracking iteration", "tracking_iteration"),
+    ("kernel by kernel", "launched_tracking_iteration"),
     ("mapping iteration", "mapping_iteration"),
 )
 GOAL_SCENE = (300_000, 1200)

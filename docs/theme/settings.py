@@ -17,9 +17,9 @@ HEAD = """# Settings
 
 Every setting that `--set SECTION.NAME=VALUE` changes, on the command line of `demo`, `run`, `inspect` and `bench`.
 A run's `config.json` says which it used. *Default* holds where a preset says nothing; *`{preset}`* is the default
-preset's value where it differs, which a run without `--preset` gets. A row without a sentence is said by its name, or
-shares the sentence of the next row, as `fx`, `fy` and `cx` do; … goes on from the row above. Units are in the names:
-`_m` metres, `_deg` degrees, `_px` pixels, `_s` seconds. `lr_` is a learning rate, `weight_` a weight of the loss.
+preset's value where it differs, which a run without `--preset` gets. … goes on from the row above. Units are in the
+names: `_m` metres, `_deg` degrees, `_px` pixels, `_s` seconds. `lr_` is a learning rate, `weight_` a weight of the
+loss.
 
 Made from [`config/`](../src/sigmasplat/config/) by `docs/theme/settings.py`. Back to the [README](../README.md).
 """

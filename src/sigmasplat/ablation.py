@@ -153,7 +153,7 @@ class Results:
         self.runs.append(
             {
                 "source": job.source, "path": job.path, "variant": job.variant, "seed": job.seed,
-                "settings": VARIANTS[job.variant], "commit": machine.git_commit(),
+                "settings": VARIANTS[job.variant], "commit": machine.code(),
                 "date": datetime.now(UTC).isoformat(timespec="seconds"), "wall_s": round(wall_s, 2),
                 "figures": figures_of(metrics), "metrics": dict(metrics),
             }

@@ -17,12 +17,15 @@ from sigmasplat.commands.inspect import inspect
 from sigmasplat.commands.mesh import make_mesh
 from sigmasplat.commands.run import demo, resume, run
 from sigmasplat.commands.view import view
-from sigmasplat.errors import SigmaSplatError
+from sigmasplat.config.text import nearest
+from sigmasplat.errors import ConfigError, SigmaSplatError
 
 REFUSED, INTERRUPTED = 2, 130
 DESCRIPTION = """RGB-D SLAM on 3D Gaussians that knows how sure it is.
 
-Start with: sigmasplat demo, then: sigmasplat run PATH; sigmasplat --version says which this is."""
+Start with: sigmasplat demo, then: sigmasplat run PATH.
+
+sigmasplat --version    show which release this is, and exit"""
 
 COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo,
@@ -38,6 +41,12 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "doctor": doctor,
     "completion": completion,
 }
+
+
+def _refuse_unknown(command: str) -> None:
+    """Raise ConfigError on what is neither a command nor an option."""
+    if command not in COMMANDS and not command.startswith("-"):
+        raise ConfigError(f"no command '{command}'{nearest(command, COMMANDS)}; there are {', '.join(COMMANDS)}")
 
 
 def _obey(arguments: Sequence[str]) -> int:
@@ -56,6 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(0)
     try:
         env.switches()
+        _refuse_unknown(given[0])
         code = _obey(given)
     except SigmaSplatError as problem:
         print(f"sigmasplat: {problem}", file=sys.stderr)

@@ -50,6 +50,7 @@ class Screen:
         """Show a count (done, total)."""
         with self._counters() as begin:
             show = begin(title, None)
+            show(0, None, "")
             yield lambda done, total: show(done, total, "")
 
     @contextmanager
@@ -162,18 +163,21 @@ class _StepShow:
 
 
 class _PlainShow:
-    """Print a line now and then, and at the end."""
+    """Print a line where nothing is done yet, now and then, and at the end."""
 
     def __init__(
         self, say: Callable[[str], None], written: Callable[[int], str], title: str, total: int | None
     ) -> None:
         self.say, self.written, self.title, self.total = say, written, title, total
-        self.last_s = time.perf_counter()
+        self.last_s, self.last_line = time.perf_counter(), ""
 
     def __call__(self, done: int, known: int | None, text: str) -> None:
         total = known or self.total
         now_s = time.perf_counter()
-        if done == total or now_s - self.last_s >= PLAIN_LINES_EVERY_S:
-            self.last_s = now_s
+        if done in (0, total) or now_s - self.last_s >= PLAIN_LINES_EVERY_S:
             whole = "?" if total is None else self.written(total)
-            self.say(f"{self.title} {self.written(done)}/{whole}  {text}".rstrip())
+            line = f"{self.title} {self.written(done)}/{whole}  {text}".rstrip()
+            line = f"{self.title} …" if done == 0 and total is None else line
+            if line != self.last_line:
+                self.say(line)
+            self.last_s, self.last_line = now_s, line

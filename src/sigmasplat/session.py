@@ -97,7 +97,8 @@ def record(
     except KeyboardInterrupt:
         status = "interrupted"
     except Exception as problem:
-        problem.add_note(f"the run up to frame {tally.frames} is in {run.path}")
+        if tally.frames:
+            problem.add_note(f"the run up to frame {tally.frames} is in {run.path}")
         raise
     finally:
         _save(slam, run, tally)

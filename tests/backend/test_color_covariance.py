@@ -11,7 +11,7 @@ from torch import Tensor
 from sigmasplat.config import MappingConfig
 from sigmasplat.fit import adam, losses
 from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.color_covariance import CovarianceView, FullCovarianceStep
+from sigmasplat.fit.color_covariance import FullCovarianceStep
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.step import CompiledImages, TorchStep
 from sigmasplat.fit.target import Keyframe, Target
@@ -21,6 +21,7 @@ from sigmasplat.model.color_covariance import MOST_CORRELATED, correlations_of, 
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.model.frame import Frame
 from sigmasplat.render import reference, render
+from sigmasplat.render.covariance_view import CovarianceView
 from sigmasplat.render.view import CpuView, make_view
 from splat_fields import OPTIONS, exact_view, maps_of, params_of, there_and_back
 from splat_scenes import SMALL, WIDE, Scene, assert_same_vector, scene

@@ -18,7 +18,7 @@ def test_every_kernel_compiles_without_a_warning(architecture: str) -> None:
         made = list(pool.map(lambda features: cubins.compiled(features, architecture), cubins.PROGRAMS))
     for features, program in zip(cubins.PROGRAMS, made, strict=True):
         assert program.log == "", f"{features} features: {program.log}"
-        assert len(cubins.kernel_names(features)) >= 5
+        assert len(cubins.kernel_names(features)) >= 4
         for name in cubins.kernel_names(features):
             of_views = name in ("pack_view", "blend_backward_pose", "chain_params", "chain_pose")
             assert (f".text.{name}\0".encode() in program.code) == (features <= 7 or not of_views), name

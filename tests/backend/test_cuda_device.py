@@ -1,21 +1,36 @@
-"""On a CUDA device: the view and the fused step held to the definition, the same bytes twice, five million splats.
+"""On a CUDA device: views, fused steps and tracking held to the definition, the same bytes twice, five million splats.
 
 Skipped without a device. For memory errors run this file under compute-sanitizer.
 """
+
+import dataclasses
+import time
+import warnings
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from sigmasplat.config import MappingConfig, TrackingConfig
+from sigmasplat.fit.cuda_pose import CudaTrackingLoss, descend_on_device
+from sigmasplat.fit.cuda_rows import CudaGathered
 from sigmasplat.fit.cuda_step import CudaStep
+from sigmasplat.fit.descent import Descent, descend
+from sigmasplat.fit.steps import step_for
+from sigmasplat.fit.tracking_loss import tracking_gradient
+from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.render import cuda_launch, render
+from sigmasplat.render import cuda_launch, cuda_stages, render
 from sigmasplat.render.cuda_view import CudaView
+from sigmasplat.render.view import CpuView, make_view
 from splat_fields import OPTIONS, crowd, exact_view, params_of, there_and_back
-from splat_scenes import KINDS, assert_same_vector, scene
+from splat_scenes import KINDS, WIDE, assert_same_vector, scene
+from splat_wall import CAMERA, TRUTH, seen_from, wall
 from test_compiled_loss import RATES, WEIGHTS, target_of
+from test_cuda_options import FULL, correlated, fitted, wide_views
 
 REASON = cuda_launch.missing()
 pytestmark = pytest.mark.skipif(REASON is not None, reason=str(REASON))
@@ -66,6 +81,128 @@ def test_a_step_is_taken() -> None:
         losses.append(float(step.images(target, WEIGHTS)))
         step.splats(field, RATES, WEIGHTS, 0)
     assert losses[-1] < losses[0] and torch.isfinite(field.params).all() and not torch.equal(field.params, before)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_ten_planes_agree(kind: str) -> None:
+    s = scene(kind, 60)
+    (field, double), T = correlated(s), s.T_camera_world.numpy()
+    field = field.on(cuda_launch.this_device())
+    got, want = wide_views(s, field, double, cuda_launch.this_device())
+    _, rows, twist = there_and_back(got, field.params, T)
+    _, want_rows, want_twist = there_and_back(want, double.params, T)
+    assert_same_vector(rows.cpu(), want_rows, 1e-3, "rows")
+    assert_same_vector(got.g_correlations.cpu(), want.g_correlations, what="correlations")
+    assert_same_vector(twist, want_twist, 1e-3, "twist")
+
+
+OF_FITS = [(1, 0, False), (3, 0, False), (1, 0, True), (1, 3, False), (1, 2, True)]
+"""Keyframes a step, degree of view-dependent colour, full colour covariance."""
+
+
+@pytest.mark.parametrize(("images", "degree", "full"), OF_FITS)
+def test_fits_are_those_of_the_cpu(images: int, degree: int, full: bool) -> None:
+    config = MappingConfig(color_covariance="full" if full else "diagonal", weight_nll_color=1e-2)
+    start = params_of(scene("random", 60))
+    ours, losses, _ = fitted(CudaView(WIDE, OPTIONS), config, images, degree)
+    theirs, wanted, _ = fitted(CpuView(WIDE, OPTIONS), config, images, degree)
+    np.testing.assert_allclose(losses, wanted, rtol=1e-3)
+    assert_same_vector(ours.params.cpu() - start, theirs.params - start, 3e-2, "what Adam moved")
+
+
+@pytest.mark.parametrize(("images", "degree", "full"), OF_FITS)
+def test_torch_waits_for_no_part_of_an_iteration(images: int, degree: int, full: bool) -> None:
+    s, device = crowd(), cuda_launch.this_device()
+    field, view = GaussianField(params_of(s)).on(device), CudaView(s.camera, OPTIONS)
+    target = target_of(s.camera, (s.camera.height, s.camera.width)).on(device)
+    weights = {**FULL, "nll_color_full": 1e-2 * full, "alignment": 0.0 if full else 0.3}
+    step, T = step_for(field, view, weights, degree), s.T_camera_world.numpy()
+    for watched in (False, True):  # the first one compiles, makes room, and counts pairs
+        torch.cuda.set_sync_debug_mode("error" if watched else "default")
+        try:
+            gathered, field.steps = CudaGathered(view, field), field.steps + 1
+            for _ in range(images):
+                step.forward(field, T, target, weights)
+                step.images(target, weights)
+                if images > 1:
+                    gathered.add(field, 1.0 / images)
+                else:
+                    step.splats(field, RATES, weights, 3)
+            if images > 1:
+                gathered.step(field, RATES, weights, 3)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+    assert torch.isfinite(field.params).all()
+
+
+def test_stages_are_measured_where_they_are_asked_for() -> None:
+    s, view = crowd(), CudaView(crowd().camera, OPTIONS)
+    params, T = params_of(s).cuda(), s.T_camera_world.numpy()
+    there_and_back(view, params, T)
+    assert not view.seconds.any()
+    cuda_stages.measure()
+    try:
+        began_s = time.perf_counter()
+        for _ in range(20):
+            there_and_back(view, params, T)
+        spent, wall_s = view.seconds, time.perf_counter() - began_s
+    finally:
+        cuda_stages.measure(False)
+    assert (spent > 0.0).all() and float(spent.sum()) < wall_s
+
+
+TRACKING = TrackingConfig(
+    lr_rotation=4e-4, lr_translation=1e-3, tau=2.0, exposure=True, outlier_factor=5.0, outlier_factor_color=5.0,
+    average="kept",
+)  # fmt: skip
+OFF = np.array([0.012, -0.015, 0.01, 0.012, -0.008, 0.015])
+
+
+def followed(config: TrackingConfig, iterations: int, room: int | None = None, way: Any = descend_on_device) -> Descent:
+    """Descend from beside the place that a wall was seen from."""
+    view = CudaView(CAMERA, OPTIONS)
+    params, target = wall().cuda(), seen_from(make_view("reference", CAMERA, OPTIONS), TRUTH).on(view.alpha.device)
+    view.raster.capacity = room
+    found: Descent = way(params, view, target, se3.exp(OFF) @ TRUTH, config, iterations)
+    return found
+
+
+@pytest.mark.parametrize("room", [None, 7], ids=["room", "too little"])
+@pytest.mark.parametrize("parametrisation", ["quaternion", "axis-angle"])
+def test_a_pose_is_found_without_the_host(parametrisation: Any, room: int | None) -> None:
+    """As the Python loop finds it; captured, whose failure would be a warning, and not: the same bytes."""
+    config = dataclasses.replace(TRACKING, parametrisation=parametrisation)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        captured = [followed(config, 20, room) for _ in range(3)]
+    plain = followed(dataclasses.replace(config, cuda_graphs=False), 20, room)
+    for found in captured:
+        assert found[1:] == plain[1:]
+        np.testing.assert_array_equal(found.T_camera_world, plain.T_camera_world)
+    loop = followed(config, 20, way=descend)
+    np.testing.assert_allclose(plain.T_camera_world, loop.T_camera_world, atol=1e-5)
+    assert plain.loss == pytest.approx(loop.loss, rel=1e-3) and plain.steps == loop.steps == 20
+    assert plain.loss < 0.6 * plain.first_loss
+
+
+def test_a_descent_stops_where_the_loop_stops() -> None:
+    crawling = dataclasses.replace(TRACKING, lr_rotation=1e-9, lr_translation=1e-9, exposure=False)
+    assert followed(dataclasses.replace(crawling, update_stop=1e-6), 100).steps == 1
+    assert followed(dataclasses.replace(crawling, plateau_stop=1e-3), 100).steps == 2
+
+
+@pytest.mark.parametrize("average", ["image", "kept"])
+def test_the_tracking_loss_is_as_defined(average: Any) -> None:
+    s, config, exposure = crowd(), dataclasses.replace(TRACKING, average=average), torch.tensor([0.12, -0.03])
+    view = CudaView(s.camera, OPTIONS)
+    target = target_of(s.camera, (s.camera.height, s.camera.width)).on(view.alpha.device)
+    view.forward(params_of(s).cuda(), s.T_camera_world.numpy())
+    got = CudaTrackingLoss(view, target, config, torch.stack([exposure[0].exp(), exposure[1]]).cuda()).launch().sum(0)
+    planes = view.g_sums.cpu()
+    want, want_exposure = tracking_gradient(view, target, config, exposure.cuda())
+    assert float(got[0]) == pytest.approx(want, rel=1e-4)
+    assert_same_vector(planes, view.g_sums.cpu(), 1e-4, "planes")
+    assert_same_vector(got[1:].cpu(), want_exposure.cpu(), 1e-4, "exposure")
 
 
 @pytest.mark.parametrize("n", [0, 5_000_000])

@@ -30,6 +30,7 @@ def works(emulator: Emulator) -> Any:
 def test_every_piece_of_work_runs(works: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gpu_works, "WARMUPS", 0)
     monkeypatch.setattr(gpu_works, "ITERATIONS", 2)
+    monkeypatch.setattr(gpu_works, "TRACKING_ITERATIONS", 2)
     found = gpu_works.time_works(works, 2)
     assert set(found) == {work for _, work in gpu_tables.COLUMNS}
     assert all(time["median_ms"] > 0 for time in found.values()) and float(works.all.alpha.max()) > 0.1

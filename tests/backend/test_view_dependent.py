@@ -10,8 +10,9 @@ from torch import Tensor
 
 from sigmasplat.config import MappingConfig
 from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.field import _step_for, fit_field, loss_weights
+from sigmasplat.fit.field import fit_field, loss_weights
 from sigmasplat.fit.step import TorchStep
+from sigmasplat.fit.steps import step_for
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.fit.view_dependent import ViewDependentStep
 from sigmasplat.model import se3
@@ -189,5 +190,5 @@ def test_frozen_colours_keep_their_harmonics_too() -> None:
 
 def test_degree_0_is_the_plain_step() -> None:
     view, weights = ReferenceView(CAMERA, OPTIONS), loss_weights(MappingConfig())
-    assert isinstance(_step_for(shiny_wall(), view, weights, 0), TorchStep)
-    assert isinstance(_step_for(shiny_wall(), view, weights, 1), ViewDependentStep)
+    assert isinstance(step_for(shiny_wall(), view, weights, 0), TorchStep)
+    assert isinstance(step_for(shiny_wall(), view, weights, 1), ViewDependentStep)

@@ -27,6 +27,9 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
+        (["rnu", "data/kitchen"], "no command 'rnu' (did you mean run?); there are demo, "),
+        (["evaluate", "--help"], "no command 'evaluate' (did you mean eval?)"),
+        (["xyzzy"], "no command 'xyzzy'; there are demo, inspect, run, resume, view, eval, mesh, export, download, be"),
         (["run", "/no/such/place"], "/no/such/place"),
         (["run", "."], "looked for"),
         (["run", "/no/such/place", "--preset", "quick"], "no preset 'quick'"),
@@ -71,6 +74,15 @@ def test_output_below_a_file_is_refused(capsys: pytest.CaptureFixture[str], tmp_
 def _sigmasplat(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "sigmasplat.cli", *arguments]
     return subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, timeout=60)
+
+
+def test_the_version_is_listed_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        cli.main(["--help"])
+    assert left.value.code == 0 and "sigmasplat --version    show which release" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as left:
+        cli.main(["--version"])
+    assert left.value.code == 0 and capsys.readouterr().out.startswith("sigmasplat ")
 
 
 def test_a_bad_environment_switch_is_one_line() -> None:

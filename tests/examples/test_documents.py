@@ -92,6 +92,26 @@ def test_documented_messages_are_those_of_the_source() -> None:
             assert any(words in constant for constant in constants), f"errors.md: no message says {words!r}"
 
 
+def test_every_warning_of_a_command_has_its_row() -> None:
+    text = (ROOT / "docs" / "errors.md").read_text(encoding="utf-8")
+    rows = [row.split("|")[2] for row in re.findall(r"^\|.*\| warning.*\|$", text, re.MULTILINE)]
+    warned = [
+        [
+            part.value
+            for part in ast.walk(node.args[0])
+            if isinstance(part, ast.Constant) and isinstance(part.value, str)
+        ]
+        for file in (PACKAGE / "commands").glob("*.py")
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "warn"
+    ]
+    said = [max((part.strip() for part in parts), key=len) for parts in warned if parts]
+    said = [words for words in said if len(words.split()) > 1]  # others say what a source has to say
+    assert len(said) >= 3
+    for words in said:
+        assert any(words in row for row in rows), f"errors.md: no row of a warning says {words!r}"
+
+
 def test_measured_tables_are_those_of_the_results(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     tables, record = map(importlib.import_module, ("tables", "record"))

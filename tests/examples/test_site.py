@@ -1,6 +1,7 @@
 """The documentation's site holds every page, every name and every source that pages link to; `make docs` builds it."""
 
 import ast
+import dataclasses
 import importlib
 import importlib.util
 import re
@@ -117,6 +118,17 @@ def test_the_api_pages_hold_every_module_and_every_public_name() -> None:
 
 def test_the_page_of_results_holds_all_of_them() -> None:
     assert "<!-- bench:* -->" in (DOCS / "benchmarks.md").read_text(encoding="utf-8")
+
+
+def test_every_setting_has_a_sentence_of_its_own() -> None:
+    settings, whole = theme("settings"), Config()
+    sections = [whole, *(value for value in vars(whole).values() if dataclasses.is_dataclass(value))]
+    for section in sections:
+        said = settings.sentences(settings.classes()[type(section).__name__].body)
+        names = {name for name, value in vars(section).items() if not dataclasses.is_dataclass(value)}
+        assert names == set(said), f"{type(section).__name__}: no sentence below {sorted(names - set(said))}"
+        short = [name for name, text in said.items() if len(text.split()) < 3 or not text.endswith((".", "…"))]
+        assert not short, f"{type(section).__name__}: {short} should say what they do, in a sentence"
 
 
 def test_the_page_of_settings_is_that_of_the_sources() -> None:

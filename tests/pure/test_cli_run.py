@@ -19,7 +19,7 @@ from rich.console import Console
 
 from sigmasplat import cli, session
 from sigmasplat.config import Config
-from sigmasplat.errors import SourceError
+from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.io.ply import read_field
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.submaps import DiskStore
@@ -29,6 +29,7 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.render import cuda_stages
 from sigmasplat.screen import Screen
 from sigmasplat.sources.base import Source
 
@@ -118,6 +119,7 @@ class MadeUpSlam:
         return step
 
     def finish(self, progress: Callable[[int, int], None]) -> None:
+        progress(0, 2)
         self.at.get("loops", lambda: None)()
         self.loops += self.tried.get("end", [])
         for done in (1, 2):
@@ -268,6 +270,28 @@ def test_a_crash_keeps_its_traceback_and_names_the_folder(corridor: Corridor) ->
     assert len(run.read_trajectory()) == 2
 
 
+@pytest.mark.parametrize("problem", [ZeroDivisionError("a bug"), SigmaSplatError("no depth"), KeyboardInterrupt()])
+def test_a_run_that_fails_before_its_first_frame_leaves_nothing(corridor: Corridor, problem: BaseException) -> None:
+    def fail() -> None:
+        raise problem
+
+    MadeUpSlam.at = {0: fail}
+    with pytest.raises((SystemExit, ZeroDivisionError)) as left:
+        cli.main(["run", "corridor"])
+    assert not getattr(left.value, "__notes__", []), "there is no folder to name"
+    assert not any(Path().iterdir()), "not even runs/"
+
+
+def test_what_is_in_the_folder_keeps_it(corridor: Corridor) -> None:
+    def fail() -> None:
+        Path("mine/notes.txt").write_text("the user's")
+        raise SigmaSplatError("no depth")
+
+    MadeUpSlam.at = {0: fail}
+    assert sigmasplat("run", "corridor", "--out", "mine") == 2
+    assert Path("mine/notes.txt").read_text() == "the user's" and Path("mine/run.json").is_file()
+
+
 CLOSED, REFUSED, LAST = MadeUpLoop(7, 0, True), MadeUpLoop(7, 2, False), MadeUpLoop(8, 1, True, 0.0149, 0.1206)
 
 
@@ -288,7 +312,7 @@ def test_submaps_and_loops_are_kept_and_told(corridor: Corridor, capsys: pytest.
     assert "frame 4: loop closed between submaps 7 and 0 (residual 0.021, moved 4.3 cm)" in said
     assert "at the end: loop closed between submaps 8 and 1 (residual 0.015, moved 12.1 cm)" in said
     assert said.count("loop closed") == 2
-    assert "final map 2/2" in said
+    assert "\nfinal map 0/2\n" in said and "\nfinal map 2/2\n" in said
     assert "3 submaps, loops: 2 closed, 1 refused" in said
     store = MadeUpSlam.latest.store
     assert isinstance(store, DiskStore) and store.folder == Path("mine/submaps")
@@ -315,6 +339,15 @@ def test_the_time_of_finishing_is_not_that_of_the_frames(corridor: Corridor, mon
     facts = RunFolder.open(Path("mine")).facts()
     assert (facts["wall_s"], facts["finish_s"]) == (5.0, 100.0)
     assert sum(RunFolder.open(Path("mine")).read_profile().values()) == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_stages_on_a_device_are_measured_where_a_profile_is_asked_for(corridor: Corridor, asked: bool) -> None:
+    seen = []
+    MadeUpSlam.at = {1: lambda: seen.append(cuda_stages.measured())}
+    assert sigmasplat("run", "corridor", "--no-eval", "--out", "mine", *["--profile"] * asked) == 0
+    cuda_stages.measure(False)
+    assert seen == [asked]
 
 
 @pytest.mark.parametrize("moment", ["loops", "finish 1"])

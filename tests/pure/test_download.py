@@ -122,6 +122,25 @@ def test_a_published_checksum_decides(algorithm: str, server: FileServer, tmp_pa
     assert obtained(public_set(server, archive), tmp_path) == FILES
 
 
+def test_a_download_that_brings_nothing_leaves_no_folders(server: FileServer, tmp_path: Path) -> None:
+    missing = public_set(server, Archive(server.url("/gone.tgz")))
+    with pytest.raises(DownloadError, match="cannot be had"):
+        obtained(missing, tmp_path / "data" / "deep")
+    assert not any(tmp_path.iterdir()), "what was made for it is taken back"
+    (tmp_path / "data").mkdir()
+    with pytest.raises(DownloadError, match="cannot be had"):
+        obtained(missing, tmp_path / "data" / "deep")
+    assert [path.name for path in tmp_path.rglob("*")] == ["data"], "what was there before stays"
+
+
+def test_what_has_come_of_a_download_keeps_its_folder(server: FileServer, tmp_path: Path) -> None:
+    server.files["/half.tgz"] = server.files["/desk.tgz"]
+    both = public_set(server, Archive(server.url("/half.tgz")), Archive(server.url("/gone.tgz")))
+    with pytest.raises(DownloadError, match="cannot be had"):
+        obtained(both, tmp_path)
+    assert (tmp_path / "test/half.tgz").read_bytes() == server.files["/desk.tgz"]
+
+
 def test_without_one_the_first_download_is_the_measure(server: FileServer, tmp_path: Path) -> None:
     obtained(public_set(server), tmp_path)
     record = tmp_path / "test/desk.tgz.sha256"

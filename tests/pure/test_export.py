@@ -21,7 +21,7 @@ from sigmasplat.model.trajectory import Trajectory
 
 @pytest.fixture
 def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """Run `sigmasplat export` beside a run, walk/, of ten splats and two poses; return what it prints."""
+    """Run `sigmasplat export` beside a run, walk/, of ten splats and two poses; return what it prints in the end."""
     monkeypatch.chdir(tmp_path)
     run = RunFolder.create(Path("walk"), Config(), "room")
     field = GaussianField.from_values(
@@ -39,7 +39,11 @@ def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
             cli.main(["export", *arguments])
         said = capsys.readouterr()
         assert left.value.code == 0, said.err
-        return said.out
+        *before, last = said.out.splitlines()
+        assert [line.split()[0] for line in before] == ["writing"] * (" splats" in last), (
+            "it says so before it takes long"
+        )
+        return last
 
     return run_it
 

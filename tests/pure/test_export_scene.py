@@ -35,7 +35,7 @@ def test_paths_are_written_by_name(here: Path, capsys: pytest.CaptureFixture[str
     assert len(list((here / "kitchen-colmap/images").iterdir())) == 3
     said = capsys.readouterr().out.splitlines()
     assert said[0].startswith("a.kitti.txt: 6 poses") and said[1].startswith("transforms.json: 5 views, no pictures")
-    assert said[2] == "kitchen-colmap: 3 views with their pictures"
+    assert said[2:] == ["pictures …", "pictures 3/3", "kitchen-colmap: 3 views with their pictures"]
 
 
 def test_film_plan_and_points_show_the_map(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -48,6 +48,7 @@ def test_film_plan_and_points_show_the_map(here: Path, capsys: pytest.CaptureFix
     assert json.loads((here / "kitchen.plan.json").read_text())["resolution_m"] == 0.1
     assert sigmasplat("export", "kitchen", "--out", "a.points.ply", "--voxel-m", "0.1") == 0
     said = capsys.readouterr().out
+    assert "film …\n" in said and "surface …\n" in said and "floor plan …\n" in said
     assert "a.gif: 2 images, 0.5 s" in said and "to scan again, also in kitchen.plan.json" in said
     assert "a.points.ply: " in said and " points, " in said
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from box_room import CAMERA, HIGH, LOW, seer, splats
 from room_run import FRAMES, LOST, PATH, T_ROOM, WORLD, Walls, made_run, picture
@@ -23,6 +23,7 @@ from sigmasplat.exports import (
 )
 from sigmasplat.exports.paths import map_points
 from sigmasplat.exports.video import from_above, sized
+from sigmasplat.metrics.film import Scale, legend_strip
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
@@ -131,6 +132,37 @@ def test_from_above_the_ceiling_is_gone_and_the_room_in_view() -> None:
         x, y, z, _ = np.linalg.inv(T) @ WORLD @ corners.T
         assert (z > 0.5).all() and (T_ROOM @ T)[2, 3] > 2.0
         assert (np.abs(CAMERA.fx * x / z) < 80).all() and (np.abs(CAMERA.fy * y / z) < 75).all()
+
+
+@pytest.mark.parametrize("width", [32, 48, 64, 96, 128, 160, 200, 320, 640])
+def test_what_is_written_under_a_film_can_be_read(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    boxes: list[tuple[float, float, float, float]] = []
+    words: list[str] = []
+    plain = ImageDraw.ImageDraw.text
+
+    def text(
+        draw: ImageDraw.ImageDraw, at: tuple[float, float], said: str, fill: str, font: object, anchor: str
+    ) -> None:
+        if said:
+            boxes.append(draw.textbbox(at, said, font=font, anchor=anchor))
+            words.append(said)
+        plain(draw, at, said, fill, font, anchor=anchor)
+
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", text)
+    strip = legend_strip(Scale((0.8, 12.4), (0.0, 0.23)), width)
+    assert strip.shape == (40, 3 * width, 3)
+    for i, (left, top, right, bottom) in enumerate(boxes):
+        assert left // width == (right - 1) // width and 0 < top < bottom < 40, f"{words[i]} leaves its panel"
+        for other in boxes[:i]:
+            apart = right + 2 < other[0] or other[2] + 2 < left or bottom <= other[1] or other[3] <= top
+            assert apart, f"{words[i]} is written over {words[boxes.index(other)]}"
+    if width >= 128:
+        assert " ".join(words).split() == ["colour", "depth", "0.8", "12.4", "m", "uncertainty", "0", "0.23"]
+    for panel in (1, 2):
+        bar = strip[:, panel * width : (panel + 1) * width].max(0) - strip[:, panel * width : (panel + 1) * width].min(
+            0
+        )
+        assert (bar.max(1) > 60).sum() >= 20, "a colour bar"
 
 
 def test_film_options_that_make_no_film_are_refused() -> None:

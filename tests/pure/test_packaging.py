@@ -1,5 +1,6 @@
 """What is handed out: metadata, extras, Dockerfile, command line, completion, and a module that asks for little."""
 
+import importlib.util
 import os
 import re
 import shutil
@@ -14,6 +15,7 @@ import pytest
 import sigmasplat
 from sigmasplat import doctor
 from sigmasplat.cli import COMMANDS
+from sigmasplat.io.machine import package_version
 from sigmasplat.presets import list_presets
 
 ROOT = Path(__file__).parents[2]
@@ -98,6 +100,76 @@ def test_sources_compile_without_a_warning() -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             compile(path.read_text(encoding="utf-8"), str(path), "exec")
+
+
+# --- which code it is ---------------------------------------------------------------------------------------------
+
+
+def git(folder: Path, *arguments: str) -> str:
+    """Run git in a folder, as somebody and without this machine's settings; return its answer."""
+    alone = {"GIT_CONFIG_GLOBAL": os.devnull, "GIT_CONFIG_SYSTEM": os.devnull}
+    as_somebody = ("-c", "user.name=T", "-c", "user.email=t@example.org")
+    command = ["git", "-C", str(folder), *as_somebody, *arguments]
+    return subprocess.run(command, env=os.environ | alone, capture_output=True, text=True, check=True).stdout.strip()
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """Make a repository of one commit that holds the one module that says what code it is."""
+    if not shutil.which("git"):
+        pytest.skip("no git here")
+    (tmp_path / "src/sigmasplat/io").mkdir(parents=True)
+    shutil.copy(ROOT / "src/sigmasplat/io/machine.py", tmp_path / "src/sigmasplat/io")
+    git(tmp_path, "init", "--quiet")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "--quiet", "--message", "one")
+    git(tmp_path, "tag", "-a", "v9", "-m", "a tag is not asked for")
+    return tmp_path
+
+
+def code_of(package: Path) -> str:
+    """Ask a copy of the package which code it is."""
+    spec = importlib.util.spec_from_file_location("machine_there", package / "io/machine.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return str(module.code())
+
+
+def test_code_is_the_checkouts_commit_then_the_builds_then_the_release(checkout: Path) -> None:
+    package, head = checkout / "src/sigmasplat", git(checkout, "rev-parse", "HEAD")
+    assert code_of(package) == head and len(head) == 40
+    (package / "commit.txt").write_text("0123abc")
+    assert code_of(package) == head, "of a checkout git knows more than an earlier build"
+    with (package / "io/machine.py").open("a") as file:
+        file.write("# changed\n")
+    assert code_of(package) == f"{head}-dirty"
+    shutil.rmtree(checkout / ".git")
+    assert code_of(package) == "0123abc"
+    (package / "commit.txt").write_text("")
+    assert code_of(package) == package_version()
+    (package / "commit.txt").unlink()
+    assert code_of(package) == package_version()
+
+
+def test_a_build_writes_down_its_commit(checkout: Path) -> None:
+    cmake = shutil.which("cmake") or str(Path(sys.executable).with_name("cmake"))
+    if not Path(cmake).exists():
+        pytest.skip("no cmake here")
+
+    def written(source: Path) -> str:
+        out = checkout / "out/commit.txt"
+        script = ROOT / "src/sigmasplat/native/commit.cmake"
+        subprocess.run([cmake, f"-DSOURCE={source}", f"-DOUT={out}", "-P", str(script)], check=True)
+        return out.read_text()
+
+    head = git(checkout, "rev-parse", "HEAD")
+    assert written(checkout) == head
+    assert written(checkout / "src") == "", "a repository further up is somebody else's"
+    (checkout / "src/sigmasplat/io/machine.py").write_text("")
+    assert written(checkout) == f"{head}-dirty"
+    text = (ROOT / "CMakeLists.txt").read_text()
+    assert "commit.cmake" in text and "install(FILES ${OUT} DESTINATION sigmasplat)" in text
+    assert "**.cmake" in PROJECT["tool"]["scikit-build"]["wheel"]["exclude"]
 
 
 # --- Dockerfile ---------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from PIL import Image
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources import open_source
-from sigmasplat.sources.registration import Registration
+from sigmasplat.sources.registration import MOST_PX, OVERLAP, Registration
 
 DEPTH = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 COLOR = Camera(80, 60, 70.0, 72.0, 40.0, 29.0)
@@ -56,6 +56,43 @@ def test_the_nearer_surface_hides_the_farther_one():
     assert (row[14:34] == 1.0).all(), "nothing shines through"
     assert (row[:13] == 4.0).all() and (row[40:61] == 4.0).all()
     assert (row[35:38] == 0.0).all(), "what the depth camera could not see stays unknown"
+
+
+def by_definition(depth_camera: Camera, color: Camera, T: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Draw one reading after the other, pixel by pixel."""
+    drawn = np.full((color.height, color.width), np.inf)
+    rays = depth_camera.rays().reshape(-1, 3).astype(np.float64) @ T[:3, :3].T
+    for ray, reading in zip(rays, depth.reshape(-1), strict=True):
+        x, y, z = ray * reading + T[:3, 3]
+        if reading <= 0 or z <= 1e-6:
+            continue
+        size = OVERLAP * reading / z
+        u, v = color.fx * x / z + color.cx, color.fy * y / z + color.cy
+        half_u = min(0.5 * size * color.fx / depth_camera.fx, MOST_PX)
+        half_v = min(0.5 * size * color.fy / depth_camera.fy, MOST_PX)
+        columns = [c for c in range(color.width) if u - half_u <= c <= u + half_u]
+        for r in range(color.height):
+            for c in columns if v - half_v <= r <= v + half_v else ():
+                drawn[r, c] = min(drawn[r, c], z)
+    return np.where(np.isinf(drawn), 0, drawn).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("depth_camera", "T_color_depth"),
+    [
+        (DEPTH, shifted(0.05, 0.02, 3.0)),
+        (Camera(120, 90, 110.0, 112.0, 60.0, 44.0), shifted(-0.03, 0.01, -2.0)),  # finer than colour
+        (Camera(12, 9, 10.0, 11.0, 6.0, 4.0), shifted(0.0, 0.1, 10.0)),  # coarser: squares of 8 px and more
+        (DEPTH, shifted(0.0, 0.0, 178.0)),  # looks the other way: some points lie at the camera itself
+    ],
+)
+def test_every_bit_is_that_of_the_definition(depth_camera, T_color_depth):
+    random = np.random.default_rng(1)
+    depth = random.uniform(0.3, 4.0, (depth_camera.height, depth_camera.width)).astype(np.float32)
+    depth[random.random(depth.shape) < 0.2] = 0
+    T_color_depth[2, 3] += 0.4
+    moved = Registration(depth_camera, COLOR, T_color_depth)(depth)
+    assert moved.any() and moved.tobytes() == by_definition(depth_camera, COLOR, T_color_depth, depth).tobytes()
 
 
 def test_no_reading_and_points_behind_give_none():

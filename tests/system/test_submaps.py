@@ -169,6 +169,23 @@ def test_an_heir_knows_what_is_in_view_and_an_empty_one_nothing() -> None:
     assert len(slam.mapper.successor(slam.view, T_submap_camera).field) == 0
 
 
+@pytest.mark.parametrize(
+    ("steps", "expected"), [("0", [(0, 1), (1, 1)]), ("2", [(0, 2), (0, 2), (1, 2), (2, 2), (2, 2)])]
+)
+def test_finishing_is_told_from_its_beginning_to_its_end(steps: str, expected: list[tuple[int, int]]) -> None:
+    slam, told, stored = Slam(settings(final__iterations=steps)), list[tuple[int, int]](), list[int]()
+    for frame in there_and_back()[:3]:
+        slam.step(frame)
+
+    def progress(done: int, total: int) -> None:
+        told.append((done, total))
+        stored.append(len(slam.store))
+
+    slam.finish(progress)
+    assert told == expected
+    assert stored[0] < stored[-1], "the first before the last submap is finished and its loops are tried"
+
+
 def test_an_unfinished_run_shows_all_submaps_side_by_side() -> None:
     slam = followed(settings(loops__close="false"), finish=False)
     assert len(slam.store) == 2

@@ -1,6 +1,7 @@
 """Carry a run through to its end: watched on the terminal and in the browser, kept now and then, scored."""
 
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,25 @@ def stage_for(screen: "Screen", ways: Ways) -> AbstractContextManager["Stage | N
     return on_stage(screen, ways.host, ways.port) if ways.view else nullcontext()
 
 
+@contextmanager
+def nothing_left_of(run: "RunFolder") -> Iterator[None]:
+    """Remove a run just begun if the block fails before anything is kept: not where there is a log, a recording, or a
+    file of the user's. The folder goes with it, and runs/ where that was all in it."""
+    from sigmasplat.session import RUNS
+
+    try:
+        yield
+    except BaseException:
+        born = [run.path / "config.json", run.path / "run.json"]  # that it is ours is the last that is lost of it
+        if {*run.path.rglob("*")} <= {run.images, *born}:
+            for file in born:
+                file.unlink(missing_ok=True)
+            for folder in (run.images, run.path, RUNS):
+                with suppress(OSError):
+                    folder.rmdir()
+        raise
+
+
 def announce(screen: "Screen", preset: str, source: "Source", folder: "RunFolder", record: Path | None) -> None:
     """Say what is run where; a live camera is recorded to `record`, or into the run folder, to be read again later."""
     from sigmasplat.session import free
@@ -42,12 +62,17 @@ def announce(screen: "Screen", preset: str, source: "Source", folder: "RunFolder
 def carry_through(
     screen: "Screen", begun: "Begun", source: "Source", folder: "RunFolder", ways: Ways, stage: "Stage | None"
 ) -> int:
-    """Run SLAM into the folder, live on the stage if there is one, then score it; return the exit code."""
+    """Run SLAM into the folder, live on the stage if there is one, then score it; return the exit code.
+
+    Raises KeyboardInterrupt where Ctrl-C came before the first frame was done.
+    """
     from sigmasplat.protocols import Together, Watcher
+    from sigmasplat.render import cuda_stages
     from sigmasplat.session import record
     from sigmasplat.snapshots import Snapshots
     from sigmasplat.sources.live import LiveSource
 
+    cuda_stages.measure(ways.profile)
     keeper = Snapshots(begun.slam, folder, ways.save_every)
     with screen.steps(None if source.live else len(source), begun.next_index) as steps:
         watch: Watcher = steps
@@ -56,6 +81,8 @@ def carry_through(
 
             watch = Together(steps, LiveView(begun.slam, stage.show, source.name))
         outcome = record(begun.slam, source, folder, watch, keeper, begun.next_index, begun.wall_s)
+    if outcome.status == "interrupted" and not outcome.frames:
+        raise KeyboardInterrupt  # there is nothing to tell of, nor to go on with
     if ways.profile:
         screen.profile(folder.read_profile())
     if source.skipped:

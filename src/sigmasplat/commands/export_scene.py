@@ -41,13 +41,27 @@ def _kitti(origin: Origin, target: Path, options: ExportOptions) -> str:
 def _nerfstudio(origin: Origin, target: Path, options: ExportOptions) -> str:
     from sigmasplat.exports import export_transforms
 
-    return _views(export_transforms(_recorded(origin, options), target, options.pictures), options)
+    return _views(_with_pictures(export_transforms, origin, target, options), options)
 
 
 def _colmap(origin: Origin, target: Path, options: ExportOptions) -> str:
     from sigmasplat.exports import export_colmap
 
-    return _views(export_colmap(_recorded(origin, options), target, options.pictures), options)
+    return _views(_with_pictures(export_colmap, origin, target, options), options)
+
+
+def _with_pictures(
+    export: "Callable[[Recorded, Path, bool, Callable[[int, int], None]], int]",
+    origin: Origin,
+    target: Path,
+    options: ExportOptions,
+) -> int:
+    """Export views, counting pictures where they are asked for; return how many views."""
+    recorded = _recorded(origin, options)
+    if not options.pictures:
+        return export(recorded, target, False, lambda done, total: None)
+    with _counting("pictures") as progress:
+        return export(recorded, target, True, progress)
 
 
 def _views(count: int, options: ExportOptions) -> str:

@@ -66,6 +66,7 @@ def _written(origin: Origin, options: ExportOptions, write: "Callable[[GaussianF
         medians = f"{doubt.sigmas(field).median():.3g} and {field.opacities.median():.3g}"
         raise RunError(f"no splat of {origin.path} is left (median σ and opacity are {medians}); give milder bounds")
     field.keep(kept.rows)
+    print(f"writing {len(field):,} splats …", flush=True)
     write(field)
     asked = options.sigma_below is not None or options.opacity_above is not None
     dropped = f"; dropped {kept.dropped:,} of {every:,}: {kept.by_sigma:,} for σ, {kept.by_opacity:,} for opacity"

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sigmasplat.commands import options
-from sigmasplat.commands.carrying import announce, carry_through, stage_for
+from sigmasplat.commands.carrying import announce, carry_through, nothing_left_of, stage_for
 from sigmasplat.commands.options import absolute, configured, prepare_torch, source_of
 from sigmasplat.errors import ConfigError
 from sigmasplat.presets import default_preset
@@ -68,10 +68,11 @@ def run(
         screen.warn("depth stays in its own camera's pixels; --register-depth on moves it to colour (see inspect)")
     with stage_for(screen, ways) as stage:
         folder = new_folder(out, config, source, overwrite, source_path=absolute(path))
-        announce(screen, config.name, source, folder, record)
-        prepare_torch()
-        begun = Begun(Slam(config, folder.submaps))
-        return carry_through(screen, begun, source, folder, ways, stage)
+        with nothing_left_of(folder):
+            announce(screen, config.name, source, folder, record)
+            prepare_torch()
+            begun = Begun(Slam(config, folder.submaps))
+            return carry_through(screen, begun, source, folder, ways, stage)
 
 
 def resume(

@@ -23,8 +23,12 @@ class Config:
     """A whole run. Every value has a working default; `presets.preset` fills in those of the published systems."""
 
     name: str = "custom"
+    """What the settings are called, in reports and folder names: the preset's name."""
     seed: int = 0
+    """Start of all random numbers; another one tells how much a result owes to chance."""
     backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
+    """What renders: auto = what SIGMASPLAT_BACKEND says, else cpu; cuda needs an NVIDIA GPU; reference is the slow
+    definition in plain torch, for machines without the compiled kernels."""
     input: InputConfig = field(default_factory=InputConfig)
     render: RenderConfig = field(default_factory=RenderConfig)
     seeding: SeedConfig = field(default_factory=SeedConfig)

@@ -22,17 +22,20 @@ class InputConfig:
     """Whether an unreadable image ends the sequence instead of being passed over."""
 
     color_topic: str = ""
+    """The topic of a ROS bag that colour is taken of; empty = found by what it holds."""
     depth_topic: str = ""
-    """The topics of a ROS bag to take; empty = found by what they hold."""
+    """… and depth."""
 
     calibration: str = ""
     """A calibration.json to use in place of what the recording says of its cameras."""
     fx: float = 0.0
+    """The colour camera's focal length in pixels, in place of the recording's; 0 = as recorded."""
     fy: float = 0.0
+    """… and the vertical one; 0 = as recorded, or as fx where nothing is."""
     cx: float = 0.0
+    """Column of its principal point, pixels; 0 = as recorded, or the image's centre where nothing is."""
     cy: float = 0.0
-    """The colour camera, pixels, in place of the recording's; 0 = as recorded. Where nothing is recorded, fy = fx,
-    and cx and cy are at the centre."""
+    """… and its row."""
     depth_scale: float = 0.0
     """PNG units per metre, in place of the recording's; 0 = as recorded."""
 
@@ -45,8 +48,9 @@ class InputConfig:
     crop_px: int = 0
     """Pixels dropped at every edge, after resizing: where an undistorted image or a sensor's depth has none."""
     min_depth_m: float = 0.1
+    """Nearer readings are none: what a sensor says below its range is noise."""
     max_depth_m: float = 8.0
-    """Readings beyond are treated as no reading."""
+    """Farther ones are none either: errors grow with the square of the depth."""
 
     def __post_init__(self) -> None:
         if self.stride < 1 or self.limit < 0:

@@ -30,6 +30,7 @@ class LoopConfig:
     descriptor: Literal["grid", "netvlad"] = "grid"
     """grid: built in (`slam.descriptors.OrientationGrid`); netvlad: from the file `weights`."""
     weights: str = ""
+    """The file of NetVLAD's weights that descriptor=netvlad needs; read at the start."""
     min_similarity: float = 0.5
     """A submap's own views are this share alike: which of their similarities is the threshold."""
     min_interval: int = 2
@@ -45,7 +46,10 @@ class LoopConfig:
     uncertainty: bool = True
     """Gate similarity by the variance-weighted opacity ratio; off = LoopSplat."""
     tau: float = 10.0
+    """τ of the weights of that ratio's splats by their σ²; smaller tells sure splats from doubtful ones more
+    sharply."""
     weight_max: float = 3.0
+    """… and their bounds: no splat counts more than this many times, or less than 1 / this."""
 
 
 @dataclass(frozen=True)
@@ -55,25 +59,35 @@ class RegistrationConfig:
     keyframes: int = 2
     """Of each submap so many keyframes are localised in the other one."""
     iterations: int = 100
+    """Adam's steps per keyframe at most, after it has been aligned; each is a render."""
     lr_rotation: float = 1.5e-2
+    """Rate of rotation in those steps, as `tracking.lr_rotation`."""
     lr_translation: float = 5e-3
+    """Rate of translation in them, metres per step."""
     plateau_stop: float = 1e-4
+    """They end when a step changes the loss by less than this share of it; 0 = when they are all done."""
     exposure: bool = True
+    """Whether a factor and an offset of the colour are fitted too: submaps may be of differently exposed images."""
     weight_color: float = 0.95
+    """λ_c of their loss; depth has 1 − λ_c."""
     uncertainty: bool = True
     """Weigh pixels by the other submap's V; off = LoopSplat."""
     tau: float = 50.0
+    """τ of those weights, as `tracking.tau`."""
     weight_max: float = 3.0
+    """… and their bounds: no pixel counts more than this many times, or less than 1 / this."""
     overlap_least: float = 0.2
     """Refused where fewer of the splats than this have a neighbour within `overlap_m` in the other submap."""
     overlap_m: float = 0.1
+    """How near a neighbour is that counts, metres; about what two maps of one wall may lie apart."""
     agreement_least: float = 0.8
     """A localisation counts if this share of the surfaces in common agrees in depth …"""
     share_least: float = 0.3
     """… and the other submap explains this share of the readings."""
     spread_m: float = 0.1
+    """Refused unless two localisations that count, at least, lie within this of one of them, metres …"""
     spread_deg: float = 5.0
-    """Refused unless two localisations that count, at least, lie within this of one of them."""
+    """… and are turned by no more than this against it."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +105,8 @@ class FinalConfig:
     spacing_m: float = 0.02
     """Distance of splats seeded on the mesh."""
     prune_every: int = 500
+    """Each so many steps splats that have faded go."""
     prune_opacity: float = 0.005
+    """Those no more opaque than this, 0 to 1."""
     uncertainty: bool = True
     """Merge by variance, keep σ² and its likelihood in refinement; off = paper."""

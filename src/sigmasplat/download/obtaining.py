@@ -3,7 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -64,8 +64,15 @@ def obtain(
             return target
     tell(f"{public.title} {name}".rstrip() + f": {said_size(recording.size_bytes)} → {target}")
     tell(f"terms: {public.licence} ({public.page}); by downloading you accept them")
-    _make(target.parent)
     errand = _Errand(public, target.parent, progress, tell, patience or Patience())
+    with _standing(target.parent):
+        _obtain(errand, name, target, keep_archive)
+    return target
+
+
+def _obtain(errand: _Errand, name: str, target: Path, keep_archive: bool) -> None:
+    """Download a recording's archives and unpack them to `target`."""
+    public, recording = errand.public, errand.public.recordings[name]
     archives = [_whole(errand, archive) for archive in recording.archives]
     with _in_place(target) as fresh:
         for archive, path in zip(recording.archives, archives, strict=True):
@@ -75,7 +82,6 @@ def obtain(
         (fresh / MARK).write_text(json.dumps(marks | {"from": [a.url for a in recording.archives]}, indent=1) + "\n")
     for path in [] if keep_archive else archives:
         path.unlink(missing_ok=True)
-    return target
 
 
 def _whole(errand: _Errand, archive: Archive) -> Path:
@@ -158,6 +164,20 @@ def _in_place(target: Path) -> Iterator[Path]:
             old.rename(target)
         _remove(fresh)
         _remove(old)
+
+
+@contextmanager
+def _standing(folder: Path) -> Iterator[None]:
+    """Make a folder, and those above it; if the block fails, take back which of them were made and are still empty."""
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    try:
+        _make(folder)
+        yield
+    except BaseException:
+        for place in made:
+            with suppress(OSError):
+                place.rmdir()
+        raise
 
 
 def _remove(folder: Path) -> None:

@@ -1,6 +1,6 @@
 """Write a run's path: KITTI, nerfstudio's transforms.json, COLMAP's text model; pictures beside it where asked for."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,12 @@ MOST_POINTS = 100_000
 LEAST_OPACITY = 0.5
 
 Floats = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+"""Is told (pictures done, of how many)."""
+
+
+def untold(done: int, total: int) -> None:
+    """Tell nobody."""
 
 
 def export_kitti(recorded: Recorded, target: Path) -> int:
@@ -28,13 +34,13 @@ def export_kitti(recorded: Recorded, target: Path) -> int:
     return len(recorded.path)
 
 
-def export_transforms(recorded: Recorded, target: Path, pictures: bool = False) -> int:
+def export_transforms(recorded: Recorded, target: Path, pictures: bool = False, progress: Progress = untold) -> int:
     """Write transforms.json; with `pictures` of the keyframes alone, and images/, depths/ and points.ply beside it.
 
     Without, of all frames that were not lost, their names those that `pictures` would give. Returns how many. Raises
     RunError.
     """
-    frames = write_pictures(recorded, target.parent, depth=True) if pictures else recorded.frames()
+    frames = write_pictures(recorded, target.parent, True, progress) if pictures else recorded.frames()
     if pictures:
         points_io.write_points(target.parent / POINTS, *map_points(recorded))
     nerfstudio.write_transforms(
@@ -49,7 +55,7 @@ def export_transforms(recorded: Recorded, target: Path, pictures: bool = False) 
     return len(frames)
 
 
-def export_colmap(recorded: Recorded, target: Path, pictures: bool = False) -> int:
+def export_colmap(recorded: Recorded, target: Path, pictures: bool = False, progress: Progress = untold) -> int:
     """Write a sparse model to sparse/0 in a folder; with `pictures` of the keyframes, which go to images/.
 
     Without, of all frames that were not lost. Returns how many. Raises RunError.
@@ -59,7 +65,7 @@ def export_colmap(recorded: Recorded, target: Path, pictures: bool = False) -> i
         model.mkdir(parents=True, exist_ok=True)
     except OSError as problem:
         raise RunError(f"cannot write {model}: {problem.strerror or problem}; choose a writable place") from problem
-    frames = write_pictures(recorded, target) if pictures else recorded.frames()
+    frames = write_pictures(recorded, target, False, progress) if pictures else recorded.frames()
     names = [picture_name(frame) for frame in frames]
     poses = recorded.path.T_world_camera[frames]
     colmap.write_model(model, recorded.camera, names, poses, *map_points(recorded))
@@ -71,15 +77,17 @@ def picture_name(frame: int) -> str:
     return f"frame-{frame:06d}.png"
 
 
-def write_pictures(recorded: Recorded, folder: Path, depth: bool = False) -> Sequence[int]:
+def write_pictures(recorded: Recorded, folder: Path, depth: bool = False, progress: Progress = untold) -> Sequence[int]:
     """Write what the keyframes saw, but lost ones; return their frames. Raises RunError if there is none."""
     trusted, written = set(recorded.frames()), []
-    for frame, picture in recorded.keyframes():
+    total = recorded.count_keyframes()
+    for done, (frame, picture) in enumerate(recorded.keyframes(), 1):
         if frame in trusted:
             pictures_io.write_color(folder / IMAGES / picture_name(frame), picture)
             if depth:
                 pictures_io.write_depth(folder / DEPTHS / picture_name(frame), picture)
             written.append(frame)
+        progress(done, total)
     if not written:
         raise RunError(f"run {recorded.run.path} has no keyframes to make pictures of; run it again")
     return written

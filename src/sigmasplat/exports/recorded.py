@@ -62,6 +62,10 @@ class Recorded:
         frames = self.frames()
         return Trajectory(self.path.timestamps_s[frames], self.path.T_world_camera[frames])
 
+    def count_keyframes(self) -> int:
+        """Return how many keyframes `keyframes` gives."""
+        return sum(bool(record["is_keyframe"]) for record in self.run.read_log()[: len(self.path)])
+
     def keyframes(self) -> Iterator[tuple[int, Picture]]:
         """Return what each keyframe saw, in the order of the frames, each once, one in memory at a time."""
         if not len(self.run.submaps):

@@ -1,22 +1,29 @@
 """Align two RGB-D images directly: Gauss–Newton on SE(3), coarse to fine, gray and depth residuals together.
 
 The reference may be a rendered map (tracking) or the previous frame (odometry). One render and a dozen steps of 0.1 ms
-replace dozens of renders.
+replace dozens of renders. It is done where the images lie: on the CPU, or on a CUDA device.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
+from sigmasplat.errors import BackendError
+from sigmasplat.fit import cuda_align
+from sigmasplat.fit.cuda_align import CudaLevel, Descent, Rules
 from sigmasplat.fit.pyramid import LEVELS, Pyramid
 from sigmasplat.model import se3
 from sigmasplat.render.backend import backend_module
 
 if TYPE_CHECKING:
     from sigmasplat.native import _core
+
+    Level = _core.Level | CudaLevel
 
 Matrix = NDArray[np.float64]
 
@@ -56,27 +63,17 @@ class Alignment:
         for H, built of noisy image gradients, is several times too steep. A degenerate direction has `UNKNOWN_M` of
         deviation. Infinite where nothing was in common.
         """
-        finest = self.pair.level(0)
-        n = normal_equations(finest, self.T_live_reference)
+        half_rad = 0.5 / self.pair.reference.cameras[0].fx
+        steps = np.repeat([half_rad * self.pair.depth_m, half_rad], 3)
+        aside = [se3.exp(sign * twist) @ self.T_live_reference for twist in np.diag(steps) for sign in (1.0, -1.0)]
+        n, *around = normal_equations(self.pair.level(0), [self.T_live_reference, *aside])
         if n.sums[1] < MIN_PIXELS:
             return np.diag(np.full(6, np.inf))
         directions, decided = _axes(n, self.pair.depth_m)
         basis, unknown = directions[:, decided], directions[:, ~decided]
-        slope = basis.T @ self._slope(finest) @ basis
+        slope = basis.T @ _slope(around, steps) @ basis
         bread = basis @ np.linalg.inv(slope) @ basis.T
         return np.asarray(bread @ n.S @ bread.T + UNKNOWN_M**2 * unknown @ unknown.T)
-
-    def _slope(self, finest: "_core.Level") -> Matrix:
-        """Differentiate the pull by the twist, by central differences of half a pixel; symmetric."""
-        half_rad = 0.5 / self.pair.reference.cameras[0].fx
-        steps, D = np.repeat([half_rad * self.pair.depth_m, half_rad], 3), np.zeros((6, 6))
-        for k, step in enumerate(steps):
-            ahead, behind = (
-                normal_equations(finest, se3.exp(sign * step * np.eye(6)[k]) @ self.T_live_reference).b
-                for sign in (1.0, -1.0)
-            )
-            D[:, k] = (ahead - behind) / (2.0 * step)
-        return 0.5 * (D + D.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,18 +85,14 @@ class Pair:
     weight_color: float
     depth_m: float
 
-    def level(self, k: int) -> "_core.Level":
+    def level(self, k: int) -> "Level":
         """Lay one level of the pyramids out for the kernels."""
+        laid_out = _laid_out(self.reference, self.live, self.weight_color, k)
+        if self.reference.on_device:
+            return CudaLevel(*laid_out)
         from sigmasplat.native import _core
 
-        reference, live, width = self.reference, self.live, min(k, LEVELS - 1)
-        c = reference.cameras[k]
-        numbers = [self.weight_color, 1.0 - self.weight_color]
-        numbers += [HUBER_GRAY[width], HUBER_DEPTH_RELATIVE[width], DEPTH_GATES_M[width]]
-        return _core.Level(
-            reference.gray[k], reference.depth[k], reference.weight[k], reference.weight_depth[k],
-            live.gray[k], live.depth[k], [c.fx, c.fy, c.cx, c.cy], numbers,
-        )  # fmt: skip
+        return _core.Level(*laid_out)
 
 
 @dataclass(eq=False)
@@ -114,13 +107,17 @@ class Normal:
     """Weighted cost, pixels used, pixels in view with depth, pixels agreeing in depth."""
 
 
-def normal_equations(level: "_core.Level", T_live_reference: Matrix) -> Normal:
-    """Linearise the residuals of a level at a motion."""
-    from sigmasplat.native import _core
+def normal_equations(level: "Level", motions: Sequence[Matrix]) -> list[Normal]:
+    """Linearise the residuals of a level at each of some motions T_live_reference, at most `cuda_align.MOTIONS`."""
+    rows = np.zeros((len(motions), cuda_align.NORMAL_TERMS))
+    if isinstance(level, CudaLevel):
+        rows = level.normal_equations(np.stack(motions))
+    else:
+        from sigmasplat.native import _core
 
-    H, b, S, sums = np.zeros(21), np.zeros(6), np.zeros(21), np.zeros(4)
-    _core.align_step(level, T_live_reference, H, b, S, sums)
-    return Normal(_symmetric(H), b, _symmetric(S), sums)
+        for row, T in zip(rows, motions, strict=True):
+            _core.align_step(level, T, row[:21], row[21:27], row[31:], row[27:31])
+    return [Normal(_symmetric(row[:21]), row[21:27], _symmetric(row[31:]), row[27:31]) for row in rows]
 
 
 def align(
@@ -138,34 +135,50 @@ def align(
     when the cost has changed by less than `plateau_stop` of it (0 = off). If the finest does neither its best iterate
     stands. Directions the images say nothing about keep the guess.
     weight_color in [0, 1] balances gray against depth, each in units of its Huber width.
-    Raises BackendError without the compiled kernels.
+    Raises BackendError without the compiled kernels, or where one image lies on a device and the other does not.
     """
-    backend_module("cpu")  # refuses in one line where the kernels are not built
-    from sigmasplat.native import _core
-
-    pair = Pair(reference, live, weight_color, _usual_depth(reference))
-    T, sums, levels = np.array(T_live_reference, np.float64), np.zeros(4), range(len(reference.cameras))
-    steps, degenerate = _core.align_images(
-        [pair.level(k) for k in levels], iterations, update_stop, plateau_stop, pair.depth_m, DEGENERATE, MIN_PIXELS,
-        T, sums,
-    )  # fmt: skip
-    reference_pixels = max(int((reference.depth[0] > 0).sum()), 1)
+    if reference.on_device != live.on_device:
+        raise BackendError("one image to align lies on a device, the other does not; make both for the same view")
+    rules, readings = Rules(iterations, update_stop, plateau_stop, DEGENERATE, MIN_PIXELS), reference.readings
+    levels = [_laid_out(reference, live, weight_color, k) for k in range(len(reference.cameras))]
+    if isinstance(readings, Tensor):
+        found = cuda_align.descend([CudaLevel(*level) for level in levels], readings, T_live_reference, rules)
+    else:
+        found = _descend(levels, readings, T_live_reference, rules)
     return Alignment(
-        se3.orthonormalise(T),
-        agreement=float(sums[3] / max(sums[2], 1.0)),
-        overlap=float(sums[2] / reference_pixels),
-        degenerate=degenerate,
-        cost=float(sums[0] / max(sums[1], 1.0)),
-        steps=steps,
-        pair=pair,
+        se3.orthonormalise(found.T),
+        agreement=float(found.sums[3] / max(found.sums[2], 1.0)),
+        overlap=float(found.sums[2] / max(found.readings, 1.0)),
+        degenerate=found.degenerate,
+        cost=float(found.sums[0] / max(found.sums[1], 1.0)),
+        steps=found.steps,
+        pair=Pair(reference, live, weight_color, found.depth_m),
     )
 
 
-def _usual_depth(reference: Pyramid) -> float:
-    """Return the mean depth of a reference, metres: what turns a rotation into the shift it makes."""
-    coarse = reference.depth[-1]
-    read = coarse[coarse > 0]
-    return float(read.mean()) if len(read) else 1.0
+def _laid_out(reference: Pyramid, live: Pyramid, weight_color: float, k: int) -> tuple[Any, ...]:
+    """Return what makes a `Level`: planes of one level, intrinsics, and how residuals are weighed."""
+    c, width = reference.cameras[k], min(k, LEVELS - 1)
+    numbers = [weight_color, 1.0 - weight_color]
+    numbers += [HUBER_GRAY[width], HUBER_DEPTH_RELATIVE[width], DEPTH_GATES_M[width]]
+    return (
+        reference.gray[k], reference.depth[k], reference.weight[k], reference.weight_depth[k],
+        live.gray[k], live.depth[k], [c.fx, c.fy, c.cx, c.cy], numbers,
+    )  # fmt: skip
+
+
+def _descend(levels: Sequence[tuple[Any, ...]], readings: Matrix, guess: Matrix, rules: Rules) -> Descent:
+    """Do on the CPU what `cuda_align.descend` does on a device."""
+    backend_module("cpu")  # refuses in one line where the kernels are not built
+    from sigmasplat.native import _core
+
+    (depth_m, n), T, sums = readings.tolist(), np.array(guess, np.float64), np.zeros(4)
+    r = rules
+    steps, degenerate = _core.align_images(
+        [_core.Level(*level) for level in levels], r.iterations, r.update_stop, r.plateau_stop, depth_m,
+        r.degenerate_share, r.min_pixels, T, sums,
+    )  # fmt: skip
+    return Descent(T, sums, steps, degenerate, depth_m, n)
 
 
 def _axes(n: Normal, depth_m: float) -> tuple[Matrix, NDArray[np.bool_]]:
@@ -176,6 +189,13 @@ def _axes(n: Normal, depth_m: float) -> tuple[Matrix, NDArray[np.bool_]]:
     unit = np.repeat([1.0, 1.0 / depth_m], 3)
     eigenvalues, directions = np.linalg.eigh(n.H * np.outer(unit, unit))
     return directions * unit[:, None], eigenvalues > DEGENERATE * max(eigenvalues[-1], 1e-300)
+
+
+def _slope(around: Sequence[Normal], steps: Matrix) -> Matrix:
+    """Differentiate the pull by the twist, by central differences: steps [6] ahead and behind; symmetric."""
+    pulls = np.stack([n.b for n in around])
+    D = ((pulls[::2] - pulls[1::2]) / (2.0 * steps[:, None])).T
+    return np.asarray(0.5 * (D + D.T))
 
 
 def _symmetric(upper: Matrix) -> Matrix:

@@ -12,11 +12,12 @@ def uncertainty_weights(variance: Tensor, mask: Tensor, tau: float, weight_max: 
     and the median of log(V+ε) over mask [H, W] (of an even count the lower middle one). Every pixel gets a weight, the
     mask chooses whose median; an empty mask gives weight 1 everywhere.
     """
-    if not mask.any():
-        return torch.ones_like(variance)
-    log_variance = (variance.clamp(min=0.0) + eps).log()
-    median = log_variance[mask].median(0).values
-    return torch.exp((median - log_variance) / tau).clamp(1.0 / weight_max, weight_max)
+    log_variance, n = (variance.clamp(min=0.0) + eps).log(), mask.sum()
+    known_first = torch.where(mask[..., None], log_variance, torch.inf).flatten(0, -2).sort(0).values
+    # Looked up by a tensor: on a device no host waits for the number of pixels.
+    median = known_first.index_select(0, (n - 1).clamp(min=0)[None] // 2)
+    weights = torch.exp((median - log_variance) / tau).clamp(1.0 / weight_max, weight_max)
+    return torch.where(n > 0, weights, 1.0)
 
 
 @torch.no_grad()

@@ -5,10 +5,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates
-from sigmasplat.fit.step import SHAPE_TERMS, Weights, render_for
+from sigmasplat.fit.adam import Rates
+from sigmasplat.fit.cuda_rows import pull_shapes, step_rows
+from sigmasplat.fit.step import Weights, render_for
 from sigmasplat.fit.target import Target
 from sigmasplat.model.field import GaussianField
+from sigmasplat.render.covariance_view import CudaCovarianceView
 from sigmasplat.render.cuda_launch import blocks_for
 from sigmasplat.render.cuda_view import CudaView
 from sigmasplat.render.view import Matrix
@@ -18,35 +20,25 @@ TILE = 16
 CHANNELS = 3
 
 
-class Loss:
-    """A loss on a device; the host waits for it when it is first read, unless it came with something else before."""
-
-    def __init__(self, there: Tensor) -> None:
-        self.there, self.here = there, np.nan
-
-    def __float__(self) -> float:
-        if np.isnan(self.here):
-            self.here = float(self.there)
-        return self.here
-
-
 class CudaStep:
-    """The image terms, the way back and Adam's step on a device. The host waits once, at its end, for twist and loss
-    together."""
+    """The image terms, the way back and Adam's step on a device. The host waits for none of it: see `step.arrived`.
+
+    On a view of ten planes it fits the full colour covariance, as `FullCovarianceStep` does.
+    """
 
     def __init__(self, view: CudaView) -> None:
         self.view = view
         (height, width), device = view.alpha.shape, view.alpha.device
         self._size, self._pixels = (width, height), width * height
         self._derivatives = torch.empty(3 * CHANNELS, height, width, device=device)
-        self._taps, self._loss = _gaussian_taps(), Loss(torch.zeros((), dtype=torch.float64, device=device))
+        self._taps = _gaussian_taps()
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
         """Render the field to the view's planes."""
         render_for(self.view, field.params, T_camera_world, target, weights)
 
-    def images(self, target: Target, weights: Weights) -> Loss:
-        """Write the gradient of every image term to the view's gradient planes; return the loss, on its way."""
+    def images(self, target: Target, weights: Weights) -> Tensor:
+        """Write the gradient of every image term to the view's gradient planes; return the loss, on the device."""
         v, per_pixel = self.view, 1.0 / max(target.valid_pixels, 1)
         local = np.array([weights.get(name, 0.0) for name in LOCAL_TERMS])
         local[2:4] *= len(v.sums) >= 7
@@ -60,8 +52,16 @@ class CudaStep:
             sums,
         )  # fmt: skip
         loss = sums.sum()
-        self._loss = Loss(loss + self._ssim(target, weights["ssim"]) if weights["ssim"] else loss)
-        return self._loss
+        if isinstance(v, CudaCovarianceView):
+            loss = loss + self._full_covariance(target, weights.get("nll_color_full", 0.0) * per_pixel / CHANNELS)
+        return loss + self._ssim(target, weights["ssim"]) if weights["ssim"] else loss
+
+    def _full_covariance(self, target: Target, weight: float) -> Tensor:
+        raster, blocks = self.view.raster, blocks_for(self._pixels)
+        costs = raster.empty(blocks, 1, dtype=torch.float64)
+        planes = (self.view.sums, target.color, target.depth)
+        raster.launch_fit("nll_color_full", blocks, *planes, self._pixels, weight, self.view.g_sums, costs)
+        return costs.sum()
 
     def _ssim(self, target: Target, weight: float) -> Tensor:
         v, (width, height) = self.view, self._size
@@ -75,25 +75,16 @@ class CudaStep:
 
     def splats(
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, pull: Tensor | None = None
-    ) -> tuple[Matrix, float]:
-        """Do what `TorchStep.splats` does."""
-        raster, n, gradient = self.view.raster, len(field), torch.empty_like(field.params)
-        twist = self.view.backward_there(field.params, gradient, pull)
-        visible, (isotropy, ratio) = raster.visible, (weights.get(name, 0.0) for name in SHAPE_TERMS)
-        costs = raster.empty(blocks_for(n), 1, dtype=torch.float64)
-        raster.launch_fit(
-            "shape_terms", blocks_for(n), field.params, visible, visible.sum(dtype=torch.int64), n, frozen_colors,
-            isotropy / (3.0 * max(n, 1)), float(ratio), gradient, costs,
-        )  # fmt: skip
-        numbers = [BETA1, BETA2, EPSILON, 1.0 / (1.0 - BETA1**field.steps), 1.0 / (1.0 - BETA2**field.steps)]
-        raster.launch_fit(
-            "adam", blocks_for(gradient.numel()), field.params, field.moment1, field.moment2, field.last_step, visible,
-            gradient, gradient.numel(), rates.per_column.numpy(), np.array(numbers, np.float32), field.steps,
-        )  # fmt: skip
-        field.last_step.masked_fill_(visible.bool(), field.steps)
-        found = torch.cat([twist, costs.sum(0), self._loss.there[None]]).cpu().numpy()
-        self._loss.here = float(found[7])
-        return found[:6], float(found[6])
+    ) -> tuple[Tensor, Tensor]:
+        """Do what `TorchStep.splats` does, or `FullCovarianceStep.splats`; twist and cost stay on the device."""
+        view, gradient = self.view, torch.empty_like(field.params)
+        twist, visible = view.backward_there(field.params, gradient, pull), view.raster.visible
+        cost = pull_shapes(view, visible, field, gradient, weights, frozen_colors)
+        step_rows(view, visible, field, gradient, rates)
+        if isinstance(view, CudaCovarianceView):
+            view.correlations.steps += 1
+            step_rows(view, visible, view.correlations, view.g_correlations, rates.of_extra("correlations"))
+        return twist, cost
 
 
 def _gaussian_taps() -> NDArray[np.float32]:

@@ -9,17 +9,13 @@ import numpy as np
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig
-from sigmasplat.errors import ConfigError
 from sigmasplat.fit.adam import Rates, settle
-from sigmasplat.fit.color_covariance import CovarianceView, FullCovarianceStep
-from sigmasplat.fit.cuda_step import CudaStep
-from sigmasplat.fit.step import COMPILED_TERMS, CompiledImages, CompiledStep, Gathered, TorchStep
+from sigmasplat.fit.step import Twist, arrived
+from sigmasplat.fit.steps import gathering, step_for
 from sigmasplat.fit.target import Keyframe
-from sigmasplat.fit.view_dependent import ViewDependentStep
 from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.render.cuda_view import CudaView
-from sigmasplat.render.view import CpuView, Matrix, ReferenceView, View
+from sigmasplat.render.view import CpuView, Matrix, View
 
 
 @dataclass
@@ -140,66 +136,31 @@ class _Steps:
     ) -> None:
         self.field, self.view, self.weights, self.frozen_colors, self.felt = field, view, weights, frozen_colors, felt
         field.moment1[:frozen_colors, COLUMNS["colors"]] = 0.0  # or they would coast on
-        self.step = _step_for(field, view, weights, degree)
+        self.step = step_for(field, view, weights, degree)
         self.pull = None if felt is None else field.params.new_zeros(len(field))
 
     def take(self, batch: Sequence[Keyframe], rates: Rates, fit: FieldFit) -> tuple[float, list[Matrix]]:
         """Step against the mean loss of a batch; return that loss, and of each image its own pose twist [6]."""
         self.field.steps += 1
-        gathered = self._gathered(len(batch))
-        loss, shape, twists = 0.0, 0.0, list[Matrix]()
+        gathered = gathering(self.step, self.field) if len(batch) > 1 else None
+        costs, shape, twists = list[float | Tensor](), list[float | Tensor](), list[Twist]()
         for keyframe in batch:
             t, target = time.perf_counter(), keyframe.target.on(self.field.params.device)
             self.step.forward(self.field, se3.inverse(keyframe.T_world_camera), target, self.weights)
             t = fit.add("forward", t)
-            cost = self.step.images(target, self.weights)
+            costs.append(self.step.images(target, self.weights))
             t = fit.add("loss", t)
             if gathered is None:
-                twist, shape = self.step.splats(self.field, rates, self.weights, self.frozen_colors, self.pull)
+                twist, cost = self.step.splats(self.field, rates, self.weights, self.frozen_colors, self.pull)
+                shape.append(cost)
             else:
-                twist = gathered.add(self.view, self.field, 1.0 / len(batch), self.pull)
+                twist = gathered.add(self.field, 1.0 / len(batch), self.pull)
             twists.append(twist)
-            loss += float(cost) / len(batch)  # read last: from a device it comes with the twist
             if self.felt is not None and self.pull is not None:
                 self.felt(keyframe, self.pull)
             t = fit.add("backward", t)
         if gathered is not None:
-            shape = gathered.step(self.field, rates, self.weights, self.frozen_colors)
-            fit.add("backward", t)
-        return loss + shape, twists
-
-    def _gathered(self, images: int) -> Gathered | None:
-        """Make room for the gradient of several images; None for one, whose step need not hold it."""
-        if images == 1:
-            return None
-        if isinstance(self.step, FullCovarianceStep | ViewDependentStep):
-            raise ConfigError("mapping.frames_per_step must be 1 with full colour covariance or view-dependent colour")
-        return Gathered(self.field)
-
-
-def _step_for(
-    field: GaussianField, view: View, weights: dict[str, float], degree: int
-) -> TorchStep | CompiledStep | CudaStep | FullCovarianceStep | ViewDependentStep:
-    """Take the fused kernels where they know every term that has weight, else the definition.
-
-    Raises ConfigError where full colour covariance meets terms that its view does not make maps for.
-    """
-    step: TorchStep | CompiledStep | FullCovarianceStep = TorchStep(view)
-    if weights["nll_color_full"] and not isinstance(view, CpuView | ReferenceView):
-        raise ConfigError(
-            "mapping.color_covariance full is not made for CUDA; take --set backend=cpu or leave it diagonal"
-        )
-    compiled = {name for name, weight in weights.items() if weight} <= {*COMPILED_TERMS, "nll_color_full"}
-    if weights["nll_color_full"] and isinstance(view, CpuView | ReferenceView):
-        if weights["alignment"] or weights["moment"]:
-            raise ConfigError(
-                "mapping.color_covariance full goes without weight_alignment and weight_moment; set both to 0"
-            )
-        wide = CovarianceView(view, field.carry("correlations"))
-        fused = compiled and isinstance(view, CpuView)
-        step = FullCovarianceStep(wide, CompiledImages(wide) if fused else TorchStep(wide))
-    elif compiled and isinstance(view, CpuView):
-        step = CompiledStep(view)
-    elif compiled and isinstance(view, CudaView) and not degree:
-        return CudaStep(view)
-    return ViewDependentStep(step, degree) if degree else step
+            shape.append(gathered.step(self.field, rates, self.weights, self.frozen_colors))
+        here, numbers = arrived(twists, [*costs, *shape])
+        fit.add("backward", t)
+        return sum(cost / len(batch) for cost in numbers[: len(costs)]) + sum(numbers[len(costs) :]), here

@@ -32,7 +32,7 @@ def term(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
 
 
 def total(weights: Mapping[str, float], maps: Mapping[str, Tensor]) -> Tensor:
-    """Add up weight × term; a term of weight 0 is not computed and its maps may be absent.
+    """Add up weight × term to a scalar []; a term of weight 0 is not computed and its maps may be absent.
 
     Raises ConfigError if a weight names no term, KeyError if a term's map is missing.
     """
@@ -52,20 +52,20 @@ def masked(values: Tensor, valid: Tensor, fill: float = 0.0) -> Tensor:
 
 
 def mean_over(values: Tensor, valid: Tensor) -> Tensor:
-    """Average values [H, W] or [H, W, C] over valid pixels and channels; 0 if there are none."""
+    """Average values [H, W] or [H, W, C] over valid [H, W] and channels, in their unit []; 0 if none is valid."""
     channels = values.numel() // max(valid.numel(), 1)
     return masked(values, valid).sum() / (valid.sum() * channels).clamp(min=1)
 
 
 @term
 def l1(color: Tensor, color_target: Tensor, valid: Tensor) -> Tensor:
-    """Take mean |Ĉ − C| over valid pixels × 3 (VarSplat §2, L_color)."""
+    """Take mean |Ĉ − C| of colours [H, W, 3] in [0, 1] over valid [H, W] × 3 (VarSplat §2, L_color)."""
     return mean_over(masked(color - color_target, valid).abs(), valid)
 
 
 @term
 def ssim(color: Tensor, color_target: Tensor, valid: Tensor) -> Tensor:
-    """Take 1 − mean SSIM over all pixels × 3 with both images 0 where not valid and beyond the border (VarSplat §2).
+    """Take 1 − mean SSIM of colours [H, W, 3], both 0 where not valid [H, W] and beyond the border (VarSplat §2).
 
     Windows without valid pixels are equal in both (SSIM 1): they dilute the mean, as in the released code.
     """
@@ -93,39 +93,42 @@ def _blur(planes: Tensor) -> Tensor:
 
 @term
 def depth(depth: Tensor, depth_target: Tensor, valid: Tensor) -> Tensor:
-    """Take mean |D̂ − D| in metres over valid pixels with a reading (VarSplat §2, L_depth)."""
+    """Take mean |D̂ − D| of depths [H, W] m over valid [H, W] with a reading, m (VarSplat §2, L_depth)."""
     valid = valid & (depth_target > 0)
     return mean_over(masked(depth - depth_target, valid).abs(), valid)
 
 
 @term
 def isotropy(scales: Tensor) -> Tensor:
-    """Take mean |s_i − mean(s_i)| in metres over splats × 3 axes (VarSplat §2, L_reg); 0 without splats."""
+    """Take mean |s_i − mean(s_i)| of scales [N, 3] m over splats × 3, m (VarSplat §2, L_reg); 0 without splats."""
     off = scales - scales.mean(1, keepdim=True)
     return off.abs().sum() / max(off.numel(), 1)
 
 
 @term
 def isotropy_ratio(scales: Tensor) -> Tensor:
-    """Take mean max(s_i) / min(s_i) − 1 over splats in view (CG-SLAM eq. 17, ε = 1); 0 without splats."""
+    """Take mean max(s_i) / min(s_i) − 1 of scales [N, 3] m in view (CG-SLAM eq. 17, ε = 1); 0 without splats."""
     return (scales.amax(1) / scales.amin(1) - 1.0).sum() / max(len(scales), 1)
 
 
 @term
 def nll_color(color: Tensor, color_target: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
-    """Take the Gaussian NLL of the colour residual under V (VarSplat §2, L_var); trains variance only."""
+    """Take the Gaussian NLL of colours [H, W, 3] under V [H, W, 3] (VarSplat §2, L_var); trains variance only."""
     return gaussian_nll(color - color_target, variance, valid)
 
 
 @term
 def nll_depth(depth: Tensor, depth_target: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
-    """Take the Gaussian NLL of the depth residual, the same for each channel of V (VarSplat §2, L_var)."""
+    """Take the Gaussian NLL of depths [H, W] m, the same for each channel of V [H, W, 3] (VarSplat §2, L_var)."""
     residual = (depth - depth_target)[..., None].expand_as(variance)
     return gaussian_nll(residual, variance, valid & (depth_target > 0))
 
 
 def gaussian_nll(residual: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
-    """Take mean ½ r²/(V+ε) + ½ log(V+ε), ε = 1e-6, r detached; V is clamped at 0 here only, never the map itself."""
+    """Take mean ½ r²/(V+ε) + ½ log(V+ε) over valid [H, W] × C, ε = 1e-6, of residuals r, detached, and V [H, W, C].
+
+    V is clamped at 0 here only, never the map itself.
+    """
     r = masked(residual.detach(), valid)
     v = masked(variance, valid, fill=1.0).clamp(min=0.0) + NLL_EPS
     return mean_over(0.5 * r * r / v + 0.5 * v.log(), valid)
@@ -133,7 +136,7 @@ def gaussian_nll(residual: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
 
 @term
 def nll_color_full(color: Tensor, color_target: Tensor, covariance: Tensor, valid: Tensor) -> Tensor:
-    """Take the Gaussian NLL of the colour residual under the full V; trains V only, as `nll_color` does.
+    """Take the Gaussian NLL of colours [H, W, 3] under the full V [H, W, 6]; trains V only, as `nll_color` does.
 
     Mean over valid pixels × 3 of ½ rᵀ (V+εI)⁻¹ r + ½ log det (V+εI), so that it is `nll_color` where nothing lies
     beside the diagonal. V+εI = L diag(d) Lᵀ, L with ones on its diagonal: then it is ½ y²/d + ½ log d with L y = r. No
@@ -154,14 +157,14 @@ def nll_color_full(color: Tensor, color_target: Tensor, covariance: Tensor, vali
 
 @term
 def moment(moment: Tensor, valid: Tensor) -> Tensor:
-    """Take mean |U| in m² over valid pixels (CG-SLAM, L_var)."""
+    """Take mean |U| of the moment [H, W] m² over valid [H, W], m² (CG-SLAM, L_var)."""
     return mean_over(masked(moment, valid).abs(), valid)
 
 
 @term
 def alignment(depth: Tensor, median_depth: Tensor, valid: Tensor) -> Tensor:
-    """Take mean |D̂ − D̂m| in metres over valid pixels, 0 where no splat takes half the light (CG-SLAM eq. 16).
+    """Take mean |D̂ − D̂m| of depths [H, W] m over valid [H, W], m; 0 without a median (CG-SLAM eq. 16).
 
-    Both sides are pulled: surfaces come to lie where half the light is gone.
+    A median is where a splat takes half the light. Both sides are pulled: surfaces come to lie there.
     """
     return masked((depth - median_depth).abs(), valid & (median_depth > 0)).sum() / valid.sum().clamp(min=1)

@@ -1,44 +1,72 @@
 """Halve images again and again: what alignment works on, coarse to fine."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import sobel
+from torch import Tensor
 
+from sigmasplat.fit import cuda_pyramid
 from sigmasplat.model.camera import Camera
 
 Image = NDArray[np.float32]
+Plane = Image | Tensor
+"""An image on the CPU, or a float32 tensor on the CUDA device that is to align it."""
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 LEVELS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Pyramid:
-    """Gray in [0, 1] and depth in metres (0 = none) at halving sizes, finest first; weights of both; cameras."""
+    """Gray in [0, 1] and depth in metres (0 = none) at halving sizes, finest first; weights of both; cameras.
 
-    gray: list[Image]
-    depth: list[Image]
-    weight: list[Image | None]
-    weight_depth: list[Image | None]
+    Its planes are arrays, or tensors on the CUDA device that aligns them.
+    """
+
+    gray: list[Plane]
+    depth: list[Plane]
+    weight: list[Plane | None]
+    weight_depth: list[Plane | None]
     cameras: list[Camera]
 
-    def weighed(self, weight: Image | None, weight_depth: Image | None = None) -> "Pyramid":
+    @property
+    def on_device(self) -> bool:
+        """Tell whether the planes are tensors on a device, to be aligned there."""
+        return isinstance(self.gray[0], Tensor)
+
+    @cached_property
+    def readings(self) -> "NDArray[np.float64] | Tensor":
+        """Return the mean depth of the coarsest level, metres (1 where nothing is read), and how many pixels of the
+        finest have a reading, float64 [2], where the planes lie."""
+        fine, coarse = self.depth[0], self.depth[-1]
+        if isinstance(fine, Tensor) and isinstance(coarse, Tensor):
+            return cuda_pyramid.readings_of(fine, coarse)
+        read = coarse[coarse > 0]
+        return np.array([float(read.mean()) if len(read) else 1.0, float((fine > 0).sum())])
+
+    def weighed(self, weight: Plane | None, weight_depth: Plane | None = None) -> "Pyramid":
         """Return the same images with other weights [H, W] of gray and depth; depth's is gray's where none is given."""
-        gray_weights = _halvings(weight, len(self.cameras))
-        depth_weights = gray_weights if weight_depth is None else _halvings(weight_depth, len(self.cameras))
-        return Pyramid(self.gray, self.depth, gray_weights, depth_weights, self.cameras)
+        gray_weights, depth_weights = ([None if w is None else _whole(w)] for w in (weight, weight_depth))
+        for _ in self.cameras[1:]:
+            halves = _averaged(gray_weights[-1], depth_weights[-1])
+            gray_weights.append(halves[0])
+            depth_weights.append(halves[1])
+        own = gray_weights if weight_depth is None else depth_weights
+        return Pyramid(self.gray, self.depth, gray_weights, own, self.cameras)
 
     @staticmethod
-    def of(gray: Image, depth_m: Image, camera: Camera, weight: Image | None = None, levels: int = LEVELS) -> "Pyramid":
+    def of(gray: Plane, depth_m: Plane, camera: Camera, weight: Plane | None = None, levels: int = LEVELS) -> "Pyramid":
         """Halve gray [H, W], depth [H, W] and an optional weight [H, W] until `levels` sizes exist."""
-        p = Pyramid([np.ascontiguousarray(gray)], [np.ascontiguousarray(depth_m)], [None], [None], [camera])
+        p = Pyramid([_whole(gray)], [_whole(depth_m)], [None], [None], [camera])
         for _ in range(levels - 1):
             c = p.cameras[-1]
             if min(c.width, c.height) < 32:
                 break
-            p.gray.append(_quarter(p.gray[-1]).mean(0))
-            p.depth.append(_half_depth(p.depth[-1]))
+            half_gray, half_depth = _halved(p.gray[-1], p.depth[-1])
+            p.gray.append(half_gray)
+            p.depth.append(half_depth)
             # Odd sizes drop their last row or column, so the scale is exactly ½.
             p.cameras.append(
                 Camera(c.width // 2, c.height // 2, c.fx / 2, c.fy / 2, (c.cx - 0.5) / 2, (c.cy - 0.5) / 2)
@@ -46,13 +74,28 @@ class Pyramid:
         return p.weighed(weight)
 
 
-def _halvings(weight: Image | None, levels: int) -> list[Image | None]:
-    """Average a weight over 2×2 cells, level by level; None stays None."""
-    found = [weight]
-    for _ in range(levels - 1):
-        last = found[-1]
-        found.append(None if last is None else _quarter(last).mean(0))
-    return found
+def _whole(plane: Plane) -> Plane:
+    """Return a plane whose rows follow each other without gaps."""
+    return plane.contiguous() if isinstance(plane, Tensor) else np.ascontiguousarray(plane)
+
+
+def _halved(gray: Plane, depth: Plane) -> tuple[Plane, Plane]:
+    """Halve an image and its depth, where they lie."""
+    if isinstance(gray, Tensor) and isinstance(depth, Tensor):
+        half_gray, _, half_depth = cuda_pyramid.halve((gray, None), depth)
+        assert half_gray is not None and half_depth is not None
+        return half_gray, half_depth
+    assert not isinstance(gray, Tensor) and not isinstance(depth, Tensor), "both planes lie in one place"
+    return _quarter(gray).mean(0), _half_depth(depth)
+
+
+def _averaged(one: Plane | None, other: Plane | None) -> tuple[Plane | None, Plane | None]:
+    """Average two weights over 2×2 cells, where they lie; None stays None."""
+    first, second = (weight if isinstance(weight, Tensor) else None for weight in (one, other))
+    if first is not None or second is not None:
+        return cuda_pyramid.halve((first, second))[:2]
+    halves = [None if w is None or isinstance(w, Tensor) else _quarter(w).mean(0) for w in (one, other)]
+    return halves[0], halves[1]
 
 
 def _quarter(image: Image) -> Image:
@@ -71,6 +114,13 @@ def _half_depth(depth: Image) -> Image:
 def gray_of(color: Image) -> Image:
     """Reduce colour [H, W, 3] to luma [H, W]."""
     return np.asarray(color @ LUMA)
+
+
+def luma(color: Tensor) -> Tensor:
+    """Do the same with planes [3, H, W], wherever they lie."""
+    red, green, blue = map(float, LUMA)
+    gray: Tensor = red * color[0] + green * color[1] + blue * color[2]
+    return gray
 
 
 def gradient_magnitude(gray: Image) -> Image:

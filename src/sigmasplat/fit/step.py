@@ -1,6 +1,6 @@
 """One mapping step on a view: the image terms' gradient on its planes, from there to the splats, and Adam's step."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -18,6 +18,19 @@ SHAPE_TERMS = ("isotropy", "isotropy_ratio")
 """Terms of the splats, not of an image."""
 COMPILED_TERMS = {"l1", "ssim", "depth", "nll_color", "nll_depth", "alignment", "moment", *SHAPE_TERMS}
 """What `CompiledImages` and `CompiledStep` know; any other term, but `nll_color_full`, needs a `TorchStep`."""
+
+
+Twist = Matrix | Tensor
+"""Of a pose [6]; a tensor may still be on its way from a device, as may a number be."""
+
+
+def arrived(twists: Sequence[Twist], numbers: Sequence[float | Tensor]) -> tuple[list[Matrix], list[float]]:
+    """Return twists and numbers as the host has them; it waits once for all that are on a device."""
+    there = [x.double().reshape(-1) for x in (*twists, *numbers) if isinstance(x, Tensor)]
+    found = torch.cat(there).cpu().numpy() if there else np.empty(0)
+    parts = iter(np.split(found, np.cumsum([len(x) for x in there])))
+    here = [next(parts) if isinstance(x, Tensor) else x for x in twists]
+    return here, [float(next(parts)[0]) if isinstance(x, Tensor) else x for x in numbers]
 
 
 def render_for(view: View, params: Tensor, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
@@ -43,14 +56,15 @@ def shape_pull(log_scales: Tensor, weights: Weights, of_all: float, of_visible: 
 class Gathered:
     """The gradient of several images' mean loss by the splats that any of them shows."""
 
-    def __init__(self, field: GaussianField) -> None:
+    def __init__(self, view: View, field: GaussianField) -> None:
+        self._view = view
         self.grad, self._rows = torch.zeros_like(field.params), torch.zeros_like(field.params)
         self.visible = torch.zeros(len(field), dtype=torch.bool, device=field.params.device)
 
-    def add(self, view: View, field: GaussianField, share: float = 1.0, pull: Tensor | None = None) -> Matrix:
-        """Add a view's gradient planes at their share of the mean; return the image's own pose twist [6]."""
-        twist = view.backward(field.params, self._rows, pull)
-        self.visible |= view.visible(len(field))
+    def add(self, field: GaussianField, share: float, pull: Tensor | None = None) -> Matrix:
+        """Add the view's gradient planes at their share of the mean; return the image's own pose twist [6]."""
+        twist = self._view.backward(field.params, self._rows, pull)
+        self.visible |= self._view.visible(len(field))
         self.grad += share * self._rows
         return twist
 
@@ -110,8 +124,8 @@ class TorchStep:
 
         Returns the pose twist [6] and what the shape terms cost. `pull` is filled as by `View.backward`.
         """
-        gathered = Gathered(field)
-        twist = gathered.add(self.view, field, pull=pull)
+        gathered = Gathered(self.view, field)
+        twist = gathered.add(field, 1.0, pull)
         return twist, gathered.step(field, rates, weights, frozen_colors)
 
 

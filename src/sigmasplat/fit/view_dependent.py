@@ -22,7 +22,7 @@ class ImageStep(Protocol):
     @property
     def view(self) -> View: ...
 
-    def images(self, target: Target, weights: Weights) -> float:
+    def images(self, target: Target, weights: Weights) -> float | Tensor:
         """Write the gradient of every image term to the view's gradient planes; return the loss."""
         ...
 
@@ -53,7 +53,7 @@ class ViewDependentStep:
             self._rows.index_copy_(0, rows, own)
         render_for(self.view, self._rows, T_camera_world, target, weights)
 
-    def images(self, target: Target, weights: Weights) -> float:
+    def images(self, target: Target, weights: Weights) -> float | Tensor:
         """Write the gradient of every image term to the view's gradient planes; return the loss."""
         return self.base.images(target, weights)
 
@@ -73,7 +73,9 @@ class ViewDependentStep:
             g, own, k = (x.index_select(0, rows) for x in (grad, field.params, harmonics.params))
             g[rows < frozen_colors, COLORS] = 0.0
             g_harmonics, g_means = self._through_colors(own, k, g[:, COLORS])
-            g_scales, term = shape_pull(own[:, SCALES], weights, len(rows) / len(field), len(rows) / len(visible))
+            g_scales, term = shape_pull(
+                own[:, SCALES], weights, len(rows) / max(len(field), 1), len(rows) / max(len(visible), 1)
+            )
             g[:, MEANS] += g_means
             g[:, SCALES] += g_scales
             if self.view.options.color_pose_gradient:  # a camera that moves by ρ leaves the directions to −ρ

@@ -44,15 +44,19 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def git_commit() -> str | None:
-    """Return the commit of the checkout the package runs from, None if installed elsewhere or git is missing.
+def code() -> str:
+    """Return which code this is: the commit of the checkout that it runs from, else the one it was built of, either
+    with -dirty where files had changed since; where neither is known, the version."""
+    package = Path(__file__).resolve().parents[1]
+    built_of = package / "commit.txt"
+    return _commit_of(package.parents[1]) or (built_of.is_file() and built_of.read_text().strip()) or package_version()
 
-    Asks only a folder that is itself the checkout: a repository further up would be somebody else's.
-    """
-    checkout = Path(__file__).resolve().parents[3]
+
+def _commit_of(checkout: Path) -> str | None:
+    """Return the commit of a folder that is itself a checkout: a repository further up would be somebody else's."""
     if not (checkout / ".git").exists():
         return None
-    command = ["git", "-C", str(checkout), "rev-parse", "--verify", "HEAD"]
+    command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
         answer = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True)
     except (OSError, subprocess.SubprocessError):

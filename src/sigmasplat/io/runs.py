@@ -54,7 +54,7 @@ class RunFolder:
         facts = {
             "program": PROGRAM,
             "version": machine.package_version(),
-            "git_commit": machine.git_commit(),
+            "code": machine.code(),
             "source": source_name,
             "machine": machine.describe(),
             "status": "running",

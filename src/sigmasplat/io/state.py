@@ -75,13 +75,14 @@ class _Encoder:
     def _array(self, value: Tensor | np.ndarray[Any, Any]) -> Any:
         kind = "tensor" if isinstance(value, Tensor) else "array"
         array = value.detach().cpu().numpy() if isinstance(value, Tensor) else value
+        there = {"device": "cuda"} if isinstance(value, Tensor) and value.is_cuda else {}
         if array.size <= INLINE:
-            return {kind: array.tolist(), "type": str(array.dtype), "shape": list(array.shape)}
+            return {kind: array.tolist(), "type": str(array.dtype), "shape": list(array.shape)} | there
         if id(value) not in self.seen:
             name = str(len(self.tensors))
             self.tensors[name] = torch.tensor(array)
             self.seen[id(value)] = name, value  # kept, so that its id is not given to another
-        return {kind: self.seen[id(value)][0]}
+        return {kind: self.seen[id(value)][0]} | there
 
 
 class _Decoder:
@@ -107,9 +108,10 @@ class _Decoder:
     def _array(self, value: dict[str, Any]) -> Any:
         kind = "tensor" if "tensor" in value else "array"
         if isinstance(value[kind], str):
-            return (self.tensors if kind == "tensor" else self.arrays)[value[kind]]
+            name = value[kind]
+            return self.tensors[name].to(value.get("device", "cpu")) if kind == "tensor" else self.arrays[name]
         array = np.array(value[kind], value["type"]).reshape(value["shape"])
-        return torch.from_numpy(array) if kind == "tensor" else array
+        return torch.from_numpy(array).to(value.get("device", "cpu")) if kind == "tensor" else array
 
 
 def _fields(value: Any) -> dict[str, Any]:

@@ -11,7 +11,10 @@ from sigmasplat.metrics import palette
 from sigmasplat.metrics.panels import BACKGROUND, COVERED_ALPHA, FAINT, TEXT
 from sigmasplat.render import Render
 
-STRIP, MARGIN = 40, 10
+STRIP, MARGIN, GAP = 40, 10, 8
+SHORTEST_BAR = 60
+"""A colour bar shorter than this, in pixels, does not share its line with a word; half of it, not with numbers."""
+Font = ImageFont.ImageFont | ImageFont.FreeTypeFont
 
 Floats = NDArray[np.float32]
 Limits = tuple[float, float]
@@ -63,28 +66,45 @@ def film_image(maps: Maps, scale: Scale, strip: palette.Rgb) -> palette.Rgb:
 
 
 def legend_strip(scale: Scale, width: int) -> palette.Rgb:
-    """Draw what is under every image of a film whose panels are `width` pixels wide, uint8 [strip, 3 width, 3]."""
+    """Draw what is under every image of a film whose panels are `width` pixels wide, uint8 [strip, 3 width, 3].
+
+    Under narrow panels words stand above their colour bars; what does not fit there either is left out.
+    """
     strip = Image.new("RGB", (3 * width, STRIP), BACKGROUND)
-    font = ImageFont.load_default(max(10, min(15, width // 20)))
-    draw = ImageDraw.Draw(strip)
-    draw.text((MARGIN, STRIP // 2), "colour", TEXT, font, anchor="lm")
-    low, high = scale.depth_m
-    _bar(strip, font, (width, width), f"depth {low:.1f}", f"{high:.1f} m", palette.VIRIDIS)
-    _bar(strip, font, (2 * width, width), "uncertainty 0", f"{scale.deviation[1]:.2f}", palette.INFERNO)
+    draw, font = ImageDraw.Draw(strip), ImageFont.load_default(max(11, min(15, width // 20)))
+    words = ("colour", "depth", "uncertainty")
+    ends = (("", ""), (f"{scale.depth_m[0]:.1f}", f"{scale.depth_m[1]:.1f} m"), ("0", f"{scale.deviation[1]:.2f}"))
+    margin = min(MARGIN, width // 16)
+    room = width - 2 * margin
+
+    def bar_px(*texts: str) -> int:
+        return int(room - sum(draw.textlength(text, font) + GAP for text in texts))
+
+    together = all(bar_px(word, low, high) >= SHORTEST_BAR for word, (low, high) in zip(words, ends, strict=True))
+    above, level = (STRIP // 2, STRIP // 2) if together else (STRIP // 4 + 1, STRIP * 3 // 4 - 1)
+    maps = (None, palette.VIRIDIS, palette.INFERNO)
+    for k, (word, (low, high), colours) in enumerate(zip(words, ends, maps, strict=True)):
+        left = k * width + margin
+        if draw.textlength(word, font) <= room:
+            draw.text((left, above), word, TEXT, font, anchor="lm")
+        if colours is not None:
+            taken = draw.textlength(word, font) + GAP if together else 0.0
+            numbers = together or bar_px(low, high) >= SHORTEST_BAR // 2
+            _bar(strip, font, (left + taken, left + room), level, (low, high) if numbers else ("", ""), colours)
     draw.line((0, 0, 3 * width, 0), FAINT)
     return np.asarray(strip)
 
 
 def _bar(
-    strip: Image.Image, font: ImageFont.ImageFont | ImageFont.FreeTypeFont, at: tuple[int, int], low: str, high: str,
+    strip: Image.Image, font: Font, span: tuple[float, float], level: int, ends: tuple[str, str],
     colours: NDArray[np.float64],
 ) -> None:  # fmt: skip
-    """Draw a colour bar between its ends in words, from pixel `at[0]` on, `at[1]` wide."""
-    draw, middle = ImageDraw.Draw(strip), STRIP // 2
-    left, right = at[0] + MARGIN, at[0] + at[1] - MARGIN
-    draw.text((left, middle), low, TEXT, font, anchor="lm")
-    draw.text((right, middle), high, TEXT, font, anchor="rm")
-    first, last = left + draw.textlength(low, font) + 8, right - draw.textlength(high, font) - 8
-    if last - first >= 8:
-        ramp = palette.colour(np.tile(np.linspace(0.0, 1.0, int(last - first)), (10, 1)), 0.0, 1.0, colours)
-        strip.paste(Image.fromarray(ramp), (int(first), middle - 5))
+    """Draw a colour bar between its ends in words, from pixel `span[0]` to `span[1]`, in row `level`."""
+    draw, (left, right) = ImageDraw.Draw(strip), span
+    for text, at, anchor in zip(ends, span, ("lm", "rm"), strict=True):
+        draw.text((at, level), text, TEXT, font, anchor=anchor)
+    before, after = (draw.textlength(text, font) + GAP if text else 0.0 for text in ends)
+    ramp = palette.colour(
+        np.tile(np.linspace(0.0, 1.0, int(right - after - left - before)), (10, 1)), 0.0, 1.0, colours
+    )
+    strip.paste(Image.fromarray(ramp), (int(left + before), level - 5))

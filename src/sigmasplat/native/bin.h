@@ -7,10 +7,11 @@ constexpr int TILE_WIDTH = SIGMASPLAT_TILE_WIDTH, TILE_HEIGHT = SIGMASPLAT_TILE_
 static_assert(TILE_WIDTH % 4 == 0 && TILE_HEIGHT % 4 == 0, "a tile is whole blocks");
 constexpr int BLOCKS_X = TILE_WIDTH / BLOCK_WIDTH, BLOCKS_Y = TILE_HEIGHT / BLOCK_HEIGHT, BLOCKS = BLOCKS_X * BLOCKS_Y;
 static_assert(BLOCKS <= 64, "a tile's blocks must fit one mask");
+using BlockMask = std::conditional_t<BLOCKS <= 32, uint32_t, uint64_t>;
 
 constexpr float LOG2_E = 1.4426950408889634f;
-// Exponents are carried as log2/8: alpha = 2^(8t), t = log2(o)/8 − p² − q², p = L1·dx + L2·dy, q = L3·dy, L = CONIC_SCALE·l.
-constexpr float CONIC_SCALE = 0.30028060219661246f;   // sqrt(log2(e)/16)
+// Exponents are of two: alpha = 2^t, t = log2(o) − p² − q², p = L1·dx + L2·dy, q = L3·dy, L = CONIC_SCALE·l.
+constexpr float CONIC_SCALE = 0.8493218002880191f;    // sqrt(log2(e)/2)
 constexpr float ALPHA_MAX = 0.99f;
 
 // A splat as the pixels read it: one row of 8 floats of geometry, then its features. `tag`: where its gradients begin among
@@ -19,31 +20,42 @@ struct Geometry { float l1, l2, l3, u, v, log_opacity, z; int tag; };
 constexpr int GEOMETRY = sizeof(Geometry) / sizeof(float);
 struct Box { uint16_t x0, y0, x1, y1; };              // in blocks, inclusive
 
-constexpr int ALPHA_CHUNK = 32;
+constexpr int ALPHA_CHUNK = 32;                       // entries of a block's list dealt with together
+typedef float Pixels[W];                              // a number of each of a block's pixels
 struct AlphaBuffer {                                  // one chunk of a block's splats that survive the alpha test
-    alignas(64) float alpha[ALPHA_CHUNK + 4][W];
-    alignas(64) float pairs[ALPHA_CHUNK + 4][2 * W];
+    alignas(64) Pixels alpha[ALPHA_CHUNK + 4];
     int entry[ALPHA_CHUNK + 4];
+};
+struct Walk {                                         // all of a block's splats that survive it, near to far: for the way back
+    Buffer<Pixels> alpha, weight, gain;
+    Buffer<int> entry;
+    alignas(64) float pairs[ALPHA_CHUNK][2 * W];
+    void reserve(size_t n) { alpha.reserve(n); weight.reserve(n); gain.reserve(n); entry.reserve(n); }
+    size_t bytes() const { return alpha.bytes() + weight.bytes() + gain.bytes() + entry.bytes(); }
 };
 struct Center { float u, v; };
 struct Scratch {                                      // one thread's tile
     Buffer<float> rows, records;
     Buffer<Center> centers;                           // from the tile's centre
-    Buffer<uint64_t> masks;
+    Buffer<BlockMask> masks;
     Buffer<int> lists;
     Buffer<uint64_t> sorted;
     AlphaBuffer alphas;
+    Walk walk;
     int counts[BLOCKS];
     size_t list_capacity = 0;
     size_t bytes() const {
-        return rows.bytes() + records.bytes() + centers.bytes() + masks.bytes() + lists.bytes() + sorted.bytes() + sizeof(*this);
+        return rows.bytes() + records.bytes() + centers.bytes() + masks.bytes() + lists.bytes() + sorted.bytes() + walk.bytes()
+               + sizeof(*this);
     }
 };
 
 
 // The feature counts compiled in; a count between them is padded with zeros.
 constexpr int feature_slots(int k) { return k <= 4 ? 4 : k <= 7 ? 7 : k <= 11 ? 11 : 16; }
-template <int K> constexpr int row_floats = GEOMETRY + (K + 3) / 4 * 4;
+// Floats of a row; the shortest fill a cache line, so that none lies across two.
+constexpr int floats_of_row(int k) { return k <= 8 ? 16 : GEOMETRY + (k + 3) / 4 * 4; }
+template <int K> constexpr int row_floats = floats_of_row(K);
 template <class F> SIGMA_INLINE void with_features(int k, F f) {   // K is compiled in: colour + depth pays for no variance
     switch (k) {
         case 4: f(std_int<4>{}); break;
@@ -60,7 +72,7 @@ struct Render {                                       // what one forward pass l
     BlendOptions options;
     const float* reference = nullptr;
     int64_t intersections = 0;
-    Buffer<float> rows, partials;
+    Buffer<float> rows, depths, partials;             // depths are in the rows too, but those are sixteen times as long
     Buffer<Box> boxes;
     Buffer<int> tiles_of, tile_begin, histogram, chunk_begin;   // chunk_begin: first slot of each chunk
     Buffer<uint64_t> items;
@@ -70,9 +82,9 @@ struct Render {                                       // what one forward pass l
 
     ~Render() { delete[] scratch; }
     void prepare(int64_t splats, int features_used, int w, int h, BlendOptions o) {
-        n = splats; used = features_used; k = feature_slots(features_used); row = GEOMETRY + (k + 3) / 4 * 4; width = w; height = h; options = o;
+        n = splats; used = features_used; k = feature_slots(features_used); row = floats_of_row(k); width = w; height = h; options = o;
         tiles_x = (w + TILE_WIDTH - 1) / TILE_WIDTH; tiles_y = (h + TILE_HEIGHT - 1) / TILE_HEIGHT;
-        rows.reserve((n + W) * row); boxes.reserve(n + W); tiles_of.reserve(n + W);
+        rows.reserve((n + W) * row); boxes.reserve(n + W); depths.reserve(n + W); tiles_of.reserve(n + W);
         chunk_begin.reserve(n / CHUNK + 2);
         if (threads < omp_get_max_threads()) {
             delete[] scratch;
@@ -84,12 +96,29 @@ struct Render {                                       // what one forward pass l
     size_t padded_width() const { return size_t(tiles_x) * TILE_WIDTH; }
     size_t plane() const { return padded_width() * tiles_y * TILE_HEIGHT; }
     size_t bytes() const {
-        size_t b = rows.bytes() + boxes.bytes() + partials.bytes() + tiles_of.bytes() + items.bytes() + histogram.bytes()
+        size_t b = rows.bytes() + depths.bytes() + boxes.bytes() + partials.bytes() + tiles_of.bytes() + items.bytes() + histogram.bytes()
                    + tile_begin.bytes() + median_gradient.bytes();
         for (int t = 0; t < threads; t++) b += scratch[t].bytes();
         return b;
     }
 };
+
+// Turn W columns at a time, of geometry and then of features, into the next W floats of the rows of the splats that are live.
+template <int ROW_FLOATS, int C = 0>
+SIGMA_INLINE void store_columns(float* rows, unsigned live, const vf* geometry, const float (*features)[W]) {
+    if constexpr (C < ROW_FLOATS) {
+        constexpr int COUNT = ROW_FLOATS - C < W ? ROW_FLOATS - C : W;
+        vf turn[W];
+        for (int q = 0; q < W; q++)
+            turn[q] = q >= COUNT ? splat(0.f) : C + q < GEOMETRY ? geometry[C + q] : load(features[C + q - GEOMETRY]);
+        transpose(turn);
+        for (unsigned m = live; m; m &= m - 1) {
+            const int l = __builtin_ctz(m);
+            store_first<COUNT>(rows + size_t(l) * ROW_FLOATS + C, turn[l]);
+        }
+        store_columns<ROW_FLOATS, C + W>(rows, live, geometry, features);
+    }
+}
 
 // Store W footprints and their features (lanes, padded to ROW_FLOATS - GEOMETRY of them); return how many tiles they reach, `before` being
 // the slots of the chunk in use already. Bounds are those of alpha ≥ alpha_min, not three sigma, so the image does not
@@ -111,6 +140,7 @@ SIGMA_INLINE int pack(Render& r, const Footprint<vf>& f, vf opacity, Mask seen, 
     seen = both(seen, both(ge(splat(r.width - 1.f), f.u - du), ge(splat(r.height - 1.f), f.v - dv)));   // not in padding only
     const unsigned live = bits(seen) & (r.n - i < W ? (1u << (r.n - i)) - 1u : ~0u);
     memset(&r.tiles_of[i], 0, W * sizeof(int));
+    store(&r.depths[i], f.z);
     if (!live) return 0;
     alignas(64) int box[4][W], tag[W];
     store(box[0], to_int(x0)); store(box[1], to_int(y0)); store(box[2], to_int(x1)); store(box[3], to_int(y1));
@@ -124,64 +154,28 @@ SIGMA_INLINE int pack(Render& r, const Footprint<vf>& f, vf opacity, Mask seen, 
         used += count;
     }
     const vf geometry[GEOMETRY] = {f.l1 * CONIC_SCALE, f.l2 * CONIC_SCALE, f.l3 * CONIC_SCALE, f.u, f.v,
-                                   log_opacity * 0.125f, f.z, float_of_bits(load(tag))};
-    for (int c = 0; c < ROW_FLOATS; c += W) {         // turn W columns at a time into W rows' next W floats
-        vf turn[W];
-        const int count = ROW_FLOATS - c < W ? ROW_FLOATS - c : W;
-        for (int q = 0; q < W; q++)
-            turn[q] = q >= count ? splat(0.f) : c + q < GEOMETRY ? geometry[c + q] : load(features[c + q - GEOMETRY]);
-        transpose(turn);
-        for (unsigned m = live; m; m &= m - 1) {
-            const int l = __builtin_ctz(m);
-            float* to = &r.rows[size_t(i + l) * ROW_FLOATS + c];
-            if (count == W) store(to, turn[l]);
-            else for (int q = 0; q < count; q += 4) memcpy(to + q, reinterpret_cast<const float*>(&turn[l]) + q, 16);
-        }
-    }
+                                   log_opacity, f.z, float_of_bits(load(tag))};
+    store_columns<ROW_FLOATS>(&r.rows[size_t(i) * ROW_FLOATS], live, geometry, features);
     return used - before;
 }
 
-// Sort (depth bits << 32 | splat) by depth, keeping the order of equals: least-significant-digit radix over the bits that differ.
-static void sort_tile(uint64_t* a, uint64_t* spare, int n) {
-    if (n <= 24) {
-        for (int i = 1; i < n; i++) {
-            const uint64_t x = a[i];
-            int j = i - 1;
-            for (; j >= 0 && a[j] > x; j--) a[j + 1] = a[j];
-            a[j + 1] = x;
-        }
+constexpr int LINE = 8;                               // items in a cache line
+
+// Visit the tiles of a splat. Most have one or two each way: those are visited without a branch, `spare` and the two after it
+// standing for tiles that it does not have.
+template <class Visit> SIGMA_INLINE void for_tiles(const Render& r, int64_t i, int spare, Visit visit) {
+    const Box b = r.boxes[i];
+    const int x = b.x0 / BLOCKS_X, y = b.y0 / BLOCKS_Y, right = b.x1 / BLOCKS_X - x, down = b.y1 / BLOCKS_Y - y;
+    const int first = y * r.tiles_x + x;
+    if (right <= 1 && down <= 1) [[likely]] {
+        visit(first);
+        visit(right ? first + 1 : spare);
+        visit(down ? first + r.tiles_x : spare + 1);
+        visit(right & down ? first + r.tiles_x + 1 : spare + 2);
         return;
     }
-    uint32_t low = ~0u, high = 0;
-    for (int i = 0; i < n; i++) {
-        const uint32_t key = a[i] >> 32;
-        low = key < low ? key : low;
-        high = key > high ? key : high;
-    }
-    const uint32_t range = high - low;
-    const int used = range ? 32 - __builtin_clz(range) : 1, passes = (used + 7) / 8, digit = (used + passes - 1) / passes;
-    const uint32_t mask = (1u << digit) - 1;
-    uint32_t counts[4][256];
-    memset(counts, 0, sizeof(counts[0]) * passes);
-    for (int i = 0; i < n; i++) {
-        const uint32_t key = uint32_t(a[i] >> 32) - low;
-        for (int p = 0; p < passes; p++) counts[p][key >> (p * digit) & mask]++;
-    }
-    uint64_t *from = a, *to = spare;
-    for (int p = 0; p < passes; p++) {
-        uint32_t sum = 0;
-        for (uint32_t d = 0; d <= mask; d++) { const uint32_t c = counts[p][d]; counts[p][d] = sum; sum += c; }
-        for (int i = 0; i < n; i++) to[counts[p][(uint32_t(from[i] >> 32) - low) >> (p * digit) & mask]++] = from[i];
-        uint64_t* t = from; from = to; to = t;
-    }
-    if (from != a) memcpy(a, from, size_t(n) * sizeof *a);
-}
-
-template <class Visit> SIGMA_INLINE void for_tiles(const Render& r, int64_t i, Visit visit) {
-    const Box b = r.boxes[i];
-    const int tx0 = b.x0 / BLOCKS_X, tx1 = b.x1 / BLOCKS_X, ty1 = b.y1 / BLOCKS_Y;
-    for (int ty = b.y0 / BLOCKS_Y; ty <= ty1; ty++)
-        for (int tx = tx0; tx <= tx1; tx++) visit(ty * r.tiles_x + tx);
+    for (int dy = 0; dy <= down; dy++)
+        for (int dx = 0; dx <= right; dx++) visit(first + dy * r.tiles_x + dx);
 }
 
 static void number_slots(Render& r) {                 // where each splat's per-tile gradients will lie
@@ -193,18 +187,18 @@ static void number_slots(Render& r) {                 // where each splat's per-
 
 static void bin(Render& r) {
     number_slots(r);
-    const int tiles = r.tiles_x * r.tiles_y, threads = omp_get_max_threads();
+    const int tiles = r.tiles_x * r.tiles_y, stride = tiles + 3, threads = omp_get_max_threads();
     r.tile_begin.reserve(tiles + 1);
-    r.histogram.reserve(size_t(threads) * tiles);
-    r.items.reserve(r.intersections + 1);
+    r.histogram.reserve(size_t(threads) * stride);
+    r.items.reserve(r.intersections + LINE * (threads + 1));   // each thread's spare tiles lie in a cache line of its own
 #pragma omp parallel num_threads(threads)
     {
         const int t = omp_get_thread_num(), team = omp_get_num_threads();
         const int64_t begin = r.n * t / team, end = r.n * (t + 1) / team;
-        int* mine = r.histogram.data + size_t(t) * tiles;
-        memset(mine, 0, size_t(tiles) * sizeof(int));
+        int* mine = r.histogram.data + size_t(t) * stride;
+        memset(mine, 0, size_t(stride) * sizeof(int));
         for (int64_t i = begin; i < end; i++)
-            if (r.tiles_of[i]) for_tiles(r, i, [&](int tile) { mine[tile]++; });
+            if (r.tiles_of[i]) for_tiles(r, i, tiles, [&](int tile) { mine[tile]++; });
 #pragma omp barrier
 #pragma omp single
         {
@@ -212,7 +206,7 @@ static void bin(Render& r) {
             for (int q = 0; q < tiles; q++) {
                 r.tile_begin[q] = sum;
                 for (int w = 0; w < team; w++) {
-                    int& h = r.histogram[size_t(w) * tiles + q];
+                    int& h = r.histogram[size_t(w) * stride + q];
                     const int count = h;
                     h = sum;
                     sum += count;
@@ -220,12 +214,17 @@ static void bin(Render& r) {
             }
             r.tile_begin[tiles] = sum;
         }
+        for (int q = tiles; q < stride; q++) mine[q] = int(r.intersections) + LINE * (t + 1);
         for (int64_t i = begin; i < end; i++)
             if (r.tiles_of[i]) {
                 uint32_t depth_bits;                  // positive floats order as their bits
-                memcpy(&depth_bits, &r.geometry(i).z, 4);
+                memcpy(&depth_bits, &r.depths[i], 4);
                 const uint64_t item = uint64_t(depth_bits) << 32 | uint32_t(i);
-                for_tiles(r, i, [&](int tile) { r.items[mine[tile]++] = item; });
+                for_tiles(r, i, tiles, [&](int tile) {
+                    int& slot = mine[tile];
+                    r.items[slot] = item;
+                    slot += tile < tiles;
+                });
             }
 #pragma omp barrier
         Scratch& s = r.scratch[t];

@@ -82,9 +82,9 @@ struct Level {
         options = {o[0], o[1], o[2], o[3], o[4]};
     }
     AlignLevel planes() const {
-        return {reference_gray.data(), reference_depth.data(), weight_gray ? weight_gray->data() : nullptr, weight_depth ? weight_depth->data() : nullptr,
-                live_gray.data(), live_depth.data(), int(reference_gray.shape(1)), int(reference_gray.shape(0)),
-                intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]};
+        return {{reference_gray.data(), reference_depth.data(), weight_gray ? weight_gray->data() : nullptr, weight_depth ? weight_depth->data() : nullptr,
+                 live_gray.data(), live_depth.data()},
+                {int(reference_gray.shape(1)), int(reference_gray.shape(0)), intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]}};
     }
 };
 

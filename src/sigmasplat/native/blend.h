@@ -1,10 +1,10 @@
 // Stage 3: tiles → pixels. A tile is cut into blocks of W pixels; lanes are pixels; a block walks its own list of
 // splats near to far. Alphas come first, a chunk at a time, so that the transmittance chain stays one multiply-add long.
 
-constexpr int AHEAD = 12;                             // splats fetched before they are needed
+constexpr int AHEAD = 24;                             // splats fetched before they are needed
 struct Tile { int index, x, y, count; };              // x, y: pixel of its corner
 
-SIGMA_INLINE uint64_t block_mask(Box b, int tile_bx, int tile_by) {
+SIGMA_INLINE BlockMask block_mask(Box b, int tile_bx, int tile_by) {
     const int c0 = b.x0 > tile_bx ? b.x0 - tile_bx : 0, c1 = (b.x1 < tile_bx + BLOCKS_X - 1 ? b.x1 - tile_bx : BLOCKS_X - 1);
     const int r0 = b.y0 > tile_by ? b.y0 - tile_by : 0, r1 = (b.y1 < tile_by + BLOCKS_Y - 1 ? b.y1 - tile_by : BLOCKS_Y - 1);
     const uint64_t columns = ((1ull << (c1 - c0 + 1)) - 1) << c0;
@@ -12,7 +12,7 @@ SIGMA_INLINE uint64_t block_mask(Box b, int tile_bx, int tile_by) {
     for (int y = 0; y < BLOCKS_Y; y++) every_row |= 1ull << (y * BLOCKS_X);
     const int rows = (r1 - r0 + 1) * BLOCKS_X;
     const uint64_t span = (rows == 64 ? ~0ull : (1ull << rows) - 1) << (r0 * BLOCKS_X);
-    return (columns * every_row) & span;
+    return BlockMask((columns * every_row) & span);
 }
 
 // List, block by block, which of a tile's n splats reach it, in order; each list ends in four entries that are never alive.
@@ -20,11 +20,13 @@ SIGMA_INLINE void list_blocks(Scratch& s, int n) {
     s.list_capacity = size_t(n) + W + 4;
     s.lists.reserve(s.list_capacity * BLOCKS);
 #if defined(__AVX512F__)
-    uint32_t halves[2][W];
+    constexpr int HALVES = sizeof(BlockMask) / sizeof(uint32_t);
+    uint32_t halves[HALVES][W];
     for (int b = 0; b < BLOCKS; b++) s.counts[b] = 0;
     for (int k = 0; k < n; k += W) {
-        for (int l = 0; l < W; l++) { halves[0][l] = uint32_t(s.masks[k + l]); halves[1][l] = uint32_t(s.masks[k + l] >> 32); }
-        const __m512i low = _mm512_loadu_si512(halves[0]), high = _mm512_loadu_si512(halves[1]);
+        for (int l = 0; l < W; l++)
+            for (int h = 0; h < HALVES; h++) halves[h][l] = uint32_t(uint64_t(s.masks[k + l]) >> (32 * h));
+        const __m512i low = _mm512_loadu_si512(halves[0]), high = _mm512_loadu_si512(halves[HALVES - 1]);
         const __m512i entry = _mm512_add_epi32(_mm512_set1_epi32(k), (__m512i)to_int(lane_index()));
         for (int b = 0; b < BLOCKS; b++) {
             const __mmask16 on = _mm512_test_epi32_mask(b < 32 ? low : high, _mm512_set1_epi32(int(1u << (b & 31))));
@@ -35,7 +37,7 @@ SIGMA_INLINE void list_blocks(Scratch& s, int n) {
 #else
     memset(s.counts, 0, sizeof s.counts);
     for (int k = 0; k < n; k++)
-        for (uint64_t m = s.masks[k]; m; m &= m - 1) {
+        for (BlockMask m = s.masks[k]; m; m &= m - 1) {
             const int b = __builtin_ctzll(m);
             s.lists[b * s.list_capacity + s.counts[b]++] = k;
         }
@@ -45,12 +47,12 @@ SIGMA_INLINE void list_blocks(Scratch& s, int n) {
 }
 
 // Bring a tile's splats together, near to far, coordinates about the tile's centre, and list them per block.
-template <bool BACKWARD> static Tile gather_tile(const Render& r, Scratch& s, int index) {
+template <int ROW_FLOATS, bool BACKWARD> static Tile gather_tile(const Render& r, Scratch& s, int index) {
     const int begin = r.tile_begin[index], n = r.tile_begin[index + 1] - begin;
     const int tx = index % r.tiles_x, ty = index / r.tiles_x;
     const Tile tile{index, tx * TILE_WIDTH, ty * TILE_HEIGHT, n};
     const float cx = tile.x + (TILE_WIDTH - 1) * 0.5f, cy = tile.y + (TILE_HEIGHT - 1) * 0.5f;
-    const size_t row = r.row, row_bytes = row * sizeof(float);
+    constexpr size_t row = ROW_FLOATS, row_bytes = row * sizeof(float);
     s.rows.reserve(size_t(n + 1) * row);
     s.masks.reserve(n + W);
     if (BACKWARD) memset(static_cast<void*>(s.centers.reserve(n + W) + n), 0, W * sizeof(Center));
@@ -79,7 +81,7 @@ template <bool BACKWARD> static Tile gather_tile(const Render& r, Scratch& s, in
         }
         s.masks[k] = block_mask(box, tx * BLOCKS_X, ty * BLOCKS_Y);
     }
-    memset(&s.masks[n], 0, W * sizeof(uint64_t));
+    memset(&s.masks[n], 0, W * sizeof(BlockMask));
     memset(&s.rows[n * row], 0, row_bytes);           // what the lists end in: never alive
     reinterpret_cast<Geometry*>(&s.rows[n * row])->log_opacity = -1e30f;
     list_blocks(s, n);
@@ -97,13 +99,18 @@ SIGMA_INLINE vf block_y(int b) {
     return y;
 }
 
+// Where the planes hold block b of a tile.
+SIGMA_INLINE size_t block_at(const Tile& tile, int b, size_t stride) {
+    return (tile.y + size_t(b / BLOCKS_X) * BLOCK_HEIGHT) * stride + tile.x + b % BLOCKS_X * BLOCK_WIDTH;
+}
+
 template <int ROW_FLOATS> SIGMA_INLINE const Geometry& geometry_of(const float* rows, int entry) {
     return *reinterpret_cast<const Geometry*>(rows + size_t(entry) * ROW_FLOATS);
 }
 
 // Alphas of up to ALPHA_CHUNK entries of a block's list; entries that reach no live pixel are dropped, without a branch.
 template <int ROW_FLOATS> SIGMA_INLINE int live_alphas(const float* rows, const int* list, int begin, int end, vf x, vf y, Mask alive,
-                             float log_alpha_min, AlphaBuffer& out) {
+                             float log_alpha_min, Pixels* alpha, int* entry) {
     const vf floor_ = splat(log_alpha_min), top = splat(ALPHA_MAX);
     int n = 0;
     for (int j = begin; j < end; j += 4) {
@@ -118,8 +125,8 @@ template <int ROW_FLOATS> SIGMA_INLINE int live_alphas(const float* rows, const 
         }
 #pragma GCC unroll 4
         for (int e = 0; e < 4; e++) {
-            store(out.alpha[n], only(live[e], min(exp2_eighth(t[e]), top)));
-            out.entry[n] = list[j + e];
+            store(alpha[n], only(live[e], min(exp2_alpha(t[e]), top)));
+            entry[n] = list[j + e];
             n += any(live[e]);
         }
     }
@@ -129,19 +136,19 @@ template <int ROW_FLOATS> SIGMA_INLINE int live_alphas(const float* rows, const 
 template <int K, bool MOMENT, bool IDS> static void blend_tiles(Render& r, Outputs o) {
     constexpr int ROW_FLOATS = row_floats<K>;
     const size_t plane = r.plane(), stride = r.padded_width();
-    const float log_alpha_min = __builtin_log2f(r.options.alpha_min) * 0.125f;
+    const float log_alpha_min = __builtin_log2f(r.options.alpha_min);
     const vf stop = splat(r.options.transmittance_stop), half = splat(0.5f), zero = splat(0.f), one = splat(1.f);
 #pragma omp parallel
     {
         Scratch& s = r.scratch[omp_get_thread_num()];
 #pragma omp for schedule(dynamic, 1)
         for (int index = 0; index < r.tiles_x * r.tiles_y; index++) {
-            const Tile tile = gather_tile<false>(r, s, index);
+            const Tile tile = gather_tile<ROW_FLOATS, false>(r, s, index);
             const float* rows = s.rows.data;
             for (int b = 0; b < BLOCKS; b++) {
                 const vf x = block_x(b), y = block_y(b);
                 const int* list = &s.lists[b * s.list_capacity];
-                const size_t at = (tile.y + size_t(b / BLOCKS_X) * BLOCK_HEIGHT) * stride + tile.x + b % BLOCKS_X * BLOCK_WIDTH;
+                const size_t at = block_at(tile, b, stride);
                 vf sum[K], moment = zero, ref = zero, T = one, T_end = one, best = zero, median_w = zero, median_z = zero;
                 vi dominant = splat(-1), median = splat(-1);
                 for (auto& c : sum) c = zero;
@@ -149,7 +156,8 @@ template <int K, bool MOMENT, bool IDS> static void blend_tiles(Render& r, Outpu
                 const int count = s.counts[b];
                 for (int j = 0; j < count; j += ALPHA_CHUNK) {
                     const int end = count < j + ALPHA_CHUNK ? count : j + ALPHA_CHUNK;
-                    const int n = live_alphas<ROW_FLOATS>(rows, list, j, end, x, y, ge(T, stop), log_alpha_min, s.alphas);
+                    const int n = live_alphas<ROW_FLOATS>(rows, list, j, end, x, y, ge(T, stop), log_alpha_min,
+                                                          s.alphas.alpha, s.alphas.entry);
                     for (int e = 0; e < n; e++) {
                         const int entry = s.alphas.entry[e];
                         const Geometry& geometry = geometry_of<ROW_FLOATS>(rows, entry);

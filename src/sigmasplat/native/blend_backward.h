@@ -28,6 +28,139 @@ constexpr int pixel_of_pair(int m) { return m < W / 2 ? m / 2 * 4 + m % 2 : (m -
 typedef long long vpair __attribute__((vector_size(W * 4)));
 SIGMA_INLINE vf splat_pair(const float* p) { long long bits; memcpy(&bits, p, 8); return (vf)(bits - vpair{}); }
 
+// ∂L/∂(outputs) at a block's pixels.
+template <int K> struct PixelGradients { vf sums[K], alpha, moment, ref; };
+
+template <int K, bool MOMENT> SIGMA_INLINE PixelGradients<K> gradients_at(const Render& r, const OutputGradients& g, size_t at) {
+    const size_t plane = r.plane(), stride = r.padded_width();
+    PixelGradients<K> on_pixels;
+    for (int c = 0; c < K; c++) on_pixels.sums[c] = load_block(g.sums + c * plane + at, stride);
+    on_pixels.alpha = g.alpha ? load_block(g.alpha + at, stride) : splat(0.f);
+    on_pixels.ref = MOMENT ? load_block(r.reference + at, stride) : splat(0.f);
+    on_pixels.moment = MOMENT ? only(gt(on_pixels.ref, splat(0.f)), load_block(g.moment + at, stride)) : splat(0.f);
+    return on_pixels;
+}
+
+// What each pixel's pair (g, w) is multiplied with: a row for every pixel, in the order of `store_pairs`, a column for every sum
+// of the record.
+template <int K, bool MOMENT> using Basis = float[W][record_floats<K, MOMENT>];
+template <int K, bool MOMENT> SIGMA_INLINE void store_basis(const PixelGradients<K>& on_pixels, vf x, vf y, Basis<K, MOMENT>& basis) {
+    constexpr int COLUMNS = record_floats<K, MOMENT>;
+    vf columns[COLUMNS];
+    for (auto& c : columns) c = splat(0.f);
+    const vf moments[6] = {splat(1.f), x, y, x * x, x * y, y * y};
+    for (int c = 0; c < 6; c++) columns[2 * c] = moments[c];
+    const auto weighed = [&](int c, vf v) { columns[c < 8 ? 2 * c + 1 : 8 + c] = v; };
+    for (int c = 0; c < K; c++) weighed(c, on_pixels.sums[c]);
+    if (MOMENT) {
+        weighed(K, 2.f * on_pixels.moment);
+        weighed(K + 1, -2.f * on_pixels.moment * on_pixels.ref);
+    }
+    for (int h = 0; h < COLUMNS; h += W) {
+        transpose(columns + h);
+        for (int m = 0; m < W; m++) store(basis[m] + h, columns[h + pixel_of_pair(m)]);
+    }
+}
+
+// Near to far: note of each splat that reaches a live pixel its alpha, its weight w and its gain G = ∂L/∂w. Returns how many there are.
+template <int ROW_FLOATS, int K, bool MOMENT>
+SIGMA_INLINE int walk_out(const float* rows, const int* list, int count, vf x, vf y, const PixelGradients<K>& on_pixels,
+                          float log_alpha_min, vf stop, Walk& walk) {
+    Pixels *const alphas = walk.alpha.data, *const weights = walk.weight.data, *const gains = walk.gain.data;
+    int* const entries = walk.entry.data;
+    vf T = splat(1.f);
+    int n = 0;
+    for (int j = 0; j < count && any(ge(T, stop)); j += ALPHA_CHUNK) {
+        const int end = count < j + ALPHA_CHUNK ? count : j + ALPHA_CHUNK, begin = n;
+        n += live_alphas<ROW_FLOATS>(rows, list, j, end, x, y, ge(T, stop), log_alpha_min, alphas + n, entries + n);
+        for (int e = begin; e < n; e++) {
+            const float* row = rows + size_t(entries[e]) * ROW_FLOATS;
+            const vf a = load(alphas[e]);
+            const Mask on = ge(T, stop);
+            vf gain = on_pixels.alpha;
+            for (int c = 0; c < K; c++) gain = fma(on_pixels.sums[c], splat(row[GEOMETRY + c]), gain);
+            if (MOMENT) {
+                const vf d = reinterpret_cast<const Geometry*>(row)->z - on_pixels.ref;
+                gain = fma(on_pixels.moment * d, d, gain);
+            }
+            store(weights[e], only(on, T * a));
+            store(gains[e], only(on, gain));
+            T = fnma(T, a, T);
+        }
+    }
+    return n;
+}
+
+// Add one splat's sums over a block's pixels to its record: pairs times basis.
+template <int K, bool MOMENT> SIGMA_INLINE void add_to_record(const float* pairs, const Basis<K, MOMENT>& basis, float* record) {
+    constexpr int EXTRA = extra_floats<K, MOMENT>;
+    vf acc[16 / W][2], rest[EXTRA ? EXTRA / W : 1];       // two chains: the sum waits half as long
+    for (int h = 0; h < 16 / W; h++) { acc[h][0] = load(record + h * W); acc[h][1] = splat(0.f); }
+    for (int h = 0; h < EXTRA / W; h++) rest[h] = load(record + 16 + h * W);
+#pragma GCC unroll 16
+    for (int m = 0; m < W; m++) {
+        const vf pair = splat_pair(pairs + 2 * m);
+        for (int h = 0; h < 16 / W; h++) acc[h][m & 1] = fma(pair, load(basis[m] + h * W), acc[h][m & 1]);
+        if (EXTRA) {
+            const vf weight = splat(pairs[2 * m + 1]);
+            for (int h = 0; h < EXTRA / W; h++) rest[h] = fma(weight, load(basis[m] + 16 + h * W), rest[h]);
+        }
+    }
+    for (int h = 0; h < 16 / W; h++) store(record + h * W, acc[h][0] + acc[h][1]);
+    for (int h = 0; h < EXTRA / W; h++) store(record + 16 + h * W, rest[h]);
+}
+
+// Far to near: with C the gain of a unit of light that comes from behind a splat, ∂L/∂α = T·(G − C), and C ← (1 − α)·C + α·G.
+// Walls in front do not enter; were C a difference of sums over all splats, rounding would leave nothing of it where T is small.
+template <int K, bool MOMENT>
+SIGMA_INLINE void walk_back(int n, const Basis<K, MOMENT>& basis, Walk& walk, float* records) {
+    const Pixels *const alphas = walk.alpha.data, *const weights = walk.weight.data, *const gains = walk.gain.data;
+    const int* const entries = walk.entry.data;
+    const vf one = splat(1.f), top = splat(ALPHA_MAX);
+    vf behind = splat(0.f);
+    for (int end = n; end > 0; end -= ALPHA_CHUNK) {
+        const int begin = end > ALPHA_CHUNK ? end - ALPHA_CHUNK : 0;
+        for (int e = end - 1; e >= begin; e--) {
+            const vf a = load(alphas[e]), w = load(weights[e]), gain = load(gains[e]);
+            store_pairs(walk.pairs[e - begin], only(gt(top, a), w * (gain - behind)), w);       // α·∂L/∂α = ∂L/∂power
+            behind = fma(one - a, behind, a * gain);
+        }
+        for (int e = begin; e < end; e++)
+            add_to_record<K, MOMENT>(walk.pairs[e - begin], basis, records + size_t(entries[e]) * record_floats<K, MOMENT>);
+    }
+}
+
+// Walk every tile's pixels once more and hand its records to `finish(scratch, tile)`. The first K of a row's ROW_K features
+// have gradients; the others have none and are passed over.
+template <int ROW_K, int K, bool MOMENT, class Finish>
+static void blend_tiles_backward(Render& r, OutputGradients g, Finish finish) {
+    constexpr int RECORD = record_floats<K, MOMENT>;
+    const float log_alpha_min = __builtin_log2f(r.options.alpha_min);
+    const vf stop = splat(r.options.transmittance_stop);
+#pragma omp parallel
+    {
+        Scratch& s = r.scratch[omp_get_thread_num()];
+        alignas(64) Basis<K, MOMENT> basis;
+#pragma omp for schedule(dynamic, 1)
+        for (int index = 0; index < r.tiles_x * r.tiles_y; index++) {
+            const Tile tile = gather_tile<row_floats<ROW_K>, true>(r, s, index);
+            memset(s.records.reserve(size_t(tile.count + W) * RECORD), 0, size_t(tile.count + W) * RECORD * sizeof(float));
+            s.walk.reserve(tile.count + 4);
+            for (int b = 0; b < BLOCKS; b++) {
+                if (!s.counts[b]) continue;
+                const vf x = block_x(b), y = block_y(b);
+                const PixelGradients<K> on_pixels = gradients_at<K, MOMENT>(r, g, block_at(tile, b, r.padded_width()));
+                store_basis<K, MOMENT>(on_pixels, x, y, basis);
+                const int n = walk_out<row_floats<ROW_K>, K, MOMENT>(s.rows.data, &s.lists[b * s.list_capacity], s.counts[b], x, y,
+                                                                     on_pixels, log_alpha_min, stop, s.walk);
+                walk_back<K, MOMENT>(n, basis, s.walk, s.records.data);
+            }
+            finish(s, tile);
+        }
+        fence();                                      // records may have been streamed
+    }
+}
+
 // Move a record's moments from the tile's centre to the splat's mean at (u, v) from there.
 template <class T> SIGMA_INLINE void shift_moments(T m0, T& mx, T& my, T& mxx, T& mxy, T& myy, T u, T v) {
     mxx += u * (u * m0 - 2.f * mx);
@@ -47,101 +180,6 @@ template <int RECORD> static void flush_records(Render& r, Scratch& s, const Til
         const Geometry& g = *reinterpret_cast<const Geometry*>(&s.rows[size_t(k) * r.row]);
         float* to = &r.partials[size_t(g.tag) * RECORD];
         for (int c = 0; c < RECORD; c += W) stream(to + c, load(&s.records[size_t(k) * RECORD + c]));
-    }
-}
-
-// Walk every tile's pixels once more and hand its records to `finish(scratch, tile)`. The first K of a row's ROW_K features
-// have gradients; the others have none and are passed over.
-template <int ROW_K, int K, bool MOMENT, class Finish>
-static void blend_tiles_backward(Render& r, Outputs o, OutputGradients g, Finish finish) {
-    constexpr int RECORD = record_floats<K, MOMENT>, EXTRA = extra_floats<K, MOMENT>;
-    constexpr int ROW_FLOATS = row_floats<ROW_K>;
-    const size_t plane = r.plane(), stride = r.padded_width();
-    const float log_alpha_min = __builtin_log2f(r.options.alpha_min) * 0.125f;
-    const vf stop = splat(r.options.transmittance_stop), zero = splat(0.f), one = splat(1.f), top = splat(ALPHA_MAX);
-#pragma omp parallel
-    {
-        Scratch& s = r.scratch[omp_get_thread_num()];
-        alignas(64) float basis[W][16 + EXTRA];
-#pragma omp for schedule(dynamic, 1)
-        for (int index = 0; index < r.tiles_x * r.tiles_y; index++) {
-            const Tile tile = gather_tile<true>(r, s, index);
-            memset(s.records.reserve(size_t(tile.count + W) * RECORD), 0, size_t(tile.count + W) * RECORD * sizeof(float));
-            const float* rows = s.rows.data;
-            for (int b = 0; b < BLOCKS; b++) {
-                const int count = s.counts[b];
-                if (!count) continue;
-                const vf x = block_x(b), y = block_y(b);
-                const int* list = &s.lists[b * s.list_capacity];
-                const size_t at = (tile.y + size_t(b / BLOCKS_X) * BLOCK_HEIGHT) * stride + tile.x + b % BLOCKS_X * BLOCK_WIDTH;
-                vf gs[K], gm = zero, ref = zero;
-                const vf ga = g.alpha ? load_block(g.alpha + at, stride) : zero;
-                vf behind = ga * load_block(o.alpha + at, stride);       // Σ over what lies behind of w·G
-                vf columns[16 + EXTRA];                 // what a pixel's (g, w) pairs are multiplied with
-                for (auto& c : columns) c = zero;
-                const vf moments[6] = {one, x, y, x * x, x * y, y * y};
-                for (int c = 0; c < 6; c++) columns[2 * c] = moments[c];
-                const auto weighed = [&](int c, vf v) { columns[c < 8 ? 2 * c + 1 : 8 + c] = v; };
-                for (int c = 0; c < K; c++) {
-                    gs[c] = load_block(g.sums + c * plane + at, stride);
-                    behind = fma(gs[c], load_block(o.sums + c * plane + at, stride), behind);
-                    weighed(c, gs[c]);
-                }
-                if (MOMENT) {
-                    ref = load_block(r.reference + at, stride);
-                    gm = only(gt(ref, zero), load_block(g.moment + at, stride));
-                    behind = fma(gm, load_block(o.moment + at, stride), behind);
-                    weighed(K, 2.f * gm);
-                    weighed(K + 1, -2.f * gm * ref);
-                }
-                for (int h = 0; h < 16 + EXTRA; h += W) {
-                    transpose(columns + h);
-                    for (int m = 0; m < W; m++) store(basis[m] + h, columns[h + pixel_of_pair(m)]);
-                }
-                vf T = one;
-                for (int j = 0; j < count; j += ALPHA_CHUNK) {
-                    const int end = count < j + ALPHA_CHUNK ? count : j + ALPHA_CHUNK;
-                    const int n = live_alphas<ROW_FLOATS>(rows, list, j, end, x, y, ge(T, stop), log_alpha_min, s.alphas);
-                    for (int e = 0; e < n; e++) {
-                        const int entry = s.alphas.entry[e];
-                        const Geometry& geometry = geometry_of<ROW_FLOATS>(rows, entry);
-                        const float* f = rows + size_t(entry) * ROW_FLOATS + GEOMETRY;
-                        const vf a = load(s.alphas.alpha[e]);
-                        const Mask on = ge(T, stop);
-                        const vf w = only(on, T * a);
-                        vf G = ga;
-                        for (int c = 0; c < K; c++) G = fma(gs[c], splat(f[c]), G);
-                        if (MOMENT) { const vf d = geometry.z - ref; G = fma(gm * d, d, G); }
-                        behind = fnma(w, G, behind);
-                        const vf g_alpha = fma(T, G, -(behind * reciprocal(one - a)));
-                        const vf g_power = only(both(on, gt(top, a)), g_alpha * a);
-                        store_pairs(s.alphas.pairs[e], g_power, w);
-                        T = fnma(T, a, T);
-                    }
-                    for (int e = 0; e < n; e++) {
-                        const float* pairs = s.alphas.pairs[e];
-                        float* record = &s.records[size_t(s.alphas.entry[e]) * RECORD];
-                        vf acc[16 / W][2], rest[EXTRA ? EXTRA / W : 1];       // two chains: the sum waits half as long
-                        for (int h = 0; h < 16 / W; h++) { acc[h][0] = load(record + h * W); acc[h][1] = zero; }
-                        for (int h = 0; h < EXTRA / W; h++) rest[h] = load(record + 16 + h * W);
-#pragma GCC unroll 16
-                        for (int m = 0; m < W; m++) {
-                            const vf pair = splat_pair(pairs + 2 * m);
-                            for (int h = 0; h < 16 / W; h++) acc[h][m & 1] = fma(pair, load(basis[m] + h * W), acc[h][m & 1]);
-                            if (EXTRA) {
-                                const vf weight = splat(pairs[2 * m + 1]);
-                                for (int h = 0; h < EXTRA / W; h++) rest[h] = fma(weight, load(basis[m] + 16 + h * W), rest[h]);
-                            }
-                        }
-                        for (int h = 0; h < 16 / W; h++) store(record + h * W, acc[h][0] + acc[h][1]);
-                        for (int h = 0; h < EXTRA / W; h++) store(record + 16 + h * W, rest[h]);
-                    }
-                    if (!any(ge(T, stop))) break;
-                }
-            }
-            finish(s, tile);
-        }
-        fence();                                      // records may have been streamed
     }
 }
 

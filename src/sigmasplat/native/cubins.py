@@ -14,13 +14,19 @@ from sigmasplat.env import install_extra
 from sigmasplat.errors import BackendError
 
 FOLDER = Path(__file__).parent
-RASTER, FIT = "raster.cu", "fit.cu"
-TEXTS = {RASTER: (RASTER, "gradients.cuh", "tiles.cuh", "device.cuh", "sums.cuh", "splat.h"), FIT: (FIT, "sums.cuh")}
+RASTER, FIT, ALIGN = "raster.cu", "fit.cu", "align.cu"
+TEXTS = {
+    RASTER: (RASTER, "gradients.cuh", "tiles.cuh", "device.cuh", "sums.cuh", "splat.h"),
+    FIT: (FIT, "harmonics.cuh", "track.cuh", "descend.cuh", "sums.cuh"),
+    ALIGN: (ALIGN, "align_pixel.h", "align_loop.h", "align_level.h", "sums.cuh"),
+}
 FEATURE_COUNTS = (4, 7, 11, 16)
 """The feature counts compiled, a program each; a count between them is padded with zeros."""
 FITTING = 0
 """In a feature count's place: the program of the fits' loops, which does without one."""
-PROGRAMS = (FITTING, *FEATURE_COUNTS)
+ALIGNING = -1
+"""The same for the program that aligns images."""
+PROGRAMS = (ALIGNING, FITTING, *FEATURE_COUNTS)
 ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
 """What the tests compile for; any other that NVRTC knows is compiled when a device asks for it."""
 INSTALL = install_extra("gpu")
@@ -53,7 +59,7 @@ def compiler_version() -> str:
 
 def text_of(features: int) -> str:
     """Name the text that a program is made of."""
-    return FIT if features == FITTING else RASTER
+    return {FITTING: FIT, ALIGNING: ALIGN}.get(features, RASTER)
 
 
 def cubin(features: int, architecture: str, folder: Path | None = None) -> bytes:

@@ -4,6 +4,7 @@
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
+#include <type_traits>
 
 #include <omp.h>
 
@@ -17,6 +18,7 @@ template <int N> struct std_int { static constexpr int value = N; };
 #include "buffer.h"
 #include "splat.h"
 #include "project.h"
+#include "sort.h"
 #include "bin.h"
 #include "blend.h"
 #include "blend_backward.h"

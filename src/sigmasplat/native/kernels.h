@@ -44,19 +44,7 @@ struct TrackOptions {                      // settings of TrackingConfig
     bool kept = false;                     // errors are averaged over the pixels they keep, not over the image
 };
 
-struct AlignLevel {                        // one pyramid level, planes of width × height
-    const float *reference_gray, *reference_depth, *weight_gray, *weight_depth, *live_gray, *live_depth;   // weights may be null
-    int width, height;
-    float fx, fy, cx, cy;
-};
-
-struct AlignOptions {
-    float weight_color, weight_depth;      // of residuals measured in units of their Huber widths
-    float huber_gray, huber_depth_relative;
-    float depth_gate;                      // metres
-};
-
-struct AlignLoop { int iterations; double update_stop, plateau_stop, depth_m, degenerate_share, min_pixels; };
+#include "align_level.h"
 
 struct Kernels {
     const char* name;

@@ -32,6 +32,15 @@ SIGMA_INLINE vf load(const float* p) { vf r; memcpy(&r, p, sizeof r); return r; 
 SIGMA_INLINE vi load(const int* p) { vi r; memcpy(&r, p, sizeof r); return r; }
 SIGMA_INLINE void store(float* p, vf a) { memcpy(p, &a, sizeof a); }
 SIGMA_INLINE void store(int* p, vi a) { memcpy(p, &a, sizeof a); }
+// Store the first COUNT lanes, a multiple of 4.
+template <int COUNT> SIGMA_INLINE void store_first(float* p, vf a) {
+    if constexpr (COUNT == W) store(p, a);
+#if defined(__AVX512F__)
+    else _mm512_mask_storeu_ps(p, __mmask16((1u << COUNT) - 1u), (__m512)a);
+#else
+    else memcpy(p, &a, COUNT * sizeof(float));
+#endif
+}
 SIGMA_INLINE vf fma(vf a, vf b, vf c) { return a * b + c; }   // contracted by -ffp-contract=fast where the ISA has it
 SIGMA_INLINE vf fnma(vf a, vf b, vf c) { return c - a * b; }
 SIGMA_INLINE vf to_float(vi a) { return __builtin_convertvector(a, vf); }
@@ -119,15 +128,16 @@ SIGMA_INLINE vf exp2(vf x) {
 }
 SIGMA_INLINE vf exp(vf x) { return exp2(x * 1.4426950408889634f); }
 
-// 2^(8x) for x in [-1, 0]: no range reduction, because a live alpha lies in [1/256, 1] (relative error 6e-7).
-SIGMA_INLINE vf exp2_eighth(vf x) {
-    vf x2 = x * x;
-    vf high = fma(splat(9.387883367e-4f), x, splat(9.188611731e-3f));
-    vf middle = fma(splat(5.527972258e-2f), x, splat(0.2401721892f));
-    vf low = fma(splat(0.6931422526f), x, splat(0.9999999251f));
-    vf p = fma(fma(high, x2, middle), x2, low);
-    p *= p; p *= p;
-    return p * p;
+// 2^x for x in [-100, 0], without `exp2`'s clamps, for a live alpha lies in [1/255, 1] (relative error 8e-8 before rounding).
+// What rounds x adds, and adders wait while the multipliers are what an alpha waits for; outside the range it is any number.
+SIGMA_INLINE vf exp2_alpha(vf x) {
+    const vf shifted = x + 12582912.f, f = x - (shifted - 12582912.f);      // 1.5·2²³: its last bits hold round(x)
+    vf p = fma(splat(1.327647217e-3f), f, splat(9.675541331e-3f));
+    p = fma(p, f, splat(5.550713273e-2f));
+    p = fma(p, f, splat(0.2402211972f));
+    p = fma(p, f, splat(0.6931469671f));
+    p = fma(p, f, splat(1.000000072f));
+    return float_of_bits(bits_of(p) + (bits_of(shifted) << 23));
 }
 
 // log2 of positive normal numbers: exponent plus an odd series in (m-1)/(m+1), m in [sqrt(1/2), sqrt(2)).
@@ -169,13 +179,6 @@ SIGMA_INLINE void fence() { _mm_sfence(); }
 #else
 SIGMA_INLINE void fence() {}
 #endif
-
-// 1/x of positive normal numbers (relative error 1e-7): Newton from a guess on the bits. Four times the division's rate.
-SIGMA_INLINE vf reciprocal(vf x) {
-    vf y = float_of_bits(0x7ef311c7 - bits_of(x));
-    for (int i = 0; i < 3; i++) y *= fnma(x, y, splat(2.f));
-    return y;
-}
 
 // A (BLOCK_WIDTH × BLOCK_HEIGHT) block of an image plane whose rows are `stride` floats apart.
 typedef float row_of_block __attribute__((vector_size(BLOCK_WIDTH * 4)));

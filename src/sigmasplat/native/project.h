@@ -20,7 +20,10 @@ template <int COLUMNS> SIGMA_INLINE void turn_rows(const float* const* rows, flo
 // W rows of a row-major [n, columns] array as lanes; rows past the end repeat the last one.
 template <int COLUMNS> SIGMA_INLINE void load_rows(const float* rows, int64_t first, int64_t n, float (*lanes)[W]) {
     const float* row[W];
-    for (int l = 0; l < W; l++) row[l] = rows + (first + l < n ? first + l : n - 1) * COLUMNS;
+    if (first + W <= n)
+        for (int l = 0; l < W; l++) row[l] = rows + (first + l) * COLUMNS;
+    else
+        for (int l = 0; l < W; l++) row[l] = rows + (first + l < n ? first + l : n - 1) * COLUMNS;
     turn_rows<COLUMNS>(row, lanes);
 }
 template <int COLUMNS> SIGMA_INLINE void store_rows(float* rows, int64_t first, int64_t n, const float (*lanes)[W]) {

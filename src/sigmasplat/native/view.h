@@ -7,13 +7,13 @@ static void blend(Render& r, Outputs o) {
         else o.dominant_id ? blend_tiles<K, false, true>(r, o) : blend_tiles<K, false, false>(r, o);
     });
 }
-static void blend_gradients(Render& r, Outputs o, OutputGradients g) {   // to each splat's slots
+static void blend_gradients(Render& r, OutputGradients g) {   // to each splat's slots
     with_features(r.k, [&](auto k) {
         const auto to_slots = [&](auto moment) {
             constexpr int K = decltype(k)::value, RECORD = record_floats<K, decltype(moment)::value != 0>;
             r.partials.reserve(size_t(r.intersections + 1) * RECORD);
             blend_tiles_backward<K, K, decltype(moment)::value != 0>(
-                r, o, g, [&](Scratch& s, const Tile& tile) { flush_records<RECORD>(r, s, tile); });
+                r, g, [&](Scratch& s, const Tile& tile) { flush_records<RECORD>(r, s, tile); });
         };
         g.moment ? to_slots(std_int<1>{}) : to_slots(std_int<0>{});
     });
@@ -62,9 +62,9 @@ static void blend_forward(Context* context, const float* means2d, const float* c
     blend(r, o);
 }
 
-static void blend_backward(Context* context, Outputs o, OutputGradients g, SplatGradients out) {
+static void blend_backward(Context* context, Outputs, OutputGradients g, SplatGradients out) {
     Render& r = *reinterpret_cast<Render*>(context);
-    blend_gradients(r, o, g);
+    blend_gradients(r, g);
     with_features(r.k, [&](auto k) {
         constexpr int K = decltype(k)::value;
         const auto finish = [&](auto record, auto moment) {
@@ -79,7 +79,7 @@ static void blend_backward(Context* context, Outputs o, OutputGradients g, Splat
                     const bool seen = i + q < r.n && r.tiles_of[i + q];
                     const Geometry g0 = seen ? r.geometry(i + q) : Geometry{1, 0, 1, 0, 0, 0, 1, 0};
                     l[0][q] = g0.l1 / CONIC_SCALE; l[1][q] = g0.l2 / CONIC_SCALE; l[2][q] = g0.l3 / CONIC_SCALE;
-                    l[3][q] = g0.z; l[4][q] = seen ? exp2f(8.f * g0.log_opacity) : 1.f;
+                    l[3][q] = g0.z; l[4][q] = seen ? exp2f(g0.log_opacity) : 1.f;
                 }
                 FootprintGradient<vf> f = footprint_gradient(moments_of(sums), load(l[0]), load(l[1]), load(l[2]));
                 if constexpr (decltype(moment)::value) f.z = fma(load(l[3]), weight_sum(sums, K), weight_sum(sums, K + 1));
@@ -126,14 +126,13 @@ template <int K> static void pack_view(Render& r, const float* params) {
         for (int64_t i = c * CHUNK; i < n && i < (c + 1) * CHUNK; i += W) {
             alignas(64) float row[ROW][W], f[8][W];
             load_rows<ROW>(params, i, n, row);
+            for (int l = 0; l <= W; l++) __builtin_prefetch(params + (i + 2 * W + l) * ROW);
             const Splats s = activate<(K > 4)>(row);
             const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
             for (int q = 0; q < 3; q++) store(f[q], s.color[q]);
             store(f[3], p.z);
-            if (K > 4) {
-                for (int q = 0; q < 3; q++) store(f[4 + q], fma(s.color[q], s.color[q], s.variance[q]));
-                store(f[7], splat(0.f));
-            }
+            for (int q = 0; q < 3; q++) store(f[4 + q], K > 4 ? fma(s.color[q], s.color[q], s.variance[q]) : splat(0.f));
+            store(f[7], splat(0.f));
             total += pack<row_floats<K>>(r, p, s.opacity, gt(p.z, splat(r.view.near_m)), i, total, f);
         }
         r.chunk_begin[c] = total;
@@ -239,11 +238,11 @@ static void chain_any(Render& r, const float* params, OutputGradients g, float* 
     r.k <= 4 ? chain(std_int<4>{}) : chain(std_int<7>{});
 }
 
-static void view_backward(Context* context, const float* params, Outputs o, OutputGradients g, float* g_params, float* pull,
+static void view_backward(Context* context, const float* params, Outputs, OutputGradients g, float* g_params, float* pull,
                           double* g_twist, double* seconds) {
     Render& r = *reinterpret_cast<Render*>(context);
     const double t0 = omp_get_wtime();
-    blend_gradients(r, o, g);
+    blend_gradients(r, g);
     const double t1 = omp_get_wtime();
     chain_any(r, params, g, pull, g_twist,
         [&](int64_t i, unsigned, const Splats&, const float (*gradient)[W]) { store_rows<ROW>(g_params, i, r.n, gradient); },
@@ -253,11 +252,11 @@ static void view_backward(Context* context, const float* params, Outputs o, Outp
 
 // Backward and one Adam step in one go: no gradient row reaches memory. Splats out of view wait (adam.h), and feel no isotropy
 // term: |s − mean(s)| is a mean over all splats, max(s)/min(s) − 1 over those in view. Returns what both cost, weighted.
-static double view_step(Context* context, float* params, Outputs o, OutputGradients g, AdamState state, AdamOptions options,
+static double view_step(Context* context, float* params, Outputs, OutputGradients g, AdamState state, AdamOptions options,
                         StepOptions terms, float* pull, double* g_twist, double* seconds) {
     Render& r = *reinterpret_cast<Render*>(context);
     const double t0 = omp_get_wtime();
-    blend_gradients(r, o, g);
+    blend_gradients(r, g);
     const double t1 = omp_get_wtime();
     const AdamRates adam(options);
     int64_t visible = 0;
@@ -283,7 +282,7 @@ static double view_step(Context* context, float* params, Outputs o, OutputGradie
 }
 
 // ∂L/∂pose alone, from gradients on colour and depth: chained tile by tile, no splat's gradient is ever formed.
-static void view_backward_pose(Context* context, const float* params, Outputs o, OutputGradients g, double* g_twist, double* seconds) {
+static void view_backward_pose(Context* context, const float* params, Outputs, OutputGradients g, double* g_twist, double* seconds) {
     Render& r = *reinterpret_cast<Render*>(context);
     const double t0 = omp_get_wtime();
     const int tiles = r.tiles_x * r.tiles_y;
@@ -314,7 +313,7 @@ static void view_backward_pose(Context* context, const float* params, Outputs o,
         }
         for (int q = 0; q < 6; q++) partial[tile.index * 6 + q] = lane_sum(twist[q]);
     };
-    r.k <= 4 ? blend_tiles_backward<4, 4, false>(r, o, g, finish) : blend_tiles_backward<7, 4, false>(r, o, g, finish);
+    r.k <= 4 ? blend_tiles_backward<4, 4, false>(r, g, finish) : blend_tiles_backward<7, 4, false>(r, g, finish);
     for (int q = 0; q < 6; q++) {
         g_twist[q] = 0;
         for (int t = 0; t < tiles; t++) g_twist[q] += partial[t * 6 + q];

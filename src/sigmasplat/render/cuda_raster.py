@@ -2,7 +2,8 @@
 
 No host waits for the device between a forward and its backward pass once a first image has said how many pairs of tile
 and splat to expect. Where there are more than expected, `blend` goes through all splats instead of lists: slowly,
-to the same image; the backward pass, which learns of it by then, lists them anew.
+to the same image; the backward pass, which learns of it by then, lists them anew. A loop that is to run without the
+host altogether bins and goes back `within` the room there is: `pairs` say, on the device, whether it sufficed.
 """
 
 import math
@@ -88,14 +89,22 @@ class Raster:
 
     def bin(self) -> None:
         """List, tile by tile, the packed splats that reach it, near to far."""
-        self._order = torch.sort(self.depths, stable=True).indices
-        self._ends = self.counts[self._order].cumsum(0)
-        self._total = self._ends[-1:] if self.n else torch.zeros(1, dtype=torch.int64, device=self.device)
+        self._order_splats()
         self._send_total()
         if self.capacity is None:
             self.make_room()
         else:
             self._list()
+
+    def bin_within(self) -> None:
+        """Do the same with what room there is, and tell the host nothing."""
+        self._order_splats()
+        self._list()
+
+    def _order_splats(self) -> None:
+        self._order = torch.sort(self.depths, stable=True).indices
+        self._ends = self.counts[self._order].cumsum(0)
+        self._total = self._ends[-1:] if self.n else torch.zeros(1, dtype=torch.int64, device=self.device)
 
     def _send_total(self) -> None:
         """Let the number of pairs travel to the host, without waiting for it."""
@@ -109,16 +118,28 @@ class Raster:
     def make_room(self) -> None:
         """List the pairs anew if there was not room for all. Waits for their number alone, known before the image.
 
-        Raises BackendError where there are more than can be numbered.
+        Raises BackendError as `expect` does.
         """
         if self._arrived is not None:
             self._arrived.synchronize()
         total = int(self._host_total)
-        if total > MOST_PAIRS // SPARE:
-            raise BackendError(f"{total} pairs of splats and tiles are too many; use fewer or smaller splats")
         if self.capacity is None or total > self.capacity:
-            self.capacity = int(SPARE * total)
+            self.expect(total)
             self._list()
+
+    def expect(self, pairs: int) -> None:
+        """Make room for so many pairs, and some more, from the next list on.
+
+        Raises BackendError where there are more than can be numbered.
+        """
+        if pairs > MOST_PAIRS // SPARE:
+            raise BackendError(f"{pairs} pairs of splats and tiles are too many; use fewer or smaller splats")
+        self.capacity = int(SPARE * pairs)
+
+    @property
+    def pairs(self) -> Struct:
+        """Return how many pairs there were, on the device, and for how many there was room, as the kernels' `Pairs`."""
+        return self._total, self._room
 
     def _list(self) -> None:
         tiles, capacity = self.tiles_x * self.tiles_y, max(self.capacity or 0, 1)
@@ -173,13 +194,22 @@ class Raster:
     def pose_gradients(self, planes: Planes, on_sums: Tensor) -> Tensor:
         """Do the same for colour and depth alone, the first four planes."""
         self.make_room()
+        return self._summed(self._pose_records(planes, on_sums))
+
+    def pose_gradients_within(self, planes: Planes, on_sums: Tensor) -> Tensor:
+        """Do the same with what room there was; where it did not suffice no splat counts."""
+        records = self._pose_records(planes, on_sums)
+        self.launch_fit("drop_pairs", blocks_for(self.n), self.pairs, self.n, self.counts)
+        return self._summed(records)
+
+    def _pose_records(self, planes: Planes, on_sums: Tensor) -> Tensor:
         records = self.empty(self._room, _rounded(MOMENTS + 4))
         outputs = Planes(planes.sums, None, planes.alpha)
         self.launch(
             "blend_backward_pose", self.tiles_x * self.tiles_y, self.frame, self.rows, self._lists, self.slots,
             self.used, outputs, (on_sums, None, None), records,
         )  # fmt: skip
-        return self._summed(records)
+        return records
 
     def _summed(self, records: Tensor) -> Tensor:
         floats = records.shape[1]

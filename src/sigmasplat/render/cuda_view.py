@@ -8,6 +8,7 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
 from sigmasplat.render import cuda_launch
 from sigmasplat.render.cuda_raster import Planes, Raster
+from sigmasplat.render.cuda_stages import Stages
 from sigmasplat.render.numbers import view_numbers
 from sigmasplat.render.view import Layers, Matrix
 
@@ -15,8 +16,8 @@ from sigmasplat.render.view import Layers, Matrix
 class CudaView:
     """A view on the CUDA kernels: `View` with planes of exactly the image's size, on a device.
 
-    A backward pass ends by reading the twist, the one moment that the host waits for the device. Its `seconds` stay 0:
-    to measure stages would be to wait for each.
+    A backward pass ends by reading the twist, the one moment that the host waits for the device. Its `seconds` stay 0
+    where nobody asked to `measure` them (render/cuda_stages.py); to read them is to wait for the device.
     """
 
     def __init__(
@@ -34,7 +35,11 @@ class CudaView:
         self.layers = Layers.of(*size, device)
         self._made = (False, False)
         self._numbers = view_numbers(camera, np.eye(4), options)
-        self.seconds = np.zeros(5)
+        self.stages = Stages()
+
+    @property
+    def seconds(self) -> Matrix:
+        return self.stages.seconds
 
     def forward(
         self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
@@ -46,9 +51,12 @@ class CudaView:
             self._reference.copy_(depth_reference)
         self._made = (depth_reference is not None, layers)
         r.prepare(n, len(self.sums), self.camera, self.options)
-        r.each_splat("pack_view", self._numbers, None, params, n, r.frame, r.packed)
-        r.bin()
-        r.blend(self._planes, self._reference if depth_reference is not None else None)
+        with self.stages.of("project"):
+            r.each_splat("pack_view", self._numbers, None, params, n, r.frame, r.packed)
+        with self.stages.of("sort"):
+            r.bin()
+        with self.stages.of("blend"):
+            r.blend(self._planes, self._reference if depth_reference is not None else None)
 
     def _here(self, params: Tensor) -> Tensor:
         """Return rows as the kernels read them, brought here from wherever they lie."""
@@ -67,13 +75,15 @@ class CudaView:
         """Do the same, and leave the twist on the device: no host waits."""
         (moment, layers), r = self._made, self.raster
         on_moment, reference = (self.g_moment, self._reference) if moment else (None, None)
-        sums, at = r.gradients(self._planes, reference, self.g_sums, on_moment, self.g_alpha)
-        on_median, twists = self._on_median() if layers else None, r.twists()
-        r.each_splat(
-            "chain_params", self._numbers, None, self._here(params), r.counts, sums, on_median, r.n, sums.shape[1], at,
-            g_params, pull, twists,
-        )  # fmt: skip
-        return twists.sum(0)
+        with self.stages.of("blend_backward"):
+            sums, at = r.gradients(self._planes, reference, self.g_sums, on_moment, self.g_alpha)
+        with self.stages.of("project_backward"):
+            on_median, twists = self._on_median() if layers else None, r.twists()
+            r.each_splat(
+                "chain_params", self._numbers, None, self._here(params), r.counts, sums, on_median, r.n, sums.shape[1],
+                at, g_params, pull, twists,
+            )  # fmt: skip
+            return twists.sum(0)
 
     def _on_median(self) -> Tensor:
         """Gather ∂L/∂(median depth) of all pixels by the splats whose depths they are, [n]."""
@@ -83,10 +93,40 @@ class CudaView:
         return found[:-1]
 
     def backward_pose(self, params: Tensor) -> Matrix:
-        r, sums = self.raster, self.raster.pose_gradients(self._planes, self.g_sums)
-        twists = r.twists()
-        r.each_splat("chain_pose", self._numbers, None, self._here(params), r.counts, sums, r.n, sums.shape[1], twists)
+        r = self.raster
+        with self.stages.of("blend_backward"):
+            sums = r.pose_gradients(self._planes, self.g_sums)
+        with self.stages.of("project_backward"):
+            twists = r.twists()
+            r.each_splat(
+                "chain_pose", self._numbers, None, self._here(params), r.counts, sums, r.n, sums.shape[1], twists
+            )
         return twists.sum(0).cpu().numpy()
+
+    def follow(self, params: Tensor, pose: Tensor) -> None:
+        """Render rows [N, 17] to `sums` and `alpha` from T_camera_world float32 [4, 4] on the device; no host waits."""
+        params = self._here(params)
+        r, n, self._made = self.raster, len(params), (False, False)
+        with self.stages.of("project"):
+            r.prepare(n, len(self.sums), self.camera, self.options)
+            r.each_splat("pack_view", self._numbers, pose, params, n, r.frame, r.packed)
+        with self.stages.of("sort"):
+            r.bin_within()
+        with self.stages.of("blend"):
+            r.blend(self._planes, None)
+
+    def follow_back(self, params: Tensor, pose: Tensor) -> Tensor:
+        """Carry the gradient planes of colour and depth to that pose: twists [blocks, 6], to be added up on the device.
+
+        They are 0 where `raster.pairs` were more than there was room for.
+        """
+        r = self.raster
+        with self.stages.of("blend_backward"):
+            sums = r.pose_gradients_within(self._planes, self.g_sums)
+        with self.stages.of("project_backward"):
+            twists, rows = r.twists(), self._here(params)
+            r.each_splat("chain_pose", self._numbers, pose, rows, r.counts, sums, r.n, sums.shape[1], twists)
+        return twists
 
     def visible(self, n: int) -> Tensor:
         return self.raster.visible[:n].bool()

@@ -68,12 +68,13 @@ class View(Protocol):
     moment: Tensor
     """U about the reference depth of the last forward pass that was given one, [rows, columns] m² (CG-SLAM eq. 10)."""
     layers: "Layers"
-    """Of the last forward pass that was asked for them."""
     g_moment: Tensor
     g_median_depth: Tensor
     """Gradients of `moment` and of the layers' median depth: felt where the last forward pass made those."""
-    seconds: NDArray[np.float64]
-    """Time spent so far in project, sort, blend, blend backward, project backward."""
+
+    @property
+    def seconds(self) -> NDArray[np.float64]:
+        """Return the time spent so far in project, sort, blend, blend backward, project backward."""
 
     def forward(
         self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
@@ -82,13 +83,11 @@ class View(Protocol):
         if asked to into `layers`."""
 
     def backward(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Matrix:
-        """Carry the gradient planes to parameter rows, written to g_params [N, 17]; return the pose twist [6].
-
-        Written to pull [N], where given, is how hard each splat's image mean is pulled, per half image size (3DGS).
-        """
+        """Carry the gradient planes to parameter rows, written to g_params [N, 17]; return the pose twist [6] (ρ, φ; m,
+        rad). To pull [N], where given, goes how hard each image mean is pulled, per half image size (3DGS)."""
 
     def backward_pose(self, params: Tensor) -> Matrix:
-        """Carry the gradient planes of colour and depth to the pose alone; return the twist [6]."""
+        """Carry the gradient planes of colour and depth to the pose alone; return the twist (ρ, φ) [6]."""
 
     def visible(self, n: int) -> Tensor:
         """Tell which of the n splats of the last forward pass reach the image, bool [n]."""
@@ -116,6 +115,7 @@ class CpuView:
     def forward(
         self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
     ) -> None:
+        """Render rows [N, 17] as `View.forward` says: planes [K, rows, columns], m and m², padded to whole tiles."""
         o, reference_depth, moment = self.options, None, None
         if depth_reference is not None:
             self._reference[: self.camera.height, : self.camera.width] = depth_reference
@@ -128,7 +128,7 @@ class CpuView:
         )  # fmt: skip
 
     def depth_gradients(self) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-        """Return moment and its gradient, median ids and their depths' gradient: None where not made."""
+        """Return moment and its gradient, median ids and their depths' gradient: [rows, columns], or None."""
         (moment, layers), ids = self._made, self.layers.median_id
         return (
             self.moment if moment else None, self.g_moment if moment else None,
@@ -136,6 +136,7 @@ class CpuView:
         )  # fmt: skip
 
     def backward(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Matrix:
+        """Write gradients by rows, g_params [N, 17], and pull [N] if given; return the pose twist (ρ, φ) [6]."""
         twist, (moment, g_moment, median_id, g_median_depth) = np.zeros(6), self.depth_gradients()
         self.raster.view_backward(
             params, self.sums, moment, self.alpha, self.g_sums, g_moment, self.g_alpha, median_id, g_median_depth,
@@ -144,11 +145,13 @@ class CpuView:
         return twist
 
     def backward_pose(self, params: Tensor) -> Matrix:
+        """Return the pose twist (ρ, φ) [6] of the gradient planes of colour and depth; params are rows [N, 17]."""
         twist = np.zeros(6)
         self.raster.backward_pose(params, self.sums, self.alpha, self.g_sums, twist, self.seconds[3:])
         return twist
 
     def visible(self, n: int) -> Tensor:
+        """Tell which of the n splats last rendered reach the image, bool [n]."""
         seen = torch.empty(n, dtype=torch.uint8)
         self.raster.visible(seen)
         return seen.bool()
@@ -174,6 +177,7 @@ class ReferenceView:
     def forward(
         self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
     ) -> None:
+        """Render rows [N, 17] as `View.forward` says: planes [K, H, W], m and m²; nothing is padded."""
         self._leaf = params.detach().clone().requires_grad_()
         self._twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
         T = torch.linalg.matrix_exp(twist_matrix(self._twist)) @ torch.as_tensor(T_camera_world)
@@ -194,6 +198,7 @@ class ReferenceView:
             self._maps.append((torch.where(b.median_id >= 0, nearest, 0.0), self.g_median_depth))
 
     def backward(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Matrix:
+        """Write gradients by rows, g_params [N, 17], and pull [N] if given; return the pose twist (ρ, φ) [6]."""
         maps, gradients = zip(*self._maps, strict=True)
         leaves = (self._leaf, self._twist, self._means2d)
         g_leaf, g_twist, g_means2d = torch.autograd.grad(maps, leaves, gradients, materialize_grads=True)
@@ -203,11 +208,13 @@ class ReferenceView:
         return np.asarray(g_twist.numpy(), np.float64)
 
     def backward_pose(self, params: Tensor) -> Matrix:
+        """Return the pose twist (ρ, φ) [6] of the gradient planes of colour and depth."""
         maps, on_maps = self._maps[0][0][:4], (self.g_sums[:4],)
         (g_twist,) = torch.autograd.grad(maps, (self._twist,), on_maps, materialize_grads=True)
         return np.asarray(g_twist.numpy(), np.float64)
 
     def visible(self, n: int) -> Tensor:
+        """Tell which splats last rendered reach the image, bool [n]."""
         return self._visible
 
 
@@ -227,7 +234,7 @@ def reaches(p: reference.Projection, opacities: Tensor, camera: Camera, options:
 
 
 def twist_matrix(xi: Tensor) -> Tensor:
-    """Write a twist (ρ, φ) [6] as the 4×4 matrix whose exponential is the motion."""
+    """Write a twist (ρ, φ) [6], m and rad, as the matrix [4, 4] whose exponential is the motion."""
     zero = torch.zeros((), dtype=xi.dtype)
     x, y, z, a, b, c = xi
     rows = [[zero, -c, b, x], [c, zero, -a, y], [-b, a, zero, z], [zero, zero, zero, zero]]

@@ -34,7 +34,7 @@ class Drift:
     last: Matrix = field(default_factory=lambda: np.eye(4))
 
     def hop(self, T_submap_camera: Matrix, covariance: Matrix | None) -> None:
-        """Add a hop to the keyframe at T_submap_camera, `covariance` [6, 6] of the left twist of T_camera_reference.
+        """Add a hop to the keyframe at T_submap_camera [4, 4], `covariance` [6, 6] of T_camera_reference's left twist.
 
         T_reference_camera = exp(ξ)⁻¹ …: on the right of the chain, ξ is felt on the left as −Ad(T_submap_camera) ξ.
         None: nothing is known of the hop, it counts as a usual one; infinite: the images have nothing in common.
@@ -51,7 +51,7 @@ class Drift:
 
     def position_m(self, T_submap_camera: Matrix) -> float:
         """Return the accumulated tracking uncertainty: the standard deviation of the camera's position in the submap,
-        metres, √ of the sum over the axes, by what alignment says of itself.
+        T_submap_camera [4, 4]'s, metres, √ of the sum over the axes, by what alignment says of itself.
 
         A twist moves the position p by ρ + φ × p.
         """
@@ -60,7 +60,7 @@ class Drift:
 
     @property
     def information(self) -> Matrix:
-        """Return what the chain says of its end [6, 6]: inverse covariance, usual errors and `BIAS` included.
+        """Return what the chain says of its end [6, 6] (m, rad): inverse covariance, usual errors and `BIAS` included.
 
         There must have been a hop.
         """
@@ -69,5 +69,5 @@ class Drift:
 
 
 def symmetric(matrix: Matrix) -> Matrix:
-    """Return a matrix that is symmetric up to rounding as one that is."""
+    """Return a matrix [n, n] that is symmetric up to rounding as one that is."""
     return np.asarray(0.5 * (matrix + matrix.T))

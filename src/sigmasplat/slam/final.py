@@ -39,7 +39,7 @@ def final_map(
     random: np.random.Generator,
     progress: Progress = lambda done, total: None,
 ) -> GaussianField:
-    """Return the map in the world, of submaps at `anchors` (T_world_submap), refined through `view`.
+    """Return the map in the world, of submaps at `anchors` (T_world_submap [4, 4] each), refined through `view`.
 
     `progress` is told (steps of refinement done, of how many). Memory holds this map, one submap and some pictures.
     Raises SigmaSplatError if there is no submap, one without an anchor, or one of another camera than the view's;
@@ -69,7 +69,7 @@ def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix], final: FinalC
 
 
 def merged(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> GaussianField:
-    """Join all submaps' splats in the world, without doubles where submaps overlap (`survivors`)."""
+    """Join all submaps' splats in the world (anchors: T_world_submap [4, 4]), without doubles (`survivors`)."""
     field, owner = GaussianField.empty(), list[NDArray[np.int64]]()
     for index in range(len(store)):
         part = _in_world(store, anchors, index)
@@ -120,8 +120,8 @@ def survivors(
 def seeded_on_surface(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> GaussianField:
     """Place splats on the surface that the submaps show, `spacing_m` apart and as large (VarSplat §7).
 
-    Their σ² is the nearest submap splat's, with `final.uncertainty` off the initial one. Raises SigmaSplatError if no
-    surface is shown.
+    anchors: T_world_submap [4, 4] of each submap. Their σ² is the nearest submap splat's, with `final.uncertainty` off
+    the initial one. Raises SigmaSplatError if no surface is shown.
     """
     final = config.final
     mesh = fuse(standpoints_of(store, anchors), count_keyframes(store), config, weigh=final.uncertainty)
@@ -148,7 +148,7 @@ def thinned_vertices(mesh: Mesh, spacing_m: float) -> tuple[Matrix, Matrix]:
 
 
 def nearest_log_variances(points: Matrix, store: SubmapStore, anchors: Sequence[Matrix]) -> Tensor:
-    """Return log σ² [M, 3] of the splat nearest to each point [M, 3], of all submaps."""
+    """Return log σ² [M, 3] of the splat nearest to each point [M, 3] m, of submaps at T_world_submap [4, 4] each."""
     found, distance = torch.full((len(points), 3), INITIAL_LOG_VARIANCE), np.full(len(points), np.inf)
     for index in range(len(store)):
         part = _in_world(store, anchors, index)
@@ -167,7 +167,8 @@ def nearest_log_variances(points: Matrix, store: SubmapStore, anchors: Sequence[
 class Keyframes:
     """All keyframes of all submaps where they are in the world; a picture is read from the store when it is asked for.
 
-    Raises SigmaSplatError if there is none, or a submap's camera is not the view's.
+    anchors: T_world_submap [4, 4] of each submap; `poses`: T_world_camera [4, 4] of each keyframe. Raises
+    SigmaSplatError if there is none, or a submap's camera is not the view's.
     """
 
     def __init__(self, store: SubmapStore, anchors: Sequence[Matrix], view: View) -> None:
@@ -206,7 +207,7 @@ def refine(
     random: np.random.Generator,
     progress: Progress,
 ) -> list[float]:
-    """Fit the field to keyframes drawn evenly, poses fixed; prune now and then; return the loss of each step.
+    """Fit the field to keyframes drawn evenly, poses fixed; prune now and then; return each step's loss (no unit).
 
     Colours gain a degree of view dependence each `sh_every` steps.
     """

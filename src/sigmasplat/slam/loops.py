@@ -35,8 +35,9 @@ class Loop:
     """A pair of submaps that look alike, and what became of it.
 
     query, database: submaps; query_frame, database_frame: their most alike keyframes' frames; similarity, gated: of
-    these (VarSplat §4); residual, overlap, localised: of the registration; translation_m, rotation_deg: by how much it
-    differs from the poses known before; chi2, weight: the pose graph's verdict on it; accepted: whether it holds.
+    these (VarSplat §4); residual, overlap, localised: of the registration; translation_m, rotation_deg: by how much
+    T_query_database [4, 4] differs from the poses known before; chi2, weight: the pose graph's verdict on it; accepted:
+    whether it holds.
     """
 
     query: int
@@ -87,13 +88,15 @@ class LoopCloser:
     loops: list[Loop] = field(default_factory=list)
 
     def submap_begun(self, index: int, T_before_new: Matrix, information: Matrix) -> None:
-        """Take note of how tracking tied a new submap to the one before it."""
+        """Take note of how tracking tied a new submap to the one before it: T_before_new [4, 4], and the information
+        [6, 6] of its left twist (m, rad)."""
         self.odometry.append(Edge(index - 1, index, T_before_new, information, loop=False))
 
     def submap_finished(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], atlas: Atlas) -> list[Loop]:
         """Look for loops from a finished submap to earlier ones; where one is found, correct the anchors.
 
-        Returns the pairs tried, the latest verdict on each.
+        descriptors [D]: of its keyframes, in order, of unit norm or zero. Returns the pairs tried, the latest verdict
+        on each.
         """
         c, field = self.config.loops, submap.field
         if not c.close or not descriptors:
@@ -145,7 +148,8 @@ class LoopCloser:
 
 
 def described(best: Candidate, a: Submap, b: Submap, found: Registration, known: Matrix) -> Loop:
-    """Return what became of registering submaps a and b, whose most alike keyframes are `best`'s."""
+    """Return what became of registering submaps a and b, whose most alike keyframes are `best`'s; known: T_a_b [4, 4]
+    of before."""
     seen_from = b.T_submap_camera[best.database_keyframe]
     moved = se3.inverse(known @ seen_from) @ found.T_a_b @ seen_from
     return Loop(

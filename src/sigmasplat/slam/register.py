@@ -12,8 +12,8 @@ from torch import Tensor
 from sigmasplat.config import Config, RegistrationConfig, TrackingConfig
 from sigmasplat.fit.align import align
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
-from sigmasplat.fit.pyramid import Pyramid, gray_of
-from sigmasplat.fit.references import map_reference
+from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.references import live_image, map_reference
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.submap import Submap, SubmapStore
@@ -34,8 +34,8 @@ OPAQUE = 0.95
 
 @dataclass(frozen=True, eq=False)
 class Localisation:
-    """One keyframe found in the other submap, as T_a_b between the submaps; residual: the loss it ended with;
-    covariance [6, 6] of T_a_b's left twist; agreement and overlap as in `PoseFit`."""
+    """One keyframe found in the other submap, as T_a_b [4, 4] between the submaps; residual: the loss it ended with;
+    covariance [6, 6] of T_a_b's left twist (m, rad); agreement and overlap as in `PoseFit`."""
 
     T_a_b: Matrix
     residual: float
@@ -46,10 +46,10 @@ class Localisation:
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """T_a_b of submaps a and b, or why it is refused.
+    """T_a_b [4, 4] of submaps a and b, or why it is refused.
 
-    information [6, 6]: inverse covariance of T_a_b's left twist; residual: mean loss of the localisations that counted,
-    `localised` of them; overlap: share of splats with a neighbour in the other submap.
+    information [6, 6]: inverse covariance of T_a_b's left twist (m, rad); residual: mean loss of the localisations that
+    counted, `localised` of them; overlap: share of splats with a neighbour in the other submap.
     """
 
     T_a_b: Matrix
@@ -69,7 +69,7 @@ class Registrar:
         self.tracking = tracking_of(config.registration, config.tracking)
 
     def register(self, pair: SubmapPair, a: Submap, b: Submap, T_a_b: Matrix) -> Registration:
-        """Register the submaps a (query) and b (database) of a pair, T_a_b as known so far."""
+        """Register the submaps a (query) and b (database) of a pair, T_a_b [4, 4] as known so far."""
         found = [self._localise(a, k, b, pair.database_keyframes, T_a_b) for k in pair.query_keyframes]
         back = [self._localise(b, k, a, pair.query_keyframes, se3.inverse(T_a_b)) for k in pair.database_keyframes]
         found += [turned(localisation) for localisation in back]
@@ -95,7 +95,7 @@ class Registrar:
     def _laid_out(self, submap: Submap, keyframe: int) -> tuple[Target, Pyramid]:
         picture = self.store.picture(submap.index, keyframe)
         target = Target.of_picture(picture, submap.camera, (self.view.sums.shape[1], self.view.sums.shape[2]))
-        return target, Pyramid.of(gray_of(picture.unit_color), picture.depth_m, submap.camera)
+        return target, live_image(self.view, picture.unit_color, picture.depth_m, target)
 
     def _aligned(self, params: Tensor, live: Pyramid, guess: Matrix) -> PoseFit:
         """Align a keyframe to the map seen from a guess, and once more to the map seen from there."""
@@ -145,25 +145,28 @@ def tracking_of(registration: RegistrationConfig, tracking: TrackingConfig) -> T
 
 
 def score(fit: PoseFit) -> float:
-    """Return how much of a keyframe its place explains."""
+    """Return how much of a keyframe its place explains, a share in [0, 1]."""
     return fit.agreement * fit.overlap
 
 
 def turned(found: Localisation) -> Localisation:
-    """Return the same as T_b_a: the inverse's left twist is −Ad(T⁻¹) ξ."""
+    """Return the same as T_b_a [4, 4]: the inverse's left twist is −Ad(T⁻¹) ξ."""
     T = se3.inverse(found.T_a_b)
     A = se3.adjoint(T)
     return dataclasses.replace(found, T_a_b=T, covariance=A @ found.covariance @ A.T)
 
 
 def differs(one: Matrix, other: Matrix, point_b: Matrix) -> tuple[float, float]:
-    """Return by how much two T_a_b differ: metres where they put a point of b, and radians."""
+    """Return by how much two T_a_b [4, 4] differ: metres where they put point_b [3] m of b, and radians."""
     apart = (one[:3, :3] - other[:3, :3]) @ point_b + one[:3, 3] - other[:3, 3]
     return float(np.linalg.norm(apart)), se3.rotation_angle(one[:3, :3].T @ other[:3, :3])
 
 
 def consensus(found: Sequence[Localisation], point_b: Matrix, spread_m: float, spread_rad: float) -> list[Localisation]:
-    """Return the most localisations that one of them agrees with, itself included; of equal ones the better one's."""
+    """Return the most localisations that one of them agrees with, itself included; of equal ones the better one's.
+
+    To agree is to put point_b [3] m of b within `spread_m` and to turn by no more than `spread_rad`.
+    """
     best: list[Localisation] = []
     for centre in sorted(found, key=lambda f: f.residual):
         apart = [differs(centre.T_a_b, f.T_a_b, point_b) for f in found]
@@ -174,7 +177,7 @@ def consensus(found: Sequence[Localisation], point_b: Matrix, spread_m: float, s
 
 
 def combined(found: Sequence[Localisation]) -> Matrix:
-    """Average T_a_b weighted by 1/residual (VarSplat §5): rotation by Procrustes of the weighted mean."""
+    """Average T_a_b [4, 4] weighted by 1/residual (VarSplat §5): rotation by Procrustes of the weighted mean."""
     weights = np.array([1.0 / max(f.residual, 1e-9) for f in found])
     mean = np.eye(4)
     mean[:3] = np.einsum("k,kij->ij", weights / weights.sum(), np.stack([f.T_a_b[:3] for f in found]))
@@ -184,7 +187,8 @@ def combined(found: Sequence[Localisation]) -> Matrix:
 def information(found: Sequence[Localisation], mean: Matrix) -> Matrix:
     """Return the inverse [6, 6] of a localisation's covariance about their mean: estimated + spread + floor.
 
-    It is not divided by their number: they look at the same two maps and err together.
+    mean: T_a_b [4, 4]; by the left twist, m and rad. It is not divided by their number: they look at the same two maps
+    and err together.
     """
     twists = np.stack([se3.log(f.T_a_b @ se3.inverse(mean)) for f in found])
     covariance = np.mean([f.covariance for f in found], 0) + twists.T @ twists / len(found)
@@ -193,7 +197,8 @@ def information(found: Sequence[Localisation], mean: Matrix) -> Matrix:
 
 
 def shared(a: Submap, b: Submap, T_a_b: Matrix, distance_m: float) -> float:
-    """Return the share of splats with a neighbour nearer than `distance_m` in the other submap: the larger of both.
+    """Return the share of splats with a neighbour nearer than `distance_m` in the other submap, laid over it by T_a_b
+    [4, 4]: the larger of both.
 
     The paper skips pairs by it before registering, at the poses known so far; drift would then hide what overlaps.
     """
@@ -212,6 +217,6 @@ def shared(a: Submap, b: Submap, T_a_b: Matrix, distance_m: float) -> float:
 def refused(
     T_a_b: Matrix, found: Sequence[Localisation], localised: int, reason: str, overlap: float = 0.0
 ) -> Registration:
-    """Return a verdict that leaves the submaps where they are."""
+    """Return a verdict that leaves the submaps where they are, T_a_b [4, 4], of no weight."""
     residual = float(np.mean([f.residual for f in found]))
     return Registration(T_a_b, np.zeros((6, 6)), residual, localised, overlap, False, reason)

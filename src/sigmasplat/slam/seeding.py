@@ -18,7 +18,7 @@ Mask = NDArray[np.bool_]
 
 
 def first_pixels(target: Target, config: SeedConfig, random: np.random.Generator) -> Mask:
-    """Pick pixels [H, W] for an empty map: uniform ∪ drawn by gradient magnitude ∪ Canny edges; only with depth."""
+    """Pick pixels, bool [H, W], for an empty map: uniform ∪ drawn by gradient ∪ Canny edges; only with depth."""
     valid = target.depth_image.numpy() > 0
     gray = gray_of(target.image.numpy())
     chosen = _draw(valid.astype(float), config.first_uniform, random)
@@ -30,7 +30,7 @@ def first_pixels(target: Target, config: SeedConfig, random: np.random.Generator
 
 
 def later_pixels(maps: PoseMaps, target: Target, config: SeedConfig) -> Mask:
-    """Find pixels [H, W] the map does not explain: thin (A < alpha_below), or a surface well behind the reading
+    """Find pixels, bool [H, W], the map does not explain: thin (A < alpha_below), or a surface well behind the reading
     (where `depth_error_factor` is above 0)."""
     measured = target.depth_image.numpy()
     valid = measured > 0
@@ -46,7 +46,7 @@ def later_pixels(maps: PoseMaps, target: Target, config: SeedConfig) -> Mask:
 
 
 def thin_out(pixels: Mask, config: SeedConfig, random: np.random.Generator) -> Mask:
-    """Keep a random share of the pixels [H, W]: `density` of them, at most `later_max`."""
+    """Keep a random share of the pixels, bool [H, W]: `density` of them, at most `later_max`."""
     count = round(config.density * int(pixels.sum()))
     return _draw(pixels.astype(float), min(count, config.later_max) if config.later_max else count, random)
 
@@ -74,9 +74,10 @@ def make_splats(
 ) -> GaussianField:
     """Unproject the chosen pixels to splats: opacity and colour from settings and image, isotropic scale, σ² = e⁻⁷.
 
-    Scale follows the distance to the 3 nearest neighbours, old and new; or, with `scale_from` "pixel", a pixel's size
-    at that depth times `spacing_px`, how far seeds lie apart. New points closer than `min_distance_m` to an old splat
-    are dropped.
+    T_world_camera [4, 4] takes them to where `field`, the old splats, lies; pixels: bool [H, W], all with depth. Scale
+    follows the distance to the 3 nearest neighbours, old and new; or, with `scale_from` "pixel", a pixel's size at that
+    depth times `spacing_px`, how far seeds lie apart. New points closer than `min_distance_m` to an old splat are
+    dropped.
     """
     depth = target.depth_image.numpy()[pixels].astype(np.float64)
     points = target.camera.rays()[pixels] * depth[:, None] * config.push_back

@@ -11,7 +11,8 @@ from torch import Tensor
 from sigmasplat.config import Config
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.fit.pyramid import Pyramid, gray_of
+from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.references import live_image
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import Atlas
@@ -94,7 +95,7 @@ class Slam:
         view = self._view_for(frame)
         before = view.seconds.copy()
         target = Target.of(frame, (view.sums.shape[1], view.sums.shape[2]))
-        live = Pyramid.of(gray_of(frame.color), frame.depth_m, frame.camera)
+        live = live_image(view, frame.color, frame.depth_m, target)
         seconds = {"prepare": time.perf_counter() - clock}
 
         tracking: dict[str, float] = {}
@@ -127,14 +128,18 @@ class Slam:
     def finish(self, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
         """Finish the last submap, look for its loops, and make the final map (VarSplat §7); once, after all frames.
 
-        `progress` is told (steps of refinement done, of how many). With one submap and no refinement nothing is done.
+        `progress` is told (steps of refinement done, of how many), from the beginning to the end; one step where
+        there are none. With one submap and no refinement nothing is done.
         """
         if not self.steps or not (len(self.store) or self._cuts or self.config.final.iterations):
             return
+        total = self.config.final.iterations or 1
+        progress(0, total)
         self._freeze()
         view = self.view
         assert view is not None
         self._final = final_map(self.store, self.atlas.anchors, self.config, view, self.random, progress)
+        progress(total, total)
 
     def checkpoint(self) -> dict[str, Tensor]:
         """Return what a run needs to be read back, in the host's memory: the active submap's field with its optimiser

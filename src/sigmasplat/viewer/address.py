@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from sigmasplat.env import install_extra
 from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.viewer.origin import own_pages_only
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -19,7 +20,10 @@ TAKEN = (errno.EADDRINUSE,)
 
 
 def open_server(host: str, port: int, title: str) -> "ViserServer":
-    """Start viser's server on the first free port from `port` on. Raises SigmaSplatError without viser or a port."""
+    """Start viser's server on the first free port from `port` on, for its own pages only (`origin`).
+
+    Raises SigmaSplatError without viser or a port, or with a viser that cannot be kept to its own pages.
+    """
     try:
         import viser
     except ImportError as problem:
@@ -35,8 +39,15 @@ def open_server(host: str, port: int, title: str) -> "ViserServer":
 
     found = free_port(host, port)
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # a browser that hangs up is no news
-    with contextlib.redirect_stdout(io.StringIO()):  # its banner: our own line says where to look
-        return LocalServer(host=host, port=found, label=title, verbose=False)
+    with own_pages_only(host) as kept, contextlib.redirect_stdout(io.StringIO()):  # its banner: our line says where
+        server = LocalServer(host=host, port=found, label=title, verbose=False)
+    if not kept:
+        close(server)
+        raise SigmaSplatError(
+            f"viser {viser.__version__} would show the run to any page open in the browser; install viser==1.1.1, with "
+            "which this was tried"
+        )
+    return server
 
 
 def close(server: "ViserServer") -> None:

@@ -40,8 +40,8 @@ class LiveView:
             self._due_s = ended_s + max(self.every_s, (ended_s - started_s) / MOST_SHARE)
 
     def finishing(self, done: int, total: int) -> None:
-        """Show the path and map that refinement starts from."""
-        if done == 0:
+        """Show the path and map that refinement starts from, the last submap finished."""
+        if done == 0 and len(self.slam.store) == len(self.slam.atlas.anchors):
             self.show(self.moment())
 
     def last_loops(self, loops: Sequence[Tried]) -> None:

@@ -22,6 +22,8 @@ struct alignas(16) float4 { float x, y, z, w; };
 inline float2 make_float2(float x, float y) { return {x, y}; }
 inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
 inline float __int_as_float(int bits) { float x; memcpy(&x, &bits, 4); return x; }
+inline int __float_as_int(float x) { int bits; memcpy(&bits, &x, 4); return bits; }
+inline int atomicAdd(int* to, int value) { return std::exchange(*to, *to + value); }   // one thread runs at a time
 
 namespace emulation {
 
@@ -214,3 +216,5 @@ const char* run(void (*kernel)(void*), int blocks, int threads, void** parameter
 #define __any_sync(mask, p) (emulation::votes(emulation::my_warp(), p, __LINE__) > 0)
 #define __shfl_sync(mask, value, lane) emulation::from_lane(value, lane, __LINE__)
 #define __shfl_xor_sync(mask, value, apart) emulation::from_lane(value, (emulation::current % 32) ^ (apart), __LINE__)
+#define __threadfence() ((void)0)          // one OS thread: what is written is seen
+inline unsigned atomicAdd(unsigned* counter, unsigned more) { return std::exchange(*counter, *counter + more); }

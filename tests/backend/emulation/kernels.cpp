@@ -1,8 +1,10 @@
 // The kernels of a program as a library that tests call by name.
 #include "emulation.h"
 
-#if FEATURES
+#if FEATURES > 0
 #include "raster.cu"
+#elif FEATURES == -1
+#include "align.cu"
 #else
 #include "fit.cu"
 #endif
@@ -10,8 +12,12 @@
 using namespace sigmasplat;
 #define ENTRY(kernel) {#kernel, emulation::Call<kernel>::run}
 static const emulation::Entry ENTRIES[] = {
-#if !FEATURES
+#if FEATURES == -1
+    ENTRY(halve_images), ENTRY(normal_equations), ENTRY(begin_alignment), ENTRY(take_align_step),
+#elif !FEATURES
     ENTRY(mapping_losses), ENTRY(ssim), ENTRY(ssim_backward), ENTRY(shape_terms), ENTRY(adam),
+    ENTRY(nll_color_full), ENTRY(show_colors), ENTRY(carry_colors),
+    ENTRY(count_errors), ENTRY(count_variances), ENTRY(count_kept), ENTRY(tracking_loss), ENTRY(drop_pairs), ENTRY(descend),
 #else
     ENTRY(project_splats), ENTRY(project_splats_backward), ENTRY(pack_given), ENTRY(list_pairs_short), ENTRY(list_pairs_int),
     ENTRY(blend), ENTRY(blend_moment), ENTRY(blend_ids), ENTRY(blend_moment_ids), ENTRY(blend_backward),

@@ -1,0 +1,65 @@
+"""Descend the tracking loss by Adam, one camera's pose and exposure, the field fixed (VarSplat §3; CG-SLAM §6)."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.config import TrackingConfig
+from sigmasplat.fit.adam import VectorAdam
+from sigmasplat.fit.motion import parametrisation
+from sigmasplat.fit.target import Target
+from sigmasplat.fit.tracking_loss import tracking_gradient
+from sigmasplat.render.view import View
+
+Matrix = NDArray[np.float64]
+
+
+class Descent(NamedTuple):
+    """What was found: T_camera_world [4, 4], exposure (a, b) of exp(a)·Ĉ + b, the first loss and the least, steps."""
+
+    T_camera_world: Matrix
+    exposure: tuple[float, float]
+    first_loss: float
+    loss: float
+    steps: int
+
+
+def descend(
+    params: Tensor, view: View, target: Target, T_camera_world: Matrix, config: TrackingConfig, iterations: int
+) -> Descent:
+    """Descend L_track over the numbers that `parametrisation` makes of the pose; the best iterate wins.
+
+    params [N, 17] and target lie where the view computes. Ends early when a step is below `update_stop`, or when it
+    changed the loss by less than `plateau_stop` of it. Without common pixels the guess comes back.
+    """
+    way = parametrisation(config, T_camera_world)
+    numbers, exposure = way.start, np.zeros(2)
+    adam, adam_exposure = VectorAdam.of(len(numbers)), VectorAdam.of(2)
+    rates = np.array([config.lr_rotation] * way.rotations + [config.lr_translation] * 3)
+    rate_exposure = np.full(2, exposure_rate(config))
+    best, best_T, best_exposure, first, previous = np.inf, T_camera_world, np.zeros(2), np.inf, np.inf
+    steps = 0
+    for steps in range(1, iterations + 1):
+        T = way.pose(numbers)
+        view.forward(params, T)
+        loss, g_exposure = tracking_gradient(view, target, config, torch.as_tensor(exposure).float())
+        first = loss if steps == 1 else first
+        blind = loss == 0.0  # where no pixel counts: that may not win over one where some do
+        if loss < best and not (blind and steps > 1):
+            best, best_T, best_exposure = loss, T, exposure.copy()
+        moved = adam.step(way.gradient(numbers, view.backward_pose(params)), rates)
+        numbers += moved
+        exposure += adam_exposure.step(g_exposure.double().cpu().numpy(), rate_exposure)
+        if np.abs(moved).max() < config.update_stop or abs(loss - previous) < config.plateau_stop * loss:
+            break
+        previous = loss
+    a, b = best_exposure.tolist()
+    return Descent(best_T, (a, b), first, best, steps)
+
+
+def exposure_rate(config: TrackingConfig) -> float:
+    """Return Adam's rate of the exposure: 0 where it is not fitted."""
+    return config.lr_exposure if config.exposure else 0.0

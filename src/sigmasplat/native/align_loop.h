@@ -1,0 +1,114 @@
+// Steps of an alignment from their normal equations: solve, move, judge, go on to the next level. In double, for one thread.
+// fit/align.py `align` says how. Includes nothing and opens no namespace; ::sqrt, ::fabs, ::sin and ::cos are known.
+
+// Eigenvalues and, as columns of V, eigenvectors of a symmetric 6×6 matrix, by cyclic Jacobi rotations.
+inline void eigen6(double (*A)[6], double* values, double (*V)[6]) {
+    for (int i = 0; i < 6; i++)
+        for (int j = 0; j < 6; j++) V[i][j] = i == j;
+    for (int sweep = 0; sweep < 30; sweep++) {
+        double off = 0, all = 0;
+        for (int i = 0; i < 6; i++)
+            for (int j = 0; j < 6; j++) { all += A[i][j] * A[i][j]; if (i != j) off += A[i][j] * A[i][j]; }
+        if (off <= 1e-30 * all) break;
+        for (int p = 0; p < 5; p++)
+            for (int q = p + 1; q < 6; q++) {
+                if (A[p][q] == 0) continue;
+                const double theta = (A[q][q] - A[p][p]) / (2 * A[p][q]);
+                const double t = (theta < 0 ? -1 : 1) / (::fabs(theta) + ::sqrt(theta * theta + 1));
+                const double c = 1 / ::sqrt(t * t + 1), s = t * c;
+                for (int k = 0; k < 6; k++) { const double a = A[k][p], b = A[k][q]; A[k][p] = c * a - s * b; A[k][q] = s * a + c * b; }
+                for (int k = 0; k < 6; k++) { const double a = A[p][k], b = A[q][k]; A[p][k] = c * a - s * b; A[q][k] = s * a + c * b; }
+                for (int k = 0; k < 6; k++) { const double a = V[k][p], b = V[k][q]; V[k][p] = c * a - s * b; V[k][q] = s * a + c * b; }
+            }
+    }
+    for (int i = 0; i < 6; i++) values[i] = A[i][i];
+}
+
+// Gauss–Newton update −H⁻¹ b within the directions whose information is more than `share` of the best one's, rotations
+// measured by the shift they make at depth_m; returns how many directions are left out (fit/align.py `_axes`).
+inline int solve_decided(const double* H, const double* b, double depth_m, double share, double* update) {
+    double A[6][6], V[6][6], values[6], best = 1e-300;
+    for (int i = 0, q = 0; i < 6; i++)
+        for (int j = i; j < 6; j++, q++) A[i][j] = A[j][i] = H[q] / ((i < 3 ? 1.0 : depth_m) * (j < 3 ? 1.0 : depth_m));
+    eigen6(A, values, V);
+    for (double v : values) best = v > best ? v : best;
+    int left_out = 0;
+    for (int i = 0; i < 6; i++) update[i] = 0;
+    for (int k = 0; k < 6; k++) {
+        if (!(values[k] > share * best)) { left_out++; continue; }
+        double along = 0;
+        for (int i = 0; i < 6; i++) along += V[i][k] * b[i] / (i < 3 ? 1.0 : depth_m);
+        for (int i = 0; i < 6; i++) update[i] -= V[i][k] / (i < 3 ? 1.0 : depth_m) * along / values[k];
+    }
+    return left_out;
+}
+
+inline void copy(const double* from, int count, double* to) { for (int k = 0; k < count; k++) to[k] = from[k]; }
+
+// T ← exp(twist) · T, T the first three rows of a rigid motion.
+inline void move_left(const double* twist, double* T) {
+    const double *r = twist, *w = twist + 3, theta2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2], theta = ::sqrt(theta2);
+    const bool small = theta2 < 1e-12;
+    const double a = small ? 1 - theta2 / 6 : ::sin(theta) / theta, b = small ? 0.5 - theta2 / 24 : (1 - ::cos(theta)) / theta2,
+                 c = small ? 1.0 / 6 - theta2 / 120 : (1 - a) / theta2;
+    const double K[3][3] = {{0, -w[2], w[1]}, {w[2], 0, -w[0]}, {-w[1], w[0], 0}};
+    double E[3][4], moved[12];
+    for (int i = 0; i < 3; i++) {
+        E[i][3] = 0;
+        for (int j = 0; j < 3; j++) {
+            const double K2 = w[i] * w[j] - (i == j ? theta2 : 0);
+            E[i][j] = (i == j) + a * K[i][j] + b * K2;
+            E[i][3] += ((i == j) + b * K[i][j] + c * K2) * r[j];
+        }
+    }
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 4; j++) moved[4 * i + j] = E[i][0] * T[j] + E[i][1] * T[4 + j] + E[i][2] * T[8 + j] + (j == 3 ? E[i][3] : 0);
+    copy(moved, 12, T);
+}
+
+constexpr double UNKNOWN_COST = 1.7976931348623157e308;
+
+// How far an alignment has come: T_live_reference; sums of the last step, or of the best where a level ended with that; what is
+// remembered within a level; `degenerate`: directions that its last step left out; steps of all levels.
+struct Descent {
+    double T[12], sums[4], best_T[12], best_sums[4], best, previous;
+    int level, taken, steps, degenerate;
+};
+
+inline void begin_level(Descent& d, int level) {
+    d.level = level;
+    if (level < 0) return;                 // it was the finest: what it leaves stands
+    d.best = d.previous = UNKNOWN_COST;
+    d.taken = 0;
+    d.degenerate = 6;
+}
+
+inline Descent begin_descent(const double* T, int levels) {
+    Descent d = {};
+    copy(T, 12, d.T);
+    begin_level(d, levels - 1);
+    return d;
+}
+
+// Take the step that the normal equations at d.T call for, in the order of NORMAL_TERMS; a level's last one goes on to the next.
+inline void take_step(Descent& d, const AlignLoop& o, const double* normal) {
+    copy(normal + 27, 4, d.sums);
+    d.steps++;
+    d.taken++;
+    const bool blind = d.sums[1] < o.min_pixels;
+    bool settled = false;
+    if (!blind) {
+        double update[6];
+        const double cost = d.sums[0] / d.sums[1];
+        if (cost < d.best) { d.best = cost; copy(d.T, 12, d.best_T); copy(d.sums, 4, d.best_sums); }
+        d.degenerate = solve_decided(normal, normal + 21, o.depth_m, o.degenerate_share, update);
+        move_left(update, d.T);
+        settled = true;
+        for (double u : update) settled = settled && ::fabs(u) < o.update_stop;
+        settled = settled || ::fabs(cost - d.previous) < o.plateau_stop * cost;
+        d.previous = cost;
+    }
+    if (!blind && !settled && d.taken < o.iterations) return;
+    if (!settled && d.best < UNKNOWN_COST) { copy(d.best_T, 12, d.T); copy(d.best_sums, 4, d.sums); }
+    begin_level(d, d.level - 1);
+}

@@ -1,0 +1,80 @@
+// What one reference pixel says of a motion, or as many as a vector has lanes: a reference image with depth, warped into the live
+// image by T_live_reference. Residuals: gray difference and depth difference, Huber weighted; left twist increment (ρ, φ) on T.
+// Written against vf, vi, Mask and the functions of lanes.h; on a GPU a thread is a vector of one lane (align.cu says how).
+// Includes nothing and opens no namespace.
+
+constexpr int CELL = 16;                   // pixels each way: neighbours err together, cells hardly do
+constexpr int MATRIX_TERMS = 21, SUMS = 4; // upper triangle of a symmetric 6×6; weighed cost, pixels used, in view with depth, agreeing
+constexpr int NORMAL_TERMS = MATRIX_TERMS + 6 + SUMS + MATRIX_TERMS;   // H, b, sums, and S = Σ b_c b_cᵀ over cells c
+
+struct Bilinear { vf value, dx, dy; };
+SIGMA_INLINE Bilinear interpolate(vf v00, vf v10, vf v01, vf v11, vf a, vf b) {
+    const vf top = fma(a, v10 - v00, v00), bottom = fma(a, v11 - v01, v01);
+    return {fma(b, bottom - top, top), fma(b, (v11 - v01) - (v10 - v00), v10 - v00), bottom - top};
+}
+SIGMA_INLINE vf huber_weight(vf r, vf width) { return min(splat(1.f), width / max(abs(r), splat(1e-12f))); }
+
+// The rotation and translation of T, rows of a 4×4, in the pixels' precision.
+struct Motion { float R[9], t[3]; };
+SIGMA_INLINE Motion motion_of(const double* T) {
+    Motion m;
+    for (int i = 0; i < 3; i++) {
+        for (int j = 0; j < 3; j++) m.R[3 * i + j] = float(T[4 * i + j]);
+        m.t[i] = float(T[4 * i + 3]);
+    }
+    return m;
+}
+
+struct ReferencePixels { const float *depth, *gray, *weight_gray, *weight_depth; };   // where they lie; weights may be null
+
+// Add residuals and derivatives of reference pixels, `off_x` and `off_y` from the principal point, to H (acc, 21), sums (acc + 21, 4)
+// and b (pull, 6). inside: lanes that are pixels.
+SIGMA_INLINE void add_residuals(const AlignLevel& L, const AlignOptions& o, const Motion& T, vf off_x, float off_y, Mask inside,
+                                const ReferencePixels& pixels, vf* acc, vf* pull) {
+    const float *R = T.R, *t = T.t;
+    const vf d = load(pixels.depth);
+    Mask ok = both(inside, gt(d, splat(0.f)));
+    if (!any(ok)) return;
+    const vf X = off_x * (1.f / L.fx) * d, Y = splat(off_y / L.fy) * d;
+    const vf px = R[0] * X + (R[1] * Y + (R[2] * d + t[0])), py = R[3] * X + (R[4] * Y + (R[5] * d + t[1])),
+             pz = R[6] * X + (R[7] * Y + (R[8] * d + t[2]));
+    ok = both(ok, gt(pz, splat(0.05f)));
+    const vf iz = 1.f / max(pz, splat(0.05f)), xn = px * iz, yn = py * iz;
+    vf u = L.fx * xn + L.cx, v = L.fy * yn + L.cy;
+    ok = both(ok, both(both(ge(u, splat(0.f)), ge(v, splat(0.f))), both(gt(splat(L.width - 1.f), u), gt(splat(L.height - 1.f), v))));
+    if (!any(ok)) return;
+    u = clamp(u, 0.f, L.width - 1.001f);
+    v = clamp(v, 0.f, L.height - 1.001f);
+    const vf fu = floor(u), fv = floor(v), a = u - fu, c = v - fv;
+    const vi i00 = to_int(fma(fv, splat(float(L.width)), fu));
+    const Bilinear I = interpolate(gather(L.live_gray, i00), gather(L.live_gray + 1, i00), gather(L.live_gray + L.width, i00), gather(L.live_gray + L.width + 1, i00), a, c);
+    const vf d00 = gather(L.live_depth, i00), d10 = gather(L.live_depth + 1, i00), d01 = gather(L.live_depth + L.width, i00), d11 = gather(L.live_depth + L.width + 1, i00);
+    const Bilinear D = interpolate(d00, d10, d01, d11, a, c);
+    const vf nearest = min(min(d00, d10), min(d01, d11)), farthest = max(max(d00, d10), max(d01, d11));
+    const Mask read = both(ok, gt(nearest, splat(0.f)));       // all four neighbours have a reading
+    const vf r_depth = D.value - pz, r_gray = I.value - load(pixels.gray);
+    const Mask agrees = both(read, gt(splat(o.depth_gate), abs(r_depth)));
+    // A depth step inside the 2×2 cell has no derivative; where the live depth is missing colour alone decides.
+    const Mask smooth = both(agrees, gt(0.03f * pz, farthest - nearest));
+    const Mask color_ok = both(ok, mask_or(agrees, mask_not(read)));
+    const vf weight_gray = pixels.weight_gray ? load(pixels.weight_gray) : splat(1.f), weight_depth = pixels.weight_depth ? load(pixels.weight_depth) : splat(1.f);
+    const vf hd = splat(o.huber_depth_relative) * pz * pz;    // sensor noise grows with z²
+    const vf wi = only(color_ok, weight_gray * (o.weight_color / (o.huber_gray * o.huber_gray)) * huber_weight(r_gray, splat(o.huber_gray)));
+    const vf wd = only(smooth, weight_depth * (o.weight_depth / (hd * hd)) * huber_weight(r_depth, hd));
+    const vf fxz = L.fx * iz, fyz = L.fy * iz, zero = splat(0.f);
+    const vf du[6] = {fxz, zero, -fxz * xn, -fxz * xn * py, fma(fxz * xn, px, fxz * pz), -fxz * py};
+    const vf dv[6] = {zero, fyz, -fyz * yn, -fma(fyz * yn, py, fyz * pz), fyz * yn * px, fyz * px};
+    vf Ji[6], Jd[6];
+    for (int k = 0; k < 6; k++) { Ji[k] = fma(I.dx, du[k], I.dy * dv[k]); Jd[k] = fma(D.dx, du[k], D.dy * dv[k]); }
+    Jd[2] -= 1.f; Jd[3] -= py; Jd[4] += px;
+    int q = 0;
+    for (int i = 0; i < 6; i++) {
+        const vf ji = wi * Ji[i], jd = wd * Jd[i];
+        for (int j = i; j < 6; j++, q++) acc[q] = fma(ji, Ji[j], fma(jd, Jd[j], acc[q]));
+        pull[i] = fma(ji, r_gray, fma(jd, r_depth, pull[i]));
+    }
+    acc[MATRIX_TERMS] += fma(wi * r_gray, r_gray, wd * r_depth * r_depth);
+    acc[MATRIX_TERMS + 1] += only(color_ok, splat(1.f));
+    acc[MATRIX_TERMS + 2] += only(read, splat(1.f));
+    acc[MATRIX_TERMS + 3] += only(agrees, splat(1.f));
+}

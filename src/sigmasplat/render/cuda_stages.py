@@ -1,0 +1,86 @@
+"""Measure the stages of renders on a CUDA device by events on its stream; nobody waits until the times are read."""
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+STAGES = ("project", "sort", "blend", "blend_backward", "project_backward")
+"""What `View.seconds` counts, in its order."""
+
+_asked = False
+
+
+def measure(asked: bool = True) -> None:
+    """Have CUDA views count their `seconds` from now on, or no longer; `run --profile` asks for it."""
+    global _asked
+    _asked = asked
+
+
+def measured() -> bool:
+    """Tell whether anybody asked to measure."""
+    return _asked
+
+
+class Event(Protocol):
+    """A mark on a stream, as `torch.cuda.Event(enable_timing=True)`."""
+
+    def record(self) -> None: ...
+    def query(self) -> bool: ...
+    def synchronize(self) -> None: ...
+    def elapsed_time(self, end: Any, /) -> float: ...
+
+
+class Stages:
+    """Times between pairs of events on the current stream, by stage. Pairs that have passed are added up on the way.
+
+    Where nobody asked to `measure` there are no events, and all stages take 0 s.
+    """
+
+    def __init__(self, event: Callable[[], Event] | None = None) -> None:
+        self._event = event or _timed
+        self._pending: deque[tuple[int, Event, Event]] = deque()
+        self._passed: list[Event] = []
+        self._seconds = np.zeros(len(STAGES))
+
+    def of(self, stage: str) -> AbstractContextManager[None]:
+        """Book what a block of code has the device do under a stage."""
+        return self._between(stage) if _asked else nullcontext()
+
+    @contextmanager
+    def _between(self, stage: str) -> Iterator[None]:
+        begin, end = self._taken(), self._taken()
+        begin.record()
+        try:
+            yield
+        finally:
+            end.record()
+            self._pending.append((STAGES.index(stage), begin, end))
+        while self._pending and self._pending[0][2].query():
+            self._add()
+
+    @property
+    def seconds(self) -> NDArray[np.float64]:
+        """Return the time spent so far by stage [5]. Waits for what has not passed yet."""
+        if self._pending:
+            self._pending[-1][2].synchronize()
+        while self._pending:
+            self._add()
+        return self._seconds.copy()
+
+    def _add(self) -> None:
+        stage, begin, end = self._pending.popleft()
+        self._seconds[stage] += begin.elapsed_time(end) / 1000.0
+        self._passed += [begin, end]
+
+    def _taken(self) -> Event:
+        return self._passed.pop() if self._passed else self._event()
+
+
+def _timed() -> Event:
+    event: Event = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]
+    return event

@@ -1,0 +1,394 @@
+"""Hold what a CUDA mapping step can do besides to its definitions in torch, float64, on the emulated kernels.
+
+Several keyframes a step, the full colour covariance, colours that depend on the view; and who waits for whom.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from emulated_cuda import Emulator
+from sigmasplat.config import MappingConfig
+from sigmasplat.errors import ConfigError
+from sigmasplat.fit.color_covariance import FullCovarianceStep
+from sigmasplat.fit.cuda_rows import CudaGathered
+from sigmasplat.fit.cuda_step import CudaStep
+from sigmasplat.fit.cuda_view_dependent import CudaViewDependentStep
+from sigmasplat.fit.field import fit_field, loss_weights
+from sigmasplat.fit.step import Gathered, TorchStep, arrived
+from sigmasplat.fit.steps import MappingStep, step_for
+from sigmasplat.fit.target import Keyframe
+from sigmasplat.fit.view_dependent import ViewDependentStep
+from sigmasplat.model import se3
+from sigmasplat.model.field import COLUMNS, GaussianField, Rows
+from sigmasplat.model.harmonics import count
+from sigmasplat.render.covariance_view import CovarianceView, CudaCovarianceView
+from sigmasplat.render.cuda_raster import Raster
+from sigmasplat.render.cuda_view import CudaView
+from sigmasplat.render.view import CpuView, ReferenceView, View
+from splat_fields import OPTIONS, crowd, exact_view, params_of, plane_gradients, there_and_back
+from splat_scenes import KINDS, SMALL, WIDE, Scene, assert_same_vector, scene
+from test_compiled_loss import RATES, WEIGHTS, fields, random_gradient, target_of
+from test_cuda_step import OF_THE_HOST, Watch
+from test_cuda_view import CPU, rubbish
+
+SHAPES = {"isotropy": 0.7, "isotropy_ratio": 0.01}
+FULL = {**dict.fromkeys(WEIGHTS, 0.0), "l1": 0.8, "ssim": 0.2, "depth": 1.0, "nll_depth": 2e-2, "nll_color_full": 1e-2}
+EXTRAS = ("correlations", "harmonics")
+
+
+@pytest.fixture(autouse=True)
+def on_the_cpu(emulator: Emulator) -> Iterator[Emulator]:
+    with emulator.standing_in(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Raster, "empty", rubbish)
+        emulator.order = 0
+        yield emulator
+        emulator.order = 0
+
+
+def turned(s: Scene, angle: float) -> np.ndarray:
+    """Return T_camera_world of a scene, its camera turned."""
+    return np.asarray(se3.exp(np.array([0, 0, 0, 0, angle, 0])) @ s.T_camera_world.numpy())
+
+
+def pair_of_fields(n: int) -> tuple[GaussianField, GaussianField]:
+    """Make a field and its double mid-run, its extras too: some rows were moved last a while ago, some never."""
+    pair, rng = fields(n), np.random.default_rng(7)
+    for name, width in zip(EXTRAS, (3, 45), strict=True):
+        drawn = [torch.as_tensor(rng.normal(0, s, (n, width))) for s in (0.3, 1e-3, 1e-3)]
+        last = torch.as_tensor(rng.choice([29, 29, 12, 0], n), dtype=torch.int32)
+        for field in pair:
+            params, moment1, moment2 = (x.to(field.params, copy=True) for x in drawn)
+            field.extras[name] = Rows(params, moment1, moment2.square(), last.clone(), 29)
+    return pair
+
+
+def assert_same_steps(got: Rows, want: Rows, start: Tensor, began: int, what: str) -> None:
+    """Compare where Adam went, its moments, and whom it moved."""
+    assert torch.equal(got.last_step, want.last_step) and got.steps == want.steps
+    assert_same_vector(got.moment1, want.moment1, 1e-3, f"{what}: moment1")
+    assert_same_vector(got.moment2, want.moment2, 1e-3, f"{what}: moment2")
+    assert_same_vector(got.params - start.to(got.params), want.params - start, 5e-3, f"{what}: steps")
+    waiting = want.last_step <= began
+    assert torch.equal(got.params[waiting], start[waiting].to(got.params))
+
+
+# ---- several keyframes a step
+
+
+@pytest.mark.parametrize("n", [0, 7, 300])
+def test_gathered_images_step_as_by_definition(n: int) -> None:
+    """Three images, one of which shows nothing; pull, frozen colours, shape terms."""
+    s, (got, want) = crowd(), fields(n)
+    start, view, exact = want.params.clone(), CudaView(s.camera, OPTIONS, True, CPU), exact_view(s.camera, True)
+    away = np.diag([-1.0, 1.0, -1.0, 1.0]) @ s.T_camera_world.numpy()
+    for poses in ((turned(s, 0.7), away, turned(s, 0.8)), (turned(s, 0.6), turned(s, 0.5), away)):
+        results: list[Any] = []
+        for field, v, gathered in (
+            (got, view, CudaGathered(view, got)),
+            (want, exact, Gathered(exact, want)),
+        ):
+            field.steps += 1
+            twists, pulls = [], []
+            for k, T in enumerate(poses):
+                v.forward(field.params, T)
+                random_gradient(v, k)  # type: ignore[arg-type]
+                pull = field.params.new_full((n,), torch.nan)
+                twists.append(gathered.add(field, 1.0 / 3.0, pull))
+                pulls.append(pull)
+            here, (cost,) = arrived(twists, [gathered.step(field, RATES, SHAPES, n // 3)])
+            results.append((np.stack(here), torch.stack(pulls), cost))
+        (twist, pull, cost), (want_twist, want_pull, want_cost) = results
+        assert cost == pytest.approx(want_cost, rel=1e-4)
+        if n:
+            assert_same_vector(torch.as_tensor(twist), torch.as_tensor(want_twist), 1e-3, "twists")
+            assert_same_vector(pull, want_pull, 1e-3, "pull")
+        assert not twist[[T is away for T in poses]].any()
+    if n:
+        assert_same_steps(got, want, start, 99, "rows")
+    if n > 100:
+        assert 5 < int((want.last_step <= 99).sum()) < n
+
+
+# ---- the full colour covariance
+
+
+def wide_views(
+    s: Scene, field: GaussianField, double: GaussianField, device: torch.device = CPU
+) -> tuple[CudaCovarianceView, CovarianceView]:
+    exact = CovarianceView(exact_view(s.camera, True), double.extras["correlations"])
+    return CudaCovarianceView(CudaView(s.camera, OPTIONS, True, device), field.extras["correlations"]), exact
+
+
+def correlated(s: Scene) -> tuple[GaussianField, GaussianField]:
+    params, drawn = params_of(s), torch.as_tensor(np.random.default_rng(0).normal(size=(len(s.means), 3))).float()
+    return tuple(  # type: ignore[return-value]
+        GaussianField(params.to(t), extras={"correlations": Rows(drawn.to(t))}) for t in (torch.float32, torch.float64)
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_ten_planes_rows_and_twist_agree(kind: str) -> None:
+    s = scene(kind, 60)
+    field, double = correlated(s)
+    (got, want), T = wide_views(s, field, double), s.T_camera_world.numpy()
+    maps, rows, twist = there_and_back(got, field.params, T)
+    want_maps, want_rows, want_twist = there_and_back(want, double.params, T)
+    for plane, (a, b) in enumerate(zip(maps, want_maps, strict=True)):
+        assert float((a - b).norm()) < 2e-5 * float(b.norm()), f"plane {plane}"
+    for name, columns in COLUMNS.items():
+        assert_same_vector(rows[:, columns], want_rows[:, columns], 1e-3, name)
+    assert_same_vector(got.g_correlations, want.g_correlations, what="correlations")
+    assert_same_vector(twist, want_twist, 1e-3, "twist")
+    assert torch.equal(got.visible(60), want.visible(60))
+    pose = got.backward_pose(field.params)
+    want.forward(double.params, T)
+    assert_same_vector(torch.as_tensor(pose), torch.as_tensor(want.backward_pose(double.params)), 1e-3, "pose")
+
+
+def test_moment_layers_and_pull_are_those_of_seven_planes() -> None:
+    """Gradients on a moment and a median depth too, which the plain view knows how to carry."""
+    s = scene("random", 60)
+    field, _ = correlated(s)
+    plain = CudaView(s.camera, OPTIONS, True, CPU)
+    found = []
+    for view in (plain, CudaCovarianceView(plain, field.extras["correlations"])):
+        view.forward(field.params, s.T_camera_world.numpy(), s.ref_depth.float(), layers=True)
+        view.g_sums.zero_()
+        view.g_sums[:7], view.g_alpha[:] = plane_gradients(s.camera, 7)
+        view.g_moment[:], view.g_median_depth[:] = plane_gradients(s.camera, 2, seed=9)[0]
+        rows, pull = torch.full_like(field.params, torch.nan), torch.full((60,), torch.nan)
+        twist = torch.as_tensor(view.backward(field.params, rows, pull))
+        found.append([view.sums[:7].clone(), view.alpha, view.moment, *view.layers, rows, pull, twist])
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4 * max(float(b.abs().max()), 1.0))
+
+
+@pytest.mark.parametrize("valid", [0.8, 0.0])
+@pytest.mark.parametrize("camera", [SMALL, WIDE], ids=lambda c: f"{c.width}x{c.height}")
+def test_likelihood_under_a_full_covariance(camera: Any, valid: float) -> None:
+    """Against autograd through `nll_color_full`, from planes with V of every kind, below zero by rounding too."""
+    s, rng = scene("random", 12, camera), np.random.default_rng(3)
+    target, size = target_of(camera, (camera.height, camera.width), valid), (camera.height, camera.width)
+    A = rng.normal(size=(*size, 3, 3)) * np.exp(rng.uniform(-2, 0, (*size, 1, 1)))
+    V = A @ A.transpose(0, 1, 3, 2) + 0.1 * np.eye(3)
+    kind = rng.integers(0, 5, size)
+    V[kind == 0] = np.diag([-1e-4, 0.02, 0.03])  # below zero by rounding
+    V[kind == 1] = np.diag([0.01, -1e-4, 0.02]) + 0.02 * (1 - np.eye(3))  # nothing a covariance is
+    V[kind == 2] = np.diag([0.03, 0.02, 0.01]) + 0.018 * (1 - np.eye(3))  # V's last pivot is below zero
+    color = rng.uniform(0, 1, (*size, 3))
+    second = (V + color[..., None] * color[..., None, :])[..., [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    planes = np.concatenate([color, rng.uniform(0.5, 4.0, (*size, 1)), second], -1)
+    results = []
+    for view in wide_views(s, *correlated(s)):
+        view.sums.copy_(torch.as_tensor(planes).float().movedim(-1, 0))
+        view.g_sums.fill_(torch.nan)
+        on_cuda = isinstance(view, CudaCovarianceView)
+        step = CudaStep(view) if on_cuda else FullCovarianceStep(view, TorchStep(view))
+        results.append((float(step.images(target, FULL)), view.g_sums.clone()))
+    (loss, got), (want_loss, want) = results
+    assert loss == pytest.approx(want_loss, rel=1e-4, abs=1e-6)
+    assert valid or torch.count_nonzero(got) == 0
+    for plane, case in product(range(10), range(5) if valid else ()):
+        a, b = got[plane, kind == case], want[plane, kind == case]
+        if b.any():
+            assert_same_vector(a, b, 2e-3, f"plane {plane}, case {case}")
+        assert torch.equal(a != 0, b != 0)
+
+
+@pytest.mark.parametrize("n", [0, 7, 300])
+def test_a_step_under_a_full_covariance_follows_its_definition(n: int) -> None:
+    s, (got, want) = crowd(), pair_of_fields(n)
+    starts = [want.params.clone(), want.extras["correlations"].params.clone()]
+    view, exact = wide_views(s, got, want)
+    steps = ((got, CudaStep(view)), (want, FullCovarianceStep(exact, TorchStep(exact))))
+    for k, angle in enumerate((0.7, -0.5, 0.7)):
+        results = []
+        for field, step in steps:
+            field.steps += 1
+            step.view.forward(field.params, turned(s, angle))
+            random_gradient(step.view, k)  # type: ignore[arg-type]
+            results.append(step.splats(field, RATES, SHAPES, n // 3))
+        (twist, cost), (want_twist, want_cost) = results
+        assert float(cost) == pytest.approx(want_cost, rel=1e-4)
+        if n:
+            assert_same_vector(torch.as_tensor(twist), torch.as_tensor(want_twist), 1e-3, "twist")
+    if n:
+        assert_same_steps(got, want, starts[0], 99, "rows")
+        assert_same_steps(got.extras["correlations"], want.extras["correlations"], starts[1], 29, "correlations")
+
+
+# ---- colours that depend on the view
+
+
+def view_dependent(s: Scene, degree: int, options: Any = OPTIONS) -> tuple[CudaViewDependentStep, ViewDependentStep]:
+    view, exact = CudaView(s.camera, options, True, CPU), exact_view(s.camera, True)
+    exact.options = options
+    return CudaViewDependentStep(CudaStep(view), degree), ViewDependentStep(TorchStep(exact), degree)
+
+
+@pytest.mark.parametrize("n", [0, 7, 300])
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_a_step_of_shown_colours_follows_its_definition(degree: int, n: int) -> None:
+    """Three steps with frozen colours, splats out of view and pull; degrees not in use are left alone."""
+    s, (got, want) = crowd(), pair_of_fields(n)
+    starts, (there, here) = [want.params.clone(), want.extras["harmonics"].params.clone()], view_dependent(s, degree)
+    target = target_of(s.camera, (s.camera.height, s.camera.width))
+    for k, angle in enumerate((0.7, -0.5, 0.7)):
+        results: list[Any] = []
+        for field, step in ((got, there), (want, here)):
+            field.steps += 1
+            step.forward(field, turned(s, angle), target, {})
+            random_gradient(step.view, k)  # type: ignore[arg-type]
+            pull = field.params.new_full((n,), torch.nan)
+            results.append((step.view.sums.clone(), pull, *step.splats(field, RATES, SHAPES, n // 3, pull)))
+        (sums, pull, twist, cost), (want_sums, want_pull, want_twist, want_cost) = results
+        assert float(cost) == pytest.approx(want_cost, rel=1e-4)
+        if n:
+            assert float((sums - want_sums).norm()) < 1e-3 * float(want_sums.norm())
+            assert_same_vector(pull, want_pull, 1e-3, "pull")
+            assert_same_vector(torch.as_tensor(twist), torch.as_tensor(want_twist), 1e-3, "twist")
+    if n:
+        harmonics, width = got.extras["harmonics"], 3 * count(degree)
+        assert_same_steps(got, want, starts[0], 99, "rows")
+        assert_same_steps(harmonics, want.extras["harmonics"], starts[1], 29, "harmonics")
+        assert torch.equal(harmonics.params[:, width:], starts[1][:, width:].float())
+
+
+@pytest.mark.parametrize("felt", [True, False])
+def test_a_pose_feels_the_directions_where_it_is_asked_to(felt: bool) -> None:
+    s = scene("random", 60)
+    options, (got, want) = replace(OPTIONS, color_pose_gradient=felt), pair_of_fields(60)
+    twists = []
+    for field, step in zip((got, want), view_dependent(s, 3, options), strict=True):
+        field.params = params_of(s).to(field.params)
+        field.steps += 1
+        target = target_of(s.camera, (s.camera.height, s.camera.width))
+        step.forward(field, s.T_camera_world.numpy(), target, {})
+        random_gradient(step.view, 5)  # type: ignore[arg-type]
+        twists.append(torch.as_tensor(step.splats(field, RATES, {}, 0)[0]))
+        step.view.forward(step._rows, s.T_camera_world.numpy())
+        plain = torch.as_tensor(step.view.backward(step._rows, torch.empty_like(field.params)))
+        assert torch.allclose(plain[:3], twists[-1][:3]) != felt
+    assert_same_vector(*twists, 1e-3, "twist")
+
+
+def test_a_splat_where_the_camera_is_has_no_direction() -> None:
+    s = scene("random", 60)
+    field = GaussianField(params_of(s), steps=1)
+    T = s.T_camera_world.numpy()
+    field.params[3, :3] = torch.as_tensor(-T[:3, :3].T @ T[:3, 3]).float()
+    step, _ = view_dependent(s, 3)
+    field.carry("harmonics").params += 0.1
+    target = target_of(s.camera, (s.camera.height, s.camera.width))
+    step.forward(field, T, target, {})
+    random_gradient(step.view, 1)  # type: ignore[arg-type]
+    twist, _ = step.splats(field, RATES, SHAPES, 0)
+    assert torch.isfinite(step.view.sums).all() and torch.isfinite(twist).all()
+    assert torch.isfinite(field.params).all() and torch.isfinite(field.extras["harmonics"].params).all()
+
+
+# ---- whole fits
+
+
+def fitted(
+    view: View, config: MappingConfig, images: int, degree: int
+) -> tuple[GaussianField, list[float], np.ndarray]:
+    s = scene("random", 60)
+    field, target = GaussianField(params_of(s)), target_of(s.camera, (view.alpha.shape[0], view.alpha.shape[1]))
+    pose, told = se3.inverse(s.T_camera_world.double().numpy()), []
+    seen = [Keyframe(k, target, pose @ se3.exp(0.01 * k * np.ones(6))) for k in range(images)]
+    fit = fit_field(
+        field, view, [seen] * 3, config, frozen_colors=5, degree=degree, felt=lambda k, pull: told.append(pull.clone())
+    )
+    assert len(told) == 3 * images and all(bool(pull.any()) for pull in told)
+    return field, fit.losses, np.stack([k.T_world_camera for k in seen])
+
+
+@pytest.mark.parametrize(
+    ("images", "degree", "full"),
+    [(3, 0, False), (1, 0, True), (1, 1, False), (1, 2, False), (1, 3, False), (1, 2, True)],
+)
+def test_fits_are_those_of_the_cpu(images: int, degree: int, full: bool) -> None:
+    pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+    config = MappingConfig(
+        color_covariance="full" if full else "diagonal", weight_nll_color=1e-2, weight_isotropy_ratio=0.1,
+        lr_pose_translation=1e-3, lr_pose_rotation=1e-3, weight_alignment=0.0 if full else 0.3,
+    )  # fmt: skip
+    start = params_of(scene("random", 60))
+    ours, losses, poses = fitted(CudaView(WIDE, OPTIONS, True, CPU), config, images, degree)
+    theirs, wanted, wanted_poses = fitted(CpuView(WIDE, OPTIONS), config, images, degree)
+    np.testing.assert_allclose(losses, wanted, rtol=1e-3)
+    np.testing.assert_allclose(poses, wanted_poses, atol=1e-4)
+    assert_same_vector(ours.params - start, theirs.params - start, 3e-2, "what Adam moved")
+    assert sorted(ours.extras) == sorted(theirs.extras)
+    for name, extra in theirs.extras.items():
+        if name == "harmonics" or not degree:
+            assert_same_vector(ours.extras[name].params, extra.params, 3e-2, name)
+        else:
+            assert not ours.extras[name].params.any() and not extra.params.any()
+
+
+def test_each_device_has_its_step() -> None:
+    field, plain, full = GaussianField(params_of(scene("random", 12))), MappingConfig(), MappingConfig(
+        color_covariance="full", weight_nll_color=1e-2
+    )  # fmt: skip
+    view = CudaView(WIDE, OPTIONS, True, CPU)
+    kinds: list[tuple[MappingStep, type, type]] = [
+        (step_for(field, view, loss_weights(plain), 0), CudaStep, CudaView),
+        (step_for(field, view, loss_weights(full), 0), CudaStep, CudaCovarianceView),
+        (step_for(field, view, loss_weights(plain), 2), CudaViewDependentStep, CudaView),
+        (step_for(field, view, loss_weights(full), 2), CudaViewDependentStep, CudaCovarianceView),
+        (step_for(field, view, loss_weights(plain) | {"unheard_of": 1.0}, 0), TorchStep, CudaView),
+        (step_for(field, ReferenceView(WIDE, OPTIONS), loss_weights(full), 0), FullCovarianceStep, CovarianceView),
+    ]
+    for step, kind, seen in kinds:
+        assert type(step) is kind and type(step.view) is seen
+
+
+@pytest.mark.parametrize(("degree", "kind"), [(1, "diagonal"), (0, "full")])
+def test_several_keyframes_are_refused_as_on_the_cpu(degree: int, kind: Any) -> None:
+    config = MappingConfig(color_covariance=kind, weight_nll_color=1e-2)
+    with pytest.raises(ConfigError, match="frames_per_step must be 1"):
+        fitted(CudaView(WIDE, OPTIONS, True, CPU), config, 2, degree)
+
+
+# ---- who waits
+
+
+@pytest.mark.parametrize(("images", "degree", "full"), [(1, 0, False), (3, 0, False), (1, 3, False), (1, 0, True)])
+def test_the_host_waits_once_a_step(images: int, degree: int, full: bool) -> None:
+    """For twists and losses of all images together, once the step is over."""
+    s = scene("random", 60)
+    field, view = GaussianField(params_of(s)), CudaView(s.camera, OPTIONS, True, CPU)
+    target, weights = target_of(s.camera, (s.camera.height, s.camera.width)), {**FULL, "nll_color_full": 1e-2 * full}
+    step, T = step_for(field, view, weights, degree), s.T_camera_world.double().numpy()
+    step.view.forward(field.params, T)  # says how many pairs to expect
+    gathered = CudaGathered(view, field) if images > 1 else None
+    with Watch() as watch:
+        field.steps += 1
+        for _ in range(images):
+            step.forward(field, T, target, weights)
+            step.images(target, weights)
+            if gathered is None:
+                step.splats(field, RATES, weights, 3)
+            else:
+                gathered.add(field, 1.0 / images)
+        if gathered is not None:
+            gathered.step(field, RATES, weights, 3)
+    pairs, rates = OF_THE_HOST
+    extras = [("adam.py", "__float__"), rates] * (degree > 0 or full)  # the rates of an extra lie on the host too
+    assert watch.reads == [pairs] * images + [rates, *extras]
+
+
+def test_what_a_step_left_on_a_device_arrives_in_its_places() -> None:
+    twists = [torch.arange(6.0), np.arange(6.0) + 10, torch.arange(6.0).double() + 20]
+    here, numbers = arrived(twists, [torch.tensor(1.5), 2.5, torch.tensor(3.5, dtype=torch.float64)])
+    assert [t.tolist() for t in here] == [[k + i for i in range(6)] for k in (0, 10, 20)] and numbers == [1.5, 2.5, 3.5]
+    assert arrived([np.zeros(6)], [0.5])[1] == [0.5] and arrived([], []) == ([], [])
