@@ -3,6 +3,7 @@
 # make test   install with the development tools, then lint, types, tests
 # make native compile the kernels beside their sources, for work with PYTHONPATH=src
 # make docs   the documentation as a site in site/, to be read from the disk
+# make gpu    every check and measurement that needs an NVIDIA GPU (benchmarks/GPU.md)
 # make wheel  a wheel in dist/ that runs where no compiler is; PYTHON=python3.12 for another Python
 # make sdist  the sources as one archive in dist/
 # make clean  remove .venv and everything built
@@ -32,7 +33,7 @@ version_of = $(shell $(1) -c 'import sys; print("%d.%d" % sys.version_info[:2])'
 same_python = $(filter $(call version_of,$(PYTHON)),$(or $(call version_of,$(BIN)/python),$(call version_of,$(PYTHON))))
 WHEEL_VENV = $(if $(same_python),$(VENV),build/venv-$(or $(call version_of,$(PYTHON)),missing))
 
-.PHONY: demo test lint types pytest install install-dev native docs wheel sdist wheel-here clean
+.PHONY: demo test lint types pytest install install-dev native docs gpu wheel sdist wheel-here clean
 .DELETE_ON_ERROR:
 
 demo: install
@@ -97,6 +98,9 @@ native: $(VENV)/build-tools
 	$(BIN)/cmake -S . -B build/inplace -G Ninja -DSIGMASPLAT_INPLACE=ON \
 		-DPython_EXECUTABLE=$(abspath $(BIN)/python) -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN)/ninja)
 	$(BIN)/cmake --build build/inplace
+
+gpu: install-dev
+	benchmarks/first_flight.sh
 
 docs: $(VENV)/installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

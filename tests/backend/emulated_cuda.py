@@ -38,11 +38,10 @@ class Emulator:
         self._libraries: dict[int, ctypes.CDLL] = {}
 
     def __call__(self, features: int, kernel: str, blocks: int, *arguments: Argument) -> None:
-        memory, addresses = laid_out(arguments)
+        memory = laid_out(arguments)
         self.launches.append(kernel)
         run = self._library(features).emulate
-        problem = run(kernel.encode(), blocks, THREADS, ctypes.c_void_p(addresses.ctypes.data), self.order)
-        del memory
+        problem = run(kernel.encode(), blocks, THREADS, ctypes.c_void_p(memory.buffer_info()[0]), self.order)
         assert problem is None, f"{kernel}: {problem.decode()}"
 
     @contextmanager

@@ -1,5 +1,7 @@
 """Compile every CUDA kernel for every architecture, as a device would at first use; no GPU is needed."""
 
+import importlib
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -8,20 +10,31 @@ import pytest
 from sigmasplat.errors import BackendError
 from sigmasplat.native import cubins
 
-pytest.importorskip("cuda.core", reason="cuda-core is not installed: pip install 'sigmasplat[gpu]'")
 pytest.importorskip("cuda.bindings.nvrtc", reason="cuda-bindings is not installed: pip install 'sigmasplat[gpu]'")
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+sys.path.append(str(BENCHMARKS))
+kernels, kernels_tables = map(importlib.import_module, ("kernels", "kernels_tables"))
+
+MOST_SPILLED = {11: 8, 16: 24}
+"""Bytes of a thread, by features: what ptxas gives away on sm_90 to hold one more block on a multiprocessor."""
 
 
 @pytest.mark.parametrize("architecture", cubins.ARCHITECTURES)
-def test_every_kernel_compiles_without_a_warning(architecture: str) -> None:
+def test_every_kernel_compiles_without_a_warning_and_keeps_to_its_registers(architecture: str) -> None:
     with ThreadPoolExecutor(2) as pool:
-        made = list(pool.map(lambda features: cubins.compiled(features, architecture), cubins.PROGRAMS))
+        made = list(pool.map(lambda f: cubins.compiled(f, architecture, kernels.TELL), cubins.PROGRAMS))
     for features, program in zip(cubins.PROGRAMS, made, strict=True):
-        assert program.log == "", f"{features} features: {program.log}"
+        assert kernels.remarks(program.log) == "", f"{features} features: {program.log}"
+        used = {usage.kernel: usage for usage in kernels.usages(program.log)}
+        for usage in used.values():
+            assert usage.spilled <= MOST_SPILLED.get(features, 0), usage
+            assert usage.shared <= 48 << 10 and kernels.blocks_held(usage, architecture) >= 1, usage
         assert len(cubins.kernel_names(features)) >= 4
         for name in cubins.kernel_names(features):
             of_views = name in ("pack_view", "blend_backward_pose", "chain_params", "chain_pose")
-            assert (f".text.{name}\0".encode() in program.code) == (features <= 7 or not of_views), name
+            there = f".text.{name}\0".encode() in program.code
+            assert there == (name in used) == (features <= 7 or not of_views), name
 
 
 @pytest.fixture
@@ -65,6 +78,41 @@ def test_an_error_shows_the_compilers_log(text: Path) -> None:
         cubins.compiled(4, "sm_90")
 
 
+def test_a_device_newer_than_the_compiler_gets_ptx(text: Path) -> None:
+    assert cubins.target_of((9, 0)) == "sm_90" and cubins.target_of((8, 6)) == "sm_86"
+    newest = cubins.target_of((99, 9))
+    assert newest.startswith("compute_") and int(newest.removeprefix("compute_")) >= 120
+    code = cubins.compiled(4, newest).code
+    assert b".visible .entry nothing" in code and code.endswith(b"\0"), "the driver reads PTX up to a zero"
+
+
+def test_a_device_older_than_the_compiler_is_named(text: Path) -> None:
+    with pytest.raises(BackendError, match=r"do not compile for sm_50 with NVRTC(?s:.*)gpu-architecture"):
+        cubins.compiled(4, cubins.target_of((5, 0)))
+
+
 def test_a_warning_is_reported(text: Path) -> None:
     text.write_text('extern "C" __global__ void idle() { int never_used; }\n')
     assert "never_used" in cubins.compiled(4, "sm_90").log
+
+
+def test_what_the_compiler_says_is_read() -> None:
+    log = (
+        "a.cu(3): warning #177-D: never_used\nptxas info    : 0 bytes gmem\n"
+        "ptxas info    : Compiling entry function 'busy' for 'sm_90'\nptxas info    : Function properties for busy\n"
+        "ptxas         .     8 bytes stack frame, 4 bytes spill stores, 12 bytes spill loads\n"
+        "ptxas info    : Used 73 registers, used 1 barriers, 8 bytes cumulative stack size, 36000 bytes smem\n"
+        "ptxas info    : Compile time = 1.0 ms\n"
+        "ptxas info    : Compiling entry function 'idle' for 'sm_90'\nptxas info    : Function properties for idle\n"
+        "ptxas         .     0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads\n"
+        "ptxas info    : Used 8 registers, used 0 barriers\n"
+    )
+    busy, idle = kernels.usages(log)
+    assert busy == ("busy", 73, 12, 36000) and idle == ("idle", 8, 0, 0)
+    assert kernels.remarks(log) == "a.cu(3): warning #177-D: never_used"
+    assert kernels.blocks_held(busy, "sm_90") == 3, "65536 registers, 80 × 256 a block"
+    assert kernels.blocks_held(busy, "sm_86") == 2, "100 KiB, 36000 + 1024 bytes a block"
+    assert kernels.blocks_held(idle, "sm_90") == 8 and kernels.blocks_held(idle, "sm_75") == 4, "2048 and 1024 threads"
+    rows = [{"architecture": "sm_90", "features": f, **busy._asdict(), "blocks": 3} for f in (4, 7)]
+    (made,) = kernels_tables.sections({"figures": {"compiler": "13.0", "kernels": rows}})
+    assert made.rows == [["busy", "4, 7", "73", "12", "36000", "3"]]

@@ -10,13 +10,16 @@ import pytest
 import torch
 
 from emulated_cuda import Emulator
+from sigmasplat.errors import BackendError
 from sigmasplat.render import cuda_launch
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path.append(str(BENCHMARKS))
-gpu_tables, gpu_works, scenes, tables = map(importlib.import_module, ("gpu_tables", "gpu_works", "scenes", "tables"))
+gpu, gpu_tables, gpu_works, record, scenes, tables = map(
+    importlib.import_module, ("gpu", "gpu_tables", "gpu_works", "record", "scenes", "tables")
+)
 
 
 @pytest.fixture
@@ -53,6 +56,31 @@ def test_goals_are_judged() -> None:
     assert all(len(row) == len(section.columns) for section in made for row in section.rows)
     alone = gpu_tables.sections({"figures": figures(1.0, peer=False)})
     assert [row[3] for row in alone[-1].rows] == ["**no**", "yes", "yes", "yes"] and len(alone) == 2
+
+
+def test_what_was_measured_is_kept_when_the_rest_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any) -> None:
+        raise BackendError("the device is gone")
+
+    asked, made = list[Any](), figures(1.0, peer=False)
+    monkeypatch.setattr(gpu_works, "refuse_without_device", lambda: None)
+    monkeypatch.setattr(gpu_works, "describe_device", lambda: made["device"])
+    monkeypatch.setattr(gpu_works, "measure", lambda *given: asked.append(given) or made["scenes"][0])
+    monkeypatch.setattr(gpu_works, "time_slam", fail)
+    assert gpu.main(gpu.Options(splats=(2000, 1000), out=tmp_path, alone=True)) == 2
+    assert [given[:3] for given in asked] == [(*size, n) for size in gpu.SIZES for n in (1000, 2000)]
+    assert not any(given[-1] for given in asked), "gsplat was to be left out"
+    (kept,) = tmp_path.iterdir()
+    assert len(record.read(kept)["figures"]["scenes"]) == 4
+
+
+def test_a_peer_that_does_not_run_is_left_out(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    def broken(*_: Any) -> None:
+        raise RuntimeError("no nvcc")
+
+    monkeypatch.setattr(gpu_works, "_time_gsplat", broken)
+    monkeypatch.setattr(gpu_works.importlib.util, "find_spec", lambda name: object())
+    assert gpu_works.time_gsplat(None, 1, torch.device("cpu")) is None and "no nvcc" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(cuda_launch.missing() is None, reason="there is a CUDA device")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat import doctor
+from sigmasplat import cli, doctor
 from sigmasplat.config import Config, MappingConfig, TrackingConfig
 from sigmasplat.config.text import override
 from sigmasplat.fit.field import fit_field
@@ -239,3 +239,11 @@ def test_what_is_written_is_read_as_from_the_host(device: torch.device, tmp_path
     restore(again, read_state(tmp_path / "state", CLASSES, fixed(again)))
     again.step(ROOM.frame(FRAMES - 1))
     assert all(torch.equal(a, b) for a, b in zip(slam.checkpoint().values(), again.checkpoint().values(), strict=True))
+
+
+def test_a_run_is_written_and_evaluated(device: torch.device, tmp_path: Path) -> None:
+    words = [word for name, value in (QUICK | {"backend": "cuda"}).items() for word in ("--set", f"{name}={value}")]
+    with pytest.raises(SystemExit, match="0"):
+        cli.main(["run", "synthetic:frames=6,width=48,height=36", "--out", str(tmp_path / "run"), *words])
+    written = {path.name for path in (tmp_path / "run").iterdir()}
+    assert {"metrics.json", "map.ply", "checkpoint.safetensors"} <= written

@@ -1,14 +1,12 @@
 """Compile the CUDA kernels' text for a GPU architecture by NVRTC, which needs no driver, and keep the result."""
 
 import hashlib
-import io
 import os
 import re
 import tempfile
-from functools import cache
-from importlib import metadata
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from sigmasplat.env import install_extra
 from sigmasplat.errors import BackendError
@@ -35,7 +33,7 @@ INSTALL_OLDER = "pip install 'cuda-bindings<13' nvidia-cuda-nvrtc-cu12"
 
 
 class Compiled(NamedTuple):
-    """Machine code of one program, and what the compiler had to say about it."""
+    """Machine code of one program, or PTX, and what the compiler had to say about it."""
 
     code: bytes
     log: str
@@ -79,49 +77,75 @@ def cubin(features: int, architecture: str, folder: Path | None = None) -> bytes
 
 def key_of(features: int, architecture: str) -> str:
     """Hash all that decides on the machine code: texts, options, architecture, the compiler's version."""
-    said = [compiler_version(), _core_version(), str(_options(features, architecture))]
+    said = [compiler_version(), *_options(features, architecture)]
     texts = [(FOLDER / name).read_text(encoding="utf-8") for name in TEXTS[text_of(features)]]
     return hashlib.sha256("\0".join(said + texts).encode()).hexdigest()[:32]
 
 
-def compiled(features: int, architecture: str) -> Compiled:
-    """Compile the program. Raises BackendError with the compiler's log, or where NVRTC is missing."""
-    compiler_version()
-    from cuda.core import Program, ProgramOptions
+def compiled(features: int, architecture: str, more: Sequence[str] = ()) -> Compiled:
+    """Compile the program: machine code for sm_90, PTX for compute_90.
 
-    log = io.StringIO()
+    more: further options of NVRTC's. Raises BackendError with the compiler's log, or where NVRTC is missing.
+    """
+    version = compiler_version()
+    from cuda.bindings import nvrtc
+
     name = text_of(features)
-    options = ProgramOptions(name=name, include_path=str(FOLDER), **_options(features, architecture))
+    options = [*_options(features, architecture), f"--include-path={FOLDER}", *more]
+    _, program = nvrtc.nvrtcCreateProgram((FOLDER / name).read_bytes(), name.encode(), 0, [], [])
     try:
-        program = Program((FOLDER / name).read_text(encoding="utf-8"), "c++", options)
-        code = bytes(program.compile("cubin", logs=log).code)
-    except Exception as problem:  # cuda-core's own family of errors is private; its text is the compiler's log
-        raise BackendError(
-            f"the CUDA kernels do not compile for {architecture} with NVRTC {compiler_version()}; try "
-            f"{INSTALL}, or report this:\n{problem}"
-        ) from problem
-    return Compiled(code, log.getvalue())
+        (result,) = nvrtc.nvrtcCompileProgram(program, len(options), [option.encode() for option in options])
+        log = _read(nvrtc.nvrtcGetProgramLogSize, nvrtc.nvrtcGetProgramLog, program).decode(errors="replace")
+        if result != nvrtc.nvrtcResult.NVRTC_SUCCESS:
+            raise BackendError(
+                f"the CUDA kernels do not compile for {architecture} with NVRTC {version}; try {INSTALL}, or report "
+                f"this:\n{result.name}\n{_said(log)}"
+            )
+        kind = "CUBIN" if architecture.startswith("sm_") else "PTX"
+        code = _read(getattr(nvrtc, f"nvrtcGet{kind}Size"), getattr(nvrtc, f"nvrtcGet{kind}"), program)
+    finally:
+        nvrtc.nvrtcDestroyProgram(program)
+    return Compiled(code, _said(log))
 
 
-def _options(features: int, architecture: str) -> dict[str, object]:
+def _read(size_of: Callable[..., Any], fill: Callable[..., Any], program: Any) -> bytes:
+    """Copy out one of a program's results."""
+    memory = bytearray(size_of(program)[1])
+    fill(program, memory)
+    return bytes(memory)
+
+
+def _said(log: str) -> str:
+    return log.rstrip("\0").strip()
+
+
+def _options(features: int, architecture: str) -> list[str]:
     """Return what the compiler is told. Without contraction rounding is what the text says, on every device."""
-    return {
-        "arch": architecture,
-        "std": "c++17",
-        "fma": False,
-        "device_as_default_execution_space": True,
-        "define_macro": [("FEATURES", str(features))],
-    }
-
-
-@cache
-def _core_version() -> str:
-    return metadata.version("cuda-core")
+    return [
+        f"--gpu-architecture={architecture}",
+        "--std=c++17",
+        "--fmad=false",
+        "--device-as-default-execution-space",
+        f"--define-macro=FEATURES={features}",
+    ]
 
 
 def architecture_of(capability: tuple[int, int]) -> str:
     """Name the architecture of a compute capability: (9, 0) is sm_90."""
     return f"sm_{capability[0]}{capability[1]}"
+
+
+def target_of(capability: tuple[int, int]) -> str:
+    """Return what to compile for a device: its architecture or, where the compiler is older than that, compute_120.
+
+    That is PTX for the newest it knows, of which the driver makes machine code. Raises BackendError without NVRTC.
+    """
+    compiler_version()
+    from cuda.bindings import nvrtc
+
+    number, known = 10 * capability[0] + capability[1], sorted(nvrtc.nvrtcGetSupportedArchs()[1])
+    older = [other for other in known if other < number]
+    return f"compute_{older[-1]}" if number not in known and older else architecture_of(capability)
 
 
 def kernel_names(features: int) -> list[str]:

@@ -183,11 +183,12 @@ KERNEL blend_backward_moment(Frame frame, const float* rows, Lists lists, const 
     blend_tile_backward<FEATURES, true>(frame, rows, lists, slots, reference, used, o, g, records);
 }
 
-// Add each splat's records, which lie side by side, in their order: a thread for every sum of every splat.
+// Add each splat's records, which lie side by side, in their order: a thread for every sum of every splat, of which there must be
+// fewer than 2³², for 64-bit divisions take several times as long.
 KERNEL sum_records(const float* records, const int* first_slots, const int* counts, int n, int record, float* sums) {
-    const long long k = (long long)blockIdx.x * THREADS + threadIdx.x;
-    if (k >= (long long)n * record) return;
-    const int i = int(k / record), c = int(k % record);
+    const unsigned k = unsigned(blockIdx.x) * THREADS + unsigned(threadIdx.x), width = unsigned(record);
+    const unsigned i = k / width, c = k - i * width;
+    if (i >= unsigned(n)) return;
     float sum = 0.f;
     if (counts[i]) {
         const float* from = records + size_t(first_slots[i]) * record + c;

@@ -1,0 +1,126 @@
+"""Read what the compiler says of every CUDA kernel: registers, spills, shared memory, blocks on a multiprocessor.
+
+Needs no device. Writes benchmarks/results/kernels-<machine>.json and prints its tables.
+
+example: python benchmarks/kernels.py --architectures sm_86
+"""
+
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import record
+import tables
+import tyro
+
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.native import cubins
+
+arg = tyro.conf.arg
+THREADS = 256
+TELL = ("--ptxas-options=-v",)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Read what the compiler says of every CUDA kernel."""
+
+    architectures: Annotated[tuple[str, ...], arg(help="what to compile for")] = ("sm_86", "sm_90")
+    quick: Annotated[bool, arg(help="print only, write nothing")] = False
+    name: Annotated[str, arg(help="name of the results")] = "kernels"
+    out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
+
+
+class Multiprocessor(NamedTuple):
+    """What a multiprocessor shares out to blocks (CUDA C++ programming guide, compute capabilities)."""
+
+    shared_kib: int
+    threads: int
+    blocks: int
+    reserved: int = 1024
+    """Bytes of shared memory that the system takes of every block."""
+
+
+MULTIPROCESSORS = {
+    "sm_75": Multiprocessor(64, 1024, 16, 0),
+    "sm_80": Multiprocessor(164, 2048, 32),
+    "sm_86": Multiprocessor(100, 1536, 16),
+    "sm_89": Multiprocessor(100, 1536, 24),
+    "sm_90": Multiprocessor(228, 2048, 32),
+    "sm_100": Multiprocessor(228, 2048, 32),
+    "sm_120": Multiprocessor(100, 1536, 24),
+}
+REGISTERS = 65536
+USED = re.compile(
+    r"Compiling entry function '(?P<name>\w+)'.*?(?P<stores>\d+) bytes spill stores, (?P<loads>\d+) bytes spill loads"
+    r".*?Used (?P<registers>\d+) registers(?P<rest>[^\n]*)",
+    re.DOTALL,
+)
+
+
+class Usage(NamedTuple):
+    """What one kernel takes; shared memory and spills in bytes, of a thread the latter."""
+
+    kernel: str
+    registers: int
+    spilled: int
+    shared: int
+
+
+def usages(log: str) -> Iterator[Usage]:
+    """Read ptxas's account of each kernel in NVRTC's log."""
+    for found in USED.finditer(log):
+        shared = re.search(r"(\d+) bytes smem", found["rest"])
+        spilled = max(int(found["stores"]), int(found["loads"]))
+        yield Usage(found["name"], int(found["registers"]), spilled, int(shared[1]) if shared else 0)
+
+
+def remarks(log: str) -> str:
+    """Return what else the log says: warnings."""
+    account = re.compile(r"ptxas (info    :|        \.) |\s*$")
+    return "\n".join(line for line in log.splitlines() if not account.match(line))
+
+
+def blocks_held(usage: Usage, architecture: str) -> int:
+    """Return how many blocks of the kernel a multiprocessor holds at once. A warp's registers come in lots of 256."""
+    has = MULTIPROCESSORS[architecture]
+    of_warp = -(-usage.registers * 32 // 256) * 256
+    shared = -(-(usage.shared + has.reserved) // 128) * 128
+    by_shared = has.shared_kib * 1024 // shared if shared else has.blocks
+    return min(REGISTERS // (of_warp * THREADS // 32), by_shared, has.threads // THREADS, has.blocks)
+
+
+def figures_of(architecture: str) -> Iterator[dict[str, Any]]:
+    """Compile every program for an architecture; yield a row for each kernel."""
+    for features in cubins.PROGRAMS:
+        for usage in usages(cubins.compiled(features, architecture, TELL).log):
+            held = blocks_held(usage, architecture)
+            yield {"architecture": architecture, "features": features, **usage._asdict(), "blocks": held}
+
+
+def main(options: Options) -> int:
+    """Compile, write, print; return the exit code."""
+    unknown = set(options.architectures) - set(MULTIPROCESSORS)
+    try:
+        if unknown:
+            raise SigmaSplatError(
+                f"no figures for {', '.join(sorted(unknown))}; there are {', '.join(MULTIPROCESSORS)}"
+            )
+        rows = [row for architecture in options.architectures for row in figures_of(architecture)]
+    except SigmaSplatError as problem:
+        print(f"kernels.py: {problem}", file=sys.stderr)
+        return 2
+    figures = {"compiler": cubins.compiler_version(), "kernels": rows}
+    config = {n: v for n, v in asdict(options).items() if n not in ("out", "quick")}
+    measured = record.results("kernels", figures, name=options.name, config=config)
+    if not options.quick:
+        print(record.write(measured, options.out), file=sys.stderr)
+    print(tables.table(measured))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))
