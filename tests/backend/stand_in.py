@@ -21,7 +21,8 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
-from emulated_cuda import HERE, Emulator
+import sigmasplat
+from emulated_cuda import FLAGS, HERE, Emulator
 from sigmasplat.render import cuda_launch
 from sigmasplat.render.cuda_launch import Argument
 
@@ -39,6 +40,7 @@ WAITING = {
     "unique_consecutive", "_linalg_check_errors",
 }  # fmt: skip
 """Operators whose result, or its size, the host needs."""
+PACKAGE = str(Path(sigmasplat.__file__).parent)
 RUBBISH = 99
 """What integers hold that nobody wrote; other numbers are NaN."""
 
@@ -230,7 +232,9 @@ class StandIn(TorchDispatchMode):
 
     def event(self, **_: Any) -> SimpleNamespace:
         """Make an event; to synchronise with it is no wait worth counting where it has long happened."""
-        return SimpleNamespace(record=lambda *_: None, synchronize=self._arrive, query=lambda: False)
+        return SimpleNamespace(
+            record=lambda *_: None, synchronize=self._arrive, query=lambda: False, elapsed_time=lambda _: 0.0
+        )
 
 
 def _made_there(make: Any) -> Any:
@@ -262,7 +266,7 @@ def _spoil(tensor: Tensor) -> None:
 def _who() -> str:
     """Return the file of this package that torch was called from, autograd's thread having none."""
     frame: FrameType | None = sys._getframe()
-    while frame is not None and f"{os.sep}sigmasplat{os.sep}" not in frame.f_code.co_filename:
+    while frame is not None and not frame.f_code.co_filename.startswith(PACKAGE):
         frame = frame.f_back
     return Path(frame.f_code.co_filename).name if frame else "autograd or a test"
 
@@ -274,16 +278,7 @@ def library_in(folder: Path) -> Any:
     """
     torch_folder, made = Path(torch.__file__).parent, folder / "device.so"
     libraries = [f"-L{torch_folder / 'lib'}", "-lc10", "-ltorch_cpu", f"-Wl,-rpath,{torch_folder / 'lib'}"]
-    flags = [
-        "-std=c++20",
-        "-O1",
-        "-fPIC",
-        "-shared",
-        "-Wall",
-        "-Wextra",
-        "-Werror",
-        f"-isystem{torch_folder / 'include'}",
-    ]
+    flags = [*FLAGS, f"-isystem{torch_folder / 'include'}"]
     line = [os.environ.get("CXX") or "g++", *flags, str(HERE / "device.cpp"), "-o", str(made), *libraries]
     done = subprocess.run(line, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -65,9 +65,25 @@ def test_render_and_its_gradient_lie_on_the_device(device: torch.device) -> None
         (seen.color.square().sum() + seen.uncertainty.sum() + seen.median_depth.sum()).backward()
         assert there.params.grad is not None and pose.grad is not None
         assert {x.device.type for x in (*vars(seen).values(), pose.grad) if x is not None} == {where.type}
-        found.append([seen.color, seen.variance, seen.uncertainty, there.params.grad, pose.grad])
-    for got, want in zip(*found, strict=True):
-        torch.testing.assert_close(got.cpu(), want, rtol=2e-3, atol=2e-4)
+        found.append((seen.color, seen.variance, seen.uncertainty, there.params.grad, pose.grad))
+    for name, got, want in zip(("color", "V", "U", "on params", "on pose"), *found, strict=True):
+        assert_same_vector(got.detach().cpu(), want.detach(), 2e-3, name)
+
+
+@pytest.mark.parametrize("pose_there", [False, True])
+@pytest.mark.parametrize("field_there", [False, True])
+def test_a_render_takes_field_and_pose_from_either_side(
+    device: torch.device, field_there: bool, pose_there: bool
+) -> None:
+    s, host = scene("random", 60), torch.device("cpu")
+    params = params_of(s).to(device if field_there else host).requires_grad_()
+    T = s.T_camera_world.to(device if pose_there else host, copy=True).requires_grad_()
+    seen = render(GaussianField(params), s.camera, T, s.ref_depth.float(), OPTIONS, backend="cuda")
+    assert seen.uncertainty is not None
+    loss = seen.color.sum() + seen.variance.sum() + seen.uncertainty.sum() + seen.median_depth.sum()
+    on_params, on_pose = torch.autograd.grad(loss, [params, T])
+    assert (seen.color.device, on_params.device, on_pose.device) == (device, params.device, T.device)
+    assert torch.isfinite(on_params).all() and torch.isfinite(on_pose).all()
 
 
 def test_a_renderer_brings_a_field_once(stand_in: StandIn) -> None:
@@ -80,6 +96,14 @@ def test_a_renderer_brings_a_field_once(stand_in: StandIn) -> None:
     assert sent == [60 * 17, 60 * 45, 60 * 17] and torch.equal(seen[0].color.cpu(), seen[4].color.cpu())
     want = render(other, s.camera, T, backend="cpu")
     torch.testing.assert_close(seen[1].color.cpu(), want.color, rtol=1e-4, atol=1e-4)
+
+
+def test_a_field_of_the_host_is_fitted_and_brought_back(device: torch.device) -> None:
+    s, pulls = scene("random", 60), list[torch.Tensor]()
+    field, view = GaussianField(params_of(s)), CudaView(s.camera, OPTIONS)
+    keyframe = Keyframe(0, target_of(s.camera, tuple(view.alpha.shape)), se3.inverse(s.T_camera_world.double().numpy()))
+    fit_field(field, view, [[keyframe]] * 2, MAPPING, felt=lambda _, pull: pulls.append(pull))
+    assert {x.device.type for x in (*field.state(), *pulls)} == {"cpu"} and not torch.equal(field.params, params_of(s))
 
 
 @pytest.mark.parametrize("images", [1, 2])
@@ -136,7 +160,7 @@ def test_a_mapping_iteration_waits_once(stand_in: StandIn) -> None:
     view, field = CudaView(s.camera, OPTIONS), GaussianField(params_of(s).to("cuda"))
     keyframe = Keyframe(0, target_of(s.camera, tuple(view.alpha.shape)), se3.inverse(s.T_camera_world.double().numpy()))
     waits = waits_of(stand_in, lambda n: fit_field(field, view, [[keyframe]] * n, MAPPING))
-    assert waits == [("cuda_step.py", "fetching")]
+    assert [reason for _, reason in waits] == ["fetching"], "twist and loss, together"
 
 
 QUICK = {
@@ -174,9 +198,8 @@ def followed(config: Config) -> Slam:
 @pytest.mark.parametrize("run", [run for run in RUNS if run != "cgslam-fast"])
 def test_slam_runs(device: torch.device, run: str) -> None:
     ours, theirs = (followed(settings(run, backend)) for backend in ("cuda", "cpu"))
-    few_steps_m = 3e-2 if "descent" in run else 5e-3  # which the last digits decide
     paths = [slam.trajectory().T_world_camera for slam in (ours, theirs)]
-    np.testing.assert_allclose(*paths, atol=few_steps_m)
+    np.testing.assert_allclose(*paths, atol=5e-3)
     assert len(ours.store) == len(theirs.store) > 1 and len(ours.field) > 100
     assert [loop.accepted for loop in ours.loops] == [loop.accepted for loop in theirs.loops]
     assert ours.mapper.field.params.device.type == "cuda"
@@ -192,9 +215,6 @@ def test_a_field_does_not_travel(stand_in: StandIn) -> None:
         slam.step(ROOM.frame(i))
         size = 2 * len(slam.mapper.field)
         large.append([copy.by for copy in stand_in.copies if copy.numbers > size and copy.by != "target.py"])
-        assert bool(stand_in.waits) == slam.steps[-1].is_keyframe, (
-            "a frame that is aligned to a keyframe needs no device"
-        )
     assert len(slam.keyframes) == 3 and len(slam.field) > 1500 and len(slam.store) == 0
     assert large[0] == ["field.py"] * 3, "what a seed is, and Adam's moments"
     assert not any(large[1:])

@@ -35,14 +35,13 @@ class Layers(NamedTuple):
     @staticmethod
     def of(rows: int, columns: int, device: torch.device | None = None) -> "Layers":
         """Make empty planes, by default in the host's memory."""
-        kinds, size = (torch.int32, torch.float32), (rows, columns)
-        ids, floats = ([torch.zeros(size, dtype=kind, device=device) for _ in range(3)] for kind in kinds)
+        ids = [torch.zeros(rows, columns, dtype=torch.int32, device=device) for _ in range(2)]
+        floats = [torch.zeros(rows, columns, device=device) for _ in range(3)]
         return Layers(ids[0], floats[0], ids[1], floats[1], floats[2])
 
     def fill(self, b: reference.Blended, z: Tensor) -> None:
         """Copy what was blended of splats at depths z [N] m."""
-        found = (b.median_id, b.median_weight, b.dominant_id, b.dominant_weight)
-        for plane, image in zip(self[:4], found, strict=True):
+        for plane, image in zip(self[:4], b[3:], strict=True):
             plane.copy_(image)
         self.fill_depth(z)
 
@@ -209,8 +208,7 @@ class ReferenceView:
 
     def backward_pose(self, params: Tensor) -> Matrix:
         """Return the pose twist (ρ, φ) [6] of the gradient planes of colour and depth."""
-        maps, on_maps = self._maps[0][0][:4], (self.g_sums[:4],)
-        (g_twist,) = torch.autograd.grad(maps, (self._twist,), on_maps, materialize_grads=True)
+        (g_twist,) = torch.autograd.grad(self._maps[0][0][:4], self._twist, self.g_sums[:4], materialize_grads=True)
         return np.asarray(g_twist.numpy(), np.float64)
 
     def visible(self, n: int) -> Tensor:
@@ -228,8 +226,7 @@ def reaches(p: reference.Projection, opacities: Tensor, camera: Camera, options:
     """Tell which splats' bounds of alpha ≥ alpha_min overlap the image, bool [N]: those a view can feel."""
     reach = (2.0 * (opacities / options.alpha_min).log()).clamp(min=0.0).sqrt()[:, None] * p.radii.detach()
     low, high = p.means2d.detach() - reach, p.means2d.detach() + reach
-    last = low.new_tensor([camera.width - 1.0, camera.height - 1.0])
-    inside = ((high >= 0) & (low <= last)).all(1)
+    inside = ((high >= 0) & (low <= low.new_tensor([camera.width - 1.0, camera.height - 1.0]))).all(1)
     return inside & (p.radii[:, 0] > 0) & (opacities > options.alpha_min)
 
 

@@ -146,10 +146,7 @@ class Slam:
         state, poses, times, keyframes, anchors, and which submap each frame belongs to."""
         path, active = self.trajectory(), self.mapper.field
         return {
-            "params": active.params.cpu(),
-            "moment1": active.moment1.cpu(),
-            "moment2": active.moment2.cpu(),
-            "last_step": active.last_step.cpu(),
+            **{name: getattr(active, name).cpu() for name in ("params", "moment1", "moment2", "last_step")},
             "adam_steps": torch.tensor(active.steps),
             "timestamps_s": torch.from_numpy(path.timestamps_s),
             "T_world_camera": torch.from_numpy(path.T_world_camera),
