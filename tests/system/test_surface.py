@@ -218,7 +218,8 @@ def test_the_command_makes_the_surface_of_a_real_run(tmp_path: Path, capsys: pyt
     capsys.readouterr()
     assert sigmasplat("mesh", out, "--voxel-m", "0.05") == 0
     said = capsys.readouterr().out.splitlines()
-    assert said[0].startswith("surface 2/2") and said[-1].endswith(f"triangles: {out}/mesh.ply")
+    assert said[0] == "surface …" and said[1].startswith("surface 2/2")
+    assert said[-1].endswith(f"triangles: {out}/mesh.ply")
     first, mesh = (tmp_path / "run" / "mesh.ply").read_bytes(), read_mesh(tmp_path / "run" / "mesh.ply")
     source = open_source(room)
     off = distances(mesh.moved(source.truth().T_world_camera[0]).vertices.astype(float), source.true_surface())

@@ -178,10 +178,9 @@ class CompiledStep(CompiledImages):
     ) -> tuple[Matrix, float]:
         """Do what `TorchStep.splats` does in one pass, without a gradient row in memory."""
         twist, v = np.zeros(6), self.view
-        moment, g_moment, median_id, g_median_depth = v.depth_gradients()
         cost = v.raster.step(
-            field.params, field.moment1, field.moment2, field.last_step, v.sums, moment, v.alpha, v.g_sums, g_moment,
-            median_id, g_median_depth, rates.per_column.numpy(), BETA1, BETA2, EPSILON, field.steps,
+            field.params, field.moment1, field.moment2, field.last_step, v.g_sums, *v.depth_gradients(),
+            rates.per_column.numpy(), BETA1, BETA2, EPSILON, field.steps,
             [weights.get(name, 0.0) for name in SHAPE_TERMS], frozen_colors, pull, twist, v.seconds[3:],
         )  # fmt: skip
         return twist, cost

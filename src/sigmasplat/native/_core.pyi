@@ -146,9 +146,6 @@ class Rasteriser:
     ) -> None: ...
     def blend_backward(
         self,
-        sums: Array,
-        moment: Array | None,
-        alpha: Array,
         g_sums: Array,
         g_moment: Array | None,
         g_alpha: Array | None,
@@ -179,9 +176,6 @@ class Rasteriser:
     def view_backward(
         self,
         params: Array,
-        sums: Array,
-        moment: Array | None,
-        alpha: Array,
         g_sums: Array,
         g_moment: Array | None,
         g_alpha: Array | None,
@@ -198,9 +192,6 @@ class Rasteriser:
         moment1: Array,
         moment2: Array,
         last_step: Array,
-        sums: Array,
-        moment: Array | None,
-        alpha: Array,
         g_sums: Array,
         g_moment: Array | None,
         median_id: Array | None,
@@ -216,7 +207,5 @@ class Rasteriser:
         g_twist: Array,
         seconds: Array,
     ) -> float: ...
-    def backward_pose(
-        self, params: Array, sums: Array, alpha: Array, g_sums: Array, g_twist: Array, seconds: Array
-    ) -> None: ...
+    def backward_pose(self, params: Array, g_sums: Array, g_twist: Array, seconds: Array) -> None: ...
     def visible(self, out: Array) -> None: ...

@@ -114,11 +114,10 @@ public:
         kernels->blend_forward(context, means2d.data(), conics.data(), z.data(), radii.data(), opacities.data(), features.data(),
                                n, k, width, height, pointer(reference), {alpha_min, stop}, o);
     }
-    void blend_backward(Floats sums, Maybe<Floats> moment, Floats alpha, ConstFloats g_sums, Maybe<ConstFloats> g_moment,
+    void blend_backward(ConstFloats g_sums, Maybe<ConstFloats> g_moment,
                         Maybe<ConstFloats> g_alpha, Floats g_means2d, Floats g_conics, Floats g_z, Floats g_opacities, Floats g_features) {
         nb::gil_scoped_release unlocked;
-        kernels->blend_backward(context, {sums.data(), pointer(moment), alpha.data(), nullptr, nullptr, nullptr, nullptr},
-                                {g_sums.data(), pointer(g_moment), pointer(g_alpha)},
+        kernels->blend_backward(context, {g_sums.data(), pointer(g_moment), pointer(g_alpha)},
                                 {g_means2d.data(), g_conics.data(), g_z.data(), g_opacities.data(), g_features.data()});
     }
     void view_forward(ConstFloats view, ConstFloats params, int k, float alpha_min, float stop, Maybe<ConstFloats> reference,
@@ -134,35 +133,31 @@ public:
         kernels->view_forward(context, view.data(), params.data(), int64_t(params.shape(0)), k, pointer(reference),
                               {alpha_min, stop}, o, seconds.data());
     }
-    void view_backward(ConstFloats params, Floats sums, Maybe<Floats> moment, Floats alpha, ConstFloats g_sums,
-                       Maybe<ConstFloats> g_moment, Maybe<ConstFloats> g_alpha, Maybe<Ints> median_id, Maybe<ConstFloats> g_median_depth,
+    void view_backward(ConstFloats params, ConstFloats g_sums, Maybe<ConstFloats> g_moment, Maybe<ConstFloats> g_alpha, Maybe<Ints> median_id, Maybe<ConstFloats> g_median_depth,
                        Floats g_params, Maybe<Floats> pull, Doubles g_twist, Doubles seconds) {
         need(g_twist.size() == 6 && seconds.size() >= 2, "g_twist has 6 numbers, seconds 2");
-        need(!median_id == !g_median_depth && !moment == !g_moment, "a gradient goes with its plane");
+        need(!median_id == !g_median_depth, "a median depth's gradient goes with the medians");
         need(!pull || pull->size() == params.shape(0), "pull must fit the rows");
         nb::gil_scoped_release unlocked;
-        kernels->view_backward(context, params.data(), {sums.data(), pointer(moment), alpha.data(), nullptr, nullptr, nullptr, nullptr},
-                               {g_sums.data(), pointer(g_moment), pointer(g_alpha), pointer(median_id), pointer(g_median_depth)},
+        kernels->view_backward(context, params.data(), {g_sums.data(), pointer(g_moment), pointer(g_alpha), pointer(median_id), pointer(g_median_depth)},
                                g_params.data(), pointer(pull), g_twist.data(), seconds.data());
     }
-    double step(Floats params, Floats moment1, Floats moment2, Ints last_step, Floats sums, Maybe<Floats> moment, Floats alpha, ConstFloats g_sums,
-                Maybe<ConstFloats> g_moment, Maybe<Ints> median_id, Maybe<ConstFloats> g_median_depth, ConstFloats rates, float beta1, float beta2,
+    double step(Floats params, Floats moment1, Floats moment2, Ints last_step, ConstFloats g_sums, Maybe<ConstFloats> g_moment,
+                Maybe<Ints> median_id, Maybe<ConstFloats> g_median_depth, ConstFloats rates, float beta1, float beta2,
                 float epsilon, int step, std::vector<float> isotropy, int64_t frozen_colors, Maybe<Floats> pull, Doubles g_twist, Doubles seconds) {
-        need(isotropy.size() == 2 && !median_id == !g_median_depth && !moment == !g_moment, "a step has two isotropy weights; a gradient goes with its plane");
+        need(isotropy.size() == 2 && !median_id == !g_median_depth, "a step has two isotropy weights; a median depth's gradient goes with the medians");
         need(!pull || pull->size() == params.shape(0), "pull must fit the rows");
         need(g_twist.size() == 6 && seconds.size() >= 2 && rates.size() == 17, "g_twist has 6 numbers, seconds 2, rates 17");
         need(last_step.size() == params.shape(0) && moment1.size() == params.size() && moment2.size() == params.size(), "Adam's state must fit the rows");
         nb::gil_scoped_release unlocked;
-        return kernels->view_step(context, params.data(), {sums.data(), pointer(moment), alpha.data(), nullptr, nullptr, nullptr, nullptr},
-                                  {g_sums.data(), pointer(g_moment), nullptr, pointer(median_id), pointer(g_median_depth)},
+        return kernels->view_step(context, params.data(), {g_sums.data(), pointer(g_moment), nullptr, pointer(median_id), pointer(g_median_depth)},
                                   {moment1.data(), moment2.data(), last_step.data()}, {rates.data(), beta1, beta2, epsilon, step},
                                   {isotropy[0], isotropy[1], frozen_colors}, pointer(pull), g_twist.data(), seconds.data());
     }
-    void backward_pose(ConstFloats params, Floats sums, Floats alpha, ConstFloats g_sums, Doubles g_twist, Doubles seconds) {
+    void backward_pose(ConstFloats params, ConstFloats g_sums, Doubles g_twist, Doubles seconds) {
         need(g_twist.size() == 6 && seconds.size() >= 1, "g_twist has 6 numbers, seconds 1");
         nb::gil_scoped_release unlocked;
-        kernels->view_backward_pose(context, params.data(), {sums.data(), nullptr, alpha.data(), nullptr, nullptr, nullptr, nullptr},
-                                    {g_sums.data(), nullptr, nullptr}, g_twist.data(), seconds.data());
+        kernels->view_backward_pose(context, params.data(), {g_sums.data(), nullptr, nullptr}, g_twist.data(), seconds.data());
     }
     void visible(Bytes out) const { kernels->view_visible(context, out.data()); }
 
@@ -288,16 +283,15 @@ NB_MODULE(_core, m) {
         .def("blend_forward", &Rasteriser::blend_forward, nb::arg("means2d"), nb::arg("conics"), nb::arg("z"), nb::arg("radii"), nb::arg("opacities"),
              nb::arg("features"), nb::arg("width"), nb::arg("height"), nb::arg("alpha_min"), nb::arg("stop"), nb::arg("reference").none(), nb::arg("sums"),
              nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(), nb::arg("median_weight").none(), nb::arg("dominant_id").none(), nb::arg("dominant_weight").none())
-        .def("blend_backward", &Rasteriser::blend_backward, nb::arg("sums"), nb::arg("moment").none(), nb::arg("alpha"), nb::arg("g_sums"), nb::arg("g_moment").none(),
+        .def("blend_backward", &Rasteriser::blend_backward, nb::arg("g_sums"), nb::arg("g_moment").none(),
              nb::arg("g_alpha").none(), nb::arg("g_means2d"), nb::arg("g_conics"), nb::arg("g_z"), nb::arg("g_opacities"), nb::arg("g_features"))
         .def("view_forward", &Rasteriser::view_forward, nb::arg("view"), nb::arg("params"), nb::arg("k"), nb::arg("alpha_min"), nb::arg("stop"), nb::arg("reference").none(),
              nb::arg("sums"), nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(), nb::arg("median_weight").none(), nb::arg("dominant_id").none(),
              nb::arg("dominant_weight").none(), nb::arg("median_depth").none(), nb::arg("seconds"))
-        .def("view_backward", &Rasteriser::view_backward, nb::arg("params"), nb::arg("sums"), nb::arg("moment").none(), nb::arg("alpha"), nb::arg("g_sums"),
+        .def("view_backward", &Rasteriser::view_backward, nb::arg("params"), nb::arg("g_sums"),
              nb::arg("g_moment").none(), nb::arg("g_alpha").none(), nb::arg("median_id").none(), nb::arg("g_median_depth").none(), nb::arg("g_params"),
              nb::arg("pull").none(), nb::arg("g_twist"), nb::arg("seconds"))
-        .def("step", &Rasteriser::step, nb::arg("params"), nb::arg("moment1"), nb::arg("moment2"), nb::arg("last_step"), nb::arg("sums"), nb::arg("moment").none(),
-             nb::arg("alpha"), nb::arg("g_sums"), nb::arg("g_moment").none(), nb::arg("median_id").none(), nb::arg("g_median_depth").none(), nb::arg("rates"),
+        .def("step", &Rasteriser::step, nb::arg("params"), nb::arg("moment1"), nb::arg("moment2"), nb::arg("last_step"), nb::arg("g_sums"), nb::arg("g_moment").none(), nb::arg("median_id").none(), nb::arg("g_median_depth").none(), nb::arg("rates"),
              nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"), nb::arg("step"), nb::arg("isotropy"), nb::arg("frozen_colors"), nb::arg("pull").none(),
              nb::arg("g_twist"), nb::arg("seconds"))
         .def("backward_pose", &Rasteriser::backward_pose)

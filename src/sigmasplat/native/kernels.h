@@ -60,17 +60,17 @@ struct Kernels {
     void (*blend_forward)(Context*, const float* means2d, const float* conics, const float* z, const float* radii,
                           const float* opacities, const float* features, int64_t n, int k, int width, int height,
                           const float* reference, BlendOptions, Outputs);
-    void (*blend_backward)(Context*, Outputs, OutputGradients, SplatGradients);
+    void (*blend_backward)(Context*, OutputGradients, SplatGradients);
     // Fused: rows of raw parameters [n, 17] straight to images of (r, g, b, z[, q, q, q]) with q = σ² + c².
     void (*view_forward)(Context*, const float* view, const float* params, int64_t n, int k, const float* reference,
                          BlendOptions, Outputs, double* seconds);
     // pull [n], or null: |∂L/∂mean| in the image, per half image size.
-    void (*view_backward)(Context*, const float* params, Outputs, OutputGradients, float* g_params, float* pull, double* g_twist,
+    void (*view_backward)(Context*, const float* params, OutputGradients, float* g_params, float* pull, double* g_twist,
                           double* seconds);
-    double (*view_step)(Context*, float* params, Outputs, OutputGradients, AdamState, AdamOptions, StepOptions, float* pull,
+    double (*view_step)(Context*, float* params, OutputGradients, AdamState, AdamOptions, StepOptions, float* pull,
                         double* g_twist, double* seconds);
     void (*adam_settle)(float* params, int64_t n, AdamState, AdamOptions);
-    void (*view_backward_pose)(Context*, const float* params, Outputs, OutputGradients, double* g_twist, double* seconds);
+    void (*view_backward_pose)(Context*, const float* params, OutputGradients, double* g_twist, double* seconds);
     void (*view_visible)(const Context*, uint8_t* visible);
     void (*ssim_target)(const float* target, const float* mask, int width, int height, size_t stride, size_t plane, float* cache);
     double (*ssim)(const float* image, const float* target, const float* cache, int width, int height, size_t stride,

@@ -62,7 +62,7 @@ static void blend_forward(Context* context, const float* means2d, const float* c
     blend(r, o);
 }
 
-static void blend_backward(Context* context, Outputs, OutputGradients g, SplatGradients out) {
+static void blend_backward(Context* context, OutputGradients g, SplatGradients out) {
     Render& r = *reinterpret_cast<Render*>(context);
     blend_gradients(r, g);
     with_features(r.k, [&](auto k) {
@@ -238,7 +238,7 @@ static void chain_any(Render& r, const float* params, OutputGradients g, float* 
     r.k <= 4 ? chain(std_int<4>{}) : chain(std_int<7>{});
 }
 
-static void view_backward(Context* context, const float* params, Outputs, OutputGradients g, float* g_params, float* pull,
+static void view_backward(Context* context, const float* params, OutputGradients g, float* g_params, float* pull,
                           double* g_twist, double* seconds) {
     Render& r = *reinterpret_cast<Render*>(context);
     const double t0 = omp_get_wtime();
@@ -252,7 +252,7 @@ static void view_backward(Context* context, const float* params, Outputs, Output
 
 // Backward and one Adam step in one go: no gradient row reaches memory. Splats out of view wait (adam.h), and feel no isotropy
 // term: |s − mean(s)| is a mean over all splats, max(s)/min(s) − 1 over those in view. Returns what both cost, weighted.
-static double view_step(Context* context, float* params, Outputs, OutputGradients g, AdamState state, AdamOptions options,
+static double view_step(Context* context, float* params, OutputGradients g, AdamState state, AdamOptions options,
                         StepOptions terms, float* pull, double* g_twist, double* seconds) {
     Render& r = *reinterpret_cast<Render*>(context);
     const double t0 = omp_get_wtime();
@@ -282,7 +282,7 @@ static double view_step(Context* context, float* params, Outputs, OutputGradient
 }
 
 // ∂L/∂pose alone, from gradients on colour and depth: chained tile by tile, no splat's gradient is ever formed.
-static void view_backward_pose(Context* context, const float* params, Outputs, OutputGradients g, double* g_twist, double* seconds) {
+static void view_backward_pose(Context* context, const float* params, OutputGradients g, double* g_twist, double* seconds) {
     Render& r = *reinterpret_cast<Render*>(context);
     const double t0 = omp_get_wtime();
     const int tiles = r.tiles_x * r.tiles_y;

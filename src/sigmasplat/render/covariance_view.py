@@ -109,7 +109,7 @@ class CovarianceView:
         else:
             g_blended = tuple(torch.empty_like(x) for x in self._blended)
             g_slots = torch.cat([g_sums, torch.zeros_like(g_sums[:1])])
-            self._raster.blend_backward(self._slots, None, self.alpha, g_slots, None, g_alpha, *g_blended)
+            self._raster.blend_backward(g_slots, None, g_alpha, *g_blended)
         self._g_means2d = g_blended[0]
         return torch.autograd.grad(self._splats, (*self._leaves, self._twist), g_blended, materialize_grads=True)
 

@@ -107,8 +107,8 @@ class _Blend(torch.autograd.Function):
             m, c, depth, r, o, f, camera.width, camera.height, options.alpha_min, options.transmittance_stop, ref,
             sums, moment, alpha, ids[0], weights[0], ids[1], weights[1],
         )  # fmt: skip
-        ctx.raster, ctx.planes, ctx.ref, ctx.shapes = raster, (sums, moment, alpha), ref, [t.shape for t in inputs]
-        ctx.size, ctx.k = (camera.height, camera.width), k
+        ctx.raster, ctx.ref, ctx.shapes = raster, ref, [t.shape for t in inputs]
+        ctx.size, ctx.padded, ctx.k = (camera.height, camera.width), sums.shape, k
         h, w = ctx.size
         maps = [sums[:k, :h, :w].permute(1, 2, 0), moment[:h, :w] if moment is not None else None, alpha[:h, :w]]
         detached = [ids[0][:h, :w], weights[0][:h, :w], ids[1][:h, :w], weights[1][:h, :w]]
@@ -117,16 +117,15 @@ class _Blend(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, g_sums, g_moment, g_alpha, *_):  # type: ignore[no-untyped-def]
-        sums, moment, alpha = ctx.planes
         h, w = ctx.size
-        on_sums, on_alpha = torch.zeros_like(sums), torch.zeros_like(alpha)
-        on_moment = None if moment is None else torch.zeros_like(moment)
+        on_sums, on_alpha = torch.zeros(ctx.padded), torch.zeros(ctx.padded[1:])
+        on_moment = None if ctx.ref is None else torch.zeros_like(on_alpha)
         on_sums[: ctx.k, :h, :w] = g_sums.permute(2, 0, 1)
         on_alpha[:h, :w] = g_alpha
         if on_moment is not None and g_moment is not None:
             on_moment[:h, :w] = g_moment
         m, c, z, _radii, o, f = (torch.zeros(s) for s in ctx.shapes)
-        ctx.raster.blend_backward(sums, moment, alpha, on_sums, on_moment, on_alpha, m, c, z, o, f)
+        ctx.raster.blend_backward(on_sums, on_moment, on_alpha, m, c, z, o, f)
         return m, c, z, None, o, f, None, None, None
 
 

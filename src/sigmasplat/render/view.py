@@ -126,27 +126,24 @@ class CpuView:
             self.sums, moment, self.alpha, *planes, self.seconds[:3],
         )  # fmt: skip
 
-    def depth_gradients(self) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-        """Return moment and its gradient, median ids and their depths' gradient: [rows, columns], or None."""
+    def depth_gradients(self) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+        """Return the moment's gradient, median ids and their depths' gradient: [rows, columns], or None."""
         (moment, layers), ids = self._made, self.layers.median_id
-        return (
-            self.moment if moment else None, self.g_moment if moment else None,
-            ids if layers else None, self.g_median_depth if layers else None,
-        )  # fmt: skip
+        return self.g_moment if moment else None, ids if layers else None, self.g_median_depth if layers else None
 
     def backward(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Matrix:
         """Write gradients by rows, g_params [N, 17], and pull [N] if given; return the pose twist (ρ, φ) [6]."""
-        twist, (moment, g_moment, median_id, g_median_depth) = np.zeros(6), self.depth_gradients()
+        twist, (g_moment, median_id, g_median_depth) = np.zeros(6), self.depth_gradients()
         self.raster.view_backward(
-            params, self.sums, moment, self.alpha, self.g_sums, g_moment, self.g_alpha, median_id, g_median_depth,
-            g_params, pull, twist, self.seconds[3:],
+            params, self.g_sums, g_moment, self.g_alpha, median_id, g_median_depth, g_params, pull, twist,
+            self.seconds[3:],
         )  # fmt: skip
         return twist
 
     def backward_pose(self, params: Tensor) -> Matrix:
         """Return the pose twist (ρ, φ) [6] of the gradient planes of colour and depth; params are rows [N, 17]."""
         twist = np.zeros(6)
-        self.raster.backward_pose(params, self.sums, self.alpha, self.g_sums, twist, self.seconds[3:])
+        self.raster.backward_pose(params, self.g_sums, twist, self.seconds[3:])
         return twist
 
     def visible(self, n: int) -> Tensor:
