@@ -17,8 +17,8 @@ sys.path.append(str(BENCHMARKS))
 kernels, kernels_tables = map(importlib.import_module, ("kernels", "kernels_tables"))
 
 MOST_SPILLED = {11: 16, 16: 24, cubins.ALIGNING: 64}
-"""Bytes of a thread, by program: what ptxas gives away from sm_90 on to hold one more block on a multiprocessor, and, where
-alignment solves for a step, to the one thread that does."""
+"""Bytes of a thread, by program: what ptxas gives away from sm_90 on to hold one more block on a multiprocessor, and,
+where alignment solves for a step, to the one thread that does."""
 
 
 @pytest.mark.parametrize("architecture", cubins.ARCHITECTURES)

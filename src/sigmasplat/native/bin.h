@@ -187,7 +187,8 @@ static void number_slots(Render& r) {                 // where each splat's per-
 
 static void bin(Render& r) {
     number_slots(r);
-    const int tiles = r.tiles_x * r.tiles_y, stride = tiles + 3, threads = omp_get_max_threads();
+    const int tiles = r.tiles_x * r.tiles_y, threads = omp_get_max_threads();
+    const int stride = (tiles + 3 + 2 * LINE - 1) / (2 * LINE) * (2 * LINE);   // counters of two threads never share a cache line
     r.tile_begin.reserve(tiles + 1);
     r.histogram.reserve(size_t(threads) * stride);
     r.items.reserve(r.intersections + LINE * (threads + 1));   // each thread's spare tiles lie in a cache line of its own
@@ -214,7 +215,7 @@ static void bin(Render& r) {
             }
             r.tile_begin[tiles] = sum;
         }
-        for (int q = tiles; q < stride; q++) mine[q] = int(r.intersections) + LINE * (t + 1);
+        for (int q = tiles; q < tiles + 3; q++) mine[q] = int(r.intersections) + LINE * (t + 1);
         for (int64_t i = begin; i < end; i++)
             if (r.tiles_of[i]) {
                 uint32_t depth_bits;                  // positive floats order as their bits
