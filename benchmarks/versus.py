@@ -1,0 +1,96 @@
+"""Time the CPU kernels of this checkout beside those of another one, turn by turn: what did a change gain?
+
+A machine's speed may halve from one hour to the next; taken in turns, two checkouts meet the same hours. Both need
+their kernels in place (make native). Writes benchmarks/results/versus-<machine>.json and prints its table.
+
+example: git worktree add ../before v0.1 && make -C ../before native && python benchmarks/versus.py ../before
+"""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import record
+import tables
+import tyro
+from cpu import default_source
+
+from sigmasplat.io.machine import usable_cores
+
+arg = tyro.conf.arg
+CHILD = Path(__file__).with_name("versus_works.py")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Time the CPU kernels of this checkout beside those of another one."""
+
+    other: Annotated[tyro.conf.Positional[Path], arg(help="the other checkout, with its kernels built")]
+    source: Annotated[str, arg(help="sequence whose depth becomes splats")] = field(default_factory=default_source)
+    frame: Annotated[int, arg(help="frame of it")] = 150
+    splats: Annotated[int, arg(help="size of the map")] = 77_000
+    width: Annotated[int, arg(help="width of the image, pixels")] = 320
+    threads: Annotated[tuple[int, ...], arg(help="numbers of threads; none = 1 and all cores")] = ()
+    rounds: Annotated[int, arg(help="turns of each checkout")] = 5
+    runs: Annotated[int, arg(help="runs of each piece of work in a turn, of which the least counts")] = 30
+    name: Annotated[str, arg(help="name of the results")] = "versus"
+    out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
+
+
+def turn(checkout: Path, request: dict[str, Any]) -> dict[str, float]:
+    """Measure a checkout in a fresh process; return the least time of each work, ms. Raises ValueError if it fails."""
+    threads = {name: str(request["threads"]) for name in ("OMP_NUM_THREADS", "SIGMASPLAT_THREADS")}
+    ended = subprocess.run(
+        [sys.executable, "-W", "ignore", str(CHILD), str(checkout), json.dumps(request)],
+        capture_output=True,
+        text=True,
+        env={**os.environ, **threads, "SIGMASPLAT_DATA": str(record.data_root())},
+    )
+    if ended.returncode:
+        last = ended.stderr.strip().splitlines()[-1:] or ["no message"]
+        raise ValueError(f"{checkout} cannot be measured: {last[0]}; are its kernels built (make native)?")
+    found: dict[str, float] = json.loads(ended.stdout.splitlines()[-1])
+    return found
+
+
+def measure_all(options: Options) -> dict[str, Any]:
+    """Let both checkouts take turns; return each turn's times by checkout and number of threads."""
+    o, places = options, {"this": record.ROOT, "other": options.other}
+    request = {"path": o.source, "index": o.frame, "splats": o.splats, "width": o.width, "runs": o.runs}
+    turns = []
+    for threads in o.threads or tuple(sorted({1, usable_cores()})):
+        for number in range(o.rounds):
+            order = list(places.items())[:: 1 if number % 2 else -1]  # neither is always the first
+            found = {name: turn(place, {**request, "threads": threads}) for name, place in order}
+            turns.append({"threads": threads, **found})
+            print(f"{threads} threads, turn {number + 1} of {o.rounds}", file=sys.stderr, flush=True)
+    return {"other": described(o.other), "turns": turns}
+
+
+def described(checkout: Path) -> str | None:
+    """Return a checkout's commit, None where there is none."""
+    ended = subprocess.run(["git", "-C", str(checkout), "rev-parse", "HEAD"], capture_output=True, text=True)
+    return ended.stdout.strip() or None
+
+
+def main(options: Options) -> int:
+    """Measure, write, print; return the exit code."""
+    try:
+        figures = measure_all(options)
+    except ValueError as problem:
+        print(f"versus.py: {problem}", file=sys.stderr)
+        return 2
+    o = options
+    config = {"source": Path(o.source).name, "frame": o.frame, "splats": o.splats, "width": o.width, "runs": o.runs}
+    measured = record.results("versus", figures, name=o.name, seeds=[0], config=config)
+    print(record.write(measured, o.out), file=sys.stderr)
+    print(tables.table(measured))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))
