@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 import torch
 
-from emulated_cuda import Emulator, why_not
+from emulated_cuda import Emulator, rubbish, why_not
 from sigmasplat.errors import BackendError
 from sigmasplat.render import Render, cuda_launch, render
+from sigmasplat.render.cuda_raster import Raster
 from stand_in import StandIn, library_in, standing_in
 
 LIBRARY = pytest.StashKey[Any]()
@@ -44,6 +45,17 @@ def emulator(tmp_path_factory: pytest.TempPathFactory) -> Emulator:
     if reason:
         pytest.skip(reason)
     return Emulator(tmp_path_factory.mktemp("emulated"))
+
+
+@pytest.fixture
+def on_the_cpu(emulator: Emulator) -> Iterator[Emulator]:
+    """Let views of the CUDA backend run in the emulation, threads in their order; what nobody wrote is not zero."""
+    with emulator.standing_in(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Raster, "empty", rubbish)
+        emulator.order = 0
+        emulator.launches.clear()
+        yield emulator
+        emulator.order = 0
 
 
 @pytest.fixture

@@ -11,10 +11,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 
 from sigmasplat.native import cubins
 from sigmasplat.render import cuda_launch
 from sigmasplat.render.cuda_launch import THREADS, Argument, laid_out
+from sigmasplat.render.cuda_raster import Raster
 
 HERE = Path(__file__).parent / "emulation"
 FLAGS = [
@@ -80,3 +82,8 @@ def why_not() -> str | None:
     if platform.system() != "Linux":
         return "CUDA is emulated on Linux only"
     return None
+
+
+def rubbish(raster: Raster, *size: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Make room as a device might: what nobody writes is not zero."""
+    return torch.full(size, torch.nan if dtype.is_floating_point else 99, dtype=dtype)

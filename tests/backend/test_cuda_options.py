@@ -3,7 +3,6 @@
 Several keyframes a step, the full colour covariance, colours that depend on the view; and who waits for whom.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
 from typing import Any
@@ -13,7 +12,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from emulated_cuda import Emulator
 from sigmasplat.config import MappingConfig
 from sigmasplat.errors import ConfigError
 from sigmasplat.fit.color_covariance import FullCovarianceStep
@@ -29,27 +27,20 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.model.harmonics import count
 from sigmasplat.render.covariance_view import CovarianceView, CudaCovarianceView
-from sigmasplat.render.cuda_raster import Raster
 from sigmasplat.render.cuda_view import CudaView
 from sigmasplat.render.view import CpuView, ReferenceView, View
 from splat_fields import OPTIONS, crowd, exact_view, params_of, plane_gradients, there_and_back
 from splat_scenes import KINDS, SMALL, WIDE, Scene, assert_same_vector, scene
 from test_compiled_loss import RATES, WEIGHTS, fields, random_gradient, target_of
 from test_cuda_step import OF_THE_HOST, Watch
-from test_cuda_view import CPU, rubbish
+from test_cuda_view import CPU
 
 SHAPES = {"isotropy": 0.7, "isotropy_ratio": 0.01}
 FULL = {**dict.fromkeys(WEIGHTS, 0.0), "l1": 0.8, "ssim": 0.2, "depth": 1.0, "nll_depth": 2e-2, "nll_color_full": 1e-2}
 EXTRAS = ("correlations", "harmonics")
 
 
-@pytest.fixture(autouse=True)
-def on_the_cpu(emulator: Emulator) -> Iterator[Emulator]:
-    with emulator.standing_in(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Raster, "empty", rubbish)
-        emulator.order = 0
-        yield emulator
-        emulator.order = 0
+pytestmark = pytest.mark.usefixtures("on_the_cpu")
 
 
 def turned(s: Scene, angle: float) -> np.ndarray:

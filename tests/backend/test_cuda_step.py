@@ -1,6 +1,5 @@
 """Hold the fused CUDA mapping step, emulated, to its definitions in torch, float64."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from traceback import extract_stack
 from types import SimpleNamespace
@@ -17,25 +16,18 @@ from sigmasplat.fit.cuda_step import CudaStep
 from sigmasplat.fit.step import TorchStep
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.render.cuda_raster import Raster
 from sigmasplat.render.cuda_view import CudaView
 from splat_fields import OPTIONS, crowd, exact_view, params_of
 from splat_scenes import SMALL, WIDE, assert_same_vector, scene
 from test_compiled_loss import RATES, TERMS, WEIGHTS, draw_planes, fields, random_gradient, target_of
-from test_cuda_view import CPU, rubbish
+from test_cuda_view import CPU
 
 Reads = list[tuple[str, str]]
 
 SIZES = (SMALL, WIDE, Camera(33, 17, 30.0, 30.0, 15.5, 8.2), Camera(16, 16, 20.0, 20.0, 7.5, 7.5))
 
 
-@pytest.fixture(autouse=True)
-def on_the_cpu(emulator: Emulator) -> Iterator[Emulator]:
-    with emulator.standing_in(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Raster, "empty", rubbish)
-        emulator.order = 0
-        yield emulator
-        emulator.order = 0
+pytestmark = pytest.mark.usefixtures("on_the_cpu")
 
 
 def planes_of(view: CudaView | SimpleNamespace) -> Tensor:

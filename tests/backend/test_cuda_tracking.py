@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
@@ -23,14 +22,12 @@ from sigmasplat.fit.tracking_loss import tracking_gradient
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
-from sigmasplat.render.cuda_raster import Raster
 from sigmasplat.render.cuda_view import CudaView
 from sigmasplat.render.view import CpuView
 from splat_fields import OPTIONS
 from splat_scenes import assert_same_vector
 from splat_wall import CAMERA, TRUTH, Array, lower_median, seen_from, wall
 from test_cuda_step import Watch
-from test_cuda_view import rubbish
 from test_tracking_options import OFF, PAPER, damaged
 
 CPU = torch.device("cpu")
@@ -45,13 +42,7 @@ WAYS = {
 }
 
 
-@pytest.fixture(autouse=True)
-def on_the_cpu(emulator: Emulator) -> Iterator[Emulator]:
-    with emulator.standing_in(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Raster, "empty", rubbish)
-        emulator.order = 0
-        yield emulator
-        emulator.order = 0
+pytestmark = pytest.mark.usefixtures("on_the_cpu")
 
 
 def view_of(variance: bool = True, camera: Camera = CAMERA) -> CudaView:

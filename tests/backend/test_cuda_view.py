@@ -1,6 +1,5 @@
 """Hold the CUDA view, raw rows to planes and back, against the reference in float64, on the emulated kernels."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,6 @@ from torch import Tensor
 from emulated_cuda import Emulator
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS
-from sigmasplat.render.cuda_raster import Raster
 from sigmasplat.render.cuda_view import CudaView
 from sigmasplat.render.view import View
 from splat_fields import OPTIONS, crowd, exact_view, params_of, plane_gradients, there_and_back
@@ -21,20 +19,7 @@ SIZES = (SMALL, WIDE, Camera(1, 1, 20.0, 20.0, 0.0, 0.0), Camera(33, 17, 30.0, 3
 CPU = torch.device("cpu")
 
 
-@pytest.fixture(autouse=True)
-def on_the_cpu(emulator: Emulator) -> Iterator[Emulator]:
-    """Emulate in every test here, threads in their order."""
-    with emulator.standing_in(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Raster, "empty", rubbish)
-        emulator.order = 0
-        emulator.launches.clear()
-        yield emulator
-        emulator.order = 0
-
-
-def rubbish(raster: Raster, *size: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Make room as a device might: what nobody writes is not zero."""
-    return torch.full(size, torch.nan if dtype.is_floating_point else 99, dtype=dtype)
+pytestmark = pytest.mark.usefixtures("on_the_cpu")
 
 
 def view_of(s: Scene, variance: bool = True) -> CudaView:
