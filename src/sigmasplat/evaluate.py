@@ -1,6 +1,5 @@
 """Score a finished run: the only place that reads ground truth. Writes metrics.json, images/ and report.html."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -22,12 +21,12 @@ from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.page import plan_of, write_page
 from sigmasplat.render import FieldRenderer
 from sigmasplat.sources.base import Source
+from sigmasplat.types import Progress
 
 SAME_TIME_S = 1e-4
 """Log and trajectory hold the same timestamps up to printing."""
 
 Log = list[dict[str, Any]]
-Progress = Callable[[int, int], None]
 
 
 def evaluate(

@@ -1,6 +1,6 @@
 """Say what a session asks of the system that it runs and of those who watch it."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,6 +10,7 @@ from torch import Tensor
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.types import Progress
 
 
 class Tried(Protocol):
@@ -61,7 +62,7 @@ class Stepper(Protocol):
     @property
     def loops(self) -> Sequence[Tried]: ...
     def step(self, frame: Frame) -> Stepped: ...
-    def finish(self, progress: Callable[[int, int], None]) -> None: ...
+    def finish(self, progress: Progress) -> None: ...
     def trajectory(self) -> Trajectory: ...
     def checkpoint(self) -> dict[str, Tensor]: ...
 

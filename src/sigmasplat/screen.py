@@ -8,13 +8,21 @@ from typing import Any
 
 from rich.console import Console
 from rich.filesize import decimal
-from rich.progress import BarColumn, DownloadColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    MofNCompleteColumn,
+    Progress as Bars,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 
 from sigmasplat.metrics.story import ranges
 from sigmasplat.metrics.tables import headline, number
 from sigmasplat.profile import shares
 from sigmasplat.protocols import Stepped, Tried
+from sigmasplat.types import Progress
 
 PLAIN_LINES_EVERY_S = 10.0
 Show = Callable[[int, int | None, str], None]
@@ -46,7 +54,7 @@ class Screen:
             yield _StepShow(self.say, begin, total, done)
 
     @contextmanager
-    def counting(self, title: str) -> Iterator[Callable[[int, int], None]]:
+    def counting(self, title: str) -> Iterator[Progress]:
         """Show a count (done, total)."""
         with self._counters() as begin:
             show = begin(title, None)
@@ -73,7 +81,7 @@ class Screen:
             return
         count = DownloadColumn() if of_bytes else MofNCompleteColumn()
         columns = ("{task.description}", BarColumn(), count, TextColumn("{task.fields[text]}"))
-        with Progress(*columns, TimeRemainingColumn(), console=self.out) as bars:
+        with Bars(*columns, TimeRemainingColumn(), console=self.out) as bars:
             yield partial(_bar, bars)
 
     def results(self, metrics: dict[str, Any]) -> None:
@@ -113,7 +121,7 @@ def _figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     return [*rows[:place], *training, *rows[place:]]
 
 
-def _bar(bars: Progress, title: str, total: int | None) -> Show:
+def _bar(bars: Bars, title: str, total: int | None) -> Show:
     """Add a bar to those shown."""
     task = bars.add_task(title, total=total, text="")
     return lambda done, known, text: bars.update(task, completed=done, total=known or total, text=text)

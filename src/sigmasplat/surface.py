@@ -21,7 +21,8 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.slam.fusion import VOXEL_M, Progress, Renderer, Standpoint, count_keyframes, fuse, standpoints_of
+from sigmasplat.slam.fusion import VOXEL_M, Renderer, Standpoint, count_keyframes, fuse, standpoints_of
+from sigmasplat.types import Progress
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[2] / "src" / "sigmasplat"
 FLOORS = [
-    ["errors", "env", "config", "presets"],
+    ["errors", "env", "types", "config", "presets"],
     ["native"],
     ["model"],
     ["render"],

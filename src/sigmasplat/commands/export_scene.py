@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from sigmasplat.exports import Recorded
+    from sigmasplat.types import Progress
 
 SOURCE, PICTURES = ("source",), ("source", "pictures")
 
@@ -25,7 +26,7 @@ def _recorded(origin: Origin, options: ExportOptions) -> "Recorded":
 
 
 @contextmanager
-def _counting(title: str) -> "Iterator[Callable[[int, int], None]]":
+def _counting(title: str) -> "Iterator[Progress]":
     from sigmasplat.screen import Screen
 
     with Screen().counting(title) as progress:
@@ -51,7 +52,7 @@ def _colmap(origin: Origin, target: Path, options: ExportOptions) -> str:
 
 
 def _with_pictures(
-    export: "Callable[[Recorded, Path, bool, Callable[[int, int], None]], int]",
+    export: "Callable[[Recorded, Path, bool, Progress], int]",
     origin: Origin,
     target: Path,
     options: ExportOptions,

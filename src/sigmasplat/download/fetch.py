@@ -10,16 +10,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from email.message import Message
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from sigmasplat.download.partial import Origin, Partial, partial
 from sigmasplat.errors import DownloadError
 
+if TYPE_CHECKING:
+    from sigmasplat.types import Progress
+
 CHUNK_BYTES = 2**18
 WORTH_ANOTHER_TRY = {408, 425, 429, 500, 502, 503, 504}
 RANGE_REFUSED = 416
-Progress = Callable[[int, int], None]
-"""Shows bytes done, and in all (0: not known)."""
 Accept = Callable[[int | None, int], None]
 """Asked with the size that the server names (None: none) and the bytes that are here; raises to refuse."""
 
@@ -48,7 +50,7 @@ class _Broken(Exception):
         self.wait_s, self.hopeless = wait_s, hopeless
 
 
-def fetch(url: str, target: Path, progress: Progress, accept: Accept, patience: Patience) -> None:
+def fetch(url: str, target: Path, progress: "Progress", accept: Accept, patience: Patience) -> None:
     """Download `url` to `target`, going on with what an earlier call left in `target`.part.
 
     What has come is kept on Ctrl-C and on every error. Raises DownloadError.
@@ -78,7 +80,7 @@ def _wait_s(failures: int, asked_s: float, patience: Patience) -> float:
     return min(max(waited, asked_s), patience.longest_wait_s)
 
 
-def _go_on(url: str, part: Partial, progress: Progress, accept: Accept, patience: Patience) -> None:
+def _go_on(url: str, part: Partial, progress: "Progress", accept: Accept, patience: Patience) -> None:
     """Ask for what is missing and write it. Raises _Broken if not all of it comes."""
     origin = part.origin(url)
     if origin and origin.size_bytes == part.size_bytes:
@@ -176,7 +178,7 @@ def _content_range(value: str) -> tuple[int, int | None]:
 
 
 def _receive(
-    response: http.client.HTTPResponse, part: Partial, size_bytes: int | None, progress: Progress, patience: Patience
+    response: http.client.HTTPResponse, part: Partial, size_bytes: int | None, progress: "Progress", patience: Patience
 ) -> None:
     """Write the body as it comes. Raises _Broken if the connection fails or hardly anything comes."""
     host = response.geturl()

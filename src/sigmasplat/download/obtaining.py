@@ -23,7 +23,7 @@ MARGIN = 3.0
 """How much more an archive may hold than archives of its kind do."""
 ROUGHLY = (0.5, 1.5)
 """Between which multiples of a rough size a download may be."""
-Progress = Callable[[str, int, int], None]
+FileProgress = Callable[[str, int, int], None]
 """Shows what is being done, bytes done, and in all (0: not known)."""
 Tell = Callable[[str], None]
 
@@ -34,7 +34,7 @@ class _Errand:
 
     public: PublicSet
     shelf: Path
-    progress: Progress
+    progress: FileProgress
     tell: Tell
     patience: Patience
 
@@ -43,7 +43,7 @@ def obtain(
     public: PublicSet,
     name: str,
     out: Path,
-    progress: Progress,
+    progress: FileProgress,
     tell: Tell = lambda line: None,
     overwrite: bool = False,
     keep_archive: bool = False,

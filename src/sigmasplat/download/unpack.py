@@ -9,19 +9,21 @@ import stat
 import tarfile
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
 from sigmasplat.errors import DownloadError
+
+if TYPE_CHECKING:
+    from sigmasplat.types import Progress
 
 CHUNK_BYTES = 2**20
 MOST_RATIO, SMALL_BYTES = 200, 2**20
 """No file of more than a MiB in a zip shrinks that much: images are compressed already, text to a fifth."""
 LITTER = {"__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini"}
-Progress = Callable[[int, int], None]
 
 
 class BadArchive(DownloadError):
@@ -53,7 +55,7 @@ def is_archive(name: str) -> bool:
     return name.lower().endswith((".zip", ".tgz", ".tar.gz"))
 
 
-def unpack(archive: Path, folder: Path, budget: Budget, progress: Progress) -> None:
+def unpack(archive: Path, folder: Path, budget: Budget, progress: "Progress") -> None:
     """Unpack a .tar.gz or .zip below `folder`, which is made; progress(done, total) counts the archive's bytes.
 
     Raises BadArchive if it is damaged, unsafe or beyond the budget, DownloadError if the disk is full; what was written
@@ -81,7 +83,7 @@ def _explained(archive: Path) -> Iterator[None]:
         raise DownloadError(f"cannot unpack {archive}: {problem.strerror or problem}; is the disk full?") from problem
 
 
-def _unpack_tar(archive: Path, folder: Path, budget: Budget, progress: Progress) -> None:
+def _unpack_tar(archive: Path, folder: Path, budget: Budget, progress: "Progress") -> None:
     size_bytes = archive.stat().st_size
     with archive.open("rb") as packed, gzip.GzipFile(fileobj=packed) as inflated:
         stream = _Metered(inflated, budget)
@@ -116,7 +118,7 @@ class _Metered(io.RawIOBase):
         return chunk
 
 
-def _unpack_zip(archive: Path, folder: Path, budget: Budget, progress: Progress) -> None:
+def _unpack_zip(archive: Path, folder: Path, budget: Budget, progress: "Progress") -> None:
     with zipfile.ZipFile(archive) as zipped:
         entries = zipped.infolist()
         for entry in entries:  # what it says of itself, before a byte is written

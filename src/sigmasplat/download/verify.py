@@ -1,17 +1,19 @@
 """Compare a downloaded file with its checksum: the published one, or the one it had when it first came."""
 
 import hashlib
-from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sigmasplat.errors import DownloadError
 from sigmasplat.io.atomic import write_text
 
+if TYPE_CHECKING:
+    from sigmasplat.types import Progress
+
 CHUNK_BYTES = 2**20
-Progress = Callable[[int, int], None]
 
 
-def verify(path: Path, published: str, progress: Progress) -> str:
+def verify(path: Path, published: str, progress: "Progress") -> str:
     """Return "algorithm:digest" of a file that is as it should be.
 
     `published` is such a text, or "": then the digest is compared with that in `path`.sha256, which is written if there
@@ -29,7 +31,7 @@ def verify(path: Path, published: str, progress: Progress) -> str:
     return found
 
 
-def _digest(path: Path, algorithm: str, progress: Progress) -> str:
+def _digest(path: Path, algorithm: str, progress: "Progress") -> str:
     digest = hashlib.new(algorithm, usedforsecurity=False)  # MD5 is all that some publish: against damage, not malice
     done, total = 0, path.stat().st_size
     with path.open("rb") as file:

@@ -1,6 +1,6 @@
 """Write a run's path: KITTI, nerfstudio's transforms.json, COLMAP's text model; pictures beside it where asked for."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from sigmasplat.errors import RunError
 from sigmasplat.exports.recorded import Recorded
 from sigmasplat.io import colmap, kitti, nerfstudio, pictures as pictures_io, points as points_io
+from sigmasplat.types import Progress
 
 IMAGES, DEPTHS, POINTS = "images", "depths", "points.ply"
 SPARSE = Path("sparse") / "0"
@@ -17,8 +18,6 @@ MOST_POINTS = 100_000
 LEAST_OPACITY = 0.5
 
 Floats = NDArray[np.float64]
-Progress = Callable[[int, int], None]
-"""Is told (pictures done, of how many)."""
 
 
 def untold(done: int, total: int) -> None:

@@ -1,6 +1,5 @@
 """Write a run's floor plan: a picture, and the same in numbers beside it."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 from sigmasplat.errors import RunError
@@ -11,6 +10,7 @@ from sigmasplat.metrics.floor_plan import CELL_M, FloorPlan, floor_plan
 from sigmasplat.metrics.plan_picture import draw_floor_plan
 from sigmasplat.metrics.sights import Renderer
 from sigmasplat.render import FieldRenderer
+from sigmasplat.types import Progress
 
 
 def export_plan(
@@ -19,7 +19,7 @@ def export_plan(
     *,
     cell_m: float = CELL_M,
     renderer: Renderer | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = lambda done, total: None,
 ) -> FloorPlan:
     """Write target (.png) and the record of the plan beside it (.json); return the plan.
 

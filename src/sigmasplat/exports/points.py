@@ -1,12 +1,12 @@
 """Write a run's surface as points with normals and colours."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 from sigmasplat.exports.recorded import Recorded
 from sigmasplat.io.points import write_points
 from sigmasplat.slam.fusion import VOXEL_M, Renderer
 from sigmasplat.surface import Recording
+from sigmasplat.types import Progress
 
 
 def export_points(
@@ -15,7 +15,7 @@ def export_points(
     *,
     voxel_m: float = VOXEL_M,
     renderer: Renderer | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = lambda done, total: None,
 ) -> int:
     """Fuse what the map shows at its keyframes and write the surface's points; return how many.
 

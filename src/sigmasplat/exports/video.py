@@ -8,7 +8,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from sigmasplat.errors import ConfigError
 from sigmasplat.exports.recorded import Recorded
@@ -23,6 +22,7 @@ from sigmasplat.model.camera_path import orbit, resampled
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import FieldRenderer
+from sigmasplat.types import Matrix, Progress
 
 SHORTEST_S, LONGEST_S, ORBIT_S = 4.0, 60.0, 12.0
 SAMPLES = 12
@@ -30,8 +30,6 @@ SAMPLES = 12
 LOOKS = 20
 CUT_M = 0.1
 """From above, what lies higher than this over the middle height of the camera is cut off: the ceiling, mostly."""
-
-Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,7 @@ def export_video(
     options: VideoOptions | None = None,
     *,
     renderer: Renderer | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = lambda done, total: None,
 ) -> int:
     """Write a film and return how many images it has; `progress` is told (images done, of how many).
 
@@ -120,9 +118,7 @@ def _show(renderer: Renderer, field: GaussianField, camera: Camera, T_world_came
         return Maps.of(renderer(field, camera, se3.inverse(T_world_camera)))
 
 
-def _images(
-    show: Callable[[Matrix], Maps], poses: Matrix, width: int, progress: Callable[[int, int], None]
-) -> Iterator[Rgb]:
+def _images(show: Callable[[Matrix], Maps], poses: Matrix, width: int, progress: Progress) -> Iterator[Rgb]:
     """Yield a film's images, their colours fixed by a few of them."""
     rows = np.unique(np.linspace(0, len(poses) - 1, min(SAMPLES, len(poses))).round().astype(int))
     scale = Scale.of([show(poses[row]) for row in rows])

@@ -19,13 +19,13 @@ from sigmasplat.fit.cuda_align import CudaLevel, Descent, Rules
 from sigmasplat.fit.pyramid import LEVELS, Pyramid
 from sigmasplat.model import se3
 from sigmasplat.render.backend import backend_module
+from sigmasplat.types import Matrix
 
 if TYPE_CHECKING:
     from sigmasplat.native import _core
 
     Level = _core.Level | CudaLevel
 
-Matrix = NDArray[np.float64]
 
 HUBER_GRAY = (0.02, 0.05, 0.1, 0.2)
 """Width of the gray residual's quadratic part, from the finest level up: far from the answer all of them are large."""

@@ -15,7 +15,8 @@ from sigmasplat.fit.target import Target
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.render.covariance_view import CovarianceView, CudaCovarianceView
 from sigmasplat.render.render import covariance_of
-from sigmasplat.render.view import Matrix, View
+from sigmasplat.render.view import View
+from sigmasplat.types import Matrix
 
 COLORS, SCALES = COLUMNS["colors"], COLUMNS["log_scales"]
 

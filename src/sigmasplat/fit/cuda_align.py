@@ -6,13 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.native.cubins import ALIGNING
 from sigmasplat.render import cuda_launch
+from sigmasplat.types import Matrix
 
-Matrix = NDArray[np.float64]
 CELL = 16
 """Pixels of a cell each way, a block of threads (native/align_pixel.h)."""
 NORMAL_TERMS = 52

@@ -19,8 +19,7 @@ from sigmasplat.fit.tracking_loss import tracking_numbers
 from sigmasplat.render.cuda_graph import Work, repeatable
 from sigmasplat.render.cuda_launch import THREADS, blocks_for
 from sigmasplat.render.cuda_view import CudaView
-
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
 
 MEDIANS, PASSES, DIGITS = 5, 3, 2048
 """Of errors of depth and colour and of three channels of V; counts by 11, 10 and 10 bits (native/track.cuh)."""

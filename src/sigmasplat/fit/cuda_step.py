@@ -13,7 +13,7 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.render.covariance_view import CudaCovarianceView
 from sigmasplat.render.cuda_launch import blocks_for
 from sigmasplat.render.cuda_view import CudaView
-from sigmasplat.render.view import Matrix
+from sigmasplat.types import Matrix
 
 LOCAL_TERMS = ("l1", "depth", "nll_color", "nll_depth", "alignment", "moment")
 TILE = 16

@@ -13,7 +13,7 @@ from sigmasplat.fit.target import Target
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.harmonics import count
 from sigmasplat.render.cuda_launch import blocks_for
-from sigmasplat.render.view import Matrix
+from sigmasplat.types import Matrix
 
 
 class CudaViewDependentStep:

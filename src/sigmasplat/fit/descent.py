@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
@@ -13,8 +12,7 @@ from sigmasplat.fit.motion import parametrisation
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import tracking_gradient
 from sigmasplat.render.view import View
-
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
 
 
 class Descent(NamedTuple):

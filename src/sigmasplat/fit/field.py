@@ -15,7 +15,8 @@ from sigmasplat.fit.steps import gathering, step_for
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.render.view import CpuView, Matrix, View
+from sigmasplat.render.view import CpuView, View
+from sigmasplat.types import Matrix
 
 
 @dataclass

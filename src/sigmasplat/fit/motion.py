@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.model import se3
+from sigmasplat.types import Matrix
 
-Matrix = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
 

@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
@@ -17,8 +15,7 @@ from sigmasplat.fit.tracking_loss import PoseMaps, agreement
 from sigmasplat.model import se3
 from sigmasplat.render.cuda_view import CudaView
 from sigmasplat.render.view import View
-
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
 
 
 @dataclass(eq=False)

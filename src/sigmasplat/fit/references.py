@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
@@ -15,8 +14,8 @@ from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import PoseMaps, tracking_numbers
 from sigmasplat.render.cuda_view import CudaView
 from sigmasplat.render.view import CpuView, View
+from sigmasplat.types import Matrix
 
-Matrix = NDArray[np.float64]
 ALIGN_ALPHA = 0.95
 """Align only where the map is this opaque: there C/A and D/A are the surface's own."""
 

@@ -11,7 +11,8 @@ from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates, adam_step
 from sigmasplat.fit.target import Target
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.render.render import variance_of
-from sigmasplat.render.view import CpuView, Matrix, View
+from sigmasplat.render.view import CpuView, View
+from sigmasplat.types import Matrix
 
 Weights = Mapping[str, float]
 SHAPE_TERMS = ("isotropy", "isotropy_ratio")

@@ -16,7 +16,8 @@ from sigmasplat.fit.view_dependent import ViewDependentStep
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render.covariance_view import CovarianceView, CudaCovarianceView, covariance_view
 from sigmasplat.render.cuda_view import CudaView
-from sigmasplat.render.view import CpuView, Matrix, View
+from sigmasplat.render.view import CpuView, View
+from sigmasplat.types import Matrix
 
 
 class MappingStep(Protocol):

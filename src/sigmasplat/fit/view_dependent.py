@@ -11,7 +11,8 @@ from sigmasplat.fit.step import Weights, render_for, shape_pull
 from sigmasplat.fit.target import Target
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.model.harmonics import basis, count, view_colors
-from sigmasplat.render.view import Matrix, View
+from sigmasplat.render.view import View
+from sigmasplat.types import Matrix
 
 COLORS, MEANS, SCALES = (COLUMNS[name] for name in ("colors", "means", "log_scales"))
 

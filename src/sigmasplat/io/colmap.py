@@ -15,8 +15,8 @@ from sigmasplat.io.atomic import write_text
 from sigmasplat.io.points import color_bytes
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.types import Matrix
 
-Matrix = NDArray[np.float64]
 Points = NDArray[np.floating]
 
 

@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sigmasplat.io.json_files import write_json
 from sigmasplat.model.camera import Camera
-
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
 
 OPENGL_FROM_OURS = np.diag([1.0, -1.0, -1.0, 1.0])
 """T_gl_camera, and its own inverse."""

@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.metrics.plot import ACCENT, BLUE, FAINT, GREEN, PURPLE, Chart, Curve, Matrix
+from sigmasplat.metrics.plot import ACCENT, BLUE, FAINT, GREEN, PURPLE, Chart, Curve
+from sigmasplat.types import Matrix
 
 SUBMAP_COLOURS = (BLUE, GREEN, PURPLE)
 """Neighbours differ; the accent is for loops."""

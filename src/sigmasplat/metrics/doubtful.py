@@ -10,6 +10,8 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 from skimage.draw import polygon
 
+from sigmasplat.types import Matrix
+
 UNSURE_DEPTH_M = 0.05
 UNSURE_COLOR = 3.0
 """Times the plan's median: how large σ is as such depends on how the map was trained."""
@@ -22,7 +24,6 @@ MOST = 12
 
 Grid = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
-Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

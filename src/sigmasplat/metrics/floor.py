@@ -3,12 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.metrics.sights import Sight
-
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
 
 TILT = np.cos(np.deg2rad(40.0))
 """Cameras are held upright, give or take this."""

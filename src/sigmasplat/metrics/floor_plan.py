@@ -1,6 +1,6 @@
 """Draw up a plan of what a map shows, cell by cell from above: what is there, how sure it is, what it never saw."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -18,6 +18,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import render
+from sigmasplat.types import Matrix, Progress
 
 CELL_M = 0.05
 UNSEEN, BARE, FREE, THING, WALL = range(5)
@@ -34,7 +35,6 @@ LEAST_POINTS = 2
 MARGIN_CELLS = 4
 
 Grid = NDArray[np.float32]
-Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ def floor_plan(
     cell_m: float = CELL_M,
     most: int = sights.MOST,
     renderer: sights.Renderer = render,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = lambda done, total: None,
 ) -> FloorPlan:
     """Look at a map from its path and draw up its plan; `camera` gives the field of view, `most` poses are looked from.
 

@@ -3,10 +3,10 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
+
 Colour = tuple[int, int, int]
 Box = tuple[float, float, float, float]
 

@@ -4,7 +4,6 @@ Distances are from points drawn on one surface to the other *surface*, not to po
 same room, 200 000 points each, lie a centimetre apart, which would drown the errors of a good map.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,10 +14,10 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.render.mesh import mesh_depth
+from sigmasplat.types import Progress
 
 Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Progress = Callable[[int, int], None]
 
 POINTS = 200_000
 """Drawn on each surface."""

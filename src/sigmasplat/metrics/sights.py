@@ -1,6 +1,6 @@
 """Look at a map from places along its path: points on its surfaces, their normals, and how sure their depth is."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,6 +15,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import Render
+from sigmasplat.types import Matrix, Progress
 
 WIDTH = 160
 """Pixels of an image that only measures: at 5 m one is about 4 cm wide."""
@@ -22,7 +23,6 @@ MOST = 60
 EDGE = 0.05
 """Neighbours whose depths differ by more than this share belong to two surfaces, and what lies between to neither."""
 
-Matrix = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 
@@ -56,7 +56,7 @@ def looks(
     camera: Camera,
     renderer: Renderer,
     most: int = MOST,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = lambda done, total: None,
 ) -> Iterator[Sight]:
     """Look from at most so many poses, evenly spread over the path, first and last among them."""
     small = camera.resized(WIDTH, max(1, round(camera.height * WIDTH / camera.width)))

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.types import Matrix
 
-Matrix = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 

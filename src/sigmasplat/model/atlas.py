@@ -4,11 +4,9 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sigmasplat.model import se3
-
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
 
 
 class Place(NamedTuple):

@@ -1,14 +1,12 @@
 """Make paths for a camera to fly: along a recorded one, calmed and at an even rate, or in a circle above a place."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.model.trajectory import Trajectory
-
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
 
 CALM_S = 0.25
 """Standard deviation of the average that takes a hand's tremble out of a path."""

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
 
 
 def hat(w: Matrix) -> Matrix:

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
-
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
 
 
 @dataclass(frozen=True, eq=False)

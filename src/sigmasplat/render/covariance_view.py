@@ -13,13 +13,13 @@ from sigmasplat.render.view import (
     NO_LAYERS,
     CpuView,
     Layers,
-    Matrix,
     ReferenceView,
     View,
     pull_of,
     reaches,
     twist_matrix,
 )
+from sigmasplat.types import Matrix
 
 PLANES, SLOTS = 10, 11
 """(r, g, b, z, Σ + c cᵀ ×6), and the next number of planes that the kernels are compiled for."""

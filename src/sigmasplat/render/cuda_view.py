@@ -10,7 +10,8 @@ from sigmasplat.render import cuda_launch
 from sigmasplat.render.cuda_raster import Planes, Raster
 from sigmasplat.render.cuda_stages import Stages
 from sigmasplat.render.numbers import view_numbers
-from sigmasplat.render.view import Layers, Matrix
+from sigmasplat.render.view import Layers
+from sigmasplat.types import Matrix
 
 
 class CudaView:

@@ -18,8 +18,7 @@ from sigmasplat.render import reference
 from sigmasplat.render.backend import backend_module, is_cuda
 from sigmasplat.render.numbers import view_numbers
 from sigmasplat.render.render import features_of
-
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
 
 
 class Layers(NamedTuple):

@@ -9,9 +9,9 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from sigmasplat.fit.pyramid import gray_of
+from sigmasplat.types import Matrix
 
 Plane = NDArray[np.float32]
-Matrix = NDArray[np.float64]
 
 WORKING_SIZE = (80, 60)
 """Width and height in pixels at which gradients are taken, whatever the camera's."""

@@ -3,11 +3,9 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sigmasplat.model import se3
-
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
 
 HOP_M, HOP_RAD = 0.002, 0.002
 """What each hop adds to odometry's deviation beyond its estimated covariance, which knows noise but not bias."""

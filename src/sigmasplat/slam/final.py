@@ -1,7 +1,7 @@
 """Make one map of all submaps once the frames have ended: merge them, or seed anew on their surface; refine it over
 every keyframe (VarSplat §7)."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
@@ -23,9 +23,7 @@ from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.tsdf import packed
 from sigmasplat.render.view import View
 from sigmasplat.slam.fusion import count_keyframes, fuse, standpoints_of
-
-Matrix = NDArray[np.float64]
-Progress = Callable[[int, int], None]
+from sigmasplat.types import Matrix, Progress
 
 CACHE_BYTES = 64 << 20
 """Of pictures laid out for the fit; the others are read again when drawn."""

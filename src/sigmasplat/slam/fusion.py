@@ -20,6 +20,7 @@ from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.tsdf import Tsdf
 from sigmasplat.render import FieldRenderer, Render
+from sigmasplat.types import Matrix, Progress
 
 VOXEL_M = 0.01
 TRUNCATION_VOXELS = 4
@@ -29,10 +30,8 @@ LEAST_ALPHA = 0.9
 LEAST_VERTICES = 200
 """Smaller parts are dropped (VarSplat §7)."""
 
-Matrix = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Renderer = Callable[[GaussianField, Camera, Matrix], Render]
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,8 +26,7 @@ from sigmasplat.slam.places import (
 )
 from sigmasplat.slam.pose_graph import Edge, LoopVerdict, optimise
 from sigmasplat.slam.register import Registrar, Registration
-
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp, softmax
 
 from sigmasplat.slam.descriptors import similarity
+from sigmasplat.types import Matrix
 
-Matrix = NDArray[np.float64]
 Descriptors = NDArray[np.float32]
 
 GATE_LEAST, GATE_MOST = 0.85, 1.20

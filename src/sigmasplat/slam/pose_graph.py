@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
@@ -17,8 +16,7 @@ from scipy.special import gammaincinv
 
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.model import se3
-
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
 
 PRUNE_WEIGHT = 0.25
 """Below this weight a loop is rejected (VarSplat §6). At μ = 1 the weight is ¼ exactly where r² = c²: the χ² test."""

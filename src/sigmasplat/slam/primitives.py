@@ -5,15 +5,13 @@ from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.render.view import View
-
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
 
 
 def primitive_uncertainty(

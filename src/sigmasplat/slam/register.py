@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -20,8 +19,7 @@ from sigmasplat.model.submap import Submap, SubmapStore
 from sigmasplat.render.view import ReferenceView, View
 from sigmasplat.slam.drift import symmetric
 from sigmasplat.slam.places import SubmapPair
-
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
 
 FLOOR_M, FLOOR_RAD = 0.005, 0.003
 """Deviation that every registration is given at least: two maps of one wall differ by about so much."""

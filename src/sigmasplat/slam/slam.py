@@ -1,7 +1,6 @@
 """SLAM: track every frame, map keyframes, cut submaps, close loops. `Slam.step` reads like the paper's overview."""
 
 import time
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -30,8 +29,8 @@ from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.rules import ends_submap, is_keyframe
 from sigmasplat.slam.step import KERNELS, Step, numbers_of
 from sigmasplat.slam.tracker import Tracker
+from sigmasplat.types import Matrix, Progress
 
-Matrix = NDArray[np.float64]
 HOST = torch.device("cpu")
 
 
@@ -125,7 +124,7 @@ class Slam:
         self.steps.append(step)
         return step
 
-    def finish(self, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
+    def finish(self, progress: Progress = lambda done, total: None) -> None:
         """Finish the last submap, look for its loops, and make the final map (VarSplat §7); once, after all frames.
 
         `progress` is told (steps of refinement done, of how many), from the beginning to the end; one step where

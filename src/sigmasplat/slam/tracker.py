@@ -4,7 +4,6 @@ import dataclasses
 from dataclasses import dataclass, field as dataclass_field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.align import align
@@ -16,8 +15,8 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render.view import ReferenceView, View
 from sigmasplat.slam.rules import is_lost, jumped
+from sigmasplat.types import Matrix
 
-Matrix = NDArray[np.float64]
 DOUBT = 0.7
 """Below this share of its usual agreement a pose is doubted and other starts are tried."""
 

@@ -16,9 +16,10 @@ from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources.bag import Bag, Message
-from sigmasplat.sources.bag_frames import Matrix, T_frames, rigid
+from sigmasplat.sources.bag_frames import T_frames, rigid
 from sigmasplat.sources.bag_topics import ImageTopic
 from sigmasplat.sources.calibration import Calibration, Lens, calibrated, camera_of
+from sigmasplat.types import Matrix
 
 UNITS_PER_METRE = 1000.0
 """Whole-number depth of ROS is millimetres (REP 118)."""

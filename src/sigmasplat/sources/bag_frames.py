@@ -3,13 +3,12 @@
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.sources.bag import Bag, Message
+from sigmasplat.types import Matrix
 
-Matrix = NDArray[np.float64]
 MOVING = 2000
 """So many messages of /tf are looked at: transforms between the cameras of one device come again and again."""
 

@@ -5,7 +5,8 @@ import numpy as np
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.bag import Bag, Message
-from sigmasplat.sources.bag_frames import Matrix, T_frames, rigid
+from sigmasplat.sources.bag_frames import T_frames, rigid
+from sigmasplat.types import Matrix
 
 KINDS = (
     "geometry_msgs/msg/PoseStamped",

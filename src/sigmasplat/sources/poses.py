@@ -5,13 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
-
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
 
 NEARLY_RIGID = 1e-2
 """Published poses are rounded, or products of many; what is this near a rotation is made one."""

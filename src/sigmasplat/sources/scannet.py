@@ -30,9 +30,10 @@ from sigmasplat.sources.folders import (
 )
 from sigmasplat.sources.frame_files import Found, frame_files, has_frame_files
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.poses import Matrix, matrix, pose_files, read_matrix
+from sigmasplat.sources.poses import matrix, pose_files, read_matrix
 from sigmasplat.sources.recorded import Images, RecordedSource, first_size
 from sigmasplat.sources.tum_lists import numbers
+from sigmasplat.types import Matrix
 
 COLOR_SIZE, DEPTH_SIZE = (1296, 968), (640, 480)
 """Width and height of ScanNet's recordings; the published matrices are for these, whatever was done to the images."""

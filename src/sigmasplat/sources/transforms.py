@@ -14,7 +14,8 @@ import numpy as np
 
 from sigmasplat.errors import SourceError
 from sigmasplat.sources.calibration import Calibration, Lens, camera_of, number
-from sigmasplat.sources.poses import FLIP_YZ, Matrix, matrix, pose
+from sigmasplat.sources.poses import FLIP_YZ, matrix, pose
+from sigmasplat.types import Matrix
 
 Fields = dict[str, Any]
 

@@ -15,7 +15,8 @@ from sigmasplat.metrics.palette import Rgb
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.sources.base import Source
-from sigmasplat.viewer.moment import BUDGET, CAMERA, Matrix, Moment, Path, Piece, bare, thinned, within_budget
+from sigmasplat.types import Matrix
+from sigmasplat.viewer.moment import BUDGET, CAMERA, Moment, Path, Piece, bare, thinned, within_budget
 
 EVERY_S = 2.0
 Log = list[dict[str, Any]]

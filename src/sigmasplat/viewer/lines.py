@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.metrics.plot import ACCENT, BLUE, DARK, GREEN
-from sigmasplat.viewer.moment import Matrix, Path
+from sigmasplat.types import Matrix
+from sigmasplat.viewer.moment import Path
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]

@@ -12,8 +12,7 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.metrics.palette import Rgb
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
-
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
 
 BUDGET = 300_000
 """Splats that a browser is given at most: 10 MB, and what it sorts at each move of the camera."""

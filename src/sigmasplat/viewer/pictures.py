@@ -15,7 +15,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render import render
-from sigmasplat.viewer.moment import Matrix
+from sigmasplat.types import Matrix
 
 Layer = Literal["colour", "depth", "V", "U", "opacity"]
 Floats = NDArray[np.float32]

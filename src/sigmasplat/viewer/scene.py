@@ -11,8 +11,8 @@ from PIL import Image
 from sigmasplat.metrics.palette import Rgb
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.types import Matrix
 from sigmasplat.viewer.lines import LOST_COLOUR, Bytes, Floats, Segments
-from sigmasplat.viewer.moment import Matrix
 from sigmasplat.viewer.splats import Splats
 
 FRUSTUM_M, THUMBNAIL_PX = 0.08, 160

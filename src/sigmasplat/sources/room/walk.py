@@ -1,13 +1,11 @@
 """Walk a camera through the room on a smooth closed path."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
 from sigmasplat.sources.room.furnish import HALF_X_M, PITCH_M
-
-Matrix = NDArray[np.float64]
+from sigmasplat.types import Matrix
 
 FINE = 4000
 """Steps in which a path is measured."""

@@ -1,0 +1,11 @@
+"""Name the types that many modules share."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Matrix = NDArray[np.float64]
+"""A float64 array of any shape; its docstring says which, as in T_world_camera [4, 4]."""
+Progress = Callable[[int, int], None]
+"""Called with (done, total) while a long task runs; a total of 0 is not known yet."""
