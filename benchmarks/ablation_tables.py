@@ -4,8 +4,8 @@ from typing import Any
 
 from tables import Section
 
-from sigmasplat.ablation import COMPARED, NAMES, WITHOUT_VARIANCE
-from sigmasplat.metrics.effects import FIGURES, columns, effects, passed_by_chance, rows
+from sigmasplat.evaluation.ablation import COMPARED, NAMES, WITHOUT_VARIANCE
+from sigmasplat.evaluation.paired_comparison import FIGURES, columns, effects, passed_by_chance, rows
 
 Runs = list[dict[str, Any]]
 JUDGED = tuple(figure for figure in FIGURES if figure.judged)

@@ -28,7 +28,7 @@ from sigmasplat.config import Config, SubmapConfig
 from sigmasplat.errors import SigmaSplatError, SourceError
 from sigmasplat.fit import losses
 from sigmasplat.metrics import views
-from sigmasplat.metrics.panels import COVERED_ALPHA, View
+from sigmasplat.metrics.scored_view import COVERED_ALPHA, ScoredView
 from sigmasplat.model import se3
 from sigmasplat.model.color_covariance import correlations_of
 from sigmasplat.model.field import GaussianField
@@ -85,7 +85,7 @@ def score(runs: dict[str, Slam], rows: Sequence[int], frames: Sequence[Frame]) -
     fields = {kind: with_correlations(run.field) for kind, run in runs.items()}
     poses = {kind: se3.inverse(run.trajectory().T_world_camera) for kind, run in runs.items()}
     sums: dict[str, list[Any]] = {kind: [] for kind in KINDS}
-    seen: dict[str, list[View]] = {kind: [] for kind in KINDS}
+    seen: dict[str, list[ScoredView]] = {kind: [] for kind in KINDS}
     for row, frame in zip(rows, frames, strict=True):
         renders = {kind: render(fields[kind], frame.camera, poses[kind][row]) for kind in KINDS}
         pixels = torch.from_numpy(frame.depth_m > 0)
@@ -120,16 +120,16 @@ def likelihoods(r: Render, frame: Frame, pixels: Tensor) -> NDArray[np.float64]:
     return np.array([count, scale * float(diagonal), scale * float(full), *second.tolist()])
 
 
-def view_of(r: Render, frame: Frame, pixels: Tensor) -> View:
+def view_of(r: Render, frame: Frame, pixels: Tensor) -> ScoredView:
     """Lay out a render as evaluation scores it, other pixels taken as without a reading."""
     depth = torch.where(pixels, r.depth / r.alpha.clamp(min=COVERED_ALPHA), 0.0)
-    return View(
+    return ScoredView(
         frame.index, "held-out", frame.color, np.where(pixels.numpy(), frame.depth_m, np.float32(0.0)),
         r.color.clamp(0.0, 1.0).numpy(), depth.numpy(), r.alpha.numpy(), r.variance.numpy(),
     )  # fmt: skip
 
 
-def figures(run: Slam, field: GaussianField, sums: NDArray[np.float64], seen: list[View]) -> dict[str, Any]:
+def figures(run: Slam, field: GaussianField, sums: NDArray[np.float64], seen: list[ScoredView]) -> dict[str, Any]:
     """Sum up one map: time, likelihoods per pixel, how its splats' colours and its errors go together, PSNR, ranks."""
     count, diagonal, full, *second = sums.sum(0)
     deviations = np.sqrt(second[:CHANNELS])

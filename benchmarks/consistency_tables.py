@@ -6,8 +6,8 @@ from typing import Any
 from accuracy_tables import failures
 from tables import Section
 
-from sigmasplat.metrics.effects import Effect, Figure, best, by_seed, deviation, passed_by_chance, rows
-from sigmasplat.metrics.tables import number
+from sigmasplat.evaluation.paired_comparison import Effect, Figure, best, by_seed, deviation, passed_by_chance, rows
+from sigmasplat.report.tables import number
 
 Scenes = dict[str, list[dict[str, Any]]]
 """Runs by scene, each with `variant`, `seed` and `figures`."""

@@ -36,7 +36,7 @@ from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, preset as preset_of
 from sigmasplat.sources import open_source
 from sigmasplat.sources.base import Source
-from sigmasplat.sources.images import color_from_bytes
+from sigmasplat.sources.files.images import color_from_bytes
 
 arg = tyro.conf.arg
 SOURCE = "synthetic:frames=2400,rooms=2,loops=4,noise=1"

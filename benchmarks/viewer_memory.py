@@ -35,12 +35,12 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.slam import Slam
-from sigmasplat.slam.step import Step
-from sigmasplat.viewer.address import HOST, close, open_server
+from sigmasplat.slam.step_result import Step
+from sigmasplat.viewer.app import Stage
 from sigmasplat.viewer.live import LiveView
-from sigmasplat.viewer.moment import to_look_at
 from sigmasplat.viewer.panel import KINDS, SAYS
-from sigmasplat.viewer.stage import Stage
+from sigmasplat.viewer.server import HOST, close, open_server
+from sigmasplat.viewer.snapshot import to_look_at
 
 arg = tyro.conf.arg
 STATM = Path("/proc/self/statm")

@@ -19,7 +19,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
-from sigmasplat.sources.images import color_from_bytes
+from sigmasplat.sources.files.images import color_from_bytes
 from sigmasplat.sources.opening import Format
 
 

@@ -16,9 +16,9 @@ import torch
 from PIL import Image
 
 from sigmasplat import Camera, SigmaSplatError
+from sigmasplat.drawing import colormap
 from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.splats import read_any
-from sigmasplat.metrics import palette
+from sigmasplat.io.splats.any_format import read_any
 from sigmasplat.model import se3
 from sigmasplat.render import render
 
@@ -38,7 +38,7 @@ def main(run: str, picture: str = "view.png", row: str = "0") -> None:
     covered = view.alpha.numpy() > 0.5
     color = (view.color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
     deviation = view.variance.mean(-1).clamp(min=0.0).sqrt().numpy()
-    unsure = palette.picture(deviation, covered, 0.0, palette.span(deviation, covered)[1], palette.INFERNO)
+    unsure = colormap.picture(deviation, covered, 0.0, colormap.span(deviation, covered)[1], colormap.INFERNO)
     Image.fromarray(np.concatenate([color, unsure], axis=1)).save(picture)
     print(f"{picture}: {covered.mean():.0%} of the view is mapped")
     if covered.any():

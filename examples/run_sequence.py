@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from sigmasplat import SigmaSplatError, Slam, open_source, preset
-from sigmasplat.io.ply import write_field
+from sigmasplat.io.splats.ply import write_field
 from sigmasplat.io.trajectory import write_trajectory
 
 

@@ -19,7 +19,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.presets import default_preset, preset
 from sigmasplat.render.cuda_view import CudaView
 from sigmasplat.render.view import CpuView, ReferenceView, View
-from sigmasplat.slam.register import Registrar
+from sigmasplat.slam.loop_closure.registration import Registrar
 from sigmasplat.slam.tracker import Tracker
 from splat_fields import OPTIONS
 from splat_wall import CAMERA, TRUTH, seen_from, wall

@@ -15,7 +15,7 @@ from sigmasplat.render import cuda_stages
 from sigmasplat.render.covariance_view import CudaCovarianceView
 from sigmasplat.render.cuda_stages import STAGES, Stages
 from sigmasplat.render.cuda_view import CudaView
-from sigmasplat.slam.step import KERNELS
+from sigmasplat.slam.step_result import KERNELS
 from splat_fields import OPTIONS, params_of, there_and_back
 from splat_scenes import scene
 

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat import cli, doctor
+from sigmasplat import cli
+from sigmasplat.checks import installation
 from sigmasplat.config import Config, MappingConfig, TrackingConfig
 from sigmasplat.config.text import override
 from sigmasplat.fit.field import fit_field
@@ -28,8 +29,8 @@ from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
 from sigmasplat.sources import SyntheticRoom
 from sigmasplat.viewer.live import LiveView
-from sigmasplat.viewer.moment import Moment
 from sigmasplat.viewer.pictures import picture_of
+from sigmasplat.viewer.snapshot import Snapshot
 from splat_fields import OPTIONS, exact_view, params_of, there_and_back
 from splat_scenes import assert_same_vector, scene
 from stand_in import StandIn
@@ -141,7 +142,7 @@ def test_a_pose_is_found(device: torch.device) -> None:
 
 
 def test_doctor_finds_it_healthy(device: torch.device) -> None:
-    found = doctor.self_test(device)
+    found = installation.self_test(device)
     assert found.ok, found.value
 
 
@@ -222,7 +223,7 @@ def test_a_field_does_not_travel(stand_in: StandIn) -> None:
 
 def test_what_is_written_is_read_as_from_the_host(device: torch.device, tmp_path: Path) -> None:
     """A run's checkpoint, its state, and what a viewer sees of it."""
-    slam, shown = Slam(settings("cgslam-loops-fast", "cuda")), list[Moment]()
+    slam, shown = Slam(settings("cgslam-loops-fast", "cuda")), list[Snapshot]()
     watch = LiveView(slam, shown.append, "a run", budget=200)
     for i in range(FRAMES - 1):
         watch(slam.step(ROOM.frame(i)))

@@ -13,8 +13,8 @@ import torch
 
 from sigmasplat import cli
 from sigmasplat.errors import SourceError
-from sigmasplat.io import compressed_ply, ply, splat, spz
-from sigmasplat.io.splats import read_any
+from sigmasplat.io.splats import compressed_ply, ply, splat, spz
+from sigmasplat.io.splats.any_format import read_any
 from sigmasplat.model.field import GaussianField
 
 WRITERS = {".ply": ply, ".compressed.ply": compressed_ply, ".splat": splat, ".spz": spz}

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sigmasplat import cli
-from sigmasplat.commands.options import Taken
+from sigmasplat.commands.options import InputOptions
 from sigmasplat.errors import ConfigError
 
 
@@ -121,13 +121,13 @@ def test_help_names_no_none(command: str, capsys: pytest.CaptureFixture[str]) ->
 
 
 def test_what_is_taken_is_what_was_given() -> None:
-    assert Taken().settings() == Taken(register_depth="auto").settings() == {}
-    given = Taken(limit=3, start=1.5, fx=570.5, strict=True, register_depth="off").settings()
+    assert InputOptions().settings() == InputOptions(register_depth="auto").settings() == {}
+    given = InputOptions(limit=3, start=1.5, fx=570.5, strict=True, register_depth="off").settings()
     assert given == {"input.limit": "3", "input.start_s": "1.5", "input.fx": "570.5", "input.strict": "True",
                      "input.register_depth": "off"}  # fmt: skip
     for name in ("limit", "stride"):
         with pytest.raises(ConfigError, match=f"--{name} must be at least 1, found 0"):
-            Taken(**{name: 0}).settings()
+            InputOptions(**{name: 0}).settings()
 
 
 @pytest.mark.parametrize("arguments", [["fly"], ["run"], ["run", "x", "--limit", "many"], ["run", "x", "--no-such"]])

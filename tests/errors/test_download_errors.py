@@ -35,7 +35,7 @@ def server(monkeypatch: pytest.MonkeyPatch, tiny_tum: Path) -> Iterator[FileServ
 
 
 def wait(monkeypatch: pytest.MonkeyPatch, patience: Patience) -> None:
-    monkeypatch.setattr("sigmasplat.download.obtaining.Patience", lambda: patience)
+    monkeypatch.setattr("sigmasplat.download.downloader.Patience", lambda: patience)
 
 
 def said(capsys: pytest.CaptureFixture[str], code: int, *arguments: str) -> tuple[str, str]:
@@ -150,7 +150,7 @@ def test_ctrl_c(server: FileServer, capsys: pytest.CaptureFixture[str], monkeypa
     def interrupted(*arguments: object, **options: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sigmasplat.download.obtaining.fetch", interrupted)
+    monkeypatch.setattr("sigmasplat.download.downloader.fetch", interrupted)
     out, err = said(capsys, 130, "tiny", "desk")
     assert out.splitlines()[-1] == "what has come is kept; the same command goes on with it"
     assert err == "sigmasplat: interrupted\n"

@@ -11,15 +11,26 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sigmasplat import ablation, cli
-from sigmasplat.ablation import COMPARED, NAMES, WITHOUT_VARIANCE, Job, Results, Study, carry_out
+import sigmasplat
+from sigmasplat import cli
 from sigmasplat.commands.bench import Ablation
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError, RunError
+from sigmasplat.evaluation import ablation
+from sigmasplat.evaluation.ablation import COMPARED, NAMES, WITHOUT_VARIANCE, Job, Results, Study, carry_out
+from sigmasplat.evaluation.paired_comparison import (
+    FIGURES,
+    best,
+    columns,
+    effects,
+    figures_of,
+    passed_by_chance,
+    sentence,
+    spread,
+)
 from sigmasplat.io.machine import RUNNING, code_digest
 from sigmasplat.io.runs import RunFolder
-from sigmasplat.metrics.effects import FIGURES, best, columns, effects, figures_of, passed_by_chance, sentence, spread
 from sigmasplat.presets import preset
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
@@ -169,7 +180,7 @@ def test_what_is_said_and_written_is_what_was_measured(tmp_path: Path, capsys: p
     assert "23% of figures that nothing changed but chance pass that bar" in said
 
     written = json.loads(out.read_text())
-    assert written["machine"]["cores"] and written["code"] == code_digest(Path(ablation.__file__).parent, RUNNING)
+    assert written["machine"]["cores"] and written["code"] == code_digest(Path(sigmasplat.__file__).parent, RUNNING)
     assert Config.from_dict(written["config"]) == ablation.common_config("sigma", (), 10.0)
     run = next(r for r in written["runs"] if (r["source"], r["variant"], r["seed"]) == ("hall", "+loop", 2))
     assert run["figures"]["ate_m"] == pytest.approx(0.0052)

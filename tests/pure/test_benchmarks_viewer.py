@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sigmasplat.viewer.live import LiveView
-from sigmasplat.viewer.moment import Moment
+from sigmasplat.viewer.snapshot import Snapshot
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
@@ -42,7 +42,7 @@ def test_the_system_made_up_is_shown_as_a_real_one(tmp_path: Path, monkeypatch: 
     pytest.importorskip("viser", reason="viser is not installed (pip install 'sigmasplat[viewer]')")
     viewer_memory = importlib.import_module("viewer_memory")
     monkeypatch.setattr(viewer_memory, "SUBMAP_EVERY", 20)
-    growing, shown = viewer_memory.Growing(tmp_path / "submaps", 300), list[Moment]()
+    growing, shown = viewer_memory.Growing(tmp_path / "submaps", 300), list[Snapshot]()
     live = LiveView(growing.slam, shown.append, "growing", budget=500, every_s=0.0, clock=lambda: 1.0)
     for _ in range(50):
         live(growing())

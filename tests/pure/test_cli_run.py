@@ -17,11 +17,11 @@ import pytest
 import torch
 from rich.console import Console
 
-from sigmasplat import cli, session
+from sigmasplat import cli
 from sigmasplat.config import Config
 from sigmasplat.errors import SigmaSplatError, SourceError
-from sigmasplat.io.ply import read_field
 from sigmasplat.io.runs import RunFolder
+from sigmasplat.io.splats.ply import read_field
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.trajectory import read_trajectory
 from sigmasplat.model.camera import Camera
@@ -30,7 +30,8 @@ from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import cuda_stages
-from sigmasplat.screen import Screen
+from sigmasplat.run import session
+from sigmasplat.run.terminal import Screen
 from sigmasplat.sources.base import Source
 
 CAMERA = Camera(8, 6, 8.0, 8.0, 3.5, 2.5)
@@ -141,10 +142,10 @@ def corridor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Corridor:
     """Put a made-up source, SLAM and evaluation in place of the real ones, and work in an empty folder."""
     source = Corridor()
     # First: it imports the real SLAM, and would keep the made-up one for good. A made-up one has no state to keep.
-    monkeypatch.setattr("sigmasplat.snapshots.Snapshots.keep", lambda *ignored: None)
+    monkeypatch.setattr("sigmasplat.run.resume.Snapshots.keep", lambda *ignored: None)
     module = ModuleType("sigmasplat.slam.slam")
     module.Slam = MadeUpSlam  # type: ignore[attr-defined]
-    scores = ModuleType("sigmasplat.evaluate")
+    scores = ModuleType("sigmasplat.evaluation.evaluate")
     scores.evaluate = evaluate  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.setitem(sys.modules, scores.__name__, scores)
@@ -333,7 +334,7 @@ def test_the_time_of_finishing_is_not_that_of_the_frames(corridor: Corridor, mon
     def pass_time(seconds: float) -> Callable[[], None]:
         return lambda: now_s.__setitem__(0, now_s[0] + seconds)
 
-    monkeypatch.setattr("sigmasplat.session.time.perf_counter", lambda: now_s[0])
+    monkeypatch.setattr("sigmasplat.run.session.time.perf_counter", lambda: now_s[0])
     MadeUpSlam.at = {3: pass_time(5.0), "loops": pass_time(30.0), "finish 1": pass_time(70.0)}
     assert sigmasplat("run", "corridor", "--no-eval", "--out", "mine") == 0
     facts = RunFolder.open(Path("mine")).facts()

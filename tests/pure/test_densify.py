@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.config import PrimitiveConfig
+from sigmasplat.config import DensifyConfig
 from sigmasplat.fit.adam import Rates, adam_step
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
@@ -146,7 +146,7 @@ def test_large_ones_are_split_and_small_ones_cloned_where_asked(with_clones: boo
     for f in (field, before):
         f.params[:, COLUMNS["log_scales"]] = torch.tensor([0.04, 0.06, 0.04, 0.06, 0.04, 0.06]).log()[:, None] - 0.5
         f.params[:, COLUMNS["log_scales"].start + 1] += 0.5  # the largest of the three counts
-    config = PrimitiveConfig(split_scale_m=0.05, clone=with_clones)
+    config = DensifyConfig(split_scale_m=0.05, clone=with_clones)
     was_split = multiply(field, mask(6, 0, 1, 2, 3), config, np.random.default_rng(0))
     assert was_split.tolist() == mask(6, 1, 3).tolist()
     assert_untouched(field, before, [0, 2, 4, 5])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sigmasplat.model.frame import Frame
-from sigmasplat.slam.descriptors import Descriptor, OrientationGrid, similarity
+from sigmasplat.slam.loop_closure.descriptors import Descriptor, OrientationGrid, similarity
 from sigmasplat.sources.opening import open_source
 
 GRID: Descriptor = OrientationGrid()

@@ -2,14 +2,14 @@
 
 import pytest
 
-from sigmasplat import doctor
+from sigmasplat.checks import installation
 from sigmasplat.errors import BackendError
 from sigmasplat.native import cubins
 from sigmasplat.render import cuda_launch
 
 
-def said() -> dict[str, doctor.Finding]:
-    return {finding.name: finding for finding in doctor.cuda()}
+def said() -> dict[str, installation.Finding]:
+    return {finding.name: finding for finding in installation.cuda()}
 
 
 def test_each_thing_that_is_missing_has_its_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -30,7 +30,7 @@ def test_a_driver_older_than_the_compiler_is_told_of(
 ) -> None:
     driver = pytest.importorskip("cuda.bindings.driver", reason="needs pip install 'sigmasplat[gpu]'")
     monkeypatch.setattr(driver, "cuDriverGetVersion", lambda: (0, version))
-    (finding,) = doctor._drivers("13.5")
+    (finding,) = installation._drivers("13.5")
     assert finding.ok is enough and (cubins.INSTALL_OLDER in finding.value) is not enough
 
 

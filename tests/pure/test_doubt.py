@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from sigmasplat.model import doubt
+from sigmasplat.model import splat_filter
 from sigmasplat.model.field import GaussianField
 
 
@@ -23,7 +23,7 @@ def three() -> GaussianField:
 def test_sigma_is_the_root_of_the_mean_variance() -> None:
     field = three()
     field.params[0, 14:17] = torch.tensor([0.01, 0.04, 0.25]).log()
-    assert doubt.sigmas(field).tolist() == pytest.approx([math.sqrt(0.1), 0.2, 0.3])
+    assert splat_filter.sigmas(field).tolist() == pytest.approx([math.sqrt(0.1), 0.2, 0.3])
 
 
 @pytest.mark.parametrize(
@@ -37,11 +37,13 @@ def test_sigma_is_the_root_of_the_mean_variance() -> None:
     ],
 )
 def test_bounds_keep_what_they_say(bounds: dict[str, float], kept: list[bool], by_sigma: int, by_opacity: int) -> None:
-    sure = doubt.sure(three(), **bounds)
+    sure = splat_filter.sure(three(), **bounds)
     assert (sure.rows.tolist(), sure.by_sigma, sure.by_opacity) == (kept, by_sigma, by_opacity)
     assert sure.dropped == kept.count(False)
 
 
 def test_a_new_map_knows_no_variance() -> None:
-    assert not doubt.knows_variance(GaussianField.from_values(torch.zeros(2, 3), torch.ones(2), torch.zeros(2, 3)))
-    assert doubt.knows_variance(three()) and not doubt.knows_variance(GaussianField.empty())
+    assert not splat_filter.has_learned_variance(
+        GaussianField.from_values(torch.zeros(2, 3), torch.ones(2), torch.zeros(2, 3))
+    )
+    assert splat_filter.has_learned_variance(three()) and not splat_filter.has_learned_variance(GaussianField.empty())

@@ -15,9 +15,9 @@ from archives import folder_content, tar_gz, zipped
 from file_server import FileServer, serving
 from sigmasplat.download import describe_recordings, describe_sets, find, obtain
 from sigmasplat.download.catalogue import SETS
+from sigmasplat.download.downloader import MARK
 from sigmasplat.download.entries import Archive, PublicSet, Recording
 from sigmasplat.download.fetch import Patience
-from sigmasplat.download.obtaining import MARK
 from sigmasplat.errors import DownloadError
 
 HASTY = Patience(attempts=2, first_wait_s=0.001)

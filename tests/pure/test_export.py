@@ -11,9 +11,9 @@ from sigmasplat import cli
 from sigmasplat.commands.export import FORMATS
 from sigmasplat.commands.export_formats import ExportOptions, Format, Origin, choose, listed, owners
 from sigmasplat.config import Config
-from sigmasplat.io import ply
 from sigmasplat.io.runs import RunFolder
-from sigmasplat.io.splats import read_any
+from sigmasplat.io.splats import ply
+from sigmasplat.io.splats.any_format import read_any
 from sigmasplat.io.trajectory import read_trajectory
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory

@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw
 
 from box_room import CAMERA, HIGH, LOW, seer, splats
 from room_run import FRAMES, LOST, PATH, T_ROOM, WORLD, Walls, made_run, picture
+from sigmasplat.drawing.film import Scale, legend_strip
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.exports import (
     Recorded,
@@ -23,7 +24,6 @@ from sigmasplat.exports import (
 )
 from sigmasplat.exports.paths import map_points
 from sigmasplat.exports.video import from_above, sized
-from sigmasplat.metrics.film import Scale, legend_strip
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField

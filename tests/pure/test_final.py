@@ -18,7 +18,7 @@ from sigmasplat.model.submap import MemoryStore, Picture, Submap
 from sigmasplat.render import render
 from sigmasplat.render.view import ReferenceView
 from sigmasplat.slam.final import Keyframes, final_map, merged, survivors
-from sigmasplat.slam.fusion import Standpoint, count_keyframes, fuse, standpoints_of
+from sigmasplat.slam.fusion import FusionView, count_keyframes, fuse, fusion_views
 
 CAMERA = Camera(20, 15, 16.0, 16.0, 9.5, 7.0)
 CONFIG = Config(backend="reference", mapping=MappingConfig(weight_nll_color=1e-3, prune_opacity=0.1))
@@ -141,7 +141,7 @@ def test_mesh_seeds_cover_the_surface(uncertainty: bool) -> None:
     field = refined(make_store(), config(seed_from="mesh", uncertainty=uncertainty))
     x, y, z = field.means.numpy().T
     assert np.abs(z - WALL_M).max() < 0.02 and len(field) > 100
-    mesh = fuse(standpoints_of(make_store(), ANCHORS), 6, config(), voxel_m=0.01)
+    mesh = fuse(fusion_views(make_store(), ANCHORS), 6, config(), voxel_m=0.01)
     assert cKDTree(field.means.numpy()).query(mesh.vertices)[0].max() < SPACING_M * np.sqrt(3)
     cells = np.floor(field.means.numpy() / SPACING_M).astype(int)
     assert len(np.unique(cells, axis=0)) > 0.9 * len(field), "spacing apart"
@@ -158,7 +158,7 @@ def test_mesh_seeds_cover_the_surface(uncertainty: bool) -> None:
 
 def test_standpoints_are_the_keyframes_in_field_and_world() -> None:
     store = make_store()
-    found = list(standpoints_of(store, ANCHORS))
+    found = list(fusion_views(store, ANCHORS))
     assert len(found) == count_keyframes(store) == 6
     for at, pose in zip(found, poses(0) + poses(1), strict=True):
         np.testing.assert_allclose(at.T_world_camera, pose, atol=1e-12)
@@ -174,7 +174,7 @@ def test_weighing_by_variance_lets_the_steadier_map_say_where_the_wall_is() -> N
     far.params[far.means[:, 0] < -0.3, COLUMNS["log_variances"]] = 0.0
     for field in (near, far):
         field.params[:, COLUMNS["colors"]] = 0.5
-    at = [Standpoint(field, CAMERA, np.eye(4), np.eye(4)) for field in (near, far)]
+    at = [FusionView(field, CAMERA, np.eye(4), np.eye(4)) for field in (near, far)]
     settings = replace(CONFIG, tracking=replace(CONFIG.tracking, tau=1.0, weight_max=100.0))
     left = {}
     for weigh in (False, True):

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from box_room import CAMERA, CHEST, HIGH, LOW, PILLAR, pose, seer, splats, walk
+from sigmasplat.drawing.plot import DARK, LIGHT
 from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.floorplan.floor_plan import BARE, CELL_M, FREE, SIGNS, THING, UNSEEN, WALL, FloorPlan, floor_plan
+from sigmasplat.floorplan.ground import floor_frame
+from sigmasplat.floorplan.picture import draw_floor_plan, kinds_picture
+from sigmasplat.floorplan.surface_samples import look, looks
 from sigmasplat.io.json_files import write_json
-from sigmasplat.metrics.floor import floor_frame
-from sigmasplat.metrics.floor_plan import BARE, CELL_M, FREE, SIGNS, THING, UNSEEN, WALL, FloorPlan, floor_plan
-from sigmasplat.metrics.plan_picture import draw_floor_plan, kinds_picture
-from sigmasplat.metrics.plot import DARK, LIGHT
-from sigmasplat.metrics.sights import look, looks
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
 

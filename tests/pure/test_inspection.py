@@ -8,12 +8,12 @@ import pytest
 from PIL import Image
 
 from sigmasplat import cli
+from sigmasplat.checks.recording import inspect_source
+from sigmasplat.checks.registration import edge_agreement, outlines
 from sigmasplat.config import InputConfig
-from sigmasplat.inspection import inspect_source
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources import open_source
-from sigmasplat.sources.edge_agreement import edge_agreement, outlines
-from sigmasplat.sources.registration import Registration
+from sigmasplat.sources.camera.depth_registration import Registration
 from sigmasplat.sources.tum import write_tum
 
 ROOM = "synthetic:frames=120,width=320,height=240"

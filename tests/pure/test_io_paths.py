@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sigmasplat.errors import RunError
-from sigmasplat.io import colmap, kitti, nerfstudio
+from sigmasplat.exports import colmap, nerfstudio
+from sigmasplat.io.trajectory import write_kitti_poses
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.trajectory import Trajectory
 
@@ -44,12 +45,12 @@ def ahead(T_world_camera: np.ndarray) -> np.ndarray:
 
 def test_kitti_rows_are_the_matrices(tmp_path: Path) -> None:
     path = some_path()
-    kitti.write_poses(tmp_path / "poses.txt", path)
+    write_kitti_poses(tmp_path / "poses.txt", path)
     rows = np.loadtxt(tmp_path / "poses.txt")
     assert rows.shape == (7, 12)
     np.testing.assert_allclose(rows.reshape(-1, 3, 4), path.T_world_camera[:, :3], atol=1e-11)
     with pytest.raises(RunError, match="cannot write"):
-        kitti.write_poses(tmp_path / "no" / "poses.txt", path)
+        write_kitti_poses(tmp_path / "no" / "poses.txt", path)
 
 
 def test_transforms_are_opengl_cameras(tmp_path: Path) -> None:

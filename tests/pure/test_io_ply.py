@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sigmasplat.errors import RunError, SourceError
-from sigmasplat.io.ply import SH_C0, read_field, write_field
+from sigmasplat.io.splats.ply import SH_C0, read_field, write_field
 from sigmasplat.model.field import GaussianField, Rows
 
 

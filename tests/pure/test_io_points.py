@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sigmasplat.exports.points import write_points
 from sigmasplat.io.mesh import write_mesh
-from sigmasplat.io.points import write_points
 from sigmasplat.model.mesh import Mesh
 
 trimesh = pytest.importorskip("trimesh", reason="the [dev] extra is not installed")

@@ -12,8 +12,8 @@ import torch
 
 from room_map import psnr_db, room_map
 from sigmasplat.errors import RunError
-from sigmasplat.io import compressed_ply, ply, splat, splats, spz
-from sigmasplat.io.splat_values import SplatValues, from_smallest_three, morton_order, smallest_three
+from sigmasplat.io.splats import any_format, compressed_ply, ply, splat, spz
+from sigmasplat.io.splats.values import SplatValues, from_smallest_three, morton_order, smallest_three
 from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.harmonics import count
 
@@ -31,7 +31,7 @@ def again(path: Path, field: GaussianField) -> GaussianField:
     """Write a field as the path's ending says, and read it by content from a file without an ending."""
     ending = max((ending for ending in WRITERS if path.name.endswith(ending)), key=len)
     WRITERS[ending](path, field)
-    return splats.read_any(path.rename(path.with_name("map")))
+    return any_format.read_any(path.rename(path.with_name("map")))
 
 
 def some(n: int = 300, degree: int = 0, seed: int = 0) -> GaussianField:
@@ -58,7 +58,7 @@ def test_ply_gives_the_same_render(tmp_path: Path, degree: int) -> None:
     field = room_map(degree)
     assert psnr_db(again(tmp_path / "a.ply", field), field) > 60.0
     ply.write_field(tmp_path / "plain.ply", field, plain=True)
-    assert psnr_db(splats.read_any(tmp_path / "plain.ply"), field) > 60.0
+    assert psnr_db(any_format.read_any(tmp_path / "plain.ply"), field) > 60.0
 
 
 @pytest.mark.parametrize(
@@ -181,7 +181,7 @@ def test_compressed_ply_without_colour_limits_is_read(tmp_path: Path) -> None:
     full = 2047 << 21 | 1023 << 11 | 2047
     splats_ = struct.pack("<4I", 0xFF_80_00_33, full, 2 << 30 | 512 << 20 | 512 << 10 | 512, full)
     (tmp_path / "a.ply").write_bytes("\n".join([*header, "end_header", ""]).encode() + limits + splats_)
-    back = splats.read_any(tmp_path / "a.ply")
+    back = any_format.read_any(tmp_path / "a.ply")
     assert back.means[0].tolist() == [1.0, 2.0, 4.0] and back.params[0, 7:10].tolist() == [-4.0] * 3
     assert back.colors[0].tolist() == pytest.approx([1.0, 128 / 255, 0.0]) and float(back.opacities) == pytest.approx(
         0.2
@@ -207,7 +207,7 @@ def test_splat_as_its_layout_says(tmp_path: Path) -> None:
 def test_splat_files_may_begin_with_any_bytes(tmp_path: Path, start: bytes) -> None:
     splat.write_field(tmp_path / "a.splat", some(3))
     (tmp_path / "b").write_bytes(start + (tmp_path / "a.splat").read_bytes()[len(start) :])
-    assert len(splats.read_any(tmp_path / "b")) == 3
+    assert len(any_format.read_any(tmp_path / "b")) == 3
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -252,7 +252,7 @@ def test_spz_of_version_2_is_read(tmp_path: Path) -> None:
         ]
     )
     (tmp_path / "a.spz").write_bytes(gzip.compress(body))
-    back = splats.read_any(tmp_path / "a.spz")
+    back = any_format.read_any(tmp_path / "a.spz")
     assert back.means[0].tolist() == [1.0, 2.0, -0.5] and back.params[0, 7:10].tolist() == [-4.0, -3.0, -2.0]
     assert float(back.opacities) == pytest.approx(0.8)
     assert back.colors[0].tolist() == pytest.approx([0.5 + 0.0036878, 0.5 + 0.0036878, 0.5 + 0.283935], abs=1e-5)

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from sigmasplat.errors import BackendError, RunError
-from sigmasplat.io.video import write_video
+from sigmasplat.exports.video import write_video
 
 SIZE = (48, 96)
 

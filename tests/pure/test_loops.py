@@ -12,11 +12,11 @@ from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.submap import MemoryStore, Picture, Submap
-from sigmasplat.slam import loops
-from sigmasplat.slam.descriptors import OrientationGrid
-from sigmasplat.slam.loops import LoopCloser, make_descriptor
-from sigmasplat.slam.places import SubmapPair
-from sigmasplat.slam.register import Registration
+from sigmasplat.slam.loop_closure import closer
+from sigmasplat.slam.loop_closure.candidates import SubmapPair
+from sigmasplat.slam.loop_closure.closer import LoopCloser, make_descriptor
+from sigmasplat.slam.loop_closure.descriptors import OrientationGrid
+from sigmasplat.slam.loop_closure.registration import Registration
 
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
 STEP = se3.exp(np.array([1.0, 0, 0, 0, 0, 0.0]))
@@ -38,9 +38,11 @@ class Registered:
         return Registration(T_a_b, SURE, 0.1, 4, 0.9, True, "accepted")
 
 
-def closer(monkeypatch: pytest.MonkeyPatch, lies: dict[tuple[int, int], np.ndarray], **changes: object) -> LoopCloser:
+def make_closer(
+    monkeypatch: pytest.MonkeyPatch, lies: dict[tuple[int, int], np.ndarray], **changes: object
+) -> LoopCloser:
     """A closer whose registrations are made up; submaps lie a metre apart, each says odometry 2 cm too far."""
-    monkeypatch.setattr(loops, "Registrar", Registered)
+    monkeypatch.setattr(closer, "Registrar", Registered)
     Registered.truth = [np.linalg.matrix_power(STEP, k) for k in range(4)]
     Registered.lies = lies
     config = Config(loops=LoopConfig(**{"min_interval": 2, "min_similarity": 1.0, **changes}))
@@ -66,7 +68,7 @@ def walked(closer: LoopCloser, alike: bool = True) -> Atlas:
 
 
 def test_a_true_loop_takes_the_drift_out_and_leaves_the_first_anchor(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = closer(monkeypatch, {})
+    made = make_closer(monkeypatch, {})
     atlas = walked(made)
     (loop,) = made.loops
     assert (loop.query, loop.database, loop.query_frame, loop.database_frame) == (3, 0, 6, 0)
@@ -77,7 +79,7 @@ def test_a_true_loop_takes_the_drift_out_and_leaves_the_first_anchor(monkeypatch
 
 
 def test_a_gross_lie_is_registered_refused_by_the_graph_and_moves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = closer(monkeypatch, {(3, 0): se3.exp(np.array([5.0, 2.0, 0, 0, 0, 1.0]))})
+    made = make_closer(monkeypatch, {(3, 0): se3.exp(np.array([5.0, 2.0, 0, 0, 0, 1.0]))})
     atlas = walked(made)
     (loop,) = made.loops
     assert not loop.accepted
@@ -87,21 +89,21 @@ def test_a_gross_lie_is_registered_refused_by_the_graph_and_moves_nothing(monkey
 
 
 def test_places_that_do_not_look_alike_are_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = closer(monkeypatch, {}, similarity_floor=0.5)
+    made = make_closer(monkeypatch, {}, similarity_floor=0.5)
     atlas = walked(made, alike=False)
     assert made.loops == []
     assert atlas.anchors[3][0, 3] == pytest.approx(3.06)
 
 
 def test_switched_off_nothing_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = closer(monkeypatch, {}, close=False)
+    made = make_closer(monkeypatch, {}, close=False)
     walked(made)
     assert made.loops == []
     assert len(made.odometry) == 3
 
 
 def test_a_refused_registration_makes_no_edge(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = closer(monkeypatch, {})
+    made = make_closer(monkeypatch, {})
     plain = Registered.register
     monkeypatch.setattr(
         Registered, "register", lambda *a: replace(plain(*a), accepted=False, reason="overlap 0.05 is below 0.2")

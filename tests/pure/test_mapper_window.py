@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat.config import Config, MappingConfig, PrimitiveConfig, RenderConfig, SeedConfig
+from sigmasplat.config import Config, DensifyConfig, MappingConfig, RenderConfig, SeedConfig
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model import se3
@@ -49,8 +49,8 @@ def shifted(x_m: float) -> np.ndarray:
     return se3.exp(np.array([x_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
 
 
-def mapper(mapping: MappingConfig = FITTED, primitives: PrimitiveConfig | None = None, **seeding: Any) -> Mapper:
-    config = Config(mapping=mapping, primitives=primitives or PrimitiveConfig(), seeding=replace(SEEDS, **seeding))
+def mapper(mapping: MappingConfig = FITTED, primitives: DensifyConfig | None = None, **seeding: Any) -> Mapper:
+    config = Config(mapping=mapping, primitives=primitives or DensifyConfig(), seeding=replace(SEEDS, **seeding))
     return Mapper(config, np.random.default_rng(0))
 
 
@@ -129,7 +129,7 @@ def floater(made: Mapper) -> int:
 
 @pytest.mark.parametrize("owner", ["dominant", "median"])
 def test_a_floater_is_doubted_and_goes_the_wall_stays(owner: Any) -> None:
-    made = mapped(mapper(replace(FITTED, iterations=20), PrimitiveConfig(uncertain_m2=0.025, owner=owner)), (0.0,))
+    made = mapped(mapper(replace(FITTED, iterations=20), DensifyConfig(uncertain_m2=0.025, owner=owner)), (0.0,))
     made.config = replace(made.config, seeding=replace(SEEDS, depth_error_factor=0.0))
     wall, floating = set(made.field.ids.tolist()), floater(made)
     made.map(view(), 1, target(), shifted(0.02))
@@ -146,7 +146,7 @@ def test_without_doubt_the_floater_stays() -> None:
 
 
 def test_hot_splats_are_split_within_the_budget() -> None:
-    hot = PrimitiveConfig(split_gradient=1e-7, split_scale_m=1e-3)
+    hot = DensifyConfig(split_gradient=1e-7, split_scale_m=1e-3)
     free, count = mapped(mapper(), (0.0,)), CAMERA.width * CAMERA.height
     assert len(free.field) == count
     assert len(mapped(mapper(primitives=hot), (0.0,)).field) > 1.5 * count
@@ -157,7 +157,7 @@ def test_hot_splats_are_split_within_the_budget() -> None:
 def test_old_colours_stay_frozen_when_rows_move() -> None:
     """Splits of old splats shift rows between the halves: frozen are those that are old, wherever they stand."""
     mapping = replace(FITTED, freeze_old_colors=True, lr_colors=0.05)
-    made = mapped(mapper(mapping, PrimitiveConfig(split_gradient=1e-7, split_scale_m=0.2), opacity=0.5), (0.0,))
+    made = mapped(mapper(mapping, DensifyConfig(split_gradient=1e-7, split_scale_m=0.2), opacity=0.5), (0.0,))
     made.field.params[:40, COLUMNS["log_scales"]] = float(np.log(0.3))
     old = dict(zip(made.field.ids.tolist(), made.field.colors.clone(), strict=True))
     made.map(view(), 1, target(), shifted(0.4))
@@ -168,7 +168,7 @@ def test_old_colours_stay_frozen_when_rows_move() -> None:
 
 
 def test_too_large_splats_go() -> None:
-    made = mapped(mapper(primitives=PrimitiveConfig(most_scale_m=0.5)), (0.0,))
+    made = mapped(mapper(primitives=DensifyConfig(most_scale_m=0.5)), (0.0,))
     made.field.params[3, COLUMNS["log_scales"]] = float(np.log(0.8))
     large = int(made.field.ids[3])
     made.map(view(), 1, target(), shifted(0.02))
@@ -190,7 +190,7 @@ def test_what_the_camera_comes_close_to_is_split_as_far_as_the_budget_goes() -> 
     """From a third of the distance seeds span three times as many pixels, and there are hardly any new ones."""
     close = {}
     for split_px, budget in ((0.0, 0), (6.0, 0), (6.0, 500)):
-        made = mapped(mapper(primitives=PrimitiveConfig(split_radius_px=split_px), max_splats=budget), (0.0,))
+        made = mapped(mapper(primitives=DensifyConfig(split_radius_px=split_px), max_splats=budget), (0.0,))
         made.map(view(), 1, target(2.0 / 3.0), se3.exp(np.array([0.0, 0.0, 4.0 / 3.0, 0.0, 0.0, 0.0])))
         close[split_px, budget] = len(made.field)
     count = CAMERA.width * CAMERA.height

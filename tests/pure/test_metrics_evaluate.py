@@ -13,8 +13,7 @@ import torch
 
 from sigmasplat.config import Config, FinalConfig, InputConfig
 from sigmasplat.errors import RunError, SourceError
-from sigmasplat.evaluate import evaluate
-from sigmasplat.io.embedded import data_uri
+from sigmasplat.evaluation.evaluate import evaluate
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.model import se3
@@ -23,6 +22,7 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import Picture, Submap
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.report.page import data_uri
 from sigmasplat.sources.base import Source
 
 CAMERA = Camera(48, 36, 40.0, 40.0, 23.5, 17.5)

@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sigmasplat.metrics import charts, palette, plot
-from sigmasplat.metrics.panels import GAP, HEAD, PANEL_WIDTH, View, panels_of, side_by_side
-from sigmasplat.metrics.report import Contents, build_report
-from sigmasplat.metrics.tables import headline, number
+from sigmasplat.drawing import colormap, plot
+from sigmasplat.drawing.view_panels import GAP, HEAD, PANEL_WIDTH, panels_of, side_by_side
+from sigmasplat.metrics.scored_view import ScoredView
+from sigmasplat.report import charts
+from sigmasplat.report.html import Contents, build_report
+from sigmasplat.report.tables import headline, number
 
 VOID = {"meta", "img", "source", "br", "!doctype"}
 
 
-def some_view(seed: int = 0) -> View:
+def some_view(seed: int = 0) -> ScoredView:
     rng = np.random.default_rng(seed)
     color = rng.uniform(size=(30, 40, 3)).astype(np.float32)
     depth = rng.uniform(1, 3, (30, 40)).astype(np.float32)
@@ -25,24 +27,26 @@ def some_view(seed: int = 0) -> View:
     alpha[20:] = 0.1
     rendered_depth = np.where(alpha > 0.5, depth + 0.1, 0).astype(np.float32)
     variance = np.full((30, 40, 3), 0.04, np.float32)
-    return View(12, "held-out", color, depth, np.clip(color + 0.1, 0, 1), rendered_depth, alpha, variance, ("lost",))
+    return ScoredView(
+        12, "held-out", color, depth, np.clip(color + 0.1, 0, 1), rendered_depth, alpha, variance, ("lost",)
+    )
 
 
-@pytest.mark.parametrize("colours", [palette.VIRIDIS, palette.INFERNO])
+@pytest.mark.parametrize("colours", [colormap.VIRIDIS, colormap.INFERNO])
 def test_palettes_grow_brighter_throughout(colours: np.ndarray) -> None:
-    ramp = palette.colour(np.linspace(0, 1, 200), 0, 1, colours).astype(float)
+    ramp = colormap.colour(np.linspace(0, 1, 200), 0, 1, colours).astype(float)
     brightness = ramp @ [0.2126, 0.7152, 0.0722]
     assert (np.diff(brightness) > -0.5).all() and brightness[-1] - brightness[0] > 150
 
 
 def test_colours_hold_their_ends_and_holes_are_slate() -> None:
     values = np.array([[-5.0, 0.0, 1.0, 9.0]])
-    out = palette.colour(values, 0.0, 1.0)
+    out = colormap.colour(values, 0.0, 1.0)
     assert (out[0, 0] == out[0, 1]).all() and (out[0, 2] == out[0, 3]).all() and tuple(out[0, 0]) == (68, 1, 84)
-    holes = palette.picture(values, np.array([[True, False, True, True]]), 0.0, 1.0, palette.VIRIDIS)
-    assert tuple(holes[0, 1]) == palette.NO_READING
-    assert palette.span(values, np.zeros_like(values, bool)) == (0.0, 1.0)
-    palette.colour(values, 2.0, 2.0)
+    holes = colormap.picture(values, np.array([[True, False, True, True]]), 0.0, 1.0, colormap.VIRIDIS)
+    assert tuple(holes[0, 1]) == colormap.NO_READING
+    assert colormap.span(values, np.zeros_like(values, bool)) == (0.0, 1.0)
+    colormap.colour(values, 2.0, 2.0)
 
 
 def test_scores_of_a_view_are_taken_where_there_is_a_reading() -> None:
@@ -69,8 +73,8 @@ def test_the_strip_shows_the_five_panels() -> None:
 
     shown = Image.fromarray((view.recorded * 255).round().astype(np.uint8)).resize((320, 240), Image.Resampling.LANCZOS)
     np.testing.assert_allclose(panel(0), np.asarray(shown, float))
-    assert (panel(2)[-70:] == palette.NO_READING).all(), "nothing mapped there"
-    assert (panel(4)[:70] == palette.NO_READING).all(), "no reading there"
+    assert (panel(2)[-70:] == colormap.NO_READING).all(), "nothing mapped there"
+    assert (panel(4)[:70] == colormap.NO_READING).all(), "no reading there"
     # V is the same at every mapped pixel: one colour, and the bar ends at its root, 0.2.
     assert len(np.unique(panel(3)[:150].reshape(-1, 3), axis=0)) == 1 and panels_of(view)[3].ends[1] == "0.200"
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import sigmasplat
-from sigmasplat import doctor
+from sigmasplat.checks import installation
 from sigmasplat.cli import COMMANDS
 from sigmasplat.io.machine import package_version
 from sigmasplat.presets import list_presets
@@ -299,8 +299,8 @@ def test_doctor_says_why_the_kernels_do_not_load(
     def refuse(name: str) -> None:
         raise problem
 
-    monkeypatch.setattr(doctor, "import_module", refuse)
-    finding = doctor.kernels()
+    monkeypatch.setattr(installation, "import_module", refuse)
+    finding = installation.kernels()
     assert finding.ok is False and str(problem) in finding.value and finding.value.endswith(remedy)
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sigmasplat.model import se3
-from sigmasplat.slam.places import (
+from sigmasplat.slam.loop_closure.candidates import (
     Candidate,
-    Signature,
+    SubmapDescriptor,
     find_candidates,
     find_nearby,
     gate,
@@ -104,12 +104,12 @@ def pairs(candidates: list[Candidate]) -> set[tuple[int, int, int]]:
 
 
 # Thresholds of the query: cos 20° for each of its four keyframes (k = 2: the nearest neighbour).
-QUERY = Signature(9, at(0, 20, 40, 60))
+QUERY = SubmapDescriptor(9, at(0, 20, 40, 60))
 DATABASE = [
-    Signature(1, at(-15, 170)),  # 15° from keyframe 0: alike
-    Signature(4, at(-25, 85)),  # 25° from keyframes 0 and 3: not quite
-    Signature(5, at(30)),  # 10° from 1 and 2
-    Signature(8, at(41)),  # 1° from 2 and 19° from 3, but next door
+    SubmapDescriptor(1, at(-15, 170)),  # 15° from keyframe 0: alike
+    SubmapDescriptor(4, at(-25, 85)),  # 25° from keyframes 0 and 3: not quite
+    SubmapDescriptor(5, at(30)),  # 10° from 1 and 2
+    SubmapDescriptor(8, at(41)),  # 1° from 2 and 19° from 3, but next door
 ]
 
 
@@ -122,7 +122,9 @@ def test_candidates_exceed_the_querys_own_threshold_and_lie_far_enough_away() ->
     assert pairs(find_candidates(QUERY, DATABASE, min_interval=1)) == pairs(found) | {(2, 8, 0), (3, 8, 0)}
     assert pairs(find_candidates(QUERY, DATABASE, min_interval=5)) == {(0, 1, 0)}
     assert find_candidates(QUERY, DATABASE, min_interval=9) == []
-    assert find_candidates(QUERY, []) == [] == find_candidates(Signature(9, np.zeros((0, 2), np.float32)), DATABASE)
+    assert (
+        find_candidates(QUERY, []) == [] == find_candidates(SubmapDescriptor(9, np.zeros((0, 2), np.float32)), DATABASE)
+    )
 
 
 def test_a_submap_is_never_a_candidate_of_itself() -> None:
@@ -130,39 +132,39 @@ def test_a_submap_is_never_a_candidate_of_itself() -> None:
 
 
 def test_submaps_on_both_sides_count() -> None:
-    later = Signature(11, at(30))
+    later = SubmapDescriptor(11, at(30))
     assert pairs(find_candidates(QUERY, [later], min_interval=2)) == {(1, 11, 0), (2, 11, 0)}
     assert find_candidates(QUERY, [later], min_interval=3) == []
 
 
 def test_the_gate_moves_pairs_across_the_threshold_unless_switched_off() -> None:
-    steady = [Signature(4, at(-25, 85), opacity_ratio=1.1)]
+    steady = [SubmapDescriptor(4, at(-25, 85), opacity_ratio=1.1)]
     assert pairs(find_candidates(QUERY, steady)) == {(0, 4, 0), (3, 4, 1)}
     assert find_candidates(QUERY, steady)[0].gated == pytest.approx(1.1 * np.cos(25 * DEGREE), rel=1e-6)
     assert find_candidates(QUERY, steady, uncertainty=False) == []
-    restless = [Signature(5, at(30), opacity_ratio=0.9)]
+    restless = [SubmapDescriptor(5, at(30), opacity_ratio=0.9)]
     assert find_candidates(QUERY, restless) == []
     ungated = find_candidates(QUERY, restless, uncertainty=False)
     assert pairs(ungated) == {(1, 5, 0), (2, 5, 0)} and all(c.gated == c.similarity for c in ungated)
 
 
 def test_no_gate_lifts_a_pair_over_the_floor() -> None:
-    steady = [Signature(4, at(-25, 85), opacity_ratio=1.2)]
+    steady = [SubmapDescriptor(4, at(-25, 85), opacity_ratio=1.2)]
     assert find_candidates(QUERY, steady, similarity_floor=0.91) == []
     assert len(find_candidates(QUERY, steady, similarity_floor=0.90)) == 2
-    unlike = Signature(9, at(0, 120, 240))
-    assert find_candidates(unlike, [Signature(1, at(100))], min_similarity=1.0, similarity_floor=0.95) == []
-    blank = Signature(9, np.zeros((3, 2), np.float32))
-    assert find_candidates(blank, [blank, Signature(1, at(0))]) == [], "nothing is like nothing"
+    unlike = SubmapDescriptor(9, at(0, 120, 240))
+    assert find_candidates(unlike, [SubmapDescriptor(1, at(100))], min_similarity=1.0, similarity_floor=0.95) == []
+    blank = SubmapDescriptor(9, np.zeros((3, 2), np.float32))
+    assert find_candidates(blank, [blank, SubmapDescriptor(1, at(0))]) == [], "nothing is like nothing"
 
 
-def random_signatures(seed: int, count: int = 6) -> list[Signature]:
+def random_signatures(seed: int, count: int = 6) -> list[SubmapDescriptor]:
     random = np.random.default_rng(seed)
     made = []
     for index in range(count):
         vectors = random.normal(size=(int(random.integers(1, 7)), 3)).astype(np.float32)
         vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-        made.append(Signature(index, vectors, float(random.uniform(0.9, 1.1))))
+        made.append(SubmapDescriptor(index, vectors, float(random.uniform(0.9, 1.1))))
     return made
 
 
@@ -191,14 +193,16 @@ def test_candidates_are_those_of_a_search_by_hand_whatever_the_order_of_the_data
 
 def test_ties_go_by_submap_then_query_keyframe_then_database_keyframe() -> None:
     same = at(0, 0)
-    found = find_candidates(Signature(9, at(0, 0, 90, 90)), [Signature(2, same), Signature(1, same)], 0.75, 2)
+    found = find_candidates(
+        SubmapDescriptor(9, at(0, 0, 90, 90)), [SubmapDescriptor(2, same), SubmapDescriptor(1, same)], 0.75, 2
+    )
     order = [(c.database_submap, c.query_keyframe, c.database_keyframe) for c in found]
     assert order == [(s, q, d) for s in (1, 2) for q in (0, 1) for d in (0, 1)]
 
 
 def test_each_submap_is_registered_once_by_the_two_most_alike_keyframes_of_each_side() -> None:
-    query = Signature(9, at(0, 50, 9, 100, 60), 1.1)
-    near, far = Signature(3, at(12, 180, 61, 58), 1.0), Signature(1, at(200, 105), 1.0)
+    query = SubmapDescriptor(9, at(0, 50, 9, 100, 60), 1.1)
+    near, far = SubmapDescriptor(3, at(12, 180, 61, 58), 1.0), SubmapDescriptor(1, at(200, 105), 1.0)
     database = [near, far]
     found = pairs_to_register(find_candidates(query, database, 0.5), query, database)
     assert [p.best.database_submap for p in found] == [3, 1]
@@ -212,7 +216,7 @@ def test_each_submap_is_registered_once_by_the_two_most_alike_keyframes_of_each_
 
 
 def test_equally_alike_keyframes_are_taken_in_order() -> None:
-    query, other = Signature(5, at(0, 0, 0, 40, 40, 40)), Signature(1, at(10, 10, 10))
+    query, other = SubmapDescriptor(5, at(0, 0, 0, 40, 40, 40)), SubmapDescriptor(1, at(10, 10, 10))
     (pair,) = pairs_to_register(find_candidates(query, [other], 0.7), query, [other])
     assert pair.query_keyframes == (0, 1) == pair.database_keyframes
 
@@ -225,7 +229,7 @@ def standing(*places: tuple[float, float]) -> np.ndarray:
 
 
 def test_places_that_should_be_near_are_tried_whatever_they_look_like() -> None:
-    signatures = [Signature(k, at(90.0 * k, 90.0 * k)) for k in range(4)]
+    signatures = [SubmapDescriptor(k, at(90.0 * k, 90.0 * k)) for k in range(4)]
     poses = [
         standing((0.4, 0.0), (0.1, 5.0)),  # near, the second keyframe more so
         standing((0.0, 40.0), (0.6, 0.0)),  # near but turned away, looking alike but far

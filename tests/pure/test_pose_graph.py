@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.model import se3
-from sigmasplat.slam.pose_graph import Edge, LoopVerdict, PoseGraph, optimise
+from sigmasplat.slam.loop_closure.pose_graph import Edge, LoopVerdict, PoseGraph, optimise
 
 Array = NDArray[np.float64]
 seeds = st.integers(0, 2**31)

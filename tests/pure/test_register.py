@@ -14,9 +14,9 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.submap import MemoryStore, Submap
 from sigmasplat.render.view import make_view
-from sigmasplat.slam import register
-from sigmasplat.slam.places import Candidate, SubmapPair
-from sigmasplat.slam.register import Localisation, Registrar, Registration
+from sigmasplat.slam.loop_closure import registration
+from sigmasplat.slam.loop_closure.candidates import Candidate, SubmapPair
+from sigmasplat.slam.loop_closure.registration import Localisation, Registrar, Registration
 from sigmasplat.slam.seeding import make_splats
 from sigmasplat.sources import SyntheticRoom
 
@@ -101,7 +101,7 @@ def localisation(T_a_b: Matrix, residual: float = 0.1, covariance: Matrix | None
 def test_one_stray_localisation_is_left_out() -> None:
     near = [localisation(se3.exp(np.full(6, 0.01 * k))) for k in range(3)]
     stray = localisation(se3.exp(np.array([1.0, 0, 0, 0, 0, 0.0])), residual=0.01)
-    agreed = register.consensus([stray, *near], np.zeros(3), 0.1, 0.1)
+    agreed = registration.consensus([stray, *near], np.zeros(3), 0.1, 0.1)
     assert len(agreed) == 3
     assert stray not in agreed
 
@@ -109,17 +109,17 @@ def test_one_stray_localisation_is_left_out() -> None:
 def test_a_turn_counts_where_the_keyframe_is_not_at_the_origin() -> None:
     turn = localisation(se3.exp(np.array([0.0, 0, 0, 0, 0, 0.05])))
     point = np.array([4.0, 0.0, 0.0])
-    assert register.differs(turn.T_a_b, np.eye(4), point) == pytest.approx((0.2, 0.05), abs=1e-3)
-    assert len(register.consensus([turn, localisation(np.eye(4))], point, 0.1, 0.1)) == 1
+    assert registration.differs(turn.T_a_b, np.eye(4), point) == pytest.approx((0.2, 0.05), abs=1e-3)
+    assert len(registration.consensus([turn, localisation(np.eye(4))], point, 0.1, 0.1)) == 1
 
 
 def test_the_mean_leans_towards_the_smaller_residual() -> None:
     far = np.eye(4)
     far[:3, 3] = [0.03, 0.0, 0.0]
-    mean = register.combined([localisation(np.eye(4), 0.1), localisation(far, 0.2)])
+    mean = registration.combined([localisation(np.eye(4), 0.1), localisation(far, 0.2)])
     assert mean[0, 3] == pytest.approx(0.01)
     turns = [localisation(se3.exp(np.array([0, 0, 0, 0, 0, angle])), 0.1) for angle in (0.1, 0.3)]
-    assert np.allclose(se3.log_rotation(register.combined(turns)[:3, :3]), [0, 0, 0.2])
+    assert np.allclose(se3.log_rotation(registration.combined(turns)[:3, :3]), [0, 0, 0.2])
 
 
 def test_turning_a_localisation_round_carries_its_covariance() -> None:
@@ -128,7 +128,7 @@ def test_turning_a_localisation_round_carries_its_covariance() -> None:
     half = np.diag([3e-3, 1e-3, 2e-3, 1e-3, 2e-3, 3e-3])
     draws = se3.exp_stack(random.standard_normal((20_000, 6)) @ half)
     drawn = np.cov(se3.log_stack(se3.inverse(draws @ T) @ T).T)
-    turned = register.turned(localisation(T, covariance=half @ half.T))
+    turned = registration.turned(localisation(T, covariance=half @ half.T))
     scale = np.sqrt(np.diag(drawn))
     assert np.allclose(turned.T_a_b, se3.inverse(T))
     assert np.abs((turned.covariance - drawn) / np.outer(scale, scale)).max() < 0.04
@@ -137,20 +137,20 @@ def test_turning_a_localisation_round_carries_its_covariance() -> None:
 def test_disagreement_costs_information() -> None:
     close = [localisation(np.eye(4)), localisation(np.eye(4))]
     apart = [localisation(se3.exp(np.array([s * 0.03, 0, 0, 0, 0, 0.0]))) for s in (-1.0, 1.0)]
-    sure, unsure = (register.information(found, np.eye(4)) for found in (close, apart))
+    sure, unsure = (registration.information(found, np.eye(4)) for found in (close, apart))
     assert np.linalg.inv(unsure)[0, 0] == pytest.approx(np.linalg.inv(sure)[0, 0] + 0.03**2)
-    assert np.linalg.inv(sure)[0, 0] == pytest.approx(1e-6 + register.FLOOR_M**2)
+    assert np.linalg.inv(sure)[0, 0] == pytest.approx(1e-6 + registration.FLOOR_M**2)
 
 
 def test_overlap_is_the_larger_share_of_splats_with_a_neighbour() -> None:
     store = MemoryStore()
     whole, part = piece(store, (0,)), piece(store, (0,))
     part.field.keep(part.field.means[:, 0] > 0)
-    assert register.shared(whole, part, np.eye(4), 0.02) == 1.0
+    assert registration.shared(whole, part, np.eye(4), 0.02) == 1.0
     away = np.eye(4)
     away[:3, 3] = [0.0, 0.0, 9.0]
-    assert register.shared(whole, part, away, 0.02) == 0.0
+    assert registration.shared(whole, part, away, 0.02) == 0.0
     assert (
-        register.shared(whole, Submap(2, GaussianField.empty(), (), np.zeros((0, 4, 4)), whole.camera), away, 1.0)
+        registration.shared(whole, Submap(2, GaussianField.empty(), (), np.zeros((0, 4, 4)), whole.camera), away, 1.0)
         == 0.0
     )

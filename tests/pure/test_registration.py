@@ -9,7 +9,7 @@ from PIL import Image
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources import open_source
-from sigmasplat.sources.registration import MOST_PX, OVERLAP, Registration
+from sigmasplat.sources.camera.depth_registration import MOST_PX, OVERLAP, Registration
 
 DEPTH = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 COLOR = Camera(80, 60, 70.0, 72.0, 40.0, 29.0)

@@ -12,9 +12,9 @@ from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.association import associate
 from sigmasplat.sources.base import Source, Subset
-from sigmasplat.sources.read_ahead import read_ahead
+from sigmasplat.sources.files.association import associate
+from sigmasplat.sources.files.prefetch import read_ahead
 
 
 class Counting(Source):

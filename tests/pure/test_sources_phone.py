@@ -8,7 +8,7 @@ import pytest
 from recordings import FRAMES, r3d_members, scene, write_exr_export, write_stray, write_zip
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources import open_source
-from sigmasplat.sources.video import Video
+from sigmasplat.sources.files.video import Video
 
 pytest.importorskip("cv2", reason="videos need the extra iphone")
 pytest.importorskip("lzfse", reason="Record3D needs the extra iphone")

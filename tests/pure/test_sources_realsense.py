@@ -10,7 +10,7 @@ from fake_realsense import Device, distortion
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.sources import open_source
-from sigmasplat.sources.depth_check import depth_warning
+from sigmasplat.sources.camera.depth_units import depth_warning
 from sigmasplat.sources.live import LiveSource, as_recorded
 from sigmasplat.sources.realsense import WARM_UP
 

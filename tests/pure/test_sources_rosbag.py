@@ -22,8 +22,8 @@ from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources import open_source
-from sigmasplat.sources.bag import Bag
-from sigmasplat.sources.lens import distort
+from sigmasplat.sources.camera.distortion import distort
+from sigmasplat.sources.ros.bag import Bag
 
 pytest.importorskip("rosbags", reason="bags need the extra ros")
 

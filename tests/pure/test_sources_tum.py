@@ -9,9 +9,9 @@ from PIL import Image
 from sigmasplat.errors import RunError
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources import SyntheticRoom, open_source
-from sigmasplat.sources.calibration import FREIBURG, freiburg_calibration
-from sigmasplat.sources.depth_check import depth_warning
-from sigmasplat.sources.lens import Undistortion, distort, undistort
+from sigmasplat.sources.camera.calibration import FREIBURG, freiburg_calibration
+from sigmasplat.sources.camera.depth_units import depth_warning
+from sigmasplat.sources.camera.distortion import Undistortion, distort, undistort
 from sigmasplat.sources.tum import write_tum
 from view_agreement import agreement
 

@@ -12,12 +12,11 @@ from PIL import Image
 from sigmasplat.config import Config
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import RunError
-from sigmasplat.io.embedded import data_uri
+from sigmasplat.floorplan.rescan import Region
 from sigmasplat.io.runs import RunFolder
-from sigmasplat.metrics.doubtful import Region
-from sigmasplat.metrics.story import advice, in_short, unsure
-from sigmasplat.page import _again, write_page
 from sigmasplat.presets import preset
+from sigmasplat.report.page import _again, data_uri, write_page
+from sigmasplat.report.summary import advice, summary_sentences, unsure
 
 GOOD = {
     "source": "kitchen", "status": "complete", "frames": 500, "splats": 1000, "frames_per_s": 13.5, "lost": 0,
@@ -30,7 +29,7 @@ RUN = "sigmasplat run data/k"
 
 
 def said(**changes) -> str:
-    return " ".join(in_short(GOOD | changes, "a laptop"))
+    return " ".join(summary_sentences(GOOD | changes, "a laptop"))
 
 
 def test_a_good_run_in_words() -> None:
@@ -70,7 +69,7 @@ def test_loops_that_moved_next_to_nothing_are_not_told(off_m: float, without_m: 
 
 
 def test_nothing_is_said_of_what_is_not_known() -> None:
-    text = " ".join(in_short({"source": "x", "frames": 1, "splats": 0, "lost": 0}))
+    text = " ".join(summary_sentences({"source": "x", "frames": 1, "splats": 0, "lost": 0}))
     assert "dB" not in text and "V tells" not in text and "None" not in text
 
 

@@ -5,14 +5,14 @@ import pytest
 import torch
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.metrics import palette
+from sigmasplat.drawing import colormap
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render import render
 from sigmasplat.viewer import lines
-from sigmasplat.viewer.moment import Moment, Path, Piece, thinned, within_budget
 from sigmasplat.viewer.pictures import Legend, legend_picture, picture_of, viewpoint
+from sigmasplat.viewer.snapshot import Path, Piece, Snapshot, thinned, within_budget
 from sigmasplat.viewer.splats import Cut, covariances, cut_of, joined, sigma_of, sigma_span, sigmas, splats_of
 
 OPTIONS = RenderConfig()
@@ -87,7 +87,7 @@ def test_splats_are_drawn_in_their_colours_or_in_those_of_sigma() -> None:
     plain = splats_of(field, "colour", (0.0, 1.0), Cut())
     np.testing.assert_array_equal(plain.colors, (field.colors.numpy() * 255).round().astype(np.uint8))
     tinted = splats_of(field, "σ", (0.0, 0.3), Cut())
-    np.testing.assert_array_equal(tinted.colors, palette.colour(sigma_of(field), 0.0, 0.3, palette.INFERNO))
+    np.testing.assert_array_equal(tinted.colors, colormap.colour(sigma_of(field), 0.0, 0.3, colormap.INFERNO))
     np.testing.assert_array_equal(tinted.centers, field.means.numpy())
     doubtful, sure = int(sigma_of(field).argmax()), int(sigma_of(field).argmin())
     assert tinted.colors[doubtful].sum() > tinted.colors[sure].sum() + 200
@@ -122,11 +122,11 @@ def test_pieces_are_joined_as_fields_are_moved_and_appended() -> None:
 def test_the_timeline_shows_the_submaps_begun_by_then_and_the_final_map_whole() -> None:
     pieces = tuple(Piece(i, field_of(3, seed=i)) for i in range(3))
     final = Piece(None, field_of(9))
-    moment = Moment("run", path_of(30), final, pieces)
+    moment = Snapshot("run", path_of(30), final, pieces)
     assert moment.shown(True, 0) == (final,) and moment.shown(False, 29) == pieces
     assert moment.shown(False, 9) == pieces[:1] and moment.shown(False, 10) == pieces[:2]
-    assert Moment("run", path_of(30), final).shown(False, 0) == (final,)
-    assert Moment("run", pieces=pieces).shown(True, 0) == pieces
+    assert Snapshot("run", path_of(30), final).shown(False, 0) == (final,)
+    assert Snapshot("run", pieces=pieces).shown(True, 0) == pieces
 
 
 def test_the_path_is_drawn_up_to_a_frame_in_the_colours_of_its_submaps_lost_frames_red() -> None:
@@ -174,7 +174,7 @@ def test_layers_show_what_the_renderer_gives() -> None:
     np.testing.assert_array_equal(shown["opacity"].pixels[..., 0], (seen.alpha * 255).double().round().numpy())
     covered = (seen.alpha > 0.5).numpy()
     for name in ("depth", "V", "U"):
-        bare = (shown[name].pixels == palette.NO_READING).all(-1)
+        bare = (shown[name].pixels == colormap.NO_READING).all(-1)
         np.testing.assert_array_equal(bare, ~covered)
     root = seen.variance.mean(2).clamp(min=0).sqrt().numpy()
     legend = shown["V"].legend
@@ -197,6 +197,6 @@ def test_u_is_the_spread_of_depth_about_the_maps_own() -> None:
 
 
 def test_a_legend_runs_from_end_to_end() -> None:
-    drawn = legend_picture(Legend(palette.INFERNO, 0.0, 0.25, " m"))
-    np.testing.assert_array_equal(drawn[0, [0, -1]], palette.INFERNO[[0, -1]])
+    drawn = legend_picture(Legend(colormap.INFERNO, 0.0, 0.25, " m"))
+    np.testing.assert_array_equal(drawn[0, [0, -1]], colormap.INFERNO[[0, -1]])
     assert len(np.unique(drawn[20:].reshape(-1, 3), axis=0)) > 2

@@ -9,23 +9,24 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat import cli, session
+from sigmasplat import cli
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError, RunError, SigmaSplatError
-from sigmasplat.evaluate import evaluate
+from sigmasplat.evaluation.evaluate import evaluate
 from sigmasplat.io.runs import TRUTH, RunFolder
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.trajectory import read_trajectory
 from sigmasplat.model import se3
 from sigmasplat.presets import default_preset, preset
-from sigmasplat.protocols import Together
+from sigmasplat.run import session
+from sigmasplat.run.protocols import CallbackList
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import SyntheticRoom, open_source
-from sigmasplat.viewer.address import free_port, is_private, open_server, url_of
 from sigmasplat.viewer.finished import Shelf, ended, refuse_mapless, running
 from sigmasplat.viewer.live import ACTIVE_SHARE, LiveView
-from sigmasplat.viewer.moment import Moment
+from sigmasplat.viewer.server import free_port, is_private, open_server, url_of
+from sigmasplat.viewer.snapshot import Snapshot
 from sigmasplat.viewer.splats import Cut, joined
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -141,11 +142,11 @@ class Clock:
         return self.now_s
 
 
-def live_run(tmp_path: Path, clock: Clock, budget: int = 300_000) -> tuple[list[Moment], Slam]:
-    config, source, shown = settings(), open_source(ROOM), list[Moment]()
+def live_run(tmp_path: Path, clock: Clock, budget: int = 300_000) -> tuple[list[Snapshot], Slam]:
+    config, source, shown = settings(), open_source(ROOM), list[Snapshot]()
     slam = Slam(config, DiskStore(tmp_path / "submaps"))
     view = LiveView(slam, shown.append, "room", budget, every_s=2.0, clock=clock)
-    watch = Together(session.Unwatched(), view)
+    watch = CallbackList(session.NullCallback(), view)
     for i in range(FRAMES):
         clock.now_s += clock.frame_s
         watch(slam.step(source.frame(i)))

@@ -14,7 +14,7 @@ import torch
 
 from sigmasplat import cli
 from sigmasplat.errors import RunError
-from sigmasplat.evaluate import evaluate
+from sigmasplat.evaluation.evaluate import evaluate
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.sources import open_source
 

@@ -12,7 +12,8 @@ import torch
 from sigmasplat import cli
 from sigmasplat.config import Config, InputConfig
 from sigmasplat.errors import ConfigError, RunError
-from sigmasplat.evaluate import evaluate
+from sigmasplat.evaluation.evaluate import evaluate
+from sigmasplat.evaluation.reconstruct import Recording, reconstruct
 from sigmasplat.io.mesh import read_mesh
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.metrics.reconstruction import distances
@@ -25,7 +26,6 @@ from sigmasplat.model.submap import Picture, Submap
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources import SyntheticRoom, open_source
 from sigmasplat.sources.base import Source
-from sigmasplat.surface import Recording, reconstruct
 
 CAMERA = Camera(96, 72, 80.0, 80.0, 47.5, 35.5)
 """The run works at half its size."""

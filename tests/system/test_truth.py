@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sigmasplat import cli, session
+from sigmasplat import cli
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
 from sigmasplat.io.runs import RunFolder
@@ -14,6 +14,7 @@ from sigmasplat.model.frame import Frame
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, preset
+from sigmasplat.run import session
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import SyntheticRoom
 from sigmasplat.sources.base import Source

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sigmasplat.config.text import override
+from sigmasplat.drawing import colormap
 from sigmasplat.io.runs import RunFolder
-from sigmasplat.metrics import palette
 from sigmasplat.presets import default_preset, preset
-from sigmasplat.session import record
+from sigmasplat.run.session import record
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import open_source
 
@@ -156,7 +156,7 @@ def colours(pixels: Pixels) -> int:
 
 def likeness(pixels: Pixels, map_colours: NDArray[np.float64]) -> float:
     """Return the share of the pixels that are not background and lie near a colour map."""
-    ramp = palette.colour(np.linspace(0, 1, 64), 0.0, 1.0, map_colours).astype(int)
+    ramp = colormap.colour(np.linspace(0, 1, 64), 0.0, 1.0, map_colours).astype(int)
     lit = pixels.reshape(-1, 3).astype(int)
     lit = lit[lit.max(1) > 60]
     away = np.abs(lit[:, None] - ramp).max(2).min(1)
@@ -186,12 +186,12 @@ def test_a_finished_run_shows_its_map_and_the_uncertainty_in_it(finished: RunFol
         plain = page.screenshot()
         keep(plain, "finished")
         page.choose("splats in", "σ")
-        wait_for(lambda: likeness(page.scene(), palette.INFERNO) > 2 * likeness(scene_of(plain), palette.INFERNO))
+        wait_for(lambda: likeness(page.scene(), colormap.INFERNO) > 2 * likeness(scene_of(plain), colormap.INFERNO))
         keep(page.screenshot(), "sigma")
         by_sigma = page.scene()
         assert np.abs(by_sigma.astype(int) - scene_of(plain)).mean() > 10
         page.choose("show", "depth")
-        wait_for(lambda: likeness(page.scene(), palette.VIRIDIS) > 0.3)
+        wait_for(lambda: likeness(page.scene(), colormap.VIRIDIS) > 0.3)
         keep(page.screenshot(), "depth")
         process.send_signal(signal.SIGINT)
         said, _ = process.communicate(timeout=PATIENCE_S)

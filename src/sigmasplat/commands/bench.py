@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from sigmasplat.ablation import COMPARED, Job, Results, Runner, Study, carry_out, common_config, perform
 from sigmasplat.commands import options
 from sigmasplat.commands.options import prepare_torch
 from sigmasplat.errors import ConfigError
+from sigmasplat.evaluation.ablation import COMPARED, Job, Results, Runner, Study, carry_out, common_config, perform
 from sigmasplat.presets import default_preset
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from sigmasplat.screen import Screen
+    from sigmasplat.run.terminal import Screen
 
 DEFAULT_PRESET = default_preset()
 WIDTH = 132
@@ -60,7 +60,7 @@ class Ablation:
 
         `runner` takes the place of a whole run of SLAM and its evaluation. Raises SigmaSplatError.
         """
-        from sigmasplat.screen import Screen
+        from sigmasplat.run.terminal import Screen
 
         screen, study = Screen(), self.study()
         results = Results(self.out, study, self.overwrite)
@@ -101,7 +101,7 @@ def check_sources(study: Study, screen: "Screen") -> None:
     Raises SourceError.
     """
     from sigmasplat.sources import open_source
-    from sigmasplat.sources.depth_check import depth_warning
+    from sigmasplat.sources.camera.depth_units import depth_warning
 
     for source in study.sources:
         paths = dict.fromkeys(job.path for job in study.jobs(source))
@@ -125,7 +125,7 @@ def table(study: Study, source: str, runs: Sequence[dict[str, Any]]) -> "Table":
     """Lay out mean ± standard deviation over seeds, a row a variant, the best of a column starred."""
     from rich.table import Table
 
-    from sigmasplat.metrics.effects import columns, rows
+    from sigmasplat.evaluation.paired_comparison import columns, rows
 
     figures = columns(runs)
     caption = f"mean ± standard deviation of {study.seeds} seeds · τ {study.config.tracking.tau:g} · * {BEST}"
@@ -139,7 +139,7 @@ def table(study: Study, source: str, runs: Sequence[dict[str, Any]]) -> "Table":
 
 def said(variants: Sequence[str], runs: Sequence[dict[str, Any]], seeds: int) -> list[str]:
     """Say of each variant what it does against the one before, and how much that means."""
-    from sigmasplat.metrics.effects import effects, passed_by_chance, sentence
+    from sigmasplat.evaluation.paired_comparison import effects, passed_by_chance, sentence
 
     pairs = [(changed, against) for changed, against in COMPARED if {changed, against} <= set(variants)]
     lines = [f"{changed} against {against}: {sentence(effects(runs, changed, against))}" for changed, against in pairs]

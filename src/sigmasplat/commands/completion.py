@@ -1,7 +1,7 @@
 """Print what makes a shell complete our commands and options: sigmasplat completion."""
 
-import io
-from contextlib import redirect_stdout, suppress
+import subprocess
+import sys
 
 from sigmasplat.commands import options
 from sigmasplat.presets import list_presets
@@ -23,12 +23,9 @@ def completion(shell: options.Shell) -> int:
 
     example: sigmasplat completion bash > ~/.local/share/bash-completion/completions/sigmasplat
     """
-    from sigmasplat.cli import main
-
-    script = io.StringIO()
-    with redirect_stdout(script), suppress(SystemExit):  # tyro prints and exits
-        main(["--tyro-print-completion", shell])
-    print(script.getvalue(), end="")
+    # A process of its own: tyro prints the script of the whole command line, and exits.
+    command = [sys.executable, "-m", "sigmasplat", "--tyro-print-completion", shell]
+    print(subprocess.run(command, capture_output=True, text=True, check=True).stdout, end="")
     if shell == "bash":
         print(BASH.format(presets=" ".join(list_presets())), end="")
     return 0

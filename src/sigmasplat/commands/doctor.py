@@ -8,7 +8,7 @@ def doctor() -> int:
 
     exit code 1 if something is wrong; example: sigmasplat doctor
     """
-    from sigmasplat.doctor import Finding, examine, verdict
+    from sigmasplat.checks.installation import Finding, examine, verdict
 
     findings: list[Finding] = []
     for finding in examine():

@@ -7,7 +7,7 @@ import tyro
 
 if TYPE_CHECKING:
     from sigmasplat.download.entries import PublicSet
-    from sigmasplat.screen import Screen
+    from sigmasplat.run.terminal import Screen
 
 arg = tyro.conf.arg
 SetName = Annotated[
@@ -37,7 +37,7 @@ def download(
     example: sigmasplat download tum fr1/desk
     """
     from sigmasplat.download import find
-    from sigmasplat.screen import Screen
+    from sigmasplat.run.terminal import Screen
 
     screen = Screen()
     if list_only or dataset == "list":

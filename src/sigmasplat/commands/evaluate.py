@@ -7,7 +7,7 @@ from sigmasplat.commands.options import prepare_torch, source_of
 
 if TYPE_CHECKING:
     from sigmasplat.io.runs import RunFolder
-    from sigmasplat.screen import Screen
+    from sigmasplat.run.terminal import Screen
     from sigmasplat.sources.base import Source
 
 
@@ -17,7 +17,7 @@ def evaluate_run(run: options.RunPath, mesh: options.WithMesh = False, moved_to:
     example: sigmasplat eval runs/kitchen-sigma
     """
     from sigmasplat.io.runs import RunFolder
-    from sigmasplat.screen import Screen
+    from sigmasplat.run.terminal import Screen
 
     folder = RunFolder.open(run)
     source = source_of(folder, moved_to)
@@ -28,7 +28,7 @@ def evaluate_run(run: options.RunPath, mesh: options.WithMesh = False, moved_to:
 
 def score(screen: "Screen", folder: "RunFolder", source: "Source", mesh: bool = False) -> None:
     """Score the run, print the table, and where the report is: it exists even where the truth does not fit."""
-    from sigmasplat.evaluate import evaluate
+    from sigmasplat.evaluation.evaluate import evaluate
 
     try:
         with screen.counting("evaluation") as progress:

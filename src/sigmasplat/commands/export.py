@@ -24,7 +24,7 @@ FORMATS = (*SPLATS, Format("trajectory", (".txt",), "the path as TUM text", _tra
 """What can be written, the first by default. A new one: a row here, or a module of rows beside `export_splats`."""
 
 
-AS_USUAL = ExportOptions()
+DEFAULT_RUN_OPTIONS = ExportOptions()
 AskedFlat = Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
 
 
@@ -33,7 +33,7 @@ def export(
     out: options.OutFile = None,
     format: options.Format = None,
     overwrite: options.Overwrite = False,
-    asked: AskedFlat = AS_USUAL,
+    asked: AskedFlat = DEFAULT_RUN_OPTIONS,
 ) -> int:
     """Write a run's map, or a map from a file, for viewers and other programs; or a run's path.
 

@@ -37,7 +37,7 @@ class Origin:
 
     def field(self) -> "GaussianField":
         """Read the map. Raises RunError if there is no run, SourceError if the map is damaged or none."""
-        from sigmasplat.io.splats import read_any
+        from sigmasplat.io.splats.any_format import read_any
 
         is_map = self.path.is_file() or (not self.path.exists() and self.path.suffix != "")
         return read_any(self.path) if is_map else self.run().read_map()

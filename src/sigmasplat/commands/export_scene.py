@@ -27,7 +27,7 @@ def _recorded(origin: Origin, options: ExportOptions) -> "Recorded":
 
 @contextmanager
 def _counting(title: str) -> "Iterator[Progress]":
-    from sigmasplat.screen import Screen
+    from sigmasplat.run.terminal import Screen
 
     with Screen().counting(title) as progress:
         yield progress

@@ -14,25 +14,25 @@ BOUNDS = ("sigma_below", "opacity_above")
 
 
 def _ply(origin: Origin, target: Path, options: ExportOptions) -> str:
-    from sigmasplat.io import ply
+    from sigmasplat.io.splats import ply
 
     return _written(origin, options, lambda field: ply.write_field(target, field, plain=options.plain))
 
 
 def _compressed_ply(origin: Origin, target: Path, options: ExportOptions) -> str:
-    from sigmasplat.io import compressed_ply
+    from sigmasplat.io.splats import compressed_ply
 
     return _written(origin, options, lambda field: compressed_ply.write_field(target, field))
 
 
 def _splat(origin: Origin, target: Path, options: ExportOptions) -> str:
-    from sigmasplat.io import splat
+    from sigmasplat.io.splats import splat
 
     return _written(origin, options, lambda field: splat.write_field(target, field))
 
 
 def _spz(origin: Origin, target: Path, options: ExportOptions) -> str:
-    from sigmasplat.io import spz
+    from sigmasplat.io.splats import spz
 
     return _written(origin, options, lambda field: spz.write_field(target, field))
 
@@ -50,20 +50,23 @@ def _written(origin: Origin, options: ExportOptions, write: "Callable[[GaussianF
 
     Raises ConfigError on a bound that makes no sense, RunError where nothing is left.
     """
-    from sigmasplat.model import doubt
+    from sigmasplat.model import splat_filter
 
     for name in BOUNDS:
         bound = getattr(options, name)
         if bound is not None and not 0.0 <= bound < float("inf"):
             raise ConfigError(f"--{name.replace('_', '-')} must be finite and not negative, found {bound}")
     field = origin.field()
-    if options.sigma_below is not None and len(field) and not doubt.knows_variance(field):
+    if options.sigma_below is not None and len(field) and not splat_filter.has_learned_variance(field):
         raise ConfigError(
             f"{origin.path} holds no σ that --sigma-below could judge by; only our runs and our PLY have it"
         )
-    kept, every = doubt.sure(field, sigma_below=options.sigma_below, opacity_above=options.opacity_above), len(field)
+    kept, every = (
+        splat_filter.sure(field, sigma_below=options.sigma_below, opacity_above=options.opacity_above),
+        len(field),
+    )
     if every and kept.dropped == every:
-        medians = f"{doubt.sigmas(field).median():.3g} and {field.opacities.median():.3g}"
+        medians = f"{splat_filter.sigmas(field).median():.3g} and {field.opacities.median():.3g}"
         raise RunError(f"no splat of {origin.path} is left (median σ and opacity are {medians}); give milder bounds")
     field.keep(kept.rows)
     print(f"writing {len(field):,} splats …", flush=True)

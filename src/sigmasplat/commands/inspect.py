@@ -19,7 +19,7 @@ SheetFile = Annotated[
 
 def inspect(
     path: options.SourcePath,
-    taken: options.TakenFlat = options.AS_RECORDED,
+    taken: options.InputOptionsFlat = options.DEFAULT_INPUT_OPTIONS,
     settings: options.Settings = (),
     out: SheetFile = None,
 ) -> int:
@@ -29,9 +29,9 @@ def inspect(
     """
     from rich.table import Table
 
-    from sigmasplat.inspection import inspect_source
+    from sigmasplat.checks.recording import inspect_source
     from sigmasplat.io.atomic import replacing
-    from sigmasplat.screen import Screen
+    from sigmasplat.run.terminal import Screen
 
     screen = Screen()
     found = inspect_source(path, configured(default_preset(), settings, None, taken).input)

@@ -15,10 +15,10 @@ def make_mesh(
 
     example: sigmasplat mesh runs/kitchen-sigma --out kitchen.glb
     """
+    from sigmasplat.evaluation.reconstruct import reconstruct
     from sigmasplat.io.mesh import check_name, write_mesh
     from sigmasplat.io.runs import MESH, RunFolder
-    from sigmasplat.screen import Screen
-    from sigmasplat.surface import reconstruct
+    from sigmasplat.run.terminal import Screen
 
     screen, folder, target = Screen(), RunFolder.open(run), out or run / MESH
     check_name(target)

@@ -12,7 +12,7 @@ from sigmasplat.config import Config
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.presets import families, preset as preset_of
-from sigmasplat.viewer.address import HOST, PORT
+from sigmasplat.viewer.server import HOST, PORT
 
 if TYPE_CHECKING:
     from sigmasplat.io.runs import RunFolder
@@ -148,7 +148,7 @@ FilmPath = Annotated[Literal["run", "orbit"], arg(help="a film goes along the ru
 
 
 @dataclass(frozen=True)
-class Taken:
+class InputOptions:
     """What is taken of a sequence: shorthands of the settings input.*, which --set reaches too."""
 
     limit: Limit = None
@@ -187,12 +187,12 @@ class Taken:
         }
 
 
-AS_RECORDED = Taken()
-TakenFlat = Annotated[Taken, arg(name=""), tyro.conf.OmitArgPrefixes]
+DEFAULT_INPUT_OPTIONS = InputOptions()
+InputOptionsFlat = Annotated[InputOptions, arg(name=""), tyro.conf.OmitArgPrefixes]
 
 
 @dataclass(frozen=True)
-class Ways:
+class RunOptions:
     """How a run is carried through: scored or not, kept how often, shown where."""
 
     evaluate: Evaluate = True
@@ -203,11 +203,13 @@ class Ways:
     port: Port = PORT
 
 
-AS_USUAL = Ways()
-WaysFlat = Annotated[Ways, arg(name=""), tyro.conf.OmitArgPrefixes]
+DEFAULT_RUN_OPTIONS = RunOptions()
+RunOptionsFlat = Annotated[RunOptions, arg(name=""), tyro.conf.OmitArgPrefixes]
 
 
-def configured(preset: str, settings: Sequence[str], seed: int | None, taken: Taken = AS_RECORDED) -> Config:
+def configured(
+    preset: str, settings: Sequence[str], seed: int | None, taken: InputOptions = DEFAULT_INPUT_OPTIONS
+) -> Config:
     """Return a preset's settings with those of --set, the shorthands and --seed in place. Raises ConfigError."""
     given = split_settings(settings) | taken.settings()
     config = override(preset_of(preset), given)
@@ -229,11 +231,6 @@ def refuse_existing(target: Path | None, overwrite: bool) -> None:
     """Raise RunError if there is something at `target` that may not be overwritten."""
     if target and target.exists() and not overwrite:
         raise RunError(f"{target} exists; give another --out, or --overwrite to replace it")
-
-
-def absolute(path: str) -> str:
-    """Return a path in full where there is something, else as it is: it may name a built-in sequence."""
-    return str(Path(path).resolve()) if Path(path).exists() else path
 
 
 def prepare_torch() -> None:

@@ -4,8 +4,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from sigmasplat.commands import options
-from sigmasplat.commands.carrying import announce, carry_through, nothing_left_of, stage_for
-from sigmasplat.commands.options import absolute, configured, prepare_torch, source_of
+from sigmasplat.commands.options import configured, prepare_torch, source_of
+from sigmasplat.commands.run_and_score import announce, nothing_left_of, run_and_score, stage_for
+from sigmasplat.config.text import full_path
 from sigmasplat.errors import ConfigError
 from sigmasplat.presets import default_preset
 
@@ -27,7 +28,7 @@ def demo(
     if frames < 1:
         raise ConfigError(f"--frames must be at least 1, found {frames}")
     whole_walk = max(frames, DEMO_FRAMES)  # fewer frames are a part of the walk: a hurried one loses the tracker
-    taken = options.Taken(limit=frames)
+    taken = options.InputOptions(limit=frames)
     return run(f"synthetic:frames={whole_walk}", preset, settings, out, overwrite=True, taken=taken, seed=seed)
 
 
@@ -37,21 +38,21 @@ def run(
     settings: options.Settings = (),
     out: options.OutFolder = None,
     overwrite: options.Overwrite = False,
-    taken: options.TakenFlat = options.AS_RECORDED,
+    taken: options.InputOptionsFlat = options.DEFAULT_INPUT_OPTIONS,
     seed: options.Seed = None,
     record: options.Record = None,
-    ways: options.WaysFlat = options.AS_USUAL,
+    ways: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
 ) -> int:
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
     example: sigmasplat run data/kitchen --limit 200 --set input.width=480
     """
-    from sigmasplat.screen import Screen
-    from sigmasplat.session import new_folder
+    from sigmasplat.run.resume import Begun
+    from sigmasplat.run.session import new_folder
+    from sigmasplat.run.terminal import Screen
     from sigmasplat.slam.slam import Slam
-    from sigmasplat.snapshots import Begun
     from sigmasplat.sources import open_source
-    from sigmasplat.sources.depth_check import depth_warning
+    from sigmasplat.sources.camera.depth_units import depth_warning
     from sigmasplat.sources.live import LiveSource, as_recorded
 
     screen, config = Screen(), configured(preset, settings, seed, taken)
@@ -67,26 +68,26 @@ def run(
     if source.registrable and not source.depth_registered:
         screen.warn("depth stays in its own camera's pixels; --register-depth on moves it to colour (see inspect)")
     with stage_for(screen, ways) as stage:
-        folder = new_folder(out, config, source, overwrite, source_path=absolute(path))
+        folder = new_folder(out, config, source, overwrite, source_path=full_path(path))
         with nothing_left_of(folder):
             announce(screen, config.name, source, folder, record)
             prepare_torch()
             begun = Begun(Slam(config, folder.submaps))
-            return carry_through(screen, begun, source, folder, ways, stage)
+            return run_and_score(screen, begun, source, folder, ways, stage)
 
 
 def resume(
     run: options.RunPath,
     moved_to: options.MovedSource = None,
-    ways: options.WaysFlat = options.AS_USUAL,
+    ways: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
 ) -> int:
     """Go on with a run that was stopped or killed, where its state was last kept.
 
     The result is the same, byte for byte, as if it had not been stopped. example: sigmasplat resume runs/kitchen-sigma
     """
     from sigmasplat.io.runs import RunFolder
-    from sigmasplat.screen import Screen
-    from sigmasplat.snapshots import resume as resumed
+    from sigmasplat.run.resume import resume as resumed
+    from sigmasplat.run.terminal import Screen
 
     screen, folder = Screen(), RunFolder.open(run)
     source = source_of(folder, moved_to)
@@ -95,7 +96,7 @@ def resume(
         begun = resumed(folder, source)
         folder.note(status="running")
         screen.say(f"{source.name}: {where(begun.next_index, len(source))} → {folder.path}")
-        return carry_through(screen, begun, source, folder, ways, stage)
+        return run_and_score(screen, begun, source, folder, ways, stage)
 
 
 def where(next_index: int, frames: int) -> str:

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 from sigmasplat.commands import options
 from sigmasplat.commands.options import prepare_torch, source_of
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.viewer.address import HOST, PORT, close, is_private, open_server, url_of
+from sigmasplat.viewer.server import HOST, PORT, close, is_private, open_server, url_of
 
 if TYPE_CHECKING:
     from sigmasplat.io.runs import RunFolder
-    from sigmasplat.screen import Screen
+    from sigmasplat.run.terminal import Screen
     from sigmasplat.sources.base import Source
-    from sigmasplat.viewer.stage import Stage
+    from sigmasplat.viewer.app import Stage
 
 
 def view(run: options.RunPath, host: options.Host = HOST, port: options.Port = PORT) -> int:
@@ -23,7 +23,7 @@ def view(run: options.RunPath, host: options.Host = HOST, port: options.Port = P
     example: sigmasplat view runs/kitchen-sigma
     """
     from sigmasplat.io.runs import RunFolder
-    from sigmasplat.screen import Screen
+    from sigmasplat.run.terminal import Screen
     from sigmasplat.viewer.finished import follow, refuse_mapless
 
     folder = RunFolder.open(run)
@@ -45,7 +45,7 @@ def on_stage(screen: "Screen", host: str, port: int) -> Iterator["Stage"]:
     Raises SigmaSplatError without viser or where the port cannot be had.
     """
     server = open_server(host, port, "SigmaSplat")
-    from sigmasplat.viewer.stage import Stage
+    from sigmasplat.viewer.app import Stage
 
     stage, found = Stage(server), server.get_port()
     try:

@@ -6,14 +6,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from sigmasplat.config.densify import DensifyConfig
 from sigmasplat.config.frames import MappingConfig, RenderConfig, SeedConfig, TrackingConfig
 from sigmasplat.config.input import InputConfig
-from sigmasplat.config.primitives import PrimitiveConfig
 from sigmasplat.config.submaps import FinalConfig, LoopConfig, RegistrationConfig, SubmapConfig
 from sigmasplat.errors import ConfigError
 
 __all__ = [
-    "Config", "FinalConfig", "InputConfig", "LoopConfig", "MappingConfig", "PrimitiveConfig", "RegistrationConfig",
+    "Config", "DensifyConfig", "FinalConfig", "InputConfig", "LoopConfig", "MappingConfig", "RegistrationConfig",
     "RenderConfig", "SeedConfig", "SubmapConfig", "TrackingConfig",
 ]  # fmt: skip
 
@@ -33,7 +33,7 @@ class Config:
     render: RenderConfig = field(default_factory=RenderConfig)
     seeding: SeedConfig = field(default_factory=SeedConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
-    primitives: PrimitiveConfig = field(default_factory=PrimitiveConfig)
+    primitives: DensifyConfig = field(default_factory=DensifyConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     submaps: SubmapConfig = field(default_factory=SubmapConfig)
     loops: LoopConfig = field(default_factory=LoopConfig)

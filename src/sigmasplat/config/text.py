@@ -4,6 +4,7 @@ import dataclasses
 import difflib
 import math
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from sigmasplat.config import Config
@@ -96,3 +97,8 @@ def nearest(name: str, known: Mapping[str, Any] | list[str]) -> str:
     """Suggest the known name that a misspelt one resembles."""
     close = difflib.get_close_matches(name, list(known), 1)
     return f" (did you mean {close[0]}?)" if close else ""
+
+
+def full_path(path: str) -> str:
+    """Return the absolute path of an existing file, any other text (the name of a built-in sequence) unchanged."""
+    return str(Path(path).resolve()) if Path(path).exists() else path

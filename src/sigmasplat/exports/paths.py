@@ -7,8 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.errors import RunError
+from sigmasplat.exports.colmap import write_model
+from sigmasplat.exports.images import write_color, write_depth
+from sigmasplat.exports.nerfstudio import write_transforms
+from sigmasplat.exports.points import write_points
 from sigmasplat.exports.recorded import Recorded
-from sigmasplat.io import colmap, kitti, nerfstudio, pictures as pictures_io, points as points_io
+from sigmasplat.io.trajectory import write_kitti_poses
 from sigmasplat.types import Progress
 
 IMAGES, DEPTHS, POINTS = "images", "depths", "points.ply"
@@ -29,7 +33,7 @@ def export_kitti(recorded: Recorded, target: Path) -> int:
 
     Raises RunError.
     """
-    kitti.write_poses(target, recorded.path)
+    write_kitti_poses(target, recorded.path)
     return len(recorded.path)
 
 
@@ -41,8 +45,8 @@ def export_transforms(recorded: Recorded, target: Path, pictures: bool = False, 
     """
     frames = write_pictures(recorded, target.parent, True, progress) if pictures else recorded.frames()
     if pictures:
-        points_io.write_points(target.parent / POINTS, *map_points(recorded))
-    nerfstudio.write_transforms(
+        write_points(target.parent / POINTS, *map_points(recorded))
+    write_transforms(
         target,
         recorded.camera,
         [f"{IMAGES}/{picture_name(frame)}" for frame in frames],
@@ -67,7 +71,7 @@ def export_colmap(recorded: Recorded, target: Path, pictures: bool = False, prog
     frames = write_pictures(recorded, target, False, progress) if pictures else recorded.frames()
     names = [picture_name(frame) for frame in frames]
     poses = recorded.path.T_world_camera[frames]
-    colmap.write_model(model, recorded.camera, names, poses, *map_points(recorded))
+    write_model(model, recorded.camera, names, poses, *map_points(recorded))
     return len(frames)
 
 
@@ -82,9 +86,9 @@ def write_pictures(recorded: Recorded, folder: Path, depth: bool = False, progre
     total = recorded.count_keyframes()
     for done, (frame, picture) in enumerate(recorded.keyframes(), 1):
         if frame in trusted:
-            pictures_io.write_color(folder / IMAGES / picture_name(frame), picture)
+            write_color(folder / IMAGES / picture_name(frame), picture)
             if depth:
-                pictures_io.write_depth(folder / DEPTHS / picture_name(frame), picture)
+                write_depth(folder / DEPTHS / picture_name(frame), picture)
             written.append(frame)
         progress(done, total)
     if not written:

@@ -4,11 +4,11 @@ from pathlib import Path
 
 from sigmasplat.errors import RunError
 from sigmasplat.exports.recorded import Recorded
+from sigmasplat.floorplan.floor_plan import CELL_M, FloorPlan, floor_plan
+from sigmasplat.floorplan.picture import draw_floor_plan
+from sigmasplat.floorplan.surface_samples import Renderer
 from sigmasplat.io.atomic import replacing
 from sigmasplat.io.json_files import write_json
-from sigmasplat.metrics.floor_plan import CELL_M, FloorPlan, floor_plan
-from sigmasplat.metrics.plan_picture import draw_floor_plan
-from sigmasplat.metrics.sights import Renderer
 from sigmasplat.render import FieldRenderer
 from sigmasplat.types import Progress
 

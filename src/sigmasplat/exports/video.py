@@ -1,21 +1,26 @@
 """Render a run as a film: colour, depth and uncertainty side by side, along its own path or in a circle above it."""
 
-from collections.abc import Callable, Iterator
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
+from PIL import Image
 
-from sigmasplat.errors import ConfigError
+from sigmasplat.drawing.colormap import Rgb
+from sigmasplat.drawing.film import Maps, Scale, film_image, legend_strip
+from sigmasplat.env import install_extra
+from sigmasplat.errors import BackendError, ConfigError, RunError
 from sigmasplat.exports.recorded import Recorded
-from sigmasplat.io.video import check_name, write_video
-from sigmasplat.metrics.film import Maps, Scale, film_image, legend_strip
-from sigmasplat.metrics.floor import floor_frame
-from sigmasplat.metrics.palette import Rgb
-from sigmasplat.metrics.sights import Renderer, looks
+from sigmasplat.floorplan.ground import floor_frame
+from sigmasplat.floorplan.surface_samples import Renderer, looks
+from sigmasplat.io.atomic import replacing
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.camera_path import orbit, resampled
@@ -126,3 +131,94 @@ def _images(show: Callable[[Matrix], Maps], poses: Matrix, width: int, progress:
     for done, pose in enumerate(poses, 1):
         yield film_image(show(pose), scale, strip)
         progress(done, len(poses))
+
+
+CODECS = {".webm": "VP90", ".mp4": "vp09"}
+PICTURES = {".gif": "GIF", ".webp": "WEBP"}
+ENDINGS = (*CODECS, *PICTURES)
+NO_IMAGES = "a film needs at least one image, found none"
+
+
+def write_video(path: Path, images: Iterable[Rgb], fps: float) -> None:
+    """Write images uint8 RGB [H, W, 3], all of one size, as a film, as its name's ending says, in one step.
+
+    Raises RunError on another ending, an unwritable place or where the codec is not there; BackendError without OpenCV.
+    """
+    check_name(path)
+    kind = path.suffix.lower()
+    with replacing(path) as temporary:
+        scratch = temporary.with_suffix(kind)  # OpenCV goes by the ending
+        try:
+            if kind in CODECS:
+                _write_vp9(scratch, images, fps, CODECS[kind])
+            else:
+                _write_pictures(scratch, iter(images), fps, PICTURES[kind])
+            os.replace(scratch, temporary)
+        finally:
+            scratch.unlink(missing_ok=True)
+
+
+def check_name(path: Path) -> None:
+    """Raise RunError unless a film can be written under this name, BackendError where OpenCV is missing for it."""
+    if path.suffix.lower() not in ENDINGS:
+        raise RunError(f"cannot write a film as {path.name}; give a name that ends in {', '.join(ENDINGS)}")
+    if path.suffix.lower() in CODECS:
+        _opencv()
+
+
+def _opencv() -> Any:
+    try:
+        import cv2
+    except ImportError as problem:
+        raise BackendError(
+            f"films as .webm and .mp4 need OpenCV: {install_extra('video')}; or write .gif or .webp"
+        ) from problem
+    return cv2
+
+
+def _write_vp9(path: Path, images: Iterable[Rgb], fps: float, codec: str) -> None:
+    """Encode with VP9; odd sizes, which it cannot halve, lose their last row or column."""
+    cv2, writer, size = _opencv(), None, (0, 0)
+    try:
+        for image in images:
+            if writer is None:
+                size = (image.shape[1] // 2 * 2, image.shape[0] // 2 * 2)
+                with _quiet():
+                    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*codec), fps, size)
+                if not writer.isOpened():
+                    raise RunError(
+                        f"cannot write {path.name} with this OpenCV; write .gif or .webp, or a writable place"
+                    )
+            writer.write(np.ascontiguousarray(image[: size[1], : size[0], ::-1]))
+    finally:
+        if writer is not None:
+            writer.release()
+    if writer is None:
+        raise RunError(NO_IMAGES)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep the process's standard error silent: OpenCV warns there of a tag in .webm that it mends itself."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+def _write_pictures(path: Path, images: Iterator[Rgb], fps: float, kind: str) -> None:
+    """Write an animation that repeats."""
+    first = next(images, None)
+    if first is None:
+        raise RunError(NO_IMAGES)
+    rest = (Image.fromarray(image) for image in images)
+    duration_ms = round(1000.0 / fps)
+    options = {"quality": 80} if kind == "WEBP" else {}
+    Image.fromarray(first).save(
+        path, kind, save_all=True, append_images=rest, duration=duration_ms, loop=0, **options
+    )  # fmt: skip

@@ -9,9 +9,10 @@ from torch import Tensor
 
 from sigmasplat.config import Config
 from sigmasplat.errors import RunError
-from sigmasplat.io import machine, ply, trajectory as tum
+from sigmasplat.io import machine, trajectory as tum
 from sigmasplat.io.atomic import replacing, write_text
 from sigmasplat.io.json_files import append_line, read_json, read_lines, write_json
+from sigmasplat.io.splats import ply
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.tensors import opened, write_tensors
 from sigmasplat.model.field import GaussianField

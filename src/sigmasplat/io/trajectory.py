@@ -55,3 +55,9 @@ def _parse(line: str, where: str) -> list[float]:
     if np.linalg.norm(values[4:]) < 1e-6:
         raise SourceError(f"{where}: the quaternion is zero, which is no rotation; identity is '0 0 0 1'")
     return values
+
+
+def write_kitti_poses(path: Path, trajectory: Trajectory) -> None:
+    """Write T_world_camera with 12 significant digits. Raises RunError if not writable."""
+    rows = (T[:3].ravel().tolist() for T in trajectory.T_world_camera)
+    write_text(path, "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows))

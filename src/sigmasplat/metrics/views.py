@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.metrics import uncertainty
-from sigmasplat.metrics.panels import COVERED_ALPHA, View
+from sigmasplat.metrics.scored_view import COVERED_ALPHA, ScoredView
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
@@ -32,7 +32,7 @@ class Scores:
     rows: list[dict[str, float]] = field(default_factory=list)
     samples: list[NDArray[np.float32]] = field(default_factory=list)
 
-    def add(self, view: View) -> None:
+    def add(self, view: ScoredView) -> None:
         """Score a view."""
         self.rows.append(view.scores())
         if self.judged:
@@ -40,7 +40,7 @@ class Scores:
 
 
 @dataclass(frozen=True, eq=False)
-class Maps:
+class MapSources:
     """Where views are looked at: the final map; and the submaps, where T_world_submap [S, 4, 4] says how they lie."""
 
     final: GaussianField
@@ -52,9 +52,9 @@ class Maps:
         return None if self.T_world_submap is None else self.store.load(index).field
 
 
-def seen(
-    frame_of: Callable[[int], Frame], maps: Maps, chosen: Mapping[str, list[dict[str, Any]]], renderer: Renderer
-) -> Iterator[tuple[View, View | None]]:
+def render_views(
+    frame_of: Callable[[int], Frame], maps: MapSources, chosen: Mapping[str, list[dict[str, Any]]], renderer: Renderer
+) -> Iterator[tuple[ScoredView, ScoredView | None]]:
     """Render the chosen records of each kind at their `T_world_camera`: in the final map and, where kept, in the submap
     of their frame (`submap`, 0 if it says none).
 
@@ -74,17 +74,17 @@ def seen(
             yield final, before
 
 
-def view_of(frame: Frame, rendered: Render, kind: str, notes: tuple[str, ...] = ()) -> View:
+def view_of(frame: Frame, rendered: Render, kind: str, notes: tuple[str, ...] = ()) -> ScoredView:
     """Put a frame beside its rendering; depth is Σwz/Σw where the map covers the pixel, else 0."""
     alpha = _array(rendered.alpha)
     depth = np.where(alpha > COVERED_ALPHA, _array(rendered.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0)
-    return View(
+    return ScoredView(
         frame.index, kind, frame.color, frame.depth_m, np.clip(_array(rendered.color), 0.0, 1.0),
         depth.astype(np.float32), alpha, _array(rendered.variance), notes,
     )  # fmt: skip
 
 
-def sample(view: View) -> NDArray[np.float32]:
+def sample(view: ScoredView) -> NDArray[np.float32]:
     """Return (V, squared error, alpha) [3, P] of every k-th pixel with a reading, at most `PIXELS_PER_VIEW`."""
     values = np.stack([view.uncertainty[view.valid], view.squared_error[view.valid], view.alpha[view.valid]])
     return values[:, :: max(1, -(-values.shape[1] // PIXELS_PER_VIEW))]

@@ -13,11 +13,11 @@ import dataclasses
 
 from sigmasplat.config import (
     Config,
+    DensifyConfig,
     FinalConfig,
     InputConfig,
     LoopConfig,
     MappingConfig,
-    PrimitiveConfig,
     RegistrationConfig,
     RenderConfig,
     SeedConfig,
@@ -58,7 +58,7 @@ PAPER = Config(
         covisibility="splats",  # both take NetVLAD's, whose weights are a download, and the paper for its speed alone
         frames_per_step=0,
     ),
-    primitives=PrimitiveConfig(
+    primitives=DensifyConfig(
         uncertain_m2=0.025, faded_opacity=0.07, least_opacity=15.0 / 255.0, split_gradient=0.002, clone=True
     ),
     tracking=TrackingConfig(

@@ -8,11 +8,11 @@ import dataclasses
 
 from sigmasplat.config import (
     Config,
+    DensifyConfig,
     FinalConfig,
     InputConfig,
     LoopConfig,
     MappingConfig,
-    PrimitiveConfig,
     RegistrationConfig,
     SeedConfig,
     SubmapConfig,
@@ -135,7 +135,7 @@ FAST = Config(
         lr_pose_rotation=1e-4,
         prune_opacity=0.05,
     ),
-    primitives=PrimitiveConfig(split_radius_px=13.0),  # or a map that submaps inherit coarsens as the camera walks on
+    primitives=DensifyConfig(split_radius_px=13.0),  # or a map that submaps inherit coarsens as the camera walks on
     tracking=TrackingConfig(
         method="align",  # Gauss–Newton on images instead of 200 renders a frame
         align_to="keyframe",

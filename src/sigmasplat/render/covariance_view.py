@@ -9,16 +9,7 @@ from sigmasplat.render import reference
 from sigmasplat.render.cuda_view import CudaView
 from sigmasplat.render.numbers import view_numbers
 from sigmasplat.render.render import covariance_features
-from sigmasplat.render.view import (
-    NO_LAYERS,
-    CpuView,
-    Layers,
-    ReferenceView,
-    View,
-    pull_of,
-    reaches,
-    twist_matrix,
-)
+from sigmasplat.render.view import NO_LAYERS, CpuView, Layers, ReferenceView, View, pull_of, reaches, twist_matrix
 from sigmasplat.types import Matrix
 
 PLANES, SLOTS = 10, 11

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.config import PrimitiveConfig
+from sigmasplat.config import DensifyConfig
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
@@ -50,7 +50,7 @@ def hot_splats(pull: Tensor, times: Tensor, split_gradient: float, most: int | N
     return hot
 
 
-def multiply(field: GaussianField, hot: Tensor, config: PrimitiveConfig, random: np.random.Generator) -> Tensor:
+def multiply(field: GaussianField, hot: Tensor, config: DensifyConfig, random: np.random.Generator) -> Tensor:
     """Split the hot splats [N] that are large, clone the others where that is asked for; return which were split [N].
 
     Those split are gone, the rows after them move up; what is new stands at the end. A hot splat makes the field larger

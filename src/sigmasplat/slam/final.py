@@ -22,7 +22,7 @@ from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.tsdf import packed
 from sigmasplat.render.view import View
-from sigmasplat.slam.fusion import count_keyframes, fuse, standpoints_of
+from sigmasplat.slam.fusion import count_keyframes, fuse, fusion_views
 from sigmasplat.types import Matrix, Progress
 
 CACHE_BYTES = 64 << 20
@@ -122,7 +122,7 @@ def seeded_on_surface(store: SubmapStore, anchors: Sequence[Matrix], config: Con
     the initial one. Raises SigmaSplatError if no surface is shown.
     """
     final = config.final
-    mesh = fuse(standpoints_of(store, anchors), count_keyframes(store), config, weigh=final.uncertainty)
+    mesh = fuse(fusion_views(store, anchors), count_keyframes(store), config, weigh=final.uncertainty)
     if not len(mesh.vertices):
         raise SigmaSplatError("the submaps show no surface to seed the final map on; take final.seed_from=submaps")
     points, colors = thinned_vertices(mesh, final.spacing_m)

@@ -35,7 +35,7 @@ Renderer = Callable[[GaussianField, Camera, Matrix], Render]
 
 
 @dataclass(frozen=True, eq=False)
-class Standpoint:
+class FusionView:
     """Where a map is looked at from: T_camera_field in the frame of its field, T_world_camera in the world."""
 
     field: GaussianField
@@ -44,7 +44,7 @@ class Standpoint:
     T_world_camera: Matrix
 
 
-def standpoints_of(store: SubmapStore, anchors: Sequence[Matrix]) -> Iterator[Standpoint]:
+def fusion_views(store: SubmapStore, anchors: Sequence[Matrix]) -> Iterator[FusionView]:
     """Return every keyframe of all submaps before its own submap, one of which is in memory at a time.
 
     anchors: T_world_submap of each.
@@ -53,7 +53,7 @@ def standpoints_of(store: SubmapStore, anchors: Sequence[Matrix]) -> Iterator[St
         submap = store.load(index)
         for T_submap_camera in submap.T_submap_camera:
             T_world_camera = anchors[index] @ T_submap_camera
-            yield Standpoint(submap.field, submap.camera, se3.inverse(T_submap_camera), T_world_camera)
+            yield FusionView(submap.field, submap.camera, se3.inverse(T_submap_camera), T_world_camera)
 
 
 def count_keyframes(store: SubmapStore) -> int:
@@ -62,7 +62,7 @@ def count_keyframes(store: SubmapStore) -> int:
 
 
 def fuse(
-    standpoints: Iterable[Standpoint],
+    standpoints: Iterable[FusionView],
     total: int,
     config: Config,
     *,

@@ -19,7 +19,7 @@ from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.submap import Picture, Submap
 from sigmasplat.render.view import View
 from sigmasplat.slam.densify import Heat, hot_splats, multiply, split, too_large
-from sigmasplat.slam.primitives import fade, primitive_uncertainty, still_uncertain
+from sigmasplat.slam.pruning import fade, splat_uncertainty, still_uncertain
 from sigmasplat.slam.rules import draw_keyframes
 from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats, thin_out
 from sigmasplat.slam.window import choose_window, dominating
@@ -159,7 +159,7 @@ class Mapper:
         p = self.config.primitives
         if not p.uncertain_m2:
             return self.field.ids[:0]
-        nu, _ = primitive_uncertainty(self.field, view, self._judges(window), p.owner)
+        nu, _ = splat_uncertainty(self.field, view, self._judges(window), p.owner)
         return fade(self.field, nu > p.uncertain_m2, p.faded_opacity)
 
     def _unconvinced(self, view: View, window: list[Keyframe], doubted: Tensor) -> Tensor:
@@ -167,7 +167,7 @@ class Mapper:
         p = self.config.primitives
         if not len(doubted):
             return torch.zeros_like(self.field.ids, dtype=torch.bool)
-        nu, _ = primitive_uncertainty(self.field, view, self._judges(window), p.owner)
+        nu, _ = splat_uncertainty(self.field, view, self._judges(window), p.owner)
         return still_uncertain(self.field, doubted, nu, p.uncertain_m2, p.least_opacity)
 
     def _prune(self, view: View, also: Tensor | None = None) -> None:

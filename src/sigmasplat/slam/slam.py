@@ -24,10 +24,10 @@ from sigmasplat.presets import default_preset, preset
 from sigmasplat.render.view import View, make_view
 from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.final import final_map
-from sigmasplat.slam.loops import Loop, LoopCloser, make_descriptor
+from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.rules import ends_submap, is_keyframe
-from sigmasplat.slam.step import KERNELS, Step, numbers_of
+from sigmasplat.slam.step_result import KERNELS, Step, metrics_of
 from sigmasplat.slam.tracker import Tracker
 from sigmasplat.types import Matrix, Progress
 
@@ -103,7 +103,7 @@ class Slam:
             T_submap_camera, mapped = self._begin(frame, live), True
         else:
             T_submap_camera, fit = self._track(view, target, live, seconds)
-            tracking = numbers_of(fit)
+            tracking = metrics_of(fit)
             mapped = not self.tracker.lost and self._is_keyframe(fit.overlap)
         if mapped:
             if self.steps and self._cuts:

@@ -10,17 +10,17 @@ from sigmasplat.model.atlas import Atlas, Place
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.slam.drift import Drift
-from sigmasplat.slam.loops import Loop, LoopCloser
+from sigmasplat.slam.loop_closure.candidates import SubmapDescriptor
+from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser
+from sigmasplat.slam.loop_closure.pose_graph import Edge
 from sigmasplat.slam.mapper import Mapper
-from sigmasplat.slam.places import Signature
-from sigmasplat.slam.pose_graph import Edge
 from sigmasplat.slam.slam import Slam
-from sigmasplat.slam.step import Step
+from sigmasplat.slam.step_result import Step
 from sigmasplat.slam.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
     Atlas, Camera, Drift, Edge, GaussianField, Keyframe, Loop, LoopCloser, Mapper, Place, Pyramid, Reference, Rows,
-    Signature, Step, Target, Tracker, VectorAdam,
+    SubmapDescriptor, Step, Target, Tracker, VectorAdam,
 )  # fmt: skip
 """What a state is made of."""
 

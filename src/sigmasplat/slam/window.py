@@ -12,7 +12,7 @@ from sigmasplat.fit.target import Keyframe
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render.view import View
-from sigmasplat.slam.descriptors import similarity
+from sigmasplat.slam.loop_closure.descriptors import similarity
 
 Ids = NDArray[np.int64]
 Scores = NDArray[np.float64]

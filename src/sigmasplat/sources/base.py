@@ -13,7 +13,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.read_ahead import read_ahead
+from sigmasplat.sources.files.prefetch import read_ahead
 
 
 class Source(ABC):

@@ -14,7 +14,7 @@ import numpy as np
 from sigmasplat.config import InputConfig
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.calibration import BONN
+from sigmasplat.sources.camera.calibration import BONN
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import RecordedSource
 from sigmasplat.sources.tum import open_tum

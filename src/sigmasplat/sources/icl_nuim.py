@@ -16,11 +16,11 @@ import numpy as np
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.calibration import ICL_NUIM, TUM_UNITS_PER_METRE, calibrated, freiburg_calibration
-from sigmasplat.sources.folders import FRAMES_PER_SECOND
+from sigmasplat.sources.camera.calibration import ICL_NUIM, TUM_UNITS_PER_METRE, calibrated, freiburg_calibration
+from sigmasplat.sources.files.folders import FRAMES_PER_SECOND
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import Images, RecordedSource, first_size
-from sigmasplat.sources.tum_lists import lines, numbers, read_poses
+from sigmasplat.sources.tum import lines, numbers, read_poses
 
 LIST_NAMES = ("associations.txt", "association.txt", "associate.txt")
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])

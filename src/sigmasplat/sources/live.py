@@ -11,8 +11,8 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
-from sigmasplat.sources.read_ahead import read_ahead
-from sigmasplat.sources.tum_writing import TumWriter
+from sigmasplat.sources.files.prefetch import read_ahead
+from sigmasplat.sources.tum import TumWriter
 
 
 class _NoLength(SourceError, TypeError):

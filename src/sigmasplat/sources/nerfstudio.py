@@ -11,12 +11,12 @@ from pathlib import Path
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
-from sigmasplat.sources.calibration import Calibration, calibrated, number, positive, read_object
-from sigmasplat.sources.folders import FRAMES_PER_SECOND, natural
+from sigmasplat.sources.camera.calibration import Calibration, calibrated, number, positive, read_object
+from sigmasplat.sources.files.folders import FRAMES_PER_SECOND, natural
+from sigmasplat.sources.files.poses import known_path
+from sigmasplat.sources.files.transforms import Fields, camera_in, frames_of, pose_in
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.poses import known_path
 from sigmasplat.sources.recorded import Images, RecordedSource, first_size
-from sigmasplat.sources.transforms import Fields, camera_in, frames_of, pose_in
 
 NAME = "transforms.json"
 METRES_PER_UNIT = 0.001

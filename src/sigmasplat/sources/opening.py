@@ -8,7 +8,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import sigmasplat.sources
 from sigmasplat.config import InputConfig
 from sigmasplat.config.text import nearest
 from sigmasplat.errors import ConfigError, SourceError
@@ -37,7 +36,7 @@ class Format:
 @cache
 def formats() -> tuple[Format, ...]:
     """Find the formats: every module directly in `sigmasplat.sources` that defines FORMAT, by priority and name."""
-    names = sorted(module.name for module in pkgutil.iter_modules(sigmasplat.sources.__path__) if not module.ispkg)
+    names = sorted(module.name for module in pkgutil.iter_modules([str(Path(__file__).parent)]) if not module.ispkg)
     modules = [importlib.import_module(f"sigmasplat.sources.{name}") for name in names]
     found = [module.FORMAT for module in modules if hasattr(module, "FORMAT")]
     return tuple(sorted(found, key=lambda known: -known.priority))

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
-from sigmasplat.sources.calibration import MILLIMETRES, calibrated
-from sigmasplat.sources.folders import (
+from sigmasplat.sources.camera.calibration import MILLIMETRES, calibrated
+from sigmasplat.sources.files.folders import (
     COLOR_ENDINGS,
     COLOR_FOLDERS,
     DEPTH_ENDINGS,
@@ -26,7 +26,7 @@ from sigmasplat.sources.folders import (
 )
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import Images, RecordedSource, first_size
-from sigmasplat.sources.tum_lists import read_poses
+from sigmasplat.sources.tum import read_poses
 
 COLOR_NAME, DEPTH_NAME = "color|rgb|images/*", "depth/*"
 

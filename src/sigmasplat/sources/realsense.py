@@ -18,12 +18,12 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame, resized_color
-from sigmasplat.sources.calibration import Calibration, Lens, calibrated
-from sigmasplat.sources.images import color_from_bytes
+from sigmasplat.sources.camera.calibration import Calibration, Lens, calibrated
+from sigmasplat.sources.camera.rectification import Rectification
+from sigmasplat.sources.files.images import color_from_bytes
+from sigmasplat.sources.files.optional import needed
 from sigmasplat.sources.live import LiveSource
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.optional import needed
-from sigmasplat.sources.rectification import Rectification
 
 OPTIONS = {"width": 640, "height": 480, "fps": 30}
 PATIENCE_MS = 5000

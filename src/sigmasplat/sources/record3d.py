@@ -23,11 +23,11 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.archive import Archive
-from sigmasplat.sources.calibration import Calibration, calibrated, camera_of, number
-from sigmasplat.sources.images import color_of, image_size, metres
+from sigmasplat.sources.camera.calibration import Calibration, calibrated, camera_of, number
+from sigmasplat.sources.files.archive import Archive
+from sigmasplat.sources.files.images import color_of, image_size, metres
+from sigmasplat.sources.files.optional import needed
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.optional import needed
 from sigmasplat.sources.recorded import Images, RecordedSource, Size
 from sigmasplat.sources.stray_scanner import shared_axis
 

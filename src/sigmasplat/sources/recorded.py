@@ -12,10 +12,10 @@ from sigmasplat.errors import SourceError
 from sigmasplat.model.frame import Frame, resized_color
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
-from sigmasplat.sources.calibration import Calibration
-from sigmasplat.sources.depth_check import refuse_without_depth
-from sigmasplat.sources.images import color_from_bytes, image_size, read_color, read_depth
-from sigmasplat.sources.rectification import Rectification, refuse_sizes
+from sigmasplat.sources.camera.calibration import Calibration
+from sigmasplat.sources.camera.depth_units import refuse_without_depth
+from sigmasplat.sources.camera.rectification import Rectification, refuse_sizes
+from sigmasplat.sources.files.images import color_from_bytes, image_size, read_color, read_depth
 
 Size = tuple[int, int]
 

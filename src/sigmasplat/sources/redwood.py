@@ -17,8 +17,7 @@ import numpy as np
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.association import associate
-from sigmasplat.sources.calibration import (
+from sigmasplat.sources.camera.calibration import (
     MILLIMETRES,
     PRIMESENSE,
     Calibration,
@@ -28,7 +27,8 @@ from sigmasplat.sources.calibration import (
     positive,
     read_object,
 )
-from sigmasplat.sources.folders import (
+from sigmasplat.sources.files.association import associate
+from sigmasplat.sources.files.folders import (
     COLOR_ENDINGS,
     COLOR_FOLDERS,
     DEPTH_ENDINGS,
@@ -38,10 +38,10 @@ from sigmasplat.sources.folders import (
     paired,
     subfolder,
 )
+from sigmasplat.sources.files.poses import known_path, matrix, pose
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.poses import known_path, matrix, pose
 from sigmasplat.sources.recorded import Images, RecordedSource, first_size
-from sigmasplat.sources.tum_lists import lines, numbers
+from sigmasplat.sources.tum import lines, numbers
 
 INTRINSIC_NAMES = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
 MAX_GAP_S = 0.02

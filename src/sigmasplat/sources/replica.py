@@ -13,8 +13,8 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.calibration import REPLICA, Calibration, calibrated, read_replica_calibration
-from sigmasplat.sources.folders import FRAMES_PER_SECOND, paired
+from sigmasplat.sources.camera.calibration import REPLICA, Calibration, calibrated, read_replica_calibration
+from sigmasplat.sources.files.folders import FRAMES_PER_SECOND, paired
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import Images, RecordedSource
 

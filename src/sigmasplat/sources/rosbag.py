@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
-from sigmasplat.sources.association import associate
-from sigmasplat.sources.bag import Bag, Entry, is_bag
-from sigmasplat.sources.bag_cameras import calibration_of
-from sigmasplat.sources.bag_images import color_from, depth_from, size_of
-from sigmasplat.sources.bag_topics import color_topic, depth_topic
-from sigmasplat.sources.bag_truth import truth_of
+from sigmasplat.sources.files.association import associate
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import Images, RecordedSource, Size
+from sigmasplat.sources.ros.bag import Bag, Entry, is_bag
+from sigmasplat.sources.ros.cameras import calibration_of
+from sigmasplat.sources.ros.images import color_from, depth_from, size_of
+from sigmasplat.sources.ros.topics import color_topic, depth_topic
+from sigmasplat.sources.ros.truth import truth_of
 
 MAX_GAP_S = 0.02
 """Colour and depth of one camera at 30 Hz are never further apart."""

@@ -18,21 +18,23 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.sources.calibration import MILLIMETRES, Calibration, calibrated, camera_of, positive
-from sigmasplat.sources.folders import (
+from sigmasplat.sources.camera.calibration import MILLIMETRES, Calibration, calibrated, camera_of, positive
+from sigmasplat.sources.files.folders import (
     COLOR_ENDINGS,
     DEPTH_ENDINGS,
     FRAMES_PER_SECOND,
+    Found,
+    frame_files,
+    has_frame_files,
     images_in,
     numbered,
     paired,
     subfolder,
 )
-from sigmasplat.sources.frame_files import Found, frame_files, has_frame_files
+from sigmasplat.sources.files.poses import matrix, pose_files, read_matrix
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.poses import matrix, pose_files, read_matrix
 from sigmasplat.sources.recorded import Images, RecordedSource, first_size
-from sigmasplat.sources.tum_lists import numbers
+from sigmasplat.sources.tum import numbers
 from sigmasplat.types import Matrix
 
 COLOR_SIZE, DEPTH_SIZE = (1296, 968), (640, 480)

@@ -13,12 +13,12 @@ from pathlib import Path
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
-from sigmasplat.sources.calibration import MILLIMETRES, calibrated, read_object
-from sigmasplat.sources.folders import FRAMES_PER_SECOND
+from sigmasplat.sources.camera.calibration import MILLIMETRES, calibrated, read_object
+from sigmasplat.sources.files.folders import FRAMES_PER_SECOND
+from sigmasplat.sources.files.poses import known_path
+from sigmasplat.sources.files.transforms import Fields, camera_in, frames_of, pose_in
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.poses import known_path
 from sigmasplat.sources.recorded import Images, RecordedSource, first_size
-from sigmasplat.sources.transforms import Fields, camera_in, frames_of, pose_in
 
 TRANSFORMS = Path("nerfstudio") / "transforms_undistorted.json"
 IMAGES, DEPTHS, LISTS = "undistorted_images", "undistorted_depths", "train_test_lists.json"

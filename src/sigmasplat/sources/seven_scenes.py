@@ -15,13 +15,12 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.calibration import MILLIMETRES, SEVEN_SCENES, SEVEN_SCENES_COLOR, Calibration, calibrated
-from sigmasplat.sources.folders import FRAMES_PER_SECOND, paired
-from sigmasplat.sources.frame_files import frame_files, has_frame_files
+from sigmasplat.sources.camera.calibration import MILLIMETRES, SEVEN_SCENES, SEVEN_SCENES_COLOR, Calibration, calibrated
+from sigmasplat.sources.camera.rectification import registers
+from sigmasplat.sources.files.folders import FRAMES_PER_SECOND, frame_files, has_frame_files, paired
+from sigmasplat.sources.files.poses import pose_files
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.poses import pose_files
 from sigmasplat.sources.recorded import Images, RecordedSource, first_size
-from sigmasplat.sources.rectification import registers
 
 
 def open_seven_scenes(folder: Path, settings: InputConfig) -> RecordedSource:

@@ -20,11 +20,11 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.calibration import Calibration, calibrated, camera_of
-from sigmasplat.sources.images import image_size, read_depth, understood
+from sigmasplat.sources.camera.calibration import Calibration, calibrated, camera_of
+from sigmasplat.sources.files.images import image_size, read_depth, understood
+from sigmasplat.sources.files.video import Video
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import Images, RecordedSource, Size, first_size
-from sigmasplat.sources.video import Video
 
 UNITS_PER_METRE = 1000.0
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")

@@ -10,7 +10,7 @@ from sigmasplat.model.frame import Frame
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
-from sigmasplat.sources.images import color_from_bytes
+from sigmasplat.sources.files.images import color_from_bytes
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.room.furnish import furnished
 from sigmasplat.sources.room.sensor import drifted_depth, measured_color, measured_depth

@@ -5,29 +5,26 @@ calibration.json                        ours: fx fy cx cy width height depth_sca
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.association import associate
 from sigmasplat.sources.base import Source
-from sigmasplat.sources.calibration import (
-    TUM_UNITS_PER_METRE,
-    Calibration,
-    calibrated,
-    freiburg_calibration,
-)
+from sigmasplat.sources.camera.calibration import TUM_UNITS_PER_METRE, Calibration, calibrated, freiburg_calibration
+from sigmasplat.sources.files.association import associate
+from sigmasplat.sources.files.images import OVERFLOW
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import Images, RecordedSource, first_size
-from sigmasplat.sources.tum_lists import read_list, read_poses
-from sigmasplat.sources.tum_writing import write_images
 
 MAX_GAP_S = 0.02
 """Colour and depth of a Kinect at 30 Hz are never further apart; TUM's own tool uses the same number."""
@@ -114,3 +111,102 @@ FORMAT = Format(
     lambda path, settings: open_tum(Path(path), settings),
     priority=1,
 )
+
+
+def read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
+    """Read "t path" lines: timestamps [N] seconds and image paths. Raises SourceError naming file and line."""
+    times, paths = [], []
+    for line, words in lines(path):
+        if len(words) < 2:
+            raise SourceError(f"{path}:{line}: 'timestamp path' wanted, found {' '.join(words)!r}")
+        times.append(numbers(path, line, words[:1])[0])
+        paths.append(path.parent / " ".join(words[1:]))
+    if not paths:
+        raise SourceError(f"{path}: lists no images")
+    return np.array(times), paths
+
+
+def read_poses(path: Path) -> Trajectory:
+    """Read "t tx ty tz qx qy qz qw" lines. Raises SourceError naming the line whose pose is not finite or not rigid."""
+    times, poses = [], []
+    for line, words in lines(path):
+        if len(words) != 8:
+            raise SourceError(f"{path}:{line}: 't tx ty tz qx qy qz qw' wanted, found {len(words)} values")
+        t, *translation_quaternion = numbers(path, line, words)
+        times.append(t)
+        poses.append(_pose(path, line, np.array(translation_quaternion)))
+    if not poses:
+        raise SourceError(f"{path}: holds no poses; fill it or delete it")
+    return Trajectory(np.array(times), np.stack(poses))
+
+
+def lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield (line number from 1, words) of every line that says something."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SourceError(f"{path}: not readable as text ({error})") from error
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split("#")[0].replace(",", " ").split()
+        if words:
+            yield number, words
+
+
+def numbers(path: Path, line: int, words: list[str]) -> list[float]:
+    """Read finite numbers. Raises SourceError naming file and line."""
+    try:
+        values = [float(word) for word in words]
+    except ValueError as error:
+        raise SourceError(f"{path}:{line}: numbers wanted, found {' '.join(words)!r}") from error
+    if not np.isfinite(values).all():
+        raise SourceError(f"{path}:{line}: not finite: {' '.join(words)!r}; drop the line")
+    return values
+
+
+def _pose(path: Path, line: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Build T_world_camera from tx ty tz qx qy qz qw; only a unit quaternion is a rotation."""
+    norm = float(np.linalg.norm(values[3:]))
+    if abs(norm - 1.0) > 1e-2:
+        raise SourceError(f"{path}:{line}: the pose is not rigid: its quaternion has length {norm:.4g}, not 1")
+    T = np.eye(4)
+    T[:3, :3] = se3.rotation_from_quaternion(values[[6, 3, 4, 5]])
+    T[:3, 3] = values[:3]
+    return T
+
+
+class TumWriter:
+    """Adds frames to a new TUM folder: both images first, then a line in each list."""
+
+    def __init__(self, folder: Path, camera: Camera) -> None:
+        """Raises RunError if the folder already holds a sequence or cannot be written."""
+        self.folder = folder
+        if (folder / "rgb.txt").exists():
+            raise RunError(f"{folder} already holds a sequence (rgb.txt); give another folder")
+        try:
+            for part in ("rgb", "depth"):
+                (folder / part).mkdir(parents=True, exist_ok=True)
+            calibration = asdict(camera) | {"depth_scale": TUM_UNITS_PER_METRE}
+            (folder / "calibration.json").write_text(json.dumps(calibration, indent=1) + "\n")
+        except OSError as error:
+            raise RunError(f"cannot write the sequence to {folder} ({error})") from error
+
+    def add(self, frame: Frame) -> None:
+        """Write one more frame; times must grow. Raises RunError if the folder cannot be written."""
+        try:
+            stem = write_images(frame, self.folder)
+            for part in ("depth", "rgb"):
+                with (self.folder / f"{part}.txt").open("a", encoding="utf-8") as file:
+                    file.write(f"{stem} {part}/{stem}.png\n")
+        except OSError as error:
+            raise RunError(f"cannot write the sequence to {self.folder} ({error})") from error
+
+
+def write_images(frame: Frame, folder: Path) -> str:
+    """Write rgb/T.png and depth/T.png, 1/5000 m, and return T; readings past 13.1 m do not fit and become 0."""
+    stem = f"{frame.timestamp_s:.6f}"
+    units = np.rint(frame.depth_m * TUM_UNITS_PER_METRE)
+    depth = np.where(units < OVERFLOW, units, 0).astype(np.uint16)
+    color = np.rint(frame.color * 255.0).astype(np.uint8)
+    Image.fromarray(color).save(folder / "rgb" / f"{stem}.png", compress_level=1)
+    Image.fromarray(depth).save(folder / "depth" / f"{stem}.png", compress_level=1)
+    return stem

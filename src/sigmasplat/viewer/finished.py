@@ -8,22 +8,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sigmasplat.drawing.colormap import Rgb
 from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.io.runs import TRUTH, RunFolder
 from sigmasplat.io.trajectory import read_trajectory
-from sigmasplat.metrics.palette import Rgb
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.sources.base import Source
 from sigmasplat.types import Matrix
-from sigmasplat.viewer.moment import BUDGET, CAMERA, Moment, Path, Piece, bare, thinned, within_budget
+from sigmasplat.viewer.snapshot import BUDGET, CAMERA, Path, Piece, Snapshot, bare, thinned, within_budget
 
 EVERY_S = 2.0
 Log = list[dict[str, Any]]
-Show = Callable[[Moment], None]
+Show = Callable[[Snapshot], None]
 
 
-def ended(run: RunFolder, source: Source | None = None, budget: int = BUDGET) -> Moment:
+def ended(run: RunFolder, source: Source | None = None, budget: int = BUDGET) -> Snapshot:
     """Return what there is of a run that has ended; `source` gives pictures of keyframes that the run did not keep.
 
     Raises RunError if it stopped before it had a map.
@@ -38,7 +38,7 @@ def ended(run: RunFolder, source: Source | None = None, budget: int = BUDGET) ->
     if pieces and len(pieces) < len(tensors["T_world_submap"]):
         active = GaussianField(tensors["params"])
         pieces.append(Piece(len(pieces), thinned(active, budget), np.asarray(tensors["T_world_submap"][-1])))
-    return Moment(
+    return Snapshot(
         run.path.resolve().name,
         Path(path.T_world_camera[:kept], *_marks(log[:kept]), keyframes),
         Piece(None, bare(final)),
@@ -52,7 +52,7 @@ def ended(run: RunFolder, source: Source | None = None, budget: int = BUDGET) ->
     )
 
 
-def running(run: RunFolder, shelf: "Shelf") -> Moment:
+def running(run: RunFolder, shelf: "Shelf") -> Snapshot:
     """Return what a run has written so far: the log's path, and the submaps finished, which lie where the log has
     their first keyframes. `shelf` keeps what has been read before."""
     log = run.read_log() if (run.path / "log.jsonl").is_file() else []
@@ -61,7 +61,7 @@ def running(run: RunFolder, shelf: "Shelf") -> Moment:
     path = Path(
         np.array(poses).reshape(-1, 4, 4), *_marks(log), tuple(r for r, x in enumerate(log) if x["is_keyframe"])
     )
-    return Moment(
+    return Snapshot(
         run.path.resolve().name, path, None, tuple(shelf.pieces.values()), None, shelf.camera or CAMERA, shelf.picture,
         config.render, config.backend, live=True, status="running",
     )  # fmt: skip

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.metrics.plot import ACCENT, BLUE, DARK, GREEN
+from sigmasplat.drawing.plot import ACCENT, BLUE, DARK, GREEN
 from sigmasplat.types import Matrix
-from sigmasplat.viewer.moment import Path
+from sigmasplat.viewer.snapshot import Path
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]

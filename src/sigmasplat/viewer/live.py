@@ -5,11 +5,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from sigmasplat.metrics.palette import Rgb
-from sigmasplat.protocols import Stepped, Tried
+from sigmasplat.drawing.colormap import Rgb
+from sigmasplat.run.protocols import LoopResult, StepResult
 from sigmasplat.slam.slam import Slam
 from sigmasplat.viewer.finished import Show
-from sigmasplat.viewer.moment import BUDGET, CAMERA, Moment, Path, Piece, bare, thinned, within_budget
+from sigmasplat.viewer.snapshot import BUDGET, CAMERA, Path, Piece, Snapshot, bare, thinned, within_budget
 
 EVERY_S = 2.0
 MOST_SHARE = 0.02
@@ -31,7 +31,7 @@ class LiveView:
         self._finished: tuple[Piece, ...] = ()
         self._places: dict[int, tuple[int, int]] = {}
 
-    def __call__(self, step: Stepped) -> None:
+    def __call__(self, step: StepResult) -> None:
         """Show how things are after a step, if it is time."""
         started_s = self._clock()
         if started_s >= self._due_s:
@@ -44,11 +44,11 @@ class LiveView:
         if done == 0 and len(self.slam.store) == len(self.slam.atlas.anchors):
             self.show(self.moment())
 
-    def last_loops(self, loops: Sequence[Tried]) -> None:
+    def last_loops(self, loops: Sequence[LoopResult]) -> None:
         """Show the map as it is in the end."""
         self.show(self.moment(finished=True))
 
-    def moment(self, finished: bool = False) -> Moment:
+    def moment(self, finished: bool = False) -> Snapshot:
         """Copy what is shown of the system as it is now; once it is finished, the final map too."""
         slam = self.slam
         lost = np.array([step.lost for step in slam.steps], np.bool_)
@@ -57,7 +57,7 @@ class LiveView:
         self._take_finished()
         final = Piece(None, thinned(bare(slam.field), self.budget)) if finished else None
         keyframes = slam.mapper.keyframes
-        return Moment(
+        return Snapshot(
             self.title, path, final, (*self._finished, *self._active()), None,
             keyframes[0].target.camera if keyframes else CAMERA, self.picture, slam.config.render, slam.config.backend,
             live=True, status="running",

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 import viser
 
-from sigmasplat.metrics.palette import NO_READING, Rgb
+from sigmasplat.drawing.colormap import NO_READING, Rgb
 from sigmasplat.viewer.pictures import LEGEND_SIZE, Layer
 from sigmasplat.viewer.splats import Colouring
 

@@ -9,8 +9,8 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
-from sigmasplat.metrics import palette
-from sigmasplat.metrics.panels import COVERED_ALPHA
+from sigmasplat.drawing import colormap
+from sigmasplat.metrics.scored_view import COVERED_ALPHA
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
@@ -35,7 +35,7 @@ class Legend(NamedTuple):
 class Picture(NamedTuple):
     """Pixels uint8 [H, W, 3], and what their colours mean where they are not the scene's own."""
 
-    pixels: palette.Rgb
+    pixels: colormap.Rgb
     legend: Legend | None = None
 
 
@@ -62,9 +62,9 @@ def picture_of(
         if layer == "colour":
             return Picture((seen.color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy())
         if layer == "opacity":
-            return Picture(palette.colour(alpha, 0.0, 1.0, GREY), Legend(GREY, 0.0, 1.0, ""))
+            return Picture(colormap.colour(alpha, 0.0, 1.0, GREY), Legend(GREY, 0.0, 1.0, ""))
         if layer == "depth":
-            return _mapped(depth_m, covered, palette.span(depth_m, covered), palette.VIRIDIS, " m")
+            return _mapped(depth_m, covered, colormap.span(depth_m, covered), colormap.VIRIDIS, " m")
         if layer == "V":
             return _from_zero(_array(seen.variance.mean(2).clamp(min=0.0).sqrt()), covered, "")
         spread = render(field, camera, T_camera_world, torch.from_numpy(depth_m), options, backend).uncertainty
@@ -73,11 +73,11 @@ def picture_of(
         return _from_zero(about, covered, " m")
 
 
-def legend_picture(legend: Legend) -> palette.Rgb:
+def legend_picture(legend: Legend) -> colormap.Rgb:
     """Draw a palette with the values of its ends, uint8 [34, 280, 3]."""
     width, height = LEGEND_SIZE
     image = Image.new("RGB", LEGEND_SIZE, PAPER)
-    ramp = palette.colour(np.tile(np.linspace(0.0, 1.0, width), (LEGEND_BAR, 1)), 0.0, 1.0, legend.palette)
+    ramp = colormap.colour(np.tile(np.linspace(0.0, 1.0, width), (LEGEND_BAR, 1)), 0.0, 1.0, legend.palette)
     image.paste(Image.fromarray(ramp), (0, 0))
     draw, font = ImageDraw.Draw(image), ImageFont.load_default(14)
     middle = (height + LEGEND_BAR) // 2
@@ -91,10 +91,10 @@ def _array(values: Tensor) -> Floats:
 
 
 def _from_zero(values: Floats, valid: NDArray[np.bool_], unit: str) -> Picture:
-    return _mapped(values, valid, (0.0, palette.span(values, valid)[1]), palette.INFERNO, unit)
+    return _mapped(values, valid, (0.0, colormap.span(values, valid)[1]), colormap.INFERNO, unit)
 
 
 def _mapped(
     values: Floats, valid: NDArray[np.bool_], ends: tuple[float, float], colours: NDArray[np.float64], unit: str
 ) -> Picture:
-    return Picture(palette.picture(values, valid, *ends, colours), Legend(colours, *ends, unit))
+    return Picture(colormap.picture(values, valid, *ends, colours), Legend(colours, *ends, unit))

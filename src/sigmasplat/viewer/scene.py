@@ -8,7 +8,7 @@ import numpy as np
 import viser
 from PIL import Image
 
-from sigmasplat.metrics.palette import Rgb
+from sigmasplat.drawing.colormap import Rgb
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.types import Matrix

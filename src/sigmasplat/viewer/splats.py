@@ -9,10 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.metrics import palette
+from sigmasplat.drawing import colormap
 from sigmasplat.model import harmonics, se3
 from sigmasplat.model.field import COLUMNS, EXTRAS, GaussianField, left_factor, quaternion_of, transformed
-from sigmasplat.viewer.moment import Piece, to_look_at
+from sigmasplat.viewer.snapshot import Piece, to_look_at
 
 Colouring = Literal["colour", "σ"]
 Floats = NDArray[np.float32]
@@ -28,7 +28,7 @@ class Splats:
 
     centers: Floats
     covariances: Floats
-    colors: palette.Rgb
+    colors: colormap.Rgb
     opacities: Floats
 
     def __len__(self) -> int:
@@ -69,7 +69,7 @@ def cut_of(ordered: Floats, hidden_share: float, least_opacity: float) -> Cut:
 
 def sigma_span(ordered: Floats) -> tuple[float, float]:
     """Return the range of σ that the palette is spread over: from 0 to all but the extremes."""
-    return 0.0, palette.span(ordered, np.ones(len(ordered), bool))[1]
+    return 0.0, colormap.span(ordered, np.ones(len(ordered), bool))[1]
 
 
 def splats_of(field: GaussianField, colouring: Colouring, span: tuple[float, float], cut: Cut) -> Splats:
@@ -77,7 +77,7 @@ def splats_of(field: GaussianField, colouring: Colouring, span: tuple[float, flo
     kept = cut.keeps(field)
     chosen = to_look_at(field.params[kept], {})
     if colouring == "σ":
-        colors = palette.colour(sigma_of(chosen), *span, palette.INFERNO)
+        colors = colormap.colour(sigma_of(chosen), *span, colormap.INFERNO)
     else:
         colors = np.asarray((chosen.colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8))
     return Splats(

@@ -2,18 +2,7 @@
 
 import numpy as np
 
-from sigmasplat.sources.room.textures import (
-    Color,
-    Floats,
-    Texture,
-    hashed,
-    line,
-    mixed,
-    noise,
-    smooth,
-    step,
-    visible,
-)
+from sigmasplat.sources.room.textures import Color, Floats, Texture, hashed, line, mixed, noise, smooth, step, visible
 
 SPINES: tuple[Color, ...] = (
     (0.62, 0.16, 0.14),

@@ -11,17 +11,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources.room.furnish import HALF_X_M, PITCH_M, furnished
 from sigmasplat.sources.room.light import Light, lit
-from sigmasplat.sources.room.shapes import (
-    Indices,
-    Rays,
-    Shape,
-    Windows,
-    cast,
-    dot,
-    image_windows,
-    normalised,
-    surface,
-)
+from sigmasplat.sources.room.shapes import Indices, Rays, Shape, Windows, cast, dot, image_windows, normalised, surface
 from sigmasplat.sources.room.textures import Floats
 
 SUBPIXELS = np.array([[-0.375, -0.125, 0.375, 0.125], [-0.125, 0.375, 0.125, -0.375]], np.float32)

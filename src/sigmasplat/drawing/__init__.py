@@ -1,0 +1,1 @@
+"""Draw images, charts and contact sheets."""

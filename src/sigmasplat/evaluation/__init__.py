@@ -1,0 +1,1 @@
+"""Score runs against the ground truth, and compare runs."""

@@ -1,0 +1,240 @@
+"""Score a finished run: the only place that reads ground truth. Writes metrics.json, images/ and report.html."""
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.config import Config, FinalConfig, InputConfig
+from sigmasplat.drawing import plot
+from sigmasplat.errors import RunError
+from sigmasplat.evaluation import reconstruct
+from sigmasplat.evaluation.novel_views import score_novel_views
+from sigmasplat.io.runs import TRUTH, RunFolder
+from sigmasplat.io.trajectory import write_trajectory
+from sigmasplat.metrics import views
+from sigmasplat.metrics.trajectory import aligned_truth, associate, path_scores_of, truth_in_estimate
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.frame import Frame
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.render import FieldRenderer
+from sigmasplat.report import charts
+from sigmasplat.report.page import Gallery, plan_of, write_page
+from sigmasplat.sources.base import Source
+from sigmasplat.types import Progress
+
+SAME_TIME_S = 1e-4
+"""Log and trajectory hold the same timestamps up to printing."""
+
+Log = list[dict[str, Any]]
+
+
+def evaluate(
+    run: RunFolder,
+    source: Source,
+    *,
+    renderer: views.Renderer | None = None,
+    views_per_kind: int = 40,
+    strips_per_kind: int = 3,
+    mesh: bool = False,
+    progress: Progress = lambda done, total: None,
+) -> dict[str, Any]:
+    """Score trajectory, map and uncertainty of a run against its source, and return the metrics written.
+
+    Training views are the run's keyframes, held-out views the frames that no map was fitted to; of each at most
+    `views_per_kind`, evenly spread. Both are rendered at the estimated poses, at the run's working resolution, with the
+    run's render settings unless a `renderer` is given; and, where the run kept its submaps, in the submap that each
+    frame belongs to as well, as it was before the final map was made. `progress` is told (views done, of how many).
+    With `mesh` the keyframes are fused into mesh.ply, which is scored where the source knows its true surface.
+    Raises RunError if the run stopped before it had a map; SourceError if the truth shares no timestamps with the run,
+    after everything else has been written.
+    """
+    records = run.read_log()
+    if not records:
+        raise RunError(f"run {run.path} has an empty log.jsonl: it stopped before its first frame; run it again")
+    path, field = run.read_trajectory(), run.read_map()
+    log = _posed(records, path, run)
+    truth = source.truth()
+    path_scores, problem = path_scores_of(path, run.read_odometry(), truth)
+    chosen = {kind: _spread(records, views_per_kind) for kind, records in _kinds(log).items()}
+    gallery, config, loops = Gallery(run, strips_per_kind), run.config(), run.read_loops()
+    standard = renderer is None
+    renderer = renderer or FieldRenderer(config.render, config.backend)
+    maps = views.MapSources(field, run.submaps, _anchors(run, records, config.final))
+    scores = _score_views(config, source, maps, chosen, gallery, renderer, progress)
+    metrics = _facts(run, source, log, field, loops) | path_scores | scores | {"reconstruction": None}
+    if mesh:
+        known = None if problem else truth
+        found = reconstruct.fuse_and_score(run, source.camera, source.true_surface(), known, renderer, progress)
+        metrics["reconstruction"] = found
+    metrics["test_views"] = None
+    apart = source.test_views()
+    if apart is not None and truth is not None and problem is None:
+        world = apart.truth(), truth_in_estimate(*_positions(log), truth)
+        metrics["test_views"] = score_novel_views(apart, *world, field, config.input, renderer, gallery, views_per_kind)
+    run.write_metrics(metrics)
+    plots = _draw_plots(run, log, None if problem else truth, loops)
+    warnings = [str(problem)] if problem else []
+    plan = plan_of(run, field, log, source.camera) if standard else None
+    write_page(run, metrics, gallery.strips, plots, warnings, plan)
+    if problem:
+        raise problem
+    return metrics
+
+
+def _anchors(run: RunFolder, records: Log, final: FinalConfig) -> NDArray[np.float64] | None:
+    """Return T_world_submap [S, 4, 4] where the run kept all submaps that its frames belong to, else None.
+
+    None too where there is one and the final map is that one as it was.
+    """
+    count = _submaps(records)
+    if len(run.submaps) != count or (count == 1 and final.seed_from == "submaps" and not final.iterations):
+        return None
+    anchors = run.read_checkpoint()[0].get("T_world_submap")
+    return None if anchors is None or len(anchors) != count else np.asarray(anchors, np.float64)
+
+
+def _submaps(log: Log) -> int:
+    """Count submaps; runs of before there were any are in one piece."""
+    return 1 + max(int(record.get("submap", 0)) for record in log)
+
+
+def _posed(log: Log, path: Trajectory, run: RunFolder) -> Log:
+    """Return the log's records that have a pose, each with its `T_world_camera` [4, 4] and its `row` in the log.
+
+    Raises RunError if none has.
+    """
+    times = np.array([record["timestamp_s"] for record in log], np.float64)
+    rows, poses = associate(times, path.timestamps_s, SAME_TIME_S)
+    if not len(rows):
+        raise RunError(f"run {run.path}: trajectory.txt and log.jsonl share no timestamps; are they of one run?")
+    return [
+        log[row] | {"T_world_camera": path.T_world_camera[pose], "row": int(row)}
+        for row, pose in zip(rows, poses, strict=True)
+    ]
+
+
+def _kinds(log: Log) -> dict[str, Log]:
+    """Split the frames by whether the map was fitted to them."""
+    return {
+        "held-out": [record for record in log if not record["is_keyframe"]],
+        "training": [record for record in log if record["is_keyframe"]],
+    }
+
+
+def _spread(records: Log, most: int) -> Log:
+    """Choose at most `most` records, evenly spread, first and last among them."""
+    rows = np.unique(np.linspace(0, len(records) - 1, min(most, len(records))).round().astype(int))
+    return [records[row] for row in rows]
+
+
+def _score_views(
+    config: Config, source: Source, maps: views.MapSources, chosen: dict[str, Log], gallery: Gallery,
+    renderer: views.Renderer, progress: Progress,
+) -> dict[str, Any]:  # fmt: skip
+    """Render and score the chosen views in the final map and in their submaps; average per kind and map; judge V."""
+    scores = {kind: views.Scores(judged=kind == "held-out") for kind in chosen}
+    before = {kind: views.Scores(judged=kind == "held-out") for kind in chosen}
+    shown = {(kind, r["index"]) for kind, records in chosen.items() for r in _spread(records, gallery.per_kind)}
+    total = sum(len(records) for records in chosen.values())
+    frame_of = partial(_prepared, source, config.input)
+    for done, (final, in_submap) in enumerate(views.render_views(frame_of, maps, chosen, renderer), 1):
+        scores[final.kind].add(final)
+        if (final.kind, final.index) in shown:
+            gallery.add(final)
+        if in_submap:
+            before[final.kind].add(in_submap)
+            if final.kind == "held-out" and (final.kind, final.index) in shown:
+                gallery.add(in_submap, ", in their submaps")
+        progress(done, total)
+    kept = maps.T_world_submap is not None
+    judged, judged_before = (views.judge(found["held-out"].samples) for found in (scores, before))
+    return {
+        **{kind.replace("-", "_"): views.average(found.rows) for kind, found in scores.items()},
+        **{f"{kind.replace('-', '_')}_submaps": views.average(before[kind].rows) if kept else None for kind in chosen},
+        "uncertainty": judged_before if kept else judged,
+        "uncertainty_final": judged if kept and _keeps_variance(config.final) else None,
+    }
+
+
+def _prepared(source: Source, settings: InputConfig, index: int) -> Frame:
+    """Read a frame as the run worked on it."""
+    s = settings
+    return source.frame(index).prepared(s.width, s.min_depth_m, s.max_depth_m, s.crop_px)
+
+
+def _keeps_variance(final: FinalConfig) -> bool:
+    """Tell whether σ² of the final map means something: learnt on while it was refined, or the submaps' own."""
+    return final.uncertainty if final.iterations else final.seed_from == "submaps"
+
+
+def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField, loops: Log) -> dict[str, Any]:
+    """Return what can be counted: frames, keyframes, lost frames, splats, size, speed."""
+    lost = [record["index"] for record in log if record.get("lost")]
+    return {
+        "source": source.name,
+        "status": run.facts().get("status"),
+        "frames": len(log),
+        "keyframes": sum(bool(record["is_keyframe"]) for record in log),
+        "lost": len(lost),
+        "lost_frames": lost,
+        "skipped": run.facts().get("skipped", list(source.skipped)),
+        "splats": len(field),
+        "map_bytes": run.map_bytes(),
+        "frames_per_s": _frames_per_s(run, log),
+        "worst_frame_s": _worst_frame_s(log),
+        "submaps": _submaps(log),
+        "loops": {"tried": len(loops), "accepted": sum(bool(loop.get("accepted")) for loop in loops)},
+        "finish_s": run.facts().get("finish_s"),
+        "total_s": _total_s(run),
+    }
+
+
+def _frames_per_s(run: RunFolder, log: Log) -> float | None:
+    """Return the speed end to end: by the wall clock (run.json, wall_s) if noted, else by the frames' own times."""
+    seconds = run.facts().get("wall_s") or sum(charts.seconds_of(record) for record in log)
+    return len(log) / seconds if seconds else None
+
+
+def _total_s(run: RunFolder) -> float | None:
+    """Return the seconds of all frames and of finishing together, None where run.json does not note both."""
+    frames_s, finish_s = (run.facts().get(key) for key in ("wall_s", "finish_s"))
+    return None if frames_s is None or finish_s is None else float(frames_s + finish_s)
+
+
+def _worst_frame_s(log: Log) -> float | None:
+    """Return the longest time of a frame after the run's first, which makes the map; None where none was timed."""
+    return max((charts.seconds_of(record) for record in log if record["row"]), default=0.0) or None
+
+
+def _positions(log: Log) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the times [N], s, and the estimated positions [N, 3], m, of the logged frames."""
+    times_s = np.array([record["timestamp_s"] for record in log])
+    return times_s, np.array([record["T_world_camera"][:3, 3] for record in log])
+
+
+def _draw_plots(run: RunFolder, log: Log, truth: Trajectory | None, loops: Log) -> dict[str, str]:
+    """Draw path, submaps and times in both themes, and write truth.txt; return the captions by name."""
+    times, estimate = _positions(log)
+    known: NDArray[np.float64] | None = None
+    aligned: Trajectory | None = None
+    if truth is not None:
+        rows, aligned = aligned_truth(times, estimate, truth)
+        known = np.full_like(estimate, np.nan)
+        known[rows] = aligned.T_world_camera[:, :3, 3]
+    _keep_truth(run, aligned)
+    drawn = charts.of_run(log, estimate, known, loops)
+    for name, (found, _) in drawn.items():
+        for theme in (plot.LIGHT, plot.DARK):
+            size = plot.SIZE if name != "seconds" else (plot.SIZE[0], 300)
+            run.write_image(f"{name}-{theme.name}.png", plot.draw_charts(found, theme, size))
+    return {name: caption for name, (_, caption) in drawn.items()}
+
+
+def _keep_truth(run: RunFolder, aligned: Trajectory | None) -> None:
+    """Write truth.txt for those who show a run; remove an earlier one where no truth is known."""
+    if aligned is None:
+        (run.path / TRUTH).unlink(missing_ok=True)
+    else:
+        write_trajectory(run.path / TRUTH, aligned)

@@ -1,0 +1,127 @@
+"""Make a surface of a run's map: render depth and colour at every keyframe, fuse, cut, clean (VarSplat §7).
+
+What is fused is the map's own view, never a recorded image nor the truth.
+"""
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from sigmasplat.config import Config
+from sigmasplat.errors import RunError
+from sigmasplat.io.mesh import write_mesh
+from sigmasplat.io.runs import MESH, RunFolder
+from sigmasplat.metrics import reconstruction
+from sigmasplat.metrics.splats import splats_to_surface
+from sigmasplat.metrics.trajectory import align_rigid, associate, paired
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.mesh import Mesh
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.slam.fusion import VOXEL_M, FusionView, Renderer, count_keyframes, fuse, fusion_views
+from sigmasplat.types import Progress
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What surfaces need of a run, read once: settings, checkpoint, and the camera of the images it worked on."""
+
+    run: RunFolder
+    config: Config
+    checkpoint: dict[str, Tensor]
+    camera: Camera
+
+    @staticmethod
+    def of(run: RunFolder, camera: Camera) -> "Recording":
+        """Read a run; `camera` is the source's. Raises RunError if it has no checkpoint or no keyframe."""
+        settings = run.config().input
+        return Recording.at(run, camera.prepared(settings.width, settings.crop_px))
+
+    @staticmethod
+    def at(run: RunFolder, camera: Camera) -> "Recording":
+        """Read a run; `camera` is of the images it worked on. Raises RunError as `of` does."""
+        config, (checkpoint, _) = run.config(), run.read_checkpoint()
+        if not {"keyframes", "T_world_camera"} <= set(checkpoint) or not len(checkpoint["keyframes"]):
+            raise RunError(f"run {run.path} has no keyframes in its checkpoint; run it again")
+        return Recording(run, config, checkpoint, camera)
+
+    def standpoints(self) -> tuple[Iterable[FusionView], int]:
+        """Return the keyframes, each before its own submap, or before the map of a run in one piece, and their number.
+
+        Raises RunError if there is no map, or the checkpoint does not know where the submaps are.
+        """
+        submaps, tensors = self.run.submaps, self.checkpoint
+        if not len(submaps):
+            field, poses = self.run.read_map(), np.asarray(tensors["T_world_camera"][tensors["keyframes"]], np.float64)
+            return [FusionView(field, self.camera, se3.inverse(T), T) for T in poses], len(poses)
+        anchors = np.asarray(tensors.get("T_world_submap", np.empty((0, 4, 4))), np.float64)
+        if len(anchors) < len(submaps):
+            raise RunError(
+                f"run {self.run.path} has {len(submaps)} submaps, its checkpoint places {len(anchors)}; run it again"
+            )
+        return fusion_views(submaps, list(anchors)), count_keyframes(submaps)
+
+    def surface(self, voxel_m: float, renderer: Renderer | None, progress: Progress) -> Mesh:
+        """Fuse the keyframes. Raises RunError as `standpoints` does, ConfigError unless voxel_m > 0."""
+        standpoints, total = self.standpoints()
+        return fuse(standpoints, total, self.config, voxel_m=voxel_m, renderer=renderer, progress=progress)
+
+
+def reconstruct(
+    run: RunFolder,
+    camera: Camera,
+    *,
+    voxel_m: float = VOXEL_M,
+    renderer: Renderer | None = None,
+    progress: Progress = lambda done, total: None,
+) -> Mesh:
+    """Fuse what the run's map shows at its keyframes into a mesh in the run's world; `camera` is the source's.
+
+    `progress` is told (keyframes done, of how many). Raises RunError if the run has no map, no checkpoint or no
+    keyframe; ConfigError unless voxel_m > 0.
+    """
+    return Recording.of(run, camera).surface(voxel_m, renderer, progress)
+
+
+def fuse_and_score(
+    run: RunFolder,
+    camera: Camera,
+    true_surface: Mesh | None,
+    true_path: Trajectory | None,
+    renderer: Renderer | None = None,
+    progress: Progress = lambda done, total: None,
+) -> dict[str, Any] | None:
+    """Write the run's mesh.ply and return its scores; None unless both the true surface and the true path are known."""
+    recording = Recording.of(run, camera)
+    mesh = recording.surface(VOXEL_M, renderer, progress)
+    write_mesh(run.path / MESH, mesh)
+    if true_surface is None or true_path is None:
+        return None
+    return score(recording, mesh, true_surface, true_path, progress)
+
+
+def score(
+    recording: Recording,
+    mesh: Mesh,
+    true_surface: Mesh,
+    true_path: Trajectory,
+    progress: Progress = lambda done, total: None,
+) -> dict[str, float]:
+    """Score a run's mesh and its splats against the true surface, aligned as its path is for the ATE.
+
+    Training views are the true poses of the keyframes. Raises SourceError if path and truth share no timestamps.
+    """
+    path, tensors = recording.run.read_trajectory(), recording.checkpoint
+    ours, theirs = paired(path, true_path)
+    T_truth_world = align_rigid(ours[:, :3, 3], theirs[:, :3, 3])
+    _, rows = associate(tensors["timestamps_s"][tensors["keyframes"]].numpy(), true_path.timestamps_s)
+    views = true_path.T_world_camera[rows]
+    seen = (true_surface, recording.camera, views)
+    of_mesh = reconstruction.score(mesh.moved(T_truth_world), *seen, progress=progress)
+    field = recording.run.read_map()
+    centers = field.means.numpy().astype(np.float64) @ T_truth_world[:3, :3].T + T_truth_world[:3, 3]
+    of_splats = splats_to_surface(centers, field.opacities.numpy().astype(np.float64), *seen)
+    return asdict(of_mesh) | asdict(of_splats)

@@ -1,0 +1,54 @@
+"""Write views and points as a sparse model in COLMAP's text format: cameras.txt, images.txt, points3D.txt.
+
+Layout: COLMAP's documentation, "Output Format". Poses are world to camera, quaternions wxyz; the image's corner is
+(0, 0) and the first pixel's centre (½, ½), so the principal point is half a pixel more than ours. Points carry no
+tracks: no features were matched.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.exports.points import color_bytes
+from sigmasplat.io.atomic import write_text
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.types import Matrix
+
+Points = NDArray[np.floating]
+
+
+def write_model(
+    folder: Path, camera: Camera, names: Sequence[str], T_world_camera: Matrix, points: Points, colors: Points
+) -> None:
+    """Write a model into an existing folder; every image is of the one camera.
+
+    names: of the images [N], relative to the folder of images; T_world_camera [N, 4, 4]; points [P, 3] m in the world;
+    colors [P, 3] in [0, 1]. Raises RunError if not writable.
+    """
+    write_text(folder / "cameras.txt", _cameras(camera))
+    write_text(folder / "images.txt", _images(names, T_world_camera))
+    write_text(folder / "points3D.txt", _points(points, colors))
+
+
+def _cameras(c: Camera) -> str:
+    numbers = " ".join(f"{value:.12g}" for value in (c.fx, c.fy, c.cx + 0.5, c.cy + 0.5))
+    return f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, FX, FY, CX, CY\n1 PINHOLE {c.width} {c.height} {numbers}\n"
+
+
+def _images(names: Sequence[str], T_world_camera: Matrix) -> str:
+    """Return two lines an image; the second, for its features, is empty."""
+    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then POINTS2D as (X, Y, POINT3D_ID)"]
+    for number, (name, T) in enumerate(zip(names, se3.inverse(T_world_camera), strict=True), 1):
+        pose = (*se3.quaternion_from_rotation(T[:3, :3]), *T[:3, 3])
+        lines += [f"{number} {' '.join(f'{value:.12g}' for value in pose)} 1 {name}", ""]
+    return "\n".join(lines) + "\n"
+
+
+def _points(points: Points, colors: Points) -> str:
+    """Return a line a point; its error is 0 and its track empty."""
+    rows = zip(points.tolist(), color_bytes(colors).tolist(), strict=True)
+    lines = (f"{i} {x:.6f} {y:.6f} {z:.6f} {r} {g} {b} 0\n" for i, ((x, y, z), (r, g, b)) in enumerate(rows, 1))
+    return "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n" + "".join(lines)

@@ -1,0 +1,1 @@
+"""Draw a floor plan from a map, with regions to rescan."""

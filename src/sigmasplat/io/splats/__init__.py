@@ -1,0 +1,1 @@
+"""Read and write splats: PLY, compressed PLY, SPZ, .splat."""

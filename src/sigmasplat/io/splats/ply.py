@@ -1,0 +1,121 @@
+"""Read and write splats as the field's standard 3DGS PLY, which SuperSplat and other viewers open.
+
+Columns: x y z, nx ny nz (0), f_dc_0..2 = (colour − ½)/C0, f_rest_0..44 where colours depend on the direction (all
+harmonics of red, of green, of blue), opacity (logit), scale_0..2 (log metres), rot_0..3 (wxyz), and ours at the end:
+log_variance_0..2. Readers that look columns up by name pass over extra ones: SuperSplat and splat-transform
+(PlayCanvas), antimatter15/splat, nianticlabs/spz. Readers that know one record of 62 floats by heart and no names take
+ours for garbage: the viewer that came with 3DGS (SIBR), 3DGS.cpp, older Unity importers. For these there is `plain`:
+those 62 columns, f_rest 0 where a map has none. No comments either way: SIBR counts the splats from line 3.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sigmasplat.errors import SourceError
+from sigmasplat.io.atomic import replacing
+from sigmasplat.io.ply_elements import read_header
+from sigmasplat.io.splats.values import SH_C0, check_values, refuse_not_finite
+from sigmasplat.model.field import COLUMNS, EXTRAS, INITIAL_LOG_VARIANCE, GaussianField, Rows
+from sigmasplat.model.harmonics import DEGREES, count
+
+PLY_COLUMNS: dict[str, list[str]] = {
+    "means": ["x", "y", "z"],
+    "quats": [f"rot_{i}" for i in range(4)],
+    "log_scales": [f"scale_{i}" for i in range(3)],
+    "opacity_logits": ["opacity"],
+    "colors": [f"f_dc_{i}" for i in range(3)],
+    "log_variances": [f"log_variance_{i}" for i in range(3)],
+}
+BEFORE_HARMONICS = [*PLY_COLUMNS["means"], "nx", "ny", "nz", *PLY_COLUMNS["colors"]]
+AFTER_HARMONICS = ["opacity", *PLY_COLUMNS["log_scales"], *PLY_COLUMNS["quats"]]
+REST = "f_rest_"
+
+
+def write_field(path: Path, field: GaussianField, *, plain: bool = False) -> None:
+    """Write the splats as binary little-endian 3DGS PLY, in one step; `plain`: in 3DGS's own 62 columns, without σ².
+
+    Raises RunError if the place is not writable.
+    """
+    params = field.params.detach().cpu().numpy().astype(np.float32)
+    harmonics = _by_channel(field)
+    rest = [f"{REST}{i}" for i in range(EXTRAS["harmonics"] if plain else harmonics.shape[1])]
+    ours = [] if plain else PLY_COLUMNS["log_variances"]
+    names_in_file = [*BEFORE_HARMONICS, *rest, *AFTER_HARMONICS, *ours]
+    rows = np.zeros(len(params), np.dtype([(name, "<f4") for name in names_in_file]))
+    for group in (group for group, names in PLY_COLUMNS.items() if names[0] in names_in_file):
+        names, values = PLY_COLUMNS[group], params[:, COLUMNS[group]]
+        if group == "colors":
+            values = ((values.astype(np.float64) - 0.5) / SH_C0).astype(np.float32)
+        for i, name in enumerate(names):
+            rows[name] = values[:, i]
+    for i, name in enumerate(rest[: harmonics.shape[1]]):
+        rows[name] = harmonics[:, i]
+    properties = "".join(f"property float {name}\n" for name in names_in_file)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        file.write(header.encode("ascii"))
+        file.write(rows.tobytes())
+
+
+def _by_channel(field: GaussianField) -> NDArray[np.float32]:
+    """Return a field's harmonics in the file's order [N, 45], or [N, 0]."""
+    if "harmonics" not in field.extras:
+        return np.empty((len(field), 0), np.float32)
+    values = field.extras["harmonics"].params.detach().cpu().numpy().astype(np.float32)
+    return values.reshape(len(field), -1, 3).swapaxes(1, 2).reshape(values.shape)
+
+
+def read_field(path: Path) -> GaussianField:
+    """Read a 3DGS PLY of ours or of another program; missing log_variance becomes −7.
+
+    Raises SourceError if it is missing, not a binary PLY of splats, truncated, holds nan, inf or a zero quaternion, or
+    f_rest of another number than 9, 24 or 45.
+    """
+    try:
+        with path.open("rb") as file:
+            elements = read_header(file, path)
+            if not elements or elements[0].name != "vertex" or elements[0].count < 0:
+                raise SourceError(f"{path}: the PLY's first element is not 'vertex', so it is not a map of splats")
+            rows = elements[0].read(file, path)
+    except OSError as problem:
+        raise SourceError(f"cannot read map {path}: {problem.strerror or problem}") from problem
+    field, harmonics = GaussianField(torch.from_numpy(_params(rows, path))), _harmonics(rows, path)
+    if harmonics is not None:
+        field.extras["harmonics"] = Rows(torch.from_numpy(harmonics))
+    return field
+
+
+def _harmonics(rows: NDArray[np.void], path: Path) -> NDArray[np.float32] | None:
+    """Gather harmonics [N, 45] from f_rest, which lower degrees have fewer of; None without. Raises SourceError."""
+    given = sum(name.startswith(REST) for name in rows.dtype.names or ())
+    names, each = [f"{REST}{i}" for i in range(given)], given // 3
+    if not names:
+        return None
+    known = [3 * count(degree) for degree in range(1, DEGREES + 1)]
+    if given not in known or not set(names) <= set(rows.dtype.names or ()):
+        raise SourceError(f"{path} has {given} columns f_rest, expected 0 or f_rest_0 to 8, 23 or 44 (degree 1 to 3)")
+    harmonics = np.zeros((len(rows), EXTRAS["harmonics"]), np.float32)
+    for i, name in enumerate(names):
+        harmonics[:, 3 * (i % each) + i // each] = rows[name]
+    refuse_not_finite(harmonics, path)
+    return harmonics
+
+
+def _params(rows: NDArray[np.void], path: Path) -> NDArray[np.float32]:
+    """Gather a field's columns [N, 17] from the rows of a PLY. Raises SourceError on missing or unusable values."""
+    present = set(rows.dtype.names or ())
+    required = [name for group, names in PLY_COLUMNS.items() if group != "log_variances" for name in names]
+    missing = [name for name in required if name not in present]
+    if missing:
+        raise SourceError(f"{path} is no map of splats: no column {', '.join(missing)} (compressed, or a point cloud?)")
+    params = np.full((len(rows), 17), INITIAL_LOG_VARIANCE, np.float32)
+    for group, names in PLY_COLUMNS.items():
+        for column, name in zip(range(17)[COLUMNS[group]], names, strict=True):
+            if name in present:
+                params[:, column] = rows[name]
+    params[:, COLUMNS["colors"]] = params[:, COLUMNS["colors"]] * SH_C0 + 0.5
+    check_values(params, path)
+    return params

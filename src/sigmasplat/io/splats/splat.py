@@ -1,0 +1,75 @@
+"""Read and write splats as `.splat`, the web's plain format: 32 bytes each, no header.
+
+Three float32 of position (metres), three of scale (metres, not their logarithms), a byte each of red, green, blue and
+opacity (255ths), a byte each of the unit quaternion wxyz (128 = 0, ±128 = ±1). The splats that cover most lie first, so
+that viewers show something before the rest has come. Colours are clipped to 0 … 1; harmonics, σ² and correlations have
+no place in the format: they are lost. Layout: antimatter15/splat, convert.py and main.js.
+
+There is nothing to recognise such a file by, but its length and that nearly any other bytes make no unit quaternions.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.errors import SourceError
+from sigmasplat.io.atomic import replacing
+from sigmasplat.io.splats.values import SplatValues, opacities_of, opacity_bytes, unit
+from sigmasplat.model.field import GaussianField
+
+ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 3), ("opacity", "u1"), ("quat", "u1", 4)])
+SMALLEST_SCALE_M = 1e-12
+UNIT = (0.9, 1.1)
+"""Norms that a unit quaternion can have after rounding to bytes, with room for other writers' ways of rounding."""
+
+
+def write_field(path: Path, field: GaussianField) -> None:
+    """Write the splats, in one step. Raises RunError if the place is not writable."""
+    values = SplatValues.of(field)
+    cover = values.log_scales.sum(1) + np.log(np.maximum(values.opacities, np.finfo(np.float64).tiny))
+    values = values.ordered(np.argsort(-cover, kind="stable"))
+    rows = np.empty(len(values), ROW)
+    rows["mean"] = values.means
+    rows["scale"] = np.exp(values.log_scales)
+    rows["color"] = np.round(np.clip(values.colors, 0.0, 1.0) * 255.0)
+    rows["opacity"] = opacity_bytes(values.opacities)
+    rows["quat"] = np.clip(np.round(values.quats * 128.0 + 128.0), 0.0, 255.0)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        file.write(rows.tobytes())
+
+
+def read_field(path: Path) -> GaussianField:
+    """Read a .splat file; σ² becomes exp(−7).
+
+    Raises SourceError if it is missing, empty, of another length than whole splats, or holds what no splats do.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as problem:
+        raise SourceError(f"cannot read map {path}: {problem.strerror or problem}") from problem
+    if not data or len(data) % ROW.itemsize:
+        what = f"{len(data)} bytes are no whole number of splats of {ROW.itemsize}" if data else "it is empty"
+        raise SourceError(f"{path} is no .splat file, or is truncated: {what}")
+    rows = np.frombuffer(data, ROW)
+    quats = (rows["quat"] - 128.0) / 128.0
+    _check(rows, np.linalg.norm(quats, axis=1), path)
+    return SplatValues(
+        rows["mean"].astype(np.float64),
+        unit(quats),
+        np.log(np.maximum(rows["scale"].astype(np.float64), SMALLEST_SCALE_M)),
+        opacities_of(rows["opacity"]),
+        rows["color"] / 255.0,
+        np.empty((len(rows), 0)),
+    ).field(path)
+
+
+def _check(rows: NDArray[np.void], norms: NDArray[np.float64], path: Path) -> None:
+    """Raise SourceError at the first splat that is none."""
+    finite = np.isfinite(rows["mean"]).all(1) & np.isfinite(rows["scale"]).all(1) & (rows["scale"] >= 0.0).all(1)
+    bad = np.flatnonzero(~(finite & (norms > UNIT[0]) & (norms < UNIT[1])))
+    if len(bad):
+        raise SourceError(
+            f"{path} is no .splat file, or is damaged: splat {bad[0]} is no finite position, scale and rotation "
+            f"({len(bad)} of {len(rows)} splats are none)"
+        )

@@ -1,0 +1,56 @@
+"""One recorded image beside its rendering, and the scores of this pair."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.metrics.image import depth_l1, psnr, ssim
+
+COVERED_ALPHA = 0.5
+"""Above this alpha the map is taken to have a surface there (depth = Σwz / Σw is meant)."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredView:
+    """A recorded image and its rendering at the estimated pose, float32.
+
+    recorded, rendered: [H, W, 3] in [0, 1]; recorded_depth_m [H, W] (0 = no reading); rendered_depth_m [H, W]
+    (0 where alpha ≤ ½); alpha [H, W]; variance: V [H, W, 3], colour² (VarSplat §1); notes are written under the strip.
+    """
+
+    index: int
+    kind: str
+    recorded: NDArray[np.float32]
+    recorded_depth_m: NDArray[np.float32]
+    rendered: NDArray[np.float32]
+    rendered_depth_m: NDArray[np.float32]
+    alpha: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Return the pixels with a depth reading [H, W]: the ones every score is taken on."""
+        return self.recorded_depth_m > 0
+
+    @property
+    def uncertainty(self) -> NDArray[np.float32]:
+        """Return V averaged over the channels [H, W], colour²; rounding below 0 counts as 0."""
+        return np.asarray(np.maximum(self.variance.mean(-1), 0.0), np.float32)
+
+    @property
+    def squared_error(self) -> NDArray[np.float32]:
+        """Return (Ĉ − C)² averaged over the channels [H, W], colour²."""
+        return np.asarray(((self.rendered - self.recorded) ** 2).mean(-1), np.float32)
+
+    def scores(self) -> dict[str, float]:
+        """Return PSNR (dB), SSIM, depth L1 (m) and the share of readings that the map covers, on valid pixels."""
+        valid = self.valid
+        covered = float((self.rendered_depth_m > 0)[valid].mean()) if valid.any() else float("nan")
+        return {
+            "psnr_db": psnr(self.rendered, self.recorded, valid),
+            "ssim": ssim(self.rendered, self.recorded, valid),
+            "depth_l1_m": depth_l1(self.rendered_depth_m, self.recorded_depth_m),
+            "depth_coverage": covered,
+        }

@@ -1,0 +1,1 @@
+"""Build a run's report: one HTML page."""

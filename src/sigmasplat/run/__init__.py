@@ -1,0 +1,1 @@
+"""Run a sequence through SLAM into a run folder; resume, profile, show progress."""

@@ -1,0 +1,1 @@
+"""Close loops: find candidate submaps, register them, solve the pose graph."""

@@ -1,0 +1,164 @@
+"""Close loops: recognise places among finished submaps, register them, and spread what that says over the anchors."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.config import Config, LoopConfig
+from sigmasplat.errors import ConfigError
+from sigmasplat.model import se3
+from sigmasplat.model.atlas import Atlas
+from sigmasplat.model.field import COLUMNS
+from sigmasplat.model.submap import Submap, SubmapStore
+from sigmasplat.render.view import View
+from sigmasplat.slam.loop_closure.candidates import (
+    Candidate,
+    SubmapDescriptor,
+    SubmapPair,
+    find_candidates,
+    find_nearby,
+    opacity_ratio,
+    pairs_to_register,
+)
+from sigmasplat.slam.loop_closure.descriptors import Descriptor, OrientationGrid
+from sigmasplat.slam.loop_closure.pose_graph import Edge, LoopVerdict, optimise
+from sigmasplat.slam.loop_closure.registration import Registrar, Registration
+from sigmasplat.types import Matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """A pair of submaps that look alike, and what became of it.
+
+    query, database: submaps; query_frame, database_frame: their most alike keyframes' frames; similarity, gated: of
+    these (VarSplat §4); residual, overlap, localised: of the registration; translation_m, rotation_deg: by how much
+    T_query_database [4, 4] differs from the poses known before; chi2, weight: the pose graph's verdict on it; accepted:
+    whether it holds.
+    """
+
+    query: int
+    database: int
+    query_frame: int
+    database_frame: int
+    similarity: float
+    gated: float
+    accepted: bool
+    reason: str
+    residual: float
+    overlap: float
+    localised: int
+    translation_m: float
+    rotation_deg: float
+    T_query_database: Matrix
+    chi2: float = float("nan")
+    weight: float = float("nan")
+
+    def record(self) -> dict[str, Any]:
+        """Return plain values, T_query_database as 4 rows."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__} | {
+            "T_query_database": self.T_query_database.tolist()
+        }
+
+
+def make_descriptor(config: LoopConfig) -> Descriptor:
+    """Make what describes keyframes. Raises ConfigError where NetVLAD is asked for without weights, or as they load."""
+    if config.descriptor == "grid":
+        return OrientationGrid()
+    if not config.weights:
+        raise ConfigError("loops.descriptor=netvlad needs a file of weights: --set loops.weights=FILE")
+    from sigmasplat.slam.loop_closure.netvlad import NetVlad, NetVladWeights
+
+    return NetVlad(NetVladWeights.load(config.weights))
+
+
+@dataclass(eq=False)
+class LoopCloser:
+    """Remembers how finished submaps look, and every edge between them; the only one to move anchors."""
+
+    config: Config
+    store: SubmapStore
+    view: View
+    signatures: list[SubmapDescriptor] = field(default_factory=list)
+    odometry: list[Edge] = field(default_factory=list)
+    closed: list[Edge] = field(default_factory=list)
+    loops: list[Loop] = field(default_factory=list)
+
+    def submap_begun(self, index: int, T_before_new: Matrix, information: Matrix) -> None:
+        """Take note of how tracking tied a new submap to the one before it: T_before_new [4, 4], and the information
+        [6, 6] of its left twist (m, rad)."""
+        self.odometry.append(Edge(index - 1, index, T_before_new, information, loop=False))
+
+    def submap_finished(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], atlas: Atlas) -> list[Loop]:
+        """Look for loops from a finished submap to earlier ones; where one is found, correct the anchors.
+
+        descriptors [D]: of its keyframes, in order, of unit norm or zero. Returns the pairs tried, the latest verdict
+        on each.
+        """
+        c, field = self.config.loops, submap.field
+        if not c.close or not descriptors:
+            return []
+        log_variances = field.params[:, COLUMNS["log_variances"]].numpy()
+        ratio = opacity_ratio(field.opacities.numpy(), log_variances, c.tau, c.weight_max)
+        signature = SubmapDescriptor(submap.index, np.stack(descriptors), ratio)
+        pairs = self._pairs(signature, atlas)
+        self.signatures.append(signature)
+        tried = [self._try(pair, submap, atlas) for pair in pairs]
+        if any(loop.accepted for loop in tried):
+            self._correct(atlas)
+        return self.loops[len(self.loops) - len(tried) :]
+
+    def _pairs(self, query: SubmapDescriptor, atlas: Atlas) -> list[SubmapPair]:
+        """Choose the earlier submaps to register with: those that look alike, then those that should be near."""
+        c = self.config.loops
+        candidates = find_candidates(
+            query, self.signatures, c.min_similarity, c.min_interval, c.similarity_floor, c.uncertainty
+        )
+        keyframes = self.config.registration.keyframes
+        pairs = pairs_to_register(candidates, query, self.signatures, keyframes)
+        if c.near_m:
+            poses = [atlas.T_world_keyframe(index) for index in range(query.index + 1)]
+            near_rad, known = np.deg2rad(c.near_deg), {pair.best.database_submap for pair in pairs}
+            near = find_nearby(query, self.signatures, poses, c.near_m, near_rad, c.min_interval, keyframes)
+            pairs += [pair for pair in near if pair.best.database_submap not in known]
+        return pairs[: c.most] if c.most else pairs
+
+    def _try(self, pair: SubmapPair, a: Submap, atlas: Atlas) -> Loop:
+        """Register a pair, of which `a` is the query, and take note of it, accepted or not."""
+        b = self.store.load(pair.best.database_submap)
+        known = se3.inverse(atlas.anchors[a.index]) @ atlas.anchors[b.index]
+        found = Registrar(self.config, self.store, self.view).register(pair, a, b, known)
+        loop = described(pair.best, a, b, found, known)
+        self.loops.append(loop)
+        if found.accepted:
+            self.closed.append(Edge(a.index, b.index, found.T_a_b, found.information, loop=True))
+        return loop
+
+    def _correct(self, atlas: Atlas) -> None:
+        """Solve the pose graph, move the anchors, and note its verdict on every loop registered so far."""
+        solution = optimise(np.stack(atlas.anchors), [*self.odometry, *self.closed])
+        atlas.anchors[:] = list(solution.T_world_node)
+        verdicts = iter(solution.verdicts)
+        registered = [i for i, loop in enumerate(self.loops) if np.isfinite(loop.chi2) or loop.accepted]
+        for i in registered:
+            self.loops[i] = judged(self.loops[i], next(verdicts))
+
+
+def described(best: Candidate, a: Submap, b: Submap, found: Registration, known: Matrix) -> Loop:
+    """Return what became of registering submaps a and b, whose most alike keyframes are `best`'s; known: T_a_b [4, 4]
+    of before."""
+    seen_from = b.T_submap_camera[best.database_keyframe]
+    moved = se3.inverse(known @ seen_from) @ found.T_a_b @ seen_from
+    return Loop(
+        a.index, b.index, a.frames[best.query_keyframe], b.frames[best.database_keyframe], best.similarity,
+        best.gated, found.accepted, found.reason, found.residual, found.overlap, found.localised,
+        float(np.linalg.norm(moved[:3, 3])), float(np.rad2deg(se3.rotation_angle(moved[:3, :3]))), found.T_a_b,
+    )  # fmt: skip
+
+
+def judged(loop: Loop, verdict: LoopVerdict) -> Loop:
+    """Return a registered loop with the pose graph's verdict on it."""
+    reason = "accepted" if verdict.accepted else f"the pose graph disagrees (χ² {verdict.chi2:.0f})"
+    return replace(loop, accepted=verdict.accepted, reason=reason, chi2=verdict.chi2, weight=verdict.weight)

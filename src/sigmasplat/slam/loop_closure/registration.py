@@ -1,0 +1,220 @@
+"""Lay two submaps onto each other: keyframes of each are localised in the other, and must agree (VarSplat §5)."""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from sigmasplat.config import Config, RegistrationConfig, TrackingConfig
+from sigmasplat.fit.align import align
+from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
+from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.references import live_image, map_reference
+from sigmasplat.fit.target import Target
+from sigmasplat.model import se3
+from sigmasplat.model.submap import Submap, SubmapStore
+from sigmasplat.render.view import ReferenceView, View
+from sigmasplat.slam.drift import symmetric
+from sigmasplat.slam.loop_closure.candidates import SubmapPair
+from sigmasplat.types import Matrix
+
+FLOOR_M, FLOOR_RAD = 0.005, 0.003
+"""Deviation that every registration is given at least: two maps of one wall differ by about so much."""
+HOPELESS = 0.5
+"""A keyframe whose alignment explains less than this share of what counts is not descended any further."""
+OVERLAP_SAMPLE = 5000
+OPAQUE = 0.95
+"""Pixels count where the other submap is this opaque (VarSplat §5 asks it of depth; here of colour as well)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Localisation:
+    """One keyframe found in the other submap, as T_a_b [4, 4] between the submaps; residual: the loss it ended with;
+    covariance [6, 6] of T_a_b's left twist (m, rad); agreement and overlap as in `PoseFit`."""
+
+    T_a_b: Matrix
+    residual: float
+    covariance: Matrix
+    agreement: float
+    overlap: float
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """T_a_b [4, 4] of submaps a and b, or why it is refused.
+
+    information [6, 6]: inverse covariance of T_a_b's left twist (m, rad); residual: mean loss of the localisations that
+    counted, `localised` of them; overlap: share of splats with a neighbour in the other submap.
+    """
+
+    T_a_b: Matrix
+    information: Matrix
+    residual: float
+    localised: int
+    overlap: float
+    accepted: bool
+    reason: str
+
+
+class Registrar:
+    """Registers submaps of one store through one view, whose camera all of them share."""
+
+    def __init__(self, config: Config, store: SubmapStore, view: View) -> None:
+        self.config, self.store, self.view = config.registration, store, view
+        self.tracking = tracking_of(config.registration, config.tracking)
+
+    def register(self, pair: SubmapPair, a: Submap, b: Submap, T_a_b: Matrix) -> Registration:
+        """Register the submaps a (query) and b (database) of a pair, T_a_b [4, 4] as known so far."""
+        found = [self._localise(a, k, b, pair.database_keyframes, T_a_b) for k in pair.query_keyframes]
+        back = [self._localise(b, k, a, pair.query_keyframes, se3.inverse(T_a_b)) for k in pair.database_keyframes]
+        found += [turned(localisation) for localisation in back]
+        centre_b = b.T_submap_camera[pair.best.database_keyframe][:3, 3]
+        return self._judge(a, b, found, centre_b, T_a_b)
+
+    def _localise(
+        self, own: Submap, keyframe: int, other: Submap, alike: Sequence[int], T_own_other: Matrix
+    ) -> Localisation:
+        """Find a keyframe of `own` in `other`: aligned from where it should be and from the keyframes it is like, then
+        by descent of the uncertainty-weighted loss with exposure, from the best of them."""
+        T_own_camera, params = own.T_submap_camera[keyframe], other.field.params.to(self.view.sums.device)
+        target, live = self._laid_out(own, keyframe)
+        expected = se3.inverse(T_own_camera) @ T_own_other
+        guesses = [expected, *(se3.inverse(other.T_submap_camera[k]) for k in alike)]
+        fit = max((self._aligned(params, live, guess) for guess in guesses), key=score)
+        if fit.alignment is None or score(fit) > HOPELESS * self.config.share_least:
+            fit = fit_pose_adam(params, self.view, target, fit.T_camera_world, self.tracking, self.config.iterations)
+        A = se3.adjoint(T_own_camera)
+        covariance = A @ self._covariance(params, live, fit.T_camera_world) @ A.T
+        return Localisation(T_own_camera @ fit.T_camera_world, fit.loss, covariance, fit.agreement, fit.overlap)
+
+    def _laid_out(self, submap: Submap, keyframe: int) -> tuple[Target, Pyramid]:
+        picture = self.store.picture(submap.index, keyframe)
+        target = Target.of_picture(picture, submap.camera, (self.view.sums.shape[1], self.view.sums.shape[2]))
+        return target, live_image(self.view, picture.unit_color, picture.depth_m, target)
+
+    def _aligned(self, params: Tensor, live: Pyramid, guess: Matrix) -> PoseFit:
+        """Align a keyframe to the map seen from a guess, and once more to the map seen from there."""
+        if isinstance(self.view, ReferenceView):
+            return PoseFit(guess, 0.0, 0.0, np.nan, np.nan, 0)  # alignment needs the compiled kernels
+        for _ in range(2):
+            fit = fit_pose_align(map_reference(params, self.view, guess, self.tracking), live, guess, self.tracking)
+            guess = fit.T_camera_world
+        return fit
+
+    def _covariance(self, params: Tensor, live: Pyramid, T_camera_map: Matrix) -> Matrix:
+        """Return the covariance [6, 6] of T_camera_map's left twist, as alignment to the map there sees it."""
+        if isinstance(self.view, ReferenceView):
+            return np.zeros((6, 6))
+        reference = map_reference(params, self.view, T_camera_map, self.tracking)
+        covariance = align(reference.pyramid, live, np.eye(4), 0, self.tracking.align_weight_color).covariance
+        return covariance if np.isfinite(covariance).all() else np.eye(6)
+
+    def _judge(
+        self, a: Submap, b: Submap, found: Sequence[Localisation], centre_b: Matrix, T_a_b: Matrix
+    ) -> Registration:
+        c = self.config
+        good = [f for f in found if f.agreement >= c.agreement_least and f.agreement * f.overlap >= c.share_least]
+        if len(good) < 2:
+            best = max(f.agreement * f.overlap for f in found)
+            why = f"{len(good)} of {len(found)} keyframes found their place (best explains {best:.0%})"
+            return refused(T_a_b, found, len(good), why)
+        agreed = consensus(good, centre_b, c.spread_m, np.deg2rad(c.spread_deg))
+        if len(agreed) < 2:
+            return refused(T_a_b, good, len(agreed), f"{len(good)} keyframes found places that disagree")
+        mean = combined(agreed)
+        overlap = shared(a, b, mean, c.overlap_m)
+        if overlap < c.overlap_least:
+            return refused(T_a_b, agreed, len(agreed), f"overlap {overlap:.2f} is below {c.overlap_least}", overlap)
+        residual = float(np.mean([f.residual for f in agreed]))
+        return Registration(mean, information(agreed, mean), residual, len(agreed), overlap, True, "accepted")
+
+
+def tracking_of(registration: RegistrationConfig, tracking: TrackingConfig) -> TrackingConfig:
+    """Return the settings by which keyframes are localised: tracking's, with registration's weights and rates."""
+    r = registration
+    return dataclasses.replace(
+        tracking, uncertainty=r.uncertainty, tau=r.tau, weight_max=r.weight_max, weight_color=r.weight_color,
+        lr_rotation=r.lr_rotation, lr_translation=r.lr_translation, exposure=r.exposure, plateau_stop=r.plateau_stop,
+        alpha_power=1.0, alpha_above=OPAQUE, outlier_factor=0.0, align_depth_by="V",
+    )  # fmt: skip
+
+
+def score(fit: PoseFit) -> float:
+    """Return how much of a keyframe its place explains, a share in [0, 1]."""
+    return fit.agreement * fit.overlap
+
+
+def turned(found: Localisation) -> Localisation:
+    """Return the same as T_b_a [4, 4]: the inverse's left twist is −Ad(T⁻¹) ξ."""
+    T = se3.inverse(found.T_a_b)
+    A = se3.adjoint(T)
+    return dataclasses.replace(found, T_a_b=T, covariance=A @ found.covariance @ A.T)
+
+
+def differs(one: Matrix, other: Matrix, point_b: Matrix) -> tuple[float, float]:
+    """Return by how much two T_a_b [4, 4] differ: metres where they put point_b [3] m of b, and radians."""
+    apart = (one[:3, :3] - other[:3, :3]) @ point_b + one[:3, 3] - other[:3, 3]
+    return float(np.linalg.norm(apart)), se3.rotation_angle(one[:3, :3].T @ other[:3, :3])
+
+
+def consensus(found: Sequence[Localisation], point_b: Matrix, spread_m: float, spread_rad: float) -> list[Localisation]:
+    """Return the most localisations that one of them agrees with, itself included; of equal ones the better one's.
+
+    To agree is to put point_b [3] m of b within `spread_m` and to turn by no more than `spread_rad`.
+    """
+    best: list[Localisation] = []
+    for centre in sorted(found, key=lambda f: f.residual):
+        apart = [differs(centre.T_a_b, f.T_a_b, point_b) for f in found]
+        near = [f for f, (m, rad) in zip(found, apart, strict=True) if m <= spread_m and rad <= spread_rad]
+        if len(near) > len(best):
+            best = near
+    return best
+
+
+def combined(found: Sequence[Localisation]) -> Matrix:
+    """Average T_a_b [4, 4] weighted by 1/residual (VarSplat §5): rotation by Procrustes of the weighted mean."""
+    weights = np.array([1.0 / max(f.residual, 1e-9) for f in found])
+    mean = np.eye(4)
+    mean[:3] = np.einsum("k,kij->ij", weights / weights.sum(), np.stack([f.T_a_b[:3] for f in found]))
+    return se3.orthonormalise(mean)
+
+
+def information(found: Sequence[Localisation], mean: Matrix) -> Matrix:
+    """Return the inverse [6, 6] of a localisation's covariance about their mean: estimated + spread + floor.
+
+    mean: T_a_b [4, 4]; by the left twist, m and rad. It is not divided by their number: they look at the same two maps
+    and err together.
+    """
+    twists = np.stack([se3.log(f.T_a_b @ se3.inverse(mean)) for f in found])
+    covariance = np.mean([f.covariance for f in found], 0) + twists.T @ twists / len(found)
+    floor = np.diag(np.repeat([FLOOR_M**2, FLOOR_RAD**2], 3))
+    return symmetric(np.asarray(np.linalg.inv(symmetric(covariance) + floor), np.float64))
+
+
+def shared(a: Submap, b: Submap, T_a_b: Matrix, distance_m: float) -> float:
+    """Return the share of splats with a neighbour nearer than `distance_m` in the other submap, laid over it by T_a_b
+    [4, 4]: the larger of both.
+
+    The paper skips pairs by it before registering, at the poses known so far; drift would then hide what overlaps.
+    """
+    points_a = a.field.means.double().numpy()
+    points_b = b.field.means.double().numpy() @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    if not len(points_a) or not len(points_b):
+        return 0.0
+    shares = []
+    for ours, theirs in ((points_a, points_b), (points_b, points_a)):
+        some = ours[:: max(1, len(ours) // OVERLAP_SAMPLE)]
+        nearest = cKDTree(theirs).query(some, distance_upper_bound=distance_m)[0]
+        shares.append(float(np.isfinite(nearest).mean()))
+    return max(shares)
+
+
+def refused(
+    T_a_b: Matrix, found: Sequence[Localisation], localised: int, reason: str, overlap: float = 0.0
+) -> Registration:
+    """Return a verdict that leaves the submaps where they are, T_a_b [4, 4], of no weight."""
+    residual = float(np.mean([f.residual for f in found]))
+    return Registration(T_a_b, np.zeros((6, 6)), residual, localised, overlap, False, reason)

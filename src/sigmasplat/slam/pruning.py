@@ -1,0 +1,82 @@
+"""Judge single splats by the readings they are held against; uncertain ones get a second chance (CG-SLAM §4)."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sigmasplat.fit.target import Keyframe
+from sigmasplat.model import se3
+from sigmasplat.model.field import COLUMNS, GaussianField
+from sigmasplat.render.view import View
+from sigmasplat.types import Matrix
+
+
+def splat_uncertainty(
+    field: GaussianField, view: View, keyframes: Sequence[Keyframe], owner: Literal["dominant", "median"]
+) -> tuple[Tensor, Tensor]:
+    """Return each splat's uncertainty ν [N] m², float64, and how many pixels n [N] it was judged on (CG-SLAM eq. 13).
+
+    ν = Σ w (D − z)² / n over the pixels with a reading D that a splat owns, in all keyframes; z is its centre's depth
+    there, w its weight. 0 where it owns none. Renders each keyframe once; the view's planes are then of the last one.
+    """
+    spread = torch.zeros(len(field), dtype=torch.float64, device=field.params.device)
+    count = torch.zeros_like(spread, dtype=torch.int64)
+    for keyframe in keyframes:
+        T_camera_world = se3.inverse(keyframe.T_world_camera)
+        view.forward(field.params, T_camera_world, layers=True)
+        rows, weights, readings = (x.to(field.params.device) for x in _owned(view, keyframe, owner))
+        off = readings - depths(field.means[rows].double(), T_camera_world)
+        # Sorted by torch where that runs in parallel, so that the sums are the same every time.
+        spread += torch.zeros_like(spread).index_put_((rows,), weights * (off * off), accumulate=True)
+        count.index_put_((rows,), torch.ones_like(rows), accumulate=True)
+    return spread / count.clamp(min=1), count
+
+
+def depths(points: Tensor, T_camera_world: Matrix) -> Tensor:
+    """Return the depths [N] m of points [N, 3] in a camera, summed in fixed order."""
+    a, b, c, d = map(float, T_camera_world[2])
+    return a * points[:, 0] + b * points[:, 1] + c * points[:, 2] + d
+
+
+def _owned(view: View, keyframe: Keyframe, owner: str) -> tuple[Tensor, Tensor, Tensor]:
+    """List the pixels that have an owner and a reading: the owner's row, its weight, the reading in m."""
+    camera, layers = view.camera, view.layers
+    ids, weights = {
+        "dominant": (layers.dominant_id, layers.dominant_weight),
+        "median": (layers.median_id, layers.median_weight),
+    }[owner]
+    rows, weight = (plane[: camera.height, : camera.width] for plane in (ids, weights))
+    reading = keyframe.target.on(rows.device).depth_image
+    judged = ((rows >= 0) & (reading > 0)).nonzero(as_tuple=True)
+    return rows[judged].long(), weight[judged].double(), reading[judged].double()
+
+
+def fade(field: GaussianField, rows: Tensor, opacity: float) -> Tensor:
+    """Lower some splats (bool [N] or indices) to at most an opacity; their opacity is at rest then. Return their ids.
+
+    To be called between fits. Moments that go on would carry the opacity back, or on down, whatever the images say.
+    """
+    column = COLUMNS["opacity_logits"].start
+    limit = float(np.log(opacity / (1.0 - opacity)))
+    rows = rows.nonzero().squeeze(1) if rows.dtype == torch.bool else rows
+    field.params[rows, column] = field.params[rows, column].clamp(max=limit)
+    field.moment1[rows, column] = 0.0
+    field.moment2[rows, column] = 0.0
+    return field.ids[rows]
+
+
+def still_uncertain(
+    field: GaussianField, faded: Tensor, uncertainty: Tensor, uncertain_m2: float, least_opacity: float
+) -> Tensor:
+    """Tell which splats [N] faded earlier (`faded`: ids) have not come back: still too uncertain, or fainter than
+    `least_opacity`. Ids that are gone meanwhile are passed over; uncertainty [N] m² is `splat_uncertainty` now.
+
+    A faded splat seldom owns a pixel, so opacity decides; and in a few dozen steps it does not fall from 0.07 to 1/255.
+    """
+    named = torch.zeros(field.born, dtype=torch.bool, device=field.ids.device)
+    named[faded] = True
+    faint = field.opacities < least_opacity
+    return named[field.ids] & (faint | (uncertainty > uncertain_m2))

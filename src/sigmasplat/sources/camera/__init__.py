@@ -1,0 +1,1 @@
+"""Camera models: calibration, lens distortion, registration of depth to colour."""

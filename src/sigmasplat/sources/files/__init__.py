@@ -1,0 +1,1 @@
+"""Find, pair and decode the files of a recording."""

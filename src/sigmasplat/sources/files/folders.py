@@ -1,0 +1,84 @@
+"""Find the image files of a recording and say which colour belongs to which depth."""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from sigmasplat.errors import SourceError
+
+FRAMES_PER_SECOND = 30.0
+"""Recordings that carry no time get this rate by convention."""
+
+COLOR_FOLDERS = ("color", "colour", "rgb", "image", "images")
+DEPTH_FOLDERS = ("depth", "depths")
+COLOR_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".tif", ".tiff", ".webp")
+DEPTH_ENDINGS = (".png", ".pgm", ".tif", ".tiff", ".npy")
+
+Key = TypeVar("Key", int, str)
+
+
+def subfolder(folder: Path, names: Iterable[str]) -> Path | None:
+    """Return the first of the named folders that is there, None if none is."""
+    return next((folder / name for name in names if (folder / name).is_dir()), None)
+
+
+def images_in(folder: Path | None, endings: Sequence[str]) -> list[Path]:
+    """List a folder's images in the order of the numbers in their names: 2.png comes before 10.png."""
+    if folder is None or not folder.is_dir():
+        return []
+    found = (path for path in folder.iterdir() if path.suffix.lower() in endings and not path.name.startswith("."))
+    return sorted(found, key=natural)
+
+
+def natural(path: Path | str) -> list[tuple[int, str]]:
+    """Return a key that sorts names by their numbers' size: digits as numbers, the rest as text."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", str(path)) if part]
+
+
+def numbered(paths: Iterable[Path]) -> dict[int, Path]:
+    """Map the last number in each file's name to its path, ascending; names without one are left out."""
+    numbers = ((re.findall(r"[0-9]+", path.stem), path) for path in paths)
+    return dict(sorted((int(found[-1]), path) for found, path in numbers if found))
+
+
+def paired(
+    folder: Path, colors: Mapping[Key, Path], depths: Mapping[Key, Path], color_name: str, depth_name: str
+) -> tuple[list[Key], list[str]]:
+    """Return the keys that colour and depth share, in the order of colour, and why the other images are left out.
+
+    The names say where each was looked for. Raises SourceError if one kind is missing or no key is shared.
+    """
+    if not depths:
+        raise SourceError(f"no depth images in {folder} (looked for {depth_name}); is this the RGB-only download?")
+    if not colors:
+        raise SourceError(f"no colour images in {folder} (looked for {color_name}); is the download whole?")
+    keys = [key for key in colors if key in depths]
+    if not keys:
+        first = f"{next(iter(colors.values())).name} and {next(iter(depths.values())).name}"
+        raise SourceError(
+            f"{folder}: no number is shared by {color_name} and {depth_name} (found {first}); "
+            "are both from one recording?"
+        )
+    return keys, [f"{colors[key]}: no {depth_name} of its number" for key in colors if key not in depths]
+
+
+Found = dict[str, dict[int, Path]]
+
+_NAME = re.compile(r"frame-([0-9]+)\.(?:(color)\.(?:png|jpe?g)|(depth)\.(?:png|pgm|tiff?)|(pose)\.txt)")
+
+
+def frame_files(folder: Path) -> Found:
+    """Map "color", "depth" and "pose" to the files of each kind by number, ascending."""
+    found: Found = {"color": {}, "depth": {}, "pose": {}}
+    for path in sorted(folder.glob("frame-*")):
+        match = _NAME.fullmatch(path.name.lower())
+        if match:
+            kind = next(group for group in match.groups()[1:] if group)
+            found[kind][int(match.group(1))] = path
+    return found
+
+
+def has_frame_files(folder: Path) -> bool:
+    """Tell whether there is at least one such colour or depth image."""
+    return any(_NAME.fullmatch(path.name.lower()) for path in folder.glob("frame-*"))

@@ -1,0 +1,56 @@
+"""Read the frames of a video file, each exactly, through OpenCV."""
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.errors import SourceError
+from sigmasplat.sources.files.optional import needed
+
+
+class Video:
+    """An open video. Reading on is quick; reading back begins again at the start, for phones do not film at a steady
+    rate, and jumping to a frame by number then lands beside it. Safe to read from several threads.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raises SourceError if OpenCV is missing or cannot read the file."""
+        self.path, self._lock = path, threading.Lock()
+        self._cv2 = needed("cv2", "iphone", f"{path}: a video")
+        self._open()
+        width, height = (
+            int(self._capture.get(p)) for p in (self._cv2.CAP_PROP_FRAME_WIDTH, self._cv2.CAP_PROP_FRAME_HEIGHT)
+        )
+        self.size = width, height
+        self.count = int(self._capture.get(self._cv2.CAP_PROP_FRAME_COUNT))
+
+    def frame(self, i: int) -> NDArray[np.uint8]:
+        """Read frame i as 8-bit RGB [H, W, 3]. Raises SourceError if the video ends before it or is damaged."""
+        with self._lock:
+            if i < self._next:
+                self._open()
+            while self._next <= i:
+                if not self._capture.grab():
+                    raise SourceError(
+                        f"{self.path}: ends after {self._next} frames, frame {i} asked for; copy it again"
+                    )
+                self._next += 1
+            read, bgr = self._capture.retrieve()
+        if not read:
+            raise SourceError(f"{self.path}: frame {i} cannot be decoded; copy the video again")
+        rgb: NDArray[np.uint8] = np.ascontiguousarray(bgr[..., ::-1])
+        return rgb
+
+    def _open(self) -> None:
+        self._next = 0
+        self._capture: Any = self._cv2.VideoCapture(str(self.path))
+        if not self._capture.isOpened():
+            raise SourceError(
+                f"{self.path}: unreadable video; copy it again (OpenCV reads no HEVC where it lacks FFmpeg)"
+            )
+        self._capture.set(
+            self._cv2.CAP_PROP_ORIENTATION_AUTO, 0
+        )  # pixels as they were filmed: depth is not turned either

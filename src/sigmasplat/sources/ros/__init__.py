@@ -1,0 +1,1 @@
+"""Read ROS 1 and ROS 2 bags."""

@@ -1,0 +1,144 @@
+"""Read ROS bags without ROS: topics, messages in order, one message again; through the rosbags package (Apache-2.0).
+
+ROS 1 is one file that starts with "#ROSBAG V2.0"; ROS 2 is a folder with metadata.yaml, or one of its storage files:
+MCAP (starts with 89 "MCAP0"), SQLite (.db3).
+"""
+
+import struct
+import threading
+import weakref
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from sigmasplat.errors import SourceError
+from sigmasplat.sources.files.optional import needed
+
+Message = Any
+Value = TypeVar("Value")
+
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0", b"\x89MCAP0", b"SQLite format 3\0"
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A name, the type of its messages (as sensor_msgs/msg/Image) and how many there are."""
+
+    name: str
+    kind: str
+    count: int
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Where a message is: when it was recorded, and which of those recorded then; `stamp_ns` is its header's."""
+
+    recorded_ns: int
+    place: int
+    stamp_ns: int
+
+
+class Bag:
+    """An open recording; nothing is kept of it but the list of topics. Safe to read from several threads."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises SourceError if the rosbags package is missing, or the file is damaged."""
+        self.path, self._lock = path, threading.Lock()
+        self.ros1 = path.is_file() and _magic(path).startswith(ROS1_MAGIC)
+        reader = needed("rosbags.rosbag1" if self.ros1 else "rosbags.rosbag2", "ros", f"{path}: a ROS bag").Reader
+        typesys = needed("rosbags.typesys", "ros", f"{path}: a ROS bag")
+        # Messages of the common types never changed; what a bag says of its own types is not needed, and may be wrong.
+        self._types = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if self.ros1 else typesys.Stores.LATEST)
+        if TRANSFORMS not in self._types.fielddefs:
+            fields = "geometry_msgs/TransformStamped[] transforms"
+            self._types.register(typesys.get_types_from_msg(fields, TRANSFORMS))
+        self._reader = self._guarded(lambda: reader(path))
+        self._guarded(self._reader.open)
+        weakref.finalize(self, self._reader.close)
+        self.topics = {
+            name: Topic(name, info.msgtype or "", info.msgcount)
+            for name, info in self._guarded(lambda: self._reader.topics).items()
+        }
+
+    def of_kind(self, *kinds: str) -> list[Topic]:
+        """Return the topics of these types that have messages, in order of name."""
+        return [topic for _, topic in sorted(self.topics.items()) if topic.kind in kinds and topic.count]
+
+    def first(self, name: str) -> Message:
+        """Read a topic's first message. Raises SourceError if it is damaged."""
+        return next(self.messages(name))
+
+    def messages(self, name: str) -> Iterator[Message]:
+        """Read a topic's messages in order of recording. Raises SourceError if one is damaged."""
+        return (self._decoded(name, raw) for _, _, raw in self._raw([name]))
+
+    def entries(self, *names: str) -> dict[str, list[Entry]]:
+        """Go once through topics whose messages have headers. Raises SourceError if the bag is damaged."""
+        found: dict[str, list[Entry]] = {name: [] for name in names}
+        for name, recorded_ns, raw in self._raw(names):
+            earlier = found[name]
+            place = earlier[-1].place + 1 if earlier and earlier[-1].recorded_ns == recorded_ns else 0
+            earlier.append(Entry(recorded_ns, place, self._stamp_ns(raw)))
+        return found
+
+    def at(self, name: str, entry: Entry) -> Message:
+        """Read one message. Raises SourceError if it is damaged."""
+        with self._lock:
+            found = [raw for _, _, raw in self._raw([name], entry.recorded_ns, entry.recorded_ns + 1)]
+        return self._decoded(name, found[entry.place])
+
+    def _raw(
+        self, names: Sequence[str], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[tuple[str, int, bytes]]:
+        """Yield name, time of recording and bytes of the messages of some topics."""
+        connections = [connection for connection in self._reader.connections if connection.topic in names]
+        items = self._guarded(lambda: self._reader.messages(connections, start_ns, stop_ns))
+        while (item := self._guarded(lambda: next(items, None))) is not None:
+            yield item[0].topic, item[1], item[2]
+
+    def _stamp_ns(self, raw: bytes) -> int:
+        """Read the time of a header: ROS 1 begins with a sequence number, CDR with four bytes that tell the order."""
+        order = "<" if self.ros1 or raw[1] & 1 else ">"
+        seconds, nanoseconds = struct.unpack_from(f"{order}II", raw, 4)
+        return int(seconds) * 10**9 + int(nanoseconds)
+
+    def _decoded(self, name: str, raw: bytes) -> Message:
+        kind = self.topics[name].kind
+        if not self.ros1:
+            return self._guarded(lambda: self._types.deserialize_cdr(raw, kind))
+        kind = TRANSFORMS if kind == "tf/msg/tfMessage" else kind  # its name before ROS Hydro
+        try:
+            return self._types.deserialize_ros1(raw, kind)
+        except Exception:  # RealSense's SDK appends the depth unit to images, four bytes that the type does not have
+            return self._guarded(lambda: self._types.deserialize_ros1(raw[:-4], kind))
+
+    def _guarded(self, call: Callable[[], Value]) -> Value:
+        """Call the library; it fails in many ways on damaged files, and all of them mean: this bag is unreadable."""
+        try:
+            return call()
+        except Exception as error:
+            raise SourceError(
+                f"{self.path}: unreadable bag ({error}); copy it again, or if its recording was cut short mend it with "
+                "rosbag reindex, ros2 bag reindex or mcap recover"
+            ) from error
+
+
+def is_bag(path: Path) -> bool:
+    """Tell whether a ROS bag lies at a path, by its first bytes; a folder, by its metadata.yaml."""
+    if path.is_dir():
+        metadata = path / "metadata.yaml"
+        return metadata.is_file() and b"rosbag2_bagfile_information" in metadata.read_bytes()[:4096]
+    return path.is_file() and _magic(path).startswith((ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC))
+
+
+def listed(topics: Iterable[Topic], most: int = 12) -> str:
+    """Write topics for a message: names, types, counts."""
+    words: Sequence[str] = [f"{t.name} ({t.kind.replace('/msg/', '/')}, {t.count})" for t in topics]
+    return ", ".join(words[:most]) + (f", … {len(words)} topics" if len(words) > most else "") or "no topic"
+
+
+def _magic(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(16)

@@ -1,0 +1,153 @@
+"""Find out from a bag's messages what is known of its cameras: intrinsics, lenses, where depth is to colour, its unit.
+
+sensor_msgs/CameraInfo lies beside the images (camera_info). Drivers say where cameras are in /tf_static or /tf, by the
+frames that images name. RealSense's SDK before version 2.58 instead has topics of its own, /device_0/sensor_0/Depth_0/…
+(librealsense, ros_file_format.h): info/camera_info, tf/N (a geometry_msgs/Transform from a reference to the stream) and
+option/Depth_Units/value of the sensor.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sigmasplat.config import InputConfig
+from sigmasplat.errors import SourceError
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.sources.camera.calibration import Calibration, Lens, calibrated, camera_of
+from sigmasplat.sources.ros.bag import Bag, Message
+from sigmasplat.sources.ros.frames import T_frames, rigid
+from sigmasplat.sources.ros.topics import ImageTopic
+from sigmasplat.types import Matrix
+
+UNITS_PER_METRE = 1000.0
+"""Whole-number depth of ROS is millimetres (REP 118)."""
+BROWN_CONRADY = ("", "plumb_bob", "brown conrady", "inverse brown conrady", "modified brown conrady", "none")
+RATIONAL = "rational_polynomial"
+
+
+@dataclass(frozen=True)
+class Optics:
+    """A camera and its lens, None for no lens."""
+
+    camera: Camera
+    lens: Lens | None
+
+
+def calibration_of(bag: Bag, color: ImageTopic, depth: ImageTopic, settings: InputConfig) -> Calibration:
+    """Return what is known of the cameras, the settings' words in place of the bag's.
+
+    Raises SourceError if the colour camera is unknown, or depth has a camera of its own and the bag does not say where.
+    """
+    optics = optics_of(bag, color)
+    units = depth_units(bag, depth)
+    recorded = Calibration(optics.camera, units, optics.lens) if optics else None
+    calibration = calibrated(bag.path, recorded, color.size, settings, units)
+    told = settings.calibration or calibration.depth_camera or settings.register_depth == "off"
+    if told or is_registered(color, depth):
+        return calibration
+    depth_optics = optics_of(bag, depth)
+    if depth_optics is None and depth.size == color.size:
+        return calibration  # nothing says otherwise; `inspect` compares edges
+    if depth_optics is None:
+        raise SourceError(
+            f"{bag.path}: {depth.name} has no camera_info, so it cannot be registered to {color.name}; record it too, "
+            "or give --calibration FILE with depth_camera and T_color_depth"
+        )
+    return replace(
+        calibration,
+        depth_camera=depth_optics.camera,
+        depth_distortion=depth_optics.lens,
+        T_color_depth=_color_depth(bag, color, depth),
+    )
+
+
+def is_registered(color: ImageTopic, depth: ImageTopic) -> bool:
+    """Tell whether depth has the colour image's pixels: its name says so, or both are in one optical frame."""
+    return depth.registered or (bool(depth.frame) and depth.frame == color.frame and not _sdk_stream(depth))
+
+
+def optics_of(bag: Bag, topic: ImageTopic) -> Optics | None:
+    """Read the CameraInfo of an image topic; None where there is none, or it is not filled in. Raises SourceError."""
+    infos = {info.name for info in bag.of_kind("sensor_msgs/msg/CameraInfo")}
+    names = (f"{topic.camera}/camera_info", f"{topic.base.removesuffix('/image/data')}/info/camera_info")
+    found = [name for name in names if name in infos]
+    if not found:
+        return None
+    info = bag.first(found[0])
+    rectified, where = "rect" in topic.base.rpartition("/")[2], bag.path / found[0].lstrip("/")
+    k = np.asarray(_field(info, "p")).reshape(3, 4)[:, :3] if rectified else np.asarray(_field(info, "k")).reshape(3, 3)
+    if rectified and k[0, 0] <= 0:
+        k = np.asarray(_field(info, "k")).reshape(3, 3)
+    if k[0, 0] <= 0:
+        return None
+    width, height = int(info.width) or topic.size[0], int(info.height) or topic.size[1]
+    camera = camera_of(where, width, height, [float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2])])
+    return Optics(camera, None if rectified else _lens(f"{bag.path}: {found[0]}", info))
+
+
+def depth_units(bag: Bag, depth: ImageTopic) -> float:
+    """Return the whole numbers per metre: of the SDK's option where it was recorded, else millimetres."""
+    sensor = "/".join(depth.name.split("/")[:3])
+    name = f"{sensor}/option/Depth_Units/value"
+    if name not in bag.topics or not bag.topics[name].count:
+        return UNITS_PER_METRE
+    metres = float(bag.first(name).data)
+    return round(1.0 / metres, 3) if metres > 0 else UNITS_PER_METRE
+
+
+def _color_depth(bag: Bag, color: ImageTopic, depth: ImageTopic) -> Matrix:
+    found = _sdk_color_depth(bag, color, depth)
+    if found is None and color.frame and depth.frame:
+        found = T_frames(bag, color.frame, depth.frame)
+    if found is None:
+        raise SourceError(
+            f"{bag.path}: nothing says where the depth camera ({depth.frame or depth.name}) is to the colour camera "
+            f"({color.frame or color.name}); record /tf_static or an aligned depth topic too, "
+            "or give --calibration FILE with depth_camera and T_color_depth"
+        )
+    return found
+
+
+def _sdk_stream(topic: ImageTopic) -> str:
+    """Return the SDK's name of a stream, as /device_0/sensor_0/Depth_0, or "" where the bag is of another kind."""
+    return topic.base.removesuffix("/image/data") if topic.base.startswith("/device_") else ""
+
+
+def _sdk_color_depth(bag: Bag, color: ImageTopic, depth: ImageTopic) -> Matrix | None:
+    poses = [_sdk_pose(bag, _sdk_stream(topic)) for topic in (color, depth)]
+    T_color_reference, T_depth_reference = poses
+    if T_color_reference is None or T_depth_reference is None:
+        return None
+    return T_color_reference @ se3.inverse(T_depth_reference)
+
+
+def _sdk_pose(bag: Bag, stream: str) -> Matrix | None:
+    """Return T_stream_reference, None where the bag is not the SDK's."""
+    found = bag.of_kind("geometry_msgs/msg/Transform")
+    names = [topic.name for topic in found if topic.name.startswith(f"{stream}/tf/")]
+    if not (stream and names):
+        return None
+    message = bag.first(names[0])
+    return rigid(f"{bag.path}: {names[0]}", message.translation, message.rotation)
+
+
+def _lens(where: str, info: Message) -> Lens | None:
+    """Return the lens in OpenCV's order. Raises SourceError if it is of a model that is not known."""
+    values = [float(v) for v in _field(info, "d")]
+    if not any(values):
+        return None
+    model = info.distortion_model.lower()
+    if model not in (*BROWN_CONRADY, RATIONAL) or len(values) < 4:
+        raise SourceError(
+            f"{where}: lens model {info.distortion_model} is not known (plumb_bob and {RATIONAL} are); "
+            "record the rectified images (image_rect_color), or give --calibration FILE"
+        )
+    return tuple([*values, 0.0][: 8 if model == RATIONAL else 5])
+
+
+def _field(message: Message, name: str) -> Iterable[float]:
+    """Read a field that ROS 1 writes in capitals and ROS 2 in small letters."""
+    values: Iterable[float] = getattr(message, name if hasattr(message, name) else name.upper())
+    return values

@@ -1,0 +1,112 @@
+"""Turn image messages of ROS into arrays: sensor_msgs/Image and sensor_msgs/CompressedImage.
+
+Raw encodings as in sensor_msgs' image_encodings.hpp. Compressed depth as image_transport's compressed_depth plugin
+writes it: 12 bytes of header (format, two quantisation parameters a and b), then a PNG; of 16UC1 the PNG holds the
+numbers themselves, of 32FC1 it holds a / depth + b.
+"""
+
+import io
+import struct
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sigmasplat.errors import SourceError
+from sigmasplat.sources.files.images import color_of, metres, understood
+from sigmasplat.sources.ros.bag import Message
+
+RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+Kind = Literal["colour", "depth", ""]
+
+COLOR_ORDER = {
+    "rgb8": (0, 1, 2),
+    "bgr8": (2, 1, 0),
+    "8UC3": (2, 1, 0),
+    "rgba8": (0, 1, 2),
+    "bgra8": (2, 1, 0),
+    "8UC4": (2, 1, 0),
+}
+"""Where red, green and blue are in a pixel."""
+DEPTH_TYPE = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+HEADER_BYTES = 12
+
+
+def kind_of(message: Message) -> Kind:
+    """Tell what an image message holds; "" for what is neither colour nor depth, as infrared."""
+    if hasattr(message, "encoding"):
+        return "colour" if message.encoding in COLOR_ORDER else "depth" if message.encoding in DEPTH_TYPE else ""
+    text = message.format
+    if "compressedDepth" in text or text.startswith(("16UC1", "mono16")):
+        return "depth"
+    return "" if text.startswith(("mono8", "8UC1")) else "colour"
+
+
+def size_of(path: Path, message: Message) -> tuple[int, int]:
+    """Return (width, height) in pixels. Raises SourceError naming `path` if a compressed image has no header."""
+    if hasattr(message, "encoding"):
+        return int(message.width), int(message.height)
+    data = message.data.tobytes()
+    start = HEADER_BYTES if "compressedDepth" in message.format else 0
+    return understood(path, lambda: Image.open(io.BytesIO(data[start:])).size)
+
+
+def color_from(path: Path, message: Message) -> NDArray[np.uint8]:
+    """Return 8-bit RGB [H, W, 3]. Raises SourceError naming `path` if the message is damaged or no colour image."""
+    if not hasattr(message, "encoding"):
+        return color_of(path, message.data.tobytes())
+    if message.encoding not in COLOR_ORDER:
+        raise _encoding(path, "colour", message.encoding, COLOR_ORDER)
+    pixels = _pixels(path, message, "u1", 4 if message.encoding in ("rgba8", "bgra8", "8UC4") else 3)
+    return np.ascontiguousarray(pixels[..., COLOR_ORDER[message.encoding]])
+
+
+def depth_from(path: Path, message: Message, units_per_metre: float) -> NDArray[np.float32]:
+    """Return depth in metres [H, W], 0 = no reading; whole numbers are divided by `units_per_metre`.
+
+    Raises SourceError naming `path` if the message is damaged or no depth image.
+    """
+    if not hasattr(message, "encoding"):
+        return _decompressed(path, message, units_per_metre)
+    if message.encoding not in DEPTH_TYPE:
+        raise _encoding(path, "depth", message.encoding, DEPTH_TYPE)
+    raw = _pixels(path, message, DEPTH_TYPE[message.encoding], 1)[..., 0]
+    return metres(path, _without_nan(raw) if raw.dtype.kind == "f" else raw, units_per_metre)
+
+
+def _decompressed(path: Path, message: Message, units_per_metre: float) -> NDArray[np.float32]:
+    if "rvl" in message.format.lower():
+        raise SourceError(f"{path}: depth is compressed as RVL, which is not read; republish it as PNG or raw")
+    data = message.data.tobytes()
+    has_header = "compressedDepth" in message.format
+    raw = understood(path, lambda: np.asarray(Image.open(io.BytesIO(data[HEADER_BYTES * has_header :]))))
+    if not (has_header and message.format.startswith("32FC1")):
+        return metres(path, raw, units_per_metre)
+    a, b = struct.unpack_from("<ff", data, 4)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return metres(path, _without_nan(np.where(raw > 0, a / (raw - b), 0.0)), units_per_metre)
+
+
+def _pixels(path: Path, message: Message, kind: str, channels: int) -> NDArray[Any]:
+    """Return [H, W, channels]: rows may be padded, and numbers of either byte order."""
+    dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
+    row = message.width * channels * dtype.itemsize
+    if len(message.data) != message.height * message.step or message.step < row:
+        raise SourceError(
+            f"{path}: unreadable image ({len(message.data)} bytes for {message.width}×{message.height} "
+            f"{message.encoding}); record it again"
+        )
+    rows = message.data.reshape(message.height, message.step)[:, :row]
+    return np.ascontiguousarray(rows).view(dtype).reshape(message.height, message.width, channels)
+
+
+def _without_nan(depth_m: NDArray[Any]) -> NDArray[np.float32]:
+    """Return float depth with 0 where ROS has NaN (no reading) or infinity (beyond range), as REP 117 has it."""
+    filled: NDArray[np.float32] = np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
+    return filled
+
+
+def _encoding(path: Path, what: str, found: str, known: dict[str, Any]) -> SourceError:
+    return SourceError(f"{path}: {what} is encoded as {found}, which is not read; there are {', '.join(known)}")

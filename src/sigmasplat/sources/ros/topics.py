@@ -1,0 +1,98 @@
+"""Choose the topics of a bag that hold colour and depth: by what the messages hold, then by how topics are named."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from sigmasplat.config.text import nearest
+from sigmasplat.errors import SourceError
+from sigmasplat.sources.ros.bag import Bag, listed
+from sigmasplat.sources.ros.images import COMPRESSED, RAW, Kind, kind_of, size_of
+
+REGISTERED = ("aligned_depth_to_color", "depth_registered", "depth_to_rgb")
+"""Names that drivers give to depth that has the colour image's pixels (RealSense; OpenNI, Kinect; Azure Kinect)."""
+NOT_DEPTH = ("infra", "/ir/", "confidence")
+"""Names of 16-bit images that are no depth."""
+
+
+@dataclass(frozen=True)
+class ImageTopic:
+    """A topic of images: what they hold, the optical frame they are in, and (width, height) of the first."""
+
+    name: str
+    kind: Kind
+    frame: str
+    size: tuple[int, int]
+
+    @property
+    def base(self) -> str:
+        """The topic without the ending that image_transport adds for a compressed copy."""
+        return self.name.removesuffix("/compressedDepth").removesuffix("/compressed")
+
+    @property
+    def camera(self) -> str:
+        """The name space in which a driver puts all images of one camera."""
+        return self.base.rpartition("/")[0]
+
+    @property
+    def registered(self) -> bool:
+        """Whether its name says that it has the colour image's pixels."""
+        return any(words in self.name for words in REGISTERED)
+
+
+def color_topic(bag: Bag, asked: str) -> ImageTopic:
+    """Return the topic asked for, or the one of colour images. Raises SourceError if there is none, or several."""
+    found = [asked_topic(bag, asked)] if asked else images(bag, "colour")
+    best = _best(found, lambda topic: not any(word in topic.name.lower() for word in ("color", "rgb")))
+    return _only(bag, "colour", best, "color")
+
+
+def depth_topic(bag: Bag, asked: str) -> ImageTopic:
+    """Return the topic asked for, or the one of depth, registered to colour if there is one.
+
+    Raises SourceError if there is none, or several.
+    """
+    if asked:
+        return _only(bag, "depth", [asked_topic(bag, asked)], "depth")
+    found = [topic for topic in images(bag, "depth") if not any(word in topic.name.lower() for word in NOT_DEPTH)]
+    return _only(bag, "depth", _best(found, lambda topic: not topic.registered), "depth")
+
+
+def images(bag: Bag, kind: Kind) -> list[ImageTopic]:
+    """Return the topics whose first message holds this kind. Raises SourceError if the bag is damaged."""
+    found = [_described(bag, topic.name) for topic in bag.of_kind(RAW, COMPRESSED)]
+    return [topic for topic in found if topic.kind == kind]
+
+
+def asked_topic(bag: Bag, name: str) -> ImageTopic:
+    """Return a topic by its name. Raises SourceError if it is none of images."""
+    topics = {topic.name: topic for topic in bag.of_kind(RAW, COMPRESSED)}
+    if name not in topics:
+        raise SourceError(
+            f"{bag.path}: no images in topic {name}{nearest(name, list(topics))}; there are {listed(topics.values())}"
+        )
+    return _described(bag, name)
+
+
+def _described(bag: Bag, name: str) -> ImageTopic:
+    message = bag.first(name)
+    size = size_of(bag.path / name.lstrip("/"), message)
+    return ImageTopic(name, kind_of(message), message.header.frame_id.lstrip("/"), size)
+
+
+def _best(topics: list[ImageTopic], worse: Callable[[ImageTopic], bool]) -> list[ImageTopic]:
+    """Keep those that are not worse; all where every one is."""
+    return [topic for topic in topics if not worse(topic)] or topics
+
+
+def _only(bag: Bag, what: str, topics: list[ImageTopic], option: str) -> ImageTopic:
+    """Return the one camera's topic: rectified before raw, uncompressed before compressed."""
+    if not topics or any(topic.kind != what for topic in topics):
+        raise SourceError(
+            f"{bag.path}: no {what} images in {topics[0].name if topics else 'any topic'}; "
+            f"the bag holds {listed(bag.topics.values())}"
+        )
+    cameras = sorted({topic.camera for topic in topics})
+    if len(cameras) > 1:
+        names = ", ".join(sorted(topic.name for topic in topics))
+        raise SourceError(f"{bag.path}: several topics hold {what} images ({names}); choose one: --{option}-topic NAME")
+    return min(topics, key=lambda topic: ("rect" not in topic.base, topic.base != topic.name, topic.name))

@@ -1,0 +1,47 @@
+"""Find the true path in a bag: the one topic of poses."""
+
+import numpy as np
+
+from sigmasplat.model import se3
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.sources.ros.bag import Bag, Message
+from sigmasplat.sources.ros.frames import T_frames, rigid
+from sigmasplat.types import Matrix
+
+KINDS = (
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+    "nav_msgs/msg/Odometry",
+)
+
+
+def truth_of(bag: Bag, camera_frame: str, recorded_time: bool) -> Trajectory | None:
+    """Return the path of the colour camera where exactly one topic holds poses, else None.
+
+    Where the messages name the body that moves, the bag's static transforms take the poses to the camera, and there is
+    no truth where they do not lead there; where they do not (PoseStamped), the poses are taken to be the camera's.
+    `recorded_time`: whether times are those of recording, not of the headers. Raises SourceError on a damaged pose.
+    """
+    topics = bag.of_kind(*KINDS)
+    if len(topics) != 1 or topics[0].count < 2:
+        return None
+    name = topics[0].name
+    entries, messages = bag.entries(name)[name], list(bag.messages(name))
+    body = getattr(messages[0], "child_frame_id", "").lstrip("/")
+    T_body_camera = np.eye(4)
+    if body and camera_frame and body != camera_frame:
+        found = T_frames(bag, body, camera_frame, moving=False)
+        if found is None:
+            return None
+        T_body_camera = found
+    times_s = np.array([(e.recorded_ns if recorded_time else e.stamp_ns) / 1e9 for e in entries])
+    poses = [_pose(f"{bag.path}: {name} at {t:.3f} s", m) for t, m in zip(times_s, messages, strict=True)]
+    return Trajectory(times_s, np.stack([se3.orthonormalise(T @ T_body_camera) for T in poses]))
+
+
+def _pose(where: str, message: Message) -> Matrix:
+    if hasattr(message, "transform"):
+        return rigid(where, message.transform.translation, message.transform.rotation)
+    pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+    return rigid(where, pose.position, pose.orientation)
