@@ -50,7 +50,7 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
     Raises SourceError if there is nothing at the path, no format knows it, or what is there cannot be used;
     ConfigError on a setting that is none.
     """
-    asked = changed(settings or InputConfig(), changes)
+    asked = with_changes(settings or InputConfig(), changes)
     source = format_of(path).open(str(path), asked)
     part = asked.stride > 1 or asked.limit or asked.start_s or asked.end_s
     return Subset(source, asked) if part and not source.live else source
@@ -58,17 +58,17 @@ def open_source(path: str | Path, settings: InputConfig | None = None, **changes
 
 def format_of(path: str | Path) -> Format:
     """Return the first format that knows what lies at the path. Raises SourceError if none does."""
-    known = _knowing(path)
+    known = _matching_format(path)
     if known is None:
-        raise SourceError(_nothing_fits(Path(path)))
+        raise SourceError(_unknown_format(Path(path)))
     return known
 
 
-def _knowing(path: str | Path) -> Format | None:
+def _matching_format(path: str | Path) -> Format | None:
     return next((known for known in formats() if known.recognises(str(path))), None)
 
 
-def changed(settings: InputConfig, changes: Mapping[str, Any]) -> InputConfig:
+def with_changes(settings: InputConfig, changes: Mapping[str, Any]) -> InputConfig:
     """Return the settings with some given by name. Raises ConfigError on an unknown name."""
     known = [field.name for field in fields(InputConfig)]
     for name in changes:
@@ -77,7 +77,7 @@ def changed(settings: InputConfig, changes: Mapping[str, Any]) -> InputConfig:
     return replace(settings, **changes)
 
 
-def _nothing_fits(path: Path) -> str:
+def _unknown_format(path: Path) -> str:
     if not path.exists():
         return (
             f"no such folder or file: {path}; give a recording, or 'synthetic' for the built-in room, "
@@ -88,7 +88,7 @@ def _nothing_fits(path: Path) -> str:
         return f"{path} is a file of unknown format; give the folder that holds the sequence (looked for {wanted})"
     entries = sorted(path.iterdir())
     likely = (entry for entry in entries if entry.is_dir() or entry.suffix in PACKED)
-    inner = [(entry.name, known.name) for entry in likely if (known := _knowing(entry))]
+    inner = [(entry.name, known.name) for entry in likely if (known := _matching_format(entry))]
     if inner:
         names = ", ".join(f"{name} ({known})" for name, known in inner[:4]) + ", …" * (len(inner) > 4)
         return f"{path} holds sequences: {names}; give the path of one of them, as {path / inner[0][0]}"
