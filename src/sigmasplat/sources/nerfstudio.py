@@ -36,7 +36,9 @@ def open_nerfstudio(folder: Path, settings: InputConfig) -> RecordedSource:
     named = sorted(read_frames(path, fields), key=lambda frame: natural_key(frame["file_path"]))
     frames = [frame for frame in named if isinstance(frame.get("depth_file_path"), str)]
     if not frames:
-        raise SourceError(f'{path}: no frame has a "depth_file_path"; depth is needed, export it with the images')
+        raise SourceError(
+            f'{path}: no frame has a "depth_file_path"; export depth with the images, see docs/data.md#without-depth'
+        )
     skipped = [f"{path}: {frame['file_path']} has no depth_file_path" for frame in named if frame not in frames]
     images = [ImagePair(i / FRAMES_PER_SECOND, *_files(folder, frame)) for i, frame in enumerate(frames)]
     calibration = _calibration(path, fields, frames, images, settings)

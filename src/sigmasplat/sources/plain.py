@@ -13,6 +13,7 @@ from pathlib import Path
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.sources.camera.calibration import MM_PER_METRE, resolve_calibration
+from sigmasplat.sources.files.color_only import without_depth
 from sigmasplat.sources.files.folders import (
     COLOR_ENDINGS,
     COLOR_FOLDERS,
@@ -34,7 +35,10 @@ COLOR_NAME, DEPTH_NAME = "color|rgb|images/*", "depth/*"
 def open_plain(folder: Path, settings: InputConfig) -> RecordedSource:
     """Open a folder; raises SourceError if images cannot be paired or the camera is not known."""
     colors = list_images(first_subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
-    depths = list_images(first_subfolder(folder, DEPTH_FOLDERS), DEPTH_ENDINGS)
+    depth_folder = first_subfolder(folder, DEPTH_FOLDERS)
+    if depth_folder is None and (problem := without_depth(folder)):
+        raise problem
+    depths = list_images(depth_folder, DEPTH_ENDINGS)
     pairs, skipped = _pairs(folder, colors, depths)
     times_s = _times_s([color for color, _ in pairs])
     images = [ImagePair(t, *pair) for t, pair in zip(times_s, pairs, strict=True)]
