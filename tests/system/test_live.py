@@ -61,7 +61,7 @@ def test_a_pulled_plug_is_one_line_and_a_valid_run(device: Device, capsys: pytes
     device.frames_until_unplugged = WARM_UP_FRAMES + 5
     assert sigmasplat("run", "realsense", "--out", "run", "--record", "seen", "--no-eval", *QUICK) == 0
     said = capsys.readouterr()
-    assert said.err.count("\n") == 1 and "no frame came for 5 s" in said.err
+    assert said.err.count("\n") == 1 and "no frame for 5 s" in said.err
     assert RunFolder.open(Path("run")).facts()["status"] == "complete"
     assert len(open_source("seen")) == 5
 
@@ -69,7 +69,7 @@ def test_a_pulled_plug_is_one_line_and_a_valid_run(device: Device, capsys: pytes
 def test_no_camera_is_one_line_and_nothing_written(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.plugged_in = False
     assert sigmasplat("run", "realsense") == 2
-    assert capsys.readouterr().err.startswith("sigmasplat: no RealSense camera gives 640×480")
+    assert capsys.readouterr().err.startswith("sigmasplat: no RealSense camera provides 640×480")
     assert not Path("runs").exists()
 
 
