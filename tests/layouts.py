@@ -1,7 +1,7 @@
 """Write a few frames in the layout of each data set, independent of the code under test."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,13 @@ def sample(size: tuple[int, int] = SMALL) -> Sample:
 def save(path: Path, pixels: np.ndarray, **options: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels).save(path, **options)
+
+
+def save_pairs(folder: Path, s: Sample, names: Iterable[str]) -> None:
+    """Write color/NAME.png and depth/NAME.png of every frame."""
+    for name, color, depth_mm in zip(names, s.color, s.depth_mm, strict=True):
+        save(folder / f"color/{name}.png", color)
+        save(folder / f"depth/{name}.png", depth_mm)
 
 
 def save_text(path: Path, text: str) -> None:
@@ -203,9 +210,7 @@ def icl_nuim(place: Path, s: Sample) -> Path:
 
 def open3d(place: Path, s: Sample) -> Path:
     folder = place / "lounge"
-    for n in range(FRAMES):
-        save(folder / f"color/{n + 1:06d}.png", s.color[n])
-        save(folder / f"depth/{n + 1:06d}.png", s.depth_mm[n])
+    save_pairs(folder, s, (f"{n + 1:06d}" for n in range(FRAMES)))
     K = intrinsic(SMALL_CAMERA)[:3, :3]
     fields = {"width": 32, "height": 24, "intrinsic_matrix": K.T.ravel().tolist(), "depth_scale": 1000.0, "fps": 15.0}
     save_text(folder / "camera_intrinsic.json", json.dumps(fields))
@@ -241,9 +246,7 @@ def nerfstudio(place: Path, s: Sample) -> Path:
 
 def plain(place: Path, s: Sample) -> Path:
     folder = place / "my_kitchen"
-    for n in range(FRAMES):
-        save(folder / f"color/{n + 8}.png", s.color[n])
-        save(folder / f"depth/{n + 8}.png", s.depth_mm[n])
+    save_pairs(folder, s, (f"{n + 8}" for n in range(FRAMES)))
     c = SMALL_CAMERA
     fields = {"fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy, "width": 32, "height": 24, "depth_scale": 1000}
     save_text(folder / "calibration.json", json.dumps(fields))

@@ -205,7 +205,7 @@ MISTAKES: dict[str, dict[str, tuple[Damage, tuple[str, ...]]]] = {
         "only colour": (without("depth"), LISTS),
         "another recording's depth": (
             another_time,
-            ("no colour image has depth within",),
+            ("no colour image of", "has depth within"),
         ),
         "images made smaller": (resized("*/*.[jp][pn]g", (320, 240)), ("320×240", "640×480")),
         "a log of words": (with_text("00021.log", "0 0 1\n1 0 0 x\n"), ("00021.log:2", "expected numbers")),
