@@ -62,13 +62,13 @@ def _written(origin: Origin, options: ExportOptions, write: "Callable[[GaussianF
             f"{origin.path} holds no σ that --sigma-below could judge by; only our runs and our PLY have it"
         )
     kept, every = (
-        splat_filter.sure(field, sigma_below=options.sigma_below, opacity_above=options.opacity_above),
+        splat_filter.filter_splats(field, sigma_below=options.sigma_below, opacity_above=options.opacity_above),
         len(field),
     )
     if every and kept.dropped == every:
         medians = f"{splat_filter.sigmas(field).median():.3g} and {field.opacities.median():.3g}"
         raise RunError(f"no splat of {origin.path} is left (median σ and opacity are {medians}); give milder bounds")
-    field.keep(kept.rows)
+    field.keep(kept.kept)
     print(f"writing {len(field):,} splats …", flush=True)
     write(field)
     asked = options.sigma_below is not None or options.opacity_above is not None
