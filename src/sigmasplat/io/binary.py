@@ -1,0 +1,18 @@
+"""Open binary files with the errors of this package."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from sigmasplat.errors import SourceError
+
+
+@contextmanager
+def open_binary(path: Path, what: str) -> Iterator[BinaryIO]:
+    """Open a file for reading. Raises SourceError "cannot read <what> …" if it, or reading in the block, fails."""
+    try:
+        with path.open("rb") as file:
+            yield file
+    except OSError as problem:
+        raise SourceError(f"cannot read {what} {path}: {problem.strerror or problem}") from problem
