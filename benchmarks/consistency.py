@@ -22,7 +22,7 @@ from systems import with_surface
 
 import sigmasplat
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.io.machine import RUNNING, code_digest
+from sigmasplat.io.machine import INSTALLED, code_digest
 
 arg = tyro.conf.arg
 SCENES: dict[str, tuple[str, int | None]] = {
@@ -68,7 +68,7 @@ def jobs_of(options: Options) -> list[tuple[str, accuracy.Job]]:
     unknown = [name for name in options.variants if name not in VARIANTS]
     if unknown:
         raise ConfigError(f"no variant {unknown[0]!r}; there are {', '.join(VARIANTS)}")
-    code = code_digest(Path(sigmasplat.__file__).parent, RUNNING)
+    code = code_digest(Path(sigmasplat.__file__).parent, INSTALLED)
     listed = []
     for scene in options.scenes:
         path, most = SCENES.get(scene, (scene, None))
