@@ -9,10 +9,10 @@ from sigmasplat.errors import SourceError
 
 
 @contextmanager
-def open_binary(path: Path, what: str) -> Iterator[BinaryIO]:
-    """Open a file for reading. Raises SourceError "cannot read <what> …" if it, or reading in the block, fails."""
+def open_binary(path: Path, error: str) -> Iterator[BinaryIO]:
+    """Open a file for reading. Raises SourceError, with a message that starts with `error`, if opening or reading fails."""
     try:
         with path.open("rb") as file:
             yield file
     except OSError as problem:
-        raise SourceError(f"cannot read {what} {path}: {problem.strerror or problem}") from problem
+        raise SourceError(f"{error} {path}: {problem.strerror or problem}") from problem

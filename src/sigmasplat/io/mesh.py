@@ -40,7 +40,7 @@ def read_mesh(path: Path) -> Mesh:
 
     Raises SourceError if it is missing, truncated, not such a PLY, or not a valid mesh.
     """
-    with open_binary(path, "mesh") as file:
+    with open_binary(path, "cannot read mesh") as file:
         order, elements = _header(file, path)
         rows = {name: _rows(file, path, order, name, count, fields) for name, count, fields in elements}
     vertices, faces = rows.get("vertex"), rows.get("face")

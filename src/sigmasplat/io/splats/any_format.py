@@ -28,7 +28,7 @@ def read_any(path: Path) -> GaussianField:
     """
     if path.is_dir():
         raise SourceError(f"{path} is a folder, not a map; give a file: {READABLE}")
-    with open_binary(path, "map") as file:
+    with open_binary(path, "cannot read map") as file:
         start = file.read(32)
     if start.startswith(b"\x1f\x8b\x08"):
         return spz.read_field(path)
@@ -36,7 +36,7 @@ def read_any(path: Path) -> GaussianField:
 
 
 def _read_ply(path: Path) -> GaussianField:
-    with open_binary(path, "map") as file:
+    with open_binary(path, "cannot read map") as file:
         compressed = compressed_ply.is_compressed(read_header(file, path))
     return compressed_ply.read_field(path) if compressed else ply.read_field(path)
 

@@ -61,7 +61,7 @@ def read_field(path: Path) -> GaussianField:
 
     Raises SourceError if it is missing, truncated, not a compressed PLY of splats, or has nan or inf.
     """
-    with open_binary(path, "map") as file:
+    with open_binary(path, "cannot read map") as file:
         elements = read_header(file, path)
         _check(elements, path)
         chunks, splats, *rest = (element.read(file, path) for element in elements)

@@ -75,7 +75,7 @@ def read_field(path: Path) -> GaussianField:
     Raises SourceError if it is missing, not a binary PLY of splats, truncated, has nan, inf or a zero quaternion, or if
     the number of f_rest columns is not 0, 9, 24 or 45.
     """
-    with open_binary(path, "map") as file:
+    with open_binary(path, "cannot read map") as file:
         elements = read_header(file, path)
         if not elements or elements[0].name != "vertex" or elements[0].count < 0:
             raise SourceError(f"{path}: the PLY's first element is not 'vertex', so it is not a map of splats")

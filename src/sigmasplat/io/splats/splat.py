@@ -46,7 +46,7 @@ def read_field(path: Path) -> GaussianField:
 
     Raises SourceError if it is missing, empty, if its length is not a multiple of 32, or if a splat is not valid.
     """
-    with open_binary(path, "map") as file:
+    with open_binary(path, "cannot read map") as file:
         data = file.read()
     if not data or len(data) % ROW.itemsize:
         what = f"{len(data)} bytes are not a multiple of {ROW.itemsize}" if data else "it is empty"

@@ -71,7 +71,7 @@ def read_field(path: Path) -> GaussianField:
 
     Raises SourceError if it is missing, damaged, truncated, of an unsupported version or degree, or not SPZ.
     """
-    with open_binary(path, "map") as file:
+    with open_binary(path, "cannot read map") as file:
         version, size, degree, bits, body = _unzipped(file, path)
     widths = _widths(version, degree)
     parts = np.split(np.frombuffer(body, "u1"), np.cumsum([size * width for width in widths])[:-1])
