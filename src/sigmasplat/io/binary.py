@@ -10,7 +10,7 @@ from sigmasplat.errors import SourceError
 
 @contextmanager
 def open_binary(path: Path, error: str) -> Iterator[BinaryIO]:
-    """Open a file for reading. Raises SourceError, with a message that starts with `error`, if opening or reading fails."""
+    """Open a file for reading. If opening or reading fails, raises SourceError with `error` as start of its message."""
     try:
         with path.open("rb") as file:
             yield file
