@@ -80,7 +80,6 @@ class LoopCloser:
 
     config: Config
     store: SubmapStore
-    view: View
     signatures: list[SubmapDescriptor] = field(default_factory=list)
     odometry: list[Edge] = field(default_factory=list)
     closed: list[Edge] = field(default_factory=list)
@@ -91,7 +90,9 @@ class LoopCloser:
         [6, 6] of its left twist (m, rad)."""
         self.odometry.append(Edge(index - 1, index, T_before_new, information, loop=False))
 
-    def submap_finished(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], atlas: Atlas) -> list[Loop]:
+    def submap_finished(
+        self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], atlas: Atlas, view: View
+    ) -> list[Loop]:
         """Look for loops from a finished submap to earlier ones; where one is found, correct the anchors.
 
         descriptors [D]: of its keyframes, in order, of unit norm or zero. Returns the pairs tried, the latest verdict
@@ -105,7 +106,7 @@ class LoopCloser:
         signature = SubmapDescriptor(submap.index, np.stack(descriptors), ratio)
         pairs = self._pairs(signature, atlas)
         self.signatures.append(signature)
-        tried = [self._try(pair, submap, atlas) for pair in pairs]
+        tried = [self._try(pair, submap, atlas, view) for pair in pairs]
         if any(loop.accepted for loop in tried):
             self._correct(atlas)
         return self.loops[len(self.loops) - len(tried) :]
@@ -125,11 +126,11 @@ class LoopCloser:
             pairs += [pair for pair in near if pair.best.database_submap not in known]
         return pairs[: c.most] if c.most else pairs
 
-    def _try(self, pair: SubmapPair, a: Submap, atlas: Atlas) -> Loop:
+    def _try(self, pair: SubmapPair, a: Submap, atlas: Atlas, view: View) -> Loop:
         """Register a pair, of which `a` is the query, and take note of it, accepted or not."""
         b = self.store.load(pair.best.database_submap)
         known = se3.inverse(atlas.anchors[a.index]) @ atlas.anchors[b.index]
-        found = Registrar(self.config, self.store, self.view).register(pair, a, b, known)
+        found = Registrar(self.config, self.store, view).register(pair, a, b, known)
         loop = described(pair.best, a, b, found, known)
         self.loops.append(loop)
         if found.accepted:
