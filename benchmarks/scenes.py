@@ -15,7 +15,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
-from sigmasplat.render import reference
+from sigmasplat.render.reference import operators as reference
 from sigmasplat.sources import open_source
 from sigmasplat.sources.base import Source
 

@@ -34,7 +34,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
 from sigmasplat.presets import default_preset, preset as preset_of
-from sigmasplat.render.view import make_view
+from sigmasplat.render.backend import make_view
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import open_source
 from sigmasplat.sources.base import Source

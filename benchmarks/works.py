@@ -21,8 +21,8 @@ from sigmasplat.fit.tracking_loss import tracking_gradient
 from sigmasplat.model.field import GaussianField
 from sigmasplat.native import _core
 from sigmasplat.presets import default_preset, preset
-from sigmasplat.render import cpu
-from sigmasplat.render.view import CpuView
+from sigmasplat.render.cpu import operators as cpu
+from sigmasplat.render.cpu.view import CpuView
 
 RENDER = RenderConfig()
 ADAM_ITERATIONS = 60

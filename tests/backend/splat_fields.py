@@ -9,7 +9,7 @@ from torch import Tensor
 from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
-from sigmasplat.render.view import ReferenceView
+from sigmasplat.render.reference.view import ReferenceView
 from splat_scenes import Scene, make
 
 OPTIONS = RenderConfig()

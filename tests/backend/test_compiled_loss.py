@@ -9,13 +9,15 @@ import torch
 
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates, adam_step, settle
-from sigmasplat.fit.step import CompiledStep, TorchStep
+from sigmasplat.fit.cpu.mapping_step import CompiledStep
+from sigmasplat.fit.mapping_step import TorchStep
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
-from sigmasplat.render.view import CpuView, ReferenceView
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.reference.view import ReferenceView
 from splat_fields import OPTIONS, crowd, exact_view, params_of
 from splat_scenes import SMALL, WIDE, assert_same_vector
 

@@ -14,7 +14,7 @@ from emulated_cuda import Emulator
 from sigmasplat.errors import BackendError
 from sigmasplat.fit import align as aligning
 from sigmasplat.fit.align import Alignment, align
-from sigmasplat.fit.cuda_align import MOTIONS, CudaLevel
+from sigmasplat.fit.cuda.align import MOTIONS, CudaLevel
 from sigmasplat.fit.pyramid import Pyramid, gray_of
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
@@ -212,9 +212,9 @@ def test_the_host_waits_once_for_a_pose_and_once_for_its_covariance() -> None:
     reference, live = there(seen(10, 48, 36, True)), there(seen(12, 48, 36))
     with Watch() as watch:
         found = align(reference, live, np.eye(4), 2)
-        assert watch.reads == [("cuda_align.py", "cpu"), ("cuda_align.py", "numpy")]
+        assert watch.reads == [("align.py", "cpu"), ("align.py", "numpy")]
         found.covariance  # noqa: B018
-    assert watch.reads == [("cuda_align.py", "cpu"), ("cuda_align.py", "numpy")] * 2
+    assert watch.reads == [("align.py", "cpu"), ("align.py", "numpy")] * 2
 
 
 def test_halving_makes_no_host_wait() -> None:

@@ -14,15 +14,16 @@ from align_oracle import HUGE, oracle, pair
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit import align as aligning
 from sigmasplat.fit.align import align
-from sigmasplat.fit.cuda_align import MOTIONS, CudaLevel
+from sigmasplat.fit.cuda.align import MOTIONS, CudaLevel
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, live_image, map_reference
 from sigmasplat.io.state import read_state, write_state
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.render import cuda_launch
-from sigmasplat.render.cuda_view import CudaView
-from sigmasplat.render.view import CpuView, View
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.cuda import launch as cuda_launch
+from sigmasplat.render.cuda.view import CudaView
+from sigmasplat.render.view import View
 from sigmasplat.slam.slam import Slam
 from splat_fields import OPTIONS
 from splat_wall import CAMERA, TRUTH, seen_from, wall

@@ -17,8 +17,10 @@ from sigmasplat.io.state import read_state, write_state
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.presets import default_preset, preset
-from sigmasplat.render.cuda_view import CudaView
-from sigmasplat.render.view import CpuView, ReferenceView, View
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.cuda.view import CudaView
+from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.view import View
 from sigmasplat.slam.register import Registrar
 from sigmasplat.slam.tracker import Tracker
 from splat_fields import OPTIONS

@@ -14,18 +14,20 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig, TrackingConfig
-from sigmasplat.fit.cuda_pose import CudaTrackingLoss, descend_on_device
-from sigmasplat.fit.cuda_rows import CudaGathered
-from sigmasplat.fit.cuda_step import CudaStep
+from sigmasplat.fit.backends import step_for
+from sigmasplat.fit.cuda.descent import CudaTrackingLoss, descend_on_device
+from sigmasplat.fit.cuda.mapping_step import CudaStep
+from sigmasplat.fit.cuda.rows import CudaGathered
 from sigmasplat.fit.descent import Descent, descend
-from sigmasplat.fit.steps import step_for
 from sigmasplat.fit.tracking_loss import tracking_gradient
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.render import cuda_launch, cuda_stages, render
-from sigmasplat.render.cuda_view import CudaView
-from sigmasplat.render.view import CpuView, make_view
+from sigmasplat.render import render
+from sigmasplat.render.backend import make_view
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.cuda import launch as cuda_launch, stages as cuda_stages
+from sigmasplat.render.cuda.view import CudaView
 from splat_fields import OPTIONS, crowd, exact_view, params_of, there_and_back
 from splat_scenes import KINDS, WIDE, assert_same_vector, scene
 from splat_wall import CAMERA, TRUTH, seen_from, wall

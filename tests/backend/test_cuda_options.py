@@ -14,21 +14,24 @@ from torch import Tensor
 
 from sigmasplat.config import MappingConfig
 from sigmasplat.errors import ConfigError
+from sigmasplat.fit.backends import MappingStep, step_for
 from sigmasplat.fit.color_covariance import FullCovarianceStep
-from sigmasplat.fit.cuda_rows import CudaGathered
-from sigmasplat.fit.cuda_step import CudaStep
-from sigmasplat.fit.cuda_view_dependent import CudaViewDependentStep
+from sigmasplat.fit.cuda.mapping_step import CudaStep
+from sigmasplat.fit.cuda.rows import CudaGathered
+from sigmasplat.fit.cuda.view_dependent import CudaViewDependentStep
 from sigmasplat.fit.field import fit_field, loss_weights
-from sigmasplat.fit.step import Gathered, TorchStep, arrived
-from sigmasplat.fit.steps import MappingStep, step_for
+from sigmasplat.fit.mapping_step import Gathered, TorchStep, arrived
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.fit.view_dependent import ViewDependentStep
 from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.model.harmonics import count
-from sigmasplat.render.covariance_view import CovarianceView, CudaCovarianceView
-from sigmasplat.render.cuda_view import CudaView
-from sigmasplat.render.view import CpuView, ReferenceView, View
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.cuda.covariance_view import CudaCovarianceView
+from sigmasplat.render.cuda.view import CudaView
+from sigmasplat.render.reference.covariance_view import CovarianceView
+from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.view import View
 from splat_fields import OPTIONS, crowd, exact_view, params_of, plane_gradients, there_and_back
 from splat_scenes import KINDS, SMALL, WIDE, Scene, assert_same_vector, scene
 from test_compiled_loss import RATES, WEIGHTS, fields, random_gradient, target_of

@@ -12,11 +12,11 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from emulated_cuda import Emulator
-from sigmasplat.fit.cuda_step import CudaStep
-from sigmasplat.fit.step import TorchStep
+from sigmasplat.fit.cuda.mapping_step import CudaStep
+from sigmasplat.fit.mapping_step import TorchStep
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.render.cuda_view import CudaView
+from sigmasplat.render.cuda.view import CudaView
 from splat_fields import OPTIONS, crowd, exact_view, params_of
 from splat_scenes import SMALL, WIDE, assert_same_vector, scene
 from test_compiled_loss import RATES, TERMS, WEIGHTS, draw_planes, fields, random_gradient, target_of
@@ -122,7 +122,7 @@ WAITS = {
 """What makes the host wait for a tensor of a device."""
 
 
-OF_THE_HOST = [("cuda_raster.py", "__int__"), ("cuda_rows.py", "numpy")]
+OF_THE_HOST = [("raster.py", "__int__"), ("rows.py", "numpy")]
 """The number of pairs, which had arrived; Adam's rates."""
 
 

@@ -12,15 +12,18 @@ from sigmasplat.config import MappingConfig
 from sigmasplat.errors import ConfigError
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import Rates
+from sigmasplat.fit.cpu.mapping_step import CompiledStep
 from sigmasplat.fit.field import fit_field, loss_weights
-from sigmasplat.fit.step import CompiledStep, TorchStep
+from sigmasplat.fit.mapping_step import TorchStep
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.model.frame import Frame
-from sigmasplat.render import reference
-from sigmasplat.render.view import CpuView, ReferenceView, View
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.reference import operators as reference
+from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.view import View
 from splat_fields import OPTIONS, crowd, exact_view, params_of, plane_gradients
 from splat_scenes import KINDS, SMALL, WIDE, Scene, assert_same_vector, scene
 

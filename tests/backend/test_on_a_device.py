@@ -22,8 +22,8 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.presets import preset
 from sigmasplat.render import FieldRenderer, render
-from sigmasplat.render.cuda_view import CudaView
-from sigmasplat.render.view import CpuView
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
 from sigmasplat.sources import SyntheticRoom

@@ -16,7 +16,8 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.render import render
-from sigmasplat.render.view import View, make_view
+from sigmasplat.render.backend import make_view
+from sigmasplat.render.view import View
 from splat_fields import OPTIONS
 from splat_scenes import assert_same_vector, twist_gradient
 from splat_wall import CAMERA, TRUTH, Array, assert_near, lower_median, seen_from, wall

@@ -15,7 +15,8 @@ from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.render import render
-from sigmasplat.render.view import View, make_view
+from sigmasplat.render.backend import make_view
+from sigmasplat.render.view import View
 from sigmasplat.sources import SyntheticRoom
 from splat_fields import OPTIONS
 from splat_wall import CAMERA, TRUTH, assert_near, lower_median, seen_from, wall

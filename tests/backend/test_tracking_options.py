@@ -17,7 +17,8 @@ from sigmasplat.fit.tracking_loss import tracking_gradient
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
-from sigmasplat.render.view import View, make_view
+from sigmasplat.render.backend import make_view
+from sigmasplat.render.view import View
 from sigmasplat.slam import tracker
 from splat_fields import OPTIONS
 from splat_scenes import assert_same_vector

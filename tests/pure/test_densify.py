@@ -10,7 +10,7 @@ from sigmasplat.fit.adam import Rates, adam_step
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, EXTRAS, WIDTH, GaussianField
-from sigmasplat.render import reference
+from sigmasplat.render.reference import operators as reference
 from sigmasplat.slam.densify import Heat, clone, hot_splats, multiply, split, too_large
 
 CAMERA = Camera(40, 30, 50.0, 52.0, 18.6, 15.3)

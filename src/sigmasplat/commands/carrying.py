@@ -67,7 +67,7 @@ def carry_through(
     Raises KeyboardInterrupt where Ctrl-C came before the first frame was done.
     """
     from sigmasplat.protocols import Together, Watcher
-    from sigmasplat.render import cuda_stages
+    from sigmasplat.render.cuda import stages as cuda_stages
     from sigmasplat.session import record
     from sigmasplat.snapshots import Snapshots
     from sigmasplat.sources.live import LiveSource

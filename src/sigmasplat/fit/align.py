@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.errors import BackendError
-from sigmasplat.fit import cuda_align
-from sigmasplat.fit.cuda_align import CudaLevel, Descent, Rules
+from sigmasplat.fit.cuda import align as cuda_align
+from sigmasplat.fit.cuda.align import CudaLevel, Descent, Rules
 from sigmasplat.fit.pyramid import LEVELS, Pyramid
 from sigmasplat.model import se3
 from sigmasplat.render.backend import backend_module

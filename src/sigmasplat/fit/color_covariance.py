@@ -10,11 +10,12 @@ from torch import Tensor
 
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import ROWS_AT_ONCE, Rates, adam_rows
-from sigmasplat.fit.step import Weights, shape_pull
+from sigmasplat.fit.mapping_step import Weights, shape_pull
 from sigmasplat.fit.target import Target
 from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.render.covariance_view import CovarianceView, CudaCovarianceView
-from sigmasplat.render.render import covariance_of
+from sigmasplat.render.channels import covariance_of
+from sigmasplat.render.cuda.covariance_view import CudaCovarianceView
+from sigmasplat.render.reference.covariance_view import CovarianceView
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 

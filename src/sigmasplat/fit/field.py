@@ -10,12 +10,13 @@ from torch import Tensor
 
 from sigmasplat.config import MappingConfig
 from sigmasplat.fit.adam import Rates, settle
-from sigmasplat.fit.step import Twist, arrived
-from sigmasplat.fit.steps import gathering, step_for
+from sigmasplat.fit.backends import gathering, step_for
+from sigmasplat.fit.mapping_step import Twist, arrived
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.render.view import CpuView, View
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 
 

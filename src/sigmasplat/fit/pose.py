@@ -6,14 +6,14 @@ from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.align import Alignment, align
-from sigmasplat.fit.cuda_pose import descend_on_device
+from sigmasplat.fit.cuda.descent import descend_on_device
 from sigmasplat.fit.descent import descend
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import PoseMaps, agreement
 from sigmasplat.model import se3
-from sigmasplat.render.cuda_view import CudaView
+from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 

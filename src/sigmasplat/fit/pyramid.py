@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import sobel
 from torch import Tensor
 
-from sigmasplat.fit import cuda_pyramid
+from sigmasplat.fit.cuda import pyramid as cuda_pyramid
 from sigmasplat.model.camera import Camera
 
 Image = NDArray[np.float32]

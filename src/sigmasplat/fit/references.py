@@ -12,8 +12,9 @@ from sigmasplat.fit.confidence import uncertainty_weights
 from sigmasplat.fit.pyramid import Image, Plane, Pyramid, gray_of, luma
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import PoseMaps, tracking_numbers
-from sigmasplat.render.cuda_view import CudaView
-from sigmasplat.render.view import CpuView, View
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.cuda.view import CudaView
+from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 
 ALIGN_ALPHA = 0.95

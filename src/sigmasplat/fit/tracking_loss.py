@@ -10,8 +10,9 @@ from torch import Tensor
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.confidence import outlier_mask, uncertainty_weights
 from sigmasplat.fit.target import Target
-from sigmasplat.render.render import variance_of
-from sigmasplat.render.view import CpuView, View
+from sigmasplat.render.channels import variance_of
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.view import View
 
 
 @dataclass(eq=False)

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from sigmasplat.fit.adam import ROWS_AT_ONCE, Rates, adam_rows
-from sigmasplat.fit.step import Weights, render_for, shape_pull
+from sigmasplat.fit.mapping_step import Weights, render_for, shape_pull
 from sigmasplat.fit.target import Target
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.model.harmonics import basis, count, view_colors

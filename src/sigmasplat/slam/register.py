@@ -16,7 +16,8 @@ from sigmasplat.fit.references import live_image, map_reference
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.submap import Submap, SubmapStore
-from sigmasplat.render.view import ReferenceView, View
+from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.view import View
 from sigmasplat.slam.drift import symmetric
 from sigmasplat.slam.places import SubmapPair
 from sigmasplat.types import Matrix

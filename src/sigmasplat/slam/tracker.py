@@ -13,7 +13,8 @@ from sigmasplat.fit.references import Reference, keyframe_reference, map_referen
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
-from sigmasplat.render.view import ReferenceView, View
+from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.view import View
 from sigmasplat.slam.rules import is_lost, jumped
 from sigmasplat.types import Matrix
 

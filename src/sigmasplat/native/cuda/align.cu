@@ -152,7 +152,7 @@ KERNEL normal_equations(AlignPlanes planes, AlignPinhole pinhole, AlignOptions o
 
 // ---- the loop: launched as often as steps may be taken; what is settled goes by ------------------------------------------
 
-struct AlignState {                        // of one alignment, in device memory; the host reads it at the end (fit/cuda_align.py)
+struct AlignState {                        // of one alignment, in device memory; the host reads it at the end (fit/cuda/align.py)
     AlignLoop loop;
     Descent descent;
     double readings;                       // pixels of the reference that have depth

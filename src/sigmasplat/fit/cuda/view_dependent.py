@@ -1,4 +1,4 @@
-"""The mapping step of view-dependent colour on a CUDA device (native/harmonics.cuh), after fit/view_dependent.py."""
+"""The mapping step of view-dependent colour (fit/view_dependent.py) on a CUDA device (native/cuda/harmonics.cuh)."""
 
 import numpy as np
 import torch
@@ -6,13 +6,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.cuda_rows import pull_shapes, step_rows
-from sigmasplat.fit.cuda_step import CudaStep
-from sigmasplat.fit.step import Weights, render_for
+from sigmasplat.fit.cuda.mapping_step import CudaStep
+from sigmasplat.fit.cuda.rows import pull_shapes, step_rows
+from sigmasplat.fit.mapping_step import Weights, render_for
 from sigmasplat.fit.target import Target
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.harmonics import count
-from sigmasplat.render.cuda_launch import blocks_for
+from sigmasplat.render.cuda.launch import blocks_for
 from sigmasplat.types import Matrix
 
 

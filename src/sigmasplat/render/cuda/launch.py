@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.errors import BackendError
-from sigmasplat.native import cubins
+from sigmasplat.native.cuda import cubins
 
 THREADS = 256
-"""Of every block (native/device.cuh)."""
+"""Of every block (native/cuda/device.cuh)."""
 Struct = tuple["Tensor | int | None", ...]
 Argument = Tensor | NDArray[Any] | Struct | int | float | None
 """A tensor is a pointer, None a null one; an array is a struct passed by value, a tuple one of pointers and 64-bit

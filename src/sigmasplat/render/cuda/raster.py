@@ -17,14 +17,14 @@ from torch import Tensor
 from sigmasplat.config import RenderConfig
 from sigmasplat.errors import BackendError
 from sigmasplat.model.camera import Camera
-from sigmasplat.native.cubins import FEATURE_COUNTS, FITTING
-from sigmasplat.render.cuda_launch import Argument, Launcher, Struct, blocks_for
+from sigmasplat.native.cuda.cubins import FEATURE_COUNTS, FITTING
+from sigmasplat.render.cuda.launch import Argument, Launcher, Struct, blocks_for
 
 TILE = 16
 GEOMETRY = 8
-"""Floats of a splat's row before its features (native/device.cuh)."""
+"""Floats of a splat's row before its features (native/cuda/device.cuh)."""
 MOMENTS = 6
-"""Sums of a record before those of the features (native/gradients.cuh)."""
+"""Sums of a record before those of the features (native/cuda/gradients.cuh)."""
 SPARE = 1.25
 """Room is made for so many times the pairs seen."""
 MOST_PAIRS = 2**31 - 1
@@ -80,7 +80,7 @@ class Raster:
         self._launch(self.features, kernel, blocks, *arguments)
 
     def launch_fit(self, kernel: str, blocks: int, *arguments: Argument) -> None:
-        """Run a kernel of the fits' loops (native/fit.cu)."""
+        """Run a kernel of the fits' loops (native/cuda/fit.cu)."""
         self._launch(FITTING, kernel, blocks, *arguments)
 
     def each_splat(self, kernel: str, *arguments: Argument) -> None:
@@ -228,7 +228,7 @@ def _rounded(floats: int) -> int:
 
 
 def _frame(camera: Camera, options: RenderConfig, tiles_x: int, tiles_y: int) -> NDArray[np.void]:
-    """Lay out the kernels' `Frame` (native/device.cuh)."""
+    """Lay out the kernels' `Frame` (native/cuda/device.cuh)."""
     numbers = (
         camera.width, camera.height, tiles_x, tiles_y, math.log2(options.alpha_min), options.transmittance_stop,
     )  # fmt: skip

@@ -1,6 +1,7 @@
 """Run the CUDA kernels: `project` and `blend` as autograd operators, float32, to the definition in `reference`.
 
-Compiled by NVRTC at first use for the device at hand (native/cubins.py); torch supplies memory, sorting and the stream.
+NVRTC compiles them at first use for the device in use (native/cuda/cubins.py); torch supplies memory, sorting and the
+stream.
 """
 
 from typing import Any
@@ -13,13 +14,13 @@ from torch import Tensor
 from sigmasplat.config import RenderConfig
 from sigmasplat.errors import BackendError
 from sigmasplat.model.camera import Camera
-from sigmasplat.native.cubins import FEATURE_COUNTS
-from sigmasplat.render import cuda_launch
-from sigmasplat.render.cuda_launch import blocks_for
-from sigmasplat.render.cuda_raster import Planes, Raster
-from sigmasplat.render.numbers import view_numbers
+from sigmasplat.native.cuda.cubins import FEATURE_COUNTS
+from sigmasplat.render.cuda import launch as cuda_launch
+from sigmasplat.render.cuda.launch import blocks_for
+from sigmasplat.render.cuda.raster import Planes, Raster
+from sigmasplat.render.kernel_params import view_numbers
 from sigmasplat.render.pose_gradient import pose_gradient
-from sigmasplat.render.reference import Blended, Projection
+from sigmasplat.render.reference.operators import Blended, Projection
 
 FEATURES_AT_ONCE = FEATURE_COUNTS[-1]
 

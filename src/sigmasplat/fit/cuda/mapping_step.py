@@ -1,4 +1,4 @@
-"""One mapping step fused in the CUDA kernels (native/fit.cu), on a view of theirs; tests hold it to `TorchStep`."""
+"""One mapping step fused in the CUDA kernels (native/cuda/fit.cu); tests hold it to `TorchStep`."""
 
 import numpy as np
 import torch
@@ -6,13 +6,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.cuda_rows import pull_shapes, step_rows
-from sigmasplat.fit.step import Weights, render_for
+from sigmasplat.fit.cuda.rows import pull_shapes, step_rows
+from sigmasplat.fit.mapping_step import Weights, render_for
 from sigmasplat.fit.target import Target
 from sigmasplat.model.field import GaussianField
-from sigmasplat.render.covariance_view import CudaCovarianceView
-from sigmasplat.render.cuda_launch import blocks_for
-from sigmasplat.render.cuda_view import CudaView
+from sigmasplat.render.cuda.covariance_view import CudaCovarianceView
+from sigmasplat.render.cuda.launch import blocks_for
+from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.types import Matrix
 
 LOCAL_TERMS = ("l1", "depth", "nll_color", "nll_depth", "alignment", "moment")

@@ -1,14 +1,14 @@
-"""From gradient rows to splats on a CUDA device (native/fit.cu): shape terms' pull, Adam, several images gathered."""
+"""From gradient rows to splats on a CUDA device (native/cuda/fit.cu): shape terms, Adam, sums over several images."""
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates
-from sigmasplat.fit.step import SHAPE_TERMS, Weights
+from sigmasplat.fit.mapping_step import SHAPE_TERMS, Weights
 from sigmasplat.model.field import EXTRAS, GaussianField, Rows
-from sigmasplat.render.cuda_launch import blocks_for
-from sigmasplat.render.cuda_view import CudaView
+from sigmasplat.render.cuda.launch import blocks_for
+from sigmasplat.render.cuda.view import CudaView
 
 MOST_COLUMNS = max(EXTRAS.values())
 """Of rows that the kernel steps."""

@@ -1,11 +1,11 @@
-"""Halve images on a CUDA device (native/align.cu), to the values that `fit.pyramid` finds on the CPU; no host waits."""
+"""Halve images on a CUDA device (native/cuda/align.cu), to the same values as on the CPU; the host does not wait."""
 
 import torch
 from torch import Tensor
 
-from sigmasplat.native.cubins import ALIGNING
-from sigmasplat.render import cuda_launch
-from sigmasplat.render.cuda_launch import blocks_for
+from sigmasplat.native.cuda.cubins import ALIGNING
+from sigmasplat.render.cuda import launch as cuda_launch
+from sigmasplat.render.cuda.launch import blocks_for
 
 Half = Tensor | None
 

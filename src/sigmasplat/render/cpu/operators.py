@@ -11,9 +11,9 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.errors import BackendError
 from sigmasplat.model.camera import Camera
 from sigmasplat.native import _core
-from sigmasplat.render.numbers import view_numbers as view_numbers
+from sigmasplat.render.kernel_params import view_numbers as view_numbers
 from sigmasplat.render.pose_gradient import pose_gradient
-from sigmasplat.render.reference import Blended, Projection
+from sigmasplat.render.reference.operators import Blended, Projection
 
 FEATURES_AT_ONCE = 16
 

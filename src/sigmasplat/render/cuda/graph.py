@@ -11,7 +11,7 @@ from functools import cache
 import torch
 
 from sigmasplat.errors import BackendError
-from sigmasplat.render.cuda_stages import measured
+from sigmasplat.render.cuda.stages import measured
 
 Work = Callable[[], None]
 

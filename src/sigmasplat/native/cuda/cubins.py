@@ -11,12 +11,13 @@ from typing import Any, NamedTuple
 from sigmasplat.env import install_extra
 from sigmasplat.errors import BackendError
 
-FOLDER = Path(__file__).parent
-RASTER, FIT, ALIGN = "raster.cu", "fit.cu", "align.cu"
+FOLDER = Path(__file__).parents[1]
+"""Of the texts: headers that the CPU's kernels share, and `cuda/` below it."""
+RASTER, FIT, ALIGN = "cuda/raster.cu", "cuda/fit.cu", "cuda/align.cu"
 TEXTS = {
-    RASTER: (RASTER, "gradients.cuh", "tiles.cuh", "device.cuh", "sums.cuh", "splat.h"),
-    FIT: (FIT, "harmonics.cuh", "track.cuh", "descend.cuh", "sums.cuh"),
-    ALIGN: (ALIGN, "align_pixel.h", "align_loop.h", "align_level.h", "sums.cuh"),
+    RASTER: (RASTER, "cuda/gradients.cuh", "cuda/tiles.cuh", "cuda/device.cuh", "cuda/sums.cuh", "splat.h"),
+    FIT: (FIT, "cuda/harmonics.cuh", "cuda/track.cuh", "cuda/descend.cuh", "cuda/sums.cuh"),
+    ALIGN: (ALIGN, "align_pixel.h", "align_loop.h", "align_level.h", "cuda/sums.cuh"),
 }
 FEATURE_COUNTS = (4, 7, 11, 16)
 """The feature counts compiled, a program each; a count between them is padded with zeros."""
@@ -91,7 +92,7 @@ def compiled(features: int, architecture: str, more: Sequence[str] = ()) -> Comp
     from cuda.bindings import nvrtc
 
     name = text_of(features)
-    options = [*_options(features, architecture), f"--include-path={FOLDER}", *more]
+    options = [*_options(features, architecture), *(f"--include-path={folder}" for folder in include_folders()), *more]
     _, program = nvrtc.nvrtcCreateProgram((FOLDER / name).read_bytes(), name.encode(), 0, [], [])
     try:
         (result,) = nvrtc.nvrtcCompileProgram(program, len(options), [option.encode() for option in options])
@@ -146,6 +147,11 @@ def target_of(capability: tuple[int, int]) -> str:
     number, known = 10 * capability[0] + capability[1], sorted(nvrtc.nvrtcGetSupportedArchs()[1])
     older = [other for other in known if other < number]
     return f"compute_{older[-1]}" if number not in known and older else architecture_of(capability)
+
+
+def include_folders() -> tuple[Path, ...]:
+    """Return where the texts' headers are."""
+    return FOLDER / "cuda", FOLDER
 
 
 def kernel_names(features: int) -> list[str]:

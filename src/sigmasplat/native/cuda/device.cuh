@@ -1,5 +1,5 @@
 // What splat.h asks of its number type, for one float of a GPU thread, and the layouts that the CUDA kernels share.
-// One program per feature count: FEATURES is defined when the text is compiled (render/cuda_raster.py lists the counts).
+// One program per feature count: FEATURES is defined when the text is compiled (render/cuda/raster.py lists the counts).
 #pragma once
 #include "sums.cuh"
 

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
-from sigmasplat.render.reference import FRUSTUM_MARGIN
+from sigmasplat.render.reference.operators import FRUSTUM_MARGIN
 
 
 def view_numbers(

@@ -1,5 +1,5 @@
-"""Align images that lie on a CUDA device (native/align.cu): every step is launched at once, and the host waits at the
-end alone. What is computed is the CPU's own text (native/align_pixel.h, align_loop.h)."""
+"""Align images that lie on a CUDA device (native/cuda/align.cu). All steps are launched at once; the host waits at the
+end only. The arithmetic is the text that the CPU's kernels use too (native/align_pixel.h, align_loop.h)."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sigmasplat.native.cubins import ALIGNING
-from sigmasplat.render import cuda_launch
+from sigmasplat.native.cuda.cubins import ALIGNING
+from sigmasplat.render.cuda import launch as cuda_launch
 from sigmasplat.types import Matrix
 
 CELL = 16

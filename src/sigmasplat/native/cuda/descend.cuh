@@ -11,7 +11,7 @@ KERNEL drop_pairs(Pairs pairs, int n, int* counts) {
     if (i < n && *pairs.total > pairs.room) counts[i] = 0;
 }
 
-struct Descending {                        // fit/cuda_pose.py lays it out
+struct Descending {                        // fit/cuda/descent.py lays it out
     double numbers[7], moment1[9], moment2[9];        // of the pose, quaternion or axis times angle first; Adam's, exposure's last
     double exposure[2], best_exposure[2];             // (a, b)
     double T[12], best_T[12];                         // T_camera_world, rows of [R | t]: now, and where the loss was least

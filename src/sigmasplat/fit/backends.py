@@ -7,16 +7,20 @@ from torch import Tensor
 from sigmasplat.errors import ConfigError
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.color_covariance import FullCovarianceStep
-from sigmasplat.fit.cuda_rows import CudaGathered
-from sigmasplat.fit.cuda_step import CudaStep
-from sigmasplat.fit.cuda_view_dependent import CudaViewDependentStep
-from sigmasplat.fit.step import COMPILED_TERMS, CompiledImages, CompiledStep, Gathered, TorchStep, Twist, Weights
+from sigmasplat.fit.cpu.mapping_step import CompiledImages, CompiledStep
+from sigmasplat.fit.cuda.mapping_step import CudaStep
+from sigmasplat.fit.cuda.rows import CudaGathered
+from sigmasplat.fit.cuda.view_dependent import CudaViewDependentStep
+from sigmasplat.fit.mapping_step import COMPILED_TERMS, Gathered, TorchStep, Twist, Weights
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.view_dependent import ViewDependentStep
 from sigmasplat.model.field import GaussianField
-from sigmasplat.render.covariance_view import CovarianceView, CudaCovarianceView, covariance_view
-from sigmasplat.render.cuda_view import CudaView
-from sigmasplat.render.view import CpuView, View
+from sigmasplat.render.backend import make_covariance_view
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.cuda.covariance_view import CudaCovarianceView
+from sigmasplat.render.cuda.view import CudaView
+from sigmasplat.render.reference.covariance_view import CovarianceView
+from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 
 
@@ -60,7 +64,7 @@ def step_for(field: GaussianField, view: View, weights: Weights, degree: int) ->
         raise ConfigError(
             "mapping.color_covariance full goes without weight_alignment and weight_moment; set both to 0"
         )
-    seen = covariance_view(view, field.carry("correlations")) if full else view
+    seen = make_covariance_view(view, field.carry("correlations")) if full else view
     fused = {name for name, weight in weights.items() if weight} <= {*COMPILED_TERMS, "nll_color_full"}
     if fused and isinstance(seen, CudaView):
         there = CudaStep(seen)

@@ -1,4 +1,4 @@
-"""Descend the tracking loss on a CUDA device without the host (native/track.cuh, descend.cuh), as `fit.descent` says.
+"""Descend the tracking loss as `fit.descent` does, on a CUDA device alone (native/cuda/track.cuh, descend.cuh).
 
 An iteration is launched and not waited for: loss, gradient, pose, stop rules and what was best stay on the device. The
 host looks at them now and then, at what was true some iterations ago. That it launches too many by then does no harm:
@@ -16,13 +16,13 @@ from sigmasplat.fit.descent import Descent, exposure_rate
 from sigmasplat.fit.motion import parametrisation
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import tracking_numbers
-from sigmasplat.render.cuda_graph import Work, repeatable
-from sigmasplat.render.cuda_launch import THREADS, blocks_for
-from sigmasplat.render.cuda_view import CudaView
+from sigmasplat.render.cuda.graph import Work, repeatable
+from sigmasplat.render.cuda.launch import THREADS, blocks_for
+from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.types import Matrix
 
 MEDIANS, PASSES, DIGITS = 5, 3, 2048
-"""Of errors of depth and colour and of three channels of V; counts by 11, 10 and 10 bits (native/track.cuh)."""
+"""Of errors of depth and colour and of three channels of V; counts by 11, 10 and 10 bits (native/cuda/track.cuh)."""
 MOST_BLOCKS = 512
 """Blocks that share an image's pixels."""
 LOOK = 8
@@ -36,7 +36,7 @@ STATE = np.dtype(
         ("previous", "f8"), ("steps", "i8"), ("stopped", "i8"), ("missing", "i8"),
     ]
 )  # fmt: skip
-"""The kernels' `Descending` (native/descend.cuh)."""
+"""The kernels' `Descending` (native/cuda/descend.cuh)."""
 
 
 def descend_on_device(

@@ -6,10 +6,10 @@ from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
-from sigmasplat.render import cuda_launch
-from sigmasplat.render.cuda_raster import Planes, Raster
-from sigmasplat.render.cuda_stages import Stages
-from sigmasplat.render.numbers import view_numbers
+from sigmasplat.render.cuda import launch as cuda_launch
+from sigmasplat.render.cuda.raster import Planes, Raster
+from sigmasplat.render.cuda.stages import Stages
+from sigmasplat.render.kernel_params import view_numbers
 from sigmasplat.render.view import Layers
 from sigmasplat.types import Matrix
 
@@ -18,8 +18,10 @@ class CudaView:
     """A view on the CUDA kernels: `View` with planes of exactly the image's size, on a device.
 
     A backward pass ends by reading the twist, the one moment that the host waits for the device. Its `seconds` stay 0
-    where nobody asked to `measure` them (render/cuda_stages.py); to read them is to wait for the device.
+    where nobody asked to `measure` them (render/cuda/stages.py); to read them is to wait for the device.
     """
+
+    backend = "cuda"
 
     def __init__(
         self, camera: Camera, options: RenderConfig, variance: bool = True, device: torch.device | None = None
