@@ -25,8 +25,9 @@ from tracking_tables import coverage
 
 from sigmasplat.config import Config
 from sigmasplat.errors import SigmaSplatError, SourceError
+from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
-from sigmasplat.fit.pyramid import Pyramid, gray_of
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import map_reference
 from sigmasplat.fit.target import Target
 from sigmasplat.metrics.trajectory import associate

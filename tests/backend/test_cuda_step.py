@@ -46,7 +46,7 @@ def both_ways(
         layers=SimpleNamespace(median_depth=view.layers.median_depth.double()),
         g_moment=torch.zeros_like(view.moment).double(), g_median_depth=torch.zeros_like(view.moment).double(),
     )  # fmt: skip
-    for plane, name in ((view.g_sums, ""), (view.g_median_depth, "alignment"), (view.g_moment, "moment")):
+    for plane, name in ((view.g_sums, ""), (view.g_median_depth, "median_depth"), (view.g_moment, "moment")):
         plane.fill_(torch.nan if weights.get(name, 1.0) else 0.0)  # whatever was there must go
     got, want = CudaStep(view).images(target, weights), TorchStep(exact).images(target, weights)  # type: ignore[arg-type]
     return (float(got), planes_of(view)), (want, planes_of(exact))

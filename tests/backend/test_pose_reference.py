@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
+from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pose import fit_pose_align
-from sigmasplat.fit.pyramid import Pyramid, gray_of
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, map_reference
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3

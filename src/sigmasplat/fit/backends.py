@@ -1,87 +1,111 @@
-"""Choose what takes a mapping step: the fused kernels of a view's device where they know all terms, or torch."""
+"""The table of devices: what each backend does for the fits. Nothing else in `fit` or above chooses by device."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Protocol
 
+import numpy as np
 from torch import Tensor
 
 from sigmasplat.errors import ConfigError
-from sigmasplat.fit.adam import Rates
+from sigmasplat.fit import adam, tracking_loss
 from sigmasplat.fit.color_covariance import FullCovarianceStep
+from sigmasplat.fit.cpu import adam as cpu_adam, images as cpu_images, tracking_loss as cpu_tracking_loss
 from sigmasplat.fit.cpu.mapping_step import CompiledImages, CompiledStep
-from sigmasplat.fit.cuda.mapping_step import CudaStep
-from sigmasplat.fit.cuda.rows import CudaGathered
+from sigmasplat.fit.cpu.reference_maps import reference_maps as cpu_reference_maps
+from sigmasplat.fit.cuda import descent as cuda_descent, images as cuda_images, rows as cuda_rows
+from sigmasplat.fit.cuda.mapping_step import CudaStep, covariance_step
 from sigmasplat.fit.cuda.view_dependent import CudaViewDependentStep
-from sigmasplat.fit.mapping_step import COMPILED_TERMS, Gathered, TorchStep, Twist, Weights
-from sigmasplat.fit.target import Target
+from sigmasplat.fit.descent import descend
+from sigmasplat.fit.fused_terms import fused_terms
+from sigmasplat.fit.interface import DeviceFits, MappingStep, Twist, Weights
+from sigmasplat.fit.mapping_step import TorchStep
+from sigmasplat.fit.reference_maps import reference_arrays, reference_maps
 from sigmasplat.fit.view_dependent import ViewDependentStep
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render.backend import make_covariance_view
-from sigmasplat.render.cpu.view import CpuView
-from sigmasplat.render.cuda.covariance_view import CudaCovarianceView
-from sigmasplat.render.cuda.view import CudaView
-from sigmasplat.render.reference.covariance_view import CovarianceView
-from sigmasplat.render.view import View
+from sigmasplat.render.view import CorrelationView, View
 from sigmasplat.types import Matrix
 
 
-class MappingStep(Protocol):
-    """One mapping step on a view: render, the image terms' gradient, from there to the splats and Adam's step.
+def _on_host(twists: Sequence[Twist], costs: Sequence[float | Tensor]) -> tuple[list[Matrix], list[float]]:
+    return [np.asarray(twist) for twist in twists], [float(cost) for cost in costs]
 
-    Twists and costs may be on a device still; `step.arrived` brings them.
-    """
+
+def _torch_covariance_step(view: CorrelationView) -> FullCovarianceStep:
+    return FullCovarianceStep(view, TorchStep(view))
+
+
+def _cpu_covariance_step(view: CorrelationView) -> FullCovarianceStep:
+    return FullCovarianceStep(view, CompiledImages(view))
+
+
+TORCH = DeviceFits(
+    mapping_step=TorchStep,
+    covariance_step=_torch_covariance_step,
+    view_dependent_step=ViewDependentStep,
+    settle=adam.settle,
+    to_host=_on_host,
+    tracking_loss=tracking_loss.tracking_gradient,
+    descend=descend,
+    reference_maps=reference_arrays,
+    live_planes=cpu_images.live_planes,
+    images=cpu_images.CPU_IMAGES,
+    aligns=False,
+)
+CPU = replace(
+    TORCH,
+    mapping_step=CompiledStep,
+    covariance_step=_cpu_covariance_step,
+    settle=cpu_adam.settle,
+    tracking_loss=cpu_tracking_loss.tracking_gradient,
+    descend=partial(descend, tracking_loss=cpu_tracking_loss.tracking_gradient),
+    reference_maps=cpu_reference_maps,
+    aligns=True,
+)
+CUDA = replace(
+    TORCH,
+    mapping_step=CudaStep,
+    covariance_step=covariance_step,
+    view_dependent_step=CudaViewDependentStep,
+    to_host=cuda_rows.to_host,
+    descend=cuda_descent.descend_on_device,
+    reference_maps=reference_maps,
+    live_planes=cuda_images.live_planes,
+    images=cuda_images.CUDA_IMAGES,
+    aligns=True,
+)
+DEVICES = {"reference": TORCH, "cpu": CPU, "cuda": CUDA}
+
+
+class OnBackend(Protocol):
+    """Anything that names its backend: a view, a pyramid."""
 
     @property
-    def view(self) -> View: ...
-
-    def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
-        """Render the field to the view's planes."""
-
-    def images(self, target: Target, weights: Weights) -> float | Tensor:
-        """Write the gradient of every image term to the view's gradient planes; return the loss."""
-        ...
-
-    def splats(
-        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, pull: Tensor | None = None
-    ) -> tuple[Twist, float | Tensor]:
-        """Step the splats in view; return the pose twist [6] and what the shape terms cost."""
-        ...
+    def backend(self) -> str: ...
 
 
-class Gathering(Protocol):
-    """The gradient of several images' mean loss, as `Gathered`."""
-
-    def add(self, field: GaussianField, share: float, pull: Tensor | None = None) -> Twist: ...
-    def step(self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int) -> float | Tensor: ...
+def fits_of(on: OnBackend) -> DeviceFits:
+    """Return what the backend of a view or a pyramid does for the fits."""
+    return DEVICES[on.backend]
 
 
 def step_for(field: GaussianField, view: View, weights: Weights, degree: int) -> MappingStep:
     """Make the step that fits a field on a view; degree: of view-dependent colour.
 
-    Raises ConfigError where full colour covariance meets terms that its view does not make maps for.
+    The device's kernels compute the loss where they have every term that has weight; else the whole loss runs in torch.
+    Raises ConfigError where full colour covariance meets terms that its view has no maps for.
     """
     full = bool(weights["nll_color_full"])
-    if full and (weights["alignment"] or weights["moment"]):
+    if full and (weights["median_depth"] or weights["moment"]):
         raise ConfigError(
             "mapping.color_covariance full goes without weight_alignment and weight_moment; set both to 0"
         )
-    seen = make_covariance_view(view, field.carry("correlations")) if full else view
-    fused = {name for name, weight in weights.items() if weight} <= {*COMPILED_TERMS, "nll_color_full"}
-    if fused and isinstance(seen, CudaView):
-        there = CudaStep(seen)
-        return CudaViewDependentStep(there, degree) if degree else there
-    step = _on_host(seen, fused and isinstance(view, CpuView))
-    return ViewDependentStep(step, degree) if degree else step
-
-
-def _on_host(view: View, compiled: bool) -> TorchStep | CompiledStep | FullCovarianceStep:
-    """Make the plain step of a view, in the CPU's kernels or in torch."""
-    if isinstance(view, CovarianceView | CudaCovarianceView):
-        return FullCovarianceStep(view, CompiledImages(view) if compiled else TorchStep(view))
-    return CompiledStep(view) if compiled and isinstance(view, CpuView) else TorchStep(view)
-
-
-def gathering(step: MappingStep, field: GaussianField) -> Gathering:
-    """Make room for the gradient of several images. Raises ConfigError where a step takes one image only."""
-    if not isinstance(step, TorchStep | CompiledStep | CudaStep) or isinstance(step.view, CudaCovarianceView):
-        raise ConfigError("mapping.frames_per_step must be 1 with full colour covariance or view-dependent colour")
-    return CudaGathered(step.view, field) if isinstance(step, CudaStep) else Gathered(step.view, field)
+    used = {name for name, weight in weights.items() if weight} - {"nll_color_full"}
+    fits = fits_of(view) if used <= fused_terms(view.backend) else TORCH
+    if full:
+        step = fits.covariance_step(make_covariance_view(view, field.carry("correlations")))
+    else:
+        step = fits.mapping_step(view)
+    return fits.view_dependent_step(step, degree) if degree else step

@@ -1,47 +1,27 @@
 """One mapping step on a view: the image terms' gradient on its planes, from there to the splats, and Adam's step."""
 
-from collections.abc import Mapping, Sequence
-
-import numpy as np
 import torch
 from torch import Tensor
 
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import Rates, adam_step
+from sigmasplat.fit.fused_terms import SHAPE_TERMS
+from sigmasplat.fit.interface import Weights
 from sigmasplat.fit.target import Target
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.render.channels import variance_of
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 
-Weights = Mapping[str, float]
-SHAPE_TERMS = ("isotropy", "isotropy_ratio")
-"""Terms of the splats, not of an image."""
-COMPILED_TERMS = {"l1", "ssim", "depth", "nll_color", "nll_depth", "alignment", "moment", *SHAPE_TERMS}
-"""What `CompiledImages` and `CompiledStep` know; any other term, but `nll_color_full`, needs a `TorchStep`."""
-
-
-Twist = Matrix | Tensor
-"""Of a pose [6]; a tensor may still be on its way from a device, as may a number be."""
-
-
-def arrived(twists: Sequence[Twist], numbers: Sequence[float | Tensor]) -> tuple[list[Matrix], list[float]]:
-    """Return twists and numbers as the host has them; it waits once for all that are on a device."""
-    there = [x.double().reshape(-1) for x in (*twists, *numbers) if isinstance(x, Tensor)]
-    found = torch.cat(there).cpu().numpy() if there else np.empty(0)
-    parts = iter(np.split(found, np.cumsum([len(x) for x in there])))
-    here = [next(parts) if isinstance(x, Tensor) else x for x in twists]
-    return here, [float(next(parts)[0]) if isinstance(x, Tensor) else x for x in numbers]
-
 
 def render_for(view: View, params: Tensor, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
     """Render rows to the view's planes, with what the terms that have weight need."""
     reference = target.depth_image if weights.get("moment") else None
-    view.forward(params, T_camera_world, reference, layers=bool(weights.get("alignment")))
+    view.forward(params, T_camera_world, reference, layers=bool(weights.get("median_depth")))
 
 
-def shape_pull(log_scales: Tensor, weights: Weights, of_all: float, of_visible: float) -> tuple[Tensor, float]:
-    """Return the pull of the weighted shape terms on some splats' log scales [n, 3], and what they cost.
+def shape_gradient(log_scales: Tensor, weights: Weights, of_all: float, of_visible: float) -> tuple[Tensor, float]:
+    """Return the gradient of the weighted shape terms by some splats' log scales [n, 3], and the cost of those terms.
 
     of_all, of_visible: share of these splats among all and among those in view, which each term is a mean over.
     """
@@ -54,7 +34,7 @@ def shape_pull(log_scales: Tensor, weights: Weights, of_all: float, of_visible: 
     return torch.autograd.grad(cost, leaf)[0], float(cost.detach())
 
 
-class Gathered:
+class GradientAccumulator:
     """The gradient of several images' mean loss by the splats that any of them shows."""
 
     def __init__(self, view: View, field: GaussianField) -> None:
@@ -62,20 +42,20 @@ class Gathered:
         self.grad, self._rows = torch.zeros_like(field.params), torch.zeros_like(field.params)
         self.visible = torch.zeros(len(field), dtype=torch.bool, device=field.params.device)
 
-    def add(self, field: GaussianField, share: float, pull: Tensor | None = None) -> Matrix:
+    def add(self, field: GaussianField, share: float, grad2d: Tensor | None = None) -> Matrix:
         """Add the view's gradient planes at their share of the mean; return the image's own pose twist [6]."""
-        twist = self._view.backward(field.params, self._rows, pull)
+        twist = self._view.backward(field.params, self._rows, grad2d)
         self.visible |= self._view.visible(len(field))
         self.grad += share * self._rows
         return twist
 
     def step(self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int) -> float:
-        """Add the shape terms' pull, take Adam's step; return what those terms cost."""
+        """Add the gradient of the shape terms, take Adam's step; return the cost of those terms."""
         scales = COLUMNS["log_scales"]
         of_all = float(self.visible.sum()) / max(len(field), 1)
-        pull, cost = shape_pull(field.params[self.visible][:, scales], weights, of_all, 1.0)
+        on_scales, cost = shape_gradient(field.params[self.visible][:, scales], weights, of_all, 1.0)
         rows = self.grad[self.visible]
-        rows[:, scales] += pull
+        rows[:, scales] += on_scales
         self.grad[self.visible] = rows
         self.grad[:frozen_colors, COLUMNS["colors"]] = 0.0
         adam_step(field, self.grad, rates, self.visible)
@@ -99,7 +79,7 @@ class TorchStep:
         planes = {"sums": (v.sums, v.g_sums)}
         if used.get("moment"):
             planes["moment"] = v.moment, v.g_moment
-        if used.get("alignment"):
+        if used.get("median_depth"):
             planes["median_depth"] = v.layers.median_depth, v.g_median_depth
         leaves = {name: values.detach().clone().requires_grad_() for name, (values, _) in planes.items()}
         sums = leaves["sums"][:, :h, :w].movedim(0, -1)
@@ -119,12 +99,16 @@ class TorchStep:
         return float(loss.detach())
 
     def splats(
-        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, pull: Tensor | None = None
+        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Matrix, float]:
-        """Carry the planes to the splats in view, add the shape terms' pull on them, and step.
+        """Carry the planes to the splats in view, add the gradient of the shape terms, and step.
 
-        Returns the pose twist [6] and what the shape terms cost. `pull` is filled as by `View.backward`.
+        Returns the pose twist [6] and the cost of the shape terms. grad2d [N] is filled as by `View.backward`.
         """
-        gathered = Gathered(self.view, field)
-        twist = gathered.add(field, 1.0, pull)
-        return twist, gathered.step(field, rates, weights, frozen_colors)
+        accumulator = self.accumulator(field)
+        twist = accumulator.add(field, 1.0, grad2d)
+        return twist, accumulator.step(field, rates, weights, frozen_colors)
+
+    def accumulator(self, field: GaussianField) -> GradientAccumulator:
+        """Make room for the gradient of several images."""
+        return GradientAccumulator(self.view, field)

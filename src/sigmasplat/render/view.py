@@ -79,9 +79,9 @@ class View(Protocol):
         """Render parameter rows [N, 17] at a pose into `sums` and `alpha`; with a depth [H, W] m into `moment` too, and
         if asked to into `layers`."""
 
-    def backward(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Matrix:
+    def backward(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Matrix:
         """Carry the gradient planes to parameter rows, written to g_params [N, 17]; return the pose twist [6] (ρ, φ; m,
-        rad). To pull [N], where given, goes how hard each image mean is pulled, per half image size (3DGS)."""
+        rad). grad2d [N], if given, receives the norm of the gradient by each image mean, per half image size (3DGS)."""
 
     def backward_pose(self, params: Tensor) -> Matrix:
         """Carry the gradient planes of colour and depth to the pose alone; return the twist (ρ, φ) [6]."""

@@ -5,7 +5,9 @@ import torch
 from torch import Tensor
 
 from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates
-from sigmasplat.fit.mapping_step import SHAPE_TERMS, Weights, render_for
+from sigmasplat.fit.fused_terms import SHAPE_TERMS, kernel_weights, pixel_weights
+from sigmasplat.fit.interface import Weights
+from sigmasplat.fit.mapping_step import GradientAccumulator, render_for
 from sigmasplat.fit.target import Target
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render.cpu.view import CpuView
@@ -26,17 +28,14 @@ class CompiledImages:
     def images(self, target: Target, weights: Weights) -> float:
         """Write the gradient of every image term to the view's gradient planes; return the loss."""
         width, height, v = target.camera.width, target.camera.height, self.planes
-        names = ("l1", "depth", "nll_color", "nll_depth", "alignment", "moment")
-        local = [weights.get(name, 0.0) for name in names]
-        median, g_median = (v.layers.median_depth, v.g_median_depth) if local[4] else (None, None)
-        moment, g_moment = (v.moment, v.g_moment) if local[5] else (None, None)
+        of_pixels = pixel_weights(weights, "cpu", variance=len(v.sums) >= 7)
+        median, g_median = (v.layers.median_depth, v.g_median_depth) if weights.get("median_depth") else (None, None)
+        moment, g_moment = (v.moment, v.g_moment) if weights.get("moment") else (None, None)
         self.core.mapping_losses(
-            v.sums, median, moment, target.color, target.depth, height, local, target.valid_pixels,
+            v.sums, median, moment, target.color, target.depth, height, of_pixels.tolist(), target.valid_pixels,
             v.g_sums, g_median, g_moment, self.parts,
         )  # fmt: skip
-        if len(v.sums) < 7:
-            local[2:4] = [0.0, 0.0]
-        loss = float(np.dot(local, self.parts))
+        loss = float(np.dot(of_pixels, self.parts))
         if weights["ssim"]:
             self.core.ssim_target(target.color, target.depth, width, height, self.cache)
             similarity = self.core.ssim(
@@ -58,13 +57,17 @@ class CompiledStep(CompiledImages):
         render_for(self.view, field.params, T_camera_world, target, weights)
 
     def splats(
-        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, pull: Tensor | None = None
+        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Matrix, float]:
         """Do what `TorchStep.splats` does in one pass, without a gradient row in memory."""
         twist, v = np.zeros(6), self.view
         cost = v.raster.step(
             field.params, field.moment1, field.moment2, field.last_step, v.g_sums, *v.depth_gradients(),
             rates.per_column.numpy(), BETA1, BETA2, EPSILON, field.steps,
-            [weights.get(name, 0.0) for name in SHAPE_TERMS], frozen_colors, pull, twist, v.seconds[3:],
+            kernel_weights(SHAPE_TERMS, weights, "cpu").tolist(), frozen_colors, grad2d, twist, v.seconds[3:],
         )  # fmt: skip
         return twist, cost
+
+    def accumulator(self, field: GaussianField) -> GradientAccumulator:
+        """Make room for the gradient of several images."""
+        return GradientAccumulator(self.view, field)

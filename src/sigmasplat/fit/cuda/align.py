@@ -2,20 +2,18 @@
 end only. The arithmetic is the text that the CPU's kernels use too (native/align_pixel.h, align_loop.h)."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from sigmasplat.fit.interface import NORMAL_TERMS, AlignedPose, AlignRules, LevelPlanes
 from sigmasplat.native.cuda.cubins import ALIGNING
 from sigmasplat.render.cuda import launch as cuda_launch
 from sigmasplat.types import Matrix
 
 CELL = 16
 """Pixels of a cell each way, a block of threads (native/align_pixel.h)."""
-NORMAL_TERMS = 52
-"""H 21, b 6, sums 4, S 21 (native/align_pixel.h)."""
 MOTIONS = 13
 """At most so many motions are linearised in one launch."""
 PINHOLE = np.dtype([("size", "i4", 2), ("intrinsics", "f4", 4)])
@@ -35,30 +33,6 @@ DESCENT = np.dtype(
 )  # fmt: skip
 STATE = np.dtype([("loop", LOOP), ("descent", DESCENT), ("readings", "f8")], align=True)
 """Structs of native/align_level.h, align_loop.h and align.cu."""
-
-
-class Rules(NamedTuple):
-    """When steps end and which directions are left alone, as native/align_level.h has it (`AlignLoop`): steps a level;
-    the update, m and rad, and the change of cost that end one; the share of the best direction's information below
-    which one is not decided; the least number of pixels."""
-
-    iterations: int
-    update_stop: float
-    plateau_stop: float
-    degenerate_share: float
-    min_pixels: float
-
-
-class Descent(NamedTuple):
-    """T_live_reference [4, 4]; sums [4] of the iterate that stands; steps of all levels; how many directions were left
-    alone; mean depth of the reference, metres, and how many of its pixels have one."""
-
-    T: Matrix
-    sums: Matrix
-    steps: int
-    degenerate: int
-    depth_m: float
-    readings: float
 
 
 class CudaLevel:
@@ -100,12 +74,17 @@ def _workspace(motions: int, cells: int, device: torch.device) -> tuple[Tensor, 
     return of_cells, torch.zeros(motions, dtype=torch.int32, device=device)
 
 
-def descend(levels: Sequence[CudaLevel], readings: Tensor, T_live_reference: Matrix, rules: Rules) -> Descent:
-    """Align from the coarsest level, the last, to the finest; readings as `readings_of`. The host waits once.
+def normal_equations(level: LevelPlanes, motions: Sequence[Matrix]) -> Matrix:
+    """Do what `ImageKernels.normal_equations` says. The host waits once."""
+    return CudaLevel(*level).normal_equations(np.stack(motions))
+
+
+def align(planes: Sequence[LevelPlanes], readings: Tensor, T_live_reference: Matrix, rules: AlignRules) -> AlignedPose:
+    """Align from the coarsest level, the last, to the finest. The host waits once.
 
     Every step there may be is launched; those of a level that has settled come to nothing.
     """
-    device, r = readings.device, rules
+    device, r, levels = readings.device, rules, [CudaLevel(*level) for level in planes]
     loop = (r.iterations, r.update_stop, r.plateau_stop, 0.0, r.degenerate_share, r.min_pixels)
     launch, guess = cuda_launch.launcher_for(device), np.array(T_live_reference[:3], np.float64)
     state = torch.empty(STATE.itemsize // 8, dtype=torch.float64, device=device)
@@ -115,11 +94,11 @@ def descend(levels: Sequence[CudaLevel], readings: Tensor, T_live_reference: Mat
         given = (level.planes, level.pinhole, level.options, number, state, of_cells, arrived)
         for _ in range(r.iterations):
             launch(ALIGNING, "take_align_step", level.cells, *given)
-    return _descent_of(state.cpu().numpy().view(STATE)[0])
+    return _pose_of(state.cpu().numpy().view(STATE)[0])
 
 
-def _descent_of(state: np.void) -> Descent:
+def _pose_of(state: np.void) -> AlignedPose:
     d, T = state["descent"], np.eye(4)
     T[:3] = d["T"].reshape(3, 4)
     steps, degenerate = int(d["steps"]), int(d["degenerate"])
-    return Descent(T, d["sums"], steps, degenerate, float(state["loop"]["depth_m"]), float(state["readings"]))
+    return AlignedPose(T, d["sums"], steps, degenerate, float(state["loop"]["depth_m"]), float(state["readings"]))

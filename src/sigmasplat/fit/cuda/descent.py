@@ -12,10 +12,11 @@ from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.adam import BETA1, BETA2, EPSILON
-from sigmasplat.fit.descent import Descent, exposure_rate
+from sigmasplat.fit.descent import exposure_rate
+from sigmasplat.fit.interface import Descent
 from sigmasplat.fit.motion import parametrisation
 from sigmasplat.fit.target import Target
-from sigmasplat.fit.tracking_loss import tracking_numbers
+from sigmasplat.fit.tracking_loss import tracking_params
 from sigmasplat.render.cuda.graph import Work, repeatable
 from sigmasplat.render.cuda.launch import THREADS, blocks_for
 from sigmasplat.render.cuda.view import CudaView
@@ -59,7 +60,7 @@ class CudaTrackingLoss:
         self._tally = empty(MEDIANS * PASSES * DIGITS + 2, dtype=torch.int32)
         self._selection = (self._tally, empty(MEDIANS, PASSES, 2, dtype=torch.int32))
         images = (view.sums, view.alpha, target.color, target.depth, pixels, self.blocks * THREADS)
-        self._given = (images, np.array(tracking_numbers(c, c.alpha_above), np.float32), exposure, self._selection)
+        self._given = (images, np.array(tracking_params(c, c.alpha_above), np.float32), exposure, self._selection)
 
     def launch(self) -> Tensor:
         """Write the gradient to the view's planes; return loss and gradient by (a, b), to be added up [blocks, 3]."""

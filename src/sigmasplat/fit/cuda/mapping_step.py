@@ -6,22 +6,24 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.cuda.rows import pull_shapes, step_rows
-from sigmasplat.fit.mapping_step import Weights, render_for
+from sigmasplat.fit.cuda.rows import CudaAccumulator, add_shape_gradient, step_rows
+from sigmasplat.fit.fused_terms import pixel_weights
+from sigmasplat.fit.interface import Accumulator, Weights, one_image_only
+from sigmasplat.fit.mapping_step import render_for
 from sigmasplat.fit.target import Target
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render.cuda.covariance_view import CudaCovarianceView
 from sigmasplat.render.cuda.launch import blocks_for
 from sigmasplat.render.cuda.view import CudaView
+from sigmasplat.render.view import CorrelationView
 from sigmasplat.types import Matrix
 
-LOCAL_TERMS = ("l1", "depth", "nll_color", "nll_depth", "alignment", "moment")
 TILE = 16
 CHANNELS = 3
 
 
 class CudaStep:
-    """The image terms, the way back and Adam's step on a device. The host waits for none of it: see `step.arrived`.
+    """The image terms, the way back and Adam's step on a device. The host waits for none of it until `to_host`.
 
     On a view of ten planes it fits the full colour covariance, as `FullCovarianceStep` does.
     """
@@ -40,16 +42,14 @@ class CudaStep:
     def images(self, target: Target, weights: Weights) -> Tensor:
         """Write the gradient of every image term to the view's gradient planes; return the loss, on the device."""
         v, per_pixel = self.view, 1.0 / max(target.valid_pixels, 1)
-        local = np.array([weights.get(name, 0.0) for name in LOCAL_TERMS])
-        local[2:4] *= len(v.sums) >= 7
-        median, on_median = (v.layers.median_depth, v.g_median_depth) if local[4] else (None, None)
-        moment, on_moment = (v.moment, v.g_moment) if local[5] else (None, None)
+        of_pixels = pixel_weights(weights, "cuda", variance=len(v.sums) >= 7).astype(np.float32)
+        median, on_median = (v.layers.median_depth, v.g_median_depth) if weights.get("median_depth") else (None, None)
+        moment, on_moment = (v.moment, v.g_moment) if weights.get("moment") else (None, None)
         planes = (v.sums, target.color, target.depth, median, moment, v.g_sums, on_median, on_moment)
         blocks = blocks_for(self._pixels)
         sums = v.raster.empty(blocks, 1, dtype=torch.float64)
         v.raster.launch_fit(
-            "mapping_losses", blocks, planes, self._pixels, int(len(v.sums) >= 7), per_pixel, local.astype(np.float32),
-            sums,
+            "mapping_losses", blocks, planes, self._pixels, int(len(v.sums) >= 7), per_pixel, of_pixels, sums,
         )  # fmt: skip
         loss = sums.sum()
         if isinstance(v, CudaCovarianceView):
@@ -74,17 +74,29 @@ class CudaStep:
         return weight * (1.0 - sums.sum() / values)
 
     def splats(
-        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, pull: Tensor | None = None
+        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Do what `TorchStep.splats` does, or `FullCovarianceStep.splats`; twist and cost stay on the device."""
         view, gradient = self.view, torch.empty_like(field.params)
-        twist, visible = view.backward_there(field.params, gradient, pull), view.raster.visible
-        cost = pull_shapes(view, visible, field, gradient, weights, frozen_colors)
+        twist, visible = view.backward_there(field.params, gradient, grad2d), view.raster.visible
+        cost = add_shape_gradient(view, visible, field, gradient, weights, frozen_colors)
         step_rows(view, visible, field, gradient, rates)
         if isinstance(view, CudaCovarianceView):
             view.correlations.steps += 1
             step_rows(view, visible, view.correlations, view.g_correlations, rates.of_extra("correlations"))
         return twist, cost
+
+    def accumulator(self, field: GaussianField) -> Accumulator:
+        """Make room for the gradient of several images. Raises ConfigError with full colour covariance."""
+        if isinstance(self.view, CudaCovarianceView):
+            raise one_image_only()
+        return CudaAccumulator(self.view, field)
+
+
+def covariance_step(view: CorrelationView) -> CudaStep:
+    """Make the step that also fits the full colour covariance."""
+    assert isinstance(view, CudaCovarianceView)
+    return CudaStep(view)
 
 
 def _gaussian_taps() -> NDArray[np.float32]:

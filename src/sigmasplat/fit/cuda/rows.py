@@ -1,25 +1,29 @@
 """From gradient rows to splats on a CUDA device (native/cuda/fit.cu): shape terms, Adam, sums over several images."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates
-from sigmasplat.fit.mapping_step import SHAPE_TERMS, Weights
+from sigmasplat.fit.fused_terms import SHAPE_TERMS, kernel_weights
+from sigmasplat.fit.interface import Twist, Weights
 from sigmasplat.model.field import EXTRAS, GaussianField, Rows
 from sigmasplat.render.cuda.launch import blocks_for
 from sigmasplat.render.cuda.view import CudaView
+from sigmasplat.types import Matrix
 
 MOST_COLUMNS = max(EXTRAS.values())
 """Of rows that the kernel steps."""
 
 
-def pull_shapes(
+def add_shape_gradient(
     view: CudaView, visible: Tensor, field: GaussianField, gradient: Tensor, weights: Weights, frozen_colors: int
 ) -> Tensor:
-    """Add the shape terms' pull on splats in view (uint8 [N]) to their gradient rows [N, 17], in place, and still the
-    colours of the first ones; return what those terms cost, on the device."""
-    n, (isotropy, ratio) = len(field), (weights.get(name, 0.0) for name in SHAPE_TERMS)
+    """Add the gradient of the shape terms to the rows [N, 17] of splats in view (uint8 [N]), in place, and zero that of
+    the first colours, which are frozen; return the cost of those terms, on the device."""
+    n, (isotropy, ratio) = len(field), kernel_weights(SHAPE_TERMS, weights, "cuda").tolist()
     costs = view.raster.empty(blocks_for(n), 1, dtype=torch.float64)
     with view.stages.of("project_backward"):
         view.raster.launch_fit(
@@ -43,23 +47,32 @@ def step_rows(view: CudaView, visible: Tensor, rows: Rows, gradient: Tensor, rat
     rows.last_step.masked_fill_(visible.bool(), step)
 
 
-class CudaGathered:
-    """Does what `Gathered` does on a device, where all of it stays: the host waits for nothing."""
+def to_host(twists: Sequence[Twist], costs: Sequence[float | Tensor]) -> tuple[list[Matrix], list[float]]:
+    """Return twists and costs in the host's memory; it waits once for all that are on a device."""
+    on_device = [x.double().reshape(-1) for x in (*twists, *costs) if isinstance(x, Tensor)]
+    found = torch.cat(on_device).cpu().numpy() if on_device else np.empty(0)
+    parts = iter(np.split(found, np.cumsum([len(x) for x in on_device])))
+    on_host = [next(parts) if isinstance(x, Tensor) else x for x in twists]
+    return on_host, [float(next(parts)[0]) if isinstance(x, Tensor) else x for x in costs]
+
+
+class CudaAccumulator:
+    """Does what `GradientAccumulator` does, on a device alone: the host waits for nothing."""
 
     def __init__(self, view: CudaView, field: GaussianField) -> None:
         self._view = view
         self.grad, self._rows = torch.zeros_like(field.params), torch.empty_like(field.params)
         self.visible = torch.zeros(len(field), dtype=torch.uint8, device=field.params.device)
 
-    def add(self, field: GaussianField, share: float, pull: Tensor | None = None) -> Tensor:
+    def add(self, field: GaussianField, share: float, grad2d: Tensor | None = None) -> Tensor:
         """Add the view's gradient planes at their share of the mean; return the image's own pose twist [6]."""
-        twist = self._view.backward_there(field.params, self._rows, pull)
+        twist = self._view.backward_there(field.params, self._rows, grad2d)
         self.visible |= self._view.raster.visible
         self.grad.add_(self._rows, alpha=share)
         return twist
 
     def step(self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int) -> Tensor:
-        """Add the shape terms' pull, take Adam's step; return what those terms cost."""
-        cost = pull_shapes(self._view, self.visible, field, self.grad, weights, frozen_colors)
+        """Add the gradient of the shape terms, take Adam's step; return the cost of those terms."""
+        cost = add_shape_gradient(self._view, self.visible, field, self.grad, weights, frozen_colors)
         step_rows(self._view, self.visible, field, self.grad, rates)
         return cost

@@ -7,8 +7,9 @@ from torch import Tensor
 
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.cuda.mapping_step import CudaStep
-from sigmasplat.fit.cuda.rows import pull_shapes, step_rows
-from sigmasplat.fit.mapping_step import Weights, render_for
+from sigmasplat.fit.cuda.rows import add_shape_gradient, step_rows
+from sigmasplat.fit.interface import Accumulator, Weights, one_image_only
+from sigmasplat.fit.mapping_step import render_for
 from sigmasplat.fit.target import Target
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.harmonics import count
@@ -17,7 +18,7 @@ from sigmasplat.types import Matrix
 
 
 class CudaViewDependentStep:
-    """Does what `ViewDependentStep` does, on a device. The host waits for none of it: see `step.arrived`."""
+    """Does what `ViewDependentStep` does, on a device. The host waits for none of it until `to_host`."""
 
     def __init__(self, base: CudaStep, degree: int) -> None:
         self.base, self.view, self.degree = base, base.view, degree
@@ -39,12 +40,12 @@ class CudaViewDependentStep:
         return self.base.images(target, weights)
 
     def splats(
-        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, pull: Tensor | None = None
+        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Do what `ViewDependentStep.splats` does; twist and cost stay on the device."""
         view, gradient, harmonics = self.view, torch.empty_like(field.params), field.carry("harmonics")
-        twist, visible = view.backward_there(self._rows, gradient, pull), view.raster.visible
-        cost = pull_shapes(view, visible, field, gradient, weights, frozen_colors)
+        twist, visible = view.backward_there(self._rows, gradient, grad2d), view.raster.visible
+        cost = add_shape_gradient(view, visible, field, gradient, weights, frozen_colors)
         on_harmonics, on_camera = self._through_colors(field, visible, gradient)
         if view.options.color_pose_gradient:
             twist[:3] += on_camera
@@ -53,6 +54,10 @@ class CudaViewDependentStep:
         of_harmonics = Rates(rates.of_extra("harmonics").per_column[: self.width])
         step_rows(view, visible, harmonics, on_harmonics, of_harmonics)
         return twist, cost
+
+    def accumulator(self, field: GaussianField) -> Accumulator:
+        """Refuse with a ConfigError: the step takes one image only."""
+        raise one_image_only()
 
     def _through_colors(self, field: GaussianField, visible: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
         """Carry the gradient of shown colours, in rows [N, 17], to the harmonics [N, width], returned, and by the

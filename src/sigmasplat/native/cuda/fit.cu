@@ -14,7 +14,7 @@ struct LossPlanes {                        // median_depth and moment, and their
     const float *sums, *color, *depth, *median_depth, *moment;
     float *on_sums, *on_median_depth, *on_moment;
 };
-struct LossWeights { float l1, depth, nll_color, nll_depth, alignment, moment; };
+struct LossWeights { float l1, depth, nll_color, nll_depth, median_depth, moment; };
 
 // Store, block by block, what the weighted terms sum up to over valid pixels; write every gradient plane whole.
 KERNEL mapping_losses(LossPlanes p, int pixels, int variance, float per_pixel, LossWeights weights, double* sums) {
@@ -28,8 +28,8 @@ KERNEL mapping_losses(LossPlanes p, int pixels, int variance, float per_pixel, L
         float on_depth = signed_weight(depth_error, weights.depth * per_pixel);
         if (p.median_depth) {              // both sides are pulled; where no splat takes half the light there is none
             const float median = p.median_depth[at], apart = valid && median > 0.f ? depth - median : 0.f;
-            const float pull = signed_weight(apart, weights.alignment * per_pixel);
-            cost += weights.alignment * per_pixel * fabsf(apart);
+            const float pull = signed_weight(apart, weights.median_depth * per_pixel);
+            cost += weights.median_depth * per_pixel * fabsf(apart);
             on_depth += pull;
             p.on_median_depth[at] = -pull;
         }

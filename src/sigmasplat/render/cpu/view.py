@@ -52,11 +52,11 @@ class CpuView:
         (moment, layers), ids = self._made, self.layers.median_id
         return self.g_moment if moment else None, ids if layers else None, self.g_median_depth if layers else None
 
-    def backward(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Matrix:
-        """Write gradients by rows, g_params [N, 17], and pull [N] if given; return the pose twist (ρ, φ) [6]."""
+    def backward(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Matrix:
+        """Write gradients by rows, g_params [N, 17], and grad2d [N] if given; return the pose twist (ρ, φ) [6]."""
         twist, (g_moment, median_id, g_median_depth) = np.zeros(6), self.depth_gradients()
         self.raster.view_backward(
-            params, self.g_sums, g_moment, self.g_alpha, median_id, g_median_depth, g_params, pull, twist,
+            params, self.g_sums, g_moment, self.g_alpha, median_id, g_median_depth, g_params, grad2d, twist,
             self.seconds[3:],
         )  # fmt: skip
         return twist

@@ -48,14 +48,14 @@ class CudaCovarianceView(CudaView):
         self._seen = means2d, conics, z, radii
         r.each_splat("pack_given", *self._seen, *self._looks, r.n, COVARIANCE_PLANES, r.frame, r.packed)
 
-    def backward_there(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Tensor:
+    def backward_there(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Tensor:
         *gradients, twist, on_means2d = self._carry_there(self.g_sums, self.g_alpha, *self._made)
         *gradients, self.g_correlations = gradients
         for columns, gradient in zip(COLUMNS.values(), gradients, strict=True):
             g_params[:, columns] = gradient
-        if pull is not None:
+        if grad2d is not None:
             half = self.camera.width / 2, self.camera.height / 2
-            pull.copy_(((on_means2d[:, 0] * half[0]).square() + (on_means2d[:, 1] * half[1]).square()).sqrt())
+            grad2d.copy_(((on_means2d[:, 0] * half[0]).square() + (on_means2d[:, 1] * half[1]).square()).sqrt())
         return twist
 
     def backward_pose(self, params: Tensor) -> Matrix:

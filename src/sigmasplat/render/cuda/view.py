@@ -71,10 +71,10 @@ class CudaView:
         ids = tuple(self.layers) if layers else ()
         return Planes(self.sums, self.moment if moment else None, self.alpha, *ids)
 
-    def backward(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Matrix:
-        return self.backward_there(params, g_params, pull).cpu().numpy()
+    def backward(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Matrix:
+        return self.backward_there(params, g_params, grad2d).cpu().numpy()
 
-    def backward_there(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Tensor:
+    def backward_there(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Tensor:
         """Do the same, and leave the twist on the device: no host waits."""
         (moment, layers), r = self._made, self.raster
         on_moment, reference = (self.g_moment, self._reference) if moment else (None, None)
@@ -84,7 +84,7 @@ class CudaView:
             on_median, twists = self._on_median() if layers else None, r.twists()
             r.each_splat(
                 "chain_params", self._numbers, None, self._here(params), r.counts, sums, on_median, r.n, sums.shape[1],
-                at, g_params, pull, twists,
+                at, g_params, grad2d, twists,
             )  # fmt: skip
             return twists.sum(0)
 

@@ -8,7 +8,7 @@ from sigmasplat.model.field import COLUMNS, Rows
 from sigmasplat.render.channels import COVARIANCE_PLANES, covariance_features
 from sigmasplat.render.pose_gradient import twist_matrix
 from sigmasplat.render.reference import operators as reference
-from sigmasplat.render.reference.view import pull_of, reaches
+from sigmasplat.render.reference.view import grad2d_of, reaches
 from sigmasplat.render.view import Layers, View
 from sigmasplat.types import Matrix
 
@@ -71,10 +71,10 @@ class CovarianceView:
         """Return the gradient of what was blended, in the order of `_splats`."""
         return torch.autograd.grad(self._maps, self._blended, (g_sums, g_alpha), materialize_grads=True)
 
-    def backward(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Matrix:
+    def backward(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Matrix:
         *gradients, self.g_correlations, g_twist = self._carry(self.g_sums, self.g_alpha)
-        if pull is not None:
-            pull.copy_(pull_of(self._g_means2d, self.camera))
+        if grad2d is not None:
+            grad2d.copy_(grad2d_of(self._g_means2d, self.camera))
         for columns, gradient in zip(COLUMNS.values(), gradients, strict=True):
             g_params[:, columns] = gradient
         return np.asarray(g_twist.numpy(), np.float64)

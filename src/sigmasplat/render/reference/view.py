@@ -51,14 +51,14 @@ class ReferenceView:
             nearest = p.z[b.median_id.clamp(min=0).long()] if len(f) else torch.zeros_like(b.alpha)
             self._maps.append((torch.where(b.median_id >= 0, nearest, 0.0), self.g_median_depth))
 
-    def backward(self, params: Tensor, g_params: Tensor, pull: Tensor | None = None) -> Matrix:
-        """Write gradients by rows, g_params [N, 17], and pull [N] if given; return the pose twist (ρ, φ) [6]."""
+    def backward(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Matrix:
+        """Write gradients by rows, g_params [N, 17], and grad2d [N] if given; return the pose twist (ρ, φ) [6]."""
         maps, gradients = zip(*self._maps, strict=True)
         leaves = (self._leaf, self._twist, self._means2d)
         g_leaf, g_twist, g_means2d = torch.autograd.grad(maps, leaves, gradients, materialize_grads=True)
         g_params.copy_(g_leaf)
-        if pull is not None:
-            pull.copy_(pull_of(g_means2d, self.camera))
+        if grad2d is not None:
+            grad2d.copy_(grad2d_of(g_means2d, self.camera))
         return np.asarray(g_twist.numpy(), np.float64)
 
     def backward_pose(self, params: Tensor) -> Matrix:
@@ -71,8 +71,8 @@ class ReferenceView:
         return self._visible
 
 
-def pull_of(g_means2d: Tensor, camera: Camera) -> Tensor:
-    """Return how hard image means are pulled, per half image size [N], of their gradients [N, 2] per px (3DGS)."""
+def grad2d_of(g_means2d: Tensor, camera: Camera) -> Tensor:
+    """Return the norm of image-mean gradients [N, 2] per px, per half image size [N] (3DGS)."""
     half_image = g_means2d.new_tensor([camera.width / 2, camera.height / 2])
     return (g_means2d * half_image).square().sum(1).sqrt()
 
