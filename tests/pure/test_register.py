@@ -13,7 +13,7 @@ from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.submap import MemoryStore, Submap
-from sigmasplat.render.view import make_view
+from sigmasplat.render.backend import make_view
 from sigmasplat.slam.loop_closure import registration
 from sigmasplat.slam.loop_closure.candidates import Candidate, SubmapPair
 from sigmasplat.slam.loop_closure.registration import Localisation, Registrar, Registration
