@@ -128,7 +128,7 @@ def test_turning_a_localisation_round_carries_its_covariance() -> None:
     half = np.diag([3e-3, 1e-3, 2e-3, 1e-3, 2e-3, 3e-3])
     draws = se3.exp_stack(random.standard_normal((20_000, 6)) @ half)
     drawn = np.cov(se3.log_stack(se3.inverse(draws @ T) @ T).T)
-    turned = registration.turned(localisation(T, covariance=half @ half.T))
+    turned = registration.inverted(localisation(T, covariance=half @ half.T))
     scale = np.sqrt(np.diag(drawn))
     assert np.allclose(turned.T_a_b, se3.inverse(T))
     assert np.abs((turned.covariance - drawn) / np.outer(scale, scale)).max() < 0.04
