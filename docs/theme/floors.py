@@ -1,6 +1,6 @@
 """Draw docs/images/floors.svg, the layers of the package and who imports whom: python docs/theme/floors.py.
 
-The imports are read from the sources. `FLOORS` is the one list of the layers: tests/pure/test_layers.py enforces it, and
+The imports are read from the sources. `FLOORS` is the one list of the layers; tests/pure/test_layers.py enforces it and
 checks that the committed picture shows the current imports.
 """
 
@@ -127,7 +127,7 @@ def draw() -> str:
     for row, floor in enumerate(FLOORS):
         shapes += _row(row, floor)
     note = (
-        "● the layer of the row imports the layer of the column. No dot right of the diagonal: imports point up only."
+        "● the layer of the row imports the layer of the column. No dot lies above the diagonal: imports point up."
     )
     shapes.append(f'<text class="quiet" x="8" y="{height - 12}">{note}</text>')
     size = f'viewBox="0 0 {WIDTH} {height}" width="{WIDTH}" height="{height}"'
