@@ -14,7 +14,7 @@ pytest.importorskip("cuda.bindings.nvrtc", reason="cuda-bindings is not installe
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path.append(str(BENCHMARKS))
-kernels, kernels_tables = map(importlib.import_module, ("kernels", "kernels_tables"))
+kernels = importlib.import_module("kernels")
 
 MOST_SPILLED = {11: 16, 16: 24, cubins.ALIGNING: 64}
 """Bytes of a thread, by program: what ptxas gives away from sm_90 on to hold one more block on a multiprocessor, and,
@@ -116,5 +116,5 @@ def test_what_the_compiler_says_is_read() -> None:
     assert kernels.blocks_held(busy, "sm_86") == 2, "100 KiB, 36000 + 1024 bytes a block"
     assert kernels.blocks_held(idle, "sm_90") == 8 and kernels.blocks_held(idle, "sm_75") == 4, "2048 and 1024 threads"
     rows = [{"architecture": "sm_90", "features": f, **busy._asdict(), "blocks": 3} for f in (4, 7)]
-    (made,) = kernels_tables.sections({"figures": {"compiler": "13.0", "kernels": rows}})
+    (made,) = kernels.sections({"figures": {"compiler": "13.0", "kernels": rows}})
     assert made.rows == [["busy", "4, 7", "73", "12", "36000", "3"]]
