@@ -1,4 +1,4 @@
-"""Pictures and the page: colours mean what their bar says, strips show what they are given, the page stands alone."""
+"""Charts, view strips and the page: colours match their bar, strips show their panels, the page is complete."""
 
 import re
 from html.parser import HTMLParser
@@ -9,12 +9,14 @@ import pytest
 from PIL import Image
 
 from sigmasplat.drawing import colormap, plot
-from sigmasplat.drawing.view_panels import GAP, HEAD, PANEL_WIDTH, panels_of, side_by_side
+from sigmasplat.drawing.view_panels import GAP, HEAD, PANEL_WIDTH, draw_view_strip, view_panels
 from sigmasplat.metrics.scored_view import ScoredView
 from sigmasplat.report import charts
 from sigmasplat.report.html import Contents, build_report
 from sigmasplat.report.tables import headline, number
+from sigmasplat.report.view_strips import PanelFigure
 
+STRIPS = {"held-out views": [[PanelFigure("input", "images/a.png")]]}
 VOID = {"meta", "img", "source", "br", "!doctype"}
 
 
@@ -33,23 +35,23 @@ def some_view(seed: int = 0) -> ScoredView:
 
 
 @pytest.mark.parametrize("colours", [colormap.VIRIDIS, colormap.INFERNO])
-def test_palettes_grow_brighter_throughout(colours: np.ndarray) -> None:
-    ramp = colormap.colour(np.linspace(0, 1, 200), 0, 1, colours).astype(float)
+def test_brightness_rises_along_a_palette(colours: np.ndarray) -> None:
+    ramp = colormap.apply(np.linspace(0, 1, 200), 0, 1, colours).astype(float)
     brightness = ramp @ [0.2126, 0.7152, 0.0722]
     assert (np.diff(brightness) > -0.5).all() and brightness[-1] - brightness[0] > 150
 
 
-def test_colours_hold_their_ends_and_holes_are_slate() -> None:
+def test_values_outside_the_range_are_clipped_and_invalid_ones_are_slate() -> None:
     values = np.array([[-5.0, 0.0, 1.0, 9.0]])
-    out = colormap.colour(values, 0.0, 1.0)
+    out = colormap.apply(values, 0.0, 1.0)
     assert (out[0, 0] == out[0, 1]).all() and (out[0, 2] == out[0, 3]).all() and tuple(out[0, 0]) == (68, 1, 84)
-    holes = colormap.picture(values, np.array([[True, False, True, True]]), 0.0, 1.0, colormap.VIRIDIS)
+    holes = colormap.apply_masked(values, np.array([[True, False, True, True]]), 0.0, 1.0, colormap.VIRIDIS)
     assert tuple(holes[0, 1]) == colormap.NO_READING
-    assert colormap.span(values, np.zeros_like(values, bool)) == (0.0, 1.0)
-    colormap.colour(values, 2.0, 2.0)
+    assert colormap.value_range(values, np.zeros_like(values, bool)) == (0.0, 1.0)
+    colormap.apply(values, 2.0, 2.0)
 
 
-def test_scores_of_a_view_are_taken_where_there_is_a_reading() -> None:
+def test_scores_of_a_view_use_pixels_with_a_depth_reading() -> None:
     view = some_view()
     score = view.scores()
     valid = np.zeros((30, 40), bool)
@@ -60,11 +62,11 @@ def test_scores_of_a_view_are_taken_where_there_is_a_reading() -> None:
     np.testing.assert_allclose(view.uncertainty, 0.04)
 
 
-def test_the_strip_shows_the_five_panels() -> None:
+def test_a_strip_shows_the_five_panels_of_a_view() -> None:
     view = some_view()
-    for word, shown in zip(("input", "colour", "depth", "V", "error"), panels_of(view), strict=True):
+    for word, shown in zip(("input", "colour", "depth", "V", "error"), view_panels(view), strict=True):
         assert word in shown.title
-    strip = np.asarray(side_by_side(view), float)
+    strip = np.asarray(draw_view_strip(view_panels(view)), float)
     assert strip.shape[1] == 5 * (PANEL_WIDTH + GAP) + GAP
 
     def panel(i: int) -> np.ndarray:
@@ -73,10 +75,10 @@ def test_the_strip_shows_the_five_panels() -> None:
 
     shown = Image.fromarray((view.recorded * 255).round().astype(np.uint8)).resize((320, 240), Image.Resampling.LANCZOS)
     np.testing.assert_allclose(panel(0), np.asarray(shown, float))
-    assert (panel(2)[-70:] == colormap.NO_READING).all(), "nothing mapped there"
+    assert (panel(2)[-70:] == colormap.NO_READING).all(), "no surface there"
     assert (panel(4)[:70] == colormap.NO_READING).all(), "no reading there"
     # V is the same at every mapped pixel: one colour, and the bar ends at its root, 0.2.
-    assert len(np.unique(panel(3)[:150].reshape(-1, 3), axis=0)) == 1 and panels_of(view)[3].ends[1] == "0.200"
+    assert len(np.unique(panel(3)[:150].reshape(-1, 3), axis=0)) == 1 and view_panels(view)[3].ends[1] == "0.200"
 
 
 @pytest.mark.parametrize(("low", "high"), [(-0.3, 1.7), (0, 1e-4), (-2000, 5), (3.1, 3.9)])
@@ -87,7 +89,7 @@ def test_ticks_are_round_and_few(low: float, high: float) -> None:
     assert round(leading, 6) in (1, 2, 5)
 
 
-def test_a_path_is_drawn_to_one_scale_and_where_it_is() -> None:
+def test_both_axes_of_a_path_have_one_scale() -> None:
     """A 2 m × 2 m square walked once: the curve's extent in pixels is square too, its colour the estimate's."""
     corners = np.array([[0, 0, 0], [2, 0, 0], [2, 0, 2], [0, 0, 2], [0, 0, 0.0]])
     laid_out = charts.trajectory_charts(corners, None)
@@ -97,7 +99,7 @@ def test_a_path_is_drawn_to_one_scale_and_where_it_is() -> None:
     assert np.ptp(rows) == pytest.approx(np.ptp(columns), abs=3) and np.ptp(rows) > 150
 
 
-def test_height_is_up_and_truth_may_have_gaps() -> None:
+def test_height_points_up_and_the_truth_may_have_gaps() -> None:
     estimate = np.array([[0, 0, 0], [0, -1.5, 0], [0, -3, 0.0]])
     truth = estimate.copy()
     truth[1] = np.nan
@@ -107,7 +109,7 @@ def test_height_is_up_and_truth_may_have_gaps() -> None:
     plot.draw_charts(laid_out, plot.DARK)
 
 
-def test_a_standstill_and_a_single_frame_can_be_drawn() -> None:
+def test_a_static_camera_and_a_single_frame_can_be_drawn() -> None:
     for n in (1, 5):
         plot.draw_charts(charts.trajectory_charts(np.zeros((n, 3)), None), plot.LIGHT)
         plot.draw_charts([charts.seconds_chart(np.arange(n), {"total": np.zeros(n)})], plot.LIGHT)
@@ -119,14 +121,14 @@ def colours_near(image: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("theme", [plot.LIGHT, plot.DARK], ids=lambda theme: theme.name)
-def test_submaps_have_colours_and_loops_are_lines_across(theme: plot.Theme) -> None:
+def test_submaps_have_colours_and_loops_are_lines(theme: plot.Theme) -> None:
     """Around a 4 m square, a submap a side: the first and the last meet, the accepted loop crosses the middle."""
     side = np.linspace(0, 4, 11)[:-1]
     nought = np.zeros(10)
     x, z = np.concatenate([side, nought + 4, 4 - side, nought]), np.concatenate([nought, side, nought + 4, 4 - side])
     estimate = np.stack([x, np.zeros(40), z], 1)
     submaps = np.arange(40) // 10
-    chart = charts.submap_chart(estimate, submaps, [charts.Link(25, 5, True), charts.Link(35, 15, False)])
+    chart = charts.submap_chart(estimate, submaps, [charts.LoopLink(25, 5, True), charts.LoopLink(35, 15, False)])
     size = (600, 400)
     image = np.asarray(plot.draw_charts([chart], theme, size))
     blank = np.asarray(plot.draw_charts([charts.submap_chart(estimate, submaps, [])], theme, size))
@@ -145,7 +147,7 @@ def test_submaps_have_colours_and_loops_are_lines_across(theme: plot.Theme) -> N
         assert np.median(at[:, axis]) == pytest.approx(0.5 * (path[:, axis].min() + path[:, axis].max()), abs=4)
 
 
-def test_neighbouring_submaps_differ_and_are_joined() -> None:
+def test_neighbouring_submaps_have_different_colours_and_are_joined() -> None:
     estimate = np.stack([np.arange(9.0), np.zeros(9), np.zeros(9)], 1)
     chart = charts.submap_chart(estimate, np.array([0, 0, 0, 1, 1, 2, 3, 3, 3]), [])
     colours = [curve.colour for curve in chart.curves]
@@ -154,23 +156,23 @@ def test_neighbouring_submaps_differ_and_are_joined() -> None:
     assert chart.labels == {"0": (0, 0), "1": (3, 0), "2": (5, 0), "3": (6, 0)}
 
 
-def test_a_long_run_is_not_buried_under_numbers() -> None:
+def test_a_long_run_has_few_labels() -> None:
     estimate = np.random.default_rng(0).normal(size=(500, 3))
     chart = charts.submap_chart(estimate, np.arange(500) // 5, [])
-    assert len(chart.curves) == 100 and 5 < len(chart.labels) <= charts.MOST_LABELS
+    assert len(chart.curves) == 100 and 5 < len(chart.labels) <= charts.MAX_LABELS
     plot.draw_charts([chart], plot.DARK)
 
 
-def test_loops_are_drawn_where_their_frames_are() -> None:
+def test_a_loop_line_joins_the_positions_of_its_frames() -> None:
     """Frames of loops count from the run's start; some have no pose, so that rows and frames differ."""
     log = [{"row": row, "index": 10 * row, "submap": row // 4} for row in (0, 1, 3, 4, 5, 7, 8)]
     estimate = np.stack([[record["row"], 0.0, 0.0] for record in log])
     loops = [{"query_frame": 8, "database_frame": 1, "accepted": True},
              {"query_frame": 5, "database_frame": 2, "accepted": False}]  # fmt: skip
-    (chart,), caption = charts.of_run(log, estimate, None, loops)["submaps"]
+    (chart,), caption = charts.run_charts(log, estimate, None, loops)["submaps"]
     lines = {curve.name: curve.points[:, 0].tolist() for curve in chart.curves if curve.name}
     assert lines == {"loop accepted": [8, 1]} and "submap" in caption
-    assert set(charts.of_run([record | {"submap": 0} for record in log], estimate, None)) == {"trajectory"}
+    assert set(charts.run_charts([record | {"submap": 0} for record in log], estimate, None)) == {"trajectory"}
 
 
 class Balance(HTMLParser):
@@ -209,22 +211,23 @@ METRICS = {
 
 
 @pytest.mark.parametrize("metrics", [METRICS, {"frames": 0}], ids=["full", "bare"])
-def test_the_page_is_whole_and_needs_nothing_from_outside(metrics: dict[str, object]) -> None:
+def test_the_page_is_complete_and_needs_no_other_file(metrics: dict[str, object]) -> None:
     contents = Contents(
-        "SigmaSplat · <room> & more", "fast", metrics, {"held-out views": ["images/a.png"]}, {"trajectory": "caption"},
+        "SigmaSplat · <room> & more", "fast", metrics, STRIPS, {"trajectory": "caption"},
         '{"name": "</pre><script>"}', ["estimate and truth share no timestamps"],
     )  # fmt: skip
     page = build_report(contents)
     reader = Balance()
     reader.feed(page)
     assert not reader.wrong and not reader.open
-    assert set(reader.addresses) == {"images/a.png", "images/trajectory-dark.png", "images/trajectory-light.png"}
+    versions = ("light", "dark", "narrow-light", "narrow-dark")
+    assert set(reader.addresses) == {"images/a.png", *(f"images/trajectory-{version}.png" for version in versions)}
     assert "http" not in page and "<script" not in page and "prefers-color-scheme: dark" in page
     text = "".join(reader.text)
     assert "<room> & more" in text and "</pre><script>" in text and "share no timestamps" in text
 
 
-def test_figures_on_the_page_are_those_measured() -> None:
+def test_the_page_shows_the_measured_figures() -> None:
     page = build_report(Contents("t", "s", METRICS))
     text = re.sub("<[^>]+>", " ", page)
     for figure in ("1.23", "29.50", "31.25", "0.9500", "0.412", "123\u202f456", "3.21", "−2.500", "98.0"):
@@ -262,12 +265,12 @@ def test_submaps_and_loops_have_a_section() -> None:
         assert figure in text, figure
 
 
-def test_a_map_in_one_piece_has_no_such_section() -> None:
+def test_a_single_submap_has_no_section() -> None:
     for metrics in (METRICS, METRICS | {"submaps": 1, "loops": {"tried": 0, "accepted": 0}, "held_out_submaps": None}):
         assert "ubmap" not in build_report(Contents("t", "s", metrics))
 
 
-def test_several_submaps_without_loops_make_a_section_without_tables() -> None:
+def test_the_section_of_submaps_has_no_tables_without_loops() -> None:
     page = build_report(Contents("t", "s", METRICS | {"submaps": 2, "loops": {"tried": 0, "accepted": 0}}))
     assert "2 submaps" in page and "refused" not in page and "verdict" not in page
 
@@ -277,16 +280,16 @@ def test_absent_figures_are_dashes() -> None:
     assert dict((name, value) for name, value, _ in headline({"held_out": None}))["PSNR, held-out"] == "–"
 
 
-def test_the_path_has_no_figure_where_no_true_one_is_known() -> None:
+def test_the_path_has_no_error_without_ground_truth() -> None:
     assert "ATE RMSE" in {name for name, _, _ in headline(METRICS)}
     assert not [name for name, _, _ in headline(METRICS | {"ate": None}) if name.startswith("ATE")]
 
 
-def test_waiting_for_the_final_map_is_told() -> None:
-    """It is among the figures, and a stage of its own, with its share: 30 of 40 s."""
+def test_the_time_of_the_final_map_is_shown() -> None:
+    """It is a headline figure, and a stage with its share: 30 of 40 s."""
     waited = {"Final map": ("30.0", "s"), "Frames and final map": ("40.0", "s")}
-    told = headline(METRICS | {"finish_s": 30.0, "total_s": 40.0})
-    assert waited.items() <= {name: (value, unit) for name, value, unit in told}.items()
+    figures = headline(METRICS | {"finish_s": 30.0, "total_s": 40.0})
+    assert waited.items() <= {name: (value, unit) for name, value, unit in figures}.items()
     assert not waited.keys() & {name for name, _, _ in headline(METRICS | {"finish_s": None})}
     page = build_report(Contents("t", "s", METRICS | {"finish_s": 30.0}, seconds={"align": 8.0, "io": 2.0}))
     text = " ".join(re.sub("<[^>]+>", " ", page).split())
@@ -295,5 +298,5 @@ def test_waiting_for_the_final_map_is_told() -> None:
 
 
 def test_the_path_comes_before_the_views() -> None:
-    page = build_report(Contents("t", "s", METRICS, {"held-out views": ["a.png"]}, {"trajectory": "a path"}))
+    page = build_report(Contents("t", "s", METRICS, STRIPS, {"trajectory": "a path"}))
     assert page.index("<h2>Trajectory") < page.index("<h2>Views")
