@@ -9,9 +9,19 @@ from numpy.typing import NDArray
 
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.sources.room.furnish import HALF_X_M, PITCH_M, furnished
-from sigmasplat.sources.room.light import Light, lit
-from sigmasplat.sources.room.shapes import Indices, Rays, Shape, Windows, cast, dot, image_windows, normalised, surface
+from sigmasplat.sources.room.furnish import HALF_X_M, PITCH_M, furnish_rooms
+from sigmasplat.sources.room.light import Light, light_room
+from sigmasplat.sources.room.shapes import (
+    Indices,
+    Rays,
+    Shape,
+    Windows,
+    cast_rays,
+    dot,
+    image_windows,
+    normalised,
+    surface_at,
+)
 from sigmasplat.sources.room.textures import Floats
 
 SUBPIXELS = np.array([[-0.375, -0.125, 0.375, 0.125], [-0.125, 0.375, 0.125, -0.375]], np.float32)
@@ -19,7 +29,7 @@ SUBPIXELS = np.array([[-0.375, -0.125, 0.375, 0.125], [-0.125, 0.375, 0.125, -0.
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class RoomScene:
     """Rooms in a row: all shapes, and each room's light."""
 
     shapes: Sequence[Shape]
@@ -27,16 +37,16 @@ class Scene:
 
 
 @lru_cache(maxsize=4)
-def scene(rooms: int, seed: int) -> Scene:
+def build_scene(rooms: int, seed: int) -> RoomScene:
     """Furnish and light the rooms (about a second each); kept, since they depend on nothing else."""
-    built = furnished(rooms, seed)
+    built = furnish_rooms(rooms, seed)
     neighbours = [built[max(k - 1, 0)] + built[k] if k else built[k] for k in range(rooms)]
-    lights = [lit(k, shapes) for k, shapes in enumerate(neighbours)]
-    return Scene([shape for shapes in built for shape in shapes], lights)
+    lights = [light_room(k, shapes) for k, shapes in enumerate(neighbours)]
+    return RoomScene([shape for shapes in built for shape in shapes], lights)
 
 
-def picture(
-    view: Scene, camera: Camera, T_world_camera: NDArray[np.float64]
+def render_scene(
+    view: RoomScene, camera: Camera, T_world_camera: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return colour [H, W, 3] in [0, 1] and exact depth [H, W] in metres along the optical axis.
 
@@ -87,16 +97,16 @@ class Hits:
     gloss: Floats
 
 
-def _met(view: Scene, rays: Rays, windows: Windows | None, focal_px: float) -> Hits:
+def _intersect(view: RoomScene, rays: Rays, windows: Windows | None, focal_px: float) -> Hits:
     """Find what each ray meets and how it is painted there."""
-    t, hit = cast(view.shapes, rays, windows)
+    t, hit = cast_rays(view.shapes, rays, windows)
     n = len(t)
     normals, paint, (glow, mirror, gloss) = np.zeros((3, n), np.float32), np.zeros((3, n), np.float32), np.zeros((3, n))
     faces = np.full(n, -1, np.intp)
     for k in np.unique(hit[hit >= 0]):
         at, shape = np.flatnonzero(hit == k), view.shapes[k]
         directions, origins = rays.directions[:, at], rays.origins[:, at] if rays.origins.shape[1] > 1 else rays.origins
-        normals[:, at], u, v = surface(shape, origins + directions * t[at])
+        normals[:, at], u, v = surface_at(shape, origins + directions * t[at])
         paint[:, at] = shape.material.texture(u, v, _pixel_m(directions, normals[:, at], t[at], focal_px))
         faces[at] = 32 * k + _face_number(shape, normals[:, at])
         glow[at], mirror[at], gloss[at] = shape.material.glow, shape.material.mirror, shape.material.gloss
@@ -119,10 +129,10 @@ def _face_number(shape: Shape, normals: Floats) -> Indices:
 
 
 def _colors(
-    view: Scene, rays: Rays, windows: Windows | None, focal_px: float, bounces: int = 1
+    view: RoomScene, rays: Rays, windows: Windows | None, focal_px: float, bounces: int = 1
 ) -> tuple[Floats, Floats, Indices]:
     """Return each ray's colour [3, N], parameter of its hit [N], and a number for the shape and face it hit [N]."""
-    hits = _met(view, rays, windows, focal_px)
+    hits = _intersect(view, rays, windows, focal_px)
     points = rays.origins + rays.directions * np.where(np.isfinite(hits.t), hits.t, 0.0)
     mirrored = rays.directions - 2.0 * dot(hits.normals, rays.directions) * hits.normals
     falling, highlight = _light(view, points, hits, normalised(mirrored))
@@ -137,7 +147,7 @@ def _colors(
     return np.sqrt(np.clip(linear, 0.0, 1.0)).astype(np.float32), hits.t, hits.faces
 
 
-def _light(view: Scene, points: Floats, hits: Hits, mirrored: Floats) -> tuple[Floats, Floats]:
+def _light(view: RoomScene, points: Floats, hits: Hits, mirrored: Floats) -> tuple[Floats, Floats]:
     """Return the light on points [3, N] and the highlight towards the viewer [N], room by room."""
     falling, highlight = np.zeros_like(points), np.zeros(points.shape[1], np.float32)
     in_front_x = points[0] + np.float32(0.05) * hits.normals[0]  # a shared wall's far face belongs to the next room
