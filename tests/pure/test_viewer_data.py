@@ -100,7 +100,7 @@ def test_splats_are_coloured_by_their_own_colour_or_by_sigma() -> None:
     plain = splat_arrays(field, "colour", (0.0, 1.0), VisibilityFilter())
     np.testing.assert_array_equal(plain.colors, (field.colors.numpy() * 255).round().astype(np.uint8))
     tinted = splat_arrays(field, "σ", (0.0, 0.3), VisibilityFilter())
-    np.testing.assert_array_equal(tinted.colors, colormap.colour(sigmas(field).numpy(), 0.0, 0.3, colormap.INFERNO))
+    np.testing.assert_array_equal(tinted.colors, colormap.apply(sigmas(field).numpy(), 0.0, 0.3, colormap.INFERNO))
     np.testing.assert_array_equal(tinted.centers, field.means.numpy())
     most, least = int(sigmas(field).numpy().argmax()), int(sigmas(field).numpy().argmin())
     assert tinted.colors[most].sum() > tinted.colors[least].sum() + 200

@@ -4,12 +4,12 @@ from pathlib import Path
 
 from sigmasplat.errors import RunError
 from sigmasplat.exports.run_reader import RunReader
-from sigmasplat.floorplan.floor_plan import CELL_M, FloorPlan, floor_plan
+from sigmasplat.floorplan.floor_plan import CELL_M, FloorPlan
 from sigmasplat.floorplan.picture import draw_floor_plan
-from sigmasplat.floorplan.surface_samples import Renderer
+from sigmasplat.floorplan.surface_samples import SurfaceRenderer
 from sigmasplat.io.atomic import replacing
 from sigmasplat.io.json_files import write_json
-from sigmasplat.render import FieldRenderer
+from sigmasplat.report.plan import run_floor_plan
 from sigmasplat.types import Progress
 
 
@@ -18,7 +18,7 @@ def export_plan(
     target: Path,
     *,
     cell_m: float = CELL_M,
-    renderer: Renderer | None = None,
+    renderer: SurfaceRenderer | None = None,
     progress: Progress = lambda done, total: None,
 ) -> FloorPlan:
     """Write the image (.png) and the data of the plan beside it (.json); return the plan.
@@ -28,10 +28,9 @@ def export_plan(
     """
     if target.suffix.lower() != ".png":
         raise RunError(f"cannot write a floor plan as {target.name}; give a name that ends in .png")
-    config = reader.config
-    renderer = renderer or FieldRenderer(config.render, config.backend)
-    field, path = reader.run.read_map(), reader.tracked_path()
-    plan = floor_plan(field, path, reader.camera, cell_m=cell_m, renderer=renderer, progress=progress)
+    plan = run_floor_plan(
+        reader.run, reader.tracked_path(), reader.camera, cell_m=cell_m, renderer=renderer, progress=progress
+    )
     picture = draw_floor_plan(plan)
     with replacing(target) as temporary:
         picture.save(temporary, "PNG")

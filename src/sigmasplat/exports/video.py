@@ -14,12 +14,12 @@ import torch
 from PIL import Image
 
 from sigmasplat.drawing.colormap import Rgb
-from sigmasplat.drawing.film import Maps, Scale, film_image, legend_strip
+from sigmasplat.drawing.film import FilmMaps, FilmScale, film_image, legend_strip
 from sigmasplat.env import install_extra
 from sigmasplat.errors import BackendError, ConfigError, RunError
 from sigmasplat.exports.run_reader import RunReader
 from sigmasplat.floorplan.ground import floor_frame
-from sigmasplat.floorplan.surface_samples import Renderer, looks
+from sigmasplat.floorplan.surface_samples import SurfaceRenderer, sample_surfaces
 from sigmasplat.io.atomic import replacing
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
@@ -73,7 +73,7 @@ def export_video(
     target: Path,
     options: VideoOptions | None = None,
     *,
-    renderer: Renderer | None = None,
+    renderer: SurfaceRenderer | None = None,
     progress: Progress = lambda done, total: None,
 ) -> int:
     """Write a film and return its number of images. Calls `progress(done, total)` after each image.
@@ -102,10 +102,10 @@ def film_camera(camera: Camera, width_px: int) -> Camera:
 
 
 def orbit_view(
-    field: GaussianField, path: Trajectory, camera: Camera, images: int, renderer: Renderer
+    field: GaussianField, path: Trajectory, camera: Camera, images: int, renderer: SurfaceRenderer
 ) -> tuple[GaussianField, Matrix]:
     """Return the map without its ceiling, and poses [images, 4, 4] on a circle above it from which it is visible."""
-    sights = list(looks(field, path, camera, renderer, SURFACE_VIEWS))
+    sights = list(sample_surfaces(field, path, camera, renderer, SURFACE_VIEWS))
     T = floor_frame(sights)
     points = np.concatenate([sight.points for sight in sights]) @ T[:3, :3].T + T[:3, 3]
     low, high = np.quantile(points, [0.02, 0.98], axis=0)
@@ -120,15 +120,15 @@ def orbit_view(
     return kept, orbit(center, T[2, :3], T[1, :3], radius_m, images)
 
 
-def _show(renderer: Renderer, field: GaussianField, camera: Camera, T_world_camera: Matrix) -> Maps:
+def _show(renderer: SurfaceRenderer, field: GaussianField, camera: Camera, T_world_camera: Matrix) -> FilmMaps:
     with torch.inference_mode():
-        return Maps.of(renderer(field, camera, se3.inverse(T_world_camera)))
+        return FilmMaps.of(renderer(field, camera, se3.inverse(T_world_camera)))
 
 
-def _images(show: Callable[[Matrix], Maps], poses: Matrix, width: int, progress: Progress) -> Iterator[Rgb]:
+def _images(show: Callable[[Matrix], FilmMaps], poses: Matrix, width: int, progress: Progress) -> Iterator[Rgb]:
     """Yield a film's images; a few of them determine the colour scale."""
     rows = np.unique(np.linspace(0, len(poses) - 1, min(SAMPLES, len(poses))).round().astype(int))
-    scale = Scale.of([show(poses[row]) for row in rows])
+    scale = FilmScale.of([show(poses[row]) for row in rows])
     strip = legend_strip(scale, width)
     for done, pose in enumerate(poses, 1):
         yield film_image(show(pose), scale, strip)

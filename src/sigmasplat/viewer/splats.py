@@ -65,7 +65,7 @@ def visibility_filter(ordered: Floats, hidden_share: float, min_opacity: float) 
 
 def sigma_range(ordered: Floats) -> tuple[float, float]:
     """Return the range of σ that the palette covers: from 0 to a high percentile."""
-    return 0.0, colormap.span(ordered, np.ones(len(ordered), bool))[1]
+    return 0.0, colormap.value_range(ordered, np.ones(len(ordered), bool))[1]
 
 
 def splat_arrays(
@@ -74,7 +74,7 @@ def splat_arrays(
     """Return the visible splats in their own colours, or coloured by σ over the range `span`."""
     chosen = field_without_moments(field.params[visible.mask(field)], {})
     if colouring == "σ":
-        colors = colormap.colour(sigmas(chosen).numpy(), *span, colormap.INFERNO)
+        colors = colormap.apply(sigmas(chosen).numpy(), *span, colormap.INFERNO)
     else:
         colors = np.asarray((chosen.colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8))
     return SplatArrays(
