@@ -15,8 +15,12 @@ import open3d as o3d
 
 DEVICE = o3d.core.Device("CPU:0")
 DEPTH_MIN_M, VOXEL_SIZE_M, BLOCKS, DISTANCE_M, TRUNCATION_VOXELS = 0.1, 0.0058, 40000, 0.07, 8.0
-"""Values of Open3D's own default_config.yml of its reconstruction system."""
-Frames = tuple[Any, Any, Any, float]
+"""Values of default_config.yml of Open3D's reconstruction system."""
+MODEL_DEPTH_MAX_M, ODOMETRY_DEPTH_MAX_M = 3.0, 8.0
+"""The first is Open3D's default. Odometry is better with the range that SigmaSplat uses."""
+ITERATIONS = (100, 50, 25, 10)
+"""On each level, coarse to fine. With Open3D's default, (10, 5, 3), hybrid does not converge on 640×480 pixels."""
+Frames = tuple[Any, Any, Any]
 
 
 def image(pixels: Any) -> Any:
@@ -25,10 +29,11 @@ def image(pixels: Any) -> Any:
 
 
 def odometry(method: Any) -> Callable[[Frames], Any]:
-    """Return a function that chains the motions from each frame to the next, with Open3D's default settings."""
+    """Return a function that chains the motions from each frame to the next, each from the identity."""
+    criteria = [o3d.t.pipelines.odometry.OdometryConvergenceCriteria(n) for n in ITERATIONS]
 
     def track(frames: Frames) -> Any:
-        color, depth, K, depth_max_m = frames
+        color, depth, K = frames
         poses = [np.eye(4)]
         T_world_last = np.eye(4)
         images = (o3d.t.geometry.RGBDImage(image(c), image(d)) for c, d in zip(color, depth, strict=True))
@@ -36,7 +41,13 @@ def odometry(method: Any) -> Callable[[Frames], Any]:
         for live in images:
             try:
                 found = o3d.t.pipelines.odometry.rgbd_odometry_multi_scale(
-                    live, last, K, depth_scale=1.0, depth_max=depth_max_m, method=method
+                    live,
+                    last,
+                    K,
+                    depth_scale=1.0,
+                    depth_max=ODOMETRY_DEPTH_MAX_M,
+                    criteria_list=criteria,
+                    method=method,
                 )
             except RuntimeError:  # too few correspondences: the chain continues with the last pose
                 poses.append(np.full((4, 4), np.nan))
@@ -51,7 +62,7 @@ def odometry(method: Any) -> Callable[[Frames], Any]:
 
 def dense_slam(frames: Frames) -> Any:
     """Track each frame against the surface fused so far, as Open3D's example dense_slam.py does."""
-    color, depth, K, depth_max_m = frames
+    color, depth, K = frames
     rows, columns = depth.shape[1:]
     slam = o3d.t.pipelines.slam
     T_world_camera = o3d.core.Tensor(np.eye(4))
@@ -64,21 +75,20 @@ def dense_slam(frames: Frames) -> Any:
         found = True
         if i:
             try:
-                result = model.track_frame_to_model(live, rendered, 1.0, depth_max_m, DISTANCE_M)
+                result = model.track_frame_to_model(live, rendered, 1.0, MODEL_DEPTH_MAX_M, DISTANCE_M)
                 T_world_camera = T_world_camera @ result.transformation
             except RuntimeError:
                 found = False
         poses.append(T_world_camera.numpy().copy() if found else np.full((4, 4), np.nan))
         model.update_frame_pose(i, T_world_camera)
         if found:
-            model.integrate(live, 1.0, depth_max_m, TRUNCATION_VOXELS)
-        model.synthesize_model_frame(rendered, 1.0, DEPTH_MIN_M, depth_max_m, TRUNCATION_VOXELS, False)
+            model.integrate(live, 1.0, MODEL_DEPTH_MAX_M, TRUNCATION_VOXELS)
+        model.synthesize_model_frame(rendered, 1.0, DEPTH_MIN_M, MODEL_DEPTH_MAX_M, TRUNCATION_VOXELS, False)
     return np.array(poses)
 
 
 METHODS = {
     "point-to-plane": odometry(o3d.t.pipelines.odometry.Method.PointToPlane),
-    "intensity": odometry(o3d.t.pipelines.odometry.Method.Intensity),
     "hybrid": odometry(o3d.t.pipelines.odometry.Method.Hybrid),
     "dense-slam": dense_slam,
 }
@@ -90,7 +100,7 @@ def main(folder: Path, method: str) -> None:
     color, depth = (np.load(folder / f"{name}.npy", mmap_mode="r") for name in ("color", "depth"))
     camera = json.loads((folder / "camera.json").read_text())
     K = [[camera["fx"], 0.0, camera["cx"]], [0.0, camera["fy"], camera["cy"]], [0.0, 0.0, 1.0]]
-    poses = METHODS[method]((color, depth, o3d.core.Tensor(np.array(K)), camera["max_depth_m"]))
+    poses = METHODS[method]((color, depth, o3d.core.Tensor(np.array(K))))
     np.save(folder / "poses.npy", poses)
     (folder / "version.txt").write_text(f"open3d {o3d.__version__}\n")
 

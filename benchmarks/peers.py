@@ -11,6 +11,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from tables import Section
 
 from sigmasplat.errors import ConfigError, SigmaSplatError, SourceError
+from sigmasplat.io.atomic import write_text
 from sigmasplat.io.trajectory import read_trajectory
 from sigmasplat.metrics.trajectory import ate, paired
 from sigmasplat.model.frame import Frame
@@ -50,7 +52,6 @@ class Peer:
 
 PEERS = (
     Peer("Open3D, odometry point-to-plane", "open3d", "point-to-plane"),
-    Peer("Open3D, odometry intensity", "open3d", "intensity"),
     Peer("Open3D, odometry hybrid", "open3d", "hybrid"),
     Peer("Open3D, dense SLAM", "open3d", "dense-slam"),
     Peer("ORB-SLAM3", "orbslam3"),
@@ -166,9 +167,17 @@ def run_peer(peer: Peer, name: str, path: str, frames: Path, options: Options, p
             result |= score(estimate, open_source(path), options.limit)
         except SigmaSplatError as wrong:
             result["problem"] = str(wrong)
-    shown = problem or f"ATE {100 * result.get('ate_m', np.nan):.2f} cm"
-    print(f"{name}, {peer.name}: {shown}", file=sys.stderr, flush=True)
     return result
+
+
+def finished(peer: Peer, path: str, options: Options) -> tuple[Path, Result, Result | None]:
+    """Return where the result of a peer is kept, its key, and the result of an earlier run with an equal key."""
+    program = (FOLDER / f"peer_{peer.package}.py").read_bytes()
+    given = {"path": path, "limit": options.limit, "method": peer.method, "vocabulary": str(options.vocabulary)}
+    key = given | {"program": sha256(program).hexdigest()}
+    kept = options.runs / f"peer-{record.slug(f'{Path(path).name} {peer.name}')}.json"
+    earlier = record.read(kept) if kept.exists() and not options.fresh else {}
+    return kept, key, earlier["result"] if earlier.get("key") == key else None
 
 
 def run_peers(options: Options) -> list[Result]:
@@ -176,11 +185,19 @@ def run_peers(options: Options) -> list[Result]:
     pythons = {"open3d": options.open3d, "orbslam3": options.orbslam3}
     chosen = [(peer, python) for peer in PEERS if (python := pythons[peer.package])]
     made = []
-    for name in options.sources if chosen else ():
+    for name in options.sources:
         path = accuracy.located(name)
+        states = [(peer, python, *finished(peer, path, options)) for peer, python in chosen]
         with tempfile.TemporaryDirectory(prefix="peers-") as folder:
-            write_frames(open_source(path), options.limit, Path(folder))
-            made += [run_peer(peer, Path(name).name, path, Path(folder), options, python) for peer, python in chosen]
+            if any(result is None for *_, result in states):
+                write_frames(open_source(path), options.limit, Path(folder))
+            for peer, python, kept, key, earlier in states:
+                result = earlier or run_peer(peer, Path(name).name, path, Path(folder), options, python)
+                if result["problem"] is None:
+                    write_text(kept, json.dumps({"key": key, "result": result}, indent=1) + "\n")
+                shown = result["problem"] or f"ATE {100 * result['ate_m']:.2f} cm"
+                print(f"{name}, {peer.name}: {shown}", file=sys.stderr, flush=True)
+                made.append(result)
     return made
 
 
@@ -189,8 +206,8 @@ def read_paths(options: Options) -> list[Result]:
     made = []
     for text in options.paths:
         system, _, rest = text.partition("=")
-        name, _, file = rest.partition("=")
-        if not file:
+        name, _, file = rest.rpartition("=")
+        if not name:
             raise ConfigError(f"--paths {text}: expected SYSTEM=SEQUENCE=FILE")
         found = score(read_trajectory(Path(file)), open_source(accuracy.located(name)), options.limit)
         made.append({"system": system, "source": Path(name).name, "problem": None, **found})
@@ -209,10 +226,10 @@ def sections(measured: dict[str, Any]) -> list[Section]:
 
 
 NOTE = (
-    "ATE: root mean square over the frames that have a pose, after a rigid fit without scale; mean ± standard deviation "
-    "over seeds. Without a pose: the system declares itself lost or writes no pose. SigmaSplat keeps a guess for a lost "
-    "frame, and the guess is scored. Same frames for all; SigmaSplat uses them at 320 pixels width, the others in full "
-    "size. † Not measured by this command: measured earlier by the project's founders on the same frames, on a CPU, with "
+    "ATE: root mean square over the frames that have a pose, after a rigid fit without scale; mean ± deviation over "
+    "several seeds. Without a pose: the system declares itself lost or writes no pose. SigmaSplat predicts a pose "
+    "for a lost frame, and that pose is scored. All systems get the same frames; SigmaSplat works at 320 pixels width, "
+    "the others at full size. † Not measured by this command, but earlier by the project's founders: same frames, CPU, "
     "RTAB-Map's settings for TUM RGB-D."
 )
 

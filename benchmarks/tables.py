@@ -54,8 +54,10 @@ def headline(measured: dict[str, Any]) -> str:
 
 
 def sections(measured: dict[str, Any]) -> list[Section]:
-    """Return the tables of results, laid out by the benchmark that made them (module <benchmark>_tables)."""
-    made: list[Section] = importlib.import_module(f"{measured['benchmark']}_tables").sections(measured)
+    """Return the tables of results, laid out by the benchmark that made them: <benchmark>_tables, or the program."""
+    program = measured["benchmark"]
+    pair = record.ROOT / "benchmarks" / f"{program}_tables.py"
+    made: list[Section] = importlib.import_module(pair.stem if pair.exists() else program).sections(measured)
     return made
 
 
