@@ -18,8 +18,8 @@ DEPTH_MIN_M, VOXEL_SIZE_M, BLOCKS, DISTANCE_M, TRUNCATION_VOXELS = 0.1, 0.0058, 
 """Values of default_config.yml of Open3D's reconstruction system."""
 MODEL_DEPTH_MAX_M, ODOMETRY_DEPTH_MAX_M = 3.0, 8.0
 """The first is Open3D's default. Odometry is better with the range that SigmaSplat uses."""
-ITERATIONS = (100, 50, 25, 10)
-"""On each level, coarse to fine. With Open3D's default, (10, 5, 3), hybrid does not converge on 640×480 pixels."""
+ITERATIONS = {"PointToPlane": (10, 5, 3), "Hybrid": (60, 30, 15, 5)}
+"""On each level, coarse to fine. The first are Open3D's default; at full size hybrid does not converge with them."""
 Frames = tuple[Any, Any, Any]
 
 
@@ -28,9 +28,10 @@ def image(pixels: Any) -> Any:
     return o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(pixels), device=DEVICE))
 
 
-def odometry(method: Any) -> Callable[[Frames], Any]:
+def odometry(name: str) -> Callable[[Frames], Any]:
     """Return a function that chains the motions from each frame to the next, each from the identity."""
-    criteria = [o3d.t.pipelines.odometry.OdometryConvergenceCriteria(n) for n in ITERATIONS]
+    criteria = [o3d.t.pipelines.odometry.OdometryConvergenceCriteria(n) for n in ITERATIONS[name]]
+    method = getattr(o3d.t.pipelines.odometry.Method, name)
 
     def track(frames: Frames) -> Any:
         color, depth, K = frames
@@ -88,8 +89,8 @@ def dense_slam(frames: Frames) -> Any:
 
 
 METHODS = {
-    "point-to-plane": odometry(o3d.t.pipelines.odometry.Method.PointToPlane),
-    "hybrid": odometry(o3d.t.pipelines.odometry.Method.Hybrid),
+    "point-to-plane": odometry("PointToPlane"),
+    "hybrid": odometry("Hybrid"),
     "dense-slam": dense_slam,
 }
 

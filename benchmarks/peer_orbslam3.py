@@ -19,7 +19,7 @@ import pyorbslam3
 
 BRANCHES, LEVELS, ROUNDS = 10, 6, 8
 """The published vocabulary's own numbers of branches and levels; rounds of k-majority clustering."""
-SECONDS_PER_FRAME = 0.3
+SECONDS_PER_FRAME = 0.5
 """ORB-SLAM3 maps in threads of its own: frames that come too fast leave them behind."""
 SETTINGS = """%YAML:1.0
 File.version: "1.0"

@@ -9,7 +9,6 @@ example: python benchmarks/peers.py --open3d ../peers/bin/python --sources redki
 import json
 import sys
 import tempfile
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -28,7 +27,6 @@ from sigmasplat.errors import ConfigError, SigmaSplatError, SourceError
 from sigmasplat.io.atomic import write_text
 from sigmasplat.io.trajectory import read_trajectory
 from sigmasplat.metrics.trajectory import ate, paired
-from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, preset as preset_of
 from sigmasplat.sources import open_source
@@ -102,20 +100,28 @@ class Options:
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
 
-def frames_of(source: Source, limit: int | None) -> Iterator[Frame]:
-    """Yield the frames in their own size, depth in the range that SigmaSplat uses."""
-    settings = preset_of(default_preset()).input
-    for i in range(min(len(source), limit or len(source))):
-        yield source.frame(i).prepared(0, settings.min_depth_m, settings.max_depth_m)
-
-
 def write_frames(source: Source, limit: int | None, folder: Path) -> None:
-    """Write color.npy (uint8), depth.npy (float32, m), times.npy (s) and camera.json for another system to read."""
-    frames = list(frames_of(source, limit))
-    np.save(folder / "color.npy", np.array([np.rint(frame.color * 255.0).astype(np.uint8) for frame in frames]))
-    np.save(folder / "depth.npy", np.array([frame.depth_m for frame in frames]))
-    np.save(folder / "times.npy", np.array([frame.timestamp_s for frame in frames]))
-    (folder / "camera.json").write_text(json.dumps(asdict(frames[0].camera)))
+    """Write color.npy (uint8), depth.npy (float32, m), times.npy (s) and camera.json for another system to read.
+
+    Frames keep their size; depth outside the range that SigmaSplat uses is 0.
+    """
+    settings, count = preset_of(default_preset()).input, frames_in(source, limit)
+    times_s = []
+    for i in range(count):
+        frame = source.frame(i).prepared(0, settings.min_depth_m, settings.max_depth_m)
+        if i == 0:
+            camera, size = frame.camera, frame.depth_m.shape
+            color = np.lib.format.open_memmap(folder / "color.npy", "w+", np.uint8, (count, *size, 3))
+            depth = np.lib.format.open_memmap(folder / "depth.npy", "w+", np.float32, (count, *size))
+        color[i], depth[i] = np.rint(frame.color * 255.0), frame.depth_m
+        times_s.append(frame.timestamp_s)
+    np.save(folder / "times.npy", times_s)
+    (folder / "camera.json").write_text(json.dumps(asdict(camera)))
+
+
+def frames_in(source: Source, limit: int | None) -> int:
+    """Return how many frames of a sequence are used."""
+    return min(len(source), limit or len(source))
 
 
 def path_of(times_s: NDArray[np.float64], poses: NDArray[np.float64]) -> Trajectory:
@@ -132,7 +138,7 @@ def score(path: Trajectory, source: Source, limit: int | None) -> dict[str, Any]
     truth = source.truth()
     if truth is None:
         raise SourceError(f"{source.name} has no true poses")
-    frames = min(len(source), limit or len(source))
+    frames = frames_in(source, limit)
     times_s = np.array([source.timestamp_s(i) for i in range(frames)])
     known, _ = paired(Trajectory(times_s, np.tile(np.eye(4), (frames, 1, 1))), path)
     found = ate(path, truth)
