@@ -140,7 +140,8 @@ def figures(run: Slam, field: GaussianField, sums: NDArray[np.float64], seen: li
     deviations = np.sqrt(second[:CHANNELS])
     errors = second[CHANNELS:] / np.array([deviations[a] * deviations[b] for a, b in ((0, 1), (0, 2), (1, 2))])
     correlations = correlations_of(field.extras["correlations"].params).abs().mean(0)
-    scores, judged = views.average([view.scores() for view in seen]), views.judge([views.sample(v) for v in seen]) or {}
+    scores = views.mean_scores([view.scores() for view in seen])
+    judged = views.score_uncertainty([views.sample_pixels(view) for view in seen]) or {}
     return {
         "mapping_s": round(sum(step.seconds.get("map", 0.0) for step in run.steps), 3),
         "keyframes": sum(step.is_keyframe for step in run.steps),

@@ -126,9 +126,7 @@ def draw() -> str:
         shapes.append(f'<line class="guide" x1="{LEFT}" x2="{x + COLUMN:g}" y1="{y + ROW:g}" y2="{y + ROW:g}"/>')
     for row, floor in enumerate(FLOORS):
         shapes += _row(row, floor)
-    note = (
-        "● the layer of the row imports the layer of the column. No dot lies above the diagonal: imports point up."
-    )
+    note = "● the layer of the row imports the layer of the column. No dot lies above the diagonal: imports point up."
     shapes.append(f'<text class="quiet" x="8" y="{height - 12}">{note}</text>')
     size = f'viewBox="0 0 {WIDTH} {height}" width="{WIDTH}" height="{height}"'
     head = f'<svg xmlns="http://www.w3.org/2000/svg" {size} role="img">'
