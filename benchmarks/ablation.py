@@ -1,52 +1,56 @@
-"""Compare the weights of σ² on four sequences as `sigmasplat bench ablation` does, and keep the result.
+"""Compare the weights of σ² on four sequences, with `sigmasplat bench ablation`.
 
-What has been run is in runs/bench/ablation/NAME.json and not run again while code and settings stay. Writes
-benchmarks/results/<name>-<machine>.json; `python benchmarks/tables.py` lays it out in the documents.
+Finished runs are kept in runs/bench/ablation/NAME.json and are not repeated while code and settings are unchanged.
+Writes benchmarks/results/<name>-<machine>.json; `python benchmarks/tables.py` writes its tables into the documents.
 
 example: python benchmarks/ablation.py --sources redkitchen --seeds 1 --limit 200
 """
 
-import sys
-from dataclasses import asdict, dataclass
+from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import program
 import record
 import tables
 import tyro
+from tables import Section
 
 from sigmasplat.commands import options as described
 from sigmasplat.commands.bench import DEFAULT_PRESET, Ablation
 from sigmasplat.errors import SigmaSplatError
+from sigmasplat.evaluation.ablation import COMPARED, NAMES, WITHOUT_VARIANCE
+from sigmasplat.evaluation.paired_comparison import FIGURES, columns, effects, passed_by_chance, rows
 
 arg = tyro.conf.arg
 SYNTHETIC = "synthetic:frames=240,overrun=20,noise=1,drift=6,seed={seed}"
-"""A room of its own for each seed, a sensor that drifts, and a walk that ends on its own beginning."""
+"""A different room for each seed, a sensor that drifts, and a path that ends where it began."""
 SOURCES = ("synthetic", "livingroom", "redkitchen", "hololens")
 RUNS = record.ROOT / "runs" / "bench" / "ablation"
 
 
 @dataclass(frozen=True)
 class Options:
-    """Compare the weights of σ² on four sequences, and keep the result."""
+    """Compare the weights of σ² on four sequences."""
 
-    sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = SOURCES
+    sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = SOURCES
     preset: described.PresetName = DEFAULT_PRESET
     settings: described.Settings = ()
     seeds: described.Seeds = 3
     tau: described.Tau = 10.0
     limit: described.Limit = None
     reference: Annotated[bool, arg(help="leave out the runs without variance", help_behavior_hint="")] = True
-    name: Annotated[str, arg(help="name of the results; another one for other --set")] = "ablation"
-    runs: Annotated[Path, arg(help="folder of what has been run")] = RUNS
+    name: Annotated[str, arg(help="name of the results; use another name with other --set")] = "ablation"
+    runs: Annotated[Path, arg(help="folder of finished runs")] = RUNS
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
     def working_file(self) -> Path:
-        """Return where runs are kept as they finish."""
+        """Return the file that finished runs are added to."""
         return self.runs / f"{record.slug(self.name)}.json"
 
     def ablation(self) -> Ablation:
-        """Return the command that does it; runs made with other settings or code are dropped."""
+        """Return the command to run; runs made with other settings or code are dropped."""
         sources = tuple(map(located, self.sources))
         return Ablation(
             sources, self.preset, self.settings, self.seeds, self.tau, self.limit, self.reference,
@@ -55,38 +59,112 @@ class Options:
 
 
 def located(name: str) -> str:
-    """Return the path of a sequence: in the data folder if it is there, else the name as it stands."""
+    """Return the path of a sequence in the data folder, or the name unchanged if it is not there."""
     known = record.data_root() / name
     return SYNTHETIC if name == "synthetic" else str(known.resolve()) if known.is_dir() else name
 
 
 def short(source: str) -> str:
-    """Return a sequence's name for tables: its folder's, or the built-in one's without its options."""
+    """Return a sequence's name for tables: the folder name, or the built-in sequence without its options."""
     return Path(source.partition(":")[0]).name
 
 
 def kept(results: dict[str, Any]) -> dict[str, Any]:
-    """Return an ablation's file for the committed results: figures only, sequences by name, not by where they lie."""
+    """Return an ablation's runs for the committed results: figures only, with names instead of paths."""
     named = [run | {"source": short(run["source"]), "path": Path(run["path"]).name} for run in results["runs"]]
     runs = [{name: value for name, value in run.items() if name != "metrics"} for run in named]
     return {"config": results["config"], "runs": runs}
 
 
+# ---- tables ----
+
+
+Runs = list[dict[str, Any]]
+JUDGED = tuple(figure for figure in FIGURES if figure.judged)
+
+
+def sections(measured: dict[str, Any]) -> list[Section]:
+    """Return the tables of results: one per sequence, `Effects`, and `Verdicts` in words."""
+    runs = measured["figures"]["runs"]
+    sources = list(dict.fromkeys(run["source"] for run in runs))
+    by_source = {source: [run for run in runs if run["source"] == source] for source in sources}
+    seeds, tau = len(measured["seeds"]), measured["config"]["tau"]
+    made = [sequence(source, found, tau) for source, found in by_source.items()]
+    return [*made, effects_of(by_source, seeds), *([verdicts(by_source)] if seeds > 1 else [])]
+
+
+def variants(runs: Runs) -> list[str]:
+    """List the variants that were run, in the order of the table."""
+    return [name for name in (WITHOUT_VARIANCE, *NAMES) if any(run["variant"] == name for run in runs)]
+
+
+def sequence(source: str, runs: Runs, tau: float) -> Section:
+    """Tabulate a sequence: one row per variant, the best value of each column in bold."""
+    figures, seeds = columns(runs), len({run["seed"] for run in runs})
+    laid_out = rows(runs, variants(runs), lambda text: f"**{text}**", figures)
+    note = f"Mean ± standard deviation of {seeds} seeds, τ = {tau:g} in every weight. Views are held out."
+    worlds = len({run["path"] for run in runs})
+    note += f" {worlds} worlds, one per seed." if worlds > 1 else ""
+    return Section(source, ["weights of σ²", *(figure.head for figure in figures)], laid_out, note)
+
+
+def effects_of(by_source: dict[str, Runs], seeds: int) -> Section:
+    """Tabulate differences at equal seeds; those larger than one standard deviation are bold."""
+    laid_out = []
+    for source, runs in by_source.items():
+        for changed, against in compared(runs):
+            found = {effect.figure.name: effect for effect in effects(runs, changed, against)}
+            cells = [found[figure.name].written() if figure.name in found else "–" for figure in JUDGED]
+            bold = [figure.name in found and found[figure.name].verdict in ("helps", "harms") for figure in JUDGED]
+            shown = [f"**{cell}**" if stands_out else cell for cell, stands_out in zip(cells, bold, strict=True)]
+            laid_out.append([source, f"{changed} against {against}", *shown])
+    note = "Mean ± standard deviation of the differences at equal seeds"
+    if seeds > 1:
+        note += f"; bold: larger than one deviation ({passed_by_chance(seeds):.0%} of figures are by chance)"
+    return Section("Effects", ["sequence", "change", *(figure.title for figure in JUDGED)], laid_out, f"{note}.")
+
+
+def verdicts(by_source: dict[str, Runs]) -> Section:
+    """List the figures that each change helps or harms by more than one deviation, and sequences without either."""
+    laid_out = []
+    for changed, against in dict.fromkeys(pair for runs in by_source.values() for pair in compared(runs)):
+        helped, harmed, neither = [], [], []
+        for source, runs in by_source.items():
+            found = effects(runs, changed, against)
+            helped += [f"{source}: {effect.figure.title}" for effect in found if effect.verdict == "helps"]
+            harmed += [f"{source}: {effect.figure.title}" for effect in found if effect.verdict == "harms"]
+            stands_out = any(effect.verdict in ("helps", "harms") for effect in found)
+            neither += [] if stands_out else [source]
+        cells = [", ".join(names) or "–" for names in (helped, harmed, neither)]
+        laid_out.append([f"{changed} against {against}", *cells])
+    return Section("Verdicts", ["change", "helps", "harms", "all within one deviation"], laid_out)
+
+
+def verdict_counts(measured: dict[str, Any], changed: str, against: str) -> Counter[str]:
+    """Count the verdicts on a change over all sequences and judged figures."""
+    runs = measured["figures"]["runs"]
+    sources = dict.fromkeys(run["source"] for run in runs)
+    by_source = [[run for run in runs if run["source"] == source] for source in sources]
+    return Counter(effect.verdict for found in by_source for effect in effects(found, changed, against))
+
+
+def compared(runs: Runs) -> list[tuple[str, str]]:
+    """List the pairs of variants to compare, of those that were run."""
+    there = set(variants(runs))
+    return [pair for pair in COMPARED if set(pair) <= there]
+
+
 def main(options: Options) -> int:
-    """Run, write, print; exit code 2 if the options mean nothing."""
+    """Run, write the results, print them; exit code 2 if the options are invalid."""
     options.runs.mkdir(parents=True, exist_ok=True)
     try:
         options.ablation().run()
     except SigmaSplatError as problem:
-        print(f"ablation.py: {problem}", file=sys.stderr)
-        return 2
-    config = {n: v for n, v in asdict(options).items() if n not in ("runs", "out")}
+        return program.refuse("ablation", problem)
     figures = kept(record.read(options.working_file()))
-    measured = record.results("ablation", figures, name=options.name, seeds=range(options.seeds), config=config)
-    print(record.write(measured, options.out), file=sys.stderr)
-    print(tables.table(measured))
+    print(tables.table(program.keep("ablation", figures, options, range(options.seeds))))
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))
+    program.start(main, Options)

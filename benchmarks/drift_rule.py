@@ -1,27 +1,26 @@
-"""Ask whether the uncertainty rule cuts submaps where tracking is weak (VarSplat §2, issue 4).
+"""Measure whether the uncertainty rule cuts submaps where tracking is weak (VarSplat §2, issue 4).
 
-Runs SLAM with `submaps.uncertainty_m` as the only rule and holds every hop from keyframe to keyframe against the truth:
-how far its pose is truly off where the rule fires and where it does not.
+Runs SLAM with `submaps.uncertainty_m` as the only rule. Compares the motion from each keyframe to the next (a hop) with
+the ground truth, where the rule fires and where it does not.
 Writes benchmarks/results/drift_rule-<machine>.json and prints tables.
 
 example: python benchmarks/drift_rule.py --sources hololens --limit 120
 """
 
-import sys
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
 import accuracy
 import numpy as np
+import program
 import record
-import tables
 import tyro
 from numpy.typing import NDArray
+from tables import Section, significant
 
 from sigmasplat.config import SubmapConfig
-from sigmasplat.errors import SigmaSplatError
 from sigmasplat.metrics.trajectory import associate
 from sigmasplat.model import se3
 from sigmasplat.presets import default_preset, preset as preset_of
@@ -34,22 +33,22 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Options:
-    """Cut submaps by accumulated uncertainty alone, and look where that is."""
+    """Cut submaps by accumulated uncertainty only, and measure the true error there."""
 
-    sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = (
+    sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = (
         "livingroom",
         "redkitchen",
         "hololens",
     )
-    preset: Annotated[str, arg(help="settings to start from")] = default_preset()
-    uncertainty_m: Annotated[float, arg(help="limit of the rule")] = 0.02
-    limit: Annotated[int | None, arg(help="take at most so many frames")] = None
+    preset: Annotated[str, arg(help="preset to start from")] = default_preset()
+    uncertainty_m: Annotated[float, arg(help="limit of the rule, metres")] = 0.02
+    limit: Annotated[int | None, arg(help="number of frames at most")] = None
     name: Annotated[str, arg(help="name of the results")] = "drift-rule"
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
 
 def measure(path: str, options: Options) -> dict[str, Any]:
-    """Run one sequence; return its hops and its submaps. Raises SourceError if it cannot be read or has no truth."""
+    """Run one sequence; return its hops and its number of submaps. Raises SourceError if it cannot be read."""
     config = preset_of(options.preset)
     rule = SubmapConfig(uncertainty_m=options.uncertainty_m, inherit=config.submaps.inherit)
     config = replace(config, submaps=rule, loops=replace(config.loops, close=False))
@@ -57,7 +56,7 @@ def measure(path: str, options: Options) -> dict[str, Any]:
     for frame in source:
         slam.step(frame)
     truth = source.truth()
-    assert truth is not None, f"{path} has no truth"
+    assert truth is not None, f"{path} has no ground truth"
     rows, true_rows = associate(np.array([step.timestamp_s for step in slam.steps]), truth.timestamps_s)
     known = dict(zip(rows.tolist(), truth.T_world_camera[true_rows], strict=True))
     path_ = slam.trajectory().T_world_camera
@@ -66,7 +65,7 @@ def measure(path: str, options: Options) -> dict[str, Any]:
 
 
 def hops_of(slam: Slam, path: Matrix, known: dict[int, Matrix]) -> dict[str, Any]:
-    """Return each hop: the frame it leads to, its submap, the uncertainty there, was it cut, its true error, m."""
+    """Return each hop: its last frame, its submap, the uncertainty there, whether a submap ended, the true error, m."""
     hops = []
     for before, after in pairwise(slam.keyframes):
         if before not in known or after not in known:
@@ -85,21 +84,46 @@ def hops_of(slam: Slam, path: Matrix, known: dict[int, Matrix]) -> dict[str, Any
     return {"hops": hops, "submaps": len(slam.atlas.anchors)}
 
 
+# ---- tables ----
+
+
+Rows = list[dict[str, Any]]
+
+
+def sections(measured: dict[str, Any]) -> list[Section]:
+    """Return one table: a row for each sequence."""
+    rows = []
+    for found in measured["figures"]["sources"]:
+        hops: Rows = found["hops"]
+        errors_cm = {cut: [100 * hop["error_m"] for hop in hops if hop["cut"] is cut] for cut in (True, False)}
+        counts = [str(len(hops)), str(found["submaps"]), str(found["lost"])]
+        cells = [level(errors_cm[cut], share) for cut in (True, False) for share in (0.5, 0.9)]
+        rows.append([found["source"], *counts, *cells])
+    head = ["sequence", "hops", "submaps", "lost frames", "error of hops where the rule fires, cm: median", "… 90 %"]
+    head += ["where it does not fire, cm: median", "… 90 %"]
+    limit_cm = significant(100 * measured["config"]["uncertainty_m"])
+    note = (
+        f"A submap ends where the camera's position in it is uncertain by more than {limit_cm} cm. Hops lead from "
+        "keyframe to keyframe; errors are relative to the ground truth, which the rule does not use."
+    )
+    return [Section("Uncertainty rule", head, rows, note)]
+
+
+def level(errors: list[float], share: float) -> str:
+    """Return the quantile `share` of the errors; a dash without errors."""
+    return significant(float(np.quantile(errors, share))) if errors else "–"
+
+
+def measure_all(options: Options) -> dict[str, Any]:
+    """Measure every sequence."""
+    found = [{"source": Path(s).name, **measure(accuracy.located(s), options)} for s in options.sources]
+    return {"sources": found}
+
+
 def main(options: Options) -> int:
-    """Measure, write, print; exit code 2 if the options mean nothing."""
-    found = []
-    try:
-        for source in options.sources:
-            found.append({"source": Path(source).name, **measure(accuracy.located(source), options)})
-    except SigmaSplatError as problem:
-        print(f"drift_rule.py: {problem}", file=sys.stderr)
-        return 2
-    config = {name: value for name, value in asdict(options).items() if name != "out"}
-    measured = record.results("drift_rule", {"sources": found}, name=options.name, seeds=[0], config=config)
-    print(record.write(measured, options.out), file=sys.stderr)
-    print(tables.table(measured))
-    return 0
+    """Measure, write the results, print them; return the exit code."""
+    return program.run("drift_rule", options, measure_all, [0])
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))
+    program.start(main, Options)

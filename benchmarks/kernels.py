@@ -1,4 +1,4 @@
-"""Read what the compiler says of every CUDA kernel: registers, spills, shared memory, blocks on a multiprocessor.
+"""List what every CUDA kernel uses: registers, spills, shared memory, blocks per multiprocessor.
 
 Needs no device. Writes benchmarks/results/kernels-<machine>.json and prints its tables.
 
@@ -6,18 +6,18 @@ example: python benchmarks/kernels.py --architectures sm_86
 """
 
 import re
-import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+import program
 import record
-import tables
 import tyro
+from tables import Section
 
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.native import cubins
+from sigmasplat.native.cuda import cubins
 
 arg = tyro.conf.arg
 THREADS = 256
@@ -26,22 +26,22 @@ TELL = ("--ptxas-options=-v",)
 
 @dataclass(frozen=True)
 class Options:
-    """Read what the compiler says of every CUDA kernel."""
+    """List registers, spills and shared memory of every CUDA kernel."""
 
-    architectures: Annotated[tuple[str, ...], arg(help="what to compile for")] = ("sm_86", "sm_90")
-    quick: Annotated[bool, arg(help="print only, write nothing")] = False
+    architectures: Annotated[tuple[str, ...], arg(help="architectures to compile for")] = ("sm_86", "sm_90")
+    quick: Annotated[bool, arg(help="print only, write no results")] = False
     name: Annotated[str, arg(help="name of the results")] = "kernels"
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
 
 class Multiprocessor(NamedTuple):
-    """What a multiprocessor shares out to blocks (CUDA C++ programming guide, compute capabilities)."""
+    """What a multiprocessor has for blocks (CUDA C++ programming guide, compute capabilities)."""
 
     shared_kib: int
     threads: int
     blocks: int
     reserved: int = 1024
-    """Bytes of shared memory that the system takes of every block."""
+    """Bytes of shared memory that the system reserves in every block."""
 
 
 MULTIPROCESSORS = {
@@ -62,7 +62,7 @@ USED = re.compile(
 
 
 class Usage(NamedTuple):
-    """What one kernel takes; shared memory and spills in bytes, of a thread the latter."""
+    """What one kernel uses; shared memory per block and spills per thread, in bytes."""
 
     kernel: str
     registers: int
@@ -71,7 +71,7 @@ class Usage(NamedTuple):
 
 
 def usages(log: str) -> Iterator[Usage]:
-    """Read ptxas's account of each kernel in NVRTC's log."""
+    """Read what ptxas reports for each kernel in NVRTC's log."""
     for found in USED.finditer(log):
         shared = re.search(r"(\d+) bytes smem", found["rest"])
         spilled = max(int(found["stores"]), int(found["loads"]))
@@ -79,13 +79,13 @@ def usages(log: str) -> Iterator[Usage]:
 
 
 def remarks(log: str) -> str:
-    """Return what else the log says: warnings."""
+    """Return the other lines of the log: warnings."""
     account = re.compile(r"ptxas (info    :|        \.) |\s*$")
     return "\n".join(line for line in log.splitlines() if not account.match(line))
 
 
 def blocks_held(usage: Usage, architecture: str) -> int:
-    """Return how many blocks of the kernel a multiprocessor holds at once. A warp's registers come in lots of 256."""
+    """Return how many blocks of the kernel fit on a multiprocessor; a warp's registers come in units of 256."""
     has = MULTIPROCESSORS[architecture]
     of_warp = -(-usage.registers * 32 // 256) * 256
     shared = -(-(usage.shared + has.reserved) // 128) * 128
@@ -101,26 +101,57 @@ def figures_of(architecture: str) -> Iterator[dict[str, Any]]:
             yield {"architecture": architecture, "features": features, **usage._asdict(), "blocks": held}
 
 
-def main(options: Options) -> int:
-    """Compile, write, print; return the exit code."""
+# ---- tables ----
+
+
+Rows = list[dict[str, Any]]
+
+
+def sections(measured: dict[str, Any]) -> list[Section]:
+    """Return the tables of results written by kernels.py."""
+    figures = measured["figures"]
+    made = dict.fromkeys(row["architecture"] for row in figures["kernels"])
+    note = f"NVRTC {figures['compiler']}; spills per thread; blocks of 256 threads that fit on a multiprocessor."
+    return [
+        _section(architecture, [row for row in figures["kernels"] if row["architecture"] == architecture], note)
+        for architecture in made
+    ]
+
+
+def _section(architecture: str, rows: Rows, note: str) -> Section:
+    head = ["kernel", "features", "registers", "spilled, B", "shared, B", "blocks"]
+    kernels = dict.fromkeys(row["kernel"] for row in rows)
+    ordered = [row for kernel in kernels for row in rows if row["kernel"] == kernel]
+    return Section(f"Kernels, {architecture}", head, [_cells(row) for row in _merged(ordered)], note)
+
+
+def _merged(rows: Rows) -> Rows:
+    """Merge rows of a kernel that are equal for several feature counts."""
+    joined: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for row in rows:
+        alike = tuple(row[name] for name in ("kernel", "registers", "spilled", "shared", "blocks"))
+        joined.setdefault(alike, row | {"counts": []})["counts"].append(row["features"])
+    return list(joined.values())
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    counts = ", ".join(str(count) for count in row["counts"] if count > 0)
+    return [row["kernel"], counts or "–", *(str(row[name]) for name in ("registers", "spilled", "shared", "blocks"))]
+
+
+def measure(options: Options) -> dict[str, Any]:
+    """Compile every kernel for every architecture. Raises SigmaSplatError for an unknown architecture."""
     unknown = set(options.architectures) - set(MULTIPROCESSORS)
-    try:
-        if unknown:
-            raise SigmaSplatError(
-                f"no figures for {', '.join(sorted(unknown))}; there are {', '.join(MULTIPROCESSORS)}"
-            )
-        rows = [row for architecture in options.architectures for row in figures_of(architecture)]
-    except SigmaSplatError as problem:
-        print(f"kernels.py: {problem}", file=sys.stderr)
-        return 2
-    figures = {"compiler": cubins.compiler_version(), "kernels": rows}
-    config = {n: v for n, v in asdict(options).items() if n not in ("out", "quick")}
-    measured = record.results("kernels", figures, name=options.name, config=config)
-    if not options.quick:
-        print(record.write(measured, options.out), file=sys.stderr)
-    print(tables.table(measured))
-    return 0
+    if unknown:
+        raise SigmaSplatError(f"no figures for {', '.join(sorted(unknown))}; there are {', '.join(MULTIPROCESSORS)}")
+    rows = [row for architecture in options.architectures for row in figures_of(architecture)]
+    return {"compiler": cubins.compiler_version(), "kernels": rows}
+
+
+def main(options: Options) -> int:
+    """Compile, write the results, print them; return the exit code."""
+    return program.run("kernels", options, measure, write=not options.quick)
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))
+    program.start(main, Options)

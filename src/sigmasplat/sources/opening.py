@@ -2,6 +2,7 @@
 
 import importlib
 import pkgutil
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache
@@ -39,7 +40,7 @@ class Format:
 @cache
 def formats() -> tuple[Format, ...]:
     """Return the formats of all modules directly in `sigmasplat.sources` that define FORMAT, by priority and name."""
-    folders = importlib.import_module("sigmasplat.sources").__path__
+    folders = sys.modules[__package__].__path__
     names = sorted(module.name for module in pkgutil.iter_modules(folders) if not module.ispkg)
     modules = [importlib.import_module(f"sigmasplat.sources.{name}") for name in names]
     found = [module.FORMAT for module in modules if hasattr(module, "FORMAT")]

@@ -1,0 +1,100 @@
+"""Render the map from a browser's viewpoint with SigmaSplat's renderer, and draw one layer of it in colours."""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from sigmasplat.config import RenderConfig
+from sigmasplat.drawing import colormap
+from sigmasplat.metrics.scored_view import COVERED_ALPHA
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import GaussianField
+from sigmasplat.render import render
+from sigmasplat.types import Matrix
+
+Layer = Literal["colour", "depth", "V", "U", "opacity"]
+Floats = NDArray[np.float32]
+GREY = np.array([(0, 0, 0), (255, 255, 255)], np.float64)
+LEGEND_SIZE, LEGEND_BAR, INK, PAPER = (280, 34), 14, (233, 237, 242), (36, 40, 46)
+
+
+class Legend(NamedTuple):
+    """A palette [K, 3], the values at its two ends, and their unit."""
+
+    palette: NDArray[np.float64]
+    low: float
+    high: float
+    unit: str
+
+
+class LayerImage(NamedTuple):
+    """Pixels uint8 [H, W, 3], and their legend unless they show the scene's own colours."""
+
+    pixels: colormap.Rgb
+    legend: Legend | None = None
+
+
+def browser_camera(fov: float, aspect: float, height: int) -> Camera:
+    """Return a browser's camera from its vertical field of view (radians), width / height, and the image's height."""
+    width, f = max(round(height * aspect), 1), 0.5 * height / np.tan(0.5 * fov)
+    return Camera(width, height, float(f), float(f), 0.5 * (width - 1), 0.5 * (height - 1))
+
+
+def render_layer(
+    field: GaussianField, camera: Camera, T_world_camera: Matrix, layer: Layer, options: RenderConfig, backend: str
+) -> LayerImage:
+    """Render a field and draw one layer of the result.
+
+    Layers: colour; depth D̂/A in m; V: √V averaged over the channels, colours being 0 to 1 (VarSplat §1); U: √U about
+    that depth, in m (CG-SLAM eq. 10); opacity A. Depth, V and U are drawn only where A > ½.
+    """
+    T_camera_world = se3.inverse(T_world_camera)
+    with torch.no_grad():
+        seen = render(field, camera, T_camera_world, None, options, backend)
+        alpha = _array(seen.alpha)
+        covered = alpha > COVERED_ALPHA
+        depth_m = np.where(covered, _array(seen.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0).astype(np.float32)
+        if layer == "colour":
+            return LayerImage((seen.color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy())
+        if layer == "opacity":
+            return LayerImage(colormap.apply(alpha, 0.0, 1.0, GREY), Legend(GREY, 0.0, 1.0, ""))
+        if layer == "depth":
+            return _mapped(depth_m, covered, colormap.value_range(depth_m, covered), colormap.VIRIDIS, " m")
+        if layer == "V":
+            return _from_zero(_array(seen.variance.mean(2).clamp(min=0.0).sqrt()), covered, "")
+        spread = render(field, camera, T_camera_world, torch.from_numpy(depth_m), options, backend).uncertainty
+        assert spread is not None
+        about = np.sqrt(np.maximum(_array(spread), 0.0) / np.maximum(alpha, COVERED_ALPHA))
+        return _from_zero(about, covered, " m")
+
+
+def draw_legend(legend: Legend) -> colormap.Rgb:
+    """Draw a palette and the values at its ends, uint8 [34, 280, 3]."""
+    width, height = LEGEND_SIZE
+    image = Image.new("RGB", LEGEND_SIZE, PAPER)
+    ramp = colormap.apply(np.tile(np.linspace(0.0, 1.0, width), (LEGEND_BAR, 1)), 0.0, 1.0, legend.palette)
+    image.paste(Image.fromarray(ramp), (0, 0))
+    draw, font = ImageDraw.Draw(image), ImageFont.load_default(14)
+    middle = (height + LEGEND_BAR) // 2
+    draw.text((1, middle), f"{legend.low:.3g}{legend.unit}", INK, font, anchor="lm")
+    draw.text((width - 1, middle), f"{legend.high:.3g}{legend.unit}", INK, font, anchor="rm")
+    return np.asarray(image)
+
+
+def _array(values: Tensor) -> Floats:
+    return np.asarray(values.cpu(), np.float32)
+
+
+def _from_zero(values: Floats, valid: NDArray[np.bool_], unit: str) -> LayerImage:
+    return _mapped(values, valid, (0.0, colormap.value_range(values, valid)[1]), colormap.INFERNO, unit)
+
+
+def _mapped(
+    values: Floats, valid: NDArray[np.bool_], ends: tuple[float, float], colours: NDArray[np.float64], unit: str
+) -> LayerImage:
+    return LayerImage(colormap.apply_masked(values, valid, *ends, colours), Legend(colours, *ends, unit))
