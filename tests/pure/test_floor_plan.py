@@ -127,7 +127,7 @@ def test_uncertain_and_thin_regions_are_found_within_a_cell(T_world_room: np.nda
     for why, x, y, area_m2, words in (
         ("unsure", -1.0, -1.0, 0.16, "depth ± 12"),
         ("thin", 0.85, -1.05, 0.25, "surface 30 % transparent"),
-        ("unsure", -1.2, 1.2, 0.16, "σ of colour 10.0 times"),
+        ("unsure", -1.2, 1.2, 0.16, "colour uncertainty 10.0 times"),
     ):
         here = [
             r for r in plan.regions if r.why == why and np.abs(np.subtract(r.center_m, (x, y - 0.3))).max() < CELL_M

@@ -6,10 +6,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFont
 
 from sigmasplat.drawing import colormap, plot
 from sigmasplat.drawing.view_panels import GAP, HEAD, PANEL_WIDTH, draw_view_strip, view_panels
+from sigmasplat.floorplan.rescan import RescanMaps, RescanRegion, find_rescan_regions
 from sigmasplat.metrics.scored_view import ScoredView
 from sigmasplat.report import charts
 from sigmasplat.report.html import Contents, build_report
@@ -60,6 +61,28 @@ def test_scores_of_a_view_use_pixels_with_a_depth_reading() -> None:
     assert score["psnr_db"] == pytest.approx(-10 * np.log10(mse))
     assert score["depth_l1_m"] == pytest.approx(0.1, abs=1e-5) and score["depth_coverage"] == pytest.approx(0.5)
     np.testing.assert_allclose(view.uncertainty, 0.04)
+
+
+def test_the_font_has_every_character_of_the_panels() -> None:
+    font = ImageFont.load_default(20)
+    texts = [word for panel in view_panels(some_view()) for word in (panel.title, panel.caption, *panel.ends)]
+    texts += [region.sentence("sq m") for region in regions_of_every_kind()]
+    assert {text.split(":")[0] for text in texts} >= {"unseen", "thin", "unsure"}
+    missing = bytes(font.getmask("\uffff"))
+    assert not [c for c in sorted({*"".join(texts)} - {" "}) if bytes(font.getmask(c)) == missing]
+
+
+def regions_of_every_kind() -> list[RescanRegion]:
+    """Return regions of maps with an uncertain patch, a thin one, and cells that were not observed."""
+    observed = np.zeros((40, 40), bool)
+    observed[2:-2, 2:-2] = True
+    observed[20:24, 20:24] = False
+    floor_unobserved = np.zeros_like(observed)
+    floor_unobserved[30:34, 4:8] = True
+    color, depth, alpha = np.full((3, 40, 40), [[[0.01]], [[0.01]], [[1.0]]])
+    color[5:10, 5:10], depth[5:10, 5:10], alpha[5:10, 20:25] = 0.1, 0.2, 0.5
+    maps = RescanMaps(~observed, floor_unobserved, observed & ~floor_unobserved, color, depth, alpha)
+    return find_rescan_regions(maps, 0.05, np.zeros(2))
 
 
 def test_a_strip_shows_the_five_panels_of_a_view() -> None:

@@ -54,7 +54,7 @@ def view_panels(view: ScoredView) -> list[ViewPanel]:
             "rendered colour", _bytes(view.rendered), f"PSNR {score['psnr_db']:.1f} dB · SSIM {score['ssim']:.3f}"
         ),
         _coloured("rendered depth", view.rendered_depth_m, mapped, depth_range, colormap.VIRIDIS, " m"),
-        _coloured("uncertainty √V", deviation, mapped, _from_zero(deviation, mapped), colormap.INFERNO),
+        _coloured("uncertainty, root of V", deviation, mapped, _from_zero(deviation, mapped), colormap.INFERNO),
         _coloured("error, RMS", error, view.valid, _from_zero(error, view.valid), colormap.INFERNO),
     ]
 
