@@ -16,7 +16,7 @@ PANEL_WIDTH, GAP, HEAD, FOOT = 320, 10, 34, 38
 
 @dataclass(frozen=True, eq=False)
 class ViewPanel:
-    """One panel of a strip: title, uint8 pixels, and either a colour bar (palette, two labels) or a line of text."""
+    """One panel of a strip: title, uint8 pixels, and a colour bar (palette, labels of its ends) or a line of text."""
 
     title: str
     pixels: colormap.Rgb
