@@ -54,7 +54,7 @@ def plain_plan() -> FloorPlan:
 
 
 def kind_at(plan: FloorPlan, x: float, y: float) -> int:
-    """Return the kind of the cell at x, y of the room. The origin of the plan is below the first camera, at (0, 0.3)."""
+    """Return the kind of the cell at x, y of the room. The plan has its origin below the first camera, at (0, 0.3)."""
     column, row = np.floor((np.array([x, y - 0.3]) - plan.origin_m) / plan.cell_m).astype(int)
     return int(plan.kind[row, column])
 
