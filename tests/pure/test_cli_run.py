@@ -30,7 +30,7 @@ from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import cuda_stages
-from sigmasplat.run import session
+from sigmasplat.run.session import Session
 from sigmasplat.run.terminal import Screen
 from sigmasplat.sources.base import Source
 
@@ -142,7 +142,7 @@ def corridor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Corridor:
     """Put a made-up source, SLAM and evaluation in place of the real ones, and work in an empty folder."""
     source = Corridor()
     # First: it imports the real SLAM, and would keep the made-up one for good. A made-up one has no state to keep.
-    monkeypatch.setattr("sigmasplat.run.resume.Snapshots.keep", lambda *ignored: None)
+    monkeypatch.setattr("sigmasplat.run.resume.StateFile.save", lambda *ignored: None)
     module = ModuleType("sigmasplat.slam.slam")
     module.Slam = MadeUpSlam  # type: ignore[attr-defined]
     scores = ModuleType("sigmasplat.evaluation.evaluate")
@@ -418,8 +418,8 @@ def test_a_terminal_gets_bars(corridor: Corridor) -> None:
     screen = Screen(Console(file=out, force_terminal=True, width=120))
     MadeUpSlam.tried = {4: [CLOSED]}
     folder = RunFolder.create(Path("direct"), Config(), "corridor")
-    with screen.steps(6) as watch:
-        session.record(MadeUpSlam(Config()), corridor, folder, watch)
+    with screen.steps(6) as callback:
+        Session(MadeUpSlam(Config()), corridor, folder, callback).execute()
     said = out.getvalue()
     assert "SLAM" in said and "6/6" in said and "final map" in said and "2/2" in said and "loop closed" in said
 
@@ -427,7 +427,7 @@ def test_a_terminal_gets_bars(corridor: Corridor) -> None:
 def test_unreadable_images_are_counted(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     corridor.broken = {1, 4}
     assert sigmasplat("run", "corridor", "--no-eval", "--out", "some") == 0
-    assert "2 unreadable images passed over (first: 1.png is truncated)" in capsys.readouterr().err
+    assert "skipped 2 unreadable images (first: 1.png is truncated)" in capsys.readouterr().err
     facts = json.loads(Path("some/run.json").read_text())
     assert facts["skipped"] == ["1.png is truncated", "4.png is truncated"]
     assert [record["index"] for record in RunFolder.open(Path("some")).read_log()] == [0, 2, 3, 5]
@@ -465,6 +465,7 @@ def test_eval_and_export_read_what_run_wrote(corridor: Corridor, capsys: pytest.
 
 
 def test_record_needs_no_screen(corridor: Corridor) -> None:
-    outcome = session.record(MadeUpSlam(Config()), corridor, RunFolder.create(Path("direct"), Config(), "corridor"))
+    folder = RunFolder.create(Path("direct"), Config(), "corridor")
+    outcome = Session(MadeUpSlam(Config()), corridor, folder).execute()
     assert (outcome.status, outcome.frames, outcome.lost) == ("complete", 6, 0)
     assert outcome.wall_s > 0

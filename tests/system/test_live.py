@@ -41,7 +41,7 @@ def test_ctrl_c_ends_it_and_it_is_finished_and_scored(device: Device, capsys: py
     device.on_frame = lambda number: signal.raise_signal(signal.SIGINT) if number == 2 * (WARM_UP + 6) else None
     assert sigmasplat("run", "realsense", "--out", "run", "--stride", "1", *QUICK) == 0
     said = capsys.readouterr()
-    assert "until Ctrl-C" in said.out and "were left out while SLAM was busy" in said.out
+    assert "until Ctrl-C" in said.out and "were dropped because SLAM was slower" in said.out
     run = RunFolder.open(Path("run"))
     facts, log = run.facts(), run.read_log()
     assert facts["status"] == "complete" and facts["finish_s"] >= 0

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from sigmasplat import cli
-from sigmasplat.commands.run import where
+from sigmasplat.commands.run import resume_line
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
 from sigmasplat.errors import RunError
@@ -105,8 +105,8 @@ def test_every_frame_is_a_place_to_go_on_from(tmp_path: Path) -> None:
 
 
 def test_where_a_run_goes_on_is_told() -> None:
-    assert where(FRAMES - 1, FRAMES) == "going on at frame 23 of 24"
-    assert where(FRAMES, FRAMES) == "all 24 frames are done: making the final map again"
+    assert resume_line(FRAMES - 1, FRAMES) == "resuming at frame 23 of 24"
+    assert resume_line(FRAMES, FRAMES) == "all 24 frames are done: making the final map again"
 
 
 def test_what_cannot_be_gone_on_with_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

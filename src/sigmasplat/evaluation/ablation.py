@@ -212,14 +212,14 @@ def perform(job: Job, folder: Path, screen: "Screen") -> dict[str, Any]:
     Raises KeyboardInterrupt where Ctrl-C ended the run early: half a run is no result.
     """
     from sigmasplat.evaluation.evaluate import evaluate
-    from sigmasplat.run.session import new_folder, record
+    from sigmasplat.run.session import Session, new_folder
     from sigmasplat.slam.slam import Slam
     from sigmasplat.sources import open_source
 
     source = open_source(job.path, job.config.input)
     run = new_folder(folder, job.config, source, True, source_path=job.path)
-    with screen.steps(len(source)) as watch:
-        outcome = record(Slam(job.config, run.submaps), source, run, watch)
+    with screen.steps(len(source)) as callback:
+        outcome = Session(Slam(job.config, run.submaps), source, run, callback).execute()
     if outcome.status == "interrupted":
         raise KeyboardInterrupt
     with screen.counting("evaluation") as progress:
