@@ -5,7 +5,7 @@ from typing import Any
 from tables import Section
 
 from sigmasplat.evaluation.ablation import COMPARED, NAMES, WITHOUT_VARIANCE
-from sigmasplat.evaluation.paired_comparison import FIGURES, columns, effects, passed_by_chance, rows
+from sigmasplat.evaluation.paired_comparison import FIGURES, columns, paired_differences, passed_by_chance, rows
 
 Runs = list[dict[str, Any]]
 JUDGED = tuple(figure for figure in FIGURES if figure.judged)
@@ -41,7 +41,7 @@ def effects_of(by_source: dict[str, Runs], seeds: int) -> Section:
     laid_out = []
     for source, runs in by_source.items():
         for changed, against in compared(runs):
-            found = {effect.figure.name: effect for effect in effects(runs, changed, against)}
+            found = {effect.figure.name: effect for effect in paired_differences(runs, changed, against)}
             cells = [found[figure.name].written() if figure.name in found else "–" for figure in JUDGED]
             bold = [figure.name in found and found[figure.name].verdict in ("helps", "harms") for figure in JUDGED]
             shown = [f"**{cell}**" if stands_out else cell for cell, stands_out in zip(cells, bold, strict=True)]
@@ -58,7 +58,7 @@ def verdicts(by_source: dict[str, Runs]) -> Section:
     for changed, against in dict.fromkeys(pair for runs in by_source.values() for pair in compared(runs)):
         helped, harmed, neither = [], [], []
         for source, runs in by_source.items():
-            found = effects(runs, changed, against)
+            found = paired_differences(runs, changed, against)
             helped += [f"{source}: {effect.figure.title}" for effect in found if effect.verdict == "helps"]
             harmed += [f"{source}: {effect.figure.title}" for effect in found if effect.verdict == "harms"]
             stands_out = any(effect.verdict in ("helps", "harms") for effect in found)

@@ -6,7 +6,15 @@ from typing import Any
 from accuracy_tables import failures
 from tables import Section
 
-from sigmasplat.evaluation.paired_comparison import Effect, Figure, best, by_seed, deviation, passed_by_chance, rows
+from sigmasplat.evaluation.paired_comparison import (
+    Figure,
+    PairedDifference,
+    best,
+    by_seed,
+    deviation,
+    passed_by_chance,
+    rows,
+)
 from sigmasplat.report.tables import number
 
 Scenes = dict[str, list[dict[str, Any]]]
@@ -88,7 +96,7 @@ def effects_of(scenes: Scenes, variants: list[str]) -> Section:
 def _effect(figure: Figure, changes: list[float]) -> str:
     if not changes:
         return "–"
-    effect = Effect(figure, statistics.fmean(changes), deviation(changes))
+    effect = PairedDifference(figure, statistics.fmean(changes), deviation(changes))
     worse = sum(figure.better * change < 0 for change in changes)
     return f"{_marked(effect.written(), effect.verdict in ('helps', 'harms'))}, {worse}/{len(changes)}"
 

@@ -27,9 +27,9 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["rnu", "data/kitchen"], "no command 'rnu' (did you mean run?); there are demo, "),
+        (["rnu", "data/kitchen"], "no command 'rnu' (did you mean run?); the commands are demo, "),
         (["evaluate", "--help"], "no command 'evaluate' (did you mean eval?)"),
-        (["xyzzy"], "no command 'xyzzy'; there are demo, inspect, run, resume, view, eval, mesh, export, download, be"),
+        (["xyzzy"], "no command 'xyzzy'; the commands are demo, inspect, run, resume, view, eval, mesh, export, down"),
         (["run", "/no/such/place"], "/no/such/place"),
         (["run", "."], "looked for"),
         (["run", "/no/such/place", "--preset", "quick"], "no preset 'quick'"),
@@ -79,7 +79,7 @@ def _sigmasplat(*arguments: str, **environment: str) -> subprocess.CompletedProc
 def test_the_version_is_listed_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
         cli.main(["--help"])
-    assert left.value.code == 0 and "sigmasplat --version    show which release" in capsys.readouterr().out
+    assert left.value.code == 0 and "sigmasplat --version    print the version" in capsys.readouterr().out
     with pytest.raises(SystemExit) as left:
         cli.main(["--version"])
     assert left.value.code == 0 and capsys.readouterr().out.startswith("sigmasplat ")

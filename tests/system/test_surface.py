@@ -13,7 +13,7 @@ from sigmasplat import cli
 from sigmasplat.config import Config, InputConfig
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.evaluation.evaluate import evaluate
-from sigmasplat.evaluation.reconstruct import Recording, reconstruct
+from sigmasplat.evaluation.reconstruct import FusionInput, reconstruct
 from sigmasplat.io.mesh import read_mesh
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.metrics.reconstruction import distances
@@ -194,13 +194,13 @@ def test_runs_without_keyframes_and_voxels_without_size_are_refused(run: RunFold
 
 def test_the_working_camera_is_that_of_prepared_frames(run: RunFolder) -> None:
     frame = WallAhead().frame(0).prepared(48, 0.1, 4.0)
-    assert Recording.of(run, CAMERA).camera == frame.camera
+    assert FusionInput.of(run, CAMERA).camera == frame.camera
 
 
 def test_a_cropped_run_has_the_cropped_camera(run: RunFolder) -> None:
     replace(CONFIG, input=replace(CONFIG.input, crop_px=3)).save(run.path / "config.json")
     frame = WallAhead().frame(0).prepared(48, 0.1, 4.0, 3)
-    assert Recording.of(run, CAMERA).camera == frame.camera and frame.camera.width == 42
+    assert FusionInput.of(run, CAMERA).camera == frame.camera and frame.camera.width == 42
 
 
 def sigmasplat(*arguments: str) -> int:

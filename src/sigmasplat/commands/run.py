@@ -211,7 +211,7 @@ def _warn_of_skipped_frames(screen: "Screen", source: "Source") -> None:
 
     if source.skipped:
         images = "image" if len(source.skipped) == 1 else "images"
-        screen.warn(f"skipped {len(source.skipped)} unreadable {images} (first: {source.skipped[0]})")
+        screen.warn(f"{len(source.skipped)} unreadable {images} skipped (first: {source.skipped[0]})")
     if isinstance(source, LiveSource) and source.ending:
         screen.warn(source.ending)
     if isinstance(source, LiveSource) and source.dropped:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.evaluation.reconstruct import Recording
+from sigmasplat.evaluation.reconstruct import FusionInput
 from sigmasplat.exports.recorded import Recorded
 from sigmasplat.io.atomic import replacing
 from sigmasplat.slam.fusion import VOXEL_M, Renderer
@@ -25,7 +25,7 @@ def export_points(
     They are the vertices of the mesh that `surface.reconstruct` makes, about one per voxel that the surface crosses.
     Raises RunError if the run has no map, checkpoint or keyframe, ConfigError unless voxel_m > 0.
     """
-    surface = Recording.at(recorded.run, recorded.camera).surface(voxel_m, renderer, progress)
+    surface = FusionInput.at(recorded.run, recorded.camera).surface(voxel_m, renderer, progress)
     colors = surface.vertices * 0.0 + 0.7 if surface.colors is None else surface.colors
     write_points(target, surface.vertices, colors, surface.normals())
     return len(surface.vertices)

@@ -12,7 +12,7 @@ from sigmasplat.config import Config
 from sigmasplat.presets.cgslam import REPLICA, SCANNET, TUM, color_share, sized
 
 
-class Scene(NamedTuple):
+class ReleasedScene(NamedTuple):
     """A row of the code's numbers: the paper's settings it goes with; tracking's iterations, rates, λ1 and λ2;
     mapping's iterations, interval, window, weights of colour (M_color, 0.1 of it for SSIM) and depth; the extent."""
 
@@ -32,23 +32,23 @@ class Scene(NamedTuple):
 
 # Replica: the extents of room1 and office2 are 4 and 2.5. The code has no row for other scenes than these.
 SCENES = {
-    "replica": Scene(REPLICA, 15, 1.5e-3, 2.15e-3, 0.2, 1.0, 60, 30, 4, 0.8, 0.25, 5.0),
-    "fr1-desk": Scene(TUM, 50, 1.5e-3, 2.15e-3, 1.0, 0.5, 50, 15, 3, 1.0, 0.8, 2.0),
-    "fr1-desk2": Scene(TUM, 50, 1.5e-3, 2.15e-3, 1.0, 0.6, 80, 10, 8, 0.9, 1.0, 2.0),
-    "fr1-room": Scene(TUM, 50, 1.5e-3, 2.15e-3, 1.0, 0.6, 80, 10, 6, 0.9, 1.0, 3.0),
-    "fr2-xyz": Scene(TUM, 50, 1.5e-3, 2.15e-3, 1.0, 0.6, 50, 15, 8, 1.0, 0.7, 5.0),
-    "fr3-office": Scene(TUM, 50, 1.5e-3, 2.15e-3, 1.0, 0.6, 30, 15, 8, 1.0, 0.8, 5.0),
-    "scene0000": Scene(SCANNET, 50, 7.5e-4, 1.15e-3, 1.0, 0.5, 50, 15, 10, 1.0, 0.7, 2.0),
-    "scene0059": Scene(SCANNET, 50, 2.5e-3, 2.15e-3, 1.0, 0.5, 50, 5, 10, 1.0, 0.8, 2.0),
-    "scene0106": Scene(SCANNET, 50, 2.5e-3, 2.15e-3, 0.8, 1.0, 50, 5, 3, 1.0, 1.0, 2.0),
-    "scene0169": Scene(SCANNET, 50, 2.5e-3, 2.15e-3, 1.0, 0.5, 50, 15, 8, 1.0, 0.7, 3.0),
-    "scene0181": Scene(SCANNET, 50, 2.5e-3, 2.15e-3, 1.0, 0.8, 50, 5, 10, 1.0, 1.0, 2.0),
-    "scene0207": Scene(SCANNET, 50, 2.5e-3, 2.15e-3, 1.0, 0.8, 50, 15, 10, 1.0, 0.7, 2.0),
+    "replica": ReleasedScene(REPLICA, 15, 1.5e-3, 2.15e-3, 0.2, 1.0, 60, 30, 4, 0.8, 0.25, 5.0),
+    "fr1-desk": ReleasedScene(TUM, 50, 1.5e-3, 2.15e-3, 1.0, 0.5, 50, 15, 3, 1.0, 0.8, 2.0),
+    "fr1-desk2": ReleasedScene(TUM, 50, 1.5e-3, 2.15e-3, 1.0, 0.6, 80, 10, 8, 0.9, 1.0, 2.0),
+    "fr1-room": ReleasedScene(TUM, 50, 1.5e-3, 2.15e-3, 1.0, 0.6, 80, 10, 6, 0.9, 1.0, 3.0),
+    "fr2-xyz": ReleasedScene(TUM, 50, 1.5e-3, 2.15e-3, 1.0, 0.6, 50, 15, 8, 1.0, 0.7, 5.0),
+    "fr3-office": ReleasedScene(TUM, 50, 1.5e-3, 2.15e-3, 1.0, 0.6, 30, 15, 8, 1.0, 0.8, 5.0),
+    "scene0000": ReleasedScene(SCANNET, 50, 7.5e-4, 1.15e-3, 1.0, 0.5, 50, 15, 10, 1.0, 0.7, 2.0),
+    "scene0059": ReleasedScene(SCANNET, 50, 2.5e-3, 2.15e-3, 1.0, 0.5, 50, 5, 10, 1.0, 0.8, 2.0),
+    "scene0106": ReleasedScene(SCANNET, 50, 2.5e-3, 2.15e-3, 0.8, 1.0, 50, 5, 3, 1.0, 1.0, 2.0),
+    "scene0169": ReleasedScene(SCANNET, 50, 2.5e-3, 2.15e-3, 1.0, 0.5, 50, 15, 8, 1.0, 0.7, 3.0),
+    "scene0181": ReleasedScene(SCANNET, 50, 2.5e-3, 2.15e-3, 1.0, 0.8, 50, 5, 10, 1.0, 1.0, 2.0),
+    "scene0207": ReleasedScene(SCANNET, 50, 2.5e-3, 2.15e-3, 1.0, 0.8, 50, 15, 10, 1.0, 0.7, 2.0),
 }
 OTHER_RATES = {"fr1-room": {"first": 1.6e-4, "last": 4e-5}, "fr3-office": {"log_scales": 1e-3}}
 
 
-def _released(scene: Scene, **rates: float) -> Config:
+def _released(scene: ReleasedScene, **rates: float) -> Config:
     """Return the settings of a scene as the code has them, and with its ways where the paper's are others."""
     s, base = scene, scene.base
     mapping = dataclasses.replace(
