@@ -270,11 +270,11 @@ def test_families_are_few_and_leave_no_preset_out() -> None:
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("fast", "no preset 'fast'; there are cgslam-fast, cgslam-loops-fast, loopsplat-fast, varsplat-fast (and "),
-        ("fr1-desk", "no preset 'fr1-desk'; there are cgslam-released-fr1-desk (and "),
-        ("cgslam-loops", "no preset 'cgslam-loops'; there are cgslam-loops-fast, cgslam-loops-replica, "),
-        ("varsplat-fst", "no preset 'varsplat-fst' (did you mean varsplat-fast?); there are cgslam-fast, "),
-        ("quick", f"no preset 'quick'; there are {', '.join(list_presets())}"),
+        ("fast", "no preset 'fast'; known: cgslam-fast, cgslam-loops-fast, loopsplat-fast, varsplat-fast (and "),
+        ("fr1-desk", "no preset 'fr1-desk'; known: cgslam-released-fr1-desk (and "),
+        ("cgslam-loops", "no preset 'cgslam-loops'; known: cgslam-loops-fast, cgslam-loops-replica, "),
+        ("varsplat-fst", "no preset 'varsplat-fst' (did you mean varsplat-fast?); known: cgslam-fast, "),
+        ("quick", f"no preset 'quick'; known: {', '.join(list_presets())}"),
     ],
 )
 def test_an_unknown_name_is_answered_with_those_like_it(name: str, told: str) -> None:
