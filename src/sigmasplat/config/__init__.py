@@ -3,6 +3,7 @@
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -41,6 +42,11 @@ class Config:
     loops: LoopConfig = field(default_factory=LoopConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     final: FinalConfig = field(default_factory=FinalConfig)
+
+    def changed(self, **sections: Mapping[str, Any]) -> "Config":
+        """Return the settings with some values replaced, as in config.changed(mapping={"every": 5})."""
+        new = {name: dataclasses.replace(getattr(self, name), **values) for name, values in sections.items()}
+        return dataclasses.replace(self, **new)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as nested dicts, as in a run's config.json."""
