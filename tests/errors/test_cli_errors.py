@@ -13,7 +13,7 @@ from sigmasplat.errors import ConfigError
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Run a command that must be refused; return its one line."""
+    """Run a command that must be refused and return its message."""
     with pytest.raises(SystemExit) as left:
         cli.main(arguments)
     said = capsys.readouterr()
@@ -104,7 +104,9 @@ def test_help_has_an_example_and_loads_no_torch(arguments: list[str]) -> None:
     ["run x --fx 57O", "run x --limit many", "run x --stride 1.5", "run x --seed None", "run x --register-depth None",
      "inspect x --depth-scale 1OOO", "export x --sigma-below small"],
 )  # fmt: skip
-def test_a_mistyped_number_is_told_without_the_parsers_types(mistyped: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_message_for_a_mistyped_number_has_no_parser_types(
+    mistyped: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
         cli.main(mistyped.split())
     told = capsys.readouterr().err
@@ -114,13 +116,13 @@ def test_a_mistyped_number_is_told_without_the_parsers_types(mistyped: str, caps
 
 
 @pytest.mark.parametrize("command", ["run", "inspect", "export", "bench", "mesh", "eval", "resume", "demo"])
-def test_help_names_no_none(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_does_not_show_none(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         cli.main([command, "--help"])
     assert "None" not in capsys.readouterr().out
 
 
-def test_what_is_taken_is_what_was_given() -> None:
+def test_input_options_become_settings() -> None:
     assert InputOptions().settings() == InputOptions(register_depth="auto").settings() == {}
     given = InputOptions(limit=3, start=1.5, fx=570.5, strict=True, register_depth="off").settings()
     assert given == {"input.limit": "3", "input.start_s": "1.5", "input.fx": "570.5", "input.strict": "True",

@@ -7,15 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from command_line import sigmasplat
 from room_run import PATH, made_run
-from sigmasplat import cli
-
-
-def sigmasplat(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as left:
-        cli.main(arguments)
-    assert isinstance(left.value.code, int)
-    return left.value.code
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The run folder: everything comes back as it went in, and an interruption at any moment leaves it readable."""
+"""The run folder: files read back as written, and the folder stays readable after an interruption at any moment."""
 
 import json
 from contextlib import suppress
@@ -27,7 +27,7 @@ def run(tmp_path: Path) -> RunFolder:
     return RunFolder.create(tmp_path / "out" / "run", CONFIG, "/data/room")
 
 
-def test_a_new_run_says_what_made_it(run: RunFolder) -> None:
+def test_a_new_run_stores_what_made_it(run: RunFolder) -> None:
     facts = RunFolder.open(run.path).facts()
     assert facts["program"] == "sigmasplat" and facts["source"] == "/data/room" and facts["status"] == "running"
     assert facts["machine"]["cpu"] and facts["machine"]["cores"] >= 1 and facts["version"]
@@ -40,7 +40,7 @@ def test_notes_are_added(run: RunFolder) -> None:
     assert facts["status"] == "complete" and facts["wall_s"] == 12.5 and facts["source"] == "/data/room"
 
 
-def test_everything_comes_back(run: RunFolder) -> None:
+def test_all_files_read_back_as_written(run: RunFolder) -> None:
     path = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
     field = GaussianField(torch.randn(5, 17))
     run.write_trajectory(path)
@@ -63,11 +63,11 @@ def test_the_log_grows_by_whole_lines(run: RunFolder) -> None:
     records = [{"index": i, "pose": np.eye(2) * i, "loss": np.float32(0.5), "bad": float("inf")} for i in range(3)]
     for i, record in enumerate(records):
         run.log(record)
-        assert len(run.read_log()) == i + 1, "each line is readable at once"
+        assert len(run.read_log()) == i + 1, "each line can be read immediately"
     assert run.read_log()[2] == {"index": 2, "pose": [[2.0, 0.0], [0.0, 2.0]], "loss": 0.5, "bad": None}
 
 
-def test_a_cut_off_last_line_is_passed_over_and_others_are_not(run: RunFolder) -> None:
+def test_only_an_incomplete_last_line_of_the_log_is_ignored(run: RunFolder) -> None:
     run.log({"index": 0})
     log = run.path / "log.jsonl"
     log.write_text(log.read_text() + '{"index": 1, "sec')
@@ -91,7 +91,7 @@ def test_ctrl_c_while_writing_keeps_the_old_file(run: RunFolder, monkeypatch: py
             write()
     torch.testing.assert_close(run.read_map().params, old.params)
     assert torch.equal(run.read_checkpoint()[0]["a"], torch.ones(2))
-    assert not list(run.path.glob(".*")), "no half file stays"
+    assert not list(run.path.glob(".*")), "no partial file stays"
 
 
 def test_overwriting_removes_our_files_and_no_others(run: RunFolder) -> None:
@@ -104,7 +104,7 @@ def test_overwriting_removes_our_files_and_no_others(run: RunFolder) -> None:
 
 
 def leave_submaps(run: RunFolder) -> None:
-    """Put into submaps/ what a killed run leaves there, and two files of the user's."""
+    """Write to submaps/ the files that a killed run leaves, and two files of the user."""
     folder = run.submaps.folder
     folder.mkdir()
     for name in ("submap-00000.safetensors", ".submap-00001.safetensors.part", "submap-mine.safetensors", "a.txt"):
@@ -120,20 +120,20 @@ def test_overwriting_removes_loops_and_our_submaps_and_no_others(run: RunFolder)
     assert sorted(p.name for p in again.submaps.folder.iterdir()) == ["a.txt", "submap-mine.safetensors"]
 
 
-def test_loops_come_back_and_are_none_in_older_runs(run: RunFolder) -> None:
+def test_loops_read_back_and_are_empty_in_older_runs(run: RunFolder) -> None:
     assert run.read_loops() == []
     run.write_loops([{"query": 7, "database": 0, "chi2": float("nan"), "T": np.eye(2)}])
     assert run.read_loops() == [{"query": 7, "database": 0, "chi2": None, "T": [[1.0, 0.0], [0.0, 1.0]]}]
 
 
 KILLED_AT = ["mkdir", "write_text", "replace", "unlink"]
-"""What a new run calls while it claims a folder, in one order or another."""
+"""Functions that a new run calls while it creates its folder."""
 
 
 @pytest.mark.parametrize("earlier", [False, True], ids=["fresh", "overwriting"])
 @pytest.mark.parametrize("call", KILLED_AT)
 @pytest.mark.parametrize("at", range(4))
-def test_a_run_killed_at_birth_leaves_a_folder_that_can_be_had(
+def test_a_run_killed_while_it_creates_its_folder_can_be_repeated_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, earlier: bool, call: str, at: int
 ) -> None:
     out = tmp_path / "run"
@@ -151,7 +151,7 @@ def test_a_run_killed_at_birth_leaves_a_folder_that_can_be_had(
 
 
 def kill_at_call(monkeypatch: pytest.MonkeyPatch, call: str, at: int) -> None:
-    """End the program as kill -9 does, cleaning nothing up, at the at-th call of a function of files."""
+    """End the program like kill -9, without any clean-up, at call number `at` of a file function."""
     owner = atomic.os if call == "replace" else Path
     real, calls = getattr(owner, call), iter(range(1000))
 

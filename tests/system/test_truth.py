@@ -1,10 +1,11 @@
-"""Ground truth stays out: a run neither asks for it nor depends on it; the evaluation alone does."""
+"""Only the evaluation reads ground truth; a run neither reads it nor depends on it."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from command_line import sigmasplat
 from sigmasplat import cli
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
@@ -28,12 +29,12 @@ OPTIONS = [word for pair in SETTINGS.items() for word in ("--set", "=".join(pair
 LEFT = ("trajectory.txt", "map.ply", "checkpoint.safetensors")
 
 
-class Asked(Exception):
-    """Somebody asked for the truth."""
+class TruthRead(Exception):
+    """The truth was read."""
 
 
 class Secretive(Source):
-    """The first frames of a room whose truth may not be asked for."""
+    """The first frames of a room; reading its truth raises TruthRead."""
 
     def __init__(self, truth: Trajectory | None = None) -> None:
         self._room, self._truth = SyntheticRoom(frames=120, width=64, height=48), truth
@@ -47,41 +48,34 @@ class Secretive(Source):
 
     def truth(self) -> Trajectory | None:
         if self._truth is None:
-            raise Asked
+            raise TruthRead
         return self._truth
 
     def true_surface(self) -> Mesh | None:
-        raise Asked
+        raise TruthRead
 
 
 def config() -> Config:
     return override(preset(default_preset()), SETTINGS)
 
 
-def sigmasplat(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as left:
-        cli.main(arguments)
-    assert isinstance(left.value.code, int)
-    return left.value.code
-
-
-def test_slam_and_session_never_ask_for_the_truth(tmp_path: Path) -> None:
+def test_slam_and_session_never_read_the_truth(tmp_path: Path) -> None:
     source, run = Secretive(), RunFolder.create(tmp_path / "run", config(), "room")
     outcome = Session(Slam(config()), source, run).execute()
     assert (outcome.status, outcome.frames, outcome.lost) == ("complete", FRAMES, 0)
     assert len(run.read_trajectory()) == FRAMES
 
 
-def test_the_command_line_asks_only_to_evaluate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_line_reads_the_truth_only_to_evaluate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sigmasplat.sources.open_source", lambda path, settings=None: Secretive())
     assert sigmasplat("run", "room", "--out", str(tmp_path / "run"), "--no-eval", *OPTIONS) == 0
     assert sigmasplat("mesh", str(tmp_path / "run"), "--voxel-m", "0.1") == 0
-    with pytest.raises(Asked):
+    with pytest.raises(TruthRead):
         cli.main(["eval", str(tmp_path / "run")])
 
 
 def tum_folder(folder: Path, kind: str) -> Path:
-    """Write the same frames with the true path, another one, or none."""
+    """Write the same frames with the true path, another path, or none."""
     whole = SyntheticRoom(frames=120, width=64, height=48).truth()
     poses = whole.T_world_camera[:FRAMES]
     if kind == "another":
@@ -92,7 +86,7 @@ def tum_folder(folder: Path, kind: str) -> Path:
     return folder
 
 
-def test_the_same_bytes_with_the_truth_with_another_and_with_none(tmp_path: Path) -> None:
+def test_results_are_the_same_bytes_with_any_truth_or_none(tmp_path: Path) -> None:
     found, errors_m = {}, {}
     for kind in ("true", "another", "none"):
         out = tmp_path / "runs" / kind
