@@ -2,6 +2,7 @@
 
 import importlib
 import pkgutil
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache
@@ -36,7 +37,7 @@ class Format:
 @cache
 def formats() -> tuple[Format, ...]:
     """Find the formats: every module directly in `sigmasplat.sources` that defines FORMAT, by priority and name."""
-    names = sorted(module.name for module in pkgutil.iter_modules([str(Path(__file__).parent)]) if not module.ispkg)
+    names = sorted(module.name for module in pkgutil.iter_modules(sys.modules[__package__].__path__) if not module.ispkg)
     modules = [importlib.import_module(f"sigmasplat.sources.{name}") for name in names]
     found = [module.FORMAT for module in modules if hasattr(module, "FORMAT")]
     return tuple(sorted(found, key=lambda known: -known.priority))
