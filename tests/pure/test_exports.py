@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw
 
 from box_room import CAMERA, HIGH, LOW, seer, splats
 from room_run import FRAMES, LOST, PATH, T_ROOM, WORLD, Walls, made_run, picture
-from sigmasplat.drawing.film import Scale, legend_strip
+from sigmasplat.drawing.film import FilmScale, legend_strip
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.exports import (
     Recorded,
@@ -149,7 +149,7 @@ def test_what_is_written_under_a_film_can_be_read(width: int, monkeypatch: pytes
         plain(draw, at, said, fill, font, anchor=anchor)
 
     monkeypatch.setattr(ImageDraw.ImageDraw, "text", text)
-    strip = legend_strip(Scale((0.8, 12.4), (0.0, 0.23)), width)
+    strip = legend_strip(FilmScale((0.8, 12.4), (0.0, 0.23)), width)
     assert strip.shape == (40, 3 * width, 3)
     for i, (left, top, right, bottom) in enumerate(boxes):
         assert left // width == (right - 1) // width and 0 < top < bottom < 40, f"{words[i]} leaves its panel"

@@ -10,7 +10,7 @@ from command_line import sigmasplat
 from fake_realsense import Device
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.sources import open_source
-from sigmasplat.sources.realsense import WARM_UP
+from sigmasplat.sources.realsense import WARM_UP_FRAMES
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -33,7 +33,7 @@ def test_ctrl_c_ends_the_frames_and_the_run_is_finished_and_scored(
     device: Device, capsys: pytest.CaptureFixture[str]
 ) -> None:
     device.missed_between = 1
-    device.on_frame = lambda number: signal.raise_signal(signal.SIGINT) if number == 2 * (WARM_UP + 6) else None
+    device.on_frame = lambda number: signal.raise_signal(signal.SIGINT) if number == 2 * (WARM_UP_FRAMES + 6) else None
     assert sigmasplat("run", "realsense", "--out", "run", "--stride", "1", *QUICK) == 0
     said = capsys.readouterr()
     assert "until Ctrl-C" in said.out and "were dropped because SLAM was slower" in said.out
@@ -53,7 +53,7 @@ def test_ctrl_c_ends_the_frames_and_the_run_is_finished_and_scored(
 
 
 def test_an_unplugged_camera_gives_one_line_and_a_valid_run(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
-    device.frames_until_unplugged = WARM_UP + 5
+    device.frames_until_unplugged = WARM_UP_FRAMES + 5
     assert sigmasplat("run", "realsense", "--out", "run", "--record", "seen", "--no-eval", *QUICK) == 0
     said = capsys.readouterr()
     assert said.err.count("\n") == 1 and "no frame came for 5 s" in said.err

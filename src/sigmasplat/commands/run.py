@@ -115,11 +115,11 @@ def _opened(screen: "Screen", path: str, config: "Config", record: Path | None) 
     """Open the source and warn of doubtful depth; the settings of a live camera become those of its recording."""
     from sigmasplat.sources import open_source
     from sigmasplat.sources.camera.depth_units import depth_warning
-    from sigmasplat.sources.live import LiveSource, as_recorded
+    from sigmasplat.sources.live import LiveSource, recording_settings
 
     source = open_source(path, config.input)
     if isinstance(source, LiveSource):
-        config = replace(config, input=as_recorded(config.input))
+        config = replace(config, input=recording_settings(config.input))
         if record:
             source.record_to(record)
     elif record:
@@ -163,7 +163,7 @@ def _run_and_score(
 
     Raises KeyboardInterrupt if Ctrl-C came before the first frame was done.
     """
-    from sigmasplat.render import cuda_stages
+    from sigmasplat.render.cuda import stages as cuda_stages
     from sigmasplat.run.resume import StateFile
     from sigmasplat.run.session import Session
     from sigmasplat.sources.live import LiveSource

@@ -13,7 +13,7 @@ from sigmasplat.metrics.trajectory import associate
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.report.page import Gallery
+from sigmasplat.report.view_strips import ViewStrips
 from sigmasplat.sources.base import Source
 
 KIND = "test"
@@ -26,14 +26,14 @@ def score_novel_views(
     field: GaussianField,
     settings: InputConfig,
     renderer: views.Renderer,
-    gallery: Gallery,
+    strips: ViewStrips,
     most: int,
 ) -> dict[str, Any] | None:
     """Render the final map at the true poses of at most `most` test views, and return their mean scores.
 
     `T_estimate_truth`, the alignment of the ATE, transforms the poses to the estimate's world. So errors of the path
-    lower these scores, as in the papers. Adds a few views to the gallery. Unreadable views and those without a pose are
-    skipped. Returns the scores as `views.average` does, or None if no poses are known.
+    lower these scores, as in the papers. Adds a few views to the strips. Unreadable views and those without a pose are
+    skipped. Returns the scores as `views.mean_scores` does, or None if no poses are known.
     """
     if poses is None:
         return None
@@ -46,7 +46,7 @@ def score_novel_views(
         rows, found = associate(np.array([frame.timestamp_s]), poses.timestamps_s)
         if len(rows):
             T_camera_world = se3.inverse(T_estimate_truth @ poses.T_world_camera[found[0]])
-            rendered.append(views.view_of(frame, renderer(field, frame.camera, T_camera_world), KIND))
-    for view in rendered[:: max(1, len(rendered) // max(gallery.per_kind, 1))][: gallery.per_kind]:
-        gallery.add(view)
-    return views.average([view.scores() for view in rendered])
+            rendered.append(views.scored_view(frame, renderer(field, frame.camera, T_camera_world), KIND))
+    for view in rendered[:: max(1, len(rendered) // max(strips.per_kind, 1))][: strips.per_kind]:
+        strips.add(view)
+    return views.mean_scores([view.scores() for view in rendered])

@@ -18,7 +18,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from sigmasplat.report.summary import ranges
+from sigmasplat.report.summary import format_ranges
 from sigmasplat.report.tables import headline, number
 from sigmasplat.run.profile import shares
 from sigmasplat.run.protocols import LoopResult, StepResult
@@ -97,7 +97,8 @@ class Screen:
         lost = metrics.get("lost_frames") or []
         if lost:
             frames = metrics.get("frames")
-            self.say(f"tracking was LOST on {len(lost)} of {frames} frames: {ranges(lost)}; their poses are unreliable")
+            where = format_ranges(lost)
+            self.say(f"tracking was LOST on {len(lost)} of {frames} frames: {where}; their poses are unreliable")
 
     def profile(self, seconds: Mapping[str, float]) -> None:
         """Print the time of each stage."""
