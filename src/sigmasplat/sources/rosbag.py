@@ -1,7 +1,7 @@
-"""Read RGB-D recordings of robots: ROS 1 bags, ROS 2 bags, MCAP files, and what RealSense's SDK records.
+"""Read ROS 1 bags, ROS 2 bags, MCAP files, and recordings of RealSense's SDK.
 
-Topics are found by what they hold, or chosen with input.color_topic and input.depth_topic. The bag is gone through once
-for the times; images are read when they are asked for.
+Topics are found by their content, or chosen with input.color_topic and input.depth_topic. Opening reads the bag once
+for the timestamps; images are read on demand.
 """
 
 from collections.abc import Sequence
@@ -24,13 +24,13 @@ from sigmasplat.sources.ros.topics import color_topic, depth_topic
 from sigmasplat.sources.ros.truth import read_truth
 
 MAX_GAP_S = 0.02
-"""Colour and depth of one camera at 30 Hz are never further apart."""
+"""Largest time difference of a colour and a depth image of one camera at 30 Hz."""
 Times = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class BagImagePair(ImagePair):
-    """A pair of messages; the paths name topic and time below the bag."""
+    """A pair of messages; the paths contain bag, topic and time."""
 
     bag: Bag
     topics: tuple[str, str]
@@ -54,7 +54,7 @@ class BagImagePair(ImagePair):
 
 
 def open_bag(path: Path, settings: InputConfig) -> RecordedSource:
-    """Open a bag; raises SourceError if it is damaged, its topics are not clear, or its cameras are not known."""
+    """Open a bag. Raises SourceError if it is damaged, its topics are ambiguous, or its cameras are unknown."""
     bag = Bag(path)
     color, depth = color_topic(bag, settings.color_topic), depth_topic(bag, settings.depth_topic)
     calibration = read_bag_calibration(bag, color, depth, settings)
@@ -78,9 +78,9 @@ def open_bag(path: Path, settings: InputConfig) -> RecordedSource:
 
 
 def _paired(entries: tuple[Sequence[Entry], Sequence[Entry]]) -> tuple[NDArray[np.intp], bool]:
-    """Pair colour with depth by the headers' times, or by those of recording where that finds more.
+    """Pair colour with depth by header time, or by recording time if that finds more pairs.
 
-    Some drivers leave headers empty, or take the times of two sensors from two clocks.
+    Some drivers leave the headers empty, or use a different clock for each sensor.
     """
     clocks = (False, True) if _headers_have_times(entries) else (True,)
     found = []
@@ -91,7 +91,7 @@ def _paired(entries: tuple[Sequence[Entry], Sequence[Entry]]) -> tuple[NDArray[n
 
 
 def _headers_have_times(entries: tuple[Sequence[Entry], Sequence[Entry]]) -> bool:
-    """Tell whether the headers hold times at all."""
+    """Return whether the headers contain times."""
     return all(part[0].stamp_ns != part[-1].stamp_ns or len(part) == 1 for part in entries)
 
 
@@ -106,7 +106,9 @@ def _message_path(path: Path, topic: str, time_s: float) -> Path:
 def _no_overlap(path: Path, topics: tuple[str, str], entries: tuple[Sequence[Entry], Sequence[Entry]]) -> str:
     times = partial(_times_s, recorded=True)
     spans = [f"{n} {times(e).min():.3f} … {times(e).max():.3f} s" for n, e in zip(topics, entries, strict=True)]
-    return f"no colour image of {path} has depth within {MAX_GAP_S:g} s ({', '.join(spans)}); one recording?"
+    return (
+        f"no colour image of {path} has depth within {MAX_GAP_S:g} s ({', '.join(spans)}); are both from one recording?"
+    )
 
 
 FORMAT = Format(

@@ -1,4 +1,4 @@
-"""Pair events of two clocks by time."""
+"""Pair two lists of timestamps."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,8 +9,8 @@ Times = NDArray[np.float64]
 def associate(first_s: Times, second_s: Times, tolerance_s: float = 0.02) -> NDArray[np.intp]:
     """Pair timestamps [N] and [M], seconds, that differ by less than `tolerance_s`; return indices [K, 2] by time.
 
-    Every index is used at most once and the closest pairs are served first; neither list need be sorted. Ties go to
-    the earlier entry of the first list, then of the second, so the answer does not depend on the sort's whims.
+    Every index is used at most once, and the closest pairs are chosen first. The lists may be unsorted. Ties go to the
+    earlier entry of the first list, then of the second, so the result does not depend on the sorting algorithm.
     """
     rows, columns = _candidates(first_s, second_s, tolerance_s)
     gaps_s = np.abs(first_s[rows] - second_s[columns])
@@ -26,7 +26,7 @@ def associate(first_s: Times, second_s: Times, tolerance_s: float = 0.02) -> NDA
 
 
 def _candidates(first_s: Times, second_s: Times, tolerance_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """List all index pairs strictly within the tolerance."""
+    """Return all index pairs that differ by less than the tolerance."""
     order = np.argsort(second_s, kind="stable")
     ordered = second_s[order]
     low = np.searchsorted(ordered, first_s - tolerance_s, "left")
