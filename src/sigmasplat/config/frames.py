@@ -43,11 +43,11 @@ class SeedConfig:
     later_max: int = 30_000
     """Maximum number of new splats per later keyframe; 0 = no limit."""
     alpha_below: float = 0.6
-    """Seed pixels where the rendered alpha of the map is below this. A higher value fills holes sooner and makes more
-    splats."""
+    """Pixels are seeded where the rendered alpha of the map is below this. A higher value fills holes sooner and makes
+    more splats."""
     depth_error_factor: float = 40.0
-    """Seed pixels where the rendered surface is behind the measured one by this multiple of the median depth error; 0 =
-    off (CG-SLAM)."""
+    """Pixels are seeded where the rendered surface is behind the measured one by this multiple of the median depth
+    error; 0 = off (CG-SLAM)."""
     depth_error_least_m: float = 0.0
     """Minimum distance, in metres, between rendered and measured surface for seeding by `depth_error_factor`."""
     min_distance_m: float = 0.01
@@ -139,15 +139,15 @@ class MappingConfig:
     """Splats with at most this opacity are removed after the steps of a keyframe. A lower value keeps haze, a higher
     one makes holes."""
     keyframe_history: int = 0
-    """Older keyframes are drawn from the latest N only; 0 = from all."""
+    """Older keyframes are drawn only from this many of the latest ones; 0 = from all."""
     window: int = 0
-    """Use only N keyframes: the newest two, and those that overlap most with the newest (CG-SLAM's sliding-window
-    bundle adjustment). 0 = all, drawn at random (VarSplat)."""
+    """Use only this many keyframes: the newest two, and those that overlap most with the newest (CG-SLAM's
+    sliding-window bundle adjustment). 0 = all, drawn at random (VarSplat)."""
     covisibility: Literal["splats", "frustum", "descriptor"] = "splats"
     """How the overlap of the window's keyframes is measured: by common dominant splats, by depth readings that the
     other keyframe sees too, or by the image descriptor of `loops`."""
     frames_per_step: int = 1
-    """Each step minimises the mean loss of N keyframes of the window; 0 = of all of them (CG-SLAM)."""
+    """Each step minimises the mean loss of this many keyframes of the window; 0 = of all of them (CG-SLAM)."""
 
 
 @dataclass(frozen=True)
