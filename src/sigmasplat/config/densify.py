@@ -22,8 +22,8 @@ class DensifyConfig:
     least_opacity: float = 15.0 / 255.0
     """A faded splat has recovered if it is no longer uncertain and has at least this opacity (CG-SLAM's α_min)."""
     split_gradient: float = 0.0
-    """A splat is densified if the mean gradient of the loss by its 2D position in the newest keyframe is at least this,
-    per half image size (3DGS); 0 = no splat is split or cloned for its gradient."""
+    """A splat is densified if the mean gradient of the loss with respect to its 2D position in the newest keyframe is
+    at least this, per half image size (3DGS); 0 = no splat is split or cloned for its gradient."""
     split_scale_m: float = 0.05
     """A densified splat larger than this is split in two."""
     split_radius_px: float = 0.0
