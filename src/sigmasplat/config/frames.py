@@ -122,10 +122,10 @@ class MappingConfig:
     """Learning rate of σ²: change of its logarithm per step. Use a higher one with few `iterations`, so that σ²
     converges."""
     lr_pose_translation: float = 0.0
-    """Learning rate of keyframe positions in mapping, metres per step; 0 = mapping keeps all poses. The first pose is
-    always fixed."""
+    """Learning rate of keyframe positions in mapping, metres per step; 0 = positions are not optimised. The first pose
+    is always fixed."""
     lr_pose_rotation: float = 0.0
-    """Learning rate of keyframe rotations in mapping, radians per step."""
+    """Learning rate of keyframe rotations in mapping, radians per step; 0 = rotations are not optimised."""
     poses: Literal["all", "newest"] = "all"
     """Which poses mapping optimises: those of all keyframes in use (CG-SLAM eq. 21), or only the newest (CG-SLAM's
     code)."""
