@@ -1,7 +1,7 @@
 """Watch a run grow in the browser for a while, and ask whether the viewer's memory grows with it (issue 7).
 
 A system is made up that grows as a real one does, without its work: frames, keyframes with pictures, submaps that are
-finished to disk, an active map that changes all the time. It is shown through the very watcher and stage of `sigmasplat
+finished to disk, an active map that changes all the time. It is shown through the callback and viewer of `sigmasplat
 run --view`, to one client in another process, which looks from ever new places; what is shown is changed every 4 s.
 Kept is the resident memory of the server's process at rest: every 15 s splats are shown in their colours and nothing
 new comes for 3 s, so that like is compared with like; and how much of it is in use, by glibc's own count. Writes
@@ -37,10 +37,10 @@ from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step_result import Step
 from sigmasplat.viewer.live import LiveView
-from sigmasplat.viewer.snapshot import to_look_at
+from sigmasplat.viewer.snapshot import field_without_moments
 
 if TYPE_CHECKING:
-    from sigmasplat.viewer.app import Stage
+    from sigmasplat.viewer.app import ViewerApp
 
 arg = tyro.conf.arg
 STATM = Path("/proc/self/statm")
@@ -113,7 +113,7 @@ class Growing:
         return step
 
     def _begin(self) -> None:
-        self.slam.mapper = Mapper(self.slam.config, self.random, to_look_at(self.field.params[:0], {}))
+        self.slam.mapper = Mapper(self.slam.config, self.random, field_without_moments(self.field.params[:0], {}))
 
     def _map(self, frame: int, pose: Any) -> None:
         """Take note of a keyframe; move the splats, and show more of them, as mapping would."""
@@ -125,7 +125,7 @@ class Growing:
         slam.atlas.keyframes[-1].append(pose)
         slam.keyframes.append(frame)
         self.field.params[:, :3] += 1e-3 * torch.sin(torch.tensor(frame))
-        slam.mapper.field = to_look_at(self.field.params[:grown], {})
+        slam.mapper.field = field_without_moments(self.field.params[:grown], {})
 
     def _pose(self, frames: int) -> Any:
         """Return where the camera is after so many frames of a submap."""
@@ -156,47 +156,47 @@ def in_use_mib() -> float:
 
 def measure(options: Options) -> dict[str, Any]:
     """Show the growing system for as long as asked; return the figures."""
-    from sigmasplat.viewer.app import Stage
+    from sigmasplat.viewer.app import ViewerApp
     from sigmasplat.viewer.server import HOST, close, open_server
 
     server = open_server(HOST, 8780, "viewer memory")
-    stage = Stage(server)
+    viewer = ViewerApp(server)
     command = [sys.executable, "-c", CLIENT, f"ws://{HOST}:{server.get_port()}"]
     client = subprocess.Popen(command)
     try:
         with TemporaryDirectory(prefix="viewer-memory-") as folder:
             growing = Growing(Path(folder) / "submaps", options.splats)
-            return watch(growing, stage, options) | {"client_gone": client.poll() is not None}
+            return watch(growing, viewer, options) | {"client_gone": client.poll() is not None}
     finally:
         client.kill()
         client.wait()
-        stage.stop()
+        viewer.stop()
         close(server)
 
 
-def watch(growing: Growing, stage: "Stage", options: Options) -> dict[str, Any]:
+def watch(growing: Growing, viewer: "ViewerApp", options: Options) -> dict[str, Any]:
     """Step, and sample the memory; return what was found."""
-    from sigmasplat.viewer.panel import KINDS, SAYS
+    from sigmasplat.viewer.panel import MODE_LABELS, VIEW_MODES
 
     shown = 0
 
-    def show(moment: Any) -> None:
+    def show(snapshot: Any) -> None:
         nonlocal shown
         shown += 1
-        stage.show(moment)
+        viewer.show(snapshot)
 
     live, begun_s = LiveView(growing.slam, show, "growing"), time.monotonic()
     samples: list[dict[str, float]] = []
     while (now_s := time.monotonic() - begun_s) < 60.0 * options.minutes:
         live(growing())
         if now_s >= SAMPLE_S * (len(samples) + 1):
-            stage.panel.kind.value, stage.panel.colouring.value = SAYS["splats"], "colour"
-            show(live.moment())
+            viewer.panel.mode.value, viewer.panel.colouring.value = MODE_LABELS["splats"], "colour"
+            show(live.snapshot())
             time.sleep(REST_S)
             memory = {"resident_mib": resident_mib(), "in_use_mib": in_use_mib()}
-            samples.append({"s": now_s, **memory, "clients": len(stage.server.get_clients())})
-        stage.panel.kind.value = SAYS[KINDS[int(now_s / CHANGE_S) % len(KINDS)]]
-        stage.panel.colouring.value = ("colour", "σ")[int(now_s / CHANGE_S / len(KINDS)) % 2]
+            samples.append({"s": now_s, **memory, "clients": len(viewer.server.get_clients())})
+        viewer.panel.mode.value = MODE_LABELS[VIEW_MODES[int(now_s / CHANGE_S) % len(VIEW_MODES)]]
+        viewer.panel.colouring.value = ("colour", "σ")[int(now_s / CHANGE_S / len(VIEW_MODES)) % 2]
         time.sleep(max(0.0, growing.frames / options.frames_per_s - (time.monotonic() - begun_s)))
     return {
         "minutes": options.minutes, "frames": growing.frames, "keyframes": len(growing.slam.keyframes),

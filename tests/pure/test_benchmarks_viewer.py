@@ -48,6 +48,6 @@ def test_the_system_made_up_is_shown_as_a_real_one(tmp_path: Path, monkeypatch: 
         live(growing())
     last = shown[-1]
     assert len(last.path) == 50 and len(last.path.keyframes) == 10 and [p.submap for p in last.pieces] == [0, 1, 2]
-    assert max(sum(len(p.field) for p in moment.pieces) for moment in shown) <= 500
+    assert max(sum(len(p.field) for p in snapshot.pieces) for snapshot in shown) <= 500
     assert np.flatnonzero(last.path.lost).tolist() == [0]
-    assert last.picture(0) is not None and last.picture(45) is not None
+    assert last.image(0) is not None and last.image(45) is not None

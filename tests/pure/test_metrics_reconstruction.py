@@ -84,20 +84,20 @@ def test_half_a_surface_is_half_complete_and_all_accurate() -> None:
 
 def test_what_no_camera_saw_is_not_counted() -> None:
     front, hidden = wall(2.0), wall(3.0, half_m=0.5)
-    truth = Mesh.joined([front, hidden])
+    truth = Mesh.concatenated([front, hidden])
     assert scored(front, truth, AHEAD).completion_ratio == 1.0, "the wall behind is hidden"
     assert scored(truth, front, AHEAD).accuracy_m < 1e-6, "and so is what was made up behind"
     behind = around(2)[1]
     behind[2, 3] += 2.0
     seen = scored(front, truth, np.stack([AHEAD[0], behind]))
     assert seen.completion_ratio < 0.7 and seen.completion_m > 0.3, "seen from the other side it counts"
-    aside = Mesh.joined([front, wall(2.0).moved(se3.exp(np.array([5.0, 0, 0, 0, 0, 0])))])
+    aside = Mesh.concatenated([front, wall(2.0).moved(se3.exp(np.array([5.0, 0, 0, 0, 0, 0])))])
     assert scored(front, aside, AHEAD).completion_ratio == scored(aside, front, AHEAD).precision == 1.0
 
 
 def test_what_is_made_up_in_front_is_counted() -> None:
     front = wall(2.0)
-    found = scored(Mesh.joined([front, wall(1.5, half_m=0.6)]), front, AHEAD)
+    found = scored(Mesh.concatenated([front, wall(1.5, half_m=0.6)]), front, AHEAD)
     assert found.precision == pytest.approx(0.5, abs=0.02) and found.accuracy_m == pytest.approx(0.25, abs=0.01)
     assert found.recall == 1.0 and found.depth_l1_m > 0.3
 
@@ -110,12 +110,12 @@ def test_depth_of_novel_views_is_taken_where_a_training_view_saw_the_surface() -
     part = scored(left, front, AHEAD)
     assert part.depth_l1_m < 1e-6 and part.depth_coverage == pytest.approx(0.5, abs=0.15)
     aside = wall(2.0).moved(se3.exp(np.array([2.0, 0, 0, 0, 0, 0])))
-    unseen = score(front, Mesh.joined([front, aside]), CAMERA, AHEAD, points=1000, novel_views=8)
+    unseen = score(front, Mesh.concatenated([front, aside]), CAMERA, AHEAD, points=1000, novel_views=8)
     assert unseen.depth_coverage > 0.99, "novel views see the other wall, but no training view did"
 
 
 def test_novel_views_are_new_clear_and_repeatable() -> None:
-    truth, poses = Mesh.joined([wall(2.0), wall(0.35)]), around(3)
+    truth, poses = Mesh.concatenated([wall(2.0), wall(0.35)]), around(3)
     views = sample_novel_views(truth, CAMERA, np.concatenate([AHEAD, poses]), 8, seed=3)
     assert len(views) == 8
     for T, depth_m, face in views:
@@ -155,7 +155,7 @@ def test_depth_of_a_slanted_plane_is_exact_and_the_nearer_face_wins() -> None:
     """The plane z = 2 + ½x, and a small square before it."""
     plane = grid(20, 20, lambda s, t: (2 * s - 1, 2 * t - 1, 2 + 0.5 * (2 * s - 1)))
     square = wall(1.2, half_m=0.2)
-    depth_m, face = mesh_depth(Mesh.joined([plane, square]), CAMERA, np.eye(4))
+    depth_m, face = mesh_depth(Mesh.concatenated([plane, square]), CAMERA, np.eye(4))
     x, y = np.moveaxis(CAMERA.rays(), 2, 0)[:2].astype(float)
     expected = 2 / (1 - 0.5 * x)
     before = (np.abs(1.2 * x) < 0.199) & (np.abs(1.2 * y) < 0.199)

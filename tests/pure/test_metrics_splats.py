@@ -68,7 +68,7 @@ def test_a_floater_is_opaque_and_far_and_may_be_hidden() -> None:
 
 def test_of_the_truth_only_what_was_seen_counts() -> None:
     unseen = wall(2.0).moved(se3.exp(np.array([5.0, 0, 0, 0, 0, 0])))
-    both, alone = Mesh.joined([wall(2.0), unseen]), scored(lattice(2.0))
+    both, alone = Mesh.concatenated([wall(2.0), unseen]), scored(lattice(2.0))
     assert scored(lattice(2.0), truth=both).splats_completion_m == pytest.approx(alone.splats_completion_m, rel=0.02)
     there = np.concatenate([lattice(2.0), lattice(2.0) + np.array([5.0, 0, 0])])
     assert scored(there, truth=both).floaters == 0.0, "a splat on a surface that no view saw does not float"

@@ -132,7 +132,7 @@ def code_of(package: Path) -> str:
     spec = importlib.util.spec_from_file_location("machine_there", package / "io/machine.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return str(module.code())
+    return str(module.code_version())
 
 
 def test_the_code_version_is_the_commit_of_the_checkout_else_of_the_build_else_the_release(checkout: Path) -> None:

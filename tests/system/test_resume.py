@@ -110,7 +110,7 @@ def test_runs_that_cannot_be_resumed_are_refused_in_one_line(
     assert "is complete" in capsys.readouterr().err
     RunFolder(out).note(status="interrupted")
     assert sigmasplat("resume", str(out)) == 2
-    assert "nothing to go on from" in capsys.readouterr().err
+    assert "nothing to resume" in capsys.readouterr().err
     (out / "state.safetensors").write_bytes(b"damaged")
     assert sigmasplat("resume", str(out)) == 2
     assert "is damaged" in capsys.readouterr().err
@@ -125,5 +125,5 @@ def test_a_state_contains_plain_data_only(tmp_path: Path) -> None:
     back = read_state(tmp_path / "s", (), {})
     assert back["a"] == tree["a"] and np.array_equal(back["b"][0], shared) and torch.equal(back[3], tree[3])
     assert np.shares_memory(*back["b"]), "shared arrays stay shared"
-    with pytest.raises(RunError, match="nothing to go on from"):
+    with pytest.raises(RunError, match="nothing to resume"):
         read_state(tmp_path / "none", (), {})

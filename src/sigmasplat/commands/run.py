@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from sigmasplat.commands import options
 from sigmasplat.commands.evaluate import score
 from sigmasplat.commands.options import configured, prepare_torch, source_of
-from sigmasplat.commands.view import on_stage, stay
+from sigmasplat.commands.view import keep_showing, serve_viewer
 from sigmasplat.config.text import full_path
 from sigmasplat.errors import ConfigError
 from sigmasplat.presets import default_preset
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from sigmasplat.run.session import Outcome
     from sigmasplat.run.terminal import Screen
     from sigmasplat.sources.base import Source
-    from sigmasplat.viewer.app import Stage
+    from sigmasplat.viewer.app import ViewerApp
 
 OK, INTERRUPTED = 0, 130
 DEFAULT_PRESET = default_preset()
@@ -131,9 +131,9 @@ def _opened(screen: "Screen", path: str, config: "Config", record: Path | None) 
     return source, config
 
 
-def _viewer(screen: "Screen", run_options: options.RunOptions) -> AbstractContextManager["Stage | None"]:
-    """Start the viewer if it is asked for. Raises as `on_stage`."""
-    return on_stage(screen, run_options.host, run_options.port) if run_options.view else nullcontext()
+def _viewer(screen: "Screen", run_options: options.RunOptions) -> AbstractContextManager["ViewerApp | None"]:
+    """Start the viewer if it is requested. Raises as `serve_viewer`."""
+    return serve_viewer(screen, run_options.host, run_options.port) if run_options.view else nullcontext()
 
 
 def _announce(screen: "Screen", preset: str, source: "Source", folder: "RunFolder", record: Path | None) -> None:
@@ -157,7 +157,7 @@ def _run_and_score(
     source: "Source",
     folder: "RunFolder",
     run_options: options.RunOptions,
-    viewer: "Stage | None",
+    viewer: "ViewerApp | None",
 ) -> int:
     """Run the session, then score it, and keep showing it in the viewer until Ctrl-C; return the exit code.
 
@@ -187,12 +187,14 @@ def _run_and_score(
     else:
         screen.say(f"{outcome.summary()}: {folder.path}")
     if viewer:
-        stay(screen, viewer, folder, source)
+        keep_showing(screen, viewer, folder, source)
     return OK
 
 
 @contextmanager
-def _progress(screen: "Screen", start: "StartPoint", source: "Source", viewer: "Stage | None") -> Iterator["Callback"]:
+def _progress(
+    screen: "Screen", start: "StartPoint", source: "Source", viewer: "ViewerApp | None"
+) -> Iterator["Callback"]:
     """Yield the callback that shows the session on the terminal, and in the viewer if there is one."""
     from sigmasplat.run.protocols import CallbackList
 

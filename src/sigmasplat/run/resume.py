@@ -77,4 +77,4 @@ def _truncate(run: RunFolder, frames: int, submaps: int) -> None:
             f"but its state needs {frames} and {submaps}; run it again"
         )
     write_text(log, "".join(lines[:frames]))
-    run.submaps.keep(submaps)
+    run.submaps.truncate(submaps)
