@@ -128,7 +128,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     for content, words in (
         (b"solid stl", "is not a PLY file"),
         (whole[:60], "no 'end_header'"),
-        (whole[:-1], "promises 80 of element face, found 79"),
+        (whole[:-1], "says 80 of element face, found 79"),
         (whole[:400], "element vertex"),
         (whole.replace(b"binary_little_endian", b"ascii"), "is not binary"),
         (whole.replace(b"property float y", b"property text y"), "cannot read the PLY's properties"),

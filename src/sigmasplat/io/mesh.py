@@ -102,7 +102,7 @@ def _rows(
     data = file.read(count * row.itemsize)
     whole = np.frombuffer(data[: len(data) // max(row.itemsize, 1) * row.itemsize], row)
     if len(whole) < count and not any((whole[k] != 3).any() for k in row.names or () if k.endswith(" count")):
-        raise SourceError(f"{path} is truncated: its header promises {count} of element {name}, found {len(whole)}")
+        raise SourceError(f"{path} is truncated: its header says {count} of element {name}, found {len(whole)}")
     return whole
 
 

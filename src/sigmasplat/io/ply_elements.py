@@ -48,7 +48,7 @@ class Element:
         if left < size:
             what = "splats" if self.name == "vertex" else f"rows of '{self.name}'"
             raise SourceError(
-                f"{path} is truncated: its header promises {self.count} {what} = {size} bytes, found {left}"
+                f"{path} is truncated: its header says {self.count} {what} = {size} bytes, found {left}"
             )
         return np.frombuffer(file.read(size), row_type)
 

@@ -123,7 +123,7 @@ def _unzipped(file: BinaryIO, path: Path) -> tuple[int, int, int, int, bytes]:
     except (EOFError, gzip.BadGzipFile, zlib.error) as problem:
         raise SourceError(f"{path} is damaged or truncated: {problem}; copy or download it again") from problem
     if len(body) < needed:
-        raise SourceError(f"{path} is truncated: its header promises {size} splats = {needed} bytes, found {len(body)}")
+        raise SourceError(f"{path} is truncated: its header says {size} splats = {needed} bytes, found {len(body)}")
     return version, size, degree, bits, body
 
 
