@@ -1,12 +1,12 @@
-"""Run the command line in the test's own process."""
+"""Run the command line in this process."""
 
 import pytest
 
 from sigmasplat import cli
 
 
-def sigmasplat(*arguments: str) -> int:
-    """Run `sigmasplat` with these arguments and return its exit code."""
+def exit_code(*arguments: str) -> int:
+    """Run `sigmasplat` with these arguments; return its exit code."""
     with pytest.raises(SystemExit) as left:
         cli.main(arguments)
     assert isinstance(left.value.code, int)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from command_line import sigmasplat
+from command_line import exit_code
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.model.trajectory import Trajectory
 
@@ -33,7 +33,7 @@ def refused(tiny_tum: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
 
     def run(*arguments: str) -> str:
         before = contents(place)
-        assert sigmasplat("run", *arguments) == 2
+        assert exit_code("run", *arguments) == 2
         said = capsys.readouterr()
         assert said.out == "" and said.err.startswith("sigmasplat: ") and said.err.count("\n") == 1, said
         assert contents(place) == before and not (place / "runs").exists()
@@ -127,7 +127,7 @@ def test_a_truncated_image_is_skipped_and_counted(
     part: str, tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     truncate(tiny_tum / part / "2.png")
-    assert sigmasplat("run", str(tiny_tum), "--out", str(tmp_path / "run"), *QUICK) == 0
+    assert exit_code("run", str(tiny_tum), "--out", str(tmp_path / "run"), *QUICK) == 0
     err = capsys.readouterr().err
     assert err.count("1 unreadable image skipped") == 1 and f"{part}/2.png" in err and "Traceback" not in err
     run = RunFolder.open(tmp_path / "run")
@@ -140,7 +140,7 @@ def test_strict_stops_at_a_truncated_image_and_keeps_the_results(
     tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     truncate(tiny_tum / "rgb/2.png")
-    assert sigmasplat("run", str(tiny_tum), "--strict", "--out", str(tmp_path / "run"), *QUICK) == 2
+    assert exit_code("run", str(tiny_tum), "--strict", "--out", str(tmp_path / "run"), *QUICK) == 2
     err = capsys.readouterr().err
     refusal = [line for line in err.splitlines() if line.startswith("sigmasplat: ")]
     assert len(refusal) == 1 and "rgb/2.png: unreadable image" in refusal[0] and "Traceback" not in err
@@ -159,7 +159,7 @@ def test_the_warning_of_a_wrong_depth_unit_has_the_median(
 ) -> None:
     """The files are in millimetres; 16 cm is too small for a room but within the depth range of mapping."""
     scaled(tiny_tum, 12_500.0)
-    assert sigmasplat("run", str(tiny_tum), "--no-eval", "--out", str(tmp_path / "run"), *QUICK) == 0
+    assert exit_code("run", str(tiny_tum), "--no-eval", "--out", str(tmp_path / "run"), *QUICK) == 0
     err = capsys.readouterr().err
     (warning,) = [line for line in err.splitlines() if line.startswith("warning: ")]
     assert "median depth is 0.16 m over 4 frames" in warning
@@ -171,7 +171,7 @@ def test_a_depth_unit_without_usable_depth_is_refused_after_a_warning(
     tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scaled(tiny_tum, 1.0)
-    assert sigmasplat("run", str(tiny_tum), "--out", str(tmp_path / "run"), *QUICK) == 2
+    assert exit_code("run", str(tiny_tum), "--out", str(tmp_path / "run"), *QUICK) == 2
     warning, refusal = [line for line in capsys.readouterr().err.splitlines() if ": " in line[:13]]
     assert warning.startswith("warning: ") and "median depth is 2000 m" in warning
     assert refusal.startswith("sigmasplat: frame 0 has no depth reading") and "check the depth scale" in refusal
@@ -182,7 +182,7 @@ def test_truth_of_another_time_is_reported_after_all_results_are_written(
     tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tiny_tum / "groundtruth.txt").write_text("".join(f"{500 + i} {i} 0 0 0 0 0 1\n" for i in range(4)))
-    assert sigmasplat("run", str(tiny_tum), "--out", str(tmp_path / "run"), *QUICK) == 2
+    assert exit_code("run", str(tiny_tum), "--out", str(tmp_path / "run"), *QUICK) == 2
     err = capsys.readouterr().err
     assert err.count("sigmasplat: estimate and truth share no timestamps") == 1 and "Traceback" not in err
     run = RunFolder.open(tmp_path / "run")
@@ -198,32 +198,32 @@ def test_an_earlier_run_is_replaced_only_with_overwrite(
 ) -> None:
     out = tmp_path / "run"
     command = ["run", str(tiny_tum), "--out", str(out), "--no-eval", *QUICK]
-    assert sigmasplat(*command) == 0
+    assert exit_code(*command) == 0
     (out / "notes.txt").write_text("mine")
     before = contents(out)
     capsys.readouterr()
-    assert sigmasplat(*command) == 2
+    assert exit_code(*command) == 2
     err = capsys.readouterr().err
     assert err.startswith("sigmasplat: output") and "exists and is not empty" in err and err.count("\n") == 1
     assert contents(out) == before
-    assert sigmasplat(*command, "--overwrite", "--limit", "2") == 0
+    assert exit_code(*command, "--overwrite", "--limit", "2") == 0
     assert len(RunFolder.open(out).read_log()) == 2 and (out / "notes.txt").read_text() == "mine"
 
 
 def test_a_refused_sequence_does_not_delete_the_earlier_run(tiny_tum: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     command = ["run", str(tiny_tum), "--out", str(out), "--no-eval", *QUICK]
-    assert sigmasplat(*command) == 0
+    assert exit_code(*command) == 0
     before = contents(out)
     half_size_depth(tiny_tum)
-    assert sigmasplat(*command, "--overwrite") == 2
+    assert exit_code(*command, "--overwrite") == 2
     assert contents(out) == before
 
 
 def test_without_out_an_existing_name_gets_a_number(tiny_tum: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tiny_tum.parent)
     for _ in range(2):
-        assert sigmasplat("run", str(tiny_tum), "--limit", "1", "--no-eval", *QUICK) == 0
+        assert exit_code("run", str(tiny_tum), "--limit", "1", "--no-eval", *QUICK) == 0
     assert sorted(path.name for path in Path("runs").iterdir()) == ["tiny-sigma", "tiny-sigma-2"]
 
 
@@ -237,6 +237,6 @@ def test_output_that_cannot_be_written_is_refused(place: str, refused: Callable[
 
 def test_the_undamaged_sequence_runs(tiny_tum: Path, tmp_path: Path) -> None:
     """Without this, the refusals above would prove nothing."""
-    assert sigmasplat("run", str(tiny_tum), "--strict", "--out", str(tmp_path / "run"), *QUICK) == 0
+    assert exit_code("run", str(tiny_tum), "--strict", "--out", str(tmp_path / "run"), *QUICK) == 0
     run = RunFolder.open(tmp_path / "run")
     assert isinstance(run.read_trajectory(), Trajectory) and run.facts()["skipped"] == []

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from command_line import sigmasplat
+from command_line import exit_code
 from fake_realsense import Device
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.sources import open_source
@@ -34,7 +34,7 @@ def test_ctrl_c_ends_the_frames_and_the_run_is_finished_and_scored(
 ) -> None:
     device.missed_between = 1
     device.on_frame = lambda number: signal.raise_signal(signal.SIGINT) if number == 2 * (WARM_UP_FRAMES + 6) else None
-    assert sigmasplat("run", "realsense", "--out", "run", "--stride", "1", *QUICK) == 0
+    assert exit_code("run", "realsense", "--out", "run", "--stride", "1", *QUICK) == 0
     said = capsys.readouterr()
     assert "until Ctrl-C" in said.out and "were dropped because SLAM was slower" in said.out
     run = RunFolder.open(Path("run"))
@@ -48,13 +48,13 @@ def test_ctrl_c_ends_the_frames_and_the_run_is_finished_and_scored(
     )
     metrics = run.read_metrics()
     assert metrics["frames"] == len(log) and metrics["ate"] is None and metrics["training"]["psnr_db"] > 5
-    assert sigmasplat("eval", "run") == 0  # does not open a camera
+    assert exit_code("eval", "run") == 0  # does not open a camera
     assert device.started == device.stopped == 1
 
 
 def test_an_unplugged_camera_gives_one_line_and_a_valid_run(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.frames_until_unplugged = WARM_UP_FRAMES + 5
-    assert sigmasplat("run", "realsense", "--out", "run", "--record", "seen", "--no-eval", *QUICK) == 0
+    assert exit_code("run", "realsense", "--out", "run", "--record", "seen", "--no-eval", *QUICK) == 0
     said = capsys.readouterr()
     assert said.err.count("\n") == 1 and "no frame came for 5 s" in said.err
     assert RunFolder.open(Path("run")).facts()["status"] == "complete"
@@ -63,7 +63,7 @@ def test_an_unplugged_camera_gives_one_line_and_a_valid_run(device: Device, caps
 
 def test_a_missing_camera_gives_one_line_and_no_files(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.plugged_in = False
-    assert sigmasplat("run", "realsense") == 2
+    assert exit_code("run", "realsense") == 2
     assert capsys.readouterr().err.startswith("sigmasplat: no RealSense camera gives 640×480")
     assert not Path("runs").exists()
 
@@ -71,5 +71,5 @@ def test_a_missing_camera_gives_one_line_and_no_files(device: Device, capsys: py
 def test_a_repeated_run_keeps_the_earlier_recording(device: Device) -> None:
     for count in (2, 3):
         more = ("--overwrite", "--no-eval", "--limit", str(count))
-        assert sigmasplat("run", "realsense", "--out", "run", *more, *QUICK) == 0
+        assert exit_code("run", "realsense", "--out", "run", *more, *QUICK) == 0
     assert len(open_source("run/recording")) == 2 and len(open_source("run/recording-2")) == 3

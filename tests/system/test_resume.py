@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from command_line import sigmasplat
+from command_line import exit_code
 from sigmasplat.commands.run import resume_line
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
@@ -59,10 +59,10 @@ def without_times(run: Path) -> list[dict]:
 
 @pytest.mark.parametrize("name, after", [("sigma", 13), ("cgslam-fast", 7)])
 def test_a_resumed_run_gives_the_same_bytes(tmp_path: Path, name: str, after: int) -> None:
-    assert sigmasplat(*arguments(tmp_path / "whole", name)) == 0
+    assert exit_code(*arguments(tmp_path / "whole", name)) == 0
     assert killed(tmp_path / "cut", name, after) < FRAMES
     assert RunFolder(tmp_path / "cut").facts()["status"] == "running"
-    assert sigmasplat("resume", str(tmp_path / "cut"), "--no-eval") == 0
+    assert exit_code("resume", str(tmp_path / "cut"), "--no-eval") == 0
     for file in SAME:
         assert (tmp_path / "cut" / file).read_bytes() == (tmp_path / "whole" / file).read_bytes(), file
     assert without_times(tmp_path / "cut") == without_times(tmp_path / "whole")
@@ -105,14 +105,14 @@ def test_runs_that_cannot_be_resumed_are_refused_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
-    assert sigmasplat(*arguments(out, "sigma")) == 0
-    assert sigmasplat("resume", str(out)) == 2
+    assert exit_code(*arguments(out, "sigma")) == 0
+    assert exit_code("resume", str(out)) == 2
     assert "is complete" in capsys.readouterr().err
     RunFolder(out).note(status="interrupted")
-    assert sigmasplat("resume", str(out)) == 2
+    assert exit_code("resume", str(out)) == 2
     assert "nothing to resume" in capsys.readouterr().err
     (out / "state.safetensors").write_bytes(b"damaged")
-    assert sigmasplat("resume", str(out)) == 2
+    assert exit_code("resume", str(out)) == 2
     assert "is damaged" in capsys.readouterr().err
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from command_line import sigmasplat
+from command_line import exit_code
 from sigmasplat.config import Config, InputConfig
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.evaluation.evaluate import evaluate
@@ -209,9 +209,9 @@ def test_the_command_makes_a_mesh_of_a_real_run(tmp_path: Path, capsys: pytest.C
     pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
     room, out = "synthetic:frames=120,width=64,height=48", str(tmp_path / "run")
     small = ["--set", "mapping.first_iterations=30", "--set", "mapping.iterations=8", "--set", "input.width=64"]
-    assert sigmasplat("run", room, "--limit", "6", "--no-eval", "--out", out, *small) == 0
+    assert exit_code("run", room, "--limit", "6", "--no-eval", "--out", out, *small) == 0
     capsys.readouterr()
-    assert sigmasplat("mesh", out, "--voxel-m", "0.05") == 0
+    assert exit_code("mesh", out, "--voxel-m", "0.05") == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0] == "surface …" and said[1].startswith("surface 2/2")
     assert said[-1].endswith(f"triangles: {out}/mesh.ply")
@@ -219,7 +219,7 @@ def test_the_command_makes_a_mesh_of_a_real_run(tmp_path: Path, capsys: pytest.C
     source = open_source(room)
     off = distances(mesh.moved(source.truth().T_world_camera[0]).vertices.astype(float), source.true_surface())
     assert len(mesh.faces) > 1000 and np.median(off) < 0.03
-    assert sigmasplat("mesh", out, "--voxel-m", "0.05") == 0, "the run's own mesh is replaced"
+    assert exit_code("mesh", out, "--voxel-m", "0.05") == 0, "the run's own mesh is replaced"
     assert (tmp_path / "run" / "mesh.ply").read_bytes() == first, "and the same"
     for refused, words in (
         (["--out", str(tmp_path / "a.stl")], "give a name that ends in .ply, .obj, .glb"),
@@ -228,7 +228,7 @@ def test_the_command_makes_a_mesh_of_a_real_run(tmp_path: Path, capsys: pytest.C
         (["--source", str(tmp_path / "nowhere")], "no such folder"),
     ):
         capsys.readouterr()
-        assert sigmasplat("mesh", out, *refused) == 2
+        assert exit_code("mesh", out, *refused) == 2
         said = capsys.readouterr().err.splitlines()
         assert len(said) == 1 and words in said[0]
 

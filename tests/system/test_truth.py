@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from command_line import sigmasplat
+from command_line import exit_code
 from sigmasplat import cli
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
@@ -68,8 +68,8 @@ def test_slam_and_session_never_read_the_truth(tmp_path: Path) -> None:
 
 def test_the_command_line_reads_the_truth_only_to_evaluate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sigmasplat.sources.open_source", lambda path, settings=None: Secretive())
-    assert sigmasplat("run", "room", "--out", str(tmp_path / "run"), "--no-eval", *OPTIONS) == 0
-    assert sigmasplat("mesh", str(tmp_path / "run"), "--voxel-m", "0.1") == 0
+    assert exit_code("run", "room", "--out", str(tmp_path / "run"), "--no-eval", *OPTIONS) == 0
+    assert exit_code("mesh", str(tmp_path / "run"), "--voxel-m", "0.1") == 0
     with pytest.raises(TruthRead):
         cli.main(["eval", str(tmp_path / "run")])
 
@@ -90,7 +90,7 @@ def test_results_are_the_same_bytes_with_any_truth_or_none(tmp_path: Path) -> No
     found, errors_m = {}, {}
     for kind in ("true", "another", "none"):
         out = tmp_path / "runs" / kind
-        assert sigmasplat("run", str(tum_folder(tmp_path / kind, kind)), "--out", str(out), *OPTIONS) == 0
+        assert exit_code("run", str(tum_folder(tmp_path / kind, kind)), "--out", str(out), *OPTIONS) == 0
         found[kind] = [(out / name).read_bytes() for name in LEFT]
         ate = RunFolder.open(out).read_metrics()["ate"]
         errors_m[kind] = ate["rmse_m"] if ate else None
