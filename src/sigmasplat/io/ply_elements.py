@@ -47,9 +47,7 @@ class Element:
         left = os.fstat(file.fileno()).st_size - file.tell()
         if left < size:
             what = "splats" if self.name == "vertex" else f"rows of '{self.name}'"
-            raise SourceError(
-                f"{path} is truncated: its header says {self.count} {what} = {size} bytes, found {left}"
-            )
+            raise SourceError(f"{path} is truncated: its header says {self.count} {what} = {size} bytes, found {left}")
         return np.frombuffer(file.read(size), row_type)
 
 
