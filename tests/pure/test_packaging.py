@@ -300,7 +300,7 @@ def test_doctor_says_why_the_kernels_do_not_load(
         raise problem
 
     monkeypatch.setattr(installation, "import_module", refuse)
-    finding = installation.kernels()
+    finding = installation.check_kernels()
     assert finding.ok is False and str(problem) in finding.value and finding.value.endswith(remedy)
 
 

@@ -9,16 +9,7 @@ from sigmasplat.drawing.colormap import Rgb
 from sigmasplat.run.protocols import LoopResult, StepResult
 from sigmasplat.slam.slam import Slam
 from sigmasplat.viewer.finished import Show
-from sigmasplat.viewer.snapshot import (
-    BUDGET,
-    DEFAULT_CAMERA,
-    Path,
-    Piece,
-    Snapshot,
-    thin,
-    within_budget,
-    without_moments,
-)
+from sigmasplat.viewer.snapshot import BUDGET, DEFAULT_CAMERA, Path, Piece, Snapshot, thin, within_budget
 
 EVERY_S = 2.0
 MAX_TIME_SHARE = 0.02
@@ -66,7 +57,7 @@ class LiveView:
         submaps = np.array([step.submap for step in slam.steps], np.int64)
         path = Path(slam.atlas.T_world_camera(), lost, submaps, tuple(slam.keyframes))
         self._add_finished()
-        final = Piece(None, thin(without_moments(slam.field), self.budget)) if finished else None
+        final = Piece(None, thin(slam.field, self.budget)) if finished else None
         keyframes = slam.mapper.keyframes
         return Snapshot(
             self.title, path, final, (*self._finished, *self._active()), None,
@@ -88,7 +79,7 @@ class LiveView:
         slam, number = self.slam, len(self.slam.store)
         if number >= len(slam.atlas.anchors):
             return ()
-        copied = thin(without_moments(slam.mapper.field), int(self.budget * ACTIVE_SHARE))
+        copied = thin(slam.mapper.field, int(self.budget * ACTIVE_SHARE))
         return (Piece(number, copied, slam.atlas.anchors[number].copy()),)
 
     def _add_finished(self) -> None:
