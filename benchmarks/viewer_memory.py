@@ -265,7 +265,7 @@ def _yes(held: bool) -> str:
 
 
 def main(options: Options) -> int:
-    """Measure, write, print; return the exit code."""
+    """Measure, write the results, print them; return the exit code."""
     return program.run("viewer_memory", options, measure, write=options.minutes >= MINUTES)
 
 
