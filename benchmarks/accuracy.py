@@ -26,7 +26,7 @@ import sigmasplat
 from sigmasplat.commands.options import Settings
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.io.machine import RUNNING, code_digest
+from sigmasplat.io.machine import INSTALLED, code_digest
 from sigmasplat.presets import default_preset, preset as preset_of
 
 arg = tyro.conf.arg
@@ -91,7 +91,7 @@ def located(name: str) -> str:
 
 def jobs_of(options: Options) -> list[Job]:
     """List the jobs, source by source. Raises ConfigError for an unknown preset or setting."""
-    code = code_digest(Path(sigmasplat.__file__).parent, RUNNING)
+    code = code_digest(Path(sigmasplat.__file__).parent, INSTALLED)
     jobs = [
         Job(Path(source).name, located(source), preset, seed, options.settings, options.limit, code)
         for source in options.sources

@@ -26,7 +26,7 @@ from tables import Section
 import sigmasplat
 from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.evaluation.paired_comparison import Effect, Figure, best, by_seed, deviation, passed_by_chance, rows
-from sigmasplat.io.machine import RUNNING, code_digest
+from sigmasplat.io.machine import INSTALLED, code_digest
 from sigmasplat.report.tables import number
 
 arg = tyro.conf.arg
@@ -75,7 +75,7 @@ def jobs_of(options: Options) -> list[tuple[str, accuracy.Job]]:
     unknown = [name for name in options.variants if name not in VARIANTS]
     if unknown:
         raise ConfigError(f"no variant {unknown[0]!r}; there are {', '.join(VARIANTS)}")
-    code = code_digest(Path(sigmasplat.__file__).parent, RUNNING)
+    code = code_digest(Path(sigmasplat.__file__).parent, INSTALLED)
     listed = []
     for scene in options.scenes:
         path, most = SCENES.get(scene, (scene, None))

@@ -23,7 +23,7 @@ from tracking import true_poses
 import sigmasplat
 from sigmasplat.config import SubmapConfig
 from sigmasplat.errors import SigmaSplatError, SourceError
-from sigmasplat.io.machine import RUNNING, code_digest
+from sigmasplat.io.machine import INSTALLED, code_digest
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.model import se3
 from sigmasplat.presets import default_preset
@@ -84,7 +84,7 @@ def shortened(options: Options) -> Options:
 
 def jobs_of(options: Options) -> list[tuple[Experiment, str, accuracy.Job]]:
     """List experiment, variant and job, seed by seed. Raises ConfigError for an unknown preset or setting."""
-    code = code_digest(Path(sigmasplat.__file__).parent, RUNNING)
+    code = code_digest(Path(sigmasplat.__file__).parent, INSTALLED)
     listed: list[tuple[Experiment, str, accuracy.Job]] = []
     for experiment in options.experiments:
         for seed in options.seeds if experiment == "drift" else options.real_seeds:

@@ -132,7 +132,7 @@ def code_of(package: Path) -> str:
     spec = importlib.util.spec_from_file_location("machine_there", package / "io/machine.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return str(module.code())
+    return str(module.code_version())
 
 
 def test_code_is_the_checkouts_commit_then_the_builds_then_the_release(checkout: Path) -> None:
@@ -300,7 +300,7 @@ def test_doctor_says_why_the_kernels_do_not_load(
         raise problem
 
     monkeypatch.setattr(installation, "import_module", refuse)
-    finding = installation.kernels()
+    finding = installation.check_kernels()
     assert finding.ok is False and str(problem) in finding.value and finding.value.endswith(remedy)
 
 

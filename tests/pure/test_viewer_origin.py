@@ -1,4 +1,4 @@
-"""Other pages of the same browser do not get at the viewer, by its address or by a name made to point there."""
+"""Other pages in the same browser cannot reach the viewer, neither by its address nor by a name that points to it."""
 
 import http.client
 import socket
@@ -16,7 +16,7 @@ HERE = "127.0.0.1:8080"
 @pytest.mark.parametrize(
     ("origin", "reached", "own"),
     [
-        (None, HERE, True),  # no browser
+        (None, HERE, True),  # not a browser
         ("http://127.0.0.1:8080", HERE, True),
         ("http://localhost:9000", "localhost:9000", True),  # ssh -L 9000:127.0.0.1:8080
         ("http://[::1]:8080", "[::1]:8080", True),
@@ -24,9 +24,9 @@ HERE = "127.0.0.1:8080"
         ("https://BOX.lan", "box.lan", True),
         (f"http://{socket.gethostname()}:8080", f"{socket.gethostname()}:8080", True),
         ("https://evil.example", HERE, False),
-        ("http://127.0.0.1:8888", HERE, False),  # another server of this machine
+        ("http://127.0.0.1:8888", HERE, False),  # another server on this machine
         ("http://localhost:8080", HERE, False),
-        ("http://evil.example:8080", "evil.example:8080", False),  # a name made to point here
+        ("http://evil.example:8080", "evil.example:8080", False),  # a foreign name that points to this machine
         ("http://box.lan.evil.example", "box.lan.evil.example", False),
         ("null", HERE, False),  # a file, a sandboxed frame
         ("", HERE, False),
@@ -35,7 +35,9 @@ HERE = "127.0.0.1:8080"
         ("http://127.0.0.1:8080", None, False),
     ],
 )
-def test_only_pages_of_the_address_itself_are_the_viewers(origin: str | None, reached: str | None, own: bool) -> None:
+def test_only_pages_of_the_same_address_belong_to_the_viewer(
+    origin: str | None, reached: str | None, own: bool
+) -> None:
     assert is_own_page(origin, reached, "box.lan") is own
 
 
@@ -47,7 +49,7 @@ def port() -> Iterator[int]:
     close(server)
 
 
-def test_a_websocket_of_another_page_is_refused_before_it_opens(port: int) -> None:
+def test_a_websocket_from_another_page_is_refused(port: int) -> None:
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
     from websockets.typing import Origin
@@ -61,20 +63,20 @@ def test_a_websocket_of_another_page_is_refused_before_it_opens(port: int) -> No
         assert refused.value.response.status_code == 403
 
 
-def test_the_viewers_page_itself_is_served(port: int) -> None:
+def test_the_viewers_own_page_is_served(port: int) -> None:
     connection = http.client.HTTPConnection(HOST, port)
     connection.request("GET", "/")
     assert connection.getresponse().status == 200
     connection.close()
 
 
-def test_other_websocket_servers_are_left_alone(port: int) -> None:
+def test_other_websocket_servers_are_not_changed(port: int) -> None:
     from websockets.asyncio import server
 
     assert server.serve.__module__ == "websockets.asyncio.server" and isinstance(server.serve, type)
 
 
-def test_a_viser_that_starts_otherwise_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_viser_version_that_cannot_be_restricted_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     viser = pytest.importorskip("viser", reason="viser is not installed (pip install 'sigmasplat[viewer]')")
     stopped = []
 

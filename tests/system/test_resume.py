@@ -116,7 +116,7 @@ def test_what_cannot_be_gone_on_with_is_refused_in_one_line(tmp_path: Path, caps
     assert "is complete" in capsys.readouterr().err
     RunFolder(out).note(status="interrupted")
     assert obey("resume", str(out)) == 2
-    assert "nothing to go on from" in capsys.readouterr().err
+    assert "nothing to resume" in capsys.readouterr().err
     (out / "state.safetensors").write_bytes(b"damaged")
     assert obey("resume", str(out)) == 2
     assert "is damaged" in capsys.readouterr().err
@@ -131,5 +131,5 @@ def test_a_state_holds_plain_data_only(tmp_path: Path) -> None:
     back = read_state(tmp_path / "s", (), {})
     assert back["a"] == tree["a"] and np.array_equal(back["b"][0], shared) and torch.equal(back[3], tree[3])
     assert np.shares_memory(*back["b"]), "what was shared stays shared"
-    with pytest.raises(RunError, match="nothing to go on from"):
+    with pytest.raises(RunError, match="nothing to resume"):
         read_state(tmp_path / "none", (), {})

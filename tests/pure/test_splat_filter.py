@@ -1,4 +1,4 @@
-"""Doubtful splats: σ as documented, bounds that keep what they say, counts that add up."""
+"""Filtering splats by σ and opacity: σ as documented, correct masks and counts."""
 
 import math
 
@@ -10,7 +10,7 @@ from sigmasplat.model.field import GaussianField
 
 
 def three() -> GaussianField:
-    """σ 0.1, 0.2, 0.3 and opacities 0.9, 0.5, 0.1."""
+    """Return splats with σ 0.1, 0.2, 0.3 and opacities 0.9, 0.5, 0.1."""
     return GaussianField.from_values(
         torch.zeros(3, 3),
         torch.ones(3),
@@ -36,13 +36,15 @@ def test_sigma_is_the_root_of_the_mean_variance() -> None:
         ({"sigma_below": 0.0}, [False, False, False], 3, 0),
     ],
 )
-def test_bounds_keep_what_they_say(bounds: dict[str, float], kept: list[bool], by_sigma: int, by_opacity: int) -> None:
-    sure = splat_filter.sure(three(), **bounds)
-    assert (sure.rows.tolist(), sure.by_sigma, sure.by_opacity) == (kept, by_sigma, by_opacity)
-    assert sure.dropped == kept.count(False)
+def test_bounds_select_splats_and_count_the_others(
+    bounds: dict[str, float], kept: list[bool], by_sigma: int, by_opacity: int
+) -> None:
+    found = splat_filter.filter_splats(three(), **bounds)
+    assert (found.kept.tolist(), found.by_sigma, found.by_opacity) == (kept, by_sigma, by_opacity)
+    assert found.dropped == kept.count(False)
 
 
-def test_a_new_map_knows_no_variance() -> None:
+def test_a_new_map_has_no_learned_variance() -> None:
     assert not splat_filter.has_learned_variance(
         GaussianField.from_values(torch.zeros(2, 3), torch.ones(2), torch.zeros(2, 3))
     )
