@@ -64,7 +64,7 @@ def test_an_unplugged_camera_gives_one_line_and_a_valid_run(device: Device, caps
 def test_a_missing_camera_gives_one_line_and_no_files(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.plugged_in = False
     assert exit_code("run", "realsense") == 2
-    assert capsys.readouterr().err.startswith("sigmasplat: no RealSense camera gives 640×480")
+    assert capsys.readouterr().err.startswith("sigmasplat: no RealSense camera provides 640×480")
     assert not Path("runs").exists()
 
 
