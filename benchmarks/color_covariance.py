@@ -101,7 +101,7 @@ def score(runs: dict[str, Slam], rows: Sequence[int], frames: Sequence[Frame]) -
 
 def with_correlations(field: GaussianField) -> GaussianField:
     """Return a field whose colours vary together, not at all where it had no such numbers: V is rendered whole."""
-    field.carry("correlations")
+    field.get_or_create("correlations")
     return field
 
 
@@ -134,7 +134,7 @@ def figures(run: Slam, field: GaussianField, sums: NDArray[np.float64], seen: li
     count, diagonal, full, *second = sums.sum(0)
     deviations = np.sqrt(second[:CHANNELS])
     errors = second[CHANNELS:] / np.array([deviations[a] * deviations[b] for a, b in ((0, 1), (0, 2), (1, 2))])
-    correlations = correlations_of(field.extras["correlations"].params).abs().mean(0)
+    correlations = correlations_of(field.attributes["correlations"].params).abs().mean(0)
     scores, judged = views.average([view.scores() for view in seen]), views.judge([views.sample(v) for v in seen]) or {}
     return {
         "mapping_s": round(sum(step.seconds.get("map", 0.0) for step in run.steps), 3),

@@ -82,7 +82,7 @@ class Works:
         self.weights = torch.zeros(2, *size)
         self.target, self.later = (Target.of(f, (size[0], size[1])) for f in (scene.frame, scene.later))
         self.reference = self.target.depth.contiguous()
-        self.numbers = cpu.view_numbers(scene.camera, np.eye(4), RENDER)
+        self.numbers = cpu.view_params(scene.camera, np.eye(4), RENDER)
         self.grad = torch.zeros_like(self.params)
         chosen = preset(default_preset())
         self.tracking, self.mapping = chosen.tracking, chosen.mapping

@@ -58,7 +58,7 @@ def test_render_and_its_gradient_lie_on_the_device(device: torch.device) -> None
     field, T = GaussianField(params_of(s)), s.T_camera_world.float()
     found = []
     for where, backend in ((device, "auto"), (torch.device("cpu"), "cpu")):
-        there = field.on(where)
+        there = field.copy_to(where)
         there.params.requires_grad_()
         pose = T.to(where, copy=True).requires_grad_()
         seen = render(there, s.camera, pose, s.ref_depth.float().to(where), backend=backend)
@@ -90,7 +90,7 @@ def test_a_render_takes_field_and_pose_from_either_side(
 def test_a_renderer_brings_a_field_once(stand_in: StandIn) -> None:
     s = scene("random", 60)
     one, other = GaussianField(params_of(s)), GaussianField(params_of(s))
-    other.carry("harmonics").params.fill_(0.01)
+    other.get_or_create("harmonics").params.fill_(0.01)
     show, T = FieldRenderer(OPTIONS, "cuda"), s.T_camera_world.numpy()
     seen = [show(field, s.camera, T) for field in (one, other) * 3]
     sent = [copy.numbers for copy in stand_in.copies if copy.to_device and copy.numbers > 16]

@@ -84,7 +84,13 @@ def test_the_checks_notice_what_they_are_for() -> None:
         "{'cpu': 1}[view.backend]", "match step:\n case CudaStep(): pass",
     ):  # fmt: skip
         assert choices_by_device(ast.parse(code)), code
-    for code in ("x.is_cuda", "view.sums.device.type == name", "device.type", "torch.device('cuda:0')", "name = 'cuda'"):
+    for code in (
+        "x.is_cuda",
+        "view.sums.device.type == name",
+        "device.type",
+        "torch.device('cuda:0')",
+        "name = 'cuda'",
+    ):
         assert names_of_devices(ast.parse(code)), code
     assert tensors_asked_for(ast.parse("isinstance(plane, Tensor)"))
     for code in ("x.to(view.sums.device)", "field.params.device != view.sums.device", "isinstance(x, Camera)"):

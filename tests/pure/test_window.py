@@ -35,7 +35,7 @@ def keyframe(
     depth = np.broadcast_to(np.asarray(depth_m, np.float32), (CAMERA.height, CAMERA.width)).copy()
     target = Target.of(Frame(0, 0.0, np.zeros((*depth.shape, 3), np.float32), depth, CAMERA), PADDED)
     T = np.eye(4) if T_world_camera is None else T_world_camera
-    return Keyframe(index, target, T, seen=None if seen is None else np.array(seen, np.int64))
+    return Keyframe(index, target, T, visible_ids=None if seen is None else np.array(seen, np.int64))
 
 
 def shared(newest: Keyframe, older: Keyframe) -> float:
@@ -127,7 +127,7 @@ def test_no_readings_no_share() -> None:
 
 def with_shares(shares: list[float]) -> list[Keyframe]:
     """Make keyframes whose splats share so much with the last one's."""
-    return [keyframe(k, seen=list(range(round(10 * share)))) for k, share in enumerate([*shares, 1.0])]
+    return [keyframe(k, visible_ids=list(range(round(10 * share)))) for k, share in enumerate([*shares, 1.0])]
 
 
 def test_the_newest_the_one_before_and_the_best_of_the_others() -> None:

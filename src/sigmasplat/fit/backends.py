@@ -105,7 +105,7 @@ def step_for(field: GaussianField, view: View, weights: Weights, degree: int) ->
     used = {name for name, weight in weights.items() if weight} - {"nll_color_full"}
     fits = fits_of(view) if used <= fused_terms(view.backend) else TORCH
     if full:
-        step = fits.covariance_step(make_covariance_view(view, field.carry("correlations")))
+        step = fits.covariance_step(make_covariance_view(view, field.get_or_create("correlations")))
     else:
         step = fits.mapping_step(view)
     return fits.view_dependent_step(step, degree) if degree else step

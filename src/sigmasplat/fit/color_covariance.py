@@ -76,7 +76,7 @@ class FullCovarianceStep:
         """
         grad, cost = torch.zeros_like(field.params), 0.0
         twist = self._wide.backward(field.params, grad, grad2d)
-        correlations, correlation_rates = self._wide.correlations, rates.of_extra("correlations")
+        correlations, correlation_rates = self._wide.correlations, rates.of_attribute("correlations")
         correlations.steps += 1
         visible = self._wide.visible(len(field)).nonzero().squeeze(1)
         for rows in torch.split(visible, ROWS_AT_ONCE):

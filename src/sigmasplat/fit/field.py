@@ -90,8 +90,8 @@ def fit_field(
             if pose_rates.any() and keyframe.movable and not keyframe.fixed:
                 keyframe.move(twist, pose_rates)
     fits_of(view).settle(field, rates)
-    for name, extra in field.extras.items():
-        settle(extra, rates.of_extra(name))
+    for name, attribute in field.attributes.items():
+        settle(attribute, rates.of_attribute(name))
     return fit
 
 
@@ -119,7 +119,7 @@ class _Steps:
         costs, shape, twists = list[float | Tensor](), list[float | Tensor](), list[Twist]()
         for keyframe in batch:
             with stopwatch.stage("forward"):
-                target = keyframe.target.on(self.field.params.device)
+                target = keyframe.target.to(self.field.params.device)
                 self.step.forward(self.field, se3.inverse(keyframe.T_world_camera), target, self.weights)
             with stopwatch.stage("loss"):
                 costs.append(self.step.images(target, self.weights))

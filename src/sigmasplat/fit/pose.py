@@ -20,7 +20,7 @@ from sigmasplat.types import Matrix
 class PoseFit:
     """T_camera_world; agreement: share of pixels seen by both map and sensor whose depths agree; overlap: share of
     sensor readings where the map has a surface; first and last loss; iterations; alignment: what found it, or None;
-    degenerate: how many directions of motion the images say nothing about (there the guess stays); exposure
+    degenerate: how many directions of motion the images say nothing about (those keep the guess); exposure
     (a, b) of exp(a)·Ĉ + b."""
 
     T_camera_world: Matrix
@@ -48,7 +48,7 @@ def fit_pose_adam(
     the loss by less than `plateau_stop` of it. Without common pixels the guess comes back. Raises BackendError where a
     CUDA device cannot number its pairs of splats and tiles.
     """
-    params, target = params.to(view.sums.device), target.on(view.sums.device)
+    params, target = params.to(view.sums.device), target.to(view.sums.device)
     found = fits_of(view).descend(params, view, target, T_camera_world, config, iterations)
     view.forward(params, found.T_camera_world)
     agree, overlap = agreement(PoseMaps.of(view), target)

@@ -24,7 +24,7 @@ class Target:
     valid_pixels: int
     _there: "Target | None" = dataclass_field(default=None, init=False, repr=False)
 
-    def on(self, device: torch.device) -> "Target":
+    def to(self, device: torch.device) -> "Target":
         """Return the target on a device; one such copy is kept."""
         if self.depth.device == device:
             return self

@@ -47,7 +47,7 @@ class ViewDependentStep:
             torch.as_tensor(part).to(field.params) for part in (T_camera_world[:3, :3], T_camera_world[:3, 3])
         )
         self._position = -(self._R * t[:, None]).sum(0)
-        self._rows, harmonics = field.params.clone(), field.carry("harmonics").params
+        self._rows, harmonics = field.params.clone(), field.get_or_create("harmonics").params
         ahead = field.means @ self._R[2] + t[2] > 0
         for rows in torch.split(ahead.nonzero().squeeze(1), ROWS_AT_ONCE):
             own, k = field.params.index_select(0, rows), harmonics.index_select(0, rows)
@@ -68,8 +68,8 @@ class ViewDependentStep:
         """
         grad, cost = torch.zeros_like(field.params), 0.0
         twist = self.view.backward(self._rows, grad, grad2d)
-        harmonics = self._begin(field.carry("harmonics"))
-        harmonic_rates = Rates(rates.of_extra("harmonics").per_column[: self.width])
+        harmonics = self._begin(field.get_or_create("harmonics"))
+        harmonic_rates = Rates(rates.of_attribute("harmonics").per_column[: self.width])
         visible = self.view.visible(len(field)).nonzero().squeeze(1)
         for rows in torch.split(visible, ROWS_AT_ONCE):
             g, own, k = (x.index_select(0, rows) for x in (grad, field.params, harmonics.params))

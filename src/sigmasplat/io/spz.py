@@ -34,7 +34,7 @@ from sigmasplat.io.splat_values import (
     smallest_three,
     unit,
 )
-from sigmasplat.model.field import EXTRAS, GaussianField
+from sigmasplat.model.field import ATTRIBUTES, GaussianField
 from sigmasplat.model.harmonics import DEGREES, count, turned
 
 MAGIC = b"NGSP"
@@ -103,7 +103,7 @@ def read_field(path: Path) -> GaussianField:
 def _turned(values: SplatValues) -> SplatValues:
     """Turn a map by 180° about x, there or back: of means, quaternions and harmonics only signs change."""
     xyz = R_RUB_RDF.diagonal().numpy()
-    ones = torch.ones(1, EXTRAS["harmonics"], dtype=torch.float64)
+    ones = torch.ones(1, ATTRIBUTES["harmonics"], dtype=torch.float64)
     signs = turned(ones, R_RUB_RDF).round().numpy()[:, : values.harmonics.shape[1]]
     quats = values.quats * np.array([1.0, *xyz])
     return replace(values, means=values.means * xyz, quats=quats, harmonics=values.harmonics * signs)

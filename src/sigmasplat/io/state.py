@@ -18,7 +18,7 @@ from sigmasplat.io.tensors import opened, write_tensors
 
 INLINE = 64
 """Arrays of at most so many numbers stand in the text: poses are many, and each tensor of a file costs a header."""
-VERSION = "1"
+VERSION = "2"
 
 
 def write_state(path: Path, tree: Any, classes: Iterable[type], fixed: Mapping[str, Any]) -> None:

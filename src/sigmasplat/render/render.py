@@ -42,19 +42,19 @@ class Render:
 
 def _colors_from(field: GaussianField, T_camera_world: Tensor) -> Tensor:
     """Return the colours [N, 3] that a camera sees."""
-    if "harmonics" not in field.extras:
+    if "harmonics" not in field.attributes:
         return field.colors
     T = T_camera_world.to(field.params)
     position = -(T[:3, :3] * T[:3, 3:]).sum(0)
-    return view_colors(field.colors, field.extras["harmonics"].params, field.means, position)
+    return view_colors(field.colors, field.attributes["harmonics"].params, field.means, position)
 
 
 def _features_from(field: GaussianField, z: Tensor, T_camera_world: Tensor) -> Tensor:
     """Return what a pixel gathers of each splat, [N, 7], or [N, 10] where colours vary together."""
     colors = _colors_from(field, T_camera_world)
-    if "correlations" not in field.extras:
+    if "correlations" not in field.attributes:
         return features_of(colors, z, field.variances)
-    return covariance_features(colors, z, field.variances, field.extras["correlations"].params)
+    return covariance_features(colors, z, field.variances, field.attributes["correlations"].params)
 
 
 def _on_device(field: GaussianField, backend: str) -> GaussianField:
@@ -62,8 +62,8 @@ def _on_device(field: GaussianField, backend: str) -> GaussianField:
     if backend_name(backend, field.params.device) != "cuda" or field.params.device.type != "cpu":
         return field
     device = cuda_launch.this_device()
-    extras = {name: Rows(extra.params.to(device)) for name, extra in field.extras.items()}
-    return GaussianField(field.params.to(device), extras=extras)
+    attributes = {name: Rows(attribute.params.to(device)) for name, attribute in field.attributes.items()}
+    return GaussianField(field.params.to(device), attributes=attributes)
 
 
 def render(
@@ -97,7 +97,7 @@ def render(
         b.median_id,
         b.dominant_id,
         b.dominant_weight,
-        covariance_of(b.sums[..., :3], b.sums[..., 4:]) if "correlations" in field.extras else None,
+        covariance_of(b.sums[..., :3], b.sums[..., 4:]) if "correlations" in field.attributes else None,
     )
 
 

@@ -81,17 +81,17 @@ class Moment:
         return tuple(piece for piece in self.pieces if piece.submap is None or piece.submap <= until)
 
 
-def to_look_at(params: Tensor, extras: Mapping[str, Tensor]) -> GaussianField:
-    """Return parameter rows [N, 17] with extras as a field that nothing will fit: its moments are one shared zero, not
-    three times the memory."""
-    moments = [values.new_zeros(()).expand_as(values) for values in (params, *extras.values())]
-    rows = {n: Rows(values, zero, zero) for (n, values), zero in zip(extras.items(), moments[1:], strict=True)}
-    return GaussianField(params, moments[0], moments[0], extras=rows)
+def to_look_at(params: Tensor, attributes: Mapping[str, Tensor]) -> GaussianField:
+    """Return parameter rows [N, 17] with attributes as a field that is not fitted: its moments are one shared zero,
+    which saves two thirds of the memory."""
+    moments = [values.new_zeros(()).expand_as(values) for values in (params, *attributes.values())]
+    rows = {n: Rows(values, zero, zero) for (n, values), zero in zip(attributes.items(), moments[1:], strict=True)}
+    return GaussianField(params, moments[0], moments[0], attributes=rows)
 
 
 def bare(splats: GaussianField) -> GaussianField:
     """Return the splats without what only a fit needs; parameters are shared, not copied."""
-    return to_look_at(splats.params, {name: rows.params for name, rows in splats.extras.items()})
+    return to_look_at(splats.params, {name: rows.params for name, rows in splats.attributes.items()})
 
 
 def thinned(splats: GaussianField, most: int) -> GaussianField:
@@ -101,7 +101,7 @@ def thinned(splats: GaussianField, most: int) -> GaussianField:
     rows = torch.arange(n) if n <= most else (torch.arange(max(most, 0)) * n).div(most, rounding_mode="floor")
     rows = rows.to(splats.params.device)
     few = to_look_at(
-        splats.params[rows].cpu(), {name: extra.params[rows].cpu() for name, extra in splats.extras.items()}
+        splats.params[rows].cpu(), {name: attribute.params[rows].cpu() for name, attribute in splats.attributes.items()}
     )
     if len(few):
         few.params[:, COLUMNS["log_scales"]] += 0.5 * float(np.log(n / len(few)))

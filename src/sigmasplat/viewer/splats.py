@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sigmasplat.metrics import palette
 from sigmasplat.model import harmonics, se3
-from sigmasplat.model.field import COLUMNS, EXTRAS, GaussianField, left_factor, quaternion_of, transformed
+from sigmasplat.model.field import ATTRIBUTES, COLUMNS, GaussianField, left_factor, quaternion_of, transformed
 from sigmasplat.viewer.moment import Piece, to_look_at
 
 Colouring = Literal["colour", "σ"]
@@ -95,14 +95,14 @@ def joined(pieces: Sequence[Piece], cut: Cut) -> GaussianField:
     """Return the splats of all pieces that the cut keeps, in the world."""
     parts = [(piece, cut.keeps(piece.field)) for piece in pieces]
     params = [piece.field.params[kept] for piece, kept in parts] or [GaussianField.empty().params]
-    names = {name for piece, _ in parts for name in piece.field.extras}
-    extras: dict[str, list[Tensor]] = {name: [] for name in sorted(names)}
+    names = {name for piece, _ in parts for name in piece.field.attributes}
+    attributes: dict[str, list[Tensor]] = {name: [] for name in sorted(names)}
     for (piece, kept), rows in zip(parts, params, strict=False):
         T = torch.from_numpy(piece.T_world_piece).to(rows)
         _move(rows, T)
-        for name, all_rows in extras.items():
+        for name, all_rows in attributes.items():
             all_rows.append(_moved_extra(piece.field, name, T)[kept])
-    return to_look_at(torch.cat(params), {name: torch.cat(all_rows) for name, all_rows in extras.items()})
+    return to_look_at(torch.cat(params), {name: torch.cat(all_rows) for name, all_rows in attributes.items()})
 
 
 def _move(params: Tensor, T_world_piece: Tensor) -> None:
@@ -114,7 +114,7 @@ def _move(params: Tensor, T_world_piece: Tensor) -> None:
 
 def _moved_extra(field: GaussianField, name: str, T_world_piece: Tensor) -> Tensor:
     """Return what splats carry besides in the world, 0 where this piece has none of it."""
-    if name not in field.extras:
-        return field.params.new_zeros(len(field), EXTRAS[name])
-    values = field.extras[name].params
+    if name not in field.attributes:
+        return field.params.new_zeros(len(field), ATTRIBUTES[name])
+    values = field.attributes[name].params
     return harmonics.turned(values, T_world_piece[:3, :3]) if name == "harmonics" else values

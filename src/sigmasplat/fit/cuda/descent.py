@@ -139,18 +139,18 @@ class _Look:
     """A descent's state as it is now in the device's order of work, on its way to the host; nobody waits."""
 
     def __init__(self, state: Tensor) -> None:
-        self._here = torch.empty(state.shape, dtype=state.dtype, pin_memory=state.is_cuda)
-        self._here.copy_(state, non_blocking=state.is_cuda)
-        self._arrived: torch.cuda.Event | None = None
+        self._on_host = torch.empty(state.shape, dtype=state.dtype, pin_memory=state.is_cuda)
+        self._on_host.copy_(state, non_blocking=state.is_cuda)
+        self._copied: torch.cuda.Event | None = None
         if state.is_cuda:
-            self._arrived = torch.cuda.Event()  # type: ignore[no-untyped-call]
-            self._arrived.record(torch.cuda.current_stream(state.device))
+            self._copied = torch.cuda.Event()  # type: ignore[no-untyped-call]
+            self._copied.record(torch.cuda.current_stream(state.device))
 
     def read(self) -> np.void:
         """Return the state as a `STATE`. Waits until it has arrived."""
-        if self._arrived is not None:
-            self._arrived.synchronize()
-        state: np.void = np.frombuffer(self._here.numpy().tobytes(), STATE)[0]
+        if self._copied is not None:
+            self._copied.synchronize()
+        state: np.void = np.frombuffer(self._on_host.numpy().tobytes(), STATE)[0]
         return state
 
 

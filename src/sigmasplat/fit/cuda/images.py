@@ -41,7 +41,7 @@ def readings_of(finest: Tensor, coarsest: Tensor) -> Tensor:
 
 def live_planes(view: View, color: Plane, depth_m: Plane, target: Target) -> tuple[Tensor, Tensor]:
     """Return gray and depth [H, W] of a frame on the view's device, from the target's copy there."""
-    on_device, (h, w) = target.on(view.sums.device), depth_m.shape
+    on_device, (h, w) = target.to(view.sums.device), depth_m.shape
     return luma(on_device.color[:, :h, :w]), on_device.depth_image
 
 

@@ -78,12 +78,12 @@ class CudaStep:
     ) -> tuple[Tensor, Tensor]:
         """Do what `TorchStep.splats` does, or `FullCovarianceStep.splats`; twist and cost stay on the device."""
         view, gradient = self.view, torch.empty_like(field.params)
-        twist, visible = view.backward_there(field.params, gradient, grad2d), view.raster.visible
+        twist, visible = view.backward_on_device(field.params, gradient, grad2d), view.raster.visible
         cost = add_shape_gradient(view, visible, field, gradient, weights, frozen_colors)
         step_rows(view, visible, field, gradient, rates)
         if isinstance(view, CudaCovarianceView):
             view.correlations.steps += 1
-            step_rows(view, visible, view.correlations, view.g_correlations, rates.of_extra("correlations"))
+            step_rows(view, visible, view.correlations, view.g_correlations, rates.of_attribute("correlations"))
         return twist, cost
 
     def accumulator(self, field: GaussianField) -> Accumulator:

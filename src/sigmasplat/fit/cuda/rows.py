@@ -9,12 +9,12 @@ from torch import Tensor
 from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates
 from sigmasplat.fit.fused_terms import SHAPE_TERMS, kernel_weights
 from sigmasplat.fit.interface import Twist, Weights
-from sigmasplat.model.field import EXTRAS, GaussianField, Rows
+from sigmasplat.model.field import ATTRIBUTES, GaussianField, Rows
 from sigmasplat.render.cuda.launch import blocks_for
 from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.types import Matrix
 
-MOST_COLUMNS = max(EXTRAS.values())
+MOST_COLUMNS = max(ATTRIBUTES.values())
 """Of rows that the kernel steps."""
 
 
@@ -66,7 +66,7 @@ class CudaAccumulator:
 
     def add(self, field: GaussianField, share: float, grad2d: Tensor | None = None) -> Tensor:
         """Add the view's gradient planes at their share of the mean; return the image's own pose twist [6]."""
-        twist = self._view.backward_there(field.params, self._rows, grad2d)
+        twist = self._view.backward_on_device(field.params, self._rows, grad2d)
         self.visible |= self._view.raster.visible
         self.grad.add_(self._rows, alpha=share)
         return twist

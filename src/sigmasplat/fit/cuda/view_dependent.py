@@ -27,7 +27,7 @@ class CudaViewDependentStep:
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
         """Render the field, as it looks from there, to the view's planes."""
-        harmonics, n = field.carry("harmonics").params, len(field)
+        harmonics, n = field.get_or_create("harmonics").params, len(field)
         self._rows, self._eye = field.params.clone(), _eye(T_camera_world)
         with self.view.stages.of("project"):
             self.view.raster.launch_fit(
@@ -43,15 +43,15 @@ class CudaViewDependentStep:
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Do what `ViewDependentStep.splats` does; twist and cost stay on the device."""
-        view, gradient, harmonics = self.view, torch.empty_like(field.params), field.carry("harmonics")
-        twist, visible = view.backward_there(self._rows, gradient, grad2d), view.raster.visible
+        view, gradient, harmonics = self.view, torch.empty_like(field.params), field.get_or_create("harmonics")
+        twist, visible = view.backward_on_device(self._rows, gradient, grad2d), view.raster.visible
         cost = add_shape_gradient(view, visible, field, gradient, weights, frozen_colors)
         on_harmonics, on_camera = self._through_colors(field, visible, gradient)
         if view.options.color_pose_gradient:
             twist[:3] += on_camera
         step_rows(view, visible, field, gradient, rates)
         harmonics.steps += 1
-        of_harmonics = Rates(rates.of_extra("harmonics").per_column[: self.width])
+        of_harmonics = Rates(rates.of_attribute("harmonics").per_column[: self.width])
         step_rows(view, visible, harmonics, on_harmonics, of_harmonics)
         return twist, cost
 
@@ -62,7 +62,7 @@ class CudaViewDependentStep:
     def _through_colors(self, field: GaussianField, visible: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
         """Carry the gradient of shown colours, in rows [N, 17], to the harmonics [N, width], returned, and by the
         directions to the means, in the same rows, and to the camera's translation, returned [3]."""
-        raster, n, harmonics = self.view.raster, len(field), field.carry("harmonics").params
+        raster, n, harmonics = self.view.raster, len(field), field.get_or_create("harmonics").params
         found, partial = raster.empty(n, self.width), raster.empty(blocks_for(n), 3, dtype=torch.float64)
         with self.view.stages.of("project_backward"):
             raster.launch_fit(

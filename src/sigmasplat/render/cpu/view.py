@@ -6,7 +6,7 @@ from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
-from sigmasplat.render.kernel_params import view_numbers
+from sigmasplat.render.kernel_params import view_params
 from sigmasplat.render.view import NO_LAYERS, Layers
 from sigmasplat.types import Matrix
 
@@ -41,7 +41,7 @@ class CpuView:
             self._reference[: self.camera.height, : self.camera.width] = depth_reference
             reference_depth, moment = self._reference, self.moment
         self._made = (depth_reference is not None, layers)
-        view, planes = view_numbers(self.camera, T_camera_world, o), self.layers if layers else NO_LAYERS
+        view, planes = view_params(self.camera, T_camera_world, o), self.layers if layers else NO_LAYERS
         self.raster.view_forward(
             view, params, self._k, o.alpha_min, o.transmittance_stop, reference_depth,
             self.sums, moment, self.alpha, *planes, self.seconds[:3],
