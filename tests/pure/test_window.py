@@ -127,7 +127,7 @@ def test_no_readings_no_share() -> None:
 
 def with_shares(shares: list[float]) -> list[Keyframe]:
     """Make keyframes whose splats share so much with the last one's."""
-    return [keyframe(k, visible_ids=list(range(round(10 * share)))) for k, share in enumerate([*shares, 1.0])]
+    return [keyframe(k, seen=list(range(round(10 * share)))) for k, share in enumerate([*shares, 1.0])]
 
 
 def test_the_newest_the_one_before_and_the_best_of_the_others() -> None:
