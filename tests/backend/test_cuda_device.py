@@ -29,9 +29,9 @@ from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda import launch as cuda_launch, stages as cuda_stages
 from sigmasplat.render.cuda.view import CudaView
 from splat_fields import OPTIONS, crowd, exact_view, params_of, there_and_back
+from splat_fits import RATES, WEIGHTS, target_of
 from splat_scenes import KINDS, WIDE, assert_same_vector, scene
 from splat_wall import CAMERA, TRUTH, seen_from, wall
-from test_compiled_loss import RATES, WEIGHTS, target_of
 from test_cuda_options import FULL, correlated, fitted, wide_views
 
 REASON = cuda_launch.missing()

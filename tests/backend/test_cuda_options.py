@@ -33,11 +33,9 @@ from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.reference.covariance_view import CovarianceView
 from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.render.view import View
-from splat_fields import OPTIONS, Gradients, crowd, exact_view, params_of, plane_gradients, there_and_back
+from splat_fields import CPU, OPTIONS, Gradients, crowd, exact_view, params_of, plane_gradients, there_and_back
+from splat_fits import RATES, WEIGHTS, fields, random_gradient, target_of
 from splat_scenes import KINDS, SMALL, WIDE, Scene, assert_same_vector, scene
-from test_compiled_loss import RATES, WEIGHTS, fields, random_gradient, target_of
-from test_cuda_step import OF_THE_HOST, Watch
-from test_cuda_view import CPU
 
 SHAPES = {"isotropy": 0.7, "isotropy_ratio": 0.01}
 FULL = {**dict.fromkeys(WEIGHTS, 0.0), "l1": 0.8, "ssim": 0.2, "depth": 1.0, "nll_depth": 2e-2, "nll_color_full": 1e-2}
@@ -274,8 +272,8 @@ def test_a_pose_feels_the_directions_where_it_is_asked_to(felt: bool) -> None:
         step.forward(field, s.T_camera_world.numpy(), target, {})
         random_gradient(step.view, 5)  # type: ignore[arg-type]
         twists.append(torch.as_tensor(step.splats(field, RATES, {}, 0)[0]))
-        step.view.forward(step._rows, s.T_camera_world.numpy())
-        plain = torch.as_tensor(step.view.backward(step._rows, torch.empty_like(field.params)))
+        step.view.forward(step.rows, s.T_camera_world.numpy())
+        plain = torch.as_tensor(step.view.backward(step.rows, torch.empty_like(field.params)))
         assert torch.allclose(plain[:3], twists[-1][:3]) != felt
     assert_same_vector(*twists, 1e-3, "twist")
 
@@ -356,36 +354,6 @@ def test_several_keyframes_are_refused_as_on_the_cpu(degree: int, kind: Any) -> 
     config = MappingConfig(color_covariance=kind, weight_nll_color=1e-2)
     with pytest.raises(ConfigError, match="frames_per_step must be 1"):
         fitted(CudaView(WIDE, OPTIONS, True, CPU), config, 2, degree)
-
-
-# ---- who waits
-
-
-@pytest.mark.parametrize(("images", "degree", "full"), [(1, 0, False), (3, 0, False), (1, 3, False), (1, 0, True)])
-def test_the_host_waits_once_a_step(images: int, degree: int, full: bool) -> None:
-    """For twists and losses of all images together, once the step is over."""
-    s = scene("random", 60)
-    field, view = GaussianField(params_of(s)), CudaView(s.camera, OPTIONS, True, CPU)
-    target, weights = target_of(s.camera, (s.camera.height, s.camera.width)), {**FULL, "nll_color_full": 1e-2 * full}
-    step, T = step_for(field, view, weights, degree), s.T_camera_world.double().numpy()
-    step.view.forward(field.params, T)  # says how many pairs to expect
-    gathered = CudaAccumulator(view, field) if images > 1 else None
-    with Watch() as watch:
-        field.steps += 1
-        for _ in range(images):
-            step.forward(field, T, target, weights)
-            step.images(target, weights)
-            if gathered is None:
-                step.splats(field, RATES, weights, 3)
-            else:
-                gathered.add(field, 1.0 / images)
-        if gathered is not None:
-            gathered.step(field, RATES, weights, 3)
-    pairs, rates = OF_THE_HOST
-    attributes = [("adam.py", "__float__"), rates] * (
-        degree > 0 or full
-    )  # the rates of an attribute lie on the host too
-    assert watch.reads == [pairs] * images + [rates, *attributes]
 
 
 def test_what_a_step_left_on_a_device_arrives_in_its_places() -> None:

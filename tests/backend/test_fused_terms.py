@@ -16,8 +16,8 @@ from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.render.view import View
 from splat_fields import OPTIONS, params_of
+from splat_fits import target_of
 from splat_scenes import WIDE, scene
-from test_compiled_loss import target_of
 
 OWN = "darkness"
 

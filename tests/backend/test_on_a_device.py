@@ -4,6 +4,7 @@ On a true device where there is one, else on what stands in for it (stand_in.py)
 """
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +33,9 @@ from sigmasplat.viewer.live import LiveView
 from sigmasplat.viewer.moment import Moment
 from sigmasplat.viewer.pictures import picture_of
 from splat_fields import OPTIONS, Gradients, exact_view, params_of, there_and_back
+from splat_fits import target_of
 from splat_scenes import assert_same_vector, scene
 from stand_in import StandIn
-from test_compiled_loss import target_of
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -156,12 +157,15 @@ def waits_of(stand_in: StandIn, do: Any) -> list[tuple[str, str]]:
     return sorted((counts[1] - counts[0]).elements())
 
 
-def test_a_mapping_iteration_waits_once(stand_in: StandIn) -> None:
+@pytest.mark.parametrize(("images", "degree", "full"), [(1, 0, False), (3, 0, False), (1, 3, False), (1, 0, True)])
+def test_a_mapping_iteration_waits_once(stand_in: StandIn, images: int, degree: int, full: bool) -> None:
     s = scene("random", 60)
     view, field = CudaView(s.camera, OPTIONS), GaussianField(params_of(s).to("cuda"))
-    keyframe = Keyframe(0, target_of(s.camera, tuple(view.alpha.shape)), se3.inverse(s.T_camera_world.double().numpy()))
-    waits = waits_of(stand_in, lambda n: fit_field(field, view, [[keyframe]] * n, MAPPING))
-    assert [reason for _, reason in waits] == ["fetching"], "twist and loss, together"
+    target, pose = target_of(s.camera, tuple(view.alpha.shape)), se3.inverse(s.T_camera_world.double().numpy())
+    keyframes = [Keyframe(k, target, pose) for k in range(images)]
+    config = replace(MAPPING, color_covariance="full", weight_alignment=0.0, weight_moment=0.0) if full else MAPPING
+    waits = waits_of(stand_in, lambda n: fit_field(field, view, [keyframes] * n, config, degree=degree))
+    assert [reason for _, reason in waits] == ["fetching"], "twists and losses of all images, together"
 
 
 QUICK = {

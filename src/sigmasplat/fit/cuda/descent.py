@@ -58,9 +58,9 @@ class CudaTrackingLoss:
         self._errors = c.outlier_factor > 0 or c.outlier_factor_color > 0
         self._weigh, self._kept = c.uncertainty and len(view.sums) == 7, c.average == "kept"
         self._tally = empty(MEDIANS * PASSES * DIGITS + 2, dtype=torch.int32)
-        self._selection = (self._tally, empty(MEDIANS, PASSES, 2, dtype=torch.int32))
+        self.selection = (self._tally, empty(MEDIANS, PASSES, 2, dtype=torch.int32))
         images = (view.sums, view.alpha, target.color, target.depth, pixels, self.blocks * THREADS)
-        self._given = (images, np.array(tracking_params(c, c.alpha_above), np.float32), exposure, self._selection)
+        self._given = (images, np.array(tracking_params(c, c.alpha_above), np.float32), exposure, self.selection)
 
     def launch(self) -> Tensor:
         """Write the gradient to the view's planes; return loss and gradient by (a, b), to be added up [blocks, 3]."""

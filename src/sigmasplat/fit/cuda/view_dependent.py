@@ -23,17 +23,17 @@ class CudaViewDependentStep:
     def __init__(self, base: CudaStep, degree: int) -> None:
         self.base, self.view, self.degree = base, base.view, degree
         self.width = 3 * count(degree)
-        self._rows, self._eye = torch.empty(0), np.zeros(15, np.float32)
+        self.rows, self._eye = torch.empty(0), np.zeros(15, np.float32)
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
         """Render the field, as it looks from there, to the view's planes."""
         harmonics, n = field.get_or_create("harmonics").params, len(field)
-        self._rows, self._eye = field.params.clone(), _eye(T_camera_world)
+        self.rows, self._eye = field.params.clone(), _eye(T_camera_world)
         with self.view.stages.of("project"):
             self.view.raster.launch_fit(
-                "show_colors", blocks_for(n), self._rows, harmonics, n, self.degree, harmonics.shape[1], self._eye
+                "show_colors", blocks_for(n), self.rows, harmonics, n, self.degree, harmonics.shape[1], self._eye
             )
-        render_for(self.view, self._rows, T_camera_world, target, weights)
+        render_for(self.view, self.rows, T_camera_world, target, weights)
 
     def images(self, target: Target, weights: Weights) -> Tensor:
         """Write the gradient of every image term to the view's gradient planes; return the loss, on the device."""
@@ -44,7 +44,7 @@ class CudaViewDependentStep:
     ) -> tuple[Tensor, Tensor]:
         """Do what `ViewDependentStep.splats` does; twist and cost stay on the device."""
         view, gradient, harmonics = self.view, torch.empty_like(field.params), field.get_or_create("harmonics")
-        twist, visible = view.backward_on_device(self._rows, gradient, grad2d), view.raster.visible
+        twist, visible = view.backward_on_device(self.rows, gradient, grad2d), view.raster.visible
         cost = add_shape_gradient(view, visible, field, gradient, weights, frozen_colors)
         on_harmonics, on_camera = self._through_colors(field, visible, gradient)
         if view.options.color_pose_gradient:
