@@ -342,7 +342,6 @@ def test_each_device_has_its_step() -> None:
         (step_for(field, view, loss_weights(full), 0), CudaStep, CudaCovarianceView),
         (step_for(field, view, loss_weights(plain), 2), CudaViewDependentStep, CudaView),
         (step_for(field, view, loss_weights(full), 2), CudaViewDependentStep, CudaCovarianceView),
-        (step_for(field, view, loss_weights(plain) | {"unheard_of": 1.0}, 0), TorchStep, CudaView),
         (step_for(field, ReferenceView(WIDE, OPTIONS), loss_weights(full), 0), FullCovarianceStep, CovarianceView),
     ]
     for step, kind, seen in kinds:
