@@ -113,7 +113,7 @@ class VectorAdam:
 
     @staticmethod
     def of(size: int) -> "VectorAdam":
-        """Start at rest on so many numbers."""
+        """Start at rest on `size` numbers."""
         return VectorAdam(np.zeros(size), np.zeros(size))
 
     def step(self, gradient: NDArray[np.float64], rates: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Fit colours that depend on where they are seen from: one mapping step with harmonics (VarSplat §7, refinement)."""
+"""Fit view-dependent colours: one mapping step with spherical harmonics (VarSplat §7, refinement)."""
 
 from typing import Protocol
 
@@ -19,7 +19,7 @@ COLORS, MEANS, SCALES = (COLUMNS[name] for name in ("colors", "means", "log_scal
 
 
 class ImageStep(Protocol):
-    """What is needed of another step: its view, and the gradient of the image terms."""
+    """The part of another step that this one uses: its view, and the gradient of the image terms."""
 
     @property
     def view(self) -> View: ...
@@ -30,10 +30,9 @@ class ImageStep(Protocol):
 
 
 class ViewDependentStep:
-    """One mapping step of a field whose colours depend on the direction they are seen from, up to a degree 1 to 3.
+    """One mapping step of a field with view-dependent colours of degree 1 to 3.
 
-    The view knows nothing of it: it renders rows that hold the colours as this camera sees them, and hands back the
-    gradient of those.
+    The view renders rows that hold the colours as this camera sees them, and returns the gradient of those rows.
     """
 
     def __init__(self, base: ImageStep, degree: int) -> None:
@@ -42,7 +41,7 @@ class ViewDependentStep:
         self.rows, self._R, self._position = torch.empty(0), torch.empty(0), torch.empty(0)
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
-        """Render the field, as it looks from there, to the view's planes."""
+        """Render the field, with the colours seen from that pose, to the view's planes."""
         self._R, t = (
             torch.as_tensor(part).to(field.params) for part in (T_camera_world[:3, :3], T_camera_world[:3, 3])
         )

@@ -1,4 +1,4 @@
-"""Lay out camera, pose and switches as every kernel reads them."""
+"""Lay out camera, pose and switches as all kernels read them."""
 
 import numpy as np
 from numpy.typing import NDArray

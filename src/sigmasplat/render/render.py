@@ -1,4 +1,4 @@
-"""See a field from a camera: two kernels, and algebra on what they gather (DESIGN §3)."""
+"""Render a field from a camera: two kernels, and algebra on their sums (DESIGN §3)."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ from sigmasplat.render.cuda import launch as cuda_launch
 
 @dataclass(frozen=True, eq=False)
 class Render:
-    """What a camera sees of a field, all [H, W] or [H, W, 3], covariance [H, W, 6].
+    """The maps that a camera sees of a field, all [H, W] or [H, W, 3], covariance [H, W, 6].
 
     color Ĉ = Σ w c; depth D̂ = Σ w z (m, not divided by alpha); alpha A = Σ w; variance V = Σ w (σ² + c²) − Ĉ², the law
     of total variance (VarSplat §1); uncertainty U = Σ w (z − D)² about a reference depth D (m², CG-SLAM eq. 10), None
     without one; median_depth: z where half the light is gone, 0 where it never is (CG-SLAM eq. 8); median_id,
-    dominant_id: the splat of that depth, the splat of largest weight, −1 = none; covariance: V with what lies beside
-    its diagonal, in the order rr, gg, bb, rg, rb, gb, None where the field has no `correlations`.
+    dominant_id: the splat of that depth, the splat of largest weight, −1 = none; covariance: V with its
+    off-diagonal, in the order rr, gg, bb, rg, rb, gb, None where the field has no `correlations`.
     """
 
     color: Tensor
@@ -102,8 +102,8 @@ def render(
 
 
 class FieldRenderer:
-    """Renders with the same settings again and again. The two fields shown last, which may not change meanwhile, are
-    brought to a device once."""
+    """Renders with the same settings repeatedly. The two fields rendered last must not change meanwhile; each is copied
+    to a device once."""
 
     def __init__(self, options: RenderConfig, backend: str) -> None:
         self.options, self.backend = options, backend

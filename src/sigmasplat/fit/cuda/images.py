@@ -16,7 +16,7 @@ Half = Tensor | None
 
 
 def halve(averaged: tuple[Half, Half], depth: Half) -> tuple[Half, Half, Half]:
-    """Do what `ImageKernels.halve` says."""
+    """Implement `ImageKernels.halve`."""
     given = (*averaged, depth)
     one = next((image for image in given if image is not None), None)
     if one is None:
@@ -32,7 +32,7 @@ def halve(averaged: tuple[Half, Half], depth: Half) -> tuple[Half, Half, Half]:
 
 
 def readings_of(finest: Tensor, coarsest: Tensor) -> Tensor:
-    """Do what `ImageKernels.readings_of` says; the result stays on the device."""
+    """Implement `ImageKernels.readings_of`; the result stays on the device."""
     read = coarsest > 0
     n = read.sum()
     mean = torch.where(read, coarsest, 0.0).double().sum() / n.clamp(min=1)

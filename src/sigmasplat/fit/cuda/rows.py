@@ -15,7 +15,7 @@ from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.types import Matrix
 
 MOST_COLUMNS = max(ATTRIBUTES.values())
-"""Of rows that the kernel steps."""
+"""The most columns of a row that the Adam kernel steps."""
 
 
 def add_shape_gradient(
@@ -34,7 +34,7 @@ def add_shape_gradient(
 
 
 def step_rows(view: CudaView, visible: Tensor, rows: Rows, gradient: Tensor, rates: Rates) -> None:
-    """Do what `adam_step` does for rows in view (uint8 [N]); gradient [N, m] and rates are of the first m columns."""
+    """Step rows in view (uint8 [N]) as `adam_step` does; gradient [N, m] and rates are those of the first m columns."""
     used, step = gradient.shape[1], rows.steps
     per_column = np.zeros(MOST_COLUMNS, np.float32)
     per_column[:used] = rates.per_column.numpy()
@@ -57,7 +57,7 @@ def to_host(twists: Sequence[Twist], costs: Sequence[float | Tensor]) -> tuple[l
 
 
 class CudaAccumulator:
-    """Does what `GradientAccumulator` does, on a device alone: the host waits for nothing."""
+    """`GradientAccumulator` on a device; the host does not wait."""
 
     def __init__(self, view: CudaView, field: GaussianField) -> None:
         self._view = view

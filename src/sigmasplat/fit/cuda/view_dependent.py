@@ -18,7 +18,7 @@ from sigmasplat.types import Matrix
 
 
 class CudaViewDependentStep:
-    """Does what `ViewDependentStep` does, on a device. The host waits for none of it until `to_host`."""
+    """`ViewDependentStep` on a device. The host does not wait until `to_host`."""
 
     def __init__(self, base: CudaStep, degree: int) -> None:
         self.base, self.view, self.degree = base, base.view, degree
@@ -26,7 +26,7 @@ class CudaViewDependentStep:
         self.rows, self._eye = torch.empty(0), np.zeros(15, np.float32)
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
-        """Render the field, as it looks from there, to the view's planes."""
+        """Render the field, with the colours seen from that pose, to the view's planes."""
         harmonics, n = field.get_or_create("harmonics").params, len(field)
         self.rows, self._eye = field.params.clone(), _eye(T_camera_world)
         with self.view.stages.of("project"):
@@ -42,7 +42,7 @@ class CudaViewDependentStep:
     def splats(
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Do what `ViewDependentStep.splats` does; twist and cost stay on the device."""
+        """Step as `ViewDependentStep.splats` does; twist and cost stay on the device."""
         view, gradient, harmonics = self.view, torch.empty_like(field.params), field.get_or_create("harmonics")
         twist, visible = view.backward_on_device(self.rows, gradient, grad2d), view.raster.visible
         cost = add_shape_gradient(view, visible, field, gradient, weights, frozen_colors)

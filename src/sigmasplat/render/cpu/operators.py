@@ -11,7 +11,7 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.errors import BackendError
 from sigmasplat.model.camera import Camera
 from sigmasplat.native import _core
-from sigmasplat.render.kernel_params import view_params as view_params
+from sigmasplat.render.kernel_params import view_params
 from sigmasplat.render.pose_gradient import pose_gradient
 from sigmasplat.render.reference.operators import Blended, Projection
 
@@ -19,7 +19,10 @@ FEATURES_AT_ONCE = 16
 
 
 def apply_switches(asked: env.Switches) -> None:
-    """Set the kernels' instruction set and threads. Raises BackendError if this machine has not what is asked for."""
+    """Set the kernels' instruction set and threads.
+
+    Raises BackendError if the requested instruction set is not supported.
+    """
     offered = _core.supported_isas()
     if asked.isa not in ("auto", *offered):
         raise BackendError(

@@ -35,7 +35,7 @@ class CpuView:
     def forward(
         self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
     ) -> None:
-        """Render rows [N, 17] as `View.forward` says: planes [K, rows, columns], m and m², padded to whole tiles."""
+        """Render rows [N, 17] as `View.forward` does: planes [K, rows, columns], m and m², padded to whole tiles."""
         o, reference_depth, moment = self.options, None, None
         if depth_reference is not None:
             self._reference[: self.camera.height, : self.camera.width] = depth_reference
@@ -68,7 +68,7 @@ class CpuView:
         return twist
 
     def visible(self, n: int) -> Tensor:
-        """Tell which of the n splats last rendered reach the image, bool [n]."""
+        """Return which of the n splats last rendered reach the image, bool [n]."""
         seen = torch.empty(n, dtype=torch.uint8)
         self.raster.visible(seen)
         return seen.bool()

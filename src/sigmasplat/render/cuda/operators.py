@@ -38,7 +38,7 @@ def _apply(function: type[torch.autograd.Function], *inputs: Any) -> Any:
 
 
 def _view(T: Tensor, camera: Camera, options: RenderConfig) -> tuple[NDArray[np.floating], Tensor | None]:
-    """Return the kernels' `View` by value, and the pose where it lies on a device: then no host waits for it."""
+    """Return the kernels' `View` by value, and the pose if it is on a device: then the host does not wait for it."""
     if T.device.type == "cpu":
         return view_params(camera, T.detach().double().numpy(), options), None
     return view_params(camera, np.eye(4), options), T.detach().float().contiguous()

@@ -17,8 +17,8 @@ from sigmasplat.types import Matrix
 class CudaView:
     """A view on the CUDA kernels: `View` with planes of exactly the image's size, on a device.
 
-    A backward pass ends by reading the twist, the one moment that the host waits for the device. Its `seconds` stay 0
-    where nobody asked to `measure` them (render/cuda/stages.py); to read them is to wait for the device.
+    A backward pass ends by reading the twist, the only time the host waits for the device. Its `seconds` stay 0 unless
+    `measure` (render/cuda/stages.py) was called; reading them waits for the device.
     """
 
     backend = "cuda"
