@@ -82,7 +82,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
     "blank depth": (blank_depth, ("depth is zero or unreadable in all 4 frames", "check the depth files")),
     "sizes differ": (half_size_depth, ("is 32×24 but", "is 16×12", "register depth to colour")),
     "no overlap in time": (later_depth, ("0.000 … 0.300 s", "100.000 … 103.000 s", "one recording?")),
-    "pose not finite": (pose_line("0.1 nan 0 0 0 0 0 1"), ("groundtruth.txt:2", "not finite", "drop the line")),
+    "pose not finite": (pose_line("0.1 nan 0 0 0 0 0 1"), ("groundtruth.txt:2", "not finite", "delete the line")),
     "pose not rigid": (pose_line("0.1 0 0 0 0 0 0 2"), ("groundtruth.txt:2", "not rigid", "length 2")),
 }
 

@@ -56,7 +56,7 @@ def test_an_unplugged_camera_gives_one_line_and_a_valid_run(device: Device, caps
     device.frames_until_unplugged = WARM_UP_FRAMES + 5
     assert exit_code("run", "realsense", "--out", "run", "--record", "seen", "--no-eval", *QUICK) == 0
     said = capsys.readouterr()
-    assert said.err.count("\n") == 1 and "no frame came for 5 s" in said.err
+    assert said.err.count("\n") == 1 and "no frame for 5 s" in said.err
     assert RunFolder.open(Path("run")).facts()["status"] == "complete"
     assert len(open_source("seen")) == 5
 
@@ -64,7 +64,7 @@ def test_an_unplugged_camera_gives_one_line_and_a_valid_run(device: Device, caps
 def test_a_missing_camera_gives_one_line_and_no_files(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.plugged_in = False
     assert exit_code("run", "realsense") == 2
-    assert capsys.readouterr().err.startswith("sigmasplat: no RealSense camera gives 640×480")
+    assert capsys.readouterr().err.startswith("sigmasplat: no RealSense camera provides 640×480")
     assert not Path("runs").exists()
 
 

@@ -154,10 +154,10 @@ def _prepare(
         if start == part.size_bytes and size_bytes in (None, origin.size_bytes):
             return origin.size_bytes
         part.restart()
-        raise _TransferError(f"{_host(url)} answered with another part of the file than was asked for")
+        raise _TransferError(f"{_host(url)} sent another part of the file than requested")
     part.restart()
     length = headers.get("Content-Length", "")
-    if not length.isdigit() and not response.chunked:  # the end could not be told from a broken connection
+    if not length.isdigit() and not response.chunked:  # the end would look like a broken connection
         raise DownloadError(f"{_host(url)} does not say how long the file is, so it could not be known to be whole")
     size_bytes = int(length) if length.isdigit() else None
     part.begin(RemoteVersion(url, _version(headers), size_bytes))

@@ -21,18 +21,15 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
-from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.camera.calibration import Calibration, build_camera, json_number, resolve_calibration
 from sigmasplat.sources.files.archive import Archive
 from sigmasplat.sources.files.images import decode_color, depth_to_metres, image_size
 from sigmasplat.sources.files.optional import import_optional
+from sigmasplat.sources.files.poses import FLIP_YZ, rigid_transform
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.recorded import ImagePair, RecordedSource, Size
+from sigmasplat.sources.recorded import ImagePair, RecordedSource, Size, first_readable
 from sigmasplat.sources.stray_scanner import with_coarser_depth
-
-FLIPPED = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Transforms our camera axes (y down, z forward) to OpenGL's (y up, z backward)."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +146,7 @@ def _calibration(
     path: Path, where: Path, metadata: dict[str, Any], images: Sequence[ImagePair], settings: InputConfig
 ) -> Calibration:
     """Read the camera, scaled to the image size, which is larger in exports than in the metadata."""
-    size, depth_size = _first_sizes(images)
+    size, depth_size = first_readable(images, lambda pair: pair.sizes())
     width, height = (int(json_number(where, metadata, key, value)) for key, value in zip(("w", "h"), size, strict=True))
     focal = _rows(where, metadata, "perFrameIntrinsicCoeffs", 4)
     if focal is not None and len(focal):
@@ -159,16 +156,6 @@ def _calibration(
         middle = [float(k[0][i]) for i in (0, 4, 6, 7)] if k is not None else None
     recorded = Calibration(build_camera(where, width, height, middle).resized(*size), 1.0) if middle else None
     return with_coarser_depth(resolve_calibration(path, recorded, size, settings, 1.0), depth_size)
-
-
-def _first_sizes(images: Sequence[ImagePair]) -> tuple[Size, Size]:
-    problem: SourceError | None = None
-    for image in images:
-        try:
-            return image.sizes()
-        except SourceError as error:
-            problem = problem or error
-    raise SourceError(f"no pair of colour and depth can be read (first: {problem})")
 
 
 def _times_s(where: Path, metadata: dict[str, Any], numbers: list[int]) -> NDArray[np.float64]:
@@ -187,14 +174,8 @@ def _truth(
     poses = _rows(where, metadata, "poses", 7)
     if poses is None or len(poses) <= numbers[-1] or np.ptp(poses, 0).max() == 0:
         return None
-    T = np.tile(np.eye(4), (len(numbers), 1, 1))
-    lengths = np.linalg.norm(poses[:, :4], axis=1)
-    if (np.abs(lengths - 1.0) > 1e-2).any():
-        n = int(np.argmax(np.abs(lengths - 1.0)))
-        raise SourceError(f"{where}: pose {n} is not rigid: its quaternion has length {lengths[n]:.4g}, not 1")
-    T[:, :3, :3] = se3.rotation_from_quaternion(poses[numbers][:, [3, 0, 1, 2]])
-    T[:, :3, 3] = poses[numbers, 4:]
-    return Trajectory(times_s, T @ FLIPPED)
+    T = np.stack([rigid_transform(f"{where}, pose {n}", poses[n, 4:], poses[n, [3, 0, 1, 2]]) for n in numbers])
+    return Trajectory(times_s, T @ FLIP_YZ)
 
 
 def _rows(where: Path, metadata: dict[str, Any], key: str, count: int) -> NDArray[np.float64] | None:

@@ -1,8 +1,9 @@
 """Read recorded sequences: a format lists the image pairs, this module reads and rectifies them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ from sigmasplat.sources.camera.rectification import Rectification, check_image_s
 from sigmasplat.sources.files.images import color_from_bytes, image_size, read_color, read_depth
 
 Size = tuple[int, int]
+File = TypeVar("File")
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
@@ -107,24 +110,21 @@ class RecordedSource(Source):
 
     def _refuse_sizes_of_first(self) -> None:
         """Raise SourceError before a run if the image sizes do not match the calibration."""
-        problem: SourceError | None = None
-        for files in self._images:
-            try:
-                size, depth_size = files.sizes()
-            except SourceError as error:
-                problem = problem or error
-                continue
-            check_image_sizes(self._rectified, files.color, size, files.depth, depth_size)
-            return
-        raise SourceError(f"no pair of colour and depth can be read (first: {problem})")
+        files, (size, depth_size) = first_readable(self._images, lambda pair: (pair, pair.sizes()))
+        check_image_sizes(self._rectified, files.color, size, files.depth, depth_size)
 
 
 def first_size(paths: Sequence[Path]) -> tuple[int, int]:
     """Return (width, height) of the first image whose header can be read. Raises SourceError if none can."""
+    return first_readable(paths, image_size)
+
+
+def first_readable(files: Iterable[File], read: Callable[[File], Value]) -> Value:
+    """Return `read` of the first file for which it raises no SourceError. Raises SourceError if it fails for all."""
     problem: SourceError | None = None
-    for path in paths:
+    for file in files:
         try:
-            return image_size(path)
+            return read(file)
         except SourceError as error:
             problem = problem or error
     raise SourceError(f"no pair of colour and depth can be read (first: {problem})")

@@ -27,7 +27,7 @@ from sigmasplat.sources.camera.calibration import (
     read_json_object,
     resolve_calibration,
 )
-from sigmasplat.sources.files.association import associate
+from sigmasplat.sources.files.association import MAX_GAP_S, associate, no_pairs
 from sigmasplat.sources.files.folders import (
     COLOR_ENDINGS,
     COLOR_FOLDERS,
@@ -44,7 +44,6 @@ from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
 from sigmasplat.sources.tum import parse_numbers, read_lines
 
 INTRINSIC_NAMES = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
-MAX_GAP_S = 0.02
 
 _TIMED = re.compile(r"([0-9]+)-([0-9]{9,})")
 
@@ -68,9 +67,9 @@ def _timed(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[I
     if not (colors and depths and all(_TIMED.fullmatch(path.stem) for path in colors + depths)):
         return None
     times_s = [np.array([int(path.stem.split("-")[1]) * 1e-6 for path in paths]) for paths in (colors, depths)]
-    pairs = associate(times_s[0], times_s[1], MAX_GAP_S)
+    pairs = associate(times_s[0], times_s[1])
     if not len(pairs):
-        raise SourceError(f"{folder}: no colour image has depth within {MAX_GAP_S:g} s; are both from one recording?")
+        raise no_pairs(folder, {"colour": times_s[0], "depth": times_s[1]})
     skipped = [f"{path}: no depth within {MAX_GAP_S:g} s" for i, path in enumerate(colors) if i not in pairs[:, 0]]
     return [ImagePair(float(times_s[1][j]), colors[i], depths[j]) for i, j in pairs], skipped
 

@@ -6,15 +6,13 @@ for the timestamps; images are read on demand.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
-from sigmasplat.errors import SourceError
-from sigmasplat.sources.files.association import associate
+from sigmasplat.sources.files.association import MAX_GAP_S, associate, no_pairs
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, Size
 from sigmasplat.sources.ros.bag import Bag, Entry, is_bag
@@ -23,8 +21,6 @@ from sigmasplat.sources.ros.images import decode_color_message, decode_depth_mes
 from sigmasplat.sources.ros.topics import color_topic, depth_topic
 from sigmasplat.sources.ros.truth import read_truth
 
-MAX_GAP_S = 0.02
-"""Largest time difference of a colour and a depth image of one camera at 30 Hz."""
 Times = NDArray[np.float64]
 
 
@@ -62,7 +58,7 @@ def open_bag(path: Path, settings: InputConfig) -> RecordedSource:
     entries = found[color.name], found[depth.name]
     pairs, recorded_time = _paired(entries)
     if not len(pairs):
-        raise SourceError(_no_overlap(path, (color.name, depth.name), entries))
+        raise no_pairs(path, {name: _times_s(found[name], True) for name in (color.name, depth.name)})
     truth = read_truth(bag, color.frame, recorded_time)
     topics = (color.name, depth.name)
     color_s, depth_s = (_times_s(part, recorded_time) for part in entries)
@@ -86,7 +82,7 @@ def _paired(entries: tuple[Sequence[Entry], Sequence[Entry]]) -> tuple[NDArray[n
     found = []
     for recorded in clocks:
         color_s, depth_s = (_times_s(part, recorded) for part in entries)
-        found.append((associate(color_s, depth_s, MAX_GAP_S), recorded))
+        found.append((associate(color_s, depth_s), recorded))
     return max(found, key=lambda answer: len(answer[0]))
 
 
@@ -101,14 +97,6 @@ def _times_s(entries: Sequence[Entry], recorded: bool) -> Times:
 
 def _message_path(path: Path, topic: str, time_s: float) -> Path:
     return path / f"{topic.lstrip('/')} at {time_s:.3f} s"
-
-
-def _no_overlap(path: Path, topics: tuple[str, str], entries: tuple[Sequence[Entry], Sequence[Entry]]) -> str:
-    times = partial(_times_s, recorded=True)
-    spans = [f"{n} {times(e).min():.3f} … {times(e).max():.3f} s" for n, e in zip(topics, entries, strict=True)]
-    return (
-        f"no colour image of {path} has depth within {MAX_GAP_S:g} s ({', '.join(spans)}); are both from one recording?"
-    )
 
 
 FORMAT = Format(

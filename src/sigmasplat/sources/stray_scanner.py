@@ -20,13 +20,12 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.camera.calibration import Calibration, build_camera, resolve_calibration
+from sigmasplat.sources.camera.calibration import MM_PER_METRE, Calibration, build_camera, resolve_calibration
 from sigmasplat.sources.files.images import guard_decoding, image_size, read_depth
 from sigmasplat.sources.files.video import Video
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, Size, first_size
 
-UNITS_PER_METRE = 1000.0
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 INTRINSICS = ("fx", "fy", "cx", "cy")
 Rows = dict[int, dict[str, float]]
@@ -133,10 +132,10 @@ def _calibration(folder: Path, rows: Rows, size: Size, depth_size: Size, setting
     recorded = None
     if rows and set(INTRINSICS) <= set(next(iter(rows.values()))):
         focal = np.median([[row[name] for name in INTRINSICS] for row in rows.values()], 0)
-        recorded = Calibration(build_camera(folder / "odometry.csv", *size, focal.tolist()), UNITS_PER_METRE)
+        recorded = Calibration(build_camera(folder / "odometry.csv", *size, focal.tolist()), MM_PER_METRE)
     elif path.is_file():
-        recorded = Calibration(build_camera(path, *size, _matrix(path)), UNITS_PER_METRE)
-    return with_coarser_depth(resolve_calibration(folder, recorded, size, settings, UNITS_PER_METRE), depth_size)
+        recorded = Calibration(build_camera(path, *size, _matrix(path)), MM_PER_METRE)
+    return with_coarser_depth(resolve_calibration(folder, recorded, size, settings, MM_PER_METRE), depth_size)
 
 
 def _matrix(path: Path) -> list[float]:

@@ -26,19 +26,19 @@ from sigmasplat.sources.camera.calibration import (
     freiburg_calibration,
     resolve_calibration,
 )
-from sigmasplat.sources.files.association import associate
+from sigmasplat.sources.files.association import MAX_GAP_S, associate, no_pairs
 from sigmasplat.sources.files.images import UINT16_MAX
+from sigmasplat.sources.files.poses import rigid_transform
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
 
-MAX_GAP_S = 0.02
-"""Largest time difference of a colour and a depth image of a Kinect at 30 Hz; TUM's own tool uses the same value."""
-
 
 def open_tum(
-    folder: Path, settings: InputConfig, max_gap_s: float = MAX_GAP_S, camera: Calibration | None = None,
+    folder: Path,
+    settings: InputConfig,
+    camera: Calibration | None = None,
     camera_path: Callable[[Trajectory], Trajectory] | None = None,
-) -> RecordedSource:  # fmt: skip
+) -> RecordedSource:
     """Open a folder. Raises SourceError if its lists, images, calibration or ground-truth poses cannot be used.
 
     camera: the calibration, if it does not follow from the folder's name;
@@ -46,12 +46,12 @@ def open_tum(
     """
     color_times_s, colors = read_list(folder / "rgb.txt")
     depth_times_s, depths = _depth_list(folder)
-    pairs = associate(color_times_s, depth_times_s, max_gap_s)
+    pairs = associate(color_times_s, depth_times_s)
     if not len(pairs):
-        raise SourceError(_no_overlap(folder, color_times_s, depth_times_s, max_gap_s))
+        raise no_pairs(folder, {"rgb.txt": color_times_s, "depth.txt": depth_times_s})
     images = [ImagePair(float(color_times_s[i]), colors[i], depths[j]) for i, j in pairs]
     paired = set(pairs[:, 0].tolist())
-    skipped = [f"{path}: no depth within {max_gap_s:g} s" for i, path in enumerate(colors) if i not in paired]
+    skipped = [f"{path}: no depth within {MAX_GAP_S:g} s" for i, path in enumerate(colors) if i not in paired]
     truth_path = folder / "groundtruth.txt"
     # Read now: damaged ground truth must stop the run before it starts, not its evaluation an hour later.
     truth = read_poses(truth_path) if truth_path.is_file() else None
@@ -71,17 +71,25 @@ def write_tum(source: Source, folder: str | Path) -> None:
     Raises RunError if the folder already holds a sequence or cannot be written.
     """
     folder = Path(folder)
+    _create_folder(folder, source.camera)
+    try:
+        _write_truth(source.truth(), folder / "groundtruth.txt")
+        stems = [write_images(frame, folder) for frame in source]
+        for part in ("depth", "rgb"):  # rgb.txt last: it marks a complete folder
+            (folder / f"{part}.txt").write_text("# timestamp path\n" + "".join(f"{s} {part}/{s}.png\n" for s in stems))
+    except OSError as error:
+        raise RunError(f"cannot write the sequence to {folder} ({error})") from error
+
+
+def _create_folder(folder: Path, camera: Camera) -> None:
+    """Create an empty TUM folder with calibration.json. Raises RunError if it holds a sequence or cannot be written."""
     if (folder / "rgb.txt").exists():
         raise RunError(f"{folder} already holds a sequence (rgb.txt); give another folder")
     try:
         for part in ("rgb", "depth"):
             (folder / part).mkdir(parents=True, exist_ok=True)
-        calibration = asdict(source.camera) | {"depth_scale": TUM_UNITS_PER_METRE}
+        calibration = asdict(camera) | {"depth_scale": TUM_UNITS_PER_METRE}
         (folder / "calibration.json").write_text(json.dumps(calibration, indent=1) + "\n")
-        _write_truth(source.truth(), folder / "groundtruth.txt")
-        stems = [write_images(frame, folder) for frame in source]
-        for part in ("depth", "rgb"):  # rgb.txt last: it marks a complete folder
-            (folder / f"{part}.txt").write_text("# timestamp path\n" + "".join(f"{s} {part}/{s}.png\n" for s in stems))
     except OSError as error:
         raise RunError(f"cannot write the sequence to {folder} ({error})") from error
 
@@ -106,23 +114,6 @@ def _depth_list(folder: Path) -> tuple[NDArray[np.float64], list[Path]]:
     raise SourceError(f"no depth images in {folder} (looked for {looked_for}); is this the RGB-only download?")
 
 
-def _no_overlap(folder: Path, color_s: NDArray[np.float64], depth_s: NDArray[np.float64], max_gap_s: float) -> str:
-    spans = [f"{name} {t.min():.3f} … {t.max():.3f} s" for name, t in (("rgb.txt", color_s), ("depth.txt", depth_s))]
-    return (
-        f"no colour image of {folder} has depth within {max_gap_s:g} s ({', '.join(spans)}); "
-        "are both from one recording?"
-    )
-
-
-FORMAT = Format(
-    "TUM",
-    "rgb.txt and depth.txt",
-    lambda path: (Path(path) / "rgb.txt").is_file() or (Path(path) / "depth.txt").is_file(),
-    lambda path, settings: open_tum(Path(path), settings),
-    priority=1,
-)
-
-
 def read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
     """Read "t path" lines: timestamps [N] seconds and image paths. Raises SourceError naming file and line."""
     times, paths = [], []
@@ -142,9 +133,10 @@ def read_poses(path: Path) -> Trajectory:
     for line, words in read_lines(path):
         if len(words) != 8:
             raise SourceError(f"{path}:{line}: expected 't tx ty tz qx qy qz qw', found {len(words)} values")
-        t, *translation_quaternion = parse_numbers(path, line, words)
+        t, *values = parse_numbers(path, line, words)
         times.append(t)
-        poses.append(_pose(path, line, np.array(translation_quaternion)))
+        x, y, z, qx, qy, qz, qw = values
+        poses.append(rigid_transform(f"{path}:{line}", [x, y, z], [qw, qx, qy, qz]))
     if not poses:
         raise SourceError(f"{path}: holds no poses; delete it or add poses")
     return Trajectory(np.array(times), np.stack(poses))
@@ -173,32 +165,13 @@ def parse_numbers(path: Path, line: int, words: list[str]) -> list[float]:
     return values
 
 
-def _pose(path: Path, line: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Build T_world_camera from tx ty tz qx qy qz qw. Raises SourceError unless the quaternion has unit length."""
-    norm = float(np.linalg.norm(values[3:]))
-    if abs(norm - 1.0) > 1e-2:
-        raise SourceError(f"{path}:{line}: the pose is not rigid: its quaternion has length {norm:.4g}, not 1")
-    T = np.eye(4)
-    T[:3, :3] = se3.rotation_from_quaternion(values[[6, 3, 4, 5]])
-    T[:3, 3] = values[:3]
-    return T
-
-
 class TumWriter:
     """Writes frames to a new TUM folder: both images first, then a line in each list."""
 
     def __init__(self, folder: Path, camera: Camera) -> None:
         """Create the folder. Raises RunError if it already holds a sequence or cannot be written."""
         self.folder = folder
-        if (folder / "rgb.txt").exists():
-            raise RunError(f"{folder} already holds a sequence (rgb.txt); give another folder")
-        try:
-            for part in ("rgb", "depth"):
-                (folder / part).mkdir(parents=True, exist_ok=True)
-            calibration = asdict(camera) | {"depth_scale": TUM_UNITS_PER_METRE}
-            (folder / "calibration.json").write_text(json.dumps(calibration, indent=1) + "\n")
-        except OSError as error:
-            raise RunError(f"cannot write the sequence to {folder} ({error})") from error
+        _create_folder(folder, camera)
 
     def add(self, frame: Frame) -> None:
         """Write one more frame; timestamps must increase. Raises RunError if the folder cannot be written."""
@@ -220,3 +193,12 @@ def write_images(frame: Frame, folder: Path) -> str:
     Image.fromarray(color).save(folder / "rgb" / f"{stem}.png", compress_level=1)
     Image.fromarray(depth).save(folder / "depth" / f"{stem}.png", compress_level=1)
     return stem
+
+
+FORMAT = Format(
+    "TUM",
+    "rgb.txt and depth.txt",
+    lambda path: (Path(path) / "rgb.txt").is_file() or (Path(path) / "depth.txt").is_file(),
+    lambda path, settings: open_tum(Path(path), settings),
+    priority=1,
+)

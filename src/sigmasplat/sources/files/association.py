@@ -1,12 +1,20 @@
 """Pair two lists of timestamps."""
 
+from collections.abc import Mapping
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
+from sigmasplat.errors import SourceError
+
 Times = NDArray[np.float64]
 
+MAX_GAP_S = 0.02
+"""Largest time difference of a colour and a depth image of one camera at 30 Hz; TUM's own tool uses the same."""
 
-def associate(first_s: Times, second_s: Times, tolerance_s: float = 0.02) -> NDArray[np.intp]:
+
+def associate(first_s: Times, second_s: Times, tolerance_s: float = MAX_GAP_S) -> NDArray[np.intp]:
     """Pair timestamps [N] and [M], seconds, that differ by less than `tolerance_s`; return indices [K, 2] by time.
 
     Every index is used at most once, and the closest pairs are chosen first. The lists may be unsorted. Ties go to the
@@ -23,6 +31,14 @@ def associate(first_s: Times, second_s: Times, tolerance_s: float = 0.02) -> NDA
             pairs.append((i, j))
     pairs.sort(key=lambda pair: (first_s[pair[0]], pair[0]))
     return np.array(pairs, np.intp).reshape(-1, 2)
+
+
+def no_pairs(path: Path, times_s: Mapping[str, Times]) -> SourceError:
+    """Return the error for a recording in which no colour image has depth; `times_s` of colour and depth by name."""
+    spans = ", ".join(f"{name} {t.min():.3f} … {t.max():.3f} s" for name, t in times_s.items())
+    return SourceError(
+        f"no colour image of {path} has depth within {MAX_GAP_S:g} s ({spans}); are both from one recording?"
+    )
 
 
 def _candidates(first_s: Times, second_s: Times, tolerance_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

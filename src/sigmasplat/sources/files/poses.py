@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
@@ -13,6 +14,9 @@ from sigmasplat.types import Matrix
 
 RIGID_TOLERANCE = 1e-2
 """Published poses are rounded; a matrix within this tolerance of a rotation is orthonormalised."""
+
+QUATERNION_TOLERANCE = 1e-2
+"""Largest deviation of a recorded quaternion's length from 1."""
 
 FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 """Transforms camera axes with y down and z forward to axes with y up and z backward (OpenGL)."""
@@ -53,6 +57,17 @@ def checked_pose(where: str, T: Matrix) -> Matrix | None:
         numbers = " ".join(f"{value:.3g}" for value in T.reshape(-1)[:12])
         raise SourceError(f"{where}: not a rigid camera-to-world pose: {numbers}; delete it or correct its rotation")
     return T if se3.is_rigid(T) else se3.orthonormalise(T)
+
+
+def rigid_transform(where: str, position: ArrayLike, quaternion_wxyz: ArrayLike) -> Matrix:
+    """Build a transform [4, 4]. Raises SourceError naming `where` unless it is finite with a unit quaternion."""
+    q, T = np.array(quaternion_wxyz, np.float64), np.eye(4)
+    T[:3, 3] = position
+    norm = float(np.linalg.norm(q))
+    if not np.isfinite(T).all() or not abs(norm - 1.0) < QUATERNION_TOLERANCE:
+        raise SourceError(f"{where}: the pose is not rigid: its quaternion has length {norm:.4g}, not 1")
+    T[:3, :3] = se3.rotation_from_quaternion(q)
+    return T
 
 
 def build_trajectory(timed: Iterable[tuple[float, Matrix | None]]) -> Trajectory | None:

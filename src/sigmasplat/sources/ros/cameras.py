@@ -15,14 +15,18 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.sources.camera.calibration import Calibration, Distortion, build_camera, resolve_calibration
+from sigmasplat.sources.camera.calibration import (
+    MM_PER_METRE,
+    Calibration,
+    Distortion,
+    build_camera,
+    resolve_calibration,
+)
 from sigmasplat.sources.ros.bag import Bag, Message
-from sigmasplat.sources.ros.tf import lookup_transform, rigid_transform
+from sigmasplat.sources.ros.tf import lookup_transform, transform_of
 from sigmasplat.sources.ros.topics import ImageTopic
 from sigmasplat.types import Matrix
 
-UNITS_PER_METRE = 1000.0
-"""Whole-number depth of ROS is millimetres (REP 118)."""
 BROWN_CONRADY = ("", "plumb_bob", "brown conrady", "inverse brown conrady", "modified brown conrady", "none")
 RATIONAL = "rational_polynomial"
 
@@ -92,9 +96,9 @@ def depth_units(bag: Bag, depth: ImageTopic) -> float:
     sensor = "/".join(depth.name.split("/")[:3])
     name = f"{sensor}/option/Depth_Units/value"
     if name not in bag.topics or not bag.topics[name].count:
-        return UNITS_PER_METRE
+        return MM_PER_METRE  # ROS depth as whole numbers is in millimetres (REP 118)
     metres = float(bag.first_message(name).data)
-    return round(1.0 / metres, 3) if metres > 0 else UNITS_PER_METRE
+    return round(1.0 / metres, 3) if metres > 0 else MM_PER_METRE
 
 
 def _color_depth(bag: Bag, color: ImageTopic, depth: ImageTopic) -> Matrix:
@@ -130,7 +134,7 @@ def _sdk_pose(bag: Bag, stream: str) -> Matrix | None:
     if not (stream and names):
         return None
     message = bag.first_message(names[0])
-    return rigid_transform(f"{bag.path}: {names[0]}", message.translation, message.rotation)
+    return transform_of(f"{bag.path}: {names[0]}", message.translation, message.rotation)
 
 
 def _lens(where: str, info: Message) -> Distortion | None:

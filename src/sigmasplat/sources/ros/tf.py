@@ -4,8 +4,8 @@ from itertools import islice
 
 import numpy as np
 
-from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
+from sigmasplat.sources.files.poses import rigid_transform
 from sigmasplat.sources.ros.bag import Bag, Message
 from sigmasplat.types import Matrix
 
@@ -25,7 +25,7 @@ def lookup_transform(bag: Bag, target: str, source: str, use_tf: bool = True) ->
         for message in islice(bag.messages(name), most):
             for link in message.transforms:
                 parent, child = link.header.frame_id.lstrip("/"), link.child_frame_id.lstrip("/")
-                T = rigid_transform(
+                T = transform_of(
                     f"{bag.path}: {name}: {parent} to {child}", link.transform.translation, link.transform.rotation
                 )
                 edges.setdefault(parent, {}).setdefault(child, T)
@@ -35,16 +35,11 @@ def lookup_transform(bag: Bag, target: str, source: str, use_tf: bool = True) ->
     return None
 
 
-def rigid_transform(where: str, position: Message, rotation: Message) -> Matrix:
+def transform_of(where: str, position: Message, rotation: Message) -> Matrix:
     """Build a transform from geometry_msgs fields. Raises SourceError naming `where` unless it is rigid."""
-    q = np.array([rotation.w, rotation.x, rotation.y, rotation.z])
-    T = np.eye(4)
-    T[:3, 3] = position.x, position.y, position.z
-    norm = float(np.linalg.norm(q))
-    if not np.isfinite(T).all() or not abs(norm - 1.0) < 1e-2:
-        raise SourceError(f"{where}: the pose is not rigid: its quaternion has length {norm:.4g}, not 1")
-    T[:3, :3] = se3.rotation_from_quaternion(q)
-    return T
+    return rigid_transform(
+        where, [position.x, position.y, position.z], [rotation.w, rotation.x, rotation.y, rotation.z]
+    )
 
 
 def _chained(edges: dict[str, dict[str, Matrix]], target: str, source: str) -> Matrix | None:

@@ -5,7 +5,7 @@ import numpy as np
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.ros.bag import Bag, Message
-from sigmasplat.sources.ros.tf import lookup_transform, rigid_transform
+from sigmasplat.sources.ros.tf import lookup_transform, transform_of
 from sigmasplat.types import Matrix
 
 POSE_TYPES = (
@@ -42,6 +42,6 @@ def read_truth(bag: Bag, camera_frame: str, recorded_time: bool) -> Trajectory |
 
 def _pose(where: str, message: Message) -> Matrix:
     if hasattr(message, "transform"):
-        return rigid_transform(where, message.transform.translation, message.transform.rotation)
+        return transform_of(where, message.transform.translation, message.transform.rotation)
     pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
-    return rigid_transform(where, pose.position, pose.orientation)
+    return transform_of(where, pose.position, pose.orientation)
