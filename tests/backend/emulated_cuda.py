@@ -42,7 +42,7 @@ class Emulator:
     def __call__(self, features: int, kernel: str, blocks: int, *arguments: Argument) -> None:
         memory = laid_out(arguments)
         self.launches.append(kernel)
-        run = self._library(features).emulate
+        run = self.library(features).emulate
         problem = run(kernel.encode(), blocks, THREADS, ctypes.c_void_p(memory.buffer_info()[0]), self.order)
         assert problem is None, f"{kernel}: {problem.decode()}"
 
@@ -54,7 +54,7 @@ class Emulator:
             patch.setattr(cuda_launch, "this_device", lambda: torch.device("cpu"))
             yield
 
-    def _library(self, features: int) -> ctypes.CDLL:
+    def library(self, features: int) -> ctypes.CDLL:
         if features not in self._libraries:
             path = self.folder / f"emulated-{features}.so"
             library = ctypes.CDLL(str(_built(path, features)))

@@ -98,7 +98,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("layout", CASES, ids=lambda layout: layout.__name__)
-def test_images_without_depth_are_named_and_the_documents_help(layout, tmp_path):
+def test_images_without_depth_are_named_with_a_link_to_the_documents(layout, tmp_path):
     path = layout(tmp_path) or tmp_path
     message = refusal(path)
     assert message.startswith(f"{path} holds images but no depth (") and CASES[layout] in message

@@ -461,7 +461,11 @@ def test_alignment_is_held_to_the_better_rates_of_each_column() -> None:
     figures = {"pairs": {"source": "x", "starts": [3], "lost": 0, "pairs": found}}
     made = {s.title: s for s in tables.sections(results("tracking", figures))}
     assert [row[2:] for row in made["Ratios"].rows] == [["1.05", "1.05", "40.0"], ["1.20", "0.500", "13.3"]]
-    held = {row[0].removeprefix("Gauss–Newton, ").replace(", 2 apart:", ""): row[3] for row in made["Goals"].rows}
+    names = [
+        row[0].removeprefix("Gauss–Newton, ").replace(", 2 frames after the keyframe:", "")
+        for row in made["Goals"].rows
+    ]
+    held = dict(zip(names, (row[3] for row in made["Goals"].rows), strict=True))
     assert held == {
         "keyframe translation error / Adam's": "yes", "keyframe rotation error / Adam's": "yes",
         "keyframe time / Adam's": "yes", "map translation error / Adam's": "**no**",
@@ -492,7 +496,7 @@ def test_whole_runs_are_held_to_adam_by_the_better_rates(tmp_path: Path, monkeyp
         ["s", "Adam, TUM's rates", "2", "3"],
         ["s", "Adam, Replica's rates", "2", "1"],
     ]
-    assert list(made["Goals"].rows) == [["s: ATE, cm, against the better Adam's", "2.50", "≤ 1.00", "**no**"]]
+    assert list(made["Goals"].rows) == [["s: ATE, cm; goal: that of the better Adam", "2.50", "≤ 1.00", "**no**"]]
     failed = [{**job, "problem": "a | b"} for job in jobs[:2]] + jobs[2:]
     made = {s.title: s for s in tables.sections(results("tracking", {"sequence": failed}))}
     assert "Goals" not in made and len(made["Failed"].rows) == 2

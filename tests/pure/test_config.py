@@ -1,4 +1,4 @@
-"""Settings: what the presets hold, what --set accepts, what the environment may say, what a config.json brings back."""
+"""Settings: values of presets, values that --set and the environment accept, and saving to config.json."""
 
 import dataclasses
 import os
@@ -70,12 +70,12 @@ def test_the_baseline_differs_by_uncertainty_alone(dataset: str) -> None:
     assert baseline["mapping"]["weight_nll_color"] == baseline["mapping"]["weight_nll_depth"] == 0.0
 
 
-def test_every_preset_carries_its_name() -> None:
+def test_every_preset_has_its_name() -> None:
     assert {preset(name).name for name in list_presets()} == set(list_presets())
     assert default_preset() in list_presets()
 
 
-def test_unknown_preset_names_the_known_ones() -> None:
+def test_an_unknown_preset_lists_the_known_ones() -> None:
     with pytest.raises(ConfigError, match=r"did you mean varsplat-tum\?.*loopsplat-replica"):
         preset("varsplat-tun")
 
@@ -95,7 +95,7 @@ def test_override_converts_to_each_type() -> None:
     assert type(tracking.iterations) is int
     assert type(tracking.tau) is float
     assert (config.seed, config.backend) == (7, "reference")
-    assert preset("varsplat-fast").seed == 0, "the preset itself stays as it is"
+    assert preset("varsplat-fast").seed == 0, "the preset itself is not changed"
 
 
 def test_override_reaches_every_setting() -> None:
@@ -148,7 +148,7 @@ def test_settings_split_at_the_first_equals_sign() -> None:
 
 
 @pytest.mark.parametrize("name", list_presets())
-def test_saved_settings_come_back(name: str, tmp_path: Path) -> None:
+def test_saved_settings_load_unchanged(name: str, tmp_path: Path) -> None:
     preset(name).save(tmp_path / "config.json")
     assert Config.load(tmp_path / "config.json") == preset(name)
 
@@ -178,7 +178,7 @@ def test_environment_defaults_and_values() -> None:
         ("SIGMASPLAT_BACKEND", "gpu"),
     ],
 )
-def test_environment_values_that_mean_nothing_are_refused(name: str, text: str) -> None:
+def test_invalid_environment_values_are_refused(name: str, text: str) -> None:
     with pytest.raises(ConfigError, match=f"{name} is {text!r}; give"):
         env.read({name: text})
 
@@ -193,14 +193,14 @@ def _python(code: str, **environment: str) -> str:
 def test_import_sets_the_wait_policy_and_loads_no_torch() -> None:
     code = "import sigmasplat, os, sys; print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules)"
     assert _python(code) == "passive False"
-    assert _python(code, OMP_WAIT_POLICY="active") == "active False", "the user's own choice stays"
+    assert _python(code, OMP_WAIT_POLICY="active") == "active False", "the value of the user is kept"
 
 
-def test_a_bad_switch_does_not_break_the_import() -> None:
+def test_an_invalid_switch_does_not_break_the_import() -> None:
     assert _python("import sigmasplat; print('in')", SIGMASPLAT_ISA="sse9") == "in"
 
 
-def test_the_public_names_are_there() -> None:
+def test_the_public_names_exist() -> None:
     import sigmasplat
 
     missing = []

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from sigmasplat.config import Config, FinalConfig, MappingConfig, RenderConfig
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.fit.adam import EXTRA_RATES
+from sigmasplat.fit.adam import ATTRIBUTE_RATES
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
@@ -126,9 +126,9 @@ def test_one_submap_is_left_as_it_is() -> None:
     store = MemoryStore()
     whole = make_store()
     store.save(whole.submaps[0], whole.pictures[0])
-    store.submaps[0].field.extras["harmonics"] = Rows(torch.ones(len(store.submaps[0].field), 45))
+    store.submaps[0].field.attributes["harmonics"] = Rows(torch.ones(len(store.submaps[0].field), 45))
     field = refined(store, config())
-    assert torch.equal(field.params, store.submaps[0].field.params) and set(field.extras) == {"harmonics"}
+    assert torch.equal(field.params, store.submaps[0].field.params) and set(field.attributes) == {"harmonics"}
     field.params += 1.0
     assert float(store.submaps[0].field.means[:, 2].max()) < 2.0, "the submap's own memory is not touched"
 
@@ -231,11 +231,11 @@ def around(angle: float) -> np.ndarray:
 def test_view_dependent_colour_is_learned_in_refinement(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures of a wall that is brighter the more it is seen from the right: harmonic 3, −x, has to say so."""
     shiny, plain, path = wall(-1.4, 1.6), wall(-1.4, 1.6), [around(a) for a in np.linspace(-0.8, 0.8, 5)]
-    shiny.extras["harmonics"] = Rows(torch.zeros(len(shiny), 45))
-    shiny.extras["harmonics"].params[:, 6:9] = 0.5
+    shiny.attributes["harmonics"] = Rows(torch.zeros(len(shiny), 45))
+    shiny.attributes["harmonics"].params[:, 6:9] = 0.5
     store = MemoryStore()
     store.save(Submap(0, plain, (0, 1, 2, 3, 4), np.array(path), CAMERA), [look(pose, shiny) for pose in path])
-    monkeypatch.setitem(EXTRA_RATES, "harmonics", ("colors", 1.0))  # 40 steps are few at a twentieth
+    monkeypatch.setitem(ATTRIBUTE_RATES, "harmonics", ("colors", 1.0))  # 40 steps are few at a twentieth
     errors = []
     for degree in (0, 1):
         settings = config(iterations=40, sh_degree=degree, sh_every=1)
@@ -243,7 +243,7 @@ def test_view_dependent_colour_is_learned_in_refinement(monkeypatch: pytest.Monk
         field = refined(store, replace(settings, mapping=only_colors))
         off = [look(around(a), field).color / 255.0 - look(around(a), shiny).color / 255.0 for a in (-0.6, 0.6)]
         errors.append(np.abs(off).mean())
-    learned = field.extras["harmonics"].params[:, :9].reshape(-1, 3, 3).mean((0, 2))
+    learned = field.attributes["harmonics"].params[:, :9].reshape(-1, 3, 3).mean((0, 2))
     assert errors[1] < 0.7 * errors[0], errors
     assert learned[2] > 0.1 and learned[2] > 3 * learned[:2].abs().max(), learned
 

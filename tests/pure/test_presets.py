@@ -1,4 +1,4 @@
-"""Presets: the constants of CG-SLAM's paper and code, row by row, written here from them and from no other file."""
+"""Presets: the constants of CG-SLAM's paper and code, row by row, copied from these and not from our sources."""
 
 import dataclasses
 from fnmatch import fnmatchcase
@@ -24,7 +24,7 @@ def value_of(config: Config, name: str) -> Any:
 
 
 def differing(a: Config, b: Config) -> set[str]:
-    """Name the settings, or sections as a whole, in which two presets differ."""
+    """Return the names of the settings in which two presets differ."""
     ours, theirs = a.to_dict(), b.to_dict()
     return {
         f"{section}.{name}"
@@ -35,7 +35,7 @@ def differing(a: Config, b: Config) -> set[str]:
     }
 
 
-# ---- what the paper says, or where it is silent its code
+# ---- values of the paper, or of its code if the paper gives none
 
 ROWS: dict[str, tuple[Any, Any, Any]] = {  # replica, tum, scannet
     "mapping.weight_l1": (0.7, 1.0, 1.0),
@@ -124,12 +124,12 @@ def test_each_dataset_has_the_papers_number(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", COMMON)
-def test_what_datasets_have_in_common_is_the_papers(name: str) -> None:
+def test_values_common_to_all_data_sets_are_the_papers(name: str) -> None:
     for config in map(preset, PAPER):
         assert value_of(config, name) == COMMON[name]
 
 
-def test_every_pixel_is_seeded_and_readings_are_not_cut_off() -> None:
+def test_every_pixel_is_seeded_and_no_reading_is_removed() -> None:
     """Replica's frames have 816 000 pixels; 16 bits of PNG end at 10, 13.1 and 65.5 m."""
     largest = (65535 / 6553.5, 65535 / 5000, 65535 / 1000)
     for config, depth_m in zip(map(preset, PAPER), largest, strict=True):
@@ -137,20 +137,20 @@ def test_every_pixel_is_seeded_and_readings_are_not_cut_off() -> None:
         assert config.input.max_depth_m >= depth_m
 
 
-def test_a_faded_splat_is_still_seen() -> None:
+def test_a_faded_splat_is_still_drawn() -> None:
     for config in map(preset, list_presets()):
         if config.primitives.uncertain_m2:
             assert config.render.alpha_min < config.primitives.faded_opacity
             assert config.mapping.prune_opacity < config.primitives.least_opacity < config.primitives.faded_opacity
 
 
-def test_light_is_half_the_width_and_nothing_else() -> None:
+def test_light_differs_only_by_half_the_width() -> None:
     for name, light, width in zip(PAPER, LIGHT, (600, 320, 320), strict=True):
         assert differing(preset(name), preset(light)) == {"input.width"}
         assert preset(light).input.width == width
 
 
-# ---- what the code's table says
+# ---- the table of the code
 # scene: track it, rot lr, trans lr, λ1, λ2, map it, interval, k, M_color, M_depth, lr_scale
 
 TABLE = """
@@ -192,7 +192,7 @@ def test_released_holds_the_scenes_row(scene: str) -> None:
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_released_has_the_codes_ways(scene: str) -> None:
+def test_released_has_the_methods_of_the_code(scene: str) -> None:
     config = preset(f"cgslam-released-{scene}")
     m, p, t = config.mapping, config.primitives, config.tracking
     assert (m.weight_alignment, m.weight_isotropy_ratio, m.weight_moment) == (0.25, 0.1, 0.15)
@@ -204,7 +204,7 @@ def test_released_has_the_codes_ways(scene: str) -> None:
     assert config.input == preset(base_of(scene)).input
 
 
-def test_every_row_has_a_preset_and_no_other() -> None:
+def test_presets_and_rows_of_the_table_match() -> None:
     released = {name.removeprefix("cgslam-released-") for name in list_presets() if "-released-" in name}
     assert released == set(SCENES)
 
@@ -213,7 +213,7 @@ def test_every_row_has_a_preset_and_no_other() -> None:
 
 
 @pytest.mark.parametrize("dataset", [*DATASETS, "fast"])
-def test_loops_are_those_of_the_other_system_and_all_else_stays(dataset: str) -> None:
+def test_loops_presets_differ_only_in_the_sections_of_loops(dataset: str) -> None:
     loops, alone = preset(f"cgslam-loops-{dataset}"), preset(f"cgslam-{dataset}")
     like, plain = preset(f"varsplat-{dataset}"), preset(f"loopsplat-{dataset}")
     sections = {name.partition(".")[0] for name in differing(loops, alone)}
@@ -234,7 +234,7 @@ def test_fast_is_one_map_without_variance() -> None:
     assert (fast.primitives.uncertain_m2, fast.primitives.split_gradient) == (0.025, 0.0)
 
 
-def test_sigma_adds_to_fast_and_takes_nothing_away() -> None:
+def test_sigma_adds_to_fast_and_removes_nothing() -> None:
     sigma, fast = preset("sigma"), preset("varsplat-fast")
     added = differing(sigma, fast)
     assert added == {"mapping.iterations", "mapping.weight_moment", "primitives.uncertain_m2"}
@@ -246,7 +246,7 @@ def test_sigma_adds_to_fast_and_takes_nothing_away() -> None:
 
 
 @pytest.mark.parametrize("name", list_presets())
-def test_a_preset_is_plain_values_that_come_back(name: str, tmp_path: Path) -> None:
+def test_a_preset_loads_unchanged_from_text(name: str, tmp_path: Path) -> None:
     config = preset(name)
     assert config.name == name
     config.save(tmp_path / "config.json")
@@ -255,32 +255,34 @@ def test_a_preset_is_plain_values_that_come_back(name: str, tmp_path: Path) -> N
         values = getattr(config, section.name)
         if not dataclasses.is_dataclass(values):
             continue
-        for field in dataclasses.fields(values):  # each is of its setting's type, one of its words, not negative
+        for field in dataclasses.fields(
+            values
+        ):  # each value has the type of its setting, is one of the choices, and is not negative
             text = f"{section.name}.{field.name}", str(getattr(values, field.name))
             assert override(config, dict([text])) == config
             assert type(getattr(values, field.name)) is type(getattr(getattr(Config(), section.name), field.name)), text
 
 
-def test_families_are_few_and_leave_no_preset_out() -> None:
+def test_each_preset_is_in_one_of_four_families() -> None:
     assert families()[0] == default_preset() and len(families()) == 4
     for name in list_presets():
         assert sum(fnmatchcase(name, family) for family in families()) == 1, name
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "message"),
     [
-        ("fast", "no preset 'fast'; there are cgslam-fast, cgslam-loops-fast, loopsplat-fast, varsplat-fast (and "),
-        ("fr1-desk", "no preset 'fr1-desk'; there are cgslam-released-fr1-desk (and "),
-        ("cgslam-loops", "no preset 'cgslam-loops'; there are cgslam-loops-fast, cgslam-loops-replica, "),
-        ("varsplat-fst", "no preset 'varsplat-fst' (did you mean varsplat-fast?); there are cgslam-fast, "),
-        ("quick", f"no preset 'quick'; there are {', '.join(list_presets())}"),
+        ("fast", "no preset 'fast'; known: cgslam-fast, cgslam-loops-fast, loopsplat-fast, varsplat-fast (and "),
+        ("fr1-desk", "no preset 'fr1-desk'; known: cgslam-released-fr1-desk (and "),
+        ("cgslam-loops", "no preset 'cgslam-loops'; known: cgslam-loops-fast, cgslam-loops-replica, "),
+        ("varsplat-fst", "no preset 'varsplat-fst' (did you mean varsplat-fast?); known: cgslam-fast, "),
+        ("quick", f"no preset 'quick'; known: {', '.join(list_presets())}"),
     ],
 )
-def test_an_unknown_name_is_answered_with_those_like_it(name: str, told: str) -> None:
+def test_an_unknown_preset_suggests_similar_ones(name: str, message: str) -> None:
     with pytest.raises(ConfigError) as problem:
         preset(name)
-    assert str(problem.value).startswith(told)
+    assert str(problem.value).startswith(message)
     assert ("varsplat-tum" in str(problem.value)) == (name in ("varsplat-fst", "quick"))
 
 
@@ -305,8 +307,8 @@ NEW = [
 
 @pytest.mark.parametrize("system", ["varsplat", "loopsplat"])
 @pytest.mark.parametrize("dataset", [*DATASETS, "fast"])
-def test_the_earlier_systems_use_nothing_of_this_one(system: str, dataset: str) -> None:
-    """Their runs stay what they were: every setting that came with CG-SLAM is at its default, which is off."""
+def test_the_other_systems_use_no_setting_of_this_one(system: str, dataset: str) -> None:
+    """Every setting added for CG-SLAM has its default, off, so that runs of the other systems do not change."""
     config, default = preset(f"{system}-{dataset}"), Config()
     assert {name: value_of(config, name) for name in NEW} == {name: value_of(default, name) for name in NEW}
     assert dataclasses.replace(config.primitives, split_radius_px=0.0) == default.primitives, "ours, not CG-SLAM's"

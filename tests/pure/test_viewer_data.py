@@ -122,14 +122,14 @@ def test_merging_pieces_equals_moving_and_appending_fields() -> None:
     """One field has harmonics, which rotate with it; the other has none."""
     T = se3.exp(np.array([1.0, 2.0, 3.0, 0.4, -0.5, 0.6]))
     first, second = field_of(30), field_of(20, seed=1)
-    second.carry("harmonics").params += torch.randn(20, 45, generator=torch.Generator().manual_seed(0))
+    second.get_or_create("harmonics").params += torch.randn(20, 45, generator=torch.Generator().manual_seed(0))
     found = merge_pieces((Piece(0, first), Piece(1, second, T)), VisibilityFilter())
     expected = first.moved(torch.eye(4))
     expected.append(second.moved(torch.from_numpy(T)))
     torch.testing.assert_close(found.params, expected.params)
-    torch.testing.assert_close(found.extras["harmonics"].params, expected.extras["harmonics"].params)
+    torch.testing.assert_close(found.attributes["harmonics"].params, expected.attributes["harmonics"].params)
     few = thin(second, 10)
-    assert torch.equal(few.extras["harmonics"].params, second.extras["harmonics"].params[::2])
+    assert torch.equal(few.attributes["harmonics"].params, second.attributes["harmonics"].params[::2])
 
 
 def test_the_timeline_shows_the_submaps_started_by_then_and_the_final_map_completely() -> None:

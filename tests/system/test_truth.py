@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from command_line import exit_code
 from sigmasplat import cli
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
@@ -14,7 +15,7 @@ from sigmasplat.model.frame import Frame
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, preset
-from sigmasplat.run import session
+from sigmasplat.run.session import Session
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import SyntheticRoom
 from sigmasplat.sources.base import Source
@@ -58,24 +59,17 @@ def config() -> Config:
     return override(preset(default_preset()), SETTINGS)
 
 
-def sigmasplat(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as left:
-        cli.main(arguments)
-    assert isinstance(left.value.code, int)
-    return left.value.code
-
-
 def test_slam_and_session_never_read_the_truth(tmp_path: Path) -> None:
     source, run = SourceWithoutTruth(), RunFolder.create(tmp_path / "run", config(), "room")
-    outcome = session.record(Slam(config()), source, run)
+    outcome = Session(Slam(config()), source, run).execute()
     assert (outcome.status, outcome.frames, outcome.lost) == ("complete", FRAMES, 0)
     assert len(run.read_trajectory()) == FRAMES
 
 
 def test_the_command_line_reads_the_truth_only_to_evaluate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sigmasplat.sources.open_source", lambda path, settings=None: SourceWithoutTruth())
-    assert sigmasplat("run", "room", "--out", str(tmp_path / "run"), "--no-eval", *OPTIONS) == 0
-    assert sigmasplat("mesh", str(tmp_path / "run"), "--voxel-m", "0.1") == 0
+    assert exit_code("run", "room", "--out", str(tmp_path / "run"), "--no-eval", *OPTIONS) == 0
+    assert exit_code("mesh", str(tmp_path / "run"), "--voxel-m", "0.1") == 0
     with pytest.raises(TruthWasRead):
         cli.main(["eval", str(tmp_path / "run")])
 
@@ -96,7 +90,7 @@ def test_the_truth_does_not_change_the_bytes_of_a_run(tmp_path: Path) -> None:
     found, errors_m = {}, {}
     for kind in ("true", "another", "none"):
         out = tmp_path / "runs" / kind
-        assert sigmasplat("run", str(tum_folder(tmp_path / kind, kind)), "--out", str(out), *OPTIONS) == 0
+        assert exit_code("run", str(tum_folder(tmp_path / kind, kind)), "--out", str(out), *OPTIONS) == 0
         found[kind] = [(out / name).read_bytes() for name in LEFT]
         ate = RunFolder.open(out).read_metrics()["ate"]
         errors_m[kind] = ate["rmse_m"] if ate else None

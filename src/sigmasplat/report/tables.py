@@ -76,7 +76,7 @@ def submap_sentence(metrics: dict[str, Any]) -> str:
 
 
 def loop_rows(loops: list[dict[str, Any]]) -> list[list[str]]:
-    """List loops: submaps, frames, similarity, fit, correction of the relative pose, verdict."""
+    """Return one row per loop: submaps, frames, similarity, quality of fit, correction of the pose, verdict."""
     head = [
         "submaps",
         "frames",

@@ -85,8 +85,8 @@ def too_large(
 
 def _copies(field: GaussianField, rows: Tensor) -> GaussianField:
     """Copy rows with what they carry besides, Adam's state at rest."""
-    extras = {name: Rows(extra.params[rows]) for name, extra in field.extras.items()}
-    return GaussianField(field.params[rows], extras=extras)
+    attributes = {name: Rows(attribute.params[rows]) for name, attribute in field.attributes.items()}
+    return GaussianField(field.params[rows], attributes=attributes)
 
 
 def _scatter(field: GaussianField, random: np.random.Generator) -> None:

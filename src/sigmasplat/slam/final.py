@@ -48,9 +48,9 @@ def final_map(
     field = seed(store, anchors, config)
     if not config.final.iterations:
         return field
-    there = field.at(view.sums.device)
-    refine(there, Keyframes(store, anchors, view), config, view, random, progress)
-    return there.at(field.params.device)
+    on_device = field.to(view.sums.device)
+    refine(on_device, Keyframes(store, anchors, view), config, view, random, progress)
+    return on_device.to(field.params.device)
 
 
 def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix], final: FinalConfig) -> None:
@@ -82,7 +82,9 @@ def merged(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> Gau
 def _in_world(store: SubmapStore, anchors: Sequence[Matrix], index: int) -> GaussianField:
     """Return a submap's splats in the world, their optimiser state left behind."""
     part = store.load(index).field.moved(torch.from_numpy(anchors[index]))
-    return GaussianField(part.params, extras={name: Rows(extra.params) for name, extra in part.extras.items()})
+    return GaussianField(
+        part.params, attributes={name: Rows(attribute.params) for name, attribute in part.attributes.items()}
+    )
 
 
 def _log_variance(field: GaussianField) -> NDArray[np.float64]:

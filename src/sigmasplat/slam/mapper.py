@@ -47,8 +47,8 @@ class Mapper:
 
         What begins with splats inherited knows its first keyframe from before, and only takes note of it.
         """
-        self.field = self.field.at(view.sums.device)  # the one place that says where the active field lies
-        c, born, begun = self.config.mapping, self.field.born, len(self.field) > 0
+        self.field = self.field.to(view.sums.device)  # the one place that says where the active field lies
+        c, first_new, begun = self.config.mapping, self.field.next_id, len(self.field) > 0
         self.keyframes.append(Keyframe(index, target, T_world_camera, not self.keyframes, descriptor=descriptor))
         if begun and len(self.keyframes) == 1:
             return FieldFit()
@@ -58,12 +58,12 @@ class Mapper:
         window = self._window(view)
         stats = DensifyStats.of(self.keyframes[-1], len(self.field), self.field.params.device)
         self._choose_movable(c.poses_from == "start")
-        fit = self._fit(view, window, steps // 2, rates, born, stats)
+        fit = self._fit(view, window, steps // 2, rates, first_new, stats)
         self._multiply(view, stats)
         self._prune(view)
         doubted = self._doubt(view, window)
         self._choose_movable(True)
-        fit.join(self._fit(view, window, steps - steps // 2, rates, born, None))
+        fit.join(self._fit(view, window, steps - steps // 2, rates, first_new, None))
         self._prune(view, self._unconvinced(view, window, doubted))
         return fit
 
@@ -84,14 +84,14 @@ class Mapper:
         window: list[Keyframe],
         steps: int,
         rates: Iterator[Rates],
-        born: int,
+        first_new: int,
         stats: DensifyStats | None,
     ) -> FieldFit:
-        """Fit the field to the window; splats with ids below `born` are the old ones."""
+        """Fit the field to the window; splats with ids below `first_new` are the old ones."""
         c = self.config.mapping
         together, history = c.frames_per_step or len(window), c.keyframe_history
         batches = draw_keyframes(window[::-1], steps, c.newest_probability, history, self.random, together)
-        frozen = int((self.field.ids < born).sum()) if c.freeze_old_colors else 0
+        frozen = int((self.field.ids < first_new).sum()) if c.freeze_old_colors else 0
         wanted = stats if self.config.primitives.split_gradient > 0 else None
         return fit_field(self.field, view, batches, c, rates, frozen, stats=wanted)
 
@@ -107,8 +107,10 @@ class Mapper:
         frames = tuple(keyframe.index for keyframe in self.keyframes)
         pictures = [keyframe.target.picture() for keyframe in self.keyframes]
         here = torch.device("cpu")
-        params, *extras = (rows.params.to(here, copy=True) for rows in (self.field, *self.field.extras.values()))
-        field = GaussianField(params, extras=dict(zip(self.field.extras, map(Rows, extras), strict=True)))
+        params, *attributes = (
+            rows.params.to(here, copy=True) for rows in (self.field, *self.field.attributes.values())
+        )
+        field = GaussianField(params, attributes=dict(zip(self.field.attributes, map(Rows, attributes), strict=True)))
         return Submap(index, field, frames, poses, self.keyframes[0].target.camera), pictures
 
     def successor(self, view: View, T_submap_camera: NDArray[np.float64]) -> "Mapper":

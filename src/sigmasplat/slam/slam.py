@@ -113,7 +113,7 @@ class Slam:
             return self._final
         active = self.mapper.field
         if not len(self.store):
-            return active.at(HOST)
+            return active.to(HOST)
         merged = GaussianField.empty()
         for index in range(len(self.store)):
             merged.append(self.store.load(index).field.moved(torch.from_numpy(self.atlas.anchors[index])))
