@@ -79,6 +79,7 @@ class Options:
     """Run SigmaSplat and other RGB-D systems on the same frames and score every path with the same evaluation."""
 
     sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = SOURCES
+    systems: Annotated[tuple[str, ...], arg(help="the other systems")] = tuple(p.method or p.package for p in PEERS)
     seeds: Annotated[tuple[int, ...], arg(help="starts of SigmaSplat's random numbers, a run each")] = (0,)
     open3d: Annotated[Path | None, arg(help="a Python with open3d", help_behavior_hint="(default: left out)")] = None
     orbslam3: Annotated[
@@ -189,7 +190,8 @@ def finished(peer: Peer, path: str, options: Options) -> tuple[Path, Result, Res
 def run_peers(options: Options) -> list[Result]:
     """Run the other systems whose Python is given, sequence by sequence."""
     pythons = {"open3d": options.open3d, "orbslam3": options.orbslam3}
-    chosen = [(peer, python) for peer in PEERS if (python := pythons[peer.package])]
+    wanted = [peer for peer in PEERS if (peer.method or peer.package) in options.systems]
+    chosen = [(peer, python) for peer in wanted if (python := pythons[peer.package])]
     made = []
     for name in options.sources:
         path = accuracy.located(name)
@@ -265,7 +267,7 @@ def main(options: Options) -> int:
         return 2
     names = {Path(name).name for name in options.sources}
     figures = {"runs": runs, "quoted": [figure for figure in QUOTED if figure["source"] in names]}
-    config = {n: v for n, v in asdict(options).items() if n in ("sources", "limit", "paths")}
+    config = {n: v for n, v in asdict(options).items() if n in ("sources", "systems", "limit", "paths")}
     measured = record.results("peers", figures, name=options.name, seeds=options.seeds, config=config)
     print(record.write(measured, options.out), file=sys.stderr)
     print(tables.table(measured))
