@@ -39,7 +39,7 @@ def test_named_tests_files_and_settings_exist(path: Path) -> None:
     text = prose(path)
     for file, name in re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text):
         assert f"def {name}(" in (ROOT / file).read_text(encoding="utf-8"), f"{path.name} names {file}::{name}"
-    for name in re.findall(r"`((?:config|native|model|render|fit|slam|sources|io|metrics)/\w+\.\w+)`", text):
+    for name in re.findall(r"`((?:config|native|model|render|fit|slam|sources|io|metrics)/[\w/]+\.\w+)`", text):
         assert (PACKAGE / name).is_file(), f"{path.name} names {name}"
     for section, name in re.findall(rf"`({'|'.join(SECTIONS)})\.([a-z]\w+)`", text):
         known = {*vars(getattr(Config(), section)), "py", "json"}
@@ -53,7 +53,7 @@ def test_named_tests_files_and_settings_exist(path: Path) -> None:
 def test_the_equations_functions_exist(document: str) -> None:
     """Every function beside a file in the papers' documents is defined there."""
     text = (ROOT / "docs" / document).read_text(encoding="utf-8")
-    pairs = re.findall(r"`(\w+/\w+\.py)` ((?:`\w+`(?:, )?)+)", text)
+    pairs = re.findall(r"`([\w/]+\.py)` ((?:`\w+`(?:, )?)+)", text)
     assert len(pairs) > 15
     for file, names in pairs:
         tree = ast.parse((PACKAGE / file).read_text(encoding="utf-8"))
