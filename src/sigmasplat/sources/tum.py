@@ -111,7 +111,10 @@ def _depth_list(folder: Path) -> tuple[NDArray[np.float64], list[Path]]:
         if any(p.is_file() for p in paths):
             return times_s, paths
     looked_for = f"the {len(paths)} files of depth.txt" if path.is_file() else "depth.txt"
-    raise SourceError(f"no depth images in {folder} (looked for {looked_for}); is this the RGB-only download?")
+    raise SourceError(
+        f"no depth images in {folder} (looked for {looked_for}); is this the RGB-only download? "
+        "see docs/data.md#without-depth"
+    )
 
 
 def read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:

@@ -50,7 +50,10 @@ def pair_images(
     color_name, depth_name: file patterns for messages. Raises SourceError if one kind is missing or no key is shared.
     """
     if not depths:
-        raise SourceError(f"no depth images in {folder} (looked for {depth_name}); is this the RGB-only download?")
+        raise SourceError(
+            f"no depth images in {folder} (looked for {depth_name}); is this the RGB-only download? "
+            "see docs/data.md#without-depth"
+        )
     if not colors:
         raise SourceError(f"no colour images in {folder} (looked for {color_name}); is the download complete?")
     keys = [key for key in colors if key in depths]
