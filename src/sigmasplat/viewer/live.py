@@ -55,7 +55,7 @@ class LiveView:
         slam = self.slam
         lost = np.array([step.lost for step in slam.steps], np.bool_)
         submaps = np.array([step.submap for step in slam.steps], np.int64)
-        path = CameraPath(slam.atlas.T_world_camera(), lost, submaps, tuple(slam.keyframes))
+        path = CameraPath(slam.atlas.T_world_camera(), lost, submaps, tuple(slam.keyframe_indices))
         self._add_finished()
         final = Piece(None, thin(slam.field, self.budget)) if finished else None
         keyframes = slam.mapper.keyframes
