@@ -39,7 +39,7 @@ ExportOptionsFlat = Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.O
 def export(
     run: options.RunOrMap,
     out: options.OutFile = None,
-    format: options.Format = None,
+    format: options.FormatName = None,
     overwrite: options.Overwrite = False,
     asked: ExportOptionsFlat = DEFAULT_EXPORT_OPTIONS,
 ) -> int:

@@ -122,7 +122,7 @@ WithMesh = Annotated[
     arg(name="mesh", help="also write mesh.ply, and score it if the true surface is known", help_behavior_hint=""),
 ]
 RunOrMap = Annotated[Path, tyro.conf.Positional, arg(metavar="RUN", help="run folder or map file")]
-Format = Annotated[
+FormatName = Annotated[
     str | None,
     arg(metavar="NAME", help="format to write", help_behavior_hint="(default: by the ending of FILE, else ply)"),
 ]
