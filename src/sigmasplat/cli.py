@@ -51,7 +51,7 @@ def _refuse_unknown(command: str) -> None:
 
 def _run_command(arguments: Sequence[str]) -> int:
     """Run the command in the arguments and return its exit code."""
-    code: int = tyro.attributes.subcommand_cli_from_dict(
+    code: int = tyro.extras.subcommand_cli_from_dict(
         COMMANDS, prog="sigmasplat", description=DESCRIPTION, args=arguments, config=(tyro.conf.FlagCreatePairsOff,)
     )
     return code
