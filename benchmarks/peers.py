@@ -26,7 +26,7 @@ from tables import Section
 from sigmasplat.errors import ConfigError, SigmaSplatError, SourceError
 from sigmasplat.io.atomic import write_text
 from sigmasplat.io.trajectory import read_trajectory
-from sigmasplat.metrics.trajectory import ate, paired
+from sigmasplat.metrics.trajectory import ate, pair_poses
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, preset as preset_of
 from sigmasplat.sources import open_source
@@ -140,7 +140,7 @@ def score(path: Trajectory, source: Source, limit: int | None) -> dict[str, Any]
         raise SourceError(f"{source.name} has no true poses")
     frames = frames_in(source, limit)
     times_s = np.array([source.timestamp_s(i) for i in range(frames)])
-    known, _ = paired(Trajectory(times_s, np.tile(np.eye(4), (frames, 1, 1))), path)
+    known, _ = pair_poses(Trajectory(times_s, np.tile(np.eye(4), (frames, 1, 1))), path)
     found = ate(path, truth)
     return {"frames": frames, "without_pose": frames - len(known), "ate_m": found.rmse_m, "ate_max_m": found.max_m}
 

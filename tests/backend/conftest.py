@@ -55,7 +55,6 @@ def on_the_cpu(emulator: Emulator) -> Iterator[Emulator]:
     with emulator.standing_in(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(Raster, "empty", rubbish)
         emulator.order = 0
-        emulator.launches.clear()
         yield emulator
         emulator.order = 0
 

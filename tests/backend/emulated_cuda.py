@@ -36,12 +36,11 @@ class Emulator:
     """A `Launcher` for tensors on the CPU; `order` is that of the threads between two barriers (emulation.h)."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.order, self.launches = folder, 0, list[str]()
+        self.folder, self.order = folder, 0
         self._libraries: dict[int, ctypes.CDLL] = {}
 
     def __call__(self, features: int, kernel: str, blocks: int, *arguments: Argument) -> None:
         memory = laid_out(arguments)
-        self.launches.append(kernel)
         run = self.library(features).emulate
         problem = run(kernel.encode(), blocks, THREADS, ctypes.c_void_p(memory.buffer_info()[0]), self.order)
         assert problem is None, f"{kernel}: {problem.decode()}"

@@ -40,7 +40,6 @@ def on_the_cpu(emulator: Emulator, monkeypatch: pytest.MonkeyPatch) -> Iterator[
     monkeypatch.setattr(torch, "empty", rubbish)
     with emulator.standing_in():
         emulator.order = 0
-        emulator.launches.clear()
         yield emulator
         emulator.order = 0
 
@@ -169,12 +168,11 @@ def test_two_images_are_aligned_as_on_the_cpu(size: tuple[int, int], weighed: bo
 
 @pytest.mark.parametrize("stops", [(0.0, 0.0), (1e-4, 0.0), (0.0, 3e-2)], ids=["never", "update", "plateau"])
 @pytest.mark.parametrize("iterations", [0, 1, 5])
-def test_steps_end_as_on_the_cpu(iterations: int, stops: tuple[float, float], on_the_cpu: Emulator) -> None:
+def test_steps_end_as_on_the_cpu(iterations: int, stops: tuple[float, float]) -> None:
     reference, live = seen(10), seen(12)
     theirs = align(reference, live, np.eye(4), iterations, 0.3, *stops)
     ours = align(there(reference), there(live), np.eye(4), iterations, 0.3, *stops)
     assert_same(ours, theirs)
-    assert on_the_cpu.launches.count("take_align_step") == iterations * len(live.cameras)
     assert stops != (0.0, 0.0) or ours.steps == iterations * len(live.cameras)
     assert ours.depth_m == pytest.approx(theirs.depth_m, rel=1e-6)
 

@@ -1,5 +1,6 @@
 """A loss term that a device's kernels do not have is computed by autograd beside them; it is never dropped."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -21,6 +22,13 @@ from splat_fits import target_of
 from splat_scenes import WIDE, scene
 
 OWN = "darkness"
+
+
+@dataclass(frozen=True)
+class OwnMapping(MappingConfig):
+    """Mapping's settings with a weight for it, as docs/recipes.md adds one."""
+
+    weight_darkness: float = 0.0
 
 
 def darkness(color: Tensor, valid: Tensor) -> Tensor:
@@ -61,12 +69,12 @@ def test_a_term_that_the_kernels_do_not_have_counts_all_the_same(
 
 def test_a_fit_descends_a_term_of_ones_own(kernels: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(losses.TERMS, OWN, darkness)
-    monkeypatch.setattr("sigmasplat.fit.field.loss_weights", lambda config: loss_weights(config) | {OWN: 3.0})
     s, brightness = scene("random", 60), {}
+    config = OwnMapping(weight_l1=0.0, lr_colors=0.02, weight_darkness=3.0)
     for degree in (0, 1):
         field, view = GaussianField(params_of(s)), view_on(kernels, WIDE)
         target = target_of(WIDE, (view.alpha.shape[0], view.alpha.shape[1]))
         keyframe = Keyframe(0, target, se3.inverse(s.T_camera_world.double().numpy()))
-        fit = fit_field(field, view, [[keyframe]] * 20, MappingConfig(weight_l1=0.0, lr_colors=0.02), degree=degree)
+        fit = fit_field(field, view, [[keyframe]] * 20, config, degree=degree)
         brightness[degree] = float(field.colors.mean())
         assert fit.losses[-1] < fit.losses[0] and brightness[degree] > float(params_of(s)[:, 11:14].mean()) + 0.02

@@ -221,7 +221,7 @@ def test_a_field_does_not_travel(stand_in: StandIn) -> None:
         slam.step(ROOM.frame(i))
         size = 2 * len(slam.mapper.field)
         large.append([copy.by for copy in stand_in.copies if copy.numbers > size and copy.by != "target.py"])
-    assert len(slam.keyframes) == 3 and len(slam.field) > 1500 and len(slam.store) == 0
+    assert len(slam.keyframe_indices) == 3 and len(slam.field) > 1500 and len(slam.store) == 0
     assert large[0] == ["field.py"] * 3, "what a seed is, and Adam's moments"
     assert not any(large[1:])
 

@@ -500,3 +500,25 @@ def test_whole_runs_are_held_to_adam_by_the_better_rates(tmp_path: Path, monkeyp
     failed = [{**job, "problem": "a | b"} for job in jobs[:2]] + jobs[2:]
     made = {s.title: s for s in tables.sections(results("tracking", {"sequence": failed}))}
     assert "Goals" not in made and len(made["Failed"].rows) == 2
+
+
+def test_the_summary_copies_cells_of_tables_and_names_what_is_missing(tmp_path: Path) -> None:
+    summary = importlib.import_module("summary")
+    measured = results("accuracy", {"jobs": [job_result("synthetic", 0, ate_m=0.00512), job_result("livingroom", 0)]})
+    record.write(measured, tmp_path)
+    found = summary.Results(tmp_path)
+    assert found.cell("accuracy", "Path and speed", ("synthetic", "sigma"), "ATE, cm") == "0.512"
+    with pytest.raises(KeyError, match="redkitchen"):
+        found.cell("accuracy", "Path and speed", ("redkitchen", "sigma"), "ATE, cm")
+    with pytest.raises(KeyError, match="systems"):
+        found.cell("systems", "synthetic", ("finish, s",), "sigma")
+    assert found.goals() == (1, 1)  # synthetic: ATE
+
+
+def test_results_are_listed_by_subject_and_unknown_benchmarks_come_last(tmp_path: Path) -> None:
+    for benchmark, name in (("unheard", "a"), ("versus", "versus"), ("accuracy", "b"), ("accuracy", "accuracy")):
+        record.write(results(benchmark, {}, name=name), tmp_path)
+    listed = {subject: list(names) for subject, names in tables.by_subject(tmp_path).items()}
+    assert listed == {"Whole runs": ["accuracy", "b"], "Kernels": ["versus"], "Other results": ["a"]}
+    assert list(listed) == ["Whole runs", "Kernels", "Other results"]
+    assert "[accuracy](#accuracy), [b](#b)" in tables.contents(tmp_path)

@@ -188,12 +188,12 @@ def test_some_errors_are_not_retried(act: Act, says: str, server: FileServer, tm
 
 
 def test_a_size_can_be_refused_before_writing(server: FileServer, tmp_path: Path) -> None:
-    def accept(size_bytes: int | None, here_bytes: int) -> None:
-        assert (size_bytes, here_bytes) == (len(BODY), 0)
+    def check_size(size_bytes: int | None, downloaded_bytes: int) -> None:
+        assert (size_bytes, downloaded_bytes) == (len(BODY), 0)
         raise DownloadError("too large")
 
     with pytest.raises(DownloadError, match="too large"):
-        fetch(server.url("/a.tgz"), tmp_path / "a.tgz", lambda *counts: None, accept, HASTY)
+        fetch(server.url("/a.tgz"), tmp_path / "a.tgz", lambda *counts: None, check_size, HASTY)
     assert not (tmp_path / "a.tgz.part").exists()
 
 

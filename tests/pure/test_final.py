@@ -17,7 +17,7 @@ from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.model.submap import MemoryStore, Picture, Submap
 from sigmasplat.render import render
 from sigmasplat.render.reference.view import ReferenceView
-from sigmasplat.slam.final import Keyframes, final_map, merged, survivors
+from sigmasplat.slam.final import KeyframeReader, final_map, merged, survivors
 from sigmasplat.slam.fusion import FusionView, count_keyframes, fuse, fusion_views
 
 CAMERA = Camera(20, 15, 16.0, 16.0, 9.5, 7.0)
@@ -253,7 +253,7 @@ def test_pictures_are_read_when_drawn_and_kept_while_there_is_room(monkeypatch: 
     monkeypatch.setattr(store, "picture", lambda s, k: read.append((s, k)) or store.pictures[s][k])
     view = ReferenceView(CAMERA, CONFIG.render)
     monkeypatch.setattr("sigmasplat.slam.final.CACHE_BYTES", 2 * 16 * 20 * 15)
-    keyframes = Keyframes(store, ANCHORS, view)
+    keyframes = KeyframeReader(store, ANCHORS, view)
     assert len(keyframes) == 6 and not read
     for i in (0, 5, 0, 5, 3, 0):
         found = keyframes[i]

@@ -13,7 +13,7 @@ from sigmasplat.model.splat_filter import sigmas
 from sigmasplat.render import render
 from sigmasplat.viewer import lines
 from sigmasplat.viewer.layers import Legend, browser_camera, draw_legend, render_layer
-from sigmasplat.viewer.snapshot import Path, Piece, Snapshot, thin, within_budget
+from sigmasplat.viewer.snapshot import CameraPath, Piece, Snapshot, thin, within_budget
 from sigmasplat.viewer.splats import (
     VisibilityFilter,
     covariances,
@@ -41,11 +41,11 @@ def field_of(count: int, seed: int = 0) -> GaussianField:
     )
 
 
-def path_of(frames: int, every: int = 5, lost: tuple[int, ...] = (), per_submap: int = 10) -> Path:
+def path_of(frames: int, every: int = 5, lost: tuple[int, ...] = (), per_submap: int = 10) -> CameraPath:
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, 0, 3] = np.arange(frames)
     marks = np.isin(np.arange(frames), lost)
-    return Path(poses, marks, np.arange(frames) // per_submap, tuple(range(0, frames, every)))
+    return CameraPath(poses, marks, np.arange(frames) // per_submap, tuple(range(0, frames, every)))
 
 
 def test_thinning_keeps_evenly_spread_splats_and_the_covered_area() -> None:

@@ -180,7 +180,7 @@ def test_the_live_map_and_its_images_equal_those_of_the_system(tmp_path: Path) -
     before_final = shown[-2]
     kept = [slam.store.load(i).field.moved(torch.from_numpy(slam.atlas.anchors[i])).params for i in range(3)]
     torch.testing.assert_close(merge_pieces(before_final.pieces, VisibilityFilter()).params, torch.cat(kept))
-    for row in slam.keyframes:
+    for row in slam.keyframe_indices:
         picture = shown[-1].image(row)
         assert picture is not None
         np.testing.assert_allclose(picture / 255.0, source.frame(row).color, atol=0.003)

@@ -49,9 +49,9 @@ def download(
     if list_only or dataset == "list":
         _list(screen, names if dataset == "list" else (dataset,))
         return 0
-    for public, name in [find_recording(dataset, name) for name in names or ("",)]:
-        target = _download(screen, public, name, out, overwrite, keep_archive)
-        start = target / public.recordings[name].start
+    for public_set, name in [find_recording(dataset, name) for name in names or ("",)]:
+        target = _download(screen, public_set, name, out, overwrite, keep_archive)
+        start = target / public_set.recordings[name].start
         _check_readable(start)
         screen.say(f"next: sigmasplat run {start}")
     return 0
@@ -64,12 +64,14 @@ def _list(screen: "Screen", set_names: tuple[str, ...]) -> None:
         screen.say(line)
 
 
-def _download(screen: "Screen", public: "PublicSet", name: str, out: Path, overwrite: bool, keep_archive: bool) -> Path:
+def _download(
+    screen: "Screen", public_set: "PublicSet", name: str, out: Path, overwrite: bool, keep_archive: bool
+) -> Path:
     from sigmasplat.download import download_recording
 
     try:
         with screen.transfers() as progress:
-            return download_recording(public, name, out, progress, screen.say, overwrite, keep_archive)
+            return download_recording(public_set, name, out, progress, screen.say, overwrite, keep_archive)
     except KeyboardInterrupt:
         screen.say("the part downloaded so far is kept; the same command resumes the download")
         raise

@@ -32,7 +32,7 @@ Log = Callable[[str], None]
 class DownloadJob:
     """The parameters shared by all archives of a recording; archive_folder: where they are stored."""
 
-    public: PublicSet
+    public_set: PublicSet
     archive_folder: Path
     progress: FileProgress
     log: Log
@@ -40,7 +40,7 @@ class DownloadJob:
 
 
 def download_recording(
-    public: PublicSet,
+    public_set: PublicSet,
     name: str,
     out: Path,
     progress: FileProgress,
@@ -54,17 +54,17 @@ def download_recording(
     `log` receives the licence and the size first. Downloaded parts are kept on errors and on Ctrl-C, and the next call
     resumes; incomplete folders are removed. Raises DownloadError; RunError if the disk cannot be written.
     """
-    recording = public.recordings[name]
-    target = out / public.folder / recording.folder
+    recording = public_set.recordings[name]
+    target = out / public_set.folder / recording.folder
     if target.exists() or target.is_symlink():
         if not (target / MARKER).is_file():
             raise DownloadError(f"{target} exists and was not created by this command; move it, or give another --out")
         if not overwrite:
             log(f"{target} exists already; --overwrite downloads it again")
             return target
-    log(f"{public.title} {name}".rstrip() + f": {format_size(recording.size_bytes)} → {target}")
-    log(f"terms: {public.licence} ({public.page}); by downloading you accept them")
-    job = DownloadJob(public, target.parent, progress, log, retry or RetryPolicy())
+    log(f"{public_set.title} {name}".rstrip() + f": {format_size(recording.size_bytes)} → {target}")
+    log(f"terms: {public_set.licence} ({public_set.page}); by downloading you accept them")
+    job = DownloadJob(public_set, target.parent, progress, log, retry or RetryPolicy())
     with _created(target.parent):
         _download(job, name, target, keep_archive)
     return target
@@ -72,13 +72,13 @@ def download_recording(
 
 def _download(job: DownloadJob, name: str, target: Path, keep_archive: bool) -> None:
     """Download the archives of a recording and unpack them to `target`."""
-    public, recording = job.public, job.public.recordings[name]
+    public_set, recording = job.public_set, job.public_set.recordings[name]
     archives = [_verified_file(job, archive) for archive in recording.archives]
     with _replacing(target) as fresh:
         for archive, path in zip(recording.archives, archives, strict=True):
             _unpack_file(job, archive, path, fresh / archive.into)
         _check_layout(fresh / recording.start, recording, archives)
-        marks = {"title": public.title, "recording": name, "licence": public.licence, "page": public.page}
+        marks = {"title": public_set.title, "recording": name, "licence": public_set.licence, "page": public_set.page}
         (fresh / MARKER).write_text(json.dumps(marks | {"from": [a.url for a in recording.archives]}, indent=1) + "\n")
     for path in [] if keep_archive else archives:
         path.unlink(missing_ok=True)
@@ -94,7 +94,7 @@ def _verified_file(job: DownloadJob, archive: RemoteFile) -> Path:
     return path
 
 
-def _check_size(job: DownloadJob, archive: RemoteFile, size_bytes: int | None, here_bytes: int) -> None:
+def _check_size(job: DownloadJob, archive: RemoteFile, size_bytes: int | None, downloaded_bytes: int) -> None:
     """Raise DownloadError if the size of the server's file is not plausible, or the disk has no space for it."""
     expected = archive.size_bytes
     if size_bytes is not None and expected is not None:
@@ -103,21 +103,21 @@ def _check_size(job: DownloadJob, archive: RemoteFile, size_bytes: int | None, h
             sizes = f"{size_bytes:,} bytes, not {'' if archive.checksum else 'about '}{expected:,}"
             raise DownloadError(f"the server's {archive.name} has {sizes}; did the data set change?")
     likely = size_bytes if size_bytes is not None else expected or 0
-    if likely > job.public.max_bytes:
+    if likely > job.public_set.max_bytes:
         raise DownloadError(f"the server's {archive.name} has {likely:,} bytes, too many for this data set")
     if expected is None:
         job.log(f"{archive.name}: {format_size(size_bytes)}")
-    _check_disk_space(job.archive_folder, likely - here_bytes + int(likely * job.public.disk_ratio))
+    _check_disk_space(job.archive_folder, likely - downloaded_bytes + int(likely * job.public_set.disk_ratio))
 
 
 def _unpack_file(job: DownloadJob, archive: RemoteFile, path: Path, into: Path) -> None:
     """Unpack an archive and its nested archives, or copy a plain file. A damaged archive is removed."""
-    public, size_bytes = job.public, path.stat().st_size
-    _check_disk_space(job.archive_folder, int(size_bytes * public.disk_ratio))
+    public_set, size_bytes = job.public_set, path.stat().st_size
+    _check_disk_space(job.archive_folder, int(size_bytes * public_set.disk_ratio))
     if not is_archive(path.name):
         shutil.copyfile(path, into)
         return
-    budget = Budget(int(SIZE_MARGIN * public.disk_ratio * size_bytes) + 2**20, public.max_files)
+    budget = Budget(int(SIZE_MARGIN * public_set.disk_ratio * size_bytes) + 2**20, public_set.max_files)
     try:
         unpack(path, into, budget, partial(job.progress, f"unpack {path.name}"))
         _remove_wrapper_folder(into)

@@ -51,7 +51,7 @@ class _TransferError(Exception):
         self.wait_s, self.hopeless = wait_s, hopeless
 
 
-def fetch(url: str, target: Path, progress: "Progress", accept: CheckSize, retry: RetryPolicy) -> None:
+def fetch(url: str, target: Path, progress: "Progress", check_size: CheckSize, retry: RetryPolicy) -> None:
     """Download `url` to `target`; resume from `target`.part if an earlier call left one.
 
     The part downloaded so far is kept on Ctrl-C and on every error. Raises DownloadError.
@@ -61,7 +61,7 @@ def fetch(url: str, target: Path, progress: "Progress", accept: CheckSize, retry
         while True:
             before = part.size_bytes
             try:
-                _continue(url, part, progress, accept, retry)
+                _continue(url, part, progress, check_size, retry)
                 break
             except _TransferError as broken:
                 gained = part.size_bytes - before
@@ -76,19 +76,19 @@ def _resume_hint(part: PartialFile) -> str:
     return f"; {part.size_bytes:,} bytes are kept, run it again to resume" if part.size_bytes else ""
 
 
-def _wait_s(failures: int, asked_s: float, retry: RetryPolicy) -> float:
+def _wait_s(failures: int, requested_s: float, retry: RetryPolicy) -> float:
     waited = retry.first_wait_s * 2.0 ** max(failures - 1, 0)
-    return min(max(waited, asked_s), retry.max_wait_s)
+    return min(max(waited, requested_s), retry.max_wait_s)
 
 
-def _continue(url: str, part: PartialFile, progress: "Progress", accept: CheckSize, retry: RetryPolicy) -> None:
+def _continue(url: str, part: PartialFile, progress: "Progress", check_size: CheckSize, retry: RetryPolicy) -> None:
     """Request the missing bytes and write them. Raises _Broken if not all of it comes."""
-    origin = part.origin(url)
-    if origin and origin.size_bytes == part.size_bytes:
+    version = part.version_of(url)
+    if version and version.size_bytes == part.size_bytes:
         return
-    with _request(url, origin, part, retry) as response:
-        size_bytes = _prepare(url, response, part, origin)
-        accept(size_bytes, part.size_bytes)
+    with _request(url, version, part, retry) as response:
+        size_bytes = _prepare(url, response, part, version)
+        check_size(size_bytes, part.size_bytes)
         _receive(response, part, size_bytes, progress, retry)
     if size_bytes is not None and part.size_bytes != size_bytes:
         if part.size_bytes > size_bytes:
@@ -96,13 +96,15 @@ def _continue(url: str, part: PartialFile, progress: "Progress", accept: CheckSi
         raise _TransferError(f"{_host(url)} closed the connection after {part.size_bytes:,} of {size_bytes:,} bytes")
 
 
-def _request(url: str, origin: RemoteVersion | None, part: PartialFile, retry: RetryPolicy) -> http.client.HTTPResponse:
+def _request(
+    url: str, version: RemoteVersion | None, part: PartialFile, retry: RetryPolicy
+) -> http.client.HTTPResponse:
     """Send the request; return the response before its body is read."""
     headers = {"User-Agent": "sigmasplat", "Accept-Encoding": "identity"}
-    if origin and part.size_bytes:
+    if version and part.size_bytes:
         headers["Range"] = f"bytes={part.size_bytes}-"
-        if origin.version:
-            headers["If-Range"] = origin.version
+        if version.version:
+            headers["If-Range"] = version.version
     request = urllib.request.Request(url, headers=headers)
     try:
         opener = urllib.request.build_opener(_SafeRedirect())
@@ -143,16 +145,16 @@ def _connection_error(url: str, reason: object) -> Exception:
 
 
 def _prepare(
-    url: str, response: http.client.HTTPResponse, part: PartialFile, origin: RemoteVersion | None
+    url: str, response: http.client.HTTPResponse, part: PartialFile, version: RemoteVersion | None
 ) -> int | None:
     """Prepare `part` for the body; return the size of the whole file, None if the server does not send it."""
     headers = response.headers
     if headers.get_content_type() == "text/html":
         raise DownloadError(f"{_host(url)} answers with a web page, not the file; is there a login page in between?")
-    if response.status == http.client.PARTIAL_CONTENT and origin and part.size_bytes:
+    if response.status == http.client.PARTIAL_CONTENT and version and part.size_bytes:
         start, size_bytes = _content_range(headers.get("Content-Range", ""))
-        if start == part.size_bytes and size_bytes in (None, origin.size_bytes):
-            return origin.size_bytes
+        if start == part.size_bytes and size_bytes in (None, version.size_bytes):
+            return version.size_bytes
         part.restart()
         raise _TransferError(f"{_host(url)} sent another part of the file than requested")
     part.restart()

@@ -16,17 +16,17 @@ def find_recording(set_name: str, recording: str = "") -> tuple[PublicSet, str]:
     Names may be written as in papers and files: freiburg1_desk, fr1_desk, rgbd_dataset_freiburg1_desk.
     Raises DownloadError if there is no such data set or recording, or if it is available only on request.
     """
-    public = _find_set(set_name)
-    if set(public.recordings) == {""}:
+    public_set = _find_set(set_name)
+    if set(public_set.recordings) == {""}:
         if recording:
             raise DownloadError(f"{set_name} is one archive, without a recording {recording!r}; leave out the name")
-        return public, ""
-    names = {_normalised(name, public.prefix): name for name in public.recordings}
-    known = names.get(_normalised(recording, public.prefix))
+        return public_set, ""
+    names = {_normalised(name, public_set.prefix): name for name in public_set.recordings}
+    known = names.get(_normalised(recording, public_set.prefix))
     if known is None:
         wanted = f"no recording {recording!r} in {set_name}" if recording else f"give a recording of {set_name}"
-        raise DownloadError(f"{wanted}; {_suggestion(recording, list(public.recordings))}")
-    return public, known
+        raise DownloadError(f"{wanted}; {_suggestion(recording, list(public_set.recordings))}")
+    return public_set, known
 
 
 def describe_sets() -> Iterator[str]:

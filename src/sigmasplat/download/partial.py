@@ -37,17 +37,17 @@ class PartialFile:
         """Return the number of bytes downloaded so far."""
         return self._file.tell()
 
-    def origin(self, url: str) -> RemoteVersion | None:
+    def version_of(self, url: str) -> RemoteVersion | None:
         """Return the version of the bytes so far; if it is unknown or not of `url`, delete them and return None."""
         try:
-            origin = RemoteVersion(**json.loads(self._note.read_text(encoding="utf-8")))
+            version = RemoteVersion(**json.loads(self._note.read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError):
-            origin = None
-        too_many = origin and origin.size_bytes is not None and self.size_bytes > origin.size_bytes
-        if origin is None or origin.url != url or too_many:
+            version = None
+        too_many = version and version.size_bytes is not None and self.size_bytes > version.size_bytes
+        if version is None or version.url != url or too_many:
             self.restart()
             return None
-        return origin
+        return version
 
     def restart(self) -> None:
         """Delete the bytes so far."""
@@ -55,10 +55,10 @@ class PartialFile:
         self._file.seek(0)
         self._file.truncate()
 
-    def begin(self, origin: RemoteVersion) -> None:
+    def begin(self, version: RemoteVersion) -> None:
         """Record the version of the following bytes."""
         with _writing(self.target):
-            self._note.write_text(json.dumps(asdict(origin)), encoding="utf-8")
+            self._note.write_text(json.dumps(asdict(version)), encoding="utf-8")
 
     def add(self, chunk: bytes) -> None:
         """Write a chunk. Raises DownloadError if the disk is full."""

@@ -70,7 +70,7 @@ def score_tables(metrics: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
 def submap_sentence(metrics: dict[str, Any]) -> str:
     """Describe how many submaps and loops there are, and how long the final map took."""
     loops, finish_s = metrics.get("loops") or {}, metrics.get("finish_s")
-    tried = f"{loops.get('tried', 0)} loops between them were tried, {loops.get('accepted', 0)} were accepted."
+    tried = f"Loops between them: {loops.get('tried', 0)} tried, {loops.get('accepted', 0)} accepted."
     after = f" The final map took {number(finish_s, 1)} s after the last frame." if finish_s is not None else ""
     return f"The map has {metrics['submaps']} submaps. {tried}{after}"
 

@@ -67,9 +67,9 @@ def too_large(
     most_scale_m: float,
     most_radius_px: float,
 ) -> Tensor:
-    """Tell which splats [N] are larger than `most_scale_m`, or than `most_radius_px` in the image (3 σ), 0 = off.
+    """Return which splats [N] are larger than `most_scale_m`, or than `most_radius_px` in the image (3 σ); 0 = off.
 
-    In the image are those before the camera whose centres the image shows.
+    The second limit applies to splats in front of the camera whose centres are inside the image.
     """
     if not (most_scale_m > 0 or most_radius_px > 0):
         return torch.zeros(len(field), dtype=torch.bool, device=field.params.device)

@@ -60,7 +60,7 @@ class RealSense(LiveSource):
         last: int | None = None
         index = 0
         try:
-            for frames in self._delivered():
+            for frames in self._framesets():
                 pair = frames if self._rectified.moves_depth else align.process(frames)
                 color, depth = pair.get_color_frame(), pair.get_depth_frame()
                 # If only depth is new, the SDK repeats the last colour image.
@@ -69,12 +69,12 @@ class RealSense(LiveSource):
                 number = color.get_frame_number()
                 self.dropped += max(number - last - 1, 0) if last is not None else 0
                 last = number
-                yield self._framed(index, color, depth)
+                yield self._to_frame(index, color, depth)
                 index += 1
         finally:
             self._stop()
 
-    def _delivered(self) -> Iterator[Any]:
+    def _framesets(self) -> Iterator[Any]:
         """Yield sets of frames until no more arrive."""
         count = 0
         while True:
@@ -90,7 +90,7 @@ class RealSense(LiveSource):
             if count > WARM_UP_FRAMES:
                 yield frames
 
-    def _framed(self, index: int, color: Any, depth: Any) -> Frame:
+    def _to_frame(self, index: int, color: Any, depth: Any) -> Frame:
         pixels = color_from_bytes(np.array(color.get_data(), np.uint8))
         units = np.asarray(depth.get_data()).astype(np.float32)
         rgb, depth_m = self._rectified(pixels, units / np.float32(self.depth_units_per_metre))

@@ -100,9 +100,9 @@ def open_record3d(path: Path, settings: InputConfig) -> RecordedSource:
     archive = Archive(path)
     name = "metadata.json" if "metadata.json" in archive else "metadata"
     metadata = _metadata(archive, name)
-    native = archive.numbered("rgbd", "depth")
-    colors = archive.numbered("rgbd", "jpg") if native else archive.numbered("rgb", "jpg|png")
-    depths = native or archive.numbered("depth", "exr")
+    native = archive.by_number("rgbd", "depth")
+    colors = archive.by_number("rgbd", "jpg") if native else archive.by_number("rgb", "jpg|png")
+    depths = native or archive.by_number("depth", "exr")
     numbers = sorted(colors.keys() & depths.keys())
     if not numbers:
         raise SourceError(

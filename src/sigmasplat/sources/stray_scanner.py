@@ -60,7 +60,7 @@ class StrayImagePair(ImagePair):
         return self.video.size, image_size(self.depth)
 
 
-def open_stray(folder: Path, settings: InputConfig) -> RecordedSource:
+def open_stray_scanner(folder: Path, settings: InputConfig) -> RecordedSource:
     """Open a folder. Raises SourceError if video, depth, camera or poses cannot be used."""
     video_path, depths = folder / "rgb.mp4", _numbered(folder / "depth")
     if not video_path.is_file():
@@ -170,5 +170,5 @@ FORMAT = Format(
     "Stray Scanner",
     "rgb.mp4, depth/ and odometry.csv",
     _recognises,
-    lambda path, settings: open_stray(Path(path), settings),
+    lambda path, settings: open_stray_scanner(Path(path), settings),
 )

@@ -39,7 +39,7 @@ class Piece:
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
+class CameraPath:
     """The frames so far: poses T_world_camera [F, 4, 4], whether each is lost bool [F], its submap [F], and the rows of
     the keyframes in ascending order."""
 
@@ -52,7 +52,7 @@ class Path:
         return len(self.T_world_camera)
 
 
-NO_PATH = Path(np.empty((0, 4, 4)), np.empty(0, np.bool_), np.empty(0, np.int64), ())
+EMPTY_PATH = CameraPath(np.empty((0, 4, 4)), np.empty(0, np.bool_), np.empty(0, np.int64), ())
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class Snapshot:
     """
 
     title: str
-    path: Path = NO_PATH
+    path: CameraPath = EMPTY_PATH
     final: Piece | None = None
     pieces: tuple[Piece, ...] = ()
     true_positions: Matrix | None = None

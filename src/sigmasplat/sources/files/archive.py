@@ -35,7 +35,7 @@ class Archive:
                 f"{self.path / name}: cannot be read from its archive ({error}); copy it again"
             ) from error
 
-    def numbered(self, folder: str, endings: str) -> dict[int, str]:
+    def by_number(self, folder: str, endings: str) -> dict[int, str]:
         """Map N to each name folder/N.ending, in order of N; `endings` is a regular expression such as "jpg|png"."""
         found = [(re.fullmatch(rf"{folder}/(\d+)\.({endings})", name), name) for name in self.names]
         return dict(sorted((int(match.group(1)), name) for match, name in found if match))

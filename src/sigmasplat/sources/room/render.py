@@ -124,7 +124,7 @@ def _face_number(shape: Shape, normals: Floats) -> Indices:
     """Tell the smooth parts of one shape apart [N]: six faces of a box, caps and side of a drum, one part of a ball."""
     if shape.kind == "ball":
         return np.zeros(normals.shape[1], np.intp)
-    n = np.rint(shape.turned(normals)).astype(np.intp) + 1
+    n = np.rint(shape.to_local_axes(normals)).astype(np.intp) + 1
     return np.asarray(n[2] if shape.kind == "drum" else n[0] + 3 * n[1] + 9 * n[2])
 
 

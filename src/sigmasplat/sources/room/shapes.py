@@ -32,22 +32,22 @@ class Shape:
     yaw_rad: float
     material: Material
 
-    def turned(self, vectors: Floats) -> Floats:
+    def to_local_axes(self, vectors: Floats) -> Floats:
         """Rotate room vectors [3, ...] to the shape's axes."""
         return _rotated_about_z(vectors, -self.yaw_rad)
 
-    def to_room(self, vectors: Floats) -> Floats:
+    def to_room_axes(self, vectors: Floats) -> Floats:
         """Rotate vectors [3, ...] from the shape's axes to the room."""
         return _rotated_about_z(vectors, self.yaw_rad)
 
     def local(self, points: Floats) -> Floats:
         """Return room points [3, N] in the shape's frame, metres."""
-        return self.turned(points - self.center[:, None])
+        return self.to_local_axes(points - self.center[:, None])
 
     def first_hit(self, origins: Floats, directions: Floats) -> Floats:
         """Return the ray parameter [N] where rays enter, inf for a miss; origins [3, 1] or [3, N]."""
         o = self.local(origins) / self.half[:, None]
-        d = self.turned(directions) / self.half[:, None]
+        d = self.to_local_axes(directions) / self.half[:, None]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             enter, leave = _INTERVALS[self.kind](o, d)
             hit = (enter < leave) & (enter > MIN_RAY_PARAMETER)
@@ -56,7 +56,7 @@ class Shape:
     def corners(self) -> NDArray[np.float64]:
         """Return the 8 corners of the bounding box, room frame [8, 3]."""
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
-        return (self.to_room((signs * self.half).T).T + self.center).astype(np.float64)
+        return (self.to_room_axes((signs * self.half).T).T + self.center).astype(np.float64)
 
 
 def dot(a: Floats, b: Floats) -> Floats:
@@ -117,14 +117,14 @@ def surface_at(shape: Shape, points: Floats) -> tuple[Floats, Floats, Floats]:
     if shape.kind == "box":
         axis = np.abs(unit).argmax(0)
         normal = np.where(np.arange(3)[:, None] == axis, np.sign(unit), 0.0).astype(np.float32)
-        return shape.to_room(normal), np.where(axis == 0, p[1], p[0]), np.where(axis == 2, p[1], p[2])
+        return shape.to_room_axes(normal), np.where(axis == 0, p[1], p[0]), np.where(axis == 2, p[1], p[2])
     around = (np.arctan2(unit[1], unit[0]) * shape.half[0]).astype(np.float32)
     if shape.kind == "ball":
-        return shape.to_room(normalised(unit / shape.half[:, None])), around, p[2]
+        return shape.to_room_axes(normalised(unit / shape.half[:, None])), around, p[2]
     cap = np.abs(unit[2]) > np.hypot(unit[0], unit[1])
     side = unit / shape.half[:, None] * np.array([[1.0], [1.0], [0.0]], np.float32)
     normal = np.where(cap, np.sign(unit[2]) * np.array([[0.0], [0.0], [1.0]]), normalised(side)).astype(np.float32)
-    return shape.to_room(normal), np.where(cap, p[0], around), np.where(cap, p[1], p[2])
+    return shape.to_room_axes(normal), np.where(cap, p[0], around), np.where(cap, p[1], p[2])
 
 
 @dataclass(frozen=True, eq=False)

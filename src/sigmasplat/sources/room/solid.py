@@ -23,7 +23,7 @@ def triangulate(shapes: Sequence[Shape]) -> Mesh:
 
 def _placed(shape: Shape, unit: Doubles, faces: NDArray[np.int32]) -> Mesh:
     """Scale, rotate and move points [N, 3] of the unit shape; drop faces without area, as at the poles of a ball."""
-    points = shape.to_room((unit * shape.half).T.astype(np.float32)).T + shape.center
+    points = shape.to_room_axes((unit * shape.half).T.astype(np.float32)).T + shape.center
     mesh = Mesh(points.astype(np.float32), faces)
     return mesh.with_faces(mesh.areas() > 1e-12)
 
