@@ -11,7 +11,7 @@
 # PYTHON=python3.12    another interpreter
 # TORCH_INDEX=URL      where torch comes from if it answers; PyTorch's own index has the build without gigabytes of CUDA
 # PIP_ARGS="…"         extra pip options
-# PYTEST_ARGS="…"      extra pytest options, for instance -k trajectory -x
+# PYTEST_ARGS="…"      extra pytest options, for instance -k trajectory -x; -n 0 runs the tests in one process
 
 PYTHON ?= python3
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
@@ -48,9 +48,10 @@ lint: install-dev
 types: install-dev
 	$(BIN)/mypy --strict src
 
-# One after the other even under -j, so that the closing line of pytest is the last one.
+# One after the other even under -j, so that the closing line of pytest is the last one. One worker per core: each takes
+# half of the files in their order, so a fixture of a file is made once, and the first to finish helps the other.
 pytest: lint types
-	$(BIN)/pytest $(PYTEST_ARGS)
+	$(BIN)/pytest -n auto --maxprocesses 8 --dist worksteal $(PYTEST_ARGS)
 
 install: $(VENV)/installed
 install-dev: $(VENV)/installed-dev

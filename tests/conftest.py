@@ -6,6 +6,10 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
+# Workers of pytest-xdist share the cores; numpy and torch read this when they are imported.
+if workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 0)):
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // workers)))
+
 import numpy as np
 import pytest
 from PIL import Image
