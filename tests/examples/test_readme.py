@@ -178,8 +178,7 @@ def test_there_are_commands_to_check() -> None:
     assert {line.split()[1] for line in commands()} == set(cli.COMMANDS)
 
 
-@pytest.mark.parametrize("line", commands())
-def test_documented_commands_parse(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_documented_commands_parse(monkeypatch: pytest.MonkeyPatch) -> None:
     def parsed_only(command):
         @functools.wraps(command)
         def stand_in(*args, **named):
@@ -190,6 +189,10 @@ def test_documented_commands_parse(line: str, monkeypatch: pytest.MonkeyPatch) -
         return stand_in
 
     monkeypatch.setattr(cli, "COMMANDS", {name: parsed_only(command) for name, command in cli.COMMANDS.items()})
-    with pytest.raises(SystemExit) as left:
-        cli.main(shlex.split(line)[1:])
-    assert left.value.code == 0
+    refused = list[str]()
+    for line in commands():
+        with pytest.raises(SystemExit) as left:
+            cli.main(shlex.split(line)[1:])
+        if left.value.code != 0:
+            refused.append(line)
+    assert refused == []
