@@ -46,7 +46,7 @@ def make_closer(
     Registered.truth = [np.linalg.matrix_power(STEP, k) for k in range(4)]
     Registered.lies = lies
     config = Config(loops=LoopConfig(**{"min_interval": 2, "min_similarity": 1.0, **changes}))
-    return LoopCloser(config, MemoryStore(), None)  # type: ignore[arg-type]
+    return LoopCloser(config, MemoryStore())
 
 
 def walked(closer: LoopCloser, alike: bool = True) -> Atlas:
@@ -63,7 +63,7 @@ def walked(closer: LoopCloser, alike: bool = True) -> Atlas:
         picture = Picture(np.zeros((3, 4, 3), np.uint8), np.ones((3, 4), np.float32))
         closer.store.save(submap, [picture, picture])
         looks = [np.array([np.cos(a), np.sin(a)], np.float32) for a in np.deg2rad([degrees, degrees + 20.0])]
-        closer.submap_finished(submap, looks, atlas)
+        closer.submap_finished(submap, looks, atlas, None)  # type: ignore[arg-type]
     return atlas
 
 

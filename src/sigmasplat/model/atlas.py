@@ -1,4 +1,4 @@
-"""Know where everything is: submaps in the world, keyframes in submaps, frames beside keyframes."""
+"""All poses: of submaps in the world, of keyframes in submaps, of frames relative to keyframes."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from sigmasplat.types import Matrix
 
 
 class Place(NamedTuple):
-    """Where a frame was seen from: beside which keyframe of which submap, both counted from 0."""
+    """The pose of a frame relative to a keyframe of a submap; both numbers count from 0."""
 
     submap: int
     keyframe: int
@@ -19,12 +19,12 @@ class Place(NamedTuple):
 
 @dataclass(eq=False)
 class Atlas:
-    """Poses of submaps, keyframes and frames, each relative to the one before: world poses are worked out on reading.
+    """Poses of submaps, keyframes and frames, each relative to the level above; world poses are computed on reading.
 
-    anchors: T_world_submap of each submap, the first one the identity; closing a loop changes these and nothing else.
-    odometry: the same as tracking alone has them, which no loop changes.
+    anchors: T_world_submap of each submap, the first one the identity; closing a loop changes only these.
+    odometry: the same poses from tracking alone; no loop changes them.
     keyframes: T_submap_camera of each submap's keyframes; those of the last submap change while it is mapped.
-    places: of each frame.
+    places: one per frame.
     """
 
     anchors: list[Matrix] = field(default_factory=list)
@@ -33,19 +33,19 @@ class Atlas:
     places: list[Place] = field(default_factory=list)
 
     def begin_submap(self, T_before_submap: Matrix | None = None) -> None:
-        """Take note of a new submap at the end, where it lies in the one before; the first one is the world."""
+        """Append a submap at its pose in the submap before; the first submap's frame is the world."""
         for chain in (self.anchors, self.odometry):
             chain.append(np.eye(4) if T_before_submap is None else se3.orthonormalise(chain[-1] @ T_before_submap))
         self.keyframes.append([])
 
     def place_frame(self, T_submap_camera: Matrix) -> None:
-        """Take note of the next frame, in the last submap, beside its newest keyframe."""
+        """Append a frame, relative to the newest keyframe of the last submap."""
         T_keyframe_camera = se3.inverse(self.keyframes[-1][-1]) @ T_submap_camera
         place = Place(len(self.anchors) - 1, len(self.keyframes[-1]) - 1, se3.orthonormalise(T_keyframe_camera))
         self.places.append(place)
 
     def T_world_camera(self, loops: bool = True) -> Matrix:
-        """Return the poses of all frames [F, 4, 4]; without `loops` as tracking alone has them."""
+        """Return the poses of all frames [F, 4, 4]; without `loops` those of tracking alone."""
         anchors = self.anchors if loops else self.odometry
         poses = [anchors[s] @ self.keyframes[s][k] @ T_keyframe_camera for s, k, T_keyframe_camera in self.places]
         return np.array(poses).reshape(-1, 4, 4)

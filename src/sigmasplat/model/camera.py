@@ -1,4 +1,4 @@
-"""Describe a pinhole camera: x right, y down, z forward, pixel centres at integer coordinates."""
+"""The pinhole camera: x right, y down, z forward, pixel centres at integer coordinates."""
 
 from dataclasses import dataclass
 
@@ -32,8 +32,8 @@ class Camera:
         return Camera(width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
 
     def prepared(self, width: int, crop_px: int = 0) -> "Camera":
-        """Return the camera of the images that the system works on: `width` pixels wide (0 = as they are), height in
-        proportion, then without `crop_px` pixels at every edge. Raises ConfigError where nothing would remain."""
+        """Return the camera of the working images: `width` pixels wide (0 = unchanged), height in proportion, then
+        cropped by `crop_px` pixels at every edge. Raises ConfigError if no pixel would remain."""
         c = self.resized(width, round(self.height * width / self.width)) if width else self
         if 2 * crop_px >= min(c.width, c.height):
             raise ConfigError(
@@ -42,7 +42,8 @@ class Camera:
         return Camera(c.width - 2 * crop_px, c.height - 2 * crop_px, c.fx, c.fy, c.cx - crop_px, c.cy - crop_px)
 
     def rays(self) -> NDArray[np.float32]:
-        """Return the point at depth 1 m on each pixel's ray, camera frame, [H, W, 3]; times depth it is the surface."""
+        """Return the point at depth 1 m on each pixel's ray [H, W, 3], camera frame; multiply by depth for the
+        surface."""
         u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
         x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
         return np.stack([x, y, np.ones_like(x)], -1).astype(np.float32)

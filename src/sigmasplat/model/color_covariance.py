@@ -1,4 +1,4 @@
-"""Say how the colour channels of a splat vary together: a 3×3 covariance from its variances and three numbers more.
+"""Full colour covariance of a splat: a 3×3 matrix from its variances and three correlation parameters.
 
 Σ = D R D, D = diag(exp(s/2)) from the field's `log_variances`, R = A Aᵀ a matrix of correlations. The rows of A, lower
 triangular, have length 1:
@@ -7,15 +7,15 @@ triangular, have length 1:
 
 so that L = D A is the Cholesky factor of Σ, and Σ is positive definite whatever a [3] is, the field's `correlations`.
 t₁ and t₂ are the correlations red–green and red–blue, t₃ that of green–blue once red is known. a = 0: no correlation,
-the paper's diagonal. Whatever a is, the variances of the channels stay exp(s) (VarSplat §1): what reads only those, V
-as tracking and loops weigh by it among them, needs to know nothing of a. a has no unit.
+the paper's diagonal. For every a, the variances of the channels stay exp(s) (VarSplat §1). Code that reads only the
+variances, such as V for tracking and loops, does not depend on a. a has no unit.
 """
 
 import torch
 from torch import Tensor
 
 MOST_CORRELATED = 0.999
-"""No correlation is nearer to ±1 than this: Σ stays invertible in float32."""
+"""The largest absolute correlation: Σ stays invertible in float32."""
 
 
 def correlations_of(parameters: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Carry one RGB-D image through the system: immutable, checked once at the border, without ground truth."""
+"""One RGB-D image: immutable, checked when it is made, without ground truth."""
 
 from dataclasses import dataclass
 
@@ -43,7 +43,7 @@ class Frame:
     def resized(self, width: int, height: int) -> "Frame":
         """Return the frame at another size: colour averaged over the pixel's area, depth of the nearest pixel.
 
-        Depth is picked, never averaged: the mean of a near and a far surface lies on neither.
+        Depth is never averaged: the mean of a near and a far surface lies on neither.
         """
         if (width, height) == (self.camera.width, self.camera.height):
             return self
@@ -57,9 +57,9 @@ class Frame:
         )
 
     def prepared(self, width: int, min_depth_m: float, max_depth_m: float, crop_px: int = 0) -> "Frame":
-        """Return the frame as the system works on it: its size that of `Camera.prepared`, depth out of range 0.
+        """Return the working frame: the size of `Camera.prepared`, and depth 0 outside the range.
 
-        Raises ConfigError where the crop would leave nothing.
+        Raises ConfigError if no pixel would remain after the crop.
         """
         camera = self.camera.prepared(width, crop_px)
         small = self.resized(camera.width + 2 * crop_px, camera.height + 2 * crop_px)

@@ -1,4 +1,4 @@
-"""Let a colour depend on where it is seen from: real spherical harmonics of degrees 1 to 3.
+"""View-dependent colour: real spherical harmonics of degrees 1 to 3.
 
 Order and signs are those of 3DGS's files: m = −l … l within each degree, odd m negative (Condon–Shortley), in the axes
 of the field. Degree 0 is the field's own `colors`.
@@ -19,7 +19,7 @@ FUNCTIONS = 15
 
 
 def count(degree: int) -> int:
-    """Return how many harmonics there are of degrees 1 to `degree`. Raises ConfigError unless 0 ≤ degree ≤ 3."""
+    """Return the number of harmonics of degrees 1 to `degree`. Raises ConfigError unless 0 ≤ degree ≤ 3."""
     if not 0 <= degree <= DEGREES:
         raise ConfigError(f"view-dependent colour has degrees 0 to {DEGREES}, found {degree}")
     return (degree + 1) ** 2 - 1
@@ -66,8 +66,8 @@ def view_colors(
 def turned(harmonics: Tensor, R_new_old: Tensor) -> Tensor:
     """Return harmonics [N, 45] as they are in axes turned by a rotation [3, 3]: Y(R d) · k_new = Y(d) · k_old.
 
-    Which harmonic turns into which is ∫ Y(R d) Y(d)ᵀ dΩ. Sums are written out, not left to a library's product, which
-    rounds as memory happens to lie.
+    The rotation matrix of the harmonics is ∫ Y(R d) Y(d)ᵀ dΩ. Sums are written out: the rounding of a library's matrix
+    product depends on memory alignment.
     """
     directions, weights = sphere_rule()
     new = basis((directions[:, None, :] * R_new_old.cpu().double()).sum(-1))

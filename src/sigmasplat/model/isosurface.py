@@ -1,4 +1,4 @@
-"""Cut the surface out of a truncated signed distance field: marching cubes, brick by brick, welded without seams."""
+"""Extract the surface of a truncated signed distance field: marching cubes, brick by brick, without seams."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,21 +12,21 @@ from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.tsdf import BLOCK, BLUE, COLOR_WEIGHT, DISTANCE, GREEN, RED, WEIGHT, Tsdf, packed, unpacked
 
 BRICK = 8
-"""Blocks along the edge of what marching cubes gets at once."""
+"""Blocks along the edge of a brick, the volume that one call of marching cubes processes."""
 EDGE = BRICK * BLOCK + 1
 """Voxels along it: the last layer is the next brick's first."""
 LEAST_DISTANCE = 1e-3
-"""Distances nearer to 0, in units of the truncation, are moved off it: no vertex then falls on a voxel, and each has
-one edge of the lattice to itself."""
+"""Distances closer to 0 (in units of the truncation) are moved away from 0. Then no vertex falls on a voxel, and each
+vertex lies on its own edge of the lattice."""
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 
 def surface(volume: Tsdf) -> Mesh:
-    """Return where the distance is 0, as a welded mesh with colours.
+    """Return the zero level set as a connected mesh with colours.
 
-    Only cubes of eight voxels that were all seen make faces. The same field makes the same bytes.
+    Only cubes whose eight voxels were all observed make faces. The same field makes the same bytes.
     """
     bricks = unpacked(np.unique(packed(volume.blocks // BRICK)))
     parts = [part for brick in bricks if (part := _brick(volume, brick * BRICK))]
@@ -51,7 +51,7 @@ class _Part:
 
 
 def _brick(volume: Tsdf, first_block: Ints) -> _Part | None:
-    """Return the surface in a brick, None where there is none."""
+    """Return the surface in a brick, None if it has no surface."""
     side = BRICK + 1
     numbers = volume.find(first_block + np.indices((side, side, side)).reshape(3, -1).T)
     there = np.flatnonzero(numbers >= 0)
@@ -97,7 +97,7 @@ def _of_corners(corner: NDArray[np.bool_], join: Callable[..., NDArray[np.bool_]
 
 
 def _colors(volume: Tsdf, numbers: NDArray[np.intp], low: Ints, high: Ints, share: Floats) -> Floats:
-    """Mix the colours of two voxels [V, 3], `share` of the second, of those that have one."""
+    """Interpolate the colours of two voxels [V, 3] (`share` of the second); a voxel without colour is ignored."""
     total, mixed = np.full(len(low), 1e-12, np.float32), np.zeros((len(low), 3), np.float32)
     for voxel, part in ((low, 1.0 - share), (high, share)):
         block, local = np.divmod(voxel, BLOCK)

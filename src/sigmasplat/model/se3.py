@@ -1,4 +1,4 @@
-"""Move rigidly: SE(3) in double precision with numpy. `T_a_b` takes coordinates in b to coordinates in a.
+"""Rigid motions: SE(3) in double precision with numpy. `T_a_b` takes coordinates in b to coordinates in a.
 
 A twist is ξ = (ρ, φ): translation first, then rotation vector (radians).
 """
@@ -72,7 +72,7 @@ def inverse(T: Matrix) -> Matrix:
 
 
 def adjoint(T: Matrix) -> Matrix:
-    """Build Ad(T) [..., 6, 6], which carries twists from one frame to the other: T exp(ξ) T⁻¹ = exp(Ad(T) ξ)."""
+    """Build Ad(T) [..., 6, 6], which transforms twists between frames: T exp(ξ) T⁻¹ = exp(Ad(T) ξ)."""
     R = T[..., :3, :3]
     out = np.zeros((*T.shape[:-2], 6, 6))
     out[..., :3, :3] = out[..., 3:, 3:] = R
@@ -174,7 +174,7 @@ def orthonormalise(T: Matrix) -> Matrix:
 
 
 def is_rigid(T: Matrix, tolerance: float = 1e-3) -> bool:
-    """Tell whether a 4×4 matrix is finite, its rotation orthonormal with determinant +1, its last row 0 0 0 1."""
+    """Return whether a 4×4 matrix is rigid: finite, rotation orthonormal with determinant +1, last row 0 0 0 1."""
     return bool(
         T.shape == (4, 4)
         and np.isfinite(T).all()

@@ -1,4 +1,4 @@
-"""Hold a finished piece of the map, and say where finished pieces are put."""
+"""Submaps, and the stores that keep finished ones."""
 
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -14,7 +14,7 @@ from sigmasplat.types import Matrix
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What a keyframe saw: color [H, W, 3] uint8 RGB, depth_m [H, W] float32 metres, 0 = no reading."""
+    """The images of a keyframe: color [H, W, 3] uint8 RGB, depth_m [H, W] float32 metres, 0 = no reading."""
 
     color: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
@@ -27,10 +27,10 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class Submap:
-    """A finished piece of the map in its own frame, which is its first keyframe's camera.
+    """A finished part of the map in its own frame, which is the camera of its first keyframe.
 
-    field: its splats; frames [K]: which frames of the sequence are its keyframes; T_submap_camera [K, 4, 4] their
-    poses; camera: of all their pictures, which a `SubmapStore` keeps. Where it lies in the world the `Atlas` knows.
+    field: its splats; frames [K]: the frame numbers of its keyframes; T_submap_camera [K, 4, 4]: their poses; camera:
+    of all keyframes. The `SubmapStore` keeps the keyframes' pictures, the `Atlas` the submap's pose in the world.
     """
 
     index: int
@@ -41,12 +41,12 @@ class Submap:
 
 
 class SubmapStore(Protocol):
-    """Where finished submaps are kept; numbers count from 0 in the order of saving."""
+    """Keeps finished submaps; numbers count from 0 in the order of saving."""
 
     def __len__(self) -> int: ...
 
     def save(self, submap: Submap, pictures: list[Picture]) -> None:
-        """Keep a submap and its keyframes' pictures, for good: nothing changes a finished submap."""
+        """Save a submap and the pictures of its keyframes. A finished submap never changes."""
 
     def load(self, index: int) -> Submap:
         """Return a submap, in memory of its own."""
@@ -59,7 +59,7 @@ class SubmapStore(Protocol):
 
 @dataclass(eq=False)
 class MemoryStore:
-    """Keep submaps in memory: for short runs and where nothing may be written."""
+    """Keeps submaps in memory: for short runs, and when no files may be written."""
 
     submaps: list[Submap] = field(default_factory=list)
     pictures: list[list[Picture]] = field(default_factory=list)
@@ -68,7 +68,7 @@ class MemoryStore:
         return len(self.submaps)
 
     def save(self, submap: Submap, pictures: list[Picture]) -> None:
-        """Keep a submap. Raises SigmaSplatError unless it is the next one and has a picture per keyframe."""
+        """Save a submap. Raises SigmaSplatError unless it is the next one and has a picture per keyframe."""
         refuse_misfit(submap, pictures, len(self))
         self.submaps.append(submap)
         self.pictures.append(pictures)
@@ -83,7 +83,7 @@ class MemoryStore:
 
 
 def refuse_misfit(submap: Submap, pictures: list[Picture], next_index: int) -> None:
-    """Raise SigmaSplatError if a submap is not the next one to keep, or its keyframes and pictures do not match."""
+    """Raise SigmaSplatError if a submap is not the next one to save, or its keyframes and pictures do not match."""
     if submap.index != next_index:
         raise SigmaSplatError(f"submap {submap.index} cannot be kept: the next one is {next_index}")
     if not len(submap.frames) == len(submap.T_submap_camera) == len(pictures):

@@ -1,4 +1,4 @@
-"""Hold a path of camera poses."""
+"""A trajectory: camera poses over time."""
 
 from dataclasses import dataclass
 

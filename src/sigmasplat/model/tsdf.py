@@ -23,7 +23,7 @@ BLOCK = 8
 """Voxels along a block's edge."""
 BLOCKS_PER_PAGE = 1024
 BLOCKS_AT_ONCE = 128
-"""So many blocks' voxels fit the processor's cache."""
+"""Number of blocks whose voxels fit in the processor's cache."""
 NEAR_M = 0.02
 DISTANCE, WEIGHT, RED, GREEN, BLUE, COLOR_WEIGHT = range(6)
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
@@ -90,9 +90,9 @@ class Tsdf:
         T_world_camera: Doubles,
         weight: Image | None = None,
     ) -> None:
-        """Add an image: depth [H, W] m, 0 = no reading; color [H, W, 3]; weight [H, W] ≥ 0 of each pixel, else 1.
+        """Add an image: depth [H, W] m, 0 = no reading; color [H, W, 3]; weight [H, W] ≥ 0 per pixel (default 1).
 
-        All blocks in view take part, so that free space erases what only other images saw there.
+        All blocks in view are updated, so that observed free space removes surfaces that only other images saw.
         """
         image = _Image.of(depth_m, color, camera, weight)
         self._allocate(image, T_world_camera)
@@ -105,7 +105,7 @@ class Tsdf:
                 self._update(self._pages[page], numbers[at] % BLOCKS_PER_PAGE, image, a, b, z)
 
     def _allocate(self, image: "_Image", T_world_camera: Doubles) -> None:
-        """Make the blocks that the surface, give or take the truncation along z or a voxel in any direction, meets."""
+        """Allocate the blocks near the surface: within the truncation along z, or one voxel in any direction."""
         R, t = T_world_camera[:3, :3].astype(np.float32), T_world_camera[:3, 3].astype(np.float32)
         rays = image.rays @ R.T
         surface = rays * image.depth_m[:, None] + t
@@ -122,7 +122,7 @@ class Tsdf:
             self._pages.append(np.zeros((BLOCKS_PER_PAGE, 6, BLOCK**3), np.float32))
 
     def _in_view(self, image: "_Image", T_world_camera: Doubles) -> tuple[NDArray[np.intp], Floats]:
-        """Return numbers [N] and projected first corners [3, N] of blocks that may be seen, by number."""
+        """Return numbers [N] and projected first corners [3, N] of the blocks that may be visible, by number."""
         T, edge_m = se3.inverse(T_world_camera), BLOCK * self.voxel_m
         corners = self.blocks * edge_m @ T[:3, :3].T + T[:3, 3]
         seen = image.may_see(corners + T[:3, :3].sum(1) * edge_m / 2, np.sqrt(0.75) * edge_m, self.truncation_m)
@@ -156,8 +156,8 @@ def _average(voxels: Floats, planes: tuple[int, ...], total: int, values: list[F
 
 @dataclass(frozen=True, eq=False)
 class _Image:
-    """An image made ready: depth_m [P], rays [P, 3] of the pixels with weight, and flat planes with a border of one
-    pixel without weight [(H+2)·(W+2)]: inverse depth w, its slopes per pixel, weight, red, green, blue.
+    """A prepared image: depth_m [P] and rays [P, 3] of the pixels with weight, and flat planes [(H+2)·(W+2)] with a
+    border of one pixel of weight 0: inverse depth w, its slopes per pixel, weight, red, green, blue.
     """
 
     camera: Camera
@@ -191,7 +191,7 @@ class _Image:
         return np.float32(1.0) / np.maximum(w, np.float32(1e-6)) - z, self.weight[pixel], pixel
 
     def may_see(self, centers: Doubles, radius_m: float, reach_m: float) -> NDArray[np.bool_]:
-        """Tell which balls, centers [N, 3] in the camera frame, may be in view and no farther than all surfaces."""
+        """Return which spheres (centers [N, 3], camera frame) may be in view and not behind all surfaces."""
         c, z = self.camera, centers[:, 2]
         least = self.inverse - 0.5 * (np.abs(self.slope_u) + np.abs(self.slope_v))
         farthest_m = 1.0 / least[self.weight > 0].min(initial=np.inf)
@@ -205,7 +205,7 @@ class _Image:
 def _slope(w: Floats, axis: int) -> Floats:
     """Return the smaller of the differences to both neighbours along an axis, 0 where they disagree in sign (minmod).
 
-    So a surface's last pixel before an edge takes no slope from what is beyond it, and no w sinks to 0 in its pixel.
+    A surface's last pixel before an edge then takes no slope from the other side, and w stays above 0 in the pixel.
     """
     w = np.moveaxis(w, axis, 0)
     step = np.where((w[1:] > 0) & (w[:-1] > 0), w[1:] - w[:-1], np.float32(0.0))
@@ -234,5 +234,5 @@ def unpacked(keys: Keys) -> Keys:
 
 
 def _runs(keys: Keys) -> Keys:
-    """Drop repetitions next to each other: most neighbours share a block, and sorting them all is the slow part."""
+    """Drop adjacent repetitions: most neighbours share a block, and sorting all of them would be slow."""
     return keys[np.concatenate([[True], keys[1:] != keys[:-1]])] if len(keys) else keys

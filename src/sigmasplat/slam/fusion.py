@@ -1,6 +1,6 @@
-"""Fuse what maps show at their keyframes into a surface: render, integrate, cut, clean (VarSplat §7).
+"""Fuse a surface from the map: render at keyframes, integrate, extract, clean (VarSplat §7).
 
-What is fused is the map's own view, never a recorded image.
+Only renders of the map are fused, never recorded images.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -26,9 +26,9 @@ VOXEL_M = 0.01
 TRUNCATION_VOXELS = 4
 """VarSplat §7: 1 cm, truncated at 4 cm."""
 LEAST_ALPHA = 0.9
-"""A pixel counts where the map stops this share of the light; depth is then Σwz / Σw."""
+"""A pixel counts if its alpha reaches this value; its depth is then Σwz / Σw."""
 LEAST_VERTICES = 200
-"""Smaller parts are dropped (VarSplat §7)."""
+"""Connected parts with fewer vertices are dropped (VarSplat §7)."""
 
 Floats = NDArray[np.float32]
 Renderer = Callable[[GaussianField, Camera, Matrix], Render]
@@ -36,7 +36,7 @@ Renderer = Callable[[GaussianField, Camera, Matrix], Render]
 
 @dataclass(frozen=True, eq=False)
 class FusionView:
-    """Where a map is looked at from: T_camera_field in the frame of its field, T_world_camera in the world."""
+    """A view to render and fuse: a field, a camera, and its pose in the field's frame and in the world."""
 
     field: GaussianField
     camera: Camera
@@ -45,9 +45,9 @@ class FusionView:
 
 
 def fusion_views(store: SubmapStore, anchors: Sequence[Matrix]) -> Iterator[FusionView]:
-    """Return every keyframe of all submaps before its own submap, one of which is in memory at a time.
+    """Yield a view of each submap at each of its keyframes; one submap is in memory at a time.
 
-    anchors: T_world_submap of each.
+    anchors: T_world_submap of each submap.
     """
     for index in range(len(store)):
         submap = store.load(index)
@@ -57,12 +57,12 @@ def fusion_views(store: SubmapStore, anchors: Sequence[Matrix]) -> Iterator[Fusi
 
 
 def count_keyframes(store: SubmapStore) -> int:
-    """Return how many keyframes all submaps have."""
+    """Return the number of keyframes in all submaps."""
     return sum(len(store.load(index).frames) for index in range(len(store)))
 
 
 def fuse(
-    standpoints: Iterable[FusionView],
+    views: Iterable[FusionView],
     total: int,
     config: Config,
     *,
@@ -71,14 +71,14 @@ def fuse(
     renderer: Renderer | None = None,
     progress: Progress = lambda done, total: None,
 ) -> Mesh:
-    """Fuse depth and colour rendered at `total` standpoints into a mesh in the world.
+    """Fuse depth and colour, rendered at `total` views, into a mesh in the world.
 
-    Readings out of the input's range are none. weigh: count pixels by how sure their map is of their colour, w̃ with the
-    τ of tracking (VarSplat §3). `progress` is told (standpoints done, total). Raises ConfigError unless voxel_m > 0.
+    Depth outside the range of the input settings is ignored. weigh: weight pixels by their colour uncertainty, w̃ with
+    the τ of tracking (VarSplat §3). Calls `progress(views done, total)`. Raises ConfigError unless voxel_m > 0.
     """
     volume = Tsdf(voxel_m, TRUNCATION_VOXELS * voxel_m)
     renderer = renderer or FieldRenderer(config.render, config.backend)
-    for done, at in enumerate(standpoints, 1):
+    for done, at in enumerate(views, 1):
         with torch.inference_mode():
             seen = renderer(at.field, at.camera, at.T_camera_field)
         depth_m, color = surface_of(seen, config)
@@ -86,12 +86,12 @@ def fuse(
         volume.integrate(depth_m, color, at.camera, at.T_world_camera, weight)
         progress(done, total)
     mesh = isosurface.surface(volume)
-    del volume  # cleaning takes as much memory again
+    del volume  # free memory: cleaning needs as much again
     return mesh.without_small_parts(LEAST_VERTICES)
 
 
 def surface_of(seen: Render, config: Config) -> tuple[Floats, Floats]:
-    """Return the depth [H, W] m, 0 = none, and the colour [H, W, 3] of what stops the light in a render."""
+    """Return depth [H, W] in m (0 = no surface) and colour [H, W, 3] of the opaque surfaces in a render."""
     alpha = _array(seen.alpha)
     opaque = np.maximum(alpha, LEAST_ALPHA)
     depth_m = np.where(alpha >= LEAST_ALPHA, _array(seen.depth) / opaque, np.float32(0.0))
@@ -100,7 +100,7 @@ def surface_of(seen: Render, config: Config) -> tuple[Floats, Floats]:
 
 
 def certainty(seen: Render, config: Config) -> Floats:
-    """Weigh the pixels [H, W] of a render by its variance: w̃, mean over the channels, median over its surfaces."""
+    """Return a weight per pixel [H, W] from the render's variance V: w̃, averaged over the colour channels."""
     c, opaque = config.tracking, seen.alpha >= LEAST_ALPHA
     return _array(uncertainty_weights(seen.variance, opaque, c.tau, c.weight_max).mean(-1))
 

@@ -1,4 +1,4 @@
-"""Judge single splats by the readings they are held against; uncertain ones get a second chance (CG-SLAM §4)."""
+"""Measure the uncertainty of single splats against depth readings; fade uncertain ones, then prune (CG-SLAM §4)."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -17,10 +17,11 @@ from sigmasplat.types import Matrix
 def splat_uncertainty(
     field: GaussianField, view: View, keyframes: Sequence[Keyframe], owner: Literal["dominant", "median"]
 ) -> tuple[Tensor, Tensor]:
-    """Return each splat's uncertainty ν [N] m², float64, and how many pixels n [N] it was judged on (CG-SLAM eq. 13).
+    """Return each splat's uncertainty ν [N] in m², float64, and the number of pixels n [N] used (CG-SLAM eq. 13).
 
-    ν = Σ w (D − z)² / n over the pixels with a reading D that a splat owns, in all keyframes; z is its centre's depth
-    there, w its weight. 0 where it owns none. Renders each keyframe once; the view's planes are then of the last one.
+    ν = Σ w (D − z)² / n over the pixels with a reading D that the splat owns, in all keyframes; z is the depth of its
+    centre, w its weight. ν is 0 for a splat that owns no pixel. Renders each keyframe once; afterwards the view holds
+    the last one.
     """
     spread = torch.zeros(len(field), dtype=torch.float64, device=field.params.device)
     count = torch.zeros_like(spread, dtype=torch.int64)
@@ -36,13 +37,13 @@ def splat_uncertainty(
 
 
 def depths(points: Tensor, T_camera_world: Matrix) -> Tensor:
-    """Return the depths [N] m of points [N, 3] in a camera, summed in fixed order."""
+    """Return the depths [N] in m of points [N, 3] in a camera; the terms are summed in a fixed order."""
     a, b, c, d = map(float, T_camera_world[2])
     return a * points[:, 0] + b * points[:, 1] + c * points[:, 2] + d
 
 
 def _owned(view: View, keyframe: Keyframe, owner: str) -> tuple[Tensor, Tensor, Tensor]:
-    """List the pixels that have an owner and a reading: the owner's row, its weight, the reading in m."""
+    """Return, for each pixel with an owner and a reading: the owner's row, its weight, the reading in m."""
     camera, layers = view.camera, view.layers
     ids, weights = {
         "dominant": (layers.dominant_id, layers.dominant_weight),
@@ -55,9 +56,9 @@ def _owned(view: View, keyframe: Keyframe, owner: str) -> tuple[Tensor, Tensor, 
 
 
 def fade(field: GaussianField, rows: Tensor, opacity: float) -> Tensor:
-    """Lower some splats (bool [N] or indices) to at most an opacity; their opacity is at rest then. Return their ids.
+    """Limit the opacity of some splats (bool [N] or indices) and clear Adam's moments of it; return their ids.
 
-    To be called between fits. Moments that go on would carry the opacity back, or on down, whatever the images say.
+    Call it between fits. Moments that are kept would move the opacity back or further down, whatever the images show.
     """
     column = COLUMNS["opacity_logits"].start
     limit = float(np.log(opacity / (1.0 - opacity)))
@@ -71,10 +72,10 @@ def fade(field: GaussianField, rows: Tensor, opacity: float) -> Tensor:
 def still_uncertain(
     field: GaussianField, faded: Tensor, uncertainty: Tensor, uncertain_m2: float, least_opacity: float
 ) -> Tensor:
-    """Tell which splats [N] faded earlier (`faded`: ids) have not come back: still too uncertain, or fainter than
-    `least_opacity`. Ids that are gone meanwhile are passed over; uncertainty [N] m² is `splat_uncertainty` now.
+    """Return which faded splats [N] did not recover: still too uncertain, or opacity below `least_opacity`.
 
-    A faded splat seldom owns a pixel, so opacity decides; and in a few dozen steps it does not fall from 0.07 to 1/255.
+    faded: their ids; ids that no longer exist are ignored. uncertainty [N] m²: `splat_uncertainty` of now. A faded
+    splat seldom owns a pixel, so opacity decides; in a few dozen steps it does not fall from 0.07 to 1/255.
     """
     named = torch.zeros(field.born, dtype=torch.bool, device=field.ids.device)
     named[faded] = True

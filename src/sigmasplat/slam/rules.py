@@ -1,4 +1,4 @@
-"""Decide: small questions about a run, answered yes or no, or with which ones."""
+"""The rules: small functions that answer yes or no, or choose from a list."""
 
 from collections.abc import Iterator, Sequence
 from typing import TypeVar
@@ -14,14 +14,15 @@ Item = TypeVar("Item")
 
 
 def is_keyframe(frames_since: int, every: int, overlap: float, overlap_below: float) -> bool:
-    """Tell whether a frame is mapped: so many frames after the last one (VarSplat §2), or when too little is shared."""
+    """Return whether to map a frame: `every` frames after the last keyframe (VarSplat §2), or when the overlap is
+    low."""
     return frames_since >= every or overlap < overlap_below
 
 
 def ends_submap(
     T_submap_camera: NDArray[np.float64], frames_since: int, uncertainty_m: float, config: SubmapConfig
 ) -> str:
-    """Name the rule by which the active submap ends at a keyframe, or "" (VarSplat §2).
+    """Return the name of the rule that ends the active submap at this keyframe, or "" if none does (VarSplat §2).
 
     frames_since: frames since the submap began; uncertainty_m: `Drift.position_m` of the keyframe.
     """
@@ -36,12 +37,12 @@ def ends_submap(
 
 
 def is_lost(fit: PoseFit, least_agreement: float, least_share: float) -> bool:
-    """Tell whether a pose is not to be believed: the surfaces in common disagree, or there are too few of them."""
+    """Return whether tracking failed: the depths of map and sensor disagree, or too few pixels are in common."""
     return fit.agreement < least_agreement or fit.agreement * fit.overlap < least_share
 
 
 def jumped(value: float, history: Sequence[float], factor: float) -> bool:
-    """Tell whether a loss exceeds `factor` times the median of its recent past (VarSplat §3, re-initialisation)."""
+    """Return whether a loss exceeds `factor` times the median of the recent losses (VarSplat §3, re-initialisation)."""
     return len(history) >= 5 and value > factor * float(np.median(history[-50:]))
 
 
@@ -53,10 +54,10 @@ def draw_keyframes(
     random: np.random.Generator,
     together: int = 1,
 ) -> Iterator[list[Item]]:
-    """Draw keyframes per iteration: the newest with the given probability, else any (VarSplat §2).
+    """Draw keyframes for each iteration: the newest with the given probability, else a random older one (VarSplat §2).
 
-    history > 0 limits the others to the latest so many. Several `together` are different ones, all where there are no
-    more (CG-SLAM §7).
+    history > 0: only the latest `history` older keyframes take part. together > 1: draw that many different keyframes,
+    or all of them if there are fewer (CG-SLAM §7).
     """
     older = list(keyframes[:-1])[-history:] if history else list(keyframes[:-1])
     everything = [*older, keyframes[-1]]

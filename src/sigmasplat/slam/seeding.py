@@ -1,4 +1,4 @@
-"""Choose pixels that become splats, and make the splats (VarSplat §2, seeding)."""
+"""Seeding: choose the pixels that become splats, and make the splats (VarSplat §2)."""
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ Mask = NDArray[np.bool_]
 
 
 def first_pixels(target: Target, config: SeedConfig, random: np.random.Generator) -> Mask:
-    """Pick pixels, bool [H, W], for an empty map: uniform ∪ drawn by gradient ∪ Canny edges; only with depth."""
+    """Choose pixels for an empty map, bool [H, W]: uniform, by gradient, and on Canny edges; only with depth."""
     valid = target.depth_image.numpy() > 0
     gray = gray_of(target.image.numpy())
     chosen = _draw(valid.astype(float), config.first_uniform, random)
@@ -30,8 +30,8 @@ def first_pixels(target: Target, config: SeedConfig, random: np.random.Generator
 
 
 def later_pixels(maps: PoseMaps, target: Target, config: SeedConfig) -> Mask:
-    """Find pixels, bool [H, W], the map does not explain: thin (A < alpha_below), or a surface well behind the reading
-    (where `depth_error_factor` is above 0)."""
+    """Find pixels that the map does not explain, bool [H, W]: low opacity (A < alpha_below), or a rendered surface far
+    behind the depth reading (if `depth_error_factor` is above 0)."""
     measured = target.depth_image.numpy()
     valid = measured > 0
     alpha = maps.alpha.cpu().numpy()
@@ -72,12 +72,12 @@ def make_splats(
     field: GaussianField,
     config: SeedConfig,
 ) -> GaussianField:
-    """Unproject the chosen pixels to splats: opacity and colour from settings and image, isotropic scale, σ² = e⁻⁷.
+    """Unproject pixels to splats: opacity from the settings, colour from the image, isotropic scale, σ² = e⁻⁷.
 
-    T_world_camera [4, 4] takes them to where `field`, the old splats, lies; pixels: bool [H, W], all with depth. Scale
-    follows the distance to the 3 nearest neighbours, old and new; or, with `scale_from` "pixel", a pixel's size at that
-    depth times `spacing_px`, how far seeds lie apart. New points closer than `min_distance_m` to an old splat are
-    dropped.
+    pixels: bool [H, W], all with depth. T_world_camera [4, 4] is the pose in the frame of `field`, the existing splats.
+    The scale follows the distance to the 3 nearest neighbours, old and new; with `scale_from` "pixel" it is the size of
+    a pixel at that depth times `spacing_px`, the distance between seeds. New points closer than `min_distance_m` to an
+    existing splat are dropped.
     """
     depth = target.depth_image.numpy()[pixels].astype(np.float64)
     points = target.camera.rays()[pixels] * depth[:, None] * config.push_back
@@ -100,8 +100,8 @@ def make_splats(
 def _neighbour_spread(
     points: NDArray[np.float64], means: Tensor, config: SeedConfig
 ) -> tuple[Mask, NDArray[np.float64]]:
-    """Return which new points to keep, and every point's root mean squared distance to its 3 nearest neighbours, old
-    ones (means [N, 3]) and new."""
+    """Return which new points to keep, and the root mean square distance of each to its 3 nearest neighbours among the
+    old points (means [N, 3]) and the new ones."""
     keep = np.ones(len(points), bool)
     if len(points) == 0:
         return keep, np.zeros(0)

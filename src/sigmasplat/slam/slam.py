@@ -1,10 +1,10 @@
-"""SLAM: track every frame, map keyframes, cut submaps, close loops. `Slam.step` reads like the paper's overview."""
+"""SLAM: track every frame, map keyframes, cut submaps, close loops. `Slam.step` reads like the papers' overviews."""
 
-import time
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import Config
@@ -27,19 +27,27 @@ from sigmasplat.slam.final import final_map
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.rules import ends_submap, is_keyframe
-from sigmasplat.slam.step_result import KERNELS, Step, metrics_of
+from sigmasplat.slam.step_result import Step, StepTimer, metrics_of
 from sigmasplat.slam.tracker import Tracker
-from sigmasplat.types import Matrix, Progress
+from sigmasplat.types import Matrix
 
 HOST = torch.device("cpu")
 
 
+class Observation(NamedTuple):
+    """One frame as each part of the system reads it: images, what the fits compare renders with, and a pyramid."""
+
+    frame: Frame
+    target: Target
+    live: Pyramid
+
+
 class Slam:
-    """Simultaneous localisation and mapping: feed frames to `step`, then call `finish`; read `field` and `trajectory()`
+    """Simultaneous localisation and mapping: give frames to `step`, then call `finish`; read `field` and `trajectory()`
     at any time.
 
-    Frame 0 fixes the gauge: the world is the first camera. Nothing here knows ground truth. Finished submaps go to
-    `store`, by default in memory.
+    Frame 0 fixes the gauge: the world is the first camera. No part of this class reads ground truth. Finished submaps
+    go to `store`, by default in memory.
     """
 
     def __init__(self, config: Config | None = None, store: SubmapStore | None = None) -> None:
@@ -47,19 +55,58 @@ class Slam:
         self.random = np.random.default_rng(self.config.seed)
         self.store = MemoryStore() if store is None else store
         self.atlas = Atlas()
-        self.mapper = Mapper(self.config, self.random)
         self.tracker = Tracker(self.config.tracking)
+        self.mapper = Mapper(self.config, self.random)
         self.drift = Drift()
         self.descriptor = make_descriptor(self.config.loops)
+        self.closer = LoopCloser(self.config, self.store)
         self.steps: list[Step] = []
         self.keyframes: list[int] = []
-        self.view: View | None = None
-        self.closer: LoopCloser | None = None
+        self._view: View | None = None
         self._final: GaussianField | None = None
+        self._timer = StepTimer()
+
+    def step(self, frame: Frame) -> Step:
+        """Process one frame: track it, map it if it is a keyframe, and cut the submap if a rule ends it here.
+
+        Raises SourceError if the first frame has no depth or a later one comes from another camera.
+        """
+        self._timer.start()
+        seen, tracking, loops = self._observe(frame), dict[str, float](), list[Loop]()
+        if not self.steps:
+            T_submap_camera, mapped = self._begin(seen), True
+        else:
+            fit = self._track(seen)
+            T_submap_camera, tracking = se3.inverse(fit.T_camera_world), metrics_of(fit)
+            mapped = not self.tracker.lost and self._is_keyframe(fit.overlap)
+            if mapped and self._cuts:
+                tracking["drift_m"] = self._add_drift(fit, seen)
+        if mapped:
+            T_submap_camera = self._map(seen, T_submap_camera)
+            if self._submap_ends(T_submap_camera):
+                loops = self._cut(T_submap_camera)
+                T_submap_camera = self._map(seen, np.eye(4))  # the next submap begins with the same keyframe
+        self.atlas.place_frame(T_submap_camera)
+        self.steps.append(self._step_result(seen.frame, T_submap_camera, mapped, tracking, loops))
+        return self.steps[-1]
+
+    def finish(self, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
+        """Finish the last submap, look for its loops, and make the final map (VarSplat §7); call it once, at the end.
+
+        Calls `progress(done, total)` with the steps of refinement, from 0 to the last one; without refinement the total
+        is 1. Does nothing when no rule cuts submaps and `final.iterations` is 0.
+        """
+        if not self.steps or not (len(self.store) or self._cuts or self.config.final.iterations):
+            return
+        total = self.config.final.iterations or 1
+        progress(0, total)
+        self._finish_submap()
+        self._final = final_map(self.store, self.atlas.anchors, self.config, self.view, self.random, progress)
+        progress(total, total)
 
     @property
     def field(self) -> GaussianField:
-        """Return the map in the world, in the host's memory: the final one once finished, till then all submaps side by
+        """Return the map in the world, in host memory: the final map after `finish`, before that all submaps side by
         side."""
         if self._final is not None:
             return self._final
@@ -75,74 +122,20 @@ class Slam:
 
     @property
     def loops(self) -> list[Loop]:
-        """Return every pair of submaps tried, with the latest verdict."""
-        return list(self.closer.loops) if self.closer else []
+        """Return every pair of submaps that was tried as a loop, with the latest verdict."""
+        return list(self.closer.loops)
 
     def trajectory(self) -> Trajectory:
         """Return the poses of all frames so far, lost ones included (their log lines say so).
 
-        A frame is remembered relative to the newest keyframe of its time, a keyframe to its submap: where mapping moves
-        the one or a loop the other, the frame follows.
+        A frame is stored relative to the newest keyframe of its time, a keyframe relative to its submap. So a frame
+        follows when mapping moves its keyframe or a loop moves its submap.
         """
         return Trajectory(np.array([s.timestamp_s for s in self.steps]), self.atlas.T_world_camera())
 
-    def step(self, frame: Frame) -> Step:
-        """Take in one frame. Raises SourceError if the first frame has no depth or a later one another camera."""
-        clock = time.perf_counter()
-        i = self.config.input
-        frame = frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px)
-        view = self._view_for(frame)
-        before = view.seconds.copy()
-        target = Target.of(frame, (view.sums.shape[1], view.sums.shape[2]))
-        live = live_image(view, frame.color, frame.depth_m, target)
-        seconds = {"prepare": time.perf_counter() - clock}
-
-        tracking: dict[str, float] = {}
-        loops: list[Loop] = []
-        if not self.steps:
-            T_submap_camera, mapped = self._begin(frame, live), True
-        else:
-            T_submap_camera, fit = self._track(view, target, live, seconds)
-            tracking = metrics_of(fit)
-            mapped = not self.tracker.lost and self._is_keyframe(fit.overlap)
-        if mapped:
-            if self.steps and self._cuts:
-                self.drift.hop(T_submap_camera, self.tracker.hop_covariance(fit, live))
-                tracking["drift_m"] = self.drift.position_m(T_submap_camera)
-            T_submap_camera = self._map(view, frame, target, live, T_submap_camera, seconds)
-            if self._submap_ends(T_submap_camera):
-                loops = self._cut(view, T_submap_camera, seconds)
-                T_submap_camera = self._map(view, frame, target, live, np.eye(4), seconds)
-        self.atlas.place_frame(T_submap_camera)
-
-        seconds |= dict(zip(KERNELS, (view.seconds - before).tolist(), strict=True))
-        step = Step(
-            frame.index, frame.timestamp_s, self.atlas.anchors[-1] @ T_submap_camera, mapped, self.tracker.lost,
-            tracking, len(self.mapper.field), len(self.atlas.anchors) - 1, tuple(loops),
-            seconds | {"total": time.perf_counter() - clock},
-        )  # fmt: skip
-        self.steps.append(step)
-        return step
-
-    def finish(self, progress: Progress = lambda done, total: None) -> None:
-        """Finish the last submap, look for its loops, and make the final map (VarSplat §7); once, after all frames.
-
-        `progress` is told (steps of refinement done, of how many), from the beginning to the end; one step where
-        there are none. With one submap and no refinement nothing is done.
-        """
-        if not self.steps or not (len(self.store) or self._cuts or self.config.final.iterations):
-            return
-        total = self.config.final.iterations or 1
-        progress(0, total)
-        self._freeze()
-        view = self.view
-        assert view is not None
-        self._final = final_map(self.store, self.atlas.anchors, self.config, view, self.random, progress)
-        progress(total, total)
-
     def checkpoint(self) -> dict[str, Tensor]:
-        """Return what a run needs to be read back, in the host's memory: the active submap's field with its optimiser
-        state, poses, times, keyframes, anchors, and which submap each frame belongs to."""
+        """Return what is needed to read a run back, in host memory: the active submap's field with its optimiser state,
+        poses, times, keyframes, anchors, and the submap of each frame."""
         path, active = self.trajectory(), self.mapper.field
         return {
             **{name: getattr(active, name).cpu() for name in ("params", "moment1", "moment2", "last_step")},
@@ -156,94 +149,111 @@ class Slam:
         }
 
     @property
-    def _cuts(self) -> bool:
-        """Tell whether any rule may end a submap."""
-        s = self.config.submaps
-        return bool(s.distance_m or s.angle_deg or s.frames or s.uncertainty_m)
-
-    @property
-    def _describes(self) -> bool:
-        """Tell whether anything compares keyframes by their looks."""
-        m = self.config.mapping
-        return (self._cuts and self.config.loops.close) or (m.window > 2 and m.covisibility == "descriptor")
-
-    def _freeze(self) -> list[Loop]:
-        """Hand the active submap to the store and look for its loops, which may move anchors."""
-        assert self.closer is not None
-        submap, pictures = self.mapper.finished(len(self.store))
-        self.store.save(submap, pictures)
-        descriptors = [keyframe.descriptor for keyframe in self.mapper.keyframes]
-        return self.closer.submap_finished(submap, [d for d in descriptors if d is not None], self.atlas)
-
-    def _cut(self, view: View, T_submap_camera: Matrix, seconds: dict[str, float]) -> list[Loop]:
-        """Finish the active submap and begin the next one at its newest keyframe, which both share; return the loops
-        tried."""
-        clock = time.perf_counter()
-        loops = self._freeze()
-        assert self.closer is not None
-        self.closer.submap_begun(len(self.store), T_submap_camera, self.drift.information)
-        self.atlas.begin_submap(T_submap_camera)
-        self.mapper = self.mapper.successor(view, T_submap_camera)
-        self.drift = Drift()
-        seconds["cut"] = time.perf_counter() - clock
-        return loops
+    def view(self) -> View:
+        """Return the view that renders for this run's camera. Raises SourceError before the first frame."""
+        if self._view is None:
+            raise SourceError("no camera yet: give a frame to `step` first")
+        return self._view
 
     def prepare(self, camera: Camera) -> View:
-        """Make what renders for the images of a camera, as `Frame.prepared` leaves it; the first frame does it too."""
+        """Make the view for the images of a camera, as `Frame.prepared` leaves them; the first frame does it too."""
         c = self.config
         learned = bool(c.mapping.weight_nll_color or c.mapping.weight_nll_depth)
         read = c.tracking.uncertainty and c.tracking.align_depth_by == "V"
-        self.view = make_view(c.backend, camera, c.render, variance=learned or read)
-        self.closer = LoopCloser(c, self.store, self.view)
-        return self.view
+        self._view = make_view(c.backend, camera, c.render, variance=learned or read)
+        return self._view
 
-    def _view_for(self, frame: Frame) -> View:
-        view = self.view or self.prepare(frame.camera)
-        if frame.camera != view.camera:
-            raise SourceError(f"frame {frame.index} comes from another camera ({frame.camera}) than the first")
-        return view
+    def _observe(self, frame: Frame) -> Observation:
+        """Bring a frame to working size and lay it out for the fits."""
+        with self._timer.stage("prepare"):
+            i = self.config.input
+            frame = frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px)
+            view = self._view or self.prepare(frame.camera)
+            if frame.camera != view.camera:
+                raise SourceError(f"frame {frame.index} comes from another camera ({frame.camera}) than the first")
+            self._timer.watch_kernels(view)
+            target = Target.of(frame, (view.sums.shape[1], view.sums.shape[2]))
+            return Observation(frame, target, live_image(view, frame.color, frame.depth_m, target))
+
+    def _begin(self, seen: Observation) -> Matrix:
+        """Begin the first submap at the first frame, whose camera is the world; return its pose."""
+        if not (seen.frame.depth_m > 0).any():
+            raise SourceError(
+                f"frame {seen.frame.index} has no depth reading in [{self.config.input.min_depth_m}, "
+                f"{self.config.input.max_depth_m}] m to start a map from; check the depth scale or start at a later one"
+            )
+        self.tracker.start(seen.live)
+        self.atlas.begin_submap()
+        return np.eye(4)
+
+    def _track(self, seen: Observation) -> PoseFit:
+        """Fit the frame's pose to the active submap."""
+        with self._timer.stage("track"), self._timer.kernels_of("track_kernels"):
+            return self.tracker.track(self.mapper.field, self.view, seen.target, seen.live)
 
     def _is_keyframe(self, overlap: float) -> bool:
         c = self.config.mapping
         return is_keyframe(len(self.steps) - self.mapper.keyframes[-1].index, c.every, overlap, c.overlap_below)
 
+    def _add_drift(self, fit: PoseFit, seen: Observation) -> float:
+        """Add the hop to this keyframe to the submap's drift; return the standard deviation of its position, metres."""
+        T_submap_camera = se3.inverse(fit.T_camera_world)
+        self.drift.hop(T_submap_camera, self.tracker.hop_covariance(fit, seen.live))
+        return self.drift.position_m(T_submap_camera)
+
+    def _map(self, seen: Observation, T_submap_camera: Matrix) -> Matrix:
+        """Map a keyframe; return its pose, which mapping may have moved."""
+        index, frame = len(self.steps), seen.frame
+        with self._timer.stage("describe"):
+            descriptor = self.descriptor.describe(frame.color, frame.depth_m) if self._describes else None
+        with self._timer.stage("map"):
+            fit = self.mapper.map(self.view, index, seen.target, T_submap_camera, descriptor)
+        self._timer.add(fit.seconds, prefix="map_")
+        if self.keyframes[-1:] != [index]:  # a keyframe that two submaps share counts once
+            self.keyframes.append(index)
+        self.atlas.keyframes[-1] = [keyframe.T_world_camera for keyframe in self.mapper.keyframes]
+        self.tracker.keep_keyframe(self.mapper.field, self.view, seen.live, self.atlas.keyframes[-1][-1])
+        return self.atlas.keyframes[-1][-1]
+
     def _submap_ends(self, T_submap_camera: Matrix) -> bool:
         since, moved_m = len(self.steps) - self.mapper.keyframes[0].index, self.drift.position_m(T_submap_camera)
         return bool(ends_submap(T_submap_camera, since, moved_m, self.config.submaps))
 
-    def _begin(self, frame: Frame, live: Pyramid) -> NDArray[np.float64]:
-        if not (frame.depth_m > 0).any():
-            raise SourceError(
-                f"frame {frame.index} has no depth reading in [{self.config.input.min_depth_m}, "
-                f"{self.config.input.max_depth_m}] m to start a map from; check the depth scale or start at a later one"
-            )
-        self.tracker.start(live)
-        self.atlas.begin_submap()
-        return np.eye(4)
+    def _cut(self, T_submap_camera: Matrix) -> list[Loop]:
+        """Finish the active submap and begin the next one at its newest keyframe; return the loops tried."""
+        with self._timer.stage("cut"):
+            loops = self._finish_submap()
+            self.closer.submap_begun(len(self.store), T_submap_camera, self.drift.information)
+            self.atlas.begin_submap(T_submap_camera)
+            self.mapper = self.mapper.successor(self.view, T_submap_camera)
+            self.drift = Drift()
+            return loops
 
-    def _track(self, view: View, target: Target, live: Pyramid, seconds: dict[str, float]) -> tuple[Matrix, PoseFit]:
-        clock = time.perf_counter()
-        before = view.seconds.sum()
-        fit = self.tracker.track(self.mapper.field, view, target, live)
-        seconds["track"] = time.perf_counter() - clock
-        seconds["track_kernels"] = float(view.seconds.sum() - before)
-        return se3.inverse(fit.T_camera_world), fit
+    def _finish_submap(self) -> list[Loop]:
+        """Move the active submap to the store and look for its loops, which may move anchors."""
+        submap, pictures = self.mapper.finished(len(self.store))
+        self.store.save(submap, pictures)
+        descriptors = [keyframe.descriptor for keyframe in self.mapper.keyframes]
+        return self.closer.submap_finished(
+            submap, [d for d in descriptors if d is not None], self.atlas, self.view
+        )  # fmt: skip
 
-    def _map(
-        self, view: View, frame: Frame, target: Target, live: Pyramid, T_submap_camera: Matrix,
-        seconds: dict[str, float],
-    ) -> Matrix:  # fmt: skip
-        """Map a keyframe; return its pose, which mapping may have moved."""
-        clock = time.perf_counter()
-        descriptor = self.descriptor.describe(frame.color, frame.depth_m) if self._describes else None
-        seconds["describe"], clock = seconds.get("describe", 0.0) + time.perf_counter() - clock, time.perf_counter()
-        fit = self.mapper.map(view, len(self.steps), target, T_submap_camera, descriptor)
-        for stage, spent in {
-            "map": time.perf_counter() - clock,
-            **{f"map_{n}": s for n, s in fit.seconds.items()},
-        }.items():
-            seconds[stage] = seconds.get(stage, 0.0) + spent
-        self.keyframes += [len(self.steps)] * (self.keyframes[-1:] != [len(self.steps)])  # a shared one counts once
-        self.atlas.keyframes[-1] = [keyframe.T_world_camera for keyframe in self.mapper.keyframes]
-        self.tracker.keep_keyframe(self.mapper.field, view, live, self.atlas.keyframes[-1][-1])
-        return self.atlas.keyframes[-1][-1]
+    def _step_result(
+        self, frame: Frame, T_submap_camera: Matrix, mapped: bool, tracking: dict[str, float], loops: list[Loop]
+    ) -> Step:
+        return Step(
+            frame.index, frame.timestamp_s, self.atlas.anchors[-1] @ T_submap_camera, mapped, self.tracker.lost,
+            tracking, len(self.mapper.field), len(self.atlas.anchors) - 1, tuple(loops), self._timer.stop(),
+        )  # fmt: skip
+
+    @property
+    def _cuts(self) -> bool:
+        """Return whether any rule may end a submap."""
+        s = self.config.submaps
+        return bool(s.distance_m or s.angle_deg or s.frames or s.uncertainty_m)
+
+    @property
+    def _describes(self) -> bool:
+        """Return whether any part compares keyframes by their descriptors."""
+        m = self.config.mapping
+        return (self._cuts and self.config.loops.close) or (m.window > 2 and m.covisibility == "descriptor")

@@ -1,21 +1,27 @@
-"""Tell what one frame brought."""
+"""The result of one frame, and the times of its stages."""
 
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.fit.pose import PoseFit
+from sigmasplat.model.stopwatch import Stopwatch
+from sigmasplat.render.view import View
 from sigmasplat.slam.loop_closure.closer import Loop
 
 KERNELS = ("project", "sort", "blend", "blend_backward", "project_backward")
-"""What `View.seconds` counts, in its order."""
+"""The stages that `View.seconds` counts, in its order."""
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What one frame brought: its pose T_world_camera [4, 4], whether it was mapped, whether it was lost, its submap,
-    the loops looked for when the submap before was finished, numbers."""
+    """The result of one frame: pose T_world_camera [4, 4], whether it was mapped, whether tracking was lost, numbers
+    of tracking, the number of splats, the submap, the loops that were tried when the submap before ended, and seconds
+    by stage."""
 
     index: int
     timestamp_s: float
@@ -30,8 +36,33 @@ class Step:
 
 
 def metrics_of(fit: PoseFit) -> dict[str, float]:
-    """Return what a step tells of its tracking."""
+    """Return the tracking numbers that a step reports."""
     return {
         "agreement": fit.agreement, "overlap": fit.overlap, "first_loss": fit.first_loss,
         "loss": fit.loss, "iterations": float(fit.iterations),
     }  # fmt: skip
+
+
+class StepTimer(Stopwatch):
+    """Wall-clock seconds of one step by stage, with what the view's kernels took of them."""
+
+    def start(self) -> None:
+        """Begin a step: forget the one before."""
+        self.seconds, self._begin_s = {}, time.perf_counter()
+
+    def watch_kernels(self, view: View) -> None:
+        """Count the kernels of this view from now on."""
+        self._view, self._kernels_before = view, view.seconds.copy()
+
+    @contextmanager
+    def kernels_of(self, name: str) -> Iterator[None]:
+        """Add the kernels' part of a block of code to a stage."""
+        before_s = self._view.seconds.sum()
+        yield
+        self.add({name: float(self._view.seconds.sum() - before_s)})
+
+    def stop(self) -> dict[str, float]:
+        """Return the seconds of all stages, of the kernels, and in total."""
+        kernels_s = (self._view.seconds - self._kernels_before).tolist()
+        self.add(dict(zip(KERNELS, kernels_s, strict=True)) | {"total": time.perf_counter() - self._begin_s})
+        return self.seconds

@@ -1,4 +1,4 @@
-"""Choose which keyframes are looked at together: the newest, the one before, those that share most with the newest."""
+"""Choose the keyframes that are fitted together: the newest, the one before, and the most co-visible others."""
 
 from collections.abc import Callable, Sequence
 from typing import Literal
@@ -18,18 +18,18 @@ Ids = NDArray[np.int64]
 Scores = NDArray[np.float64]
 
 GRID = 40
-"""Readings are looked up on so many rows and columns of the newest keyframe (1600 pixels, as in CG-SLAM's code)."""
+"""Rows and columns of the grid of depth readings in the newest keyframe (1600 pixels, as in CG-SLAM's code)."""
 HIDDEN_RELATIVE, HIDDEN_M = 0.05, 0.05
-"""A point farther than the other camera's reading by more than both together lies behind what that camera saw."""
+"""A point is occluded if it is farther than the other camera's reading by more than the sum of both."""
 
 
 def choose_window(
     keyframes: Sequence[Keyframe], size: int, by: Literal["splats", "frustum", "descriptor"]
 ) -> list[Keyframe]:
-    """Return the newest keyframe, the one before it, then those of the others that share most, best first (CG-SLAM §7).
+    """Return the newest keyframe, the one before it, then the most co-visible others, best first (CG-SLAM §7).
 
-    keyframes in the order of time; size ≥ 1, fewer while there are fewer; of equals the later one. Raises
-    SigmaSplatError where a keyframe holds nothing to go `by`.
+    keyframes: in the order of time; size ≥ 1: the most to return. Between equal scores the later keyframe wins. Raises
+    SigmaSplatError if a keyframe lacks the data that `by` compares.
     """
     latest, older = list(keyframes[-2:]), keyframes[:-2]
     window = latest[::-1][:size]
@@ -41,7 +41,7 @@ def choose_window(
 
 
 def dominating(view: View, field: GaussianField) -> Ids:
-    """Name the splats that dominate a pixel of a view's last forward pass with layers: sorted `field.ids`."""
+    """Return the sorted `field.ids` of splats that dominate a pixel in the view's last forward pass with layers."""
     rows = view.layers.dominant_id[: view.camera.height, : view.camera.width]
     there = torch.zeros(len(field), dtype=torch.bool, device=rows.device)
     there[rows[rows >= 0].long()] = True
@@ -49,7 +49,7 @@ def dominating(view: View, field: GaussianField) -> Ids:
 
 
 def covisible_splats(newest: Ids, others: Sequence[Ids]) -> Scores:
-    """Return the share of the newest's splats that each of the others has too; all are sorted sets of ids ≥ 0."""
+    """Return the share of the newest keyframe's splats that each other keyframe sees too; ids are ≥ 0 and sorted."""
     scores = np.zeros(len(others))
     if len(newest) == 0:
         return scores
@@ -79,11 +79,11 @@ SCORES: dict[str, Callable[[Keyframe, Sequence[Keyframe]], Scores]] = {
     "frustum": _by_readings,
     "descriptor": _by_descriptor,
 }
-"""How much each of some keyframes shares with the newest, by what is compared."""
+"""Co-visibility of keyframes with the newest one, by method."""
 
 
 def _readings(keyframe: Keyframe) -> NDArray[np.float64]:
-    """Return readings of a grid of pixels as points in the world [n, 3], metres."""
+    """Return the depth readings on a grid of pixels as points in the world [n, 3], metres."""
     camera = keyframe.target.camera
     rows, columns = (np.unique((np.arange(GRID) + 0.5) * n // GRID).astype(int) for n in (camera.height, camera.width))
     grid = np.ix_(rows, columns)
@@ -94,7 +94,7 @@ def _readings(keyframe: Keyframe) -> NDArray[np.float64]:
 
 
 def _share_seen(points: NDArray[np.float64], keyframe: Keyframe) -> float:
-    """Return the share of points [n, 3], world, that lie in a keyframe's image and not behind what it saw there."""
+    """Return the share of points [n, 3] in the world that a keyframe sees: inside its image and not occluded."""
     T, camera, depth_m = se3.inverse(keyframe.T_world_camera), keyframe.target.camera, keyframe.target.depth_image
     x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
     ahead = z > 0

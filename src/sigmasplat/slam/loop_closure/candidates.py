@@ -1,4 +1,4 @@
-"""Decide which submaps may show the same place, and by which keyframes to register them (VarSplat §4)."""
+"""Loop candidates: submaps that may show the same place, and the keyframes to register them by (VarSplat §4)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ GATE_LEAST, GATE_MOST = 0.85, 1.20
 
 @dataclass(frozen=True, eq=False)
 class SubmapDescriptor:
-    """What is remembered of a finished submap for recognising it.
+    """Descriptors of a finished submap.
 
-    index: position among the submaps; descriptors [n, D], one per keyframe, unit norm; opacity_ratio: r of its splats.
+    index: its number; descriptors [n, D]: one per keyframe, unit norm; opacity_ratio: r of its splats.
     """
 
     index: int
@@ -30,9 +30,9 @@ class SubmapDescriptor:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A keyframe of one submap that looks like a keyframe of another; gated = similarity × gate.
+    """Two similar keyframes of different submaps; gated = similarity × gate.
 
-    Keyframes count within their submap, as the rows of its descriptors do.
+    Keyframe numbers count within the submap, as the rows of its descriptors do.
     """
 
     query_submap: int
@@ -45,7 +45,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class SubmapPair:
-    """Two submaps worth registering; best: their most similar keyframes; keyframes: who is localised in the other."""
+    """Two submaps to register; best: their most similar keyframes; keyframes: those to localise in the other submap."""
 
     best: Candidate
     query_keyframes: tuple[int, ...]
@@ -53,10 +53,10 @@ class SubmapPair:
 
 
 def variance_weights(log_variances: NDArray[np.floating], tau: float = 10.0, weight_max: float = 3.0) -> Matrix:
-    """Weigh splats by how steady their colour is (VarSplat §4, w_i), [N].
+    """Return a weight per splat [N], high for a low colour variance (VarSplat §4, w_i).
 
-    w = clamp(exp(−(log σ̄² − median)/τ) / mean, 1/weight_max, weight_max), σ̄² the mean over the channels of σ² =
-    exp(log_variances [N, 3]), the mean of exp(·) over the submap's splats. A common factor in all σ² cancels.
+    w = clamp(exp(−(log σ̄² − median)/τ) / mean, 1/weight_max, weight_max). σ̄² is the mean over the channels of σ² =
+    exp(log_variances [N, 3]); "mean" is that of exp(·) over the submap's splats. A common factor in all σ² cancels.
     """
     log_mean = logsumexp(np.asarray(log_variances, np.float64), axis=1)
     # exp(·) / mean is N × softmax, in which the median and the ⅓ of the channel mean cancel and nothing overflows.
@@ -66,9 +66,9 @@ def variance_weights(log_variances: NDArray[np.floating], tau: float = 10.0, wei
 def opacity_ratio(
     opacities: NDArray[np.floating], log_variances: NDArray[np.floating], tau: float = 10.0, weight_max: float = 3.0
 ) -> float:
-    """Return r = Σ w o / Σ o of a submap's splats (VarSplat §4): above 1 where the opaque ones are the steady ones.
+    """Return r = Σ w o / Σ o of a submap's splats (VarSplat §4): above 1 if opaque splats have low variance.
 
-    opacities [N] in [0, 1], log_variances [N, 3]. 1 where all σ² are equal, and where there is nothing opaque to judge.
+    opacities [N] in [0, 1], log_variances [N, 3]. r is 1 if all σ² are equal, or if no splat is opaque.
     """
     opaque = np.asarray(opacities, np.float64)
     total = float(opaque.sum())
@@ -81,10 +81,10 @@ def gate(query_ratio: float, database_ratio: float) -> float:
 
 
 def self_similarity(descriptors: Descriptors, min_similarity: float = 0.5) -> Matrix:
-    """Return for each keyframe of a submap [n] how alike another view must be to count as the same place (VarSplat §4).
+    """Return, for each keyframe of a submap [n], the similarity that another view must exceed (VarSplat §4).
 
-    It is the keyframe's k-th highest similarity to the n keyframes of its own submap, itself included, with k =
-    max(⌊n · min_similarity⌋, 1): at 0.5 the median of a place seen from nearby. A lone keyframe has threshold 1.
+    It is the k-th highest similarity to the n keyframes of the same submap, itself included, with k =
+    max(⌊n · min_similarity⌋, 1); with 0.5 it is the median. A single keyframe has threshold 1.
     """
     count = len(descriptors)
     if count == 0:
@@ -101,12 +101,12 @@ def find_candidates(
     similarity_floor: float = 0.0,
     uncertainty: bool = True,
 ) -> list[Candidate]:
-    """List the keyframe pairs of the query with other submaps that may show one place (VarSplat §4), best first.
+    """List the keyframe pairs of the query and other submaps that may show the same place (VarSplat §4), best first.
 
-    A pair counts when its submaps are at least `min_interval` apart, when similarity × gate exceeds the query
-    keyframe's `self_similarity`, and when the similarity itself, ungated, exceeds `similarity_floor`: a submap of
-    unlike views has a low threshold, and no gate makes strangers of one place. `uncertainty` off = gate 1. The order is
-    by gated similarity; ties by database submap, query keyframe, database keyframe; not by how `database` is ordered.
+    A pair counts if its submaps are at least `min_interval` apart, if similarity × gate exceeds the query keyframe's
+    `self_similarity`, and if the similarity without gate exceeds `similarity_floor` (a submap of dissimilar views has a
+    low `self_similarity`). Without `uncertainty` the gate is 1. The order is by gated similarity, then by database
+    submap, query keyframe, database keyframe; the order of `database` does not matter.
     """
     threshold = self_similarity(query.descriptors, min_similarity)
     found: list[Candidate] = []
@@ -132,11 +132,12 @@ def find_nearby(
     min_interval: int = 2,
     keyframes: int = 2,
 ) -> list[SubmapPair]:
-    """List pairs of submaps that by the poses known so far see one place, whatever they look like; nearest first.
+    """List pairs of submaps that show the same place according to the current poses; nearest first.
 
-    Ours, beside the paper's: where drift is small, poses know of more revisits than descriptors do. T_world_keyframe:
-    per submap by its index, [K, 4, 4]. Pairs count with keyframes nearer than near_m and turned by less than near_rad;
-    the nearest `keyframes` of each side, in units of both limits, are to be localised.
+    An addition to the paper: while drift is small, poses find more revisits than descriptors do. T_world_keyframe:
+    poses [K, 4, 4] of each submap, by its index. A pair counts if two keyframes are nearer than near_m and their
+    rotations differ by less than near_rad. The nearest `keyframes` of each side, in units of both limits, are to be
+    localised.
     """
     found: list[tuple[float, SubmapPair]] = []
     ours = T_world_keyframe[query.index]
@@ -161,22 +162,22 @@ def find_nearby(
 def pairs_to_register(
     candidates: Sequence[Candidate], query: SubmapDescriptor, database: Sequence[SubmapDescriptor], keyframes: int = 2
 ) -> list[SubmapPair]:
-    """Gather a query's candidates by submap, best pair first, with the keyframes to localise (VarSplat §5).
+    """Group a query's candidates by submap, best pair first, and choose the keyframes to localise (VarSplat §5).
 
-    candidates are `find_candidates`' for the same query and database. Of each side those `keyframes` are taken whose
-    best similarity to the other side's keyframes is highest, in that order; fewer where there are fewer.
+    candidates: the result of `find_candidates` for the same query and database. Of each side, the `keyframes` most
+    similar to any keyframe of the other side are chosen, most similar first.
     """
-    signatures = {signature.index: signature for signature in database}
+    submaps = {submap.index: submap for submap in database}
     best: dict[int, Candidate] = {}
     for candidate in candidates:
         best.setdefault(candidate.database_submap, candidate)
     pairs = []
     for index, candidate in best.items():
-        alike = similarity(query.descriptors, signatures[index].descriptors)
+        alike = similarity(query.descriptors, submaps[index].descriptors)
         pairs.append(SubmapPair(candidate, _highest(alike.max(1), keyframes), _highest(alike.max(0), keyframes)))
     return pairs
 
 
 def _highest(scores: Matrix, count: int) -> tuple[int, ...]:
-    """Return where the highest scores stand, best first; of equal ones the earlier."""
+    """Return the indices of the highest scores, best first; between equal scores the lower index first."""
     return tuple(int(i) for i in np.argsort(-scores, kind="stable")[:count])

@@ -1,4 +1,4 @@
-"""Close loops: recognise places among finished submaps, register them, and spread what that says over the anchors."""
+"""Close loops: find candidate submaps, register them, solve the pose graph, and move the anchors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -31,12 +31,12 @@ from sigmasplat.types import Matrix
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A pair of submaps that look alike, and what became of it.
+    """A pair of submaps that was tried as a loop, and the result.
 
-    query, database: submaps; query_frame, database_frame: their most alike keyframes' frames; similarity, gated: of
-    these (VarSplat §4); residual, overlap, localised: of the registration; translation_m, rotation_deg: by how much
-    T_query_database [4, 4] differs from the poses known before; chi2, weight: the pose graph's verdict on it; accepted:
-    whether it holds.
+    query, database: submaps; query_frame, database_frame: the frames of their most similar keyframes; similarity,
+    gated: of these keyframes (VarSplat §4); residual, overlap, localised: of the registration; translation_m,
+    rotation_deg: the difference between T_query_database [4, 4] and the poses before; chi2, weight: verdict of the pose
+    graph; accepted: whether the loop is used.
     """
 
     query: int
@@ -64,7 +64,7 @@ class Loop:
 
 
 def make_descriptor(config: LoopConfig) -> Descriptor:
-    """Make what describes keyframes. Raises ConfigError where NetVLAD is asked for without weights, or as they load."""
+    """Make the descriptor of keyframes. Raises ConfigError if NetVLAD has no weights file or cannot load it."""
     if config.descriptor == "grid":
         return OrientationGrid()
     if not config.weights:
@@ -76,60 +76,61 @@ def make_descriptor(config: LoopConfig) -> Descriptor:
 
 @dataclass(eq=False)
 class LoopCloser:
-    """Remembers how finished submaps look, and every edge between them; the only one to move anchors."""
+    """Keeps the descriptors of finished submaps and all edges between them; nothing else moves anchors."""
 
     config: Config
     store: SubmapStore
-    view: View
-    signatures: list[SubmapDescriptor] = field(default_factory=list)
+    descriptors: list[SubmapDescriptor] = field(default_factory=list)
     odometry: list[Edge] = field(default_factory=list)
     closed: list[Edge] = field(default_factory=list)
     loops: list[Loop] = field(default_factory=list)
 
     def submap_begun(self, index: int, T_before_new: Matrix, information: Matrix) -> None:
-        """Take note of how tracking tied a new submap to the one before it: T_before_new [4, 4], and the information
-        [6, 6] of its left twist (m, rad)."""
+        """Add the odometry edge from the previous submap to a new one: T_before_new [4, 4], and the information [6, 6]
+        of its left twist (m, rad)."""
         self.odometry.append(Edge(index - 1, index, T_before_new, information, loop=False))
 
-    def submap_finished(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], atlas: Atlas) -> list[Loop]:
-        """Look for loops from a finished submap to earlier ones; where one is found, correct the anchors.
+    def submap_finished(
+        self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], atlas: Atlas, view: View
+    ) -> list[Loop]:
+        """Look for loops from a finished submap to earlier ones; if one is found, correct the anchors.
 
-        descriptors [D]: of its keyframes, in order, of unit norm or zero. Returns the pairs tried, the latest verdict
-        on each.
+        descriptors [D]: one per keyframe, in order, of unit norm or zero. Returns the pairs that were tried, each with
+        the latest verdict.
         """
         c, field = self.config.loops, submap.field
         if not c.close or not descriptors:
             return []
         log_variances = field.params[:, COLUMNS["log_variances"]].numpy()
         ratio = opacity_ratio(field.opacities.numpy(), log_variances, c.tau, c.weight_max)
-        signature = SubmapDescriptor(submap.index, np.stack(descriptors), ratio)
-        pairs = self._pairs(signature, atlas)
-        self.signatures.append(signature)
-        tried = [self._try(pair, submap, atlas) for pair in pairs]
+        query = SubmapDescriptor(submap.index, np.stack(descriptors), ratio)
+        pairs = self._pairs(query, atlas)
+        self.descriptors.append(query)
+        tried = [self._try(pair, submap, atlas, view) for pair in pairs]
         if any(loop.accepted for loop in tried):
             self._correct(atlas)
         return self.loops[len(self.loops) - len(tried) :]
 
     def _pairs(self, query: SubmapDescriptor, atlas: Atlas) -> list[SubmapPair]:
-        """Choose the earlier submaps to register with: those that look alike, then those that should be near."""
+        """Choose the earlier submaps to register with: first similar ones, then those near by the current poses."""
         c = self.config.loops
         candidates = find_candidates(
-            query, self.signatures, c.min_similarity, c.min_interval, c.similarity_floor, c.uncertainty
+            query, self.descriptors, c.min_similarity, c.min_interval, c.similarity_floor, c.uncertainty
         )
         keyframes = self.config.registration.keyframes
-        pairs = pairs_to_register(candidates, query, self.signatures, keyframes)
+        pairs = pairs_to_register(candidates, query, self.descriptors, keyframes)
         if c.near_m:
             poses = [atlas.T_world_keyframe(index) for index in range(query.index + 1)]
             near_rad, known = np.deg2rad(c.near_deg), {pair.best.database_submap for pair in pairs}
-            near = find_nearby(query, self.signatures, poses, c.near_m, near_rad, c.min_interval, keyframes)
+            near = find_nearby(query, self.descriptors, poses, c.near_m, near_rad, c.min_interval, keyframes)
             pairs += [pair for pair in near if pair.best.database_submap not in known]
         return pairs[: c.most] if c.most else pairs
 
-    def _try(self, pair: SubmapPair, a: Submap, atlas: Atlas) -> Loop:
-        """Register a pair, of which `a` is the query, and take note of it, accepted or not."""
+    def _try(self, pair: SubmapPair, a: Submap, atlas: Atlas, view: View) -> Loop:
+        """Register a pair, with `a` as the query, and record the result, accepted or not."""
         b = self.store.load(pair.best.database_submap)
         known = se3.inverse(atlas.anchors[a.index]) @ atlas.anchors[b.index]
-        found = Registrar(self.config, self.store, self.view).register(pair, a, b, known)
+        found = Registrar(self.config, self.store, view).register(pair, a, b, known)
         loop = described(pair.best, a, b, found, known)
         self.loops.append(loop)
         if found.accepted:
@@ -137,7 +138,7 @@ class LoopCloser:
         return loop
 
     def _correct(self, atlas: Atlas) -> None:
-        """Solve the pose graph, move the anchors, and note its verdict on every loop registered so far."""
+        """Solve the pose graph, move the anchors, and update the verdict on every registered loop."""
         solution = optimise(np.stack(atlas.anchors), [*self.odometry, *self.closed])
         atlas.anchors[:] = list(solution.T_world_node)
         verdicts = iter(solution.verdicts)
@@ -147,8 +148,8 @@ class LoopCloser:
 
 
 def described(best: Candidate, a: Submap, b: Submap, found: Registration, known: Matrix) -> Loop:
-    """Return what became of registering submaps a and b, whose most alike keyframes are `best`'s; known: T_a_b [4, 4]
-    of before."""
+    """Return the loop record of a registration of submaps a and b; best: their most similar keyframes; known: T_a_b
+    [4, 4] before it."""
     seen_from = b.T_submap_camera[best.database_keyframe]
     moved = se3.inverse(known @ seen_from) @ found.T_a_b @ seen_from
     return Loop(

@@ -1,4 +1,4 @@
-"""Sum a frame up in one vector, so that two views of the same place are recognised by the angle between them."""
+"""Global image descriptors: one vector per frame; views of the same place have a small angle between them."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -14,27 +14,27 @@ from sigmasplat.types import Matrix
 Plane = NDArray[np.float32]
 
 WORKING_SIZE = (80, 60)
-"""Width and height in pixels at which gradients are taken, whatever the camera's."""
+"""Width and height in pixels of the image that gradients are computed on, for every camera."""
 BLUR_PX = 1.0
 """Standard deviation of the blur at that size."""
 LEAST_READINGS = 0.25
-"""A small pixel has a depth if at least this share of the large ones it covers has."""
+"""A small pixel has depth if at least this share of the large pixels under it have depth."""
 SOFTENING = 0.5
-"""Cells with far less gradient than this multiple of the typical are noise: they fade, not grow to norm 1."""
+"""Softens the normalisation of cells: a cell with little gradient, which is mostly noise, keeps a small norm."""
 LEAST_GRADIENT = 1e-4
-"""A mean gradient below this (√gray or log m over two pixels) is rounding: the half shows nothing."""
+"""A mean gradient below this (√gray or log m over two pixels) is rounding error: that half of the vector is zero."""
 CENTRING = 0.5
-"""Share of the mean taken off. Histograms are ≥ 0, hence all alike; taking all of it off lost wide-baseline matches."""
+"""Share of the mean that is subtracted. All histograms are ≥ 0 and therefore similar; subtracting the whole mean lost
+wide-baseline matches."""
 
 
 class Descriptor(Protocol):
-    """Describe a view by a vector; built in is `OrientationGrid`, with weights of one's own `netvlad.NetVlad`."""
+    """Describes a view by a vector: `OrientationGrid` is built in, `netvlad.NetVlad` needs a file of weights."""
 
     def describe(self, color: NDArray[np.float32], depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return a float32 vector [D] of unit norm, or of zeros where there is nothing to describe.
+        """Return a float32 vector [D] of unit norm, or zeros for an image without structure.
 
-        color [H, W, 3] RGB in [0, 1]; depth_m [H, W] metres, 0 = no reading. All vectors of one descriptor have one
-        length, whatever H and W.
+        color [H, W, 3] RGB in [0, 1]; depth_m [H, W] metres, 0 = no reading. D does not depend on H and W.
         """
         ...
 
@@ -48,9 +48,9 @@ def similarity(a: NDArray[np.float32], b: NDArray[np.float32]) -> Matrix:
 class OrientationGrid:
     """Histograms of gradient orientation on a coarse grid, of gray and of log depth. Needs no weights.
 
-    Directions are taken modulo 180°, so that it does not matter which side of an edge is the brighter; magnitudes are
-    compared within a cell only, so that neither exposure nor the unit of depth matters. The coarse grid with cells that
-    fade into each other bears a shift of a fifth of the image. `depth_share` of the squared norm is depth's.
+    Directions are modulo 180°: it does not matter which side of an edge is brighter. Magnitudes are normalised within
+    each cell: exposure and the unit of depth do not matter. The coarse grid with overlapping cells tolerates a shift of
+    a fifth of the image. `depth_share` is the share of depth in the squared norm.
     """
 
     columns: int = 4
@@ -59,9 +59,9 @@ class OrientationGrid:
     depth_share: float = 0.35
 
     def describe(self, color: NDArray[np.float32], depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return float32 [2 · rows · columns · bins] of unit norm: gray's half, then depth's (`Descriptor.describe`).
+        """Return float32 [2 · rows · columns · bins] of unit norm: first gray, then depth (`Descriptor.describe`).
 
-        A half that shows no gradient at all (a blank wall, no readings) is zero, the other one then stands alone.
+        A half without any gradient (a blank wall, no depth readings) is zero; the other half then has unit norm.
         """
         gray = gaussian_filter(_small(np.sqrt(gray_of(color))), BLUR_PX)
         log_depth, valid = _small_log_depth(depth_m)
@@ -72,7 +72,7 @@ class OrientationGrid:
         return _unit(np.concatenate(halves)).astype(np.float32)
 
     def _histograms(self, image: Plane, valid: NDArray[np.bool_]) -> Matrix:
-        """Return the cells' histograms [rows · columns · bins], unit norm; zero where no gradient is known."""
+        """Return the histograms of all cells [rows · columns · bins], unit norm; zero if no gradient is known."""
         magnitude, turn, known = _gradients(image, valid)
         bin_ = turn * self.bins
         lower = np.floor(bin_).astype(int)
@@ -102,7 +102,7 @@ def _small(plane: Plane) -> Plane:
 
 
 def _small_log_depth(depth_m: Plane) -> tuple[Plane, NDArray[np.bool_]]:
-    """Average log depth over readings only, and blur it likewise; return it and where there is any."""
+    """Average and blur log depth over valid readings only; return it, and which small pixels are valid."""
     measured = depth_m > 0.0
     share = _small(measured.astype(np.float32))
     total = _small(np.log(depth_m, where=measured, out=np.zeros(depth_m.shape, np.float32)))
@@ -113,7 +113,7 @@ def _small_log_depth(depth_m: Plane) -> tuple[Plane, NDArray[np.bool_]]:
 
 
 def _gradients(image: Plane, valid: NDArray[np.bool_]) -> tuple[Matrix, Matrix, NDArray[np.bool_]]:
-    """Return central differences' magnitude, their direction in half turns [0, 1), and where both are known."""
+    """Return the gradient's magnitude, its direction in half turns [0, 1), and which pixels have both."""
     image = image.astype(np.float64)
     dx, dy = np.zeros_like(image), np.zeros_like(image)
     dx[:, 1:-1] = image[:, 2:] - image[:, :-2]

@@ -21,16 +21,16 @@ CONVOLUTIONS = tuple(f"conv{block}_{i + 1}" for block, count in enumerate((2, 2,
 POOLED_BEFORE = ("conv2_1", "conv3_1", "conv4_1", "conv5_1")
 SMALLEST_PX = 2 ** len(POOLED_BEFORE)
 LAYER_NUMBERS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
-"""Where the convolutions stand when ReLUs and poolings are counted too, as both formats met in the wild do."""
+"""Numbers of the convolutions if ReLUs and poolings are counted too, as both common formats do."""
 VLAD_LAYER, WHITEN_LAYER = 30, 33
-"""Where the Matlab network has its NetVLAD layer and the whitening after it."""
+"""Numbers of the NetVLAD layer and the whitening layer in the Matlab network."""
 IMAGENET_MEAN, IMAGENET_STD = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
 FORMATS = "a pytorch-NetVlad checkpoint, hloc's VGG16-NetVLAD-Pitts30K.mat or a file NetVladWeights.save wrote"
 
 
 @dataclass(frozen=True, eq=False)
 class NetVladWeights:
-    """VGG16 and NetVLAD layer in float32, whatever file they came from; the shapes say how wide the network is.
+    """VGG16 and the NetVLAD layer in float32, from any file format; the shapes give the width of the network.
 
     convolutions: 13 of weight [out, in, 3, 3] and bias [out], the last out = D; assign [K, D] and assign_bias [K]: the
     soft assignment to K clusters; centroids [K, D]; whitening: weight [P, K · D] and bias [P] of the PCA over the
@@ -80,7 +80,7 @@ class NetVladWeights:
 
 @dataclass(frozen=True, eq=False)
 class NetVlad:
-    """A `Descriptor` of colour alone; width: pixels to work at (0 = as the image comes; 640 is what it learned on)."""
+    """A `Descriptor` of colour alone; width: working width in pixels (0 = the image's own; it was trained at 640)."""
 
     weights: NetVladWeights
     width: int = 0
@@ -129,7 +129,7 @@ def _vgg(weights: NetVladWeights, image: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class _TensorFile:
-    """The tensors of a file by our names, in PyTorch's order of axes; alias: the names they have there."""
+    """The tensors of a file by our names, in PyTorch's order of axes; alias: their names in the file."""
 
     path: Path
     tensors: dict[str, Tensor]
@@ -153,7 +153,7 @@ class _TensorFile:
             raise ConfigError(f"{where} is {sizes}, expected {expected}; give {FORMATS}")
         if not torch.isfinite(tensor).all():
             raise ConfigError(f"{where} holds NaN or inf, expected finite weights; download the file again")
-        # A copy: the last bits of a product depend on how its factors are aligned, and a file aligns them anyhow.
+        # A copy: the last bits of a product depend on memory alignment, which differs from file to file.
         return torch.empty(found).copy_(tensor.reshape(found))
 
     def weights(self) -> NetVladWeights:
@@ -206,7 +206,7 @@ def _read_matlab(path: Path) -> _TensorFile:
     tensors: dict[str, Tensor] = {}
     for i, layer in enumerate(np.ravel(net.layers)):
         for j, weights in enumerate(np.ravel(getattr(layer, "weights", ()))):
-            # Matlab has axes the other way round: [height, width, in, out], [D, K].
+            # Matlab's order of axes is reversed: [height, width, in, out], [D, K].
             array = np.asarray(weights, np.float32).T
             array = array.swapaxes(2, 3) if array.ndim == 4 else array
             tensors[f"net.layers[{i}].weights[{j}]"] = torch.tensor(array.copy())

@@ -1,8 +1,8 @@
-"""Correct submaps' poses by what loops say about them: Levenberg–Marquardt on SE(3), with loops under suspicion.
+"""Robust pose graph: Levenberg–Marquardt on SE(3) that rejects false loops.
 
 Odometry edges are trusted. Loop edges are judged while the graph is solved, by graduated non-convexity with the
-Geman–McClure loss (Yang et al., RA-L 2020): at first every loop pulls nearly fully, at last only those that agree with
-the rest of the graph. Those accepted then count fully and the others not at all.
+Geman–McClure loss (Yang et al., RA-L 2020): at first every loop has nearly full weight, at the end only loops that
+agree with the rest of the graph. Then accepted loops get weight 1 and the others weight 0.
 """
 
 from collections.abc import Sequence
@@ -19,18 +19,18 @@ from sigmasplat.model import se3
 from sigmasplat.types import Matrix
 
 PRUNE_WEIGHT = 0.25
-"""Below this weight a loop is rejected (VarSplat §6). At μ = 1 the weight is ¼ exactly where r² = c²: the χ² test."""
+"""A loop with a lower weight is rejected (VarSplat §6). At μ = 1 the weight is ¼ exactly if r² = c²: the χ² test."""
 GRADUATION = 1.4
 """Factor from one μ to the next (Yang et al. 2020, remark 5)."""
 STEPS_PER_MU = 10
-"""As many as settle it. With two, one loop that is false by half a turn bent the first solutions so far that thirteen
-true ones were rejected with it (half a metre of drift, 36 submaps)."""
+"""Enough steps to converge. With two steps, one loop that was wrong by half a turn distorted the first solutions so
+much that thirteen true loops were rejected with it (half a metre of drift, 36 submaps)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """T_a_b as measured between nodes a and b, and the information [6, 6] (inverse covariance, 1/m² and 1/rad²) of its
-    left twist ξ = (ρ, φ): the truth is exp(ξ) T_a_b. Odometry is trusted, a loop is judged."""
+    """A measurement T_a_b between nodes a and b, and the information [6, 6] (inverse covariance, 1/m² and 1/rad²) of
+    its left twist ξ = (ρ, φ): the true motion is exp(ξ) T_a_b. Odometry is trusted, a loop is judged."""
 
     a: int
     b: int
@@ -41,8 +41,8 @@ class Edge:
 
 @dataclass(frozen=True)
 class LoopVerdict:
-    """Whether loop a → b was believed; its Geman–McClure weight in [0, 1] when that was decided; and the χ² (6 degrees
-    of freedom) by which it differs from the solution."""
+    """Whether loop a → b was accepted; its Geman–McClure weight in [0, 1] at the decision; the χ² (6 degrees of
+    freedom) of its difference to the solution."""
 
     a: int
     b: int
@@ -66,7 +66,7 @@ class PoseGraphSolution:
 def optimise(
     T_world_node: Matrix, edges: Sequence[Edge], confidence: float = 0.99, max_iterations: int = 100
 ) -> PoseGraphSolution:
-    """Find the poses [N, 4, 4] that agree best with the edges; node 0 stays where it is.
+    """Find the poses [N, 4, 4] that agree best with the edges; node 0 is fixed.
 
     A loop is rejected where its χ² exceeds the `confidence` quantile of 6 degrees of freedom; confidence = 1 believes
     every loop (plain least squares). Without loops the poses come back as they are. Up to `max_iterations` steps follow
@@ -105,7 +105,7 @@ def optimise(
 
 
 class PoseGraph:
-    """The edges as stacks, and where each one's blocks lie in the normal equations. Node 0 has no row: it is fixed."""
+    """The edges as arrays, and the position of their blocks in the normal equations. Node 0 is fixed and has no row."""
 
     def __init__(self, nodes: int, edges: Sequence[Edge]) -> None:
         self.nodes = nodes
@@ -122,7 +122,7 @@ class PoseGraph:
         self._columns = np.broadcast_to(6 * columns + six, blocks)[self._free]
 
     def residuals(self, T_world_node: Matrix) -> Matrix:
-        """Return the twists e [E, 6] by which the poses differ from the edges: T_a⁻¹ T_b = exp(e) T_a_b."""
+        """Return the difference of the poses to each edge as a twist e [E, 6]: T_a⁻¹ T_b = exp(e) T_a_b."""
         T_a_b = se3.inverse(T_world_node[self.a]) @ T_world_node[self.b]
         return se3.log_stack(T_a_b @ self.T_b_a)
 
@@ -150,7 +150,7 @@ class PoseGraph:
 
 
 def _graduate(graph: PoseGraph, T: Matrix, chi2_limit: float) -> tuple[Matrix, Matrix, int]:
-    """Solve with ever stricter loops: poses, weights [E] of the Geman–McClure loss with c² = chi2_limit, steps taken.
+    """Solve while μ falls: return poses, weights [E] of the Geman–McClure loss with c² = chi2_limit, and steps taken.
 
     w = (μc² / (r² + μc²))², μ from 2 max r² / c² down to 1 (Yang et al. 2020, eq. 12 and remark 5). The first r² is
     that of the given poses; where all loops weigh alike, false ones have bent the graph most.
@@ -191,7 +191,7 @@ def _minimise(graph: PoseGraph, T: Matrix, weights: Matrix, max_iterations: int)
 
 
 def _refuse_bad_input(poses: Matrix, edges: Sequence[Edge]) -> None:
-    """Raise SigmaSplatError in one line that names the node or the edge."""
+    """Raise SigmaSplatError with one line that names the node or the edge."""
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
         raise SigmaSplatError(
             f"pose graph: poses have shape {list(poses.shape)}; give [N, 4, 4] with at least one node"
@@ -216,7 +216,7 @@ def _refuse_bad_input(poses: Matrix, edges: Sequence[Edge]) -> None:
 
 
 def _is_positive_definite(information: Matrix) -> bool:
-    """Tell whether a matrix is finite, 6×6, symmetric to rounding and its least eigenvalue above rounding."""
+    """Return whether a matrix is finite, 6×6, symmetric and positive definite, up to rounding."""
     if information.shape != (6, 6) or not np.isfinite(information).all():
         return False
     if np.abs(information - information.T).max() > 1e-9 * np.abs(information).max():

@@ -1,4 +1,4 @@
-"""Lay two submaps onto each other: keyframes of each are localised in the other, and must agree (VarSplat §5)."""
+"""Register two submaps: keyframes of each are localised in the other, and the results must agree (VarSplat §5)."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -22,17 +22,17 @@ from sigmasplat.slam.loop_closure.candidates import SubmapPair
 from sigmasplat.types import Matrix
 
 FLOOR_M, FLOOR_RAD = 0.005, 0.003
-"""Deviation that every registration is given at least: two maps of one wall differ by about so much."""
+"""Least standard deviation of a registration: two maps of the same wall differ by about this much."""
 HOPELESS = 0.5
-"""A keyframe whose alignment explains less than this share of what counts is not descended any further."""
+"""If alignment explains less than this share of `share_least`, the keyframe is not refined further."""
 OVERLAP_SAMPLE = 5000
 OPAQUE = 0.95
-"""Pixels count where the other submap is this opaque (VarSplat §5 asks it of depth; here of colour as well)."""
+"""Pixels count if the other submap's alpha is above this (VarSplat §5 uses it for depth; here for colour too)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Localisation:
-    """One keyframe found in the other submap, as T_a_b [4, 4] between the submaps; residual: the loss it ended with;
+    """A keyframe's pose in the other submap, expressed as T_a_b [4, 4] between the submaps; residual: the final loss;
     covariance [6, 6] of T_a_b's left twist (m, rad); agreement and overlap as in `PoseFit`."""
 
     T_a_b: Matrix
@@ -44,10 +44,10 @@ class Localisation:
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """T_a_b [4, 4] of submaps a and b, or why it is refused.
+    """T_a_b [4, 4] between submaps a and b, or the reason why the registration was refused.
 
-    information [6, 6]: inverse covariance of T_a_b's left twist (m, rad); residual: mean loss of the localisations that
-    counted, `localised` of them; overlap: share of splats with a neighbour in the other submap.
+    information [6, 6]: inverse covariance of T_a_b's left twist (m, rad); localised: the number of localisations that
+    were used; residual: their mean loss; overlap: share of splats with a neighbour in the other submap.
     """
 
     T_a_b: Matrix
@@ -60,25 +60,25 @@ class Registration:
 
 
 class Registrar:
-    """Registers submaps of one store through one view, whose camera all of them share."""
+    """Registers submaps of one store; all of them share the camera of the view."""
 
     def __init__(self, config: Config, store: SubmapStore, view: View) -> None:
         self.config, self.store, self.view = config.registration, store, view
         self.tracking = tracking_of(config.registration, config.tracking)
 
     def register(self, pair: SubmapPair, a: Submap, b: Submap, T_a_b: Matrix) -> Registration:
-        """Register the submaps a (query) and b (database) of a pair, T_a_b [4, 4] as known so far."""
+        """Register the submaps a (query) and b (database) of a pair; T_a_b [4, 4] is the current estimate."""
         found = [self._localise(a, k, b, pair.database_keyframes, T_a_b) for k in pair.query_keyframes]
         back = [self._localise(b, k, a, pair.query_keyframes, se3.inverse(T_a_b)) for k in pair.database_keyframes]
-        found += [turned(localisation) for localisation in back]
+        found += [inverted(localisation) for localisation in back]
         centre_b = b.T_submap_camera[pair.best.database_keyframe][:3, 3]
         return self._judge(a, b, found, centre_b, T_a_b)
 
     def _localise(
         self, own: Submap, keyframe: int, other: Submap, alike: Sequence[int], T_own_other: Matrix
     ) -> Localisation:
-        """Find a keyframe of `own` in `other`: aligned from where it should be and from the keyframes it is like, then
-        by descent of the uncertainty-weighted loss with exposure, from the best of them."""
+        """Localise a keyframe of `own` in `other`: align from the expected pose and from the poses of similar
+        keyframes, then refine the best one by gradient descent on the uncertainty-weighted loss with exposure."""
         T_own_camera, params = own.T_submap_camera[keyframe], other.field.params.to(self.view.sums.device)
         target, live = self._laid_out(own, keyframe)
         expected = se3.inverse(T_own_camera) @ T_own_other
@@ -96,7 +96,7 @@ class Registrar:
         return target, live_image(self.view, picture.unit_color, picture.depth_m, target)
 
     def _aligned(self, params: Tensor, live: Pyramid, guess: Matrix) -> PoseFit:
-        """Align a keyframe to the map seen from a guess, and once more to the map seen from there."""
+        """Align a keyframe to the map rendered at a guess, then again to the map rendered at the result."""
         if isinstance(self.view, ReferenceView):
             return PoseFit(guess, 0.0, 0.0, np.nan, np.nan, 0)  # alignment needs the compiled kernels
         for _ in range(2):
@@ -105,7 +105,7 @@ class Registrar:
         return fit
 
     def _covariance(self, params: Tensor, live: Pyramid, T_camera_map: Matrix) -> Matrix:
-        """Return the covariance [6, 6] of T_camera_map's left twist, as alignment to the map there sees it."""
+        """Return the covariance [6, 6] of T_camera_map's left twist, estimated by alignment to the map at that pose."""
         if isinstance(self.view, ReferenceView):
             return np.zeros((6, 6))
         reference = map_reference(params, self.view, T_camera_map, self.tracking)
@@ -119,11 +119,11 @@ class Registrar:
         good = [f for f in found if f.agreement >= c.agreement_least and f.agreement * f.overlap >= c.share_least]
         if len(good) < 2:
             best = max(f.agreement * f.overlap for f in found)
-            why = f"{len(good)} of {len(found)} keyframes found their place (best explains {best:.0%})"
+            why = f"{len(good)} of {len(found)} keyframes were localised (the best explains {best:.0%})"
             return refused(T_a_b, found, len(good), why)
         agreed = consensus(good, centre_b, c.spread_m, np.deg2rad(c.spread_deg))
         if len(agreed) < 2:
-            return refused(T_a_b, good, len(agreed), f"{len(good)} keyframes found places that disagree")
+            return refused(T_a_b, good, len(agreed), f"the poses of {len(good)} keyframes disagree")
         mean = combined(agreed)
         overlap = shared(a, b, mean, c.overlap_m)
         if overlap < c.overlap_least:
@@ -133,7 +133,7 @@ class Registrar:
 
 
 def tracking_of(registration: RegistrationConfig, tracking: TrackingConfig) -> TrackingConfig:
-    """Return the settings by which keyframes are localised: tracking's, with registration's weights and rates."""
+    """Return the settings for localising keyframes: those of tracking, with the weights and rates of registration."""
     r = registration
     return dataclasses.replace(
         tracking, uncertainty=r.uncertainty, tau=r.tau, weight_max=r.weight_max, weight_color=r.weight_color,
@@ -143,27 +143,29 @@ def tracking_of(registration: RegistrationConfig, tracking: TrackingConfig) -> T
 
 
 def score(fit: PoseFit) -> float:
-    """Return how much of a keyframe its place explains, a share in [0, 1]."""
+    """Return the share of a keyframe that its pose explains, in [0, 1]: agreement × overlap."""
     return fit.agreement * fit.overlap
 
 
-def turned(found: Localisation) -> Localisation:
-    """Return the same as T_b_a [4, 4]: the inverse's left twist is −Ad(T⁻¹) ξ."""
+def inverted(found: Localisation) -> Localisation:
+    """Return the localisation with T_a_b [4, 4] inverted; the left twist of the inverse is −Ad(T⁻¹) ξ."""
     T = se3.inverse(found.T_a_b)
     A = se3.adjoint(T)
     return dataclasses.replace(found, T_a_b=T, covariance=A @ found.covariance @ A.T)
 
 
 def differs(one: Matrix, other: Matrix, point_b: Matrix) -> tuple[float, float]:
-    """Return by how much two T_a_b [4, 4] differ: metres where they put point_b [3] m of b, and radians."""
+    """Return the difference of two T_a_b [4, 4]: in metres at a point of b (point_b [3], m), and in radians."""
     apart = (one[:3, :3] - other[:3, :3]) @ point_b + one[:3, 3] - other[:3, 3]
     return float(np.linalg.norm(apart)), se3.rotation_angle(one[:3, :3].T @ other[:3, :3])
 
 
 def consensus(found: Sequence[Localisation], point_b: Matrix, spread_m: float, spread_rad: float) -> list[Localisation]:
-    """Return the most localisations that one of them agrees with, itself included; of equal ones the better one's.
+    """Return the largest group of localisations that agree with one of them; between equal groups, the one with the
+    lower residual.
 
-    To agree is to put point_b [3] m of b within `spread_m` and to turn by no more than `spread_rad`.
+    Two agree if they map point_b [3] (m, in b) within `spread_m` of each other and their rotations differ by at most
+    `spread_rad`.
     """
     best: list[Localisation] = []
     for centre in sorted(found, key=lambda f: f.residual):
@@ -175,7 +177,7 @@ def consensus(found: Sequence[Localisation], point_b: Matrix, spread_m: float, s
 
 
 def combined(found: Sequence[Localisation]) -> Matrix:
-    """Average T_a_b [4, 4] weighted by 1/residual (VarSplat §5): rotation by Procrustes of the weighted mean."""
+    """Average T_a_b [4, 4] with weights 1/residual (VarSplat §5); the rotation is the nearest to the weighted mean."""
     weights = np.array([1.0 / max(f.residual, 1e-9) for f in found])
     mean = np.eye(4)
     mean[:3] = np.einsum("k,kij->ij", weights / weights.sum(), np.stack([f.T_a_b[:3] for f in found]))
@@ -183,10 +185,10 @@ def combined(found: Sequence[Localisation]) -> Matrix:
 
 
 def information(found: Sequence[Localisation], mean: Matrix) -> Matrix:
-    """Return the inverse [6, 6] of a localisation's covariance about their mean: estimated + spread + floor.
+    """Return the information [6, 6] of the mean T_a_b: the inverse of estimated covariance + spread + floor.
 
-    mean: T_a_b [4, 4]; by the left twist, m and rad. It is not divided by their number: they look at the same two maps
-    and err together.
+    mean: T_a_b [4, 4]; of its left twist, m and rad. The covariance is not divided by the number of localisations: they
+    use the same two maps, so their errors are correlated.
     """
     twists = np.stack([se3.log(f.T_a_b @ se3.inverse(mean)) for f in found])
     covariance = np.mean([f.covariance for f in found], 0) + twists.T @ twists / len(found)
@@ -195,10 +197,10 @@ def information(found: Sequence[Localisation], mean: Matrix) -> Matrix:
 
 
 def shared(a: Submap, b: Submap, T_a_b: Matrix, distance_m: float) -> float:
-    """Return the share of splats with a neighbour nearer than `distance_m` in the other submap, laid over it by T_a_b
-    [4, 4]: the larger of both.
+    """Return the share of splats with a neighbour nearer than `distance_m` in the other submap, after T_a_b [4, 4]: the
+    larger share of the two submaps.
 
-    The paper skips pairs by it before registering, at the poses known so far; drift would then hide what overlaps.
+    The paper computes it before registration, at the current poses; drift could then hide an overlap.
     """
     points_a = a.field.means.double().numpy()
     points_b = b.field.means.double().numpy() @ T_a_b[:3, :3].T + T_a_b[:3, 3]
@@ -215,6 +217,6 @@ def shared(a: Submap, b: Submap, T_a_b: Matrix, distance_m: float) -> float:
 def refused(
     T_a_b: Matrix, found: Sequence[Localisation], localised: int, reason: str, overlap: float = 0.0
 ) -> Registration:
-    """Return a verdict that leaves the submaps where they are, T_a_b [4, 4], of no weight."""
+    """Return a refused registration with zero information, which keeps T_a_b [4, 4]."""
     residual = float(np.mean([f.residual for f in found]))
     return Registration(T_a_b, np.zeros((6, 6)), residual, localised, overlap, False, reason)
