@@ -30,7 +30,10 @@ def test_a_driver_older_than_the_compiler_is_told_of(
 ) -> None:
     driver = pytest.importorskip("cuda.bindings.driver", reason="needs pip install 'sigmasplat[gpu]'")
     monkeypatch.setattr(driver, "cuDriverGetVersion", lambda: (0, version))
-    (finding,) = installation._drivers("13.5")
+    monkeypatch.setattr(cubins, "compiler_version", lambda: "13.5")
+    monkeypatch.setattr(cuda_launch, "missing", lambda: "")
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 0)
+    finding = said()["CUDA driver"]
     assert finding.ok is enough and (cubins.INSTALL_OLDER in finding.value) is not enough
 
 
