@@ -20,6 +20,9 @@ import sigmasplat  # noqa: F401 - before any test imports torch: idle OpenMP thr
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# Their assertions explain themselves as those of tests do.
+pytest.register_assert_rewrite("benchmark_results", "command_line")
+
 TINY_SIZE = (32, 24)  # width, height
 TINY_DEPTH_M = 2.0
 

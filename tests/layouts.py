@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,14 @@ def sample(size: tuple[int, int] = SMALL) -> Sample:
 def save(path: Path, pixels: np.ndarray, **options: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels).save(path, **options)
+
+
+def save_frames(folder: Path, s: Sample, names: tuple[str, str], first: int = 0) -> None:
+    """Save colour and depth under names like "color/{:06d}.png", numbered from `first`; JPEG as exactly as it can."""
+    for n, images in enumerate(zip(s.color, s.depth_mm, strict=True), first):
+        for name, pixels in zip(names, images, strict=True):
+            jpeg = {"quality": 100, "subsampling": 0} if name.lower().endswith(".jpg") else {}
+            save(folder / name.format(n), pixels, **jpeg)
 
 
 def save_text(path: Path, text: str) -> None:
@@ -100,9 +108,7 @@ def bonn(place: Path, s: Sample) -> Path:
 
 def replica(place: Path, s: Sample) -> Path:
     folder = place / "room0"
-    for n in range(FRAMES):
-        save(folder / f"results/frame{n:06d}.jpg", s.color[n], quality=100, subsampling=0)
-        save(folder / f"results/depth{n:06d}.png", s.depth_mm[n])
+    save_frames(folder, s, ("results/frame{:06d}.jpg", "results/depth{:06d}.png"))
     save_text(folder / "traj.txt", "".join(rows(T).replace("\n", " ").strip() + "\n" for T in s.T_world_camera))
     c = SMALL_CAMERA
     camera = {"w": 32, "h": 24, "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy, "scale": 1000.0}
@@ -162,9 +168,7 @@ def opengl(T: np.ndarray) -> list[list[float]]:
 def scannetpp(place: Path, s: Sample) -> Path:
     """Frame 3 is a test view; training photographs are listed out of order in the file."""
     dslr = place / "0a5c013435" / "dslr"
-    for n in range(FRAMES):
-        save(dslr / f"undistorted_images/DSC{n:05d}.JPG", s.color[n], quality=100, subsampling=0)
-        save(dslr / f"undistorted_depths/DSC{n:05d}.png", s.depth_mm[n])
+    save_frames(dslr, s, ("undistorted_images/DSC{:05d}.JPG", "undistorted_depths/DSC{:05d}.png"))
     frames = [
         {"file_path": f"DSC{n:05d}.JPG", "transform_matrix": opengl(s.T_world_camera[n]), "is_bad": False}
         for n in range(FRAMES)
@@ -191,9 +195,7 @@ def icl_nuim(place: Path, s: Sample) -> Path:
     """The true path is in the mirrored world: y of the camera and of the world point up."""
     folder = place / "living_room_traj2_frei_png"
     mirror = np.diag([1.0, -1.0, 1.0, 1.0])
-    for n in range(FRAMES):
-        save(folder / f"rgb/{n + 1}.png", s.color[n])
-        save(folder / f"depth/{n + 1}.png", s.depth_mm[n] * 5)
+    save_frames(folder, replace(s, depth_mm=s.depth_mm * 5), ("rgb/{}.png", "depth/{}.png"), first=1)
     numbers = range(1, FRAMES + 1)
     save_text(folder / "associations.txt", "".join(f"{n} depth/{n}.png {n} rgb/{n}.png\n" for n in numbers))
     poses = zip(numbers, mirror @ s.T_world_camera @ mirror, strict=True)
@@ -203,9 +205,7 @@ def icl_nuim(place: Path, s: Sample) -> Path:
 
 def open3d(place: Path, s: Sample) -> Path:
     folder = place / "lounge"
-    for n in range(FRAMES):
-        save(folder / f"color/{n + 1:06d}.png", s.color[n])
-        save(folder / f"depth/{n + 1:06d}.png", s.depth_mm[n])
+    save_frames(folder, s, ("color/{:06d}.png", "depth/{:06d}.png"), first=1)
     K = intrinsic(SMALL_CAMERA)[:3, :3]
     fields = {"width": 32, "height": 24, "intrinsic_matrix": K.T.ravel().tolist(), "depth_scale": 1000.0, "fps": 15.0}
     save_text(folder / "camera_intrinsic.json", json.dumps(fields))
@@ -228,10 +228,9 @@ def redwood(place: Path, s: Sample) -> Path:
 def nerfstudio(place: Path, s: Sample) -> Path:
     """Frames 0 … 3 are named 8, 9, 10, 11, and are listed in the alphabet's order."""
     folder = place / "capture"
+    save_frames(folder, s, ("images/frame_{}.png", "depths/frame_{}.png"), first=8)
     frames = []
     for n in range(FRAMES):
-        save(folder / f"images/frame_{n + 8}.png", s.color[n])
-        save(folder / f"depths/frame_{n + 8}.png", s.depth_mm[n])
         names = {"file_path": f"images/frame_{n + 8}.png", "depth_file_path": f"depths/frame_{n + 8}.png"}
         frames.append(names | {"transform_matrix": opengl(s.T_world_camera[n])})
     frames.sort(key=lambda frame: frame["file_path"])
@@ -241,9 +240,7 @@ def nerfstudio(place: Path, s: Sample) -> Path:
 
 def plain(place: Path, s: Sample) -> Path:
     folder = place / "my_kitchen"
-    for n in range(FRAMES):
-        save(folder / f"color/{n + 8}.png", s.color[n])
-        save(folder / f"depth/{n + 8}.png", s.depth_mm[n])
+    save_frames(folder, s, ("color/{}.png", "depth/{}.png"), first=8)
     c = SMALL_CAMERA
     fields = {"fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy, "width": 32, "height": 24, "depth_scale": 1000}
     save_text(folder / "calibration.json", json.dumps(fields))

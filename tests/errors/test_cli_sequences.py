@@ -9,21 +9,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sigmasplat import cli
+from command_line import exit_code
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.model.trajectory import Trajectory
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
-SETTINGS = ("input.width=32", "mapping.first_iterations=3", "mapping.iterations=2")
+SETTINGS = ("input.width=32", "mapping.first_iterations=3", "mapping.iterations=2", "final.iterations=2")
 QUICK = [word for setting in SETTINGS for word in ("--set", setting)]
-
-
-def sigmasplat(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as left:
-        cli.main(arguments)
-    assert isinstance(left.value.code, int)
-    return left.value.code
 
 
 def contents(folder: Path) -> dict[str, str]:
@@ -40,7 +33,7 @@ def refused(tiny_tum: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
 
     def run(*arguments: str) -> str:
         before = contents(place)
-        assert sigmasplat("run", *arguments) == 2
+        assert exit_code("run", *arguments) == 2
         said = capsys.readouterr()
         assert said.out == "" and said.err.startswith("sigmasplat: ") and said.err.count("\n") == 1, said
         assert contents(place) == before and not (place / "runs").exists()
@@ -134,7 +127,7 @@ def test_a_truncated_image_is_passed_over_and_counted(
     part: str, tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     truncate(tiny_tum / part / "2.png")
-    assert sigmasplat("run", str(tiny_tum), "--out", str(tmp_path / "run"), *QUICK) == 0
+    assert exit_code("run", str(tiny_tum), "--out", str(tmp_path / "run"), *QUICK) == 0
     err = capsys.readouterr().err
     assert err.count("1 unreadable image passed over") == 1 and f"{part}/2.png" in err and "Traceback" not in err
     run = RunFolder.open(tmp_path / "run")
@@ -147,7 +140,7 @@ def test_strict_stops_at_a_truncated_image_and_keeps_what_was_done(
     tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     truncate(tiny_tum / "rgb/2.png")
-    assert sigmasplat("run", str(tiny_tum), "--strict", "--out", str(tmp_path / "run"), *QUICK) == 2
+    assert exit_code("run", str(tiny_tum), "--strict", "--out", str(tmp_path / "run"), *QUICK) == 2
     err = capsys.readouterr().err
     refusal = [line for line in err.splitlines() if line.startswith("sigmasplat: ")]
     assert len(refusal) == 1 and "rgb/2.png: unreadable image" in refusal[0] and "Traceback" not in err
@@ -166,7 +159,7 @@ def test_a_wrong_depth_unit_is_warned_of_with_the_median(
 ) -> None:
     """The files hold millimetres; 16 cm are outside what a room has but within what is mapped."""
     scaled(tiny_tum, 12_500.0)
-    assert sigmasplat("run", str(tiny_tum), "--no-eval", "--out", str(tmp_path / "run"), *QUICK) == 0
+    assert exit_code("run", str(tiny_tum), "--no-eval", "--out", str(tmp_path / "run"), *QUICK) == 0
     err = capsys.readouterr().err
     (warning,) = [line for line in err.splitlines() if line.startswith("warning: ")]
     assert "median depth is 0.16 m over 4 frames" in warning
@@ -178,7 +171,7 @@ def test_a_unit_that_leaves_no_usable_depth_is_warned_of_and_refused(
     tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scaled(tiny_tum, 1.0)
-    assert sigmasplat("run", str(tiny_tum), "--out", str(tmp_path / "run"), *QUICK) == 2
+    assert exit_code("run", str(tiny_tum), "--out", str(tmp_path / "run"), *QUICK) == 2
     warning, refusal = [line for line in capsys.readouterr().err.splitlines() if ": " in line[:13]]
     assert warning.startswith("warning: ") and "median depth is 2000 m" in warning
     assert refusal.startswith("sigmasplat: frame 0 has no depth reading") and "check the depth scale" in refusal
@@ -189,7 +182,7 @@ def test_truth_of_another_time_is_said_after_everything_else_was_written(
     tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tiny_tum / "groundtruth.txt").write_text("".join(f"{500 + i} {i} 0 0 0 0 0 1\n" for i in range(4)))
-    assert sigmasplat("run", str(tiny_tum), "--out", str(tmp_path / "run"), *QUICK) == 2
+    assert exit_code("run", str(tiny_tum), "--out", str(tmp_path / "run"), *QUICK) == 2
     err = capsys.readouterr().err
     assert err.count("sigmasplat: estimate and truth share no timestamps") == 1 and "Traceback" not in err
     run = RunFolder.open(tmp_path / "run")
@@ -203,32 +196,32 @@ def test_truth_of_another_time_is_said_after_everything_else_was_written(
 def test_an_earlier_run_is_kept_unless_told(tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
     command = ["run", str(tiny_tum), "--out", str(out), "--no-eval", *QUICK]
-    assert sigmasplat(*command) == 0
+    assert exit_code(*command) == 0
     (out / "notes.txt").write_text("mine")
     before = contents(out)
     capsys.readouterr()
-    assert sigmasplat(*command) == 2
+    assert exit_code(*command) == 2
     err = capsys.readouterr().err
     assert err.startswith("sigmasplat: output") and "exists and is not empty" in err and err.count("\n") == 1
     assert contents(out) == before
-    assert sigmasplat(*command, "--overwrite", "--limit", "2") == 0
+    assert exit_code(*command, "--overwrite", "--limit", "2") == 0
     assert len(RunFolder.open(out).read_log()) == 2 and (out / "notes.txt").read_text() == "mine"
 
 
 def test_a_refused_sequence_spares_the_run_it_would_have_replaced(tiny_tum: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     command = ["run", str(tiny_tum), "--out", str(out), "--no-eval", *QUICK]
-    assert sigmasplat(*command) == 0
+    assert exit_code(*command) == 0
     before = contents(out)
     half_size_depth(tiny_tum)
-    assert sigmasplat(*command, "--overwrite") == 2
+    assert exit_code(*command, "--overwrite") == 2
     assert contents(out) == before
 
 
 def test_without_out_a_taken_name_is_numbered(tiny_tum: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tiny_tum.parent)
     for _ in range(2):
-        assert sigmasplat("run", str(tiny_tum), "--limit", "1", "--no-eval", *QUICK) == 0
+        assert exit_code("run", str(tiny_tum), "--limit", "1", "--no-eval", *QUICK) == 0
     assert sorted(path.name for path in Path("runs").iterdir()) == ["tiny-sigma", "tiny-sigma-2"]
 
 
@@ -242,6 +235,6 @@ def test_output_that_cannot_be_written_is_refused(place: str, refused: Callable[
 
 def test_the_undamaged_sequence_runs(tiny_tum: Path, tmp_path: Path) -> None:
     """Else every refusal above proves nothing."""
-    assert sigmasplat("run", str(tiny_tum), "--strict", "--out", str(tmp_path / "run"), *QUICK) == 0
+    assert exit_code("run", str(tiny_tum), "--strict", "--out", str(tmp_path / "run"), *QUICK) == 0
     run = RunFolder.open(tmp_path / "run")
     assert isinstance(run.read_trajectory(), Trajectory) and run.facts()["skipped"] == []

@@ -37,40 +37,31 @@ def with_text(name: str, text: str) -> Damage:
     return damage
 
 
-def resized(pattern: str, size: tuple[int, int] = (20, 14)) -> Damage:
-    """Make images another size, as a viewer or an exporter might have."""
+def redrawn(pattern: str, draw: Callable[[Image.Image], Image.Image]) -> Damage:
+    """Put other images in the place of some."""
 
     def damage(folder: Path) -> None:
         for path in folder.glob(pattern):
             with Image.open(path) as image:
-                pixels = image.resize(size, Image.Resampling.NEAREST)
-            pixels.save(path)
+                other = draw(image)
+            other.save(path)
 
     return damage
+
+
+def resized(pattern: str, size: tuple[int, int] = (20, 14)) -> Damage:
+    """Make images another size, as a viewer or an exporter might have."""
+    return redrawn(pattern, lambda image: image.resize(size, Image.Resampling.NEAREST))
 
 
 def painted(pattern: str) -> Damage:
     """Put 8-bit colour pictures where depth should be."""
-
-    def damage(folder: Path) -> None:
-        for path in folder.glob(pattern):
-            with Image.open(path) as image:
-                size = image.size
-            Image.new("RGB", size, (90, 40, 10)).save(path.with_suffix(".png"))
-
-    return damage
+    return redrawn(pattern, lambda image: Image.new("RGB", image.size, (90, 40, 10)))
 
 
 def blank(pattern: str) -> Damage:
     """Make every depth pixel 0."""
-
-    def damage(folder: Path) -> None:
-        for path in folder.glob(pattern):
-            with Image.open(path) as image:
-                size = image.size
-            Image.fromarray(np.zeros(size[::-1], np.uint16)).save(path)
-
-    return damage
+    return redrawn(pattern, lambda image: Image.fromarray(np.zeros(image.size[::-1], np.uint16)))
 
 
 def renumbered(pattern: str) -> Damage:

@@ -17,6 +17,7 @@ import pytest
 import torch
 from rich.console import Console
 
+from command_line import exit_code
 from sigmasplat import cli
 from sigmasplat.config import Config
 from sigmasplat.errors import SigmaSplatError, SourceError
@@ -169,16 +170,8 @@ def evaluate(run: RunFolder, source: Source, *, mesh: bool, progress: Callable[[
     return metrics
 
 
-def sigmasplat(*arguments: str) -> int:
-    """Run the command line; return its exit code."""
-    with pytest.raises(SystemExit) as left:
-        cli.main(arguments)
-    assert isinstance(left.value.code, int)
-    return left.value.code
-
-
 def test_run_leaves_a_whole_run_folder(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
-    assert sigmasplat("run", "corridor", "--set", "tracking.tau=7", "--set", "mapping.every=2", "--seed", "4") == 0
+    assert exit_code("run", "corridor", "--set", "tracking.tau=7", "--set", "mapping.every=2", "--seed", "4") == 0
     run = RunFolder.open(Path("runs/my-corridor-sigma"))
     config = run.config()
     assert (config.tracking.tau, config.mapping.every, config.seed) == (7.0, 2, 4)
@@ -204,21 +197,21 @@ def test_run_leaves_a_whole_run_folder(corridor: Corridor, capsys: pytest.Captur
 
 def test_a_second_run_takes_another_folder(corridor: Corridor) -> None:
     for _ in range(3):
-        assert sigmasplat("run", "corridor", "--no-eval") == 0
+        assert exit_code("run", "corridor", "--no-eval") == 0
     names = sorted(path.name for path in Path("runs").iterdir())
     assert names == [f"my-corridor-sigma{ending}" for ending in ("", "-2", "-3")]
 
 
 def test_overwrite_replaces_the_default_folder(corridor: Corridor) -> None:
-    assert sigmasplat("run", "corridor", "--no-eval") == 0
-    assert sigmasplat("run", "corridor", "--no-eval", "--overwrite", "--preset", "sigma") == 0
+    assert exit_code("run", "corridor", "--no-eval") == 0
+    assert exit_code("run", "corridor", "--no-eval", "--overwrite", "--preset", "sigma") == 0
     assert [path.name for path in Path("runs").iterdir()] == ["my-corridor-sigma"]
     assert len(RunFolder.open(Path("runs/my-corridor-sigma")).read_log()) == 6
 
 
 def test_lost_frames_are_said_plainly(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     MadeUpSlam.lost = {2, 3, 5}
-    assert sigmasplat("run", "corridor") == 0
+    assert exit_code("run", "corridor") == 0
     said = capsys.readouterr().out
     assert "frame 2 (t = 2.000 s): tracking lost" in said
     assert "frame 4 (t = 4.000 s): tracking found again, lost since frame 2" in said
@@ -232,7 +225,7 @@ def test_ctrl_c_finishes_the_frame_and_leaves_a_valid_folder(
 ) -> None:
     before = signal.getsignal(signal.SIGINT)
     MadeUpSlam.at = {3: lambda: os.kill(os.getpid(), signal.SIGINT)}
-    assert sigmasplat("run", "corridor", "--out", "cut") == 130
+    assert exit_code("run", "corridor", "--out", "cut") == 130
     run = RunFolder.open(Path("cut"))
     assert run.facts()["status"] == "interrupted"
     assert len(run.read_log()) == len(run.read_trajectory()) == 4
@@ -252,7 +245,7 @@ def test_a_second_ctrl_c_stops_at_once(corridor: Corridor) -> None:
         time.sleep(1.0)
 
     MadeUpSlam.at = {3: twice}
-    assert sigmasplat("run", "corridor", "--out", "cut") == 130
+    assert exit_code("run", "corridor", "--out", "cut") == 130
     run = RunFolder.open(Path("cut"))
     assert run.facts()["status"] == "interrupted"
     assert len(run.read_log()) == len(run.read_trajectory()) == 3
@@ -289,7 +282,7 @@ def test_what_is_in_the_folder_keeps_it(corridor: Corridor) -> None:
         raise SigmaSplatError("no depth")
 
     MadeUpSlam.at = {0: fail}
-    assert sigmasplat("run", "corridor", "--out", "mine") == 2
+    assert exit_code("run", "corridor", "--out", "mine") == 2
     assert Path("mine/notes.txt").read_text() == "the user's" and Path("mine/run.json").is_file()
 
 
@@ -301,7 +294,7 @@ def test_submaps_and_loops_are_kept_and_told(corridor: Corridor, capsys: pytest.
     MadeUpSlam.tried = {4: [CLOSED, REFUSED], "end": [LAST]}
     told_while_running: list[list[dict[str, Any]]] = []
     MadeUpSlam.at = {5: lambda: told_while_running.append(RunFolder.open(Path("mine")).read_loops())}
-    assert sigmasplat("run", "corridor", "--no-eval", "--out", "mine") == 0
+    assert exit_code("run", "corridor", "--no-eval", "--out", "mine") == 0
     run, log = RunFolder.open(Path("mine")), RunFolder.open(Path("mine")).read_log()
     assert [record["submap"] for record in log] == [0, 0, 1, 1, 2, 2]
     assert [len(record.get("loops", [])) for record in log] == [0, 0, 0, 0, 2, 0]
@@ -323,7 +316,7 @@ def test_loops_take_their_latest_verdict_to_the_end(corridor: Corridor) -> None:
     loop = MadeUpLoop(7, 0, True)
     MadeUpSlam.tried = {2: [loop]}
     MadeUpSlam.at = {4: lambda: setattr(loop, "accepted", False)}
-    assert sigmasplat("run", "corridor", "--no-eval", "--out", "mine") == 0
+    assert exit_code("run", "corridor", "--no-eval", "--out", "mine") == 0
     assert not RunFolder.open(Path("mine")).read_loops()[0]["accepted"]
     assert RunFolder.open(Path("mine")).read_log()[2]["loops"][0]["accepted"], "the log says what was known then"
 
@@ -336,7 +329,7 @@ def test_the_time_of_finishing_is_not_that_of_the_frames(corridor: Corridor, mon
 
     monkeypatch.setattr("sigmasplat.run.session.time.perf_counter", lambda: now_s[0])
     MadeUpSlam.at = {3: pass_time(5.0), "loops": pass_time(30.0), "finish 1": pass_time(70.0)}
-    assert sigmasplat("run", "corridor", "--no-eval", "--out", "mine") == 0
+    assert exit_code("run", "corridor", "--no-eval", "--out", "mine") == 0
     facts = RunFolder.open(Path("mine")).facts()
     assert (facts["wall_s"], facts["finish_s"]) == (5.0, 100.0)
     assert sum(RunFolder.open(Path("mine")).read_profile().values()) == pytest.approx(5.0)
@@ -346,7 +339,7 @@ def test_the_time_of_finishing_is_not_that_of_the_frames(corridor: Corridor, mon
 def test_stages_on_a_device_are_measured_where_a_profile_is_asked_for(corridor: Corridor, asked: bool) -> None:
     seen = []
     MadeUpSlam.at = {1: lambda: seen.append(cuda_stages.measured())}
-    assert sigmasplat("run", "corridor", "--no-eval", "--out", "mine", *["--profile"] * asked) == 0
+    assert exit_code("run", "corridor", "--no-eval", "--out", "mine", *["--profile"] * asked) == 0
     cuda_stages.measure(False)
     assert seen == [asked]
 
@@ -357,7 +350,7 @@ def test_ctrl_c_while_finishing_keeps_everything(
 ) -> None:
     MadeUpSlam.at = {moment: lambda: signal.raise_signal(signal.SIGINT)}
     MadeUpSlam.tried = {4: [CLOSED], "end": [LAST]}
-    assert sigmasplat("run", "corridor", "--out", "cut") == 130
+    assert exit_code("run", "corridor", "--out", "cut") == 130
     assert MadeUpSlam.latest.finished == 0
     run = RunFolder.open(Path("cut"))
     assert run.facts()["status"] == "interrupted" and run.facts()["wall_s"] > 0 and "finish_s" not in run.facts()
@@ -369,14 +362,14 @@ def test_ctrl_c_while_finishing_keeps_everything(
 
 def test_ctrl_c_when_all_is_done_changes_nothing(corridor: Corridor) -> None:
     MadeUpSlam.at = {"finish 2": lambda: signal.raise_signal(signal.SIGINT)}
-    assert sigmasplat("run", "corridor", "--no-eval", "--out", "mine") == 0
+    assert exit_code("run", "corridor", "--no-eval", "--out", "mine") == 0
     assert RunFolder.open(Path("mine")).facts()["status"] == "complete"
 
 
 def test_an_interrupted_run_is_not_finished(corridor: Corridor) -> None:
     MadeUpSlam.at = {3: lambda: signal.raise_signal(signal.SIGINT)}
     MadeUpSlam.tried = {2: [CLOSED]}
-    assert sigmasplat("run", "corridor", "--out", "cut") == 130
+    assert exit_code("run", "corridor", "--out", "cut") == 130
     run = RunFolder.open(Path("cut"))
     assert MadeUpSlam.latest.finished == 0 and "finish_s" not in run.facts() and len(run.read_loops()) == 1
 
@@ -397,14 +390,14 @@ def test_a_crash_while_finishing_keeps_everything(corridor: Corridor) -> None:
 def test_the_results_show_what_refinement_brought(
     corridor: Corridor, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert sigmasplat("run", "corridor", "--out", "one") == 0
+    assert exit_code("run", "corridor", "--out", "one") == 0
     assert "submap" not in capsys.readouterr().out.lower()
     before = {"held_out_submaps": {"psnr_db": 25.19}, "training_submaps": {"psnr_db": 28.84}}
     counts = {"submaps": 4, "loops": {"tried": 7, "accepted": 3}}
     monkeypatch.setitem(METRICS, "finish_s", 3.0)
     for name, value in (before | counts).items():
         monkeypatch.setitem(METRICS, name, value)
-    assert sigmasplat("run", "corridor", "--out", "several") == 0
+    assert exit_code("run", "corridor", "--out", "several") == 0
     rows = [" ".join(line.replace("│", " ").split()) for line in capsys.readouterr().out.splitlines()]
     wanted = ["PSNR, held-out 27.31 dB", "PSNR, held-out, in submaps 25.19 dB", "PSNR, training 31.25 dB",
               "PSNR, training, in submaps 28.84 dB"]  # fmt: skip
@@ -426,7 +419,7 @@ def test_a_terminal_gets_bars(corridor: Corridor) -> None:
 
 def test_unreadable_images_are_counted(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     corridor.broken = {1, 4}
-    assert sigmasplat("run", "corridor", "--no-eval", "--out", "some") == 0
+    assert exit_code("run", "corridor", "--no-eval", "--out", "some") == 0
     assert "2 unreadable images passed over (first: 1.png is truncated)" in capsys.readouterr().err
     facts = json.loads(Path("some/run.json").read_text())
     assert facts["skipped"] == ["1.png is truncated", "4.png is truncated"]
@@ -435,7 +428,7 @@ def test_unreadable_images_are_counted(corridor: Corridor, capsys: pytest.Captur
 
 def test_strict_damage_is_one_line_and_nothing_is_lost(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     corridor.broken, corridor.strict = {3}, True
-    assert sigmasplat("run", "corridor", "--out", "strict") == 2
+    assert exit_code("run", "corridor", "--out", "strict") == 2
     assert capsys.readouterr().err.strip() == "sigmasplat: 3.png is truncated"
     run = RunFolder.open(Path("strict"))
     assert run.facts()["status"] == "failed"
@@ -444,24 +437,24 @@ def test_strict_damage_is_one_line_and_nothing_is_lost(corridor: Corridor, capsy
 
 def test_a_wrong_depth_unit_is_warned_of(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     corridor.depth_m = 2000.0
-    assert sigmasplat("run", "corridor", "--no-eval") == 0
+    assert exit_code("run", "corridor", "--no-eval") == 0
     err = capsys.readouterr().err
     assert err.startswith("warning: ")
     assert "2000 m" in err
 
 
 def test_eval_and_export_read_what_run_wrote(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
-    sigmasplat("run", "corridor", "--no-eval", "--out", "mine", "--limit", "5")
-    assert sigmasplat("eval", "mine") == 0
+    exit_code("run", "corridor", "--no-eval", "--out", "mine", "--limit", "5")
+    assert exit_code("eval", "mine") == 0
     assert "27.31" in capsys.readouterr().out
     assert RunFolder.open(Path("mine")).read_metrics()["frames"] == 6
-    assert sigmasplat("export", "mine") == 0
+    assert exit_code("export", "mine") == 0
     assert torch.allclose(read_field(Path("mine.ply")).params, RunFolder.open(Path("mine")).read_map().params)
-    assert sigmasplat("export", "mine", "--out", "path.txt") == 0
+    assert exit_code("export", "mine", "--out", "path.txt") == 0
     assert len(read_trajectory(Path("path.txt"))) == 6
-    assert sigmasplat("export", "mine") == 2
+    assert exit_code("export", "mine") == 2
     assert "mine.ply exists" in capsys.readouterr().err
-    assert sigmasplat("export", "mine", "--overwrite", "--format", "ply") == 0
+    assert exit_code("export", "mine", "--overwrite", "--format", "ply") == 0
 
 
 def test_record_needs_no_screen(corridor: Corridor) -> None:

@@ -7,15 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from command_line import exit_code
 from room_run import PATH, made_run
-from sigmasplat import cli
-
-
-def sigmasplat(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as left:
-        cli.main(arguments)
-    assert isinstance(left.value.code, int)
-    return left.value.code
 
 
 @pytest.fixture
@@ -27,11 +20,11 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_paths_are_written_by_name(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert sigmasplat("export", "kitchen", "--out", "a.kitti.txt") == 0
+    assert exit_code("export", "kitchen", "--out", "a.kitti.txt") == 0
     assert np.loadtxt("a.kitti.txt").shape == (len(PATH), 12)
-    assert sigmasplat("export", "kitchen", "--out", "transforms.json") == 0
+    assert exit_code("export", "kitchen", "--out", "transforms.json") == 0
     assert len(json.loads((here / "transforms.json").read_text())["frames"]) == 5
-    assert sigmasplat("export", "kitchen", "--format", "colmap", "--pictures") == 0
+    assert exit_code("export", "kitchen", "--format", "colmap", "--pictures") == 0
     assert len(list((here / "kitchen-colmap/images").iterdir())) == 3
     said = capsys.readouterr().out.splitlines()
     assert said[0].startswith("a.kitti.txt: 6 poses") and said[1].startswith("transforms.json: 5 views, no pictures")
@@ -41,12 +34,12 @@ def test_paths_are_written_by_name(here: Path, capsys: pytest.CaptureFixture[str
 def test_film_plan_and_points_show_the_map(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
     film = ("--out", "a.gif", "--size", "64", "--fps", "4", "--seconds", "0.5", "--path", "orbit")
-    assert sigmasplat("export", "kitchen", *film) == 0
+    assert exit_code("export", "kitchen", *film) == 0
     with Image.open("a.gif") as drawn:
         assert drawn.size == (192, 88) and drawn.n_frames == 2
-    assert sigmasplat("export", "kitchen", "--format", "plan", "--cell-m", "0.1") == 0
+    assert exit_code("export", "kitchen", "--format", "plan", "--cell-m", "0.1") == 0
     assert json.loads((here / "kitchen.plan.json").read_text())["resolution_m"] == 0.1
-    assert sigmasplat("export", "kitchen", "--out", "a.points.ply", "--voxel-m", "0.1") == 0
+    assert exit_code("export", "kitchen", "--out", "a.points.ply", "--voxel-m", "0.1") == 0
     said = capsys.readouterr().out
     assert "film …\n" in said and "surface …\n" in said and "floor plan …\n" in said
     assert "a.gif: 2 images, 0.5 s" in said and "to scan again, also in kitchen.plan.json" in said
@@ -66,7 +59,7 @@ def test_what_does_not_go_together_is_refused(here: Path, capsys: pytest.Capture
         (["kitchen", "--out", "missing/a.kitti.txt"], "choose a writable place"),
         (["map.ply", "--out", "a.png"], "a map can be exported to formats of maps only"),
     ):
-        assert sigmasplat("export", *arguments) == 2
+        assert exit_code("export", *arguments) == 2
         said = capsys.readouterr().err.splitlines()
         assert len(said) == 1 and words in said[0], said
     assert sorted(path.name for path in here.iterdir()) == ["kitchen", "map.ply"]

@@ -1,6 +1,5 @@
 """What is handed out: metadata, extras, Dockerfile, command line, completion, and a module that asks for little."""
 
-import importlib.util
 import os
 import re
 import shutil
@@ -13,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import sigmasplat
+from module_files import module_from
 from sigmasplat.checks import installation
 from sigmasplat.cli import COMMANDS
 from sigmasplat.io.machine import package_version
@@ -129,10 +129,7 @@ def checkout(tmp_path: Path) -> Path:
 
 def code_of(package: Path) -> str:
     """Ask a copy of the package which code it is."""
-    spec = importlib.util.spec_from_file_location("machine_there", package / "io/machine.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return str(module.code())
+    return str(module_from(package / "io/machine.py").code())
 
 
 def test_code_is_the_checkouts_commit_then_the_builds_then_the_release(checkout: Path) -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from command_line import exit_code
 from fake_realsense import Device
-from sigmasplat import cli
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.sources import open_source
 from sigmasplat.sources.realsense import WARM_UP
@@ -29,17 +29,10 @@ def device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Device:
     return made
 
 
-def sigmasplat(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as left:
-        cli.main(arguments)
-    assert isinstance(left.value.code, int)
-    return left.value.code
-
-
 def test_ctrl_c_ends_it_and_it_is_finished_and_scored(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.missed_between = 1
     device.on_frame = lambda number: signal.raise_signal(signal.SIGINT) if number == 2 * (WARM_UP + 6) else None
-    assert sigmasplat("run", "realsense", "--out", "run", "--stride", "1", *QUICK) == 0
+    assert exit_code("run", "realsense", "--out", "run", "--stride", "1", *QUICK) == 0
     said = capsys.readouterr()
     assert "until Ctrl-C" in said.out and "were left out while SLAM was busy" in said.out
     run = RunFolder.open(Path("run"))
@@ -53,13 +46,13 @@ def test_ctrl_c_ends_it_and_it_is_finished_and_scored(device: Device, capsys: py
     )
     metrics = run.read_metrics()
     assert metrics["frames"] == len(log) and metrics["ate"] is None and metrics["training"]["psnr_db"] > 5
-    assert sigmasplat("eval", "run") == 0  # no camera is asked for again
+    assert exit_code("eval", "run") == 0  # no camera is asked for again
     assert device.started == device.stopped == 1
 
 
 def test_a_pulled_plug_is_one_line_and_a_valid_run(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.frames_until_unplugged = WARM_UP + 5
-    assert sigmasplat("run", "realsense", "--out", "run", "--record", "seen", "--no-eval", *QUICK) == 0
+    assert exit_code("run", "realsense", "--out", "run", "--record", "seen", "--no-eval", *QUICK) == 0
     said = capsys.readouterr()
     assert said.err.count("\n") == 1 and "no frame came for 5 s" in said.err
     assert RunFolder.open(Path("run")).facts()["status"] == "complete"
@@ -68,7 +61,7 @@ def test_a_pulled_plug_is_one_line_and_a_valid_run(device: Device, capsys: pytes
 
 def test_no_camera_is_one_line_and_nothing_written(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.plugged_in = False
-    assert sigmasplat("run", "realsense") == 2
+    assert exit_code("run", "realsense") == 2
     assert capsys.readouterr().err.startswith("sigmasplat: no RealSense camera gives 640×480")
     assert not Path("runs").exists()
 
@@ -76,5 +69,5 @@ def test_no_camera_is_one_line_and_nothing_written(device: Device, capsys: pytes
 def test_a_recording_is_kept_when_the_run_is_made_anew(device: Device) -> None:
     for count in (2, 3):
         more = ("--overwrite", "--no-eval", "--limit", str(count))
-        assert sigmasplat("run", "realsense", "--out", "run", *more, *QUICK) == 0
+        assert exit_code("run", "realsense", "--out", "run", *more, *QUICK) == 0
     assert len(open_source("run/recording")) == 2 and len(open_source("run/recording-2")) == 3

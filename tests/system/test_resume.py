@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat import cli
+from command_line import exit_code
 from sigmasplat.commands.run import where
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
@@ -39,14 +39,6 @@ def arguments(out: Path, name: str) -> list[str]:
     return ["run", ROOM, "--preset", name, "--out", str(out), "--no-eval", "--save-every", "0.001", *settings]
 
 
-def obey(*words: str) -> int:
-    with pytest.raises(SystemExit) as ended:
-        cli.main(list(words))
-    code = ended.value.code
-    assert isinstance(code, int)
-    return code
-
-
 def killed(out: Path, name: str, after: int) -> int:
     """Run in a process of its own and kill it without warning once so many frames are logged; return how many were."""
     process = subprocess.Popen(
@@ -67,10 +59,10 @@ def without_times(run: Path) -> list[dict]:
 
 @pytest.mark.parametrize("name, after", [("sigma", 13), ("cgslam-fast", 7)])
 def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path: Path, name: str, after: int) -> None:
-    assert obey(*arguments(tmp_path / "whole", name)) == 0
+    assert exit_code(*arguments(tmp_path / "whole", name)) == 0
     assert killed(tmp_path / "cut", name, after) < FRAMES
     assert RunFolder(tmp_path / "cut").facts()["status"] == "running"
-    assert obey("resume", str(tmp_path / "cut"), "--no-eval") == 0
+    assert exit_code("resume", str(tmp_path / "cut"), "--no-eval") == 0
     for file in SAME:
         assert (tmp_path / "cut" / file).read_bytes() == (tmp_path / "whole" / file).read_bytes(), file
     assert without_times(tmp_path / "cut") == without_times(tmp_path / "whole")
@@ -111,14 +103,14 @@ def test_where_a_run_goes_on_is_told() -> None:
 
 def test_what_cannot_be_gone_on_with_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
-    assert obey(*arguments(out, "sigma")) == 0
-    assert obey("resume", str(out)) == 2
+    assert exit_code(*arguments(out, "sigma")) == 0
+    assert exit_code("resume", str(out)) == 2
     assert "is complete" in capsys.readouterr().err
     RunFolder(out).note(status="interrupted")
-    assert obey("resume", str(out)) == 2
+    assert exit_code("resume", str(out)) == 2
     assert "nothing to go on from" in capsys.readouterr().err
     (out / "state.safetensors").write_bytes(b"damaged")
-    assert obey("resume", str(out)) == 2
+    assert exit_code("resume", str(out)) == 2
     assert "is damaged" in capsys.readouterr().err
 
 

@@ -1,5 +1,6 @@
 """Submaps as part of SLAM, on the beginning of a walk through the built-in room, small."""
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -18,27 +19,21 @@ from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.presets import default_preset, preset
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import SyntheticRoom
+from small_room import frame_at, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
-SMALL = {"input.width": "160", "mapping.first_iterations": "40", "mapping.iterations": "10"}
+SMALL = {"input.width": "160", "mapping.first_iterations": "40", "mapping.iterations": "10", "final.iterations": "20"}
 ONE = {"submaps.distance_m": "0", "submaps.angle_deg": "0", "submaps.uncertainty_m": "0"}
 CUT = ONE | {"submaps.frames": "10", "loops.min_interval": "1", "loops.min_similarity": "0.3"}
 FRAMES = 26
 
 
 @cache
-def walk() -> SyntheticRoom:
-    return SyntheticRoom(frames=200, width=160, height=120)
-
-
-@cache
 def there_and_back() -> list[Frame]:
     """Walk thirteen frames ahead and the same way back, so that the end sees the beginning's place."""
     order = [*range(FRAMES // 2), *reversed(range(FRAMES // 2))]
-    frames = [walk().frame(i) for i in order]
-    return [Frame(n, n / 30.0, f.color, f.depth_m, f.camera) for n, f in enumerate(frames)]
+    return [replace(frame_at(i), index=n, timestamp_s=n / 30.0) for n, i in enumerate(order)]
 
 
 def settings(**changes: str) -> Config:

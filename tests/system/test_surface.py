@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat import cli
+from command_line import exit_code
 from sigmasplat.config import Config, InputConfig
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.evaluation.evaluate import evaluate
@@ -203,20 +203,14 @@ def test_a_cropped_run_has_the_cropped_camera(run: RunFolder) -> None:
     assert Recording.of(run, CAMERA).camera == frame.camera and frame.camera.width == 42
 
 
-def sigmasplat(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as left:
-        cli.main(arguments)
-    assert isinstance(left.value.code, int)
-    return left.value.code
-
-
 def test_the_command_makes_the_surface_of_a_real_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
     room, out = "synthetic:frames=120,width=64,height=48", str(tmp_path / "run")
-    small = ["--set", "mapping.first_iterations=30", "--set", "mapping.iterations=8", "--set", "input.width=64"]
-    assert sigmasplat("run", room, "--limit", "6", "--no-eval", "--out", out, *small) == 0
+    small = ["--set", "mapping.first_iterations=30", "--set", "mapping.iterations=8", "--set", "input.width=64",
+             "--set", "final.iterations=40"]  # fmt: skip
+    assert exit_code("run", room, "--limit", "6", "--no-eval", "--out", out, *small) == 0
     capsys.readouterr()
-    assert sigmasplat("mesh", out, "--voxel-m", "0.05") == 0
+    assert exit_code("mesh", out, "--voxel-m", "0.05") == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0] == "surface …" and said[1].startswith("surface 2/2")
     assert said[-1].endswith(f"triangles: {out}/mesh.ply")
@@ -224,7 +218,7 @@ def test_the_command_makes_the_surface_of_a_real_run(tmp_path: Path, capsys: pyt
     source = open_source(room)
     off = distances(mesh.moved(source.truth().T_world_camera[0]).vertices.astype(float), source.true_surface())
     assert len(mesh.faces) > 1000 and np.median(off) < 0.03
-    assert sigmasplat("mesh", out, "--voxel-m", "0.05") == 0, "the run's own mesh is replaced"
+    assert exit_code("mesh", out, "--voxel-m", "0.05") == 0, "the run's own mesh is replaced"
     assert (tmp_path / "run" / "mesh.ply").read_bytes() == first, "and the same"
     for refused, words in (
         (["--out", str(tmp_path / "a.stl")], "give a name that ends in .ply, .obj, .glb"),
@@ -233,7 +227,7 @@ def test_the_command_makes_the_surface_of_a_real_run(tmp_path: Path, capsys: pyt
         (["--source", str(tmp_path / "nowhere")], "no such folder"),
     ):
         capsys.readouterr()
-        assert sigmasplat("mesh", out, *refused) == 2
+        assert exit_code("mesh", out, *refused) == 2
         said = capsys.readouterr().err.splitlines()
         assert len(said) == 1 and words in said[0]
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from command_line import exit_code
 from sigmasplat import cli
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
@@ -22,7 +23,7 @@ from sigmasplat.sources.tum import write_tum
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
-SETTINGS = {"input.width": "64", "mapping.first_iterations": "10", "mapping.iterations": "4"}
+SETTINGS = {"input.width": "64", "mapping.first_iterations": "10", "mapping.iterations": "4", "final.iterations": "10"}
 FRAMES = 7
 OPTIONS = [word for pair in SETTINGS.items() for word in ("--set", "=".join(pair))]
 LEFT = ("trajectory.txt", "map.ply", "checkpoint.safetensors")
@@ -58,13 +59,6 @@ def config() -> Config:
     return override(preset(default_preset()), SETTINGS)
 
 
-def sigmasplat(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as left:
-        cli.main(arguments)
-    assert isinstance(left.value.code, int)
-    return left.value.code
-
-
 def test_slam_and_session_never_ask_for_the_truth(tmp_path: Path) -> None:
     source, run = Secretive(), RunFolder.create(tmp_path / "run", config(), "room")
     outcome = session.record(Slam(config()), source, run)
@@ -74,8 +68,8 @@ def test_slam_and_session_never_ask_for_the_truth(tmp_path: Path) -> None:
 
 def test_the_command_line_asks_only_to_evaluate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sigmasplat.sources.open_source", lambda path, settings=None: Secretive())
-    assert sigmasplat("run", "room", "--out", str(tmp_path / "run"), "--no-eval", *OPTIONS) == 0
-    assert sigmasplat("mesh", str(tmp_path / "run"), "--voxel-m", "0.1") == 0
+    assert exit_code("run", "room", "--out", str(tmp_path / "run"), "--no-eval", *OPTIONS) == 0
+    assert exit_code("mesh", str(tmp_path / "run"), "--voxel-m", "0.1") == 0
     with pytest.raises(Asked):
         cli.main(["eval", str(tmp_path / "run")])
 
@@ -96,7 +90,7 @@ def test_the_same_bytes_with_the_truth_with_another_and_with_none(tmp_path: Path
     found, errors_m = {}, {}
     for kind in ("true", "another", "none"):
         out = tmp_path / "runs" / kind
-        assert sigmasplat("run", str(tum_folder(tmp_path / kind, kind)), "--out", str(out), *OPTIONS) == 0
+        assert exit_code("run", str(tum_folder(tmp_path / kind, kind)), "--out", str(out), *OPTIONS) == 0
         found[kind] = [(out / name).read_bytes() for name in LEFT]
         ate = RunFolder.open(out).read_metrics()["ate"]
         errors_m[kind] = ate["rmse_m"] if ate else None
