@@ -17,6 +17,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any
 
+import program
 import record
 import tables
 import tyro
@@ -186,8 +187,7 @@ def main(options: Options) -> int:
     try:
         jobs = jobs_of(options)
     except SigmaSplatError as problem:
-        print(f"accuracy.py: {problem}", file=sys.stderr)
-        return 2
+        return program.refuse("accuracy", problem)
     return publish("accuracy", run_all(jobs, options), options)
 
 
@@ -199,12 +199,9 @@ def publish(benchmark: str, results: list[dict[str, Any]], options: Any) -> int:
     kept = [{name: value for name, value in result.items() if name != "key"} for result in results]
     for result in kept:
         result["job"] |= {"path": Path(result["job"]["path"]).name}
-    config = {n: v for n, v in asdict(options).items() if n not in ("runs", "out", "fresh")}
-    measured = record.results(benchmark, {"jobs": kept}, name=options.name, seeds=options.seeds, config=config)
-    print(record.write(measured, options.out), file=sys.stderr)
-    print(tables.table(measured))
+    print(tables.table(program.keep(benchmark, {"jobs": kept}, options, options.seeds)))
     return int(any(result["problem"] for result in results))
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))
+    program.start(main, Options)

@@ -9,23 +9,24 @@ example: python benchmarks/color_covariance.py --sources redkitchen --frames 30 
 
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import accuracy
-import color_covariance_tables
 import numpy as np
+import program
 import record
-import tables
 import torch
 import tyro
+from accuracy_tables import spread
 from cpu import alone
 from numpy.typing import NDArray
+from tables import Section
 from torch import Tensor
 
 from sigmasplat.config import Config, SubmapConfig
-from sigmasplat.errors import SigmaSplatError, SourceError
+from sigmasplat.errors import SourceError
 from sigmasplat.fit import losses
 from sigmasplat.metrics import views
 from sigmasplat.metrics.scored_view import COVERED_ALPHA, ScoredView
@@ -39,7 +40,7 @@ from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import open_source
 
 arg = tyro.conf.arg
-KINDS = color_covariance_tables.KINDS
+KINDS = ("diagonal", "full")
 CHANNELS = 3
 
 
@@ -135,7 +136,8 @@ def figures(run: Slam, field: GaussianField, sums: NDArray[np.float64], seen: li
     deviations = np.sqrt(second[:CHANNELS])
     errors = second[CHANNELS:] / np.array([deviations[a] * deviations[b] for a, b in ((0, 1), (0, 2), (1, 2))])
     correlations = correlations_of(field.extras["correlations"].params).abs().mean(0)
-    scores, judged = views.average([view.scores() for view in seen]), views.judge([views.sample(v) for v in seen]) or {}
+    scores = views.mean_scores([view.scores() for view in seen])
+    judged = views.score_uncertainty([views.sample_pixels(view) for view in seen]) or {}
     return {
         "mapping_s": round(sum(step.seconds.get("map", 0.0) for step in run.steps), 3),
         "keyframes": sum(step.is_keyframe for step in run.steps),
@@ -150,28 +152,43 @@ def figures(run: Slam, field: GaussianField, sums: NDArray[np.float64], seen: li
     }
 
 
+# ---- tables ----
+
+
+def sections(measured: dict[str, Any]) -> list[Section]:
+    """Lay out the figures: one row for each sequence and map, means ± deviations over the seeds."""
+    rows = []
+    for source in measured["figures"]["sources"]:
+        for kind in KINDS:
+            found = [run[kind] for run in source["runs"]]
+            ratios = [run["mapping_time_ratio"] for run in source["runs"]] if kind == "full" else [1.0]
+            together = [float(np.mean(run["mean_correlation"])) for run in found]
+            names = ("nll_diagonal", "nll_full", "psnr_db", "spearman")
+            columns = [ratios, *([run[name] for run in found] for name in names[:2]), together]
+            columns += [[run[name] for run in found] for name in names[2:]]
+            rows.append([source["source"], kind, *(spread(values) for values in columns)])
+    head = ("sequence", "map", "mapping time", "NLL, diagonal", "NLL, full", "mean absolute ρ", "PSNR, dB", "Spearman")
+    note = "NLL in nats per pixel, 3 channels, on held-out frames, under V's diagonal and under all of V."
+    return [Section("colour covariance", head, rows, note)]
+
+
+def measure_all(options: Options) -> dict[str, Any]:
+    """Measure every sequence with every seed, each pair of maps in a fresh process."""
+    found = []
+    for source in options.sources:
+        runs = []
+        for seed in options.seeds:
+            runs.append(alone(measure, accuracy.located(source), options, seed))
+            line = f"{Path(source).name}, seed {seed}: {runs[-1]['mapping_time_ratio']} times the mapping time"
+            print(line, file=sys.stderr, flush=True)
+        found.append({"source": Path(source).name, "runs": runs})
+    return {"sources": found}
+
+
 def main(options: Options) -> int:
-    """Measure, write, print; exit code 2 if the options mean nothing."""
-    try:
-        found = []
-        for source in options.sources:
-            runs = []
-            for seed in options.seeds:
-                runs.append(alone(measure, accuracy.located(source), options, seed))
-                told = f"{Path(source).name}, seed {seed}: {runs[-1]['mapping_time_ratio']} times the mapping time"
-                print(told, file=sys.stderr, flush=True)
-            found.append({"source": Path(source).name, "runs": runs})
-    except SigmaSplatError as problem:
-        print(f"color_covariance.py: {problem}", file=sys.stderr)
-        return 2
-    config = {name: value for name, value in asdict(options).items() if name != "out"}
-    measured = record.results(
-        "color_covariance", {"sources": found}, name=options.name, seeds=options.seeds, config=config
-    )
-    print(record.write(measured, options.out), file=sys.stderr)
-    print(tables.table(measured))
-    return 0
+    """Measure, write, print; return the exit code."""
+    return program.run("color_covariance", options, measure_all, options.seeds)
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))
+    program.start(main, Options)

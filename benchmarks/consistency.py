@@ -9,20 +9,25 @@ example: python benchmarks/consistency.py --scenes room --seeds 0 --jobs 2
 
 import os
 import queue
-import sys
+import statistics
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import accuracy
+import program
 import record
 import tyro
+from accuracy_tables import failures
 from systems import with_surface
+from tables import Section
 
 import sigmasplat
 from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.evaluation.paired_comparison import Effect, Figure, best, by_seed, deviation, passed_by_chance, rows
 from sigmasplat.io.machine import RUNNING, code_digest
+from sigmasplat.report.tables import number
 
 arg = tyro.conf.arg
 SCENES: dict[str, tuple[str, int | None]] = {
@@ -119,15 +124,105 @@ def measure(options: Options) -> list[dict[str, Any]]:
         return list(pool.map(work, enumerate(listed, 1)))
 
 
+# ---- tables ----
+
+
+Scenes = dict[str, list[dict[str, Any]]]
+"""Runs by scene, each with `variant`, `seed` and `figures`."""
+FULL = "full"
+FIGURES = (
+    Figure("ate_m", "ATE", "cm", -1, 100.0),
+    Figure("splats_chamfer_m", "Chamfer", "cm", -1, 100.0),
+    Figure("splats_accuracy_m", "splats to surface", "cm", -1, 100.0),
+    Figure("splats_completion_m", "surface to splats", "cm", -1, 100.0),
+    Figure("floaters", "floaters", "%", -1, 100.0),
+    Figure("held_out_psnr_db", "PSNR", "dB", +1),
+    Figure("held_out_depth_l1_m", "depth L1", "cm", -1, 100.0),
+    Figure("splats", "splats", "k", 0, 1e-3, digits=1, judged=False),
+    Figure("lost", "lost", "", -1, digits=1, judged=False),
+)
+JUDGED = tuple(figure for figure in FIGURES if figure.judged)
+HEADS = [figure.head for figure in FIGURES]
+
+
+def sections(measured: dict[str, Any]) -> list[Section]:
+    """Return the tables of results written by consistency.py."""
+    results = measured["figures"]["jobs"]
+    variants, scenes = list(dict.fromkeys(result["variant"] for result in results)), by_scene(results)
+    made = [mean_of(scenes, variants), effects_of(scenes, variants)]
+    made += [scene(name, runs, variants) for name, runs in scenes.items()]
+    return [section for section in [*made, failures(results)] if section.rows]
+
+
+def by_scene(results: list[dict[str, Any]]) -> Scenes:
+    """Group the runs that succeeded."""
+    found: Scenes = {}
+    for result in results:
+        if result["problem"] is None:
+            found.setdefault(result["job"]["source"], []).append(result | {"seed": result["job"]["seed"]})
+    return found
+
+
+def scene(name: str, runs: list[dict[str, Any]], variants: list[str]) -> Section:
+    """Lay out a scene, a row a variant: mean ± standard deviation over its seeds, the best of each column in bold."""
+    laid_out = rows(runs, variants, lambda text: f"**{text}**", FIGURES)
+    return Section(name, ["variant", *HEADS], laid_out, "Mean ± standard deviation over the seeds; views are held out.")
+
+
+def mean_of(scenes: Scenes, variants: list[str]) -> Section:
+    """Lay out the mean over the scenes of each scene's mean over its seeds, of the scenes that every variant has."""
+    columns = []
+    for figure in FIGURES:
+        found = [{v: list(by_seed(runs, v, figure).values()) for v in variants} for runs in scenes.values()]
+        whole = [by_variant for by_variant in found if all(by_variant.values())]
+        means = {v: statistics.fmean(statistics.fmean(b[v]) for b in whole) for v in variants} if whole else {}
+        top = best(means, figure)
+        columns.append([_marked(number(means[v], figure.digits), v in top) if means else "–" for v in variants])
+    laid_out = [[variant, *cells] for variant, *cells in zip(variants, *columns, strict=True)]
+    return Section("Mean of scenes", ["variant", *HEADS], laid_out if scenes else [])
+
+
+def differences(scenes: Scenes, variant: str, figure: Figure) -> list[float]:
+    """Return what a variant changes against the full method, at equal scene and seed, in the figure's unit."""
+    pairs = [(by_seed(runs, variant, figure), by_seed(runs, FULL, figure)) for runs in scenes.values()]
+    return [there[seed] - full[seed] for there, full in pairs for seed in there if seed in full]
+
+
+def effects_of(scenes: Scenes, variants: list[str]) -> Section:
+    """Lay out the differences to the full method, those beyond one standard deviation in bold."""
+    laid_out, most = [], 0
+    for variant in (variant for variant in variants if variant != FULL):
+        changes = [(figure, differences(scenes, variant, figure)) for figure in JUDGED]
+        most = max(most, *(len(found) for _, found in changes))
+        laid_out.append([variant, *(_effect(figure, found) for figure, found in changes)])
+    note = (
+        "Difference to the full method at equal scene and seed: mean ± standard deviation, and in how many it is worse."
+    )
+    if most > 1:
+        note += f" Bold: beyond one deviation, as {passed_by_chance(most):.1%} of figures are by chance."
+    return Section("Effects", ["variant", *(f.title for f in JUDGED)], laid_out if most else [], note)
+
+
+def _effect(figure: Figure, changes: list[float]) -> str:
+    if not changes:
+        return "–"
+    effect = Effect(figure, statistics.fmean(changes), deviation(changes))
+    worse = sum(figure.better * change < 0 for change in changes)
+    return f"{_marked(effect.written(), effect.verdict in ('helps', 'harms'))}, {worse}/{len(changes)}"
+
+
+def _marked(text: str, stands_out: bool) -> str:
+    return f"**{text}**" if stands_out else text
+
+
 def main(options: Options) -> int:
     """Run, score, write, print; exit code 1 if a job failed, 2 if the options mean nothing."""
     try:
         results = measure(options)
     except SigmaSplatError as problem:
-        print(f"consistency.py: {problem}", file=sys.stderr)
-        return 2
+        return program.refuse("consistency", problem)
     return accuracy.publish("consistency", results, options)
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,))))
+    program.start(main, Options, __doc__)

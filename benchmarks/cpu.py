@@ -11,12 +11,12 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+import program
 import record
-import tables
 import tyro
 
 from sigmasplat.errors import SigmaSplatError
@@ -102,18 +102,10 @@ def measure_all(options: Options) -> dict[str, Any]:
 
 def main(options: Options) -> int:
     """Measure, write, print; return the exit code."""
-    try:
-        figures = measure_all(options)
-    except (SigmaSplatError, ValueError, ImportError, AttributeError) as problem:
-        print(f"cpu.py: {problem}", file=sys.stderr)
-        return 2
-    config = {n: v for n, v in asdict(options).items() if n != "out"} | {"source": figures["source"]}
-    measured = record.results("cpu", figures, name=options.name, seeds=[options.seed], config=config)
-    if not options.quick:
-        print(record.write(measured, options.out), file=sys.stderr)
-    print(tables.table(measured))
-    return 0
+    refused = (SigmaSplatError, ValueError, ImportError, AttributeError)
+    name = Path(options.source).name
+    return program.run("cpu", options, measure_all, [options.seed], not options.quick, refused, source=name)
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))
+    program.start(main, Options)

@@ -7,21 +7,20 @@ Writes benchmarks/results/drift_rule-<machine>.json and prints tables.
 example: python benchmarks/drift_rule.py --sources hololens --limit 120
 """
 
-import sys
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
 import accuracy
 import numpy as np
+import program
 import record
-import tables
 import tyro
 from numpy.typing import NDArray
+from tables import Section, significant
 
 from sigmasplat.config import SubmapConfig
-from sigmasplat.errors import SigmaSplatError
 from sigmasplat.metrics.trajectory import associate
 from sigmasplat.model import se3
 from sigmasplat.presets import default_preset, preset as preset_of
@@ -85,21 +84,46 @@ def hops_of(slam: Slam, path: Matrix, known: dict[int, Matrix]) -> dict[str, Any
     return {"hops": hops, "submaps": len(slam.atlas.anchors)}
 
 
+# ---- tables ----
+
+
+Rows = list[dict[str, Any]]
+
+
+def sections(measured: dict[str, Any]) -> list[Section]:
+    """Return one table: a row for each sequence."""
+    rows = []
+    for found in measured["figures"]["sources"]:
+        hops: Rows = found["hops"]
+        errors_cm = {cut: [100 * hop["error_m"] for hop in hops if hop["cut"] is cut] for cut in (True, False)}
+        counts = [str(len(hops)), str(found["submaps"]), str(found["lost"])]
+        cells = [level(errors_cm[cut], share) for cut in (True, False) for share in (0.5, 0.9)]
+        rows.append([found["source"], *counts, *cells])
+    head = ["sequence", "hops", "submaps", "lost frames", "error of hops where it fires, cm: median", "… 90 %"]
+    head += ["where it does not, cm: median", "… 90 %"]
+    limit_cm = significant(100 * measured["config"]["uncertainty_m"])
+    note = (
+        f"A submap ends where the camera's position in it is uncertain by more than {limit_cm} cm. Hops lead from "
+        "keyframe to keyframe; their errors are against the truth, which the rule does not know."
+    )
+    return [Section("the uncertainty rule", head, rows, note)]
+
+
+def level(errors: list[float], share: float) -> str:
+    """Return the error that a share of them stays below; a dash where there are none."""
+    return significant(float(np.quantile(errors, share))) if errors else "–"
+
+
+def measure_all(options: Options) -> dict[str, Any]:
+    """Measure every sequence."""
+    found = [{"source": Path(s).name, **measure(accuracy.located(s), options)} for s in options.sources]
+    return {"sources": found}
+
+
 def main(options: Options) -> int:
-    """Measure, write, print; exit code 2 if the options mean nothing."""
-    found = []
-    try:
-        for source in options.sources:
-            found.append({"source": Path(source).name, **measure(accuracy.located(source), options)})
-    except SigmaSplatError as problem:
-        print(f"drift_rule.py: {problem}", file=sys.stderr)
-        return 2
-    config = {name: value for name, value in asdict(options).items() if name != "out"}
-    measured = record.results("drift_rule", {"sources": found}, name=options.name, seeds=[0], config=config)
-    print(record.write(measured, options.out), file=sys.stderr)
-    print(tables.table(measured))
-    return 0
+    """Measure, write, print; return the exit code."""
+    return program.run("drift_rule", options, measure_all, [0])
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))
+    program.start(main, Options)

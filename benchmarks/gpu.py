@@ -7,13 +7,15 @@ example: python benchmarks/gpu.py --quick
 
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import program
 import record
 import tables
 import tyro
+from tables import Section, significant
 
 from sigmasplat.errors import SigmaSplatError
 
@@ -56,20 +58,94 @@ def measured_so_far(options: Options) -> Iterator[dict[str, Any]]:
         yield figures
 
 
+# ---- tables ----
+
+
+COLUMNS = (
+    ("forward, all outputs", "forward_all"),
+    ("colour + depth", "forward_color_depth"),
+    ("forward + backward, all outputs", "both_all"),
+    ("colour + depth", "both_color_depth"),
+    ("pose only", "both_pose"),
+    ("tracking iteration", "tracking_iteration"),
+    ("kernel by kernel", "launched_tracking_iteration"),
+    ("mapping iteration", "mapping_iteration"),
+)
+GOAL_SCENE = (300_000, 1200)
+MOST_OVERHEAD, TRACKING_MS, MAPPING_MS, LEAST_FRAMES_PER_S = 1.15, 2.0, 4.0, 30.0
+Figures = dict[str, Any]
+
+
+def sections(measured: Figures) -> list[Section]:
+    """Return all tables."""
+    figures = measured["figures"]
+    scenes = figures["scenes"]
+    note = f"{figures['device']['name']}, torch {figures['device']['torch']}."
+    made = [
+        Section(
+            "Times, ms", ["splats, image", *(title for title, _ in COLUMNS), "peak, MiB"], list(_times(scenes)), note
+        )
+    ]
+    if any(scene["gsplat"] for scene in scenes):
+        head = ["splats, image", "ours, forward", "gsplat", "ours, forward + backward", "gsplat", "mean difference"]
+        made.append(Section("Beside gsplat, colour and depth, ms", head, list(_peers(scenes))))
+    goals = list(_goals(figures))
+    if goals:
+        made.append(Section("Goals", ["", "goal", "measured", "held"], goals))
+    return made
+
+
+def _name(scene: Figures) -> str:
+    return f"{scene['splats'] // 1000} k, {scene['width']}×{scene['height']}"
+
+
+def _ms(scene: Figures, work: str) -> float:
+    return float(scene["works"][work]["median_ms"])
+
+
+def _times(scenes: list[Figures]) -> Iterator[list[str]]:
+    for scene in scenes:
+        yield [_name(scene), *(significant(_ms(scene, work)) for _, work in COLUMNS), f"{scene['peak_mib']:.0f}"]
+
+
+def _peers(scenes: list[Figures]) -> Iterator[list[str]]:
+    for scene in scenes:
+        if peer := scene["gsplat"]:
+            ours = [_ms(scene, "forward_color_depth"), _ms(scene, "both_color_depth")]
+            pairs = zip(ours, (peer["forward"], peer["both"]), strict=True)
+            times = [significant(value) for mine, theirs in pairs for value in (mine, theirs["median_ms"])]
+            yield [_name(scene), *times, significant(peer["mean_color_difference"])]
+
+
+def _goals(figures: Figures) -> Iterator[list[str]]:
+    for scene in figures["scenes"]:
+        if (scene["splats"], scene["width"]) == GOAL_SCENE:
+            overhead = _ms(scene, "both_all") / _ms(scene, "both_color_depth")
+            yield _row(f"all outputs / colour + depth, {_name(scene)}", "≤", MOST_OVERHEAD, overhead)
+            yield _row(f"tracking iteration, ms, {_name(scene)}", "≤", TRACKING_MS, _ms(scene, "tracking_iteration"))
+            yield _row(f"mapping iteration, ms, {_name(scene)}", "≤", MAPPING_MS, _ms(scene, "mapping_iteration"))
+        if peer := scene["gsplat"]:
+            speed = peer["both"]["median_ms"] / _ms(scene, "both_color_depth")
+            yield _row(f"gsplat / ours, forward + backward, {_name(scene)}", "≥", 1.0, speed)
+    if slam := figures["slam"]:
+        yield _row("frames/s from end to end, 640×480", "≥", LEAST_FRAMES_PER_S, slam["frames_per_s"])
+
+
+def _row(what: str, sign: str, goal: float, found: float) -> list[str]:
+    held = found <= goal if sign == "≤" else found >= goal
+    return [what, f"{sign} {significant(goal)}", significant(found), "yes" if held else "**no**"]
+
+
 def main(options: Options) -> int:
-    """Measure, write as it goes, print; return the exit code."""
-    config = {n: v for n, v in asdict(options).items() if n != "out"}
+    """Measure, write after each scene, print; return the exit code."""
     try:
         for figures in measured_so_far(options):
-            measured = record.results("gpu", figures, name=options.name, seeds=[options.seed], config=config)
-            path = None if options.quick else record.write(measured, options.out)
+            measured = program.keep("gpu", figures, options, [options.seed], not options.quick)
     except (SigmaSplatError, ValueError) as problem:
-        print(f"gpu.py: {problem}", file=sys.stderr)
-        return 2
-    print(path or "nothing is written", file=sys.stderr)
+        return program.refuse("gpu", problem)
     print(tables.table(measured))
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))
+    program.start(main, Options)

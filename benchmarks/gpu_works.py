@@ -21,8 +21,8 @@ from sigmasplat.fit.pose import fit_pose_adam
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.metrics.trajectory import ate
 from sigmasplat.presets import default_preset, preset
-from sigmasplat.render import cuda_launch
-from sigmasplat.render.cuda_view import CudaView
+from sigmasplat.render.cuda import launch as cuda_launch
+from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import SyntheticRoom
 

@@ -6,18 +6,18 @@ example: python benchmarks/kernels.py --architectures sm_86
 """
 
 import re
-import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+import program
 import record
-import tables
 import tyro
+from tables import Section
 
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.native import cubins
+from sigmasplat.native.cuda import cubins
 
 arg = tyro.conf.arg
 THREADS = 256
@@ -101,26 +101,57 @@ def figures_of(architecture: str) -> Iterator[dict[str, Any]]:
             yield {"architecture": architecture, "features": features, **usage._asdict(), "blocks": held}
 
 
+# ---- tables ----
+
+
+Rows = list[dict[str, Any]]
+
+
+def sections(measured: dict[str, Any]) -> list[Section]:
+    """Return the tables of results written by kernels.py."""
+    figures = measured["figures"]
+    made = dict.fromkeys(row["architecture"] for row in figures["kernels"])
+    note = f"NVRTC {figures['compiler']}; spills of a thread; blocks of 256 threads that a multiprocessor holds."
+    return [
+        _section(architecture, [row for row in figures["kernels"] if row["architecture"] == architecture], note)
+        for architecture in made
+    ]
+
+
+def _section(architecture: str, rows: Rows, note: str) -> Section:
+    head = ["kernel", "features", "registers", "spilled, B", "shared, B", "blocks"]
+    kernels = dict.fromkeys(row["kernel"] for row in rows)
+    ordered = [row for kernel in kernels for row in rows if row["kernel"] == kernel]
+    return Section(f"Kernels, {architecture}", head, [_cells(row) for row in _merged(ordered)], note)
+
+
+def _merged(rows: Rows) -> Rows:
+    """Join what programs of several feature counts say alike of a kernel."""
+    joined: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for row in rows:
+        alike = tuple(row[name] for name in ("kernel", "registers", "spilled", "shared", "blocks"))
+        joined.setdefault(alike, row | {"counts": []})["counts"].append(row["features"])
+    return list(joined.values())
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    counts = ", ".join(str(count) for count in row["counts"] if count > 0)
+    return [row["kernel"], counts or "–", *(str(row[name]) for name in ("registers", "spilled", "shared", "blocks"))]
+
+
+def measure(options: Options) -> dict[str, Any]:
+    """Compile every kernel for every architecture. Raises SigmaSplatError for an unknown architecture."""
+    unknown = set(options.architectures) - set(MULTIPROCESSORS)
+    if unknown:
+        raise SigmaSplatError(f"no figures for {', '.join(sorted(unknown))}; there are {', '.join(MULTIPROCESSORS)}")
+    rows = [row for architecture in options.architectures for row in figures_of(architecture)]
+    return {"compiler": cubins.compiler_version(), "kernels": rows}
+
+
 def main(options: Options) -> int:
     """Compile, write, print; return the exit code."""
-    unknown = set(options.architectures) - set(MULTIPROCESSORS)
-    try:
-        if unknown:
-            raise SigmaSplatError(
-                f"no figures for {', '.join(sorted(unknown))}; there are {', '.join(MULTIPROCESSORS)}"
-            )
-        rows = [row for architecture in options.architectures for row in figures_of(architecture)]
-    except SigmaSplatError as problem:
-        print(f"kernels.py: {problem}", file=sys.stderr)
-        return 2
-    figures = {"compiler": cubins.compiler_version(), "kernels": rows}
-    config = {n: v for n, v in asdict(options).items() if n not in ("out", "quick")}
-    measured = record.results("kernels", figures, name=options.name, config=config)
-    if not options.quick:
-        print(record.write(measured, options.out), file=sys.stderr)
-    print(tables.table(measured))
-    return 0
+    return program.run("kernels", options, measure, write=not options.quick)
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))
+    program.start(main, Options)

@@ -14,7 +14,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.render import Render, render
-from sigmasplat.render.view import twist_matrix
+from sigmasplat.render.pose_gradient import twist_matrix
 
 Matrix = NDArray[np.float64]
 WAYS = {

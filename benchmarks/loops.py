@@ -7,16 +7,14 @@ Writes benchmarks/results/loops-<machine>.json, prints tables; benchmarks/README
 example: python benchmarks/loops.py --experiments drift
 """
 
-import sys
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import accuracy
 import numpy as np
+import program
 import record
-import tables
 import tyro
 from loops_tables import FALSE_ROTATION_DEG, FALSE_TRANSLATION_M
 from numpy.typing import NDArray
@@ -161,29 +159,19 @@ def checked(options: Options) -> None:
         open_source(f"{options.source},seed={seed}")
 
 
+def measure_all(options: Options) -> dict[str, Any]:
+    """Check the options, then measure."""
+    checked(options)
+    return {"jobs": measure(options)}
+
+
 def main(options: Options) -> int:
-    """Measure, write, print; exit code 1 if a run failed, 2 if the options mean nothing."""
+    """Measure, write, print; return the exit code."""
     if options.quick:
         options = shortened(options)
-    try:
-        checked(options)
-        jobs = measure(options)
-    except SigmaSplatError as problem:
-        print(f"loops.py: {problem}", file=sys.stderr)
-        return 2
-    config = {n: v for n, v in asdict(options).items() if n not in ("runs", "out", "fresh", "quick")}
-    config["real"] = Path(options.real).name
-    measured = record.results("loops", {"jobs": jobs}, name=options.name, seeds=options.seeds, config=config)
-    if not options.quick:
-        print(record.write(measured, options.out), file=sys.stderr)
-    print(tables.table(measured))
-    return int(failed(jobs))
-
-
-def failed(jobs: Sequence[dict[str, Any]]) -> bool:
-    """Tell whether a run failed."""
-    return any(job["problem"] for job in jobs)
+    name = Path(options.real).name
+    return program.run("loops", options, measure_all, options.seeds, not options.quick, real=name)
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))
+    program.start(main, Options)

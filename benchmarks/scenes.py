@@ -10,12 +10,13 @@ from scipy.spatial import cKDTree
 from sigmasplat.config import RenderConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.align import align
-from sigmasplat.fit.pyramid import Pyramid, gray_of
+from sigmasplat.fit.gray import gray_of
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
-from sigmasplat.render import reference
+from sigmasplat.render.reference import operators as reference
 from sigmasplat.sources import open_source
 from sigmasplat.sources.base import Source
 

@@ -13,7 +13,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import accuracy
+import program
 import tyro
+from accuracy_tables import Result, failures, groups, spread, values_of
+from tables import Section
 
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError, SigmaSplatError
@@ -81,18 +84,62 @@ def with_surface(job: accuracy.Job, result: dict[str, Any], runs: Path, before: 
     return result | {"figures": figures_of(metrics)}
 
 
+# ---- tables ----
+
+
+ROWS = (
+    ("ATE, cm", "ate_m", 100.0),
+    ("lost frames", "lost", 1.0),
+    ("PSNR held-out, dB", "held_out_psnr_db", 1.0),
+    ("depth L1 held-out, cm", "held_out_depth_l1_m", 100.0),
+    ("Spearman V ~ error²", "spearman", 1.0),
+    ("Accuracy, cm", "accuracy_m", 100.0),
+    ("Completion, cm", "completion_m", 100.0),
+    ("Completion ratio, %", "completion_ratio", 100.0),
+    ("Chamfer of splats, cm", "splats_chamfer_m", 100.0),
+    ("map, MB", "map_bytes", 1e-6),
+    ("splats, k", "splats", 1e-3),
+    ("frames/s", "frames_per_s", 1.0),
+    ("finish, s", "finish_s", 1.0),
+    ("worst frame, ms", "worst_frame_s", 1e3),
+    ("peak memory, MiB", "peak_mib", 1.0),
+)
+"""Title, name of the figure, factor; a row that no run has is left out."""
+NOTE = (
+    "Mean ± standard deviation over the seeds. Frames/s: reading, tracking, mapping and loops, end to end; the final "
+    "map comes after and is `finish`. Worst frame: without the first, which makes the map, and without reading."
+)
+
+
+def sections(measured: dict[str, Any]) -> list[Section]:
+    """Return the tables of results written by systems.py: one per sequence, and what failed."""
+    results = measured["figures"]["jobs"]
+    sources = dict.fromkeys(result["job"]["source"] for result in results)
+    made = [sequence(source, [r for r in results if r["job"]["source"] == source]) for source in sources]
+    return [section for section in [*made, failures(results)] if section.rows]
+
+
+def sequence(source: str, results: list[Result]) -> Section:
+    """Lay out the runs of one sequence."""
+    by_preset = {preset: runs for (_, preset), runs in groups(results).items()}
+    rows = [["runs", *(str(len(runs)) for runs in by_preset.values())]]
+    for title, figure, factor in ROWS:
+        values = [[factor * value for value in values_of(runs, figure)] for runs in by_preset.values()]
+        rows += [[title, *map(spread, values)]] if any(values) else []
+    return Section(source, ["", *by_preset], rows, NOTE)
+
+
 def main(options: Options) -> int:
     """Run, score, write, print; exit code 1 if a job failed, 2 if the options mean nothing."""
     try:
         refuse_unequal_input(options.presets, options.settings)
         jobs = accuracy.jobs_of(options)
     except SigmaSplatError as problem:
-        print(f"systems.py: {problem}", file=sys.stderr)
-        return 2
+        return program.refuse("systems", problem)
     results = accuracy.run_all(jobs, options)
     scored = [with_surface(job, result, options.runs) for job, result in zip(jobs, results, strict=True)]
     return accuracy.publish("systems", scored, options)
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,))))
+    program.start(main, Options, __doc__)

@@ -3,7 +3,8 @@
 A document holds <!-- bench:NAME --> … <!-- /bench -->, or bench:NAME/SECTION for one table of several;
 `python benchmarks/tables.py` rewrites what stands between, in README.md and docs/*.md. NAME is that of the results
 (the newest of any machine) or the whole file name without .json; SECTION is a table's title, as in path-and-speed.
-bench:* is all there is, each result under a heading of its own.
+bench:* shows all results, each under its own heading, and bench:contents lists these headings; bench:summary is the
+table of summary.py.
 """
 
 import ast
@@ -11,14 +12,25 @@ import importlib
 import math
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any
 
 import record
 import tyro
 
+SUBJECTS = {
+    "Whole runs": ("accuracy", "systems"),
+    "Effect of σ²": ("ablation", "color_covariance"),
+    "Camera tracking": ("tracking", "pose_gradient"),
+    "Loops and submaps": ("loops", "drift_rule"),
+    "Consistent maps": ("consistency",),
+    "Kernels": ("cpu", "versus", "gpu", "kernels"),
+    "Long runs": ("long_run", "viewer_memory"),
+}
+"""Benchmarks by the subject under which their results are listed, in this order; any other follows at the end."""
 BLOCK = re.compile(r"(<!-- bench:(?P<what>[\w./+-]+|\*) -->\n)(?P<body>.*?)(<!-- /bench -->)", re.DOTALL)
 
 
@@ -54,9 +66,15 @@ def headline(measured: dict[str, Any]) -> str:
 
 
 def sections(measured: dict[str, Any]) -> list[Section]:
-    """Return the tables of results, laid out by the benchmark that made them (module <benchmark>_tables)."""
-    made: list[Section] = importlib.import_module(f"{measured['benchmark']}_tables").sections(measured)
+    """Return the tables of results, in the layout of the benchmark that made them."""
+    made: list[Section] = layout(measured["benchmark"]).sections(measured)
     return made
+
+
+def layout(benchmark: str) -> ModuleType:
+    """Return the module that lays out a benchmark's results: <benchmark>_tables, else the benchmark itself."""
+    apart = record.ROOT / "benchmarks" / f"{benchmark}_tables.py"
+    return importlib.import_module(apart.stem if apart.is_file() else benchmark)
 
 
 def table(measured: dict[str, Any], section: str | None = None) -> str:
@@ -70,23 +88,47 @@ def table(measured: dict[str, Any], section: str | None = None) -> str:
 
 def compared(measured: Sequence[dict[str, Any]], source: str) -> str:
     """Write results of one benchmark with different settings as one table, a row each, of one source's runs."""
-    section: Section = importlib.import_module(f"{measured[0]['benchmark']}_tables").compared(measured, source)
+    section: Section = layout(measured[0]["benchmark"]).compared(measured, source)
     made_on, commits = measured[0]["machine"], sorted({(m["commit"] or "no commit")[:9] for m in measured})
     dates = sorted({m["date"][:10] for m in measured})
     head = f"{made_on['cpu']}, {made_on['cores']} cores · commit {', '.join(commits)} · {', '.join(dates)}"
     return f"{head}\n\n{section.markdown()}"
 
 
+def by_subject(folder: Path = record.RESULTS) -> dict[str, dict[str, dict[str, Any]]]:
+    """Return every result of a folder by subject and heading: in the order of SUBJECTS, then by name."""
+    found = [(record.read(path), path.stem) for path in sorted(folder.glob("*.json"))]
+    names = [measured["name"] for measured, _ in found]
+    order = [benchmark for benchmarks in SUBJECTS.values() for benchmark in benchmarks]
+
+    def rank(pair: tuple[dict[str, Any], str]) -> tuple[int, str, bool, str]:
+        benchmark = pair[0]["benchmark"]
+        known = order.index(benchmark) if benchmark in order else len(order)
+        return known, benchmark, pair[0]["name"] != benchmark, pair[1]
+
+    listed: dict[str, dict[str, dict[str, Any]]] = {}
+    for measured, stem in sorted(found, key=rank):
+        subject = next((s for s, members in SUBJECTS.items() if measured["benchmark"] in members), "Other results")
+        heading = measured["name"] if names.count(measured["name"]) == 1 else stem
+        listed.setdefault(subject, {})[heading] = measured
+    return listed
+
+
 def everything(folder: Path = record.RESULTS) -> str:
-    """Write every result of a folder: a heading, what its benchmark asks, every table. By benchmark, then by name."""
-    found = [(record.read(path), path.stem) for path in folder.glob("*.json")]
-    ordered = sorted(found, key=lambda pair: (pair[0]["benchmark"], pair[0]["name"] != pair[0]["benchmark"], pair[1]))
-    names = [m["name"] for m, _ in ordered]
-    titles = [m["name"] if names.count(m["name"]) == 1 else stem for m, stem in ordered]
-    written = (
-        f"## {title}\n\n{question(m['benchmark'])}\n\n{table(m)}" for title, (m, _) in zip(titles, ordered, strict=True)
-    )
+    """Write every result of a folder: a heading by subject, then for each result a heading and its tables."""
+    written = []
+    for subject, listed in by_subject(folder).items():
+        written.append(f"## {subject}\n")
+        written += [f"### {name}\n\n{question(m['benchmark'])}\n\n{table(m)}" for name, m in listed.items()]
     return "\n" + "\n".join(written)
+
+
+def contents(folder: Path = record.RESULTS) -> str:
+    """Write the list of contents of `everything`: a line for each subject, with links to its results."""
+    links = {
+        subject: ", ".join(f"[{name}](#{name.lower()})" for name in m) for subject, m in by_subject(folder).items()
+    }
+    return "".join(f"- **{subject}**: {line}\n" for subject, line in links.items())
 
 
 def question(benchmark: str) -> str:
@@ -95,6 +137,16 @@ def question(benchmark: str) -> str:
     source = (record.ROOT / "benchmarks" / program).read_text(encoding="utf-8")
     asked = (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
     return f"{asked} Figures: [{program}](../benchmarks/README.md#{program.replace('.', '')})."
+
+
+def summary(folder: Path = record.RESULTS) -> str:
+    """Write the summary of all results (see summary.py). Raises KeyError if it lacks a result."""
+    made: str = importlib.import_module("summary").table(folder)
+    return made
+
+
+WHOLE: dict[str, Callable[[Path], str]] = {"*": everything, "contents": contents, "summary": summary}
+"""Blocks that show more than the results of one name."""
 
 
 def rewritten(text: str, folder: Path = record.RESULTS) -> tuple[str, list[str]]:
@@ -106,8 +158,8 @@ def rewritten(text: str, folder: Path = record.RESULTS) -> tuple[str, list[str]]
     missing: list[str] = []
 
     def block(match: re.Match[str]) -> str:
-        if match["what"] == "*":
-            return f"{match[1]}{everything(folder)}{match[4]}"
+        if match["what"] in WHOLE:
+            return f"{match[1]}{WHOLE[match['what']](folder)}{match[4]}"
         name, _, section = match["what"].partition("/")
         found = {part: record.latest(part, folder) for part in name.split("+")}
         missing.extend(part for part, results in found.items() if results is None)

@@ -10,23 +10,24 @@ example: python benchmarks/tracking.py --experiments pairs consistency
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import accuracy
 import numpy as np
+import program
 import record
-import tables
 import tyro
 from cpu import alone, default_source
 from numpy.typing import NDArray
 from tracking_tables import coverage
 
 from sigmasplat.config import Config
-from sigmasplat.errors import SigmaSplatError, SourceError
+from sigmasplat.errors import SourceError
+from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
-from sigmasplat.fit.pyramid import Pyramid, gray_of
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import map_reference
 from sigmasplat.fit.target import Target
 from sigmasplat.metrics.trajectory import associate
@@ -34,7 +35,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
 from sigmasplat.presets import default_preset, preset as preset_of
-from sigmasplat.render.view import make_view
+from sigmasplat.render.backend import make_view
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import open_source
 from sigmasplat.sources.base import Source
@@ -229,22 +230,12 @@ def measure(options: Options) -> dict[str, Any]:
 
 
 def main(options: Options) -> int:
-    """Measure, write, print; exit code 1 if a run failed, 2 if the options mean nothing."""
+    """Measure, write, print; return the exit code."""
     if options.quick:
         options = replace(options, starts=min(options.starts, 3), limit=min(options.limit or 30, 30))
-    try:
-        figures = measure(options)
-    except SigmaSplatError as problem:
-        print(f"tracking.py: {problem}", file=sys.stderr)
-        return 2
-    config = {n: v for n, v in asdict(options).items() if n not in ("runs", "out", "fresh", "quick")}
-    config["source"] = Path(options.source).name
-    measured = record.results("tracking", figures, name=options.name, seeds=options.seeds, config=config)
-    if not options.quick:
-        print(record.write(measured, options.out), file=sys.stderr)
-    print(tables.table(measured))
-    return int(any(job["problem"] for job in figures.get("sequence", [])))
+    name = Path(options.source).name
+    return program.run("tracking", options, measure, options.seeds, not options.quick, source=name)
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))
+    program.start(main, Options)

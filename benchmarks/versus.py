@@ -14,10 +14,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+import program
 import record
-import tables
 import tyro
 from cpu import default_source
+from tables import Section, significant
+from versus_works import NAMES
 
 from sigmasplat.io.machine import usable_cores
 
@@ -77,20 +80,42 @@ def described(checkout: Path) -> str | None:
     return ended.stdout.strip() or None
 
 
+# ---- tables ----
+
+
+def sections(measured: dict[str, Any]) -> list[Section]:
+    """Return the table of results written by versus.py."""
+    figures, config = measured["figures"], measured["config"]
+    header = ["threads", "work", "before, ms", "now, ms", "now / before", "turn by turn, median (least – most)"]
+    turns: list[dict[str, Any]] = figures["turns"]
+    rows = [
+        _row(threads, name, [t for t in turns if t["threads"] == threads])
+        for threads in sorted({t["threads"] for t in turns})
+        for name in NAMES
+    ]
+    note = (
+        f"Before: commit {str(figures['other'])[:9]}. Least of {config['runs']} runs in each of {len(turns)} turns; "
+        f"{config['splats']} splats of {config['source']}, {config['width']} pixels wide."
+    )
+    return [Section("Beside another checkout", header, rows, note)]
+
+
+def _row(threads: int, name: str, turns: list[dict[str, Any]]) -> list[str]:
+    now, before = (np.array([turn[of][name] for turn in turns]) for of in ("this", "other"))
+    ratios = now / before
+    spread = " – ".join(significant(float(x), 3) for x in (ratios.min(), ratios.max()))
+    return [
+        str(threads),
+        name,
+        *(significant(float(x)) for x in (before.min(), now.min(), now.min() / before.min())),
+        f"{significant(float(np.median(ratios)), 3)} ({spread})",
+    ]
+
+
 def main(options: Options) -> int:
     """Measure, write, print; return the exit code."""
-    try:
-        figures = measure_all(options)
-    except ValueError as problem:
-        print(f"versus.py: {problem}", file=sys.stderr)
-        return 2
-    o = options
-    config = {"source": Path(o.source).name, "frame": o.frame, "splats": o.splats, "width": o.width, "runs": o.runs}
-    measured = record.results("versus", figures, name=o.name, seeds=[0], config=config)
-    print(record.write(measured, o.out), file=sys.stderr)
-    print(tables.table(measured))
-    return 0
+    return program.run("versus", options, measure_all, [0], refused=(ValueError,), source=Path(options.source).name)
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))
+    program.start(main, Options)

@@ -15,18 +15,18 @@ import os
 import subprocess
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+import program
 import record
-import tables
 import torch
 import tyro
+from tables import Section, significant
 
-from sigmasplat.errors import SigmaSplatError
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.model import se3
@@ -36,11 +36,11 @@ from sigmasplat.model.frame import Frame
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step_result import Step
-from sigmasplat.viewer.app import Stage
 from sigmasplat.viewer.live import LiveView
-from sigmasplat.viewer.panel import KINDS, SAYS
-from sigmasplat.viewer.server import HOST, close, open_server
 from sigmasplat.viewer.snapshot import to_look_at
+
+if TYPE_CHECKING:
+    from sigmasplat.viewer.app import Stage
 
 arg = tyro.conf.arg
 STATM = Path("/proc/self/statm")
@@ -156,6 +156,9 @@ def in_use_mib() -> float:
 
 def measure(options: Options) -> dict[str, Any]:
     """Show the growing system for as long as asked; return the figures."""
+    from sigmasplat.viewer.app import Stage
+    from sigmasplat.viewer.server import HOST, close, open_server
+
     server = open_server(HOST, 8780, "viewer memory")
     stage = Stage(server)
     command = [sys.executable, "-c", CLIENT, f"ws://{HOST}:{server.get_port()}"]
@@ -171,8 +174,10 @@ def measure(options: Options) -> dict[str, Any]:
         close(server)
 
 
-def watch(growing: Growing, stage: Stage, options: Options) -> dict[str, Any]:
+def watch(growing: Growing, stage: "Stage", options: Options) -> dict[str, Any]:
     """Step, and sample the memory; return what was found."""
+    from sigmasplat.viewer.panel import KINDS, SAYS
+
     shown = 0
 
     def show(moment: Any) -> None:
@@ -199,20 +204,70 @@ def watch(growing: Growing, stage: Stage, options: Options) -> dict[str, Any]:
     }  # fmt: skip
 
 
+# ---- tables ----
+
+
+MINUTES, LARGER = 10.0, 0.05
+"""Issue 7: flat over ten minutes of live updates."""
+
+
+def fifths(samples: list[dict[str, float]]) -> list[dict[str, float]]:
+    """Return of each fifth of the samples when it ended, s, and its resident memory, MiB."""
+    parts = [part for part in np.array_split(np.arange(len(samples)), 5) if len(part)]
+    return [
+        {
+            "until_s": samples[part[-1]]["s"],
+            "median_mib": float(np.median([samples[i]["resident_mib"] for i in part])),
+            "most_mib": max(samples[i]["resident_mib"] for i in part),
+            "in_use_mib": float(np.median([samples[i]["in_use_mib"] for i in part])),
+            "clients": min(samples[i]["clients"] for i in part),
+        }
+        for part in parts
+    ]
+
+
+def sections(measured: dict[str, Any]) -> list[Section]:
+    """Return the tables of results written by viewer_memory.py."""
+    figures = measured["figures"]
+    parts = fifths(figures["samples"])
+    rows = [
+        [
+            f"{p['until_s']:.0f} s",
+            *(significant(p[f"{n}_mib"]) for n in ("median", "most", "in_use")),
+            f"{p['clients']:.0f}",
+        ]
+        for p in parts
+    ]
+    note = (
+        f"{figures['updates']} updates of a run of {figures['frames']} frames, {figures['keyframes']} keyframes, "
+        f"{figures['submaps']} submaps."
+    )
+    second, last = parts[min(1, len(parts) - 1)], parts[-1]
+    kinds = {"resident memory": "median_mib", "memory in use": "in_use_mib"}
+    ratios = {name: last[kind] / second[kind] for name, kind in kinds.items()}
+    clients = min(p["clients"] for p in parts[1:] or parts)
+    held = [
+        ["minutes", significant(figures["minutes"]), f"≥ {MINUTES:.0f}", _yes(figures["minutes"] >= MINUTES)],
+        *(
+            [f"{name}, last fifth / second", significant(ratio, 4), f"≤ {1 + LARGER:.2f}", _yes(ratio <= 1 + LARGER)]
+            for name, ratio in ratios.items()
+        ),
+        ["clients, least", f"{clients:.0f}", "≥ 1", _yes(clients >= 1)],
+    ]
+    return [
+        Section("Memory", ["until", "MiB, median", "… most", "in use, median", "clients, least"], rows, note),
+        Section("Goals", ["", "found", "goal", "held"], held),
+    ]
+
+
+def _yes(held: bool) -> str:
+    return "yes" if held else "**no**"
+
+
 def main(options: Options) -> int:
     """Measure, write, print; return the exit code."""
-    try:
-        figures = measure(options)
-    except SigmaSplatError as problem:
-        print(f"viewer_memory.py: {problem}", file=sys.stderr)
-        return 2
-    config = {n: v for n, v in asdict(options).items() if n != "out"}
-    measured = record.results("viewer_memory", figures, name=options.name, config=config)
-    if options.minutes >= 10:
-        print(record.write(measured, options.out), file=sys.stderr)
-    print(tables.table(measured))
-    return 0
+    return program.run("viewer_memory", options, measure, write=options.minutes >= MINUTES)
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, config=(tyro.conf.FlagCreatePairsOff,))))
+    program.start(main, Options)

@@ -12,17 +12,18 @@ from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.fit import losses
+from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.field import fit_field
+from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pose import fit_pose_adam, fit_pose_align
-from sigmasplat.fit.pyramid import Pyramid, gray_of
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import keyframe_reference, map_reference
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.fit.tracking_loss import tracking_gradient
 from sigmasplat.model.field import GaussianField
 from sigmasplat.native import _core
 from sigmasplat.presets import default_preset, preset
-from sigmasplat.render import cpu
-from sigmasplat.render.view import CpuView
+from sigmasplat.render.cpu import operators as cpu
+from sigmasplat.render.cpu.view import CpuView
 
 RENDER = RenderConfig()
 ADAM_ITERATIONS = 60
@@ -110,7 +111,7 @@ class Works:
     def pose_only(self) -> None:
         """Take one step's gradient of tracking by Adam: forward, loss, backward to the pose alone."""
         self.view.forward(self.params, np.eye(4))
-        tracking_gradient(self.view, self.later, self.tracking, self.exposure)
+        fits_of(self.view).tracking_loss(self.view, self.later, self.tracking, self.exposure)
         self.view.backward_pose(self.params)
 
     def backward(self) -> None:

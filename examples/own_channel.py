@@ -18,7 +18,7 @@ from sigmasplat import Camera, GaussianField, open_source
 from sigmasplat.config import RenderConfig
 from sigmasplat.model import se3
 from sigmasplat.model.frame import Frame
-from sigmasplat.render import cpu
+from sigmasplat.render.cpu import operators as cpu
 
 OPTIONS = RenderConfig()
 

@@ -38,7 +38,8 @@ def main(run: str, picture: str = "view.png", row: str = "0") -> None:
     covered = view.alpha.numpy() > 0.5
     color = (view.color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
     deviation = view.variance.mean(-1).clamp(min=0.0).sqrt().numpy()
-    unsure = colormap.picture(deviation, covered, 0.0, colormap.span(deviation, covered)[1], colormap.INFERNO)
+    high = colormap.value_range(deviation, covered)[1]
+    unsure = colormap.apply_masked(deviation, covered, 0.0, high, colormap.INFERNO)
     Image.fromarray(np.concatenate([color, unsure], axis=1)).save(picture)
     print(f"{picture}: {covered.mean():.0%} of the view is mapped")
     if covered.any():

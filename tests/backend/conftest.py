@@ -12,8 +12,9 @@ import torch
 
 from emulated_cuda import Emulator, rubbish, why_not
 from sigmasplat.errors import BackendError
-from sigmasplat.render import Render, cuda_launch, render
-from sigmasplat.render.cuda_raster import Raster
+from sigmasplat.render import Render, render
+from sigmasplat.render.cuda import launch as cuda_launch
+from sigmasplat.render.cuda.raster import Raster
 from stand_in import StandIn, library_in, standing_in
 
 LIBRARY = pytest.StashKey[Any]()
@@ -86,20 +87,20 @@ def backend(request: pytest.FixtureRequest) -> Backend:
 
 
 def _reference(request: pytest.FixtureRequest) -> Backend:
-    from sigmasplat.render import reference
+    from sigmasplat.render.reference import operators as reference
 
     return Backend("reference", reference.project, reference.blend, partial(render, backend="reference"))
 
 
 def _cpu(request: pytest.FixtureRequest) -> Backend:
     pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built (make test builds it)")
-    from sigmasplat.render import cpu
+    from sigmasplat.render.cpu import operators as cpu
 
     return Backend("cpu", cpu.project, cpu.blend, partial(render, backend="cpu"))
 
 
 def _emulated(request: pytest.FixtureRequest) -> Backend:
-    from sigmasplat.render import cuda
+    from sigmasplat.render.cuda import operators as cuda
 
     emulator: Emulator = request.getfixturevalue("emulator")
 
@@ -115,7 +116,7 @@ def _emulated(request: pytest.FixtureRequest) -> Backend:
 
 
 def _cuda(request: pytest.FixtureRequest) -> Backend:
-    from sigmasplat.render import cuda
+    from sigmasplat.render.cuda import operators as cuda
 
     reason = cuda_launch.missing()
     if reason:

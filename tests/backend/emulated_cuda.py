@@ -13,10 +13,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.native import cubins
-from sigmasplat.render import cuda_launch
-from sigmasplat.render.cuda_launch import THREADS, Argument, laid_out
-from sigmasplat.render.cuda_raster import Raster
+from sigmasplat.native.cuda import cubins
+from sigmasplat.render.cuda import launch as cuda_launch
+from sigmasplat.render.cuda.launch import THREADS, Argument, laid_out
+from sigmasplat.render.cuda.raster import Raster
 
 HERE = Path(__file__).parent / "emulation"
 FLAGS = [
@@ -65,7 +65,8 @@ class Emulator:
 
 def _built(path: Path, features: int) -> Path:
     flags = FLAGS + ["-mfma"] * (platform.machine() == "x86_64")
-    sources = [f"-DFEATURES={features}", f"-I{cubins.FOLDER}", str(HERE / "kernels.cpp"), "-o", str(path)]
+    includes = [f"-I{folder}" for folder in cubins.include_folders()]
+    sources = [f"-DFEATURES={features}", *includes, str(HERE / "kernels.cpp"), "-o", str(path)]
     made = subprocess.run([_compiler(), *flags, *sources], capture_output=True, text=True)
     assert made.returncode == 0, made.stderr
     return path

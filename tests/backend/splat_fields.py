@@ -7,15 +7,26 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
+from sigmasplat.fit.target import Keyframe
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
-from sigmasplat.render.view import ReferenceView
+from sigmasplat.render.reference.view import ReferenceView
 from splat_scenes import Scene, make
 
 OPTIONS = RenderConfig()
 BIG = Camera(101, 75, 90.0, 92.0, 52.3, 34.8)
 """Several tiles each way, a multiple of none; with `CROWD` splats several units of work, the last one ragged."""
 CROWD = 2003
+
+
+class Gradients:
+    """Statistics of a fit that keep every gradient: (keyframe's index, norms [N]) in the order given."""
+
+    def __init__(self) -> None:
+        self.given: list[tuple[int, Tensor]] = []
+
+    def on_gradient(self, keyframe: Keyframe, grad2d: Tensor) -> None:
+        self.given.append((keyframe.index, grad2d.clone()))
 
 
 def params_of(s: Scene) -> Tensor:

@@ -12,17 +12,21 @@ from sigmasplat.config import MappingConfig
 from sigmasplat.fit import adam, losses
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.color_covariance import FullCovarianceStep
+from sigmasplat.fit.cpu.mapping_step import CompiledImages
 from sigmasplat.fit.field import fit_field
-from sigmasplat.fit.step import CompiledImages, TorchStep
+from sigmasplat.fit.mapping_step import TorchStep
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.color_covariance import MOST_CORRELATED, correlations_of, covariances_of
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.model.frame import Frame
-from sigmasplat.render import reference, render
-from sigmasplat.render.covariance_view import CovarianceView
-from sigmasplat.render.view import CpuView, make_view
+from sigmasplat.render import render
+from sigmasplat.render.backend import make_view
+from sigmasplat.render.cpu.covariance_view import CpuCovarianceView
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.reference import operators as reference
+from sigmasplat.render.reference.covariance_view import CovarianceView
 from splat_fields import OPTIONS, exact_view, maps_of, params_of, there_and_back
 from splat_scenes import SMALL, WIDE, Scene, assert_same_vector, scene
 
@@ -163,7 +167,7 @@ def wide_views(s: Scene) -> tuple[CovarianceView, CovarianceView]:
     """Make the view of a scene with correlations on the kernels, and its definition in float64."""
     field = field_of(s)
     exact = CovarianceView(exact_view(s.camera, True), double(field).extras["correlations"])
-    return CovarianceView(CpuView(s.camera, OPTIONS), field.extras["correlations"]), exact
+    return CpuCovarianceView(CpuView(s.camera, OPTIONS), field.extras["correlations"]), exact
 
 
 @pytest.mark.parametrize("kind", ["random", "needles", "off_screen", "huge"])
@@ -261,7 +265,7 @@ def view_sees(s: Scene, field: GaussianField) -> Tensor:
 def test_frozen_colours_stay_and_the_others_move() -> None:
     s = scene("random", 60, WIDE)
     field = field_of(s)
-    view = CovarianceView(CpuView(s.camera, OPTIONS), field.extras["correlations"])
+    view = CpuCovarianceView(CpuView(s.camera, OPTIONS), field.extras["correlations"])
     step, before, field.steps = FullCovarianceStep(view, CompiledImages(view)), field.params.clone(), 1
     target = target_of(s.camera, tuple(view.alpha.shape))
     step.forward(field, s.T_camera_world.numpy(), target, WEIGHTS)

@@ -9,23 +9,26 @@ import torch
 
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates, adam_step, settle
-from sigmasplat.fit.step import CompiledStep, TorchStep
+from sigmasplat.fit.cpu.adam import settle as settle_compiled
+from sigmasplat.fit.cpu.mapping_step import CompiledStep
+from sigmasplat.fit.mapping_step import TorchStep
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
-from sigmasplat.render.view import CpuView, ReferenceView
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.reference.view import ReferenceView
 from splat_fields import OPTIONS, crowd, exact_view, params_of
 from splat_scenes import SMALL, WIDE, assert_same_vector
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 WEIGHTS = {
-    "l1": 0.8, "ssim": 0.2, "depth": 1.0, "nll_color": 1e-2, "nll_depth": 2e-2, "alignment": 0.3, "moment": 0.2,
+    "l1": 0.8, "ssim": 0.2, "depth": 1.0, "nll_color": 1e-2, "nll_depth": 2e-2, "median_depth": 0.3, "moment": 0.2,
     "isotropy": 1.0, "isotropy_ratio": 0.1,
 }  # fmt: skip
-TERMS = ("l1", "ssim", "depth", "nll_color", "nll_depth", "alignment", "moment")
+TERMS = ("l1", "ssim", "depth", "nll_color", "nll_depth", "median_depth", "moment")
 
 
 def target_of(camera: Camera, size: tuple[int, int], valid_share: float = 0.8) -> Target:
@@ -62,7 +65,7 @@ def both_ways(camera: Camera, weights: dict[str, float], variance: bool, valid_s
         layers=SimpleNamespace(median_depth=view.layers.median_depth.double()),
         g_moment=torch.zeros_like(view.moment).double(), g_median_depth=torch.zeros_like(view.moment).double(),
     )  # fmt: skip
-    for plane, name in ((view.g_sums, ""), (view.g_median_depth, "alignment"), (view.g_moment, "moment")):
+    for plane, name in ((view.g_sums, ""), (view.g_median_depth, "median_depth"), (view.g_moment, "moment")):
         plane.fill_(torch.nan if weights.get(name, 1.0) else 0.0)  # whatever was there must go
     losses = CompiledStep(view).images(target, weights), TorchStep(exact).images(target, weights)
     outside = gradients_of(view)
@@ -202,7 +205,7 @@ def test_a_row_that_was_away_ends_where_dense_adam_has_it(away: int, settled: bo
     assert settled == (not torch.equal(lazy.last_step, dense.last_step))
     if settled:
         assert float((dense.params - lazy.params).abs().max()) > 1e-3
-        settle(lazy, EVEN, compiled=False)
+        settle(lazy, EVEN)
     torch.testing.assert_close(lazy.params, dense.params, rtol=1e-3, atol=1e-6)
     torch.testing.assert_close(lazy.moment1, dense.moment1, rtol=1e-9, atol=1e-15)
     torch.testing.assert_close(lazy.moment2, dense.moment2, rtol=1e-9, atol=1e-15)
@@ -213,15 +216,15 @@ def test_a_row_that_was_away_ends_where_dense_adam_has_it(away: int, settled: bo
 def test_settling_follows_its_definition(isa: str, n: int) -> None:
     got, want = fields(n)
     start = want.params.clone()
-    settle(got, RATES, compiled=True)
-    settle(want, Rates(RATES.per_column.double()), compiled=False)
+    settle_compiled(got, RATES)
+    settle(want, Rates(RATES.per_column.double()))
     if n > 1:
         assert_same_vector(got.params - start, want.params - start, 1e-3, f"{isa} steps")
     assert_same_vector(got.moment1, want.moment1, 1e-5, f"{isa} moment1")
     assert_same_vector(got.moment2, want.moment2, 1e-5, f"{isa} moment2")
     assert bool((got.last_step == 99).all()) and torch.equal(got.last_step, want.last_step)
     again = got.params.clone()
-    settle(got, RATES, compiled=True)
+    settle_compiled(got, RATES)
     assert torch.equal(got.params, again)
 
 

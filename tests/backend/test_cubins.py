@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from sigmasplat.errors import BackendError
-from sigmasplat.native import cubins
+from sigmasplat.native.cuda import cubins
 
 pytest.importorskip("cuda.bindings.nvrtc", reason="cuda-bindings is not installed: pip install 'sigmasplat[gpu]'")
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path.append(str(BENCHMARKS))
-kernels, kernels_tables = map(importlib.import_module, ("kernels", "kernels_tables"))
+kernels = importlib.import_module("kernels")
 
 MOST_SPILLED = {11: 16, 16: 24, cubins.ALIGNING: 64}
 """Bytes of a thread, by program: what ptxas gives away from sm_90 on to hold one more block on a multiprocessor, and,
@@ -41,6 +41,7 @@ def test_every_kernel_compiles_without_a_warning_and_keeps_to_its_registers(arch
 @pytest.fixture
 def text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Put a small program in the kernels' place."""
+    (tmp_path / "cuda").mkdir()
     for name in {*cubins.TEXTS[cubins.RASTER], *cubins.TEXTS[cubins.FIT]}:
         (tmp_path / name).write_text("#pragma once\n")
     program = tmp_path / cubins.RASTER
@@ -59,7 +60,7 @@ def test_a_program_is_compiled_once(text: Path, tmp_path: Path, monkeypatch: pyt
 
 def test_what_decides_on_the_code_decides_on_its_place(text: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     keys = [cubins.key_of(4, "sm_80"), cubins.key_of(7, "sm_80"), cubins.key_of(4, "sm_90")]
-    (text.parent / cubins.TEXTS[cubins.RASTER][-1]).write_text("#pragma once\n// another\n")
+    (cubins.FOLDER / cubins.TEXTS[cubins.RASTER][-1]).write_text("#pragma once\n// another\n")
     keys.append(cubins.key_of(4, "sm_80"))
     monkeypatch.setattr(cubins, "compiler_version", lambda: "99.9")
     keys.append(cubins.key_of(4, "sm_80"))
@@ -115,5 +116,5 @@ def test_what_the_compiler_says_is_read() -> None:
     assert kernels.blocks_held(busy, "sm_86") == 2, "100 KiB, 36000 + 1024 bytes a block"
     assert kernels.blocks_held(idle, "sm_90") == 8 and kernels.blocks_held(idle, "sm_75") == 4, "2048 and 1024 threads"
     rows = [{"architecture": "sm_90", "features": f, **busy._asdict(), "blocks": 3} for f in (4, 7)]
-    (made,) = kernels_tables.sections({"figures": {"compiler": "13.0", "kernels": rows}})
+    (made,) = kernels.sections({"figures": {"compiler": "13.0", "kernels": rows}})
     assert made.rows == [["busy", "4, 7", "73", "12", "36000", "3"]]

@@ -14,8 +14,12 @@ from emulated_cuda import Emulator
 from sigmasplat.errors import BackendError
 from sigmasplat.fit import align as aligning
 from sigmasplat.fit.align import Alignment, align
-from sigmasplat.fit.cuda_align import MOTIONS, CudaLevel
-from sigmasplat.fit.pyramid import Pyramid, gray_of
+from sigmasplat.fit.cpu.images import CPU_IMAGES
+from sigmasplat.fit.cuda.align import MOTIONS
+from sigmasplat.fit.cuda.images import CUDA_IMAGES
+from sigmasplat.fit.gray import gray_of
+from sigmasplat.fit.interface import LevelPlanes
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources import SyntheticRoom
@@ -59,7 +63,7 @@ def there(image: Pyramid, device: str = "cpu") -> Pyramid:
         for planes in (image.gray, image.depth, image.weight, image.weight_depth)
     )
     assert gray is not None and depth is not None
-    return Pyramid.of(gray, depth, image.cameras[0], levels=len(image.cameras)).weighed(*weights)
+    return Pyramid.of(gray, depth, image.cameras[0], levels=len(image.cameras), backend="cuda").weighed(*weights)
 
 
 @pytest.mark.parametrize("size", [(80, 60), (97, 69), (33, 32)], ids=str)
@@ -70,13 +74,13 @@ def test_pyramids_are_the_cpus_to_the_bit(size: tuple[int, int], weighed: bool) 
     depth[5:20, 7:30:3] = 0.0
     want = Pyramid.of(want.gray[0], depth, want.cameras[0]).weighed(want.weight[0], want.weight_depth[0])
     got = there(want)
-    assert got.on_device and not want.on_device and got.cameras == want.cameras and len(want.cameras) > 1
+    assert got.cameras == want.cameras and len(want.cameras) > 1
     for name in ("gray", "depth", "weight", "weight_depth"):
         for ours, theirs in zip(getattr(got, name), getattr(want, name), strict=True):
             assert (ours is None) == (theirs is None) == (not weighed and name.startswith("weight"))
             if ours is not None:
                 np.testing.assert_array_equal(ours.numpy(), theirs)
-    np.testing.assert_allclose(got.readings.numpy(), want.readings, rtol=1e-6)  # type: ignore[union-attr]
+    np.testing.assert_allclose(got.readings.numpy(), want.readings, rtol=1e-6)
 
 
 def test_one_weight_is_for_both() -> None:
@@ -85,13 +89,14 @@ def test_one_weight_is_for_both() -> None:
     assert all(one is other for one, other in zip(image.weight, image.weight_depth, strict=True))
 
 
-def level_of(p: Pair, kind: Any, weighed: bool = True, device: str = "cpu") -> Any:
+def level_of(p: Pair, weighed: bool = True, device: str | None = None) -> LevelPlanes:
+    """Lay a pair out: arrays, or tensors on a device."""
     planes = (p.gray, p.depth, p.weight if weighed else None, p.weight_depth if weighed else None)
     images = [None if x is None else np.ascontiguousarray(x, np.float32) for x in (*planes, p.live_gray, p.live_depth)]
-    if kind is CudaLevel:
+    if device is not None:
         images = [None if x is None else torch.from_numpy(x).to(device) for x in images]
     c = CAMERA
-    return kind(*images, [c.fx, c.fy, c.cx, c.cy], [p.colors, p.depths, p.huber_gray, p.huber_depth, p.gate])
+    return LevelPlanes(*images, [c.fx, c.fy, c.cx, c.cy], [p.colors, p.depths, p.huber_gray, p.huber_depth, p.gate])
 
 
 @pytest.mark.parametrize("weighed", [True, False], ids=["weighed", "unweighed"])
@@ -101,7 +106,8 @@ def test_normal_equations_are_the_cpus_and_those_of_the_residuals(huber: Any, ho
     p = pair(*huber, holes)
     if not weighed:
         p = dataclasses.replace(p, weight=np.ones_like(p.weight), weight_depth=np.ones_like(p.weight_depth))
-    (got,), (want,) = (aligning.normal_equations(level_of(p, k, weighed), [p.T]) for k in (CudaLevel, _core.Level))
+    (got,) = aligning.normal_equations(CUDA_IMAGES, level_of(p, weighed, "cpu"), [p.T])
+    (want,) = aligning.normal_equations(CPU_IMAGES, level_of(p, weighed), [p.T])
     H, b, sums = oracle(p)
     np.testing.assert_array_equal(got.sums[1:], want.sums[1:])
     np.testing.assert_array_equal(got.sums[1:], sums[1:])
@@ -116,24 +122,23 @@ def test_normal_equations_are_the_cpus_and_those_of_the_residuals(huber: Any, ho
 def test_several_motions_at_once_are_each_alone() -> None:
     p = pair(0.05, 0.004, True)
     motions = [se3.exp(0.002 * k * np.ones(6)) @ p.T for k in range(MOTIONS)]
-    level = level_of(p, CudaLevel)
-    for T, n in zip(motions, aligning.normal_equations(level, motions), strict=True):
-        (alone,) = aligning.normal_equations(level, [T])
+    level = level_of(p, device="cpu")
+    for T, n in zip(motions, aligning.normal_equations(CUDA_IMAGES, level, motions), strict=True):
+        (alone,) = aligning.normal_equations(CUDA_IMAGES, level, [T])
         for name in ("H", "b", "S", "sums"):
             np.testing.assert_array_equal(getattr(n, name), getattr(alone, name))
 
 
 def test_a_reference_behind_the_camera_contributes_nothing() -> None:
-    (n,) = aligning.normal_equations(level_of(pair(), CudaLevel), [np.diag([-1.0, 1.0, -1.0, 1.0])])
+    (n,) = aligning.normal_equations(CUDA_IMAGES, level_of(pair(), device="cpu"), [np.diag([-1.0, 1.0, -1.0, 1.0])])
     assert not n.H.any() and not n.b.any() and not n.S.any() and not n.sums.any()
 
 
 def test_planes_of_a_level_are_alike() -> None:
     images = [torch.zeros(40, 30) for _ in range(6)]
-    with pytest.raises(ValueError, match="of one size"):
-        CudaLevel(*images[:5], torch.zeros(40, 31), [1.0] * 4, [1.0] * 5)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="float32"):
-        CudaLevel(*(image.double() for image in images), [1.0] * 4, [1.0] * 5)  # type: ignore[arg-type]
+    for planes in ([*images[:5], torch.zeros(40, 31)], [image.double() for image in images]):
+        with pytest.raises(ValueError, match="planes of a level"):
+            aligning.normal_equations(CUDA_IMAGES, LevelPlanes(*planes, [1.0] * 4, [1.0] * 5), [np.eye(4)])
 
 
 def test_images_in_two_places_are_refused_in_one_line() -> None:
@@ -171,7 +176,7 @@ def test_steps_end_as_on_the_cpu(iterations: int, stops: tuple[float, float], on
     assert_same(ours, theirs)
     assert on_the_cpu.launches.count("take_align_step") == iterations * len(live.cameras)
     assert stops != (0.0, 0.0) or ours.steps == iterations * len(live.cameras)
-    assert ours.pair.depth_m == pytest.approx(theirs.pair.depth_m, rel=1e-6)
+    assert ours.depth_m == pytest.approx(theirs.depth_m, rel=1e-6)
 
 
 def test_a_bare_wall_decides_three_directions() -> None:
@@ -212,13 +217,13 @@ def test_the_host_waits_once_for_a_pose_and_once_for_its_covariance() -> None:
     reference, live = there(seen(10, 48, 36, True)), there(seen(12, 48, 36))
     with Watch() as watch:
         found = align(reference, live, np.eye(4), 2)
-        assert watch.reads == [("cuda_align.py", "cpu"), ("cuda_align.py", "numpy")]
+        assert watch.reads == [("align.py", "cpu"), ("align.py", "numpy")]
         found.covariance  # noqa: B018
-    assert watch.reads == [("cuda_align.py", "cpu"), ("cuda_align.py", "numpy")] * 2
+    assert watch.reads == [("align.py", "cpu"), ("align.py", "numpy")] * 2
 
 
 def test_halving_makes_no_host_wait() -> None:
     gray, depth, weight = torch.rand(3, 60, 80)
     with Watch() as watch:
-        Pyramid.of(gray, depth, Camera(80, 60, 70.0, 70.0, 39.5, 29.5), weight)
+        Pyramid.of(gray, depth, Camera(80, 60, 70.0, 70.0, 39.5, 29.5), weight, backend="cuda")
     assert watch.reads == []

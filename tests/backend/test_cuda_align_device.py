@@ -14,15 +14,18 @@ from align_oracle import HUGE, oracle, pair
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit import align as aligning
 from sigmasplat.fit.align import align
-from sigmasplat.fit.cuda_align import MOTIONS, CudaLevel
+from sigmasplat.fit.cpu.images import CPU_IMAGES
+from sigmasplat.fit.cuda.align import MOTIONS
+from sigmasplat.fit.cuda.images import CUDA_IMAGES
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, live_image, map_reference
 from sigmasplat.io.state import read_state, write_state
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.render import cuda_launch
-from sigmasplat.render.cuda_view import CudaView
-from sigmasplat.render.view import CpuView, View
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.cuda import launch as cuda_launch
+from sigmasplat.render.cuda.view import CudaView
+from sigmasplat.render.view import View
 from sigmasplat.slam.slam import Slam
 from splat_fields import OPTIONS
 from splat_wall import CAMERA, TRUTH, seen_from, wall
@@ -50,8 +53,8 @@ def test_pyramids_are_the_cpus_to_the_bit(size: tuple[int, int]) -> None:
 def test_normal_equations_are_the_cpus_and_those_of_the_residuals(huber: Any, holes: bool) -> None:
     p = pair(*huber, holes)
     motions = [p.T] * MOTIONS
-    got = aligning.normal_equations(level_of(p, CudaLevel, device="cuda"), motions)
-    (want,), (H, b, sums) = aligning.normal_equations(level_of(p, _core.Level), [p.T]), oracle(p)
+    got = aligning.normal_equations(CUDA_IMAGES, level_of(p, device="cuda"), motions)
+    (want,), (H, b, sums) = aligning.normal_equations(CPU_IMAGES, level_of(p), [p.T]), oracle(p)
     for n in got:
         np.testing.assert_array_equal(n.sums[1:], sums[1:])
         for ours, theirs, exact in ((n.H, want.H, H), (n.b, want.b, b), (n.sums[:1], want.sums[:1], sums[:1])):

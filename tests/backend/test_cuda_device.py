@@ -14,18 +14,20 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig, TrackingConfig
-from sigmasplat.fit.cuda_pose import CudaTrackingLoss, descend_on_device
-from sigmasplat.fit.cuda_rows import CudaGathered
-from sigmasplat.fit.cuda_step import CudaStep
+from sigmasplat.fit.backends import step_for
+from sigmasplat.fit.cuda.descent import CudaTrackingLoss, descend_on_device
+from sigmasplat.fit.cuda.mapping_step import CudaStep
+from sigmasplat.fit.cuda.rows import CudaAccumulator
 from sigmasplat.fit.descent import Descent, descend
-from sigmasplat.fit.steps import step_for
 from sigmasplat.fit.tracking_loss import tracking_gradient
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.render import cuda_launch, cuda_stages, render
-from sigmasplat.render.cuda_view import CudaView
-from sigmasplat.render.view import CpuView, make_view
+from sigmasplat.render import render
+from sigmasplat.render.backend import make_view
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.cuda import launch as cuda_launch, stages as cuda_stages
+from sigmasplat.render.cuda.view import CudaView
 from splat_fields import OPTIONS, crowd, exact_view, params_of, there_and_back
 from splat_scenes import KINDS, WIDE, assert_same_vector, scene
 from splat_wall import CAMERA, TRUTH, seen_from, wall
@@ -115,12 +117,12 @@ def test_torch_waits_for_no_part_of_an_iteration(images: int, degree: int, full:
     s, device = crowd(), cuda_launch.this_device()
     field, view = GaussianField(params_of(s)).on(device), CudaView(s.camera, OPTIONS)
     target = target_of(s.camera, (s.camera.height, s.camera.width)).on(device)
-    weights = {**FULL, "nll_color_full": 1e-2 * full, "alignment": 0.0 if full else 0.3}
+    weights = {**FULL, "nll_color_full": 1e-2 * full, "median_depth": 0.0 if full else 0.3}
     step, T = step_for(field, view, weights, degree), s.T_camera_world.numpy()
     for watched in (False, True):  # the first one compiles, makes room, and counts pairs
         torch.cuda.set_sync_debug_mode("error" if watched else "default")
         try:
-            gathered, field.steps = CudaGathered(view, field), field.steps + 1
+            gathered, field.steps = CudaAccumulator(view, field), field.steps + 1
             for _ in range(images):
                 step.forward(field, T, target, weights)
                 step.images(target, weights)

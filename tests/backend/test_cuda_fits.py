@@ -19,9 +19,9 @@ from sigmasplat.fit.target import Keyframe
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.presets import default_preset, preset
-from sigmasplat.render import cuda_view
-from sigmasplat.render.cuda_view import CudaView
-from sigmasplat.render.view import CpuView
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.cuda import view as cuda_view
+from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import SyntheticRoom
 from splat_fields import OPTIONS, params_of

@@ -14,22 +14,26 @@ from torch import Tensor
 
 from sigmasplat.config import MappingConfig
 from sigmasplat.errors import ConfigError
+from sigmasplat.fit.backends import step_for
 from sigmasplat.fit.color_covariance import FullCovarianceStep
-from sigmasplat.fit.cuda_rows import CudaGathered
-from sigmasplat.fit.cuda_step import CudaStep
-from sigmasplat.fit.cuda_view_dependent import CudaViewDependentStep
+from sigmasplat.fit.cuda.mapping_step import CudaStep
+from sigmasplat.fit.cuda.rows import CudaAccumulator, to_host
+from sigmasplat.fit.cuda.view_dependent import CudaViewDependentStep
 from sigmasplat.fit.field import fit_field, loss_weights
-from sigmasplat.fit.step import Gathered, TorchStep, arrived
-from sigmasplat.fit.steps import MappingStep, step_for
+from sigmasplat.fit.interface import MappingStep
+from sigmasplat.fit.mapping_step import GradientAccumulator, TorchStep
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.fit.view_dependent import ViewDependentStep
 from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.model.harmonics import count
-from sigmasplat.render.covariance_view import CovarianceView, CudaCovarianceView
-from sigmasplat.render.cuda_view import CudaView
-from sigmasplat.render.view import CpuView, ReferenceView, View
-from splat_fields import OPTIONS, crowd, exact_view, params_of, plane_gradients, there_and_back
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.cuda.covariance_view import CudaCovarianceView
+from sigmasplat.render.cuda.view import CudaView
+from sigmasplat.render.reference.covariance_view import CovarianceView
+from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.view import View
+from splat_fields import OPTIONS, Gradients, crowd, exact_view, params_of, plane_gradients, there_and_back
 from splat_scenes import KINDS, SMALL, WIDE, Scene, assert_same_vector, scene
 from test_compiled_loss import RATES, WEIGHTS, fields, random_gradient, target_of
 from test_cuda_step import OF_THE_HOST, Watch
@@ -82,8 +86,8 @@ def test_gathered_images_step_as_by_definition(n: int) -> None:
     for poses in ((turned(s, 0.7), away, turned(s, 0.8)), (turned(s, 0.6), turned(s, 0.5), away)):
         results: list[Any] = []
         for field, v, gathered in (
-            (got, view, CudaGathered(view, got)),
-            (want, exact, Gathered(exact, want)),
+            (got, view, CudaAccumulator(view, got)),
+            (want, exact, GradientAccumulator(exact, want)),
         ):
             field.steps += 1
             twists, pulls = [], []
@@ -93,7 +97,7 @@ def test_gathered_images_step_as_by_definition(n: int) -> None:
                 pull = field.params.new_full((n,), torch.nan)
                 twists.append(gathered.add(field, 1.0 / 3.0, pull))
                 pulls.append(pull)
-            here, (cost,) = arrived(twists, [gathered.step(field, RATES, SHAPES, n // 3)])
+            here, (cost,) = to_host(twists, [gathered.step(field, RATES, SHAPES, n // 3)])
             results.append((np.stack(here), torch.stack(pulls), cost))
         (twist, pull, cost), (want_twist, want_pull, want_cost) = results
         assert cost == pytest.approx(want_cost, rel=1e-4)
@@ -293,12 +297,10 @@ def fitted(
 ) -> tuple[GaussianField, list[float], np.ndarray]:
     s = scene("random", 60)
     field, target = GaussianField(params_of(s)), target_of(s.camera, (view.alpha.shape[0], view.alpha.shape[1]))
-    pose, told = se3.inverse(s.T_camera_world.double().numpy()), []
+    pose, stats = se3.inverse(s.T_camera_world.double().numpy()), Gradients()
     seen = [Keyframe(k, target, pose @ se3.exp(0.01 * k * np.ones(6))) for k in range(images)]
-    fit = fit_field(
-        field, view, [seen] * 3, config, frozen_colors=5, degree=degree, felt=lambda k, pull: told.append(pull.clone())
-    )
-    assert len(told) == 3 * images and all(bool(pull.any()) for pull in told)
+    fit = fit_field(field, view, [seen] * 3, config, frozen_colors=5, degree=degree, stats=stats)
+    assert len(stats.given) == 3 * images and all(bool(grad2d.any()) for _, grad2d in stats.given)
     return field, fit.losses, np.stack([k.T_world_camera for k in seen])
 
 
@@ -361,7 +363,7 @@ def test_the_host_waits_once_a_step(images: int, degree: int, full: bool) -> Non
     target, weights = target_of(s.camera, (s.camera.height, s.camera.width)), {**FULL, "nll_color_full": 1e-2 * full}
     step, T = step_for(field, view, weights, degree), s.T_camera_world.double().numpy()
     step.view.forward(field.params, T)  # says how many pairs to expect
-    gathered = CudaGathered(view, field) if images > 1 else None
+    gathered = CudaAccumulator(view, field) if images > 1 else None
     with Watch() as watch:
         field.steps += 1
         for _ in range(images):
@@ -380,6 +382,6 @@ def test_the_host_waits_once_a_step(images: int, degree: int, full: bool) -> Non
 
 def test_what_a_step_left_on_a_device_arrives_in_its_places() -> None:
     twists = [torch.arange(6.0), np.arange(6.0) + 10, torch.arange(6.0).double() + 20]
-    here, numbers = arrived(twists, [torch.tensor(1.5), 2.5, torch.tensor(3.5, dtype=torch.float64)])
+    here, numbers = to_host(twists, [torch.tensor(1.5), 2.5, torch.tensor(3.5, dtype=torch.float64)])
     assert [t.tolist() for t in here] == [[k + i for i in range(6)] for k in (0, 10, 20)] and numbers == [1.5, 2.5, 3.5]
-    assert arrived([np.zeros(6)], [0.5])[1] == [0.5] and arrived([], []) == ([], [])
+    assert to_host([np.zeros(6)], [0.5])[1] == [0.5] and to_host([], []) == ([], [])

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from emulated_cuda import Emulator
-from sigmasplat.fit.cuda_step import CudaStep
+from sigmasplat.fit.cuda.mapping_step import CudaStep
 from sigmasplat.model.field import GaussianField, Rows
-from sigmasplat.render import cuda_stages
-from sigmasplat.render.covariance_view import CudaCovarianceView
-from sigmasplat.render.cuda_stages import STAGES, Stages
-from sigmasplat.render.cuda_view import CudaView
+from sigmasplat.render.cuda import stages as cuda_stages
+from sigmasplat.render.cuda.covariance_view import CudaCovarianceView
+from sigmasplat.render.cuda.stages import STAGES, Stages
+from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.slam.step_result import KERNELS
 from splat_fields import OPTIONS, params_of, there_and_back
 from splat_scenes import scene

@@ -12,11 +12,11 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from emulated_cuda import Emulator
-from sigmasplat.fit.cuda_step import CudaStep
-from sigmasplat.fit.step import TorchStep
+from sigmasplat.fit.cuda.mapping_step import CudaStep
+from sigmasplat.fit.mapping_step import TorchStep
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.render.cuda_view import CudaView
+from sigmasplat.render.cuda.view import CudaView
 from splat_fields import OPTIONS, crowd, exact_view, params_of
 from splat_scenes import SMALL, WIDE, assert_same_vector, scene
 from test_compiled_loss import RATES, TERMS, WEIGHTS, draw_planes, fields, random_gradient, target_of
@@ -46,7 +46,7 @@ def both_ways(
         layers=SimpleNamespace(median_depth=view.layers.median_depth.double()),
         g_moment=torch.zeros_like(view.moment).double(), g_median_depth=torch.zeros_like(view.moment).double(),
     )  # fmt: skip
-    for plane, name in ((view.g_sums, ""), (view.g_median_depth, "alignment"), (view.g_moment, "moment")):
+    for plane, name in ((view.g_sums, ""), (view.g_median_depth, "median_depth"), (view.g_moment, "moment")):
         plane.fill_(torch.nan if weights.get(name, 1.0) else 0.0)  # whatever was there must go
     got, want = CudaStep(view).images(target, weights), TorchStep(exact).images(target, weights)  # type: ignore[arg-type]
     return (float(got), planes_of(view)), (want, planes_of(exact))
@@ -122,7 +122,7 @@ WAITS = {
 """What makes the host wait for a tensor of a device."""
 
 
-OF_THE_HOST = [("cuda_raster.py", "__int__"), ("cuda_rows.py", "numpy")]
+OF_THE_HOST = [("raster.py", "__int__"), ("rows.py", "numpy")]
 """The number of pairs, which had arrived; Adam's rates."""
 
 

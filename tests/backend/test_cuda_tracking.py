@@ -13,8 +13,8 @@ from torch import Tensor
 from emulated_cuda import Emulator
 from sigmasplat.config import TrackingConfig
 from sigmasplat.errors import BackendError
-from sigmasplat.fit import cuda_pose
-from sigmasplat.fit.cuda_pose import CudaDescent, CudaTrackingLoss, descend_on_device
+from sigmasplat.fit.cuda import descent as cuda_descent
+from sigmasplat.fit.cuda.descent import CudaDescent, CudaTrackingLoss, descend_on_device
 from sigmasplat.fit.descent import Descent, descend
 from sigmasplat.fit.pose import fit_pose_adam
 from sigmasplat.fit.target import Target
@@ -22,8 +22,8 @@ from sigmasplat.fit.tracking_loss import tracking_gradient
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
-from sigmasplat.render.cuda_view import CudaView
-from sigmasplat.render.view import CpuView
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.cuda.view import CudaView
 from splat_fields import OPTIONS
 from splat_scenes import assert_same_vector
 from splat_wall import CAMERA, TRUTH, Array, lower_median, seen_from, wall
@@ -209,8 +209,8 @@ def test_a_median_of_variances_is_exact() -> None:
 
 @pytest.fixture
 def looking_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cuda_pose, "LOOK", 2)
-    monkeypatch.setattr(cuda_pose, "GRAPH_FROM", 3)
+    monkeypatch.setattr(cuda_descent, "LOOK", 2)
+    monkeypatch.setattr(cuda_descent, "GRAPH_FROM", 3)
 
 
 def both_ways(
@@ -357,7 +357,7 @@ def pairs_at(T_camera_world: Array) -> int:
 
 
 def test_pairs_that_cannot_be_numbered_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sigmasplat.render.cuda_raster.MOST_PAIRS", 100)
+    monkeypatch.setattr("sigmasplat.render.cuda.raster.MOST_PAIRS", 100)
     with pytest.raises(BackendError, match=r"\d+ pairs of splats and tiles are too many"):
         descended(3, 7)
 
@@ -390,7 +390,7 @@ class Recorded:
 @pytest.fixture
 def graphs(monkeypatch: pytest.MonkeyPatch, looking_often: None) -> type[Recorded]:
     Recorded.made = 0
-    monkeypatch.setattr(cuda_pose, "repeatable", Recorded)
+    monkeypatch.setattr(cuda_descent, "repeatable", Recorded)
     return Recorded
 
 
@@ -410,5 +410,5 @@ def test_a_graph_is_made_anew_where_room_was(graphs: type[Recorded]) -> None:
 
 
 def test_a_few_iterations_are_no_graph(graphs: type[Recorded]) -> None:
-    descended(cuda_pose.GRAPH_FROM, None)
+    descended(cuda_descent.GRAPH_FROM, None)
     assert graphs.made == 0

@@ -10,7 +10,7 @@ from torch import Tensor
 from emulated_cuda import Emulator
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS
-from sigmasplat.render.cuda_view import CudaView
+from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.view import View
 from splat_fields import OPTIONS, crowd, exact_view, params_of, plane_gradients, there_and_back
 from splat_scenes import KINDS, SMALL, WIDE, Scene, assert_same_vector, scene

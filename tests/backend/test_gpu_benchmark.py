@@ -11,14 +11,14 @@ import torch
 
 from emulated_cuda import Emulator
 from sigmasplat.errors import BackendError
-from sigmasplat.render import cuda_launch
+from sigmasplat.render.cuda import launch as cuda_launch
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path.append(str(BENCHMARKS))
-gpu, gpu_tables, gpu_works, record, scenes, tables = map(
-    importlib.import_module, ("gpu", "gpu_tables", "gpu_works", "record", "scenes", "tables")
+gpu, gpu_works, record, scenes, tables = map(
+    importlib.import_module, ("gpu", "gpu_works", "record", "scenes", "tables")
 )
 
 
@@ -35,13 +35,13 @@ def test_every_piece_of_work_runs(works: Any, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(gpu_works, "ITERATIONS", 2)
     monkeypatch.setattr(gpu_works, "TRACKING_ITERATIONS", 2)
     found = gpu_works.time_works(works, 2)
-    assert set(found) == {work for _, work in gpu_tables.COLUMNS}
+    assert set(found) == {work for _, work in gpu.COLUMNS}
     assert all(time["median_ms"] > 0 for time in found.values()) and float(works.all.alpha.max()) > 0.1
     assert works.field.steps == 2, "mapping took its iterations"
 
 
 def figures(tracking_ms: float, peer: bool) -> dict[str, Any]:
-    works = {work: {"median_ms": 1.0} for _, work in gpu_tables.COLUMNS} | {"both_all": {"median_ms": 1.2}}
+    works = {work: {"median_ms": 1.0} for _, work in gpu.COLUMNS} | {"both_all": {"median_ms": 1.2}}
     works["tracking_iteration"] = {"median_ms": tracking_ms}
     times = {"forward": {"median_ms": 0.5}, "both": {"median_ms": 3.0}, "mean_color_difference": 1e-4}
     scene = {"splats": 300_000, "width": 1200, "height": 680, "peak_mib": 9.0, "gsplat": times if peer else None}
@@ -50,11 +50,11 @@ def figures(tracking_ms: float, peer: bool) -> dict[str, Any]:
 
 
 def test_goals_are_judged() -> None:
-    made = gpu_tables.sections({"figures": figures(2.5, peer=True)})
+    made = gpu.sections({"figures": figures(2.5, peer=True)})
     assert [section.title for section in made] == ["Times, ms", "Beside gsplat, colour and depth, ms", "Goals"]
     assert [row[3] for row in made[-1].rows] == ["**no**", "**no**", "yes", "yes", "yes"]
     assert all(len(row) == len(section.columns) for section in made for row in section.rows)
-    alone = gpu_tables.sections({"figures": figures(1.0, peer=False)})
+    alone = gpu.sections({"figures": figures(1.0, peer=False)})
     assert [row[3] for row in alone[-1].rows] == ["**no**", "yes", "yes", "yes"] and len(alone) == 2
 
 

@@ -7,19 +7,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.render import reference
+from sigmasplat.render.reference import operators as reference
 from splat_fields import BIG, OPTIONS, crowd, exact_view, params_of, there_and_back
 from splat_scenes import KINDS, assert_same_vector, gradients, probe, render, scene
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 from sigmasplat.fit.adam import Rates
+from sigmasplat.fit.cpu.mapping_step import CompiledStep
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.fit.step import CompiledStep
 from sigmasplat.model.field import GaussianField
 from sigmasplat.native import _core
-from sigmasplat.render import cpu
-from sigmasplat.render.view import CpuView
+from sigmasplat.render.cpu import operators as cpu
+from sigmasplat.render.cpu.view import CpuView
 
 Outputs = dict[str, Tensor]
 THREADS = (1, 2, 3)

@@ -15,6 +15,7 @@ from sigmasplat import cli
 from sigmasplat.checks import installation
 from sigmasplat.config import Config, MappingConfig, TrackingConfig
 from sigmasplat.config.text import override
+from sigmasplat.errors import BackendError
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.pose import fit_pose_adam
 from sigmasplat.fit.target import Keyframe
@@ -23,15 +24,15 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.presets import preset
 from sigmasplat.render import FieldRenderer, render
-from sigmasplat.render.cuda_view import CudaView
-from sigmasplat.render.view import CpuView
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
 from sigmasplat.sources import SyntheticRoom
 from sigmasplat.viewer.live import LiveView
 from sigmasplat.viewer.pictures import picture_of
 from sigmasplat.viewer.snapshot import Snapshot
-from splat_fields import OPTIONS, exact_view, params_of, there_and_back
+from splat_fields import OPTIONS, Gradients, exact_view, params_of, there_and_back
 from splat_scenes import assert_same_vector, scene
 from stand_in import StandIn
 from test_compiled_loss import target_of
@@ -99,12 +100,12 @@ def test_a_renderer_brings_a_field_once(stand_in: StandIn) -> None:
     torch.testing.assert_close(seen[1].color.cpu(), want.color, rtol=1e-4, atol=1e-4)
 
 
-def test_a_field_of_the_host_is_fitted_and_brought_back(device: torch.device) -> None:
-    s, pulls = scene("random", 60), list[torch.Tensor]()
+def test_a_field_in_other_memory_than_the_view_is_refused(device: torch.device) -> None:
+    s = scene("random", 60)
     field, view = GaussianField(params_of(s)), CudaView(s.camera, OPTIONS)
-    keyframe = Keyframe(0, target_of(s.camera, tuple(view.alpha.shape)), se3.inverse(s.T_camera_world.double().numpy()))
-    fit_field(field, view, [[keyframe]] * 2, MAPPING, felt=lambda _, pull: pulls.append(pull))
-    assert {x.device.type for x in (*field.state(), *pulls)} == {"cpu"} and not torch.equal(field.params, params_of(s))
+    with pytest.raises(BackendError, match="the view's device"):
+        fit_field(field, view, [], MAPPING)
+    assert torch.equal(field.params, params_of(s))
 
 
 @pytest.mark.parametrize("images", [1, 2])
@@ -119,11 +120,11 @@ def test_a_field_is_fitted(device: torch.device, images: int, degree: int) -> No
         target = target_of(s.camera, tuple(view.alpha.shape))
         pose = se3.inverse(s.T_camera_world.double().numpy())
         keyframes = [Keyframe(k, target, pose @ se3.exp(0.01 * k * np.ones(6))) for k in range(images)]
-        pulls = list[torch.Tensor]()
-        fit = fit_field(
-            field, view, [keyframes] * 3, MAPPING, degree=degree, felt=lambda _, pull, pulls=pulls: pulls.append(pull)
-        )
-        assert {x.device.type for x in (*pulls, *field.state())} == {view.sums.device.type}
+        stats = Gradients()
+        fit = fit_field(field, view, [keyframes] * 3, MAPPING, degree=degree, stats=stats)
+        assert {x.device.type for x in (*(given for _, given in stats.given), *field.state())} == {
+            view.sums.device.type
+        }
         found.append((field.params.cpu() - start, fit.losses, keyframes[-1].T_world_camera))
     assert_same_vector(found[0][0], found[1][0], 2e-2, "what Adam moved")
     np.testing.assert_allclose(found[0][1], found[1][1], rtol=1e-4)

@@ -14,16 +14,17 @@ from torch import Tensor
 from sigmasplat.config import RenderConfig
 from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS
-from sigmasplat.render import reference
-from sigmasplat.render.view import ReferenceView, View
+from sigmasplat.render.reference import operators as reference
+from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.view import View
 from splat_fields import params_of
 from splat_oracle import look
 from splat_scenes import FIELD, WIDE, Scene, render, twist_gradient
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
-from sigmasplat.render import cpu
-from sigmasplat.render.view import CpuView
+from sigmasplat.render.cpu import operators as cpu
+from sigmasplat.render.cpu.view import CpuView
 
 OPTIONS = RenderConfig(depth_pose_gradient=False)
 """Walls as wide as the world move the image by their depth alone: without it the pose feels what lies behind them."""

@@ -9,14 +9,15 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
+from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam
 from sigmasplat.fit.target import Target
-from sigmasplat.fit.tracking_loss import tracking_gradient
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.render import render
-from sigmasplat.render.view import View, make_view
+from sigmasplat.render.backend import make_view
+from sigmasplat.render.view import View
 from splat_fields import OPTIONS
 from splat_scenes import assert_same_vector, twist_gradient
 from splat_wall import CAMERA, TRUTH, Array, assert_near, lower_median, seen_from, wall
@@ -80,7 +81,7 @@ def test_planes_hold_the_gradient_of_the_papers_loss(view: View, name: str) -> N
     target, h, w = damaged(view), CAMERA.height, CAMERA.width
     view.forward(wall(), se3.exp(OFF) @ TRUTH)
     view.g_sums.fill_(torch.nan)  # whatever was there must go
-    loss, g_exposure = tracking_gradient(view, target, config, exposure)
+    loss, g_exposure = fits_of(view).tracking_loss(view, target, config, exposure)
     leaves = view.sums[:, :h, :w].double().requires_grad_(), exposure.double().requires_grad_()
     alpha = view.alpha[:h, :w].double().requires_grad_()
     want = paper_loss(leaves[0], alpha, target, config, leaves[1])
@@ -94,7 +95,7 @@ def test_weights_and_alpha_are_held_still(view: View) -> None:
     """The pose may not lower the loss by looking where V is large or the map is thin: no path leads there."""
     target, h, w = damaged(view), CAMERA.height, CAMERA.width
     view.forward(wall(), se3.exp(OFF) @ TRUTH)
-    tracking_gradient(view, target, TrackingConfig(tau=1.0), PLAIN)
+    fits_of(view).tracking_loss(view, target, TrackingConfig(tau=1.0), PLAIN)
     assert torch.count_nonzero(view.g_sums[4:]) == 0 and torch.count_nonzero(view.g_alpha) == 0
     outside = view.g_sums.clone()
     outside[:, :h, :w] = 0.0
@@ -104,7 +105,7 @@ def test_weights_and_alpha_are_held_still(view: View) -> None:
 def test_no_gradient_where_there_is_no_reading(view: View) -> None:
     target, h, w = damaged(view), CAMERA.height, CAMERA.width
     view.forward(wall(), TRUTH)
-    tracking_gradient(view, target, TrackingConfig(outlier_factor=0.0), PLAIN)
+    fits_of(view).tracking_loss(view, target, TrackingConfig(outlier_factor=0.0), PLAIN)
     unread = target.depth_image == 0
     assert unread.sum() > 100 and torch.count_nonzero(view.g_sums[:, :h, :w][:, unread]) == 0
     assert torch.count_nonzero(view.g_sums[:, :h, :w][:, ~unread]) > 1000
@@ -115,7 +116,7 @@ def test_the_twist_is_the_loss_differentiated_by_the_pose_through_the_renderer(v
     target, config, h, w = damaged(view), TrackingConfig(tau=2.0), CAMERA.height, CAMERA.width
     T_start = se3.exp(OFF) @ TRUTH
     view.forward(wall(), T_start)
-    tracking_gradient(view, target, config, PLAIN)
+    fits_of(view).tracking_loss(view, target, config, PLAIN)
     twist = view.backward_pose(wall())
     T = torch.as_tensor(T_start).requires_grad_()
     with torch.no_grad():

@@ -10,14 +10,15 @@ from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.step import TorchStep
+from sigmasplat.fit.mapping_step import TorchStep
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.view_dependent import ViewDependentStep
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.harmonics import view_colors
-from sigmasplat.render import Render, reference, render
-from sigmasplat.render.render import features_of
+from sigmasplat.render import Render, render
+from sigmasplat.render.channels import features_of
+from sigmasplat.render.reference import operators as reference
 from splat_fields import exact_view, params_of, plane_gradients
 from splat_scenes import SMALL, Scene, assert_same_vector, probe, scene, twist_gradient
 
@@ -200,7 +201,7 @@ def turns_by_kernels(s: Scene, p: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
     """Do the same by the kernels' own arithmetic, compiled in double."""
     pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
     from sigmasplat.native import _core
-    from sigmasplat.render.cpu import view_numbers
+    from sigmasplat.render.kernel_params import view_numbers
 
     numbers = view_numbers(s.camera, s.T_camera_world.numpy(), options_of(SINGLE[1]), np.float64)
     footprint, out = np.empty((len(p), 6)), np.empty((len(p), 16))

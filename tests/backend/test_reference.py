@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from sigmasplat.model import se3
-from sigmasplat.render import reference
+from sigmasplat.render.reference import operators as reference
 from splat_oracle import flat, look
 from splat_scenes import FIELD, KINDS, SMALL, Scene, assert_same_vector, gradients, probe, render, scene
 

@@ -9,18 +9,23 @@ import pytest
 
 from sigmasplat import env
 from sigmasplat.errors import BackendError
-from sigmasplat.render import reference
-from sigmasplat.render.backend import backend_module
-from sigmasplat.render.view import CpuView, ReferenceView, make_view
+from sigmasplat.render.backend import backend_module, make_view
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.reference import operators as reference
+from sigmasplat.render.reference.view import ReferenceView
 from splat_fields import OPTIONS
 from splat_scenes import SMALL
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 from sigmasplat.native import _core
-from sigmasplat.render import cpu
+from sigmasplat.render.cpu import operators as cpu
 
-SHOW = "import sigmasplat.render.cpu; from sigmasplat.native import _core; print(_core.isa_name(), _core.threads())"
+SHOW = """
+import sigmasplat.render.cpu.operators
+from sigmasplat.native import _core
+print(_core.isa_name(), _core.threads())
+"""
 
 
 def shown(**environment: str) -> str:

@@ -10,14 +10,16 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
+from sigmasplat.fit.backends import fits_of
+from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam
-from sigmasplat.fit.pyramid import Pyramid, gray_of
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.target import Target
-from sigmasplat.fit.tracking_loss import tracking_gradient
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
-from sigmasplat.render.view import View, make_view
+from sigmasplat.render.backend import make_view
+from sigmasplat.render.view import View
 from sigmasplat.slam import tracker
 from splat_fields import OPTIONS
 from splat_scenes import assert_same_vector
@@ -88,7 +90,7 @@ def test_planes_hold_the_gradient_of_the_loss(view: View, average: Any, factor_c
     target = damaged(view)
     view.forward(wall(), se3.exp(OFF) @ TRUTH)
     view.g_sums.fill_(torch.nan)  # whatever was there must go
-    loss, g_exposure = tracking_gradient(view, target, config, EXPOSURE)
+    loss, g_exposure = fits_of(view).tracking_loss(view, target, config, EXPOSURE)
     leaves = view.sums[:, :H, :W].double().requires_grad_(), EXPOSURE.double().requires_grad_()
     want = written_out(leaves[0], view.alpha[:H, :W].double(), target, config, leaves[1])
     g_sums, want_exposure = torch.autograd.grad(want, leaves)
@@ -106,7 +108,7 @@ def test_the_kernel_does_as_the_definition(isa: str, average: Any, factor_color:
     slow, fast = (make_view(backend, CAMERA, OPTIONS) for backend in ("reference", "cpu"))
     slow.forward(wall(), se3.exp(OFF) @ TRUTH)
     fast.sums[:, :H, :W], fast.alpha[:H, :W] = slow.sums, slow.alpha
-    found = [tracking_gradient(v, damaged(v), config, EXPOSURE) for v in (slow, fast)]
+    found = [fits_of(v).tracking_loss(v, damaged(v), config, EXPOSURE) for v in (slow, fast)]
     (want, want_exposure), (got, got_exposure) = found
     assert got == pytest.approx(want, rel=1e-5) and want > 0
     assert_same_vector(fast.g_sums[:, :H, :W], slow.g_sums, 1e-5, "planes")
@@ -120,7 +122,7 @@ def test_colour_and_depth_each_leave_out_their_own_outliers(view: View) -> None:
     gain, offset = EXPOSURE[0].exp(), EXPOSURE[1]
     target.color.mul_(gain).add_(offset)  # so that exposure explains all but noise and the patch
     view.forward(wall(), TRUTH)
-    tracking_gradient(view, target, config, EXPOSURE)
+    fits_of(view).tracking_loss(view, target, config, EXPOSURE)
     solid = (view.alpha[:H, :W] > 0.99) & (target.depth_image > 0)
     by_color, by_depth = (view.g_sums[:3, :H, :W] != 0).any(0), view.g_sums[3, :H, :W] != 0
     wrong_color, wrong_depth = torch.zeros(H, W, dtype=torch.bool), torch.zeros(H, W, dtype=torch.bool)
@@ -136,10 +138,10 @@ def test_a_mean_over_what_is_kept_does_not_know_how_much_is_left_out(view: View)
     target.color.add_(0.1)
     target.depth.add_(0.2 * (target.depth > 0))
     view.forward(wall(), TRUTH)
-    whole, _ = tracking_gradient(view, target, config, torch.zeros(2))
+    whole, _ = fits_of(view).tracking_loss(view, target, config, torch.zeros(2))
     assert whole == pytest.approx((0.2 * 0.1 + 0.2) / 1.2, rel=1e-4)
     target.depth[::2] = 0.0
-    assert tracking_gradient(view, target, config, torch.zeros(2))[0] == pytest.approx(whole, rel=1e-4)
+    assert fits_of(view).tracking_loss(view, target, config, torch.zeros(2))[0] == pytest.approx(whole, rel=1e-4)
 
 
 @pytest.mark.parametrize("average", ["image", "kept"])
@@ -150,7 +152,7 @@ def test_nothing_kept_is_no_loss_and_no_gradient(view: View, average: Any, uncer
     view.forward(wall(), se3.exp(OFF) @ TRUTH)
     view.g_sums.fill_(torch.nan)
     config = dataclasses.replace(PAPER, average=average, uncertainty=uncertainty)
-    loss, g_exposure = tracking_gradient(view, target, config, EXPOSURE)
+    loss, g_exposure = fits_of(view).tracking_loss(view, target, config, EXPOSURE)
     assert loss == 0.0 and g_exposure.tolist() == [0.0, 0.0]
     assert torch.count_nonzero(view.g_sums) == 0  # NaN is not zero
 

@@ -14,8 +14,9 @@ from splat_scenes import KINDS, SMALL, WIDE, Scene, assert_same_vector, scene
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
-from sigmasplat.render import reference
-from sigmasplat.render.view import CpuView, reaches
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.reference import operators as reference
+from sigmasplat.render.reference.view import reaches
 
 SIZES = (SMALL, WIDE, Camera(1, 1, 20.0, 20.0, 0.0, 0.0), Camera(33, 17, 30.0, 30.0, 15.5, 8.2))
 

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from sigmasplat.config import MappingConfig
 from sigmasplat.fit.adam import Rates
+from sigmasplat.fit.backends import step_for
 from sigmasplat.fit.field import fit_field, loss_weights
-from sigmasplat.fit.step import TorchStep
-from sigmasplat.fit.steps import step_for
+from sigmasplat.fit.mapping_step import TorchStep
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.fit.view_dependent import ViewDependentStep
 from sigmasplat.model import se3
@@ -21,7 +21,9 @@ from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.harmonics import count
 from sigmasplat.render import render
-from sigmasplat.render.view import CpuView, ReferenceView, View
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.reference.view import ReferenceView
+from sigmasplat.render.view import View
 from splat_fields import OPTIONS, exact_view, params_of, plane_gradients
 from splat_scenes import SMALL, WIDE, Scene, assert_same_vector, scene
 

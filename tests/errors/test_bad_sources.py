@@ -8,6 +8,7 @@ from PIL import Image
 
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.sources import open_source
+from sigmasplat.sources.opening import formats
 
 
 def refusal(path, **options) -> str:
@@ -29,14 +30,14 @@ def test_missing_folder(tmp_path):
 
 
 def test_a_file_instead_of_a_folder(tmp_path):
-    (tmp_path / "film.mp4").write_bytes(b"x")
-    assert "is a file" in refusal(tmp_path / "film.mp4")
+    (tmp_path / "notes.txt").write_bytes(b"x")
+    assert "is a file of unknown format" in refusal(tmp_path / "notes.txt")
 
 
-def test_unknown_format_says_what_was_looked_for_and_found(tmp_path):
-    (tmp_path / "film.mp4").write_bytes(b"x")
+def test_unknown_format_lists_the_known_formats_and_the_content(tmp_path):
+    (tmp_path / "notes.txt").write_bytes(b"x")
     message = refusal(tmp_path)
-    for words in ("unknown format", "rgb.txt", "results/frame*.jpg", "film.mp4"):
+    for words in ("unknown format", "notes.txt", "docs/data.md", *(known.name for known in formats())):
         assert words in message
 
 

@@ -31,7 +31,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["evaluate", "--help"], "no command 'evaluate' (did you mean eval?)"),
         (["xyzzy"], "no command 'xyzzy'; there are demo, inspect, run, resume, view, eval, mesh, export, download, be"),
         (["run", "/no/such/place"], "/no/such/place"),
-        (["run", "."], "looked for"),
+        (["run", "."], "unknown format"),
         (["run", "/no/such/place", "--preset", "quick"], "no preset 'quick'"),
         (["run", "/no/such/place", "--set", "tracking.speed=9"], "unknown setting 'tracking.speed'"),
         (["run", "/no/such/place", "--set", "fast"], "SECTION.NAME=VALUE"),

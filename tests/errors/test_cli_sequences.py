@@ -76,7 +76,7 @@ def no_lists(folder: Path) -> None:
 
 
 DAMAGE: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
-    "unknown format": (no_lists, ("unknown format", "rgb.txt", "results/frame*.jpg", "found calibration.json")),
+    "unknown format": (no_lists, ("unknown format", "TUM, ", "Replica, ", "found calibration.json")),
     "no depth list": (no_depth_list, ("no depth images in", "looked for depth.txt", "RGB-only")),
     "no depth files": (no_depth_files, ("no depth images in", "the 4 files of depth.txt", "RGB-only")),
     "blank depth": (blank_depth, ("depth is zero or unreadable in all 4 frames", "check the depth files")),

@@ -11,8 +11,8 @@ import file_server as acts
 from archives import folder_content, tar_gz
 from file_server import Act, FileServer, serving
 from sigmasplat import cli
-from sigmasplat.download.entries import Archive, PublicSet, Recording
-from sigmasplat.download.fetch import Patience
+from sigmasplat.download.entries import PublicRecording, PublicSet, RemoteFile
+from sigmasplat.download.fetch import RetryPolicy
 
 DESK = "rgbd_dataset_freiburg1_desk"
 
@@ -26,16 +26,16 @@ def server(monkeypatch: pytest.MonkeyPatch, tiny_tum: Path) -> Iterator[FileServ
         server.files["/desk.tgz"] = tar_gz(folder_content(tiny_tum, f"{DESK}/"))
         server.files["/bare.tgz"] = tar_gz({"bare/readme": b"nothing else"})
         recordings = {
-            name: Recording(name, (Archive(server.url(f"/{name}.tgz")),)) for name in ("desk", "bare", "gone")
+            name: PublicRecording(name, (RemoteFile(server.url(f"/{name}.tgz")),)) for name in ("desk", "bare", "gone")
         }
         tiny = PublicSet("Tiny", "http://page", "free", "tiny", recordings, 2**20, 99)
         monkeypatch.setattr("sigmasplat.download.lookup.SETS", {"tiny": tiny})
-        wait(monkeypatch, Patience(attempts=2, first_wait_s=0.001))
+        wait(monkeypatch, RetryPolicy(max_attempts=2, first_wait_s=0.001))
         yield server
 
 
-def wait(monkeypatch: pytest.MonkeyPatch, patience: Patience) -> None:
-    monkeypatch.setattr("sigmasplat.download.downloader.Patience", lambda: patience)
+def wait(monkeypatch: pytest.MonkeyPatch, retry: RetryPolicy) -> None:
+    monkeypatch.setattr("sigmasplat.download.downloader.RetryPolicy", lambda: retry)
 
 
 def said(capsys: pytest.CaptureFixture[str], code: int, *arguments: str) -> tuple[str, str]:
@@ -114,7 +114,7 @@ def test_servers_that_fail(first: list[Act], says: str, server: FileServer, caps
 def test_a_server_that_sends_hardly_anything(
     server: FileServer, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    wait(monkeypatch, Patience(timeout_s=0.5, attempts=1))
+    wait(monkeypatch, RetryPolicy(timeout_s=0.5, max_attempts=1))
     server.acts = [acts.trickle(2.0)]
     assert "hardly anything comes from 127.0.0.1" in refused(capsys, "tiny", "desk")
 

@@ -226,7 +226,8 @@ MISTAKES: dict[str, dict[str, tuple[Damage, tuple[str, ...]]]] = {
     },
     "plain": {
         "no camera": (without("calibration.json"), ("camera unknown", "--fx")),
-        "colour alone": (without("depth"), LISTS),
+        "colour alone": (without("depth"), ("holds images but no depth", "docs/data.md#without-depth")),
+        "an empty depth folder": (without("depth/*"), LISTS),
         "depth alone": (without("color"), ("no colour images in",)),
         "sizes differ": (resized("depth/*"), ("20×14", "32×24", "depth_camera")),
         "a frame lost and names that differ": (

@@ -34,9 +34,7 @@ from sigmasplat.io.runs import RunFolder
 from sigmasplat.presets import preset
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-bench_ablation, ablation_tables, record, tables = map(
-    importlib.import_module, ("ablation", "ablation_tables", "record", "tables")
-)
+bench_ablation, record, tables = map(importlib.import_module, ("ablation", "record", "tables"))
 BASE = preset("varsplat-fast")
 
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from align_oracle import CAMERA, HUGE, Pair, oracle, pair
 from sigmasplat.fit.align import align
-from sigmasplat.fit.pyramid import Pyramid, gray_of
+from sigmasplat.fit.gray import gray_of
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources import SyntheticRoom

@@ -25,7 +25,8 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.native import _core
 from sigmasplat.presets import preset
-from sigmasplat.render import reference, render
+from sigmasplat.render import render
+from sigmasplat.render.reference import operators as reference
 from sigmasplat.slam.tracker import Tracker
 from sigmasplat.sources import open_source
 

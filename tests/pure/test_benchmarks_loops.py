@@ -18,8 +18,8 @@ from sigmasplat.model import se3
 from sigmasplat.presets import preset
 from sigmasplat.sources import open_source
 
-accuracy, long_run, long_run_tables, loops, loops_tables, tables = map(
-    importlib.import_module, ("accuracy", "long_run", "long_run_tables", "loops", "loops_tables", "tables")
+accuracy, long_run, loops, loops_tables, tables = map(
+    importlib.import_module, ("accuracy", "long_run", "loops", "loops_tables", "tables")
 )
 ROOM = "synthetic:frames=40,width=32,height=24"
 
@@ -170,7 +170,7 @@ def test_quarters_are_summed_up_and_held_against_each_other() -> None:
     memory = np.array([300.0, 400.0, 430.0, 470.0])[quarter]
     each = {"seconds": seconds.tolist(), "resident_mib": memory.tolist(), "submap": (np.arange(count) // 40).tolist()}
     rest = {"frames": count, "lost": 0, "submaps": 51, "loops_tried": 9, "loops_accepted": 4, "ate_m": 0.1}
-    parts = long_run_tables.quarters(each)
+    parts = long_run.quarters(each)
     assert [part["frames"] for part in parts] == [501, 500, 500, 500]
     assert [part["median_s"] for part in parts] == pytest.approx([0.02, 0.040, 0.03, 0.043])
     assert parts[1]["mean_s"] == pytest.approx(0.040 + 5 / 500) and parts[3]["submaps"] == 51

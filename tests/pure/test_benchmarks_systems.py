@@ -14,9 +14,9 @@ from sigmasplat.config import Config
 from sigmasplat.errors import ConfigError
 from sigmasplat.io.runs import RunFolder
 
-accuracy, consistency, consistency_tables, systems, systems_tables, tables = map(
+accuracy, consistency, systems, tables = map(
     importlib.import_module,
-    ("accuracy", "consistency", "consistency_tables", "systems", "systems_tables", "tables"),
+    ("accuracy", "consistency", "systems", "tables"),
 )
 ROOM = "synthetic:frames=120,width=64,height=48,noise=1"
 TINY = ("input.width=64", "mapping.first_iterations=30", "mapping.iterations=8", "final.iterations=5")
@@ -59,8 +59,8 @@ def test_each_sequence_has_a_table_with_a_column_for_each_system() -> None:
 def test_every_figure_of_a_table_is_one_that_is_picked() -> None:
     picked = systems.figures_of({"worst_frame_s": 0.5, "reconstruction": {"floaters": 0.25, "accuracy_m": None}})
     assert picked["worst_frame_s"] == 0.5 and picked["floaters"] == 0.25 and picked["map_bytes"] is None
-    assert {figure for _, figure, _ in systems_tables.ROWS} - {"peak_mib"} <= set(picked)
-    assert {figure.name for figure in consistency_tables.FIGURES} <= set(picked)
+    assert {figure for _, figure, _ in systems.ROWS} - {"peak_mib"} <= set(picked)
+    assert {figure.name for figure in consistency.FIGURES} <= set(picked)
 
 
 @pytest.fixture
@@ -174,7 +174,7 @@ def test_a_tiny_ablation_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureF
     (written,) = (tmp_path / "out").glob("consistency-*.json")
     (job,) = json.loads(written.read_text())["figures"]["jobs"]
     assert job["variant"] == "full" and job["problem"] is None
-    shown = [figure.name for figure in consistency_tables.FIGURES]
+    shown = [figure.name for figure in consistency.FIGURES]
     assert all(job["figures"][name] is not None for name in shown)
     assert 0 < job["figures"]["splats_chamfer_m"] < 0.5 and 0 <= job["figures"]["floaters"] < 1
     assert job["figures"]["worst_frame_s"] > 0 and job["figures"]["map_bytes"] > 1000

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-versus, versus_tables, versus_works = map(importlib.import_module, ("versus", "versus_tables", "versus_works"))
+versus, versus_works = map(importlib.import_module, ("versus", "versus_works"))
 
 
 def test_ratios_are_of_least_times_and_turn_by_turn() -> None:
@@ -20,7 +20,7 @@ def test_ratios_are_of_least_times_and_turn_by_turn() -> None:
         {"threads": 1, "this": of(9.0), "other": of(12.0)},
     ]
     config = {"source": "room", "splats": 5, "width": 64, "runs": 3}
-    (section,) = versus_tables.sections({"figures": {"other": "a" * 40, "turns": turns}, "config": config})
+    (section,) = versus.sections({"figures": {"other": "a" * 40, "turns": turns}, "config": config})
     assert [row[1] for row in section.rows] == list(versus_works.NAMES)
     assert section.rows[0][2:] == ["10.0", "8.00", "0.800", "0.800 (0.750 – 1.50)"]
 

@@ -13,7 +13,7 @@ from sigmasplat.viewer.snapshot import Snapshot
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-viewer_memory_tables = importlib.import_module("viewer_memory_tables")
+viewer_memory = importlib.import_module("viewer_memory")
 
 
 def figures(resident_mib: list[float], clients: int = 1, minutes: float = 10.0) -> dict[str, Any]:
@@ -25,7 +25,7 @@ def figures(resident_mib: list[float], clients: int = 1, minutes: float = 10.0) 
 
 
 def held(found: dict[str, Any]) -> list[str]:
-    return [row[3] for row in viewer_memory_tables.sections({"figures": found})[1].rows]
+    return [row[3] for row in viewer_memory.sections({"figures": found})[1].rows]
 
 
 def test_memory_is_held_to_staying_flat_with_a_client_for_ten_minutes() -> None:
@@ -34,7 +34,7 @@ def test_memory_is_held_to_staying_flat_with_a_client_for_ten_minutes() -> None:
     assert held(figures(settling + [500.0 + 5.0 * i for i in range(16)])) == ["yes", "**no**", "**no**", "yes"]
     assert held(figures(settling + [500.0] * 16, clients=0)) == ["yes", "yes", "yes", "**no**"]
     assert held(figures(settling + [500.0] * 16, minutes=2.0)) == ["**no**", "yes", "yes", "yes"]
-    parts = viewer_memory_tables.fifths(figures(settling + [500.0] * 16)["samples"])
+    parts = viewer_memory.fifths(figures(settling + [500.0] * 16)["samples"])
     assert [p["until_s"] for p in parts] == [15.0, 35.0, 55.0, 75.0, 95.0] and parts[0]["median_mib"] == 350.0
 
 

@@ -30,7 +30,7 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.render import cuda_stages
+from sigmasplat.render.cuda import stages as cuda_stages
 from sigmasplat.run import session
 from sigmasplat.run.terminal import Screen
 from sigmasplat.sources.base import Source

@@ -7,11 +7,13 @@ from torch import Tensor
 
 from sigmasplat.config import DensifyConfig
 from sigmasplat.fit.adam import Rates, adam_step
+from sigmasplat.fit.densify_stats import DensifyStats
+from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, EXTRAS, WIDTH, GaussianField
-from sigmasplat.render import reference
-from sigmasplat.slam.densify import Heat, clone, hot_splats, multiply, split, too_large
+from sigmasplat.render.reference import operators as reference
+from sigmasplat.slam.densify import clone, densify_mask, multiply, split, too_large
 
 CAMERA = Camera(40, 30, 50.0, 52.0, 18.6, 15.3)
 MOVED = [*range(0, 3), *range(7, 10)]
@@ -158,31 +160,39 @@ def test_large_ones_are_split_and_small_ones_cloned_where_asked(with_clones: boo
     assert_at_rest(field, 4)
 
 
-def test_heat_is_the_mean_pull_over_the_steps_that_saw_a_splat() -> None:
-    heat = Heat.of(4)
-    for pull in ([2.0, 0.0, 0.5, 0.0], [0.0, 0.0, 0.7, 1.0], [4.0, 0.0, 0.6, 0.0]):
-        heat.add(torch.tensor(pull))
-    assert heat.times.tolist() == [2, 0, 3, 1]
-    torch.testing.assert_close(heat.pull, torch.tensor([6.0, 0.0, 1.8, 1.0]))
-    assert hot_splats(heat.pull, heat.times, 1.0).tolist() == [True, False, False, True]
-    assert hot_splats(heat.pull, heat.times, 0.55).tolist() == [True, False, True, True]
-    assert hot_splats(heat.pull, heat.times, 3.01).tolist() == [False] * 4
-    assert hot_splats(heat.pull, heat.times, 0.0).tolist() == [False] * 4, "off"
+def seen() -> Keyframe:
+    return Keyframe(0, Target(CAMERA, torch.zeros(3, 30, 40), torch.zeros(30, 40), 0), np.eye(4))
 
 
-def test_heat_does_not_hold_on_to_what_it_was_given() -> None:
-    heat, pull = Heat.of(2), torch.tensor([1.0, 2.0])
-    heat.add(pull)
-    heat.add(pull)
-    assert pull.tolist() == [1.0, 2.0] and heat.pull.tolist() == [2.0, 4.0]
-    assert Heat.of(2).pull.tolist() == [0.0, 0.0]
+def test_densification_goes_by_the_mean_gradient_over_the_steps_that_saw_a_splat() -> None:
+    newest, other = seen(), seen()
+    stats = DensifyStats.of(newest, 4)
+    for grad2d in ([2.0, 0.0, 0.5, 0.0], [0.0, 0.0, 0.7, 1.0], [4.0, 0.0, 0.6, 0.0]):
+        stats.on_gradient(newest, torch.tensor(grad2d))
+        stats.on_gradient(other, torch.tensor([9.0] * 4))  # of another keyframe: ignored
+    assert stats.times.tolist() == [2, 0, 3, 1]
+    torch.testing.assert_close(stats.grad2d, torch.tensor([6.0, 0.0, 1.8, 1.0]))
+    assert densify_mask(stats, 1.0).tolist() == [True, False, False, True]
+    assert densify_mask(stats, 0.55).tolist() == [True, False, True, True]
+    assert densify_mask(stats, 3.01).tolist() == [False] * 4
+    assert densify_mask(stats, 0.0).tolist() == [False] * 4, "off"
 
 
-def test_a_budget_is_given_to_the_hottest() -> None:
-    pull, times = torch.tensor([2.0, 9.0, 3.0, 3.0, 0.1]), torch.tensor([1.0, 3.0, 1.0, 1.0, 0.0])
-    assert hot_splats(pull, times, 1.0).tolist() == [True, True, True, True, False]
-    for most, hot in ((5, [0, 1, 2, 3]), (3, [1, 2, 3]), (2, [1, 2]), (1, [1]), (0, []), (-4, [])):
-        assert hot_splats(pull, times, 1.0, most).nonzero().squeeze(1).tolist() == hot
+def test_statistics_copy_the_gradients_they_are_given() -> None:
+    keyframe, grad2d = seen(), torch.tensor([1.0, 2.0])
+    stats = DensifyStats.of(keyframe, 2)
+    stats.on_gradient(keyframe, grad2d)
+    stats.on_gradient(keyframe, grad2d)
+    assert grad2d.tolist() == [1.0, 2.0] and stats.grad2d.tolist() == [2.0, 4.0]
+    assert DensifyStats.of(keyframe, 2).grad2d.tolist() == [0.0, 0.0]
+
+
+def test_a_budget_goes_to_the_largest_gradients() -> None:
+    grad2d, times = torch.tensor([2.0, 9.0, 3.0, 3.0, 0.1]), torch.tensor([1.0, 3.0, 1.0, 1.0, 0.0])
+    stats = DensifyStats(seen(), grad2d, times)
+    assert densify_mask(stats, 1.0).tolist() == [True, True, True, True, False]
+    for most, chosen in ((5, [0, 1, 2, 3]), (3, [1, 2, 3]), (2, [1, 2]), (1, [1]), (0, []), (-4, [])):
+        assert densify_mask(stats, 1.0, most).nonzero().squeeze(1).tolist() == chosen
 
 
 def splat_at(x: float, y: float, z: float, scale_m: float) -> GaussianField:

@@ -4,8 +4,8 @@ import pytest
 
 from sigmasplat.checks import installation
 from sigmasplat.errors import BackendError
-from sigmasplat.native import cubins
-from sigmasplat.render import cuda_launch
+from sigmasplat.native.cuda import cubins
+from sigmasplat.render.cuda import launch as cuda_launch
 
 
 def said() -> dict[str, installation.Finding]:
@@ -59,7 +59,7 @@ def test_asking_for_cuda_without_a_device_is_refused_in_one_line() -> None:
     from sigmasplat.model.camera import Camera
     from sigmasplat.model.field import GaussianField
     from sigmasplat.render import render
-    from sigmasplat.render.view import make_view
+    from sigmasplat.render.backend import make_view
 
     camera = Camera(8, 6, 7.0, 7.0, 3.5, 2.5)
     for ask in (

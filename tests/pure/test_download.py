@@ -13,14 +13,14 @@ import pytest
 import file_server as acts
 from archives import folder_content, tar_gz, zipped
 from file_server import FileServer, serving
-from sigmasplat.download import describe_recordings, describe_sets, find, obtain
+from sigmasplat.download import describe_recordings, describe_sets, download_recording, find_recording
 from sigmasplat.download.catalogue import SETS
-from sigmasplat.download.downloader import MARK
-from sigmasplat.download.entries import Archive, PublicSet, Recording
-from sigmasplat.download.fetch import Patience
+from sigmasplat.download.downloader import MARKER
+from sigmasplat.download.entries import PublicRecording, PublicSet, RemoteFile
+from sigmasplat.download.fetch import RetryPolicy
 from sigmasplat.errors import DownloadError
 
-HASTY = Patience(attempts=2, first_wait_s=0.001)
+HASTY = RetryPolicy(max_attempts=2, first_wait_s=0.001)
 FILES = {"rgb.txt": b"# colour\n", "rgb/1.png": bytes(i * i % 251 for i in range(5000))}
 PUBLIC = [entry for entry in SETS.values() if isinstance(entry, PublicSet)]
 
@@ -33,18 +33,18 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[FileServer]:
         yield server
 
 
-def public_set(server: FileServer, *archives: Archive, start: str = "") -> PublicSet:
+def public_set(server: FileServer, *archives: RemoteFile, start: str = "") -> PublicSet:
     """Describe a set of one recording, `desk`; by default of /desk.tgz of the server."""
-    made = archives or (Archive(server.url("/desk.tgz")),)
-    return PublicSet("Test", "http://page", "free", "test", {"desk": Recording("desk", made, start)}, 2**20, 20)
+    made = archives or (RemoteFile(server.url("/desk.tgz")),)
+    return PublicSet("Test", "http://page", "free", "test", {"desk": PublicRecording("desk", made, start)}, 2**20, 20)
 
 
 def obtained(public: PublicSet, out: Path, **options: bool) -> dict[str, bytes]:
     """Obtain `desk`; return its files without our mark."""
-    folder = obtain(public, "desk", out, lambda *counts: None, patience=HASTY, **options)
+    folder = download_recording(public, "desk", out, lambda *counts: None, retry=HASTY, **options)
     assert folder == out / "test" / "desk"
     files = folder_content(folder)
-    assert json.loads(files.pop(MARK))["recording"] == "desk"
+    assert json.loads(files.pop(MARKER))["recording"] == "desk"
     return files
 
 
@@ -63,8 +63,8 @@ def test_the_second_time_nothing_is_asked_for(server: FileServer, tmp_path: Path
 def test_terms_and_size_come_first(server: FileServer, tmp_path: Path) -> None:
     told: list[str] = []
     size = len(server.files["/desk.tgz"])
-    public = public_set(server, Archive(server.url("/desk.tgz"), size))
-    obtain(public, "desk", tmp_path, lambda *counts: told.append("bytes"), told.append)
+    public = public_set(server, RemoteFile(server.url("/desk.tgz"), size))
+    download_recording(public, "desk", tmp_path, lambda *counts: told.append("bytes"), told.append)
     assert told[0].startswith("Test desk: ") and told[0].endswith(f"→ {tmp_path / 'test' / 'desk'}")
     assert told[1].startswith("terms: free (http://page)") and told[2] == "bytes"
 
@@ -87,9 +87,9 @@ def test_several_archives_make_a_folder(server: FileServer, tmp_path: Path) -> N
     server.files |= {"/c.zip": zipped({"1.jpg": b"c", "2.jpg": b"d"}), "/d.zip": zipped({"w/1.png": b"d"})}
     server.files["/path.txt"] = b"0 0 0\n"
     parts = (
-        Archive(server.url("/c.zip"), into="color"),
-        Archive(server.url("/d.zip"), into="depth"),
-        Archive(server.url("/path.txt"), into="trajectory.log"),
+        RemoteFile(server.url("/c.zip"), into="color"),
+        RemoteFile(server.url("/d.zip"), into="depth"),
+        RemoteFile(server.url("/path.txt"), into="trajectory.log"),
     )
     assert obtained(public_set(server, *parts, start="color"), tmp_path) == {
         "color/1.jpg": b"c",
@@ -102,7 +102,7 @@ def test_several_archives_make_a_folder(server: FileServer, tmp_path: Path) -> N
 def test_archives_within_an_archive_are_unpacked_too(server: FileServer, tmp_path: Path) -> None:
     inner = zipped({"seq-01/frame.png": FILES["rgb/1.png"], "seq-01/Thumbs.db": b"x"})
     server.files["/desk.zip"] = zipped({"desk/seq-01.zip": inner, "desk/TestSplit.txt": b"1"})
-    public = public_set(server, Archive(server.url("/desk.zip"), nested=True), start="seq-01")
+    public = public_set(server, RemoteFile(server.url("/desk.zip"), nested=True), start="seq-01")
     assert obtained(public, tmp_path) == {"seq-01/frame.png": FILES["rgb/1.png"], "TestSplit.txt": b"1"}
 
 
@@ -113,7 +113,7 @@ def checksum(algorithm: str, content: bytes) -> str:
 @pytest.mark.parametrize("algorithm", ["sha256", "md5"])
 def test_a_published_checksum_decides(algorithm: str, server: FileServer, tmp_path: Path) -> None:
     content = server.files["/desk.tgz"]
-    archive = Archive(server.url("/desk.tgz"), len(content), checksum(algorithm, content))
+    archive = RemoteFile(server.url("/desk.tgz"), len(content), checksum(algorithm, content))
     server.files["/desk.tgz"] = content[:99] + bytes([content[99] ^ 1]) + content[100:]
     with pytest.raises(DownloadError, match=rf"was damaged and is removed; its checksum is {algorithm}:\w+, not"):
         obtained(public_set(server, archive), tmp_path)
@@ -123,7 +123,7 @@ def test_a_published_checksum_decides(algorithm: str, server: FileServer, tmp_pa
 
 
 def test_a_download_that_brings_nothing_leaves_no_folders(server: FileServer, tmp_path: Path) -> None:
-    missing = public_set(server, Archive(server.url("/gone.tgz")))
+    missing = public_set(server, RemoteFile(server.url("/gone.tgz")))
     with pytest.raises(DownloadError, match="cannot be had"):
         obtained(missing, tmp_path / "data" / "deep")
     assert not any(tmp_path.iterdir()), "what was made for it is taken back"
@@ -135,7 +135,7 @@ def test_a_download_that_brings_nothing_leaves_no_folders(server: FileServer, tm
 
 def test_what_has_come_of_a_download_keeps_its_folder(server: FileServer, tmp_path: Path) -> None:
     server.files["/half.tgz"] = server.files["/desk.tgz"]
-    both = public_set(server, Archive(server.url("/half.tgz")), Archive(server.url("/gone.tgz")))
+    both = public_set(server, RemoteFile(server.url("/half.tgz")), RemoteFile(server.url("/gone.tgz")))
     with pytest.raises(DownloadError, match="cannot be had"):
         obtained(both, tmp_path)
     assert (tmp_path / "test/half.tgz").read_bytes() == server.files["/desk.tgz"]
@@ -148,7 +148,7 @@ def test_without_one_the_first_download_is_the_measure(server: FileServer, tmp_p
     server.files["/desk.tgz"] = tar_gz({"desk/rgb.txt": b"new"})
     with pytest.raises(DownloadError, match=r"it was another one last time .*delete .*sha256 to accept it"):
         obtained(public_set(server), tmp_path, overwrite=True)
-    assert folder_content(tmp_path / "test/desk").keys() == {*FILES, MARK}, "what was there is still there"
+    assert folder_content(tmp_path / "test/desk").keys() == {*FILES, MARKER}, "what was there is still there"
     record.unlink()
     assert obtained(public_set(server), tmp_path, overwrite=True) == {"rgb.txt": b"new"}
 
@@ -159,7 +159,7 @@ def test_what_is_not_ours_is_left_alone(there: str, server: FileServer, tmp_path
     target.parent.mkdir()
     {"folder": target.mkdir, "file": target.touch, "broken link": lambda: target.symlink_to("/no/such")}[there]()
     with pytest.raises(DownloadError, match="was not made by this command"):
-        obtain(public_set(server), "desk", tmp_path, lambda *counts: None, overwrite=True)
+        download_recording(public_set(server), "desk", tmp_path, lambda *counts: None, overwrite=True)
     assert server.ranges == [] and (target.exists() or target.is_symlink())
 
 
@@ -178,7 +178,7 @@ def test_too_many_bytes_or_files_are_refused(server: FileServer, tmp_path: Path)
         obtained(public_set(server), tmp_path)
     server.files["/bomb.tgz"] = tar_gz({"desk/zeros": bytes(2**22)})
     with pytest.raises(DownloadError, match="more bytes than such a recording can have"):
-        obtained(public_set(server, Archive(server.url("/bomb.tgz"))), tmp_path)
+        obtained(public_set(server, RemoteFile(server.url("/bomb.tgz"))), tmp_path)
 
 
 def test_an_unexpected_layout_is_refused(server: FileServer, tmp_path: Path) -> None:
@@ -190,13 +190,13 @@ def test_an_unexpected_layout_is_refused(server: FileServer, tmp_path: Path) -> 
 def test_another_file_than_announced_is_refused_early(server: FileServer, tmp_path: Path) -> None:
     size = len(server.files["/desk.tgz"])
     for archive, says in (
-        (Archive(server.url("/desk.tgz"), 9 * size), "not about"),
-        (Archive(server.url("/desk.tgz"), size + 1, "sha256:00"), f"has {size:,} bytes, not {size + 1:,}"),
+        (RemoteFile(server.url("/desk.tgz"), 9 * size), "not about"),
+        (RemoteFile(server.url("/desk.tgz"), size + 1, "sha256:00"), f"has {size:,} bytes, not {size + 1:,}"),
     ):
         with pytest.raises(DownloadError, match=says):
             obtained(public_set(server, archive), tmp_path)
     with pytest.raises(DownloadError, match="too many to be what was asked for"):
-        obtained(replace(public_set(server), most_bytes=100), tmp_path)
+        obtained(replace(public_set(server), max_bytes=100), tmp_path)
     assert folder_content(tmp_path) == {}
 
 
@@ -216,7 +216,7 @@ def test_ctrl_c_while_unpacking_leaves_the_archive_only(server: FileServer, tmp_
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        obtain(public_set(server), "desk", tmp_path, interrupt)
+        download_recording(public_set(server), "desk", tmp_path, interrupt)
     assert {path.name for path in (tmp_path / "test").iterdir()} == {"desk.tgz", "desk.tgz.sha256"}
     requests = list(server.ranges)
     assert obtained(public_set(server), tmp_path) == FILES
@@ -233,9 +233,9 @@ def test_a_broken_download_goes_on_next_time(server: FileServer, tmp_path: Path)
 
 def test_names_are_found_as_people_write_them() -> None:
     for name in ("fr1/desk", "FR1/desk", "fr1_desk", "freiburg1_desk", "rgbd_dataset_freiburg1_desk", "fr1-desk"):
-        assert find("tum", name)[1] == "fr1/desk"
-    assert find("bonn", "rgbd_bonn_balloon2")[1] == "balloon2"
-    assert find("Replica") == (SETS["replica"], "")
+        assert find_recording("tum", name)[1] == "fr1/desk"
+    assert find_recording("bonn", "rgbd_bonn_balloon2")[1] == "balloon2"
+    assert find_recording("Replica") == (SETS["replica"], "")
 
 
 @pytest.mark.parametrize(
@@ -252,7 +252,7 @@ def test_names_are_found_as_people_write_them() -> None:
 )
 def test_what_is_not_found_is_said(asked: tuple[str, str], says: str) -> None:
     with pytest.raises(DownloadError, match=re.escape(says)):
-        find(*asked)
+        find_recording(*asked)
 
 
 def test_the_catalogue_is_listed() -> None:
@@ -271,7 +271,7 @@ def test_the_catalogue_is_sound(public: PublicSet) -> None:
     for archive in archives:
         parts = urlsplit(archive.url)
         assert parts.scheme == "https" and parts.hostname and not parts.query
-        assert (archive.size_bytes or 0) <= public.most_bytes
+        assert (archive.size_bytes or 0) <= public.max_bytes
         assert re.fullmatch(r"(sha256:[0-9a-f]{64}|md5:[0-9a-f]{32})?", archive.checksum)
         assert archive.name.endswith((".tgz", ".tar.gz", ".zip")) or archive.into
     for folder in folders:

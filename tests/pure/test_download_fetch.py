@@ -9,13 +9,13 @@ import pytest
 
 import file_server as acts
 from file_server import Act, FileServer, serving
-from sigmasplat.download.fetch import Patience, fetch
-from sigmasplat.download.partial import partial
+from sigmasplat.download.fetch import RetryPolicy, fetch
+from sigmasplat.download.partial import open_partial
 from sigmasplat.errors import DownloadError
 
 BODY = bytes(range(256)) * 40
-HASTY = Patience(attempts=3, progress_bytes=1000, first_wait_s=0.001)
-IMPATIENT = replace(HASTY, timeout_s=0.5, least_bytes_per_s=1000.0, attempts=9)
+HASTY = RetryPolicy(max_attempts=3, progress_bytes=1000, first_wait_s=0.001)
+IMPATIENT = replace(HASTY, timeout_s=0.5, min_bytes_per_s=1000.0, max_attempts=9)
 
 
 @pytest.fixture
@@ -26,10 +26,10 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[FileServer]:
         yield server
 
 
-def fetched(server: FileServer, target: Path, patience: Patience = HASTY) -> list[tuple[int, int]]:
+def fetched(server: FileServer, target: Path, retry: RetryPolicy = HASTY) -> list[tuple[int, int]]:
     """Fetch /a.tgz; return what the progress was told."""
     told: list[tuple[int, int]] = []
-    fetch(server.url("/a.tgz"), target, lambda *counts: told.append(counts), lambda *sizes: None, patience)
+    fetch(server.url("/a.tgz"), target, lambda *counts: told.append(counts), lambda *sizes: None, retry)
     return told
 
 
@@ -161,7 +161,7 @@ def test_patience_ends(act: Act, says: str, server: FileServer, tmp_path: Path) 
 def test_slowness_is_noticed(act: Act, says: str, server: FileServer, tmp_path: Path) -> None:
     server.acts = [act]
     with pytest.raises(DownloadError, match=says):
-        fetched(server, tmp_path / "a.tgz", replace(IMPATIENT, attempts=1))
+        fetched(server, tmp_path / "a.tgz", replace(IMPATIENT, max_attempts=1))
 
 
 @pytest.mark.parametrize(
@@ -194,7 +194,7 @@ def test_a_size_may_be_refused_before_a_byte_is_written(server: FileServer, tmp_
 
 
 def test_two_processes_do_not_write_one_file(server: FileServer, tmp_path: Path) -> None:
-    with partial(tmp_path / "a.tgz") as part:
+    with open_partial(tmp_path / "a.tgz") as part:
         part.add(b"mine")
         with pytest.raises(DownloadError, match="another process"):
             fetched(server, tmp_path / "a.tgz")
@@ -215,5 +215,5 @@ def test_a_full_disk_is_an_error(server: FileServer, tmp_path: Path) -> None:
 
 def test_nobody_listens(tmp_path: Path, server: FileServer) -> None:
     with pytest.raises(DownloadError, match=r"cannot connect to 127.0.0.1 .*refused"):
-        fetch("http://127.0.0.1:1/a.tgz", tmp_path / "a.tgz", lambda *c: None, lambda *s: None, Patience())
+        fetch("http://127.0.0.1:1/a.tgz", tmp_path / "a.tgz", lambda *c: None, lambda *s: None, RetryPolicy())
     assert left_in(tmp_path) == set()

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw
 
 from box_room import CAMERA, HIGH, LOW, seer, splats
 from room_run import FRAMES, LOST, PATH, T_ROOM, WORLD, Walls, made_run, picture
-from sigmasplat.drawing.film import Scale, legend_strip
+from sigmasplat.drawing.film import FilmScale, legend_strip
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.exports import (
     Recorded,
@@ -148,7 +148,7 @@ def test_the_legend_of_a_film_can_be_read(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(ImageDraw.ImageDraw, "text", text)
     for width in (32, 48, 64, 96, 128, 160, 200, 320, 640):
         drawn.clear()
-        strip = legend_strip(Scale((0.8, 12.4), (0.0, 0.23)), width)
+        strip = legend_strip(FilmScale((0.8, 12.4), (0.0, 0.23)), width)
         assert strip.shape == (40, 3 * width, 3)
         for i, (word, (left, top, right, bottom)) in enumerate(drawn):
             inside = left // width == (right - 1) // width and 0 < top < bottom < 40

@@ -16,7 +16,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.model.submap import MemoryStore, Picture, Submap
 from sigmasplat.render import render
-from sigmasplat.render.view import ReferenceView
+from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.slam.final import Keyframes, final_map, merged, survivors
 from sigmasplat.slam.fusion import FusionView, count_keyframes, fuse, fusion_views
 

@@ -1,4 +1,4 @@
-"""Floor plans of a room whose view is known: walls, things and doubts are where they are, wherever the world is."""
+"""Floor plans of a synthetic room: walls, objects and rescan regions are at their true places in any world frame."""
 
 import json
 from functools import cache
@@ -10,10 +10,20 @@ import pytest
 from box_room import CAMERA, CHEST, HIGH, LOW, PILLAR, pose, seer, splats, walk
 from sigmasplat.drawing.plot import DARK, LIGHT
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.floorplan.floor_plan import BARE, CELL_M, FREE, SIGNS, THING, UNSEEN, WALL, FloorPlan, floor_plan
+from sigmasplat.floorplan.floor_plan import (
+    CELL_M,
+    FLOOR_UNOBSERVED,
+    FREE,
+    OBJECT,
+    SIGNS,
+    UNOBSERVED,
+    WALL,
+    FloorPlan,
+    floor_plan,
+)
 from sigmasplat.floorplan.ground import floor_frame
-from sigmasplat.floorplan.picture import draw_floor_plan, kinds_picture
-from sigmasplat.floorplan.surface_samples import look, looks
+from sigmasplat.floorplan.picture import draw_floor_plan, draw_kinds
+from sigmasplat.floorplan.surface_samples import sample_surface, sample_surfaces
 from sigmasplat.io.json_files import write_json
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
@@ -49,41 +59,43 @@ def kind_at(plan: FloorPlan, x: float, y: float) -> int:
     return int(plan.kind[row, column])
 
 
-def test_the_floor_is_found_wherever_the_world_is() -> None:
+def test_the_floor_is_found_in_any_world_frame() -> None:
     """The frame takes the room's axes: z up from the floor, y where the first camera looks, below that camera."""
     for T_world_room in (UPRIGHT, WORLD):
-        sights = list(looks(splats(T_world_room), walk(T_world_room), CAMERA, seer(T_world_room), most=8))
-        T_floor_room = floor_frame(sights) @ T_world_room
+        samples = list(
+            sample_surfaces(splats(T_world_room), walk(T_world_room), CAMERA, seer(T_world_room), max_poses=8)
+        )
+        T_floor_room = floor_frame(samples) @ T_world_room
         np.testing.assert_allclose(T_floor_room[:3, :3], np.eye(3), atol=2e-3)
         np.testing.assert_allclose(T_floor_room[:3, 3], [0.0, -0.3, 0.0], atol=0.01)
 
 
-def test_axes_run_along_the_walls_though_the_camera_looks_askew() -> None:
+def test_axes_follow_the_walls_even_if_the_camera_looks_diagonally() -> None:
     poses = np.stack([pose((0.0, 0.0, 1.4), yaw, -0.4) for yaw in np.deg2rad([70.0, 150.0, 230.0, 310.0])])
-    sights = list(looks(splats(UPRIGHT), Trajectory(np.arange(4.0), poses), CAMERA, seer(UPRIGHT)))
-    np.testing.assert_allclose(floor_frame(sights)[:3, :3], np.eye(3), atol=5e-3)
+    samples = list(sample_surfaces(splats(UPRIGHT), Trajectory(np.arange(4.0), poses), CAMERA, seer(UPRIGHT)))
+    np.testing.assert_allclose(floor_frame(samples)[:3, :3], np.eye(3), atol=5e-3)
 
 
 @pytest.mark.parametrize("pitch", [0.0, 0.9])
-def test_a_camera_that_never_sees_the_floor_still_knows_up(pitch: float) -> None:
-    """Walls say it, or the ceiling; where the floor is they do not: the lowest point seen stands for it."""
+def test_up_is_found_without_the_floor_in_view(pitch: float) -> None:
+    """Walls or the ceiling give the direction. The lowest visible point then stands for the floor."""
     path = walk(WORLD, images=8, pitch=pitch)
     narrow = CAMERA.__class__(160, 120, 200.0, 200.0, 79.5, 59.5)
-    sights = list(looks(splats(WORLD), path, narrow, seer(WORLD)))
-    assert floor_frame(sights)[2, :3] @ WORLD[:3, 2] > np.cos(np.deg2rad(2.0))
+    samples = list(sample_surfaces(splats(WORLD), path, narrow, seer(WORLD)))
+    assert floor_frame(samples)[2, :3] @ WORLD[:3, 2] > np.cos(np.deg2rad(2.0))
 
 
-def test_normals_and_areas_are_the_surfaces() -> None:
-    sight = look(splats(UPRIGHT), CAMERA, pose((0.0, 0.0, 1.5), 0.3, -0.8), seer(UPRIGHT, boxes=()))
-    off_walls = ((sight.points > np.add(LOW, [0.1, 0.1, -1.0])) & (sight.points < HIGH - 0.1)).all(1)
-    on_floor = (sight.points[:, 2] < 1e-3) & off_walls
-    np.testing.assert_allclose(sight.normals[on_floor], np.tile([0, 0, 1.0], (on_floor.sum(), 1)), atol=1e-3)
+def test_samples_have_the_normals_and_areas_of_the_surfaces() -> None:
+    sample = sample_surface(splats(UPRIGHT), CAMERA, pose((0.0, 0.0, 1.5), 0.3, -0.8), seer(UPRIGHT, boxes=()))
+    off_walls = ((sample.points > np.add(LOW, [0.1, 0.1, -1.0])) & (sample.points < HIGH - 0.1)).all(1)
+    on_floor = (sample.points[:, 2] < 1e-3) & off_walls
+    np.testing.assert_allclose(sample.normals[on_floor], np.tile([0, 0, 1.0], (on_floor.sum(), 1)), atol=1e-3)
     low, high = [0.5, -0.5], [1.5, 0.5]
-    part = on_floor & (sight.points[:, :2] > low).all(1) & (sight.points[:, :2] < high).all(1)
-    assert sight.area_m2[part].sum() == pytest.approx(1.0, rel=0.05)
+    part = on_floor & (sample.points[:, :2] > low).all(1) & (sample.points[:, :2] < high).all(1)
+    assert sample.area_m2[part].sum() == pytest.approx(1.0, rel=0.05)
 
 
-def test_walls_and_things_stand_where_they_were_put() -> None:
+def test_walls_and_objects_are_at_their_true_places() -> None:
     plan = plain_plan()
     rows, columns = np.nonzero(plan.kind == WALL)
     x = plan.origin_m[0] + (columns + 0.5) * CELL_M
@@ -91,16 +103,16 @@ def test_walls_and_things_stand_where_they_were_put() -> None:
     for found, true in ((x.min(), LOW[0]), (x.max(), HIGH[0]), (y.min(), LOW[1]), (y.max(), HIGH[1])):
         assert abs(found - true) <= CELL_M
     assert kind_at(plan, PILLAR[0][0] + 0.01, 0.7) == WALL, "the pillar's near side"
-    assert kind_at(plan, -1.7, 0.0) == THING and kind_at(plan, CHEST[1][0] + 0.12, 0.0) == FREE
-    assert kind_at(plan, 0.0, 0.6) == BARE, "too near below the camera"
-    assert kind_at(plan, 1.1, 0.7) == UNSEEN, "inside the pillar"
-    assert kind_at(plan, HIGH[0] + 0.15, 0.0) == UNSEEN, "beyond the wall"
-    assert plan.area_m2(UNSEEN, BARE, FREE, THING, WALL) == pytest.approx(plan.kind.size * CELL_M**2)
+    assert kind_at(plan, -1.7, 0.0) == OBJECT and kind_at(plan, CHEST[1][0] + 0.12, 0.0) == FREE
+    assert kind_at(plan, 0.0, 0.6) == FLOOR_UNOBSERVED, "too near below the camera"
+    assert kind_at(plan, 1.1, 0.7) == UNOBSERVED, "inside the pillar"
+    assert kind_at(plan, HIGH[0] + 0.15, 0.0) == UNOBSERVED, "beyond the wall"
+    assert plan.area_m2(UNOBSERVED, FLOOR_UNOBSERVED, FREE, OBJECT, WALL) == pytest.approx(plan.kind.size * CELL_M**2)
     np.testing.assert_allclose(plan.path_m[0], [0.0, 0.0], atol=0.01)
 
 
 @pytest.mark.parametrize("T_world_room", [UPRIGHT, WORLD])
-def test_holes_of_doubt_are_found_within_a_cell(T_world_room: np.ndarray) -> None:
+def test_uncertain_and_thin_regions_are_found_within_a_cell(T_world_room: np.ndarray) -> None:
     blurred, thin, patchy = (
         patch((-1.2, -1.2), (-0.8, -0.8)),
         patch((0.6, -1.3), (1.1, -0.8)),
@@ -114,8 +126,8 @@ def test_holes_of_doubt_are_found_within_a_cell(T_world_room: np.ndarray) -> Non
     )
     for why, x, y, area_m2, words in (
         ("unsure", -1.0, -1.0, 0.16, "depth ± 12"),
-        ("thin", 0.85, -1.05, 0.25, "lets 30 % of the light through"),
-        ("unsure", -1.2, 1.2, 0.16, "colour 10.0 times"),
+        ("thin", 0.85, -1.05, 0.25, "surface 30 % transparent"),
+        ("unsure", -1.2, 1.2, 0.16, "σ of colour 10.0 times"),
     ):
         here = [
             r for r in plan.regions if r.why == why and np.abs(np.subtract(r.center_m, (x, y - 0.3))).max() < CELL_M
@@ -125,19 +137,19 @@ def test_holes_of_doubt_are_found_within_a_cell(T_world_room: np.ndarray) -> Non
     assert [r.area_m2 for r in plan.regions] == sorted([r.area_m2 for r in plan.regions], reverse=True)
 
 
-def test_a_sure_map_has_no_unsure_place_and_what_hides_behind_the_pillar_is_told() -> None:
+def test_a_certain_map_has_only_unobserved_regions_such_as_behind_the_pillar() -> None:
     plan = plain_plan()
     assert {region.why for region in plan.regions} == {"unseen"}
-    hidden = np.array([(x, y + 0.3) for x, y in (r.center_m for r in plan.regions if r.found == "never in view")])
+    hidden = np.array([(x, y + 0.3) for x, y in (r.center_m for r in plan.regions if r.found == "not observed")])
     behind = (hidden > PILLAR[0][:2]).all(1)
     assert behind.any(), hidden
     assert (np.linalg.norm(hidden[~behind], axis=1) < 0.3).all(), "and where the camera turned round, looking outwards"
-    floor = next(r for r in plan.regions if "its floor was never" in r.found)
+    floor = next(r for r in plan.regions if r.found == "floor not observed")
     assert np.linalg.norm(np.add(floor.center_m, (0.0, 0.3))) < 0.8, "around the camera"
-    assert kind_at(plan, floor.center_m[0], floor.center_m[1] + 0.3) == BARE
+    assert kind_at(plan, floor.center_m[0], floor.center_m[1] + 0.3) == FLOOR_UNOBSERVED
 
 
-def test_moving_the_world_changes_the_plan_by_rounding_only() -> None:
+def test_another_world_frame_changes_the_plan_by_rounding_only() -> None:
     here, there = plain_plan(), plan_of(WORLD)
     np.testing.assert_allclose(there.T_floor_world @ WORLD, here.T_floor_world, atol=2e-3)
     np.testing.assert_allclose(there.origin_m, here.origin_m, atol=1e-9)
@@ -146,7 +158,7 @@ def test_moving_the_world_changes_the_plan_by_rounding_only() -> None:
     np.testing.assert_allclose(there.depth_sigma_m[both], here.depth_sigma_m[both], atol=1e-4)
 
 
-def test_the_record_says_where_everything_is(tmp_path: Path) -> None:
+def test_the_record_holds_frame_cells_and_regions(tmp_path: Path) -> None:
     blurred = patch((-1.2, -1.2), (-0.8, -0.8))
     plan = plan_of(WORLD, sigma_m=lambda at: np.where(blurred(at), 0.12, 0.01))
     write_json(tmp_path / "plan.json", plan.record())
@@ -158,12 +170,12 @@ def test_the_record_says_where_everything_is(tmp_path: Path) -> None:
     np.testing.assert_allclose(in_room[:3], [-1.0, -1.0, 0.0], atol=CELL_M)
 
 
-def test_the_picture_shows_the_cells_with_y_upwards() -> None:
+def test_the_picture_shows_the_cells_with_y_up() -> None:
     plan = plain_plan()
     for theme in (LIGHT, DARK):
         picture = draw_floor_plan(plan, theme)
         assert picture.getpixel((2, 2)) == theme.background and picture.mode == "RGB"
-        cells = kinds_picture(plan, theme)
+        cells = draw_kinds(plan, theme)
         assert tuple(cells[plan.kind == WALL][0]) == theme.text
     size = round(440 / max(plan.kind.shape))
     row = plan.kind.shape[0] - 1 - int((1.2 - 0.3 - plan.origin_m[1]) / CELL_M)  # y = 1.2 of the room, from above
@@ -174,15 +186,15 @@ def test_the_picture_shows_the_cells_with_y_upwards() -> None:
     assert tuple(drawn) == LIGHT.background and kind_at(plan, -1.0, 1.2) == FREE
 
 
-def test_what_makes_no_plan_is_refused() -> None:
+def test_bad_cells_and_maps_without_surfaces_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"0\.001 to 1 m wide, found 0"):
         floor_plan(splats(UPRIGHT), walk(UPRIGHT), CAMERA, cell_m=0.0, renderer=seer(UPRIGHT))
     nothing = seer(UPRIGHT, alpha=lambda at: np.zeros(at.shape[:-1]))
-    with pytest.raises(SigmaSplatError, match="shows no surface from its path"):
+    with pytest.raises(SigmaSplatError, match="no surface of the map is visible"):
         floor_plan(splats(UPRIGHT), walk(UPRIGHT), CAMERA, renderer=nothing)
 
 
-def test_progress_counts_the_looks() -> None:
-    told: list[tuple[int, int]] = []
-    floor_plan(splats(UPRIGHT), walk(UPRIGHT, 3), CAMERA, renderer=seer(UPRIGHT), progress=lambda *at: told.append(at))
-    assert told == [(1, 3), (2, 3), (3, 3)]
+def test_progress_counts_the_poses() -> None:
+    calls: list[tuple[int, int]] = []
+    floor_plan(splats(UPRIGHT), walk(UPRIGHT, 3), CAMERA, renderer=seer(UPRIGHT), progress=lambda *at: calls.append(at))
+    assert calls == [(1, 3), (2, 3), (3, 3)]

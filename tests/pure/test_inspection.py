@@ -13,7 +13,7 @@ from sigmasplat.checks.registration import edge_agreement, outlines
 from sigmasplat.config import InputConfig
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources import open_source
-from sigmasplat.sources.camera.depth_registration import Registration
+from sigmasplat.sources.camera.depth_registration import DepthRegistration
 from sigmasplat.sources.tum import write_tum
 
 ROOM = "synthetic:frames=120,width=320,height=240"
@@ -31,7 +31,7 @@ def unregistered(frame):
     T = np.eye(4)
     T[0, 3] = 0.025
     depth_camera = replace(c, fx=1.1 * c.fx, fy=1.1 * c.fy)
-    return replace(frame, depth_m=Registration(c, depth_camera, T)(frame.depth_m))
+    return replace(frame, depth_m=DepthRegistration(c, depth_camera, T)(frame.depth_m))
 
 
 def test_colour_and_depth_of_one_camera_agree(frames):

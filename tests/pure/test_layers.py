@@ -1,38 +1,21 @@
 """Hold the house to its floor plan (docs/architecture.md): read the sources, run nothing."""
 
 import ast
+import importlib
 import re
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 import scipy.sparse
 
-PACKAGE = Path(__file__).parents[2] / "src" / "sigmasplat"
-FLOORS = [
-    ["errors", "env", "types"],
-    ["config"],
-    ["presets"],
-    ["native"],
-    ["model"],
-    ["render"],
-    ["fit"],
-    ["slam"],
-    ["sources"],
-    ["io"],
-    ["metrics"],
-    ["drawing"],
-    ["floorplan"],
-    ["report"],
-    ["checks"],
-    ["run"],
-    ["evaluation"],
-    ["exports"],
-    ["viewer"],
-    ["download"],
-    ["commands"],
-    ["cli", "__init__", "__main__"],
-]
+ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "src" / "sigmasplat"
+sys.path.append(str(ROOT / "docs" / "theme"))
+floors = importlib.import_module("floors")
+imported = floors.imported
+FLOORS = [list(floor.names) for floor in floors.FLOORS]
 FLOOR = {name: number for number, names in enumerate(FLOORS) for name in names}
 # Sources, results and scores do not know how SLAM decides, though they come after it in the list.
 FORBIDDEN = {(user, "slam") for user in ("sources", "io", "metrics", "drawing", "floorplan", "report", "checks")} | {
@@ -56,16 +39,6 @@ def floor_of(path: Path) -> str:
     """Name the floor a file stands on: its folder, or its own name at the top."""
     first = path.relative_to(PACKAGE).parts[0]
     return first.removesuffix(".py")
-
-
-def imported(tree: ast.AST) -> Iterator[str]:
-    """Yield every module (or name in one) imported anywhere in a file, dotted; TYPE_CHECKING blocks count too."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, "imports are absolute, so that the floors can be read"
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
 def used_floors(tree: ast.AST) -> set[str]:
@@ -133,9 +106,16 @@ def parsed(path: Path) -> ast.AST:
 
 def test_a_floor_imports_only_from_above() -> None:
     homeless = [str(path) for path in FILES if floor_of(path) not in FLOOR]
-    assert not homeless, "give these a floor in docs/architecture.md and here"
+    assert not homeless, "give these a floor in docs/theme/floors.py"
     found = {str(path.relative_to(PACKAGE)): problems_of_floors(floor_of(path), parsed(path)) for path in FILES}
     assert {path: problems for path, problems in found.items() if problems} == {}
+
+
+def test_the_picture_of_the_floors_shows_the_current_imports() -> None:
+    committed = floors.PICTURE.read_text(encoding="utf-8")
+    same = floors.without_sizes(committed) == floors.without_sizes(floors.draw())
+    assert same, "run python docs/theme/floors.py"
+    assert "<title>slam imports fit</title>" in committed and "<title>fit imports slam</title>" not in committed
 
 
 def test_no_modules_import_each_other() -> None:

@@ -11,7 +11,7 @@ from sigmasplat.fit.target import Target
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS
 from sigmasplat.model.frame import Frame
-from sigmasplat.render.view import ReferenceView
+from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.slam.mapper import Mapper
 
 CAMERA = Camera(16, 12, 15.0, 15.0, 7.5, 5.5)

@@ -15,7 +15,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.model.frame import Frame
-from sigmasplat.render.view import ReferenceView
+from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.slam import mapper as mapper_module
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.rules import draw_keyframes

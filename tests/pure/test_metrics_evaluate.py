@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from sigmasplat.config import Config, FinalConfig, InputConfig
+from sigmasplat.drawing.view_panels import FOOT, GAP, HEAD, PANEL_WIDTH
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.evaluation.evaluate import evaluate
 from sigmasplat.io.runs import RunFolder
@@ -22,7 +24,7 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import Picture, Submap
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.report.page import data_uri
+from sigmasplat.report.view_strips import data_uri, file_data_uri
 from sigmasplat.sources.base import Source
 
 CAMERA = Camera(48, 36, 40.0, 40.0, 23.5, 17.5)
@@ -105,7 +107,7 @@ def truth_of(move: Callable[[np.ndarray], np.ndarray] = lambda T: T) -> Trajecto
     return Trajectory(TIMES + 0.004, move(WORLD @ poses()))
 
 
-def test_training_and_held_out_views_are_kept_apart(run: RunFolder) -> None:
+def test_training_and_held_out_views_are_separate(run: RunFolder) -> None:
     metrics = score(run, HandMade(truth_of()))
     ramp = np.linspace(0.5, 1.5, 36)
     for kind, offset, views in (("training", 0.01, 5), ("held_out", 0.04, 15)):
@@ -115,7 +117,7 @@ def test_training_and_held_out_views_are_kept_apart(run: RunFolder) -> None:
         assert metrics[kind]["depth_coverage"] == pytest.approx(30 / 36)
 
 
-def test_uncertainty_is_judged_on_held_out_views(run: RunFolder) -> None:
+def test_uncertainty_is_scored_on_held_out_views(run: RunFolder) -> None:
     scores = score(run, HandMade(None), renderer=KnownErrors(training=0.3))["uncertainty"]
     assert scores["pixels"] == 15 * 36 * 32, "pixels with a reading only"
     assert scores["spearman"] == pytest.approx(1.0, abs=1e-3) and scores["ause"] == pytest.approx(0.0, abs=1e-3)
@@ -159,7 +161,7 @@ def test_everything_is_written(run: RunFolder) -> None:
     assert json.loads((run.path / "metrics.json").read_text())["held_out"] == metrics["held_out"]
     page = (run.path / "report.html").read_text()
     names = shown(run, page)
-    assert names == {p.name for p in run.images.iterdir()} and len(names) == 8
+    assert names == {p.name for p in run.images.iterdir()} and len(names) == 12
     assert {"view-training-000000.png", "view-held-out-000019.png"} <= names
 
 
@@ -170,19 +172,26 @@ def test_a_page_holds_three_views_of_each_kind(run: RunFolder) -> None:
 
 
 def shown(run: RunFolder, page: str) -> set[str]:
-    """Name the run's pictures that its page holds."""
-    drawn = {path.name: data_uri(path, lossless="view-" not in path.name) for path in run.images.iterdir()}
-    return {name for name, picture in drawn.items() if picture in page}
+    """Return the names of the pictures in images/ that the page holds: charts whole, view strips panel by panel."""
+    return {path.name for path in run.images.iterdir() if all(address in page for address in addresses(path))}
+
+
+def addresses(path: Path) -> list[str]:
+    if not path.name.startswith("view-"):
+        return [file_data_uri(path)]
+    strip = Image.open(path)
+    lefts = range(GAP, strip.width - GAP, PANEL_WIDTH + GAP)
+    return [data_uri(strip.crop((left, HEAD, left + PANEL_WIDTH, strip.height - FOOT))) for left in lefts]
 
 
 def test_views_are_sampled_evenly(run: RunFolder) -> None:
-    renderer, told = KnownErrors(), []
-    score(run, HandMade(None), renderer=renderer, views_per_kind=3, progress=lambda *at: told.append(at))
+    renderer, calls = KnownErrors(), []
+    score(run, HandMade(None), renderer=renderer, views_per_kind=3, progress=lambda *at: calls.append(at))
     assert sorted(renderer.seen) == [0, 1, 8, 10, 16, 19]
-    assert told == [(i, 6) for i in range(1, 7)]
+    assert calls == [(i, 6) for i in range(1, 7)]
 
 
-def test_an_interrupted_run_is_scored_as_far_as_it_came(run: RunFolder) -> None:
+def test_an_interrupted_run_is_scored_up_to_its_last_pose(run: RunFolder) -> None:
     run.write_trajectory(Trajectory(TIMES[:9], poses()[:9]))
     metrics = score(run, HandMade(truth_of()))
     assert metrics["frames"] == 9 and metrics["ate"]["pairs"] == 9
@@ -196,7 +205,7 @@ def test_a_run_of_keyframes_only_has_no_held_out_views(run: RunFolder) -> None:
     assert (run.path / "report.html").exists()
 
 
-def test_truth_of_another_recording_is_said_after_the_rest_is_kept(run: RunFolder) -> None:
+def test_truth_of_another_recording_is_reported_after_everything_is_written(run: RunFolder) -> None:
     late = Trajectory(TIMES + 1000, WORLD @ poses())
     with pytest.raises(SourceError, match="share no timestamps"):
         score(run, HandMade(late))
@@ -257,7 +266,7 @@ def cut_run(run: RunFolder) -> RunFolder:
     return run
 
 
-def test_views_are_also_seen_in_their_submaps(cut_run: RunFolder) -> None:
+def test_views_are_also_rendered_in_their_submaps(cut_run: RunFolder) -> None:
     metrics = score(cut_run, HandMade(None), renderer=KnownInSubmaps())
     ramp = np.linspace(0.5, 1.5, 36)
     for name, offset, views in (
@@ -292,7 +301,7 @@ def test_each_submap_is_loaded_once_and_each_frame_read_once(
         (FinalConfig(iterations=0, seed_from="mesh", uncertainty=True), False),
     ],
 )
-def test_uncertainty_is_judged_where_it_was_learnt(cut_run: RunFolder, final: FinalConfig, keeps: bool) -> None:
+def test_uncertainty_is_scored_where_it_was_learned(cut_run: RunFolder, final: FinalConfig, keeps: bool) -> None:
     (cut_run.path / "config.json").write_text(json.dumps(replace(CONFIG, final=final).to_dict()))
     metrics = score(cut_run, HandMade(None), renderer=KnownInSubmaps())
     square = (np.linspace(0.5, 1.5, 36) ** 2).mean()
@@ -312,7 +321,7 @@ def test_submaps_are_on_the_page(cut_run: RunFolder) -> None:
     assert "held-out views, in their submaps" in page and "overlap &lt;0.2" in page
 
 
-def test_a_run_in_one_piece_says_so(run: RunFolder) -> None:
+def test_a_run_with_one_submap_has_no_scores_in_submaps(run: RunFolder) -> None:
     metrics = score(run, HandMade(None))
     assert metrics["submaps"] == 1 and metrics["loops"] == {"tried": 0, "accepted": 0} and metrics["finish_s"] is None
     assert metrics["held_out_submaps"] is metrics["training_submaps"] is metrics["uncertainty_final"] is None
@@ -320,7 +329,7 @@ def test_a_run_in_one_piece_says_so(run: RunFolder) -> None:
 
 
 @pytest.mark.parametrize("iterations", [0, 50])
-def test_one_submap_is_scored_apart_where_it_was_refined(run: RunFolder, iterations: int) -> None:
+def test_a_refined_single_submap_has_its_own_scores(run: RunFolder, iterations: int) -> None:
     config = replace(CONFIG, final=FinalConfig(iterations=iterations))
     (run.path / "config.json").write_text(json.dumps(config.to_dict()))
     shown = [Picture(np.zeros((36, 48, 3), np.uint8), np.zeros((36, 48), np.float32))]
@@ -366,8 +375,8 @@ def test_runs_without_frames_or_of_two_sessions_are_refused(run: RunFolder) -> N
         score(run, HandMade(None))
 
 
-class Apart(HandMade):
-    """The same frames as views kept apart, of which one cannot be read and one has no pose."""
+class NovelViews(HandMade):
+    """The same frames as test views. One cannot be read, one has no pose."""
 
     def __init__(self, poses: Trajectory | None) -> None:
         super().__init__(poses)
@@ -379,28 +388,28 @@ class Apart(HandMade):
 
 
 class WithViews(HandMade):
-    def __init__(self, truth: Trajectory | None, apart: Source) -> None:
+    def __init__(self, truth: Trajectory | None, test_views: Source) -> None:
         super().__init__(truth)
-        self.apart = apart
+        self._test_views = test_views
 
     def test_views(self) -> Source:
-        return self.apart
+        return self._test_views
 
 
-def test_views_kept_apart_are_scored_at_their_true_poses(run: RunFolder) -> None:
-    """The run's path is exact, so the fit of the truth is the world's and each view is recognised by its pose."""
+def test_novel_views_are_scored_at_their_true_poses(run: RunFolder) -> None:
+    """The path of the run is exact, so the alignment is exact too, and each view is recognised by its pose."""
     truth = truth_of()
     known = Trajectory(truth.timestamps_s[:-1], truth.T_world_camera[:-1])
     renderer = KnownErrors(training=0.02, held_out=0.02)
-    metrics = score(run, WithViews(truth, Apart(known)), renderer=renderer, strips_per_kind=2)
+    metrics = score(run, WithViews(truth, NovelViews(known)), renderer=renderer, strips_per_kind=2)
     assert metrics["test_views"]["views"] == FRAMES - 2
     assert metrics["test_views"]["psnr_db"] == pytest.approx(metrics["held_out"]["psnr_db"], abs=0.3)
     assert len(list(run.images.glob("view-test-*.png"))) == 2
     page = (run.path / "report.html").read_text()
-    assert "PSNR, views kept apart" in page and "kept apart" in page
+    assert "PSNR, novel views" in page and "<h3>novel views" in page
 
 
-def test_views_kept_apart_need_the_truth(run: RunFolder) -> None:
+def test_novel_views_need_the_truth(run: RunFolder) -> None:
     assert score(run, HandMade(truth_of()))["test_views"] is None
-    assert score(run, WithViews(None, Apart(truth_of())))["test_views"] is None
-    assert score(run, WithViews(truth_of(), Apart(None)))["test_views"] is None
+    assert score(run, WithViews(None, NovelViews(truth_of())))["test_views"] is None
+    assert score(run, WithViews(truth_of(), NovelViews(None)))["test_views"] is None

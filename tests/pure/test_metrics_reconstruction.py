@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sigmasplat.metrics.reconstruction import Reconstruction, distances, f1, in_front, novel, score
+from sigmasplat.metrics.reconstruction import MeshScores, distances, f1, sample_novel_views, score, visible_points
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.mesh import Mesh
@@ -48,7 +48,7 @@ def around(views: int = 12, distance_m: float = 3.0) -> np.ndarray:
 AHEAD = np.eye(4)[None]
 
 
-def scored(found: Mesh, truth: Mesh, poses: np.ndarray) -> Reconstruction:
+def scored(found: Mesh, truth: Mesh, poses: np.ndarray) -> MeshScores:
     return score(found, truth, CAMERA, poses, points=10_000, novel_views=3)
 
 
@@ -116,13 +116,13 @@ def test_depth_of_novel_views_is_taken_where_a_training_view_saw_the_surface() -
 
 def test_novel_views_are_new_clear_and_repeatable() -> None:
     truth, poses = Mesh.joined([wall(2.0), wall(0.35)]), around(3)
-    views = novel(truth, CAMERA, np.concatenate([AHEAD, poses]), 8, seed=3)
+    views = sample_novel_views(truth, CAMERA, np.concatenate([AHEAD, poses]), 8, seed=3)
     assert len(views) == 8
     for T, depth_m, face in views:
         assert np.abs(poses - T).max((1, 2)).min() > 0.02 and depth_m[face >= 0].min(initial=9.0) >= 0.2
-    again = novel(truth, CAMERA, np.concatenate([AHEAD, poses]), 8, seed=3)
+    again = sample_novel_views(truth, CAMERA, np.concatenate([AHEAD, poses]), 8, seed=3)
     assert all((a[0] == b[0]).all() for a, b in zip(views, again, strict=True))
-    assert novel(truth, CAMERA, np.empty((0, 4, 4)), 8, seed=3) == []
+    assert sample_novel_views(truth, CAMERA, np.empty((0, 4, 4)), 8, seed=3) == []
 
 
 def test_nothing_found_is_said_not_hidden() -> None:
@@ -180,4 +180,4 @@ def test_points_are_seen_up_to_the_depth_and_a_little() -> None:
     depth_m = np.full((60, 80), 2.0, np.float32)
     depth_m[:, :40] = 0.0  # nothing there: seen through
     points = np.array([[0.3, 0, 1.0], [0.3, 0, 2.04], [0.3, 0, 2.06], [-0.3, 0, 9.0], [0.3, 0, -1.0], [9, 0, 1.0]])
-    assert in_front(points, depth_m, CAMERA, np.eye(4), 0.05).tolist() == [True, True, False, True, False, False]
+    assert visible_points(points, depth_m, CAMERA, np.eye(4), 0.05).tolist() == [True, True, False, True, False, False]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sigmasplat.metrics.splats import FLOATER_M, OPAQUE, SplatSurface, splats_to_surface
+from sigmasplat.metrics.splats import FLOATER_M, OPAQUE, SplatScores, score_splats
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.mesh import Mesh
@@ -33,9 +33,9 @@ def lattice(z_m: float) -> np.ndarray:
     return np.stack([x.ravel(), y.ravel(), np.full(x.size, z_m)], 1)
 
 
-def scored(centers: np.ndarray, opacities: np.ndarray | float = 0.9, truth: Mesh | None = None) -> SplatSurface:
+def scored(centers: np.ndarray, opacities: np.ndarray | float = 0.9, truth: Mesh | None = None) -> SplatScores:
     opaque = np.broadcast_to(opacities, len(centers))
-    return splats_to_surface(centers, opaque, truth or wall(2.0), CAMERA, AHEAD, points=20_000)
+    return score_splats(centers, opaque, truth or wall(2.0), CAMERA, AHEAD, points=20_000)
 
 
 def test_splats_on_the_surface_leave_the_gaps_between_them() -> None:

@@ -6,7 +6,7 @@ from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 from sigmasplat.errors import SourceError
-from sigmasplat.metrics.trajectory import align_rigid, associate, ate, paired, rpe
+from sigmasplat.metrics.trajectory import align_rigid, associate, ate, pair_poses, rpe
 from sigmasplat.model.trajectory import Trajectory
 
 Array = np.ndarray
@@ -132,7 +132,7 @@ def test_poses_are_paired_by_time_not_by_row() -> None:
     truth = random_path(1)
     some = np.array([40, 3, 17, 25])
     estimate = Trajectory(truth.timestamps_s[some] + 0.005, truth.T_world_camera[some])
-    ours, theirs = paired(estimate, truth)
+    ours, theirs = pair_poses(estimate, truth)
     np.testing.assert_array_equal(ours, theirs)
 
 

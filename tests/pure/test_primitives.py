@@ -15,9 +15,11 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.model.frame import Frame
-from sigmasplat.render import reference
-from sigmasplat.render.render import features_of, render
-from sigmasplat.render.view import View, make_view
+from sigmasplat.render.backend import make_view
+from sigmasplat.render.channels import features_of
+from sigmasplat.render.reference import operators as reference
+from sigmasplat.render.render import render
+from sigmasplat.render.view import View
 from sigmasplat.slam.pruning import depths, fade, splat_uncertainty, still_uncertain
 
 Array = NDArray[np.float64]

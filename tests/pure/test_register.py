@@ -12,7 +12,7 @@ from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.submap import MemoryStore, Submap
-from sigmasplat.render.view import make_view
+from sigmasplat.render.backend import make_view
 from sigmasplat.slam.loop_closure import registration
 from sigmasplat.slam.loop_closure.candidates import Candidate, SubmapPair
 from sigmasplat.slam.loop_closure.registration import Localisation, Registrar, Registration
@@ -122,7 +122,7 @@ def test_turning_a_localisation_round_carries_its_covariance() -> None:
     half = np.diag([3e-3, 1e-3, 2e-3, 1e-3, 2e-3, 3e-3])
     draws = se3.exp_stack(random.standard_normal((20_000, 6)) @ half)
     drawn = np.cov(se3.log_stack(se3.inverse(draws @ T) @ T).T)
-    turned = registration.turned(localisation(T, covariance=half @ half.T))
+    turned = registration.inverted(localisation(T, covariance=half @ half.T))
     scale = np.sqrt(np.diag(drawn))
     assert np.allclose(turned.T_a_b, se3.inverse(T))
     assert np.abs((turned.covariance - drawn) / np.outer(scale, scale)).max() < 0.04

@@ -9,7 +9,7 @@ from PIL import Image
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources import open_source
-from sigmasplat.sources.camera.depth_registration import MOST_PX, OVERLAP, Registration
+from sigmasplat.sources.camera.depth_registration import MAX_HALF_FOOTPRINT_PX, OVERLAP, DepthRegistration
 
 DEPTH = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 COLOR = Camera(80, 60, 70.0, 72.0, 40.0, 29.0)
@@ -31,7 +31,7 @@ def plane_depth(camera: Camera, T_plane_camera: np.ndarray, normal: np.ndarray, 
 def test_the_same_camera_changes_nothing():
     depth = np.random.default_rng(0).uniform(1, 3, (48, 64)).astype(np.float32)
     depth[10:20, 5:9] = 0
-    moved = Registration(DEPTH, DEPTH, np.eye(4))(depth)
+    moved = DepthRegistration(DEPTH, DEPTH, np.eye(4))(depth)
     nearest = np.minimum.reduce([depth])
     assert np.array_equal(moved, nearest)
 
@@ -40,7 +40,7 @@ def test_the_same_camera_changes_nothing():
 def test_a_plane_stays_the_plane_it_was(normal):
     T_color_depth, n = shifted(0.05, 0.02, 3.0), np.array(normal)
     measured = plane_depth(DEPTH, np.eye(4), n, 2.0).astype(np.float32)
-    moved = Registration(DEPTH, COLOR, T_color_depth)(measured)
+    moved = DepthRegistration(DEPTH, COLOR, T_color_depth)(measured)
     exact = plane_depth(COLOR, np.linalg.inv(T_color_depth), n, 2.0)
     seen = moved > 0
     assert seen[8:-8, 12:-12].all(), "no cracks inside"
@@ -51,7 +51,7 @@ def test_a_plane_stays_the_plane_it_was(normal):
 def test_the_nearer_surface_hides_the_farther_one():
     depth = np.full((48, 64), 4.0, np.float32)
     depth[:, 20:40] = 1.0
-    moved = Registration(DEPTH, DEPTH, shifted(-0.1))(depth)  # the near wall moves by 6 px, the far one by 1.5
+    moved = DepthRegistration(DEPTH, DEPTH, shifted(-0.1))(depth)  # the near wall moves by 6 px, the far one by 1.5
     row = moved[24]
     assert (row[14:34] == 1.0).all(), "nothing shines through"
     assert (row[:13] == 4.0).all() and (row[40:61] == 4.0).all()
@@ -68,8 +68,8 @@ def by_definition(depth_camera: Camera, color: Camera, T: np.ndarray, depth: np.
             continue
         size = OVERLAP * reading / z
         u, v = color.fx * x / z + color.cx, color.fy * y / z + color.cy
-        half_u = min(0.5 * size * color.fx / depth_camera.fx, MOST_PX)
-        half_v = min(0.5 * size * color.fy / depth_camera.fy, MOST_PX)
+        half_u = min(0.5 * size * color.fx / depth_camera.fx, MAX_HALF_FOOTPRINT_PX)
+        half_v = min(0.5 * size * color.fy / depth_camera.fy, MAX_HALF_FOOTPRINT_PX)
         columns = [c for c in range(color.width) if u - half_u <= c <= u + half_u]
         for r in range(color.height):
             for c in columns if v - half_v <= r <= v + half_v else ():
@@ -91,15 +91,15 @@ def test_every_bit_is_that_of_the_definition(depth_camera, T_color_depth):
     depth = random.uniform(0.3, 4.0, (depth_camera.height, depth_camera.width)).astype(np.float32)
     depth[random.random(depth.shape) < 0.2] = 0
     T_color_depth[2, 3] += 0.4
-    moved = Registration(depth_camera, COLOR, T_color_depth)(depth)
+    moved = DepthRegistration(depth_camera, COLOR, T_color_depth)(depth)
     assert moved.any() and moved.tobytes() == by_definition(depth_camera, COLOR, T_color_depth, depth).tobytes()
 
 
 def test_no_reading_and_points_behind_give_none():
     back = np.diag([1.0, 1.0, 1.0, 1.0])
     back[2, 3] = -3.0
-    assert not Registration(DEPTH, COLOR, np.eye(4))(np.zeros((48, 64), np.float32)).any()
-    assert not Registration(DEPTH, COLOR, back)(np.full((48, 64), 2.0, np.float32)).any()
+    assert not DepthRegistration(DEPTH, COLOR, np.eye(4))(np.zeros((48, 64), np.float32)).any()
+    assert not DepthRegistration(DEPTH, COLOR, back)(np.full((48, 64), 2.0, np.float32)).any()
 
 
 def with_depth_camera(folder, **changes):

@@ -11,8 +11,8 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.sources import open_source
 from sigmasplat.sources.camera.depth_units import depth_warning
-from sigmasplat.sources.live import LiveSource, as_recorded
-from sigmasplat.sources.realsense import WARM_UP
+from sigmasplat.sources.live import LiveSource, recording_settings
+from sigmasplat.sources.realsense import WARM_UP_FRAMES
 
 
 @pytest.fixture
@@ -34,8 +34,8 @@ def test_frames_are_the_cameras(device: Device) -> None:
     assert source.camera == device.room.camera and source.depth_units_per_metre == 2000.0
     assert device.asked == [("depth", 640, 480, "z16", 30), ("color", 640, 480, "rgb8", 30)]
     for i, frame in enumerate(frames):
-        seen = device.room.frame(WARM_UP + 1 + i)
-        assert (frame.index, frame.timestamp_s) == (i, pytest.approx((WARM_UP + 1 + i) / 30))
+        seen = device.room.frame(WARM_UP_FRAMES + 1 + i)
+        assert (frame.index, frame.timestamp_s) == (i, pytest.approx((WARM_UP_FRAMES + 1 + i) / 30))
         assert np.array_equal(frame.color, seen.color)
         assert np.abs(frame.depth_m - seen.depth_m).max() <= 0.5 * 0.0005 + 1e-6
     assert (device.started, device.stopped) == (1, 1) and source.dropped == 0
@@ -90,7 +90,7 @@ def test_depth_is_registered_here_on_demand(device: Device) -> None:
     device.must_align = False
     source = opened(limit=1, register_depth="on")
     frame = next(iter(source))
-    seen = device.room.frame(WARM_UP + 1)
+    seen = device.room.frame(WARM_UP_FRAMES + 1)
     inner = np.s_[2:-2, 2:-2]
     assert source.camera == device.room.camera
     assert np.median(np.abs(frame.depth_m - seen.depth_m)[inner]) < 0.001
@@ -98,12 +98,12 @@ def test_depth_is_registered_here_on_demand(device: Device) -> None:
 
 def test_stride_and_time_count_from_the_first_frame(device: Device) -> None:
     times = [frame.timestamp_s for frame in opened(stride=2, start_s=0.12, end_s=0.3)]
-    begin_s = (WARM_UP + 1) / 30
+    begin_s = (WARM_UP_FRAMES + 1) / 30
     assert times == pytest.approx([begin_s + i / 30 for i in (4, 6, 8)])
 
 
 def test_unplugging_ends_the_sequence_with_a_reason(device: Device, tmp_path: Path) -> None:
-    device.frames_until_unplugged = WARM_UP + 4
+    device.frames_until_unplugged = WARM_UP_FRAMES + 4
     source = opened()
     source.record_to(tmp_path / "recording")
     assert len(list(source)) == 4
@@ -136,4 +136,4 @@ def test_what_only_a_recording_can_do_says_so(device: Device, ask: object) -> No
 
 def test_what_was_done_before_recording_is_not_done_again() -> None:
     given = InputConfig(stride=3, limit=9, start_s=1.0, fx=5.0, depth_scale=9.0, crop_px=4, width=320, strict=True)
-    assert as_recorded(given) == InputConfig(crop_px=4, width=320, strict=True)
+    assert recording_settings(given) == InputConfig(crop_px=4, width=320, strict=True)

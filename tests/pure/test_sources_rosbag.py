@@ -303,9 +303,9 @@ def test_a_bag_keeps_no_messages(tmp_path: Path) -> None:
     """What is kept of a message is where it is: three numbers."""
     path, _ = written(tmp_path, "mcap")
     bag = Bag(path)
-    entries = bag.entries(*CAMERA_TOPICS)[CAMERA_TOPICS[0]]
+    entries = bag.index(*CAMERA_TOPICS)[CAMERA_TOPICS[0]]
     assert [vars(entry).keys() for entry in entries] == [{"recorded_ns", "place", "stamp_ns"}] * FRAMES
-    assert bag.at(CAMERA_TOPICS[0], entries[3]).height == 24
+    assert bag.read(CAMERA_TOPICS[0], entries[3]).height == 24
 
 
 def test_messages_of_one_moment_are_told_apart(tmp_path: Path) -> None:

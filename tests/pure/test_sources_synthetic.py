@@ -9,11 +9,11 @@ from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources import SyntheticRoom, open_source
-from sigmasplat.sources.room.sensor import WARMING_FRAMES, drifted_depth, measured_depth, noise_sigma_m
-from sigmasplat.sources.room.shapes import Rays, Shape, cast, image_windows, surface
+from sigmasplat.sources.room.render import build_scene, render_scene
+from sigmasplat.sources.room.sensor import DRIFT_KNOT_FRAMES, drifted_depth, measured_depth, noise_sigma_m
+from sigmasplat.sources.room.shapes import Rays, Shape, cast_rays, image_windows, surface_at
 from sigmasplat.sources.room.textures import Material, noise, plain
-from sigmasplat.sources.room.view import picture, scene
-from sigmasplat.sources.room.walk import path
+from sigmasplat.sources.room.walk import camera_path
 from view_agreement import agreement
 
 MATT = Material(plain((0.5, 0.5, 0.5)))
@@ -70,7 +70,7 @@ def test_depth_is_along_the_axis_not_along_the_ray():
     looking_along_y[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
     rays = camera.rays().reshape(-1, 3).T
     directions = (looking_along_y[:3, :3] @ rays).astype(np.float32)
-    t, hit = cast([wall], Rays(np.zeros((3, 1), np.float32), directions))
+    t, hit = cast_rays([wall], Rays(np.zeros((3, 1), np.float32), directions))
     assert (hit == 0).all() and np.abs(t - 2.0).max() < 1e-5
 
 
@@ -91,7 +91,7 @@ def test_entry_points_and_normals_worked_by_hand():
         origin, ray = np.array([[0], [0], [start_z]], np.float32), slope.astype(np.float32)[:, None]
         t = solid.first_hit(origin, ray)
         assert t[0] == pytest.approx(entry, rel=2e-3)
-        normals, _, _ = surface(solid, origin + ray * t)
+        normals, _, _ = surface_at(solid, origin + ray * t)
         assert normals[:, 0] == pytest.approx(np.array(normal), abs=2e-3)
 
 
@@ -104,13 +104,13 @@ def test_a_ray_that_passes_by_or_starts_behind_misses():
 
 def test_windows_hide_nothing():
     """The image windows are only a saving: casting every shape at every pixel finds the same surfaces."""
-    view, room = scene(1, 0), SyntheticRoom(frames=8, width=80, height=60)
+    view, room = build_scene(1, 0), SyntheticRoom(frames=8, width=80, height=60)
     for T in room.truth().T_world_camera[::3]:
         pixels = np.indices((60, 80), np.float32).reshape(2, -1)[::-1]
         directions = (T[:3, :3] @ room.camera.rays().reshape(-1, 3).T).astype(np.float32)
         rays = Rays(T[:3, 3:].astype(np.float32), directions, pixels)
-        t, hit = cast(view.shapes, rays, image_windows(view.shapes, se3.inverse(T), room.camera))
-        t_all, hit_all = cast(view.shapes, rays)
+        t, hit = cast_rays(view.shapes, rays, image_windows(view.shapes, se3.inverse(T), room.camera))
+        t_all, hit_all = cast_rays(view.shapes, rays)
         assert np.array_equal(hit, hit_all) and np.array_equal(t, t_all)
 
 
@@ -135,7 +135,7 @@ def test_same_seed_same_bytes_in_any_order():
 
 def test_the_walk_is_smooth_closed_and_rigid():
     for frames, loops, rooms in [(200, 1, 1), (400, 2, 1), (600, 1, 2), (900, 1, 3)]:
-        T = path(frames, loops, rooms, seed=1)
+        T = camera_path(frames, loops, rooms, seed=1)
         assert all(se3.is_rigid(pose, 1e-9) for pose in T)
         assert np.abs(T[0] - T[-1]).max() < 1e-6
         steps_m = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
@@ -157,7 +157,7 @@ def test_exposure_swings_by_eight_percent_and_back():
 
 def test_the_mirror_shows_another_colour_from_another_place():
     """The panel and the sphere are the surfaces whose colour depends on the viewpoint; depth is the panel's own."""
-    view, camera = scene(1, 0), Camera(40, 30, 40.0, 40.0, 19.5, 14.5)
+    view, camera = build_scene(1, 0), Camera(40, 30, 40.0, 40.0, 19.5, 14.5)
     mirror = next(s for s in view.shapes if s.material.mirror > 0.5)
     seen = []
     for x in (0.6, 1.9):
@@ -169,7 +169,7 @@ def test_the_mirror_shows_another_colour_from_another_place():
         T = np.eye(4)
         T[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
         T[:3, 3] = eye
-        color, depth_m = picture(view, camera, T)
+        color, depth_m = render_scene(view, camera, T)
         assert depth_m[14, 20] == pytest.approx(np.linalg.norm(mirror.center - eye), abs=0.1)
         seen.append(color[10:20, 15:25].reshape(-1, 3).mean(0))
     assert np.abs(seen[0] - seen[1]).max() > 0.02
@@ -220,8 +220,8 @@ def test_drift_has_its_deviation_and_no_bias_over_walks():
 
 
 def test_drift_is_smooth_over_frames_and_over_the_image():
-    errors = drift_errors(range(3 * WARMING_FRAMES))
-    assert np.abs(np.diff(errors, axis=0)).max() < 15 * 0.01 / WARMING_FRAMES
+    errors = drift_errors(range(3 * DRIFT_KNOT_FRAMES))
+    assert np.abs(np.diff(errors, axis=0)).max() < 15 * 0.01 / DRIFT_KNOT_FRAMES
     assert max(np.abs(np.diff(errors, axis=axis)).max() for axis in (1, 2)) < 0.01 / 2
     assert np.abs(errors[-1] - errors[0]).max() > 0.005, "yet another one after a while"
 
@@ -254,7 +254,7 @@ def test_what_is_seen_again_can_be_laid_onto_what_was_seen():
 
 def test_an_overrun_repeats_the_walks_beginning():
     for rooms, pace in [(1, 200), (2, 600), (3, 900)]:
-        turn, walk = path(pace + 1, 1, rooms, 1), path(round(1.25 * pace) + 1, 1, rooms, 1, overrun=0.25)
+        turn, walk = camera_path(pace + 1, 1, rooms, 1), camera_path(round(1.25 * pace) + 1, 1, rooms, 1, overrun=0.25)
         np.testing.assert_allclose(walk[: pace + 1], turn, atol=1e-9)
         np.testing.assert_allclose(walk[pace:], turn[: pace // 4 + 1], atol=1e-9)
 

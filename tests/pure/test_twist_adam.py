@@ -12,7 +12,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
-from sigmasplat.render.view import ReferenceView
+from sigmasplat.render.reference.view import ReferenceView
 
 Array = NDArray[np.float64]
 RATES = np.repeat([2e-3, 5e-3], 3)

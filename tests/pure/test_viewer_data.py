@@ -87,7 +87,7 @@ def test_splats_are_drawn_in_their_colours_or_in_those_of_sigma() -> None:
     plain = splats_of(field, "colour", (0.0, 1.0), Cut())
     np.testing.assert_array_equal(plain.colors, (field.colors.numpy() * 255).round().astype(np.uint8))
     tinted = splats_of(field, "σ", (0.0, 0.3), Cut())
-    np.testing.assert_array_equal(tinted.colors, colormap.colour(sigma_of(field), 0.0, 0.3, colormap.INFERNO))
+    np.testing.assert_array_equal(tinted.colors, colormap.apply(sigma_of(field), 0.0, 0.3, colormap.INFERNO))
     np.testing.assert_array_equal(tinted.centers, field.means.numpy())
     doubtful, sure = int(sigma_of(field).argmax()), int(sigma_of(field).argmin())
     assert tinted.colors[doubtful].sum() > tinted.colors[sure].sum() + 200

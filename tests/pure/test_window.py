@@ -14,7 +14,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
-from sigmasplat.render.view import ReferenceView
+from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.slam.window import SCORES, choose_window, covisible_splats, dominating
 
 Array = NDArray[np.float64]
@@ -186,7 +186,7 @@ def test_splats_that_dominate_are_named_by_their_ids() -> None:
 
 def test_padding_is_not_seen() -> None:
     pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built")
-    from sigmasplat.render.view import CpuView
+    from sigmasplat.render.cpu.view import CpuView
 
     wide = Camera(40, 30, 40.0, 42.0, 22.6, 18.3)
     random = np.random.default_rng(0)

@@ -13,7 +13,7 @@ from sigmasplat.config.text import override
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model import se3
 from sigmasplat.presets import default_preset, preset
-from sigmasplat.render.view import make_view
+from sigmasplat.render.backend import make_view
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import SyntheticRoom

@@ -10,7 +10,7 @@ from command_line import exit_code
 from fake_realsense import Device
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.sources import open_source
-from sigmasplat.sources.realsense import WARM_UP
+from sigmasplat.sources.realsense import WARM_UP_FRAMES
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -31,7 +31,7 @@ def device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Device:
 
 def test_ctrl_c_ends_it_and_it_is_finished_and_scored(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.missed_between = 1
-    device.on_frame = lambda number: signal.raise_signal(signal.SIGINT) if number == 2 * (WARM_UP + 6) else None
+    device.on_frame = lambda number: signal.raise_signal(signal.SIGINT) if number == 2 * (WARM_UP_FRAMES + 6) else None
     assert exit_code("run", "realsense", "--out", "run", "--stride", "1", *QUICK) == 0
     said = capsys.readouterr()
     assert "until Ctrl-C" in said.out and "were left out while SLAM was busy" in said.out
@@ -51,7 +51,7 @@ def test_ctrl_c_ends_it_and_it_is_finished_and_scored(device: Device, capsys: py
 
 
 def test_a_pulled_plug_is_one_line_and_a_valid_run(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
-    device.frames_until_unplugged = WARM_UP + 5
+    device.frames_until_unplugged = WARM_UP_FRAMES + 5
     assert exit_code("run", "realsense", "--out", "run", "--record", "seen", "--no-eval", *QUICK) == 0
     said = capsys.readouterr()
     assert said.err.count("\n") == 1 and "no frame came for 5 s" in said.err

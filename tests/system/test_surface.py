@@ -254,10 +254,10 @@ def test_the_rooms_triangles_are_where_its_rays_hit() -> None:
 
 @pytest.mark.parametrize("kind", ["box", "ball", "drum"])
 def test_the_rooms_shapes_are_closed_and_face_outwards(kind: str) -> None:
-    from sigmasplat.sources.room.furnish import furnished
-    from sigmasplat.sources.room.solid import triangles
+    from sigmasplat.sources.room.furnish import furnish_rooms
+    from sigmasplat.sources.room.solid import triangulate
 
-    shape = next(s for s in furnished(1, 0)[0] if s.kind == kind)
-    a, b, c = np.moveaxis(triangles([shape]).corners - shape.center, 1, 0)
+    shape = next(s for s in furnish_rooms(1, 0)[0] if s.kind == kind)
+    a, b, c = np.moveaxis(triangulate([shape]).corners - shape.center, 1, 0)
     per_half = {"box": 8.0, "ball": 4 / 3 * np.pi, "drum": 2 * np.pi}
     assert (a * np.cross(b, c)).sum() / 6 == pytest.approx(per_half[kind] * float(np.prod(shape.half)), rel=0.01)

@@ -156,7 +156,7 @@ def colours(pixels: Pixels) -> int:
 
 def likeness(pixels: Pixels, map_colours: NDArray[np.float64]) -> float:
     """Return the share of the pixels that are not background and lie near a colour map."""
-    ramp = colormap.colour(np.linspace(0, 1, 64), 0.0, 1.0, map_colours).astype(int)
+    ramp = colormap.apply(np.linspace(0, 1, 64), 0.0, 1.0, map_colours).astype(int)
     lit = pixels.reshape(-1, 3).astype(int)
     lit = lit[lit.max(1) > 60]
     away = np.abs(lit[:, None] - ramp).max(2).min(1)

@@ -52,7 +52,7 @@ def verdict(findings: list[Finding]) -> tuple[bool, str]:
 def kernels() -> Finding:
     """Load the compiled kernels and say which instruction set is used, of those this processor runs."""
     try:
-        core: Any = import_module("sigmasplat.render.cpu") and import_module("sigmasplat.native._core")
+        core: Any = import_module("sigmasplat.render.cpu.operators") and import_module("sigmasplat.native._core")
     except ImportError as problem:
         return Finding("kernels", f"cannot be loaded ({problem}); {_remedy(problem)}", False)
     offered = ", ".join(core.supported_isas())
@@ -73,8 +73,8 @@ def cuda() -> Iterator[Finding]:
     import torch
 
     from sigmasplat.errors import BackendError
-    from sigmasplat.native import cubins
-    from sigmasplat.render import cuda_launch
+    from sigmasplat.native.cuda import cubins
+    from sigmasplat.render.cuda import launch as cuda_launch
 
     try:
         compiler = cubins.compiler_version()
@@ -95,7 +95,7 @@ def _drivers(compiler: str) -> Iterator[Finding]:
     """Compare driver and compiler: a driver runs what compilers of its own major version make, or older ones."""
     from cuda.bindings import driver
 
-    from sigmasplat.native import cubins
+    from sigmasplat.native.cuda import cubins
 
     version = driver.cuDriverGetVersion()[1]
     enough = version // 1000 >= int(compiler.split(".")[0])
@@ -108,7 +108,7 @@ def _device(device: Any) -> Iterator[Finding]:
     import torch
 
     from sigmasplat.errors import BackendError
-    from sigmasplat.native import cubins
+    from sigmasplat.native.cuda import cubins
 
     about = torch.cuda.get_device_properties(device)
     architecture = cubins.architecture_of((about.major, about.minor))
@@ -123,8 +123,8 @@ def self_test(device: Any = "cpu") -> Finding:
     """Render a few hundred splats with a device's kernels and with their definition, and compare."""
     import torch
 
-    from sigmasplat.render import reference
     from sigmasplat.render.backend import backend_module
+    from sigmasplat.render.reference import operators as reference
 
     started_s = time.perf_counter()
     name = "cpu" if str(device) == "cpu" else "cuda"

@@ -174,18 +174,18 @@ def _sheet(frames: list[Frame]) -> Image.Image:
     """Draw colour, depth and depth's outlines on the image, a column a frame."""
     chosen = [frames[int(k)] for k in np.linspace(0, len(frames) - 1, min(SHOWN, len(frames))).round()]
     depths = np.concatenate([frame.depth_m.reshape(-1) for frame in chosen])
-    low, high = colormap.span(depths, depths > 0)
+    low, high = colormap.value_range(depths, depths > 0)
     columns = [
-        contact_sheet.Column(
+        contact_sheet.SheetColumn(
             f"{frame.timestamp_s:.2f} s",
             (
                 (frame.color * 255.0).round().astype(np.uint8),
-                colormap.picture(frame.depth_m, frame.depth_m > 0, low, high, colormap.VIRIDIS),
+                colormap.apply_masked(frame.depth_m, frame.depth_m > 0, low, high, colormap.VIRIDIS),
                 overlay(frame),
             ),
         )
         for frame in chosen
     ]
-    return contact_sheet.sheet(
+    return contact_sheet.draw_contact_sheet(
         columns, ("colour", f"depth, {low:.2f} to {high:.2f} m", "depth's outlines on the image")
     )

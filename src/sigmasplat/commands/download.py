@@ -36,14 +36,14 @@ def download(
 
     example: sigmasplat download tum fr1/desk
     """
-    from sigmasplat.download import find
+    from sigmasplat.download import find_recording
     from sigmasplat.run.terminal import Screen
 
     screen = Screen()
     if list_only or dataset == "list":
         _tell_what_there_is(screen, names if dataset == "list" else (dataset,))
         return 0
-    for public, name in [find(dataset, name) for name in names or ("",)]:
+    for public, name in [find_recording(dataset, name) for name in names or ("",)]:
         target = _obtained(screen, public, name, out, overwrite, keep_archive)
         start = target / public.recordings[name].start
         _refuse_unknown(start)
@@ -59,11 +59,11 @@ def _tell_what_there_is(screen: "Screen", set_names: tuple[str, ...]) -> None:
 
 
 def _obtained(screen: "Screen", public: "PublicSet", name: str, out: Path, overwrite: bool, keep_archive: bool) -> Path:
-    from sigmasplat.download import obtain
+    from sigmasplat.download import download_recording
 
     try:
         with screen.transfers() as progress:
-            return obtain(public, name, out, progress, screen.say, overwrite, keep_archive)
+            return download_recording(public, name, out, progress, screen.say, overwrite, keep_archive)
     except KeyboardInterrupt:
         screen.say("what has come is kept; the same command goes on with it")
         raise

@@ -53,12 +53,12 @@ def run(
     from sigmasplat.slam.slam import Slam
     from sigmasplat.sources import open_source
     from sigmasplat.sources.camera.depth_units import depth_warning
-    from sigmasplat.sources.live import LiveSource, as_recorded
+    from sigmasplat.sources.live import LiveSource, recording_settings
 
     screen, config = Screen(), configured(preset, settings, seed, taken)
     source = open_source(path, config.input)
     if isinstance(source, LiveSource):
-        config = replace(config, input=as_recorded(config.input))
+        config = replace(config, input=recording_settings(config.input))
         if record:
             source.record_to(record)
     elif record:

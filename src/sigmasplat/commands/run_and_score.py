@@ -66,7 +66,7 @@ def run_and_score(
 
     Raises KeyboardInterrupt where Ctrl-C came before the first frame was done.
     """
-    from sigmasplat.render import cuda_stages
+    from sigmasplat.render.cuda import stages as cuda_stages
     from sigmasplat.run.protocols import Callback, CallbackList
     from sigmasplat.run.resume import Snapshots
     from sigmasplat.run.session import record

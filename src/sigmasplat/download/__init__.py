@@ -1,6 +1,6 @@
 """Download public data sets: a catalogue of values, a fetcher that resumes, an unpacker that trusts no archive."""
 
-from sigmasplat.download.downloader import obtain
-from sigmasplat.download.lookup import describe_recordings, describe_sets, find
+from sigmasplat.download.downloader import download_recording
+from sigmasplat.download.lookup import describe_recordings, describe_sets, find_recording
 
-__all__ = ["describe_recordings", "describe_sets", "find", "obtain"]
+__all__ = ["describe_recordings", "describe_sets", "download_recording", "find_recording"]

@@ -9,7 +9,7 @@ rough.
 
 from collections.abc import Mapping
 
-from sigmasplat.download.entries import Archive, AskedFor, PublicSet, Recording
+from sigmasplat.download.entries import PublicRecording, PublicSet, RemoteFile, RestrictedSet
 
 MB, GB = 10**6, 10**9
 
@@ -77,51 +77,53 @@ REDWOOD_MD5 = {
 REDWOOD_URL = "https://github.com/isl-org/open3d_downloads/releases/download/augmented-icl-nuim"
 
 
-def _tum(name: str, rough_mb: int | None) -> Recording:
+def _tum(name: str, rough_mb: int | None) -> PublicRecording:
     camera, scene = name.split("/")
     part = camera.replace("fr", "freiburg")
     folder = f"rgbd_dataset_{part}_{scene}"
     size_bytes, checksum = TUM_EXACT.get(name, (rough_mb and rough_mb * MB, ""))
     url = f"https://cvg.cit.tum.de/rgbd/dataset/{part}/{folder}.tgz"
-    return Recording(folder, (Archive(url, size_bytes, checksum),))
+    return PublicRecording(folder, (RemoteFile(url, size_bytes, checksum),))
 
 
-def _icl(stem: str) -> Recording:
-    return Recording(stem, (Archive(f"https://www.doc.ic.ac.uk/~ahanda/{stem}.tar.gz"),))
+def _icl(stem: str) -> PublicRecording:
+    return PublicRecording(stem, (RemoteFile(f"https://www.doc.ic.ac.uk/~ahanda/{stem}.tar.gz"),))
 
 
-def _seven_scenes(name: str, size_bytes: int) -> Recording:
+def _seven_scenes(name: str, size_bytes: int) -> PublicRecording:
     checksum = CHESS_SHA256 if name == "chess" else ""
-    archive = Archive(f"{SEVEN_SCENES_URL}/{name}.zip", size_bytes, checksum, nested=True)
-    return Recording(name, (archive,), start="seq-01")
+    archive = RemoteFile(f"{SEVEN_SCENES_URL}/{name}.zip", size_bytes, checksum, nested=True)
+    return PublicRecording(name, (archive,), start="seq-01")
 
 
-def _bonn(name: str) -> Recording:
+def _bonn(name: str) -> PublicRecording:
     folder = f"rgbd_bonn_{name}"
-    return Recording(folder, (Archive(f"https://www.ipb.uni-bonn.de/html/projects/rgbd_dynamic2019/{folder}.zip"),))
+    return PublicRecording(
+        folder, (RemoteFile(f"https://www.ipb.uni-bonn.de/html/projects/rgbd_dynamic2019/{folder}.zip"),)
+    )
 
 
-def _redwood(name: str) -> Recording:
+def _redwood(name: str) -> PublicRecording:
     color, depth, path = (f"md5:{digest}" for digest in REDWOOD_MD5[name])
-    return Recording(
+    return PublicRecording(
         name,
         (
-            Archive(f"{REDWOOD_URL}/{name}-color.zip", None, color, into="color"),
-            Archive(f"{REDWOOD_URL}/{name}-depth-simulated.zip", None, depth, into="depth"),
-            Archive(f"{REDWOOD_URL}/{name}-traj.txt", None, path, into="trajectory.log"),
+            RemoteFile(f"{REDWOOD_URL}/{name}-color.zip", None, color, into="color"),
+            RemoteFile(f"{REDWOOD_URL}/{name}-depth-simulated.zip", None, depth, into="depth"),
+            RemoteFile(f"{REDWOOD_URL}/{name}-traj.txt", None, path, into="trajectory.log"),
         ),
     )
 
 
-SETS: Mapping[str, PublicSet | AskedFor] = {
+SETS: Mapping[str, PublicSet | RestrictedSet] = {
     "tum": PublicSet(
         title="TUM RGB-D, static scenes",
         page="https://cvg.cit.tum.de/data/datasets/rgbd-dataset",
         licence="CC BY 4.0",
         folder="tum",
         recordings={name: _tum(name, size) for name, size in TUM_SIZES_MB.items()},
-        most_bytes=5 * GB,
-        most_files=50_000,
+        max_bytes=5 * GB,
+        max_files=50_000,
         prefix="rgbd_dataset_",
     ),
     "replica": PublicSet(
@@ -130,14 +132,14 @@ SETS: Mapping[str, PublicSet | AskedFor] = {
         licence="Replica research licence, not for commercial use",
         folder="",
         recordings={
-            "": Recording(
+            "": PublicRecording(
                 "replica",
-                (Archive("https://cvg-data.inf.ethz.ch/nice-slam/data/Replica.zip", 12_400 * MB),),
+                (RemoteFile("https://cvg-data.inf.ethz.ch/nice-slam/data/Replica.zip", 12_400 * MB),),
                 start="room0",
             )
         },
-        most_bytes=20 * GB,
-        most_files=100_000,
+        max_bytes=20 * GB,
+        max_files=100_000,
     ),
     "icl": PublicSet(
         title="ICL-NUIM, synthetic, as TUM-compatible PNGs",
@@ -146,8 +148,8 @@ SETS: Mapping[str, PublicSet | AskedFor] = {
         folder="icl",
         recordings={f"living_room{i}": _icl(f"living_room_traj{i}_frei_png") for i in range(4)}
         | {f"office{i}": _icl(f"traj{i}_frei_png") for i in range(4)},
-        most_bytes=3 * GB,
-        most_files=20_000,
+        max_bytes=3 * GB,
+        max_files=20_000,
     ),
     "7scenes": PublicSet(
         title="7-Scenes",
@@ -155,9 +157,9 @@ SETS: Mapping[str, PublicSet | AskedFor] = {
         licence="Microsoft Research licence, not for commercial use",
         folder="7scenes",
         recordings={name: _seven_scenes(name, size) for name, size in SEVEN_SCENES_SIZES.items()},
-        most_bytes=8 * GB,
-        most_files=100_000,
-        growth=2.4,
+        max_bytes=8 * GB,
+        max_files=100_000,
+        disk_ratio=2.4,
     ),
     "bonn": PublicSet(
         title="Bonn RGB-D Dynamic",
@@ -165,8 +167,8 @@ SETS: Mapping[str, PublicSet | AskedFor] = {
         licence="for research, terms and citation on its page",
         folder="bonn",
         recordings={name: _bonn(name) for name in BONN_NAMES},
-        most_bytes=5 * GB,
-        most_files=50_000,
+        max_bytes=5 * GB,
+        max_files=50_000,
         prefix="rgbd_bonn_",
     ),
     "redwood": PublicSet(
@@ -175,9 +177,11 @@ SETS: Mapping[str, PublicSet | AskedFor] = {
         licence="terms and citation on its page",
         folder="redwood",
         recordings={name: _redwood(name) for name in REDWOOD_MD5},
-        most_bytes=3 * GB,
-        most_files=20_000,
+        max_bytes=3 * GB,
+        max_files=20_000,
     ),
-    "scannet": AskedFor("ScanNet", "http://www.scan-net.org (terms of use to sign)"),
-    "scannetpp": AskedFor("ScanNet++", "https://scannetpp.mlsg.cit.tum.de/scannetpp/ (an account and an application)"),
+    "scannet": RestrictedSet("ScanNet", "http://www.scan-net.org (terms of use to sign)"),
+    "scannetpp": RestrictedSet(
+        "ScanNet++", "https://scannetpp.mlsg.cit.tum.de/scannetpp/ (an account and an application)"
+    ),
 }

@@ -10,126 +10,126 @@ from pathlib import Path
 
 from rich.filesize import decimal
 
-from sigmasplat.download.entries import Archive, PublicSet, Recording
-from sigmasplat.download.fetch import Patience, fetch
-from sigmasplat.download.lookup import said_size
-from sigmasplat.download.unpack import BadArchive, Budget, is_archive, unpack
+from sigmasplat.download.entries import PublicRecording, PublicSet, RemoteFile
+from sigmasplat.download.fetch import RetryPolicy, fetch
+from sigmasplat.download.lookup import format_size
+from sigmasplat.download.unpack import ArchiveError, Budget, is_archive, unpack
 from sigmasplat.download.verify import verify
 from sigmasplat.errors import DownloadError
 
-MARK = ".sigmasplat-download.json"
+MARKER = ".sigmasplat-download.json"
 """Written last into a folder of ours: one that has it is whole."""
-MARGIN = 3.0
+SIZE_MARGIN = 3.0
 """How much more an archive may hold than archives of its kind do."""
-ROUGHLY = (0.5, 1.5)
+ROUGH_SIZE_RANGE = (0.5, 1.5)
 """Between which multiples of a rough size a download may be."""
 FileProgress = Callable[[str, int, int], None]
 """Shows what is being done, bytes done, and in all (0: not known)."""
-Tell = Callable[[str], None]
+Log = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class DownloadJob:
-    """What all archives of a recording have in common; shelf: where they are put."""
+    """What all archives of a recording have in common; archive_folder: where they are put."""
 
     public: PublicSet
-    shelf: Path
+    archive_folder: Path
     progress: FileProgress
-    tell: Tell
-    patience: Patience
+    log: Log
+    retry: RetryPolicy
 
 
-def obtain(
+def download_recording(
     public: PublicSet,
     name: str,
     out: Path,
     progress: FileProgress,
-    tell: Tell = lambda line: None,
+    log: Log = lambda line: None,
     overwrite: bool = False,
     keep_archive: bool = False,
-    patience: Patience | None = None,
+    retry: RetryPolicy | None = None,
 ) -> Path:
     """Return the folder of a recording of a set below `out`, downloaded unless it is there already.
 
-    `tell` gets the terms and the size first. What was downloaded is kept on errors and on Ctrl-C, and the next call
+    `log` gets the terms and the size first. What was downloaded is kept on errors and on Ctrl-C, and the next call
     goes on with it; nothing half unpacked is left. Raises DownloadError; RunError if the disk cannot be written.
     """
     recording = public.recordings[name]
     target = out / public.folder / recording.folder
     if target.exists() or target.is_symlink():
-        if not (target / MARK).is_file():
+        if not (target / MARKER).is_file():
             raise DownloadError(f"{target} exists and was not made by this command; move it, or give another --out")
         if not overwrite:
-            tell(f"{target} is there already; --overwrite downloads it again")
+            log(f"{target} is there already; --overwrite downloads it again")
             return target
-    tell(f"{public.title} {name}".rstrip() + f": {said_size(recording.size_bytes)} → {target}")
-    tell(f"terms: {public.licence} ({public.page}); by downloading you accept them")
-    errand = DownloadJob(public, target.parent, progress, tell, patience or Patience())
-    with _standing(target.parent):
-        _obtain(errand, name, target, keep_archive)
+    log(f"{public.title} {name}".rstrip() + f": {format_size(recording.size_bytes)} → {target}")
+    log(f"terms: {public.licence} ({public.page}); by downloading you accept them")
+    job = DownloadJob(public, target.parent, progress, log, retry or RetryPolicy())
+    with _created(target.parent):
+        _download(job, name, target, keep_archive)
     return target
 
 
-def _obtain(errand: DownloadJob, name: str, target: Path, keep_archive: bool) -> None:
+def _download(job: DownloadJob, name: str, target: Path, keep_archive: bool) -> None:
     """Download a recording's archives and unpack them to `target`."""
-    public, recording = errand.public, errand.public.recordings[name]
-    archives = [_whole(errand, archive) for archive in recording.archives]
-    with _in_place(target) as fresh:
+    public, recording = job.public, job.public.recordings[name]
+    archives = [_verified_file(job, archive) for archive in recording.archives]
+    with _replacing(target) as fresh:
         for archive, path in zip(recording.archives, archives, strict=True):
-            _unpack_one(errand, archive, path, fresh / archive.into)
-        _refuse_empty(fresh / recording.start, recording, archives)
+            _unpack_file(job, archive, path, fresh / archive.into)
+        _check_layout(fresh / recording.start, recording, archives)
         marks = {"title": public.title, "recording": name, "licence": public.licence, "page": public.page}
-        (fresh / MARK).write_text(json.dumps(marks | {"from": [a.url for a in recording.archives]}, indent=1) + "\n")
+        (fresh / MARKER).write_text(json.dumps(marks | {"from": [a.url for a in recording.archives]}, indent=1) + "\n")
     for path in [] if keep_archive else archives:
         path.unlink(missing_ok=True)
 
 
-def _whole(errand: DownloadJob, archive: Archive) -> Path:
+def _verified_file(job: DownloadJob, archive: RemoteFile) -> Path:
     """Return an archive on disk, downloaded unless it is there, its checksum right."""
-    path = errand.shelf / archive.name
+    path = job.archive_folder / archive.name
     if not path.exists():
-        progress = partial(errand.progress, f"download {archive.name}")
-        fetch(archive.url, path, progress, partial(_accept, errand, archive), errand.patience)
-    verify(path, archive.checksum, partial(errand.progress, f"check {archive.name}"))
+        progress = partial(job.progress, f"download {archive.name}")
+        fetch(archive.url, path, progress, partial(_check_size, job, archive), job.retry)
+    verify(path, archive.checksum, partial(job.progress, f"check {archive.name}"))
     return path
 
 
-def _accept(errand: DownloadJob, archive: Archive, size_bytes: int | None, here_bytes: int) -> None:
+def _check_size(job: DownloadJob, archive: RemoteFile, size_bytes: int | None, here_bytes: int) -> None:
     """Raise DownloadError if what the server has to offer cannot be the archive, or there is no room for it."""
     expected = archive.size_bytes
     if size_bytes is not None and expected is not None:
-        low, high = (1.0, 1.0) if archive.checksum else ROUGHLY
+        low, high = (1.0, 1.0) if archive.checksum else ROUGH_SIZE_RANGE
         if not low * expected <= size_bytes <= high * expected:
             sizes = f"{size_bytes:,} bytes, not {'' if archive.checksum else 'about '}{expected:,}"
             raise DownloadError(f"the server's {archive.name} has {sizes}; has the set changed, is it another file?")
     likely = size_bytes if size_bytes is not None else expected or 0
-    if likely > errand.public.most_bytes:
+    if likely > job.public.max_bytes:
         raise DownloadError(f"the server's {archive.name} has {likely:,} bytes, too many to be what was asked for")
     if expected is None:
-        errand.tell(f"{archive.name}: {said_size(size_bytes)}")
-    _refuse_without_room(errand.shelf, likely - here_bytes + int(likely * errand.public.growth))
+        job.log(f"{archive.name}: {format_size(size_bytes)}")
+    _check_disk_space(job.archive_folder, likely - here_bytes + int(likely * job.public.disk_ratio))
 
 
-def _unpack_one(errand: DownloadJob, archive: Archive, path: Path, into: Path) -> None:
+def _unpack_file(job: DownloadJob, archive: RemoteFile, path: Path, into: Path) -> None:
     """Unpack an archive, and those in it; copy what is none. An archive that is no good is removed."""
-    public, size_bytes = errand.public, path.stat().st_size
-    _refuse_without_room(errand.shelf, int(size_bytes * public.growth))
+    public, size_bytes = job.public, path.stat().st_size
+    _check_disk_space(job.archive_folder, int(size_bytes * public.disk_ratio))
     if not is_archive(path.name):
         shutil.copyfile(path, into)
         return
-    budget = Budget(int(MARGIN * public.growth * size_bytes) + 2**20, public.most_files)
+    budget = Budget(int(SIZE_MARGIN * public.disk_ratio * size_bytes) + 2**20, public.max_files)
     try:
-        unpack(path, into, budget, partial(errand.progress, f"unpack {path.name}"))
-        _take_out_of_wrapping(into)
+        unpack(path, into, budget, partial(job.progress, f"unpack {path.name}"))
+        _remove_wrapper_folder(into)
         for inner in sorted(into.rglob("*.zip")) if archive.nested else []:
-            unpack(inner, inner.parent, budget, partial(errand.progress, f"unpack {inner.name}"))
+            unpack(inner, inner.parent, budget, partial(job.progress, f"unpack {inner.name}"))
             inner.unlink()
-    except BadArchive as problem:
+    except ArchiveError as problem:
         path.unlink(missing_ok=True)
-        raise BadArchive(f"{problem}; {path} is removed, run it again to download it anew") from problem
+        raise ArchiveError(f"{problem}; {path} is removed, run it again to download it anew") from problem
 
 
-def _take_out_of_wrapping(folder: Path) -> None:
+def _remove_wrapper_folder(folder: Path) -> None:
     """Where a folder holds one folder and nothing else, move what is in that up."""
     entries = list(folder.iterdir())
     if len(entries) != 1 or not entries[0].is_dir():
@@ -139,19 +139,19 @@ def _take_out_of_wrapping(folder: Path) -> None:
     wrapping.rename(folder)
 
 
-def _refuse_empty(start: Path, recording: Recording, archives: list[Path]) -> None:
+def _check_layout(start: Path, recording: PublicRecording, archives: list[Path]) -> None:
     if not start.is_dir() or not any(start.iterdir()):
         names = ", ".join(path.name for path in archives)
         raise DownloadError(f"{names} does not hold {recording.start or 'anything'}; its layout has changed")
 
 
 @contextmanager
-def _in_place(target: Path) -> Iterator[Path]:
+def _replacing(target: Path) -> Iterator[Path]:
     """Yield a folder beside `target` that takes its place if the block succeeds, and is removed if not."""
     fresh, old = (target.with_name(f".{target.name}.{word}") for word in ("unpacking", "old"))
     try:
         _remove(fresh)
-        _make(fresh)
+        _make_folder(fresh)
         yield fresh
         if target.exists():
             _remove(old)
@@ -167,11 +167,11 @@ def _in_place(target: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _standing(folder: Path) -> Iterator[None]:
+def _created(folder: Path) -> Iterator[None]:
     """Make a folder, and those above it; if the block fails, take back which of them were made and are still empty."""
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
-        _make(folder)
+        _make_folder(folder)
         yield
     except BaseException:
         for place in made:
@@ -186,14 +186,14 @@ def _remove(folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def _make(folder: Path) -> None:
+def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as problem:
         raise DownloadError(f"cannot make {folder}: {problem.strerror or problem}; give another --out") from problem
 
 
-def _refuse_without_room(folder: Path, needed_bytes: int) -> None:
+def _check_disk_space(folder: Path, needed_bytes: int) -> None:
     free_bytes = shutil.disk_usage(folder).free
     if needed_bytes > free_bytes:
         room = f"{decimal(needed_bytes)} needed, {decimal(free_bytes)} free"

@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 
 
 @dataclass(frozen=True)
-class Archive:
+class RemoteFile:
     """A file on a server: an archive, or a plain file where its name ends otherwise.
 
     size_bytes: of the download, None where nobody says; checksum: "sha256:…" or "md5:…", "" where none is known, and
@@ -28,11 +28,11 @@ class Archive:
 
 
 @dataclass(frozen=True)
-class Recording:
+class PublicRecording:
     """What is downloaded at once: `folder` is made of `archives`; `start`, below it, is a sequence to begin with."""
 
     folder: str
-    archives: tuple[Archive, ...]
+    archives: tuple[RemoteFile, ...]
     start: str = ""
 
     @property
@@ -46,8 +46,8 @@ class Recording:
 class PublicSet:
     """A data set that may be downloaded without asking.
 
-    folder: below the data folder; recordings: by short name, "" where there is one only; most_bytes: no archive is
-    larger; most_files: none holds more; growth: bytes on disk while unpacking, for each byte of the archive;
+    folder: below the data folder; recordings: by short name, "" where there is one only; max_bytes: no archive is
+    larger; max_files: none holds more; disk_ratio: bytes on disk while unpacking, for each byte of the archive;
     prefix: what may stand before a short name.
     """
 
@@ -55,15 +55,15 @@ class PublicSet:
     page: str
     licence: str
     folder: str
-    recordings: Mapping[str, Recording]
-    most_bytes: int
-    most_files: int
-    growth: float = 1.3
+    recordings: Mapping[str, PublicRecording]
+    max_bytes: int
+    max_files: int
+    disk_ratio: float = 1.3
     prefix: str = ""
 
 
 @dataclass(frozen=True)
-class AskedFor:
+class RestrictedSet:
     """A data set whose owners want to be asked: where."""
 
     title: str

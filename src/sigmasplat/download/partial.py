@@ -17,7 +17,7 @@ from sigmasplat.errors import DownloadError
 
 
 @dataclass(frozen=True)
-class Origin:
+class RemoteVersion:
     """Where a file comes from; version: its ETag or date, "" if the server names neither."""
 
     url: str
@@ -25,22 +25,22 @@ class Origin:
     size_bytes: int | None
 
 
-class Partial:
+class PartialFile:
     """The part of `target` that is on disk: open for writing, and nobody else's while it is."""
 
     def __init__(self, target: Path, file: FileIO) -> None:
         self.target, self._file = target, file
-        self._note = _note(target)
+        self._note = _note_path(target)
 
     @property
     def size_bytes(self) -> int:
         """Count the bytes so far."""
         return self._file.tell()
 
-    def origin(self, url: str) -> Origin | None:
+    def origin(self, url: str) -> RemoteVersion | None:
         """Return where the bytes so far came from; None, and no bytes, where that was not `url` or is not known."""
         try:
-            origin = Origin(**json.loads(self._note.read_text(encoding="utf-8")))
+            origin = RemoteVersion(**json.loads(self._note.read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError):
             origin = None
         too_many = origin and origin.size_bytes is not None and self.size_bytes > origin.size_bytes
@@ -55,21 +55,21 @@ class Partial:
         self._file.seek(0)
         self._file.truncate()
 
-    def begin(self, origin: Origin) -> None:
+    def begin(self, origin: RemoteVersion) -> None:
         """Note where the bytes to come are from."""
-        with _written(self.target):
+        with _writing(self.target):
             self._note.write_text(json.dumps(asdict(origin)), encoding="utf-8")
 
     def add(self, chunk: bytes) -> None:
         """Write a chunk. Raises DownloadError if the disk is full."""
         rest = memoryview(chunk)
-        with _written(self.target):
+        with _writing(self.target):
             while rest:
                 rest = rest[_write_some(self._file, rest) :]
 
     def finish(self) -> None:
         """Put the file in place under its own name: it is whole."""
-        with _written(self.target):
+        with _writing(self.target):
             self._file.flush()
             os.fsync(self._file.fileno())
             os.replace(self._file.name, self.target)
@@ -77,9 +77,9 @@ class Partial:
 
 
 @contextmanager
-def partial(target: Path) -> Iterator[Partial]:
+def open_partial(target: Path) -> Iterator[PartialFile]:
     """Open the part of `target` that is there, or an empty one. Raises DownloadError if another process writes it."""
-    with _written(target):
+    with _writing(target):
         file = target.with_name(f"{target.name}.part").open("ab", buffering=0)
     with file:
         with suppress(OSError):  # a file system without locks: then nobody is kept out
@@ -88,11 +88,11 @@ def partial(target: Path) -> Iterator[Partial]:
             except BlockingIOError as problem:
                 raise DownloadError(f"{file.name} is being downloaded by another process; wait for it") from problem
         try:
-            yield Partial(target, file)
+            yield PartialFile(target, file)
         finally:
             if not file.tell():
                 Path(file.name).unlink(missing_ok=True)
-                _note(target).unlink(missing_ok=True)
+                _note_path(target).unlink(missing_ok=True)
 
 
 def _write_some(file: FileIO, chunk: memoryview) -> int:
@@ -100,12 +100,12 @@ def _write_some(file: FileIO, chunk: memoryview) -> int:
     return file.write(chunk)
 
 
-def _note(target: Path) -> Path:
+def _note_path(target: Path) -> Path:
     return target.with_name(f"{target.name}.part.json")
 
 
 @contextmanager
-def _written(path: Path) -> Iterator[None]:
+def _writing(path: Path) -> Iterator[None]:
     """Turn what may go wrong in writing into one line."""
     try:
         yield

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from sigmasplat.types import Progress
 
 CHUNK_BYTES = 2**20
-MOST_RATIO, SMALL_BYTES = 200, 2**20
+MAX_RATIO, RATIO_CHECKED_ABOVE_BYTES = 200, 2**20
 """No file of more than a MiB in a zip shrinks that much: images are compressed already, text to a fifth."""
-LITTER = {"__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini"}
+DESKTOP_FILES = {"__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini"}
 
 
-class BadArchive(DownloadError):
+class ArchiveError(DownloadError):
     """Refuse an archive that is damaged or unsafe."""
 
 
@@ -41,13 +41,13 @@ class Budget:
         """Take note of bytes to be written. Raises BadArchive if they are too many."""
         self.bytes -= count
         if self.bytes < 0:
-            raise BadArchive("holds more bytes than such a recording can have")
+            raise ArchiveError("holds more bytes than such a recording can have")
 
     def spend_file(self) -> None:
         """Take note of a file or folder to be made. Raises BadArchive if they are too many."""
         self.files -= 1
         if self.files < 0:
-            raise BadArchive("holds more files than such a recording can have")
+            raise ArchiveError("holds more files than such a recording can have")
 
 
 def is_archive(name: str) -> bool:
@@ -61,7 +61,7 @@ def unpack(archive: Path, folder: Path, budget: Budget, progress: "Progress") ->
     Raises BadArchive if it is damaged, unsafe or beyond the budget, DownloadError if the disk is full; what was written
     until then stays, so give a folder to throw away.
     """
-    with _explained(archive):
+    with _naming_archive(archive):
         folder.mkdir(parents=True, exist_ok=True)
         if archive.name.lower().endswith(".zip"):
             _unpack_zip(archive, folder, budget, progress)
@@ -70,15 +70,15 @@ def unpack(archive: Path, folder: Path, budget: Budget, progress: "Progress") ->
 
 
 @contextmanager
-def _explained(archive: Path) -> Iterator[None]:
+def _naming_archive(archive: Path) -> Iterator[None]:
     try:
         yield
-    except BadArchive as problem:
-        raise BadArchive(f"{archive.name} {problem}; refused, nothing of it is kept") from problem
+    except ArchiveError as problem:
+        raise ArchiveError(f"{archive.name} {problem}; refused, nothing of it is kept") from problem
     except (tarfile.TarError, zipfile.BadZipFile, gzip.BadGzipFile, zlib.error, EOFError) as problem:
-        raise BadArchive(f"{archive.name} is damaged ({problem}); nothing of it is kept") from problem
+        raise ArchiveError(f"{archive.name} is damaged ({problem}); nothing of it is kept") from problem
     except (NotImplementedError, RuntimeError) as problem:  # a way to compress that Python lacks; encrypted
-        raise BadArchive(f"{archive.name} cannot be read ({problem}); nothing of it is kept") from problem
+        raise ArchiveError(f"{archive.name} cannot be read ({problem}); nothing of it is kept") from problem
     except OSError as problem:
         raise DownloadError(f"cannot unpack {archive}: {problem.strerror or problem}; is the disk full?") from problem
 
@@ -86,26 +86,26 @@ def _explained(archive: Path) -> Iterator[None]:
 def _unpack_tar(archive: Path, folder: Path, budget: Budget, progress: "Progress") -> None:
     size_bytes = archive.stat().st_size
     with archive.open("rb") as packed, gzip.GzipFile(fileobj=packed) as inflated:
-        stream = _Metered(inflated, budget)
+        stream = _BudgetedStream(inflated, budget)
         with tarfile.open(fileobj=stream, mode="r|") as tar:
             for member in tar:
                 budget.spend_file()
-                place = _place(folder, member.name)
+                place = _target_path(folder, member.name)
                 if member.isdir():
                     _make_folder(place)
                 elif member.isreg() and not member.issparse():
                     source = tar.extractfile(member)
                     assert source is not None
-                    _write(source, place, member.size)
+                    _copy(source, place, member.size)
                 else:
-                    raise BadArchive(f"holds {member.name!r}, which is no plain file or folder")
+                    raise ArchiveError(f"holds {member.name!r}, which is no plain file or folder")
                 progress(min(packed.tell(), size_bytes - 1), size_bytes)
         while stream.read(CHUNK_BYTES):  # to the end, where the checksum of the whole stream is
             pass
     progress(size_bytes, size_bytes)
 
 
-class _Metered(io.RawIOBase):
+class _BudgetedStream(io.RawIOBase):
     """Read a stream on account of a budget."""
 
     def __init__(self, stream: gzip.GzipFile, budget: Budget) -> None:
@@ -124,55 +124,57 @@ def _unpack_zip(archive: Path, folder: Path, budget: Budget, progress: "Progress
         for entry in entries:  # what it says of itself, before a byte is written
             budget.spend_file()
             budget.spend_bytes(entry.file_size)
-            _refuse_strange(entry)
-            _place(folder, entry.filename)
+            _check_entry(entry)
+            _target_path(folder, entry.filename)
         done, total = 0, sum(entry.compress_size for entry in entries)
         for entry in entries:
-            place = _place(folder, entry.filename)
+            place = _target_path(folder, entry.filename)
             if entry.is_dir():
                 _make_folder(place)
             else:
                 with zipped.open(entry) as source:
-                    _write(source, place, entry.file_size)
+                    _copy(source, place, entry.file_size)
             progress(done, total)
             done += entry.compress_size
         progress(total, total)
 
 
-def _refuse_strange(entry: zipfile.ZipInfo) -> None:
+def _check_entry(entry: zipfile.ZipInfo) -> None:
     kind = stat.S_IFMT(entry.external_attr >> 16)
     if kind not in {0, stat.S_IFREG, stat.S_IFDIR}:
-        raise BadArchive(f"holds {entry.filename!r}, which is no plain file or folder")
-    if entry.file_size > SMALL_BYTES and entry.file_size > MOST_RATIO * entry.compress_size:
-        raise BadArchive(f"holds {entry.filename!r}, which grows {entry.file_size // max(entry.compress_size, 1)}-fold")
+        raise ArchiveError(f"holds {entry.filename!r}, which is no plain file or folder")
+    if entry.file_size > RATIO_CHECKED_ABOVE_BYTES and entry.file_size > MAX_RATIO * entry.compress_size:
+        raise ArchiveError(
+            f"holds {entry.filename!r}, which grows {entry.file_size // max(entry.compress_size, 1)}-fold"
+        )
 
 
-def _place(folder: Path, name: str) -> Path | None:
+def _target_path(folder: Path, name: str) -> Path | None:
     """Return where an entry goes, None where it is litter of a desktop. Raises BadArchive if that is out of `folder`.
 
     Windows' separators are understood.
     """
     parts = name.replace("\\", "/").split("/")
     if name.startswith(("/", "\\")) or ".." in parts or "\0" in name or parts[0].endswith(":"):
-        raise BadArchive(f"holds {name!r}, a name that leads out of its folder")
+        raise ArchiveError(f"holds {name!r}, a name that leads out of its folder")
     kept = [part for part in parts if part not in {"", "."}]
     if not kept:
         return folder
-    litter = LITTER & set(kept) or kept[-1].startswith("._")
+    litter = DESKTOP_FILES & set(kept) or kept[-1].startswith("._")
     return None if litter else folder.joinpath(*kept)
 
 
 def _make_folder(place: Path | None) -> None:
     if place is not None:
-        with _no_clash(place):
+        with _refusing_duplicates(place):
             place.mkdir(parents=True, exist_ok=True)
 
 
-def _write(source: IO[bytes], place: Path | None, size_bytes: int) -> None:
+def _copy(source: IO[bytes], place: Path | None, size_bytes: int) -> None:
     """Copy as many bytes as are announced. Raises BadArchive if there are others, or something is there already."""
     if place is None:
         return
-    with _no_clash(place):
+    with _refusing_duplicates(place):
         place.parent.mkdir(parents=True, exist_ok=True)
         with place.open("xb") as file:
             left = size_bytes
@@ -180,12 +182,12 @@ def _write(source: IO[bytes], place: Path | None, size_bytes: int) -> None:
                 left -= len(chunk)
                 file.write(chunk)
     if left:
-        raise BadArchive(f"is damaged: {place.name} is not as long as it says")
+        raise ArchiveError(f"is damaged: {place.name} is not as long as it says")
 
 
 @contextmanager
-def _no_clash(place: Path) -> Iterator[None]:
+def _refusing_duplicates(place: Path) -> Iterator[None]:
     try:
         yield
     except (FileExistsError, NotADirectoryError, IsADirectoryError) as problem:
-        raise BadArchive(f"holds {place.name!r} twice") from problem
+        raise ArchiveError(f"holds {place.name!r} twice") from problem

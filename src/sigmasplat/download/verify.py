@@ -22,10 +22,10 @@ def verify(path: Path, published: str, progress: "Progress") -> str:
     algorithm = published.partition(":")[0] or "sha256"
     found = f"{algorithm}:{_digest(path, algorithm, progress)}"
     record = path.with_name(f"{path.name}.sha256")
-    wanted = published or _recorded(record)
+    wanted = published or _recorded_checksum(record)
     if wanted and found != wanted:
         path.unlink()
-        raise DownloadError(f"{path} was damaged and is removed; {_what_now(record, published, found, wanted)}")
+        raise DownloadError(f"{path} was damaged and is removed; {_advice(record, published, found, wanted)}")
     if not wanted:
         write_text(record, f"{found.partition(':')[2]}  {path.name}\n")
     return found
@@ -42,13 +42,13 @@ def _digest(path: Path, algorithm: str, progress: "Progress") -> str:
     return digest.hexdigest()
 
 
-def _recorded(record: Path) -> str:
+def _recorded_checksum(record: Path) -> str:
     """Read a line as sha256sum writes it; "" if there is none."""
     words = record.read_text(encoding="utf-8").split() if record.is_file() else []
     return f"sha256:{words[0]}" if words else ""
 
 
-def _what_now(record: Path, published: str, found: str, wanted: str) -> str:
+def _advice(record: Path, published: str, found: str, wanted: str) -> str:
     if published:
         return f"its checksum is {found}, not {wanted}; run it again"
     return f"it was another one last time (then {wanted}, now {found}); run it again, or delete {record} to accept it"

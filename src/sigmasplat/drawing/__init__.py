@@ -1,1 +1,1 @@
-"""Draw images, charts and contact sheets."""
+"""Draw charts, view strips, film images and contact sheets."""

@@ -1,4 +1,4 @@
-"""Turn numbers into colours: two perceptually even maps, interpolated from a few control points."""
+"""Apply colour maps to arrays: viridis and inferno, interpolated from a few control points."""
 
 from typing import Any
 
@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 Rgb = NDArray[np.uint8]
-Map = NDArray[np.floating[Any]]
+Values = NDArray[np.floating[Any]]
 
-# Equally spaced samples of matplotlib's maps (CC0), brightness rising evenly from end to end.
+# Equally spaced samples of matplotlib's colour maps (CC0); brightness rises evenly from end to end.
 VIRIDIS = np.array(
     [(68, 1, 84), (71, 44, 122), (59, 81, 139), (44, 113, 142), (33, 144, 141), (39, 173, 129), (92, 200, 99),
      (170, 220, 50), (253, 231, 37)], np.float64,
@@ -19,11 +19,11 @@ INFERNO = np.array(
 )  # fmt: skip
 
 NO_READING = (38, 42, 48)
-"""Slate: not on either map, so a hole is never taken for a value."""
+"""Slate grey: in neither colour map, so a hole cannot be mistaken for a value."""
 
 
-def colour(values: Map, low: float, high: float, palette: NDArray[np.float64] = VIRIDIS) -> Rgb:
-    """Map values of any shape from [low, high] onto a palette [K, 3]: uint8 [..., 3]; beyond it the ends hold."""
+def apply(values: Values, low: float, high: float, palette: NDArray[np.float64] = VIRIDIS) -> Rgb:
+    """Map values of any shape from [low, high] to a palette [K, 3]: uint8 [..., 3]. Values outside are clipped."""
     span = high - low if high > low else 1.0
     position = np.clip((values.astype(np.float64) - low) / span, 0.0, 1.0) * (len(palette) - 1)
     stops = np.arange(len(palette))
@@ -31,15 +31,19 @@ def colour(values: Map, low: float, high: float, palette: NDArray[np.float64] = 
     return np.stack(channels, -1).round().astype(np.uint8)
 
 
-def picture(values: Map, valid: NDArray[np.bool_], low: float, high: float, palette: NDArray[np.float64]) -> Rgb:
-    """Colour a map [H, W], with `NO_READING` where it is not valid."""
-    out = colour(values, low, high, palette)
+def apply_masked(
+    values: Values, valid: NDArray[np.bool_], low: float, high: float, palette: NDArray[np.float64]
+) -> Rgb:
+    """Colour an array [H, W], with `NO_READING` where it is not valid."""
+    out = apply(values, low, high, palette)
     out[~valid] = NO_READING
     return out
 
 
-def span(values: Map, valid: NDArray[np.bool_], percent: tuple[float, float] = (1.0, 99.0)) -> tuple[float, float]:
-    """Return the range of the valid values without their extremes; (0, 1) if none is valid."""
+def value_range(
+    values: Values, valid: NDArray[np.bool_], percent: tuple[float, float] = (1.0, 99.0)
+) -> tuple[float, float]:
+    """Return two percentiles of the valid values; (0, 1) if no value is valid."""
     if not valid.any():
         return 0.0, 1.0
     low, high = np.percentile(values[valid], percent)

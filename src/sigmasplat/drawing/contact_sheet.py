@@ -1,4 +1,4 @@
-"""Draw a contact sheet: small pictures of one sequence in rows and columns."""
+"""Draw a contact sheet: small pictures of a sequence in rows and columns."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,15 +13,15 @@ WIDTH, GAP, HEAD, LINE = 260, 8, 28, 26
 
 
 @dataclass(frozen=True, eq=False)
-class Column:
-    """One moment: its title, and a picture uint8 [H, W, 3] for each row."""
+class SheetColumn:
+    """One column: its title, and a picture uint8 [H, W, 3] for each row."""
 
     title: str
     pictures: tuple[colormap.Rgb, ...]
 
 
-def sheet(columns: Sequence[Column], rows: Sequence[str]) -> Image.Image:
-    """Lay out the columns side by side, each row under its name; all pictures take the first one's proportions."""
+def draw_contact_sheet(columns: Sequence[SheetColumn], rows: Sequence[str]) -> Image.Image:
+    """Draw the columns side by side, with the name of each row above it. All pictures get the aspect of the first."""
     first = columns[0].pictures[0]
     height = round(WIDTH * first.shape[0] / first.shape[1])
     size = (len(columns) * (WIDTH + GAP) + GAP, HEAD + len(rows) * (height + LINE) + GAP)

@@ -1,4 +1,4 @@
-"""Lay out a film's images: colour, depth and uncertainty side by side over a strip that says what the colours mean."""
+"""Draw the images of a film: colour, depth and uncertainty side by side, with a legend strip below."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from sigmasplat.render import Render
 
 STRIP, MARGIN, GAP = 40, 10, 8
 SHORTEST_BAR = 60
-"""A colour bar shorter than this, in pixels, does not share its line with a word; half of it, not with numbers."""
+"""A colour bar shorter than this, in pixels, is drawn below its label; below half of it, its numbers are left out."""
 Font = ImageFont.ImageFont | ImageFont.FreeTypeFont
 
 Floats = NDArray[np.float32]
@@ -22,8 +22,8 @@ Limits = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class Maps:
-    """What a film shows of a render: color [H, W, 3] in [0, 1]; depth_m, deviation √V [H, W]; where there is a map."""
+class FilmMaps:
+    """Maps of one render: color [H, W, 3] in [0, 1]; depth_m and deviation √V [H, W]; mapped: pixels with a surface."""
 
     color: Floats
     depth_m: Floats
@@ -31,45 +31,45 @@ class Maps:
     mapped: NDArray[np.bool_]
 
     @staticmethod
-    def of(seen: Render) -> "Maps":
-        """Take the maps out of a render: depth Σwz / Σw; V averaged over the channels, as its root."""
+    def of(seen: Render) -> "FilmMaps":
+        """Compute the maps of a render: depth Σwz / Σw; deviation √V, with V averaged over the channels."""
         alpha = np.asarray(seen.alpha.cpu(), np.float32)
         depth_m = np.asarray(seen.depth.cpu() / seen.alpha.cpu().clamp(min=COVERED_ALPHA), np.float32)
         variance = np.asarray(seen.variance.cpu(), np.float32).mean(-1)
         color = np.asarray(seen.color.cpu().clamp(0.0, 1.0), np.float32)
-        return Maps(color, depth_m, np.sqrt(np.maximum(variance, 0.0)), alpha > COVERED_ALPHA)
+        return FilmMaps(color, depth_m, np.sqrt(np.maximum(variance, 0.0)), alpha > COVERED_ALPHA)
 
 
 @dataclass(frozen=True)
-class Scale:
-    """The ends of a whole film's colours: depth in metres, deviation of colour."""
+class FilmScale:
+    """The colour ranges of a whole film: depth in metres, deviation of colour."""
 
     depth_m: Limits
     deviation: Limits
 
     @staticmethod
-    def of(samples: Sequence[Maps]) -> "Scale":
-        """Fit the scale to some of a film's images: 1st to 99th percentile of depth, 0 to the 99th of deviation."""
+    def of(samples: Sequence[FilmMaps]) -> "FilmScale":
+        """Choose the ranges from sample images: 1st to 99th percentile of depth, 0 to the 99th of deviation."""
         mapped = np.concatenate([maps.mapped.ravel() for maps in samples])
         depth_m = np.concatenate([maps.depth_m.ravel() for maps in samples])
         deviation = np.concatenate([maps.deviation.ravel() for maps in samples])
-        return Scale(colormap.span(depth_m, mapped), (0.0, colormap.span(deviation, mapped)[1]))
+        return FilmScale(colormap.value_range(depth_m, mapped), (0.0, colormap.value_range(deviation, mapped)[1]))
 
 
-def film_image(maps: Maps, scale: Scale, strip: colormap.Rgb) -> colormap.Rgb:
-    """Lay out one image: three panels and the strip under them, uint8 [H + strip, 3 W, 3]."""
+def film_image(maps: FilmMaps, scale: FilmScale, strip: colormap.Rgb) -> colormap.Rgb:
+    """Draw one image: three panels with the legend strip below, uint8 [H + strip, 3 W, 3]."""
     panels = [
         np.rint(maps.color * 255.0).astype(np.uint8),
-        colormap.picture(maps.depth_m, maps.mapped, *scale.depth_m, colormap.VIRIDIS),
-        colormap.picture(maps.deviation, maps.mapped, *scale.deviation, colormap.INFERNO),
+        colormap.apply_masked(maps.depth_m, maps.mapped, *scale.depth_m, colormap.VIRIDIS),
+        colormap.apply_masked(maps.deviation, maps.mapped, *scale.deviation, colormap.INFERNO),
     ]
     return np.concatenate([np.concatenate(panels, axis=1), strip])
 
 
-def legend_strip(scale: Scale, width: int) -> colormap.Rgb:
-    """Draw what is under every image of a film whose panels are `width` pixels wide, uint8 [strip, 3 width, 3].
+def legend_strip(scale: FilmScale, width: int) -> colormap.Rgb:
+    """Draw the legend strip of a film whose panels are `width` pixels wide, uint8 [strip, 3 width, 3].
 
-    Under narrow panels words stand above their colour bars; what does not fit there either is left out.
+    For narrow panels the labels are above the colour bars; labels that still do not fit are left out.
     """
     strip = Image.new("RGB", (3 * width, STRIP), BACKGROUND)
     draw, font = ImageDraw.Draw(strip), ImageFont.load_default(max(11, min(15, width // 20)))
@@ -100,12 +100,12 @@ def _bar(
     strip: Image.Image, font: Font, span: tuple[float, float], level: int, ends: tuple[str, str],
     colours: NDArray[np.float64],
 ) -> None:  # fmt: skip
-    """Draw a colour bar between its ends in words, from pixel `span[0]` to `span[1]`, in row `level`."""
+    """Draw a colour bar between its two labels, from pixel `span[0]` to `span[1]`, in row `level`."""
     draw, (left, right) = ImageDraw.Draw(strip), span
     for text, at, anchor in zip(ends, span, ("lm", "rm"), strict=True):
         draw.text((at, level), text, TEXT, font, anchor=anchor)
     before, after = (draw.textlength(text, font) + GAP if text else 0.0 for text in ends)
-    ramp = colormap.colour(
+    ramp = colormap.apply(
         np.tile(np.linspace(0.0, 1.0, int(right - after - left - before)), (10, 1)), 0.0, 1.0, colours
     )
     strip.paste(Image.fromarray(ramp), (int(left + before), level - 5))

@@ -1,4 +1,4 @@
-"""Draw curves on axes with PIL, for a light and for a dark page."""
+"""Draw line charts with PIL, for a light and a dark page."""
 
 from dataclasses import dataclass, field
 
@@ -11,10 +11,12 @@ Colour = tuple[int, int, int]
 Box = tuple[float, float, float, float]
 
 DRAW_SCALE = 2
-"""Pixels drawn per pixel kept: PIL's lines are smooth only when shrunk."""
+"""Pictures are drawn this many times larger and then reduced, because PIL does not smooth lines."""
 SIZE = (1040, 430)
+NARROW_SIZE = (376, 300)
+"""Size of one chart on a page as narrow as a phone."""
 ACCENT, BLUE, GREEN, PURPLE, FAINT = range(5)
-"""Places in `Theme.curves`."""
+"""Indices into `Theme.curves`."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ DARK = Theme(
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A line through points [N, 2] (x, y), or dots; one without a name is left out of the legend."""
+    """A line through points [N, 2] (x, y), or dots. A curve without a name is not in the legend."""
 
     name: str
     points: Matrix
@@ -51,7 +53,10 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """One pair of axes and the curves on it; `square` gives both axes one scale; labels are texts beside points."""
+    """Curves on one pair of axes.
+
+    `square`: both axes have the same scale; `from_zero`: the y axis starts at 0; labels: texts beside points.
+    """
 
     title: str
     x_label: str
@@ -63,7 +68,7 @@ class Chart:
 
 
 def draw_charts(charts: list[Chart], theme: Theme, size: tuple[int, int] = SIZE) -> Image.Image:
-    """Draw charts beside each other on one picture of `size` pixels."""
+    """Draw charts side by side on one picture of `size` pixels."""
     width, height = size[0] * DRAW_SCALE, size[1] * DRAW_SCALE
     image = Image.new("RGB", (width, height), theme.background)
     share = width / len(charts)
@@ -72,8 +77,17 @@ def draw_charts(charts: list[Chart], theme: Theme, size: tuple[int, int] = SIZE)
     return image.resize(size, Image.Resampling.LANCZOS)
 
 
+def draw_narrow_charts(charts: list[Chart], theme: Theme) -> Image.Image:
+    """Draw charts one below the other on one picture, each of `NARROW_SIZE` pixels."""
+    width, height = NARROW_SIZE
+    image = Image.new("RGB", (width, height * len(charts)), theme.background)
+    for i, chart in enumerate(charts):
+        image.paste(draw_charts([chart], theme, NARROW_SIZE), (0, i * height))
+    return image
+
+
 def nice_ticks(low: float, high: float, wanted: int = 5) -> Matrix:
-    """Return round numbers (1, 2 or 5 times a power of ten apart) inside [low, high], about `wanted` of them."""
+    """Return about `wanted` round numbers inside [low, high]; their step is 1, 2 or 5 times a power of ten."""
     raw = (high - low) / wanted
     power = 10.0 ** np.floor(np.log10(raw))
     step = power * min((1.0, 2.0, 5.0, 10.0), key=lambda m: abs(m * power - raw))
@@ -81,7 +95,7 @@ def nice_ticks(low: float, high: float, wanted: int = 5) -> Matrix:
 
 
 def _limits(chart: Chart, box: Box) -> tuple[Matrix, Matrix]:
-    """Return the data range of both axes (low [2], high [2]), widened a little, to one scale where `square`."""
+    """Return the range of both axes (low [2], high [2]) with a small margin; if `square`, with the same scale."""
     points = np.concatenate([curve.points for curve in chart.curves])
     points = points[np.isfinite(points).all(1)]
     if not len(points):
@@ -100,7 +114,7 @@ def _limits(chart: Chart, box: Box) -> tuple[Matrix, Matrix]:
 
 
 def _draw_chart(draw: ImageDraw.ImageDraw, chart: Chart, theme: Theme, cell: Box) -> None:
-    """Draw title, grid, curves and legend of one chart into its cell."""
+    """Draw the title, grid, curves and legend of one chart in its cell."""
     s = DRAW_SCALE
     box = (cell[0] + 64 * s, cell[1] + 48 * s, cell[2] - 20 * s, cell[3] - 52 * s)
     low, high = _limits(chart, box)
@@ -120,7 +134,7 @@ def _draw_chart(draw: ImageDraw.ImageDraw, chart: Chart, theme: Theme, cell: Box
 
 
 def _draw_curve(draw: ImageDraw.ImageDraw, curve: Curve, places: list[tuple[float, float]], theme: Theme) -> None:
-    """Draw one curve through places in pixels; a single point becomes a dot."""
+    """Draw one curve through pixel positions; a single point becomes a dot."""
     s, colour = DRAW_SCALE, theme.curves[curve.colour]
     if curve.dots or len(places) == 1:
         for x, y in places:
@@ -130,7 +144,7 @@ def _draw_curve(draw: ImageDraw.ImageDraw, curve: Curve, places: list[tuple[floa
 
 
 def _draw_grid(draw: ImageDraw.ImageDraw, chart: Chart, theme: Theme, box: Box, limits: tuple[Matrix, Matrix]) -> None:
-    """Draw grid lines with their numbers, and the names of the axes."""
+    """Draw grid lines with their numbers, and the label of the x axis."""
     s, (low, high) = DRAW_SCALE, limits
     font = ImageFont.load_default(13 * s)
     for x in nice_ticks(low[0], high[0]):
@@ -145,15 +159,20 @@ def _draw_grid(draw: ImageDraw.ImageDraw, chart: Chart, theme: Theme, box: Box, 
 
 
 def _draw_head(draw: ImageDraw.ImageDraw, chart: Chart, theme: Theme, box: Box, middle: float) -> None:
-    """Draw the title with the y axis's name on the left and the legend on the right."""
+    """Draw the title and the label of the y axis on the left, the legend on the right; on two lines if they overlap."""
     s = DRAW_SCALE
     title, font = ImageFont.load_default(17 * s), ImageFont.load_default(14 * s)
-    draw.text((box[0], middle), chart.title, theme.text, title, anchor="lm")
+    named = [curve for curve in chart.curves if curve.name] if len(chart.curves) > 1 else []
     after = box[0] + draw.textlength(chart.title, title) + 10 * s
-    draw.text((after, middle), chart.y_label, theme.text, font, anchor="lm")
+    legend_left = box[2] - sum(draw.textlength(curve.name, font) + 40 * s for curve in named)
+    first, second = middle, middle
+    if legend_left < after + draw.textlength(chart.y_label, font):
+        first, second, after = middle - 11 * s, middle + 10 * s, box[0]
+    draw.text((box[0], first), chart.title, theme.text, title, anchor="lm")
+    draw.text((after, second), chart.y_label, theme.text, font, anchor="lm")
     right = box[2]
-    for curve in reversed([curve for curve in chart.curves if curve.name] if len(chart.curves) > 1 else []):
-        draw.text((right, middle), curve.name, theme.text, font, anchor="rm")
+    for curve in reversed(named):
+        draw.text((right, second), curve.name, theme.text, font, anchor="rm")
         right -= draw.textlength(curve.name, font) + 8 * s
-        draw.line((right - 16 * s, middle, right, middle), theme.curves[curve.colour], 3 * s)
+        draw.line((right - 16 * s, second, right, second), theme.curves[curve.colour], 3 * s)
         right -= 32 * s

@@ -1,5 +1,6 @@
-"""Show one view as a strip: input, rendered colour, depth, uncertainty V and error, side by side with their ranges."""
+"""Draw one view as a strip of panels: input, rendered colour, depth, uncertainty V and error, with their ranges."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +15,8 @@ PANEL_WIDTH, GAP, HEAD, FOOT = 320, 10, 34, 38
 
 
 @dataclass(frozen=True, eq=False)
-class Panel:
-    """One picture of a strip: title, uint8 pixels, and either a colour bar (palette, end labels) or a line of text."""
+class ViewPanel:
+    """One panel of a strip: title, uint8 pixels, and either a colour bar (palette, two labels) or a line of text."""
 
     title: str
     pixels: colormap.Rgb
@@ -23,11 +24,17 @@ class Panel:
     bar: NDArray[np.float64] | None = None
     ends: tuple[str, str] = ("", "")
 
+    def picture(self, height: int) -> Image.Image:
+        """Return the pixels as a picture `PANEL_WIDTH` wide; small maps with a colour bar keep sharp pixels."""
+        enlarged = self.pixels.shape[1] < PANEL_WIDTH
+        how = Image.Resampling.NEAREST if enlarged and self.bar is not None else Image.Resampling.LANCZOS
+        return Image.fromarray(self.pixels).resize((PANEL_WIDTH, height), how)
 
-def side_by_side(view: ScoredView) -> Image.Image:
-    """Draw the strip of one view, an RGB picture about 1650 pixels wide."""
-    panels = panels_of(view)
-    height = round(PANEL_WIDTH * view.recorded.shape[0] / view.recorded.shape[1])
+
+def draw_view_strip(panels: Sequence[ViewPanel]) -> Image.Image:
+    """Draw the panels of one view side by side, an RGB picture about 1650 pixels wide."""
+    first = panels[0].pixels
+    height = round(PANEL_WIDTH * first.shape[0] / first.shape[1])
     size = (len(panels) * (PANEL_WIDTH + GAP) + GAP, height + HEAD + FOOT)
     strip = Image.new("RGB", size, BACKGROUND)
     for i, panel in enumerate(panels):
@@ -35,52 +42,52 @@ def side_by_side(view: ScoredView) -> Image.Image:
     return strip
 
 
-def panels_of(view: ScoredView) -> list[Panel]:
-    """Return the five panels of a view. Uncertainty and error are shown as roots, so that both read as colour steps."""
-    depth_range = colormap.span(view.recorded_depth_m, view.valid)
+def view_panels(view: ScoredView) -> list[ViewPanel]:
+    """Return the five panels of a view. Uncertainty and error are shown as square roots, in units of colour."""
+    depth_range = colormap.value_range(view.recorded_depth_m, view.valid)
     deviation, error = np.sqrt(view.uncertainty), np.sqrt(view.squared_error)
     mapped = view.alpha > COVERED_ALPHA
     score = view.scores()
     return [
-        Panel("input", _bytes(view.recorded), " · ".join((f"frame {view.index}", view.kind, *view.notes))),
-        Panel("rendered colour", _bytes(view.rendered), f"PSNR {score['psnr_db']:.1f} dB · SSIM {score['ssim']:.3f}"),
-        _mapped("rendered depth", view.rendered_depth_m, mapped, depth_range, colormap.VIRIDIS, " m"),
-        _mapped("uncertainty V, as root", deviation, mapped, _from_zero(deviation, mapped), colormap.INFERNO),
-        _mapped("error, root mean square", error, view.valid, _from_zero(error, view.valid), colormap.INFERNO),
+        ViewPanel("input", _bytes(view.recorded), " · ".join((f"frame {view.index}", view.kind, *view.notes))),
+        ViewPanel(
+            "rendered colour", _bytes(view.rendered), f"PSNR {score['psnr_db']:.1f} dB · SSIM {score['ssim']:.3f}"
+        ),
+        _coloured("rendered depth", view.rendered_depth_m, mapped, depth_range, colormap.VIRIDIS, " m"),
+        _coloured("uncertainty √V", deviation, mapped, _from_zero(deviation, mapped), colormap.INFERNO),
+        _coloured("error, RMS", error, view.valid, _from_zero(error, view.valid), colormap.INFERNO),
     ]
 
 
 def _from_zero(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> tuple[float, float]:
-    """Return 0 and the 99th percentile."""
-    return 0.0, colormap.span(values, valid)[1]
+    """Return 0 and the 99th percentile of the valid values."""
+    return 0.0, colormap.value_range(values, valid)[1]
 
 
-def _mapped(
+def _coloured(
     title: str,
     values: NDArray[np.float32],
     valid: NDArray[np.bool_],
     limits: tuple[float, float],
     colours: NDArray[np.float64],
     unit: str = "",
-) -> Panel:
-    """Colour a map and label its range."""
+) -> ViewPanel:
+    """Apply a colour map, and label its range."""
     digits = 2 if unit else 3
     ends = (f"{limits[0]:.{digits}f}{unit}", f"{limits[1]:.{digits}f}{unit}")
-    return Panel(title, colormap.picture(values, valid, *limits, colours), bar=colours, ends=ends)
+    return ViewPanel(title, colormap.apply_masked(values, valid, *limits, colours), bar=colours, ends=ends)
 
 
 def _bytes(color: NDArray[np.float32]) -> colormap.Rgb:
-    """Turn [0, 1] into 0 … 255."""
+    """Convert colours in [0, 1] to 0 … 255."""
     return (np.clip(color, 0.0, 1.0) * 255.0).round().astype(np.uint8)
 
 
-def _draw(strip: Image.Image, panel: Panel, left: int, height: int) -> None:
-    """Put one panel into the strip: title above, picture, bar or caption below."""
+def _draw(strip: Image.Image, panel: ViewPanel, left: int, height: int) -> None:
+    """Draw one panel in the strip: title above, picture, bar or caption below."""
     draw = ImageDraw.Draw(strip)
     draw.text((left + 2, HEAD // 2), panel.title, TEXT, ImageFont.load_default(18), anchor="lm")
-    enlarged = panel.pixels.shape[1] < PANEL_WIDTH
-    how = Image.Resampling.NEAREST if enlarged and panel.bar is not None else Image.Resampling.LANCZOS
-    strip.paste(Image.fromarray(panel.pixels).resize((PANEL_WIDTH, height), how), (left, HEAD))
+    strip.paste(panel.picture(height), (left, HEAD))
     middle = HEAD + height + FOOT // 2
     small = ImageFont.load_default(16)
     if panel.bar is None:
@@ -88,5 +95,5 @@ def _draw(strip: Image.Image, panel: Panel, left: int, height: int) -> None:
         return
     draw.text((left + 2, middle), panel.ends[0], FAINT, small, anchor="lm")
     draw.text((left + PANEL_WIDTH - 2, middle), panel.ends[1], FAINT, small, anchor="rm")
-    ramp = colormap.colour(np.tile(np.linspace(0.0, 1.0, PANEL_WIDTH - 160), (10, 1)), 0.0, 1.0, panel.bar)
+    ramp = colormap.apply(np.tile(np.linspace(0.0, 1.0, PANEL_WIDTH - 160), (10, 1)), 0.0, 1.0, panel.bar)
     strip.paste(Image.fromarray(ramp), (left + 80, middle - 5))

@@ -7,20 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config, FinalConfig, InputConfig
-from sigmasplat.drawing import plot
 from sigmasplat.errors import RunError
 from sigmasplat.evaluation import reconstruct
 from sigmasplat.evaluation.novel_views import score_novel_views
 from sigmasplat.io.runs import TRUTH, RunFolder
 from sigmasplat.io.trajectory import write_trajectory
 from sigmasplat.metrics import views
-from sigmasplat.metrics.trajectory import aligned_truth, associate, path_scores_of, truth_in_estimate
+from sigmasplat.metrics.trajectory import aligned_truth, associate, score_path, truth_in_estimate
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import FieldRenderer
 from sigmasplat.report import charts
-from sigmasplat.report.page import Gallery, plan_of, write_page
+from sigmasplat.report.page import report_plan, write_charts, write_page
+from sigmasplat.report.view_strips import ViewStrips
 from sigmasplat.sources.base import Source
 from sigmasplat.types import Progress
 
@@ -56,13 +56,13 @@ def evaluate(
     path, field = run.read_trajectory(), run.read_map()
     log = _posed(records, path, run)
     truth = source.truth()
-    path_scores, problem = path_scores_of(path, run.read_odometry(), truth)
+    path_scores, problem = score_path(path, run.read_odometry(), truth)
     chosen = {kind: _spread(records, views_per_kind) for kind, records in _kinds(log).items()}
-    gallery, config, loops = Gallery(run, strips_per_kind), run.config(), run.read_loops()
+    strips, config, loops = ViewStrips(run, strips_per_kind), run.config(), run.read_loops()
     standard = renderer is None
     renderer = renderer or FieldRenderer(config.render, config.backend)
     maps = views.MapSources(field, run.submaps, _anchors(run, records, config.final))
-    scores = _score_views(config, source, maps, chosen, gallery, renderer, progress)
+    scores = _score_views(config, source, maps, chosen, strips, renderer, progress)
     metrics = _facts(run, source, log, field, loops) | path_scores | scores | {"reconstruction": None}
     if mesh:
         known = None if problem else truth
@@ -72,12 +72,12 @@ def evaluate(
     apart = source.test_views()
     if apart is not None and truth is not None and problem is None:
         world = apart.truth(), truth_in_estimate(*_positions(log), truth)
-        metrics["test_views"] = score_novel_views(apart, *world, field, config.input, renderer, gallery, views_per_kind)
+        metrics["test_views"] = score_novel_views(apart, *world, field, config.input, renderer, strips, views_per_kind)
     run.write_metrics(metrics)
     plots = _draw_plots(run, log, None if problem else truth, loops)
     warnings = [str(problem)] if problem else []
-    plan = plan_of(run, field, log, source.camera) if standard else None
-    write_page(run, metrics, gallery.strips, plots, warnings, plan)
+    plan = report_plan(run, log, source.camera) if standard else None
+    write_page(run, metrics, strips.figures, plots, warnings, plan)
     if problem:
         raise problem
     return metrics
@@ -130,29 +130,32 @@ def _spread(records: Log, most: int) -> Log:
 
 
 def _score_views(
-    config: Config, source: Source, maps: views.MapSources, chosen: dict[str, Log], gallery: Gallery,
+    config: Config, source: Source, maps: views.MapSources, chosen: dict[str, Log], strips: ViewStrips,
     renderer: views.Renderer, progress: Progress,
 ) -> dict[str, Any]:  # fmt: skip
     """Render and score the chosen views in the final map and in their submaps; average per kind and map; judge V."""
-    scores = {kind: views.Scores(judged=kind == "held-out") for kind in chosen}
-    before = {kind: views.Scores(judged=kind == "held-out") for kind in chosen}
-    shown = {(kind, r["index"]) for kind, records in chosen.items() for r in _spread(records, gallery.per_kind)}
+    scores = {kind: views.ViewScores(keep_samples=kind == "held-out") for kind in chosen}
+    before = {kind: views.ViewScores(keep_samples=kind == "held-out") for kind in chosen}
+    shown = {(kind, r["index"]) for kind, records in chosen.items() for r in _spread(records, strips.per_kind)}
     total = sum(len(records) for records in chosen.values())
     frame_of = partial(_prepared, source, config.input)
     for done, (final, in_submap) in enumerate(views.render_views(frame_of, maps, chosen, renderer), 1):
         scores[final.kind].add(final)
         if (final.kind, final.index) in shown:
-            gallery.add(final)
+            strips.add(final)
         if in_submap:
             before[final.kind].add(in_submap)
             if final.kind == "held-out" and (final.kind, final.index) in shown:
-                gallery.add(in_submap, ", in their submaps")
+                strips.add(in_submap, ", in their submaps")
         progress(done, total)
     kept = maps.T_world_submap is not None
-    judged, judged_before = (views.judge(found["held-out"].samples) for found in (scores, before))
+    judged, judged_before = (views.score_uncertainty(found["held-out"].samples) for found in (scores, before))
     return {
-        **{kind.replace("-", "_"): views.average(found.rows) for kind, found in scores.items()},
-        **{f"{kind.replace('-', '_')}_submaps": views.average(before[kind].rows) if kept else None for kind in chosen},
+        **{kind.replace("-", "_"): views.mean_scores(found.rows) for kind, found in scores.items()},
+        **{
+            f"{kind.replace('-', '_')}_submaps": views.mean_scores(before[kind].rows) if kept else None
+            for kind in chosen
+        },
         "uncertainty": judged_before if kept else judged,
         "uncertainty_final": judged if kept and _keeps_variance(config.final) else None,
     }
@@ -193,7 +196,7 @@ def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField, loops
 
 def _frames_per_s(run: RunFolder, log: Log) -> float | None:
     """Return the speed end to end: by the wall clock (run.json, wall_s) if noted, else by the frames' own times."""
-    seconds = run.facts().get("wall_s") or sum(charts.seconds_of(record) for record in log)
+    seconds = run.facts().get("wall_s") or sum(charts.frame_seconds(record) for record in log)
     return len(log) / seconds if seconds else None
 
 
@@ -205,7 +208,7 @@ def _total_s(run: RunFolder) -> float | None:
 
 def _worst_frame_s(log: Log) -> float | None:
     """Return the longest time of a frame after the run's first, which makes the map; None where none was timed."""
-    return max((charts.seconds_of(record) for record in log if record["row"]), default=0.0) or None
+    return max((charts.frame_seconds(record) for record in log if record["row"]), default=0.0) or None
 
 
 def _positions(log: Log) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -215,7 +218,7 @@ def _positions(log: Log) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _draw_plots(run: RunFolder, log: Log, truth: Trajectory | None, loops: Log) -> dict[str, str]:
-    """Draw path, submaps and times in both themes, and write truth.txt; return the captions by name."""
+    """Draw the charts of path, submaps and times, and write truth.txt; return the captions by name."""
     times, estimate = _positions(log)
     known: NDArray[np.float64] | None = None
     aligned: Trajectory | None = None
@@ -224,12 +227,7 @@ def _draw_plots(run: RunFolder, log: Log, truth: Trajectory | None, loops: Log) 
         known = np.full_like(estimate, np.nan)
         known[rows] = aligned.T_world_camera[:, :3, 3]
     _keep_truth(run, aligned)
-    drawn = charts.of_run(log, estimate, known, loops)
-    for name, (found, _) in drawn.items():
-        for theme in (plot.LIGHT, plot.DARK):
-            size = plot.SIZE if name != "seconds" else (plot.SIZE[0], 300)
-            run.write_image(f"{name}-{theme.name}.png", plot.draw_charts(found, theme, size))
-    return {name: caption for name, (_, caption) in drawn.items()}
+    return write_charts(run, charts.run_charts(log, estimate, known, loops))
 
 
 def _keep_truth(run: RunFolder, aligned: Trajectory | None) -> None:

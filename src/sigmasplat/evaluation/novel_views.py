@@ -12,7 +12,7 @@ from sigmasplat.metrics.trajectory import associate
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.report.page import Gallery
+from sigmasplat.report.view_strips import ViewStrips
 from sigmasplat.sources.base import Source
 
 KIND = "test"
@@ -25,13 +25,13 @@ def score_novel_views(
     field: GaussianField,
     settings: InputConfig,
     renderer: views.Renderer,
-    gallery: Gallery,
+    strips: ViewStrips,
     most: int,
 ) -> dict[str, Any] | None:
     """Render the final map at the true poses of at most `most` views, taken to the estimate's world by the ATE's fit.
 
-    Returns their mean scores, as `views.average` gives them, and draws a few; None where no poses are known. The path's
-    error counts against them, as it does in the papers. Unreadable views and those without a pose are left out.
+    Returns their mean scores (`views.mean_scores`), and draws a few; None where no poses are known. The path's error
+    counts against them, as it does in the papers. Unreadable views and those without a pose are left out.
     """
     if poses is None:
         return None
@@ -46,7 +46,7 @@ def score_novel_views(
         rows, found = associate(np.array([frame.timestamp_s]), poses.timestamps_s)
         if len(rows):
             T_camera_world = se3.inverse(T_estimate_truth @ poses.T_world_camera[found[0]])
-            seen.append(views.view_of(frame, renderer(field, frame.camera, T_camera_world), KIND))
-    for view in seen[:: max(1, len(seen) // max(gallery.per_kind, 1))][: gallery.per_kind]:
-        gallery.add(view)
-    return views.average([view.scores() for view in seen])
+            seen.append(views.scored_view(frame, renderer(field, frame.camera, T_camera_world), KIND))
+    for view in seen[:: max(1, len(seen) // max(strips.per_kind, 1))][: strips.per_kind]:
+        strips.add(view)
+    return views.mean_scores([view.scores() for view in seen])

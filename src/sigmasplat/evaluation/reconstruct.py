@@ -15,8 +15,8 @@ from sigmasplat.errors import RunError
 from sigmasplat.io.mesh import write_mesh
 from sigmasplat.io.runs import MESH, RunFolder
 from sigmasplat.metrics import reconstruction
-from sigmasplat.metrics.splats import splats_to_surface
-from sigmasplat.metrics.trajectory import align_rigid, associate, paired
+from sigmasplat.metrics.splats import score_splats
+from sigmasplat.metrics.trajectory import align_rigid, associate, pair_poses
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.mesh import Mesh
@@ -115,7 +115,7 @@ def score(
     Training views are the true poses of the keyframes. Raises SourceError if path and truth share no timestamps.
     """
     path, tensors = recording.run.read_trajectory(), recording.checkpoint
-    ours, theirs = paired(path, true_path)
+    ours, theirs = pair_poses(path, true_path)
     T_truth_world = align_rigid(ours[:, :3, 3], theirs[:, :3, 3])
     _, rows = associate(tensors["timestamps_s"][tensors["keyframes"]].numpy(), true_path.timestamps_s)
     views = true_path.T_world_camera[rows]
@@ -123,5 +123,5 @@ def score(
     of_mesh = reconstruction.score(mesh.moved(T_truth_world), *seen, progress=progress)
     field = recording.run.read_map()
     centers = field.means.numpy().astype(np.float64) @ T_truth_world[:3, :3].T + T_truth_world[:3, 3]
-    of_splats = splats_to_surface(centers, field.opacities.numpy().astype(np.float64), *seen)
+    of_splats = score_splats(centers, field.opacities.numpy().astype(np.float64), *seen)
     return asdict(of_mesh) | asdict(of_splats)

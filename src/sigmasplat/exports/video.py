@@ -14,12 +14,12 @@ import torch
 from PIL import Image
 
 from sigmasplat.drawing.colormap import Rgb
-from sigmasplat.drawing.film import Maps, Scale, film_image, legend_strip
+from sigmasplat.drawing.film import FilmMaps, FilmScale, film_image, legend_strip
 from sigmasplat.env import install_extra
 from sigmasplat.errors import BackendError, ConfigError, RunError
 from sigmasplat.exports.recorded import Recorded
 from sigmasplat.floorplan.ground import floor_frame
-from sigmasplat.floorplan.surface_samples import Renderer, looks
+from sigmasplat.floorplan.surface_samples import SurfaceRenderer, sample_surfaces
 from sigmasplat.io.atomic import replacing
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
@@ -71,7 +71,7 @@ def export_video(
     target: Path,
     options: VideoOptions | None = None,
     *,
-    renderer: Renderer | None = None,
+    renderer: SurfaceRenderer | None = None,
     progress: Progress = lambda done, total: None,
 ) -> int:
     """Write a film and return how many images it has; `progress` is told (images done, of how many).
@@ -100,10 +100,10 @@ def sized(camera: Camera, width_px: int) -> Camera:
 
 
 def from_above(
-    field: GaussianField, path: Trajectory, camera: Camera, images: int, renderer: Renderer
+    field: GaussianField, path: Trajectory, camera: Camera, images: int, renderer: SurfaceRenderer
 ) -> tuple[GaussianField, Matrix]:
     """Return the map without its ceiling, and a circle of poses [images, 4, 4] above it that keeps it in view."""
-    sights = list(looks(field, path, camera, renderer, LOOKS))
+    sights = list(sample_surfaces(field, path, camera, renderer, LOOKS))
     T = floor_frame(sights)
     points = np.concatenate([sight.points for sight in sights]) @ T[:3, :3].T + T[:3, 3]
     low, high = np.quantile(points, [0.02, 0.98], axis=0)
@@ -118,15 +118,15 @@ def from_above(
     return kept, orbit(center, T[2, :3], T[1, :3], radius_m, images)
 
 
-def _show(renderer: Renderer, field: GaussianField, camera: Camera, T_world_camera: Matrix) -> Maps:
+def _show(renderer: SurfaceRenderer, field: GaussianField, camera: Camera, T_world_camera: Matrix) -> FilmMaps:
     with torch.inference_mode():
-        return Maps.of(renderer(field, camera, se3.inverse(T_world_camera)))
+        return FilmMaps.of(renderer(field, camera, se3.inverse(T_world_camera)))
 
 
-def _images(show: Callable[[Matrix], Maps], poses: Matrix, width: int, progress: Progress) -> Iterator[Rgb]:
+def _images(show: Callable[[Matrix], FilmMaps], poses: Matrix, width: int, progress: Progress) -> Iterator[Rgb]:
     """Yield a film's images, their colours fixed by a few of them."""
     rows = np.unique(np.linspace(0, len(poses) - 1, min(SAMPLES, len(poses))).round().astype(int))
-    scale = Scale.of([show(poses[row]) for row in rows])
+    scale = FilmScale.of([show(poses[row]) for row in rows])
     strip = legend_strip(scale, width)
     for done, pose in enumerate(poses, 1):
         yield film_image(show(pose), scale, strip)

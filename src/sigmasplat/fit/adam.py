@@ -70,19 +70,8 @@ def adam_rows(field: Rows, rows: Tensor, g: Tensor, rates: Rates) -> None:
     field.last_step[rows] = field.steps
 
 
-def settle(field: Rows, rates: Rates, compiled: bool) -> None:
-    """Bring every row to the present step, as dense Adam would have it: to be called when a fit ends.
-
-    `compiled` is for rows of a field's 17 columns only.
-    """
-    if compiled:
-        from sigmasplat.native import _core
-
-        _core.adam_settle(
-            field.params, field.moment1, field.moment2, field.last_step, rates.per_column.numpy(),
-            BETA1, BETA2, EPSILON, field.steps,
-        )  # fmt: skip
-        return
+def settle(field: Rows, rates: Rates) -> None:
+    """Bring every row to the present step, as dense Adam would have it: to be called when a fit ends."""
     rows = (field.last_step != field.steps).nonzero().squeeze(1)
     field.params[rows], field.moment1[rows], field.moment2[rows] = _catch_up(field, rows, rates, field.steps)
     field.last_step[rows] = field.steps

@@ -1,31 +1,21 @@
 """Align two RGB-D images directly: Gauss–Newton on SE(3), coarse to fine, gray and depth residuals together.
 
 The reference may be a rendered map (tracking) or the previous frame (odometry). One render and a dozen steps of 0.1 ms
-replace dozens of renders. It is done where the images lie: on the CPU, or on a CUDA device.
+replace dozens of renders. It runs where the images are: on the CPU, or on a CUDA device.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from sigmasplat.errors import BackendError
-from sigmasplat.fit import cuda_align
-from sigmasplat.fit.cuda_align import CudaLevel, Descent, Rules
+from sigmasplat.fit.interface import AlignRules, ImageKernels, LevelPlanes
 from sigmasplat.fit.pyramid import LEVELS, Pyramid
 from sigmasplat.model import se3
-from sigmasplat.render.backend import backend_module
 from sigmasplat.types import Matrix
-
-if TYPE_CHECKING:
-    from sigmasplat.native import _core
-
-    Level = _core.Level | CudaLevel
-
 
 HUBER_GRAY = (0.02, 0.05, 0.1, 0.2)
 """Width of the gray residual's quadratic part, from the finest level up: far from the answer all of them are large."""
@@ -44,7 +34,7 @@ UNKNOWN_M = 1.0
 class Alignment:
     """T_live_reference; agreement: share of overlapping pixels whose depths agree; overlap: share of reference pixels
     that land on a live reading; degenerate: how many directions of motion the images say nothing about; cost per pixel;
-    steps taken."""
+    steps taken; depth_m: mean depth of the reference."""
 
     T_live_reference: Matrix
     agreement: float
@@ -53,6 +43,7 @@ class Alignment:
     cost: float
     steps: int
     pair: "Pair"
+    depth_m: float
 
     @cached_property
     def covariance(self) -> Matrix:
@@ -64,12 +55,12 @@ class Alignment:
         deviation. Infinite where nothing was in common.
         """
         half_rad = 0.5 / self.pair.reference.cameras[0].fx
-        steps = np.repeat([half_rad * self.pair.depth_m, half_rad], 3)
+        steps = np.repeat([half_rad * self.depth_m, half_rad], 3)
         aside = [se3.exp(sign * twist) @ self.T_live_reference for twist in np.diag(steps) for sign in (1.0, -1.0)]
-        n, *around = normal_equations(self.pair.level(0), [self.T_live_reference, *aside])
+        n, *around = normal_equations(self.pair.kernels, self.pair.level(0), [self.T_live_reference, *aside])
         if n.sums[1] < MIN_PIXELS:
             return np.diag(np.full(6, np.inf))
-        directions, decided = _axes(n, self.pair.depth_m)
+        directions, decided = _axes(n, self.depth_m)
         basis, unknown = directions[:, decided], directions[:, ~decided]
         slope = basis.T @ _slope(around, steps) @ basis
         bread = basis @ np.linalg.inv(slope) @ basis.T
@@ -78,21 +69,27 @@ class Alignment:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two images to align and how gray weighs against depth; depth_m: mean depth of the reference."""
+    """Two images to align, and how much gray counts against depth."""
 
     reference: Pyramid
     live: Pyramid
     weight_color: float
-    depth_m: float
 
-    def level(self, k: int) -> "Level":
+    @property
+    def kernels(self) -> ImageKernels:
+        """Return what aligns the two."""
+        return self.reference.kernels
+
+    def level(self, k: int) -> LevelPlanes:
         """Lay one level of the pyramids out for the kernels."""
-        laid_out = _laid_out(self.reference, self.live, self.weight_color, k)
-        if self.reference.on_device:
-            return CudaLevel(*laid_out)
-        from sigmasplat.native import _core
-
-        return _core.Level(*laid_out)
+        r, live, width = self.reference, self.live, min(k, LEVELS - 1)
+        c = r.cameras[k]
+        options = [self.weight_color, 1.0 - self.weight_color]
+        options += [HUBER_GRAY[width], HUBER_DEPTH_RELATIVE[width], DEPTH_GATES_M[width]]
+        return LevelPlanes(
+            r.gray[k], r.depth[k], r.weight[k], r.weight_depth[k], live.gray[k], live.depth[k],
+            [c.fx, c.fy, c.cx, c.cy], options,
+        )  # fmt: skip
 
 
 @dataclass(eq=False)
@@ -107,16 +104,9 @@ class Normal:
     """Weighted cost, pixels used, pixels in view with depth, pixels agreeing in depth."""
 
 
-def normal_equations(level: "Level", motions: Sequence[Matrix]) -> list[Normal]:
-    """Linearise the residuals of a level at each of some motions T_live_reference, at most `cuda_align.MOTIONS`."""
-    rows = np.zeros((len(motions), cuda_align.NORMAL_TERMS))
-    if isinstance(level, CudaLevel):
-        rows = level.normal_equations(np.stack(motions))
-    else:
-        from sigmasplat.native import _core
-
-        for row, T in zip(rows, motions, strict=True):
-            _core.align_step(level, T, row[:21], row[21:27], row[31:], row[27:31])
+def normal_equations(kernels: ImageKernels, level: LevelPlanes, motions: Sequence[Matrix]) -> list[Normal]:
+    """Linearise the residuals of a level at some motions T_live_reference, at most 13."""
+    rows = kernels.normal_equations(level, motions)
     return [Normal(_symmetric(row[:21]), row[21:27], _symmetric(row[31:]), row[27:31]) for row in rows]
 
 
@@ -137,14 +127,12 @@ def align(
     weight_color in [0, 1] balances gray against depth, each in units of its Huber width.
     Raises BackendError without the compiled kernels, or where one image lies on a device and the other does not.
     """
-    if reference.on_device != live.on_device:
+    if reference.kernels is not live.kernels:
         raise BackendError("one image to align lies on a device, the other does not; make both for the same view")
-    rules, readings = Rules(iterations, update_stop, plateau_stop, DEGENERATE, MIN_PIXELS), reference.readings
-    levels = [_laid_out(reference, live, weight_color, k) for k in range(len(reference.cameras))]
-    if isinstance(readings, Tensor):
-        found = cuda_align.descend([CudaLevel(*level) for level in levels], readings, T_live_reference, rules)
-    else:
-        found = _descend(levels, readings, T_live_reference, rules)
+    rules = AlignRules(iterations, update_stop, plateau_stop, DEGENERATE, MIN_PIXELS)
+    pair = Pair(reference, live, weight_color)
+    levels = [pair.level(k) for k in range(len(reference.cameras))]
+    found = pair.kernels.align(levels, reference.readings, T_live_reference, rules)
     return Alignment(
         se3.orthonormalise(found.T),
         agreement=float(found.sums[3] / max(found.sums[2], 1.0)),
@@ -152,33 +140,9 @@ def align(
         degenerate=found.degenerate,
         cost=float(found.sums[0] / max(found.sums[1], 1.0)),
         steps=found.steps,
-        pair=Pair(reference, live, weight_color, found.depth_m),
+        pair=pair,
+        depth_m=found.depth_m,
     )
-
-
-def _laid_out(reference: Pyramid, live: Pyramid, weight_color: float, k: int) -> tuple[Any, ...]:
-    """Return what makes a `Level`: planes of one level, intrinsics, and how residuals are weighed."""
-    c, width = reference.cameras[k], min(k, LEVELS - 1)
-    numbers = [weight_color, 1.0 - weight_color]
-    numbers += [HUBER_GRAY[width], HUBER_DEPTH_RELATIVE[width], DEPTH_GATES_M[width]]
-    return (
-        reference.gray[k], reference.depth[k], reference.weight[k], reference.weight_depth[k],
-        live.gray[k], live.depth[k], [c.fx, c.fy, c.cx, c.cy], numbers,
-    )  # fmt: skip
-
-
-def _descend(levels: Sequence[tuple[Any, ...]], readings: Matrix, guess: Matrix, rules: Rules) -> Descent:
-    """Do on the CPU what `cuda_align.descend` does on a device."""
-    backend_module("cpu")  # refuses in one line where the kernels are not built
-    from sigmasplat.native import _core
-
-    (depth_m, n), T, sums = readings.tolist(), np.array(guess, np.float64), np.zeros(4)
-    r = rules
-    steps, degenerate = _core.align_images(
-        [_core.Level(*level) for level in levels], r.iterations, r.update_stop, r.plateau_stop, depth_m,
-        r.degenerate_share, r.min_pixels, T, sums,
-    )  # fmt: skip
-    return Descent(T, sums, steps, degenerate, depth_m, n)
 
 
 def _axes(n: Normal, depth_m: float) -> tuple[Matrix, NDArray[np.bool_]]:

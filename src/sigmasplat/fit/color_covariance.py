@@ -10,12 +10,12 @@ from torch import Tensor
 
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import ROWS_AT_ONCE, Rates, adam_rows
-from sigmasplat.fit.step import Weights, shape_pull
+from sigmasplat.fit.interface import Accumulator, Weights, one_image_only
+from sigmasplat.fit.mapping_step import shape_gradient
 from sigmasplat.fit.target import Target
 from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.render.covariance_view import CovarianceView, CudaCovarianceView
-from sigmasplat.render.render import covariance_of
-from sigmasplat.render.view import View
+from sigmasplat.render.channels import covariance_of
+from sigmasplat.render.view import CorrelationView, View
 from sigmasplat.types import Matrix
 
 COLORS, SCALES = COLUMNS["colors"], COLUMNS["log_scales"]
@@ -36,7 +36,7 @@ class FullCovarianceStep:
     weights of splats in a pixel.
     """
 
-    def __init__(self, view: CovarianceView | CudaCovarianceView, others: ImageTerms) -> None:
+    def __init__(self, view: CorrelationView, others: ImageTerms) -> None:
         self._wide, self._others = view, others
 
     @property
@@ -68,14 +68,14 @@ class FullCovarianceStep:
         return loss + float(term.detach())
 
     def splats(
-        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, pull: Tensor | None = None
+        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Matrix, float]:
-        """Carry the planes to the splats in view, add the shape terms' pull on them, and step, correlations too.
+        """Carry the planes to the splats in view, add the gradient of the shape terms, and step, correlations too.
 
-        Returns the pose twist [6] and what the shape terms cost. `pull` is filled as by `View.backward`.
+        Returns the pose twist [6] and the cost of the shape terms. grad2d [N] is filled as by `View.backward`.
         """
         grad, cost = torch.zeros_like(field.params), 0.0
-        twist = self._wide.backward(field.params, grad, pull)
+        twist = self._wide.backward(field.params, grad, grad2d)
         correlations, correlation_rates = self._wide.correlations, rates.of_extra("correlations")
         correlations.steps += 1
         visible = self._wide.visible(len(field)).nonzero().squeeze(1)
@@ -83,9 +83,13 @@ class FullCovarianceStep:
             g = grad[rows]
             g[rows < frozen_colors, COLORS] = 0.0
             shares = len(rows) / max(len(field), 1), len(rows) / max(len(visible), 1)
-            g_scales, term = shape_pull(field.params[rows][:, SCALES], weights, *shares)
+            g_scales, term = shape_gradient(field.params[rows][:, SCALES], weights, *shares)
             g[:, SCALES] += g_scales
             cost += term
             adam_rows(field, rows, g, rates)
             adam_rows(correlations, rows, self._wide.g_correlations[rows], correlation_rates)
         return twist, cost
+
+    def accumulator(self, field: GaussianField) -> Accumulator:
+        """Refuse with a ConfigError: the step takes one image only."""
+        raise one_image_only()

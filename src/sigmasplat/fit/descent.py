@@ -1,6 +1,7 @@
 """Descend the tracking loss by Adam, one camera's pose and exposure, the field fixed (VarSplat §3; CG-SLAM §6)."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -8,30 +9,30 @@ from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.adam import VectorAdam
+from sigmasplat.fit.interface import Descent
 from sigmasplat.fit.motion import parametrisation
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import tracking_gradient
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 
-
-class Descent(NamedTuple):
-    """What was found: T_camera_world [4, 4], exposure (a, b) of exp(a)·Ĉ + b, the first loss and the least, steps."""
-
-    T_camera_world: Matrix
-    exposure: tuple[float, float]
-    first_loss: float
-    loss: float
-    steps: int
+TrackingLoss = Callable[[Any, Target, TrackingConfig, Tensor], tuple[float, Tensor]]
 
 
 def descend(
-    params: Tensor, view: View, target: Target, T_camera_world: Matrix, config: TrackingConfig, iterations: int
+    params: Tensor,
+    view: View,
+    target: Target,
+    T_camera_world: Matrix,
+    config: TrackingConfig,
+    iterations: int,
+    tracking_loss: TrackingLoss = tracking_gradient,
 ) -> Descent:
     """Descend L_track over the numbers that `parametrisation` makes of the pose; the best iterate wins.
 
-    params [N, 17] and target lie where the view computes. Ends early when a step is below `update_stop`, or when it
-    changed the loss by less than `plateau_stop` of it. Without common pixels the guess comes back.
+    params [N, 17] and target are on the view's device; tracking_loss is what that device computes it by. Ends early
+    when a step is below `update_stop`, or when it changed the loss by less than `plateau_stop` of it. Without common
+    pixels the guess is returned.
     """
     way = parametrisation(config, T_camera_world)
     numbers, exposure = way.start, np.zeros(2)
@@ -43,7 +44,7 @@ def descend(
     for steps in range(1, iterations + 1):
         T = way.pose(numbers)
         view.forward(params, T)
-        loss, g_exposure = tracking_gradient(view, target, config, torch.as_tensor(exposure).float())
+        loss, g_exposure = tracking_loss(view, target, config, torch.as_tensor(exposure).float())
         first = loss if steps == 1 else first
         blind = loss == 0.0  # where no pixel counts: that may not win over one where some do
         if loss < best and not (blind and steps > 1):

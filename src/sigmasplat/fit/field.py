@@ -1,7 +1,6 @@
 """fit_field: adjust the splats to keyframes, and the keyframes' poses too if asked. Mapping is this one function."""
 
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field as dataclass_field
 from itertools import repeat
 
@@ -9,34 +8,34 @@ import numpy as np
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig
+from sigmasplat.errors import BackendError
 from sigmasplat.fit.adam import Rates, settle
-from sigmasplat.fit.step import Twist, arrived
-from sigmasplat.fit.steps import gathering, step_for
+from sigmasplat.fit.backends import fits_of, step_for
+from sigmasplat.fit.interface import FitStats, Twist
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField
-from sigmasplat.render.view import CpuView, View
+from sigmasplat.model.stopwatch import Stopwatch
+from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 
 
 @dataclass
 class FieldFit:
-    """What a fit did: the loss of each iteration, and seconds spent by stage."""
+    """Result of a fit: the loss of each iteration, and the seconds of each stage."""
 
     losses: list[float] = dataclass_field(default_factory=list)
-    seconds: dict[str, float] = dataclass_field(default_factory=dict)
+    stopwatch: Stopwatch = dataclass_field(default_factory=Stopwatch)
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Return the seconds by stage: forward, loss, backward."""
+        return self.stopwatch.seconds
 
     def join(self, later: "FieldFit") -> None:
-        """Take in what a later fit did."""
+        """Append a later fit's losses and add its seconds."""
         self.losses += later.losses
-        for stage, seconds in later.seconds.items():
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
-
-    def add(self, stage: str, since: float) -> float:
-        """Book the time since then under a stage; return now."""
-        now = time.perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - since
-        return now
+        self.stopwatch.add(later.seconds)
 
 
 def loss_weights(config: MappingConfig) -> dict[str, float]:
@@ -52,17 +51,9 @@ def loss_weights(config: MappingConfig) -> dict[str, float]:
         "nll_depth": config.weight_nll_depth,
         "isotropy": config.weight_isotropy,
         "isotropy_ratio": config.weight_isotropy_ratio,
-        "alignment": config.weight_alignment,
+        "median_depth": config.weight_alignment,
         "moment": config.weight_moment,
     }
-
-
-Felt = Callable[[Keyframe, Tensor], None]
-
-
-def not_fixed(keyframe: Keyframe) -> bool:
-    """Tell whether a keyframe's pose may move."""
-    return not keyframe.fixed
 
 
 def fit_field(
@@ -73,53 +64,34 @@ def fit_field(
     schedule: Iterable[Rates] | None = None,
     frozen_colors: int = 0,
     degree: int = 0,
-    may_move: Callable[[Keyframe], bool] = not_fixed,
-    felt: Felt | None = None,
+    stats: FitStats | None = None,
 ) -> FieldFit:
     """Take one Adam step on the field per batch of keyframes, against their mean loss, in the order given.
 
     schedule: the rates of each step; by default those of the settings. The first `frozen_colors` splats keep their
-    colours. degree: of view-dependent colour, fitted too if above 0. may_move: which keyframes' poses follow, at the
-    settings' rates. felt: told how hard each splat's image mean was pulled [N] (3DGS), keyframe by keyframe.
-    Adam's moments live on from fit to fit. A new splat's start from zero while the bias correction has run out, so its
-    first steps are a few times longer: it has farther to go. Raises ConfigError where colour covariances or
+    colours. degree: of view-dependent colour, fitted too if above 0. Poses of keyframes that are `movable` and not
+    `fixed` are fitted too, at the settings' rates. stats: receives the gradient by each splat's image mean, keyframe
+    by keyframe.
+    Adam's moments continue from fit to fit. A new splat's moments start from zero after the bias correction has run
+    out, so its first steps are a few times longer, which suits the longer way it has to go.
+    Raises BackendError where the field is not on the view's device; ConfigError where colour covariances or
     view-dependent colours are to be fitted to several keyframes at once.
     """
     if field.params.device != view.sums.device:
-        return _fit_there(field, view, batches, config, schedule, frozen_colors, degree, may_move, felt)
+        where = f"the field is on {field.params.device}, the view on {view.sums.device}"
+        raise BackendError(f"{where}; bring the field to the view's device with GaussianField.to")
     fit, rates = FieldFit(), Rates.of(config)
     pose_rates = np.repeat([config.lr_pose_translation, config.lr_pose_rotation], 3)
-    steps = _Steps(field, view, loss_weights(config), frozen_colors, degree, felt)
+    steps = _Steps(field, view, loss_weights(config), frozen_colors, degree, stats)
     for batch, rates in zip(batches, schedule or repeat(rates), strict=False):  # noqa: B020 # the last ones settle the fit
-        loss, twists = steps.take(batch, rates, fit)
+        loss, twists = steps.take(batch, rates, fit.stopwatch)
         fit.losses.append(loss)
         for keyframe, twist in zip(batch, twists, strict=True):
-            if pose_rates.any() and may_move(keyframe):
+            if pose_rates.any() and keyframe.movable and not keyframe.fixed:
                 keyframe.move(twist, pose_rates)
-    settle(field, rates, compiled=isinstance(view, CpuView))
+    fits_of(view).settle(field, rates)
     for name, extra in field.extras.items():
-        settle(extra, rates.of_extra(name), compiled=False)
-    return fit
-
-
-def _fit_there(
-    field: GaussianField,
-    view: View,
-    batches: Iterable[Sequence[Keyframe]],
-    config: MappingConfig,
-    schedule: Iterable[Rates] | None,
-    frozen_colors: int,
-    degree: int,
-    may_move: Callable[[Keyframe], bool],
-    felt: Felt | None,
-) -> FieldFit:
-    """Fit on the view's device, and bring the field back to where it lies."""
-    there, here = field.on(view.sums.device), field.params.device
-    told = None if felt is None else lambda keyframe, pull: felt(keyframe, pull.to(here))
-    fit = fit_field(there, view, batches, config, schedule, frozen_colors, degree, may_move, told)
-    for name, extra in there.extras.items():
-        field.carry(name).take(extra)
-    field.take(there)
+        settle(extra, rates.of_extra(name))
     return fit
 
 
@@ -133,35 +105,35 @@ class _Steps:
         weights: dict[str, float],
         frozen_colors: int,
         degree: int,
-        felt: Felt | None,
+        stats: FitStats | None,
     ) -> None:
-        self.field, self.view, self.weights, self.frozen_colors, self.felt = field, view, weights, frozen_colors, felt
+        self.field, self.weights, self.frozen_colors, self.stats = field, weights, frozen_colors, stats
         field.moment1[:frozen_colors, COLUMNS["colors"]] = 0.0  # or they would coast on
-        self.step = step_for(field, view, weights, degree)
-        self.pull = None if felt is None else field.params.new_zeros(len(field))
+        self.step, self.to_host = step_for(field, view, weights, degree), fits_of(view).to_host
+        self.grad2d = None if stats is None else field.params.new_zeros(len(field))
 
-    def take(self, batch: Sequence[Keyframe], rates: Rates, fit: FieldFit) -> tuple[float, list[Matrix]]:
+    def take(self, batch: Sequence[Keyframe], rates: Rates, stopwatch: Stopwatch) -> tuple[float, list[Matrix]]:
         """Step against the mean loss of a batch; return that loss, and of each image its own pose twist [6]."""
         self.field.steps += 1
-        gathered = gathering(self.step, self.field) if len(batch) > 1 else None
+        accumulator = self.step.accumulator(self.field) if len(batch) > 1 else None
         costs, shape, twists = list[float | Tensor](), list[float | Tensor](), list[Twist]()
         for keyframe in batch:
-            t, target = time.perf_counter(), keyframe.target.on(self.field.params.device)
-            self.step.forward(self.field, se3.inverse(keyframe.T_world_camera), target, self.weights)
-            t = fit.add("forward", t)
-            costs.append(self.step.images(target, self.weights))
-            t = fit.add("loss", t)
-            if gathered is None:
-                twist, cost = self.step.splats(self.field, rates, self.weights, self.frozen_colors, self.pull)
-                shape.append(cost)
-            else:
-                twist = gathered.add(self.field, 1.0 / len(batch), self.pull)
-            twists.append(twist)
-            if self.felt is not None and self.pull is not None:
-                self.felt(keyframe, self.pull)
-            t = fit.add("backward", t)
-        if gathered is not None:
-            shape.append(gathered.step(self.field, rates, self.weights, self.frozen_colors))
-        here, numbers = arrived(twists, [*costs, *shape])
-        fit.add("backward", t)
-        return sum(cost / len(batch) for cost in numbers[: len(costs)]) + sum(numbers[len(costs) :]), here
+            with stopwatch.stage("forward"):
+                target = keyframe.target.on(self.field.params.device)
+                self.step.forward(self.field, se3.inverse(keyframe.T_world_camera), target, self.weights)
+            with stopwatch.stage("loss"):
+                costs.append(self.step.images(target, self.weights))
+            with stopwatch.stage("backward"):
+                if accumulator is None:
+                    twist, cost = self.step.splats(self.field, rates, self.weights, self.frozen_colors, self.grad2d)
+                    shape.append(cost)
+                else:
+                    twist = accumulator.add(self.field, 1.0 / len(batch), self.grad2d)
+                twists.append(twist)
+                if self.stats is not None and self.grad2d is not None:
+                    self.stats.on_gradient(keyframe, self.grad2d)
+        with stopwatch.stage("backward"):
+            if accumulator is not None:
+                shape.append(accumulator.step(self.field, rates, self.weights, self.frozen_colors))
+            on_host, numbers = self.to_host(twists, [*costs, *shape])
+        return sum(cost / len(batch) for cost in numbers[: len(costs)]) + sum(numbers[len(costs) :]), on_host

@@ -162,7 +162,7 @@ def moment(moment: Tensor, valid: Tensor) -> Tensor:
 
 
 @term
-def alignment(depth: Tensor, median_depth: Tensor, valid: Tensor) -> Tensor:
+def median_depth(depth: Tensor, median_depth: Tensor, valid: Tensor) -> Tensor:
     """Take mean |D̂ − D̂m| of depths [H, W] m over valid [H, W], m; 0 without a median (CG-SLAM eq. 16).
 
     A median is where a splat takes half the light. Both sides are pulled: surfaces come to lie there.

@@ -6,14 +6,12 @@ from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.align import Alignment, align
-from sigmasplat.fit.cuda_pose import descend_on_device
-from sigmasplat.fit.descent import descend
+from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import PoseMaps, agreement
 from sigmasplat.model import se3
-from sigmasplat.render.cuda_view import CudaView
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 
@@ -51,10 +49,7 @@ def fit_pose_adam(
     CUDA device cannot number its pairs of splats and tiles.
     """
     params, target = params.to(view.sums.device), target.on(view.sums.device)
-    if isinstance(view, CudaView):
-        found = descend_on_device(params, view, target, T_camera_world, config, iterations)
-    else:
-        found = descend(params, view, target, T_camera_world, config, iterations)
+    found = fits_of(view).descend(params, view, target, T_camera_world, config, iterations)
     view.forward(params, found.T_camera_world)
     agree, overlap = agreement(PoseMaps.of(view), target)
     T_best = se3.orthonormalise(found.T_camera_world)

@@ -64,14 +64,19 @@ class Target:
 
 @dataclass(eq=False)
 class Keyframe:
-    """A target with the pose it was seen from, T_world_camera float64 [4, 4]; mapping may move it unless `fixed`."""
+    """A target with the pose it was seen from, T_world_camera float64 [4, 4].
+
+    A `fixed` pose never moves; of the others a fit moves those that are `movable`, which is set before it.
+    """
 
     index: int
     target: Target
     T_world_camera: NDArray[np.float64]
     fixed: bool = False
+    movable: bool = True
     motion: VectorAdam = dataclass_field(default_factory=lambda: VectorAdam.of(6))
-    seen: NDArray[np.int64] | None = None
+    visible_ids: NDArray[np.int64] | None = None
+    """Sorted ids of the splats that dominate a pixel of it; None where nobody asked."""
     descriptor: NDArray[np.float32] | None = None
 
     def move(self, gradient: NDArray[np.float64], rates: NDArray[np.float64]) -> None:

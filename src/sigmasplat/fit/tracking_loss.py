@@ -3,15 +3,14 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.confidence import outlier_mask, uncertainty_weights
 from sigmasplat.fit.target import Target
-from sigmasplat.render.render import variance_of
-from sigmasplat.render.view import CpuView, View
+from sigmasplat.render.channels import variance_of
+from sigmasplat.render.view import View
 
 
 @dataclass(eq=False)
@@ -81,8 +80,6 @@ def tracking_gradient(view: View, target: Target, config: TrackingConfig, exposu
     L_track = Σ A³ M (λ_c w̃ |exp(a) Ĉ + b − C| + (1 − λ_c) |D̂ − D|), here a mean over pixels (VarSplat §3), or over
     those that colour and depth each keep (CG-SLAM §6).
     """
-    if isinstance(view, CpuView):
-        return _compiled(view, target, config, exposure)
     maps, c = PoseMaps.of(view), config
     gain, offset = exposure[0].exp(), exposure[1]
     color_error = gain * maps.color + offset - target.image
@@ -101,21 +98,8 @@ def tracking_gradient(view: View, target: Target, config: TrackingConfig, exposu
     return float(loss), g_exposure
 
 
-def _compiled(view: CpuView, target: Target, config: TrackingConfig, exposure: Tensor) -> tuple[float, Tensor]:
-    """Do the same in the kernels (native/track.h): medians, weights and loss without a torch round trip."""
-    from sigmasplat.native import _core
-
-    g_exposure, camera = np.zeros(2), view.camera
-    loss = _core.tracking_loss(
-        view.sums, view.alpha, target.color, target.depth, camera.width, camera.height,
-        tracking_numbers(config, config.alpha_above), config.uncertainty, config.average == "kept",
-        float(exposure[0].exp()), float(exposure[1]), view.g_sums, g_exposure,
-    )  # fmt: skip
-    return loss, torch.as_tensor(g_exposure, dtype=exposure.dtype)
-
-
-def tracking_numbers(config: TrackingConfig, alpha_above: float) -> list[float]:
-    """Lay settings out as the kernels' `TrackOptions`."""
+def tracking_params(config: TrackingConfig, alpha_above: float) -> list[float]:
+    """Lay settings out as `TrackOptions` of the kernels (native/track.h)."""
     c = config
     return [
         alpha_above, c.alpha_power, c.outlier_factor, c.outlier_factor_color, c.weight_color, c.tau, c.weight_max,

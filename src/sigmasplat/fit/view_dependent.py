@@ -7,7 +7,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from sigmasplat.fit.adam import ROWS_AT_ONCE, Rates, adam_rows
-from sigmasplat.fit.step import Weights, render_for, shape_pull
+from sigmasplat.fit.interface import Accumulator, Weights, one_image_only
+from sigmasplat.fit.mapping_step import render_for, shape_gradient
 from sigmasplat.fit.target import Target
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.model.harmonics import basis, count, view_colors
@@ -59,14 +60,14 @@ class ViewDependentStep:
         return self.base.images(target, weights)
 
     def splats(
-        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, pull: Tensor | None = None
+        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Matrix, float]:
-        """Carry the planes to the splats in view and their harmonics, add the shape terms' pull on them, and step.
+        """Carry the planes to the splats in view and their harmonics, add the gradient of the shape terms, and step.
 
-        Returns the pose twist [6] and what the shape terms cost. `pull` is filled as by `View.backward`.
+        Returns the pose twist [6] and the cost of the shape terms. grad2d [N] is filled as by `View.backward`.
         """
         grad, cost = torch.zeros_like(field.params), 0.0
-        twist = self.view.backward(self._rows, grad, pull)
+        twist = self.view.backward(self._rows, grad, grad2d)
         harmonics = self._begin(field.carry("harmonics"))
         harmonic_rates = Rates(rates.of_extra("harmonics").per_column[: self.width])
         visible = self.view.visible(len(field)).nonzero().squeeze(1)
@@ -74,7 +75,7 @@ class ViewDependentStep:
             g, own, k = (x.index_select(0, rows) for x in (grad, field.params, harmonics.params))
             g[rows < frozen_colors, COLORS] = 0.0
             g_harmonics, g_means = self._through_colors(own, k, g[:, COLORS])
-            g_scales, term = shape_pull(
+            g_scales, term = shape_gradient(
                 own[:, SCALES], weights, len(rows) / max(len(field), 1), len(rows) / max(len(visible), 1)
             )
             g[:, MEANS] += g_means
@@ -85,6 +86,10 @@ class ViewDependentStep:
             adam_rows(field, rows, g, rates)
             adam_rows(harmonics, rows, g_harmonics, harmonic_rates)
         return twist, cost
+
+    def accumulator(self, field: GaussianField) -> Accumulator:
+        """Refuse with a ConfigError: the step takes one image only."""
+        raise one_image_only()
 
     def _begin(self, harmonics: Rows) -> Rows:
         """Begin a step of the harmonics; return those of the degrees in use, in the memory of all."""

@@ -1,1 +1,1 @@
-"""Draw a floor plan from a map, with regions to rescan."""
+"""Make a floor plan of a map, with the regions to scan again."""

@@ -1,4 +1,4 @@
-"""Draw up a plan of what a map shows, cell by cell from above: what is there, how sure it is, what it never saw."""
+"""Make a floor plan of a map: cells seen from above with what is there, its uncertainty, and what is not observed."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.errors import ConfigError
-from sigmasplat.floorplan import surface_samples
 from sigmasplat.floorplan.ground import floor_frame
-from sigmasplat.floorplan.rescan import Region, RescanMaps, regions_of
-from sigmasplat.floorplan.surface_samples import SurfaceSample
+from sigmasplat.floorplan.rescan import RescanMaps, RescanRegion, find_rescan_regions
+from sigmasplat.floorplan.surface_samples import SurfaceRenderer, SurfaceSample, sample_surfaces
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
@@ -21,17 +20,18 @@ from sigmasplat.render import render
 from sigmasplat.types import Matrix, Progress
 
 CELL_M = 0.05
-UNSEEN, BARE, FREE, THING, WALL = range(5)
-"""What a cell is: never seen; seen through, but not its floor; free floor; something stands there; something tall."""
+UNOBSERVED, FLOOR_UNOBSERVED, FREE, OBJECT, WALL = range(5)
+"""Kinds of cells. FLOOR_UNOBSERVED: a ray passed above the cell, but its floor was not observed."""
 SIGNS = "?,.o#"
-"""Of the kinds, in the record's rows."""
-MEANINGS = ("never seen", "floor never seen", "free", "something", "wall or something tall")
+"""One sign per kind, for the rows of `FloorPlan.record`."""
+MEANINGS = ("not observed", "floor not observed", "free floor", "object", "wall or tall object")
 LOW_M, HIGH_M = 0.1, 2.0
-"""What people bump into is in between; what hangs higher is left out, as is the ceiling."""
+"""Heights of obstacles. Everything higher is left out, such as lamps and the ceiling."""
 LAYER_M = 0.1
 WALL_LAYERS = 8
-LEAST_POINTS = 2
-"""A single pixel is not believed."""
+"""A cell with surfaces in this many layers of height is a wall."""
+MIN_POINTS = 2
+"""A single point in a layer is ignored as noise."""
 MARGIN_CELLS = 4
 
 Grid = NDArray[np.float32]
@@ -39,12 +39,13 @@ Grid = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class FloorPlan:
-    """A map from above, cells [rows, columns] of cell_m; row 0 is at the lowest y, column 0 at the lowest x.
+    """A map from above, cells [rows, columns] of size cell_m; row 0 is at the lowest y, column 0 at the lowest x.
 
-    T_floor_world: z up, floor at 0, x and y along the walls; origin_m: x, y of the corner where row and column 0 begin.
-    kind: UNSEEN, BARE, FREE, THING or WALL. color_sigma: mean √σ² of the splats there (colour, 0 to 1);
-    depth_sigma_m: mean spread in depth of the surfaces there; alpha: how opaque they are; nan where there is no
-    surface. path_m [N, 2]: where the camera went. regions: where to scan again, the largest first.
+    T_floor_world: z up, floor at 0, x and y along the walls; origin_m: x, y of the outer corner of row 0, column 0.
+    kind: UNOBSERVED, FLOOR_UNOBSERVED, FREE, OBJECT or WALL. color_sigma: mean √σ² of the splats in the cell (colour, 0
+    to 1); depth_sigma_m: mean standard deviation of depth of the surfaces in the cell; alpha: their mean opacity. These
+    three are nan in cells without a surface. path_m [N, 2]: the camera path. regions: where to scan again, the largest
+    first.
     """
 
     cell_m: float
@@ -55,14 +56,14 @@ class FloorPlan:
     depth_sigma_m: Grid
     alpha: Grid
     path_m: Matrix
-    regions: tuple[Region, ...]
+    regions: tuple[RescanRegion, ...]
 
     def area_m2(self, *kinds: int) -> float:
-        """Return the area of the cells of some kinds."""
+        """Return the total area of the cells of these kinds."""
         return float(np.isin(self.kind, kinds).sum()) * self.cell_m**2
 
     def record(self) -> dict[str, Any]:
-        """Return what JSON holds of the plan: the frame, a sign per cell (rows from the lowest y up), the regions."""
+        """Return the plan as values for JSON: the frame, one sign per cell (row 0 at the lowest y), the regions."""
         T_world_floor = se3.inverse(self.T_floor_world)
         places = [
             np.append(region.center_m, 0.0) @ T_world_floor[:3, :3].T + T_world_floor[:3, 3] for region in self.regions
@@ -87,42 +88,43 @@ def floor_plan(
     camera: Camera,
     *,
     cell_m: float = CELL_M,
-    most: int = surface_samples.MOST,
-    renderer: surface_samples.Renderer = render,
+    renderer: SurfaceRenderer = render,
     progress: Progress = lambda done, total: None,
 ) -> FloorPlan:
-    """Look at a map from its path and draw up its plan; `camera` gives the field of view, `most` poses are looked from.
+    """Make the floor plan of a map from poses along its path; `camera` gives the field of view.
 
-    `progress` is told (looks done, of how many). Raises ConfigError unless 1 mm ≤ cell_m ≤ 1 m; SigmaSplatError if
-    nothing is seen.
+    Calls `progress(poses done, total)`. Raises ConfigError unless 1 mm ≤ cell_m ≤ 1 m; SigmaSplatError if no surface is
+    visible.
     """
     if not 0.001 <= cell_m <= 1.0:
         raise ConfigError(f"a cell of the floor plan must be 0.001 to 1 m wide, found {cell_m}")
-    seen = list(surface_samples.looks(field, trajectory, camera, renderer, most, progress))
-    T_floor_world = floor_frame(seen)
-    moved = partial(_moved, T_floor_world)
-    grid = _Cells.around([moved(sight.points) for sight in seen], moved(trajectory.T_world_camera[:, :3, 3]), cell_m)
-    for sight in seen:
-        grid.carve(moved(sight.points), moved(sight.T_world_camera[None, :3, 3])[0])
-    for sight in seen:
-        grid.fill(moved(sight.points), sight)
+    samples = list(sample_surfaces(field, trajectory, camera, renderer, progress=progress))
+    T_floor_world = floor_frame(samples)
+    to_floor = partial(_transformed, T_floor_world)
+    path = to_floor(trajectory.T_world_camera[:, :3, 3])
+    grid = _Cells.around([to_floor(sample.points) for sample in samples], path, cell_m)
+    for sample in samples:
+        grid.add_rays(to_floor(sample.points), to_floor(sample.T_world_camera[None, :3, 3])[0])
+    for sample in samples:
+        grid.add_points(to_floor(sample.points), sample)
     kind, (alpha, depth_sigma_m) = grid.kinds(), grid.means()
-    color_sigma = grid.of_splats(moved(field.means.numpy()), field)
+    color_sigma = grid.color_sigma(to_floor(field.means.numpy()), field)
     color_sigma[np.isnan(alpha)] = np.nan
-    path_m = moved(trajectory.T_world_camera[:, :3, 3])[:, :2]
-    doubts = RescanMaps(kind == UNSEEN, kind == BARE, kind == FREE, color_sigma, depth_sigma_m, alpha)
-    regions = regions_of(doubts, cell_m, grid.origin_m)
+    maps = RescanMaps(
+        kind == UNOBSERVED, kind == FLOOR_UNOBSERVED, kind == FREE, color_sigma, depth_sigma_m, alpha
+    )  # fmt: skip
+    regions = find_rescan_regions(maps, cell_m, grid.origin_m)
     return FloorPlan(
-        cell_m, grid.origin_m, T_floor_world, kind, color_sigma, depth_sigma_m, alpha, path_m, tuple(regions)
+        cell_m, grid.origin_m, T_floor_world, kind, color_sigma, depth_sigma_m, alpha, path[:, :2], tuple(regions)
     )  # fmt: skip
 
 
-def _moved(T: Matrix, points: NDArray[np.floating]) -> Matrix:
+def _transformed(T: Matrix, points: NDArray[np.floating]) -> Matrix:
     return np.asarray(points.astype(np.float64) @ T[:3, :3].T + T[:3, 3])
 
 
 class _Cells:
-    """Counts and sums per cell while sights are added: points in the floor's frame throughout."""
+    """Counts and sums per cell, to which surface samples are added. All points are in the frame of the floor."""
 
     def __init__(self, origin_m: Matrix, shape: tuple[int, int], cell_m: float) -> None:
         self.origin_m, self.shape, self.cell_m = origin_m, shape, cell_m
@@ -133,7 +135,7 @@ class _Cells:
 
     @staticmethod
     def around(points: Sequence[Matrix], path: Matrix, cell_m: float) -> "_Cells":
-        """Make cells for all points but a hundredth at each end, and the path; edges at whole cells."""
+        """Make a grid that holds the path and the points, except 0.2 % outliers at each end of each axis."""
         flat = np.concatenate([p[:, :2] for p in points])
         low = np.minimum(np.quantile(flat, 0.002, axis=0), path[:, :2].min(0))
         high = np.maximum(np.quantile(flat, 0.998, axis=0), path[:, :2].max(0))
@@ -141,51 +143,51 @@ class _Cells:
         count = np.ceil(high / cell_m).astype(int) + MARGIN_CELLS - first
         return _Cells(first * cell_m, (int(count[1]), int(count[0])), cell_m)
 
-    def place(self, points: Matrix) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-        """Return the cell of each point as one number, and which points have one."""
+    def cell_index(self, points: Matrix) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+        """Return the flat index of the cell of each point, and which points are inside the grid."""
         cells = np.floor((points[:, :2] - self.origin_m) / self.cell_m).astype(np.intp)
         inside = ((cells >= 0) & (cells < [self.shape[1], self.shape[0]])).all(1)
         return np.asarray(cells[:, 1] * self.shape[1] + cells[:, 0], np.intp), np.asarray(inside)
 
-    def carve(self, points: Matrix, eye: Matrix) -> None:
-        """Note the cells that the light passes on its way to every third point, up to two cells before it."""
+    def add_rays(self, points: Matrix, eye: Matrix) -> None:
+        """Mark the cells between the camera and every third point as passed, up to two cells before the point."""
         rays = points[::3] - eye
         length = np.linalg.norm(rays, axis=1)
         steps = np.arange(0.0, max(length.max(initial=0.0) - 2 * self.cell_m, 0.0), self.cell_m)
         for step in steps:
             far = length > step + 2 * self.cell_m
             at = eye + rays[far] * (step / length[far])[:, None]
-            cell, inside = self.place(at)
+            cell, inside = self.cell_index(at)
             inside &= (at[:, 2] > LOW_M) & (at[:, 2] < HIGH_M)
             self.passed[np.unique(cell[inside])] += 1
 
-    def fill(self, points: Matrix, sight: SurfaceSample) -> None:
-        """Add points on surfaces: how many in each layer of height, and what the map says of them."""
-        cell, inside = self.place(points)
+    def add_points(self, points: Matrix, sample: SurfaceSample) -> None:
+        """Add surface points: their number per layer of height, and their alpha and depth sigma."""
+        cell, inside = self.cell_index(points)
         standing = inside & (points[:, 2] > LOW_M) & (points[:, 2] < HIGH_M)
         layer = np.minimum(((points[standing, 2] - LOW_M) / LAYER_M).astype(int), self.layers - 1)
         np.add.at(self.points, (cell[standing], layer), 1)
-        judged = inside & (points[:, 2] > -LOW_M) & (points[:, 2] < HIGH_M)
-        for total, values in ((self.weight, None), (self.sums[0], sight.alpha), (self.sums[1], sight.depth_sigma_m)):
-            area = sight.area_m2[judged].astype(np.float64)
-            total += np.bincount(cell[judged], area if values is None else area * values[judged], len(total))
+        used = inside & (points[:, 2] > -LOW_M) & (points[:, 2] < HIGH_M)
+        for total, values in ((self.weight, None), (self.sums[0], sample.alpha), (self.sums[1], sample.depth_sigma_m)):
+            area = sample.area_m2[used].astype(np.float64)
+            total += np.bincount(cell[used], area if values is None else area * values[used], len(total))
 
     def kinds(self) -> NDArray[np.uint8]:
-        """Return what each cell is."""
-        filled = (self.points >= LEAST_POINTS).sum(1)
-        kind = np.where(self.passed > 0, BARE, UNSEEN)
+        """Return the kind of each cell [rows, columns]."""
+        filled = (self.points >= MIN_POINTS).sum(1)
+        kind = np.where(self.passed > 0, FLOOR_UNOBSERVED, UNOBSERVED)
         kind = np.where(self.weight > 0, FREE, kind)
-        kind = np.where(filled >= WALL_LAYERS, WALL, np.where(filled > 0, THING, kind))
+        kind = np.where(filled >= WALL_LAYERS, WALL, np.where(filled > 0, OBJECT, kind))
         return kind.astype(np.uint8).reshape(self.shape)
 
     def means(self) -> Grid:
-        """Return mean alpha and depth sigma by area [2, rows, columns], nan where no surface was seen."""
+        """Return mean alpha and depth sigma, weighted by area, [2, rows, columns]; nan without a surface."""
         means = np.divide(self.sums, self.weight, out=np.full_like(self.sums, np.nan), where=self.weight > 0)
         return np.asarray(means.reshape(2, *self.shape), np.float32)
 
-    def of_splats(self, centers: Matrix, field: GaussianField) -> Grid:
-        """Return mean colour σ of the splats in each cell, by opacity and size; nan without any."""
-        cell, inside = self.place(centers)
+    def color_sigma(self, centers: Matrix, field: GaussianField) -> Grid:
+        """Return the mean colour σ of the splats in each cell, weighted by opacity and size; nan without splats."""
+        cell, inside = self.cell_index(centers)
         inside &= (centers[:, 2] > -LOW_M) & (centers[:, 2] < HIGH_M)
         scales = np.sort(field.scales.numpy()[inside], axis=1).astype(np.float64)
         weight = field.opacities.numpy()[inside] * scales[:, 1] * scales[:, 2]

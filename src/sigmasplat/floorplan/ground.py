@@ -1,4 +1,4 @@
-"""Find the floor in what a map shows: which way is up, how high the floor lies, which way the walls run."""
+"""Find the floor from surface samples: the up direction, the height of the floor, the direction of the walls."""
 
 from collections.abc import Sequence
 
@@ -8,28 +8,28 @@ from sigmasplat.errors import SigmaSplatError
 from sigmasplat.floorplan.surface_samples import SurfaceSample
 from sigmasplat.types import Matrix
 
-TILT = np.cos(np.deg2rad(40.0))
-"""Cameras are held upright, give or take this."""
-ALIKE = np.cos(np.deg2rad(8.0))
+MAX_TILT_COS = np.cos(np.deg2rad(40.0))
+"""Cameras are assumed upright within 40°."""
+PARALLEL_COS = np.cos(np.deg2rad(8.0))
 CANDIDATES = 400
-LEAST_SHARE = 0.02
-"""Of all area: a floor, ceiling or table tops of less do not say which way is up."""
+MIN_LEVEL_SHARE = 0.02
+"""If level surfaces have less than this share of all area, they are not used to find the up direction."""
 LAYER_M = 0.025
-FLOOR_SHARE = 0.1
-"""The floor is the lowest layer with at least this share of the largest one's area: a table may show more."""
-SEEN_MOST = 16_000
-"""Points are thinned to so many."""
+MIN_FLOOR_SHARE = 0.1
+"""The floor is the lowest layer with at least this share of the largest layer's area: a table may have more area."""
+MAX_POINTS = 16_000
+"""Samples are reduced to about this many points."""
 
 
-def floor_frame(sights: Sequence[SurfaceSample]) -> Matrix:
+def floor_frame(samples: Sequence[SurfaceSample]) -> Matrix:
     """Return T_floor_world: z up, floor at z = 0, origin below the first camera, x and y along the walls.
 
-    y is the direction along the walls nearest to where the first camera looks. Everything but that follows the world
-    where it is moved. Raises SigmaSplatError if nothing is seen.
+    y is the direction along the walls that is nearest to the viewing direction of the first camera. Raises
+    SigmaSplatError if no surface is visible.
     """
-    points, normals, area = _thinned(sights)
-    poses = np.stack([sight.T_world_camera for sight in sights])
-    up = upwards(normals, area, poses)
+    points, normals, area = _subsampled(samples)
+    poses = np.stack([sample.T_world_camera for sample in samples])
+    up = up_direction(normals, area, poses)
     height_m = floor_height(points @ up, normals @ up, area, float((poses[:, :3, 3] @ up).min()))
     ahead = _horizontal(poses[0], up)
     ahead = along_walls(normals, area, up, ahead)
@@ -40,61 +40,62 @@ def floor_frame(sights: Sequence[SurfaceSample]) -> Matrix:
     return T
 
 
-def _thinned(sights: Sequence[SurfaceSample]) -> tuple[Matrix, Matrix, Matrix]:
-    """Return points, normals [P, 3] and areas [P] of all sights, every k-th."""
-    total = sum(len(sight.points) for sight in sights)
+def _subsampled(samples: Sequence[SurfaceSample]) -> tuple[Matrix, Matrix, Matrix]:
+    """Return points, normals [P, 3] and areas [P] of every k-th sample."""
+    total = sum(len(sample.points) for sample in samples)
     if not total:
-        raise SigmaSplatError("the map shows no surface from its path; is it a map of splats, and its path?")
-    step = max(1, total // SEEN_MOST)
-    stacked = [np.concatenate([getattr(s, name) for s in sights])[::step] for name in ("points", "normals", "area_m2")]
+        raise SigmaSplatError("no surface of the map is visible from its path; do map and path belong together?")
+    step = max(1, total // MAX_POINTS)
+    stacked = [np.concatenate([getattr(s, name) for s in samples])[::step] for name in ("points", "normals", "area_m2")]
     points, normals, area = (values.astype(np.float64) for values in stacked)
     return points, normals, area
 
 
-def upwards(normals: Matrix, area: Matrix, poses: Matrix) -> Matrix:
-    """Return the unit vector upwards: of the normals within 40° of the cameras' mean up the one that most area agrees
-    with, lying along it or at right angles to it.
+def up_direction(normals: Matrix, area: Matrix, poses: Matrix) -> Matrix:
+    """Return the unit vector that points up.
 
-    Where hardly any area lies level, at right angles to the walls; without walls, the cameras' mean up.
+    Candidates are normals within 40° of the mean up direction of the cameras. The best one has the most area whose
+    normals are parallel (weight 1) or perpendicular (weight ½) to it. With too few level surfaces the result is
+    perpendicular to the walls; without walls, it is the mean up direction of the cameras.
     """
-    held = _unit(-poses[:, :3, 1].sum(0), -poses[0, :3, 1])
-    level = np.abs(normals @ held) > TILT
-    if area[level].sum() < LEAST_SHARE * area.sum():
-        return _across_walls(normals, area, held)
+    camera_up = _unit(-poses[:, :3, 1].sum(0), -poses[0, :3, 1])
+    level = np.abs(normals @ camera_up) > MAX_TILT_COS
+    if area[level].sum() < MIN_LEVEL_SHARE * area.sum():
+        return _across_walls(normals, area, camera_up)
     rows = np.flatnonzero(level)
     candidates = normals[rows[np.linspace(0, len(rows) - 1, min(CANDIDATES, len(rows))).astype(int)]]
     cosines = np.abs(candidates @ normals.T)
-    votes = ((cosines > ALIKE) + 0.5 * (cosines < np.sqrt(1.0 - ALIKE**2))) @ area
+    votes = ((cosines > PARALLEL_COS) + 0.5 * (cosines < np.sqrt(1.0 - PARALLEL_COS**2))) @ area
     up = candidates[int(votes.argmax())]
     for _ in range(3):
         cosine = normals @ up
-        agree = np.abs(cosine) > ALIKE
+        agree = np.abs(cosine) > PARALLEL_COS
         up = _unit((np.sign(cosine) * area)[agree] @ normals[agree], up)
-    return np.asarray(up * np.sign(up @ held))
+    return np.asarray(up * np.sign(up @ camera_up))
 
 
-def _across_walls(normals: Matrix, area: Matrix, held: Matrix) -> Matrix:
-    """Return the direction that upright surfaces have least to do with, if there are two walls, else `held`."""
-    walls = np.abs(normals @ held) < np.sqrt(1.0 - TILT**2)
+def _across_walls(normals: Matrix, area: Matrix, camera_up: Matrix) -> Matrix:
+    """Return the direction perpendicular to the walls if there are walls in two directions, else `camera_up`."""
+    walls = np.abs(normals @ camera_up) < np.sqrt(1.0 - MAX_TILT_COS**2)
     values, vectors = np.linalg.eigh((normals[walls] * area[walls, None]).T @ normals[walls])
     if not walls.any() or values[0] > 0.2 * values[1]:
-        return held
-    up = vectors[:, 0] * np.sign(vectors[:, 0] @ held)
-    return up if up @ held > TILT else held
+        return camera_up
+    up = vectors[:, 0] * np.sign(vectors[:, 0] @ camera_up)
+    return up if up @ camera_up > MAX_TILT_COS else camera_up
 
 
 def floor_height(heights_m: Matrix, cosines: Matrix, area: Matrix, camera_m: float) -> float:
-    """Return the floor's height: of the layers that face up, below all cameras, the lowest with much area.
+    """Return the height of the floor: the lowest layer with much area that faces up and is below all cameras.
 
-    heights_m [P] and cosines to up [P] of points on surfaces. Without any, nearly the lowest point there is.
+    heights_m [P] and cosines to up [P] of surface points. Without such a layer, the 1st percentile of the heights.
     """
-    level = (cosines > ALIKE) & (heights_m < camera_m)
-    if area[level].sum() < 0.1 * LEAST_SHARE * area.sum():
+    level = (cosines > PARALLEL_COS) & (heights_m < camera_m)
+    if area[level].sum() < 0.1 * MIN_LEVEL_SHARE * area.sum():
         return float(np.quantile(heights_m, 0.01))
     edges = np.arange(heights_m[level].min() - 2 * LAYER_M, camera_m + 3 * LAYER_M, LAYER_M)
     layers, _ = np.histogram(heights_m[level], edges, weights=area[level])
-    pairs = layers[:-1] + layers[1:]  # a layer cut in two by an edge counts whole
-    lowest = int(np.argmax(pairs >= FLOOR_SHARE * pairs.max()))
+    pairs = layers[:-1] + layers[1:]  # a layer split by a bin edge counts as one
+    lowest = int(np.argmax(pairs >= MIN_FLOOR_SHARE * pairs.max()))
     peak = lowest + int(np.argmax(pairs[lowest : lowest + 3]))
     near = level & (np.abs(heights_m - edges[peak + 1]) < 1.5 * LAYER_M)
     order = np.argsort(heights_m[near])
@@ -103,13 +104,13 @@ def floor_height(heights_m: Matrix, cosines: Matrix, area: Matrix, camera_m: flo
 
 
 def along_walls(normals: Matrix, area: Matrix, up: Matrix, ahead: Matrix) -> Matrix:
-    """Turn a level direction by at most 45° so that it runs along most walls; as it is where there are none."""
-    walls = np.abs(normals @ up) < np.sqrt(1.0 - ALIKE**2)
-    if area[walls].sum() < LEAST_SHARE * area.sum():
+    """Rotate a level direction by at most 45° so that it is parallel to most walls; unchanged without walls."""
+    walls = np.abs(normals @ up) < np.sqrt(1.0 - PARALLEL_COS**2)
+    if area[walls].sum() < MIN_LEVEL_SHARE * area.sum():
         return ahead
     aside = np.cross(ahead, up)
     angle = np.arctan2(normals[walls] @ aside, normals[walls] @ ahead)
-    # Fourfold: walls at right angles vote for one angle. The strongest degree first, then the mean around it.
+    # Angles count modulo 90°, so that perpendicular walls vote for one angle: the best degree, then the mean around it.
     votes = np.bincount(np.rint(np.rad2deg(angle)).astype(int) % 90, area[walls], 90)
     best = np.deg2rad(float(np.argmax(np.convolve(np.r_[votes[-2:], votes, votes[:2]], np.ones(5), "valid"))))
     off = np.angle(np.exp(4j * (angle - best))) / 4.0
@@ -120,7 +121,7 @@ def along_walls(normals: Matrix, area: Matrix, up: Matrix, ahead: Matrix) -> Mat
 
 
 def _horizontal(T_world_camera: Matrix, up: Matrix) -> Matrix:
-    """Return the level direction a camera looks in; where it looks straight down, that of its image's upper edge."""
+    """Return the horizontal viewing direction of a camera; looking straight down, that of the image's upper edge."""
     for direction in (T_world_camera[:3, 2], -T_world_camera[:3, 1]):
         level = direction - (direction @ up) * up
         if np.linalg.norm(level) > 0.3:
@@ -129,6 +130,6 @@ def _horizontal(T_world_camera: Matrix, up: Matrix) -> Matrix:
 
 
 def _unit(vector: Matrix, otherwise: Matrix) -> Matrix:
-    """Return a vector at length 1, another one where it has none."""
+    """Return a vector scaled to length 1, or `otherwise` if its length is 0."""
     length = float(np.linalg.norm(vector))
     return np.asarray(vector / length) if length > 1e-9 else otherwise

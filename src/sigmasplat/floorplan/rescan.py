@@ -1,4 +1,4 @@
-"""Say where to scan again: what a floor plan is unsure of, has too little of, or never saw though it lies inside."""
+"""Find the regions of a floor plan to scan again: not observed, mapped too thinly, or uncertain."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,24 +12,27 @@ from skimage.draw import polygon
 
 from sigmasplat.types import Matrix
 
-UNSURE_DEPTH_M = 0.05
-UNSURE_COLOR = 3.0
-"""Times the plan's median: how large σ is as such depends on how the map was trained."""
-THIN_ALPHA = 0.9
-"""As for fusing surfaces: less stops the light only in part."""
-LEAST_AREA_M2 = 0.03
-REACH_M = 0.3
-"""Of what was never seen, only this much beyond what was is told: farther off there may be nothing."""
-MOST = 12
+MAX_DEPTH_SIGMA_M = 0.05
+MAX_COLOR_SIGMA_RATIO = 3.0
+"""Relative to the median of the plan: the absolute size of σ depends on how the map was trained."""
+MIN_ALPHA = 0.9
+"""As for surface fusion: below this alpha a surface is partly transparent."""
+MIN_AREA_M2 = 0.03
+MAX_GAP_M = 0.3
+"""A region that was not observed reaches at most this far beyond observed space: farther away there may be nothing."""
+MAX_REGIONS = 12
 
 Grid = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class Region:
-    """Where to scan again: center_m (x, y), the middle of its widest place, where a circle of radius_m fits; area_m2;
-    why: unseen, thin or unsure; found: what was measured there, in words."""
+class RescanRegion:
+    """One region to scan again.
+
+    center_m (x, y): centre of the widest place, where a circle of radius_m fits; area_m2; why: unseen, thin or unsure;
+    found: what was measured there, in words.
+    """
 
     center_m: tuple[float, float]
     radius_m: float
@@ -37,64 +40,80 @@ class Region:
     why: str
     found: str
 
+    def sentence(self, area_unit: str = "m²") -> str:
+        """Describe the region: why, what was measured, how large it is, and where it is relative to the start."""
+        x_m, y_m = self.center_m
+        side, along = "right" if x_m > 0 else "left", "ahead of" if y_m > 0 else "behind"
+        where = f"{abs(x_m):.1f} m {side}, {abs(y_m):.1f} m {along} the start"
+        return f"{self.why}: {self.found} · {self.area_m2:.2f} {area_unit} · {where}"
+
 
 @dataclass(frozen=True, eq=False)
 class RescanMaps:
-    """What a plan's cells [rows, columns] say: unseen, floor unseen, free; the measures, nan where no surface is."""
+    """Maps of a plan [rows, columns] that show where to scan again.
 
-    unseen: Mask
-    bare: Mask
+    unobserved, floor_unobserved, free: cells of these kinds; the measurements are nan in cells without a surface.
+    """
+
+    unobserved: Mask
+    floor_unobserved: Mask
     free: Mask
     color_sigma: Grid
     depth_sigma_m: Grid
     alpha: Grid
 
 
-def regions_of(doubts: RescanMaps, cell_m: float, origin_m: Matrix) -> list[Region]:
-    """Return at most `MOST` regions of at least `LEAST_AREA_M2`, the largest first."""
+def find_rescan_regions(maps: RescanMaps, cell_m: float, origin_m: Matrix) -> list[RescanRegion]:
+    """Return at most `MAX_REGIONS` regions of at least `MIN_AREA_M2`, the largest first."""
     found = []
-    for why, mask, say in _kinds(doubts, cell_m):
+    for why, mask, describe in _reasons(maps, cell_m):
         labels, count = ndimage.label(_open(mask), np.ones((3, 3)))
         for number in range(1, count + 1):
             at = labels == number
             area_m2 = float(at.sum()) * cell_m**2
-            if area_m2 >= LEAST_AREA_M2:
-                (row, column), radius = _widest(at)
+            if area_m2 >= MIN_AREA_M2:
+                (row, column), radius = _widest_place(at)
                 center = (float(origin_m[0] + (column + 0.5) * cell_m), float(origin_m[1] + (row + 0.5) * cell_m))
-                found.append(Region(center, radius * cell_m, area_m2, why, say(at)))
-    return sorted(found, key=lambda region: -region.area_m2)[:MOST]
+                found.append(RescanRegion(center, radius * cell_m, area_m2, why, describe(at)))
+    return sorted(found, key=lambda region: -region.area_m2)[:MAX_REGIONS]
 
 
-def _kinds(d: RescanMaps, cell_m: float) -> list[tuple[str, Mask, Callable[[Mask], str]]]:
-    """Return each reason's cells and the words for some of them."""
-    typical = float(np.nanmedian(d.color_sigma)) if np.isfinite(d.color_sigma).any() else 1.0
+def _reasons(maps: RescanMaps, cell_m: float) -> list[tuple[str, Mask, Callable[[Mask], str]]]:
+    """Return for each reason its name, its cells, and a function that describes a part of these cells."""
+    median_sigma = float(np.nanmedian(maps.color_sigma)) if np.isfinite(maps.color_sigma).any() else 1.0
     with np.errstate(invalid="ignore"):
-        thin = np.asarray(d.alpha < THIN_ALPHA)
-        blurred, patchy = d.depth_sigma_m > UNSURE_DEPTH_M, d.color_sigma > UNSURE_COLOR * typical
+        thin = np.asarray(maps.alpha < MIN_ALPHA)
+        unsure_depth = maps.depth_sigma_m > MAX_DEPTH_SIGMA_M
+        unsure_color = maps.color_sigma > MAX_COLOR_SIGMA_RATIO * median_sigma
 
-    def doubt(at: Mask) -> str:
-        depth = f"depth ± {100.0 * np.nanmean(d.depth_sigma_m[at]):.1f} cm"
-        color = f"colour {np.nanmean(d.color_sigma[at]) / typical:.1f} times as unsure as usual"
-        return ", ".join(words for words, cause in ((depth, blurred), (color, patchy)) if cause[at].any())
+    def describe_uncertainty(at: Mask) -> str:
+        depth = f"depth ± {100.0 * np.nanmean(maps.depth_sigma_m[at]):.1f} cm"
+        color = f"σ of colour {np.nanmean(maps.color_sigma[at]) / median_sigma:.1f} times the median"
+        return ", ".join(words for words, cause in ((depth, unsure_depth), (color, unsure_color)) if cause[at].any())
 
     return [
-        ("unseen", _hidden(d.unseen, d.free | d.bare, cell_m), lambda at: "never in view"),
-        ("unseen", d.bare, lambda at: "seen through, but its floor was never in view"),
-        ("thin", thin, lambda at: f"lets {100.0 * (1.0 - np.nanmean(d.alpha[at])):.0f} % of the light through"),
-        ("unsure", np.asarray((blurred | patchy) & ~thin), doubt),
+        (
+            "unseen",
+            _hidden(maps.unobserved, maps.free | maps.floor_unobserved, cell_m),
+            lambda at: "not observed",
+        ),
+        ("unseen", maps.floor_unobserved, lambda at: "floor not observed"),
+        ("thin", thin, lambda at: f"surface {100.0 * (1.0 - np.nanmean(maps.alpha[at])):.0f} % transparent"),
+        ("unsure", np.asarray((unsure_depth | unsure_color) & ~thin), describe_uncertainty),
     ]
 
 
 def _open(mask: Mask) -> Mask:
-    """Close gaps of a cell, then drop what is only one cell wide."""
+    """Close gaps of one cell, then drop parts that are only one cell wide."""
     closed = ndimage.binary_closing(np.pad(mask, 1), np.ones((3, 3), bool))[1:-1, 1:-1]
     return np.asarray(ndimage.binary_opening(closed, np.ones((2, 2), bool)))
 
 
-def _widest(mask: Mask) -> tuple[tuple[float, float], float]:
-    """Return row and column of the middle of the widest place, and how many cells it is wide on either side.
+def _widest_place(mask: Mask) -> tuple[tuple[float, float], float]:
+    """Return row and column of the centre of the largest circle inside the mask, and its radius in cells.
 
-    Of places as wide, those within half a cell, their mean if it is one of them, else the one nearest to it.
+    Of all centres whose radius is within half a cell of the largest, this is their mean if it is one of them, else the
+    centre nearest to the mean.
     """
     inside = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
     places = np.argwhere(inside >= inside.max() - 0.5)
@@ -104,16 +123,16 @@ def _widest(mask: Mask) -> tuple[tuple[float, float], float]:
     return (float(row), float(column)), float(inside.max()) - 0.5
 
 
-def _hidden(unseen: Mask, empty: Mask, cell_m: float) -> Mask:
-    """Return the unseen cells within the hull of what was seen and within reach of seen empty space.
+def _hidden(unobserved: Mask, empty: Mask, cell_m: float) -> Mask:
+    """Return the unobserved cells inside the convex hull of observed cells and at most `MAX_GAP_M` from empty space.
 
-    Reach goes through unseen cells only: what lies behind a wall was not missed.
+    The distance is measured through unobserved cells only, so that space behind a wall does not count.
     """
-    inside = unseen & _hull(~unseen)
+    inside = unobserved & _hull(~unobserved)
     frontier = inside & ndimage.binary_dilation(empty)
     if not frontier.any():
         return frontier
-    return np.asarray(ndimage.binary_dilation(frontier, iterations=max(1, round(REACH_M / cell_m)), mask=inside))
+    return np.asarray(ndimage.binary_dilation(frontier, iterations=max(1, round(MAX_GAP_M / cell_m)), mask=inside))
 
 
 def _hull(cells: Mask) -> Mask:

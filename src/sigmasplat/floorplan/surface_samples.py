@@ -1,4 +1,4 @@
-"""Look at a map from places along its path: points on its surfaces, their normals, and how sure their depth is."""
+"""Sample the surfaces of a map from poses along its path: points, normals and the standard deviation of depth."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,17 +17,17 @@ from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import Render
 from sigmasplat.types import Matrix, Progress
 
-WIDTH = 160
-"""Pixels of an image that only measures: at 5 m one is about 4 cm wide."""
-MOST = 60
-EDGE = 0.05
-"""Neighbours whose depths differ by more than this share belong to two surfaces, and what lies between to neither."""
+WIDTH_PX = 160
+"""Width of the rendered images: at 5 m a pixel is about 4 cm wide."""
+MAX_POSES = 60
+MAX_DEPTH_STEP = 0.05
+"""A pixel is dropped as an edge if the depth of a neighbour differs by more than this share."""
 
 Floats = NDArray[np.float32]
 
 
-class Renderer(Protocol):
-    """Shows a field from T_camera_world, with U about a depth [H, W] m if one is given (`render.render`)."""
+class SurfaceRenderer(Protocol):
+    """Renders a field from T_camera_world; with a reference depth [H, W], m, also U about it (`render.render`)."""
 
     def __call__(
         self, field: GaussianField, camera: Camera, T_camera_world: Matrix, depth_reference: Tensor | None = None
@@ -36,10 +36,10 @@ class Renderer(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSample:
-    """What one look shows of surfaces, pixel by pixel [P]: edges and what the map has nothing at are left out.
+    """Surfaces seen from one pose, one sample per pixel [P]; edges and pixels without a surface are left out.
 
-    points, normals [P, 3] m in the world, normals towards the camera; area_m2: of the surface in the pixel; alpha;
-    depth_sigma_m: √(U/A), how far apart along the ray the splats lie that make the depth.
+    points, normals [P, 3] m in the world, normals towards the camera; area_m2: area of the surface in the pixel; alpha;
+    depth_sigma_m: √(U/A), the spread along the ray of the splats that make up the depth.
     """
 
     T_world_camera: Matrix
@@ -50,24 +50,26 @@ class SurfaceSample:
     depth_sigma_m: Floats
 
 
-def looks(
+def sample_surfaces(
     field: GaussianField,
     trajectory: Trajectory,
     camera: Camera,
-    renderer: Renderer,
-    most: int = MOST,
+    renderer: SurfaceRenderer,
+    max_poses: int = MAX_POSES,
     progress: Progress = lambda done, total: None,
 ) -> Iterator[SurfaceSample]:
-    """Look from at most so many poses, evenly spread over the path, first and last among them."""
-    small = camera.resized(WIDTH, max(1, round(camera.height * WIDTH / camera.width)))
-    rows = np.unique(np.linspace(0, len(trajectory) - 1, min(most, len(trajectory))).round().astype(int))
+    """Sample from at most `max_poses` poses, evenly spaced over the path, including the first and the last."""
+    small = camera.resized(WIDTH_PX, max(1, round(camera.height * WIDTH_PX / camera.width)))
+    rows = np.unique(np.linspace(0, len(trajectory) - 1, min(max_poses, len(trajectory))).round().astype(int))
     for done, row in enumerate(rows, 1):
-        yield look(field, small, trajectory.T_world_camera[row], renderer)
+        yield sample_surface(field, small, trajectory.T_world_camera[row], renderer)
         progress(done, len(rows))
 
 
-def look(field: GaussianField, camera: Camera, T_world_camera: Matrix, renderer: Renderer) -> SurfaceSample:
-    """Look once: render depth, then how far it is spread about itself."""
+def sample_surface(
+    field: GaussianField, camera: Camera, T_world_camera: Matrix, renderer: SurfaceRenderer
+) -> SurfaceSample:
+    """Sample from one pose: render depth, then its spread about that depth."""
     T_camera_world = se3.inverse(T_world_camera)
     with torch.inference_mode():
         seen = renderer(field, camera, T_camera_world)
@@ -82,19 +84,19 @@ def look(field: GaussianField, camera: Camera, T_world_camera: Matrix, renderer:
     across = np.cross(points[2:, 1:-1] - points[:-2, 1:-1], points[1:-1, 2:] - points[1:-1, :-2])[on]
     length = np.maximum(np.linalg.norm(across, axis=1), 1e-12)
     normals = across / length[:, None]
-    here = points[inner][on]
-    normals *= -np.sign((normals * here).sum(1, keepdims=True))
+    on_surface = points[inner][on]
+    normals *= -np.sign((normals * on_surface).sum(1, keepdims=True))
     R, t = T_world_camera[:3, :3].astype(np.float32), T_world_camera[:3, 3].astype(np.float32)
-    measured = (here @ R.T + t, normals @ R.T, length / 4.0, alpha[inner][on], sigma_m[inner][on])
+    measured = (on_surface @ R.T + t, normals @ R.T, length / 4.0, alpha[inner][on], sigma_m[inner][on])
     return SurfaceSample(T_world_camera, *(np.asarray(values, np.float32) for values in measured))
 
 
-def _smooth(depth_m: Floats, there: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Tell which inner pixels [H − 2, W − 2] lie on one surface with their four neighbours."""
-    z, on = depth_m[1:-1, 1:-1], there[1:-1, 1:-1].copy()
+def _smooth(depth_m: Floats, covered: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which inner pixels [H − 2, W − 2] lie on one surface with their four neighbours."""
+    z, on = depth_m[1:-1, 1:-1], covered[1:-1, 1:-1].copy()
     for rows, columns in ((0, 1), (2, 1), (1, 0), (1, 2)):
         near = np.s_[rows : rows + z.shape[0], columns : columns + z.shape[1]]
-        on &= there[near] & (np.abs(depth_m[near] - z) < EDGE * z)
+        on &= covered[near] & (np.abs(depth_m[near] - z) < MAX_DEPTH_STEP * z)
     return on
 
 

@@ -1,4 +1,4 @@
-"""Score a rendered image against the recorded one: PSNR, SSIM, depth L1. Pixels without a reading are masked."""
+"""Score a rendered image against the recorded one: PSNR, SSIM, depth L1. Pixels without a depth reading are masked."""
 
 from typing import Any
 
@@ -32,8 +32,8 @@ def psnr(rendered: Pixels, recorded: Pixels, valid: Mask | None = None) -> float
 def ssim(rendered: Pixels, recorded: Pixels, valid: Mask | None = None) -> float:
     """Return the structural similarity of colours [H, W, 3] in [0, 1] (Wang et al. 2004, eq. 13).
 
-    Gaussian window 11×11, σ 1.5, C1 = 0.01², C2 = 0.03²; only windows that lie inside the image, averaged over
-    channels and over windows whose centre is in `valid` [H, W]; nan if there is none.
+    Gaussian window 11×11, σ 1.5, C1 = 0.01², C2 = 0.03². Only windows inside the image count. The result is the mean
+    over channels and over the windows whose centre is in `valid` [H, W]; nan if no window is left.
     Raises SigmaSplatError if the image is smaller than a window.
     """
     if min(rendered.shape[:2]) < 2 * WINDOW_RADIUS + 1:
@@ -47,7 +47,7 @@ def ssim(rendered: Pixels, recorded: Pixels, valid: Mask | None = None) -> float
 
 
 def ssim_map(rendered: Pixels, recorded: Pixels) -> NDArray[np.float64]:
-    """Return the similarity of every window [H − 10, W − 10, 3], indexed by its centre less 5 pixels."""
+    """Return the similarity of every window [H − 10, W − 10, 3], indexed by its centre minus 5 pixels."""
     x, y = rendered.astype(np.float64), recorded.astype(np.float64)
     mean_x, mean_y = _window_mean(x), _window_mean(y)
     variance_x = _window_mean(x * x) - mean_x**2
@@ -71,9 +71,9 @@ def _window_mean(image: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def depth_l1(rendered_m: Pixels, recorded_m: Pixels, valid: Mask | None = None) -> float:
-    """Return the mean absolute depth error, metres, of [H, W] maps where both have a reading (> 0) and `valid` holds.
+    """Return the mean absolute depth error, metres, of [H, W] maps where both have a reading (> 0) and `valid` is true.
 
-    nan where no pixel is left.
+    nan if no pixel is left.
     """
     both = (rendered_m > 0) & (recorded_m > 0)
     if valid is not None:

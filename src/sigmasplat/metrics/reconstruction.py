@@ -1,7 +1,7 @@
-"""Score a surface against the true one, as iMAP and NICE-SLAM do: of both, only what a camera of the run could see.
+"""Score a mesh against the true surface, as iMAP and NICE-SLAM do: only parts that a camera of the run could see count.
 
-Distances are from points drawn on one surface to the other *surface*, not to points drawn on it: two samples of the
-same room, 200 000 points each, lie a centimetre apart, which would drown the errors of a good map.
+Distances are measured from points sampled on one surface to the other *surface*, not to points sampled on it. Two
+samples of the same room with 200 000 points each are about a centimetre apart, more than the errors of a good map.
 """
 
 from dataclasses import dataclass
@@ -20,32 +20,34 @@ Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 POINTS = 200_000
-"""Drawn on each surface."""
+"""Points sampled on each surface."""
 COMPLETE_M = 0.05
-"""Completion ratio: the share of the true surface that has a reconstructed one within this distance."""
+"""Completion ratio: the share of the true surface with a reconstructed surface within this distance."""
 CORRECT_M = 0.01
-"""Precision, recall and F1 are at this distance."""
+"""Precision, recall and F1 use this distance."""
 SLACK_M = 0.005
-"""A true face may be smaller than a pixel and lie between pixel centres; then its own centre decides, this near."""
+"""A true face may be smaller than a pixel and lie between pixel centres. It is also visible if its centre is at most
+this far behind the rendered depth."""
 BEHIND_M = 0.05
-"""A reconstructed face this far behind the true surface is hidden by it."""
+"""A reconstructed face more than this far behind the true surface is hidden."""
 CANDIDATES = 8
-"""Faces examined for each point: those of the nearest centroids."""
+"""Faces tested for each point: those with the nearest centroids."""
 POINTS_AT_ONCE = 20_000
 NOVEL_VIEWS = 20
 NOVEL_SHIFT_M, NOVEL_TURN_RAD, NOVEL_LEAST_M = 0.3, 0.35, 0.2
-"""A novel view is a training view, shifted and turned by up to this much along each axis, that is nowhere nearer to
-the true surface than the last."""
+"""A novel view is a training view, shifted and rotated by up to the first two values along each axis. No pixel of it
+may be nearer to the true surface than NOVEL_LEAST_M."""
 
 
 @dataclass(frozen=True)
-class Reconstruction:
-    """Distances in metres, shares in [0, 1].
+class MeshScores:
+    """Scores of a mesh: distances in metres, shares in [0, 1].
 
-    accuracy_m: mean distance from the reconstruction to the truth; completion_m: from the truth to the reconstruction;
-    completion_ratio: share of the truth within 5 cm; precision, recall: shares of reconstruction and truth within 1 cm;
-    f1: their harmonic mean; depth_l1_m: mean |depth difference| in novel views where both have a surface and a training
-    view saw the true one; depth_coverage: share of such pixels of the truth that have one.
+    accuracy_m: mean distance from the reconstruction to the true surface; completion_m: from the true surface to the
+    reconstruction; completion_ratio: share of the true surface within 5 cm of the reconstruction; precision, recall:
+    share of the reconstruction, and of the true surface, within 1 cm of the other; f1: their harmonic mean.
+    The last two use pixels of novel views whose true surface a training view saw: depth_l1_m is the mean |depth
+    difference| where the reconstruction has a surface too; depth_coverage is the share of pixels where it has one.
     """
 
     accuracy_m: float
@@ -68,44 +70,45 @@ def score(
     novel_views: int = NOVEL_VIEWS,
     seed: int = 0,
     progress: Progress = lambda done, total: None,
-) -> Reconstruction:
-    """Score mesh `found` against mesh `truth`, both in the truth's frame, seen from true poses [K, 4, 4].
+) -> MeshScores:
+    """Score mesh `found` against mesh `truth`, both in the frame of the truth, as seen from true poses [K, 4, 4].
 
-    The truth's faces should be small (a few cm): one is counted if a training view shows it at a pixel, or has its
-    centre within `SLACK_M` of what it shows there; a face found counts if its centre is in some training view no more
-    than `BEHIND_M` behind the truth. `progress` is told (views done, of how many). Values that do not exist are nan.
+    The true faces should be small (a few cm). A true face counts if a training view shows it at a pixel, or if its
+    centre is at most `SLACK_M` behind the depth rendered there. A reconstructed face counts if its centre is in a
+    training view and at most `BEHIND_M` behind the true surface. Calls `progress(views done, total)`. Scores without
+    data are nan.
     """
     total = len(T_world_camera) + novel_views
-    seen_true, seen_found = seen(
+    seen_true, seen_found = visible_parts(
         truth, found.corners.mean(1), camera, T_world_camera, lambda at, _: progress(at, total)
     )
     ours, theirs = found.with_faces(seen_found), truth.with_faces(seen_true)
     to_truth = distances(ours.sampled(points, seed), theirs)
     to_found = distances(theirs.sampled(points, seed + 1), ours)
     precision, recall = _share(to_truth, CORRECT_M), _share(to_found, CORRECT_M)
-    views = novel(truth, camera, T_world_camera, novel_views, seed)
+    views = sample_novel_views(truth, camera, T_world_camera, novel_views, seed)
     compared = []
     for done, (T, depth_m, face) in enumerate(views, len(T_world_camera) + 1):
         compared.append(_depth_pairs(found, seen_true, camera, T, depth_m, face))
         progress(done, total)
     both = np.concatenate([*compared, np.empty((2, 0))], axis=1)
     has = both[0] > 0
-    return Reconstruction(
+    return MeshScores(
         _mean(to_truth), _mean(to_found), _share(to_found, COMPLETE_M), precision, recall, f1(precision, recall),
         _mean(np.abs(both[0] - both[1])[has]), _mean(has.astype(np.float64)),
     )  # fmt: skip
 
 
-def seen(
+def visible_parts(
     truth: Mesh,
     points: Doubles,
     camera: Camera,
     T_world_camera: Doubles,
     progress: Progress = lambda done, total: None,
 ) -> tuple[Mask, Mask]:
-    """Tell which faces [F] of the truth, and which points [N] made beside it, count as seen from poses [K, 4, 4].
+    """Return which faces [F] of the truth and which points [N] of the map are visible from poses [K, 4, 4].
 
-    `score` has the rules; `progress` is told (views done, of how many).
+    `score` describes the rules. Calls `progress(views done, total)`.
     """
     seen_true, seen_points, centers = (
         np.zeros(len(truth.faces), bool),
@@ -115,21 +118,24 @@ def seen(
     for done, T in enumerate(T_world_camera, 1):
         depth_m, face = mesh_depth(truth, camera, se3.inverse(T))
         seen_true[face[face >= 0]] = True
-        seen_true |= in_front(centers, depth_m, camera, T, SLACK_M)
-        seen_points |= in_front(points, depth_m, camera, T, BEHIND_M)
+        seen_true |= visible_points(centers, depth_m, camera, T, SLACK_M)
+        seen_points |= visible_points(points, depth_m, camera, T, BEHIND_M)
         progress(done, len(T_world_camera))
     return seen_true, seen_points
 
 
 def f1(precision: float, recall: float) -> float:
-    """Return the harmonic mean, 0 where both are 0."""
+    """Return the harmonic mean; 0 if both are 0."""
     return 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0 * (precision + recall)
 
 
-def in_front(
+def visible_points(
     points: Doubles, depth_m: NDArray[np.float32], camera: Camera, T_world_camera: Doubles, slack_m: float
 ) -> Mask:
-    """Tell which points [N, 3] a camera sees: in its image, at most `slack_m` behind the depth [H, W] if any."""
+    """Return which points [N, 3] a camera sees: inside its image and at most `slack_m` behind the depth [H, W].
+
+    A pixel with depth 0 hides nothing.
+    """
     T = se3.inverse(T_world_camera)
     x, y, z = T[:3, :3] @ points.T + T[:3, 3:]
     ahead = np.maximum(z, 1e-6)
@@ -142,7 +148,7 @@ def in_front(
 
 
 def distances(points: Doubles, mesh: Mesh) -> Doubles:
-    """Return the distance [N] of each point to the nearest of the mesh's faces near it, inf where there is none."""
+    """Return the distance [N] of each point to the nearest face of the mesh; inf if the mesh has no face."""
     if not len(mesh.faces) or not len(points):
         return np.full(len(points), np.inf)
     corners = mesh.corners
@@ -157,7 +163,10 @@ def distances(points: Doubles, mesh: Mesh) -> Doubles:
 
 
 def _squared_distance(p: Doubles, a: Doubles, b: Doubles, c: Doubles) -> Doubles:
-    """Return squared distances [...] of points to triangles [..., 3]: to the plane if above it, else to an edge."""
+    """Return squared distances [...] of points to triangles [..., 3].
+
+    This is the distance to the plane if the point projects into the triangle, else to the nearest edge.
+    """
     edges = [(a, b - a), (b, c - b), (c, a - c)]
     normal = np.cross(b - a, c - a)
     to_edges, above = np.full(normal.shape[:-1], np.inf), _dot(normal, normal) > 0
@@ -175,10 +184,10 @@ def _dot(a: Doubles, b: Doubles) -> Doubles:
     return np.asarray(np.einsum("...k,...k->...", a, b))
 
 
-def novel(
+def sample_novel_views(
     truth: Mesh, camera: Camera, T_world_camera: Doubles, views: int, seed: int
 ) -> list[tuple[Doubles, NDArray[np.float32], NDArray[np.intp]]]:
-    """Choose up to so many novel views: each pose, with the truth's depth and faces there (see `NOVEL_SHIFT_M`)."""
+    """Sample at most `views` novel views. Return their poses, true depth and true faces (see `NOVEL_SHIFT_M`)."""
     rng, found = np.random.default_rng(seed), []
     for _ in range(4 * views if len(T_world_camera) else 0):
         shift, turn = rng.uniform(-1, 1, (2, 3)) * np.array([[NOVEL_SHIFT_M], [NOVEL_TURN_RAD]])
@@ -194,7 +203,7 @@ def novel(
 def _depth_pairs(
     found: Mesh, seen_true: Mask, camera: Camera, T: Doubles, depth_m: NDArray[np.float32], face: NDArray[np.intp]
 ) -> Doubles:
-    """Return found and true depth [2, P] at the pixels whose true face a training view saw; 0 = nothing found."""
+    """Return reconstructed and true depth [2, P] where a training view saw the true face; 0 = no reconstruction."""
     ours, _ = mesh_depth(found, camera, se3.inverse(T))
     counted = (face >= 0) & seen_true[face]
     return np.stack([ours[counted], depth_m[counted]]).astype(np.float64)

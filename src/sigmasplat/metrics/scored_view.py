@@ -1,4 +1,4 @@
-"""One recorded image beside its rendering, and the scores of this pair."""
+"""Hold one recorded image with its rendering, and score the pair."""
 
 from dataclasses import dataclass, field
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from sigmasplat.metrics.image import depth_l1, psnr, ssim
 
 COVERED_ALPHA = 0.5
-"""Above this alpha the map is taken to have a surface there (depth = Σwz / Σw is meant)."""
+"""Above this alpha a pixel counts as covered by the map: its depth is Σwz / Σw."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,7 +16,7 @@ class ScoredView:
     """A recorded image and its rendering at the estimated pose, float32.
 
     recorded, rendered: [H, W, 3] in [0, 1]; recorded_depth_m [H, W] (0 = no reading); rendered_depth_m [H, W]
-    (0 where alpha ≤ ½); alpha [H, W]; variance: V [H, W, 3], colour² (VarSplat §1); notes are written under the strip.
+    (0 where alpha ≤ ½); alpha [H, W]; variance: V [H, W, 3], colour² (VarSplat §1); notes: shown below the view strip.
     """
 
     index: int
@@ -31,12 +31,12 @@ class ScoredView:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """Return the pixels with a depth reading [H, W]: the ones every score is taken on."""
+        """Return which pixels have a depth reading [H, W]. Every score uses only these pixels."""
         return self.recorded_depth_m > 0
 
     @property
     def uncertainty(self) -> NDArray[np.float32]:
-        """Return V averaged over the channels [H, W], colour²; rounding below 0 counts as 0."""
+        """Return V averaged over the channels [H, W], colour². Negative values (rounding) become 0."""
         return np.asarray(np.maximum(self.variance.mean(-1), 0.0), np.float32)
 
     @property
@@ -45,7 +45,7 @@ class ScoredView:
         return np.asarray(((self.rendered - self.recorded) ** 2).mean(-1), np.float32)
 
     def scores(self) -> dict[str, float]:
-        """Return PSNR (dB), SSIM, depth L1 (m) and the share of readings that the map covers, on valid pixels."""
+        """Return PSNR (dB), SSIM, depth L1 (m) and the share of depth readings that the map covers, on valid pixels."""
         valid = self.valid
         covered = float((self.rendered_depth_m > 0)[valid].mean()) if valid.any() else float("nan")
         return {

@@ -1,26 +1,27 @@
-"""Hold the centres of splats against the true surface (CG-SLAM's Chamfer distance), and count those that float."""
+"""Measure the distance of splat centres to the true surface (CG-SLAM's Chamfer distance), and count floaters."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sigmasplat.metrics.reconstruction import POINTS, Doubles, distances, seen
+from sigmasplat.metrics.reconstruction import POINTS, Doubles, distances, visible_parts
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.mesh import Mesh
 
 OPAQUE = 0.1
-"""A splat of more than this opacity can be a floater …"""
+"""Only a splat above this opacity can be a floater."""
 FLOATER_M = 0.1
-"""… if its centre lies further than this from every true surface."""
+"""A floater is an opaque splat whose centre is farther than this from every true surface."""
 
 
 @dataclass(frozen=True)
-class SplatSurface:
-    """Distances in metres, floaters as a share in [0, 1]; nan or inf where there is nothing to measure.
+class SplatScores:
+    """Scores of splat centres: distances in metres, shares in [0, 1]; nan or inf without data.
 
-    splats_accuracy_m: mean distance from a splat's centre to the true surface; splats_completion_m: from the true
-    surface to the nearest centre; splats_chamfer_m: mean of the two; floaters: share of the opaque splats that float.
+    splats_accuracy_m: mean distance from a splat centre to the true surface; splats_completion_m: from the true
+    surface to the nearest splat centre; splats_chamfer_m: mean of the two; floaters: share of the opaque splats that
+    are floaters.
     """
 
     splats_accuracy_m: float
@@ -29,7 +30,7 @@ class SplatSurface:
     floaters: float
 
 
-def splats_to_surface(
+def score_splats(
     centers: Doubles,
     opacities: Doubles,
     truth: Mesh,
@@ -38,21 +39,22 @@ def splats_to_surface(
     *,
     points: int = POINTS,
     seed: int = 0,
-) -> SplatSurface:
-    """Hold splats, centers [N, 3] m and opacities [N], against the truth, in its frame, seen from true poses [K, 4, 4].
+) -> SplatScores:
+    """Score splats, centers [N, 3] m and opacities [N], in the frame of the truth, as seen from true poses [K, 4, 4].
 
-    Chamfer takes splats of every opacity, and of both sides what a training view could see (`reconstruction.score`). It
-    is never 0: centres have gaps between them. Floaters are judged by the whole surface, those hidden behind it too.
+    The Chamfer distance uses splats of every opacity, and only parts that a training view could see
+    (`reconstruction.score`). It is never 0 because there are gaps between splat centres. Floaters are measured against
+    the whole true surface, and splats hidden behind it count too.
     """
-    seen_true, seen_splats = seen(truth, centers, camera, T_world_camera)
+    seen_true, seen_splats = visible_parts(truth, centers, camera, T_world_camera)
     theirs, ours = truth.with_faces(seen_true), centers[seen_splats]
     accuracy, completion = _mean(distances(ours, theirs)), _mean(_to_nearest(theirs.sampled(points, seed), ours))
     floating = distances(centers[opacities > OPAQUE], truth) > FLOATER_M
-    return SplatSurface(accuracy, completion, (accuracy + completion) / 2, _mean(floating.astype(np.float64)))
+    return SplatScores(accuracy, completion, (accuracy + completion) / 2, _mean(floating.astype(np.float64)))
 
 
 def _to_nearest(points: Doubles, centers: Doubles) -> Doubles:
-    """Return the distance [P] of each point to the nearest centre, inf where there are none."""
+    """Return the distance [P] of each point to the nearest centre; inf if there is no centre."""
     if not len(centers):
         return np.full(len(points), np.inf)
     return np.asarray(cKDTree(centers).query(points)[0])

@@ -1,4 +1,4 @@
-"""Score a path against the truth: absolute (ATE) and relative (RPE) error after a rigid fit."""
+"""Score a trajectory against the truth: absolute error (ATE) after a rigid alignment, and relative error (RPE)."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -27,7 +27,7 @@ class AbsoluteError:
 
 @dataclass(frozen=True)
 class RelativeError:
-    """Error of the motion over `delta_frames` frames: metres and degrees, root mean square over `pairs` motions."""
+    """Error of the motion over `delta_frames` frames, metres and degrees: root mean square over `pairs` motions."""
 
     translation_rmse_m: float
     rotation_rmse_deg: float
@@ -36,9 +36,9 @@ class RelativeError:
 
 
 def align_rigid(estimate: Matrix, truth: Matrix) -> Matrix:
-    """Fit T_truth_estimate [4, 4] that carries positions `estimate` [N, 3] onto `truth` [N, 3] with least squares.
+    """Fit T_truth_estimate [4, 4] that maps positions `estimate` [N, 3] to `truth` [N, 3], by least squares.
 
-    Closed form without scale: the rotation nearest to the cross-covariance, by SVD (Umeyama 1991, eq. 40–42, c = 1).
+    Closed form without scale: the rotation comes from the SVD of the cross-covariance (Umeyama 1991, eq. 40–42, c = 1).
     """
     centre_estimate, centre_truth = estimate.mean(0), truth.mean(0)
     covariance = (truth - centre_truth).T @ (estimate - centre_estimate)
@@ -51,9 +51,9 @@ def align_rigid(estimate: Matrix, truth: Matrix) -> Matrix:
 
 
 def aligned_truth(times_s: Matrix, estimate: Matrix, truth: Trajectory) -> tuple[Rows, Trajectory]:
-    """Return the true poses in the estimate's world, after the rigid fit of the ATE, and which frames they are of.
+    """Return the rows of the frames with a true pose, and their true poses in the world of the estimate.
 
-    times_s [N], estimate [N, 3]: of all frames, m. Frames without a true pose in time are left out.
+    The rigid alignment is that of the ATE. times_s [N], s, and estimate [N, 3], m: of all frames.
     """
     rows, truth_rows = associate(times_s, truth.timestamps_s)
     T_estimate_truth = truth_in_estimate(times_s, estimate, truth)
@@ -61,15 +61,15 @@ def aligned_truth(times_s: Matrix, estimate: Matrix, truth: Trajectory) -> tuple
 
 
 def truth_in_estimate(times_s: Matrix, estimate: Matrix, truth: Trajectory) -> Matrix:
-    """Return T_estimate_truth [4, 4], the ATE's rigid fit of true positions to estimated ones [N, 3], m."""
+    """Return T_estimate_truth [4, 4], the rigid alignment of the ATE: true positions to estimated ones [N, 3], m."""
     rows, truth_rows = associate(times_s, truth.timestamps_s)
     return align_rigid(truth.T_world_camera[truth_rows, :3, 3], estimate[rows])
 
 
 def associate(times_a_s: Matrix, times_b_s: Matrix, max_difference_s: float = 0.02) -> tuple[Rows, Rows]:
-    """Pair timestamps that are each other's nearest and at most `max_difference_s` apart: rows of a, rows of b.
+    """Pair timestamps that are mutual nearest neighbours and differ by at most `max_difference_s`: rows of a and of b.
 
-    One-to-one, so that a slow truth never pairs one pose with two frames (which would fake a standstill in the RPE).
+    Pairs are one-to-one. If a low-rate truth paired one pose with two frames, the RPE would see no motion there.
     """
     if not len(times_a_s) or not len(times_b_s):
         return np.empty(0, np.intp), np.empty(0, np.intp)
@@ -83,7 +83,7 @@ def associate(times_a_s: Matrix, times_b_s: Matrix, max_difference_s: float = 0.
 
 
 def _nearest(wanted: Matrix, among: Matrix) -> Rows:
-    """Return for each value of `wanted` the row of the nearest value of `among` (any order, ties to the earlier)."""
+    """Return for each value of `wanted` the row of the nearest value of `among` (unsorted; a tie takes the earlier)."""
     order = np.argsort(among, kind="stable")
     ordered = among[order]
     right = np.clip(np.searchsorted(ordered, wanted), 1, max(len(among) - 1, 1))
@@ -93,10 +93,10 @@ def _nearest(wanted: Matrix, among: Matrix) -> Rows:
     return order[np.where(nearer_right, right, left)]
 
 
-def paired(estimate: Trajectory, truth: Trajectory, max_difference_s: float = 0.02) -> tuple[Matrix, Matrix]:
-    """Return T_world_camera of both paths [M, 4, 4] at the timestamps they share, in the estimate's order.
+def pair_poses(estimate: Trajectory, truth: Trajectory, max_difference_s: float = 0.02) -> tuple[Matrix, Matrix]:
+    """Return T_world_camera of both trajectories [M, 4, 4] at shared timestamps, in the order of the estimate.
 
-    Raises SourceError if none lies within `max_difference_s`.
+    Raises SourceError if no timestamps agree within `max_difference_s`.
     """
     rows, truth_rows = associate(estimate.timestamps_s, truth.timestamps_s, max_difference_s)
     if not len(rows):
@@ -108,18 +108,18 @@ def paired(estimate: Trajectory, truth: Trajectory, max_difference_s: float = 0.
 
 
 def _span(path: Trajectory) -> str:
-    """Say from when to when a path lasts."""
+    """Describe the time span of a trajectory."""
     if not len(path):
         return "no poses"
     return f"{path.timestamps_s.min():.3f} … {path.timestamps_s.max():.3f} s ({len(path)} poses)"
 
 
 def ate(estimate: Trajectory, truth: Trajectory, max_difference_s: float = 0.02) -> AbsoluteError:
-    """Measure the absolute trajectory error: position distances after `align_rigid` (Sturm et al. 2012, eq. 3).
+    """Measure the absolute trajectory error: position errors after `align_rigid` (Sturm et al. 2012, eq. 3).
 
     Raises SourceError if no timestamps match.
     """
-    ours, theirs = paired(estimate, truth, max_difference_s)
+    ours, theirs = pair_poses(estimate, truth, max_difference_s)
     T = align_rigid(ours[:, :3, 3], theirs[:, :3, 3])
     distance = np.linalg.norm(ours[:, :3, 3] @ T[:3, :3].T + T[:3, 3] - theirs[:, :3, 3], axis=1)
     return AbsoluteError(
@@ -134,11 +134,11 @@ def ate(estimate: Trajectory, truth: Trajectory, max_difference_s: float = 0.02)
 def rpe(
     estimate: Trajectory, truth: Trajectory, delta_frames: int = 1, max_difference_s: float = 0.02
 ) -> RelativeError:
-    """Measure the relative pose error over `delta_frames` paired frames (Sturm et al. 2012, eq. 1); needs no alignment.
+    """Measure the relative pose error over `delta_frames` paired frames (Sturm et al. 2012, eq. 1), without alignment.
 
-    Fewer than delta_frames + 1 pairs give nan and pairs = 0. Raises SourceError if no timestamps match.
+    With fewer than delta_frames + 1 pairs the errors are nan and pairs = 0. Raises SourceError if no timestamps match.
     """
-    ours, theirs = paired(estimate, truth, max_difference_s)
+    ours, theirs = pair_poses(estimate, truth, max_difference_s)
     motion_ours = se3.inverse(ours[:-delta_frames]) @ ours[delta_frames:]
     motion_theirs = se3.inverse(theirs[:-delta_frames]) @ theirs[delta_frames:]
     error = se3.inverse(motion_theirs) @ motion_ours
@@ -149,16 +149,17 @@ def rpe(
 
 
 def _root_mean_square(values: Matrix) -> float:
-    """Return √mean(x²), nan for no values."""
+    """Return √mean(x²); nan without values."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
 
 
-def path_scores_of(
+def score_path(
     path: Trajectory, odometry: Trajectory | None, truth: Trajectory | None
 ) -> tuple[dict[str, Any], SourceError | None]:
-    """Return ATE and RPE over all frames, and the ATE of the path without loops (`odometry`) where one is given.
+    """Return ATE and RPE over all frames, and the ATE of the path without loop closures (`odometry`) if given.
 
-    None without truth; where the truth does not fit, None and the reason.
+    All scores are None without a truth. If the truth shares no timestamps with the path, they are None and the
+    error is returned too.
     """
     unknown: dict[str, Any] = {"ate": None, "rpe": None, "ate_odometry": None}
     if truth is None:

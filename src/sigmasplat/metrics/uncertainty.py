@@ -1,7 +1,7 @@
-"""Ask whether a predicted variance is worth something: does it rank, match and remove the errors that occur?
+"""Score a predicted variance against the squared error: rank correlation, likelihood, calibration, sparsification.
 
-Everything takes two arrays of one shape: predicted variance V and squared error r², both in colour² (or m²), already
-restricted to valid pixels.
+Every function takes two arrays of one shape: predicted variance V and squared error r², both in colour² (or m²). They
+hold valid pixels only.
 """
 
 from dataclasses import asdict, dataclass
@@ -14,7 +14,7 @@ from scipy.stats import spearmanr
 Values = NDArray[np.floating[Any]]
 
 EPSILON = 1e-6
-"""VarSplat's ε, colour²: keeps log and division finite where V is 0."""
+"""VarSplat's ε, colour²: keeps the logarithm and the division finite where V is 0."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class ReliabilityBin:
 
 
 def spearman(variance: Values, squared_error: Values) -> float:
-    """Return the rank correlation of V and r² in [−1, 1]; nan if one of them is constant or there are < 2 values."""
+    """Return the rank correlation of V and r² in [−1, 1]; nan if one is constant or with fewer than 2 values."""
     v, e = variance.ravel(), squared_error.ravel()
     if v.size < 2 or v.min() == v.max() or e.min() == e.max():
         return float("nan")
@@ -35,13 +35,16 @@ def spearman(variance: Values, squared_error: Values) -> float:
 
 
 def gaussian_nll(variance: Values, squared_error: Values, epsilon: float = EPSILON) -> float:
-    """Return mean ½ r²/(V+ε) + ½ log(V+ε) (VarSplat §2, NLL_x; without the constant ½ log 2π). V < 0 counts as 0."""
+    """Return the mean of ½ r²/(V+ε) + ½ log(V+ε) (VarSplat §2, NLL_x, without the constant ½ log 2π).
+
+    A negative V counts as 0.
+    """
     v = np.maximum(variance.astype(np.float64), 0.0) + epsilon
     return float(np.mean(0.5 * squared_error / v + 0.5 * np.log(v))) if v.size else float("nan")
 
 
 def reliability(variance: Values, squared_error: Values, bins: int = 10) -> list[ReliabilityBin]:
-    """Split the pixels into `bins` equal shares by V and compare mean V with mean r² in each, from sure to unsure."""
+    """Split the pixels into `bins` equal shares by rising V, and return mean V and mean r² of each."""
     v, e = variance.ravel().astype(np.float64), squared_error.ravel().astype(np.float64)
     order = np.argsort(v, kind="stable")
     parts = [rows for rows in np.array_split(order, bins) if len(rows)]
@@ -49,7 +52,7 @@ def reliability(variance: Values, squared_error: Values, bins: int = 10) -> list
 
 
 def sparsification(order_by: Values, squared_error: Values, steps: int = 100) -> NDArray[np.float64]:
-    """Return the RMSE [steps] left after removing the share 0, 1/steps, … of pixels that `order_by` ranks highest."""
+    """Return the RMSE [steps] after removing the share 0, 1/steps, … of pixels with the highest `order_by`."""
     e = squared_error.ravel().astype(np.float64)
     rising = e[np.argsort(order_by.ravel(), kind="stable")]
     kept = np.ceil(len(e) * (1.0 - np.arange(steps) / steps)).astype(int).clip(1)
@@ -59,7 +62,8 @@ def sparsification(order_by: Values, squared_error: Values, steps: int = 100) ->
 def ause(variance: Values, squared_error: Values, steps: int = 100) -> float:
     """Return the area between the sparsification curves by V and by the true error, as a share of the RMSE (Ilg 2018).
 
-    0 = V ranks like the error itself; chance has the area of the oracle's own drop. nan without pixels or error.
+    0: V ranks the pixels exactly like the error. A random V removes no error on average. nan without pixels, or if
+    all errors are 0.
     """
     if not squared_error.size or not float(squared_error.max()) > 0.0:
         return float("nan")
@@ -69,7 +73,7 @@ def ause(variance: Values, squared_error: Values, steps: int = 100) -> float:
 
 
 def score(variance: Values, squared_error: Values) -> dict[str, Any]:
-    """Return every score of this file, with both means and the number of pixels, as plain values."""
+    """Return all scores of this module, the means of V and r², and the number of pixels, as plain values."""
     return {
         "pixels": int(variance.size),
         "spearman": spearman(variance, squared_error),

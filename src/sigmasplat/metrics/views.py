@@ -1,4 +1,4 @@
-"""Look at many views and sum up their scores: averages per kind, and one judgement of V over all their pixels."""
+"""Render many views and summarise their scores: means per kind of view, and scores of V over all sampled pixels."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -19,46 +19,46 @@ from sigmasplat.model.submap import SubmapStore
 from sigmasplat.render import Render
 
 Renderer = Callable[[GaussianField, Camera, NDArray[np.float64]], Render]
-"""Shows a field from T_camera_world."""
+"""Renders a field from T_camera_world."""
 PIXELS_PER_VIEW = 20_000
-"""Every k-th valid pixel of a view goes into the uncertainty scores, so that their sorts stay short."""
+"""At most this many valid pixels per view, every k-th one, go into the uncertainty scores: sorting stays fast."""
 
 
 @dataclass(eq=False)
-class Scores:
-    """What the views of one kind came to; samples of V are kept where it is to be judged."""
+class ViewScores:
+    """Scores of the views of one kind. With `keep_samples`, pixels are sampled to score V over all views."""
 
-    judged: bool
+    keep_samples: bool
     rows: list[dict[str, float]] = field(default_factory=list)
     samples: list[NDArray[np.float32]] = field(default_factory=list)
 
     def add(self, view: ScoredView) -> None:
         """Score a view."""
         self.rows.append(view.scores())
-        if self.judged:
-            self.samples.append(sample(view))
+        if self.keep_samples:
+            self.samples.append(sample_pixels(view))
 
 
 @dataclass(frozen=True, eq=False)
 class MapSources:
-    """Where views are looked at: the final map; and the submaps, where T_world_submap [S, 4, 4] says how they lie."""
+    """The maps that views are rendered from: the final map, and the submaps if T_world_submap [S, 4, 4] is known."""
 
     final: GaussianField
     store: SubmapStore
     T_world_submap: NDArray[np.float64] | None
 
     def submap(self, index: int) -> GaussianField | None:
-        """Return a submap's splats in its own frame, None where the run kept none."""
+        """Return the splats of a submap in its own frame; None if the run kept no submaps."""
         return None if self.T_world_submap is None else self.store.load(index).field
 
 
 def render_views(
     frame_of: Callable[[int], Frame], maps: MapSources, chosen: Mapping[str, list[dict[str, Any]]], renderer: Renderer
 ) -> Iterator[tuple[ScoredView, ScoredView | None]]:
-    """Render the chosen records of each kind at their `T_world_camera`: in the final map and, where kept, in the submap
-    of their frame (`submap`, 0 if it says none).
+    """Render the chosen records of each kind at their `T_world_camera`, in the final map and, if kept, in their submap.
 
-    Submap by submap, so that each is loaded once and one at a time.
+    `submap` of a record names its submap (default 0). Views are ordered by submap: each submap is loaded once, and only
+    one is in memory.
     """
     wanted = [(record.get("submap", 0), kind, record) for kind, records in chosen.items() for record in records]
     for index, group in groupby(sorted(wanted, key=lambda view: view[0]), key=lambda view: view[0]):
@@ -66,16 +66,16 @@ def render_views(
         for _, kind, record in group:
             frame, T_camera_world = frame_of(record["index"]), se3.inverse(record["T_world_camera"])
             notes = ("lost",) if record.get("lost") else ()
-            final = view_of(frame, renderer(maps.final, frame.camera, T_camera_world), kind, notes)
+            final = scored_view(frame, renderer(maps.final, frame.camera, T_camera_world), kind, notes)
             before = None
             if submap is not None and maps.T_world_submap is not None:
                 rendered = renderer(submap, frame.camera, T_camera_world @ maps.T_world_submap[index])
-                before = view_of(frame, rendered, kind, (*notes, f"in submap {index}"))
+                before = scored_view(frame, rendered, kind, (*notes, f"in submap {index}"))
             yield final, before
 
 
-def view_of(frame: Frame, rendered: Render, kind: str, notes: tuple[str, ...] = ()) -> ScoredView:
-    """Put a frame beside its rendering; depth is Σwz/Σw where the map covers the pixel, else 0."""
+def scored_view(frame: Frame, rendered: Render, kind: str, notes: tuple[str, ...] = ()) -> ScoredView:
+    """Pair a frame with its rendering. Depth is Σwz/Σw where the map covers the pixel, else 0."""
     alpha = _array(rendered.alpha)
     depth = np.where(alpha > COVERED_ALPHA, _array(rendered.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0)
     return ScoredView(
@@ -84,22 +84,22 @@ def view_of(frame: Frame, rendered: Render, kind: str, notes: tuple[str, ...] = 
     )  # fmt: skip
 
 
-def sample(view: ScoredView) -> NDArray[np.float32]:
-    """Return (V, squared error, alpha) [3, P] of every k-th pixel with a reading, at most `PIXELS_PER_VIEW`."""
+def sample_pixels(view: ScoredView) -> NDArray[np.float32]:
+    """Return (V, squared error, alpha) [3, P] of every k-th pixel with a depth reading, at most `PIXELS_PER_VIEW`."""
     values = np.stack([view.uncertainty[view.valid], view.squared_error[view.valid], view.alpha[view.valid]])
     return values[:, :: max(1, -(-values.shape[1] // PIXELS_PER_VIEW))]
 
 
-def average(rows: list[dict[str, float]]) -> dict[str, Any]:
-    """Average each score over the views that have it, None where none has; `views` counts them."""
+def mean_scores(rows: list[dict[str, float]]) -> dict[str, Any]:
+    """Average each score over the views that have it; None if no view has it. `views` is the number of views."""
     columns = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
     return {"views": len(rows)} | {name: _mean(column) for name, column in columns.items()}
 
 
-def judge(samples: list[NDArray[np.float32]]) -> dict[str, Any] | None:
-    """Score V against the squared error over all sampled pixels (`uncertainty.score`); None without any pixel.
+def score_uncertainty(samples: list[NDArray[np.float32]]) -> dict[str, Any] | None:
+    """Score V against the squared error over all sampled pixels (`uncertainty.score`); None without pixels.
 
-    Adds spearman_covered (only pixels where the map has a surface) and spearman_per_view (mean of the views' own).
+    Adds spearman_covered (only pixels that the map covers) and spearman_per_view (mean of the correlations per view).
     """
     if not sum(part.shape[1] for part in samples):
         return None
@@ -112,11 +112,11 @@ def judge(samples: list[NDArray[np.float32]]) -> dict[str, Any] | None:
 
 
 def _mean(values: NDArray[np.float64]) -> float | None:
-    """Return the mean of the values that exist, None if none does."""
+    """Return the mean of the values that are not nan; None if all are nan."""
     existing = values[~np.isnan(values)]
     return float(existing.mean()) if len(existing) else None
 
 
 def _array(values: Tensor) -> NDArray[np.float32]:
-    """Turn a tensor of any device into a numpy array."""
+    """Copy a tensor from any device to a numpy array."""
     return np.asarray(values.detach().cpu(), np.float32)

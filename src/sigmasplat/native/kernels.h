@@ -28,7 +28,7 @@ struct OutputGradients {                   // planes like Outputs; all but sums 
 
 struct SplatGradients { float *means2d, *conics, *z, *opacities, *features; };
 
-struct LossWeights { float l1, depth, nll_color, nll_depth, alignment, moment; };
+struct LossWeights { float l1, depth, nll_color, nll_depth, median_depth, moment; };
 struct DepthMaps { const float *median_depth, *moment; };                              // null where their weight is 0
 struct DepthGradients { float *median_depth, *moment; };
 

@@ -27,7 +27,7 @@ static void mapping_losses(const float* sums, const float* target_color, const f
             if (maps.median_depth) {                  // both sides are pulled; where no splat takes half the light there is none
                 const vf median = load(maps.median_depth + at);
                 const vf apart = only(both(valid, gt(median, zero)), load(sums + 3 * plane + at) - median);
-                const vf g = signed_weight(apart, weights.alignment * per_pixel);
+                const vf g = signed_weight(apart, weights.median_depth * per_pixel);
                 total[4] += abs(apart);
                 g_depth += g;
                 store(gradients.median_depth + at, zero - g);

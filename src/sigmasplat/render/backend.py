@@ -1,42 +1,84 @@
-"""Choose what computes: the kernels of the device that the tensors lie on, or their definition in plain torch."""
+"""Choose what renders: the kernels of a device, or their definition in plain torch. Nothing else chooses by device,
+but the fits' table (fit/backends.py), which goes by the name that a view has from here."""
 
 from types import ModuleType
 
 import torch
 
 from sigmasplat import env
+from sigmasplat.config import RenderConfig
 from sigmasplat.errors import BackendError
-from sigmasplat.render import reference
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import Rows
+from sigmasplat.render.view import CorrelationView, View
 
 BACKENDS = ("auto", "cpu", "cuda", "reference")
 
 
-def is_cuda(kernels: ModuleType) -> bool:
-    """Tell whether `backend_module` returned the kernels that want tensors on a CUDA device."""
-    return kernels.__name__ == "sigmasplat.render.cuda"
-
-
-def backend_module(name: str, device: torch.device | None = None) -> ModuleType:
-    """Return the module whose `project` and `blend` do the work; "auto" is SIGMASPLAT_BACKEND's, else the kernels.
-
-    device: where the tensors lie; those of a CUDA device are for `cuda` unless another is named. Raises BackendError if
-    it is unknown or not built.
-    """
-    if name == "auto":
-        name = env.switches().backend
-    if name == "reference":
-        return reference
+def backend_name(asked: str, device: torch.device | None = None) -> str:
+    """Return "cpu", "cuda" or "reference" for what is asked for; "auto" is SIGMASPLAT_BACKEND's, else the kernels of
+    the device that the tensors lie on, without one the CPU's. Raises BackendError if the name is unknown."""
+    name = env.switches().backend if asked == "auto" else asked
     if name not in BACKENDS:
         raise BackendError(f"unknown backend {name!r} (known: {', '.join(BACKENDS)})")
-    if name == "cuda" or (name == "auto" and device is not None and device.type == "cuda"):
-        from sigmasplat.render import cuda
+    if name == "auto":
+        return "cuda" if device is not None and device.type == "cuda" else "cpu"
+    return name
+
+
+def backend_module(asked: str, device: torch.device | None = None) -> ModuleType:
+    """Return the module whose `project` and `blend` do the work, by `backend_name`.
+
+    Raises BackendError if it is unknown or not built.
+    """
+    name = backend_name(asked, device)
+    if name == "reference":
+        from sigmasplat.render.reference import operators as reference
+
+        return reference
+    if name == "cuda":
+        from sigmasplat.render.cuda import operators as cuda
 
         return cuda
     try:
-        from sigmasplat.render import cpu
+        from sigmasplat.render.cpu import operators as cpu
     except ImportError as problem:
         raise BackendError(
             f"the compiled kernels cannot be loaded ({problem}); reinstall with `pip install .`, or use the slow "
             "plain-torch backend: --set backend=reference --set tracking.method=adam"
         ) from problem
     return cpu
+
+
+def make_view(backend: str, camera: Camera, options: RenderConfig, variance: bool = True) -> View:
+    """Make a view on a backend by name (one of `BACKENDS`). Raises BackendError as `backend_module` does."""
+    backend_module(backend)  # refuses in one line where the kernels are missing
+    name = backend_name(backend)
+    if name == "reference":
+        from sigmasplat.render.reference.view import ReferenceView
+
+        return ReferenceView(camera, options, variance)
+    if name == "cuda":
+        from sigmasplat.render.cuda.view import CudaView
+
+        return CudaView(camera, options, variance)
+    from sigmasplat.render.cpu.view import CpuView
+
+    return CpuView(camera, options, variance)
+
+
+def make_covariance_view(view: View, correlations: Rows) -> CorrelationView:
+    """Make the view of ten planes that goes with a view of seven, on its backend."""
+    if view.backend == "reference":
+        from sigmasplat.render.reference.covariance_view import CovarianceView
+
+        return CovarianceView(view, correlations)
+    if view.backend == "cuda":
+        from sigmasplat.render.cuda.covariance_view import CudaCovarianceView
+        from sigmasplat.render.cuda.view import CudaView
+
+        assert isinstance(view, CudaView)
+        return CudaCovarianceView(view, correlations)
+    from sigmasplat.render.cpu.covariance_view import CpuCovarianceView
+
+    return CpuCovarianceView(view, correlations)

@@ -18,3 +18,11 @@ def pose_gradient(T_camera_world: Tensor, twist: NDArray[np.float64] | Tensor) -
     turned = torch.linalg.cross(a[:, None].expand(3, 3), T[:3, :3], dim=0)  # [a]× R
     bottom = torch.zeros_like(T[:1])
     return torch.cat([torch.cat([turned, g_rho[:, None]], 1), bottom]).to(T_camera_world.dtype)
+
+
+def twist_matrix(xi: Tensor) -> Tensor:
+    """Write a twist (ρ, φ) [6], m and rad, as the matrix [4, 4] whose exponential is the motion."""
+    zero = torch.zeros((), dtype=xi.dtype)
+    x, y, z, a, b, c = xi
+    rows = [[zero, -c, b, x], [c, zero, -a, y], [-b, a, zero, z], [zero, zero, zero, zero]]
+    return torch.stack([torch.stack(row) for row in rows])

@@ -2,7 +2,6 @@
 
 from collections import deque
 from dataclasses import dataclass
-from types import ModuleType
 
 import numpy as np
 import torch
@@ -11,11 +10,11 @@ from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.color_covariance import covariances_of, outer
 from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.harmonics import view_colors
-from sigmasplat.render import cuda_launch
-from sigmasplat.render.backend import backend_module, is_cuda
+from sigmasplat.render.backend import backend_module, backend_name
+from sigmasplat.render.channels import covariance_features, covariance_of, features_of, variance_of
+from sigmasplat.render.cuda import launch as cuda_launch
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,26 +40,6 @@ class Render:
     covariance: Tensor | None = None
 
 
-def features_of(colors: Tensor, z: Tensor, variances: Tensor) -> Tensor:
-    """Stack what a pixel gathers of each splat: (r, g, b, z, σ² + c² ×3), [N, 7]."""
-    return torch.cat([colors, z[:, None], variances + colors**2], 1)
-
-
-def variance_of(sums: Tensor) -> Tensor:
-    """Apply the law of total variance to features [H, W, 7]: V = E[σ² + c²] − E[c]² [H, W, 3] (VarSplat §1)."""
-    return sums[..., 4:7] - sums[..., 0:3] ** 2
-
-
-def covariance_features(colors: Tensor, z: Tensor, variances: Tensor, correlations: Tensor) -> Tensor:
-    """Stack what a pixel gathers where colours vary together: (r, g, b, z, Σ + c cᵀ ×6), [N, 10], as `features_of`."""
-    return torch.cat([colors, z[:, None], covariances_of(variances, correlations) + outer(colors)], 1)
-
-
-def covariance_of(color: Tensor, second: Tensor) -> Tensor:
-    """Apply the law of total covariance: V = E[Σ + c cᵀ] − E[c] E[c]ᵀ [H, W, 6] of E[c] [H, W, 3] and E[Σ + c cᵀ]."""
-    return second - outer(color)
-
-
 def _colors_from(field: GaussianField, T_camera_world: Tensor) -> Tensor:
     """Return the colours [N, 3] that a camera sees."""
     if "harmonics" not in field.extras:
@@ -78,9 +57,9 @@ def _features_from(field: GaussianField, z: Tensor, T_camera_world: Tensor) -> T
     return covariance_features(colors, z, field.variances, field.extras["correlations"].params)
 
 
-def _brought(field: GaussianField, kernels: ModuleType) -> GaussianField:
-    """Return what a render needs of a field where the kernels want it; no optimiser state travels."""
-    if not is_cuda(kernels) or field.params.device.type != "cpu":
+def _on_device(field: GaussianField, backend: str) -> GaussianField:
+    """Return what a render needs of a field in the memory that the backend reads, without optimiser state."""
+    if backend_name(backend, field.params.device) != "cuda" or field.params.device.type != "cpu":
         return field
     device = cuda_launch.this_device()
     extras = {name: Rows(extra.params.to(device)) for name, extra in field.extras.items()}
@@ -101,7 +80,7 @@ def render(
     directions from which `harmonics` are seen. Raises BackendError if the backend is not available.
     """
     kernels, options = backend_module(backend, field.params.device), options or RenderConfig()
-    field = _brought(field, kernels)
+    field = _on_device(field, backend)
     T = torch.as_tensor(T_camera_world)
     p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
     features = _features_from(field, p.z, T if options.color_pose_gradient else T.detach())
@@ -138,8 +117,8 @@ class FieldRenderer:
         depth_reference: Tensor | None = None,
     ) -> Render:
         """Render a field as `render` does."""
-        there = next((there for one, there in self._kept if one is field), None)
-        if there is None:
-            there = _brought(field, backend_module(self.backend, field.params.device))
-            self._kept.append((field, there))
-        return render(there, camera, T_camera_world, depth_reference, self.options, self.backend)
+        on_device = next((copy for one, copy in self._kept if one is field), None)
+        if on_device is None:
+            on_device = _on_device(field, self.backend)
+            self._kept.append((field, on_device))
+        return render(on_device, camera, T_camera_world, depth_reference, self.options, self.backend)

@@ -1,1 +1,1 @@
-"""Build a run's report: one HTML page."""
+"""Write the report of a run: one HTML page."""

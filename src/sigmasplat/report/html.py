@@ -1,21 +1,27 @@
-"""Write report.html: the run in words, figures, views, path, times, advice, settings. One file, no scripts."""
+"""Build report.html: summary, figures, floor plan, views, scores, times, advice, settings. One file, no scripts."""
 
 import html
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from sigmasplat.floorplan.rescan import RescanRegion
 from sigmasplat.report import tables
 from sigmasplat.report.summary import Advice
 from sigmasplat.report.tables import headline
+from sigmasplat.report.view_strips import PanelFigure
+
+NARROW = "(max-width: 640px)"
+"""Pages this narrow show the narrow version of charts and plan."""
 
 STYLE = """
 :root { color-scheme: light dark; --page: #f6f7f9; --card: #ffffff; --ink: #1b1f24; --soft: #5c6670; --line: #e1e4e8;
-  --accent: #c2501b; }
+  --accent: #c2501b; --unsure: #d65a1e; --unseen: #286ebe; --thin: #825aaa; }
 @media (prefers-color-scheme: dark) {
-  :root { --page: #101317; --card: #181b20; --ink: #e8ebef; --soft: #99a3ad; --line: #2c3138; --accent: #ff8c46; } }
+  :root { --page: #101317; --card: #181b20; --ink: #e8ebef; --soft: #99a3ad; --line: #2c3138;
+    --accent: #ff8c46; --unsure: #ff8c46; --unseen: #64aafa; --thin: #be96e6; } }
 * { box-sizing: border-box; }
-body { margin: 0; background: var(--page); color: var(--ink);
+body { margin: 0; background: var(--page); color: var(--ink); overflow-wrap: break-word;
   font: 16px/1.55 system-ui, -apple-system, "Segoe UI", "Helvetica Neue", sans-serif; }
 main { max-width: 1180px; margin: 0 auto; padding: 40px 24px 80px; }
 h1 { font-size: 30px; line-height: 1.2; letter-spacing: -0.02em; margin: 0 0 4px; }
@@ -30,7 +36,8 @@ p { max-width: 74ch; margin: 0 0 12px; }
 .tile b { display: block; font-size: 26px; line-height: 1.25; font-weight: 620; font-variant-numeric: tabular-nums; }
 .tile span { font-size: 13px; color: var(--soft); }
 .tile .unit { display: inline; font-size: 15px; font-weight: 400; }
-.pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(340px, 1fr)); gap: 12px; align-items: start; }
+.pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr)); gap: 12px;
+  align-items: start; }
 table { border-collapse: collapse; width: 100%; font-size: 14.5px; font-variant-numeric: tabular-nums; }
 th, td { text-align: right; padding: 6px 10px; border-bottom: 1px solid var(--line); font-weight: 400; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; }
@@ -38,34 +45,54 @@ tr:last-child td { border-bottom: 0; }
 figure { margin: 0 0 14px; }
 figure img { display: block; width: 100%; height: auto; border-radius: 10px; border: 1px solid var(--line); }
 figcaption { font-size: 14px; margin-top: 6px; }
+.view { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 10px;
+  background: #15181d; color: #e9edf2; border-radius: 10px; padding: 10px; font-size: 13px; line-height: 1.4; }
+.view img { border: 0; border-radius: 4px; margin: 4px 0; }
+.view span { color: #9aa2ac; }
+.bar { display: grid; grid-template-columns: auto 1fr auto; gap: 6px; align-items: center; white-space: nowrap; }
+.bar i { height: 8px; border-radius: 2px; }
+.regions { list-style: none; padding: 0; font-size: 15px; }
+.regions li { display: grid; grid-template-columns: 26px 1fr; gap: 10px; align-items: start; }
+.regions b { width: 24px; height: 24px; border-radius: 50%; color: var(--card); font-size: 13px; line-height: 24px;
+  text-align: center; }
+.regions .unseen b { background: var(--unseen); } .regions .thin b { background: var(--thin); }
+.regions .unsure b { background: var(--unsure); }
 ul { max-width: 74ch; padding-left: 20px; } li { margin-bottom: 10px; }
 li pre { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 8px 12px;
-  margin-top: 4px; }
+  margin-top: 4px; user-select: all; }
 details { margin-top: 12px; } summary { cursor: pointer; }
-pre { overflow-x: auto; font: 13px/1.5 ui-monospace, "SF Mono", Menlo, Consolas, monospace; margin: 0; }
-"""
+pre { white-space: pre-wrap; overflow-wrap: anywhere; margin: 0;
+  font: 13px/1.5 ui-monospace, "SF Mono", Menlo, Consolas, monospace; }
+@media NARROW {
+  main { padding: 24px 12px 56px; } h1 { font-size: 24px; } h2 { margin-top: 36px; }
+  .tiles { gap: 8px; grid-template-columns: 1fr 1fr; } .tile b { font-size: 22px; }
+  th, td { padding: 6px; } .card { padding: 12px; } }
+""".replace("NARROW", NARROW)
 
 
 @dataclass(frozen=True)
 class Contents:
-    """What a report shows. Pictures are file names, of which `picture` makes what a page can show; `plots` come as
-    <name>-light/-dark.png, with their captions.
+    """What a report shows.
 
-    story: sentences; advice: what to try next, with a command or without; unsure: a picture of where, and sentences;
-    seconds: where the time went, by stage; loops: the records of loops.json.
+    summary: sentences; advice: what to try next, with or without a command; rescan: sentences about what to scan again;
+    regions: the same numbered regions as in the floor plan; strips: panels of views by heading; plots: captions by
+    name; seconds: time per stage; loops: the records of loops.json. `picture` turns the name of a picture file into an
+    address for the page. Each plot has four files: images/<name>-light.png, <name>-dark.png, <name>-narrow-light.png
+    and <name>-narrow-dark.png.
     """
 
     title: str
     subtitle: str
     metrics: dict[str, Any]
-    strips: dict[str, list[str]] = field(default_factory=dict)
+    strips: dict[str, list[list[PanelFigure]]] = field(default_factory=dict)
     plots: dict[str, str] = field(default_factory=dict)
     config: str = ""
     warnings: list[str] = field(default_factory=list)
     loops: list[dict[str, Any]] = field(default_factory=list)
-    story: list[str] = field(default_factory=list)
+    summary: list[str] = field(default_factory=list)
     advice: list[Advice] = field(default_factory=list)
-    unsure: list[str] = field(default_factory=list)
+    rescan: list[str] = field(default_factory=list)
+    regions: Sequence[RescanRegion] = ()
     seconds: dict[str, float] = field(default_factory=dict)
     picture: Callable[[str], str] = str
 
@@ -75,9 +102,9 @@ def build_report(contents: Contents) -> str:
     parts = [
         f"<h1>{html.escape(contents.title)}</h1><p class=soft>{html.escape(contents.subtitle)}</p>",
         "".join(f"<p class=alarm>{html.escape(warning)}</p>" for warning in contents.warnings),
-        _story(contents.story),
+        _summary(contents.summary),
         _tiles(contents.metrics),
-        _unsure(contents),
+        _rescan(contents),
         _plot(contents, "trajectory", "Trajectory"),
         _strips(contents),
         _submaps(contents),
@@ -86,7 +113,7 @@ def build_report(contents: Contents) -> str:
         _advice(contents.advice),
         _settings(contents),
     ]
-    head = "<meta charset=utf-8><meta name=viewport content='width=device-width'>"
+    head = "<meta charset=utf-8><meta name=viewport content='width=device-width, initial-scale=1'>"
     title, body = html.escape(contents.title), "\n".join(parts)
     return (
         f"<!doctype html>\n<html lang=en>{head}<title>{title}</title><style>{STYLE}</style>\n"
@@ -103,34 +130,41 @@ def _tiles(metrics: dict[str, Any]) -> str:
     return f"<div class=tiles>{''.join(tiles)}</div>"
 
 
-def _story(sentences: list[str]) -> str:
-    """Say the whole run in words."""
-    return f"<h2>In short</h2><p>{html.escape(' '.join(sentences))}</p>" if sentences else ""
+def _summary(sentences: list[str]) -> str:
+    """Show the summary sentences."""
+    return f"<h2>Summary</h2><p>{html.escape(' '.join(sentences))}</p>" if sentences else ""
 
 
-def _unsure(contents: Contents) -> str:
-    """Show where the map is unsure: what a second visit should look at."""
-    if not contents.unsure:
+def _rescan(contents: Contents) -> str:
+    """Show where to scan again: sentences, the floor plan, and the list of its numbered regions."""
+    if not contents.rescan and "plan" not in contents.plots:
         return ""
-    words = "".join(f"<p>{html.escape(sentence)}</p>" for sentence in contents.unsure)
-    return f"<h2>Where it was unsure</h2>{words}{_figure(contents, 'plan', 'Floor plan of uncertainty')}"
+    words = "".join(f"<p>{html.escape(sentence)}</p>" for sentence in contents.rescan)
+    items = "".join(
+        f"<li class={html.escape(region.why)}><b>{number}</b><span>{html.escape(region.sentence())}</span></li>"
+        for number, region in enumerate(contents.regions, 1)
+    )
+    listed = f"<ol class=regions>{items}</ol>" if items else ""
+    return f"<h2>Where to scan again</h2>{words}{_figure(contents, 'plan', 'Floor plan')}{listed}"
 
 
 def _time(contents: Contents) -> str:
-    """Show where the time went: by frame, and by stage in all, the final map among them."""
+    """Show where the time went: per frame, and in total per stage, including the final map."""
     if "seconds" not in contents.plots and not contents.seconds:
         return ""
     finish_s = contents.metrics.get("finish_s")
     seconds = contents.seconds | ({} if finish_s is None else {"final map": finish_s})
-    whole = sum(seconds.values()) or 1.0
-    largest = sorted(seconds.items(), key=lambda item: -item[1])
-    rows = [[stage, tables.number(spent, 1), tables.number(spent / whole, 0, 100.0)] for stage, spent in largest]
-    table = _table([["stage", "seconds", "%"], *rows]) if rows else ""
-    return f"<h2>Time</h2>{_figure(contents, 'seconds', 'Time')}<div class=card>{table}</div>"
+    total_s = sum(seconds.values()) or 1.0
+    longest_first = sorted(seconds.items(), key=lambda item: -item[1])
+    rows = [
+        [stage, tables.number(spent, 1), tables.number(spent / total_s, 0, 100.0)] for stage, spent in longest_first
+    ]
+    table = f"<div class=card>{_table([['stage', 'seconds', '%'], *rows])}</div>" if rows else ""
+    return f"<h2>Time</h2>{_figure(contents, 'seconds', 'Seconds per frame')}{table}"
 
 
 def _advice(advice: list[Advice]) -> str:
-    """Say what to try next, with the commands."""
+    """Show what to try next, with commands. A click on a command selects all of it."""
     if not advice:
         return ""
     items = [
@@ -141,52 +175,68 @@ def _advice(advice: list[Advice]) -> str:
 
 
 def _strips(contents: Contents) -> str:
-    """Show the strips of each kind of view under a heading."""
-    strips = contents.strips
-    if not any(strips.values()):
+    """Show the views of each kind, each as a row of panels that wraps on narrow pages."""
+    if not any(contents.strips.values()):
         return ""
     explanation = (
         "<p class=soft>Rendered at the estimated poses. V is the variance of colour along each ray that the map itself "
-        "predicts. Its root and the root of the squared error have a scale each: the two pictures look alike where the "
-        "map knows what it does not know. Slate pixels: no depth reading, or nothing mapped.</p>"
+        "predicts. √V and the RMS error have separate colour scales. Where both pictures look alike, V predicts the "
+        "error well. Slate pixels: no depth reading, or no surface in the map.</p>"
     )
     parts = ["<h2>Views</h2>", explanation]
-    for kind, names in strips.items():
-        if names:
+    for kind, strips in contents.strips.items():
+        if strips:
             parts.append(f"<h3>{html.escape(kind)}</h3>")
-            parts += [
-                f"<figure><img src='{html.escape(contents.picture(name))}' alt='view'></figure>" for name in names
-            ]
+            parts += [f"<figure class=view>{''.join(map(_panel, panels))}</figure>" for panels in strips]
     return "".join(parts)
 
 
+def _panel(panel: PanelFigure) -> str:
+    """Show one panel of a view: title, picture, and its colour bar or caption."""
+    low, high = (html.escape(end) for end in panel.ends)
+    below = (
+        f"<span class=bar>{low}<i style='background: linear-gradient(90deg, {', '.join(panel.bar)})'></i>{high}</span>"
+        if panel.bar
+        else f"<span>{html.escape(panel.caption)}</span>"
+    )
+    title = html.escape(panel.title)
+    return f"<div>{title}<img src='{html.escape(panel.address)}' alt='{title}'>{below}</div>"
+
+
 def _plot(contents: Contents, name: str, title: str) -> str:
-    """Show a plot under a heading of its own."""
+    """Show a plot below its own heading."""
     return f"<h2>{title}</h2>{_figure(contents, name, title)}" if name in contents.plots else ""
 
 
 def _figure(contents: Contents, name: str, title: str) -> str:
-    """Show a plot in the version that fits the reader's page."""
+    """Show a plot in the version that fits the page: light or dark, wide or narrow."""
     if name not in contents.plots:
         return ""
-    light, dark = (html.escape(contents.picture(f"images/{name}-{theme}.png")) for theme in ("light", "dark"))
+    light, dark, narrow_light, narrow_dark = (
+        html.escape(contents.picture(f"images/{name}-{version}.png"))
+        for version in ("light", "dark", "narrow-light", "narrow-dark")
+    )
+    dark_page = "(prefers-color-scheme: dark)"
     return (
-        f"<figure><picture><source media='(prefers-color-scheme: dark)' srcset='{dark}'>"
+        f"<figure><picture><source media='{NARROW} and {dark_page}' srcset='{narrow_dark}'>"
+        f"<source media='{NARROW}' srcset='{narrow_light}'><source media='{dark_page}' srcset='{dark}'>"
         f"<img src='{light}' alt='{title}'></picture>"
         f"<figcaption>{html.escape(contents.plots[name])}</figcaption></figure>"
     )
 
 
 def _tables(metrics: dict[str, Any]) -> str:
-    """Show the scores of pictures, path, surface and uncertainty in full."""
+    """Show all scores of pictures, path, surface and uncertainty."""
     body = "".join(
-        f"<div class=card><h3>{title}</h3>{_table(rows)}</div>" for title, rows in tables.cards(metrics) if rows[1:]
+        f"<div class=card><h3>{title}</h3>{_table(rows)}</div>"
+        for title, rows in tables.score_tables(metrics)
+        if rows[1:]
     )
     return f"<h2>Scores</h2><div class=pair>{body}</div>"
 
 
 def _submaps(contents: Contents) -> str:
-    """Show how the map was cut and which loops were closed, where there is more than one submap."""
+    """Show the submaps and the loops between them, if there are several submaps."""
     if (contents.metrics.get("submaps") or 1) < 2:
         return ""
     accepted = [loop for loop in contents.loops if loop.get("accepted")]
@@ -205,17 +255,17 @@ def _submaps(contents: Contents) -> str:
 
 
 def _table(rows: list[list[str]]) -> str:
-    """Lay out rows of text; the first is the head."""
+    """Return a table of text; the first row is the head."""
     head = "".join(f"<th>{html.escape(cell)}</th>" for cell in rows[0])
     body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows[1:])
     return f"<table><tr>{head}</tr>{body}</table>"
 
 
 def _settings(contents: Contents) -> str:
-    """Show the used configuration, folded."""
+    """Show the settings of the run, folded."""
     if not contents.config:
         return ""
     return (
-        "<h2>Settings</h2><details class=card><summary>config.json, as used</summary>"
+        "<h2>Settings</h2><details class=card><summary>all settings (config.json)</summary>"
         f"<pre>{html.escape(contents.config)}</pre></details>"
     )

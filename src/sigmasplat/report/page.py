@@ -1,54 +1,46 @@
-"""Put a scored run onto its page, report.html: one file that can be sent, readable by somebody who was not there."""
+"""Write the report of an evaluated run, report.html: one file that you can share, without scripts."""
 
-import base64
-import io
 import json
 import shlex
-from functools import partial
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from sigmasplat.config import Config
 from sigmasplat.config.text import differences
-from sigmasplat.drawing.plot import DARK, LIGHT
-from sigmasplat.drawing.view_panels import side_by_side
+from sigmasplat.drawing import plot
 from sigmasplat.errors import RunError, SigmaSplatError
-from sigmasplat.floorplan.floor_plan import FloorPlan, floor_plan
-from sigmasplat.floorplan.picture import draw_floor_plan
+from sigmasplat.floorplan.floor_plan import FloorPlan
+from sigmasplat.floorplan.picture import draw_floor_plan, draw_narrow_floor_plan
 from sigmasplat.io.runs import RunFolder
-from sigmasplat.metrics.scored_view import ScoredView
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, list_presets, preset
-from sigmasplat.render import FieldRenderer
 from sigmasplat.report.html import Contents, build_report
-from sigmasplat.report.summary import advice, summary_sentences, unsure
+from sigmasplat.report.plan import run_floor_plan
+from sigmasplat.report.summary import advice, rescan_sentences, summary_sentences
+from sigmasplat.report.view_strips import PanelFigure, file_data_uri
 
-LOOKS = 24
-"""Enough for a picture on a page; `export` looks from more places."""
+SECONDS_SIZE = (plot.SIZE[0], 300)
 
 
 def write_page(
     run: RunFolder,
     metrics: dict[str, Any],
-    strips: dict[str, list[str]],
+    strips: dict[str, list[list[PanelFigure]]],
     plots: dict[str, str],
     warnings: list[str],
     plan: FloorPlan | None = None,
 ) -> None:
-    """Write report.html from metrics and the pictures in images/; `strips` names views by kind, `plots` holds captions.
+    """Write report.html from metrics and pictures; `strips`: panels of views by heading, `plots`: captions by name.
 
-    Raises RunError if a picture cannot be read or the page not be written.
+    Raises RunError if a picture cannot be read or the page cannot be written.
     """
     config, facts = run.config(), run.facts()
     if plan is not None:
-        for theme in (LIGHT, DARK):
-            run.write_image(f"plan-{theme.name}.png", draw_floor_plan(plan, theme))
-        plots = plots | {"plan": "The map from above. Circles are worth another visit, the largest first."}
+        _write_plan(run, plan)
+        plots = plots | {"plan": "The map from above. Numbered circles are regions to scan again, the largest first."}
     contents = Contents(
         title=f"SigmaSplat · {metrics.get('source')}",
         subtitle=" · ".join([config.name, f"version {facts.get('version')}", _machine(run), str(facts.get("status"))]),
@@ -58,29 +50,45 @@ def write_page(
         config=json.dumps(config.to_dict(), indent=2),
         warnings=warnings,
         loops=run.read_loops(),
-        story=summary_sentences(metrics, _machine(run)),
-        advice=advice(metrics, str(run.path), _again(config, facts), config.to_dict()),
-        unsure=unsure(metrics, plan),
+        summary=summary_sentences(metrics, _machine(run)),
+        advice=advice(metrics, str(run.path), rerun_command(config, facts), config.to_dict()),
+        rescan=rescan_sentences(metrics, plan),
+        regions=plan.regions if plan else (),
         seconds=_seconds(run),
-        picture=partial(_shown, run),
+        picture=lambda name: file_data_uri(run.path / name),
     )
     run.write_report(build_report(contents))
 
 
-def plan_of(run: RunFolder, field: GaussianField, log: list[dict[str, Any]], camera: Camera) -> FloorPlan | None:
-    """Draw up the plan of a run's map, looked at from its path but for lost frames; None where nothing is seen.
+def write_charts(run: RunFolder, charts: Mapping[str, tuple[list[plot.Chart], str]]) -> dict[str, str]:
+    """Draw charts into images/, wide and narrow, light and dark; return their captions by name."""
+    for name, (drawn, _) in charts.items():
+        for theme in (plot.LIGHT, plot.DARK):
+            size = SECONDS_SIZE if name == "seconds" else plot.SIZE
+            run.write_image(f"{name}-{theme.name}.png", plot.draw_charts(drawn, theme, size))
+            run.write_image(f"{name}-narrow-{theme.name}.png", plot.draw_narrow_charts(drawn, theme))
+    return {name: caption for name, (_, caption) in charts.items()}
 
-    log: records with their `T_world_camera`; `camera` is the source's.
+
+def _write_plan(run: RunFolder, plan: FloorPlan) -> None:
+    """Draw the floor plan into images/, wide and narrow, light and dark. The page lists the regions as text."""
+    for theme in (plot.LIGHT, plot.DARK):
+        run.write_image(f"plan-{theme.name}.png", draw_floor_plan(plan, theme, list_regions=False))
+        run.write_image(f"plan-narrow-{theme.name}.png", draw_narrow_floor_plan(plan, theme))
+
+
+def report_plan(run: RunFolder, log: list[dict[str, Any]], camera: Camera) -> FloorPlan | None:
+    """Return the floor plan of a run, seen from the frames that were not lost; None if no surface is visible.
+
+    log: records with their `T_world_camera`; camera: that of the source.
     """
-    config, known = run.config(), [record for record in log if not record["lost"]]
+    tracked, settings = [record for record in log if not record["lost"]], run.config().input
     path = Trajectory(
-        np.array([record["timestamp_s"] for record in known]),
-        np.array([record["T_world_camera"] for record in known]).reshape(-1, 4, 4),
+        np.array([record["timestamp_s"] for record in tracked]),
+        np.array([record["T_world_camera"] for record in tracked]).reshape(-1, 4, 4),
     )
-    seen_by = camera.prepared(config.input.width, config.input.crop_px)
-    renderer = FieldRenderer(config.render, config.backend)
     try:
-        return floor_plan(field, path, seen_by, most=LOOKS, renderer=renderer)
+        return run_floor_plan(run, path, camera.prepared(settings.width, settings.crop_px))
     except SigmaSplatError:
         return None
 
@@ -90,8 +98,8 @@ def _machine(run: RunFolder) -> str:
     return f"{made_on.get('cpu')}, {made_on.get('cores')} cores"
 
 
-def _again(config: Config, facts: dict[str, Any]) -> str:
-    """Return the command that makes the run again: its preset, and every setting that differs from it."""
+def rerun_command(config: Config, facts: dict[str, Any]) -> str:
+    """Return the command that makes the run again: its preset, and every setting that differs from the preset."""
     words = ["sigmasplat", "run", str(facts.get("source_path") or "PATH")]
     if config.name not in list_presets():
         return shlex.join(words)
@@ -103,44 +111,8 @@ def _again(config: Config, facts: dict[str, Any]) -> str:
 
 
 def _seconds(run: RunFolder) -> dict[str, float]:
-    """Return the seconds of each stage; none where the run stopped before it noted them."""
+    """Return the seconds of each stage; empty if the run stopped before it wrote them."""
     try:
         return run.read_profile()
     except RunError:
         return {}
-
-
-def _shown(run: RunFolder, name: str) -> str:
-    """Return a picture as the page holds it; charts keep their sharp lines."""
-    return data_uri(run.path / name, lossless="view-" not in name)
-
-
-QUALITY = 86
-
-
-def data_uri(path: Path, lossless: bool = False) -> str:
-    """Return a picture as a data: URI, WebP. Raises RunError if it cannot be read."""
-    try:
-        with Image.open(path) as picture:
-            buffer = io.BytesIO()
-            picture.convert("RGB").save(buffer, "WEBP", quality=QUALITY, lossless=lossless)
-    except OSError as problem:
-        raise RunError(f"cannot read picture {path}: {problem}") from problem
-    return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
-
-
-class Gallery:
-    """Draw the strips of a few views of each kind into images/ and remember their names for the report."""
-
-    def __init__(self, run: RunFolder, per_kind: int) -> None:
-        """Start empty; strips of an earlier evaluation are removed, since the views may differ."""
-        self.run, self.per_kind = run, per_kind
-        self.strips: dict[str, list[str]] = {}
-        for old in run.images.glob("view-*.png"):
-            old.unlink()
-
-    def add(self, view: ScoredView, place: str = "") -> None:
-        """Draw one view; `place` says in which map it was seen if not in the final one."""
-        name = f"view-{view.kind.replace(' ', '-')}{place and '-submap'}-{view.index:06d}.png"
-        self.run.write_image(name, side_by_side(view))
-        self.strips.setdefault(f"{view.kind} views{place}", []).append(f"images/{name}")

@@ -1,4 +1,4 @@
-"""Say what scores mean, to somebody who was not there: what was made, how good it is, what to try next."""
+"""Describe the scores of a run in sentences: what was made, how good it is, where to scan again, what to try next."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -9,63 +9,64 @@ if TYPE_CHECKING:
 
 Metrics = dict[str, Any]
 Advice = tuple[str, str]
-"""What was noticed and what it means, and a command to try; the command may be empty."""
+"""What was found and what it means, and a command to try; the command may be empty."""
 
-PICTURES = ((30.0, "hard to tell from the camera's"), (25.0, "good"), (20.0, "recognisable, fine detail blurred"))
-RANKS = ((0.5, "well"), (0.3, "fairly well"), (0.1, "roughly"))
-DEPTHS = ((0.01, "close"), (0.03, "good"))
-FEW_DB = 3.0
-"""Views the map was fitted to that look this much better than others say that there were too few of them."""
+PSNR_WORDS = ((30.0, "very close to the camera images"), (25.0, "good"), (20.0, "recognisable, fine detail is blurred"))
+RANK_WORDS = ((0.5, "well"), (0.3, "fairly well"), (0.1, "weakly"))
+DEPTH_WORDS = ((0.01, "very accurate"), (0.03, "good"))
+OVERFIT_DB = 3.0
+"""If training views are better than held-out views by this much, there are too few keyframes."""
 SLOW_PER_S = 5.0
-"""Fewer images a second than this are slow."""
+"""Below this number of images per second a run is slow."""
 
 
 def summary_sentences(metrics: Metrics, machine: str = "") -> list[str]:
     """Return sentences about the whole run, the most important first."""
     return [
-        _made(metrics, machine),
+        _overview(metrics, machine),
         _path(metrics),
-        *_pictures(metrics),
+        *_images(metrics),
         *_depth(metrics),
         *_uncertainty(metrics),
     ]
 
 
-def _made(metrics: Metrics, machine: str) -> str:
+def _overview(metrics: Metrics, machine: str) -> str:
     speed = metrics.get("frames_per_s")
-    how = f", {number(speed, 1)} images a second" if speed else ""
+    how = f" at {number(speed, 1)} images per second" if speed else ""
     status = metrics.get("status")
     unfinished = (
-        "" if status in (None, "complete") else f" The run is {status}: what follows is what there was by then."
+        "" if status in (None, "complete") else f" The run is {status}: this report covers the frames up to that point."
     )
     return (
-        f"{number(metrics.get('frames'), 0)} colour + depth images of {metrics.get('source')} became a path and "
-        f"a map of {number(metrics.get('splats'), 0)} splats{how}{f' on {machine}' if machine else ''}.{unfinished}"
+        f"SigmaSplat made a camera path and a map of {number(metrics.get('splats'), 0)} splats from "
+        f"{number(metrics.get('frames'), 0)} colour and depth images of {metrics.get('source')}{how}"
+        f"{f' on {machine}' if machine else ''}.{unfinished}"
     )
 
 
 def _path(metrics: Metrics) -> str:
     lost, ate = metrics.get("lost") or 0, metrics.get("ate") or {}
-    followed = (
-        f"The camera was lost on {lost} of {metrics.get('frames')} images; poses there are guesses."
+    tracked = (
+        f"Tracking was lost on {lost} of {metrics.get('frames')} images; do not trust their poses."
         if lost
-        else "The camera was followed all the way."
+        else "Tracking was never lost."
     )
     if ate.get("rmse_m") is None:
-        return f"{followed} No true path is known, so that the path's error is not known either."
+        return f"{tracked} The error of the path is unknown, because the recording has no ground truth."
     before = (metrics.get("ate_odometry") or {}).get("rmse_m")
-    told = before is not None and abs(before - ate["rmse_m"]) > max(0.1 * ate["rmse_m"], 1e-3)
-    loops = f" Without its closed loops it would be off by {number(before, 1, 100.0)} cm." if told else ""
-    error, worst = number(ate["rmse_m"], 1, 100.0), number(ate.get("max_m"), 1, 100.0)
-    return f"{followed} Its path is off by {error} cm (root mean square), at worst by {worst} cm.{loops}"
+    differs = before is not None and abs(before - ate["rmse_m"]) > max(0.1 * ate["rmse_m"], 1e-3)
+    loops = f" Without loop closure the RMS error is {number(before, 1, 100.0)} cm." if differs else ""
+    error, largest = number(ate["rmse_m"], 1, 100.0), number(ate.get("max_m"), 1, 100.0)
+    return f"{tracked} The RMS error of the path is {error} cm; the largest error is {largest} cm.{loops}"
 
 
-def _pictures(metrics: Metrics) -> list[str]:
+def _images(metrics: Metrics) -> list[str]:
     psnr_db = (metrics.get("held_out") or {}).get("psnr_db")
     if psnr_db is None:
         return []
-    said = next((words for least, words in PICTURES if psnr_db >= least), "poor")
-    return [f"Pictures from places that the map was not fitted to come out at {number(psnr_db, 1)} dB PSNR: {said}."]
+    rating = next((words for least, words in PSNR_WORDS if psnr_db >= least), "poor")
+    return [f"Rendered images of held-out frames reach {number(psnr_db, 1)} dB PSNR: {rating}."]
 
 
 def _depth(metrics: Metrics) -> list[str]:
@@ -73,40 +74,43 @@ def _depth(metrics: Metrics) -> list[str]:
     if held_out.get("depth_l1_m") is None:
         return []
     holes = 1.0 - (held_out.get("depth_coverage") or 0.0)
-    missing = f" {number(holes, 0, 100.0)} % of what the camera measured is missing in the map." if holes > 0.02 else ""
-    off_m = held_out["depth_l1_m"]
-    said = next((words for most, words in DEPTHS if off_m <= most), "coarse")
-    return [f"Its surfaces lie {number(off_m, 1, 100.0)} cm from the measured ones: {said}.{missing}"]
+    missing = f" {number(holes, 0, 100.0)} % of the depth readings have no surface in the map." if holes > 0.02 else ""
+    error_m = held_out["depth_l1_m"]
+    rating = next((words for most, words in DEPTH_WORDS if error_m <= most), "coarse")
+    return [
+        f"The depth of the map differs from the measured depth by {number(error_m, 1, 100.0)} cm on average: {rating}."
+        f"{missing}"
+    ]
 
 
 def _uncertainty(metrics: Metrics) -> list[str]:
     rank = (metrics.get("uncertainty") or {}).get("spearman")
     if rank is None:
         return []
-    said = next((words for least, words in RANKS if rank >= least), "hardly")
-    return [
-        f"The map's own uncertainty V tells right pixels from wrong ones {said} (rank correlation {number(rank, 2)})."
-    ]
+    rating = next(
+        (f"V predicts {words} where" for least, words in RANK_WORDS if rank >= least), "V does not show where"
+    )
+    return [f"The uncertainty {rating} the rendered colours are wrong (rank correlation {number(rank, 2)})."]
 
 
-def unsure(metrics: Metrics, plan: "FloorPlan | None") -> list[str]:
-    """Return sentences about where the map should not be trusted: frames that were lost, and what a plan shows."""
+def rescan_sentences(metrics: Metrics, plan: "FloorPlan | None") -> list[str]:
+    """Return sentences about where not to trust the map: frames where tracking was lost, and regions of the plan."""
     sentences = []
     lost = metrics.get("lost_frames") or []
     if lost:
-        sentences.append(f"Do not trust what was seen around images {ranges(lost)}: the camera was lost there.")
+        sentences.append(f"Tracking was lost at images {format_ranges(lost)}: do not trust the map there.")
     if plan is None:
         return sentences
-    said = {"unseen": "never seen", "thin": "mapped thinly", "unsure": "mapped, but unsure"}
-    areas = {why: [region.area_m2 for region in plan.regions if region.why == why] for why in said}
-    parts = [f"{len(found)} {said[why]} ({number(sum(found), 1)} m²)" for why, found in areas.items() if found]
+    reasons = {"unseen": "not observed", "thin": "mapped too thinly", "unsure": "mapped with high uncertainty"}
+    areas = {why: [region.area_m2 for region in plan.regions if region.why == why] for why in reasons}
+    parts = [f"{len(found)} {reasons[why]} ({number(sum(found), 1)} m²)" for why, found in areas.items() if found]
     if parts:
-        sentences.append(f"Worth another visit, of the places that the path passes: {', '.join(parts)}.")
+        sentences.append(f"Regions near the path to scan again: {', '.join(parts)}.")
     return sentences
 
 
-def ranges(indices: list[int], most: int = 4) -> str:
-    """Write increasing indices as ranges: 3–5, 9."""
+def format_ranges(indices: list[int], most: int = 4) -> str:
+    """Write increasing indices as at most `most` ranges: 3–5, 9."""
     runs: list[list[int]] = []
     for i in indices:
         if runs and i == runs[-1][-1] + 1:
@@ -118,11 +122,14 @@ def ranges(indices: list[int], most: int = 4) -> str:
 
 
 def advice(metrics: Metrics, run: str, again: str, settings: dict[str, Any]) -> list[Advice]:
-    """Return what to try next; `run` is its folder, `again` the command that made it, `settings` its config.json."""
+    """Return what to try next.
+
+    run: the run folder; again: the command that makes the run again; settings: the values of its config.json.
+    """
     found = [rule(metrics, again, settings) for rule in (_lost, _few_keyframes, _blurred, _holes, _slow, _no_loop)]
-    use = ("Look at it from all sides, hide what is doubtful:", f"sigmasplat view {run}")
-    surface = ("Make a surface for other programs:", f"sigmasplat mesh {run} --out room.glb")
-    return [*filter(None, found), use, surface]
+    view = ("View the map in 3D, and hide uncertain splats:", f"sigmasplat view {run}")
+    mesh = ("Export a mesh for other programs:", f"sigmasplat mesh {run} --out room.glb")
+    return [*filter(None, found), view, mesh]
 
 
 def _lost(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
@@ -130,11 +137,12 @@ def _lost(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | No
         return None
     stride = (settings.get("input") or {}).get("stride", 1)
     if stride > 1:
-        return f"The camera was lost, and only every {stride}th image was used: use them all.", f"{again} --stride 1"
+        words = f"Tracking was lost, and the run used one image in {stride}. Use all images:"
+        return words, f"{again} --stride 1"
     every = max((settings.get("mapping") or {}).get("every", 1) // 2, 1)
     return (
-        "The camera was lost: it moved too fast, or looked at a bare wall. Map more often; if that does not help, "
-        "record that part again, slower.",
+        "Tracking was lost: the camera moved too fast, or saw only a bare wall. Map more often; if this does not help, "
+        "record that part again and move more slowly.",
         f"{again} --set mapping.every={every}",
     )
 
@@ -142,10 +150,10 @@ def _lost(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | No
 def _few_keyframes(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
     training, held_out = (((metrics.get(kind) or {}).get("psnr_db")) for kind in ("training", "held_out"))
     every = (settings.get("mapping") or {}).get("every", 1)
-    if training is None or held_out is None or training - held_out < FEW_DB or every < 2:
+    if training is None or held_out is None or training - held_out < OVERFIT_DB or every < 2:
         return None
     return (
-        f"Views that the map was fitted to look {number(training - held_out, 1)} dB better than others: use more.",
+        f"Training views are {number(training - held_out, 1)} dB better than held-out views. Use more keyframes:",
         f"{again} --set mapping.every={every // 2}",
     )
 
@@ -153,10 +161,11 @@ def _few_keyframes(metrics: Metrics, again: str, settings: dict[str, Any]) -> Ad
 def _blurred(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
     psnr_db = (metrics.get("held_out") or {}).get("psnr_db")
     width = (settings.get("input") or {}).get("width", 0)
-    if psnr_db is None or psnr_db >= PICTURES[1][0] or not width:
+    if psnr_db is None or psnr_db >= PSNR_WORDS[1][0] or not width:
         return None
     return (
-        f"Pictures are blurred; the map was made from images {width} pixels wide. Larger ones are slower and sharper.",
+        f"Rendered images are blurred. The map was made from images {width} pixels wide; larger images give a sharper "
+        "map, but take longer:",
         f"{again} --set input.width={2 * width}",
     )
 
@@ -165,10 +174,8 @@ def _holes(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | N
     covered = (metrics.get("held_out") or {}).get("depth_coverage")
     if covered is None or covered > 0.9:
         return None
-    return (
-        f"{number(1 - covered, 0, 100.0)} % of what was measured is missing in the map: pass there again, slower.",
-        "",
-    )
+    missing = number(1 - covered, 0, 100.0)
+    return f"{missing} % of the depth readings have no surface in the map. Scan these places again, more slowly.", ""
 
 
 def _slow(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
@@ -180,7 +187,7 @@ def _slow(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | No
         return None
     smaller = max((width or 640) * 3 // 4 // 16 * 16, 160)
     return (
-        f"{number(speed, 1)} images a second is slow; smaller images are faster.",
+        f"The run is slow: {number(speed, 1)} images per second. Smaller images are faster:",
         f"{again} --set input.width={smaller}",
     )
 
@@ -188,12 +195,13 @@ def _slow(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | No
 def _slow_to_finish(
     frames: int, frames_s: float, finish_s: float, again: str, settings: dict[str, Any]
 ) -> Advice | None:
-    """Advise fewer steps of the final map where it took longer than the frames, and both together long."""
+    """Advise fewer iterations of the final map if it took longer than all frames, and the run was slow in total."""
     steps = (settings.get("final") or {}).get("iterations", 0)
     if steps < 2 or frames / (frames_s + finish_s) >= SLOW_PER_S:
         return None
     return (
-        f"The final map took {number(finish_s, 0)} s after {number(frames_s, 0)} s of frames; fewer steps are faster.",
+        f"The final map took {number(finish_s, 0)} s, all frames took {number(frames_s, 0)} s. "
+        "Fewer iterations are faster:",
         f"{again} --set final.iterations={steps // 2}",
     )
 
@@ -201,4 +209,4 @@ def _slow_to_finish(
 def _no_loop(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
     if (metrics.get("submaps") or 1) < 3 or (metrics.get("loops") or {}).get("accepted"):
         return None
-    return "No place was seen twice, so that drift could not be taken out: end a scan where it began.", ""
+    return "No loop was closed, so drift could not be corrected. End a scan where it started.", ""

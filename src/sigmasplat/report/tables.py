@@ -1,18 +1,18 @@
-"""Turn metrics into rows of text: the figures of first interest, and the report's tables. The first row is the head."""
+"""Turn metrics into rows of text: headline figures, and the tables of the report, whose first row is the head."""
 
 import math
 from typing import Any
 
 
 def number(value: float | None, digits: int, scale: float = 1.0) -> str:
-    """Write a figure with fixed digits and thin thousands, or a dash where there is none."""
+    """Format a figure with fixed digits and thin spaces between thousands; a dash if it is None, nan or inf."""
     if value is None or not math.isfinite(value):
         return "–"
     return f"{value * scale:,.{digits}f}".replace(",", "\u202f").replace("-", "−")
 
 
 def headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Return the figures of first interest as (name, value, unit), in order; for the page's top and the CLI's table."""
+    """Return the headline figures as (name, value, unit), for the top of the page and the table of the command line."""
     held_out = metrics.get("held_out") or {}
     path = [("ATE RMSE", number(metrics["ate"]["rmse_m"], 2, 100.0), "cm")] if metrics.get("ate") else []
     found = metrics.get("reconstruction")
@@ -20,18 +20,18 @@ def headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     before = metrics.get("held_out_submaps")
     in_submaps = [("PSNR, held-out, in submaps", number(before.get("psnr_db"), 2), "dB")] if before else []
     test = metrics.get("test_views")
-    apart = [("PSNR, views kept apart", number(test.get("psnr_db"), 2), "dB")] if test else []
+    novel = [("PSNR, novel views", number(test.get("psnr_db"), 2), "dB")] if test else []
     return [
         *path,
         ("PSNR, held-out", number(held_out.get("psnr_db"), 2), "dB"),
-        *apart,
+        *novel,
         *in_submaps,
         ("Depth L1, held-out", number(held_out.get("depth_l1_m"), 2, 100.0), "cm"),
         *surface,
         ("Spearman V ~ error²", number((metrics.get("uncertainty") or {}).get("spearman"), 3), ""),
         ("Speed", number(metrics.get("frames_per_s"), 2), "frames/s"),
         ("Longest frame after the first", number(metrics.get("worst_frame_s"), 0, 1e3), "ms"),
-        *_after_the_frames(metrics),
+        *_total_times(metrics),
         ("Splats", number(metrics.get("splats"), 0), ""),
         ("Map file", number(metrics.get("map_bytes"), 1, 1e-6), "MB"),
         ("Lost frames", number(metrics.get("lost"), 0), f"of {metrics.get('frames', 0)}"),
@@ -39,14 +39,14 @@ def headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     ]
 
 
-def _after_the_frames(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Return what was waited for after the last frame and in all, nothing where it is not known."""
+def _total_times(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Return the times of the final map and of the whole run, if known."""
     known = {"Final map": metrics.get("finish_s"), "Frames and final map": metrics.get("total_s")}
     return [(name, number(seconds, 1), "s") for name, seconds in known.items() if seconds is not None]
 
 
 def _submap_figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Return how many submaps and loops there are, nothing for a map in one piece."""
+    """Return the numbers of submaps and loops; nothing for a single submap."""
     if (metrics.get("submaps") or 1) < 2:
         return []
     loops = metrics.get("loops") or {}
@@ -54,30 +54,40 @@ def _submap_figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     return [("Submaps", number(metrics["submaps"], 0), ""), closed]
 
 
-def cards(metrics: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
-    """Return the tables of scores, each with its title; those without figures hold a head at most."""
-    seen = "held-out, in submaps" if metrics.get("held_out_submaps") else "held-out"
+def score_tables(metrics: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
+    """Return the tables of scores with their titles. A table without figures has at most a head."""
+    views = "held-out, in submaps" if metrics.get("held_out_submaps") else "held-out"
     return [
-        ("Pictures", _picture_rows(metrics)),
+        ("Rendered images", _image_rows(metrics)),
         ("Path", _path_rows(metrics)),
         ("Surface", _surface_rows(metrics)),
-        (f"Uncertainty V, {seen}", _uncertainty_rows(metrics.get("uncertainty"))),
+        (f"Uncertainty V, {views}", _uncertainty_rows(metrics.get("uncertainty"))),
         ("Uncertainty V, held-out, final map", _uncertainty_rows(metrics.get("uncertainty_final"))),
-        (f"Reliability of V, {seen}", _reliability_rows(metrics.get("uncertainty"))),
+        (f"Calibration of V, {views}", _calibration_rows(metrics.get("uncertainty"))),
     ]
 
 
 def submap_sentence(metrics: dict[str, Any]) -> str:
-    """Say how many submaps and loops there are, and what finishing cost."""
+    """Describe how many submaps and loops there are, and how long the final map took."""
     loops, finish_s = metrics.get("loops") or {}, metrics.get("finish_s")
-    tried = f"{loops.get('tried', 0)} pairs of them were tried as loops, {loops.get('accepted', 0)} accepted."
-    after = f" Finishing took {number(finish_s, 1)} s after the last frame." if finish_s is not None else ""
-    return f"The map was made in {metrics['submaps']} submaps. {tried}{after}"
+    tried = f"{loops.get('tried', 0)} loops between them were tried, {loops.get('accepted', 0)} were accepted."
+    after = f" The final map took {number(finish_s, 1)} s after the last frame." if finish_s is not None else ""
+    return f"The map has {metrics['submaps']} submaps. {tried}{after}"
 
 
 def loop_rows(loops: list[dict[str, Any]]) -> list[list[str]]:
-    """List loops: who, how alike, how well they fit, how far from where they were thought to be, the verdict."""
-    head = ["submaps", "frames", "similarity", "residual", "overlap, %", "moved, cm", "turned, °", "verdict", "reason"]
+    """List loops: submaps, frames, similarity, fit, correction of the relative pose, verdict."""
+    head = [
+        "submaps",
+        "frames",
+        "similarity",
+        "residual",
+        "overlap, %",
+        "shift, cm",
+        "rotation, °",
+        "verdict",
+        "reason",
+    ]
     return [head, *(_loop_row(loop) for loop in loops)]
 
 
@@ -96,15 +106,15 @@ def _loop_row(loop: dict[str, Any]) -> list[str]:
     ]
 
 
-def _picture_rows(metrics: dict[str, Any]) -> list[list[str]]:
+def _image_rows(metrics: dict[str, Any]) -> list[list[str]]:
     columns = {"training": "training", "held-out": "held_out"}
     if metrics.get("test_views"):
-        columns |= {"kept apart": "test_views"}
+        columns |= {"novel views": "test_views"}
     if metrics.get("training_submaps") or metrics.get("held_out_submaps"):
         columns |= {"training, in submaps": "training_submaps", "held-out, in submaps": "held_out_submaps"}
     kinds = [metrics.get(key) or {} for key in columns.values()]
     lines = [("Views", "views", 0, 1.0), ("PSNR, dB", "psnr_db", 2, 1.0), ("SSIM", "ssim", 4, 1.0),
-             ("Depth L1, cm", "depth_l1_m", 2, 100.0), ("Readings covered, %", "depth_coverage", 1, 100.0)]  # fmt: skip
+             ("Depth L1, cm", "depth_l1_m", 2, 100.0), ("Depth covered, %", "depth_coverage", 1, 100.0)]  # fmt: skip
     return [["", *columns]] + [
         [label, *(number(kind.get(key), digits, scale) for kind in kinds)] for label, key, digits, scale in lines
     ]
@@ -117,9 +127,9 @@ def _path_rows(metrics: dict[str, Any]) -> list[list[str]]:
     rows = [[f"ATE {name}, cm", number(ate[f"{name}_m"], 3, 100.0)] for name in ("rmse", "mean", "median", "max")]
     without = metrics.get("ate_odometry")
     if without:
-        rows.append(["ATE rmse without the loops, cm", number(without["rmse_m"], 3, 100.0)])
+        rows.append(["ATE rmse without loop closure, cm", number(without["rmse_m"], 3, 100.0)])
     return [
-        ["over all frames, rigidly aligned", f"{ate['pairs']} poses"],
+        ["all frames, rigid alignment", f"{ate['pairs']} poses"],
         *rows,
         ["RPE translation, cm per frame", number(rpe["translation_rmse_m"], 3, 100.0)],
         ["RPE rotation, ° per frame", number(rpe["rotation_rmse_deg"], 3)],
@@ -133,11 +143,11 @@ def _surface_rows(metrics: dict[str, Any]) -> list[list[str]]:
     lines = [("Accuracy, cm", "accuracy_m", 2), ("Completion, cm", "completion_m", 2),
              ("Completion ratio (< 5 cm), %", "completion_ratio", 1), ("Precision (< 1 cm), %", "precision", 1),
              ("Recall (< 1 cm), %", "recall", 1), ("F1 (1 cm), %", "f1", 1),
-             ("Depth L1, novel views, cm", "depth_l1_m", 2), ("… covered, %", "depth_coverage", 1),
+             ("Depth L1, novel views, cm", "depth_l1_m", 2), ("Depth covered, novel views, %", "depth_coverage", 1),
              ("Splats to surface, cm", "splats_accuracy_m", 2), ("Surface to splats, cm", "splats_completion_m", 2),
-             ("Their mean (Chamfer), cm", "splats_chamfer_m", 2),
+             ("Chamfer distance of splats, cm", "splats_chamfer_m", 2),
              ("Floaters (> 10 cm) among opaque splats, %", "floaters", 2)]  # fmt: skip
-    return [["of what a keyframe could see", "mesh.ply, map.ply"]] + [
+    return [["parts visible from keyframes", "mesh.ply, map.ply"]] + [
         [label, number(found.get(key), digits, 100.0)] for label, key, digits in lines
     ]
 
@@ -146,18 +156,18 @@ def _uncertainty_rows(scores: dict[str, Any] | None) -> list[list[str]]:
     if not scores:
         return []
     return [
-        ["on pixels with a reading", f"{number(scores['pixels'], 0)} pixels"],
+        ["pixels with a depth reading", f"{number(scores['pixels'], 0)} pixels"],
         ["Spearman of V and squared error", number(scores["spearman"], 3)],
-        ["… where the map covers the pixel", number(scores.get("spearman_covered"), 3)],
-        ["AUSE (0 = as good as knowing the error)", number(scores["ause"], 3)],
+        ["Spearman, only covered pixels", number(scores.get("spearman_covered"), 3)],
+        ["AUSE (0 = perfect ranking)", number(scores["ause"], 3)],
         ["Gaussian NLL", number(scores["nll"], 3)],
         ["mean V, 10⁻³", number(scores["mean_variance"], 3, 1e3)],
         ["mean squared error, 10⁻³", number(scores["mean_squared_error"], 3, 1e3)],
     ]
 
 
-def _reliability_rows(scores: dict[str, Any] | None) -> list[list[str]]:
+def _calibration_rows(scores: dict[str, Any] | None) -> list[list[str]]:
     rows = (scores or {}).get("reliability") or []
-    return [["tenth of pixels, by V", "mean V, 10⁻³", "squared error, 10⁻³"]] + [
+    return [["decile of V", "mean V, 10⁻³", "squared error, 10⁻³"]] + [
         [str(i), number(row["predicted"], 3, 1e3), number(row["empirical"], 3, 1e3)] for i, row in enumerate(rows, 1)
     ]

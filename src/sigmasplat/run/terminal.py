@@ -18,7 +18,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from sigmasplat.report.summary import ranges
+from sigmasplat.report.summary import format_ranges
 from sigmasplat.report.tables import headline, number
 from sigmasplat.run.profile import shares
 from sigmasplat.run.protocols import LoopResult, StepResult
@@ -94,7 +94,8 @@ class Screen:
         lost = metrics.get("lost_frames") or []
         if lost:
             frames = metrics.get("frames")
-            self.say(f"tracking was LOST on {len(lost)} of {frames} frames: {ranges(lost)}; do not trust those poses")
+            where = format_ranges(lost)
+            self.say(f"tracking was LOST on {len(lost)} of {frames} frames: {where}; do not trust those poses")
 
     def profile(self, seconds: Mapping[str, float]) -> None:
         """Print where the time went, a stage a line."""

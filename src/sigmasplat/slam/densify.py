@@ -1,13 +1,12 @@
 """Multiply splats where the loss pulls hardest, and find those that have grown too large (3DGS; CG-SLAM §5)."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import DensifyConfig
+from sigmasplat.fit.densify_stats import DensifyStats
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
@@ -18,59 +17,41 @@ CHILD_SCALE = 1.6
 RADIUS_SIGMAS = 3.0
 
 
-@dataclass(eq=False)
-class Heat:
-    """How hard the loss pulled at N splats' means: the sum over steps [N], and over how many [N]. It is of one half of
-    a keyframe's steps: when rows are dropped or added it means nothing any more."""
+def densify_mask(stats: DensifyStats, split_gradient: float, most: int | None = None) -> Tensor:
+    """Return which splats to densify, bool [N]: those whose mean gradient over the steps that saw them is at least
+    `split_gradient` (0 = none).
 
-    pull: Tensor
-    times: Tensor
-
-    @staticmethod
-    def of(n: int, device: torch.device | None = None) -> "Heat":
-        """Start cold, on a device; by default in the host's memory."""
-        return Heat(torch.zeros(n, device=device), torch.zeros(n, device=device))
-
-    def add(self, pull: Tensor) -> None:
-        """Take in one step's pulls [N] ≥ 0, 0 where a splat was not seen."""
-        self.pull += pull
-        self.times += pull > 0
-
-
-def hot_splats(pull: Tensor, times: Tensor, split_gradient: float, most: int | None = None) -> Tensor:
-    """Tell which splats were pulled at hard, bool [N]: by `split_gradient` or more, on average over the times seen.
-
-    pull [N]: sums of pulls; split_gradient 0 = none; most: only so many, the hottest, of equals the first.
+    most: at most this many, those of the largest gradient, the first of equal ones.
     """
-    mean = pull / times.clamp(min=1)
-    hot = (times > 0) & (mean >= split_gradient) & (split_gradient > 0)
-    if most is not None and int(hot.sum()) > most:
-        order = torch.where(hot, mean, -1.0).sort(descending=True, stable=True).indices
-        hot[order[max(most, 0) :]] = False
-    return hot
+    mean = stats.grad2d / stats.times.clamp(min=1)
+    chosen = (stats.times > 0) & (mean >= split_gradient) & (split_gradient > 0)
+    if most is not None and int(chosen.sum()) > most:
+        order = torch.where(chosen, mean, -1.0).sort(descending=True, stable=True).indices
+        chosen[order[max(most, 0) :]] = False
+    return chosen
 
 
-def multiply(field: GaussianField, hot: Tensor, config: DensifyConfig, random: np.random.Generator) -> Tensor:
-    """Split the hot splats [N] that are large, clone the others where that is asked for; return which were split [N].
+def multiply(field: GaussianField, chosen: Tensor, config: DensifyConfig, random: np.random.Generator) -> Tensor:
+    """Split the chosen splats [N] that are large, clone the others if asked; return which were split [N].
 
-    Those split are gone, the rows after them move up; what is new stands at the end. A hot splat makes the field larger
-    by one at most.
+    Split splats are removed and the rows after them move up; new splats are appended. A chosen splat makes the field
+    larger by one at most.
     """
-    large = hot & (field.scales.amax(1) > config.split_scale_m)
-    twins = _copies(field, hot & ~large & config.clone)
+    large = chosen & (field.scales.amax(1) > config.split_scale_m)
+    twins = _copies(field, chosen & ~large & config.clone)
     split(field, large, random)
     field.append(twins)
     return large
 
 
-def split(field: GaussianField, hot: Tensor, random: np.random.Generator) -> None:
-    """Replace each hot splat (bool [N]) by two smaller ones, drawn from its Gaussian; they stand at the end, in pairs.
+def split(field: GaussianField, chosen: Tensor, random: np.random.Generator) -> None:
+    """Replace each chosen splat (bool [N]) by two smaller ones drawn from its Gaussian, appended in pairs.
 
     All but place and size is the parent's; ids are new and Adam's state is at rest.
     """
-    halves = _copies(field, hot.nonzero().squeeze(1).repeat_interleave(2))
+    halves = _copies(field, chosen.nonzero().squeeze(1).repeat_interleave(2))
     _scatter(halves, random)
-    field.keep(~hot)
+    field.keep(~chosen)
     field.append(halves)
 
 

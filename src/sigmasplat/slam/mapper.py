@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sigmasplat.config import Config
 from sigmasplat.fit.adam import Rates
+from sigmasplat.fit.densify_stats import DensifyStats
 from sigmasplat.fit.field import FieldFit, fit_field
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.fit.tracking_loss import PoseMaps
@@ -18,7 +19,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.submap import Picture, Submap
 from sigmasplat.render.view import View
-from sigmasplat.slam.densify import Heat, hot_splats, multiply, split, too_large
+from sigmasplat.slam.densify import densify_mask, multiply, split, too_large
 from sigmasplat.slam.pruning import fade, splat_uncertainty, still_uncertain
 from sigmasplat.slam.rules import draw_keyframes
 from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats, thin_out
@@ -54,12 +55,15 @@ class Mapper:
         self._seed(view, target, T_world_camera)
         steps = c.iterations if begun else c.first_iterations
         rates = iter([Rates.of(c)] * steps if begun else Rates.falling(c, steps))
-        window, heat = self._window(view), Heat.of(len(self.field), self.field.params.device)
-        fit = self._fit(view, window, steps // 2, rates, born, c.poses_from == "start", heat)
-        self._multiply(view, heat)
+        window = self._window(view)
+        stats = DensifyStats.of(self.keyframes[-1], len(self.field), self.field.params.device)
+        self._choose_movable(c.poses_from == "start")
+        fit = self._fit(view, window, steps // 2, rates, born, stats)
+        self._multiply(view, stats)
         self._prune(view)
         doubted = self._doubt(view, window)
-        fit.join(self._fit(view, window, steps - steps // 2, rates, born, True, None))
+        self._choose_movable(True)
+        fit.join(self._fit(view, window, steps - steps // 2, rates, born, None))
         self._prune(view, self._unconvinced(view, window, doubted))
         return fit
 
@@ -71,7 +75,7 @@ class Mapper:
         if c.covisibility == "splats":
             newest = self.keyframes[-1]
             view.forward(self.field.params, se3.inverse(newest.T_world_camera), layers=True)
-            newest.seen = dominating(view, self.field)
+            newest.visible_ids = dominating(view, self.field)
         return choose_window(self.keyframes, c.window, c.covisibility)
 
     def _fit(
@@ -81,24 +85,20 @@ class Mapper:
         steps: int,
         rates: Iterator[Rates],
         born: int,
-        poses: bool,
-        heat: Heat | None,
+        stats: DensifyStats | None,
     ) -> FieldFit:
         """Fit the field to the window; splats with ids below `born` are the old ones."""
-        c, newest = self.config.mapping, self.keyframes[-1]
+        c = self.config.mapping
         together, history = c.frames_per_step or len(window), c.keyframe_history
         batches = draw_keyframes(window[::-1], steps, c.newest_probability, history, self.random, together)
         frozen = int((self.field.ids < born).sum()) if c.freeze_old_colors else 0
+        wanted = stats if self.config.primitives.split_gradient > 0 else None
+        return fit_field(self.field, view, batches, c, rates, frozen, stats=wanted)
 
-        def may_move(keyframe: Keyframe) -> bool:
-            return poses and not keyframe.fixed and (c.poses == "all" or keyframe is newest)
-
-        def felt(keyframe: Keyframe, pull: Tensor) -> None:
-            if heat is not None and keyframe is newest:
-                heat.add(pull)
-
-        pulled = felt if heat is not None and self.config.primitives.split_gradient > 0 else None
-        return fit_field(self.field, view, batches, c, rates, frozen, may_move=may_move, felt=pulled)
+    def _choose_movable(self, poses: bool) -> None:
+        """Mark the keyframes whose poses the next fit may move: all, the newest, or none."""
+        for keyframe in self.keyframes:
+            keyframe.movable = poses and (self.config.mapping.poses == "all" or keyframe is self.keyframes[-1])
 
     def finished(self, index: int) -> tuple[Submap, list[Picture]]:
         """Return what has been mapped as a finished submap, which rests in the host's memory, and what its keyframes
@@ -138,12 +138,12 @@ class Mapper:
             new.keep(torch.from_numpy(self.random.permutation(len(new))[: max(room, 0)].copy()).sort().values)
         self.field.append(new)
 
-    def _multiply(self, view: View, heat: Heat) -> None:
-        """Split and clone the splats that the newest keyframe pulled at hardest, and those it sees too large, as far as
-        the budget goes."""
+    def _multiply(self, view: View, stats: DensifyStats) -> None:
+        """Split and clone the splats with the largest gradient in the newest keyframe, and split those too large in it,
+        within the budget."""
         p, most = self.config.primitives, self.config.seeding.max_splats
         room = max(most - len(self.field), 0) if most else len(self.field)
-        multiply(self.field, hot_splats(heat.pull, heat.times, p.split_gradient, room), p, self.random)
+        multiply(self.field, densify_mask(stats, p.split_gradient, room), p, self.random)
         if p.split_radius_px:
             T_camera_world = se3.inverse(self.keyframes[-1].T_world_camera)
             coarse = too_large(self.field, T_camera_world, view.camera, 0.0, p.split_radius_px)

@@ -9,7 +9,7 @@ from skimage.feature import canny
 from torch import Tensor
 
 from sigmasplat.config import SeedConfig
-from sigmasplat.fit.pyramid import gradient_magnitude, gray_of
+from sigmasplat.fit.gray import gradient_magnitude, gray_of
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.model.field import GaussianField

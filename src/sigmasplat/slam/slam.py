@@ -21,7 +21,8 @@ from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import MemoryStore, SubmapStore
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, preset
-from sigmasplat.render.view import View, make_view
+from sigmasplat.render.backend import make_view
+from sigmasplat.render.view import View
 from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.final import final_map
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor

@@ -7,13 +7,14 @@ import numpy as np
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.align import align
+from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, map_reference
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
-from sigmasplat.render.view import ReferenceView, View
+from sigmasplat.render.view import View
 from sigmasplat.slam.rules import is_lost, jumped
 from sigmasplat.types import Matrix
 
@@ -99,7 +100,7 @@ class Tracker:
 
     def _odometry(self, view: View, live: Pyramid) -> Matrix | None:
         """Align the last image to this one; None if they do not fit together either."""
-        if self.last_image is None or (self.config.method == "adam" and isinstance(view, ReferenceView)):
+        if self.last_image is None or (self.config.method == "adam" and not fits_of(view).aligns):
             return None  # alignment needs the compiled kernels
         guesses = (se3.inverse(self.velocity), np.eye(4))
         found = [
@@ -114,7 +115,7 @@ class Tracker:
     def keep_keyframe(self, field: GaussianField, view: View, live: Pyramid, T_world_camera: Matrix) -> None:
         """Take note of a freshly mapped keyframe: where mapping left its pose, and its image as the next reference."""
         self.previous = T_world_camera
-        if self.config.method == "align" or not isinstance(view, ReferenceView):  # else nothing could align to it
+        if self.config.method == "align" or fits_of(view).aligns:  # else nothing could align to it
             self.keyframe = keyframe_reference(field.params, view, live, se3.inverse(T_world_camera), self.config)
 
     def hop_covariance(self, fit: PoseFit, live: Pyramid) -> Matrix | None:

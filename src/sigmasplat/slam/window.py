@@ -108,9 +108,9 @@ def _share_seen(points: NDArray[np.float64], keyframe: Keyframe) -> float:
 
 
 def _seen(keyframe: Keyframe) -> Ids:
-    if keyframe.seen is None:
+    if keyframe.visible_ids is None:
         raise _nothing(keyframe, "a list of the splats it sees", "splats")
-    return keyframe.seen
+    return keyframe.visible_ids
 
 
 def _descriptor(keyframe: Keyframe) -> NDArray[np.float32]:

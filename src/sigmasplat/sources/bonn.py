@@ -32,14 +32,14 @@ T_MARKERS_CAMERA = se3.orthonormalise(
 )
 
 
-def of_camera(markers: Trajectory) -> Trajectory:
+def camera_trajectory(markers: Trajectory) -> Trajectory:
     """Turn the recorded path of the markers into that of the camera."""
     return Trajectory(markers.timestamps_s, T_ROS @ markers.T_world_camera @ T_ROS @ T_MARKERS_CAMERA)
 
 
 def open_bonn(folder: Path, settings: InputConfig) -> RecordedSource:
     """Open a folder; raises SourceError as a TUM folder does."""
-    return open_tum(folder, settings, camera=BONN, camera_path=of_camera)
+    return open_tum(folder, settings, camera=BONN, camera_path=camera_trajectory)
 
 
 def recognises(path: str) -> bool:

@@ -16,11 +16,16 @@ import numpy as np
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.camera.calibration import ICL_NUIM, TUM_UNITS_PER_METRE, calibrated, freiburg_calibration
+from sigmasplat.sources.camera.calibration import (
+    ICL_NUIM,
+    TUM_UNITS_PER_METRE,
+    freiburg_calibration,
+    resolve_calibration,
+)
 from sigmasplat.sources.files.folders import FRAMES_PER_SECOND
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.recorded import Images, RecordedSource, first_size
-from sigmasplat.sources.tum import lines, numbers, read_poses
+from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
+from sigmasplat.sources.tum import parse_numbers, read_lines, read_poses
 
 LIST_NAMES = ("associations.txt", "association.txt", "associate.txt")
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -35,26 +40,28 @@ def open_icl_nuim(folder: Path, settings: InputConfig) -> RecordedSource:
     truth_path = next(iter(sorted(folder.glob("*.gt.freiburg"))), None)
     rendered = truth_path is not None or "frei_png" in folder.resolve().name
     recorded = ICL_NUIM if rendered else freiburg_calibration(folder)
-    calibration = calibrated(folder, recorded, first_size([i.color for i in images]), settings, TUM_UNITS_PER_METRE)
+    calibration = resolve_calibration(
+        folder, recorded, first_size([i.color for i in images]), settings, TUM_UNITS_PER_METRE
+    )
     truth = _truth(folder, truth_path)
     return RecordedSource(folder.resolve().name, images, calibration, settings, truth)
 
 
-def _images(path: Path) -> list[Images]:
+def _images(path: Path) -> list[ImagePair]:
     """Read the list; which of the two columns is depth, the names say."""
     images = []
-    for line, words in lines(path):
+    for line, words in read_lines(path):
         if len(words) != 4 or ("depth" in words[1]) == ("depth" in words[3]):
             raise SourceError(
                 f"{path}:{line}: 'time depth/image time rgb/image' wanted, found {' '.join(words)[:60]!r}"
             )
-        times = numbers(path, line, [words[0], words[2]])
+        times = parse_numbers(path, line, [words[0], words[2]])
         color, depth = (3, 1) if "depth" in words[1] else (1, 3)
-        images.append(Images(times[color // 2], path.parent / words[color], path.parent / words[depth]))
+        images.append(ImagePair(times[color // 2], path.parent / words[color], path.parent / words[depth]))
     if not images:
         raise SourceError(f"{path}: lists no images")
     if all(image.timestamp_s.is_integer() for image in images):  # numbers of frames, not seconds
-        images = [Images(i.timestamp_s / FRAMES_PER_SECOND, i.color, i.depth) for i in images]
+        images = [ImagePair(i.timestamp_s / FRAMES_PER_SECOND, i.color, i.depth) for i in images]
     return sorted(images, key=lambda image: image.timestamp_s)
 
 

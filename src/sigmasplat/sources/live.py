@@ -85,7 +85,7 @@ class LiveSource(Source):
         return f"{self.name}: a live camera gives its frames once; run it, then read the folder it was recorded to"
 
 
-def as_recorded(settings: InputConfig) -> InputConfig:
+def recording_settings(settings: InputConfig) -> InputConfig:
     """Return the settings to read a recording with: what was done to the frames before they were written is done."""
     return InputConfig(
         strict=settings.strict, width=settings.width, crop_px=settings.crop_px,

@@ -11,12 +11,18 @@ from pathlib import Path
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
-from sigmasplat.sources.camera.calibration import Calibration, calibrated, number, positive, read_object
-from sigmasplat.sources.files.folders import FRAMES_PER_SECOND, natural
-from sigmasplat.sources.files.poses import known_path
-from sigmasplat.sources.files.transforms import Fields, camera_in, frames_of, pose_in
+from sigmasplat.sources.camera.calibration import (
+    Calibration,
+    check_positive,
+    json_number,
+    read_json_object,
+    resolve_calibration,
+)
+from sigmasplat.sources.files.folders import FRAMES_PER_SECOND, natural_key
+from sigmasplat.sources.files.poses import build_trajectory
+from sigmasplat.sources.files.transforms import Fields, read_camera, read_frames, read_pose
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.recorded import Images, RecordedSource, first_size
+from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
 
 NAME = "transforms.json"
 METRES_PER_UNIT = 0.001
@@ -26,15 +32,17 @@ METRES_PER_UNIT = 0.001
 def open_nerfstudio(folder: Path, settings: InputConfig) -> RecordedSource:
     """Open a folder; raises SourceError if its file, images or camera cannot be used."""
     path = folder / NAME
-    fields = read_object(path)
-    named = sorted(frames_of(path, fields), key=lambda frame: natural(frame["file_path"]))
+    fields = read_json_object(path)
+    named = sorted(read_frames(path, fields), key=lambda frame: natural_key(frame["file_path"]))
     frames = [frame for frame in named if isinstance(frame.get("depth_file_path"), str)]
     if not frames:
-        raise SourceError(f'{path}: no frame has a "depth_file_path"; depth is needed, export it with the images')
+        raise SourceError(
+            f'{path}: no frame has a "depth_file_path"; export depth with the images, see docs/data.md#without-depth'
+        )
     skipped = [f"{path}: {frame['file_path']} has no depth_file_path" for frame in named if frame not in frames]
-    images = [Images(i / FRAMES_PER_SECOND, *_files(folder, frame)) for i, frame in enumerate(frames)]
+    images = [ImagePair(i / FRAMES_PER_SECOND, *_files(folder, frame)) for i, frame in enumerate(frames)]
     calibration = _calibration(path, fields, frames, images, settings)
-    truth = known_path((i.timestamp_s, pose_in(path, frame)) for i, frame in zip(images, frames, strict=True))
+    truth = build_trajectory((i.timestamp_s, read_pose(path, frame)) for i, frame in zip(images, frames, strict=True))
     return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
 
 
@@ -46,16 +54,16 @@ def _files(folder: Path, frame: Fields) -> tuple[Path, Path]:
 
 
 def _calibration(
-    path: Path, fields: Fields, frames: list[Fields], images: list[Images], settings: InputConfig
+    path: Path, fields: Fields, frames: list[Fields], images: list[ImagePair], settings: InputConfig
 ) -> Calibration:
     size, depth_size = first_size([i.color for i in images]), first_size([i.depth for i in images])
-    per_unit = number(path, fields, "depth_unit_scale_factor", METRES_PER_UNIT)
-    units = round(1.0 / positive(path, "depth_unit_scale_factor", per_unit), 6)
-    known = camera_in(path, fields, frames, size, units)
+    per_unit = json_number(path, fields, "depth_unit_scale_factor", METRES_PER_UNIT)
+    units = round(1.0 / check_positive(path, "depth_unit_scale_factor", per_unit), 6)
+    known = read_camera(path, fields, frames, size, units)
     if depth_size != size:
         depth_camera = known.camera.resized(*depth_size)
         known = replace(known, depth_camera=depth_camera, depth_distortion=known.distortion)
-    return calibrated(path.parent, known, size, settings, units)
+    return resolve_calibration(path.parent, known, size, settings, units)
 
 
 FORMAT = Format(

@@ -1,7 +1,8 @@
-"""Open a sequence whatever its format: ask each format of this folder whether it knows the path."""
+"""Open a sequence of any known format: ask each format of this folder whether it recognises the path."""
 
 import importlib
 import pkgutil
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache
@@ -12,18 +13,21 @@ from sigmasplat.config import InputConfig
 from sigmasplat.config.text import nearest
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.sources.base import Source, Subset
+from sigmasplat.sources.files.color_only import without_depth
 
 PACKED = (".bag", ".mcap", ".db3", ".r3d")
-"""Endings of files that may be whole sequences; only for the message that names those of a folder."""
+"""Endings of files that may each be a whole sequence. A folder of such files is refused with their names."""
 
 
 @dataclass(frozen=True)
 class Format:
-    """One way a sequence can be laid out. A module of this folder that defines `FORMAT` is found by itself.
+    """One layout of a sequence on disk. Every module of this folder that defines `FORMAT` is found automatically.
 
-    recognises(path): looks at the content only; looked_for: what it looked for, for the error message;
-    open(path, settings): builds the source of all its frames; priority: formats of a higher one are asked first, so
-    that what is special wins over what is general (above 0: more than its lists; below: a guess for want of better).
+    recognises(path): returns whether the path has this format, from its content only;
+    looked_for: names the files that identify the format, for messages;
+    open(path, settings): builds the source of all its frames;
+    priority: formats of higher priority are asked first, so that a special format comes before a general one. Above 0:
+    other formats recognise the same files; below 0: the format is a guess.
     """
 
     name: str
@@ -35,41 +39,42 @@ class Format:
 
 @cache
 def formats() -> tuple[Format, ...]:
-    """Find the formats: every module directly in `sigmasplat.sources` that defines FORMAT, by priority and name."""
-    names = sorted(module.name for module in pkgutil.iter_modules([str(Path(__file__).parent)]) if not module.ispkg)
+    """Return the formats of all modules directly in `sigmasplat.sources` that define FORMAT, by priority and name."""
+    folders = sys.modules[__package__].__path__
+    names = sorted(module.name for module in pkgutil.iter_modules(folders) if not module.ispkg)
     modules = [importlib.import_module(f"sigmasplat.sources.{name}") for name in names]
     found = [module.FORMAT for module in modules if hasattr(module, "FORMAT")]
     return tuple(sorted(found, key=lambda known: -known.priority))
 
 
 def open_source(path: str | Path, settings: InputConfig | None = None, **changes: Any) -> Source:
-    """Open a recorded or synthetic sequence, its format guessed from what lies at `path`.
+    """Open a recorded or synthetic sequence; the format is recognised from the content of `path`.
 
-    `path` is a folder or file, or "synthetic" with options as in "synthetic:frames=200,seed=1,noise=1". Which frames
-    are taken, and what is done to them, say the settings; any of them may be given by name: stride=2, limit=100.
-    Raises SourceError if there is nothing at the path, no format knows it, or what is there cannot be used;
-    ConfigError on a setting that is none.
+    `path` is a folder or file, or "synthetic" with options as in "synthetic:frames=200,seed=1,noise=1". `settings` say
+    which frames are read and how they are processed; each can also be given by name: stride=2, limit=100.
+    Raises SourceError if the path does not exist, no format recognises it, or its content cannot be used;
+    ConfigError on an unknown setting.
     """
-    asked = changed(settings or InputConfig(), changes)
-    source = format_of(path).open(str(path), asked)
-    part = asked.stride > 1 or asked.limit or asked.start_s or asked.end_s
-    return Subset(source, asked) if part and not source.live else source
+    chosen = with_changes(settings or InputConfig(), changes)
+    source = format_of(path).open(str(path), chosen)
+    part = chosen.stride > 1 or chosen.limit or chosen.start_s or chosen.end_s
+    return Subset(source, chosen) if part and not source.live else source
 
 
 def format_of(path: str | Path) -> Format:
-    """Return the first format that knows what lies at the path. Raises SourceError if none does."""
-    known = _knowing(path)
+    """Return the first format that recognises the path. Raises SourceError if none does."""
+    known = _matching_format(path)
     if known is None:
-        raise SourceError(_nothing_fits(Path(path)))
+        raise _unknown_format(Path(path))
     return known
 
 
-def _knowing(path: str | Path) -> Format | None:
+def _matching_format(path: str | Path) -> Format | None:
     return next((known for known in formats() if known.recognises(str(path))), None)
 
 
-def changed(settings: InputConfig, changes: Mapping[str, Any]) -> InputConfig:
-    """Return the settings with some given by name. Raises ConfigError on an unknown name."""
+def with_changes(settings: InputConfig, changes: Mapping[str, Any]) -> InputConfig:
+    """Return the settings with some of them replaced by name. Raises ConfigError on an unknown name."""
     known = [field.name for field in fields(InputConfig)]
     for name in changes:
         if name not in known:
@@ -77,21 +82,29 @@ def changed(settings: InputConfig, changes: Mapping[str, Any]) -> InputConfig:
     return replace(settings, **changes)
 
 
-def _nothing_fits(path: Path) -> str:
+def _unknown_format(path: Path) -> SourceError:
+    """Return the error for a path that no format recognises: missing, of several sequences, without depth, unknown."""
     if not path.exists():
-        return (
+        return SourceError(
             f"no such folder or file: {path}; give a recording, or 'synthetic' for the built-in room, "
             "or 'realsense' for the camera"
         )
-    wanted = "; ".join(f"{f.name}: {f.looked_for}" for f in formats())
-    if not path.is_dir():
-        return f"{path} is a file of unknown format; give the folder that holds the sequence (looked for {wanted})"
-    entries = sorted(path.iterdir())
-    likely = (entry for entry in entries if entry.is_dir() or entry.suffix in PACKED)
-    inner = [(entry.name, known.name) for entry in likely if (known := _knowing(entry))]
+    entries = sorted(path.iterdir()) if path.is_dir() else []
+    candidates = (entry for entry in entries if entry.is_dir() or entry.suffix in PACKED)
+    inner = [(entry.name, known) for entry in candidates if (known := _matching_format(entry))]
     if inner:
-        names = ", ".join(f"{name} ({known})" for name, known in inner[:4]) + ", …" * (len(inner) > 4)
-        return f"{path} holds sequences: {names}; give the path of one of them, as {path / inner[0][0]}"
+        names = ", ".join(f"{name} ({known.name}: {known.looked_for})" for name, known in inner[:4])
+        names += ", …" * (len(inner) > 4)
+        return SourceError(f"{path} holds sequences: {names}; give the path of one of them, as {path / inner[0][0]}")
+    if problem := without_depth(path):
+        return problem
+    known_names = ", ".join(known.name for known in formats())
+    if not path.is_dir():
+        return SourceError(
+            f"{path} is a file of unknown format; give the folder of the sequence (known formats: {known_names})"
+        )
     found = [entry.name + "/" * entry.is_dir() for entry in entries]
     listing = ", ".join(found[:8]) + (f", … {len(found)} entries" if len(found) > 8 else "") or "an empty folder"
-    return f"unknown format: {path} (looked for {wanted}; found {listing}); docs/data.md shows the layouts"
+    return SourceError(
+        f"unknown format: {path} (found {listing}; known formats: {known_names}); docs/data.md shows the layouts"
+    )

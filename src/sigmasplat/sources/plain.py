@@ -12,20 +12,21 @@ from pathlib import Path
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
-from sigmasplat.sources.camera.calibration import MILLIMETRES, calibrated
+from sigmasplat.sources.camera.calibration import MM_PER_METRE, resolve_calibration
+from sigmasplat.sources.files.color_only import without_depth
 from sigmasplat.sources.files.folders import (
     COLOR_ENDINGS,
     COLOR_FOLDERS,
     DEPTH_ENDINGS,
     DEPTH_FOLDERS,
     FRAMES_PER_SECOND,
-    images_in,
-    numbered,
-    paired,
-    subfolder,
+    first_subfolder,
+    index_by_number,
+    list_images,
+    pair_images,
 )
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.recorded import Images, RecordedSource, first_size
+from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
 from sigmasplat.sources.tum import read_poses
 
 COLOR_NAME, DEPTH_NAME = "color|rgb|images/*", "depth/*"
@@ -33,12 +34,15 @@ COLOR_NAME, DEPTH_NAME = "color|rgb|images/*", "depth/*"
 
 def open_plain(folder: Path, settings: InputConfig) -> RecordedSource:
     """Open a folder; raises SourceError if images cannot be paired or the camera is not known."""
-    colors = images_in(subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
-    depths = images_in(subfolder(folder, DEPTH_FOLDERS), DEPTH_ENDINGS)
+    colors = list_images(first_subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
+    depth_folder = first_subfolder(folder, DEPTH_FOLDERS)
+    if depth_folder is None and (problem := without_depth(folder)):
+        raise problem
+    depths = list_images(depth_folder, DEPTH_ENDINGS)
     pairs, skipped = _pairs(folder, colors, depths)
     times_s = _times_s([color for color, _ in pairs])
-    images = [Images(t, *pair) for t, pair in zip(times_s, pairs, strict=True)]
-    calibration = calibrated(folder, None, first_size([i.color for i in images]), settings, MILLIMETRES)
+    images = [ImagePair(t, *pair) for t, pair in zip(times_s, pairs, strict=True)]
+    calibration = resolve_calibration(folder, None, first_size([i.color for i in images]), settings, MM_PER_METRE)
     truth_path = folder / "groundtruth.txt"
     truth = read_poses(truth_path) if truth_path.is_file() else None
     return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
@@ -48,18 +52,18 @@ def _pairs(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[t
     """Pair by name, else by number, else by order where there are as many of both."""
     stems, depth_stems = {path.stem: path for path in colors}, {path.stem: path for path in depths}
     if stems.keys() & depth_stems.keys():
-        names, skipped = paired(folder, stems, depth_stems, COLOR_NAME, DEPTH_NAME)
+        names, skipped = pair_images(folder, stems, depth_stems, COLOR_NAME, DEPTH_NAME)
         return [(stems[name], depth_stems[name]) for name in names], skipped
-    by_number, depth_by_number = numbered(colors), numbered(depths)
-    if colors and len(colors) == len(depths) and not by_number.keys() & depth_by_number.keys():
+    color_by_number, depth_by_number = index_by_number(colors), index_by_number(depths)
+    if colors and len(colors) == len(depths) and not color_by_number.keys() & depth_by_number.keys():
         return list(zip(colors, depths, strict=True)), []
-    if colors and depths and (len(by_number), len(depth_by_number)) != (len(colors), len(depths)):
+    if colors and depths and (len(color_by_number), len(depth_by_number)) != (len(colors), len(depths)):
         raise SourceError(
             f"{folder}: {len(colors)} colour and {len(depths)} depth images share no names, and their numbers are not "
             "all different; name both alike"
         )
-    keys, skipped = paired(folder, by_number, depth_by_number, COLOR_NAME, DEPTH_NAME)
-    return [(by_number[n], depth_by_number[n]) for n in keys], skipped
+    keys, skipped = pair_images(folder, color_by_number, depth_by_number, COLOR_NAME, DEPTH_NAME)
+    return [(color_by_number[n], depth_by_number[n]) for n in keys], skipped
 
 
 def _times_s(paths: list[Path]) -> list[float]:
@@ -77,7 +81,7 @@ def _times_s(paths: list[Path]) -> list[float]:
 FORMAT = Format(
     "plain folder",
     "color/ (or rgb/, images/) and depth/",
-    lambda path: subfolder(Path(path), (*COLOR_FOLDERS, *DEPTH_FOLDERS)) is not None,
+    lambda path: first_subfolder(Path(path), (*COLOR_FOLDERS, *DEPTH_FOLDERS)) is not None,
     lambda path, settings: open_plain(Path(path), settings),
     priority=-1,
 )

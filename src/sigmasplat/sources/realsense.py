@@ -18,16 +18,16 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame, resized_color
-from sigmasplat.sources.camera.calibration import Calibration, Lens, calibrated
+from sigmasplat.sources.camera.calibration import Calibration, Distortion, resolve_calibration
 from sigmasplat.sources.camera.rectification import Rectification
 from sigmasplat.sources.files.images import color_from_bytes
-from sigmasplat.sources.files.optional import needed
+from sigmasplat.sources.files.optional import import_optional
 from sigmasplat.sources.live import LiveSource
 from sigmasplat.sources.opening import Format
 
 OPTIONS = {"width": 640, "height": 480, "fps": 30}
-PATIENCE_MS = 5000
-WARM_UP = 15
+TIMEOUT_MS = 5000
+WARM_UP_FRAMES = 15
 """So many frames are let go by at first, while the exposure settles."""
 
 
@@ -43,7 +43,7 @@ class RealSense(LiveSource):
         camera, lens = _optics(sdk, color.get_intrinsics())
         recorded = Calibration(camera, round(1.0 / scale_m, 3), lens)
         size = (camera.width, camera.height)
-        calibration = calibrated(Path("realsense"), recorded, size, settings, recorded.depth_units_per_metre)
+        calibration = resolve_calibration(Path("realsense"), recorded, size, settings, recorded.depth_units_per_metre)
         if settings.register_depth == "on" and not settings.calibration:
             depth_camera, depth_lens = _optics(sdk, depth.get_intrinsics())
             T = _transform(depth.get_extrinsics_to(color))
@@ -61,7 +61,7 @@ class RealSense(LiveSource):
         index = 0
         try:
             for frames in self._delivered():
-                pair = frames if self._rectified.registers else align.process(frames)
+                pair = frames if self._rectified.moves_depth else align.process(frames)
                 color, depth = pair.get_color_frame(), pair.get_depth_frame()
                 # Where only depth is new the SDK gives the last colour image again.
                 if not color or not depth or color.get_frame_number() == last:
@@ -79,17 +79,15 @@ class RealSense(LiveSource):
         count = 0
         while True:
             try:
-                frames = self._pipeline.wait_for_frames(PATIENCE_MS)
+                frames = self._pipeline.wait_for_frames(TIMEOUT_MS)
             except RuntimeError as error:
-                problem = (
-                    f"{self.name}: no frame came for {PATIENCE_MS / 1000:g} s ({error}); is the camera plugged in?"
-                )
-                if count <= WARM_UP:
+                problem = f"{self.name}: no frame came for {TIMEOUT_MS / 1000:g} s ({error}); is the camera plugged in?"
+                if count <= WARM_UP_FRAMES:
                     raise SourceError(problem) from error
                 self.ending = problem
                 return
             count += 1
-            if count > WARM_UP:
+            if count > WARM_UP_FRAMES:
                 yield frames
 
     def _framed(self, index: int, color: Any, depth: Any) -> Frame:
@@ -103,7 +101,7 @@ class RealSense(LiveSource):
 def open_realsense(text: str, settings: InputConfig) -> RealSense:
     """Start the camera. Raises SourceError if the SDK or the camera is missing, or cannot do what is asked."""
     options = _parsed(text)
-    sdk = needed("pyrealsense2", "realsense", "the RealSense camera")
+    sdk = import_optional("pyrealsense2", "realsense", "the RealSense camera")
     pipeline, wanted = sdk.pipeline(), sdk.config()
     if options["serial"]:
         wanted.enable_device(options["serial"])
@@ -135,7 +133,7 @@ def _parsed(text: str) -> dict[str, Any]:
     return options
 
 
-def _optics(sdk: Any, intrinsics: Any) -> tuple[Camera, Lens | None]:
+def _optics(sdk: Any, intrinsics: Any) -> tuple[Camera, Distortion | None]:
     """Return camera and lens, in OpenCV's order; Brown–Conrady of the SDK's three kinds projects alike (rsutil.h)."""
     i = intrinsics
     camera = Camera(i.width, i.height, i.fx, i.fy, i.ppx, i.ppy)

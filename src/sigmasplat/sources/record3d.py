@@ -23,20 +23,20 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.camera.calibration import Calibration, calibrated, camera_of, number
+from sigmasplat.sources.camera.calibration import Calibration, build_camera, json_number, resolve_calibration
 from sigmasplat.sources.files.archive import Archive
-from sigmasplat.sources.files.images import color_of, image_size, metres
-from sigmasplat.sources.files.optional import needed
+from sigmasplat.sources.files.images import decode_color, depth_to_metres, image_size
+from sigmasplat.sources.files.optional import import_optional
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.recorded import Images, RecordedSource, Size
-from sigmasplat.sources.stray_scanner import shared_axis
+from sigmasplat.sources.recorded import ImagePair, RecordedSource, Size
+from sigmasplat.sources.stray_scanner import with_coarser_depth
 
 FLIPPED = np.diag([1.0, -1.0, -1.0, 1.0])
 """Takes our camera axes (y down, z forward) to OpenGL's (y up, z backward)."""
 
 
 @dataclass(frozen=True)
-class PhoneImages(Images):
+class R3dImagePair(ImagePair):
     """One frame of a .r3d: three members of the archive."""
 
     archive: Archive
@@ -46,7 +46,7 @@ class PhoneImages(Images):
 
     def read_color(self) -> NDArray[np.uint8]:
         """Read 8-bit RGB [H, W, 3]. Raises SourceError naming the member."""
-        return color_of(self.color, self.archive.read(f"rgbd/{self.number}.jpg"))
+        return decode_color(self.color, self.archive.read(f"rgbd/{self.number}.jpg"))
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
         """Read depth in metres [H, W], 0 where the phone had no confidence. Raises SourceError naming the member."""
@@ -55,7 +55,7 @@ class PhoneImages(Images):
         name = f"rgbd/{self.number}.conf"
         if name in self.archive:
             depth_m = np.where(self._unpacked("conf", np.uint8) > 0, depth_m, np.float32(0.0))
-        return metres(self.depth, depth_m, units_per_metre)
+        return depth_to_metres(self.depth, depth_m, units_per_metre)
 
     def sizes(self) -> tuple[Size, Size]:
         """Return (width, height) of colour and depth. Raises SourceError naming the colour image."""
@@ -72,7 +72,7 @@ class PhoneImages(Images):
 
 
 @dataclass(frozen=True)
-class ExportedImages(Images):
+class ExrImagePair(ImagePair):
     """One frame of the export: a picture and an EXR file."""
 
     openexr: Any
@@ -82,7 +82,7 @@ class ExportedImages(Images):
         channels = self._opened().channels()
         name = next((name for name in ("R", "Y", "Z") if name in channels), next(iter(channels)))
         depth_m = np.asarray(channels[name].pixels, np.float32)
-        return metres(self.depth, np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0), units_per_metre)
+        return depth_to_metres(self.depth, np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0), units_per_metre)
 
     def sizes(self) -> tuple[Size, Size]:
         """Return (width, height) of colour and depth. Raises SourceError naming the file."""
@@ -112,14 +112,14 @@ def open_record3d(path: Path, settings: InputConfig) -> RecordedSource:
         )
     times_s = _times_s(path / name, metadata, numbers)
     pairs = [(float(t), path / colors[n], path / depths[n]) for t, n in zip(times_s, numbers, strict=True)]
-    images: Sequence[Images]
+    images: Sequence[ImagePair]
     if native:
-        lzfse = needed("lzfse", "iphone", f"{path}: depth of Record3D")
+        lzfse = import_optional("lzfse", "iphone", f"{path}: depth of Record3D")
         size = _depth_size(path / name, metadata)
-        images = [PhoneImages(*pair, archive, n, size, lzfse) for pair, n in zip(pairs, numbers, strict=True)]
+        images = [R3dImagePair(*pair, archive, n, size, lzfse) for pair, n in zip(pairs, numbers, strict=True)]
     else:
-        openexr = needed("OpenEXR", "iphone", f"{path}: depth of Record3D")
-        images = [ExportedImages(*pair, openexr) for pair in pairs]
+        openexr = import_optional("OpenEXR", "iphone", f"{path}: depth of Record3D")
+        images = [ExrImagePair(*pair, openexr) for pair in pairs]
     calibration = _calibration(path, path / name, metadata, images, settings)
     skipped = [f"{path / colors[n]}: no depth {n} beside it" for n in sorted(colors.keys() - depths.keys())]
     truth = _truth(path / name, metadata, numbers, times_s)
@@ -138,28 +138,28 @@ def _metadata(archive: Archive, name: str) -> dict[str, Any]:
 
 def _depth_size(path: Path, metadata: dict[str, Any]) -> Size:
     """Return (width, height) of depth; files of before metadata said it have a LiDAR's 256×192, turned as colour is."""
-    width, height = (int(number(path, metadata, key)) for key in ("w", "h"))
+    width, height = (int(json_number(path, metadata, key)) for key in ("w", "h"))
     wide = (256, 192) if width > height else (192, 256)
-    return int(number(path, metadata, "dw", wide[0])), int(number(path, metadata, "dh", wide[1]))
+    return int(json_number(path, metadata, "dw", wide[0])), int(json_number(path, metadata, "dh", wide[1]))
 
 
 def _calibration(
-    path: Path, where: Path, metadata: dict[str, Any], images: Sequence[Images], settings: InputConfig
+    path: Path, where: Path, metadata: dict[str, Any], images: Sequence[ImagePair], settings: InputConfig
 ) -> Calibration:
     """Read the camera, scaled to the pictures: exports hold them larger than metadata says."""
     size, depth_size = _first_sizes(images)
-    width, height = (int(number(where, metadata, key, value)) for key, value in zip(("w", "h"), size, strict=True))
+    width, height = (int(json_number(where, metadata, key, value)) for key, value in zip(("w", "h"), size, strict=True))
     focal = _rows(where, metadata, "perFrameIntrinsicCoeffs", 4)
     if focal is not None and len(focal):
         middle = np.median(focal, 0).tolist()
     else:
         k = _rows(where, {"K": [metadata.get("K")]}, "K", 9) if metadata.get("K") else None
         middle = [float(k[0][i]) for i in (0, 4, 6, 7)] if k is not None else None
-    recorded = Calibration(camera_of(where, width, height, middle).resized(*size), 1.0) if middle else None
-    return shared_axis(calibrated(path, recorded, size, settings, 1.0), depth_size)
+    recorded = Calibration(build_camera(where, width, height, middle).resized(*size), 1.0) if middle else None
+    return with_coarser_depth(resolve_calibration(path, recorded, size, settings, 1.0), depth_size)
 
 
-def _first_sizes(images: Sequence[Images]) -> tuple[Size, Size]:
+def _first_sizes(images: Sequence[ImagePair]) -> tuple[Size, Size]:
     problem: SourceError | None = None
     for image in images:
         try:
@@ -173,9 +173,9 @@ def _times_s(where: Path, metadata: dict[str, Any], numbers: list[int]) -> NDArr
     """Return the frames' times, of a steady rate where none are recorded. Raises SourceError."""
     times = metadata.get("frameTimestamps")
     if isinstance(times, list) and len(times) > numbers[-1]:
-        values = [number(where, {"frameTimestamps": times[n]}, "frameTimestamps") for n in numbers]
+        values = [json_number(where, {"frameTimestamps": times[n]}, "frameTimestamps") for n in numbers]
         return np.array(values)
-    return np.array(numbers) / (number(where, metadata, "fps", 60.0) or 60.0)
+    return np.array(numbers) / (json_number(where, metadata, "fps", 60.0) or 60.0)
 
 
 def _truth(

@@ -14,14 +14,14 @@ from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
 from sigmasplat.sources.camera.calibration import Calibration
 from sigmasplat.sources.camera.depth_units import refuse_without_depth
-from sigmasplat.sources.camera.rectification import Rectification, refuse_sizes
+from sigmasplat.sources.camera.rectification import Rectification, check_image_sizes
 from sigmasplat.sources.files.images import color_from_bytes, image_size, read_color, read_depth
 
 Size = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Images:
+class ImagePair:
     """The colour and the depth file of one frame, and its time in seconds.
 
     Formats whose images are no files by themselves (members of an archive, frames of a video, messages of a bag) derive
@@ -51,7 +51,7 @@ class RecordedSource(Source):
     def __init__(
         self,
         name: str,
-        images: Sequence[Images],
+        images: Sequence[ImagePair],
         calibration: Calibration,
         settings: InputConfig,
         truth: Trajectory | None = None,
@@ -66,7 +66,7 @@ class RecordedSource(Source):
         self._rectified = Rectification(name, calibration, settings)
         super().__init__(name, self._rectified.camera, settings.strict)
         self.depth_units_per_metre: float = calibration.depth_units_per_metre
-        self.depth_registered = self._rectified.registers
+        self.depth_registered = self._rectified.moves_depth
         self.registrable = calibration.depth_camera is not None
         self.skipped = list(skipped)
         self._images, self._truth, self._test = images, truth, test
@@ -85,7 +85,7 @@ class RecordedSource(Source):
         files = self._images[self._checked_index(i)]
         color = color_from_bytes(files.read_color())
         depth_m = files.read_depth(self.depth_units_per_metre)
-        refuse_sizes(self._rectified, files.color, color.shape[1::-1], files.depth, depth_m.shape[::-1])
+        check_image_sizes(self._rectified, files.color, color.shape[1::-1], files.depth, depth_m.shape[::-1])
         color, depth_m = self._rectified(color, depth_m)
         color = resized_color(color, self.camera.width, self.camera.height)
         return Frame(i, files.timestamp_s, color, depth_m, self.camera)
@@ -94,7 +94,7 @@ class RecordedSource(Source):
         """Read the depth of frame i without its colour, as `frame` does."""
         files = self._images[self._checked_index(i)]
         depth_m, camera = files.read_depth(self.depth_units_per_metre), self._rectified.calibration.camera
-        refuse_sizes(self._rectified, files.color, (camera.width, camera.height), files.depth, depth_m.shape[::-1])
+        check_image_sizes(self._rectified, files.color, (camera.width, camera.height), files.depth, depth_m.shape[::-1])
         return self._rectified.depth(depth_m)
 
     def truth(self) -> Trajectory | None:
@@ -114,7 +114,7 @@ class RecordedSource(Source):
             except SourceError as error:
                 problem = problem or error
                 continue
-            refuse_sizes(self._rectified, files.color, size, files.depth, depth_size)
+            check_image_sizes(self._rectified, files.color, size, files.depth, depth_size)
             return
         raise SourceError(f"no pair of colour and depth can be read (first: {problem})")
 

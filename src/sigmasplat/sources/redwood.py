@@ -18,14 +18,14 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.camera.calibration import (
-    MILLIMETRES,
+    MM_PER_METRE,
     PRIMESENSE,
     Calibration,
-    calibrated,
-    camera_of,
-    number,
-    positive,
-    read_object,
+    build_camera,
+    check_positive,
+    json_number,
+    read_json_object,
+    resolve_calibration,
 )
 from sigmasplat.sources.files.association import associate
 from sigmasplat.sources.files.folders import (
@@ -33,15 +33,15 @@ from sigmasplat.sources.files.folders import (
     COLOR_FOLDERS,
     DEPTH_ENDINGS,
     FRAMES_PER_SECOND,
-    images_in,
-    numbered,
-    paired,
-    subfolder,
+    first_subfolder,
+    index_by_number,
+    list_images,
+    pair_images,
 )
-from sigmasplat.sources.files.poses import known_path, matrix, pose
+from sigmasplat.sources.files.poses import build_trajectory, checked_pose, to_matrix
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.recorded import Images, RecordedSource, first_size
-from sigmasplat.sources.tum import lines, numbers
+from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
+from sigmasplat.sources.tum import parse_numbers, read_lines
 
 INTRINSIC_NAMES = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
 MAX_GAP_S = 0.02
@@ -52,18 +52,18 @@ _TIMED = re.compile(r"([0-9]+)-([0-9]{9,})")
 def open_redwood(folder: Path, settings: InputConfig) -> RecordedSource:
     """Open a folder; raises SourceError if images, camera or trajectory cannot be used."""
     path = _intrinsic_file(folder)
-    fields = read_object(path) if path else {}
-    rate = positive(path or folder, "fps", number(path or folder, fields, "fps", FRAMES_PER_SECOND))
-    colors = images_in(subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
-    depths = images_in(folder / "depth", DEPTH_ENDINGS)
+    fields = read_json_object(path) if path else {}
+    rate = check_positive(path or folder, "fps", json_number(path or folder, fields, "fps", FRAMES_PER_SECOND))
+    colors = list_images(first_subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
+    depths = list_images(folder / "depth", DEPTH_ENDINGS)
     images, skipped = _timed(folder, colors, depths) or _numbered(folder, colors, depths, rate)
     recorded = _recorded(path, fields) if path else PRIMESENSE
     size = first_size([i.color for i in images])
-    calibration = calibrated(folder, recorded, size, settings, recorded.depth_units_per_metre)
+    calibration = resolve_calibration(folder, recorded, size, settings, recorded.depth_units_per_metre)
     return RecordedSource(folder.resolve().name, images, calibration, settings, _truth(folder, images), skipped)
 
 
-def _timed(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[Images], list[str]] | None:
+def _timed(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[ImagePair], list[str]] | None:
     """Pair images that carry their time in the name, None if they do not."""
     if not (colors and depths and all(_TIMED.fullmatch(path.stem) for path in colors + depths)):
         return None
@@ -72,13 +72,13 @@ def _timed(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[I
     if not len(pairs):
         raise SourceError(f"{folder}: no colour image has depth within {MAX_GAP_S:g} s; are both from one recording?")
     skipped = [f"{path}: no depth within {MAX_GAP_S:g} s" for i, path in enumerate(colors) if i not in pairs[:, 0]]
-    return [Images(float(times_s[1][j]), colors[i], depths[j]) for i, j in pairs], skipped
+    return [ImagePair(float(times_s[1][j]), colors[i], depths[j]) for i, j in pairs], skipped
 
 
-def _numbered(folder: Path, colors: list[Path], depths: list[Path], rate: float) -> tuple[list[Images], list[str]]:
-    of_color, of_depth = numbered(colors), numbered(depths)
-    keys, skipped = paired(folder, of_color, of_depth, f"{'|'.join(COLOR_FOLDERS)}/*.jpg", "depth/*.png")
-    return [Images(n / rate, of_color[n], of_depth[n]) for n in keys], skipped
+def _numbered(folder: Path, colors: list[Path], depths: list[Path], rate: float) -> tuple[list[ImagePair], list[str]]:
+    of_color, of_depth = index_by_number(colors), index_by_number(depths)
+    keys, skipped = pair_images(folder, of_color, of_depth, f"{'|'.join(COLOR_FOLDERS)}/*.jpg", "depth/*.png")
+    return [ImagePair(n / rate, of_color[n], of_depth[n]) for n in keys], skipped
 
 
 def _recorded(path: Path, fields: dict[str, object]) -> Calibration:
@@ -86,21 +86,21 @@ def _recorded(path: Path, fields: dict[str, object]) -> Calibration:
     values = fields.get("intrinsic_matrix")
     if not isinstance(values, list) or len(values) != 9:
         raise SourceError(f'{path}: field "intrinsic_matrix" is {values!r}, 9 numbers by columns are wanted')
-    fx, fy, cx, cy = (number(path, {"intrinsic_matrix": values[i]}, "intrinsic_matrix") for i in (0, 4, 6, 7))
-    width, height = (int(number(path, fields, key)) for key in ("width", "height"))
-    units = positive(path, "depth_scale", number(path, fields, "depth_scale", MILLIMETRES))
-    return Calibration(camera_of(path, width, height, [fx, fy, cx, cy]), units)
+    fx, fy, cx, cy = (json_number(path, {"intrinsic_matrix": values[i]}, "intrinsic_matrix") for i in (0, 4, 6, 7))
+    width, height = (int(json_number(path, fields, key)) for key in ("width", "height"))
+    units = check_positive(path, "depth_scale", json_number(path, fields, "depth_scale", MM_PER_METRE))
+    return Calibration(build_camera(path, width, height, [fx, fy, cx, cy]), units)
 
 
-def _truth(folder: Path, images: list[Images]) -> Trajectory | None:
+def _truth(folder: Path, images: list[ImagePair]) -> Trajectory | None:
     """Read the log: its first number counts the depth images in order, from 0."""
     path = _log_in(folder)
     if path is None:
         return None
-    rows = [(line, numbers(path, line, words)) for line, words in lines(path)]
+    rows = [(line, parse_numbers(path, line, words)) for line, words in read_lines(path)]
     if len(rows) % 5 or any(len(row) != (3 if i % 5 == 0 else 4) for i, (_, row) in enumerate(rows)):
         raise SourceError(f"{path}: each pose takes 5 lines, three numbers and 4 rows of 4; is the file cut short?")
-    depths = images_in(folder / "depth", DEPTH_ENDINGS)
+    depths = list_images(folder / "depth", DEPTH_ENDINGS)
     times = {image.depth: image.timestamp_s for image in images}
     timed = []
     for start in range(0, len(rows), 5):
@@ -108,8 +108,8 @@ def _truth(folder: Path, images: list[Images]) -> Trajectory | None:
         time = times.get(depths[int(index)]) if 0 <= index < len(depths) else None
         if time is not None:
             where = f"{path}:{line}"
-            timed.append((time, pose(where, matrix(where, [row for _, row in rows[start + 1 : start + 5]]))))
-    return known_path(timed)
+            timed.append((time, checked_pose(where, to_matrix(where, [row for _, row in rows[start + 1 : start + 5]]))))
+    return build_trajectory(timed)
 
 
 def _log_in(folder: Path) -> Path | None:
@@ -133,7 +133,7 @@ def _intrinsic_file(folder: Path) -> Path | None:
 def recognises(path: str) -> bool:
     """Tell whether there are image folders, and a camera, a trajectory or names as Open3D and Redwood write them."""
     folder = Path(path)
-    colors = subfolder(folder, COLOR_FOLDERS)
+    colors = first_subfolder(folder, COLOR_FOLDERS)
     if colors is None and not (folder / "depth").is_dir():
         return False
     timed = colors is not None and any(_TIMED.fullmatch(entry.stem) for entry in colors.iterdir())

@@ -13,20 +13,20 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.camera.calibration import REPLICA, Calibration, calibrated, read_replica_calibration
-from sigmasplat.sources.files.folders import FRAMES_PER_SECOND, paired
+from sigmasplat.sources.camera.calibration import REPLICA, Calibration, read_replica_calibration, resolve_calibration
+from sigmasplat.sources.files.folders import FRAMES_PER_SECOND, pair_images
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.recorded import Images, RecordedSource
+from sigmasplat.sources.recorded import ImagePair, RecordedSource
 
 
 def open_replica(folder: Path, settings: InputConfig) -> RecordedSource:
     """Open a folder; raises SourceError if images, calibration or true poses cannot be used."""
     colors, depths = _numbered(folder, "frame"), _numbered(folder, "depth")
-    numbers, skipped = paired(folder, colors, depths, "results/frame*.jpg", "results/depth*.png")
-    images = [Images(n / FRAMES_PER_SECOND, colors[n], depths[n]) for n in numbers]
+    numbers, skipped = pair_images(folder, colors, depths, "results/frame*.jpg", "results/depth*.png")
+    images = [ImagePair(n / FRAMES_PER_SECOND, colors[n], depths[n]) for n in numbers]
     recorded = _calibration(folder)
     size = (recorded.camera.width, recorded.camera.height)
-    calibration = calibrated(folder, recorded, size, settings, recorded.depth_units_per_metre)
+    calibration = resolve_calibration(folder, recorded, size, settings, recorded.depth_units_per_metre)
     truth = _truth(folder / "traj.txt", numbers)
     return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
 

@@ -18,23 +18,29 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.sources.camera.calibration import MILLIMETRES, Calibration, calibrated, camera_of, positive
+from sigmasplat.sources.camera.calibration import (
+    MM_PER_METRE,
+    Calibration,
+    build_camera,
+    check_positive,
+    resolve_calibration,
+)
 from sigmasplat.sources.files.folders import (
     COLOR_ENDINGS,
     DEPTH_ENDINGS,
     FRAMES_PER_SECOND,
-    Found,
+    FrameFiles,
+    first_subfolder,
     frame_files,
     has_frame_files,
-    images_in,
-    numbered,
-    paired,
-    subfolder,
+    index_by_number,
+    list_images,
+    pair_images,
 )
-from sigmasplat.sources.files.poses import matrix, pose_files, read_matrix
+from sigmasplat.sources.files.poses import read_matrix, read_pose_files, to_matrix
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.recorded import Images, RecordedSource, first_size
-from sigmasplat.sources.tum import numbers
+from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
+from sigmasplat.sources.tum import parse_numbers
 from sigmasplat.types import Matrix
 
 COLOR_SIZE, DEPTH_SIZE = (1296, 968), (640, 480)
@@ -50,22 +56,22 @@ def open_scannet(folder: Path, settings: InputConfig) -> RecordedSource:
         raise SourceError(
             f"{packed[0]} is still packed; extract color, depth, pose and intrinsic from it with ScanNet's SensReader"
         )
-    keys, skipped = paired(folder, files["color"], files["depth"], "color/*.jpg", "depth/*.png")
-    images = [Images(n / FRAMES_PER_SECOND, files["color"][n], files["depth"][n]) for n in keys]
+    keys, skipped = pair_images(folder, files["color"], files["depth"], "color/*.jpg", "depth/*.png")
+    images = [ImagePair(n / FRAMES_PER_SECOND, files["color"][n], files["depth"][n]) for n in keys]
     size, depth_size = first_size([i.color for i in images]), first_size([i.depth for i in images])
     recorded = _recorded(folder, size, depth_size)
-    calibration = calibrated(folder, recorded, size, settings, MILLIMETRES)
-    truth = pose_files((n / FRAMES_PER_SECOND, files["pose"][n]) for n in keys if n in files["pose"])
+    calibration = resolve_calibration(folder, recorded, size, settings, MM_PER_METRE)
+    truth = read_pose_files((n / FRAMES_PER_SECOND, files["pose"][n]) for n in keys if n in files["pose"])
     return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
 
 
-def _files(folder: Path) -> Found:
+def _files(folder: Path) -> FrameFiles:
     if has_frame_files(folder):
         return frame_files(folder)
     return {
-        "color": numbered(images_in(subfolder(folder, ("color", "rgb")), COLOR_ENDINGS)),
-        "depth": numbered(images_in(folder / "depth", DEPTH_ENDINGS)),
-        "pose": numbered(images_in(folder / "pose", (".txt",))),
+        "color": index_by_number(list_images(first_subfolder(folder, ("color", "rgb")), COLOR_ENDINGS)),
+        "depth": index_by_number(list_images(folder / "depth", DEPTH_ENDINGS)),
+        "pose": index_by_number(list_images(folder / "pose", (".txt",))),
     }
 
 
@@ -87,16 +93,16 @@ def _recorded(folder: Path, size: tuple[int, int], depth_size: tuple[int, int]) 
 
 def _matrices(folder: Path) -> tuple[dict[str, Path], dict[str, Matrix], float]:
     """Return each matrix's file and value by `{color|depth}_{intrinsic|extrinsic}`, and depth units per metre."""
-    where, found, units = {}, {}, MILLIMETRES
+    where, found, units = {}, {}, MM_PER_METRE
     for info in (folder / name for name in INFO_NAMES if (folder / name).is_file()):
         entries = dict(_entry(line) for line in info.read_text("utf-8", "replace").splitlines() if "=" in line)
         if shift := entries.get("m_depthShift"):
-            units = positive(info, "m_depthShift", numbers(info, 1, [shift])[0])
+            units = check_positive(info, "m_depthShift", parse_numbers(info, 1, [shift])[0])
         for key, kind in (("Color", "color"), ("Depth", "depth")):
             for part in ("Intrinsic", "Extrinsic"):
                 if text := entries.get(f"m_calibration{key}{part}"):
                     name = f"{kind}_{part.lower()}"
-                    where[name], found[name] = info, matrix(f"{info} {key}{part}", text.split())
+                    where[name], found[name] = info, to_matrix(f"{info} {key}{part}", text.split())
         return where, found, units
     for kind in ("color", "depth"):
         for part in ("intrinsic", "extrinsic"):
@@ -115,7 +121,7 @@ def _entry(line: str) -> tuple[str, str]:
 def _camera(path: Path, K: Matrix, size: tuple[int, int], published: tuple[int, int]) -> Camera:
     """Build the camera of images of `size`: the matrix's own if its centre fits, else resized as they were."""
     own = size if abs(2 * K[0, 2] - size[0]) < 0.2 * size[0] else published
-    return camera_of(path, *own, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]).resized(*size)
+    return build_camera(path, *own, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]).resized(*size)
 
 
 def recognises(path: str) -> bool:
@@ -124,7 +130,7 @@ def recognises(path: str) -> bool:
     has_info = any((folder / name).is_file() for name in INFO_NAMES)
     if any(folder.glob("*.sens")) or (has_info and has_frame_files(folder)):
         return True
-    images = subfolder(folder, ("color", "rgb", "depth"))
+    images = first_subfolder(folder, ("color", "rgb", "depth"))
     camera = (folder / "intrinsic").is_dir() or any(folder.glob("intrinsic*_*.txt"))
     return images is not None and (camera or (folder / "pose").is_dir())
 

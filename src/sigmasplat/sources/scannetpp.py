@@ -13,12 +13,12 @@ from pathlib import Path
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
-from sigmasplat.sources.camera.calibration import MILLIMETRES, calibrated, read_object
+from sigmasplat.sources.camera.calibration import MM_PER_METRE, read_json_object, resolve_calibration
 from sigmasplat.sources.files.folders import FRAMES_PER_SECOND
-from sigmasplat.sources.files.poses import known_path
-from sigmasplat.sources.files.transforms import Fields, camera_in, frames_of, pose_in
+from sigmasplat.sources.files.poses import build_trajectory
+from sigmasplat.sources.files.transforms import Fields, read_camera, read_frames, read_pose
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.recorded import Images, RecordedSource, first_size
+from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
 
 TRANSFORMS = Path("nerfstudio") / "transforms_undistorted.json"
 IMAGES, DEPTHS, LISTS = "undistorted_images", "undistorted_depths", "train_test_lists.json"
@@ -27,7 +27,7 @@ IMAGES, DEPTHS, LISTS = "undistorted_images", "undistorted_depths", "train_test_
 def open_scannetpp(scene: Path, settings: InputConfig) -> RecordedSource:
     """Open a scene's folder or its `dslr`; raises SourceError if its file, images or camera cannot be used."""
     dslr = _dslr(scene)
-    fields = read_object(dslr / TRANSFORMS)
+    fields = read_json_object(dslr / TRANSFORMS)
     _refuse_missing_folders(dslr)
     views = _chosen(dslr, fields, "test", "test_frames") if fields.get("test_frames") else []
     views = [view for view in views if (dslr / IMAGES / view["file_path"]).is_file()]
@@ -40,18 +40,18 @@ def _source(
 ) -> RecordedSource:
     path, scene = dslr / TRANSFORMS, dslr.resolve().parent
     files = [(dslr / IMAGES / f["file_path"], (dslr / DEPTHS / f["file_path"]).with_suffix(".png")) for f in frames]
-    images = [Images(i / FRAMES_PER_SECOND, *pair) for i, pair in enumerate(files)]
+    images = [ImagePair(i / FRAMES_PER_SECOND, *pair) for i, pair in enumerate(files)]
     size = first_size([color for color, _ in files])
-    camera = camera_in(path, fields, frames, size, MILLIMETRES)
-    calibration = calibrated(scene, camera, size, settings, MILLIMETRES)
-    truth = known_path((i.timestamp_s, pose_in(path, frame)) for i, frame in zip(images, frames, strict=True))
+    camera = read_camera(path, fields, frames, size, MM_PER_METRE)
+    calibration = resolve_calibration(scene, camera, size, settings, MM_PER_METRE)
+    truth = build_trajectory((i.timestamp_s, read_pose(path, frame)) for i, frame in zip(images, frames, strict=True))
     return RecordedSource(scene.name, images, calibration, settings, truth, test=test)
 
 
 def _chosen(dslr: Path, fields: Fields, split: str, key: str) -> list[Fields]:
     """Return a split's frames in the order of the list where there is one, else of their names."""
-    frames = {frame["file_path"]: frame for frame in frames_of(dslr / TRANSFORMS, fields, key)}
-    lists = read_object(dslr / LISTS) if (dslr / LISTS).is_file() else {}
+    frames = {frame["file_path"]: frame for frame in read_frames(dslr / TRANSFORMS, fields, key)}
+    lists = read_json_object(dslr / LISTS) if (dslr / LISTS).is_file() else {}
     names = lists.get(split, sorted(frames))
     if not isinstance(names, list) or not names:
         raise SourceError(f"{dslr / LISTS}: {split!r} is {str(names)[:60]}, a list of file names is wanted")

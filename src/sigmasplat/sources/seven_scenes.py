@@ -15,12 +15,18 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.camera.calibration import MILLIMETRES, SEVEN_SCENES, SEVEN_SCENES_COLOR, Calibration, calibrated
-from sigmasplat.sources.camera.rectification import registers
-from sigmasplat.sources.files.folders import FRAMES_PER_SECOND, frame_files, has_frame_files, paired
-from sigmasplat.sources.files.poses import pose_files
+from sigmasplat.sources.camera.calibration import (
+    MM_PER_METRE,
+    SEVEN_SCENES,
+    SEVEN_SCENES_COLOR,
+    Calibration,
+    resolve_calibration,
+)
+from sigmasplat.sources.camera.rectification import registers_depth
+from sigmasplat.sources.files.folders import FRAMES_PER_SECOND, frame_files, has_frame_files, pair_images
+from sigmasplat.sources.files.poses import read_pose_files
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.recorded import Images, RecordedSource, first_size
+from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
 
 
 def open_seven_scenes(folder: Path, settings: InputConfig) -> RecordedSource:
@@ -28,21 +34,21 @@ def open_seven_scenes(folder: Path, settings: InputConfig) -> RecordedSource:
     if not has_frame_files(folder):
         folder = _only_sequence(folder)
     files = frame_files(folder)
-    numbers, skipped = paired(folder, files["color"], files["depth"], "frame-*.color.png", "frame-*.depth.png")
-    images = [Images(n / FRAMES_PER_SECOND, files["color"][n], files["depth"][n]) for n in numbers]
+    numbers, skipped = pair_images(folder, files["color"], files["depth"], "frame-*.color.png", "frame-*.depth.png")
+    images = [ImagePair(n / FRAMES_PER_SECOND, files["color"][n], files["depth"][n]) for n in numbers]
     calibration = _calibration(folder, images, settings)
-    truth = pose_files((n / FRAMES_PER_SECOND, files["pose"][n]) for n in numbers if n in files["pose"])
-    if truth and registers(calibration, settings):
+    truth = read_pose_files((n / FRAMES_PER_SECOND, files["pose"][n]) for n in numbers if n in files["pose"])
+    if truth and registers_depth(calibration, settings):
         truth = Trajectory(truth.timestamps_s, truth.T_world_camera @ se3.inverse(calibration.T_color_depth))
     source = RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
     source.registrable = source.registrable or calibration.camera == SEVEN_SCENES.camera
     return source
 
 
-def _calibration(folder: Path, images: list[Images], settings: InputConfig) -> Calibration:
+def _calibration(folder: Path, images: list[ImagePair], settings: InputConfig) -> Calibration:
     known = SEVEN_SCENES_COLOR if settings.register_depth == "on" else SEVEN_SCENES
     size = first_size([files.color for files in images])
-    calibration = calibrated(folder, known, size, settings, MILLIMETRES)
+    calibration = resolve_calibration(folder, known, size, settings, MM_PER_METRE)
     T = calibration.T_color_depth
     return replace(calibration, T_color_depth=se3.orthonormalise(T))
 

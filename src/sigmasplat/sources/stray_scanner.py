@@ -20,11 +20,11 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.camera.calibration import Calibration, calibrated, camera_of
-from sigmasplat.sources.files.images import image_size, read_depth, understood
+from sigmasplat.sources.camera.calibration import Calibration, build_camera, resolve_calibration
+from sigmasplat.sources.files.images import guard_decoding, image_size, read_depth
 from sigmasplat.sources.files.video import Video
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.recorded import Images, RecordedSource, Size, first_size
+from sigmasplat.sources.recorded import ImagePair, RecordedSource, Size, first_size
 
 UNITS_PER_METRE = 1000.0
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
@@ -33,7 +33,7 @@ Rows = dict[int, dict[str, float]]
 
 
 @dataclass(frozen=True)
-class ScannedImages(Images):
+class StrayImagePair(ImagePair):
     """A frame of the video, a depth image, and how sure the phone was of each reading."""
 
     video: Video
@@ -49,7 +49,7 @@ class ScannedImages(Images):
         depth_m = read_depth(self.depth, units_per_metre)
         if not self.confidence.is_file():
             return depth_m
-        confidence = understood(self.confidence, lambda: np.asarray(Image.open(self.confidence)))
+        confidence = guard_decoding(self.confidence, lambda: np.asarray(Image.open(self.confidence)))
         if confidence.shape != depth_m.shape:
             raise SourceError(
                 f"{self.confidence}: {confidence.shape} values for depth of {depth_m.shape}; copy it again"
@@ -76,7 +76,7 @@ def open_stray(folder: Path, settings: InputConfig) -> RecordedSource:
             f"({len(rows)} lines); copy the whole folder again"
         )
     images = [
-        ScannedImages(rows[n]["timestamp"], folder / f"rgb.mp4 frame {n}", depths[n], video, n,
+        StrayImagePair(rows[n]["timestamp"], folder / f"rgb.mp4 frame {n}", depths[n], video, n,
                       folder / "confidence" / depths[n].name)
         for n in numbers
     ]  # fmt: skip
@@ -86,7 +86,7 @@ def open_stray(folder: Path, settings: InputConfig) -> RecordedSource:
     return RecordedSource(folder.resolve().name, images, calibration, settings, _truth(rows, numbers), skipped)
 
 
-def shared_axis(calibration: Calibration, depth_size: Size) -> Calibration:
+def with_coarser_depth(calibration: Calibration, depth_size: Size) -> Calibration:
     """Return the calibration of a phone, whose depth is the colour camera's view on a coarser grid."""
     if depth_size == (calibration.camera.width, calibration.camera.height) or calibration.depth_camera:
         return calibration
@@ -133,10 +133,10 @@ def _calibration(folder: Path, rows: Rows, size: Size, depth_size: Size, setting
     recorded = None
     if rows and set(INTRINSICS) <= set(next(iter(rows.values()))):
         focal = np.median([[row[name] for name in INTRINSICS] for row in rows.values()], 0)
-        recorded = Calibration(camera_of(folder / "odometry.csv", *size, focal.tolist()), UNITS_PER_METRE)
+        recorded = Calibration(build_camera(folder / "odometry.csv", *size, focal.tolist()), UNITS_PER_METRE)
     elif path.is_file():
-        recorded = Calibration(camera_of(path, *size, _matrix(path)), UNITS_PER_METRE)
-    return shared_axis(calibrated(folder, recorded, size, settings, UNITS_PER_METRE), depth_size)
+        recorded = Calibration(build_camera(path, *size, _matrix(path)), UNITS_PER_METRE)
+    return with_coarser_depth(resolve_calibration(folder, recorded, size, settings, UNITS_PER_METRE), depth_size)
 
 
 def _matrix(path: Path) -> list[float]:

@@ -12,11 +12,11 @@ from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
 from sigmasplat.sources.files.images import color_from_bytes
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.room.furnish import furnished
+from sigmasplat.sources.room.furnish import furnish_rooms
+from sigmasplat.sources.room.render import build_scene, render_scene
 from sigmasplat.sources.room.sensor import drifted_depth, measured_color, measured_depth
-from sigmasplat.sources.room.solid import triangles
-from sigmasplat.sources.room.view import picture, scene
-from sigmasplat.sources.room.walk import path
+from sigmasplat.sources.room.solid import triangulate
+from sigmasplat.sources.room.walk import camera_path
 
 FRAMES_PER_SECOND = 30.0
 FOCAL_PER_WIDTH = 0.8
@@ -65,7 +65,7 @@ class SyntheticRoom(Source):
         super().__init__("synthetic", camera)
         self._seed, self._noise, self._rooms = seed, noise, rooms
         self._exposure_change, self._drift = exposure_change, drift / 1000
-        self._T_world_camera = path(frames, loops, rooms, seed, overrun / 100)
+        self._T_world_camera = camera_path(frames, loops, rooms, seed, overrun / 100)
 
     def __len__(self) -> int:
         return len(self._T_world_camera)
@@ -73,7 +73,7 @@ class SyntheticRoom(Source):
     def frame(self, i: int) -> Frame:
         """Draw frame i, colour in steps of 1/255 as a camera delivers it."""
         T_world_camera = self._T_world_camera[self._checked_index(i)]
-        color, depth_m = picture(scene(self._rooms, self._seed), self.camera, T_world_camera)
+        color, depth_m = render_scene(build_scene(self._rooms, self._seed), self.camera, T_world_camera)
         color = np.clip(color * np.float32(self._gain(i)), 0.0, 1.0)
         if self._drift:
             depth_m = drifted_depth(depth_m, i, self._seed, self._drift)
@@ -89,7 +89,7 @@ class SyntheticRoom(Source):
 
     def true_surface(self) -> Mesh:
         """Return the outsides of all shapes, those against a wall or inside another shape too, in the room's frame."""
-        return triangles([shape for shapes in furnished(self._rooms, self._seed) for shape in shapes])
+        return triangulate([shape for shapes in furnish_rooms(self._rooms, self._seed) for shape in shapes])
 
     def _gain(self, i: int) -> float:
         """Return the exposure of frame i: one slow swing over the sequence, back at its start with the camera."""
@@ -98,7 +98,7 @@ class SyntheticRoom(Source):
         return 1.0 + EXPOSURE_SWING * float(np.sin(2 * np.pi * i / max(len(self) - 1, 1)))
 
 
-def parse(text: str) -> SyntheticRoom:
+def open_synthetic(text: str) -> SyntheticRoom:
     """Build a room from "synthetic" or "synthetic:frames=200,seed=1,noise=1". Raises SourceError on any other."""
     options: dict[str, Any] = {}
     for part in filter(None, text.partition(":")[2].split(",")):
@@ -120,6 +120,6 @@ FORMAT = Format(
     "synthetic",
     "the word 'synthetic'",
     lambda path: path.partition(":")[0] == "synthetic",
-    lambda path, settings: parse(path),
+    lambda path, settings: open_synthetic(path),
     priority=3,
 )

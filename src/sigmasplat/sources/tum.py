@@ -20,11 +20,16 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
-from sigmasplat.sources.camera.calibration import TUM_UNITS_PER_METRE, Calibration, calibrated, freiburg_calibration
+from sigmasplat.sources.camera.calibration import (
+    TUM_UNITS_PER_METRE,
+    Calibration,
+    freiburg_calibration,
+    resolve_calibration,
+)
 from sigmasplat.sources.files.association import associate
-from sigmasplat.sources.files.images import OVERFLOW
+from sigmasplat.sources.files.images import UINT16_MAX
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.recorded import Images, RecordedSource, first_size
+from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
 
 MAX_GAP_S = 0.02
 """Colour and depth of a Kinect at 30 Hz are never further apart; TUM's own tool uses the same number."""
@@ -44,7 +49,7 @@ def open_tum(
     pairs = associate(color_times_s, depth_times_s, max_gap_s)
     if not len(pairs):
         raise SourceError(_no_overlap(folder, color_times_s, depth_times_s, max_gap_s))
-    images = [Images(float(color_times_s[i]), colors[i], depths[j]) for i, j in pairs]
+    images = [ImagePair(float(color_times_s[i]), colors[i], depths[j]) for i, j in pairs]
     paired = set(pairs[:, 0].tolist())
     skipped = [f"{path}: no depth within {max_gap_s:g} s" for i, path in enumerate(colors) if i not in paired]
     truth_path = folder / "groundtruth.txt"
@@ -53,7 +58,9 @@ def open_tum(
     if truth and camera_path:
         truth = camera_path(truth)
     size = first_size([pair.color for pair in images])
-    calibration = calibrated(folder, camera or freiburg_calibration(folder), size, settings, TUM_UNITS_PER_METRE)
+    calibration = resolve_calibration(
+        folder, camera or freiburg_calibration(folder), size, settings, TUM_UNITS_PER_METRE
+    )
     return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
 
 
@@ -116,10 +123,10 @@ FORMAT = Format(
 def read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
     """Read "t path" lines: timestamps [N] seconds and image paths. Raises SourceError naming file and line."""
     times, paths = [], []
-    for line, words in lines(path):
+    for line, words in read_lines(path):
         if len(words) < 2:
             raise SourceError(f"{path}:{line}: 'timestamp path' wanted, found {' '.join(words)!r}")
-        times.append(numbers(path, line, words[:1])[0])
+        times.append(parse_numbers(path, line, words[:1])[0])
         paths.append(path.parent / " ".join(words[1:]))
     if not paths:
         raise SourceError(f"{path}: lists no images")
@@ -129,10 +136,10 @@ def read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
 def read_poses(path: Path) -> Trajectory:
     """Read "t tx ty tz qx qy qz qw" lines. Raises SourceError naming the line whose pose is not finite or not rigid."""
     times, poses = [], []
-    for line, words in lines(path):
+    for line, words in read_lines(path):
         if len(words) != 8:
             raise SourceError(f"{path}:{line}: 't tx ty tz qx qy qz qw' wanted, found {len(words)} values")
-        t, *translation_quaternion = numbers(path, line, words)
+        t, *translation_quaternion = parse_numbers(path, line, words)
         times.append(t)
         poses.append(_pose(path, line, np.array(translation_quaternion)))
     if not poses:
@@ -140,7 +147,7 @@ def read_poses(path: Path) -> Trajectory:
     return Trajectory(np.array(times), np.stack(poses))
 
 
-def lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+def read_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield (line number from 1, words) of every line that says something."""
     try:
         text = path.read_text(encoding="utf-8")
@@ -152,7 +159,7 @@ def lines(path: Path) -> Iterator[tuple[int, list[str]]]:
             yield number, words
 
 
-def numbers(path: Path, line: int, words: list[str]) -> list[float]:
+def parse_numbers(path: Path, line: int, words: list[str]) -> list[float]:
     """Read finite numbers. Raises SourceError naming file and line."""
     try:
         values = [float(word) for word in words]
@@ -205,7 +212,7 @@ def write_images(frame: Frame, folder: Path) -> str:
     """Write rgb/T.png and depth/T.png, 1/5000 m, and return T; readings past 13.1 m do not fit and become 0."""
     stem = f"{frame.timestamp_s:.6f}"
     units = np.rint(frame.depth_m * TUM_UNITS_PER_METRE)
-    depth = np.where(units < OVERFLOW, units, 0).astype(np.uint16)
+    depth = np.where(units < UINT16_MAX, units, 0).astype(np.uint16)
     color = np.rint(frame.color * 255.0).astype(np.uint8)
     Image.fromarray(color).save(folder / "rgb" / f"{stem}.png", compress_level=1)
     Image.fromarray(depth).save(folder / "depth" / f"{stem}.png", compress_level=1)

@@ -62,9 +62,9 @@ def picture_of(
         if layer == "colour":
             return Picture((seen.color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy())
         if layer == "opacity":
-            return Picture(colormap.colour(alpha, 0.0, 1.0, GREY), Legend(GREY, 0.0, 1.0, ""))
+            return Picture(colormap.apply(alpha, 0.0, 1.0, GREY), Legend(GREY, 0.0, 1.0, ""))
         if layer == "depth":
-            return _mapped(depth_m, covered, colormap.span(depth_m, covered), colormap.VIRIDIS, " m")
+            return _mapped(depth_m, covered, colormap.value_range(depth_m, covered), colormap.VIRIDIS, " m")
         if layer == "V":
             return _from_zero(_array(seen.variance.mean(2).clamp(min=0.0).sqrt()), covered, "")
         spread = render(field, camera, T_camera_world, torch.from_numpy(depth_m), options, backend).uncertainty
@@ -77,7 +77,7 @@ def legend_picture(legend: Legend) -> colormap.Rgb:
     """Draw a palette with the values of its ends, uint8 [34, 280, 3]."""
     width, height = LEGEND_SIZE
     image = Image.new("RGB", LEGEND_SIZE, PAPER)
-    ramp = colormap.colour(np.tile(np.linspace(0.0, 1.0, width), (LEGEND_BAR, 1)), 0.0, 1.0, legend.palette)
+    ramp = colormap.apply(np.tile(np.linspace(0.0, 1.0, width), (LEGEND_BAR, 1)), 0.0, 1.0, legend.palette)
     image.paste(Image.fromarray(ramp), (0, 0))
     draw, font = ImageDraw.Draw(image), ImageFont.load_default(14)
     middle = (height + LEGEND_BAR) // 2
@@ -91,10 +91,10 @@ def _array(values: Tensor) -> Floats:
 
 
 def _from_zero(values: Floats, valid: NDArray[np.bool_], unit: str) -> Picture:
-    return _mapped(values, valid, (0.0, colormap.span(values, valid)[1]), colormap.INFERNO, unit)
+    return _mapped(values, valid, (0.0, colormap.value_range(values, valid)[1]), colormap.INFERNO, unit)
 
 
 def _mapped(
     values: Floats, valid: NDArray[np.bool_], ends: tuple[float, float], colours: NDArray[np.float64], unit: str
 ) -> Picture:
-    return Picture(colormap.picture(values, valid, *ends, colours), Legend(colours, *ends, unit))
+    return Picture(colormap.apply_masked(values, valid, *ends, colours), Legend(colours, *ends, unit))

@@ -69,7 +69,7 @@ def cut_of(ordered: Floats, hidden_share: float, least_opacity: float) -> Cut:
 
 def sigma_span(ordered: Floats) -> tuple[float, float]:
     """Return the range of σ that the palette is spread over: from 0 to all but the extremes."""
-    return 0.0, colormap.span(ordered, np.ones(len(ordered), bool))[1]
+    return 0.0, colormap.value_range(ordered, np.ones(len(ordered), bool))[1]
 
 
 def splats_of(field: GaussianField, colouring: Colouring, span: tuple[float, float], cut: Cut) -> Splats:
@@ -77,7 +77,7 @@ def splats_of(field: GaussianField, colouring: Colouring, span: tuple[float, flo
     kept = cut.keeps(field)
     chosen = to_look_at(field.params[kept], {})
     if colouring == "σ":
-        colors = colormap.colour(sigma_of(chosen), *span, colormap.INFERNO)
+        colors = colormap.apply(sigma_of(chosen), *span, colormap.INFERNO)
     else:
         colors = np.asarray((chosen.colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8))
     return Splats(

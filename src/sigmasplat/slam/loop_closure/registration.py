@@ -10,13 +10,14 @@ from torch import Tensor
 
 from sigmasplat.config import Config, RegistrationConfig, TrackingConfig
 from sigmasplat.fit.align import align
+from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import live_image, map_reference
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.submap import Submap, SubmapStore
-from sigmasplat.render.view import ReferenceView, View
+from sigmasplat.render.view import View
 from sigmasplat.slam.drift import symmetric
 from sigmasplat.slam.loop_closure.candidates import SubmapPair
 from sigmasplat.types import Matrix
@@ -97,7 +98,7 @@ class Registrar:
 
     def _aligned(self, params: Tensor, live: Pyramid, guess: Matrix) -> PoseFit:
         """Align a keyframe to the map rendered at a guess, then again to the map rendered at the result."""
-        if isinstance(self.view, ReferenceView):
+        if not fits_of(self.view).aligns:
             return PoseFit(guess, 0.0, 0.0, np.nan, np.nan, 0)  # alignment needs the compiled kernels
         for _ in range(2):
             fit = fit_pose_align(map_reference(params, self.view, guess, self.tracking), live, guess, self.tracking)
@@ -106,7 +107,7 @@ class Registrar:
 
     def _covariance(self, params: Tensor, live: Pyramid, T_camera_map: Matrix) -> Matrix:
         """Return the covariance [6, 6] of T_camera_map's left twist, estimated by alignment to the map at that pose."""
-        if isinstance(self.view, ReferenceView):
+        if not fits_of(self.view).aligns:
             return np.zeros((6, 6))
         reference = map_reference(params, self.view, T_camera_map, self.tracking)
         covariance = align(reference.pyramid, live, np.eye(4), 0, self.tracking.align_weight_color).covariance

@@ -14,7 +14,7 @@ from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 
-Lens = tuple[float, ...]
+Distortion = tuple[float, ...]
 """Radial and tangential distortion k1, k2, p1, p2, k3 [, k4, k5, k6 of the rational model's denominator]."""
 
 
@@ -25,16 +25,16 @@ class Calibration:
     camera, distortion: of the colour image, None for no lens; depth_units_per_metre: of whole-number depth;
     depth_camera, depth_distortion: of depth images that are not registered to colour, None where they are;
     T_color_depth [4, 4]: takes points of the depth camera to the colour camera, metres;
-    registers: whether such depth is moved to colour unless the settings say otherwise.
+    register_by_default: whether such depth is moved to colour unless the settings say otherwise.
     """
 
     camera: Camera
     depth_units_per_metre: float
-    distortion: Lens | None = None
+    distortion: Distortion | None = None
     depth_camera: Camera | None = None
-    depth_distortion: Lens | None = None
+    depth_distortion: Distortion | None = None
     T_color_depth: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
-    registers: bool = True
+    register_by_default: bool = True
 
 
 class CameraUnknown(SourceError):
@@ -60,15 +60,15 @@ FREIBURG = {
 
 REPLICA = Calibration(Camera(1200, 680, 600.0, 600.0, 599.5, 339.5), 6553.5)
 
-MILLIMETRES = 1000.0
+MM_PER_METRE = 1000.0
 
 # 585, 320, 240 are the numbers of the 7-Scenes page; they are the depth camera's, and so are the published poses. The
 # colour camera and where it sits were fitted to the RedKitchen sequence, by maximising the agreement of neighbouring
 # images (andyzeng/tsdf-fusion-python, data/; the fit is that of shared/data/redkitchen/calibration.json).
-SEVEN_SCENES = Calibration(Camera(640, 480, 585.0, 585.0, 320.0, 240.0), MILLIMETRES)
+SEVEN_SCENES = Calibration(Camera(640, 480, 585.0, 585.0, 320.0, 240.0), MM_PER_METRE)
 SEVEN_SCENES_COLOR = Calibration(
     Camera(640, 480, 528.12, 528.12, 318.96, 232.91),
-    MILLIMETRES,
+    MM_PER_METRE,
     depth_camera=SEVEN_SCENES.camera,
     T_color_depth=np.array(
         [
@@ -91,7 +91,7 @@ BONN = Calibration(
 )
 
 # Factory numbers of the PrimeSense cameras, which the Redwood recordings were made with (Open3D's PrimeSenseDefault).
-PRIMESENSE = Calibration(Camera(640, 480, 525.0, 525.0, 319.5, 239.5), MILLIMETRES)
+PRIMESENSE = Calibration(Camera(640, 480, 525.0, 525.0, 319.5, 239.5), MM_PER_METRE)
 
 
 def freiburg_calibration(folder: Path) -> Calibration | None:
@@ -109,10 +109,10 @@ def read_calibration(path: Path, size: tuple[int, int], default_units_per_metre:
     Where depth is not registered to colour: depth_camera, an object of the same fields, and T_color_depth, 4 rows.
     `size` (width, height) in pixels stands in where the file gives none. Raises SourceError naming file and field.
     """
-    fields = read_object(path)
-    units = number(path, fields, "depth_scale", default_units_per_metre)
+    fields = read_json_object(path)
+    units = json_number(path, fields, "depth_scale", default_units_per_metre)
     calibration = Calibration(
-        _camera(path, fields, size), positive(path, "depth_scale", units), _distortion(path, fields)
+        _camera(path, fields, size), check_positive(path, "depth_scale", units), _distortion(path, fields)
     )
     inner = fields.get("depth_camera")
     if inner is None:
@@ -120,10 +120,12 @@ def read_calibration(path: Path, size: tuple[int, int], default_units_per_metre:
     if not isinstance(inner, dict):
         raise SourceError(f'{path}: field "depth_camera" is {inner!r}, an object with fx, fy, cx, cy is wanted')
     camera, lens = _camera(path, inner, size), _distortion(path, inner)
-    return replace(calibration, depth_camera=camera, depth_distortion=lens, T_color_depth=_rigid(path, fields))
+    return replace(
+        calibration, depth_camera=camera, depth_distortion=lens, T_color_depth=_rigid_transform(path, fields)
+    )
 
 
-def calibrated(
+def resolve_calibration(
     folder: Path, recorded: Calibration | None, size: tuple[int, int], settings: InputConfig, default_units: float
 ) -> Calibration:
     """Return what is known of the cameras: the settings' words, else calibration.json's, else the recording's.
@@ -151,14 +153,16 @@ def calibrated(
 
 def read_replica_calibration(path: Path) -> Calibration:
     """Read Replica's `cam_params.json`: {"camera": {w, h, fx, fy, cx, cy, scale}}. Raises SourceError."""
-    fields = read_object(path).get("camera")
+    fields = read_json_object(path).get("camera")
     if not isinstance(fields, dict):
         raise SourceError(f'{path}: no "camera" object with w, h, fx, fy, cx, cy, scale')
-    w, h, fx, fy, cx, cy, scale = (number(path, fields, key) for key in ("w", "h", "fx", "fy", "cx", "cy", "scale"))
-    return Calibration(camera_of(path, int(w), int(h), [fx, fy, cx, cy]), positive(path, "scale", scale))
+    w, h, fx, fy, cx, cy, scale = (
+        json_number(path, fields, key) for key in ("w", "h", "fx", "fy", "cx", "cy", "scale")
+    )
+    return Calibration(build_camera(path, int(w), int(h), [fx, fy, cx, cy]), check_positive(path, "scale", scale))
 
 
-def read_object(path: Path) -> dict[str, Any]:
+def read_json_object(path: Path) -> dict[str, Any]:
     """Read a JSON file that holds one object. Raises SourceError naming the file."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -169,7 +173,7 @@ def read_object(path: Path) -> dict[str, Any]:
     return content
 
 
-def number(path: Path, fields: dict[str, Any], key: str, default: float | None = None) -> float:
+def json_number(path: Path, fields: dict[str, Any], key: str, default: float | None = None) -> float:
     """Take one finite number from a JSON object. Raises SourceError naming file and field."""
     value = fields.get(key, default)
     if value is None:
@@ -179,14 +183,14 @@ def number(path: Path, fields: dict[str, Any], key: str, default: float | None =
     return float(value)
 
 
-def positive(path: Path, key: str, value: float) -> float:
+def check_positive(path: Path, key: str, value: float) -> float:
     """Return a number that must be above 0. Raises SourceError naming file and field."""
     if value <= 0:
         raise SourceError(f'{path}: field "{key}" is {value:g}, it must be above 0')
     return value
 
 
-def camera_of(path: Path, width: int, height: int, focal: list[float]) -> Camera:
+def build_camera(path: Path, width: int, height: int, focal: list[float]) -> Camera:
     """Build a camera from numbers of a file. Raises SourceError naming the file if they make none."""
     try:
         return Camera(width, height, *focal)
@@ -195,13 +199,13 @@ def camera_of(path: Path, width: int, height: int, focal: list[float]) -> Camera
 
 
 def _camera(path: Path, fields: dict[str, Any], size: tuple[int, int]) -> Camera:
-    width, height = number(path, fields, "width", size[0]), number(path, fields, "height", size[1])
-    return camera_of(
-        path, int(width), int(height), [number(path, fields, key) for key in ("fx", "fy", "cx", "cy")]
+    width, height = json_number(path, fields, "width", size[0]), json_number(path, fields, "height", size[1])
+    return build_camera(
+        path, int(width), int(height), [json_number(path, fields, key) for key in ("fx", "fy", "cx", "cy")]
     )  # fmt: skip
 
 
-def _rigid(path: Path, fields: dict[str, Any]) -> NDArray[np.float64]:
+def _rigid_transform(path: Path, fields: dict[str, Any]) -> NDArray[np.float64]:
     """Read T_color_depth, identity where absent. Raises SourceError unless it is a rigid 4×4."""
     try:
         T = np.array(fields.get("T_color_depth", np.eye(4)), np.float64)
@@ -218,5 +222,5 @@ def _distortion(path: Path, fields: dict[str, Any]) -> tuple[float, ...] | None:
         return None
     if not isinstance(values, list) or len(values) not in (4, 5):
         raise SourceError(f'{path}: field "distortion" is {values!r}, [k1, k2, p1, p2, k3] is wanted')
-    numbers = [number(path, {"distortion": v}, "distortion") for v in [*values, 0.0][:5]]
+    numbers = [json_number(path, {"distortion": v}, "distortion") for v in [*values, 0.0][:5]]
     return tuple(numbers) if any(numbers) else None

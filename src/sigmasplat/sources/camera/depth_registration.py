@@ -9,15 +9,15 @@ from sigmasplat.model.camera import Camera
 
 OVERLAP = 1.1
 """Footprints are drawn this much larger than they are, so that rotation leaves no cracks between neighbours."""
-MOST_PX = 32.0
+MAX_HALF_FOOTPRINT_PX = 32.0
 """Half of the largest footprint: a reading at the camera's own centre must not fill the image."""
-AT_ONCE = 8192
+CHUNK_READINGS = 8192
 """Readings that are moved together: few enough that all of their numbers stay in the processor's cache."""
 
 Floats = NDArray[np.float64]
 
 
-class Registration:
+class DepthRegistration:
     """Draw each depth pixel as the square that it covers in the colour image; where several fall, the nearest counts.
 
     So a surface that the colour camera cannot see does not shine through one in front of it, and a coarser depth image
@@ -39,9 +39,9 @@ class Registration:
         """Return depth [H, W] of the colour camera from that [h, w] of the depth camera, m along the axis; 0 = none."""
         c, z_depth = self.color_camera, depth_m.reshape(-1)
         nearest = np.full(c.height * c.width, np.inf)
-        for first in range(0, len(z_depth), AT_ONCE):
-            seen = first + np.flatnonzero(z_depth[first : first + AT_ONCE] > 0)
-            draw(nearest, c.width, *self._footprints(seen, z_depth[seen]))
+        for first in range(0, len(z_depth), CHUNK_READINGS):
+            seen = first + np.flatnonzero(z_depth[first : first + CHUNK_READINGS] > 0)
+            draw_footprints(nearest, c.width, *self._footprints(seen, z_depth[seen]))
         nearest[np.isinf(nearest)] = 0.0
         return nearest.astype(np.float32).reshape(c.height, c.width)
 
@@ -57,7 +57,7 @@ class Registration:
         return columns, rows, z
 
 
-def draw(nearest: Floats, width: int, columns: Floats, rows: Floats, z: Floats) -> None:
+def draw_footprints(nearest: Floats, width: int, columns: Floats, rows: Floats, z: Floats) -> None:
     """Put depths z [N] into pixels first … last [2, N] of an image `nearest` [rows · width]; the least one stays."""
     most = [int(np.fmax.reduce(ends[1] - ends[0], initial=-1.0)) for ends in (columns, rows)]
     for dy in range(most[1] + 1):
@@ -71,5 +71,5 @@ def draw(nearest: Floats, width: int, columns: Floats, rows: Floats, z: Floats) 
 def _span(centre: Floats, half: Floats, count: int) -> Floats:
     """Return the first and the last of `count` pixels whose centre lies within centre ± half, [2, N]; last < first
     where there is none."""
-    bounded = np.clip(half, 0.0, MOST_PX)
+    bounded = np.clip(half, 0.0, MAX_HALF_FOOTPRINT_PX)
     return np.stack([np.maximum(np.ceil(centre - bounded), 0.0), np.minimum(np.floor(centre + bounded), count - 1.0)])

@@ -9,15 +9,15 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources.camera.calibration import Calibration
-from sigmasplat.sources.camera.depth_registration import Registration
+from sigmasplat.sources.camera.depth_registration import DepthRegistration
 from sigmasplat.sources.camera.distortion import Undistortion
 
 Image = NDArray[np.float32]
 
 
-def registers(calibration: Calibration, settings: InputConfig) -> bool:
+def registers_depth(calibration: Calibration, settings: InputConfig) -> bool:
     """Tell whether depth is moved to the colour camera: where the cameras are known, and unless the settings say no."""
-    wanted = calibration.registers if settings.register_depth == "auto" else settings.register_depth == "on"
+    wanted = calibration.register_by_default if settings.register_depth == "auto" else settings.register_depth == "on"
     return wanted and calibration.depth_camera is not None
 
 
@@ -37,11 +37,11 @@ class Rectification:
         self.camera = calibration.camera
         self._color_lens = _undistortion(calibration.camera, lens)
         self._depth_lens = self._color_lens
-        self._registration: Registration | None = None
+        self._registration: DepthRegistration | None = None
         if depth_camera is not None:
-            self.camera = _no_finer(calibration.camera, max(depth_camera.width, settings.width))
+            self.camera = _limited_width(calibration.camera, max(depth_camera.width, settings.width))
             self._depth_lens = _undistortion(depth_camera, depth_lens)
-            self._registration = Registration(depth_camera, self.camera, calibration.T_color_depth)
+            self._registration = DepthRegistration(depth_camera, self.camera, calibration.T_color_depth)
 
     def _depth_camera(self, name: str, settings: InputConfig) -> Camera | None:
         """Return the camera that depth is to be moved from, None where it stays as it is."""
@@ -51,10 +51,10 @@ class Rectification:
                 f"{name}: depth cannot be registered, the depth camera is unknown; "
                 "give depth_camera and T_color_depth in calibration.json"
             )
-        return known if registers(self.calibration, settings) else None
+        return known if registers_depth(self.calibration, settings) else None
 
     @property
-    def registers(self) -> bool:
+    def moves_depth(self) -> bool:
         """Tell whether depth is moved to the colour camera."""
         return self._registration is not None
 
@@ -75,12 +75,12 @@ class Rectification:
         return self._registration(depth_m) if self._registration else depth_m
 
 
-def refuse_sizes(
+def check_image_sizes(
     rectification: Rectification, color: Path, color_size: tuple[int, ...], depth: Path, depth_size: tuple[int, ...]
 ) -> None:
     """Raise SourceError where an image's (width, height) is not that of its camera."""
     c = rectification.calibration.camera
-    if tuple(color_size) != tuple(depth_size) and not rectification.registers:
+    if tuple(color_size) != tuple(depth_size) and not rectification.moves_depth:
         raise SourceError(
             f"{color} is {color_size[0]}×{color_size[1]} but {depth} is {depth_size[0]}×{depth_size[1]}; "
             "register depth to colour and give both one size, or name depth_camera in calibration.json"
@@ -100,6 +100,6 @@ def _undistortion(camera: Camera, coefficients: tuple[float, ...] | None) -> Und
     return Undistortion(camera, np.array(coefficients)) if coefficients else None
 
 
-def _no_finer(color: Camera, width: int) -> Camera:
+def _limited_width(color: Camera, width: int) -> Camera:
     """Return the colour camera at no more than so many pixels across."""
     return color if color.width <= width else color.resized(width, round(color.height * width / color.width))

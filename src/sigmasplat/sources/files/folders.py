@@ -18,31 +18,31 @@ DEPTH_ENDINGS = (".png", ".pgm", ".tif", ".tiff", ".npy")
 Key = TypeVar("Key", int, str)
 
 
-def subfolder(folder: Path, names: Iterable[str]) -> Path | None:
+def first_subfolder(folder: Path, names: Iterable[str]) -> Path | None:
     """Return the first of the named folders that is there, None if none is."""
     return next((folder / name for name in names if (folder / name).is_dir()), None)
 
 
-def images_in(folder: Path | None, endings: Sequence[str]) -> list[Path]:
+def list_images(folder: Path | None, endings: Sequence[str]) -> list[Path]:
     """List a folder's images in the order of the numbers in their names: 2.png comes before 10.png."""
     if folder is None or not folder.is_dir():
         return []
     found = (path for path in folder.iterdir() if path.suffix.lower() in endings and not path.name.startswith("."))
-    return sorted(found, key=natural)
+    return sorted(found, key=natural_key)
 
 
-def natural(path: Path | str) -> list[tuple[int, str]]:
+def natural_key(path: Path | str) -> list[tuple[int, str]]:
     """Return a key that sorts names by their numbers' size: digits as numbers, the rest as text."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", str(path)) if part]
 
 
-def numbered(paths: Iterable[Path]) -> dict[int, Path]:
+def index_by_number(paths: Iterable[Path]) -> dict[int, Path]:
     """Map the last number in each file's name to its path, ascending; names without one are left out."""
     numbers = ((re.findall(r"[0-9]+", path.stem), path) for path in paths)
     return dict(sorted((int(found[-1]), path) for found, path in numbers if found))
 
 
-def paired(
+def pair_images(
     folder: Path, colors: Mapping[Key, Path], depths: Mapping[Key, Path], color_name: str, depth_name: str
 ) -> tuple[list[Key], list[str]]:
     """Return the keys that colour and depth share, in the order of colour, and why the other images are left out.
@@ -63,14 +63,14 @@ def paired(
     return keys, [f"{colors[key]}: no {depth_name} of its number" for key in colors if key not in depths]
 
 
-Found = dict[str, dict[int, Path]]
+FrameFiles = dict[str, dict[int, Path]]
 
 _NAME = re.compile(r"frame-([0-9]+)\.(?:(color)\.(?:png|jpe?g)|(depth)\.(?:png|pgm|tiff?)|(pose)\.txt)")
 
 
-def frame_files(folder: Path) -> Found:
+def frame_files(folder: Path) -> FrameFiles:
     """Map "color", "depth" and "pose" to the files of each kind by number, ascending."""
-    found: Found = {"color": {}, "depth": {}, "pose": {}}
+    found: FrameFiles = {"color": {}, "depth": {}, "pose": {}}
     for path in sorted(folder.glob("frame-*")):
         match = _NAME.fullmatch(path.name.lower())
         if match:

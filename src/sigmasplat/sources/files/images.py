@@ -14,7 +14,7 @@ from sigmasplat.errors import SourceError
 
 Value = TypeVar("Value")
 
-OVERFLOW = 65535
+UINT16_MAX = 65535
 """Several sensors write the largest 16-bit number where they saw nothing."""
 
 _COLOR_OF_BYTE = (np.arange(256) / 255.0).astype(np.float32)
@@ -27,20 +27,20 @@ def color_from_bytes(values: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 def read_color(path: Path) -> NDArray[np.uint8]:
     """Read an image as 8-bit RGB [H, W, 3]. Raises SourceError naming a missing, cut short or corrupt file."""
-    return _guarded(path, lambda: _decode(path, "RGB"))
+    return _guard_reading(path, lambda: _decode(path, "RGB"))
 
 
-def color_of(path: Path, data: bytes) -> NDArray[np.uint8]:
+def decode_color(path: Path, data: bytes) -> NDArray[np.uint8]:
     """Decode an image in memory as 8-bit RGB [H, W, 3]; `path` names it. Raises SourceError if it is damaged."""
-    return understood(path, lambda: np.asarray(Image.open(io.BytesIO(data)).convert("RGB")))
+    return guard_decoding(path, lambda: np.asarray(Image.open(io.BytesIO(data)).convert("RGB")))
 
 
 def image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) in pixels from the header alone. Raises SourceError if the file is no image."""
     if path.suffix == ".npy":
-        height, width = _guarded(path, lambda: np.load(path, mmap_mode="r").shape[:2])
+        height, width = _guard_reading(path, lambda: np.load(path, mmap_mode="r").shape[:2])
         return int(width), int(height)
-    return _guarded(path, lambda: _header_size(path))
+    return _guard_reading(path, lambda: _header_size(path))
 
 
 def read_depth(path: Path, units_per_metre: float) -> NDArray[np.float32]:
@@ -49,12 +49,12 @@ def read_depth(path: Path, units_per_metre: float) -> NDArray[np.float32]:
     Whole numbers (16-bit PNG, integer .npy) are divided by `units_per_metre`; floats (.tiff, .npy) are metres already.
     Raises SourceError if the file is unreadable, not a single-channel depth image, negative, or holds NaN or inf.
     """
-    return metres(
-        path, _guarded(path, lambda: np.load(path) if path.suffix == ".npy" else _decode(path)), units_per_metre
+    return depth_to_metres(
+        path, _guard_reading(path, lambda: np.load(path) if path.suffix == ".npy" else _decode(path)), units_per_metre
     )
 
 
-def metres(path: Path, raw: NDArray[Any], units_per_metre: float) -> NDArray[np.float32]:
+def depth_to_metres(path: Path, raw: NDArray[Any], units_per_metre: float) -> NDArray[np.float32]:
     """Turn a depth image as stored into float32 metres, as `read_depth` says; `path` names it. Raises SourceError."""
     if raw.ndim != 2 or raw.dtype == np.uint8 or raw.dtype.kind not in "iuf":
         raise SourceError(
@@ -62,7 +62,7 @@ def metres(path: Path, raw: NDArray[Any], units_per_metre: float) -> NDArray[np.
         )
     if raw.dtype.kind == "f":
         return _checked_metres(path, raw.astype(np.float32))
-    readings = np.where(raw == OVERFLOW, 0, raw)
+    readings = np.where(raw == UINT16_MAX, 0, raw)
     return _checked_metres(path, (readings / units_per_metre).astype(np.float32))
 
 
@@ -85,14 +85,14 @@ def _header_size(path: Path) -> tuple[int, int]:
         return image.size
 
 
-def _guarded(path: Path, read: Callable[[], Value]) -> Value:
+def _guard_reading(path: Path, read: Callable[[], Value]) -> Value:
     """Run a reader of a file. Raises SourceError if the file is missing or unreadable."""
     if not path.is_file():
         raise SourceError(f"{path}: the image is missing; download it again or drop it from the list")
-    return understood(path, read)
+    return guard_decoding(path, read)
 
 
-def understood(path: Path, read: Callable[[], Value]) -> Value:
+def guard_decoding(path: Path, read: Callable[[], Value]) -> Value:
     """Run a decoder; those fail in many ways on damaged bytes, and all become a SourceError that names `path`."""
     try:
         return read()

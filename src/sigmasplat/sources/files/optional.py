@@ -7,7 +7,7 @@ from sigmasplat.env import install_extra
 from sigmasplat.errors import SourceError
 
 
-def needed(module: str, extra: str, what: str) -> Any:
+def import_optional(module: str, extra: str, what: str) -> Any:
     """Import a module. Raises SourceError that says for what it is needed and which extra of ours brings it."""
     try:
         return importlib.import_module(module)

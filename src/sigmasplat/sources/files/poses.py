@@ -11,7 +11,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.types import Matrix
 
-NEARLY_RIGID = 1e-2
+RIGID_TOLERANCE = 1e-2
 """Published poses are rounded, or products of many; what is this near a rotation is made one."""
 
 FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -22,12 +22,12 @@ def read_matrix(path: Path) -> Matrix:
     """Read 3×4 or 4×4 numbers in rows as [4, 4]; they need not be finite. Raises SourceError naming the file."""
     try:
         text = path.read_text(encoding="utf-8")
-        return matrix(str(path), [float(word) for word in text.replace(",", " ").split()])
+        return to_matrix(str(path), [float(word) for word in text.replace(",", " ").split()])
     except (OSError, ValueError) as error:
         raise SourceError(f"{path}: not readable as a matrix of numbers ({error}); download it again") from error
 
 
-def matrix(where: str, values: Any) -> Matrix:
+def to_matrix(where: str, values: Any) -> Matrix:
     """Shape 12 or 16 numbers as [4, 4]. Raises SourceError naming the place if they are not so many numbers."""
     try:
         flat = np.array(values, np.float64).reshape(-1)
@@ -42,25 +42,25 @@ def _described(values: Any) -> str:
     return f"{len(values)} values" if isinstance(values, list) else repr(values)[:60]
 
 
-def pose(where: str, T: Matrix) -> Matrix | None:
+def checked_pose(where: str, T: Matrix) -> Matrix | None:
     """Return a camera-to-world pose, None where it is not finite: so recordings mark frames without one.
 
     Raises SourceError naming the place if the matrix is finite but no rigid motion.
     """
     if not np.isfinite(T).all():
         return None
-    if not se3.is_rigid(T, NEARLY_RIGID):
+    if not se3.is_rigid(T, RIGID_TOLERANCE):
         numbers = " ".join(f"{value:.3g}" for value in T.reshape(-1)[:12])
         raise SourceError(f"{where}: not a rigid camera-to-world pose: {numbers}; drop it or mend its rotation")
     return T if se3.is_rigid(T) else se3.orthonormalise(T)
 
 
-def known_path(timed: Iterable[tuple[float, Matrix | None]]) -> Trajectory | None:
+def build_trajectory(timed: Iterable[tuple[float, Matrix | None]]) -> Trajectory | None:
     """Build the path of the frames (time in seconds, T_world_camera) that have a pose, None if none has."""
     known = [(t, T) for t, T in timed if T is not None]
     return Trajectory(np.array([t for t, _ in known]), np.stack([T for _, T in known])) if known else None
 
 
-def pose_files(timed: Iterable[tuple[float, Path]]) -> Trajectory | None:
+def read_pose_files(timed: Iterable[tuple[float, Path]]) -> Trajectory | None:
     """Read one pose file per frame, given with its time; a file that is not there is a pose not known."""
-    return known_path((t, pose(str(path), read_matrix(path))) for t, path in timed if path.is_file())
+    return build_trajectory((t, checked_pose(str(path), read_matrix(path))) for t, path in timed if path.is_file())

@@ -13,18 +13,18 @@ from typing import Any
 import numpy as np
 
 from sigmasplat.errors import SourceError
-from sigmasplat.sources.camera.calibration import Calibration, Lens, camera_of, number
-from sigmasplat.sources.files.poses import FLIP_YZ, matrix, pose
+from sigmasplat.sources.camera.calibration import Calibration, Distortion, build_camera, json_number
+from sigmasplat.sources.files.poses import FLIP_YZ, checked_pose, to_matrix
 from sigmasplat.types import Matrix
 
 Fields = dict[str, Any]
 
-PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
-SAME_PX = 0.5
+PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+CAMERA_TOLERANCE_PX = 0.5
 """Cameras of two frames whose numbers differ by less are one camera."""
 
 
-def frames_of(path: Path, fields: Fields, key: str = "frames") -> list[Fields]:
+def read_frames(path: Path, fields: Fields, key: str = "frames") -> list[Fields]:
     """Return the frames of a file. Raises SourceError if there are none, or one names no image."""
     frames = fields.get(key)
     if not isinstance(frames, list) or not frames:
@@ -35,53 +35,55 @@ def frames_of(path: Path, fields: Fields, key: str = "frames") -> list[Fields]:
     return frames
 
 
-def camera_in(path: Path, fields: Fields, frames: Sequence[Fields], size: tuple[int, int], units: float) -> Calibration:
+def read_camera(
+    path: Path, fields: Fields, frames: Sequence[Fields], size: tuple[int, int], units: float
+) -> Calibration:
     """Build the one camera of all frames; `size` (width, height) stands in where the file gives none.
 
     Raises SourceError naming the field that is missing, the frame that differs, or a lens that is no pinhole's.
     """
     first = {**fields, **frames[0]}
     model = str(first.get("camera_model", "OPENCV")).upper()
-    if model not in PINHOLES or first.get("is_fisheye"):
+    if model not in PINHOLE_MODELS or first.get("is_fisheye"):
         raise SourceError(f"{path}: camera_model is {model}; only pinholes are read, undistort the images first")
     for frame in frames[1:]:
         for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
             if key not in first:
                 continue
-            a, b = number(path, first, key), number(path, {**first, **frame}, key)
-            if abs(a - b) > SAME_PX:
+            a, b = json_number(path, first, key), json_number(path, {**first, **frame}, key)
+            if abs(a - b) > CAMERA_TOLERANCE_PX:
                 raise SourceError(
                     f"{path}: the frames have several cameras ({key} {a:g} and {b:g}, {frame['file_path']}); "
                     "one pinhole for all is wanted: undistort to one, or leave the others out"
                 )
-    width, height = (int(number(path, first, key, size[i])) for i, key in enumerate(("w", "h")))
-    camera = camera_of(path, width, height, _focal(path, first, width, height))
+    width, height = (int(json_number(path, first, key, size[i])) for i, key in enumerate(("w", "h")))
+    camera = build_camera(path, width, height, _focal(path, first, width, height))
     return Calibration(camera, units, _lens(path, first))
 
 
-def pose_in(path: Path, frame: Fields) -> Matrix | None:
+def read_pose(path: Path, frame: Fields) -> Matrix | None:
     """Return T_world_camera in our axes, None where the frame has none. Raises SourceError if it is not rigid."""
     values = frame.get("transform_matrix")
     if values is None:
         return None
     where = f"{path}, {frame['file_path']}"
-    T = pose(where, matrix(where, values))
+    T = checked_pose(where, to_matrix(where, values))
     return None if T is None else T @ FLIP_YZ
 
 
 def _focal(path: Path, fields: Fields, width: int, height: int) -> list[float]:
     """Return fx, fy, cx, cy; a file may give the field of view instead."""
     if "fl_x" not in fields and "camera_angle_x" in fields:
-        fx = 0.5 * width / float(np.tan(0.5 * number(path, fields, "camera_angle_x")))
+        fx = 0.5 * width / float(np.tan(0.5 * json_number(path, fields, "camera_angle_x")))
     else:
-        fx = number(path, fields, "fl_x")
-    fy = number(path, fields, "fl_y", fx)
-    cx, cy = number(path, fields, "cx", width / 2), number(path, fields, "cy", height / 2)
+        fx = json_number(path, fields, "fl_x")
+    fy = json_number(path, fields, "fl_y", fx)
+    cx, cy = json_number(path, fields, "cx", width / 2), json_number(path, fields, "cy", height / 2)
     return [fx, fy, cx - 0.5, cy - 0.5]
 
 
-def _lens(path: Path, fields: Fields) -> Lens | None:
-    k1, k2, p1, p2, k3, k4 = (number(path, fields, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3", "k4"))
+def _lens(path: Path, fields: Fields) -> Distortion | None:
+    k1, k2, p1, p2, k3, k4 = (json_number(path, fields, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3", "k4"))
     if k4:
         raise SourceError(f"{path}: the lens has a k4 of {k4:g}, which is not known here; undistort the images first")
     return (k1, k2, p1, p2, k3) if any((k1, k2, p1, p2, k3)) else None

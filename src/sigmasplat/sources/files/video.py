@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.errors import SourceError
-from sigmasplat.sources.files.optional import needed
+from sigmasplat.sources.files.optional import import_optional
 
 
 class Video:
@@ -19,7 +19,7 @@ class Video:
     def __init__(self, path: Path) -> None:
         """Raises SourceError if OpenCV is missing or cannot read the file."""
         self.path, self._lock = path, threading.Lock()
-        self._cv2 = needed("cv2", "iphone", f"{path}: a video")
+        self._cv2 = import_optional("cv2", "iphone", f"{path}: a video")
         self._open()
         width, height = (
             int(self._capture.get(p)) for p in (self._cv2.CAP_PROP_FRAME_WIDTH, self._cv2.CAP_PROP_FRAME_HEIGHT)

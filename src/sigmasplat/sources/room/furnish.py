@@ -65,7 +65,7 @@ class Room:
         return (self.seed + self.number) % choices
 
 
-def furnished(rooms: int, seed: int) -> list[list[Shape]]:
+def furnish_rooms(rooms: int, seed: int) -> list[list[Shape]]:
     """Build a row of furnished rooms; return the shapes of each, shared walls in the room before them."""
     built = []
     for number in range(rooms):
@@ -205,12 +205,12 @@ def _middle(room: Room, seed: int) -> None:
     place("box", (0.1, 0.0, 0.70), (0.58, 0.36, 0.022), top, turn)
     for sx in (-1, 1):
         for sy in (-1, 1):
-            x, y = _turned(0.5 * sx, 0.29 * sy, turn)
+            x, y = _rotated(0.5 * sx, 0.29 * sy, turn)
             place("drum", (0.1 + x, y, 0.34), (0.032, 0.032, 0.34), plain((0.42, 0.30, 0.20), 0.05))
-    x, y = _turned(0.22, 0.06, turn)
+    x, y = _rotated(0.22, 0.06, turn)
     chrome = Material(plain((0.42, 0.44, 0.48), 0.02), mirror=0.3, gloss=0.9)  # the specular sphere
     place("ball", (0.1 + x, y, 0.722 + 0.13), (0.13, 0.13, 0.13), chrome)
-    x, y = _turned(-0.3, 0.1, turn)
+    x, y = _rotated(-0.3, 0.1, turn)
     place(
         "box",
         (0.1 + x, y, 0.722 + 0.09),
@@ -218,9 +218,9 @@ def _middle(room: Room, seed: int) -> None:
         checks((0.86, 0.62, 0.18), (0.22, 0.24, 0.30), 0.06, seed),
         0.7,
     )
-    x, y = _turned(-0.12, -0.17, turn)
+    x, y = _rotated(-0.12, -0.17, turn)
     place("box", (0.1 + x, y, 0.722 + 0.03), (0.14, 0.1, 0.03), books(0.06, seed + 9), 0.1)
-    x, y = _turned(0.4, -0.15, turn)
+    x, y = _rotated(0.4, -0.15, turn)
     place(
         "drum", (0.1 + x, y, 0.722 + 0.05), (0.042, 0.042, 0.05), Material(plain((0.75, 0.25, 0.2), 0.05), gloss=0.25)
     )
@@ -235,15 +235,15 @@ def _chair(room: Room, x: float, y: float, yaw_rad: float, seed: int) -> None:
     room.place(
         "box", (x, y, 0.44), (0.2, 0.2, 0.025), weave((0.52, 0.20, 0.18), (0.72, 0.42, 0.34), 0.05, seed), yaw_rad
     )
-    back_x, back_y = _turned(-0.19, 0.0, yaw_rad)
+    back_x, back_y = _rotated(-0.19, 0.0, yaw_rad)
     room.place("box", (x + back_x, y + back_y, 0.72), (0.018, 0.2, 0.2), timber, yaw_rad)
     for sx in (-1, 1):
         for sy in (-1, 1):
-            leg_x, leg_y = _turned(0.175 * sx, 0.175 * sy, yaw_rad)
+            leg_x, leg_y = _rotated(0.175 * sx, 0.175 * sy, yaw_rad)
             height = 0.36 if sx < 0 else 0.21  # the back's posts reach up to carry it
             room.place("box", (x + leg_x, y + leg_y, height), (0.02, 0.02, height), timber, yaw_rad)
 
 
-def _turned(x: float, y: float, angle_rad: float) -> tuple[float, float]:
+def _rotated(x: float, y: float, angle_rad: float) -> tuple[float, float]:
     c, s = float(np.cos(angle_rad)), float(np.sin(angle_rad))
     return c * x - s * y, s * x + c * y

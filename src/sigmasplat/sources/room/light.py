@@ -33,8 +33,8 @@ class Light:
         """Return the light falling on surfaces, RGB [3, N], and the shares of lamp and window seen from them [2, N]."""
         ambient, lamp, window = self._shares_at(points + np.float32(0.6 * CELL_M) * normals)
         total = AMBIENT_COLOR * (0.35 + 0.65 * ambient)
-        total = total + LAMP_COLOR * (lamp * _falling(self.lamp - points, normals, 1.6))
-        total = total + WINDOW_COLOR * (window * _falling(self.window - points, normals, 1.4))
+        total = total + LAMP_COLOR * (lamp * _lamp_light(self.lamp - points, normals, 1.6))
+        total = total + WINDOW_COLOR * (window * _lamp_light(self.window - points, normals, 1.4))
         return total.astype(np.float32), np.stack([lamp, window])
 
     @property
@@ -57,7 +57,7 @@ class Light:
         return seen
 
 
-def _falling(towards: Floats, normals: Floats, reach_m: float) -> Floats:
+def _lamp_light(towards: Floats, normals: Floats, reach_m: float) -> Floats:
     """Return what a lamp `towards` [3, N] away sheds on a surface: cosine, wrapped a little, over growing distance."""
     distance2 = dot(towards, towards)
     cosine = dot(towards, normals) / np.sqrt(distance2 + 1e-6)
@@ -65,7 +65,7 @@ def _falling(towards: Floats, normals: Floats, reach_m: float) -> Floats:
     return np.asarray(wrapped * (reach_m * reach_m * 1.6 / (reach_m * reach_m + distance2)), np.float32)
 
 
-def lit(number: int, shapes: Sequence[Shape]) -> Light:
+def light_room(number: int, shapes: Sequence[Shape]) -> Light:
     """Work out the light in one room from the shapes in it."""
     side = -1.0 if number % 2 else 1.0
     light = Light(number * PITCH_M, side, np.zeros((3, 1, 1, 1), np.float32))
@@ -76,7 +76,7 @@ def lit(number: int, shapes: Sequence[Shape]) -> Light:
     opaque = [s for s in shapes if not s.material.glow and s.half.min() > 0.015 and s.half.max() > 0.1]
     shares = [_ambient_share(points, opaque), *(_lamp_share(points, opaque, light, which) for which in (0, 1))]
     solid = _inside_any(points, opaque).reshape(counts)
-    return Light(light.room_x_m, side, np.stack([_grown(s.reshape(counts), solid) for s in shares]))
+    return Light(light.room_x_m, side, np.stack([_filled(s.reshape(counts), solid) for s in shares]))
 
 
 def _ambient_share(points: Floats, shapes: Sequence[Shape]) -> Floats:
@@ -113,7 +113,7 @@ def _inside_any(points: Floats, shapes: Sequence[Shape]) -> np.ndarray[tuple[int
     return inside
 
 
-def _grown(shares: Floats, solid: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> Floats:
+def _filled(shares: Floats, solid: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> Floats:
     """Give places inside solids the light of the nearest free place, lest their darkness leaks out at the surface."""
     if solid.all() or not solid.any():
         return shares

@@ -2,7 +2,18 @@
 
 import numpy as np
 
-from sigmasplat.sources.room.textures import Color, Floats, Texture, hashed, line, mixed, noise, smooth, step, visible
+from sigmasplat.sources.room.textures import (
+    Color,
+    Floats,
+    Texture,
+    detail_visibility,
+    draw_line,
+    hash_cell,
+    mix,
+    noise,
+    smoothstep,
+    step,
+)
 
 SPINES: tuple[Color, ...] = (
     (0.62, 0.16, 0.14),
@@ -30,12 +41,12 @@ def books(spine_m: float, seed: int = 0) -> Texture:
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         number = np.floor(u / np.float32(spine_m))
         palette = np.array(SPINES, np.float32)
-        chosen = palette[(hashed(number, 0, seed) * len(SPINES)).astype(int) % len(SPINES)].T
-        seen = visible(spine_m, pixel_m)
-        body = mixed(palette.mean(0), chosen, seen)
-        label = line(v - (hashed(number, 1, seed) - 0.3) * np.float32(0.1), 0.02, pixel_m) * seen
-        gap = line((np.abs(u / np.float32(spine_m) - number - 0.5) - 0.5) * spine_m, 0.005, pixel_m)
-        return mixed(body, (0.86, 0.8, 0.62), 0.7 * label) * (1.0 - 0.7 * gap)
+        chosen = palette[(hash_cell(number, 0, seed) * len(SPINES)).astype(int) % len(SPINES)].T
+        seen = detail_visibility(spine_m, pixel_m)
+        body = mix(palette.mean(0), chosen, seen)
+        label = draw_line(v - (hash_cell(number, 1, seed) - 0.3) * np.float32(0.1), 0.02, pixel_m) * seen
+        gap = draw_line((np.abs(u / np.float32(spine_m) - number - 0.5) - 0.5) * spine_m, 0.005, pixel_m)
+        return mix(body, (0.86, 0.8, 0.62), 0.7 * label) * (1.0 - 0.7 * gap)
 
     return texture
 
@@ -49,14 +60,14 @@ def painting(half_u_m: float, half_v_m: float, seed: int, frame: Color = (0.32, 
 
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         hill = 0.35 * half_v_m * noise(u, v * 0.4, pixel_m, 0.22, seed) + 0.03 * noise(u, v, pixel_m, 0.05, seed + 1)
-        color = mixed(colors[0], colors[0], np.zeros_like(u))
+        color = mix(colors[0], colors[0], np.zeros_like(u))
         for band, paint in zip(bands, colors[1:], strict=True):
-            color = mixed(color, paint, step(v + hill - band * np.float32(half_v_m), pixel_m, 0.02))
+            color = mix(color, paint, step(v + hill - band * np.float32(half_v_m), pixel_m, 0.02))
         sun = step(0.2 * half_v_m - np.hypot(u - sun_u, v - sun_v).astype(np.float32), pixel_m)
-        color = mixed(color, (0.95, 0.85, 0.55), sun) * (1.0 + 0.08 * noise(u, v, pixel_m, 0.025, seed + 2))
+        color = mix(color, (0.95, 0.85, 0.55), sun) * (1.0 + 0.08 * noise(u, v, pixel_m, 0.025, seed + 2))
         edge = np.minimum(half_u_m - np.abs(u), half_v_m - np.abs(v)).astype(np.float32)
-        passepartout = mixed(color, (0.92, 0.9, 0.85), step(0.09 - edge, pixel_m))
-        return mixed(passepartout, frame, step(0.035 - edge, pixel_m))
+        passepartout = mix(color, (0.92, 0.9, 0.85), step(0.09 - edge, pixel_m))
+        return mix(passepartout, frame, step(0.035 - edge, pixel_m))
 
     return texture
 
@@ -67,10 +78,12 @@ def rug(radius_m: float, a: Color, b: Color, c: Color, seed: int = 0) -> Texture
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         r = np.hypot(u, v).astype(np.float32) / np.float32(radius_m)
         angle = np.arctan2(v, u).astype(np.float32)
-        petals = smooth(0.5 + 2.0 * np.sin(12 * angle) * np.sin(np.float32(3 * np.pi) * r)) * visible(0.1, pixel_m)
-        rings = smooth(0.5 + 2.0 * np.sin(np.float32(7 * np.pi) * r)) * visible(0.1, pixel_m)
+        petals = smoothstep(0.5 + 2.0 * np.sin(12 * angle) * np.sin(np.float32(3 * np.pi) * r)) * detail_visibility(
+            0.1, pixel_m
+        )
+        rings = smoothstep(0.5 + 2.0 * np.sin(np.float32(7 * np.pi) * r)) * detail_visibility(0.1, pixel_m)
         pile = 1.0 + 0.12 * noise(u, v, pixel_m, 0.03, seed)
-        return mixed(mixed(a, b, petals), c, 0.75 * rings) * pile
+        return mix(mix(a, b, petals), c, 0.75 * rings) * pile
 
     return texture
 
@@ -80,7 +93,7 @@ def leaves(seed: int = 0) -> Texture:
 
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         light = 0.5 + 0.5 * noise(u, v, pixel_m, 0.05, seed) + 0.25 * noise(u, v, pixel_m, 0.025, seed + 1)
-        return mixed((0.08, 0.22, 0.08), (0.42, 0.62, 0.22), light)
+        return mix((0.08, 0.22, 0.08), (0.42, 0.62, 0.22), light)
 
     return texture
 
@@ -89,9 +102,9 @@ def sky(half_v_m: float) -> Texture:
     """Show what a window shows: a bright sky over a line of hills."""
 
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
-        height = smooth(0.5 + v / np.float32(2 * half_v_m))
-        air = mixed((0.93, 0.95, 0.95), (0.55, 0.74, 0.93), height)
+        height = smoothstep(0.5 + v / np.float32(2 * half_v_m))
+        air = mix((0.93, 0.95, 0.95), (0.55, 0.74, 0.93), height)
         hills = step(-v - np.float32(0.45 * half_v_m) + 0.12 * noise(u, v * 0, pixel_m, 0.35, 5), pixel_m, 0.02)
-        return mixed(air, (0.42, 0.55, 0.42), hills)
+        return mix(air, (0.42, 0.55, 0.42), hills)
 
     return texture

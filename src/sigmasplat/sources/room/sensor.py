@@ -11,7 +11,7 @@ Image = NDArray[np.float32]
 JITTER_PX = 0.6
 RANGE_M = (0.35, 7.0)
 COLOR_SIGMA = 0.008
-WARMING_FRAMES = 300
+DRIFT_KNOT_FRAMES = 300
 """The calibration is another one, by chance, each so many frames; between them it changes smoothly."""
 
 
@@ -25,7 +25,7 @@ def measured_depth(depth_m: Image, camera: Camera, rng: np.random.Generator) -> 
 
     Holes: grazing surfaces, a rim along jumps in depth, random patches and speckles, and what is out of range.
     """
-    seen = _wandering(depth_m, rng)
+    seen = _jittered(depth_m, rng)
     noisy = seen + rng.standard_normal(seen.shape, np.float32) * noise_sigma_m(seen)
     in_range = (noisy > RANGE_M[0]) & (noisy < RANGE_M[1])
     blind = _grazing(depth_m, camera) | _rims(depth_m, rng) | _patches(depth_m.shape, rng)
@@ -45,13 +45,13 @@ def drifted_depth(depth_m: Image, i: int, seed: int, deviation: float) -> Image:
     # Legendre's polynomials: each of mean square 1, orthogonal, so that their variances add up.
     one, tilt_u, tilt_v = np.ones((height, width)), np.sqrt(3.0) * u, np.sqrt(3.0) * v
     shapes = (one, tilt_u, tilt_v, tilt_u * tilt_v, *(np.sqrt(1.25) * (3.0 * x**2 - 1.0) for x in (u, v)))
-    error = sum(_wandering_number(i, (seed, k, 8)) * shape for k, shape in enumerate(shapes)) / np.sqrt(len(shapes))
+    error = sum(_smooth_process(i, (seed, k, 8)) * shape for k, shape in enumerate(shapes)) / np.sqrt(len(shapes))
     return np.asarray(depth_m * (1.0 + deviation * error), np.float32)
 
 
-def _wandering_number(i: int, seed: tuple[int, ...]) -> float:
+def _smooth_process(i: int, seed: tuple[int, ...]) -> float:
     """Return a random process of mean 0 and variance 1 at frame i: a cubic spline between normal numbers."""
-    knot, s = divmod(i / WARMING_FRAMES, 1.0)
+    knot, s = divmod(i / DRIFT_KNOT_FRAMES, 1.0)
     weights = np.array([(1 - s) ** 3, 3 * s**3 - 6 * s**2 + 4, -3 * s**3 + 3 * s**2 + 3 * s + 1, s**3])
     normals = [np.random.default_rng((*seed, int(knot) + k)).standard_normal() for k in range(4)]
     return float(weights @ normals / np.linalg.norm(weights))
@@ -62,7 +62,7 @@ def measured_color(color: Image, rng: np.random.Generator) -> Image:
     return np.clip(color + COLOR_SIGMA * rng.standard_normal(color.shape, np.float32), 0.0, 1.0)
 
 
-def _wandering(depth_m: Image, rng: np.random.Generator) -> Image:
+def _jittered(depth_m: Image, rng: np.random.Generator) -> Image:
     """Read every pixel a fraction of a pixel off: silhouettes fray, surfaces hardly change."""
     v, u = np.indices(depth_m.shape, np.float32)
     offsets = rng.normal(0.0, JITTER_PX, (2, *depth_m.shape)).astype(np.float32)

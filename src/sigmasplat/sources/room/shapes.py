@@ -18,7 +18,7 @@ from sigmasplat.sources.room.textures import Floats, Material
 Indices = NDArray[np.intp]
 Kind = Literal["box", "ball", "drum"]
 
-MIN_HIT = 1e-3
+MIN_RAY_PARAMETER = 1e-3
 """Ray parameters below this are the surface that the ray starts on."""
 
 
@@ -34,11 +34,11 @@ class Shape:
 
     def turned(self, vectors: Floats) -> Floats:
         """Rotate room vectors [3, ...] into the shape's axes."""
-        return _yawed(vectors, -self.yaw_rad)
+        return _rotated_about_z(vectors, -self.yaw_rad)
 
     def to_room(self, vectors: Floats) -> Floats:
         """Rotate vectors [3, ...] of the shape's axes into the room."""
-        return _yawed(vectors, self.yaw_rad)
+        return _rotated_about_z(vectors, self.yaw_rad)
 
     def local(self, points: Floats) -> Floats:
         """Return room points [3, N] in the shape's axes about its center, metres."""
@@ -50,7 +50,7 @@ class Shape:
         d = self.turned(directions) / self.half[:, None]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             enter, leave = _INTERVALS[self.kind](o, d)
-            hit = (enter < leave) & (enter > MIN_HIT)
+            hit = (enter < leave) & (enter > MIN_RAY_PARAMETER)
         return np.where(hit, enter, np.float32(np.inf)).astype(np.float32)
 
     def corners(self) -> NDArray[np.float64]:
@@ -70,7 +70,7 @@ def normalised(v: Floats) -> Floats:
     return (v / np.maximum(np.sqrt(dot(v, v)), 1e-9)).astype(np.float32)
 
 
-def _yawed(v: Floats, angle_rad: float) -> Floats:
+def _rotated_about_z(v: Floats, angle_rad: float) -> Floats:
     if angle_rad == 0.0:
         return v
     c, s = np.float32(np.cos(angle_rad)), np.float32(np.sin(angle_rad))
@@ -107,7 +107,7 @@ def _drum_interval(o: Floats, d: Floats) -> tuple[Floats, Floats]:
 _INTERVALS = {"box": _box_interval, "ball": _within_unit, "drum": _drum_interval}
 
 
-def surface(shape: Shape, points: Floats) -> tuple[Floats, Floats, Floats]:
+def surface_at(shape: Shape, points: Floats) -> tuple[Floats, Floats, Floats]:
     """Return outward normals [3, N] (room frame) and surface coordinates u, v [N] in metres at points on a shape.
 
     u, v run along the face of a box and the cap of a drum, around and up a ball or a drum's side.
@@ -139,7 +139,7 @@ class Rays:
 Windows = list[tuple[float, float, float, float] | None]
 
 
-def cast(shapes: Sequence[Shape], rays: Rays, windows: Windows | None = None) -> tuple[Floats, Indices]:
+def cast_rays(shapes: Sequence[Shape], rays: Rays, windows: Windows | None = None) -> tuple[Floats, Indices]:
     """Return the nearest hit of each ray: its parameter [N] (inf: none) and the index of the shape [N] (−1: none).
 
     `windows`, from `image_windows`, spares the shapes the pixels that cannot see them.

@@ -10,13 +10,13 @@ from sigmasplat.sources.room.shapes import Shape
 
 EDGE_M = 0.05
 """Faces are no longer than this along a shape's axes, so that a face is either seen or hidden."""
-LEAST_AROUND = 48
+MIN_SIDES = 48
 """Faces around a ball or a drum: a ball of 13 cm is then true to 0.3 mm."""
 
 Doubles = NDArray[np.float64]
 
 
-def triangles(shapes: Sequence[Shape]) -> Mesh:
+def triangulate(shapes: Sequence[Shape]) -> Mesh:
     """Return the outsides of all shapes as one mesh, in the room's frame; where shapes meet, nothing is cut away."""
     return Mesh.joined([_placed(shape, *patch) for shape in shapes for patch in _PATCHES[shape.kind](shape)])
 
@@ -56,7 +56,7 @@ def _box(shape: Shape) -> list[tuple[Doubles, NDArray[np.int32]]]:
 
 def _ball(shape: Shape) -> list[tuple[Doubles, NDArray[np.int32]]]:
     """Return a ball, from the south pole to the north pole."""
-    around = max(LEAST_AROUND, _cells(2 * np.pi * float(shape.half.max())))
+    around = max(MIN_SIDES, _cells(2 * np.pi * float(shape.half.max())))
     s, t, faces = _grid(around, around // 2)
     longitude, latitude = 2 * np.pi * s, np.pi * (t - 0.5)
     level = np.cos(latitude)
@@ -66,7 +66,7 @@ def _ball(shape: Shape) -> list[tuple[Doubles, NDArray[np.int32]]]:
 def _drum(shape: Shape) -> list[tuple[Doubles, NDArray[np.int32]]]:
     """Return a drum's side and caps."""
     radius = float(shape.half[:2].max())
-    around = max(LEAST_AROUND, _cells(2 * np.pi * radius))
+    around = max(MIN_SIDES, _cells(2 * np.pi * radius))
     s, t, faces = _grid(around, _cells(2 * shape.half[2]))
     side = np.stack([np.cos(2 * np.pi * s), np.sin(2 * np.pi * s), 2 * t - 1], -1)
     s, t, rings = _grid(around, _cells(radius))

@@ -28,7 +28,7 @@ class Material:
     gloss: float = 0.0
 
 
-def hashed(i: Floats, j: Floats | int, seed: int) -> Floats:
+def hash_cell(i: Floats, j: Floats | int, seed: int) -> Floats:
     """Give each integer cell (i, j) a number in [0, 1), the same on every machine."""
     a = np.atleast_1d(np.asarray(i, np.int32)).view(np.uint32) * np.uint32(0x9E3779B1)
     b = np.atleast_1d(np.asarray(j, np.int32)).view(np.uint32) * np.uint32(0x85EBCA77)
@@ -38,39 +38,39 @@ def hashed(i: Floats, j: Floats | int, seed: int) -> Floats:
     return ((h ^ (h >> np.uint32(15))) >> np.uint32(8)).astype(np.float32) / np.float32(1 << 24)
 
 
-def smooth(x: Floats) -> Floats:
+def smoothstep(x: Floats) -> Floats:
     """Rise from 0 at x ≤ 0 to 1 at x ≥ 1 with no kink."""
     x = np.clip(x, 0.0, 1.0)
     return (x * x * (3.0 - 2.0 * x)).astype(np.float32)
 
 
-def visible(detail_m: float, pixel_m: Floats) -> Floats:
+def detail_visibility(detail_m: float, pixel_m: Floats) -> Floats:
     """Return how much of a pattern with details of this size survives under pixels of that size, 1 … 0."""
-    return smooth(2.0 - 2.0 * pixel_m / np.float32(detail_m))
+    return smoothstep(2.0 - 2.0 * pixel_m / np.float32(detail_m))
 
 
 def noise(u: Floats, v: Floats, pixel_m: Floats, cell_m: float, seed: int) -> Floats:
     """Return smooth random values in [−1, 1], one independent value per lattice point `cell_m` apart."""
     x, y = u / np.float32(cell_m), v / np.float32(cell_m)
     i, j = np.floor(x), np.floor(y)
-    a, b = smooth(x - i), smooth(y - j)
-    low = hashed(i, j, seed) * (1 - a) + hashed(i + 1, j, seed) * a
-    high = hashed(i, j + 1, seed) * (1 - a) + hashed(i + 1, j + 1, seed) * a
-    return ((low * (1 - b) + high * b) * 2 - 1) * visible(cell_m, pixel_m)
+    a, b = smoothstep(x - i), smoothstep(y - j)
+    low = hash_cell(i, j, seed) * (1 - a) + hash_cell(i + 1, j, seed) * a
+    high = hash_cell(i, j + 1, seed) * (1 - a) + hash_cell(i + 1, j + 1, seed) * a
+    return ((low * (1 - b) + high * b) * 2 - 1) * detail_visibility(cell_m, pixel_m)
 
 
-def line(distance_m: Floats, width_m: float, pixel_m: Floats) -> Floats:
+def draw_line(distance_m: Floats, width_m: float, pixel_m: Floats) -> Floats:
     """Draw a line: 1 on it, 0 away from it; a line thinner than a pixel keeps its share of it."""
     soft = np.maximum(np.float32(width_m), pixel_m)
-    return smooth(1.0 - np.abs(distance_m) / soft) * (np.float32(width_m) / soft)
+    return smoothstep(1.0 - np.abs(distance_m) / soft) * (np.float32(width_m) / soft)
 
 
 def step(x_m: Floats, pixel_m: Floats, soft_m: float = 0.004) -> Floats:
     """Rise from 0 to 1 around x = 0 within a pixel's width."""
-    return smooth(0.5 + x_m / np.maximum(2 * pixel_m, np.float32(soft_m)))
+    return smoothstep(0.5 + x_m / np.maximum(2 * pixel_m, np.float32(soft_m)))
 
 
-def mixed(a: Color | Floats, b: Color | Floats, share: Floats) -> Floats:
+def mix(a: Color | Floats, b: Color | Floats, share: Floats) -> Floats:
     """Blend two colours by the share [N] of the second, [3, N]."""
     first, second = _column(a), _column(b)
     return (first + (second - first) * share).astype(np.float32)
@@ -96,13 +96,15 @@ def wood(color: Color, plank_m: float = 0.14, seed: int = 0, length_m: float = 1
 
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         row = np.floor(v / np.float32(plank_m))
-        along = u + hashed(row, 0, seed) * np.float32(length_m)
+        along = u + hash_cell(row, 0, seed) * np.float32(length_m)
         plank = np.floor(along / np.float32(length_m))
-        tone = (hashed(row, plank, seed + 1) - 0.5) * visible(plank_m, pixel_m)
+        tone = (hash_cell(row, plank, seed + 1) - 0.5) * detail_visibility(plank_m, pixel_m)
         grain = noise(u * 0.16, v, pixel_m, 0.016, seed + 2) + noise(u * 0.2, v, pixel_m, 0.045, seed + 3)
         across = np.abs(v / np.float32(plank_m) - row - 0.5) * np.float32(plank_m)
         ends = np.abs(along / np.float32(length_m) - plank - 0.5) * np.float32(length_m)
-        seam = np.maximum(line(across - plank_m / 2, 0.006, pixel_m), line(ends - length_m / 2, 0.006, pixel_m))
+        seam = np.maximum(
+            draw_line(across - plank_m / 2, 0.006, pixel_m), draw_line(ends - length_m / 2, 0.006, pixel_m)
+        )
         return _column(color) * (1.0 + 0.3 * tone + 0.09 * grain) * (1.0 - 0.4 * seam)
 
     return texture
@@ -113,11 +115,11 @@ def wallpaper(ground: Color, figure: Color, period_m: float, seed: int = 0) -> T
 
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         k = np.float32(2 * np.pi / period_m)
-        stripes = 0.35 * smooth(0.5 + 1.5 * np.sin(k * u)) * visible(period_m / 3, pixel_m)
+        stripes = 0.35 * smoothstep(0.5 + 1.5 * np.sin(k * u)) * detail_visibility(period_m / 3, pixel_m)
         flower = np.cos(k * u) * np.cos(k * v) + 0.55 * np.cos(2 * k * (u + v)) * np.cos(2 * k * (u - v))
-        flowers = 0.6 * smooth(2.2 * flower - 1.0) * visible(period_m / 5, pixel_m)
+        flowers = 0.6 * smoothstep(2.2 * flower - 1.0) * detail_visibility(period_m / 5, pixel_m)
         clouds = 0.05 * noise(u, v, pixel_m, 0.21, seed) + 0.05 * noise(u, v, pixel_m, 0.05, seed + 1)
-        return mixed(ground, figure, stripes + flowers) * (1.0 + clouds)
+        return mix(ground, figure, stripes + flowers) * (1.0 + clouds)
 
     return texture
 
@@ -129,12 +131,12 @@ def brick(color: Color, mortar: Color, seed: int = 0, width_m: float = 0.26, hei
         row = np.floor(v / np.float32(height_m))
         x = u / np.float32(width_m) + 0.5 * (row % 2)
         column = np.floor(x)
-        tone = (hashed(row, column, seed) - 0.5) * visible(height_m, pixel_m)
+        tone = (hash_cell(row, column, seed) - 0.5) * detail_visibility(height_m, pixel_m)
         rough = noise(u, v, pixel_m, 0.03, seed + 1)
-        joint_u = line((np.abs(x - column - 0.5) - 0.5) * width_m, 0.011, pixel_m)
-        joint_v = line((np.abs(v / np.float32(height_m) - row - 0.5) - 0.5) * height_m, 0.011, pixel_m)
+        joint_u = draw_line((np.abs(x - column - 0.5) - 0.5) * width_m, 0.011, pixel_m)
+        joint_v = draw_line((np.abs(v / np.float32(height_m) - row - 0.5) - 0.5) * height_m, 0.011, pixel_m)
         body = _column(color) * (1.0 + 0.32 * tone + 0.07 * rough)
-        return mixed(body, mortar, np.maximum(joint_u, joint_v))
+        return mix(body, mortar, np.maximum(joint_u, joint_v))
 
     return texture
 
@@ -144,10 +146,10 @@ def two_tone(upper: Color, lower: Color, height_m: float, seed: int = 0) -> Text
 
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         plaster = 0.04 * noise(u, v, pixel_m, 0.3, seed) + 0.05 * noise(u, v, pixel_m, 0.06, seed + 1)
-        paint = mixed(lower, upper, step(v - np.float32(height_m), pixel_m))
-        panel = line(np.abs(u / 0.5 - np.floor(u / 0.5) - 0.5) * 0.5 - 0.25, 0.012, pixel_m) * (v < height_m)
-        band = line(v - np.float32(height_m), 0.035, pixel_m)
-        return mixed(mixed(paint, (0.35, 0.33, 0.3), 0.5 * panel), (0.93, 0.91, 0.86), band) * (1.0 + plaster)
+        paint = mix(lower, upper, step(v - np.float32(height_m), pixel_m))
+        panel = draw_line(np.abs(u / 0.5 - np.floor(u / 0.5) - 0.5) * 0.5 - 0.25, 0.012, pixel_m) * (v < height_m)
+        band = draw_line(v - np.float32(height_m), 0.035, pixel_m)
+        return mix(mix(paint, (0.35, 0.33, 0.3), 0.5 * panel), (0.93, 0.91, 0.86), band) * (1.0 + plaster)
 
     return texture
 
@@ -158,8 +160,8 @@ def checks(a: Color, b: Color, size_m: float, seed: int = 0) -> Texture:
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         k = np.float32(np.pi / size_m)
         wave = np.sin(k * u) * np.sin(k * v)
-        share = 0.5 + (smooth(0.5 + 2.5 * wave) - 0.5) * visible(size_m, pixel_m)
-        return mixed(a, b, share) * (1.0 + 0.06 * noise(u, v, pixel_m, 0.02, seed))
+        share = 0.5 + (smoothstep(0.5 + 2.5 * wave) - 0.5) * detail_visibility(size_m, pixel_m)
+        return mix(a, b, share) * (1.0 + 0.06 * noise(u, v, pixel_m, 0.02, seed))
 
     return texture
 
@@ -169,8 +171,8 @@ def weave(a: Color, b: Color, period_m: float, seed: int = 0) -> Texture:
 
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         k = np.float32(2 * np.pi / period_m)
-        ribs = (np.sin(k * u) + np.sin(k * v)) * 0.25 * visible(period_m / 2, pixel_m)
+        ribs = (np.sin(k * u) + np.sin(k * v)) * 0.25 * detail_visibility(period_m / 2, pixel_m)
         worn = 0.35 * noise(u, v, pixel_m, 0.12, seed) + 0.25 * noise(u, v, pixel_m, 0.04, seed + 1)
-        return mixed(a, b, 0.5 + ribs + worn)
+        return mix(a, b, 0.5 + ribs + worn)
 
     return texture

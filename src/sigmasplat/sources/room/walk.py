@@ -7,13 +7,13 @@ from scipy.ndimage import gaussian_filter1d
 from sigmasplat.sources.room.furnish import HALF_X_M, PITCH_M
 from sigmasplat.types import Matrix
 
-FINE = 4000
+PATH_SAMPLES = 4000
 """Steps in which a path is measured."""
-CALM_M = 0.9
+YAW_SMOOTHING_M = 0.9
 """Standard deviation, along the way, of the average that smooths where the camera looks."""
 
 
-def path(frames: int, loops: int, rooms: int, seed: int, overrun: float = 0.0) -> Matrix:
+def camera_path(frames: int, loops: int, rooms: int, seed: int, overrun: float = 0.0) -> Matrix:
     """Return T_world_camera [frames, 4, 4], camera x right, y down, z forward; the last pose is the first one again,
     or `overrun` turns beyond it: what was seen at the start is then seen again from the same places.
 
@@ -51,18 +51,22 @@ def _corridor(loop: Matrix, rooms: int) -> tuple[Matrix, Matrix]:
     knots = np.array(corners)
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))])
     curve = CubicSpline(length, knots, bc_type="periodic")
-    fine = np.linspace(0.0, length[-1], FINE + 1)
+    fine = np.linspace(0.0, length[-1], PATH_SAMPLES + 1)
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve(fine), axis=0), axis=1))])
     where = np.interp(loop * travelled[-1], travelled, fine)
-    yaw_rad = _calm_yaw(curve(np.interp(np.linspace(0, travelled[-1], FINE + 1), travelled, fine), 1), travelled[-1])
-    return np.column_stack([curve(where), np.zeros(len(loop))]), np.interp(loop, np.linspace(0, 1, FINE + 1), yaw_rad)
+    yaw_rad = _smooth_yaw(
+        curve(np.interp(np.linspace(0, travelled[-1], PATH_SAMPLES + 1), travelled, fine), 1), travelled[-1]
+    )
+    return np.column_stack([curve(where), np.zeros(len(loop))]), np.interp(
+        loop, np.linspace(0, 1, PATH_SAMPLES + 1), yaw_rad
+    )
 
 
-def _calm_yaw(ahead: Matrix, length_m: float) -> Matrix:
+def _smooth_yaw(ahead: Matrix, length_m: float) -> Matrix:
     """Return the yaw of a closed path's directions, evenly spaced, averaged over `CALM_M` so that turns begin early."""
     turn = np.linspace(0.0, 2 * np.pi, len(ahead))
     wobble = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])) - turn
-    calm = gaussian_filter1d(wobble[:-1], CALM_M / length_m * FINE, mode="wrap")
+    calm = gaussian_filter1d(wobble[:-1], YAW_SMOOTHING_M / length_m * PATH_SAMPLES, mode="wrap")
     return np.asarray(turn + np.append(calm, calm[0]))
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from sigmasplat.errors import SourceError
-from sigmasplat.sources.files.optional import needed
+from sigmasplat.sources.files.optional import import_optional
 
 Message = Any
 Value = TypeVar("Value")
@@ -27,7 +27,7 @@ class Topic:
     """A name, the type of its messages (as sensor_msgs/msg/Image) and how many there are."""
 
     name: str
-    kind: str
+    msgtype: str
     count: int
 
 
@@ -47,8 +47,10 @@ class Bag:
         """Raises SourceError if the rosbags package is missing, or the file is damaged."""
         self.path, self._lock = path, threading.Lock()
         self.ros1 = path.is_file() and _magic(path).startswith(ROS1_MAGIC)
-        reader = needed("rosbags.rosbag1" if self.ros1 else "rosbags.rosbag2", "ros", f"{path}: a ROS bag").Reader
-        typesys = needed("rosbags.typesys", "ros", f"{path}: a ROS bag")
+        reader = import_optional(
+            "rosbags.rosbag1" if self.ros1 else "rosbags.rosbag2", "ros", f"{path}: a ROS bag"
+        ).Reader
+        typesys = import_optional("rosbags.typesys", "ros", f"{path}: a ROS bag")
         # Messages of the common types never changed; what a bag says of its own types is not needed, and may be wrong.
         self._types = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if self.ros1 else typesys.Stores.LATEST)
         if TRANSFORMS not in self._types.fielddefs:
@@ -62,11 +64,11 @@ class Bag:
             for name, info in self._guarded(lambda: self._reader.topics).items()
         }
 
-    def of_kind(self, *kinds: str) -> list[Topic]:
+    def topics_of_type(self, *types: str) -> list[Topic]:
         """Return the topics of these types that have messages, in order of name."""
-        return [topic for _, topic in sorted(self.topics.items()) if topic.kind in kinds and topic.count]
+        return [topic for _, topic in sorted(self.topics.items()) if topic.msgtype in types and topic.count]
 
-    def first(self, name: str) -> Message:
+    def first_message(self, name: str) -> Message:
         """Read a topic's first message. Raises SourceError if it is damaged."""
         return next(self.messages(name))
 
@@ -74,7 +76,7 @@ class Bag:
         """Read a topic's messages in order of recording. Raises SourceError if one is damaged."""
         return (self._decoded(name, raw) for _, _, raw in self._raw([name]))
 
-    def entries(self, *names: str) -> dict[str, list[Entry]]:
+    def index(self, *names: str) -> dict[str, list[Entry]]:
         """Go once through topics whose messages have headers. Raises SourceError if the bag is damaged."""
         found: dict[str, list[Entry]] = {name: [] for name in names}
         for name, recorded_ns, raw in self._raw(names):
@@ -83,7 +85,7 @@ class Bag:
             earlier.append(Entry(recorded_ns, place, self._stamp_ns(raw)))
         return found
 
-    def at(self, name: str, entry: Entry) -> Message:
+    def read(self, name: str, entry: Entry) -> Message:
         """Read one message. Raises SourceError if it is damaged."""
         with self._lock:
             found = [raw for _, _, raw in self._raw([name], entry.recorded_ns, entry.recorded_ns + 1)]
@@ -105,14 +107,14 @@ class Bag:
         return int(seconds) * 10**9 + int(nanoseconds)
 
     def _decoded(self, name: str, raw: bytes) -> Message:
-        kind = self.topics[name].kind
+        msgtype = self.topics[name].msgtype
         if not self.ros1:
-            return self._guarded(lambda: self._types.deserialize_cdr(raw, kind))
-        kind = TRANSFORMS if kind == "tf/msg/tfMessage" else kind  # its name before ROS Hydro
+            return self._guarded(lambda: self._types.deserialize_cdr(raw, msgtype))
+        msgtype = TRANSFORMS if msgtype == "tf/msg/tfMessage" else msgtype  # its name before ROS Hydro
         try:
-            return self._types.deserialize_ros1(raw, kind)
+            return self._types.deserialize_ros1(raw, msgtype)
         except Exception:  # RealSense's SDK appends the depth unit to images, four bytes that the type does not have
-            return self._guarded(lambda: self._types.deserialize_ros1(raw[:-4], kind))
+            return self._guarded(lambda: self._types.deserialize_ros1(raw[:-4], msgtype))
 
     def _guarded(self, call: Callable[[], Value]) -> Value:
         """Call the library; it fails in many ways on damaged files, and all of them mean: this bag is unreadable."""
@@ -133,9 +135,9 @@ def is_bag(path: Path) -> bool:
     return path.is_file() and _magic(path).startswith((ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC))
 
 
-def listed(topics: Iterable[Topic], most: int = 12) -> str:
+def list_topics(topics: Iterable[Topic], most: int = 12) -> str:
     """Write topics for a message: names, types, counts."""
-    words: Sequence[str] = [f"{t.name} ({t.kind.replace('/msg/', '/')}, {t.count})" for t in topics]
+    words: Sequence[str] = [f"{t.name} ({t.msgtype.replace('/msg/', '/')}, {t.count})" for t in topics]
     return ", ".join(words[:most]) + (f", … {len(words)} topics" if len(words) > most else "") or "no topic"
 
 

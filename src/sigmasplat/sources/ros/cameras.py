@@ -15,9 +15,9 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.sources.camera.calibration import Calibration, Lens, calibrated, camera_of
+from sigmasplat.sources.camera.calibration import Calibration, Distortion, build_camera, resolve_calibration
 from sigmasplat.sources.ros.bag import Bag, Message
-from sigmasplat.sources.ros.frames import T_frames, rigid
+from sigmasplat.sources.ros.tf import lookup_transform, rigid_transform
 from sigmasplat.sources.ros.topics import ImageTopic
 from sigmasplat.types import Matrix
 
@@ -32,22 +32,22 @@ class Optics:
     """A camera and its lens, None for no lens."""
 
     camera: Camera
-    lens: Lens | None
+    lens: Distortion | None
 
 
-def calibration_of(bag: Bag, color: ImageTopic, depth: ImageTopic, settings: InputConfig) -> Calibration:
+def read_bag_calibration(bag: Bag, color: ImageTopic, depth: ImageTopic, settings: InputConfig) -> Calibration:
     """Return what is known of the cameras, the settings' words in place of the bag's.
 
     Raises SourceError if the colour camera is unknown, or depth has a camera of its own and the bag does not say where.
     """
-    optics = optics_of(bag, color)
+    optics = read_optics(bag, color)
     units = depth_units(bag, depth)
     recorded = Calibration(optics.camera, units, optics.lens) if optics else None
-    calibration = calibrated(bag.path, recorded, color.size, settings, units)
+    calibration = resolve_calibration(bag.path, recorded, color.size, settings, units)
     told = settings.calibration or calibration.depth_camera or settings.register_depth == "off"
     if told or is_registered(color, depth):
         return calibration
-    depth_optics = optics_of(bag, depth)
+    depth_optics = read_optics(bag, depth)
     if depth_optics is None and depth.size == color.size:
         return calibration  # nothing says otherwise; `inspect` compares edges
     if depth_optics is None:
@@ -68,14 +68,14 @@ def is_registered(color: ImageTopic, depth: ImageTopic) -> bool:
     return depth.registered or (bool(depth.frame) and depth.frame == color.frame and not _sdk_stream(depth))
 
 
-def optics_of(bag: Bag, topic: ImageTopic) -> Optics | None:
+def read_optics(bag: Bag, topic: ImageTopic) -> Optics | None:
     """Read the CameraInfo of an image topic; None where there is none, or it is not filled in. Raises SourceError."""
-    infos = {info.name for info in bag.of_kind("sensor_msgs/msg/CameraInfo")}
+    infos = {info.name for info in bag.topics_of_type("sensor_msgs/msg/CameraInfo")}
     names = (f"{topic.camera}/camera_info", f"{topic.base.removesuffix('/image/data')}/info/camera_info")
     found = [name for name in names if name in infos]
     if not found:
         return None
-    info = bag.first(found[0])
+    info = bag.first_message(found[0])
     rectified, where = "rect" in topic.base.rpartition("/")[2], bag.path / found[0].lstrip("/")
     k = np.asarray(_field(info, "p")).reshape(3, 4)[:, :3] if rectified else np.asarray(_field(info, "k")).reshape(3, 3)
     if rectified and k[0, 0] <= 0:
@@ -83,7 +83,7 @@ def optics_of(bag: Bag, topic: ImageTopic) -> Optics | None:
     if k[0, 0] <= 0:
         return None
     width, height = int(info.width) or topic.size[0], int(info.height) or topic.size[1]
-    camera = camera_of(where, width, height, [float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2])])
+    camera = build_camera(where, width, height, [float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2])])
     return Optics(camera, None if rectified else _lens(f"{bag.path}: {found[0]}", info))
 
 
@@ -93,14 +93,14 @@ def depth_units(bag: Bag, depth: ImageTopic) -> float:
     name = f"{sensor}/option/Depth_Units/value"
     if name not in bag.topics or not bag.topics[name].count:
         return UNITS_PER_METRE
-    metres = float(bag.first(name).data)
+    metres = float(bag.first_message(name).data)
     return round(1.0 / metres, 3) if metres > 0 else UNITS_PER_METRE
 
 
 def _color_depth(bag: Bag, color: ImageTopic, depth: ImageTopic) -> Matrix:
     found = _sdk_color_depth(bag, color, depth)
     if found is None and color.frame and depth.frame:
-        found = T_frames(bag, color.frame, depth.frame)
+        found = lookup_transform(bag, color.frame, depth.frame)
     if found is None:
         raise SourceError(
             f"{bag.path}: nothing says where the depth camera ({depth.frame or depth.name}) is to the colour camera "
@@ -125,15 +125,15 @@ def _sdk_color_depth(bag: Bag, color: ImageTopic, depth: ImageTopic) -> Matrix |
 
 def _sdk_pose(bag: Bag, stream: str) -> Matrix | None:
     """Return T_stream_reference, None where the bag is not the SDK's."""
-    found = bag.of_kind("geometry_msgs/msg/Transform")
+    found = bag.topics_of_type("geometry_msgs/msg/Transform")
     names = [topic.name for topic in found if topic.name.startswith(f"{stream}/tf/")]
     if not (stream and names):
         return None
-    message = bag.first(names[0])
-    return rigid(f"{bag.path}: {names[0]}", message.translation, message.rotation)
+    message = bag.first_message(names[0])
+    return rigid_transform(f"{bag.path}: {names[0]}", message.translation, message.rotation)
 
 
-def _lens(where: str, info: Message) -> Lens | None:
+def _lens(where: str, info: Message) -> Distortion | None:
     """Return the lens in OpenCV's order. Raises SourceError if it is of a model that is not known."""
     values = [float(v) for v in _field(info, "d")]
     if not any(values):

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sigmasplat.errors import SourceError
-from sigmasplat.sources.files.images import color_of, metres, understood
+from sigmasplat.sources.files.images import decode_color, depth_to_metres, guard_decoding
 from sigmasplat.sources.ros.bag import Message
 
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-Kind = Literal["colour", "depth", ""]
+ImageKind = Literal["colour", "depth", ""]
 
 COLOR_ORDER = {
     "rgb8": (0, 1, 2),
@@ -34,7 +34,7 @@ DEPTH_TYPE = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 HEADER_BYTES = 12
 
 
-def kind_of(message: Message) -> Kind:
+def image_kind(message: Message) -> ImageKind:
     """Tell what an image message holds; "" for what is neither colour nor depth, as infrared."""
     if hasattr(message, "encoding"):
         return "colour" if message.encoding in COLOR_ORDER else "depth" if message.encoding in DEPTH_TYPE else ""
@@ -44,26 +44,26 @@ def kind_of(message: Message) -> Kind:
     return "" if text.startswith(("mono8", "8UC1")) else "colour"
 
 
-def size_of(path: Path, message: Message) -> tuple[int, int]:
+def message_size(path: Path, message: Message) -> tuple[int, int]:
     """Return (width, height) in pixels. Raises SourceError naming `path` if a compressed image has no header."""
     if hasattr(message, "encoding"):
         return int(message.width), int(message.height)
     data = message.data.tobytes()
     start = HEADER_BYTES if "compressedDepth" in message.format else 0
-    return understood(path, lambda: Image.open(io.BytesIO(data[start:])).size)
+    return guard_decoding(path, lambda: Image.open(io.BytesIO(data[start:])).size)
 
 
-def color_from(path: Path, message: Message) -> NDArray[np.uint8]:
+def decode_color_message(path: Path, message: Message) -> NDArray[np.uint8]:
     """Return 8-bit RGB [H, W, 3]. Raises SourceError naming `path` if the message is damaged or no colour image."""
     if not hasattr(message, "encoding"):
-        return color_of(path, message.data.tobytes())
+        return decode_color(path, message.data.tobytes())
     if message.encoding not in COLOR_ORDER:
         raise _encoding(path, "colour", message.encoding, COLOR_ORDER)
     pixels = _pixels(path, message, "u1", 4 if message.encoding in ("rgba8", "bgra8", "8UC4") else 3)
     return np.ascontiguousarray(pixels[..., COLOR_ORDER[message.encoding]])
 
 
-def depth_from(path: Path, message: Message, units_per_metre: float) -> NDArray[np.float32]:
+def decode_depth_message(path: Path, message: Message, units_per_metre: float) -> NDArray[np.float32]:
     """Return depth in metres [H, W], 0 = no reading; whole numbers are divided by `units_per_metre`.
 
     Raises SourceError naming `path` if the message is damaged or no depth image.
@@ -73,7 +73,7 @@ def depth_from(path: Path, message: Message, units_per_metre: float) -> NDArray[
     if message.encoding not in DEPTH_TYPE:
         raise _encoding(path, "depth", message.encoding, DEPTH_TYPE)
     raw = _pixels(path, message, DEPTH_TYPE[message.encoding], 1)[..., 0]
-    return metres(path, _without_nan(raw) if raw.dtype.kind == "f" else raw, units_per_metre)
+    return depth_to_metres(path, _without_nan(raw) if raw.dtype.kind == "f" else raw, units_per_metre)
 
 
 def _decompressed(path: Path, message: Message, units_per_metre: float) -> NDArray[np.float32]:
@@ -81,12 +81,12 @@ def _decompressed(path: Path, message: Message, units_per_metre: float) -> NDArr
         raise SourceError(f"{path}: depth is compressed as RVL, which is not read; republish it as PNG or raw")
     data = message.data.tobytes()
     has_header = "compressedDepth" in message.format
-    raw = understood(path, lambda: np.asarray(Image.open(io.BytesIO(data[HEADER_BYTES * has_header :]))))
+    raw = guard_decoding(path, lambda: np.asarray(Image.open(io.BytesIO(data[HEADER_BYTES * has_header :]))))
     if not (has_header and message.format.startswith("32FC1")):
-        return metres(path, raw, units_per_metre)
+        return depth_to_metres(path, raw, units_per_metre)
     a, b = struct.unpack_from("<ff", data, 4)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return metres(path, _without_nan(np.where(raw > 0, a / (raw - b), 0.0)), units_per_metre)
+        return depth_to_metres(path, _without_nan(np.where(raw > 0, a / (raw - b), 0.0)), units_per_metre)
 
 
 def _pixels(path: Path, message: Message, kind: str, channels: int) -> NDArray[Any]:

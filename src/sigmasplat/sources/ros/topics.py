@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 from sigmasplat.config.text import nearest
 from sigmasplat.errors import SourceError
-from sigmasplat.sources.ros.bag import Bag, listed
-from sigmasplat.sources.ros.images import COMPRESSED, RAW, Kind, kind_of, size_of
+from sigmasplat.sources.ros.bag import Bag, list_topics
+from sigmasplat.sources.ros.images import COMPRESSED, RAW, ImageKind, image_kind, message_size
 
-REGISTERED = ("aligned_depth_to_color", "depth_registered", "depth_to_rgb")
+REGISTERED_NAMES = ("aligned_depth_to_color", "depth_registered", "depth_to_rgb")
 """Names that drivers give to depth that has the colour image's pixels (RealSense; OpenNI, Kinect; Azure Kinect)."""
-NOT_DEPTH = ("infra", "/ir/", "confidence")
+NOT_DEPTH_NAMES = ("infra", "/ir/", "confidence")
 """Names of 16-bit images that are no depth."""
 
 
@@ -19,7 +19,7 @@ class ImageTopic:
     """A topic of images: what they hold, the optical frame they are in, and (width, height) of the first."""
 
     name: str
-    kind: Kind
+    kind: ImageKind
     frame: str
     size: tuple[int, int]
 
@@ -36,60 +36,63 @@ class ImageTopic:
     @property
     def registered(self) -> bool:
         """Whether its name says that it has the colour image's pixels."""
-        return any(words in self.name for words in REGISTERED)
+        return any(words in self.name for words in REGISTERED_NAMES)
 
 
-def color_topic(bag: Bag, asked: str) -> ImageTopic:
-    """Return the topic asked for, or the one of colour images. Raises SourceError if there is none, or several."""
-    found = [asked_topic(bag, asked)] if asked else images(bag, "colour")
-    best = _best(found, lambda topic: not any(word in topic.name.lower() for word in ("color", "rgb")))
-    return _only(bag, "colour", best, "color")
+def color_topic(bag: Bag, requested: str) -> ImageTopic:
+    """Return the topic requested for, or the one of colour images. Raises SourceError if there is none, or several."""
+    found = [topic_by_name(bag, requested)] if requested else image_topics(bag, "colour")
+    best = _preferred(found, lambda topic: not any(word in topic.name.lower() for word in ("color", "rgb")))
+    return _one_camera(bag, "colour", best, "color")
 
 
-def depth_topic(bag: Bag, asked: str) -> ImageTopic:
-    """Return the topic asked for, or the one of depth, registered to colour if there is one.
+def depth_topic(bag: Bag, requested: str) -> ImageTopic:
+    """Return the topic requested for, or the one of depth, registered to colour if there is one.
 
     Raises SourceError if there is none, or several.
     """
-    if asked:
-        return _only(bag, "depth", [asked_topic(bag, asked)], "depth")
-    found = [topic for topic in images(bag, "depth") if not any(word in topic.name.lower() for word in NOT_DEPTH)]
-    return _only(bag, "depth", _best(found, lambda topic: not topic.registered), "depth")
+    if requested:
+        return _one_camera(bag, "depth", [topic_by_name(bag, requested)], "depth")
+    found = [
+        topic for topic in image_topics(bag, "depth") if not any(word in topic.name.lower() for word in NOT_DEPTH_NAMES)
+    ]
+    return _one_camera(bag, "depth", _preferred(found, lambda topic: not topic.registered), "depth")
 
 
-def images(bag: Bag, kind: Kind) -> list[ImageTopic]:
+def image_topics(bag: Bag, kind: ImageKind) -> list[ImageTopic]:
     """Return the topics whose first message holds this kind. Raises SourceError if the bag is damaged."""
-    found = [_described(bag, topic.name) for topic in bag.of_kind(RAW, COMPRESSED)]
+    found = [_described(bag, topic.name) for topic in bag.topics_of_type(RAW, COMPRESSED)]
     return [topic for topic in found if topic.kind == kind]
 
 
-def asked_topic(bag: Bag, name: str) -> ImageTopic:
+def topic_by_name(bag: Bag, name: str) -> ImageTopic:
     """Return a topic by its name. Raises SourceError if it is none of images."""
-    topics = {topic.name: topic for topic in bag.of_kind(RAW, COMPRESSED)}
+    topics = {topic.name: topic for topic in bag.topics_of_type(RAW, COMPRESSED)}
     if name not in topics:
         raise SourceError(
-            f"{bag.path}: no images in topic {name}{nearest(name, list(topics))}; there are {listed(topics.values())}"
+            f"{bag.path}: no images in topic {name}{nearest(name, list(topics))}; "
+            f"there are {list_topics(topics.values())}"
         )
     return _described(bag, name)
 
 
 def _described(bag: Bag, name: str) -> ImageTopic:
-    message = bag.first(name)
-    size = size_of(bag.path / name.lstrip("/"), message)
-    return ImageTopic(name, kind_of(message), message.header.frame_id.lstrip("/"), size)
+    message = bag.first_message(name)
+    size = message_size(bag.path / name.lstrip("/"), message)
+    return ImageTopic(name, image_kind(message), message.header.frame_id.lstrip("/"), size)
 
 
-def _best(topics: list[ImageTopic], worse: Callable[[ImageTopic], bool]) -> list[ImageTopic]:
+def _preferred(topics: list[ImageTopic], worse: Callable[[ImageTopic], bool]) -> list[ImageTopic]:
     """Keep those that are not worse; all where every one is."""
     return [topic for topic in topics if not worse(topic)] or topics
 
 
-def _only(bag: Bag, what: str, topics: list[ImageTopic], option: str) -> ImageTopic:
+def _one_camera(bag: Bag, what: str, topics: list[ImageTopic], option: str) -> ImageTopic:
     """Return the one camera's topic: rectified before raw, uncompressed before compressed."""
     if not topics or any(topic.kind != what for topic in topics):
         raise SourceError(
             f"{bag.path}: no {what} images in {topics[0].name if topics else 'any topic'}; "
-            f"the bag holds {listed(bag.topics.values())}"
+            f"the bag holds {list_topics(bag.topics.values())}"
         )
     cameras = sorted({topic.camera for topic in topics})
     if len(cameras) > 1:

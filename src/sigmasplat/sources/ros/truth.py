@@ -5,10 +5,10 @@ import numpy as np
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.ros.bag import Bag, Message
-from sigmasplat.sources.ros.frames import T_frames, rigid
+from sigmasplat.sources.ros.tf import lookup_transform, rigid_transform
 from sigmasplat.types import Matrix
 
-KINDS = (
+POSE_TYPES = (
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "geometry_msgs/msg/TransformStamped",
@@ -16,22 +16,22 @@ KINDS = (
 )
 
 
-def truth_of(bag: Bag, camera_frame: str, recorded_time: bool) -> Trajectory | None:
+def read_truth(bag: Bag, camera_frame: str, recorded_time: bool) -> Trajectory | None:
     """Return the path of the colour camera where exactly one topic holds poses, else None.
 
     Where the messages name the body that moves, the bag's static transforms take the poses to the camera, and there is
     no truth where they do not lead there; where they do not (PoseStamped), the poses are taken to be the camera's.
     `recorded_time`: whether times are those of recording, not of the headers. Raises SourceError on a damaged pose.
     """
-    topics = bag.of_kind(*KINDS)
+    topics = bag.topics_of_type(*POSE_TYPES)
     if len(topics) != 1 or topics[0].count < 2:
         return None
     name = topics[0].name
-    entries, messages = bag.entries(name)[name], list(bag.messages(name))
+    entries, messages = bag.index(name)[name], list(bag.messages(name))
     body = getattr(messages[0], "child_frame_id", "").lstrip("/")
     T_body_camera = np.eye(4)
     if body and camera_frame and body != camera_frame:
-        found = T_frames(bag, body, camera_frame, moving=False)
+        found = lookup_transform(bag, body, camera_frame, use_tf=False)
         if found is None:
             return None
         T_body_camera = found
@@ -42,6 +42,6 @@ def truth_of(bag: Bag, camera_frame: str, recorded_time: bool) -> Trajectory | N
 
 def _pose(where: str, message: Message) -> Matrix:
     if hasattr(message, "transform"):
-        return rigid(where, message.transform.translation, message.transform.rotation)
+        return rigid_transform(where, message.transform.translation, message.transform.rotation)
     pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
-    return rigid(where, pose.position, pose.orientation)
+    return rigid_transform(where, pose.position, pose.orientation)

@@ -1,0 +1,173 @@
+"""Summarise the results on one screen: each figure is copied from a table, to which its row links.
+
+`tables.py` writes the summary where a document has <!-- bench:summary -->.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import record
+import tables
+from ablation import verdict_counts
+
+from sigmasplat.evaluation.paired_comparison import passed_by_chance
+
+SEQUENCES = ("livingroom", "synthetic", "redkitchen")
+
+
+@dataclass(frozen=True)
+class Results:
+    """The results of a folder, read table by table."""
+
+    folder: Path
+
+    def measured(self, name: str) -> dict[str, Any]:
+        """Return the newest results of a name. Raises KeyError without results."""
+        found = record.latest(name, self.folder)
+        if found is None:
+            raise KeyError(f"the summary needs the results {name!r}")
+        return found
+
+    def cell(self, name: str, title: str, row: Sequence[str], column: str) -> str:
+        """Return a cell of a table, from the first row that begins with `row`. Raises KeyError if there is none."""
+        for section in tables.sections(self.measured(name)):
+            for cells in section.rows if section.title == title and column in section.columns else ():
+                if tuple(cells[: len(row)]) == tuple(row):
+                    return cells[list(section.columns).index(column)].strip("*")
+        raise KeyError(f"the summary needs {column!r} of {', '.join(row)} in table {title!r} of {name}")
+
+    def each(self, title: str, column: str) -> str:
+        """Return a figure of the preset sigma on each sequence of the accuracy benchmark."""
+        return " · ".join(self.cell("accuracy", title, (name, "sigma"), column) for name in SEQUENCES)
+
+    def goals(self) -> tuple[int, int]:
+        """Return how many goals all results hold, and how many goals there are."""
+        measured = [record.read(path) for path in sorted(self.folder.glob("*.json"))]
+        rows = [row for m in measured for s in tables.sections(m) if s.title == "Goals" for row in s.rows]
+        return sum(row[-1] == "yes" for row in rows), len(rows)
+
+
+def weights_of_variance(results: Results) -> str:
+    """Count which figures the weights of σ² improve."""
+    measured = results.measured("ablation")
+    earlier = verdict_counts(measured, "+registration", "none")
+    final = verdict_counts(measured, "+final", "+registration")
+    chance = passed_by_chance(len(measured["seeds"]))
+    return (
+        f"**mostly within one deviation**: with σ² in tracking, loops and registration {earlier['helps']} of "
+        f"{earlier.total()} figures are better, {earlier['harms']} worse, {earlier['within the spread']} within one "
+        f"standard deviation ({chance:.0%} lie beyond it by chance); with σ² in the final map too {final['helps']} "
+        f"better, {final['harms']} worse of {final.total()}"
+    )
+
+
+def systems(results: Results) -> str:
+    """Compare the presets on the real sequence."""
+    presets = ("varsplat-fast", "loopsplat-fast", "cgslam-fast", "sigma")
+    found = {
+        p: [results.cell("systems", "redkitchen", (row,), p) for row in ("ATE, cm", "PSNR held-out, dB")]
+        for p in presets
+    }
+    return "redkitchen: " + "; ".join(f"`{preset}` {ate} cm, {psnr} dB" for preset, (ate, psnr) in found.items())
+
+
+def alignment(results: Results) -> str:
+    """Compare tracking by alignment with tracking by Adam."""
+    row = ("1", "Gauss–Newton, keyframe")
+    ratio = results.cell("tracking", "Ratios", row, "translation error / Adam's")
+    ms = [results.cell("tracking", "Pairs", ("1", method), "ms, median") for method in (row[1], "Adam, TUM's rates")]
+    return f"one frame after the keyframe: {ratio} × Adam's translation error, {ms[0]} ms instead of {ms[1]} ms"
+
+
+def coverage(results: Results) -> str:
+    """Give the share of poses whose error the covariance covers."""
+    rooms = ("synthetic:frames=200,noise=1", "synthetic:frames=200")
+    noisy, exact = (results.cell("tracking", "Consistency", (room, "all"), "in the band, %") for room in rooms)
+    return f"not fully: {noisy} % of the errors lie in the 95 % band with a sensor's noise, {exact} % with exact depth"
+
+
+def loops(results: Results) -> str:
+    """Give what closing loops does to the path under drift."""
+    ratio = results.cell("loops", "Goals", ("drift: ATE over that without loops, of means",), "measured")
+    wrong = results.cell("loops", "Goals", ("drift: false loops closed, all seeds",), "measured")
+    seeds = len(results.measured("loops")["seeds"])
+    return f"ATE × {ratio} (rooms with drift, mean of {seeds} seeds); false loops closed: {wrong}"
+
+
+def kernels(results: Results) -> str:
+    """Give the times of the main pieces of work."""
+    columns = {
+        "render all outputs": "forward, all outputs",
+        "track a frame": "track, Gauss–Newton",
+        "mapping iteration": "mapping iteration",
+    }
+    ms = {what: results.cell("cpu", "Times, ms", ("77 k, 320×240",), column) for what, column in columns.items()}
+    return f"77 k splats at 320×240: {', '.join(f'{what} {value} ms' for what, value in ms.items())}"
+
+
+def growth(results: Results) -> str:
+    """Give how time and memory grow over a long run."""
+    column = "measured"
+    frames, time, memory = (
+        results.cell("long-run", "Goals", (row,), column) for row in ("frames", "… mean", "resident memory, median")
+    )
+    return f"{frames} frames: the last quarter takes {time} × the time of the second, {memory} × its memory"
+
+
+def hard_sequence(results: Results) -> str:
+    """Give the error on the hardest sequence."""
+    ate, fast = (
+        results.cell("hololens", "Path and speed", ("hololens", p), "ATE, cm") for p in ("sigma", "varsplat-fast")
+    )
+    lost = results.cell("hololens", "Path and speed", ("hololens", "varsplat-fast"), "lost")
+    return f"`sigma` {ate} cm, `varsplat-fast` {fast} cm with {lost} frames lost"
+
+
+def speed(results: Results) -> str:
+    """Give frames per second, and the time of the final map beside it."""
+    finish = (results.cell("systems", name, ("finish, s",), "sigma") for name in SEQUENCES)
+    return f"{results.each('Path and speed', 'frames/s')}; then the final map, s: {' · '.join(finish)}"
+
+
+def goals(results: Results) -> str:
+    """Count the goals that are held."""
+    held, total = results.goals()
+    return f"{held} of {total}; the others are marked **no**"
+
+
+def each(title: str, column: str) -> Callable[[Results], str]:
+    """Give a figure of the preset sigma on each sequence."""
+    return lambda results: results.each(title, column)
+
+
+PATH, MAP = "Path and speed", "Map and uncertainty"
+ROWS: tuple[tuple[str, Callable[[Results], str], tuple[str, ...]], ...] = (
+    ("Error of the path (ATE), cm", each(PATH, "ATE, cm"), ("accuracy",)),
+    ("Frames per second", speed, ("accuracy", "systems")),
+    ("Peak memory, MiB", each(PATH, "peak memory, MiB"), ("accuracy",)),
+    ("Held-out views, PSNR, dB", each(MAP, "PSNR held-out, dB"), ("accuracy",)),
+    ("Held-out views, depth L1, cm", each(MAP, "depth L1 held-out, cm"), ("accuracy",)),
+    ("Does V rank the errors? (Spearman, 1 = perfectly)", each(MAP, "Spearman V ~ error²"), ("accuracy",)),
+    ("Do the weights of σ² help?", weights_of_variance, ("ablation",)),
+    ("Which preset? (ATE, PSNR)", systems, ("systems",)),
+    ("Alignment or Adam for tracking?", alignment, ("tracking",)),
+    ("Does the pose covariance cover the error?", coverage, ("tracking",)),
+    ("Do loops help?", loops, ("loops", "loops-real")),
+    ("How fast are the kernels?", kernels, ("cpu",)),
+    ("Does a long run slow down?", growth, ("long-run", "viewer-memory")),
+    ("A sequence it finds hard (hololens, ATE)", hard_sequence, ("hololens",)),
+    ("Goals held, all results", goals, ()),
+)  # fmt: skip
+"""Question, answer, results it is taken from."""
+
+
+def table(folder: Path = record.RESULTS) -> str:
+    """Write the summary as a markdown table. Raises KeyError if a result is missing."""
+    results = Results(folder)
+    head = ["question", f"result ({' · '.join(SEQUENCES)})", "tables"]
+    lines = [head, ["---"] * 3]
+    for question, answer, names in ROWS:
+        lines.append([question, answer(results), ", ".join(f"[{name}](#{name})" for name in names) or "all"])
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)

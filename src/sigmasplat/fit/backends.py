@@ -1,0 +1,111 @@
+"""The table of devices: what each backend does for the fits. Nothing else in `fit` or above chooses by device."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+from torch import Tensor
+
+from sigmasplat.errors import ConfigError
+from sigmasplat.fit import adam, tracking_loss
+from sigmasplat.fit.color_covariance import FullCovarianceStep
+from sigmasplat.fit.cpu import adam as cpu_adam, images as cpu_images, tracking_loss as cpu_tracking_loss
+from sigmasplat.fit.cpu.mapping_step import CompiledImages, CompiledStep
+from sigmasplat.fit.cpu.reference_maps import reference_maps as cpu_reference_maps
+from sigmasplat.fit.cuda import descent as cuda_descent, images as cuda_images, rows as cuda_rows
+from sigmasplat.fit.cuda.mapping_step import CudaStep, covariance_step
+from sigmasplat.fit.cuda.view_dependent import CudaViewDependentStep
+from sigmasplat.fit.descent import descend
+from sigmasplat.fit.fused_terms import fused_terms
+from sigmasplat.fit.interface import DeviceFits, MappingStep, Twist, Weights
+from sigmasplat.fit.mapping_step import TorchStep
+from sigmasplat.fit.reference_maps import reference_arrays, reference_maps
+from sigmasplat.fit.view_dependent import ViewDependentStep
+from sigmasplat.model.field import GaussianField
+from sigmasplat.render.backend import make_covariance_view
+from sigmasplat.render.view import CorrelationView, View
+from sigmasplat.types import Matrix
+
+
+def _on_host(twists: Sequence[Twist], costs: Sequence[float | Tensor]) -> tuple[list[Matrix], list[float]]:
+    return [np.asarray(twist) for twist in twists], [float(cost) for cost in costs]
+
+
+def _torch_covariance_step(view: CorrelationView) -> FullCovarianceStep:
+    return FullCovarianceStep(view, TorchStep(view))
+
+
+def _cpu_covariance_step(view: CorrelationView) -> FullCovarianceStep:
+    return FullCovarianceStep(view, CompiledImages(view))
+
+
+TORCH = DeviceFits(
+    mapping_step=TorchStep,
+    covariance_step=_torch_covariance_step,
+    view_dependent_step=ViewDependentStep,
+    settle=adam.settle,
+    to_host=_on_host,
+    tracking_loss=tracking_loss.tracking_gradient,
+    descend=descend,
+    reference_maps=reference_arrays,
+    live_planes=cpu_images.live_planes,
+    images=cpu_images.CPU_IMAGES,
+    aligns=False,
+)
+CPU = replace(
+    TORCH,
+    mapping_step=CompiledStep,
+    covariance_step=_cpu_covariance_step,
+    settle=cpu_adam.settle,
+    tracking_loss=cpu_tracking_loss.tracking_gradient,
+    descend=partial(descend, tracking_loss=cpu_tracking_loss.tracking_gradient),
+    reference_maps=cpu_reference_maps,
+    aligns=True,
+)
+CUDA = replace(
+    TORCH,
+    mapping_step=CudaStep,
+    covariance_step=covariance_step,
+    view_dependent_step=CudaViewDependentStep,
+    to_host=cuda_rows.to_host,
+    descend=cuda_descent.descend_on_device,
+    reference_maps=reference_maps,
+    live_planes=cuda_images.live_planes,
+    images=cuda_images.CUDA_IMAGES,
+    aligns=True,
+)
+DEVICES = {"reference": TORCH, "cpu": CPU, "cuda": CUDA}
+
+
+class OnBackend(Protocol):
+    """Anything that names its backend: a view, a pyramid."""
+
+    @property
+    def backend(self) -> str: ...
+
+
+def fits_of(on: OnBackend) -> DeviceFits:
+    """Return what the backend of a view or a pyramid does for the fits."""
+    return DEVICES[on.backend]
+
+
+def step_for(field: GaussianField, view: View, weights: Weights, degree: int) -> MappingStep:
+    """Make the step that fits a field on a view; degree: of view-dependent colour.
+
+    The device's kernels compute the loss where they have every term that has weight; else the whole loss runs in torch.
+    Raises ConfigError where full colour covariance meets terms that its view has no maps for.
+    """
+    full = bool(weights["nll_color_full"])
+    if full and (weights["median_depth"] or weights["moment"]):
+        raise ConfigError(
+            "mapping.color_covariance full goes without weight_alignment and weight_moment; set both to 0"
+        )
+    used = {name for name, weight in weights.items() if weight} - {"nll_color_full"}
+    fits = fits_of(view) if used <= fused_terms(view.backend) else TORCH
+    if full:
+        step = fits.covariance_step(make_covariance_view(view, field.carry("correlations")))
+    else:
+        step = fits.mapping_step(view)
+    return fits.view_dependent_step(step, degree) if degree else step

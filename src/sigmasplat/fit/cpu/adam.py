@@ -1,0 +1,14 @@
+"""Adam's settling of a field in the compiled CPU kernels (native/adam.h)."""
+
+from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates
+from sigmasplat.model.field import Rows
+
+
+def settle(field: Rows, rates: Rates) -> None:
+    """Do what `fit.adam.settle` does, for rows of a field's 17 columns."""
+    from sigmasplat.native import _core
+
+    _core.adam_settle(
+        field.params, field.moment1, field.moment2, field.last_step, rates.per_column.numpy(),
+        BETA1, BETA2, EPSILON, field.steps,
+    )  # fmt: skip

@@ -1,0 +1,86 @@
+"""Halve and align images in the host's memory: numpy, and the compiled CPU kernels (native/align.h)."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from sigmasplat.fit.gray import Image, gray_of
+from sigmasplat.fit.interface import NORMAL_TERMS, AlignedPose, AlignRules, ImageKernels, LevelPlanes
+from sigmasplat.fit.target import Target
+from sigmasplat.render.backend import backend_module
+from sigmasplat.render.view import View
+from sigmasplat.types import Matrix
+
+if TYPE_CHECKING:
+    from sigmasplat.native import _core
+
+Half = Image | None
+
+
+def halve(averaged: tuple[Half, Half], depth: Half) -> tuple[Half, Half, Half]:
+    """Do what `ImageKernels.halve` says."""
+    first, second = (None if image is None else np.asarray(_quarter(image).mean(0)) for image in averaged)
+    return first, second, None if depth is None else _half_depth(depth)
+
+
+def _quarter(image: Image) -> Image:
+    """Stack the four pixels of each 2×2 cell, [4, H/2, W/2]."""
+    h, w = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
+    return np.stack([image[0:h:2, 0:w:2], image[0:h:2, 1:w:2], image[1:h:2, 0:w:2], image[1:h:2, 1:w:2]])
+
+
+def _half_depth(depth: Image) -> Image:
+    """Average 2×2 cells that lie on one surface; a cell with a hole or a step has no reading."""
+    cells = _quarter(depth)
+    near, far = cells.min(0), cells.max(0)
+    return np.where((near > 0) & (far - near < 0.05), cells.mean(0), np.float32(0.0))
+
+
+def readings_of(finest: Image, coarsest: Image) -> Matrix:
+    """Do what `ImageKernels.readings_of` says."""
+    read = coarsest[coarsest > 0]
+    return np.array([float(read.mean()) if len(read) else 1.0, float((finest > 0).sum())])
+
+
+def align(levels: Sequence[LevelPlanes], readings: Matrix, T_live_reference: Matrix, rules: AlignRules) -> AlignedPose:
+    """Align from the coarsest level, the last, to the finest, in one call of the kernels.
+
+    Raises BackendError where they are not built.
+    """
+    backend_module("cpu")  # refuses in one line where the kernels are not built
+    from sigmasplat.native import _core
+
+    (depth_m, n), T, sums = readings.tolist(), np.array(T_live_reference, np.float64), np.zeros(4)
+    r = rules
+    steps, degenerate = _core.align_images(
+        [_laid_out(level) for level in levels], r.iterations, r.update_stop, r.plateau_stop, depth_m,
+        r.degenerate_share, r.min_pixels, T, sums,
+    )  # fmt: skip
+    return AlignedPose(T, sums, steps, degenerate, depth_m, n)
+
+
+def normal_equations(level: LevelPlanes, motions: Sequence[Matrix]) -> Matrix:
+    """Do what `ImageKernels.normal_equations` says."""
+    from sigmasplat.native import _core
+
+    rows, laid_out = np.zeros((len(motions), NORMAL_TERMS)), _laid_out(level)
+    for row, T in zip(rows, motions, strict=True):
+        _core.align_step(laid_out, T, row[:21], row[21:27], row[31:], row[27:31])
+    return rows
+
+
+def _laid_out(level: LevelPlanes) -> "_core.Level":
+    from sigmasplat.native import _core
+
+    planes: tuple[Any, ...] = level
+    return _core.Level(*planes)
+
+
+def live_planes(view: View, color: Image, depth_m: Image, target: Target) -> tuple[Image, Image]:
+    """Return gray and depth [H, W] of a frame."""
+    return gray_of(color), depth_m
+
+
+CPU_IMAGES = ImageKernels(np.ascontiguousarray, torch.tensor, halve, readings_of, align, normal_equations)

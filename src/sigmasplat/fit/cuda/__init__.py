@@ -1,0 +1,1 @@
+"""What the CUDA kernels do for the fits. Experimental: this code has never run on a GPU."""

@@ -1,0 +1,179 @@
+"""Descend the tracking loss as `fit.descent` does, on a CUDA device alone (native/cuda/track.cuh, descend.cuh).
+
+An iteration is launched and not waited for: loss, gradient, pose, stop rules and what was best stay on the device. The
+host looks at them now and then, at what was true some iterations ago. That it launches too many by then does no harm:
+where the descent has stopped they change nothing.
+"""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.config import TrackingConfig
+from sigmasplat.fit.adam import BETA1, BETA2, EPSILON
+from sigmasplat.fit.descent import exposure_rate
+from sigmasplat.fit.interface import Descent
+from sigmasplat.fit.motion import parametrisation
+from sigmasplat.fit.target import Target
+from sigmasplat.fit.tracking_loss import tracking_params
+from sigmasplat.render.cuda.graph import Work, repeatable
+from sigmasplat.render.cuda.launch import THREADS, blocks_for
+from sigmasplat.render.cuda.view import CudaView
+from sigmasplat.types import Matrix
+
+MEDIANS, PASSES, DIGITS = 5, 3, 2048
+"""Of errors of depth and colour and of three channels of V; counts by 11, 10 and 10 bits (native/cuda/track.cuh)."""
+MOST_BLOCKS = 512
+"""Blocks that share an image's pixels."""
+LOOK = 8
+"""So many iterations are launched at once; meanwhile the host looks at what those before led to."""
+GRAPH_FROM = 12
+"""With fewer iterations to go a graph is not worth its making."""
+STATE = np.dtype(
+    [
+        ("numbers", "f8", 7), ("moment1", "f8", 9), ("moment2", "f8", 9), ("exposure", "f8", 2),
+        ("best_exposure", "f8", 2), ("T", "f8", (3, 4)), ("best_T", "f8", (3, 4)), ("first", "f8"), ("best", "f8"),
+        ("previous", "f8"), ("steps", "i8"), ("stopped", "i8"), ("missing", "i8"),
+    ]
+)  # fmt: skip
+"""The kernels' `Descending` (native/cuda/descend.cuh)."""
+
+
+def descend_on_device(
+    params: Tensor, view: CudaView, target: Target, T_camera_world: Matrix, config: TrackingConfig, iterations: int
+) -> Descent:
+    """Do what `descend` does. Raises BackendError where pairs of splats and tiles cannot be numbered."""
+    if view.raster.capacity is None:
+        view.forward(params, T_camera_world)  # says how many pairs to expect
+    return CudaDescent(params, view, target, T_camera_world, config).run(iterations)
+
+
+class CudaTrackingLoss:
+    """L_track of a view's planes against a target, under an exposure (exp(a), b) float32 [2] on the device."""
+
+    def __init__(self, view: CudaView, target: Target, config: TrackingConfig, exposure: Tensor) -> None:
+        c, empty, pixels = config, view.raster.empty, view.alpha.numel()
+        self.view, self.blocks = view, min(blocks_for(pixels), MOST_BLOCKS)
+        self._errors = c.outlier_factor > 0 or c.outlier_factor_color > 0
+        self._weigh, self._kept = c.uncertainty and len(view.sums) == 7, c.average == "kept"
+        self._tally = empty(MEDIANS * PASSES * DIGITS + 2, dtype=torch.int32)
+        self._selection = (self._tally, empty(MEDIANS, PASSES, 2, dtype=torch.int32))
+        images = (view.sums, view.alpha, target.color, target.depth, pixels, self.blocks * THREADS)
+        self._given = (images, np.array(tracking_params(c, c.alpha_above), np.float32), exposure, self._selection)
+
+    def launch(self) -> Tensor:
+        """Write the gradient to the view's planes; return loss and gradient by (a, b), to be added up [blocks, 3]."""
+        self._tally.zero_()
+        for kernel in ["count_errors"] * self._errors + ["count_variances"] * self._weigh:
+            for digit in range(PASSES):
+                self._on_pixels(kernel, digit)
+        kept = self._tally[-2:] if self._kept else None
+        if kept is not None:
+            self._on_pixels("count_kept", kept)
+        sums = self.view.raster.empty(self.blocks, 3, dtype=torch.float64)
+        planes = self.view.g_sums
+        self._on_pixels("tracking_loss", kept, int(self._weigh), len(planes), planes, sums)
+        return sums
+
+    def _on_pixels(self, kernel: str, *further: Tensor | int | None) -> None:
+        self.view.raster.launch_fit(kernel, self.blocks, *self._given, *further)
+
+
+class CudaDescent:
+    """One descent and its buffers on the device."""
+
+    def __init__(
+        self, params: Tensor, view: CudaView, target: Target, T_camera_world: Matrix, config: TrackingConfig
+    ) -> None:
+        self.params, self.view, self.config = params.contiguous(), view, config
+        self._axis = int(config.parametrisation == "axis-angle")
+        state, device = _at_rest(T_camera_world, config), view.alpha.device
+        self._state = torch.from_numpy(np.frombuffer(state.tobytes(), np.int64).copy()).to(device)
+        self._shown = torch.from_numpy(_shown(state["T"])).to(device)
+        self._numbers = _settings(T_camera_world, config)
+        self._pose = self._shown[:16]
+        self.loss = CudaTrackingLoss(view, target, config, self._shown[16:])
+
+    def run(self, iterations: int) -> Descent:
+        """Take so many steps, fewer where a rule stops them. Where there was not room for all pairs, make it and go on
+        from the step that was not taken."""
+        work, left, at_once, look = self.iterate, iterations, 1, _Look(self._state)
+        while left:
+            for _ in range(min(at_once, left)):
+                work()
+            left -= min(at_once, left)
+            earlier, look, at_once = look, _Look(self._state), LOOK
+            seen = (earlier if left else look).read()
+            if seen["stopped"]:
+                break
+            if seen["missing"]:
+                left, look = self._make_room(iterations)
+                work = self.iterate
+            if work == self.iterate and self.config.cuda_graphs and left >= GRAPH_FROM:
+                work = self._graph()
+        return _found(look.read())
+
+    def iterate(self) -> None:
+        """Launch one iteration."""
+        self.view.follow(self.params, self._pose)
+        losses = self.loss.launch()
+        twists = self.view.follow_back(self.params, self._pose)
+        self.view.raster.launch_fit(
+            "descend", 1, self._state, self._shown, self._numbers, self._axis, losses, len(losses), twists, len(twists),
+            self.view.raster.pairs,
+        )  # fmt: skip
+
+    def _graph(self) -> Work:
+        return repeatable(self.iterate, self.view.alpha.device)
+
+    def _make_room(self, iterations: int) -> "tuple[int, _Look]":
+        """Make room for the pairs that were missing; return how many steps are to be taken yet."""
+        now = _Look(self._state).read()
+        self.view.raster.expect(int(now["missing"]))
+        self._state[-1] = 0
+        return iterations - int(now["steps"]), _Look(self._state)
+
+
+class _Look:
+    """A descent's state as it is now in the device's order of work, on its way to the host; nobody waits."""
+
+    def __init__(self, state: Tensor) -> None:
+        self._here = torch.empty(state.shape, dtype=state.dtype, pin_memory=state.is_cuda)
+        self._here.copy_(state, non_blocking=state.is_cuda)
+        self._arrived: torch.cuda.Event | None = None
+        if state.is_cuda:
+            self._arrived = torch.cuda.Event()  # type: ignore[no-untyped-call]
+            self._arrived.record(torch.cuda.current_stream(state.device))
+
+    def read(self) -> np.void:
+        """Return the state as a `STATE`. Waits until it has arrived."""
+        if self._arrived is not None:
+            self._arrived.synchronize()
+        state: np.void = np.frombuffer(self._here.numpy().tobytes(), STATE)[0]
+        return state
+
+
+def _at_rest(T_camera_world: Matrix, config: TrackingConfig) -> NDArray[np.void]:
+    way, state = parametrisation(config, T_camera_world), np.zeros((), STATE)
+    numbers = way.start
+    state["numbers"][: len(numbers)], state["T"], state["best_T"] = numbers, way.pose(numbers)[:3], T_camera_world[:3]
+    state["first"] = state["best"] = state["previous"] = np.inf
+    return state
+
+
+def _shown(T: Matrix) -> NDArray[np.float32]:
+    """Lay out the kernels' `Shown`: T_camera_world [4, 4] of a pose [3, 4], no exposure."""
+    return np.concatenate([T.ravel(), [0, 0, 0, 1], [1, 0]]).astype(np.float32)
+
+
+def _settings(T_camera_world: Matrix, config: TrackingConfig) -> Matrix:
+    """Lay out the kernels' `DescentNumbers`."""
+    c = config
+    rates = [c.lr_rotation, c.lr_translation, exposure_rate(c)]
+    return np.array([*T_camera_world[:3].ravel(), BETA1, BETA2, EPSILON, *rates, c.update_stop, c.plateau_stop])
+
+
+def _found(state: np.void) -> Descent:
+    T, (a, b) = np.vstack([state["best_T"], [0.0, 0.0, 0.0, 1.0]]), state["best_exposure"].tolist()
+    return Descent(T, (a, b), float(state["first"]), float(state["best"]), int(state["steps"]))

@@ -1,0 +1,56 @@
+"""Halve images on a CUDA device (native/cuda/align.cu), to the same values as on the CPU; the host does not wait."""
+
+import torch
+from torch import Tensor
+
+from sigmasplat.fit.cuda.align import align, normal_equations
+from sigmasplat.fit.gray import luma
+from sigmasplat.fit.interface import ImageKernels, Plane
+from sigmasplat.fit.target import Target
+from sigmasplat.native.cuda.cubins import ALIGNING
+from sigmasplat.render.cuda import launch as cuda_launch
+from sigmasplat.render.cuda.launch import blocks_for
+from sigmasplat.render.view import View
+
+Half = Tensor | None
+
+
+def halve(averaged: tuple[Half, Half], depth: Half) -> tuple[Half, Half, Half]:
+    """Do what `ImageKernels.halve` says."""
+    given = (*averaged, depth)
+    one = next((image for image in given if image is not None), None)
+    if one is None:
+        return None, None, None
+    height, width = one.shape
+    size = (height // 2, width // 2)
+    halves = [None if image is None else torch.empty(size, device=one.device) for image in given]
+    cuda_launch.launcher_for(one.device)(
+        ALIGNING, "halve_images", blocks_for(size[0] * size[1]), averaged, (halves[0], halves[1]), depth,
+        halves[2], width, height,
+    )  # fmt: skip
+    return halves[0], halves[1], halves[2]
+
+
+def readings_of(finest: Tensor, coarsest: Tensor) -> Tensor:
+    """Do what `ImageKernels.readings_of` says; the result stays on the device."""
+    read = coarsest > 0
+    n = read.sum()
+    mean = torch.where(read, coarsest, 0.0).double().sum() / n.clamp(min=1)
+    return torch.stack([torch.where(n > 0, mean, 1.0), (finest > 0).sum().double()])
+
+
+def live_planes(view: View, color: Plane, depth_m: Plane, target: Target) -> tuple[Tensor, Tensor]:
+    """Return gray and depth [H, W] of a frame on the view's device, from the target's copy there."""
+    on_device, (h, w) = target.on(view.sums.device), depth_m.shape
+    return luma(on_device.color[:, :h, :w]), on_device.depth_image
+
+
+def _contiguous(plane: Tensor) -> Tensor:
+    return plane.contiguous()
+
+
+def _as_tensor(plane: Tensor) -> Tensor:
+    return plane
+
+
+CUDA_IMAGES = ImageKernels(_contiguous, _as_tensor, halve, readings_of, align, normal_equations)

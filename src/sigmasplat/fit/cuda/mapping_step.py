@@ -1,0 +1,105 @@
+"""One mapping step fused in the CUDA kernels (native/cuda/fit.cu); tests hold it to `TorchStep`."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.fit.adam import Rates
+from sigmasplat.fit.cuda.rows import CudaAccumulator, add_shape_gradient, step_rows
+from sigmasplat.fit.fused_terms import pixel_weights
+from sigmasplat.fit.interface import Accumulator, Weights, one_image_only
+from sigmasplat.fit.mapping_step import render_for
+from sigmasplat.fit.target import Target
+from sigmasplat.model.field import GaussianField
+from sigmasplat.render.cuda.covariance_view import CudaCovarianceView
+from sigmasplat.render.cuda.launch import blocks_for
+from sigmasplat.render.cuda.view import CudaView
+from sigmasplat.render.view import CorrelationView
+from sigmasplat.types import Matrix
+
+TILE = 16
+CHANNELS = 3
+
+
+class CudaStep:
+    """The image terms, the way back and Adam's step on a device. The host waits for none of it until `to_host`.
+
+    On a view of ten planes it fits the full colour covariance, as `FullCovarianceStep` does.
+    """
+
+    def __init__(self, view: CudaView) -> None:
+        self.view = view
+        (height, width), device = view.alpha.shape, view.alpha.device
+        self._size, self._pixels = (width, height), width * height
+        self._derivatives = torch.empty(3 * CHANNELS, height, width, device=device)
+        self._taps = _gaussian_taps()
+
+    def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
+        """Render the field to the view's planes."""
+        render_for(self.view, field.params, T_camera_world, target, weights)
+
+    def images(self, target: Target, weights: Weights) -> Tensor:
+        """Write the gradient of every image term to the view's gradient planes; return the loss, on the device."""
+        v, per_pixel = self.view, 1.0 / max(target.valid_pixels, 1)
+        of_pixels = pixel_weights(weights, "cuda", variance=len(v.sums) >= 7).astype(np.float32)
+        median, on_median = (v.layers.median_depth, v.g_median_depth) if weights.get("median_depth") else (None, None)
+        moment, on_moment = (v.moment, v.g_moment) if weights.get("moment") else (None, None)
+        planes = (v.sums, target.color, target.depth, median, moment, v.g_sums, on_median, on_moment)
+        blocks = blocks_for(self._pixels)
+        sums = v.raster.empty(blocks, 1, dtype=torch.float64)
+        v.raster.launch_fit(
+            "mapping_losses", blocks, planes, self._pixels, int(len(v.sums) >= 7), per_pixel, of_pixels, sums,
+        )  # fmt: skip
+        loss = sums.sum()
+        if isinstance(v, CudaCovarianceView):
+            loss = loss + self._full_covariance(target, weights.get("nll_color_full", 0.0) * per_pixel / CHANNELS)
+        return loss + self._ssim(target, weights["ssim"]) if weights["ssim"] else loss
+
+    def _full_covariance(self, target: Target, weight: float) -> Tensor:
+        raster, blocks = self.view.raster, blocks_for(self._pixels)
+        costs = raster.empty(blocks, 1, dtype=torch.float64)
+        planes = (self.view.sums, target.color, target.depth)
+        raster.launch_fit("nll_color_full", blocks, *planes, self._pixels, weight, self.view.g_sums, costs)
+        return costs.sum()
+
+    def _ssim(self, target: Target, weight: float) -> Tensor:
+        v, (width, height) = self.view, self._size
+        blocks = CHANNELS * -(-width // TILE) * -(-height // TILE)
+        given = (v.sums, target.color, target.depth, width, height, self._taps)
+        sums = v.raster.empty(blocks, 1, dtype=torch.float64)
+        v.raster.launch_fit("ssim", blocks, *given, self._derivatives, sums)
+        values = CHANNELS * self._pixels
+        v.raster.launch_fit("ssim_backward", blocks, *given, self._derivatives, -weight / values, v.g_sums)
+        return weight * (1.0 - sums.sum() / values)
+
+    def splats(
+        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Do what `TorchStep.splats` does, or `FullCovarianceStep.splats`; twist and cost stay on the device."""
+        view, gradient = self.view, torch.empty_like(field.params)
+        twist, visible = view.backward_there(field.params, gradient, grad2d), view.raster.visible
+        cost = add_shape_gradient(view, visible, field, gradient, weights, frozen_colors)
+        step_rows(view, visible, field, gradient, rates)
+        if isinstance(view, CudaCovarianceView):
+            view.correlations.steps += 1
+            step_rows(view, visible, view.correlations, view.g_correlations, rates.of_extra("correlations"))
+        return twist, cost
+
+    def accumulator(self, field: GaussianField) -> Accumulator:
+        """Make room for the gradient of several images. Raises ConfigError with full colour covariance."""
+        if isinstance(self.view, CudaCovarianceView):
+            raise one_image_only()
+        return CudaAccumulator(self.view, field)
+
+
+def covariance_step(view: CorrelationView) -> CudaStep:
+    """Make the step that also fits the full colour covariance."""
+    assert isinstance(view, CudaCovarianceView)
+    return CudaStep(view)
+
+
+def _gaussian_taps() -> NDArray[np.float32]:
+    """Return the Gaussian of SSIM's window (σ 1.5 px, 11 wide, normalised) from its middle out, [6]."""
+    whole = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
+    return np.asarray((whole / whole.sum())[5:], np.float32)

@@ -1,0 +1,78 @@
+"""The mapping step of view-dependent colour (fit/view_dependent.py) on a CUDA device (native/cuda/harmonics.cuh)."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.fit.adam import Rates
+from sigmasplat.fit.cuda.mapping_step import CudaStep
+from sigmasplat.fit.cuda.rows import add_shape_gradient, step_rows
+from sigmasplat.fit.interface import Accumulator, Weights, one_image_only
+from sigmasplat.fit.mapping_step import render_for
+from sigmasplat.fit.target import Target
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.harmonics import count
+from sigmasplat.render.cuda.launch import blocks_for
+from sigmasplat.types import Matrix
+
+
+class CudaViewDependentStep:
+    """Does what `ViewDependentStep` does, on a device. The host waits for none of it until `to_host`."""
+
+    def __init__(self, base: CudaStep, degree: int) -> None:
+        self.base, self.view, self.degree = base, base.view, degree
+        self.width = 3 * count(degree)
+        self._rows, self._eye = torch.empty(0), np.zeros(15, np.float32)
+
+    def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
+        """Render the field, as it looks from there, to the view's planes."""
+        harmonics, n = field.carry("harmonics").params, len(field)
+        self._rows, self._eye = field.params.clone(), _eye(T_camera_world)
+        with self.view.stages.of("project"):
+            self.view.raster.launch_fit(
+                "show_colors", blocks_for(n), self._rows, harmonics, n, self.degree, harmonics.shape[1], self._eye
+            )
+        render_for(self.view, self._rows, T_camera_world, target, weights)
+
+    def images(self, target: Target, weights: Weights) -> Tensor:
+        """Write the gradient of every image term to the view's gradient planes; return the loss, on the device."""
+        return self.base.images(target, weights)
+
+    def splats(
+        self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Do what `ViewDependentStep.splats` does; twist and cost stay on the device."""
+        view, gradient, harmonics = self.view, torch.empty_like(field.params), field.carry("harmonics")
+        twist, visible = view.backward_there(self._rows, gradient, grad2d), view.raster.visible
+        cost = add_shape_gradient(view, visible, field, gradient, weights, frozen_colors)
+        on_harmonics, on_camera = self._through_colors(field, visible, gradient)
+        if view.options.color_pose_gradient:
+            twist[:3] += on_camera
+        step_rows(view, visible, field, gradient, rates)
+        harmonics.steps += 1
+        of_harmonics = Rates(rates.of_extra("harmonics").per_column[: self.width])
+        step_rows(view, visible, harmonics, on_harmonics, of_harmonics)
+        return twist, cost
+
+    def accumulator(self, field: GaussianField) -> Accumulator:
+        """Refuse with a ConfigError: the step takes one image only."""
+        raise one_image_only()
+
+    def _through_colors(self, field: GaussianField, visible: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        """Carry the gradient of shown colours, in rows [N, 17], to the harmonics [N, width], returned, and by the
+        directions to the means, in the same rows, and to the camera's translation, returned [3]."""
+        raster, n, harmonics = self.view.raster, len(field), field.carry("harmonics").params
+        found, partial = raster.empty(n, self.width), raster.empty(blocks_for(n), 3, dtype=torch.float64)
+        with self.view.stages.of("project_backward"):
+            raster.launch_fit(
+                "carry_colors", blocks_for(n), field.params, harmonics, visible, n, self.degree, harmonics.shape[1],
+                self.width, self._eye, gradient, found, partial,
+            )  # fmt: skip
+        return found, partial.sum(0)
+
+
+def _eye(T_camera_world: Matrix) -> NDArray[np.float32]:
+    """Lay out the kernels' `Eye`: the camera's position, and its pose's R and t, [15]."""
+    R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
+    return np.concatenate([-R.T @ t, R.ravel(), t]).astype(np.float32)

@@ -1,0 +1,178 @@
+// Aligning two images on a GPU: pyramids, normal equations, and steps that no host waits for. fit/align.py is the definition;
+// residuals and steps are the CPU's own text (align_pixel.h, align_loop.h). A block is a cell of CELL×CELL pixels, a thread a pixel.
+#include "sums.cuh"
+
+namespace sigmasplat {
+
+// What lanes.h is on a CPU: a vector of one lane.
+typedef float vf;
+typedef int vi;
+typedef bool Mask;
+#define SIGMA_INLINE inline
+inline vf splat(float a) { return a; }
+inline vf load(const float* p) { return *p; }
+inline vf gather(const float* p, vi i) { return p[i]; }
+inline vf fma(vf a, vf b, vf c) { return fmaf(a, b, c); }
+inline vf min(vf a, vf b) { return fminf(a, b); }
+inline vf max(vf a, vf b) { return fmaxf(a, b); }
+inline vf abs(vf a) { return fabsf(a); }
+inline vf floor(vf a) { return floorf(a); }
+inline vf clamp(vf x, float low, float high) { return fminf(fmaxf(x, low), high); }
+inline vi to_int(vf a) { return int(a); }
+inline Mask gt(vf a, vf b) { return a > b; }
+inline Mask ge(vf a, vf b) { return a >= b; }
+inline Mask both(Mask a, Mask b) { return a && b; }
+inline Mask mask_or(Mask a, Mask b) { return a || b; }
+inline Mask mask_not(Mask a) { return !a; }
+inline Mask any(Mask a) { return a; }
+inline vf only(Mask mask, vf a) { return mask ? a : 0.f; }
+
+#include "align_level.h"
+#include "align_loop.h"
+#include "align_pixel.h"
+
+static_assert(CELL * CELL == THREADS, "a thread for each pixel of a cell");
+constexpr int WARPS = THREADS / 32;
+constexpr int PULL = MATRIX_TERMS + SUMS, FLOATS = 32;   // of a pixel: H, sums, b, and one to spare
+
+// ---- pyramids -------------------------------------------------------------------------------------------------------
+
+struct Averaged { const float *a, *b; };   // planes; both may be null
+struct Halved { float *a, *b; };
+
+// Halve images [height, width]: two that are averaged over 2×2 cells, and a depth, which has a reading where all four pixels of
+// a cell have one, of one surface.
+KERNEL halve_images(Averaged from, Halved to, const float* depth, float* half_depth, int width, int height) {
+    const int w = width / 2, h = height / 2, i = thread_number();
+    if (i >= w * h) return;
+    const size_t at = size_t(i / w) * 2 * width + i % w * 2, below = at + width;
+    if (from.a) to.a[i] = (from.a[at] + from.a[at + 1] + from.a[below] + from.a[below + 1]) / 4.f;
+    if (from.b) to.b[i] = (from.b[at] + from.b[at + 1] + from.b[below] + from.b[below + 1]) / 4.f;
+    if (!depth) return;
+    const float z[4] = {depth[at], depth[at + 1], depth[below], depth[below + 1]};
+    const float nearest = fminf(fminf(z[0], z[1]), fminf(z[2], z[3])), farthest = fmaxf(fmaxf(z[0], z[1]), fmaxf(z[2], z[3]));
+    half_depth[i] = nearest > 0.f && farthest - nearest < 0.05f ? (z[0] + z[1] + z[2] + z[3]) / 4.f : 0.f;
+}
+
+// ---- normal equations -----------------------------------------------------------------------------------------------
+
+// Add 32 numbers over a warp's lanes, in 31 shuffles: half of them change hands at each round; lane k returns the sum of the k-th.
+template <int HALF> inline float sum_of_lanes(float* values) {
+    const bool upper = int(threadIdx.x) & HALF;
+    for (int k = 0; k < HALF; k++) {
+        const float keep = upper ? values[k + HALF] : values[k], give = upper ? values[k] : values[k + HALF];
+        values[k] = keep + __shfl_xor_sync(ALL_LANES, give, HALF);
+    }
+    if constexpr (HALF > 1) return sum_of_lanes<HALF / 2>(values);
+    return values[0];
+}
+
+inline int cells_of(const AlignLevel& L) { return (L.width + CELL - 1) / CELL * ((L.height + CELL - 1) / CELL); }
+
+// Store the sums of one cell's pixels, float within a warp and double beyond, in the order of NORMAL_TERMS. Every thread must come.
+inline void store_cell(const AlignLevel& L, const AlignOptions& o, const double* T, int cell, double* stored) {
+    __shared__ float of_warps[WARPS][FLOATS];
+    __shared__ double of_cell[FLOATS];
+    const int thread = int(threadIdx.x), cells_x = (L.width + CELL - 1) / CELL;
+    const int x = cell % cells_x * CELL + thread % CELL, y = cell / cells_x * CELL + thread / CELL;
+    float terms[FLOATS] = {};
+    if (x < L.width && y < L.height) {
+        const size_t at = size_t(y) * L.width + x;
+        const ReferencePixels pixel = {L.reference_depth + at, L.reference_gray + at, L.weight_gray ? L.weight_gray + at : nullptr,
+                                       L.weight_depth ? L.weight_depth + at : nullptr};
+        add_residuals(L, o, motion_of(T), float(x) - L.cx, float(y) - L.cy, true, pixel, terms, terms + PULL);
+    }
+    of_warps[thread / 32][thread % 32] = sum_of_lanes<16>(terms);
+    __syncthreads();
+    if (thread < FLOATS) {
+        double sum = 0.0;
+        for (int w = 0; w < WARPS; w++) sum += of_warps[w][thread];
+        of_cell[thread] = sum;
+    }
+    __syncthreads();
+    if (thread >= NORMAL_TERMS) return;
+    const double* b = of_cell + PULL;
+    double value;
+    if (thread < MATRIX_TERMS) value = of_cell[thread];
+    else if (thread < MATRIX_TERMS + 6) value = b[thread - MATRIX_TERMS];
+    else if (thread < MATRIX_TERMS + 6 + SUMS) value = of_cell[thread - 6];
+    else {
+        int row = 0, at = thread - (MATRIX_TERMS + 6 + SUMS);
+        for (; at >= 6 - row; row++) at -= 6 - row;
+        value = b[row] * b[row + at];
+    }
+    stored[thread] = value;
+}
+
+// Store a cell's share; the block that comes last adds up all cells, in their order, to `total`, and is told so.
+// arrived: 0, and left at 0. Every thread must come.
+inline bool add_cells(const AlignLevel& L, const AlignOptions& o, const double* T, int cell, double* of_cells, unsigned* arrived,
+                      double* total) {
+    constexpr int GROUPS = THREADS / NORMAL_TERMS;
+    __shared__ bool last;
+    __shared__ double of_groups[GROUPS * NORMAL_TERMS];
+    const int thread = int(threadIdx.x), cells = cells_of(L);
+    store_cell(L, o, T, cell, of_cells + size_t(cell) * NORMAL_TERMS);
+    __threadfence();                       // what this thread stored is seen before the block is counted
+    __syncthreads();
+    if (thread == 0) last = atomicAdd(arrived, 1u) == unsigned(cells) - 1u;
+    __syncthreads();
+    if (!last) return false;
+    __threadfence();
+    if (thread < GROUPS * NORMAL_TERMS) {
+        double sum = 0.0;
+        for (int k = thread / NORMAL_TERMS; k < cells; k += GROUPS) sum += of_cells[size_t(k) * NORMAL_TERMS + thread % NORMAL_TERMS];
+        of_groups[thread] = sum;
+    }
+    __syncthreads();
+    if (thread < NORMAL_TERMS) {
+        double sum = 0.0;
+        for (int g = 0; g < GROUPS; g++) sum += of_groups[g * NORMAL_TERMS + thread];
+        total[thread] = sum;
+    }
+    if (thread == 0) *arrived = 0;
+    __syncthreads();
+    return true;
+}
+
+constexpr int MOTIONS = 13;                // at most, of one launch: a motion and six steps to either side
+struct Motions { double T[MOTIONS][12]; };
+
+// Linearise a level at several motions, as many blocks for each as there are cells: found [motions, NORMAL_TERMS],
+// of_cells [motions, cells, NORMAL_TERMS], arrived [motions].
+KERNEL normal_equations(AlignPlanes planes, AlignPinhole pinhole, AlignOptions options, Motions motions, double* of_cells,
+                        unsigned* arrived, double* found) {
+    __shared__ double total[NORMAL_TERMS];
+    const AlignLevel level = {planes, pinhole};
+    const int cells = cells_of(level), motion = int(blockIdx.x) / cells;
+    double* stored = of_cells + size_t(motion) * cells * NORMAL_TERMS;
+    if (add_cells(level, options, motions.T[motion], int(blockIdx.x) % cells, stored, arrived + motion, total) && threadIdx.x < NORMAL_TERMS)
+        found[motion * NORMAL_TERMS + int(threadIdx.x)] = total[threadIdx.x];
+}
+
+// ---- the loop: launched as often as steps may be taken; what is settled goes by ------------------------------------------
+
+struct AlignState {                        // of one alignment, in device memory; the host reads it at the end (fit/cuda/align.py)
+    AlignLoop loop;
+    Descent descent;
+    double readings;                       // pixels of the reference that have depth
+};
+struct Guess { double T[12]; };
+
+// reference [2]: its usual depth, metres, and how many pixels have one.
+KERNEL begin_alignment(AlignState* state, AlignLoop loop, Guess guess, int levels, const double* reference) {
+    if (threadIdx.x) return;
+    loop.depth_m = reference[0];
+    *state = {loop, begin_descent(guess.T, levels), reference[1]};
+}
+
+// Take a step on a level, unless it is settled. of_cells [cells, NORMAL_TERMS], arrived [1].
+KERNEL take_align_step(AlignPlanes planes, AlignPinhole pinhole, AlignOptions options, int number, AlignState* state,
+                       double* of_cells, unsigned* arrived) {
+    __shared__ double total[NORMAL_TERMS];
+    if (state->descent.level != number) return;
+    if (add_cells({planes, pinhole}, options, state->descent.T, int(blockIdx.x), of_cells, arrived, total) && threadIdx.x == 0)
+        take_step(state->descent, state->loop, total);
+}
+
+}  // namespace sigmasplat

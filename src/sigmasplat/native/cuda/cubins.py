@@ -1,0 +1,171 @@
+"""Compile the CUDA kernels' text for a GPU architecture by NVRTC, which needs no driver, and keep the result."""
+
+import hashlib
+import os
+import re
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sigmasplat.env import install_extra
+from sigmasplat.errors import BackendError
+
+FOLDER = Path(__file__).parents[1]
+"""Of the texts: headers that the CPU's kernels share, and `cuda/` below it."""
+RASTER, FIT, ALIGN = "cuda/raster.cu", "cuda/fit.cu", "cuda/align.cu"
+TEXTS = {
+    RASTER: (RASTER, "cuda/gradients.cuh", "cuda/tiles.cuh", "cuda/device.cuh", "cuda/sums.cuh", "splat.h"),
+    FIT: (FIT, "cuda/harmonics.cuh", "cuda/track.cuh", "cuda/descend.cuh", "cuda/sums.cuh"),
+    ALIGN: (ALIGN, "align_pixel.h", "align_loop.h", "align_level.h", "cuda/sums.cuh"),
+}
+FEATURE_COUNTS = (4, 7, 11, 16)
+"""The feature counts compiled, a program each; a count between them is padded with zeros."""
+FITTING = 0
+"""In a feature count's place: the program of the fits' loops, which does without one."""
+ALIGNING = -1
+"""The same for the program that aligns images."""
+PROGRAMS = (ALIGNING, FITTING, *FEATURE_COUNTS)
+ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
+"""What the tests compile for; any other that NVRTC knows is compiled when a device asks for it."""
+INSTALL = install_extra("gpu")
+INSTALL_OLDER = "pip install 'cuda-bindings<13' nvidia-cuda-nvrtc-cu12"
+"""For drivers that know CUDA 12 only."""
+
+
+class Compiled(NamedTuple):
+    """Machine code of one program, or PTX, and what the compiler had to say about it."""
+
+    code: bytes
+    log: str
+
+
+def cache_folder() -> Path:
+    """Return where compiled kernels are kept: the user's cache folder, as the XDG base directories have it."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sigmasplat" / "kernels"
+
+
+def compiler_version() -> str:
+    """Say which NVRTC there is. Raises BackendError if there is none."""
+    try:
+        from cuda.bindings import nvrtc
+
+        _, major, minor = nvrtc.nvrtcVersion()
+    except (ImportError, RuntimeError) as problem:
+        raise BackendError(f"the CUDA kernels need NVRTC ({problem}): {INSTALL}") from problem
+    return f"{major}.{minor}"
+
+
+def text_of(features: int) -> str:
+    """Name the text that a program is made of."""
+    return {FITTING: FIT, ALIGNING: ALIGN}.get(features, RASTER)
+
+
+def cubin(features: int, architecture: str, folder: Path | None = None) -> bytes:
+    """Return the program of one feature count as machine code, from the cache where it is there, else compiled.
+
+    folder: instead of the user's cache. A cache that cannot be written is done without. Raises BackendError as
+    `compiled` does.
+    """
+    kept = (folder or cache_folder()) / f"{architecture}-{features}-{key_of(features, architecture)}.cubin"
+    try:
+        return kept.read_bytes()
+    except OSError:
+        code = compiled(features, architecture).code
+    _keep(kept, code)
+    return code
+
+
+def key_of(features: int, architecture: str) -> str:
+    """Hash all that decides on the machine code: texts, options, architecture, the compiler's version."""
+    said = [compiler_version(), *_options(features, architecture)]
+    texts = [(FOLDER / name).read_text(encoding="utf-8") for name in TEXTS[text_of(features)]]
+    return hashlib.sha256("\0".join(said + texts).encode()).hexdigest()[:32]
+
+
+def compiled(features: int, architecture: str, more: Sequence[str] = ()) -> Compiled:
+    """Compile the program: machine code for sm_90, PTX for compute_90.
+
+    more: further options of NVRTC's. Raises BackendError with the compiler's log, or where NVRTC is missing.
+    """
+    version = compiler_version()
+    from cuda.bindings import nvrtc
+
+    name = text_of(features)
+    options = [*_options(features, architecture), *(f"--include-path={folder}" for folder in include_folders()), *more]
+    _, program = nvrtc.nvrtcCreateProgram((FOLDER / name).read_bytes(), name.encode(), 0, [], [])
+    try:
+        (result,) = nvrtc.nvrtcCompileProgram(program, len(options), [option.encode() for option in options])
+        log = _read(nvrtc.nvrtcGetProgramLogSize, nvrtc.nvrtcGetProgramLog, program).decode(errors="replace")
+        if result != nvrtc.nvrtcResult.NVRTC_SUCCESS:
+            raise BackendError(
+                f"the CUDA kernels do not compile for {architecture} with NVRTC {version}; try {INSTALL}, or report "
+                f"this:\n{result.name}\n{_said(log)}"
+            )
+        kind = "CUBIN" if architecture.startswith("sm_") else "PTX"
+        code = _read(getattr(nvrtc, f"nvrtcGet{kind}Size"), getattr(nvrtc, f"nvrtcGet{kind}"), program)
+    finally:
+        nvrtc.nvrtcDestroyProgram(program)
+    return Compiled(code, _said(log))
+
+
+def _read(size_of: Callable[..., Any], fill: Callable[..., Any], program: Any) -> bytes:
+    """Copy out one of a program's results."""
+    memory = bytearray(size_of(program)[1])
+    fill(program, memory)
+    return bytes(memory)
+
+
+def _said(log: str) -> str:
+    return log.rstrip("\0").strip()
+
+
+def _options(features: int, architecture: str) -> list[str]:
+    """Return what the compiler is told. Without contraction rounding is what the text says, on every device."""
+    return [
+        f"--gpu-architecture={architecture}",
+        "--std=c++17",
+        "--fmad=false",
+        "--device-as-default-execution-space",
+        f"--define-macro=FEATURES={features}",
+    ]
+
+
+def architecture_of(capability: tuple[int, int]) -> str:
+    """Name the architecture of a compute capability: (9, 0) is sm_90."""
+    return f"sm_{capability[0]}{capability[1]}"
+
+
+def target_of(capability: tuple[int, int]) -> str:
+    """Return what to compile for a device: its architecture or, where the compiler is older than that, compute_120.
+
+    That is PTX for the newest it knows, of which the driver makes machine code. Raises BackendError without NVRTC.
+    """
+    compiler_version()
+    from cuda.bindings import nvrtc
+
+    number, known = 10 * capability[0] + capability[1], sorted(nvrtc.nvrtcGetSupportedArchs()[1])
+    older = [other for other in known if other < number]
+    return f"compute_{older[-1]}" if number not in known and older else architecture_of(capability)
+
+
+def include_folders() -> tuple[Path, ...]:
+    """Return where the texts' headers are."""
+    return FOLDER / "cuda", FOLDER
+
+
+def kernel_names(features: int) -> list[str]:
+    """List the kernels that a program's texts define, whatever the feature count."""
+    texts = ((FOLDER / name).read_text(encoding="utf-8") for name in TEXTS[text_of(features)])
+    return [name for text in texts for name in re.findall(r"^KERNEL (\w+)\(", text, re.MULTILINE)]
+
+
+def _keep(path: Path, code: bytes) -> None:
+    """Write machine code to the cache in one step; several processes may do so at once."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as part:
+            part.write(code)
+        os.replace(part.name, path)
+    except OSError:
+        return

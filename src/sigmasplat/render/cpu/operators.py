@@ -1,0 +1,147 @@
+"""Run the compiled kernels: `project` and `blend` as autograd operators, float32, to the definition in `reference`."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sigmasplat import env
+from sigmasplat.config import RenderConfig
+from sigmasplat.errors import BackendError
+from sigmasplat.model.camera import Camera
+from sigmasplat.native import _core
+from sigmasplat.render.kernel_params import view_numbers as view_numbers
+from sigmasplat.render.pose_gradient import pose_gradient
+from sigmasplat.render.reference.operators import Blended, Projection
+
+FEATURES_AT_ONCE = 16
+
+
+def apply_switches(asked: env.Switches) -> None:
+    """Set the kernels' instruction set and threads. Raises BackendError if this machine has not what is asked for."""
+    offered = _core.supported_isas()
+    if asked.isa not in ("auto", *offered):
+        raise BackendError(
+            f"SIGMASPLAT_ISA is {asked.isa!r}, which this machine cannot run; unset it or give {', '.join(offered)}"
+        )
+    _core.set_isa(asked.isa)
+    if asked.threads:
+        _core.set_threads(asked.threads)
+
+
+apply_switches(env.switches())
+
+
+def feature_slots(k: int) -> int:
+    """Return how many feature planes a blend of k features writes: the next count the kernels are compiled for."""
+    return next(slots for slots in (4, 7, 11, 16) if slots >= k)
+
+
+def padded_size(camera: Camera) -> tuple[int, int]:
+    """Return (rows, columns) of an image plane padded to whole tiles of the active instruction set."""
+    tile_width, tile_height = _core.tile_size()
+    return -(-camera.height // tile_height) * tile_height, -(-camera.width // tile_width) * tile_width
+
+
+def _float32(name: str, value: Tensor) -> Tensor:
+    if value.dtype != torch.float32 or value.device.type != "cpu":
+        raise BackendError(
+            f"the cpu backend takes float32 tensors on the CPU; {name} is {value.dtype} on {value.device}"
+        )
+    return value.detach().contiguous()
+
+
+def _apply(function: type[torch.autograd.Function], *inputs: Any) -> Any:
+    return function.apply(*inputs)  # type: ignore[no-untyped-call] # torch leaves apply untyped
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, means, quats, scales, T, camera, options):  # type: ignore[no-untyped-def]
+        m, q, s = _float32("means", means), _float32("quats", quats), _float32("scales", scales)
+        view = view_numbers(camera, T.detach().double().numpy(), options)
+        n = len(m)
+        means2d, conics, z, radii = m.new_empty(n, 2), m.new_empty(n, 3), m.new_empty(n), m.new_empty(n, 2)
+        _core.project_forward(view, m, q, s, means2d, conics, z, radii)
+        seen = radii[:, :1] > 0
+        means2d, conics = torch.where(seen, means2d, 0.0), torch.where(seen, conics, 0.0)
+        ctx.save_for_backward(m, q, s, radii, T)
+        ctx.view = view
+        ctx.mark_non_differentiable(radii)
+        return means2d, conics, z, radii
+
+    @staticmethod
+    def backward(ctx, g_means2d, g_conics, g_z, _):  # type: ignore[no-untyped-def]
+        m, q, s, radii, T = ctx.saved_tensors
+        g_m, g_q, g_s, twist = torch.empty_like(m), torch.empty_like(q), torch.empty_like(s), np.zeros(6)
+        given = [g.contiguous() for g in (g_means2d, g_conics, g_z)]
+        _core.project_backward(ctx.view, m, q, s, radii, given[0], given[1], given[2], g_m, g_q, g_s, twist)
+        return g_m, g_q, g_s, pose_gradient(T, twist), None, None
+
+
+def project(
+    means: Tensor, quats: Tensor, scales: Tensor, T_camera_world: Tensor, camera: Camera, options: RenderConfig
+) -> Projection:
+    """Project splats to the image; arguments and result as `reference.project`, float32 (the pose may be float64)."""
+    return Projection(*_apply(_Project, means, quats, scales, T_camera_world, camera, options))
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, means2d, conics, z, radii, opacities, features, ref_depth, camera, options):  # type: ignore[no-untyped-def]
+        names = ("means2d", "conics", "z", "radii", "opacities", "features")
+        given = (means2d, conics, z, radii, opacities, features)
+        m, c, depth, r, o, f = inputs = [_float32(n, t) for n, t in zip(names, given, strict=True)]
+        rows, columns = padded_size(camera)
+        k = features.shape[1]
+        sums = torch.empty(feature_slots(k), rows, columns)
+        alpha, weights = torch.empty(rows, columns), torch.empty(2, rows, columns)
+        ids = torch.empty(2, rows, columns, dtype=torch.int32)
+        moment = ref = None
+        if ref_depth is not None:
+            moment, ref = torch.empty(rows, columns), torch.zeros(rows, columns)
+            ref[: camera.height, : camera.width] = ref_depth
+        raster = _core.Rasteriser()
+        raster.blend_forward(
+            m, c, depth, r, o, f, camera.width, camera.height, options.alpha_min, options.transmittance_stop, ref,
+            sums, moment, alpha, ids[0], weights[0], ids[1], weights[1],
+        )  # fmt: skip
+        ctx.raster, ctx.ref, ctx.shapes = raster, ref, [t.shape for t in inputs]
+        ctx.size, ctx.padded, ctx.k = (camera.height, camera.width), sums.shape, k
+        h, w = ctx.size
+        maps = [sums[:k, :h, :w].permute(1, 2, 0), moment[:h, :w] if moment is not None else None, alpha[:h, :w]]
+        detached = [ids[0][:h, :w], weights[0][:h, :w], ids[1][:h, :w], weights[1][:h, :w]]
+        ctx.mark_non_differentiable(*detached)
+        return (*(m.clone() if m is not None else None for m in maps), *detached)
+
+    @staticmethod
+    def backward(ctx, g_sums, g_moment, g_alpha, *_):  # type: ignore[no-untyped-def]
+        h, w = ctx.size
+        on_sums, on_alpha = torch.zeros(ctx.padded), torch.zeros(ctx.padded[1:])
+        on_moment = None if ctx.ref is None else torch.zeros_like(on_alpha)
+        on_sums[: ctx.k, :h, :w] = g_sums.permute(2, 0, 1)
+        on_alpha[:h, :w] = g_alpha
+        if on_moment is not None and g_moment is not None:
+            on_moment[:h, :w] = g_moment
+        m, c, z, _radii, o, f = (torch.zeros(s) for s in ctx.shapes)
+        ctx.raster.blend_backward(on_sums, on_moment, on_alpha, m, c, z, o, f)
+        return m, c, z, None, o, f, None, None, None
+
+
+def blend(
+    means2d: Tensor,
+    conics: Tensor,
+    z: Tensor,
+    radii: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    ref_depth: Tensor | None,
+    camera: Camera,
+    options: RenderConfig,
+) -> Blended:
+    """Composite splats front to back; arguments and result as `reference.blend`, float32, any number of features."""
+    groups = torch.split(features, FEATURES_AT_ONCE, dim=1)
+    first = _apply(_Blend, means2d, conics, z, radii, opacities, groups[0], ref_depth, camera, options)
+    more = [_apply(_Blend, means2d, conics, z, radii, opacities, g, None, camera, options)[0] for g in groups[1:]]
+    return Blended(torch.cat([first[0], *more], -1) if more else first[0], *first[1:])

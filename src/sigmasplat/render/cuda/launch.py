@@ -1,0 +1,171 @@
+"""Launch the CUDA kernels: arguments laid out as their parameters, machine code loaded once for each device."""
+
+import struct
+from array import array
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.errors import BackendError
+from sigmasplat.native.cuda import cubins
+
+THREADS = 256
+"""Of every block (native/cuda/device.cuh)."""
+Struct = tuple["Tensor | int | None", ...]
+Argument = Tensor | NDArray[Any] | Struct | int | float | None
+"""A tensor is a pointer, None a null one; an array is a struct passed by value, a tuple one of pointers and 64-bit
+numbers; int is 32 bits, float single precision."""
+
+
+class Launcher(Protocol):
+    """What runs a kernel: a device, or in tests its emulation."""
+
+    def __call__(self, features: int, kernel: str, blocks: int, *arguments: Argument) -> None:
+        """Run blocks of `THREADS` threads of a kernel of the program of that many features, on torch's stream."""
+
+
+def blocks_for(threads: int) -> int:
+    """Return how many blocks hold so many threads."""
+    return -(-threads // THREADS)
+
+
+def laid_out(arguments: tuple[Argument, ...]) -> "array[int]":
+    """Lay arguments out in memory, 64 bits at a time: the address of each argument, then the arguments."""
+    begins, words = list[int](), list[int]()
+    for argument in arguments:
+        begins.append(len(words))
+        words += _words_of(argument)
+    memory = array("Q", begins + words)
+    address = memory.buffer_info()[0] + 8 * len(begins)
+    for i, begin in enumerate(begins):
+        memory[i] = address + 8 * begin
+    return memory
+
+
+def _words_of(argument: Argument) -> Iterable[int]:
+    if argument is None or isinstance(argument, Tensor):
+        return (_address(argument),)
+    if isinstance(argument, tuple):
+        return [a % 2**64 if isinstance(a, int) else _address(a) for a in argument]
+    if isinstance(argument, np.ndarray):
+        given = argument.tobytes()
+        return array("Q", given + bytes(-len(given) % 8))
+    return (int.from_bytes(struct.pack("<f" if isinstance(argument, float) else "<i", argument), "little"),)
+
+
+def _address(tensor: Tensor | None) -> int:
+    if tensor is None:
+        return 0
+    assert tensor.is_contiguous(), "kernels read whole arrays"
+    return tensor.data_ptr()
+
+
+class Device:
+    """The kernels on one CUDA device, compiled at first use, a program at a time."""
+
+    def __init__(self, device: torch.device) -> None:
+        """Raises BackendError, which says why, where the CUDA backend cannot run."""
+        refuse_where_missing()
+        self._device = device
+        self._kernels: dict[tuple[int, str], Any] = {}
+        self._modules: dict[int, Any] = {}
+        self._context = _primary_context(device)
+        self.architecture = cubins.target_of(torch.cuda.get_device_capability(device))
+
+    def __call__(self, features: int, kernel: str, blocks: int, *arguments: Argument) -> None:
+        """Run a kernel on the device's current stream. Raises BackendError if the driver refuses."""
+        if blocks == 0:
+            return
+        memory = laid_out(arguments)
+        stream = torch.cuda.current_stream(self._device).cuda_stream
+        with self._current() as driver:
+            function = self._kernel(features, kernel)
+            found = driver.cuLaunchKernel(function, blocks, 1, 1, THREADS, 1, 1, 0, stream, memory.buffer_info()[0], 0)
+        _checked(found, f"the CUDA kernel {kernel} cannot be launched")
+
+    @contextmanager
+    def _current(self) -> Iterator[Any]:
+        """Make torch's context of the device the thread's own for a while: threads of autograd begin without one."""
+        from cuda.bindings import driver
+
+        _checked(driver.cuCtxPushCurrent(self._context), f"{self._device} cannot be used")
+        try:
+            yield driver
+        finally:
+            driver.cuCtxPopCurrent()
+
+    def _kernel(self, features: int, name: str) -> Any:
+        if (features, name) not in self._kernels:
+            from cuda.bindings import driver
+
+            found = driver.cuModuleGetFunction(self._module(features), name.encode())
+            self._kernels[features, name] = _checked(found, f"the CUDA kernel {name} is not in its program")
+        return self._kernels[features, name]
+
+    def _module(self, features: int) -> Any:
+        if features not in self._modules:
+            from cuda.bindings import driver
+
+            code = cubins.cubin(features, self.architecture)
+            found = driver.cuModuleLoadData(code)
+            self._modules[features] = _checked(found, f"the CUDA kernels for {self.architecture} cannot be loaded")
+        return self._modules[features]
+
+
+def _primary_context(device: torch.device) -> Any:
+    """Return the context that torch uses on a device."""
+    from cuda.bindings import driver
+
+    _checked(driver.cuInit(0), "the CUDA driver cannot be used")
+    ordinal = _checked(driver.cuDeviceGet(device.index), f"{device} cannot be found")
+    return _checked(driver.cuDevicePrimaryCtxRetain(ordinal), f"{device} cannot be used")
+
+
+def _checked(found: tuple[Any, ...], failure: str) -> Any:
+    """Return what the driver found. Raises BackendError with its reason where it did not succeed."""
+    result, *values = found
+    if result.value != 0:
+        raise BackendError(f"{failure}: {result.name}; `sigmasplat doctor` tells more")
+    return values[0] if values else None
+
+
+def missing() -> str | None:
+    """Say in one line what keeps the CUDA backend from running here, and what to do; None where nothing does."""
+    if torch.version.cuda is None:
+        return f"torch {torch.__version__} is built without CUDA; install one that is (https://pytorch.org)"
+    if not torch.cuda.is_available():
+        return "torch finds no CUDA device; is there one, and its driver?"
+    try:
+        cubins.compiler_version()
+    except BackendError as problem:
+        return f"{problem}"
+    return None
+
+
+def refuse_where_missing() -> None:
+    """Raise BackendError, which says why, where the CUDA backend cannot run."""
+    reason = missing()
+    if reason:
+        raise BackendError(f"the CUDA backend cannot run: {reason}")
+
+
+_device = cache(Device)
+
+
+def this_device() -> torch.device:
+    """Return torch's current CUDA device. Raises BackendError, which says why, where the CUDA backend cannot run."""
+    refuse_where_missing()
+    return torch.device("cuda", torch.cuda.current_device())
+
+
+def launcher_for(device: torch.device) -> Launcher:
+    """Return what runs kernels on tensors of a device. Raises BackendError where nothing can."""
+    if device.type != "cuda":
+        raise BackendError(f"the cuda backend takes tensors on a CUDA device; these are on {device}")
+    return _device(this_device() if device.index is None else device)

@@ -1,0 +1,235 @@
+"""Bin and blend on CUDA: what one render leaves for its backward pass. torch supplies memory, sorts and sums.
+
+No host waits for the device between a forward and its backward pass once a first image has said how many pairs of tile
+and splat to expect. Where there are more than expected, `blend` goes through all splats instead of lists: slowly,
+to the same image; the backward pass, which learns of it by then, lists them anew. A loop that is to run without the
+host altogether bins and goes back `within` the room there is: `pairs` say, on the device, whether it sufficed.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.config import RenderConfig
+from sigmasplat.errors import BackendError
+from sigmasplat.model.camera import Camera
+from sigmasplat.native.cuda.cubins import FEATURE_COUNTS, FITTING
+from sigmasplat.render.cuda.launch import Argument, Launcher, Struct, blocks_for
+
+TILE = 16
+GEOMETRY = 8
+"""Floats of a splat's row before its features (native/cuda/device.cuh)."""
+MOMENTS = 6
+"""Sums of a record before those of the features (native/cuda/gradients.cuh)."""
+SPARE = 1.25
+"""Room is made for so many times the pairs seen."""
+MOST_PAIRS = 2**31 - 1
+
+
+class Planes(NamedTuple):
+    """What is blended to, as the kernels' `Planes`: sums [K, H, W], the others [H, W], None where not asked for."""
+
+    sums: Tensor
+    moment: Tensor | None
+    alpha: Tensor
+    median_id: Tensor | None = None
+    median_weight: Tensor | None = None
+    dominant_id: Tensor | None = None
+    dominant_weight: Tensor | None = None
+    median_depth: Tensor | None = None
+
+
+def program_for(features: int) -> int:
+    """Return the feature count of the program that blends so many."""
+    return next(count for count in FEATURE_COUNTS if count >= features)
+
+
+class Raster:
+    """The buffers of one render of n splats on a device, kept from its forward to its backward pass."""
+
+    def __init__(self, launch: Launcher, device: torch.device, capacity: int | None = None) -> None:
+        """capacity: pairs to make room for at first; by default the first image is waited for."""
+        self._launch, self.device, self.capacity = launch, device, capacity
+        self._arrived: torch.cuda.Event | None = None
+        self.n = 0
+
+    def prepare(self, n: int, used: int, camera: Camera, options: RenderConfig) -> None:
+        """Make room for n splats with so many features."""
+        self.n, self.used, self.features = n, used, program_for(used)
+        self.tiles_x, self.tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
+        self.frame = _frame(camera, options, self.tiles_x, self.tiles_y)
+        self.rows = self.empty(n, GEOMETRY + -(-self.features // 4) * 4)
+        self.boxes, self.counts = self.empty(n, 4, dtype=torch.int16), self.empty(n, dtype=torch.int32)
+        self.depths, self.visible = self.empty(n), self.empty(n, dtype=torch.uint8)
+
+    @property
+    def packed(self) -> Struct:
+        """Return where splats are packed to, as the kernels' `Packed`."""
+        return self.rows, self.boxes, self.counts, self.depths, self.visible
+
+    def empty(self, *size: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Make room on the device."""
+        return torch.empty(size, dtype=dtype, device=self.device)
+
+    def launch(self, kernel: str, blocks: int, *arguments: Argument) -> None:
+        """Run a kernel of the program for this render's features."""
+        self._launch(self.features, kernel, blocks, *arguments)
+
+    def launch_fit(self, kernel: str, blocks: int, *arguments: Argument) -> None:
+        """Run a kernel of the fits' loops (native/cuda/fit.cu)."""
+        self._launch(FITTING, kernel, blocks, *arguments)
+
+    def each_splat(self, kernel: str, *arguments: Argument) -> None:
+        """Run a kernel with a thread for each splat."""
+        self.launch(kernel, blocks_for(self.n), *arguments)
+
+    def bin(self) -> None:
+        """List, tile by tile, the packed splats that reach it, near to far."""
+        self._order_splats()
+        self._send_total()
+        if self.capacity is None:
+            self.make_room()
+        else:
+            self._list()
+
+    def bin_within(self) -> None:
+        """Do the same with what room there is, and tell the host nothing."""
+        self._order_splats()
+        self._list()
+
+    def _order_splats(self) -> None:
+        self._order = torch.sort(self.depths, stable=True).indices
+        self._ends = self.counts[self._order].cumsum(0)
+        self._total = self._ends[-1:] if self.n else torch.zeros(1, dtype=torch.int64, device=self.device)
+
+    def _send_total(self) -> None:
+        """Let the number of pairs travel to the host, without waiting for it."""
+        on_cuda = self.device.type == "cuda"
+        self._host_total = torch.empty(1, dtype=torch.int64, pin_memory=on_cuda)
+        self._host_total.copy_(self._total, non_blocking=on_cuda)
+        if on_cuda:
+            self._arrived = torch.cuda.Event()  # type: ignore[no-untyped-call]
+            self._arrived.record(torch.cuda.current_stream(self.device))
+
+    def make_room(self) -> None:
+        """List the pairs anew if there was not room for all. Waits for their number alone, known before the image.
+
+        Raises BackendError as `expect` does.
+        """
+        if self._arrived is not None:
+            self._arrived.synchronize()
+        total = int(self._host_total)
+        if self.capacity is None or total > self.capacity:
+            self.expect(total)
+            self._list()
+
+    def expect(self, pairs: int) -> None:
+        """Make room for so many pairs, and some more, from the next list on.
+
+        Raises BackendError where there are more than can be numbered.
+        """
+        if pairs > MOST_PAIRS // SPARE:
+            raise BackendError(f"{pairs} pairs of splats and tiles are too many; use fewer or smaller splats")
+        self.capacity = int(SPARE * pairs)
+
+    @property
+    def pairs(self) -> Struct:
+        """Return how many pairs there were, on the device, and for how many there was room, as the kernels' `Pairs`."""
+        return self._total, self._room
+
+    def _list(self) -> None:
+        tiles, capacity = self.tiles_x * self.tiles_y, max(self.capacity or 0, 1)
+        short = tiles < torch.iinfo(torch.int16).max
+        number = torch.int16 if short else torch.int32
+        tile_of = torch.full((capacity,), tiles, dtype=number, device=self.device)
+        owners = torch.zeros(capacity, dtype=torch.int32, device=self.device)
+        self.first_slots = self.empty(self.n, dtype=torch.int32)
+        self.each_splat(
+            "list_pairs_short" if short else "list_pairs_int", self._order, self._ends, self.counts, self.boxes,
+            self.rows, self.n, capacity, self.frame, self.first_slots, tile_of, owners,
+        )  # fmt: skip
+        tile_of, self.slots = torch.sort(tile_of, stable=True)
+        self._items = owners[self.slots]
+        bounds = torch.arange(tiles + 1, dtype=number, device=self.device)
+        self._tile_begin = torch.searchsorted(tile_of, bounds, out_int32=True)
+        self._room = capacity
+
+    @property
+    def _lists(self) -> Struct:
+        return self._items, self._tile_begin, self._order, self._total, self.counts, self.n, self._room
+
+    def blend(self, planes: Planes, reference: Tensor | None) -> None:
+        """Blend the listed splats to planes; the depth reference [H, W] goes with a moment plane."""
+        kernel = "blend" + "_moment" * (planes.moment is not None) + "_ids" * (planes.median_id is not None)
+        self.launch(
+            kernel, self.tiles_x * self.tiles_y, self.frame, self.rows, self._lists, reference, self.used, planes
+        )
+
+    def gradients(
+        self,
+        planes: Planes,
+        reference: Tensor | None,
+        on_sums: Tensor,
+        on_moment: Tensor | None,
+        on_alpha: Tensor | None,
+    ) -> tuple[Tensor, int]:
+        """Sum the planes' gradients over pixels, splat by splat: records [n, R], and where the moment's two sums lie in
+        one (0 = nowhere)."""
+        self.make_room()
+        moment = MOMENTS + self.features if on_moment is not None else 0
+        floats = _rounded(moment + 2 if moment else MOMENTS + self.features)
+        kernel = "blend_backward_moment" if moment else "blend_backward"
+        outputs = Planes(planes.sums, planes.moment if moment else None, planes.alpha)
+        records = self.empty(self._room, floats)
+        self.launch(
+            kernel, self.tiles_x * self.tiles_y, self.frame, self.rows, self._lists, self.slots, reference, self.used,
+            outputs, (on_sums, on_moment, on_alpha), records,
+        )  # fmt: skip
+        return self._summed(records), moment
+
+    def pose_gradients(self, planes: Planes, on_sums: Tensor) -> Tensor:
+        """Do the same for colour and depth alone, the first four planes."""
+        self.make_room()
+        return self._summed(self._pose_records(planes, on_sums))
+
+    def pose_gradients_within(self, planes: Planes, on_sums: Tensor) -> Tensor:
+        """Do the same with what room there was; where it did not suffice no splat counts."""
+        records = self._pose_records(planes, on_sums)
+        self.launch_fit("drop_pairs", blocks_for(self.n), self.pairs, self.n, self.counts)
+        return self._summed(records)
+
+    def _pose_records(self, planes: Planes, on_sums: Tensor) -> Tensor:
+        records = self.empty(self._room, _rounded(MOMENTS + 4))
+        outputs = Planes(planes.sums, None, planes.alpha)
+        self.launch(
+            "blend_backward_pose", self.tiles_x * self.tiles_y, self.frame, self.rows, self._lists, self.slots,
+            self.used, outputs, (on_sums, None, None), records,
+        )  # fmt: skip
+        return records
+
+    def _summed(self, records: Tensor) -> Tensor:
+        floats = records.shape[1]
+        sums = self.empty(self.n, floats)
+        blocks = blocks_for(self.n * floats)
+        self.launch("sum_records", blocks, records, self.first_slots, self.counts, self.n, floats, sums)
+        return sums
+
+    def twists(self) -> Tensor:
+        """Make room for the pose twist [blocks, 6] that each block of a chain adds up."""
+        return self.empty(blocks_for(self.n), 6, dtype=torch.float64)
+
+
+def _rounded(floats: int) -> int:
+    return -(-floats // 4) * 4
+
+
+def _frame(camera: Camera, options: RenderConfig, tiles_x: int, tiles_y: int) -> NDArray[np.void]:
+    """Lay out the kernels' `Frame` (native/cuda/device.cuh)."""
+    numbers = (
+        camera.width, camera.height, tiles_x, tiles_y, math.log2(options.alpha_min), options.transmittance_stop,
+    )  # fmt: skip
+    return np.array(numbers, dtype="i4,i4,i4,i4,f4,f4")

@@ -1,0 +1,136 @@
+"""A view on the CUDA kernels: raw parameter rows to image planes and back, without autograd."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sigmasplat.config import RenderConfig
+from sigmasplat.model.camera import Camera
+from sigmasplat.render.cuda import launch as cuda_launch
+from sigmasplat.render.cuda.raster import Planes, Raster
+from sigmasplat.render.cuda.stages import Stages
+from sigmasplat.render.kernel_params import view_numbers
+from sigmasplat.render.view import Layers
+from sigmasplat.types import Matrix
+
+
+class CudaView:
+    """A view on the CUDA kernels: `View` with planes of exactly the image's size, on a device.
+
+    A backward pass ends by reading the twist, the one moment that the host waits for the device. Its `seconds` stay 0
+    where nobody asked to `measure` them (render/cuda/stages.py); to read them is to wait for the device.
+    """
+
+    backend = "cuda"
+
+    def __init__(
+        self, camera: Camera, options: RenderConfig, variance: bool = True, device: torch.device | None = None
+    ) -> None:
+        device = device or cuda_launch.this_device()
+        self.camera, self.options = camera, options
+        self.raster = Raster(cuda_launch.launcher_for(device), device)
+        size = (camera.height, camera.width)
+        zeros = [torch.zeros(7 if variance else 4, *size, device=device) for _ in range(2)]
+        self.sums, self.g_sums = zeros
+        self.alpha, self.g_alpha, self.moment, self.g_moment, self._reference, self.g_median_depth = (
+            torch.zeros(size, device=device) for _ in range(6)
+        )
+        self.layers = Layers.of(*size, device)
+        self._made = (False, False)
+        self._numbers = view_numbers(camera, np.eye(4), options)
+        self.stages = Stages()
+
+    @property
+    def seconds(self) -> Matrix:
+        return self.stages.seconds
+
+    def forward(
+        self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
+    ) -> None:
+        params = self._here(params)
+        r, n = self.raster, len(params)
+        self._numbers = view_numbers(self.camera, T_camera_world, self.options)
+        if depth_reference is not None:
+            self._reference.copy_(depth_reference)
+        self._made = (depth_reference is not None, layers)
+        r.prepare(n, len(self.sums), self.camera, self.options)
+        with self.stages.of("project"):
+            r.each_splat("pack_view", self._numbers, None, params, n, r.frame, r.packed)
+        with self.stages.of("sort"):
+            r.bin()
+        with self.stages.of("blend"):
+            r.blend(self._planes, self._reference if depth_reference is not None else None)
+
+    def _here(self, params: Tensor) -> Tensor:
+        """Return rows as the kernels read them, brought here from wherever they lie."""
+        return params.detach().to(self.raster.device).contiguous()
+
+    @property
+    def _planes(self) -> Planes:
+        moment, layers = self._made
+        ids = tuple(self.layers) if layers else ()
+        return Planes(self.sums, self.moment if moment else None, self.alpha, *ids)
+
+    def backward(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Matrix:
+        return self.backward_there(params, g_params, grad2d).cpu().numpy()
+
+    def backward_there(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Tensor:
+        """Do the same, and leave the twist on the device: no host waits."""
+        (moment, layers), r = self._made, self.raster
+        on_moment, reference = (self.g_moment, self._reference) if moment else (None, None)
+        with self.stages.of("blend_backward"):
+            sums, at = r.gradients(self._planes, reference, self.g_sums, on_moment, self.g_alpha)
+        with self.stages.of("project_backward"):
+            on_median, twists = self._on_median() if layers else None, r.twists()
+            r.each_splat(
+                "chain_params", self._numbers, None, self._here(params), r.counts, sums, on_median, r.n, sums.shape[1],
+                at, g_params, grad2d, twists,
+            )  # fmt: skip
+            return twists.sum(0)
+
+    def _on_median(self) -> Tensor:
+        """Gather ∂L/∂(median depth) of all pixels by the splats whose depths they are, [n]."""
+        ids, found = self.layers.median_id.flatten().long(), torch.zeros(self.raster.n + 1, device=self.raster.device)
+        # Pixels without one (−1) add to the last row. Sorted by torch, so that the sums are the same every time; told
+        # that the rows exist (the last argument), it does not make the host wait to look.
+        torch.ops.aten._index_put_impl_(found, [ids], self.g_median_depth.flatten(), True, True)
+        return found[:-1]
+
+    def backward_pose(self, params: Tensor) -> Matrix:
+        r = self.raster
+        with self.stages.of("blend_backward"):
+            sums = r.pose_gradients(self._planes, self.g_sums)
+        with self.stages.of("project_backward"):
+            twists = r.twists()
+            r.each_splat(
+                "chain_pose", self._numbers, None, self._here(params), r.counts, sums, r.n, sums.shape[1], twists
+            )
+        return twists.sum(0).cpu().numpy()
+
+    def follow(self, params: Tensor, pose: Tensor) -> None:
+        """Render rows [N, 17] to `sums` and `alpha` from T_camera_world float32 [4, 4] on the device; no host waits."""
+        params = self._here(params)
+        r, n, self._made = self.raster, len(params), (False, False)
+        with self.stages.of("project"):
+            r.prepare(n, len(self.sums), self.camera, self.options)
+            r.each_splat("pack_view", self._numbers, pose, params, n, r.frame, r.packed)
+        with self.stages.of("sort"):
+            r.bin_within()
+        with self.stages.of("blend"):
+            r.blend(self._planes, None)
+
+    def follow_back(self, params: Tensor, pose: Tensor) -> Tensor:
+        """Carry the gradient planes of colour and depth to that pose: twists [blocks, 6], to be added up on the device.
+
+        They are 0 where `raster.pairs` were more than there was room for.
+        """
+        r = self.raster
+        with self.stages.of("blend_backward"):
+            sums = r.pose_gradients_within(self._planes, self.g_sums)
+        with self.stages.of("project_backward"):
+            twists, rows = r.twists(), self._here(params)
+            r.each_splat("chain_pose", self._numbers, pose, rows, r.counts, sums, r.n, sums.shape[1], twists)
+        return twists
+
+    def visible(self, n: int) -> Tensor:
+        return self.raster.visible[:n].bool()

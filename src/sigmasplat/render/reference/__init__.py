@@ -1,0 +1,1 @@
+"""The definition of both kernels in plain torch."""

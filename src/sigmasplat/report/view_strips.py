@@ -1,0 +1,73 @@
+"""Draw view strips for the report: files in images/, and one figure per panel for the page."""
+
+import base64
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image
+
+from sigmasplat.drawing.view_panels import PANEL_WIDTH, ViewPanel, draw_view_strip, view_panels
+from sigmasplat.errors import RunError
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.metrics.scored_view import ScoredView
+
+QUALITY = 86
+HEADINGS = {"test": "novel views"}
+"""Headings of kinds of views; without an entry "<kind> views"."""
+
+
+@dataclass(frozen=True)
+class PanelFigure:
+    """One panel of a view on the page: title, address of its picture, and a caption or a colour bar.
+
+    bar: CSS colours from low to high; ends: the labels of both ends of the bar.
+    """
+
+    title: str
+    address: str
+    caption: str = ""
+    bar: tuple[str, ...] = ()
+    ends: tuple[str, str] = ("", "")
+
+
+class ViewStrips:
+    """Draw the strips of a few views of each kind into images/, and collect their panels for the page."""
+
+    def __init__(self, run: RunFolder, per_kind: int) -> None:
+        """Start empty. Strips of an earlier evaluation are deleted, because the views may differ."""
+        self.run, self.per_kind = run, per_kind
+        self.figures: dict[str, list[list[PanelFigure]]] = {}
+        for old in run.images.glob("view-*.png"):
+            old.unlink()
+
+    def add(self, view: ScoredView, place: str = "") -> None:
+        """Draw one view; `place` is added to its heading if it was not rendered from the final map."""
+        name = f"view-{view.kind.replace(' ', '-')}{place and '-submap'}-{view.index:06d}.png"
+        panels = view_panels(view)
+        self.run.write_image(name, draw_view_strip(panels))
+        heading = HEADINGS.get(view.kind, f"{view.kind} views") + place
+        self.figures.setdefault(heading, []).append([panel_figure(panel) for panel in panels])
+
+
+def panel_figure(panel: ViewPanel) -> PanelFigure:
+    """Return a panel for the page, with its picture as a data: URI."""
+    height = round(PANEL_WIDTH * panel.pixels.shape[0] / panel.pixels.shape[1])
+    colours = () if panel.bar is None else tuple(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in panel.bar)
+    return PanelFigure(panel.title, data_uri(panel.picture(height)), panel.caption, colours, panel.ends)
+
+
+def data_uri(picture: Image.Image, lossless: bool = False) -> str:
+    """Return a picture as a data: URI, WebP."""
+    buffer = io.BytesIO()
+    picture.convert("RGB").save(buffer, "WEBP", quality=QUALITY, lossless=lossless)
+    return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def file_data_uri(path: Path) -> str:
+    """Return a picture file as a lossless data: URI. Raises RunError if it cannot be read."""
+    try:
+        with Image.open(path) as picture:
+            return data_uri(picture, lossless=True)
+    except OSError as problem:
+        raise RunError(f"cannot read picture {path}: {problem}") from problem

@@ -1,0 +1,101 @@
+"""The recipes that change the package itself: each is carried out on a copy of it, then used in a fresh process."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from documents import ROOT
+
+PACKAGE = ROOT / "src" / "sigmasplat"
+TINY = "synthetic:frames=120,width=64,height=48"
+
+
+def replace(path: Path, old: str, new: str) -> None:
+    """Replace the first occurrence of a text that must be there."""
+    source = path.read_text(encoding="utf-8")
+    assert old in source, f"{path.name} has no {old!r}"
+    path.write_text(source.replace(old, new, 1), encoding="utf-8")
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """Return a copy of the package's sources and kernels."""
+    return shutil.copytree(PACKAGE, tmp_path / "sigmasplat", ignore=shutil.ignore_patterns("__pycache__"))
+
+
+@pytest.fixture
+def run(package: Path) -> Callable[[str], None]:
+    """Return a function that runs Python code with the copy of the package."""
+
+    def with_the_copy(code: str) -> None:
+        environment = {**os.environ, "PYTHONPATH": str(package.parent), "PYTHONDONTWRITEBYTECODE": "1"}
+        command = [sys.executable, "-c", f"import sigmasplat; assert {str(package)!r} in sigmasplat.__file__\n{code}"]
+        ended = subprocess.run(command, capture_output=True, text=True, cwd=package.parent, env=environment)
+        assert ended.returncode == 0, ended.stderr
+
+    return with_the_copy
+
+
+def test_a_preset_is_values_and_a_setting_is_a_field(package: Path, run: Callable[[str], None]) -> None:
+    presets = package / "presets"
+    (presets / "mine.py").write_text(
+        '"""Settings for my robot."""\n\nfrom sigmasplat.config.text import override\n'
+        "from sigmasplat.presets.sigma import SIGMA\n\n"
+        'PRESETS = {"robot": override(SIGMA, {"input.width": "480", "tracking.patience_s": "0.5"})}\n',
+        encoding="utf-8",
+    )
+    replace(presets / "__init__.py", "sigma, varsplat", "mine, sigma, varsplat")
+    replace(presets / "__init__.py", "sigma.PRESETS)", "sigma.PRESETS, mine.PRESETS)")
+    replace(presets / "varsplat.py", '"fast": FAST}', '"fast": FAST, "office": TUM}')
+    frames = package / "config" / "frames.py"
+    source = frames.read_text(encoding="utf-8")
+    method = source.index("\n    method: ", source.index("class TrackingConfig")) + 1
+    field = '    patience_s: float = 0.0\n    """Seconds to wait for a frame."""\n'
+    frames.write_text(source[:method] + field + source[method:], encoding="utf-8")
+    run(
+        "from sigmasplat.config.text import override\n"
+        "from sigmasplat.errors import ConfigError\n"
+        "from sigmasplat.presets import list_presets, preset\n"
+        "robot = preset('robot')\n"
+        "assert (robot.name, robot.input.width, robot.tracking.patience_s) == ('robot', 480, 0.5)\n"
+        "assert {'robot', 'varsplat-office', 'loopsplat-office'} <= set(list_presets())\n"
+        "changed = override(preset('sigma'), {'tracking.patience_s': '2'})\n"
+        "assert changed.tracking.patience_s == 2.0 and changed.to_dict()['tracking']['patience_s'] == 2.0\n"
+        "try:\n    override(robot, {'tracking.pateince_s': '2'})\n"
+        "except ConfigError as problem:\n    assert 'patience_s' in str(problem)\n"
+        "else:\n    raise AssertionError('a misspelt name was accepted')\n"
+    )
+
+
+def test_a_rule_is_a_function_and_a_descriptor_a_class(package: Path, run: Callable[[str], None]) -> None:
+    pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
+    with (package / "slam" / "rules.py").open("a", encoding="utf-8") as rules:
+        rules.write("\n\ndef is_keyframe(*arguments):\n    return True\n")
+    loops = package / "slam" / "loop_closure"
+    with (loops / "descriptors.py").open("a", encoding="utf-8") as descriptors:
+        descriptors.write(
+            "\n\nclass MeanColor:\n    def describe(self, color, depth_m):\n"
+            "        mean = color.mean((0, 1))\n        return mean / np.linalg.norm(mean)\n"
+        )
+    replace(package / "config" / "submaps.py", 'Literal["grid", "netvlad"]', 'Literal["grid", "netvlad", "mean"]')
+    replace(loops / "closer.py", "import Descriptor, OrientationGrid", "import Descriptor, MeanColor, OrientationGrid")
+    replace(
+        loops / "closer.py",
+        '    if config.descriptor == "grid":',
+        '    if config.descriptor == "mean":\n        return MeanColor()\n    if config.descriptor == "grid":',
+    )
+    run(
+        "from sigmasplat import Slam, open_source, preset\n"
+        "from sigmasplat.config.text import override\n"
+        "short = {'input.width': '64', 'mapping.first_iterations': '4', 'mapping.iterations': '2',\n"
+        "         'loops.descriptor': 'mean', 'final.iterations': '0', 'submaps.frames': '2'}\n"
+        "slam = Slam(override(preset('varsplat-fast'), short))\n"
+        f"steps = [slam.step(frame) for frame in open_source({TINY!r}, limit=4)]\n"
+        "slam.finish()\n"
+        "assert all(step.is_keyframe for step in steps) and len(slam.atlas.anchors) > 1\n"
+    )

@@ -1,0 +1,302 @@
+"""Charts, view strips and the page: colours match their bar, strips show their panels, the page is complete."""
+
+import re
+from html.parser import HTMLParser
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sigmasplat.drawing import colormap, plot
+from sigmasplat.drawing.view_panels import GAP, HEAD, PANEL_WIDTH, draw_view_strip, view_panels
+from sigmasplat.metrics.scored_view import ScoredView
+from sigmasplat.report import charts
+from sigmasplat.report.html import Contents, build_report
+from sigmasplat.report.tables import headline, number
+from sigmasplat.report.view_strips import PanelFigure
+
+STRIPS = {"held-out views": [[PanelFigure("input", "images/a.png")]]}
+VOID = {"meta", "img", "source", "br", "!doctype"}
+
+
+def some_view(seed: int = 0) -> ScoredView:
+    rng = np.random.default_rng(seed)
+    color = rng.uniform(size=(30, 40, 3)).astype(np.float32)
+    depth = rng.uniform(1, 3, (30, 40)).astype(np.float32)
+    depth[:10] = 0.0
+    alpha = np.full((30, 40), 0.9, np.float32)
+    alpha[20:] = 0.1
+    rendered_depth = np.where(alpha > 0.5, depth + 0.1, 0).astype(np.float32)
+    variance = np.full((30, 40, 3), 0.04, np.float32)
+    return ScoredView(
+        12, "held-out", color, depth, np.clip(color + 0.1, 0, 1), rendered_depth, alpha, variance, ("lost",)
+    )
+
+
+@pytest.mark.parametrize("colours", [colormap.VIRIDIS, colormap.INFERNO])
+def test_brightness_rises_along_a_palette(colours: np.ndarray) -> None:
+    ramp = colormap.apply(np.linspace(0, 1, 200), 0, 1, colours).astype(float)
+    brightness = ramp @ [0.2126, 0.7152, 0.0722]
+    assert (np.diff(brightness) > -0.5).all() and brightness[-1] - brightness[0] > 150
+
+
+def test_values_outside_the_range_are_clipped_and_invalid_ones_are_slate() -> None:
+    values = np.array([[-5.0, 0.0, 1.0, 9.0]])
+    out = colormap.apply(values, 0.0, 1.0)
+    assert (out[0, 0] == out[0, 1]).all() and (out[0, 2] == out[0, 3]).all() and tuple(out[0, 0]) == (68, 1, 84)
+    holes = colormap.apply_masked(values, np.array([[True, False, True, True]]), 0.0, 1.0, colormap.VIRIDIS)
+    assert tuple(holes[0, 1]) == colormap.NO_READING
+    assert colormap.value_range(values, np.zeros_like(values, bool)) == (0.0, 1.0)
+    colormap.apply(values, 2.0, 2.0)
+
+
+def test_scores_of_a_view_use_pixels_with_a_depth_reading() -> None:
+    view = some_view()
+    score = view.scores()
+    valid = np.zeros((30, 40), bool)
+    valid[10:] = True
+    mse = ((view.rendered - view.recorded)[valid].astype(float) ** 2).mean()
+    assert score["psnr_db"] == pytest.approx(-10 * np.log10(mse))
+    assert score["depth_l1_m"] == pytest.approx(0.1, abs=1e-5) and score["depth_coverage"] == pytest.approx(0.5)
+    np.testing.assert_allclose(view.uncertainty, 0.04)
+
+
+def test_a_strip_shows_the_five_panels_of_a_view() -> None:
+    view = some_view()
+    for word, shown in zip(("input", "colour", "depth", "V", "error"), view_panels(view), strict=True):
+        assert word in shown.title
+    strip = np.asarray(draw_view_strip(view_panels(view)), float)
+    assert strip.shape[1] == 5 * (PANEL_WIDTH + GAP) + GAP
+
+    def panel(i: int) -> np.ndarray:
+        left = GAP + i * (PANEL_WIDTH + GAP)
+        return strip[HEAD : HEAD + 240, left : left + PANEL_WIDTH]
+
+    shown = Image.fromarray((view.recorded * 255).round().astype(np.uint8)).resize((320, 240), Image.Resampling.LANCZOS)
+    np.testing.assert_allclose(panel(0), np.asarray(shown, float))
+    assert (panel(2)[-70:] == colormap.NO_READING).all(), "no surface there"
+    assert (panel(4)[:70] == colormap.NO_READING).all(), "no reading there"
+    # V is the same at every mapped pixel: one colour, and the bar ends at its root, 0.2.
+    assert len(np.unique(panel(3)[:150].reshape(-1, 3), axis=0)) == 1 and view_panels(view)[3].ends[1] == "0.200"
+
+
+def test_ticks_are_round_and_few() -> None:
+    for low, high in [(-0.3, 1.7), (0, 1e-4), (-2000, 5), (3.1, 3.9)]:
+        ticks = plot.nice_ticks(low, high)
+        assert 2 <= len(ticks) <= 12 and ticks[0] >= low - 1e-9 and ticks[-1] <= high + 1e-9
+        leading = float(f"{ticks[1] - ticks[0]:e}".split("e")[0])
+        assert round(leading, 6) in (1, 2, 5)
+
+
+def test_both_axes_of_a_path_have_one_scale() -> None:
+    """A 2 m × 2 m square walked once: the curve's extent in pixels is square too, its colour the estimate's."""
+    corners = np.array([[0, 0, 0], [2, 0, 0], [2, 0, 2], [0, 0, 2], [0, 0, 0.0]])
+    laid_out = charts.trajectory_charts(corners, None)
+    image = np.asarray(plot.draw_charts(laid_out[:1], plot.LIGHT, (600, 400))).astype(int)
+    orange = np.abs(image - plot.LIGHT.curves[0]).sum(-1) < 60
+    rows, columns = np.nonzero(orange)
+    assert np.ptp(rows) == pytest.approx(np.ptp(columns), abs=3) and np.ptp(rows) > 150
+
+
+def test_height_points_up_and_the_truth_may_have_gaps() -> None:
+    estimate = np.array([[0, 0, 0], [0, -1.5, 0], [0, -3, 0.0]])
+    truth = estimate.copy()
+    truth[1] = np.nan
+    laid_out = charts.trajectory_charts(estimate, truth, np.array([False, True, False]))
+    assert [curve.name for curve in laid_out[1].curves] == ["truth", "estimate", "lost"]
+    assert laid_out[1].curves[1].points[:, 1].tolist() == [0, 1.5, 3]
+    plot.draw_charts(laid_out, plot.DARK)
+
+
+def test_a_static_camera_and_a_single_frame_can_be_drawn() -> None:
+    for n in (1, 5):
+        plot.draw_charts(charts.trajectory_charts(np.zeros((n, 3)), None), plot.LIGHT)
+        plot.draw_charts([charts.seconds_chart(np.arange(n), {"total": np.zeros(n)})], plot.LIGHT)
+
+
+def colours_near(image: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
+    """Return where a picture shows a colour, as (row, column) pairs."""
+    return np.argwhere(np.abs(image.astype(int) - colour).sum(-1) < 60)
+
+
+@pytest.mark.parametrize("theme", [plot.LIGHT, plot.DARK], ids=lambda theme: theme.name)
+def test_submaps_have_colours_and_loops_are_lines(theme: plot.Theme) -> None:
+    """Around a 4 m square, a submap a side: the first and the last meet, the accepted loop crosses the middle."""
+    side = np.linspace(0, 4, 11)[:-1]
+    nought = np.zeros(10)
+    x, z = np.concatenate([side, nought + 4, 4 - side, nought]), np.concatenate([nought, side, nought + 4, 4 - side])
+    estimate = np.stack([x, np.zeros(40), z], 1)
+    submaps = np.arange(40) // 10
+    chart = charts.submap_chart(estimate, submaps, [charts.LoopLink(25, 5, True), charts.LoopLink(35, 15, False)])
+    size = (600, 400)
+    image = np.asarray(plot.draw_charts([chart], theme, size))
+    blank = np.asarray(plot.draw_charts([charts.submap_chart(estimate, submaps, [])], theme, size))
+    for place in charts.SUBMAP_COLOURS:
+        assert len(colours_near(blank, theme.curves[place])) > 100
+    assert len(colours_near(blank, theme.curves[plot.ACCENT])) == 0
+    # The accepted one runs along x = 2 m, a column of the picture, the refused one along z = 2 m, a row.
+    changed = np.argwhere((image != blank).any(-1))
+    changed = changed[changed[:, 0] > 40]  # below the legend
+    accepted = colours_near(image[40:], theme.curves[plot.ACCENT])
+    middle = np.median(accepted[:, 1])
+    refused = changed[np.abs(changed[:, 1] - middle) > 6]
+    path = np.concatenate([colours_near(blank, theme.curves[place]) for place in charts.SUBMAP_COLOURS])
+    assert np.ptp(accepted[:, 1]) < 6 and np.ptp(accepted[:, 0]) > 200 and np.ptp(refused[:, 0]) < 6
+    for at, axis in ((accepted, 1), (refused, 0)):
+        assert np.median(at[:, axis]) == pytest.approx(0.5 * (path[:, axis].min() + path[:, axis].max()), abs=4)
+
+
+def test_neighbouring_submaps_have_different_colours_and_are_joined() -> None:
+    estimate = np.stack([np.arange(9.0), np.zeros(9), np.zeros(9)], 1)
+    chart = charts.submap_chart(estimate, np.array([0, 0, 0, 1, 1, 2, 3, 3, 3]), [])
+    colours = [curve.colour for curve in chart.curves]
+    assert len(colours) == 4 and all(a != b for a, b in pairwise(colours))
+    assert [curve.points[:, 0].tolist() for curve in chart.curves] == [[0, 1, 2, 3], [3, 4, 5], [5, 6], [6, 7, 8]]
+    assert chart.labels == {"0": (0, 0), "1": (3, 0), "2": (5, 0), "3": (6, 0)}
+
+
+def test_a_long_run_has_few_labels() -> None:
+    estimate = np.random.default_rng(0).normal(size=(500, 3))
+    chart = charts.submap_chart(estimate, np.arange(500) // 5, [])
+    assert len(chart.curves) == 100 and 5 < len(chart.labels) <= charts.MAX_LABELS
+    plot.draw_charts([chart], plot.DARK)
+
+
+def test_a_loop_line_joins_the_positions_of_its_frames() -> None:
+    """Frames of loops count from the run's start; some have no pose, so that rows and frames differ."""
+    log = [{"row": row, "index": 10 * row, "submap": row // 4} for row in (0, 1, 3, 4, 5, 7, 8)]
+    estimate = np.stack([[record["row"], 0.0, 0.0] for record in log])
+    loops = [{"query_frame": 8, "database_frame": 1, "accepted": True},
+             {"query_frame": 5, "database_frame": 2, "accepted": False}]  # fmt: skip
+    (chart,), caption = charts.run_charts(log, estimate, None, loops)["submaps"]
+    lines = {curve.name: curve.points[:, 0].tolist() for curve in chart.curves if curve.name}
+    assert lines == {"loop accepted": [8, 1]} and "submap" in caption
+    assert set(charts.run_charts([record | {"submap": 0} for record in log], estimate, None)) == {"trajectory"}
+
+
+class Balance(HTMLParser):
+    """Note tags that close what was not open, and every address used."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.wrong: list[str] = []
+        self.addresses: list[str] = []
+        self.text: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "srcset")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if not self.open or self.open.pop() != tag:
+            self.wrong.append(tag)
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+
+METRICS = {
+    "frames": 200, "lost": 0, "splats": 123456, "frames_per_s": 3.21,
+    "ate": {"rmse_m": 0.0123, "mean_m": 0.01, "median_m": 0.009, "max_m": 0.03, "pairs": 200},
+    "rpe": {"translation_rmse_m": 0.001, "rotation_rmse_deg": 0.05, "pairs": 199, "delta_frames": 1},
+    "training": {"views": 40, "psnr_db": 31.25, "ssim": 0.95, "depth_l1_m": 0.01, "depth_coverage": 0.99},
+    "held_out": {"views": 40, "psnr_db": 29.5, "ssim": 0.94, "depth_l1_m": 0.012, "depth_coverage": 0.98},
+    "uncertainty": {"pixels": 8, "spearman": 0.412, "spearman_covered": 0.5, "nll": -2.5, "ause": 0.2,
+                    "mean_variance": 0.001, "mean_squared_error": 0.002,
+                    "reliability": [{"predicted": 1e-3, "empirical": 2e-3, "pixels": 8}]},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("metrics", [METRICS, {"frames": 0}], ids=["full", "bare"])
+def test_the_page_is_complete_and_needs_no_other_file(metrics: dict[str, object]) -> None:
+    contents = Contents(
+        "SigmaSplat · <room> & more", "fast", metrics, STRIPS, {"trajectory": "caption"},
+        '{"name": "</pre><script>"}', ["estimate and truth share no timestamps"],
+    )  # fmt: skip
+    page = build_report(contents)
+    reader = Balance()
+    reader.feed(page)
+    assert not reader.wrong and not reader.open
+    versions = ("light", "dark", "narrow-light", "narrow-dark")
+    assert set(reader.addresses) == {"images/a.png", *(f"images/trajectory-{version}.png" for version in versions)}
+    assert "http" not in page and "<script" not in page and "prefers-color-scheme: dark" in page
+    text = "".join(reader.text)
+    assert "<room> & more" in text and "</pre><script>" in text and "share no timestamps" in text
+
+
+def test_the_page_shows_the_measured_figures() -> None:
+    page = build_report(Contents("t", "s", METRICS))
+    text = re.sub("<[^>]+>", " ", page)
+    for figure in ("1.23", "29.50", "31.25", "0.9500", "0.412", "123\u202f456", "3.21", "−2.500", "98.0"):
+        assert figure in text, figure
+
+
+def loop(query: int, accepted: bool, **values: object) -> dict[str, object]:
+    """Make a record of loops.json."""
+    return {
+        "query": query, "database": 0, "query_frame": 412, "database_frame": 3, "similarity": 0.875, "residual": 0.0213,
+        "overlap": 0.61, "translation_m": 0.043, "rotation_deg": 1.5, "accepted": accepted,
+        "reason": "accepted" if accepted else "agreement < 0.8",
+    } | values  # fmt: skip
+
+
+BEFORE = {"views": 40, "psnr_db": 27.75, "ssim": 0.9, "depth_l1_m": 0.02, "depth_coverage": 0.97}
+IN_SUBMAPS = METRICS | {
+    "submaps": 8, "loops": {"tried": 3, "accepted": 1}, "finish_s": 12.5, "held_out_submaps": BEFORE,
+    "training_submaps": BEFORE | {"psnr_db": 26.5}, "uncertainty_final": METRICS["uncertainty"] | {"spearman": 0.222},
+}  # fmt: skip
+
+
+def test_submaps_and_loops_have_a_section() -> None:
+    loops = [loop(6, False, residual=None, reason="no overlap & <nothing>"), loop(7, True), loop(5, False)]
+    page = build_report(Contents("t", "s", IN_SUBMAPS, plots={"submaps": "a caption"}, loops=loops))
+    reader = Balance()
+    reader.feed(page)
+    assert not reader.wrong and not reader.open and "images/submaps-dark.png" in reader.addresses
+    text = " ".join(re.sub("<[^>]+>", " ", page).split())
+    assert "Submaps and loops" in text and "8 submaps" in text and "12.5 s" in text and "a caption" in text
+    assert "7 → 0 412 → 3 0.875 0.0213 61 4.3 1.50 accepted" in text
+    assert "6 → 0 412 → 3 0.875 – 61 4.3 1.50 refused no overlap &amp; &lt;nothing&gt;" in text
+    assert "2 loops tried and refused" in text and text.index("7 → 0") < text.index("6 → 0")
+    for figure in ("27.75", "26.50", "0.222", "Submaps", "1 of 3 tried"):
+        assert figure in text, figure
+
+
+def test_a_single_submap_has_no_section() -> None:
+    for metrics in (METRICS, METRICS | {"submaps": 1, "loops": {"tried": 0, "accepted": 0}, "held_out_submaps": None}):
+        assert "ubmap" not in build_report(Contents("t", "s", metrics))
+
+
+def test_the_section_of_submaps_has_no_tables_without_loops() -> None:
+    page = build_report(Contents("t", "s", METRICS | {"submaps": 2, "loops": {"tried": 0, "accepted": 0}}))
+    assert "2 submaps" in page and "refused" not in page and "verdict" not in page
+
+
+def test_absent_figures_are_dashes() -> None:
+    assert number(None, 2) == number(float("nan"), 1) == "–" and number(-1234.5, 1) == "−1\u202f234.5"
+    assert dict((name, value) for name, value, _ in headline({"held_out": None}))["PSNR, held-out"] == "–"
+
+
+def test_the_path_has_no_error_without_ground_truth() -> None:
+    assert "ATE RMSE" in {name for name, _, _ in headline(METRICS)}
+    assert not [name for name, _, _ in headline(METRICS | {"ate": None}) if name.startswith("ATE")]
+
+
+def test_the_time_of_the_final_map_is_shown() -> None:
+    """It is a headline figure, and a stage with its share: 30 of 40 s."""
+    waited = {"Final map": ("30.0", "s"), "Frames and final map": ("40.0", "s")}
+    figures = headline(METRICS | {"finish_s": 30.0, "total_s": 40.0})
+    assert waited.items() <= {name: (value, unit) for name, value, unit in figures}.items()
+    assert not waited.keys() & {name for name, _, _ in headline(METRICS | {"finish_s": None})}
+    page = build_report(Contents("t", "s", METRICS | {"finish_s": 30.0}, seconds={"align": 8.0, "io": 2.0}))
+    text = " ".join(re.sub("<[^>]+>", " ", page).split())
+    assert "final map 30.0 75 align 8.0 20 io 2.0 5" in text
+    assert "final map" not in build_report(Contents("t", "s", METRICS, seconds={"align": 8.0}))
+
+
+def test_the_path_comes_before_the_views() -> None:
+    page = build_report(Contents("t", "s", METRICS, STRIPS, {"trajectory": "a path"}))
+    assert page.index("<h2>Trajectory") < page.index("<h2>Views")

@@ -1,0 +1,159 @@
+"""The sentences of the report follow from the figures, and its commands can be run."""
+
+import json
+import shlex
+from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace
+
+import pytest
+from PIL import Image
+
+from sigmasplat.config import Config
+from sigmasplat.config.text import override, split_settings
+from sigmasplat.errors import RunError
+from sigmasplat.floorplan.rescan import RescanRegion
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.presets import preset
+from sigmasplat.report.page import rerun_command, write_page
+from sigmasplat.report.summary import advice, rescan_sentences, summary_sentences
+from sigmasplat.report.view_strips import PanelFigure, data_uri, file_data_uri
+
+GOOD = {
+    "source": "kitchen", "status": "complete", "frames": 500, "splats": 1000, "frames_per_s": 13.5, "lost": 0,
+    "ate": {"rmse_m": 0.026, "max_m": 0.09}, "ate_odometry": {"rmse_m": 0.035},
+    "held_out": {"psnr_db": 31.0, "depth_l1_m": 0.019, "depth_coverage": 0.999},
+    "training": {"psnr_db": 31.5}, "uncertainty": {"spearman": 0.55}, "submaps": 1, "loops": {"accepted": 0},
+}  # fmt: skip
+SETTINGS = preset("sigma").to_dict()
+RUN = "sigmasplat run data/k"
+
+
+def summary(**changes) -> str:
+    return " ".join(summary_sentences(GOOD | changes, "a laptop"))
+
+
+def test_a_good_run_in_words() -> None:
+    text = summary()
+    for words in (
+        "500 colour and depth images of kitchen", "13.5 images per second on a laptop", "never lost", "path is 2.6 cm",
+        "error is 9.0 cm", "Without loop closure the RMS error is 3.5 cm", "31.0 dB PSNR: very close",
+        "1.9 cm on average: good", "V predicts well where",
+    ):  # fmt: skip
+        assert words in text, words
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"lost": 52}, "lost on 52 of 500 images"),
+        ({"ate": None}, "no ground truth"),
+        ({"status": "interrupted"}, "The run is interrupted"),
+        ({"held_out": {"psnr_db": 17.0}}, "17.0 dB PSNR: poor"),
+        (
+            {"held_out": {"psnr_db": 24.0, "depth_l1_m": 0.01, "depth_coverage": 0.7}},
+            "30 % of the depth readings",
+        ),
+        ({"held_out": {"depth_l1_m": 0.009, "depth_coverage": 1.0}}, "0.9 cm on average: very accurate."),
+        ({"held_out": {"depth_l1_m": 0.031, "depth_coverage": 1.0}}, "3.1 cm on average: coarse."),
+        ({"ate_odometry": {"rmse_m": 0.020}}, "Without loop closure the RMS error is 2.0 cm"),
+        ({"uncertainty": {"spearman": 0.02}}, "does not show where"),
+    ],
+)
+def test_the_summary_names_what_is_wrong(changes: dict, words: str) -> None:
+    assert words in summary(**changes)
+
+
+def test_loops_with_hardly_any_effect_are_left_out() -> None:
+    for off_m, without_m in [(0.026, 0.028), (0.002, 0.0028), (0.026, None)]:
+        assert "Without loop closure" not in summary(ate={"rmse_m": off_m}, ate_odometry={"rmse_m": without_m})
+
+
+def test_unknown_figures_are_left_out() -> None:
+    text = " ".join(summary_sentences({"source": "x", "frames": 1, "splats": 0, "lost": 0}))
+    assert "dB" not in text and " V " not in text and "None" not in text
+
+
+@pytest.mark.parametrize(
+    "changes, settings, words, command",
+    [
+        ({"lost": 3}, {"input.stride": "3"}, "one image in 3", "--stride 1"),
+        ({"lost": 3}, {}, "record that part again", "mapping.every=2"),
+        ({"training": {"psnr_db": 36.0}}, {}, "5.0 dB better", "mapping.every=2"),
+        ({"held_out": {"psnr_db": 22.0}}, {}, "320 pixels wide", "input.width=640"),
+        ({"held_out": {"psnr_db": 31.0, "depth_coverage": 0.6}}, {}, "40 % of the depth readings", ""),
+        ({"frames_per_s": 1.2}, {}, "slow: 1.2 images per second", "input.width=240"),
+        ({"frames_per_s": 1.2, "finish_s": 400.0}, {}, "slow: 1.2 images per second", "input.width=240"),
+        ({"frames_per_s": 1.2, "finish_s": 430.0}, {}, "took 430 s, all frames took 417 s", "final.iterations=750"),
+        ({"finish_s": 80.0}, {"final.iterations": "300"}, "took 80 s, all frames took 37 s", "final.iterations=150"),
+        ({"submaps": 5}, {}, "End a scan where it started", ""),
+    ],
+)
+def test_commands_of_the_advice_can_be_run(changes: dict, settings: dict, words: str, command: str) -> None:
+    config = override(preset("sigma"), settings)
+    found = [item for item in advice(GOOD | changes, "runs/k", RUN, config.to_dict()) if words in item[0]]
+    assert len(found) == 1 and command in found[0][1]
+    given = shlex.split(found[0][1])
+    override(config, split_settings(value for flag, value in pairwise(given) if flag == "--set"))
+
+
+def test_after_a_good_run_the_advice_is_to_view_and_to_export() -> None:
+    assert [command.split()[1] for _, command in advice(GOOD, "runs/k", RUN, SETTINGS)] == [
+        "view",
+        "mesh",
+    ]
+
+
+def test_the_command_to_run_again_keeps_the_settings_of_the_run() -> None:
+    config = override(
+        preset("sigma"), {"input.fx": "570", "input.register_depth": "on", "input.limit": "7", "seed": "3"}
+    )
+    again = rerun_command(config, {"source_path": "data/my room"})
+    words = shlex.split(again)
+    assert words[:3] == ["sigmasplat", "run", "data/my room"]
+    made = override(preset("sigma"), split_settings(value for flag, value in pairwise(words) if flag == "--set"))
+    assert made == config
+    assert shlex.split(rerun_command(preset("varsplat-fast"), {}))[3:] == ["--preset", "varsplat-fast"]
+    assert rerun_command(replace(config, name="mine"), {}) == "sigmasplat run PATH"
+
+
+def test_a_fast_final_map_and_one_without_iterations_are_not_shortened() -> None:
+    for finish_s, iterations in [(50.0, "1500"), (900.0, "0")]:
+        config = override(preset("sigma"), {"final.iterations": iterations})
+        found = advice(GOOD | {"finish_s": finish_s}, "runs/k", "data/k", config.to_dict())
+        assert [command.split()[1] for _, command in found] == ["view", "mesh"]
+
+
+def test_regions_to_scan_again_are_summed_up() -> None:
+    plan = SimpleNamespace(regions=[RescanRegion((0, 0), 0.3, area, why, "") for area, why in
+                                    ((2.0, "unseen"), (1.5, "unseen"), (0.4, "unsure"))])  # fmt: skip
+    assert rescan_sentences(GOOD, None) == []
+    (sentence,) = rescan_sentences(GOOD, plan)
+    assert "2 not observed (3.5 m²), 1 mapped with high uncertainty (0.4 m²)" in sentence
+    lost = rescan_sentences(GOOD | {"lost_frames": [3, 4, 5, 9]}, SimpleNamespace(regions=[]))
+    assert len(lost) == 1 and "3–5, 9" in lost[0]
+
+
+def test_the_page_is_one_file(tmp_path) -> None:
+    run = RunFolder.create(tmp_path / "run", replace(Config(), name="made-up"), "kitchen")
+    run.note(status="complete", source_path="data/kitchen")
+    for version in ("light", "dark", "narrow-light", "narrow-dark"):
+        run.write_image(f"trajectory-{version}.png", Image.new("RGB", (40, 30), (200, 60, 20)))
+    run.write_profile({"blend": 6.0, "io": 2.0})
+    write_page(
+        run,
+        GOOD | {"uncertainty": None},
+        {"held-out": [[PanelFigure("input", data_uri(Image.new("RGB", (40, 30))))]]},
+        {"trajectory": "a path"},
+        ["careful"],
+    )
+    page = (run.path / "report.html").read_text()
+    for words in ("Summary", "What to try next", "careful", "sigmasplat view", "75", "all settings (config.json)"):
+        assert words in page
+    assert page.count("data:image/webp;base64,") == 5 and "images/" not in page and "http" not in page
+
+
+def test_the_error_names_a_missing_picture(tmp_path) -> None:
+    with pytest.raises(RunError, match=r"view\.png"):
+        file_data_uri(tmp_path / "view.png")
+    assert json.dumps(SETTINGS)
