@@ -23,7 +23,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import resized_color
 from sigmasplat.sources import open_source
-from sigmasplat.sources.camera.depth_registration import Registration
+from sigmasplat.sources.camera.depth_registration import DepthRegistration
 from sigmasplat.sources.camera.distortion import Undistortion, distort
 from sigmasplat.sources.ros.bag import Bag
 
@@ -127,7 +127,7 @@ def test_raw_depth_is_registered_by_the_transforms(tmp_path: Path, kind: str, li
     source = open_source(path)
     assert source.depth_registered and source.camera == Camera(*SIZE, *FOCAL).resized(16, 12)
     rectified = Camera(16, 12, DEPTH_FOCAL[0] + 1, DEPTH_FOCAL[1] + 1, *DEPTH_FOCAL[2:])  # P, not K
-    move = Registration(rectified, source.camera, LINK)
+    move = DepthRegistration(rectified, source.camera, LINK)
     for frame, depth_mm in zip(source, seen.depths_mm[:, ::2, ::2], strict=True):
         np.testing.assert_allclose(frame.depth_m, move(metres(depth_mm)), atol=1e-6)
 
@@ -288,7 +288,7 @@ def test_a_realsense_sdks_bag(tmp_path: Path) -> None:
     np.testing.assert_allclose(bent.frame(2).color, resized_color(color, 16, 12), atol=1e-6)
     np.testing.assert_allclose(straight.frame(2).color, resized_color(lens.color(color), 16, 12), atol=1e-6)
     depth_m = (seen.depths_mm[2, ::2, ::2] / 2000.0).astype(np.float32)
-    moved = Registration(Camera(16, 12, *DEPTH_FOCAL), bent.camera, LINK)(depth_m)
+    moved = DepthRegistration(Camera(16, 12, *DEPTH_FOCAL), bent.camera, LINK)(depth_m)
     for source in (straight, bent):
         assert source.depth_units_per_metre == 2000.0 and source.depth_registered
         np.testing.assert_allclose(source.frame(2).depth_m, moved, atol=1e-6)
