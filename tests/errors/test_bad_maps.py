@@ -84,7 +84,7 @@ MISTAKES: dict[str, tuple[bytes, str]] = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_what_is_no_map_is_refused_in_a_line(tmp_path: Path, mistake: str) -> None:
+def test_files_that_are_not_maps_are_refused_in_one_line(tmp_path: Path, mistake: str) -> None:
     content, says = MISTAKES[mistake]
     (tmp_path / "given").write_bytes(content)
     assert says in refusal(tmp_path / "given")

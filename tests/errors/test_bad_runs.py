@@ -23,14 +23,14 @@ def refused(path: Path, overwrite: bool = False) -> str:
     return str(caught.value)
 
 
-def test_an_existing_run_is_kept_unless_told(tmp_path: Path) -> None:
+def test_an_existing_run_is_kept_by_default(tmp_path: Path) -> None:
     make(tmp_path / "run").log({"index": 0})
     assert "--overwrite" in refused(tmp_path / "run")
     assert len(RunFolder.open(tmp_path / "run").read_log()) == 1
 
 
 @pytest.mark.parametrize("names", [["photo.jpg"], ["config.json"], ["run.json"], ["config.json", "run.json"]])
-def test_a_folder_of_somebody_else_is_never_overwritten(tmp_path: Path, names: list[str]) -> None:
+def test_a_folder_that_is_not_a_run_is_never_overwritten(tmp_path: Path, names: list[str]) -> None:
     for name in names:
         (tmp_path / name).write_text('{"model": "theirs"}')
     assert "not a run folder of ours" in refused(tmp_path, overwrite=True)

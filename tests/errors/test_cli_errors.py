@@ -104,7 +104,7 @@ def test_help_has_an_example_and_loads_no_torch(arguments: list[str]) -> None:
     ["run x --fx 57O", "run x --limit many", "run x --stride 1.5", "run x --seed None", "run x --register-depth None",
      "inspect x --depth-scale 1OOO", "export x --sigma-below small"],
 )  # fmt: skip
-def test_a_mistyped_number_is_told_without_the_parsers_types(mistyped: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_error_on_a_mistyped_number_is_plain(mistyped: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         cli.main(mistyped.split())
     told = capsys.readouterr().err
@@ -114,7 +114,7 @@ def test_a_mistyped_number_is_told_without_the_parsers_types(mistyped: str, caps
 
 
 @pytest.mark.parametrize("command", ["run", "inspect", "export", "bench", "mesh", "eval", "resume", "demo"])
-def test_help_names_no_none(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_shows_no_none(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         cli.main([command, "--help"])
     assert "None" not in capsys.readouterr().out

@@ -178,7 +178,7 @@ def test_a_unit_that_leaves_no_usable_depth_is_warned_of_and_refused(
     assert not (tmp_path / "run").exists(), "nothing came of it"
 
 
-def test_truth_of_another_time_is_said_after_everything_else_was_written(
+def test_truth_of_another_time_is_reported_after_the_results_are_written(
     tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tiny_tum / "groundtruth.txt").write_text("".join(f"{500 + i} {i} 0 0 0 0 0 1\n" for i in range(4)))
@@ -193,7 +193,7 @@ def test_truth_of_another_time_is_said_after_everything_else_was_written(
 # ---- the place the results go to
 
 
-def test_an_earlier_run_is_kept_unless_told(tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_earlier_run_is_kept_by_default(tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
     command = ["run", str(tiny_tum), "--out", str(out), "--no-eval", *QUICK]
     assert exit_code(*command) == 0

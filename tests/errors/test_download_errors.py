@@ -127,11 +127,11 @@ def test_damaged_on_the_disk(server: FileServer, capsys: pytest.CaptureFixture[s
     assert Path("data/tiny/desk/rgb.txt").is_file() and not Path("data/tiny/desk.tgz").exists()
 
 
-def test_what_cannot_be_run_is_said(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
+def test_recordings_that_cannot_be_run_are_reported(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
     assert "downloaded, but not to be run as it is: unknown format: data/tiny/bare" in refused(capsys, "tiny", "bare")
 
 
-def test_somebody_elses_folder(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_of_another_program_is_kept(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
     Path("data/tiny/desk").mkdir(parents=True)
     assert "data/tiny/desk exists and was not made by this command" in refused(capsys, "tiny", "desk", "--overwrite")
 

@@ -306,7 +306,7 @@ def test_a_damaged_message_is_passed_over_by_topic_and_time(tmp_path: Path) -> N
     assert "camera/color/image_raw at 1000.067 s: unreadable image" in source.skipped[0]
 
 
-def test_a_known_camera_mends_what_is_not_recorded(tmp_path: Path) -> None:
+def test_a_calibration_of_the_user_replaces_the_missing_one(tmp_path: Path) -> None:
     """What the messages advise works."""
     assert open_source(bag(only(*CAMERA_TOPICS))(tmp_path), fx=33.0).camera.fx == 33.0
     camera = dict(zip(("fx", "fy", "cx", "cy"), FOCAL, strict=True))

@@ -137,7 +137,7 @@ def test_the_page_of_settings_is_that_of_the_sources() -> None:
     assert sorted(rows) == sorted({*flat, "name", "seed", "backend"})
 
 
-def test_a_setting_is_said_by_the_text_below_it() -> None:
+def test_a_setting_is_explained_by_the_text_below_it() -> None:
     fields = ("x: int = 1", "y: int = 2", '"""Two\n    lines."""', "z = 3", '"""Not a field."""')
     source = "\n    ".join(("class A:", '"""Of all."""', *fields))
     (found,) = ast.parse(source).body

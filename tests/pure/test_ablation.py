@@ -199,7 +199,7 @@ def test_an_interrupted_ablation_goes_on_where_it_stopped(tmp_path: Path, capsys
     assert not list(tmp_path.glob(".*"))
 
 
-def test_runs_are_dropped_only_where_it_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_are_deleted_only_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "a.json"
     Ablation(("room",), seeds=1, out=out).run(MadeUpRuns())
     before = out.read_text()
@@ -230,7 +230,7 @@ def test_run_folders_stay_where_they_are_to_be_kept(tmp_path: Path) -> None:
     assert sorted(tmp_path.joinpath("kept").iterdir()) == sorted(runner.folders) and len(set(runner.folders)) == 10
 
 
-def test_code_is_told_apart_by_its_bytes(tmp_path: Path) -> None:
+def test_code_is_identified_by_its_bytes(tmp_path: Path) -> None:
     (tmp_path / "kernel.so").write_bytes(b"1")
     first = code_digest(tmp_path, RUNNING)
     (tmp_path / "notes.txt").write_text("no code")

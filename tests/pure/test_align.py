@@ -95,7 +95,7 @@ def test_without_depth_the_guess_comes_back(blind: str) -> None:
     np.testing.assert_array_equal(found.covariance, np.diag(np.full(6, np.inf)))  # nothing in common, nothing known
 
 
-def test_views_apart_do_not_agree() -> None:
+def test_distant_views_do_not_agree() -> None:
     apart, near = (align(seen(10), seen(j), np.eye(4)) for j in (110, 12))
     assert np.isfinite(apart.T_live_reference).all()
     assert apart.agreement * apart.overlap < 0.7 * near.agreement * near.overlap

@@ -225,7 +225,7 @@ def test_a_job_is_taken_from_before_only_if_nothing_changed(tmp_path: Path) -> N
         accuracy.jobs_of(accuracy.Options(presets=("varsplat-nothing",)))
 
 
-def test_a_run_that_fails_is_told_and_leaves_no_result_to_reuse(
+def test_a_failed_run_is_reported_and_leaves_no_result_to_reuse(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = accuracy.Job("nothere", "p", "varsplat-fast", 0, (), 2, "abc")

@@ -142,7 +142,7 @@ def test_half_size_is_cropped_after_resizing() -> None:
     assert (small.cx, small.cy) == pytest.approx((319.1 / 2 - 0.5 - 8, 255.8 / 2 - 0.5 - 8))
 
 
-def test_a_crop_that_leaves_nothing_is_refused() -> None:
+def test_a_crop_of_the_whole_image_is_refused() -> None:
     for width, crop_px in [(0, 3), (4, 2), (16, 6), (0, 100)]:
         with pytest.raises(
             ConfigError, match=rf"input\.crop_px is {crop_px}, which leaves nothing of \d+×\d+"

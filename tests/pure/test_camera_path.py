@@ -54,7 +54,7 @@ def test_full_turns_do_not_unwind() -> None:
     np.testing.assert_allclose(steps, np.pi / 2 * 12 / 199, rtol=0.02)
 
 
-def test_one_pose_and_equal_times_make_a_path_and_none_does_not() -> None:
+def test_one_pose_or_equal_times_are_accepted_and_an_empty_path_is_not() -> None:
     one = turning(np.array([2.0]))
     np.testing.assert_array_equal(resampled(one, 3), np.repeat(one.T_world_camera, 3, 0))
     assert len(resampled(turning(np.array([0.0, 0.0, 1.0])), 5)) == 5

@@ -209,7 +209,7 @@ def test_overwrite_replaces_the_default_folder(corridor: Corridor) -> None:
     assert len(RunFolder.open(Path("runs/my-corridor-sigma")).read_log()) == 6
 
 
-def test_lost_frames_are_said_plainly(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
+def test_lost_frames_are_reported(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     MadeUpSlam.lost = {2, 3, 5}
     assert exit_code("run", "corridor") == 0
     said = capsys.readouterr().out
@@ -289,7 +289,7 @@ def test_what_is_in_the_folder_keeps_it(corridor: Corridor) -> None:
 CLOSED, REFUSED, LAST = MadeUpLoop(7, 0, True), MadeUpLoop(7, 2, False), MadeUpLoop(8, 1, True, 0.0149, 0.1206)
 
 
-def test_submaps_and_loops_are_kept_and_told(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
+def test_submaps_and_loops_are_saved_and_printed(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     MadeUpSlam.every = 2
     MadeUpSlam.tried = {4: [CLOSED, REFUSED], "end": [LAST]}
     told_while_running: list[list[dict[str, Any]]] = []

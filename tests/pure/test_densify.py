@@ -164,7 +164,7 @@ def seen() -> Keyframe:
     return Keyframe(0, Target(CAMERA, torch.zeros(3, 30, 40), torch.zeros(30, 40), 0), np.eye(4))
 
 
-def test_densification_goes_by_the_mean_gradient_over_the_steps_that_saw_a_splat() -> None:
+def test_densification_uses_the_mean_gradient_over_the_steps_that_saw_a_splat() -> None:
     newest, other = seen(), seen()
     stats = DensifyStats.of(newest, 4)
     for grad2d in ([2.0, 0.0, 0.5, 0.0], [0.0, 0.0, 0.7, 1.0], [4.0, 0.0, 0.6, 0.0]):

@@ -25,7 +25,7 @@ def test_each_thing_that_is_missing_has_its_line(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize(("version", "enough"), [(13020, True), (12080, False)])
-def test_a_driver_older_than_the_compiler_is_told_of(
+def test_a_driver_older_than_the_compiler_is_reported(
     monkeypatch: pytest.MonkeyPatch, version: int, enough: bool
 ) -> None:
     driver = pytest.importorskip("cuda.bindings.driver", reason="needs pip install 'sigmasplat[gpu]'")

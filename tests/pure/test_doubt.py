@@ -26,7 +26,7 @@ def test_sigma_is_the_root_of_the_mean_variance() -> None:
     assert splat_filter.sigmas(field).tolist() == pytest.approx([math.sqrt(0.1), 0.2, 0.3])
 
 
-def test_bounds_keep_what_they_say() -> None:
+def test_bounds_filter_splats() -> None:
     for bounds, kept, by_sigma, by_opacity in [
         ({}, [True, True, True], 0, 0),
         ({"sigma_below": 0.25}, [True, True, False], 1, 0),
@@ -39,7 +39,7 @@ def test_bounds_keep_what_they_say() -> None:
         assert sure.dropped == kept.count(False)
 
 
-def test_a_new_map_knows_no_variance() -> None:
+def test_a_new_map_has_no_learned_variance() -> None:
     assert not splat_filter.has_learned_variance(
         GaussianField.from_values(torch.zeros(2, 3), torch.ones(2), torch.zeros(2, 3))
     )

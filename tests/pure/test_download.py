@@ -53,7 +53,7 @@ def test_a_recording_is_downloaded_and_unpacked_out_of_its_wrapping(server: File
     assert sorted(path.name for path in (tmp_path / "test").iterdir()) == ["desk", "desk.tgz.sha256"]
 
 
-def test_the_second_time_nothing_is_asked_for(server: FileServer, tmp_path: Path) -> None:
+def test_the_second_time_nothing_is_downloaded(server: FileServer, tmp_path: Path) -> None:
     obtained(public_set(server), tmp_path)
     requests = list(server.ranges)
     assert obtained(public_set(server), tmp_path) == FILES
@@ -250,7 +250,7 @@ def test_names_are_found_as_people_write_them() -> None:
         (("scannetpp", ""), "is given on request only: ask at https://scannetpp"),
     ],
 )
-def test_what_is_not_found_is_said(asked: tuple[str, str], says: str) -> None:
+def test_the_error_on_an_unknown_name_lists_the_known_ones(asked: tuple[str, str], says: str) -> None:
     with pytest.raises(DownloadError, match=re.escape(says)):
         find_recording(*asked)
 

@@ -60,7 +60,7 @@ def test_a_file_comes_whole_and_alone(server: FileServer, tmp_path: Path) -> Non
     ],
     ids=lambda first: str(len(first)),
 )
-def test_it_is_whole_in_spite_of(first: list[Act], server: FileServer, tmp_path: Path) -> None:
+def test_the_file_is_complete_in_spite_of_errors(first: list[Act], server: FileServer, tmp_path: Path) -> None:
     server.acts = list(first)
     server.files["/moved.tgz"] = BODY
     fetched(server, tmp_path / "a.tgz")
@@ -69,14 +69,14 @@ def test_it_is_whole_in_spite_of(first: list[Act], server: FileServer, tmp_path:
 
 
 @pytest.mark.parametrize("slow", [acts.trickle(5.0), acts.silence(0.8)], ids=["trickle", "silence"])
-def test_it_is_whole_though_one_try_was_slow(slow: Act, server: FileServer, tmp_path: Path) -> None:
+def test_the_file_is_complete_although_one_try_was_slow(slow: Act, server: FileServer, tmp_path: Path) -> None:
     server.acts = [acts.drop_after(3000), slow]
     fetched(server, tmp_path / "a.tgz", IMPATIENT)
     assert (tmp_path / "a.tgz").read_bytes() == BODY
     assert len(server.ranges) >= 3 and server.ranges[1] == "bytes=3000-"
 
 
-def test_it_goes_on_where_it_broke(server: FileServer, tmp_path: Path) -> None:
+def test_a_broken_download_continues(server: FileServer, tmp_path: Path) -> None:
     server.acts = [acts.drop_after(3000), acts.drop_after(2500)]
     fetched(server, tmp_path / "a.tgz")
     assert server.ranges == ["", "bytes=3000-", "bytes=5500-"]

@@ -65,7 +65,7 @@ def test_a_hop_of_unknown_covariance_counts_as_a_usual_one() -> None:
     assert np.allclose(drift.information @ OWN, np.eye(6))
 
 
-def test_a_hop_between_images_with_nothing_in_common_is_as_good_as_none() -> None:
+def test_a_hop_without_overlap_carries_no_information() -> None:
     for nothing in [np.inf, np.nan]:
         drift = Drift()
         drift.hop(np.eye(4), np.full((6, 6), nothing))
@@ -87,7 +87,7 @@ def test_what_is_bent_grows_with_the_way_not_with_its_root() -> None:
     assert deviations[0] == pytest.approx(BIAS * 2.0, rel=0.01)
 
 
-def test_each_rule_ends_a_submap_by_itself_and_none_of_them_where_it_is_off() -> None:
+def test_each_rule_alone_ends_a_submap_unless_it_is_off() -> None:
     T = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, np.deg2rad(30.0), 0.0]))
     T[:3, 3] = [0.3, 0.4, 0.0]
     for rule, config in (

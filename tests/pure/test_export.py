@@ -83,7 +83,7 @@ def test_plain_leaves_out_what_3dgs_does_not_know(export: Callable[..., str]) ->
     assert header.count(b"property float ") == 62 and b"log_variance" not in header
 
 
-def test_every_format_can_be_told_from_the_others() -> None:
+def test_every_format_can_be_distinguished() -> None:
     names = [row.name for row in FORMATS]
     assert len(set(names)) == len(names)
     for row in FORMATS:

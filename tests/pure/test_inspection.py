@@ -40,14 +40,14 @@ def test_colour_and_depth_of_one_camera_agree(frames):
     assert found.magnification == 0.0 and np.abs(found.shift_px).max() <= 1.0
 
 
-def test_depth_of_another_camera_is_noticed_and_what_would_mend_it_is_told(frames):
+def test_depth_of_another_camera_is_detected_and_a_fix_is_suggested(frames):
     found = edge_agreement([unregistered(frame) for frame in frames])
     assert found.known and not found.registered and found.score < 0.5
     assert found.magnification == pytest.approx(1 / 1.1 - 1, abs=0.03)
     assert "magnified by -" in found.sentence()
 
 
-def test_where_there_is_nothing_to_see_nothing_is_said(frames):
+def test_blank_images_give_no_finding(frames):
     wall = replace(frames[0], depth_m=np.full_like(frames[0].depth_m, 2.0))
     assert edge_agreement([wall]) is None
     noise = np.random.default_rng(0).uniform(1, 4, wall.depth_m.shape).astype(np.float32)
@@ -77,7 +77,7 @@ def test_rows_tell_what_is_there(tiny_tum):
     assert np.asarray(found.sheet).std() > 10
 
 
-def test_a_depth_scale_that_was_given_is_asked_about(tiny_tum):
+def test_an_implausible_depth_scale_of_the_user_gives_a_warning(tiny_tum):
     rows = dict(inspect_source(tiny_tum, InputConfig(depth_scale=2500.0)).rows)
     assert rows["depth unit"] == "2500 per metre"
     assert rows["your depth scale"] == "half of what is seen is nearer than 0.80 m: is that so?"
@@ -141,7 +141,7 @@ class Unregistered:
         return map(unregistered, self.source)
 
 
-def test_a_recording_of_two_cameras_is_noticed_and_mended_by_the_option_that_is_named(tmp_path):
+def test_unregistered_depth_is_detected_and_the_named_option_fixes_it(tmp_path):
     room = open_source("synthetic:frames=120,width=320,height=240", stride=15)
     write_tum(Unregistered(room), tmp_path / "two")
     first = inspect_source(tmp_path / "two", InputConfig())

@@ -91,7 +91,7 @@ def write_colmap(folder: Path) -> tuple[Trajectory, np.ndarray, np.ndarray]:
     return path, points, colors
 
 
-def test_colmap_text_is_as_its_documents_say(tmp_path: Path) -> None:
+def test_colmap_text_follows_its_documentation(tmp_path: Path) -> None:
     path, points, colors = write_colmap(tmp_path)
     lines = {
         name: [line for line in (tmp_path / f"{name}.txt").read_text().split("\n") if not line.startswith("#")]

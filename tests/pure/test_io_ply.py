@@ -78,7 +78,7 @@ def test_columns_are_found_by_a_reader_of_names(tmp_path: Path, harmonics: bool)
 
 
 @pytest.mark.parametrize("harmonics", [False, True])
-def test_plain_files_are_the_record_that_3dgs_knows_by_heart(tmp_path: Path, harmonics: bool) -> None:
+def test_plain_files_have_the_record_of_the_3dgs_viewer(tmp_path: Path, harmonics: bool) -> None:
     """As its own viewer reads: the number of splats from line 3, then records of 62 floats, names unseen."""
     field = random_field(3)
     if harmonics:
@@ -159,7 +159,7 @@ def other_programs_ply(path: Path, order: str, drop: str = "", rows: int = 3, re
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_maps_of_others_are_read_by_name(tmp_path: Path, order: str) -> None:
+def test_maps_of_other_programs_are_read_by_column_name(tmp_path: Path, order: str) -> None:
     other_programs_ply(tmp_path / "other.ply", order)
     field = read_field(tmp_path / "other.ply")
     assert field.means[1].tolist() == [4.125, 5.125, 6.125]

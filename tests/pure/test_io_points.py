@@ -36,7 +36,7 @@ def test_points_are_loaded_with_normals_and_colours(tmp_path: Path, normals: boo
         np.testing.assert_allclose(found, mesh.normals(), atol=1e-6)
 
 
-def test_no_points_are_written_as_none(tmp_path: Path) -> None:
+def test_an_empty_point_cloud_can_be_written(tmp_path: Path) -> None:
     write_points(tmp_path / "a.ply", np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)))
     assert b"element vertex 0\n" in (tmp_path / "a.ply").read_bytes()
 

@@ -120,7 +120,7 @@ def test_overwriting_removes_loops_and_our_submaps_and_no_others(run: RunFolder)
     assert sorted(p.name for p in again.submaps.folder.iterdir()) == ["a.txt", "submap-mine.safetensors"]
 
 
-def test_loops_come_back_and_are_none_in_older_runs(run: RunFolder) -> None:
+def test_loops_come_back_and_older_runs_have_an_empty_list(run: RunFolder) -> None:
     assert run.read_loops() == []
     run.write_loops([{"query": 7, "database": 0, "chi2": float("nan"), "T": np.eye(2)}])
     assert run.read_loops() == [{"query": 7, "database": 0, "chi2": None, "T": [[1.0, 0.0], [0.0, 1.0]]}]
@@ -133,7 +133,7 @@ KILLED_AT = ["mkdir", "write_text", "replace", "unlink"]
 @pytest.mark.parametrize("earlier", [False, True], ids=["fresh", "overwriting"])
 @pytest.mark.parametrize("call", KILLED_AT)
 @pytest.mark.parametrize("at", range(4))
-def test_a_run_killed_at_birth_leaves_a_folder_that_can_be_had(
+def test_a_run_killed_while_it_is_created_leaves_a_folder_that_can_be_overwritten(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, earlier: bool, call: str, at: int
 ) -> None:
     out = tmp_path / "run"

@@ -274,7 +274,7 @@ def test_morton_order_keeps_neighbours_together() -> None:
     assert morton_order(np.zeros((3, 3))).tolist() == [0, 1, 2] and len(morton_order(np.empty((0, 3)))) == 0
 
 
-def test_smallest_three_say_the_rotation() -> None:
+def test_the_three_smallest_components_give_the_rotation() -> None:
     quats = np.random.default_rng(0).normal(size=(200, 4))
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     which, others = smallest_three(quats)

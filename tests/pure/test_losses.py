@@ -134,7 +134,7 @@ def test_nll_is_least_where_variance_equals_squared_residual() -> None:
     assert float(m["variance"].grad[settled].abs().max()) < 1e-9
 
 
-def test_nll_bears_variance_below_zero_by_rounding_without_changing_the_map() -> None:
+def test_nll_accepts_variance_slightly_below_zero() -> None:
     m = maps()
     with torch.no_grad():
         m["variance"][0, 0] = -1e-7
@@ -184,7 +184,7 @@ def test_full_nll_is_least_where_the_covariance_is_that_of_the_residuals() -> No
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_full_nll_bears_what_rounding_makes_of_a_covariance(dtype: torch.dtype) -> None:
+def test_full_nll_stays_finite_for_a_covariance_with_rounding_errors(dtype: torch.dtype) -> None:
     """Nothing at all, one direction only, and indefinite by a rounding error: finite, with finite gradients."""
     m = {name: x.detach().to(dtype) if name != "valid" else x for name, x in maps().items()}
     line = torch.rand(W, 3, dtype=dtype)

@@ -52,7 +52,7 @@ def scored(found: Mesh, truth: Mesh, poses: np.ndarray) -> MeshScores:
     return score(found, truth, CAMERA, poses, points=10_000, novel_views=3)
 
 
-def test_a_surface_is_as_good_as_itself() -> None:
+def test_a_surface_scores_perfectly_against_itself() -> None:
     found = scored(ball(), ball(), around())
     assert found.accuracy_m < 1e-5 and found.completion_m < 1e-5 and found.depth_l1_m == 0.0
     shares = [found.completion_ratio, found.precision, found.recall, found.f1, found.depth_coverage]
@@ -125,7 +125,7 @@ def test_novel_views_are_new_clear_and_repeatable() -> None:
     assert sample_novel_views(truth, CAMERA, np.empty((0, 4, 4)), 8, seed=3) == []
 
 
-def test_nothing_found_is_said_not_hidden() -> None:
+def test_an_empty_result_is_reported() -> None:
     found = scored(EMPTY, wall(2.0), AHEAD)
     assert np.isnan(found.accuracy_m) and np.isnan(found.precision) and np.isnan(found.depth_l1_m)
     assert found.completion_ratio == found.recall == found.depth_coverage == 0.0 and found.completion_m == np.inf

@@ -74,7 +74,7 @@ def test_of_the_truth_only_what_was_seen_counts() -> None:
     assert scored(there, truth=both).floaters == 0.0, "a splat on a surface that no view saw does not float"
 
 
-def test_nothing_is_said_not_hidden() -> None:
+def test_an_empty_result_is_reported() -> None:
     found = scored(np.empty((0, 3)))
     assert np.isnan(found.splats_accuracy_m) and found.splats_completion_m == np.inf and np.isnan(found.floaters)
     faint = scored(lattice(2.0), 0.05)

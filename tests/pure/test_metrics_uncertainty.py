@@ -69,6 +69,6 @@ def test_ause_ranks_rankings() -> None:
     assert np.isnan(ause(np.empty(0), np.empty(0))) and np.isnan(ause(np.ones(3), np.zeros(3)))
 
 
-def test_score_of_nothing_is_nan_not_a_crash() -> None:
+def test_the_score_of_zero_pixels_is_nan() -> None:
     values = score(np.empty(0), np.empty(0))
     assert values["pixels"] == 0 and np.isnan(values["spearman"]) and values["reliability"] == []

@@ -166,7 +166,7 @@ def test_saving_and_loading_changes_no_bit(tmp_path: Path, kind: str) -> None:
     assert np.array_equal(described(tmp_path / "ours.safetensors"), described(path))
 
 
-def test_the_format_is_told_by_content_not_by_name(tmp_path: Path) -> None:
+def test_the_format_follows_from_the_content_not_the_name(tmp_path: Path) -> None:
     n = net()
     wrong = save_matlab(tmp_path / "net.mat", n).rename(tmp_path / "net.pth")
     assert described(wrong).shape == (P,)

@@ -194,7 +194,7 @@ def test_the_dockerfile_copies_what_there_is_and_what_the_build_needs() -> None:
     assert "*" in ignored and "**/*.so" in ignored
 
 
-def test_the_dockerfile_is_as_the_project_says() -> None:
+def test_the_dockerfile_matches_the_project() -> None:
     names = [name for name, _ in instructions()]
     known = {"ARG", "FROM", "RUN", "WORKDIR", "COPY", "USER", "ENTRYPOINT", "CMD"}
     assert set(names) == known  # no ADD, which fetches addresses and unpacks

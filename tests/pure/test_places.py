@@ -81,7 +81,7 @@ def test_the_spread_of_variances_may_be_extreme() -> None:
     assert np.isfinite(w).all() and w[0] == 3.0 and (w[1:] == pytest.approx(1 / 3))
 
 
-def test_the_gate_is_the_product_within_its_bounds_and_knows_no_sides() -> None:
+def test_the_gate_is_the_clamped_product_and_symmetric() -> None:
     assert gate(1.02, 1.05) == pytest.approx(1.071) and gate(1.0, 1.0) == 1.0
     assert gate(0.9, 0.9) == 0.85 and gate(0.5, 0.5) == 0.85
     assert gate(1.2, 1.1) == 1.20 and gate(3.0, 3.0) == 1.20

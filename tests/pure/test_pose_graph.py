@@ -82,7 +82,7 @@ def small(seed: int) -> tuple[Array, list[Edge]]:
 # The false loop must not bend the map: issue 4.
 
 
-def test_two_false_loops_of_six_harm_no_more_than_none() -> None:
+def test_two_false_loops_of_six_do_no_harm() -> None:
     for seed in range(8):
         truth, drifted, edges = scene(seed)
         found = optimise(drifted, edges)

@@ -321,7 +321,7 @@ def test_families_are_few_and_leave_no_preset_out() -> None:
         ("quick", f"no preset 'quick'; there are {', '.join(list_presets())}"),
     ],
 )
-def test_an_unknown_name_is_answered_with_those_like_it(name: str, told: str) -> None:
+def test_the_error_on_an_unknown_preset_suggests_similar_ones(name: str, told: str) -> None:
     with pytest.raises(ConfigError) as problem:
         preset(name)
     assert str(problem.value).startswith(told)

@@ -95,7 +95,7 @@ def test_every_bit_is_that_of_the_definition(depth_camera, T_color_depth):
     assert moved.any() and moved.tobytes() == by_definition(depth_camera, COLOR, T_color_depth, depth).tobytes()
 
 
-def test_no_reading_and_points_behind_give_none():
+def test_missing_readings_and_points_behind_the_camera_are_left_out():
     back = np.diag([1.0, 1.0, 1.0, 1.0])
     back[2, 3] = -3.0
     assert not DepthRegistration(DEPTH, COLOR, np.eye(4))(np.zeros((48, 64), np.float32)).any()
@@ -128,7 +128,7 @@ def test_registration_can_be_refused_and_asked_for(tiny_tum):
 
 
 @pytest.mark.parametrize("matrix", [[[1, 2], [3, 4]], np.diag([2.0, 1, 1, 1]).tolist(), "none", [[1, "x"]]])
-def test_a_transform_that_is_none_is_refused(tiny_tum, matrix):
+def test_an_invalid_transform_is_refused(tiny_tum, matrix):
     with_depth_camera(tiny_tum, T_color_depth=matrix)
     with pytest.raises(SourceError, match=r"calibration.json: field \"T_color_depth\" is no rigid 4×4"):
         open_source(tiny_tum)

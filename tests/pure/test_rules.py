@@ -15,7 +15,7 @@ def fit(agreement: float, overlap: float) -> PoseFit:
     return PoseFit(np.eye(4), agreement, overlap, NAN, 0.0, 1)
 
 
-def test_a_keyframe_is_due_after_so_many_frames_or_when_too_little_is_shared() -> None:
+def test_a_keyframe_is_due_after_a_number_of_frames_or_at_low_overlap() -> None:
     due = {(4, 1.0): False, (5, 1.0): True, (6, 1.0): True, (1, 0.71): False, (1, 0.69): True, (1, 0.0): True}
     assert {(frames, overlap): is_keyframe(frames, 5, overlap, 0.7) for frames, overlap in due} == due
 
@@ -67,7 +67,7 @@ def test_history_leaves_out_what_is_older() -> None:
     assert shares(9, 0.4, history=3)[8] == pytest.approx(0.4, abs=0.02)
 
 
-def test_the_newest_alone_where_there_is_no_other_or_none_is_wanted() -> None:
+def test_only_the_newest_is_drawn_if_it_is_alone_or_certain() -> None:
     for keyframes, probability in [(1, 0.0), (1, 0.4), (6, 1.0)]:
         assert shares(keyframes, probability, draws=200) == {keyframes - 1: 1.0}
 

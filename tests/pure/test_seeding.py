@@ -136,7 +136,7 @@ def test_what_has_gone_behind_is_not_seeded() -> None:
     assert not later_pixels(maps(np.full(SIZE, 3.0, np.float32)), target(depth), SETTINGS).any()
 
 
-def test_the_bound_is_the_factor_times_the_median_error_but_at_least_so_many_metres() -> None:
+def test_the_bound_is_the_factor_times_the_median_error_with_a_minimum_in_metres() -> None:
     depth, surface = np.full(SIZE, 3.0, np.float32), np.full(SIZE, 3.01, np.float32)  # the median error is 1 cm
     depth[0, 0], depth[0, 1] = 3.01 - 0.39, 3.01 - 0.41
 
@@ -184,7 +184,7 @@ def made(pixels: Mask, depth_m: Array, spacing_px: float = 1.0, field: GaussianF
     return make_splats(seen, POSE, pixels, spacing_px, field or GaussianField.empty(), changed(**values)), seen
 
 
-def test_splats_lie_on_their_pixels_rays_as_far_behind_the_reading_as_asked() -> None:
+def test_splats_lie_on_their_pixels_rays_behind_the_reading_by_push_back() -> None:
     for push_back in [1.0, 1.005, 1.02]:
         depth = random(6).uniform(1.0, 4.0, SIZE).astype(np.float32)
         field, seen = made(SOME, depth, opacity=0.8, scale_from="pixel", push_back=push_back)
@@ -247,7 +247,7 @@ def test_a_stray_reading_is_removed_where_asked() -> None:
     assert np.linalg.norm(kept.means.numpy() - POSE[:3, 3], axis=1).max() < 5 and len(kept) > 0.8 * len(everything)
 
 
-def test_few_pixels_or_none_make_few_splats_or_none() -> None:
+def test_the_number_of_pixels_is_the_number_of_splats() -> None:
     for count, scale_from in itertools.product([0, 1, 3], ["pixel", "neighbours"]):
         pixels = np.zeros(SIZE, bool)
         pixels[5, 5 : 5 + count] = True

@@ -121,7 +121,7 @@ def test_a_scene_without_any_pose_has_no_truth(tmp_path):
 # ScanNet++
 
 
-def test_test_views_are_apart_with_poses_in_the_same_world(tmp_path):
+def test_test_views_are_separate_with_poses_in_the_same_world(tmp_path):
     written = sample()
     scene = layouts.scannetpp(tmp_path, written)
     views = open_source(scene, stride=2).test_views()
@@ -252,7 +252,7 @@ def test_smaller_depth_is_seen_by_the_same_camera_and_the_unit_is_the_files(tmp_
     assert (source.frame(0).depth_m == 2.0).all() and source.depth_units_per_metre == 100.0
 
 
-def test_a_lens_is_taken_out_and_a_frame_without_pose_or_depth_is_borne(tmp_path):
+def test_distortion_is_removed_and_a_frame_without_pose_or_depth_is_accepted(tmp_path):
     folder = layouts.nerfstudio(tmp_path, sample())
     frames = json.loads((folder / "transforms.json").read_text())["frames"]
     named = {frame["file_path"]: frame for frame in frames}

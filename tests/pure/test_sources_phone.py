@@ -99,7 +99,7 @@ def test_record3ds_poses_are_turned_from_opengls_axes(tmp_path: Path) -> None:
     assert truth.timestamps_s.tolist() == seen.times_s.tolist()
 
 
-def test_record3ds_front_camera_knows_no_path(tmp_path: Path) -> None:
+def test_record3ds_front_camera_has_no_path(tmp_path: Path) -> None:
     still = [[0, 0, 0, 1, 0, 0, 0]] * FRAMES
     assert open_source(write_zip(tmp_path / "a.r3d", r3d_members(scene(SMALL), poses=still))).truth() is None
 

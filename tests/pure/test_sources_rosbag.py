@@ -308,7 +308,7 @@ def test_a_bag_keeps_no_messages(tmp_path: Path) -> None:
     assert bag.read(CAMERA_TOPICS[0], entries[3]).height == 24
 
 
-def test_messages_of_one_moment_are_told_apart(tmp_path: Path) -> None:
+def test_messages_with_the_same_time_are_distinguished(tmp_path: Path) -> None:
     def fill(recorder: Recorder, seen: Scene) -> None:
         aligned(recorder, seen)
         recorder.messages = [(topic, kind, 5 * 10**9, message) for topic, kind, _, message in recorder.messages]

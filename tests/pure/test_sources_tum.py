@@ -65,7 +65,7 @@ def test_float_depth_is_metres_already(tiny_tum):
     assert (open_source(tiny_tum).frame(0).depth_m == 1.25).all()
 
 
-def test_the_folders_name_gives_the_camera_away(tmp_path):
+def test_the_camera_follows_from_the_name_of_the_folder(tmp_path):
     camera = {
         "rgbd_dataset_freiburg1_desk": "1",
         "rgbd_dataset_freiburg2_xyz": "2",

@@ -62,7 +62,7 @@ def test_the_share_is_of_the_newest_keyframes_splats() -> None:
     assert covisible_splats(few[:0], [many, few]).tolist() == [0.0, 0.0]
 
 
-def test_a_camera_shares_all_readings_with_itself_and_none_with_one_that_looks_away() -> None:
+def test_a_camera_shares_all_readings_with_itself_and_zero_with_an_opposite_one() -> None:
     rough = np.random.default_rng(0).uniform(0.5, 5.0, (CAMERA.height, CAMERA.width))
     rough[::3] = 0.0
     at = pose(1.0, -2.0, 3.0, 30.0)

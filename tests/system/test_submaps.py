@@ -75,7 +75,7 @@ def test_the_map_is_cut_and_the_path_goes_on(run: Slam) -> None:
     assert error_m(run) < 0.01
 
 
-def test_each_submap_begins_at_its_own_origin_with_the_keyframe_that_ended_the_one_before(run: Slam) -> None:
+def test_each_submap_starts_with_the_last_keyframe_of_the_previous_one_at_its_origin(run: Slam) -> None:
     pieces = [run.store.load(i) for i in range(len(run.store))]
     assert len(pieces) == 3
     for before, after in pairwise(pieces):
@@ -148,7 +148,7 @@ def test_one_submap_is_refined_too() -> None:
     assert slam.field is not slam.mapper.field
 
 
-def test_an_heir_knows_what_is_in_view_and_an_empty_one_nothing() -> None:
+def test_a_successor_inherits_the_splats_in_view_unless_inherit_is_off() -> None:
     """Inherited splats are where they were in the world, and only those that the new submap's first view can feel."""
     slam = followed(settings(loops__close="false", submaps__frames="0"), finish=False)
     T_submap_camera, whole = slam.mapper.keyframes[-1].T_world_camera, slam.mapper.field
@@ -167,7 +167,7 @@ def test_an_heir_knows_what_is_in_view_and_an_empty_one_nothing() -> None:
 @pytest.mark.parametrize(
     ("steps", "expected"), [("0", [(0, 1), (1, 1)]), ("2", [(0, 2), (0, 2), (1, 2), (2, 2), (2, 2)])]
 )
-def test_finishing_is_told_from_its_beginning_to_its_end(steps: str, expected: list[tuple[int, int]]) -> None:
+def test_finishing_reports_progress_from_start_to_end(steps: str, expected: list[tuple[int, int]]) -> None:
     slam, told, stored = Slam(settings(final__iterations=steps)), list[tuple[int, int]](), list[int]()
     for frame in there_and_back()[:3]:
         slam.step(frame)
