@@ -1,7 +1,7 @@
-"""Compare the weights of σ² on four sequences as `sigmasplat bench ablation` does, and keep the result.
+"""Compare the weights of σ² on four sequences, with `sigmasplat bench ablation`.
 
-What has been run is in runs/bench/ablation/NAME.json and not run again while code and settings stay. Writes
-benchmarks/results/<name>-<machine>.json; `python benchmarks/tables.py` lays it out in the documents.
+Finished runs are kept in runs/bench/ablation/NAME.json and are not repeated while code and settings are unchanged.
+Writes benchmarks/results/<name>-<machine>.json; `python benchmarks/tables.py` writes its tables into the documents.
 
 example: python benchmarks/ablation.py --sources redkitchen --seeds 1 --limit 200
 """
@@ -25,32 +25,32 @@ from sigmasplat.evaluation.paired_comparison import FIGURES, columns, effects, p
 
 arg = tyro.conf.arg
 SYNTHETIC = "synthetic:frames=240,overrun=20,noise=1,drift=6,seed={seed}"
-"""A room of its own for each seed, a sensor that drifts, and a walk that ends on its own beginning."""
+"""A different room for each seed, a sensor that drifts, and a path that ends where it began."""
 SOURCES = ("synthetic", "livingroom", "redkitchen", "hololens")
 RUNS = record.ROOT / "runs" / "bench" / "ablation"
 
 
 @dataclass(frozen=True)
 class Options:
-    """Compare the weights of σ² on four sequences, and keep the result."""
+    """Compare the weights of σ² on four sequences."""
 
-    sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = SOURCES
+    sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = SOURCES
     preset: described.PresetName = DEFAULT_PRESET
     settings: described.Settings = ()
     seeds: described.Seeds = 3
     tau: described.Tau = 10.0
     limit: described.Limit = None
     reference: Annotated[bool, arg(help="leave out the runs without variance", help_behavior_hint="")] = True
-    name: Annotated[str, arg(help="name of the results; another one for other --set")] = "ablation"
-    runs: Annotated[Path, arg(help="folder of what has been run")] = RUNS
+    name: Annotated[str, arg(help="name of the results; use another name with other --set")] = "ablation"
+    runs: Annotated[Path, arg(help="folder of finished runs")] = RUNS
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
     def working_file(self) -> Path:
-        """Return where runs are kept as they finish."""
+        """Return the file that finished runs are added to."""
         return self.runs / f"{record.slug(self.name)}.json"
 
     def ablation(self) -> Ablation:
-        """Return the command that does it; runs made with other settings or code are dropped."""
+        """Return the command to run; runs made with other settings or code are dropped."""
         sources = tuple(map(located, self.sources))
         return Ablation(
             sources, self.preset, self.settings, self.seeds, self.tau, self.limit, self.reference,
@@ -59,18 +59,18 @@ class Options:
 
 
 def located(name: str) -> str:
-    """Return the path of a sequence: in the data folder if it is there, else the name as it stands."""
+    """Return the path of a sequence in the data folder, or the name unchanged if it is not there."""
     known = record.data_root() / name
     return SYNTHETIC if name == "synthetic" else str(known.resolve()) if known.is_dir() else name
 
 
 def short(source: str) -> str:
-    """Return a sequence's name for tables: its folder's, or the built-in one's without its options."""
+    """Return a sequence's name for tables: the folder name, or the built-in sequence without its options."""
     return Path(source.partition(":")[0]).name
 
 
 def kept(results: dict[str, Any]) -> dict[str, Any]:
-    """Return an ablation's file for the committed results: figures only, sequences by name, not by where they lie."""
+    """Return an ablation's runs for the committed results: figures only, with names instead of paths."""
     named = [run | {"source": short(run["source"]), "path": Path(run["path"]).name} for run in results["runs"]]
     runs = [{name: value for name, value in run.items() if name != "metrics"} for run in named]
     return {"config": results["config"], "runs": runs}
@@ -84,7 +84,7 @@ JUDGED = tuple(figure for figure in FIGURES if figure.judged)
 
 
 def sections(measured: dict[str, Any]) -> list[Section]:
-    """Return the tables of results written by ablation.py: one per sequence, `Effects`, and `Verdicts` in words."""
+    """Return the tables of results: one per sequence, `Effects`, and `Verdicts` in words."""
     runs = measured["figures"]["runs"]
     sources = list(dict.fromkeys(run["source"] for run in runs))
     by_source = {source: [run for run in runs if run["source"] == source] for source in sources}
@@ -94,22 +94,22 @@ def sections(measured: dict[str, Any]) -> list[Section]:
 
 
 def variants(runs: Runs) -> list[str]:
-    """List the variants that were run, in the table's order."""
+    """List the variants that were run, in the order of the table."""
     return [name for name in (WITHOUT_VARIANCE, *NAMES) if any(run["variant"] == name for run in runs)]
 
 
 def sequence(source: str, runs: Runs, tau: float) -> Section:
-    """Lay out a sequence, a row a variant, the best of each column in bold."""
+    """Tabulate a sequence: one row per variant, the best value of each column in bold."""
     figures, seeds = columns(runs), len({run["seed"] for run in runs})
     laid_out = rows(runs, variants(runs), lambda text: f"**{text}**", figures)
     note = f"Mean ± standard deviation of {seeds} seeds, τ = {tau:g} in every weight. Views are held out."
     worlds = len({run["path"] for run in runs})
-    note += f" {worlds} worlds, one a seed." if worlds > 1 else ""
+    note += f" {worlds} worlds, one per seed." if worlds > 1 else ""
     return Section(source, ["weights of σ²", *(figure.head for figure in figures)], laid_out, note)
 
 
 def effects_of(by_source: dict[str, Runs], seeds: int) -> Section:
-    """Lay out differences at equal seeds, those beyond one standard deviation in bold."""
+    """Tabulate differences at equal seeds; those larger than one standard deviation are bold."""
     laid_out = []
     for source, runs in by_source.items():
         for changed, against in compared(runs):
@@ -120,12 +120,12 @@ def effects_of(by_source: dict[str, Runs], seeds: int) -> Section:
             laid_out.append([source, f"{changed} against {against}", *shown])
     note = "Mean ± standard deviation of the differences at equal seeds"
     if seeds > 1:
-        note += f"; bold: the mean is beyond one deviation, as {passed_by_chance(seeds):.0%} of figures are by chance"
+        note += f"; bold: larger than one deviation ({passed_by_chance(seeds):.0%} of figures are by chance)"
     return Section("Effects", ["sequence", "change", *(figure.title for figure in JUDGED)], laid_out, f"{note}.")
 
 
 def verdicts(by_source: dict[str, Runs]) -> Section:
-    """Say on which sequences a change helps or harms which figure beyond one deviation, and where it does neither."""
+    """List the figures that each change helps or harms by more than one deviation, and sequences without either."""
     laid_out = []
     for changed, against in dict.fromkeys(pair for runs in by_source.values() for pair in compared(runs)):
         helped, harmed, neither = [], [], []
@@ -137,7 +137,7 @@ def verdicts(by_source: dict[str, Runs]) -> Section:
             neither += [] if stands_out else [source]
         cells = [", ".join(names) or "–" for names in (helped, harmed, neither)]
         laid_out.append([f"{changed} against {against}", *cells])
-    return Section("Verdicts", ["change", "helps", "harms", "no effect beyond the seeds"], laid_out)
+    return Section("Verdicts", ["change", "helps", "harms", "all within one deviation"], laid_out)
 
 
 def verdict_counts(measured: dict[str, Any], changed: str, against: str) -> Counter[str]:
@@ -149,13 +149,13 @@ def verdict_counts(measured: dict[str, Any], changed: str, against: str) -> Coun
 
 
 def compared(runs: Runs) -> list[tuple[str, str]]:
-    """List which variant is judged against which, of those that were run."""
+    """List the pairs of variants to compare, of those that were run."""
     there = set(variants(runs))
     return [pair for pair in COMPARED if set(pair) <= there]
 
 
 def main(options: Options) -> int:
-    """Run, write, print; exit code 2 if the options mean nothing."""
+    """Run, write the results, print them; exit code 2 if the options are invalid."""
     options.runs.mkdir(parents=True, exist_ok=True)
     try:
         options.ablation().run()

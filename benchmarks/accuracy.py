@@ -1,7 +1,7 @@
-"""Run SLAM on sequences × presets × seeds, as the command line does, and sum up what each run was worth.
+"""Run SLAM on sequences × presets × seeds with the command line, and collect accuracy, speed and memory.
 
-Every job is `sigmasplat run` in a process of its own, its run folder under runs/bench/. A job whose code and settings
-have been run before is read, not run, unless --fresh. Writes benchmarks/results/<name>-<machine>.json, prints tables.
+Every job is `sigmasplat run` in its own process, with its run folder under runs/bench/. A finished job with the same
+code and settings is read, not repeated, unless --fresh. Writes benchmarks/results/<name>-<machine>.json, prints tables.
 
 example: python benchmarks/accuracy.py --sources synthetic redkitchen --seeds 0 1
 """
@@ -26,7 +26,7 @@ import sigmasplat
 from sigmasplat.commands.options import Settings
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.io.machine import RUNNING, code_digest
+from sigmasplat.io.machine import INSTALLED, code_digest
 from sigmasplat.presets import default_preset, preset as preset_of
 
 arg = tyro.conf.arg
@@ -37,22 +37,22 @@ RUNS = record.ROOT / "runs" / "bench"
 
 @dataclass(frozen=True)
 class Options:
-    """Run SLAM on sequences × presets × seeds and sum up what each run was worth."""
+    """Run SLAM on sequences × presets × seeds and collect accuracy, speed and memory."""
 
-    sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = SOURCES
-    presets: Annotated[tuple[str, ...], arg(help="settings to start from")] = (default_preset(),)
-    seeds: Annotated[tuple[int, ...], arg(help="starts of the random numbers, a run each")] = (0, 1, 2)
+    sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = SOURCES
+    presets: Annotated[tuple[str, ...], arg(help="preset to start from")] = (default_preset(),)
+    seeds: Annotated[tuple[int, ...], arg(help="random seeds, one run for each")] = (0, 1, 2)
     settings: Settings = ()
-    limit: Annotated[int | None, arg(help="take at most so many frames", help_behavior_hint="(default: all)")] = None
-    name: Annotated[str, arg(help="name of the results; another one for other --set")] = "accuracy"
-    fresh: Annotated[bool, arg(help="run also what has been run before")] = False
+    limit: Annotated[int | None, arg(help="number of frames at most", help_behavior_hint="(default: all)")] = None
+    name: Annotated[str, arg(help="name of the results; use another name with other --set")] = "accuracy"
+    fresh: Annotated[bool, arg(help="repeat runs that exist already")] = False
     runs: Annotated[Path, arg(help="folder of the run folders")] = RUNS
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run: a sequence by name and path, all that changes its result, and the code it is run with."""
+    """One run: a sequence by name and path, every setting that changes its result, and a digest of the code."""
 
     source: str
     path: str
@@ -63,18 +63,18 @@ class Job:
     code: str
 
     def key(self) -> dict[str, Any]:
-        """Return what must be equal for an earlier result to be this job's: code, source, every setting in full."""
+        """Return what must be equal to reuse an earlier result: code, source, every setting."""
         settings = split_settings(self.settings) | {"seed": str(self.seed)}
         config = override(preset_of(self.preset), settings).to_dict()
         return {"code": self.code, "path": self.path, "limit": self.limit, "config": config}
 
     def folder(self, runs: Path) -> Path:
-        """Return where the job leaves its run, log and result; other settings or lengths have other folders."""
-        told_apart = sha256(json.dumps([self.path, self.settings, self.limit]).encode()).hexdigest()[:8]
-        return runs / f"{record.slug(self.source)}-{self.preset}-seed{self.seed}-{told_apart}"
+        """Return the folder of the job's run, log and result; it depends on settings and length."""
+        digest = sha256(json.dumps([self.path, self.settings, self.limit]).encode()).hexdigest()[:8]
+        return runs / f"{record.slug(self.source)}-{self.preset}-seed{self.seed}-{digest}"
 
     def command(self, run: Path) -> list[str]:
-        """Return the command line that does it."""
+        """Return the command line of the run."""
         words = [sys.executable, "-m", "sigmasplat.cli", "run", self.path, "--preset", self.preset]
         words += ["--seed", str(self.seed), "--out", str(run), "--overwrite"]
         words += [word for setting in self.settings for word in ("--set", setting)]
@@ -82,7 +82,7 @@ class Job:
 
 
 def located(name: str) -> str:
-    """Return the path of a sequence: in the data folder if it is there, else the name as it stands."""
+    """Return the path of a sequence in the data folder, or the name unchanged if it is not there."""
     if name == "synthetic":
         return SYNTHETIC
     known = record.data_root() / name
@@ -90,8 +90,8 @@ def located(name: str) -> str:
 
 
 def jobs_of(options: Options) -> list[Job]:
-    """List the jobs, source by source. Raises ConfigError on an unknown preset or setting."""
-    code = code_digest(Path(sigmasplat.__file__).parent, RUNNING)
+    """List the jobs, source by source. Raises ConfigError for an unknown preset or setting."""
+    code = code_digest(Path(sigmasplat.__file__).parent, INSTALLED)
     jobs = [
         Job(Path(source).name, located(source), preset, seed, options.settings, options.limit, code)
         for source in options.sources
@@ -104,7 +104,7 @@ def jobs_of(options: Options) -> list[Job]:
 
 
 def finished(job: Job, runs: Path) -> dict[str, Any] | None:
-    """Return the result of an earlier run of the same job with the same code, None if there is none or it failed."""
+    """Return the result of an earlier run of the same job with the same code; None without one or if it failed."""
     try:
         result = record.read(job.folder(runs) / "result.json")
     except (OSError, ValueError):
@@ -114,7 +114,7 @@ def finished(job: Job, runs: Path) -> dict[str, Any] | None:
 
 
 def call(command: Sequence[str], output: Path) -> tuple[str | None, float]:
-    """Run a command, what it says in a file; return its last words if it failed, and its peak memory, MiB."""
+    """Run a command with its output in a file; return its last line if it failed, and its peak memory, MiB."""
     with output.open("w") as log:
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
         _, status, usage = os.wait4(process.pid, 0)  # wait4: the peak memory of this child alone
@@ -123,9 +123,9 @@ def call(command: Sequence[str], output: Path) -> tuple[str | None, float]:
 
 
 def perform(job: Job, runs: Path, before: Sequence[str] = ()) -> dict[str, Any]:
-    """Run a job to its end and write result.json; a run that fails has its last line as `problem`.
+    """Run a job and write result.json; for a run that fails, `problem` is its last line.
 
-    Words `before` its command line may say on which cores it runs.
+    `before` is put before the command, for instance to choose cores.
     """
     folder = job.folder(runs)
     folder.mkdir(parents=True, exist_ok=True)
@@ -151,7 +151,7 @@ def _last_line(output: Path) -> str:
 
 
 def figures_of(metrics: dict[str, Any]) -> dict[str, float | None]:
-    """Pick a run's figures from its metrics.json, under the names of `accuracy_tables`; None where there is none."""
+    """Return a run's figures from its metrics.json, by the names in `accuracy_tables`; None for a missing one."""
     ate, rpe = metrics.get("ate") or {}, metrics.get("rpe") or {}
     picked: dict[str, float | None] = {
         "ate_m": ate.get("rmse_m"),
@@ -168,13 +168,13 @@ def figures_of(metrics: dict[str, Any]) -> dict[str, float | None]:
 
 
 def run_all(jobs: list[Job], options: Options) -> list[dict[str, Any]]:
-    """Run or read every job, one after the other, a line each on standard error."""
+    """Run or read every job, one after the other, with a line on standard error for each."""
     total = len(jobs)
     return [run_one(job, f"{number}/{total}", options.runs, options.fresh) for number, job in enumerate(jobs, 1)]
 
 
 def run_one(job: Job, number: str, runs: Path, fresh: bool, before: Sequence[str] = ()) -> dict[str, Any]:
-    """Run a job (see `perform`), or read it if it was run before and not to be `fresh`; a line on standard error."""
+    """Run a job (see `perform`), or read its earlier result unless `fresh`; print a line on standard error."""
     earlier = None if fresh else finished(job, runs)
     result = earlier or perform(job, runs, before)
     how = "run before" if earlier else result["problem"] or f"{result['wall_s']:.0f} s"
@@ -183,7 +183,7 @@ def run_one(job: Job, number: str, runs: Path, fresh: bool, before: Sequence[str
 
 
 def main(options: Options) -> int:
-    """Run, write, print; exit code 1 if a job failed, 2 if the options mean nothing."""
+    """Run, write the results, print them; exit code 1 if a job failed, 2 if the options are invalid."""
     try:
         jobs = jobs_of(options)
     except SigmaSplatError as problem:
@@ -194,7 +194,7 @@ def main(options: Options) -> int:
 def publish(benchmark: str, results: list[dict[str, Any]], options: Any) -> int:
     """Write the results of jobs and print their tables; return 1 if one failed.
 
-    `options` are a program's, with its results' name, its seeds and the folder `out`.
+    `options` are those of the program, with `name`, `seeds` and the folder `out`.
     """
     kept = [{name: value for name, value in result.items() if name != "key"} for result in results]
     for result in kept:

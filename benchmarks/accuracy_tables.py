@@ -1,4 +1,4 @@
-"""Lay out the figures of the accuracy benchmark: mean ± standard deviation over seeds, and the goals."""
+"""Tabulate the figures of the accuracy benchmark: mean ± standard deviation over seeds, and the goals."""
 
 import statistics
 from collections.abc import Callable, Sequence
@@ -29,12 +29,12 @@ PICTURES = (
     ("AUSE", "ause", 1.0),
     ("NLL", "nll", 1.0),
 )
-"""Title, name of the figure, factor."""
+"""Title, name of the figure, factor to the unit of the title."""
 
 
 @dataclass(frozen=True)
 class Goal:
-    """A bound that every seed's run of a whole sequence with the default preset is held to (issues 2 and 3)."""
+    """A limit for every seed of a whole sequence with the default preset (issues 2 and 3)."""
 
     source: str
     figure: str
@@ -61,12 +61,12 @@ FACTORS = {figure: factor for _, figure, factor in (*PLACE, *PICTURES)}
 
 
 def mean_std(values: list[float]) -> tuple[float, float | None]:
-    """Return mean and sample standard deviation; of a single value the deviation is None."""
+    """Return mean and sample standard deviation; the deviation of a single value is None."""
     return statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None
 
 
 def spread(values: list[float]) -> str:
-    """Write mean ± standard deviation; a count that never differs as it is, a dash without values."""
+    """Write mean ± standard deviation; one number if all values are the same integer; a dash without values."""
     if not values:
         return "–"
     mean, std = mean_std(values)
@@ -76,13 +76,13 @@ def spread(values: list[float]) -> str:
 
 
 def values_of(results: list[Result], figure: str) -> list[float]:
-    """Collect a figure of the runs that have it."""
+    """Return a figure of every run that has it."""
     all_values = [result.get(figure, result["figures"].get(figure)) for result in results]
     return [float(value) for value in all_values if value is not None]
 
 
 def groups(results: list[Result]) -> dict[tuple[str, str], list[Result]]:
-    """Group the runs that succeeded by source and preset, in order."""
+    """Group the successful runs by source and preset, in order."""
     grouped: dict[tuple[str, str], list[Result]] = {}
     for result in results:
         members = grouped.setdefault((result["job"]["source"], result["job"]["preset"]), [])
@@ -102,13 +102,13 @@ COMPARED = (*(f for f in PLACE if f[1] in ("frames_per_s", "ate_m", "splats")), 
 
 
 def compared(measured: Sequence[dict[str, Any]], source: str) -> Section:
-    """Compare results made with different settings on one source, a row each, in order of their speed."""
+    """Compare results of different settings on one source: one row each, fastest first."""
     rows = []
     for results in measured:
         runs = [r for r in results["figures"]["jobs"] if r["problem"] is None and r["job"]["source"] == source]
         speed = statistics.fmean(values_of(runs, "frames_per_s") or [0.0])
         figures = [spread([factor * value for value in values_of(runs, name)]) for _, name, factor in COMPARED]
-        settings = ", ".join(results["config"].get("settings") or ()) or "as the preset is"
+        settings = ", ".join(results["config"].get("settings") or ()) or "preset unchanged"
         rows.append((speed, [settings, str(results["machine"]["cores"]), str(len(runs)), *figures]))
     ordered = [row for _, row in sorted(rows, key=lambda pair: -pair[0])]
     return Section(
@@ -121,12 +121,12 @@ def _figures(title: str, figures: tuple[tuple[str, str, float], ...], results: l
         [source, preset, str(len(runs)), *(spread([f * v for v in values_of(runs, name)]) for _, name, f in figures)]
         for (source, preset), runs in groups(results).items()
     ]
-    note = "Mean ± standard deviation over the runs, which differ by their seed. Views at estimated poses."
+    note = "Mean ± standard deviation over the seeds. Views are rendered at estimated poses."
     return Section(title, ["sequence", "preset", "runs", *(name for name, _, _ in figures)], rows, note)
 
 
 def goals(measured: dict[str, Any]) -> Section:
-    """Hold the worst seed to each goal; only whole sequences with the default preset as it is count."""
+    """Compare every seed with each goal; only for whole sequences with the unchanged default preset."""
     rows = []
     config = measured["config"]
     whole = config.get("limit") is None and not config.get("settings")
@@ -136,12 +136,12 @@ def goals(measured: dict[str, Any]) -> Section:
         if values:
             shown = ", ".join(significant(FACTORS[goal.figure] * value) for value in values)
             rows.append([f"{goal.source}: {goal.text}", shown, "yes" if all(map(goal.held, values)) else "**no**"])
-    return Section("Goals", ["", "measured, each seed", "held by all"], rows)
+    return Section("Goals", ["goal", "measured, each seed", "reached by all"], rows)
 
 
 def failures(results: list[Result]) -> Section:
-    """List the runs that failed, with what they said last."""
+    """List the runs that failed, with the last line they printed."""
     failed = [result for result in results if result["problem"] is not None]
     names = [", ".join((r["job"]["source"], r["job"]["preset"], f"seed {r['job']['seed']}")) for r in failed]
     rows = [[name, str(result["problem"]).replace("|", "/")] for name, result in zip(names, failed, strict=True)]
-    return Section("Failed", ["run", "last words"], rows)
+    return Section("Failed", ["run", "last line"], rows)

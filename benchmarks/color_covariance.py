@@ -1,8 +1,8 @@
-"""Map the same stretches with one variance a colour channel (paper) and with the full 3×3 colour covariance.
+"""Compare one variance per colour channel (paper) with the full 3×3 colour covariance, on the same frames.
 
-Both maps grow side by side, frame by frame, each with poses of its own. Then both are asked how likely the colours of
-the frames are that no map was fitted to: on the same pixels, under the diagonal of V and under all of V.
-Writes benchmarks/results/color-covariance-<machine>.json, prints a table.
+Both maps are built frame by frame, each with its own poses. Then the likelihood of the colours of held-out frames is
+computed with both: on the same pixels, with the diagonal of V and with all of V.
+Writes benchmarks/results/color-covariance-<machine>.json and prints a table.
 
 example: python benchmarks/color_covariance.py --sources redkitchen --frames 30 --seeds 0
 """
@@ -46,35 +46,39 @@ CHANNELS = 3
 
 @dataclass(frozen=True)
 class Options:
-    """Map the same stretches with one variance a channel and with the full colour covariance."""
+    """Compare one variance per colour channel with the full colour covariance."""
 
-    sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = (
+    sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = (
         "redkitchen",
         f"{accuracy.SYNTHETIC},noise=1",
     )
-    frames: Annotated[int, arg(help="of each sequence, from its start")] = 60
-    preset: Annotated[str, arg(help="settings to start from")] = default_preset()
-    seeds: Annotated[tuple[int, ...], arg(help="starts of the random numbers, a pair of maps each")] = (0, 1, 2)
+    frames: Annotated[int, arg(help="number of frames, from the start of each sequence")] = 60
+    preset: Annotated[str, arg(help="preset to start from")] = default_preset()
+    seeds: Annotated[tuple[int, ...], arg(help="random seeds, a pair of maps for each")] = (0, 1, 2)
     name: Annotated[str, arg(help="name of the results")] = "color-covariance"
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
     def config(self, seed: int, kind: str) -> Config:
-        """Return a run's settings, one submap in all. Raises ConfigError on an unknown preset."""
+        """Return a run's settings, with a single submap. Raises ConfigError for an unknown preset."""
         config = replace(preset_of(self.preset), seed=seed, submaps=SubmapConfig())
         return replace(config, mapping=replace(config.mapping, color_covariance=kind))
 
 
 def measure(path: str, options: Options, seed: int) -> dict[str, Any]:
-    """Grow both maps and score them on the frames that neither was fitted to. Raises SourceError if there are none."""
+    """Build both maps and score them on held-out frames. Raises SourceError if there are none."""
     source = open_source(path, limit=options.frames)
     runs = {kind: Slam(options.config(seed, kind)) for kind in KINDS}
     for index, frame in enumerate(source):
-        for kind in KINDS if index % 2 else reversed(KINDS):  # neither is always the first on a warm cache
+        for kind in (
+            KINDS if index % 2 else reversed(KINDS)
+        ):  # alternate, so that neither always profits from a warm cache
             runs[kind].step(frame)
     steps = list(zip(*(run.steps for run in runs.values()), strict=True))
     held_out = [i for i, pair in enumerate(steps) if not any(step.is_keyframe or step.lost for step in pair)]
     if not held_out:
-        raise SourceError(f"{path}: both maps were fitted to every frame; a preset that maps each frame leaves none")
+        raise SourceError(
+            f"{path}: every frame was mapped, so no frame is held out; use a preset with mapping.every above 1"
+        )
     i = options.config(seed, "full").input
     shown = [source.frame(steps[k][0].index) for k in held_out]
     frames = [frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px) for frame in shown]
@@ -82,7 +86,7 @@ def measure(path: str, options: Options, seed: int) -> dict[str, Any]:
 
 
 def score(runs: dict[str, Slam], rows: Sequence[int], frames: Sequence[Frame]) -> dict[str, Any]:
-    """Score both maps on frames (`rows` of their trajectories): on pixels with a reading that both maps cover."""
+    """Score both maps on frames (`rows` of their trajectories), on pixels with a reading that both maps cover."""
     fields = {kind: with_correlations(run.field) for kind, run in runs.items()}
     poses = {kind: se3.inverse(run.trajectory().T_world_camera) for kind, run in runs.items()}
     sums: dict[str, list[Any]] = {kind: [] for kind in KINDS}
@@ -101,13 +105,13 @@ def score(runs: dict[str, Slam], rows: Sequence[int], frames: Sequence[Frame]) -
 
 
 def with_correlations(field: GaussianField) -> GaussianField:
-    """Return a field whose colours vary together, not at all where it had no such numbers: V is rendered whole."""
+    """Return the field with correlations, zeros if it has none, so that V is rendered completely."""
     field.carry("correlations")
     return field
 
 
 def likelihoods(r: Render, frame: Frame, pixels: Tensor) -> NDArray[np.float64]:
-    """Return pixels, the NLL of their colours under V's diagonal and under all of V, and Σ r rᵀ: sums over them [9].
+    """Return sums over pixels [9]: their number, the NLL of their colours with the diagonal and with all of V, Σ r rᵀ.
 
     Float64, ε = 1e-6 as in training, the constant 3/2 log 2π left out.
     """
@@ -122,7 +126,7 @@ def likelihoods(r: Render, frame: Frame, pixels: Tensor) -> NDArray[np.float64]:
 
 
 def view_of(r: Render, frame: Frame, pixels: Tensor) -> ScoredView:
-    """Lay out a render as evaluation scores it, other pixels taken as without a reading."""
+    """Return a render as evaluation scores it; other pixels count as without a reading."""
     depth = torch.where(pixels, r.depth / r.alpha.clamp(min=COVERED_ALPHA), 0.0)
     return ScoredView(
         frame.index, "held-out", frame.color, np.where(pixels.numpy(), frame.depth_m, np.float32(0.0)),
@@ -131,7 +135,7 @@ def view_of(r: Render, frame: Frame, pixels: Tensor) -> ScoredView:
 
 
 def figures(run: Slam, field: GaussianField, sums: NDArray[np.float64], seen: list[ScoredView]) -> dict[str, Any]:
-    """Sum up one map: time, likelihoods per pixel, how its splats' colours and its errors go together, PSNR, ranks."""
+    """Summarise one map: time, likelihood per pixel, correlations of splats and of errors, PSNR, Spearman."""
     count, diagonal, full, *second = sums.sum(0)
     deviations = np.sqrt(second[:CHANNELS])
     errors = second[CHANNELS:] / np.array([deviations[a] * deviations[b] for a, b in ((0, 1), (0, 2), (1, 2))])
@@ -156,7 +160,7 @@ def figures(run: Slam, field: GaussianField, sums: NDArray[np.float64], seen: li
 
 
 def sections(measured: dict[str, Any]) -> list[Section]:
-    """Lay out the figures: one row for each sequence and map, means ± deviations over the seeds."""
+    """Tabulate the figures: one row for each sequence and map, mean ± standard deviation over the seeds."""
     rows = []
     for source in measured["figures"]["sources"]:
         for kind in KINDS:
@@ -167,9 +171,18 @@ def sections(measured: dict[str, Any]) -> list[Section]:
             columns = [ratios, *([run[name] for run in found] for name in names[:2]), together]
             columns += [[run[name] for run in found] for name in names[2:]]
             rows.append([source["source"], kind, *(spread(values) for values in columns)])
-    head = ("sequence", "map", "mapping time", "NLL, diagonal", "NLL, full", "mean absolute ρ", "PSNR, dB", "Spearman")
-    note = "NLL in nats per pixel, 3 channels, on held-out frames, under V's diagonal and under all of V."
-    return [Section("colour covariance", head, rows, note)]
+    head = (
+        "sequence",
+        "covariance of colour",
+        "mapping time / diagonal",
+        "NLL, diagonal",
+        "NLL, full",
+        "mean absolute ρ",
+        "PSNR, dB",
+        "Spearman",
+    )
+    note = "NLL in nats per pixel, 3 channels, on held-out frames, with the diagonal of V and with all of V."
+    return [Section("Colour covariance", head, rows, note)]
 
 
 def measure_all(options: Options) -> dict[str, Any]:
@@ -186,7 +199,7 @@ def measure_all(options: Options) -> dict[str, Any]:
 
 
 def main(options: Options) -> int:
-    """Measure, write, print; return the exit code."""
+    """Measure, write the results, print them; return the exit code."""
     return program.run("color_covariance", options, measure_all, options.seeds)
 
 

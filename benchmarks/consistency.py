@@ -1,8 +1,8 @@
-"""Leave out one part of the consistent field at a time, on synthetic scenes with a sensor's noise: CG-SLAM's ablation.
+"""Leave out one part of CG-SLAM's method at a time, on synthetic scenes with sensor noise: the ablation of its paper.
 
-Variants × scenes × seeds, several runs at once, each on one core of its own. Then `sigmasplat eval --mesh` holds mesh
-and splats against the true surface. Runs are kept as `accuracy.py` keeps them, and read where they were run before.
-Writes benchmarks/results/consistency-<machine>.json, prints tables.
+Variants × scenes × seeds, several runs at a time, each on its own core. Then `sigmasplat eval --mesh` compares mesh and
+splats with the true surface. Finished runs are reused as in `accuracy.py`.
+Writes benchmarks/results/consistency-<machine>.json and prints tables.
 
 example: python benchmarks/consistency.py --scenes room --seeds 0 --jobs 2
 """
@@ -26,7 +26,7 @@ from tables import Section
 import sigmasplat
 from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.evaluation.paired_comparison import Effect, Figure, best, by_seed, deviation, passed_by_chance, rows
-from sigmasplat.io.machine import RUNNING, code_digest
+from sigmasplat.io.machine import INSTALLED, code_digest
 from sigmasplat.report.tables import number
 
 arg = tyro.conf.arg
@@ -35,9 +35,9 @@ SCENES: dict[str, tuple[str, int | None]] = {
     "two rooms": ("synthetic:frames=600,rooms=2,noise=1,seed=2", 300),
     "three rooms": ("synthetic:frames=900,rooms=3,noise=1,seed=3", 300),
 }
-"""Sequence, and how many of its frames: one turn across a room; the way out through one doorway; through two.
+"""Sequence and number of frames: one turn through a room; a path through one doorway; a path through two.
 
-Seeds change patterns, books, plants and noise; the large furniture stays, mirrored in every second room.
+Seeds change patterns, books, plants and noise; the large furniture is the same, mirrored in every second room.
 """
 ALIGNMENT, VARIANCE = "mapping.weight_alignment=0", "mapping.weight_moment=0"
 VARIANTS: dict[str, tuple[str, ...]] = {
@@ -48,32 +48,34 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "without isotropy": ("mapping.weight_isotropy_ratio=0",),
     "without primitive uncertainty": ("primitives.uncertain_m2=0",),
 }
-"""Settings over those of --set; both: alignment and variance, as in the paper."""
+"""Settings added to those of --set. "without both" means alignment and variance, as in the paper."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Leave out one part of the consistent field at a time, on synthetic scenes with a sensor's noise."""
+    """Leave out one part of CG-SLAM's method at a time, on synthetic scenes with sensor noise."""
 
-    scenes: Annotated[tuple[str, ...], arg(help=f"of {', '.join(SCENES)}; or a built-in room's options")] = (*SCENES,)
-    variants: Annotated[tuple[str, ...], arg(help="which of them")] = (*VARIANTS,)
-    preset: Annotated[str, arg(help="settings to start from")] = "cgslam-fast"
-    seeds: Annotated[tuple[int, ...], arg(help="starts of the random numbers, a run each")] = (0, 1, 2)
+    scenes: Annotated[tuple[str, ...], arg(help=f"scenes: {', '.join(SCENES)}, or options of a built-in room")] = (
+        *SCENES,
+    )
+    variants: Annotated[tuple[str, ...], arg(help="which ones to run")] = (*VARIANTS,)
+    preset: Annotated[str, arg(help="preset to start from")] = "cgslam-fast"
+    seeds: Annotated[tuple[int, ...], arg(help="random seeds, one run for each")] = (0, 1, 2)
     settings: accuracy.Settings = ()
-    limit: Annotated[int | None, arg(help="take at most so many frames", help_behavior_hint="(default: all)")] = None
-    jobs: Annotated[int, arg(help="runs at once, each on one core")] = 1
-    name: Annotated[str, arg(help="name of the results; another one for other --set")] = "consistency"
-    fresh: Annotated[bool, arg(help="run also what has been run before")] = False
+    limit: Annotated[int | None, arg(help="number of frames at most", help_behavior_hint="(default: all)")] = None
+    jobs: Annotated[int, arg(help="number of runs at a time, each on one core")] = 1
+    name: Annotated[str, arg(help="name of the results; use another name with other --set")] = "consistency"
+    fresh: Annotated[bool, arg(help="repeat runs that exist already")] = False
     runs: Annotated[Path, arg(help="folder of the run folders")] = accuracy.RUNS
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
 
 def jobs_of(options: Options) -> list[tuple[str, accuracy.Job]]:
-    """List variant and job, scene by scene. Raises ConfigError on an unknown variant, preset or setting."""
+    """List variant and job, scene by scene. Raises ConfigError for an unknown variant, preset or setting."""
     unknown = [name for name in options.variants if name not in VARIANTS]
     if unknown:
         raise ConfigError(f"no variant {unknown[0]!r}; there are {', '.join(VARIANTS)}")
-    code = code_digest(Path(sigmasplat.__file__).parent, RUNNING)
+    code = code_digest(Path(sigmasplat.__file__).parent, INSTALLED)
     listed = []
     for scene in options.scenes:
         path, most = SCENES.get(scene, (scene, None))
@@ -88,12 +90,12 @@ def jobs_of(options: Options) -> list[tuple[str, accuracy.Job]]:
 
 
 def pinned(core: int) -> list[str]:
-    """Return the words before a command that keep it on one core with one thread."""
+    """Return the words that, put before a command, run it on one core with one thread."""
     return ["taskset", "-c", str(core), "env", "OMP_NUM_THREADS=1", "SIGMASPLAT_THREADS=1"]
 
 
 def cores_of(options: Options) -> "queue.SimpleQueue[int]":
-    """Return the cores to run on. Raises ConfigError unless there are as many as --jobs asks for, and it for one."""
+    """Return the cores to run on. Raises ConfigError if --jobs is below 1 or above the number of cores."""
     there = sorted(os.sched_getaffinity(0))
     if not 1 <= options.jobs <= len(there):
         raise ConfigError(f"--jobs {options.jobs}: this machine has {len(there)} cores; give 1 to {len(there)}")
@@ -104,7 +106,7 @@ def cores_of(options: Options) -> "queue.SimpleQueue[int]":
 
 
 def measure(options: Options) -> list[dict[str, Any]]:
-    """Run every job, so many at once, and score its surface; results in the order of the jobs, each with its variant.
+    """Run every job, `jobs` at a time, and score its surface; return the results in order, each with its variant.
 
     Raises ConfigError as `jobs_of` and `cores_of` do.
     """
@@ -114,8 +116,8 @@ def measure(options: Options) -> list[dict[str, Any]]:
         number, (variant, job) = numbered
         core = free.get()
         try:
-            told = f"{number}/{len(listed)}, {variant}"
-            result = accuracy.run_one(job, told, options.runs, options.fresh, pinned(core))
+            label = f"{number}/{len(listed)}, {variant}"
+            result = accuracy.run_one(job, label, options.runs, options.fresh, pinned(core))
             return {"variant": variant} | with_surface(job, result, options.runs, pinned(core))
         finally:
             free.put(core)
@@ -155,7 +157,7 @@ def sections(measured: dict[str, Any]) -> list[Section]:
 
 
 def by_scene(results: list[dict[str, Any]]) -> Scenes:
-    """Group the runs that succeeded."""
+    """Group the successful runs by scene."""
     found: Scenes = {}
     for result in results:
         if result["problem"] is None:
@@ -164,13 +166,13 @@ def by_scene(results: list[dict[str, Any]]) -> Scenes:
 
 
 def scene(name: str, runs: list[dict[str, Any]], variants: list[str]) -> Section:
-    """Lay out a scene, a row a variant: mean ± standard deviation over its seeds, the best of each column in bold."""
+    """Tabulate a scene: one row per variant, mean ± standard deviation over its seeds, the best of each column bold."""
     laid_out = rows(runs, variants, lambda text: f"**{text}**", FIGURES)
-    return Section(name, ["variant", *HEADS], laid_out, "Mean ± standard deviation over the seeds; views are held out.")
+    return Section(name, ["variant", *HEADS], laid_out, "Mean ± standard deviation over the seeds. Views are held out.")
 
 
 def mean_of(scenes: Scenes, variants: list[str]) -> Section:
-    """Lay out the mean over the scenes of each scene's mean over its seeds, of the scenes that every variant has."""
+    """Tabulate the mean over scenes of each scene's mean over seeds, for scenes that every variant has."""
     columns = []
     for figure in FIGURES:
         found = [{v: list(by_seed(runs, v, figure).values()) for v in variants} for runs in scenes.values()]
@@ -183,23 +185,23 @@ def mean_of(scenes: Scenes, variants: list[str]) -> Section:
 
 
 def differences(scenes: Scenes, variant: str, figure: Figure) -> list[float]:
-    """Return what a variant changes against the full method, at equal scene and seed, in the figure's unit."""
+    """Return the differences of a variant to the full method, at equal scene and seed, in the figure's unit."""
     pairs = [(by_seed(runs, variant, figure), by_seed(runs, FULL, figure)) for runs in scenes.values()]
     return [there[seed] - full[seed] for there, full in pairs for seed in there if seed in full]
 
 
 def effects_of(scenes: Scenes, variants: list[str]) -> Section:
-    """Lay out the differences to the full method, those beyond one standard deviation in bold."""
+    """Tabulate the differences to the full method; those larger than one standard deviation are bold."""
     laid_out, most = [], 0
     for variant in (variant for variant in variants if variant != FULL):
         changes = [(figure, differences(scenes, variant, figure)) for figure in JUDGED]
         most = max(most, *(len(found) for _, found in changes))
         laid_out.append([variant, *(_effect(figure, found) for figure, found in changes)])
     note = (
-        "Difference to the full method at equal scene and seed: mean ± standard deviation, and in how many it is worse."
+        "Difference to the full method at equal scene and seed: mean ± standard deviation, and how often it is worse."
     )
     if most > 1:
-        note += f" Bold: beyond one deviation, as {passed_by_chance(most):.1%} of figures are by chance."
+        note += f" Bold: larger than one deviation ({passed_by_chance(most):.1%} of figures are by chance)."
     return Section("Effects", ["variant", *(f.title for f in JUDGED)], laid_out if most else [], note)
 
 
@@ -216,7 +218,7 @@ def _marked(text: str, stands_out: bool) -> str:
 
 
 def main(options: Options) -> int:
-    """Run, score, write, print; exit code 1 if a job failed, 2 if the options mean nothing."""
+    """Run, score, write the results, print them; exit code 1 if a job failed, 2 if the options are invalid."""
     try:
         results = measure(options)
     except SigmaSplatError as problem:

@@ -1,7 +1,7 @@
-"""Time the CPU core on maps back-projected from real depth: every piece of work, instruction set, number of threads.
+"""Time the CPU kernels on maps back-projected from real depth: every operation, instruction set, number of threads.
 
 Writes benchmarks/results/cpu-<machine>.json and prints its tables; benchmarks/README.md says what each figure means.
-Leave the machine alone while it runs.
+Do not use the machine for anything else meanwhile.
 
 example: python benchmarks/cpu.py --quick
 """
@@ -24,52 +24,52 @@ from sigmasplat.io.machine import usable_cores
 
 arg = tyro.conf.arg
 REFERENCE, QUICK_REFERENCE = 20_000, 4_000
-"""Splats that plain torch renders at 80 pixels' width: every pair of them takes seconds."""
+"""Splats that plain torch renders at a width of 80 pixels; it computes every pair and takes seconds."""
 SYNTHETIC = "synthetic:frames=200,width=640,height=480"
 
 
 def default_source() -> str:
-    """Return the Kinect kitchen where the real data lies, else the built-in room."""
+    """Return redkitchen if the real data is available, otherwise the built-in room."""
     kitchen = record.data_root() / "redkitchen"
     return str(kitchen) if kitchen.is_dir() else SYNTHETIC
 
 
 @dataclass(frozen=True)
 class Options:
-    """Time the CPU core on maps back-projected from real depth."""
+    """Time the CPU kernels on maps back-projected from real depth."""
 
     source: Annotated[str, arg(help="sequence whose depth becomes splats")] = field(default_factory=default_source)
-    frame: Annotated[int, arg(help="frame of it")] = 150
+    frame: Annotated[int, arg(help="frame of the sequence")] = 150
     splats: Annotated[tuple[int, ...], arg(help="sizes of the map")] = (20_000, 77_000, 100_000, 300_000)
     widths: Annotated[tuple[int, ...], arg(help="widths of the image, pixels")] = (320, 640)
-    isas: Annotated[tuple[str, ...], arg(help="instruction sets, the main one first; none = all supported")] = ()
-    threads: Annotated[tuple[int, ...], arg(help="numbers of threads; none = 1 and all cores")] = ()
-    runs: Annotated[int, arg(help="runs of each piece of work; at least 7 for a median to publish")] = 15
+    isas: Annotated[tuple[str, ...], arg(help="instruction sets, the main one first (default: all supported)")] = ()
+    threads: Annotated[tuple[int, ...], arg(help="numbers of threads (default: 1 and all cores)")] = ()
+    runs: Annotated[int, arg(help="runs of each operation; at least 7 for published medians")] = 15
     seed: int = 0
     peer: Annotated[
         str | None,
         arg(help="MODULE:FUNCTION of another CPU rasteriser, see benchmarks/README.md", help_behavior_hint=""),
     ] = None
-    quick: Annotated[bool, arg(help="a minute: two small maps, one width, 7 runs; nothing is written")] = False
+    quick: Annotated[bool, arg(help="a minute: two small maps, one width, 7 runs, no results written")] = False
     name: Annotated[str, arg(help="name of the results")] = "cpu"
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
 
 def alone(work: Callable[..., Any], *arguments: Any) -> Any:
-    """Run a function in a fresh process and return its result: nothing is warm, peak memory is its own."""
+    """Run a function in a fresh process and return its result: cold caches, its own peak memory."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         return pool.submit(work, *arguments).result()
 
 
 def supported_isas() -> tuple[str, ...]:
-    """List the instruction sets of the kernels on this machine, widest first."""
+    """List the supported instruction sets, widest first."""
     from sigmasplat.native import _core
 
     return tuple(_core.supported_isas())
 
 
 def wanted(options: Options) -> list[dict[str, Any]]:
-    """List the requests that the options ask for, small maps first."""
+    """List the requests of these options, small maps first."""
     quick = options.quick
     shared = {
         "path": options.source,
@@ -101,7 +101,7 @@ def measure_all(options: Options) -> dict[str, Any]:
 
 
 def main(options: Options) -> int:
-    """Measure, write, print; return the exit code."""
+    """Measure, write the results, print them; return the exit code."""
     refused = (SigmaSplatError, ValueError, ImportError, AttributeError)
     name = Path(options.source).name
     return program.run("cpu", options, measure_all, [options.seed], not options.quick, refused, source=name)

@@ -1,4 +1,4 @@
-"""Measure one scene, or compare with plain torch, in a process of its own: clean caches, its own peak memory."""
+"""Measure one scene, or compare with plain torch, in a separate process: cold caches, its own peak memory."""
 
 import importlib
 import resource
@@ -18,7 +18,7 @@ from sigmasplat.render.reference.view import ReferenceView
 
 PAIR_PIXELS = 400
 REFERENCE_WIDTH, REFERENCE_BACKWARD_SHARE = 80, 10
-"""Plain torch holds every (pixel, splat) pair for its backward pass, so that gets a tenth of the splats."""
+"""Plain torch stores every (pixel, splat) pair for its backward pass, which therefore gets a tenth of the splats."""
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,12 @@ class Request:
 
 
 def peak_mib() -> float:
-    """Return the most memory this process has held so far, MiB."""
+    """Return the peak memory of this process so far, MiB."""
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
 
 
 def measure(request: Request) -> dict[str, Any]:
-    """Time all works on every instruction set and number of threads; the first set on most threads is the main one."""
+    """Time all operations on every instruction set and number of threads; the first set with all threads is main."""
     scene = make_scene(request.path, request.index, request.splats, request.width, request.seed)
     before = peak_mib()
     main = (request.isas[0], max(request.threads))
@@ -79,16 +79,16 @@ def _entry(isa: str, threads: int, works: dict[str, dict[str, float]]) -> dict[s
 
 
 def load_peer(name: str) -> Callable[..., Any]:
-    """Find the function that "module:function" names. Raises ValueError, ImportError or AttributeError."""
+    """Return the function named "module:function". Raises ValueError, ImportError or AttributeError."""
     module, colon, function = name.partition(":")
     if not (module and colon and function):
-        raise ValueError(f"a peer is module:function, found {name!r}")
+        raise ValueError(f"a peer must be given as module:function, found {name!r}")
     found: Callable[..., Any] = getattr(importlib.import_module(module), function)
     return found
 
 
 def time_peer(name: str, scene: Scene, runs: int) -> dict[str, Any]:
-    """Time another rasteriser on the same splats, and say how far its picture is from ours.
+    """Time another rasteriser on the same splats, and measure the difference of its image to ours.
 
     It is called as function(means [N, 3], quats [N, 4] wxyz, scales [N, 3], opacities [N], colors [N, 3], K [3, 3],
     T_camera_world [4, 4], width, height) with float32 tensors, and returns an image [H, W, 3].
@@ -106,7 +106,7 @@ def time_peer(name: str, scene: Scene, runs: int) -> dict[str, Any]:
 
 
 def compare_reference(request: Request, splats: int) -> dict[str, Any]:
-    """Time plain torch and the kernels on the same small work: forward, and forward with the full backward pass."""
+    """Time plain torch and the kernels on the same small input: forward, and forward with the full backward pass."""
     set_up(request.isas[0], max(request.threads))
     whole = make_scene(request.path, request.index, splats, REFERENCE_WIDTH, request.seed)
     part = make_scene(request.path, request.index, splats // REFERENCE_BACKWARD_SHARE, REFERENCE_WIDTH, request.seed)
@@ -121,7 +121,7 @@ def compare_reference(request: Request, splats: int) -> dict[str, Any]:
 
 
 def _passes(view: CpuView | ReferenceView, scene: Scene, backward: bool) -> Callable[[], None]:
-    """Return one pass over a view: forward, and backward with every gradient 1 if asked for."""
+    """Return one pass over a view: forward, and optionally backward with every gradient 1."""
     params, grad = scene.field.params, torch.zeros_like(scene.field.params)
     view.g_sums.fill_(1.0)
     view.g_alpha.fill_(1.0)

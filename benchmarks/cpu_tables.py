@@ -1,4 +1,4 @@
-"""Lay out the figures of the CPU benchmark: times, ratios, instruction sets, peers, and the goals they are held to."""
+"""Tabulate the figures of the CPU benchmark: times, ratios, instruction sets, peers, goals."""
 
 import math
 from collections.abc import Iterator
@@ -12,10 +12,10 @@ COLUMNS = (
     ("forward + loss + pose gradient", "pose_only"),
     ("full backward", "backward"),
     ("mapping iteration", "mapping_iteration"),
-    ("SSIM f+b", "ssim"),
-    ("keyframe's reference", "keyframe_reference"),
+    ("SSIM + gradient", "ssim"),
+    ("reference of a keyframe", "keyframe_reference"),
     ("track, Gauss–Newton", "track_align"),
-    ("… its render included", "track_align_map"),
+    ("track, Gauss–Newton + render", "track_align_map"),
     ("track, 60 Adam", "track_adam"),
 )
 TITLES = {work: title for title, work in COLUMNS}
@@ -48,12 +48,12 @@ def works_of(scene: Figures, isa: str, threads: int) -> Works | None:
 
 
 def median_ms(works: Works | None, work: str) -> float | None:
-    """Return the median of a piece of work, None if it was not timed."""
+    """Return the median of an operation, None if it was not timed."""
     return works[work]["median_ms"] if works and work in works else None
 
 
 def ratio(above: float | None, below: float | None) -> float | None:
-    """Divide, None where either is missing."""
+    """Divide two numbers; None if one is missing."""
     return above / below if above is not None and below else None
 
 
@@ -81,7 +81,7 @@ def sections(measured: dict[str, Any]) -> list[Section]:
 
 
 def times(figures: Figures) -> Section:
-    """Tabulate the median of each piece of work by scene."""
+    """Tabulate the median of each operation by scene."""
     rows = [
         [named(s), *(significant(median_ms(main_works(s), work)) for _, work in COLUMNS)] for s in figures["scenes"]
     ]
@@ -93,7 +93,7 @@ def times(figures: Figures) -> Section:
 
 
 def work_done(figures: Figures) -> Section:
-    """Tabulate how much work lies in an image, at what rate it is done, and the memory it takes."""
+    """Tabulate the number of pairs in an image, the rate at which they are processed, and the memory used."""
     rows = []
     for s in figures["scenes"]:
         forward, millions = median_ms(main_works(s), "forward_all"), s["pairs"] / 1e6
@@ -103,13 +103,13 @@ def work_done(figures: Figures) -> Section:
         rows.append([named(s), pairs, *(significant(x) for x in numbers), process])
     columns = ["splats, image", "pairs, M", "pairs per splat", "G pairs/s forward", "buffers, MiB", "process, MiB"]
     pixels = figures["scenes"][0]["pairs_sampled_pixels"] if figures["scenes"] else 0
-    pairs = f"Pairs of a pixel and a splat that adds to it, extrapolated from {pixels} random pixels (± standard error)"
-    note = f"{pairs}. Process: peak memory with the map made, and after every piece of work."
+    pairs = f"Pairs of a pixel and a contributing splat, extrapolated from {pixels} random pixels (± standard error)"
+    note = f"{pairs}. Process: peak memory after making the map, and after all operations."
     return Section("Work", columns, rows, note)
 
 
 def goals(figures: Figures) -> Section:
-    """Hold the times to the goals; scenes that were not measured are left out."""
+    """Compare the times with the goals; scenes that were not measured are left out."""
     rows = []
     for (splats, width), work, goal_ms in GOALS_MS:
         scene = scene_of(figures, splats, width)
@@ -121,11 +121,11 @@ def goals(figures: Figures) -> Section:
         if value is not None:
             held = value <= bound if at_most else value >= bound
             rows.append([text, f"{'≤' if at_most else '≥'} {bound:g}", significant(value), verdict(held)])
-    return Section("Goals", ["", "goal", "measured", "held"], rows)
+    return Section("Goals", ["figure", "goal", "measured", "reached"], rows)
 
 
 def verdict(held: bool) -> str:
-    """Say whether a goal is held."""
+    """Write whether a goal is reached."""
     return "yes" if held else "**no**"
 
 
@@ -155,7 +155,7 @@ def _growth_goals(figures: Figures) -> Iterator[tuple[str, float | None, float, 
 
 
 def ratios(figures: Figures) -> Section:
-    """Tabulate what a scene's times are to each other."""
+    """Tabulate ratios of the times of a scene."""
     rows = []
     for s in figures["scenes"]:
         main, first = main_works(s), s["timings"][0]
@@ -169,14 +169,14 @@ def ratios(figures: Figures) -> Section:
             ratio(median_ms(main, "track_adam"), median_ms(main, "track_align_map")),
         ]
         rows.append([named(s), *(significant(value) for value in pairs)])
-    shares = ["colour + depth / all outputs", "… / with variance"]
+    shares = ["colour + depth / all outputs", "colour + depth / with variance"]
     threads = ["1 → all threads, forward", "… backward", "… mapping"]
-    columns = ["splats, image", *shares, *threads, "torch / our SSIM", "60 Adam / Gauss–Newton with its render"]
+    columns = ["splats, image", *shares, *threads, "torch SSIM / ours", "60 Adam / Gauss–Newton + render"]
     return Section("Ratios", columns, rows)
 
 
 def growth(figures: Figures) -> Section:
-    """Tabulate the exponents with which time grows with splats and with pixels."""
+    """Tabulate the exponents of the growth of time with splats and with pixels."""
     found: dict[str, dict[str, float]] = {}
     for text, work, value in _exponents(figures):
         found.setdefault(text, {})[work] = value
@@ -208,7 +208,7 @@ def _pixels(scene: Figures) -> float:
 
 
 def sets(figures: Figures) -> Section:
-    """Tabulate every instruction set and number of threads on one scene: the goals' own, else the largest."""
+    """Tabulate every instruction set and number of threads on one scene: that of the goals, otherwise the largest."""
     scene = scene_of(figures, *KITCHEN) or (figures["scenes"][-1] if figures["scenes"] else None)
     chosen = [(title, work) for title, work in COLUMNS if work != "track_adam"]
     columns = ["instruction set, threads", *(title for title, _ in chosen)]
@@ -220,18 +220,18 @@ def sets(figures: Figures) -> Section:
 
 
 def plain_torch(figures: Figures) -> Section:
-    """Tabulate the plain-torch definition against the kernels on the same small work."""
+    """Tabulate the plain-torch definition and the kernels on the same small input."""
     rows = [
         [f"{c['work']}, {named(c)}", significant(c["kernels"]["median_ms"]), significant(c["torch"]["median_ms"]),
          significant(ratio(c["torch"]["median_ms"], c["kernels"]["median_ms"]))]
         for c in figures["reference"]["compared"]
     ]  # fmt: skip
-    note = "The definition holds every pair, contributing or not; it is there to be read and to test against."
-    return Section("Plain torch", ["", "kernels, ms", "torch, ms", "ratio"], rows, note)
+    note = "The definition computes every pair, even without a contribution; it exists for reading and testing."
+    return Section("Plain torch", ["operation", "kernels, ms", "torch, ms", "ratio"], rows, note)
 
 
 def peers(figures: Figures) -> Section:
-    """Tabulate another rasteriser on the same splats against colour + depth."""
+    """Tabulate another rasteriser and our colour + depth on the same splats."""
     rows = []
     for s in (s for s in figures["scenes"] if s.get("peer")):
         ours, theirs = median_ms(main_works(s), "forward_color_depth"), s["peer"]["forward"]["median_ms"]

@@ -1,7 +1,7 @@
-"""Ask whether the uncertainty rule cuts submaps where tracking is weak (VarSplat §2, issue 4).
+"""Measure whether the uncertainty rule cuts submaps where tracking is weak (VarSplat §2, issue 4).
 
-Runs SLAM with `submaps.uncertainty_m` as the only rule and holds every hop from keyframe to keyframe against the truth:
-how far its pose is truly off where the rule fires and where it does not.
+Runs SLAM with `submaps.uncertainty_m` as the only rule. Compares the motion from each keyframe to the next (a hop) with
+the ground truth, where the rule fires and where it does not.
 Writes benchmarks/results/drift_rule-<machine>.json and prints tables.
 
 example: python benchmarks/drift_rule.py --sources hololens --limit 120
@@ -33,22 +33,22 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Options:
-    """Cut submaps by accumulated uncertainty alone, and look where that is."""
+    """Cut submaps by accumulated uncertainty only, and measure the true error there."""
 
-    sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = (
+    sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = (
         "livingroom",
         "redkitchen",
         "hololens",
     )
-    preset: Annotated[str, arg(help="settings to start from")] = default_preset()
-    uncertainty_m: Annotated[float, arg(help="limit of the rule")] = 0.02
-    limit: Annotated[int | None, arg(help="take at most so many frames")] = None
+    preset: Annotated[str, arg(help="preset to start from")] = default_preset()
+    uncertainty_m: Annotated[float, arg(help="limit of the rule, metres")] = 0.02
+    limit: Annotated[int | None, arg(help="number of frames at most")] = None
     name: Annotated[str, arg(help="name of the results")] = "drift-rule"
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
 
 def measure(path: str, options: Options) -> dict[str, Any]:
-    """Run one sequence; return its hops and its submaps. Raises SourceError if it cannot be read or has no truth."""
+    """Run one sequence; return its hops and its number of submaps. Raises SourceError if it cannot be read."""
     config = preset_of(options.preset)
     rule = SubmapConfig(uncertainty_m=options.uncertainty_m, inherit=config.submaps.inherit)
     config = replace(config, submaps=rule, loops=replace(config.loops, close=False))
@@ -56,7 +56,7 @@ def measure(path: str, options: Options) -> dict[str, Any]:
     for frame in source:
         slam.step(frame)
     truth = source.truth()
-    assert truth is not None, f"{path} has no truth"
+    assert truth is not None, f"{path} has no ground truth"
     rows, true_rows = associate(np.array([step.timestamp_s for step in slam.steps]), truth.timestamps_s)
     known = dict(zip(rows.tolist(), truth.T_world_camera[true_rows], strict=True))
     path_ = slam.trajectory().T_world_camera
@@ -65,7 +65,7 @@ def measure(path: str, options: Options) -> dict[str, Any]:
 
 
 def hops_of(slam: Slam, path: Matrix, known: dict[int, Matrix]) -> dict[str, Any]:
-    """Return each hop: the frame it leads to, its submap, the uncertainty there, was it cut, its true error, m."""
+    """Return each hop: its last frame, its submap, the uncertainty there, whether a submap ended, the true error, m."""
     hops = []
     for before, after in pairwise(slam.keyframes):
         if before not in known or after not in known:
@@ -99,18 +99,18 @@ def sections(measured: dict[str, Any]) -> list[Section]:
         counts = [str(len(hops)), str(found["submaps"]), str(found["lost"])]
         cells = [level(errors_cm[cut], share) for cut in (True, False) for share in (0.5, 0.9)]
         rows.append([found["source"], *counts, *cells])
-    head = ["sequence", "hops", "submaps", "lost frames", "error of hops where it fires, cm: median", "… 90 %"]
-    head += ["where it does not, cm: median", "… 90 %"]
+    head = ["sequence", "hops", "submaps", "lost frames", "error of hops where the rule fires, cm: median", "… 90 %"]
+    head += ["where it does not fire, cm: median", "… 90 %"]
     limit_cm = significant(100 * measured["config"]["uncertainty_m"])
     note = (
         f"A submap ends where the camera's position in it is uncertain by more than {limit_cm} cm. Hops lead from "
-        "keyframe to keyframe; their errors are against the truth, which the rule does not know."
+        "keyframe to keyframe; errors are relative to the ground truth, which the rule does not use."
     )
-    return [Section("the uncertainty rule", head, rows, note)]
+    return [Section("Uncertainty rule", head, rows, note)]
 
 
 def level(errors: list[float], share: float) -> str:
-    """Return the error that a share of them stays below; a dash where there are none."""
+    """Return the quantile `share` of the errors; a dash without errors."""
     return significant(float(np.quantile(errors, share))) if errors else "–"
 
 
@@ -121,7 +121,7 @@ def measure_all(options: Options) -> dict[str, Any]:
 
 
 def main(options: Options) -> int:
-    """Measure, write, print; return the exit code."""
+    """Measure, write the results, print them; return the exit code."""
     return program.run("drift_rule", options, measure_all, [0])
 
 

@@ -1,4 +1,4 @@
-"""Time the CUDA backend on maps back-projected from the built-in room's depth; beside gsplat where it is installed.
+"""Time the CUDA backend on maps back-projected from the depth of the built-in room; gsplat too if installed.
 
 Writes benchmarks/results/gpu-<device>.json and prints its tables; benchmarks/README.md says what each figure means.
 
@@ -25,22 +25,22 @@ SIZES = ((640, 480), (1200, 680))
 
 @dataclass(frozen=True)
 class Options:
-    """Time the CUDA backend on maps back-projected from the built-in room's depth."""
+    """Time the CUDA backend on maps back-projected from the depth of the built-in room."""
 
     splats: Annotated[tuple[int, ...], arg(help="sizes of the map")] = (100_000, 300_000, 1_000_000)
-    runs: Annotated[int, arg(help="runs of each piece of work; at least 7 for a median to publish")] = 50
-    slam_frames: Annotated[int, arg(help="frames of the run from end to end; 0 = none")] = 200
+    runs: Annotated[int, arg(help="runs of each operation; at least 7 for published medians")] = 50
+    slam_frames: Annotated[int, arg(help="frames of the complete run; 0 = none")] = 200
     seed: int = 0
-    quick: Annotated[bool, arg(help="a minute: one small map and image, 7 runs, no SLAM; nothing is written")] = False
-    alone: Annotated[bool, arg(help="leave gsplat out")] = False
+    quick: Annotated[bool, arg(help="a minute: one small map and image, 7 runs, no SLAM, no results written")] = False
+    alone: Annotated[bool, arg(help="leave out gsplat")] = False
     name: Annotated[str, arg(help="name of the results")] = "gpu"
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
 
 def measured_so_far(options: Options) -> Iterator[dict[str, Any]]:
-    """Measure scene after scene, then a run from end to end; yield all there is after each.
+    """Measure scene after scene, then a complete run; yield all figures so far after each.
 
-    Raises BackendError where there is no CUDA device.
+    Raises BackendError without a CUDA device.
     """
     from gpu_works import describe_device, measure, refuse_without_device, time_slam
 
@@ -77,7 +77,7 @@ Figures = dict[str, Any]
 
 
 def sections(measured: Figures) -> list[Section]:
-    """Return all tables."""
+    """Return the tables of results: times, further outputs, gsplat, the goals of issue 6."""
     figures = measured["figures"]
     scenes = figures["scenes"]
     note = f"{figures['device']['name']}, torch {figures['device']['torch']}."
@@ -91,7 +91,7 @@ def sections(measured: Figures) -> list[Section]:
         made.append(Section("Beside gsplat, colour and depth, ms", head, list(_peers(scenes))))
     goals = list(_goals(figures))
     if goals:
-        made.append(Section("Goals", ["", "goal", "measured", "held"], goals))
+        made.append(Section("Goals", ["figure", "goal", "measured", "reached"], goals))
     return made
 
 

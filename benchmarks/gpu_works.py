@@ -1,4 +1,4 @@
-"""Name the pieces of work the GPU benchmark times, each as the product does it, and time them on a device."""
+"""Define the operations that the GPU benchmark times, each as the product runs it, and time them on a device."""
 
 import dataclasses
 import importlib.util
@@ -28,18 +28,18 @@ from sigmasplat.sources import SyntheticRoom
 
 FRAME = 100
 WARMUPS, ITERATIONS, TRACKING_ITERATIONS = 3, 10, 60
-"""Fits are timed by so many iterations at once, and said by one."""
+"""Numbers of iterations of the timed fits; the time of one iteration is reported."""
 
 
 def refuse_without_device() -> None:
-    """Raise BackendError, one line, where the CUDA backend cannot run."""
+    """Raise BackendError, one line, if the CUDA backend cannot run."""
     reason = cuda_launch.missing()
     if reason:
         raise BackendError(f"nothing to time: {reason}")
 
 
 def describe_device() -> dict[str, Any]:
-    """Name the device and what it runs."""
+    """Return the device's name, capability, memory, and torch's version."""
     about = torch.cuda.get_device_properties(0)
     memory_gib = round(about.total_memory / 2**30, 1)
     return {
@@ -51,7 +51,7 @@ def describe_device() -> dict[str, Any]:
 
 
 def timed(work: Callable[[], object], runs: int, device: torch.device) -> Timing:
-    """Time a piece of work by the wall clock until the device has done it, after a few runs that do not count."""
+    """Time an operation by the wall clock until the device has finished, after some warm-up runs."""
     seconds = []
     for run in range(WARMUPS + runs):
         _wait(device)
@@ -69,7 +69,7 @@ def _wait(device: torch.device) -> None:
 
 
 class GpuWorks:
-    """Everything a frame costs on one scene; the world is its camera. Each method is one piece of work, run once."""
+    """All operations of a frame on one scene, in the coordinates of its camera. Each method runs one operation once."""
 
     def __init__(self, scene: Scene, device: torch.device) -> None:
         self.scene, self.device = scene, device
@@ -93,17 +93,17 @@ class GpuWorks:
         self.color_depth.forward(self.params, np.eye(4))
 
     def both_all(self) -> None:
-        """Render all, and carry gradients on all of it to every parameter and the pose."""
+        """Render all outputs, and propagate gradients of all of them to every parameter and the pose."""
         self.forward_all()
         self.all.backward(self.params, self.grad)
 
     def both_color_depth(self) -> None:
-        """Do the same with colour, depth and alpha only."""
+        """Do the same for colour, depth and alpha only."""
         self.forward_color_depth()
         self.color_depth.backward(self.params, self.grad)
 
     def both_pose(self) -> None:
-        """Render colour and depth, and carry their gradients to the pose alone."""
+        """Render colour and depth, and propagate their gradients to the pose only."""
         self.forward_color_depth()
         self.color_depth.backward_pose(self.params)
 
@@ -126,7 +126,7 @@ MANY = ("tracking_iterations", "launched_tracking_iterations", "mapping_iteratio
 
 
 def measure(width: int, height: int, splats: int, runs: int, seed: int, with_peer: bool = True) -> dict[str, Any]:
-    """Time all works on one scene, and gsplat, if asked to, on the same splats."""
+    """Time all operations on one scene, and optionally gsplat on the same splats."""
     device = torch.device("cuda", torch.cuda.current_device())
     scene = make_scene(f"synthetic:frames=200,width={width},height={height}", FRAME, splats, width, seed)
     torch.cuda.reset_peak_memory_stats(device)
@@ -140,7 +140,7 @@ def measure(width: int, height: int, splats: int, runs: int, seed: int, with_pee
 
 
 def time_works(works: GpuWorks, runs: int) -> dict[str, dict[str, float]]:
-    """Time every piece of work; of fits, one iteration."""
+    """Time every operation; for fits, one iteration."""
     found = {name: timed(getattr(works, name), runs, works.device).plain() for name in SINGLE}
     for name in MANY:
         taken = timed(getattr(works, name), max(runs // ITERATIONS, 1), works.device)
@@ -150,12 +150,12 @@ def time_works(works: GpuWorks, runs: int) -> dict[str, dict[str, float]]:
 
 
 def time_gsplat(scene: Scene, runs: int, device: torch.device) -> dict[str, Any] | None:
-    """Time gsplat's colour and depth on the same splats and camera; None where it is not installed or does not run."""
+    """Time gsplat's colour and depth on the same splats and camera; None if it is not installed or does not run."""
     if importlib.util.find_spec("gsplat") is None:
         return None
     try:
         return _time_gsplat(scene, runs, device)
-    except Exception as problem:  # it is compiled when first used, and that may go wrong in many ways
+    except Exception as problem:  # it is compiled at first use, which can fail in many ways
         print(f"gsplat is left out: {problem!r}"[:500], file=sys.stderr, flush=True)
         return None
 
@@ -191,7 +191,7 @@ def _time_gsplat(scene: Scene, runs: int, device: torch.device) -> dict[str, Any
 
 
 def time_slam(frames: int, seed: int) -> dict[str, Any]:
-    """Follow the built-in room at 640×480 with the default preset on CUDA; return frames/s, ATE and peak memory."""
+    """Run SLAM on the built-in room at 640×480 with the default preset on CUDA; return frames/s, ATE, memory."""
     room = SyntheticRoom(frames=200, width=640, height=480)
     frames, device = min(frames, len(room)), torch.device("cuda", torch.cuda.current_device())
     torch.cuda.reset_peak_memory_stats(device)

@@ -1,4 +1,4 @@
-"""Read what the compiler says of every CUDA kernel: registers, spills, shared memory, blocks on a multiprocessor.
+"""List what every CUDA kernel uses: registers, spills, shared memory, blocks per multiprocessor.
 
 Needs no device. Writes benchmarks/results/kernels-<machine>.json and prints its tables.
 
@@ -26,22 +26,22 @@ TELL = ("--ptxas-options=-v",)
 
 @dataclass(frozen=True)
 class Options:
-    """Read what the compiler says of every CUDA kernel."""
+    """List registers, spills and shared memory of every CUDA kernel."""
 
-    architectures: Annotated[tuple[str, ...], arg(help="what to compile for")] = ("sm_86", "sm_90")
-    quick: Annotated[bool, arg(help="print only, write nothing")] = False
+    architectures: Annotated[tuple[str, ...], arg(help="architectures to compile for")] = ("sm_86", "sm_90")
+    quick: Annotated[bool, arg(help="print only, write no results")] = False
     name: Annotated[str, arg(help="name of the results")] = "kernels"
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
 
 class Multiprocessor(NamedTuple):
-    """What a multiprocessor shares out to blocks (CUDA C++ programming guide, compute capabilities)."""
+    """What a multiprocessor has for blocks (CUDA C++ programming guide, compute capabilities)."""
 
     shared_kib: int
     threads: int
     blocks: int
     reserved: int = 1024
-    """Bytes of shared memory that the system takes of every block."""
+    """Bytes of shared memory that the system reserves in every block."""
 
 
 MULTIPROCESSORS = {
@@ -62,7 +62,7 @@ USED = re.compile(
 
 
 class Usage(NamedTuple):
-    """What one kernel takes; shared memory and spills in bytes, of a thread the latter."""
+    """What one kernel uses; shared memory per block and spills per thread, in bytes."""
 
     kernel: str
     registers: int
@@ -71,7 +71,7 @@ class Usage(NamedTuple):
 
 
 def usages(log: str) -> Iterator[Usage]:
-    """Read ptxas's account of each kernel in NVRTC's log."""
+    """Read what ptxas reports for each kernel in NVRTC's log."""
     for found in USED.finditer(log):
         shared = re.search(r"(\d+) bytes smem", found["rest"])
         spilled = max(int(found["stores"]), int(found["loads"]))
@@ -79,13 +79,13 @@ def usages(log: str) -> Iterator[Usage]:
 
 
 def remarks(log: str) -> str:
-    """Return what else the log says: warnings."""
+    """Return the other lines of the log: warnings."""
     account = re.compile(r"ptxas (info    :|        \.) |\s*$")
     return "\n".join(line for line in log.splitlines() if not account.match(line))
 
 
 def blocks_held(usage: Usage, architecture: str) -> int:
-    """Return how many blocks of the kernel a multiprocessor holds at once. A warp's registers come in lots of 256."""
+    """Return how many blocks of the kernel fit on a multiprocessor; a warp's registers come in units of 256."""
     has = MULTIPROCESSORS[architecture]
     of_warp = -(-usage.registers * 32 // 256) * 256
     shared = -(-(usage.shared + has.reserved) // 128) * 128
@@ -111,7 +111,7 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     """Return the tables of results written by kernels.py."""
     figures = measured["figures"]
     made = dict.fromkeys(row["architecture"] for row in figures["kernels"])
-    note = f"NVRTC {figures['compiler']}; spills of a thread; blocks of 256 threads that a multiprocessor holds."
+    note = f"NVRTC {figures['compiler']}; spills per thread; blocks of 256 threads that fit on a multiprocessor."
     return [
         _section(architecture, [row for row in figures["kernels"] if row["architecture"] == architecture], note)
         for architecture in made
@@ -126,7 +126,7 @@ def _section(architecture: str, rows: Rows, note: str) -> Section:
 
 
 def _merged(rows: Rows) -> Rows:
-    """Join what programs of several feature counts say alike of a kernel."""
+    """Merge rows of a kernel that are equal for several feature counts."""
     joined: dict[tuple[Any, ...], dict[str, Any]] = {}
     for row in rows:
         alike = tuple(row[name] for name in ("kernel", "registers", "spilled", "shared", "blocks"))
@@ -149,7 +149,7 @@ def measure(options: Options) -> dict[str, Any]:
 
 
 def main(options: Options) -> int:
-    """Compile, write, print; return the exit code."""
+    """Compile, write the results, print them; return the exit code."""
     return program.run("kernels", options, measure, write=not options.quick)
 
 

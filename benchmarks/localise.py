@@ -1,4 +1,4 @@
-"""Find a camera in a map by plain descent through `render`, with some paths of the pose's gradient or with all."""
+"""Find a camera pose in a map by gradient descent through `render`, with some or all paths of the pose gradient."""
 
 import time
 from dataclasses import dataclass
@@ -22,14 +22,14 @@ WAYS = {
     "+ covariance": RenderConfig(color_pose_gradient=False),
     "+ harmonics": RenderConfig(),
 }
-"""Each has all paths of those before it."""
+"""Each way includes the paths of the ways before it."""
 PATHS = ("mean", "depth", "covariance", "color")
 COVERED_ALPHA = 0.95
 
 
 @dataclass(frozen=True)
 class Search:
-    """How far off a camera begins, how many steps it has to find its place, and colour's share of the loss."""
+    """Initial pose error, number of steps, and the share of colour in the loss."""
 
     off_m: float
     off_deg: float
@@ -38,7 +38,7 @@ class Search:
 
 
 def disturbed(T_camera_world: Matrix, search: Search, random: np.random.Generator) -> Matrix:
-    """Return a pose moved and turned by what `search` says, in a direction and about an axis that are drawn evenly."""
+    """Return a pose moved and rotated as `search` says, in a random direction and about a random axis."""
     drawn = random.normal(size=(2, 3))
     drawn *= np.array([[search.off_m], [np.radians(search.off_deg)]]) / np.linalg.norm(drawn, axis=1, keepdims=True)
     T = T_camera_world.copy()
@@ -50,10 +50,10 @@ def disturbed(T_camera_world: Matrix, search: Search, random: np.random.Generato
 def localise(
     field: GaussianField, frame: Frame, T_camera_world: Matrix, switches: RenderConfig, search: Search
 ) -> tuple[Matrix, float]:
-    """Descend by Adam on a twist about the middle of what is seen; return the last pose and the ms per step.
+    """Descend by Adam on a twist about the centre of the view; return the last pose and the ms per step.
 
-    About the camera a turn and a shift look alike, and descent creeps along the valley between them. Rates fall evenly
-    to 0; all steps together reach four times as far as the start is off.
+    About the camera centre, rotation and translation have similar effects, and descent would be slow. Learning rates
+    fall linearly to 0; all steps together can reach four times the initial error.
     """
     adam, n, middle = VectorAdam.of(6), search.steps, middle_of(frame)
     rates = np.repeat([search.off_m, np.radians(search.off_deg)], 3) * 8.0 / n
@@ -66,7 +66,7 @@ def localise(
 
 
 def middle_of(frame: Frame) -> Matrix:
-    """Return T_camera_middle: on the optical axis, as far as the median reading."""
+    """Return T_camera_middle: a point on the optical axis at the median depth."""
     middle = np.eye(4)
     middle[2, 3] = np.median(frame.depth_m[frame.depth_m > 0])
     return middle
@@ -85,7 +85,7 @@ def gradient(
 
 
 def shares(field: GaussianField, frame: Frame, T_camera_world: Matrix, search: Search) -> dict[str, list[float]]:
-    """Return how large each path's gradient is beside that of all, by ρ and by φ: |∂L| of the path over |∂L|."""
+    """Return the size of each path's gradient relative to the whole, by ρ and by φ: |∂L| of the path over |∂L|."""
     whole = gradient(field, frame, T_camera_world, RenderConfig(), search)
     found = {}
     for path in PATHS:
@@ -96,7 +96,7 @@ def shares(field: GaussianField, frame: Frame, T_camera_world: Matrix, search: S
 
 
 def pose_loss(seen: Render, color: Tensor, depth_m: Tensor, weight_color: float) -> Tensor:
-    """Average the absolute errors of colour and depth, where there is a reading and the map covers it."""
+    """Return the mean absolute error of colour and depth, where there is a reading and the map covers it."""
     valid = (depth_m > 0) & (seen.alpha.detach() > COVERED_ALPHA)
     on_color, on_depth = (seen.color - color).abs().mean(-1), (seen.depth - depth_m).abs()
     each = weight_color * on_color + (1.0 - weight_color) * on_depth
@@ -104,7 +104,7 @@ def pose_loss(seen: Render, color: Tensor, depth_m: Tensor, weight_color: float)
 
 
 def view_dependence(field: GaussianField, frame: Frame, T_camera_world: Matrix) -> float:
-    """Return how much the harmonics change what a camera sees: mean absolute difference of colour."""
+    """Return how much the harmonics change the rendered image: mean absolute difference of colour."""
     plain = GaussianField(field.params)
     with_them, without = (render(shown, frame.camera, T_camera_world).color for shown in (field, plain))
     return float((with_them - without).abs().mean())

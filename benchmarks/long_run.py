@@ -1,8 +1,8 @@
-"""Walk so long that submaps pile up, and ask whether frames get slower or memory grows (issue 4).
+"""Run so many frames that submaps accumulate, and measure whether frames get slower or memory grows (issue 4).
 
-The frames are drawn beforehand by all cores; then SLAM steps through them alone in a fresh process, finished submaps
-paged to disk and images read ahead by a thread, as `sigmasplat run` has it. Each frame's time is kept, and the resident
-memory of the process after it. Writes benchmarks/results/long-run-<machine>.json, prints tables. Linux only.
+All cores render the frames first. Then a fresh process runs SLAM on them alone, with finished submaps on disk and
+images read ahead by a thread, as `sigmasplat run` does. The time of each frame and the resident memory after it are
+recorded. Writes benchmarks/results/long-run-<machine>.json and prints tables. Linux only.
 
 example: python benchmarks/long_run.py --quick
 """
@@ -41,32 +41,32 @@ from sigmasplat.sources.files.images import color_from_bytes
 
 arg = tyro.conf.arg
 SOURCE = "synthetic:frames=2400,rooms=2,loops=4,noise=1"
-"""Four turns, so that each quarter of the run sees all there is to see once."""
+"""Four turns, so that each quarter of the run sees the whole scene once."""
 QUICK_SOURCE, QUICK_SETTING = "synthetic:frames=240,loops=4,noise=1,width=160,height=120", "input.width=160"
 STATM = Path("/proc/self/statm")
 
 
 @dataclass(frozen=True)
 class Options:
-    """Walk so long that submaps pile up, and ask whether frames get slower or memory grows."""
+    """Run so many frames that submaps accumulate, and measure whether frames get slower or memory grows."""
 
     source: Annotated[str, arg(help="sequence, at least 2000 frames for a result")] = SOURCE
-    preset: Annotated[str, arg(help="settings to start from")] = default_preset()
+    preset: Annotated[str, arg(help="preset to start from")] = default_preset()
     settings: Settings = ()
     seed: int = 0
-    finish: Annotated[bool, arg(help="make the final map too, after the frames")] = True
-    quick: Annotated[bool, arg(help="a minute or so: 240 small frames; nothing is written")] = False
+    finish: Annotated[bool, arg(help="also make the final map after the frames")] = True
+    quick: Annotated[bool, arg(help="about a minute: 240 small frames, no results written")] = False
     name: Annotated[str, arg(help="name of the results")] = "long-run"
     scratch: Annotated[Path, arg(help="folder for the frames and submaps, removed afterwards: 2 GB")] = accuracy.RUNS
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
     def config(self) -> Config:
-        """Return the run's settings. Raises ConfigError on an unknown preset or setting."""
+        """Return the run's settings. Raises ConfigError for an unknown preset or setting."""
         return override(preset_of(self.preset), split_settings(self.settings) | {"seed": str(self.seed)})
 
 
 class Drawn(Source):
-    """Frames of another source that `draw` has kept in a folder."""
+    """Frames of another source, saved in a folder by `draw`."""
 
     def __init__(self, whole: Source, folder: Path) -> None:
         super().__init__(whole.name, whole.camera)
@@ -82,17 +82,17 @@ class Drawn(Source):
             return Frame(i, float(file["timestamp_s"]), color, file["depth_m"], self.camera)
 
     def truth(self) -> Trajectory | None:
-        """Return the true path of the source drawn."""
+        """Return the true path of the original source."""
         return self._whole.truth()
 
 
 def kept(folder: Path, i: int) -> Path:
-    """Return where frame i is kept."""
+    """Return the file of frame i."""
     return folder / f"{i:06d}.npz"
 
 
 def draw(path: str, folder: Path, indices: range) -> None:
-    """Keep frames of a source, colour in the 255 steps that cameras deliver."""
+    """Save frames of a source, with colour as 8-bit values like those of a camera."""
     source = open_source(path)
     for i in indices:
         frame = source.frame(i)
@@ -101,7 +101,7 @@ def draw(path: str, folder: Path, indices: range) -> None:
 
 
 def draw_all(path: str, folder: Path) -> None:
-    """Keep all frames of a source, drawn by all cores."""
+    """Save all frames of a source, rendered by all cores."""
     workers, frames = usable_cores(), len(open_source(path))
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         parts = [pool.submit(draw, path, folder, range(k, frames, workers)) for k in range(workers)]
@@ -110,18 +110,20 @@ def draw_all(path: str, folder: Path) -> None:
 
 
 def resident_mib() -> float:
-    """Return the resident memory of this process, MiB. Raises SourceError where there is no /proc."""
+    """Return the resident memory of this process, MiB. Raises SourceError without /proc."""
     try:
         pages = int(STATM.read_text().split()[1])
     except OSError as problem:
-        raise SourceError(f"resident memory is read from {STATM}, which this system has not ({problem})") from problem
+        raise SourceError(
+            f"resident memory is read from {STATM}, which this system does not have ({problem})"
+        ) from problem
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def follow(path: str, scratch: Path, config: Config, finish: bool) -> dict[str, Any]:
-    """Step through the frames drawn in scratch/frames; return time, memory and submap of each, and figures of the run.
+    """Run SLAM on the frames in scratch/frames; return time, memory and submap of each, and figures of the run.
 
-    seconds: `Step.seconds["total"]`, reading the frame not included; resident_mib: after the frame.
+    seconds: `Step.seconds["total"]`, without reading the frame; resident_mib: after the frame.
     """
     from sigmasplat.slam.slam import Slam
 
@@ -151,7 +153,7 @@ def follow(path: str, scratch: Path, config: Config, finish: bool) -> dict[str, 
 
 
 def measure(options: Options) -> dict[str, Any]:
-    """Draw the frames, then walk through them in a fresh process; return the figures."""
+    """Render the frames, then run SLAM on them in a fresh process; return the figures."""
     options.scratch.mkdir(parents=True, exist_ok=True)
     config = options.config()
     with TemporaryDirectory(prefix="long-run-", dir=options.scratch) as folder:
@@ -159,7 +161,7 @@ def measure(options: Options) -> dict[str, Any]:
         (scratch / "frames").mkdir()
         clock = time.perf_counter()
         draw_all(options.source, scratch / "frames")
-        print(f"frames drawn in {time.perf_counter() - clock:.0f} s", file=sys.stderr, flush=True)
+        print(f"frames rendered in {time.perf_counter() - clock:.0f} s", file=sys.stderr, flush=True)
         found: dict[str, Any] = alone(follow, options.source, scratch, config, options.finish)
     return {"source": Path(options.source).name, **found}
 
@@ -172,7 +174,7 @@ FRAMES, SLOWER, LARGER = 2000, 0.10, 0.15
 
 
 def quarters(each: dict[str, list[float]]) -> list[dict[str, float]]:
-    """Sum up each quarter of the frames: seconds a frame takes, resident memory, submaps there are at its end."""
+    """Summarise each quarter of the frames: seconds per frame, resident memory, submaps at its end."""
     parts = {name: np.array_split(np.array(values), 4) for name, values in each.items()}
     return [
         {
@@ -195,13 +197,13 @@ def sections(measured: dict[str, Any]) -> list[Section]:
 
 
 def by_quarter(figures: dict[str, Any]) -> Section:
-    """Lay out time and memory by quarters."""
+    """Tabulate time and memory by quarter."""
     rows = []
     for number, part in enumerate(quarters(figures["each"]), 1):
         times = [1e3 * part[name] for name in ("median_s", "mean_s", "longest_s")]
         cells = [*times, part["median_mib"], part["most_mib"]]
         rows.append([str(number), str(part["frames"]), str(part["submaps"]), *map(significant, cells)])
-    head = ["quarter", "frames", "submaps at its end", "ms a frame, median", "… mean", "… longest", "MiB, median"]
+    head = ["quarter", "frames", "submaps at its end", "ms per frame, median", "… mean", "… longest", "MiB, median"]
     ate_m, finish = figures["ate_m"], figures["finish"]
     note = (
         f"{figures['source']}: lost {figures['lost']}, loops accepted {figures['loops_accepted']} of "
@@ -209,21 +211,21 @@ def by_quarter(figures: dict[str, Any]) -> Section:
     )
     if finish:
         note += f" The final map took {significant(finish['finish_s'])} s, {significant(finish['resident_mib'])} MiB."
-    return Section("Quarters", [*head, "… most"], rows, note)
+    return Section("Quarters", [*head, "… max"], rows, note)
 
 
 def goals(figures: dict[str, Any]) -> Section:
-    """Hold the last quarter against the second; the median frame has no mapping in it, the mean one has."""
+    """Compare the last quarter with the second. The median frame is not mapped; the mean includes mapping."""
     _, second, _, last = quarters(figures["each"])
     rows = [["frames", str(figures["frames"]), f"≥ {FRAMES}", _held(figures["frames"] >= FRAMES)]]
     for what, name, most in (
-        ("time of a frame, median", "median_s", SLOWER),
+        ("time per frame, median", "median_s", SLOWER),
         ("… mean", "mean_s", SLOWER),
         ("resident memory, median", "median_mib", LARGER),
     ):
         ratio = last[name] / second[name]
         rows.append([what, significant(ratio), f"{1 - most:.2f} … {1 + most:.2f}", _held(abs(ratio - 1) <= most)])
-    return Section("Goals", ["last quarter over the second", "measured", "goal", "held"], rows)
+    return Section("Goals", ["last quarter / second quarter", "measured", "goal", "reached"], rows)
 
 
 def _held(yes: bool) -> str:
@@ -231,7 +233,7 @@ def _held(yes: bool) -> str:
 
 
 def main(options: Options) -> int:
-    """Measure, write, print; return the exit code."""
+    """Measure, write the results, print them; return the exit code."""
     if options.quick:
         options = replace(options, source=QUICK_SOURCE, settings=(*options.settings, QUICK_SETTING))
     name = Path(options.source).name

@@ -1,8 +1,8 @@
-"""Ask what closing loops is worth: whole runs with and without, every loop held against the truth (issue 4).
+"""Measure the effect of loop closure: complete runs with and without it, every loop compared with the truth (issue 4).
 
-drift: the rooms of the synthetic walk whose depth goes astray, and the same run without its loops; real: redkitchen in
-submaps with loops, and in one submap. Runs are made by `accuracy.py`, which reads what has been run before.
-Writes benchmarks/results/loops-<machine>.json, prints tables; benchmarks/README.md says what each figure means.
+drift: synthetic rooms with a drifting depth error, and the same run without its loops. real: redkitchen in submaps with
+loops, and in one submap. `accuracy.py` makes the runs and reuses finished ones.
+Writes benchmarks/results/loops-<machine>.json and prints tables; benchmarks/README.md says what each figure means.
 
 example: python benchmarks/loops.py --experiments drift
 """
@@ -23,7 +23,7 @@ from tracking import true_poses
 import sigmasplat
 from sigmasplat.config import SubmapConfig
 from sigmasplat.errors import SigmaSplatError, SourceError
-from sigmasplat.io.machine import RUNNING, code_digest
+from sigmasplat.io.machine import INSTALLED, code_digest
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.model import se3
 from sigmasplat.presets import default_preset
@@ -34,47 +34,57 @@ Matrix = NDArray[np.float64]
 Records = list[dict[str, Any]]
 Experiment = Literal["drift", "real"]
 DRIFTING = "synthetic:frames=720,rooms=2,overrun=20,noise=1,drift=6"
-"""See `sigmasplat.sources.synthetic.SyntheticRoom` for why this one."""
+"""See `sigmasplat.sources.synthetic.SyntheticRoom` for the reason for this one."""
 ONE_SUBMAP = tuple(f"submaps.{field.name}=0" for field in fields(SubmapConfig))
 WAYS: dict[Experiment, dict[str, tuple[str, ...]]] = {
     "drift": {"loops": ("loops.close=true",)},
     "real": {"loops": (), "one submap": ONE_SUBMAP},
 }
-"""The settings that are compared in each experiment, over those of --set.
+"""The settings compared in each experiment, added to those of --set.
 
-The preset itself closes loops: its runs of the real sequence are those of accuracy.py.
+The preset itself closes loops, so its runs of the real sequence are those of accuracy.py.
 """
 QUICK = (",width=160,height=120", "input.width=160")
 
 
 @dataclass(frozen=True)
 class Options:
-    """Ask what closing loops is worth: whole runs with and without, every loop held against the truth."""
+    """Measure the effect of loop closure: complete runs with and without it, every loop compared with the truth."""
 
-    experiments: Annotated[tuple[Experiment, ...], arg(help="which of them")] = ("drift", "real")
-    source: Annotated[str, arg(help="sequence of the drift, without its seed: each run's is added")] = DRIFTING
-    seeds: Annotated[tuple[int, ...], arg(help="of the drift: room, noise and run")] = (0, 1, 2, 3, 4)
-    real: Annotated[str, arg(help="real sequence, name or path")] = "redkitchen"
-    real_seeds: Annotated[tuple[int, ...], arg(help="of the real sequence: of the run")] = (0, 1, 2)
-    preset: Annotated[str, arg(help="settings to start from")] = default_preset()
+    experiments: Annotated[tuple[Experiment, ...], arg(help="which ones to run")] = ("drift", "real")
+    source: Annotated[str, arg(help="sequence for the drift experiment, without a seed; each run adds its own")] = (
+        DRIFTING
+    )
+    seeds: Annotated[tuple[int, ...], arg(help="seeds of the drift experiment, for room, noise and run")] = (
+        0,
+        1,
+        2,
+        3,
+        4,
+    )
+    real: Annotated[str, arg(help="real sequence: name or path")] = "redkitchen"
+    real_seeds: Annotated[tuple[int, ...], arg(help="seeds of the runs on the real sequence")] = (0, 1, 2)
+    preset: Annotated[str, arg(help="preset to start from")] = default_preset()
     settings: accuracy.Settings = ()
-    quick: Annotated[bool, arg(help="minutes: one seed of the drift, half as wide; nothing is written")] = False
+    quick: Annotated[
+        bool, arg(help="some minutes: one seed of the drift experiment at half width, no results written")
+    ] = False
     name: Annotated[str, arg(help="name of the results")] = "loops"
-    fresh: Annotated[bool, arg(help="run also what has been run before")] = False
+    fresh: Annotated[bool, arg(help="repeat runs that exist already")] = False
     runs: Annotated[Path, arg(help="folder of the run folders")] = accuracy.RUNS
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
 
 def shortened(options: Options) -> Options:
-    """Return the options of a quick look."""
+    """Return the options for --quick."""
     width, setting = QUICK
     short = replace(options, experiments=("drift",), seeds=options.seeds[:1], source=options.source + width)
     return replace(short, settings=(*options.settings, setting))
 
 
 def jobs_of(options: Options) -> list[tuple[Experiment, str, accuracy.Job]]:
-    """List experiment, way and job, seed by seed. Raises ConfigError on an unknown preset or setting."""
-    code = code_digest(Path(sigmasplat.__file__).parent, RUNNING)
+    """List experiment, variant and job, seed by seed. Raises ConfigError for an unknown preset or setting."""
+    code = code_digest(Path(sigmasplat.__file__).parent, INSTALLED)
     listed: list[tuple[Experiment, str, accuracy.Job]] = []
     for experiment in options.experiments:
         for seed in options.seeds if experiment == "drift" else options.real_seeds:
@@ -91,7 +101,7 @@ def jobs_of(options: Options) -> list[tuple[Experiment, str, accuracy.Job]]:
 
 
 def submap_starts(log: Records) -> dict[int, dict[str, Any]]:
-    """Return the first log line of each submap: its first keyframe, whose camera is the submap's frame."""
+    """Return the first log line of each submap: its first keyframe, whose camera defines the submap's coordinates."""
     starts: dict[int, dict[str, Any]] = {}
     for line in log:
         starts.setdefault(line["submap"], line)
@@ -99,7 +109,7 @@ def submap_starts(log: Records) -> dict[int, dict[str, Any]]:
 
 
 def judged(loop: dict[str, Any], T_world_query: Matrix, T_world_database: Matrix) -> dict[str, Any]:
-    """Return a loop's record with its error against the true poses [4, 4] of both submaps, in place of its matrix."""
+    """Return a loop's record with its error relative to the true poses [4, 4] of both submaps, without its matrix."""
     T_true = se3.inverse(T_world_query) @ T_world_database
     error = se3.inverse(T_true) @ np.array(loop["T_query_database"], np.float64)
     error_m = float(np.linalg.norm(error[:3, 3]))
@@ -110,17 +120,17 @@ def judged(loop: dict[str, Any], T_world_query: Matrix, T_world_database: Matrix
 
 
 def judge_all(loops: Records, log: Records, T_world_camera: Matrix) -> Records:
-    """Judge loops by the true poses [F, 4, 4] of the frames logged, which are in the log's order."""
+    """Compare loops with the true poses [F, 4, 4] of the logged frames, in the order of the log."""
     rows = {line["index"]: row for row, line in enumerate(log)}
     starts = {submap: T_world_camera[rows[line["index"]]] for submap, line in submap_starts(log).items()}
     return [judged(loop, starts[loop["query"]], starts[loop["database"]]) for loop in loops]
 
 
 def described(run: RunFolder, path: str, wanted: bool) -> dict[str, Any]:
-    """Return how many submaps a run has, how many loops it tried, and those registered, judged by the truth.
+    """Return the number of submaps and of tried loops of a run, and its registered loops compared with the truth.
 
-    Without `wanted` a run has no loops. Raises SourceError if a loop's frames have no true pose, SigmaSplatError or
-    OSError if the run's files are not as they should be.
+    If not `wanted`, there are no loops. Raises SourceError if a loop's frames have no true pose, SigmaSplatError or
+    OSError if the run's files are damaged.
     """
     log = run.read_log()
     submaps = len({line.get("submap", 0) for line in log})
@@ -134,7 +144,7 @@ def described(run: RunFolder, path: str, wanted: bool) -> dict[str, Any]:
 
 
 def measure(options: Options) -> Records:
-    """Run every job and describe it; a run that failed, or whose loops cannot be read, has its `problem`."""
+    """Run every job and describe it; a run that failed, or whose loops cannot be read, has a `problem`."""
     listed, results = jobs_of(options), []
     wanted = accuracy.Options(fresh=options.fresh, runs=options.runs)
     for (experiment, way, job), result in zip(
@@ -152,7 +162,7 @@ def measure(options: Options) -> Records:
 
 
 def checked(options: Options) -> None:
-    """Raise SourceError if the drift's sequence cannot be read with the seeds asked for."""
+    """Raise SourceError if the sequence of the drift experiment cannot be read with the chosen seeds."""
     if "drift" in options.experiments and ",seed=" in options.source:
         raise SourceError(f"--source {options.source} has a seed; each run adds its own, give --seeds")
     for seed in options.seeds if "drift" in options.experiments else ():
@@ -166,7 +176,7 @@ def measure_all(options: Options) -> dict[str, Any]:
 
 
 def main(options: Options) -> int:
-    """Measure, write, print; return the exit code."""
+    """Measure, write the results, print them; return the exit code."""
     if options.quick:
         options = shortened(options)
     name = Path(options.real).name

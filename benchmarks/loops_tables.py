@@ -1,4 +1,4 @@
-"""Lay out the figures of the loop benchmark: runs with and without loops, the loops themselves, issue 4's goals."""
+"""Tabulate the figures of the loop benchmark: runs with and without loops, the loops, the goals of issue 4."""
 
 import statistics
 from typing import Any
@@ -8,7 +8,7 @@ from tables import Section, significant
 
 Rows = list[dict[str, Any]]
 FALSE_TRANSLATION_M, FALSE_ROTATION_DEG = 0.3, 10.0
-"""A loop is false if the pose it gives one submap in the other is off by more than this from the true one."""
+"""A loop is false if its relative pose of the two submaps differs from the true one by more than this."""
 RATIO = 0.6
 """Issue 4: ATE with loops ≤ 60 % of ATE without."""
 RUN = (
@@ -21,7 +21,7 @@ RUN = (
     ("frames/s", "frames_per_s", 1.0),
     ("peak memory, MiB", "peak_mib", 1.0),
 )
-"""Title, name of the figure, factor."""
+"""Title, name of the figure, factor to the unit of the title."""
 
 
 def sections(measured: dict[str, Any]) -> list[Section]:
@@ -32,29 +32,29 @@ def sections(measured: dict[str, Any]) -> list[Section]:
 
 
 def succeeded(jobs: Rows, experiment: str, way: str | None = None) -> Rows:
-    """Choose an experiment's runs, all or those of one way, that did not fail."""
+    """Return the successful runs of an experiment, all or those of one variant."""
     return [j for j in jobs if j["experiment"] == experiment and way in (None, j["way"]) and j["problem"] is None]
 
 
 def accepted(job: dict[str, Any], true: bool) -> int:
-    """Count the true or the false ones of a run's accepted loops."""
+    """Count the true or the false loops among a run's accepted ones."""
     return sum(loop["accepted"] and loop["true"] is true for loop in job["loops"])
 
 
 def runs(jobs: Rows) -> Section:
-    """Lay out the runs by experiment and way."""
+    """Tabulate the runs by experiment and variant."""
     rows = []
     for experiment, way in dict.fromkeys((job["experiment"], job["way"]) for job in jobs):
         done = succeeded(jobs, experiment, way)
         cells = [spread([factor * value for value in values_of(done, name)]) for _, name, factor in RUN]
         rows.append([done[0]["source"] if done else experiment, way, str(len(done)), *cells])
-    head = ["sequence", "with", "runs", *(title for title, _, _ in RUN)]
-    return Section("Runs", head, rows, "Mean ± standard deviation over the runs, which differ by their seed.")
+    head = ["sequence", "variant", "runs", *(title for title, _, _ in RUN)]
+    return Section("Runs", head, rows, "Mean ± standard deviation over the seeds.")
 
 
 def paired(jobs: Rows, experiment: str) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """Return with each run with loops the one without: of the drift the same run's path as tracking alone has it, which
-    is that of a run without loops to the last bit (tests/system/test_submaps.py); else the run of the same seed."""
+    """Pair each run with loops with one without. For drift this is the same run's path by tracking alone, equal bit
+    for bit to a run without loops (tests/system/test_submaps.py); otherwise the run with the same seed."""
     done = succeeded(jobs, experiment)
     if experiment == "drift":
         return [(job, job | {"figures": job["figures"] | {"ate_m": without_loops_m(job)}}) for job in done]
@@ -63,13 +63,13 @@ def paired(jobs: Rows, experiment: str) -> list[tuple[dict[str, Any], dict[str, 
 
 
 def without_loops_m(job: dict[str, Any]) -> float:
-    """Return the ATE of a run's path without loops, m; with none accepted that is the path."""
+    """Return the ATE of a run's path without loops, m; without accepted loops that of the path."""
     found: float | None = job["figures"].get("ate_odometry_m")
     return job["figures"]["ate_m"] if found is None else found
 
 
 def seeds(jobs: Rows) -> Section:
-    """Lay out each seed's ATE with and without loops, and how many loops were tried, accepted, true and false."""
+    """Tabulate each seed's ATE with and without loops, and how many loops were tried, accepted, true and false."""
     rows = []
     for experiment in dict.fromkeys(job["experiment"] for job in jobs):
         for job, other in paired(jobs, experiment):
@@ -81,10 +81,10 @@ def seeds(jobs: Rows) -> Section:
             counts = [job["submaps"], job["tried"], right + wrong, right, wrong, bent, caught]
             rows.append([job["source"], str(job["seed"]), *cells, *map(str, counts)])
     head = ["sequence", "seed", "ATE, cm", "… without loops", "ratio", "submaps", "loops tried", "accepted", "… true"]
-    head += ["… false", "true ones that the graph refused", "false ones"]
+    head += ["… false", "true loops rejected by the pose graph", "false loops rejected"]
     note = (
-        f"False: off by more than {FALSE_TRANSLATION_M} m or {FALSE_ROTATION_DEG:.0f}° from the true pose of one "
-        "submap's first keyframe in the other's."
+        f"False: more than {FALSE_TRANSLATION_M} m or {FALSE_ROTATION_DEG:.0f}° from the true relative pose of the "
+        "first keyframes of both submaps."
     )
     return Section("Seeds", head, rows, note)
 
@@ -99,12 +99,12 @@ def edges(jobs: Rows) -> Section:
             moved = [100 * loop["translation_m"], loop["rotation_deg"], 100 * loop["error_m"], loop["error_deg"]]
             figures = [loop["similarity"], loop["residual"], loop["overlap"], loop["chi2"], *moved]
             rows.append([str(job["seed"]), between, frames, *map(significant, figures)])
-    head = ["seed", "submaps", "frames", "similarity", "residual", "overlap", "χ²", "moves it by, cm", "… °"]
-    return Section("Edges", [*head, "off the truth, cm", "… °"], rows)
+    head = ["seed", "submaps", "frames", "similarity", "residual", "overlap", "χ²", "correction, cm", "… °"]
+    return Section("Edges", [*head, "error, cm", "… °"], rows)
 
 
 def goals(jobs: Rows) -> Section:
-    """Hold the loops to issue 4: of the ATE every seed's ratio and that of the means."""
+    """Compare the loops with the goals of issue 4: the ATE ratio of every seed and of the means."""
     rows = []
     pairs = paired(jobs, "drift")
     if pairs:
@@ -113,14 +113,14 @@ def goals(jobs: Rows) -> Section:
         of_means = _mean_ate_m(job for job, _ in pairs) / _mean_ate_m(other for _, other in pairs)
         rows.append(_row("drift: true loops closed, each seed", right, "≥ 1", min(right) >= 1))
         rows.append(_row("drift: false loops closed, all seeds", [sum(wrong)], "0", sum(wrong) == 0))
-        rows.append(_row("drift: ATE over that without loops, of means", [of_means], f"≤ {RATIO}", of_means <= RATIO))
+        rows.append(_row("drift: ATE with loops / without, of means", [of_means], f"≤ {RATIO}", of_means <= RATIO))
         rows.append(_row("… each seed", ratios, f"≤ {RATIO}", max(ratios) <= RATIO))
     pairs = paired(jobs, "real")
     if pairs:
         ours_cm, theirs_cm = (100 * _mean_ate_m(pair[k] for pair in pairs) for k in (0, 1))
-        title = f"{pairs[0][0]['source']}: ATE, cm, against one submap's"
+        title = f"{pairs[0][0]['source']}: ATE, cm; goal: that of one submap"
         rows.append(_row(title, [ours_cm], f"≤ {significant(theirs_cm)}", ours_cm <= theirs_cm))
-    return Section("Goals", ["", "measured", "goal", "held"], rows)
+    return Section("Goals", ["figure", "measured", "goal", "reached"], rows)
 
 
 def _mean_ate_m(jobs: Any) -> float:
@@ -133,10 +133,10 @@ def _row(what: str, values: list[Any], goal: str, held: bool) -> list[str]:
 
 
 def failures(jobs: Rows) -> Section:
-    """List the runs that failed, with what they said last."""
+    """List the runs that failed, with the last line they printed."""
     rows = [
         [f"{job['source']}, {job['way']}, seed {job['seed']}", job["problem"].replace("|", "/")]
         for job in jobs
         if job["problem"] is not None
     ]
-    return Section("Failed", ["run", "last words"], rows)
+    return Section("Failed", ["run", "last line"], rows)

@@ -1,9 +1,9 @@
-"""Switch paths of the pose's gradient off and on: what does each do to the pose, and what does it cost (CG-SLAM §2.1)?
+"""Measure the effect of each path of the pose gradient on pose accuracy and time (CG-SLAM §2.1).
 
-sequence: whole sequences tracked by Adam through the renderer, without and with the path through the 2D covariance.
-localise: single frames found again in a map with spherical harmonics, without and with that path, and with the path
-through the direction from which colours are seen.
-Writes benchmarks/results/pose-gradient-<machine>.json, prints tables; benchmarks/README.md says what each figure means.
+sequence: complete sequences tracked by Adam through the renderer, without and with the path through the 2D covariance.
+localise: single frames localised in a map with spherical harmonics, without and with that path, and with the path
+through view-dependent colours.
+Writes benchmarks/results/pose-gradient-<machine>.json, prints tables; benchmarks/README.md explains each figure.
 
 example: python benchmarks/pose_gradient.py --experiments localise --sources livingroom
 """
@@ -42,51 +42,51 @@ arg = tyro.conf.arg
 Matrix = NDArray[np.float64]
 Experiment = Literal["sequence", "localise"]
 RATES = {**tracking.RATES, "CG-SLAM": (7.5e-4, 2.15e-3)}
-"""Of tracking by Adam: of a quaternion, which turns by twice as much, and of translation. CG-SLAM turns by 1.5e-3."""
+"""Learning rates of tracking by Adam: quaternion, which rotates by twice as much, and translation. CG-SLAM: 1.5e-3."""
 ONE_MAP = ("submaps.distance_m=0", "submaps.angle_deg=0", "submaps.frames=0", "submaps.uncertainty_m=0")
 SEEDS_PER_PIXEL = (0.5, 0.2)
-"""Of the first frame: drawn evenly, and by gradient; what varsplat-fast takes at its own width."""
+"""In the first frame, drawn uniformly and by gradient; the same density as varsplat-fast at its own width."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Measure what each path of the pose's gradient does to poses, and what it costs."""
+    """Measure the effect of each path of the pose gradient on pose accuracy and time."""
 
-    experiments: Annotated[tuple[Experiment, ...], arg(help="which of them")] = ("sequence", "localise")
-    sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = (
+    experiments: Annotated[tuple[Experiment, ...], arg(help="which ones to run")] = ("sequence", "localise")
+    sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = (
         "synthetic:frames=400,width=160,height=120",
         "livingroom",
         "redkitchen",
     )
-    limit: Annotated[int, arg(help="frames of each, from its start")] = 80
+    limit: Annotated[int, arg(help="number of frames, from the start of each sequence")] = 80
     width: Annotated[int, arg(help="working width, pixels")] = 160
-    preset: Annotated[str, arg(help="settings to start from")] = "varsplat-fast"
-    seeds: Annotated[tuple[int, ...], arg(help="starts of the random numbers, a run or a map each")] = (0, 1)
-    iterations: Annotated[int, arg(help="of Adam, per tracked frame")] = 30
-    rates: Annotated[Literal["Replica", "TUM", "CG-SLAM"], arg(help="whose learning rates Adam tracks with")] = (
-        "CG-SLAM"
-    )
-    refinement: Annotated[int, arg(help="steps that refine the map, harmonics included")] = 1000
-    degree: Annotated[int, arg(help="of the harmonics, 1 to 3")] = 2
-    frames: Annotated[int, arg(help="held-out frames to be found, per map")] = 8
-    steps: Annotated[int, arg(help="of Adam, per frame to be found; rates fall to 0 meanwhile")] = 60
-    off_m: Annotated[float, arg(help="how far off each begins, metres")] = 0.02
-    off_deg: Annotated[float, arg(help="… and degrees")] = 1.0
+    preset: Annotated[str, arg(help="preset to start from")] = "varsplat-fast"
+    seeds: Annotated[tuple[int, ...], arg(help="random seeds, one run or map for each")] = (0, 1)
+    iterations: Annotated[int, arg(help="Adam iterations per tracked frame")] = 30
+    rates: Annotated[
+        Literal["Replica", "TUM", "CG-SLAM"], arg(help="system whose learning rates Adam uses in tracking")
+    ] = "CG-SLAM"
+    refinement: Annotated[int, arg(help="refinement steps of the map, including harmonics")] = 1000
+    degree: Annotated[int, arg(help="degree of the harmonics, 1 to 3")] = 2
+    frames: Annotated[int, arg(help="held-out frames to localise in each map")] = 8
+    steps: Annotated[int, arg(help="Adam steps per localised frame, while learning rates fall to 0")] = 60
+    off_m: Annotated[float, arg(help="initial position error, metres")] = 0.02
+    off_deg: Annotated[float, arg(help="initial rotation error, degrees")] = 1.0
     weight_color: Annotated[float, arg(help="share of colour in the loss")] = 0.6
-    quick: Annotated[bool, arg(help="a minute: one short sequence, one seed; nothing is written")] = False
+    quick: Annotated[bool, arg(help="a minute: one short sequence, one seed, no results written")] = False
     name: Annotated[str, arg(help="name of the results")] = "pose-gradient"
-    fresh: Annotated[bool, arg(help="run also the sequences that have been run before")] = False
+    fresh: Annotated[bool, arg(help="repeat runs that exist already")] = False
     runs: Annotated[Path, arg(help="folder of the run folders")] = accuracy.RUNS
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
     def map_settings(self) -> tuple[str, ...]:
-        """Return what makes maps of this width: one of all frames, as dense as the preset's."""
+        """Return the settings for maps of this width: one submap, as dense as with the preset."""
         uniform, gradient = (int(share * self.width**2 * 0.75) for share in SEEDS_PER_PIXEL)
         seeds = (f"seeding.first_uniform={uniform}", f"seeding.first_gradient={gradient}")
         return (f"input.width={self.width}", *seeds, *ONE_MAP, "loops.close=false")
 
     def tracking_settings(self, way: str) -> tuple[str, ...]:
-        """Return the settings of a whole sequence tracked by Adam."""
+        """Return the settings of a complete sequence tracked by Adam."""
         rotation, translation = RATES[self.rates]
         return (
             *self.map_settings(), "final.iterations=0", "tracking.method=adam",
@@ -96,16 +96,16 @@ class Options:
         )  # fmt: skip
 
     def map_config(self, seed: int) -> Config:
-        """Return the settings of a map with harmonics. Raises ConfigError on an unknown preset or degree."""
+        """Return the settings of a map with harmonics. Raises ConfigError for an unknown preset or degree."""
         if not 1 <= self.degree <= DEGREES:
-            raise ConfigError(f"--degree of the harmonics is 1 to {DEGREES}, found {self.degree}")
+            raise ConfigError(f"--degree of the harmonics must be 1 to {DEGREES}, found {self.degree}")
         every = max(1, self.refinement // 10)
         final = (f"final.iterations={self.refinement}", f"final.sh_degree={self.degree}", f"final.sh_every={every}")
         settings = split_settings((*self.map_settings(), *final)) | {"seed": str(seed)}
         return override(preset_of(self.preset), settings)
 
     def search(self) -> Search:
-        """Return how single frames are found."""
+        """Return the settings for localising single frames."""
         return Search(self.off_m, self.off_deg, self.steps, self.weight_color)
 
 
@@ -113,9 +113,9 @@ class Options:
 
 
 def measure_sequences(options: Options) -> list[dict[str, Any]]:
-    """Run whole sequences without and with the covariance's path; a run that failed has its `problem`.
+    """Run complete sequences without and with the covariance path; a run that failed has a `problem`.
 
-    No map is tracked on that has harmonics, so that there is no third way.
+    Maps used for tracking have no harmonics, so there is no third variant.
     """
     found = []
     for way in tuple(WAYS)[:2]:
@@ -135,9 +135,9 @@ def measure_sequences(options: Options) -> list[dict[str, Any]]:
 
 
 def iteration_ms(log: Sequence[dict[str, Any]]) -> float | None:
-    """Return the median over a run's frames of tracking time by iteration, ms; None if no frame was tracked.
+    """Return the median over a run's frames of tracking time per iteration, ms; None if no frame was tracked.
 
-    A frame that was tried again has the time of all tries and the iterations of one: the median passes it over.
+    A frame tracked twice has the time of both tries and the iterations of one; the median ignores such outliers.
     """
     tracked = [line for line in log if (line.get("tracking") or {}).get("iterations")]
     times = [1e3 * line["seconds"]["track"] / line["tracking"]["iterations"] for line in tracked]
@@ -148,9 +148,9 @@ def iteration_ms(log: Sequence[dict[str, Any]]) -> float | None:
 
 
 def measure_localise(path: str, options: Options, seed: int) -> dict[str, Any]:
-    """Map a sequence, harmonics and all; find held-out frames in it by every way from the same start.
+    """Map a sequence with harmonics; localise held-out frames in it by every variant from the same start.
 
-    Raises SourceError if there is no frame to be found, or no truth to judge by.
+    Raises SourceError if no frame is held out, or without ground truth.
     """
     source, slam = open_source(path, limit=options.limit), Slam(options.map_config(seed))
     for frame in source:
@@ -159,7 +159,7 @@ def measure_localise(path: str, options: Options, seed: int) -> dict[str, Any]:
     estimated, views = slam.trajectory().T_world_camera, held_out(slam, options.frames)
     truth = tracking.true_poses(source, [step.timestamp_s for step in slam.steps])
     if not views:
-        raise SourceError(f"{path}: no frame is tracked that the map was not fitted to; give a longer --limit")
+        raise SourceError(f"{path}: no tracked frame is held out; use a larger --limit")
     random, found = np.random.default_rng(seed), list[dict[str, Any]]()
     changes, parts = list[float](), list[dict[str, list[float]]]()
     for row, keyframe in views:
@@ -179,14 +179,14 @@ def measure_localise(path: str, options: Options, seed: int) -> dict[str, Any]:
 def found_poses(
     field: GaussianField, frame: Frame, tracked: Matrix, search: Search, random: np.random.Generator
 ) -> dict[str, tuple[Matrix, float]]:
-    """Return T_camera_world as tracked, as disturbed, and as each way finds it from there, with its ms per step."""
+    """Return T_camera_world as tracked, as disturbed, and as found by each variant from there, with its ms per step."""
     start = disturbed(tracked, search, random)
     poses = {"as tracked": (tracked, 0.0), "start": (start, 0.0)}
     return poses | {way: localise(field, frame, start, switches, search) for way, switches in WAYS.items()}
 
 
 def held_out(slam: Slam, count: int) -> list[tuple[int, int]]:
-    """Choose frames that no map was fitted to, evenly spread: (row, row of the newest keyframe before it)."""
+    """Choose evenly spread held-out frames: (row, row of the newest keyframe before it)."""
     pairs, keyframe = list[tuple[int, int]](), -1
     for row, step in enumerate(slam.steps):
         if step.is_keyframe:
@@ -201,13 +201,13 @@ def held_out(slam: Slam, count: int) -> list[tuple[int, int]]:
 
 
 def shortened(options: Options) -> Options:
-    """Return what --quick does of it."""
+    """Return the options for --quick."""
     few = {"limit": min(options.limit, 24), "refinement": min(options.refinement, 60), "frames": min(options.frames, 3)}
     return replace(options, sources=options.sources[:1], seeds=options.seeds[:1], **few)
 
 
 def measure(options: Options) -> dict[str, Any]:
-    """Carry out the experiments asked for; maps are made in fresh processes. Raises SigmaSplatError."""
+    """Run the chosen experiments; maps are made in fresh processes. Raises SigmaSplatError."""
     options.map_config(0)
     figures: dict[str, Any] = {}
     if "sequence" in options.experiments:
@@ -218,7 +218,7 @@ def measure(options: Options) -> dict[str, Any]:
             maps = []
             for seed in options.seeds:
                 maps.append(alone(measure_localise, accuracy.located(source), options, seed))
-                print(f"{Path(source).name}, seed {seed}: frames found in a map", file=sys.stderr, flush=True)
+                print(f"{Path(source).name}, seed {seed}: frames localised", file=sys.stderr, flush=True)
             figures["localise"].append({"source": Path(source).name, "maps": maps})
     return figures
 
@@ -229,14 +229,14 @@ def measure(options: Options) -> dict[str, Any]:
 Rows = list[dict[str, Any]]
 RUN = (*(figure for figure in PLACE if figure[1] in ("ate_m", "rpe_m", "rpe_deg", "lost")),
        ("ms per iteration", "ms_per_iteration", 1.0))  # fmt: skip
-"""Title, name of the figure, factor."""
+"""Title, name of the figure, factor to the unit of the title."""
 ERRORS = ("translation_cm", "rotation_deg")
 FIRST = "mean + depth"
-"""What the other ways are held against."""
+"""The variant that the others are compared with."""
 
 
 def sequences(jobs: Rows) -> Section:
-    """Lay out whole runs by sequence and way."""
+    """Tabulate complete runs by sequence and variant."""
     rows = []
     for source, way in dict.fromkeys((job["source"], job["way"]) for job in jobs):
         done = [job for job in jobs if (job["source"], job["way"], job["problem"]) == (source, way, None)]
@@ -244,17 +244,17 @@ def sequences(jobs: Rows) -> Section:
         rows.append([source, way, str(len(done)), *cells])
     head = ["sequence", "paths", "runs", *(title for title, _, _ in RUN)]
     rows.sort(key=lambda row: [job["source"] for job in jobs].index(row[0]))
-    return Section("Sequences", head, rows, "Mean ± standard deviation over the runs, which differ by their seed.")
+    return Section("Sequences", head, rows, "Mean ± standard deviation over the seeds.")
 
 
 def pairs_of(maps: Rows, way: str, figure: str) -> tuple[list[float], list[float]]:
-    """Collect a figure of every frame by a way, and beside it of the same frames by the first."""
+    """Return a figure of every frame by a variant, and of the same frames by the first variant."""
     ours, firsts = ([f[figure] for m in maps for f in m["found"] if f["way"] == w] for w in (way, FIRST))
     return ours, firsts
 
 
 def localisation(measured: Rows) -> Section:
-    """Lay out the errors of single frames: medians over frames and seeds, and how many a way brings nearer."""
+    """Tabulate the errors of single frames: medians over frames and seeds, and the share of frames that improve."""
     rows = []
     for source in measured:
         maps = source["maps"]
@@ -267,34 +267,36 @@ def localisation(measured: Rows) -> Section:
                 cells += [significant(float(np.median(ours))), significant(nearer, 2)]
             cells.append(significant(float(np.median(pairs_of(maps, way, "ms")[0])) if fitted else None))
             rows.append([source["source"], way, *cells])
-    head = ["sequence", "paths", "frames", "cm, median", "nearer, %", "°, median", "nearer, %", "ms per iteration"]
-    note = f"Nearer: of the frames, those that {FIRST} leave farther from the truth. "
+    head = ["sequence", "paths", "frames", "cm, median", "better, %", "°, median", "better, %", "ms per iteration"]
+    note = f"Better: share of frames with a smaller error than by {FIRST}. "
     return Section("Localisation", head, rows, note + harmonics_of(measured))
 
 
 def paths(measured: Rows) -> Section:
-    """Lay out how large each path's gradient is where the search begins."""
+    """Tabulate the size of each path's gradient at the start of the search."""
     rows = []
     for source in measured:
         found = [part for m in source["maps"] for part in m["shares"]]
         for path in found[0]:
             medians = np.median([part[path] for part in found], 0)
             rows.append([source["source"], path, *(significant(100.0 * float(share)) for share in medians)])
-    head = ["sequence", "path alone", "of the gradient by ρ, %", "… by φ, %"]
-    return Section("Paths", head, rows, "Length over that of all paths together, median; paths may pull apart.")
+    head = ["sequence", "path", "share of the gradient by ρ, %", "… by φ, %"]
+    return Section(
+        "Paths", head, rows, "Norm relative to that of all paths together, median. Paths can have opposite signs."
+    )
 
 
 def harmonics_of(measured: Rows) -> str:
-    """Say how much the maps' colours depend on the direction."""
+    """Write how much the maps' colours depend on the viewing direction."""
     shares = [f"{s['source']} {np.mean([m['view_dependence'] for m in s['maps']]):.4f}" for s in measured]
-    return f"Harmonics change a picture by, mean absolute colour: {', '.join(shares)}."
+    return f"Mean absolute change of colour by harmonics: {', '.join(shares)}."
 
 
 def failures(jobs: Rows) -> Section:
-    """List the runs that failed, with what they said last."""
+    """List the runs that failed, with the last line they printed."""
     failed = [job for job in jobs if job["problem"] is not None]
     rows = [[f"{j['source']}, {j['way']}, seed {j['seed']}", j["problem"].replace("|", "/")] for j in failed]
-    return Section("Failed", ["run", "last words"], rows)
+    return Section("Failed", ["run", "last line"], rows)
 
 
 def sections(measured: dict[str, Any]) -> list[Section]:
@@ -305,7 +307,7 @@ def sections(measured: dict[str, Any]) -> list[Section]:
 
 
 def main(options: Options) -> int:
-    """Measure, write, print; return the exit code."""
+    """Measure, write the results, print them; return the exit code."""
     if options.quick:
         options = shortened(options)
     return program.run("pose_gradient", options, measure, options.seeds, not options.quick)

@@ -1,4 +1,4 @@
-"""Keep what a benchmark measured: one JSON per benchmark and machine, with all it takes to measure it again."""
+"""Record what a benchmark measured: one JSON file per benchmark and machine, with what is needed to repeat it."""
 
 import json
 import os
@@ -17,28 +17,28 @@ from sigmasplat.io.machine import code_digest
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 MEASURED = ("src", "CMakeLists.txt", "benchmarks", ":!benchmarks/results", ":!benchmarks/*.md")
-"""What the figures depend on, as git path specifications."""
+"""The files that figures depend on, as git path specifications."""
 LOAD_AVERAGE = round(os.getloadavg()[0], 2)
-"""Of the minute before the program started: near 0 where the machine was left alone."""
+"""The load in the minute before the program started: near 0 on an idle machine."""
 
 
 def data_root() -> Path:
-    """Return the folder of the real sequences: $SIGMASPLAT_DATA, else ../shared/data beside the checkout."""
+    """Return the folder of the real sequences: $SIGMASPLAT_DATA, otherwise ../shared/data beside the checkout."""
     return Path(os.environ.get("SIGMASPLAT_DATA", ROOT.parent / "shared" / "data"))
 
 
 def slug(text: str) -> str:
-    """Turn a processor's or a sequence's name into a file name: lower case, words joined by hyphens."""
+    """Turn the name of a processor or a sequence into a file name: lower case, words joined by hyphens."""
     return re.sub(r"[^a-z0-9]+", "-", re.sub(r"\((r|tm)\)", " ", text.lower())).strip("-") or "unknown"
 
 
 def machine_slug(described: dict[str, Any]) -> str:
-    """Name a machine by processor and cores, from `sigmasplat.io.machine.describe()`."""
+    """Return a machine's name from processor and cores, as `sigmasplat.io.machine.describe()` gives them."""
     return f"{slug(str(described['cpu']))}-{described['cores']}-cores"
 
 
 def commit() -> dict[str, Any]:
-    """Return the checkout's commit and whether code differs from it; both None outside git."""
+    """Return the commit of the checkout and whether the code differs from it; both None outside git."""
     head = _git("rev-parse", "--verify", "HEAD")
     if head is None:
         return {"commit": None, "dirty": None}
@@ -46,7 +46,7 @@ def commit() -> dict[str, Any]:
 
 
 def _git(*words: str) -> str | None:
-    """Return what git says of the checkout, None if it cannot."""
+    """Return the output of a git command in the checkout; None if it fails."""
     try:
         answer = subprocess.run(
             ["git", "-C", str(ROOT), *words], capture_output=True, text=True, timeout=20, check=True
@@ -59,7 +59,7 @@ def _git(*words: str) -> str | None:
 def results(
     benchmark: str, figures: dict[str, Any], *, name: str = "", seeds: Sequence[int] = (), config: Any = None
 ) -> dict[str, Any]:
-    """Lay out figures with their circumstances: benchmark is the program, name what it is called here (the same)."""
+    """Return figures with machine, commit, date and command; `name` names the results, by default as the program."""
     return {
         "name": name or benchmark,
         "benchmark": benchmark,
@@ -86,13 +86,13 @@ def write(measured: dict[str, Any], folder: Path = RESULTS) -> Path:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Read results written by `write`. Raises OSError or ValueError if they are not there or damaged."""
+    """Read results written by `write`. Raises OSError or ValueError if they are missing or damaged."""
     measured: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     return measured
 
 
 def latest(name: str, folder: Path = RESULTS) -> dict[str, Any] | None:
-    """Return the newest results of a name whatever the machine, or those of an exact file stem; None without any."""
+    """Return the newest results of a name from any machine, or those of an exact file stem; None without results."""
     exact = folder / f"{name}.json"
     found = [read(exact)] if exact.is_file() else [read(path) for path in sorted(folder.glob(f"{slug(name)}-*.json"))]
     named = found if exact.is_file() else [measured for measured in found if measured["name"] == name]

@@ -1,4 +1,4 @@
-"""Make splats from real depth: the maps that the CPU benchmark renders, and how much work lies in one image."""
+"""Make splats from real depth, the maps of the CPU benchmark, and count the work of one image."""
 
 from dataclasses import dataclass
 
@@ -22,17 +22,17 @@ from sigmasplat.sources.base import Source
 
 DEPTH_RANGE_M = (0.1, 8.0)
 OFFSETS = (0, 5, -5, 10, -10, 15, -15, 20, -20)
-"""Frames that lend their pixels where the first has too few."""
+"""Frames whose pixels are added if the first has too few."""
 LATER = 1
-"""Tracking aligns the frame so many later to the map."""
+"""Tracking aligns the frame this many frames later to the map."""
 LEAST_FIT = 0.3
-"""A frame whose odometry explains less than this share lends nothing."""
+"""A frame whose odometry explains less than this share is not used."""
 Points = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A field back-projected from `frames` frames, its world the camera of `frame`; `later` is to be tracked in it."""
+    """A field back-projected from `frames` frames, in the camera coordinates of `frame`; `later` is to be tracked."""
 
     field: GaussianField
     frame: Frame
@@ -48,8 +48,8 @@ class Scene:
 def make_scene(path: str, index: int, splats: int, width: int, seed: int = 0) -> Scene:
     """Back-project frame `index` of a sequence to `splats` splats, seen `width` pixels wide.
 
-    One splat per pixel drawn, isotropic, as wide as its 3 neighbours are far in the mean, opacity uniform in (.5, .99).
-    Raises SourceError if the frames around cannot give so many.
+    One isotropic splat per drawn pixel, as wide as the mean distance to 3 neighbours, opacity uniform in (.5, .99).
+    Raises SourceError if the neighbouring frames have too few pixels.
     """
     source, random = open_source(path), np.random.default_rng(seed)
     points, colors, frames = gather(source, index, splats, random)
@@ -68,10 +68,10 @@ def make_scene(path: str, index: int, splats: int, width: int, seed: int = 0) ->
 def gather(
     source: Source, index: int, count: int, random: np.random.Generator
 ) -> tuple[Points, NDArray[np.float32], int]:
-    """Draw points [count, 3] m and colours [count, 3] that frame `index` sees, and say from how many frames.
+    """Draw points [count, 3] m and colours [count, 3] seen by frame `index`; return them and the frames used.
 
-    A frame gives all it has before the next one is asked. Neighbours are laid in place by odometry and give only what
-    falls into the first image. Raises SourceError if all of them have too few.
+    All pixels of a frame are used before the next frame. Neighbouring frames are aligned by odometry, and only points
+    inside the first image are used. Raises SourceError if all frames together have too few.
     """
     first = source.frame(index).prepared(0, *DEPTH_RANGE_M)
     parts, missing = [], count
@@ -82,11 +82,11 @@ def gather(
         missing -= len(drawn)
         if missing == 0:
             return np.concatenate([p for p, _ in parts]), np.concatenate([c for _, c in parts]), len(parts)
-    raise SourceError(f"{source.name}: {count} splats asked for, frames around {index} have {count - missing}")
+    raise SourceError(f"{source.name}: {count} splats asked for, the frames around {index} have {count - missing}")
 
 
 def _points(frame: Frame, first: Frame) -> tuple[Points, NDArray[np.float32]]:
-    """Back-project the readings of a frame into the first camera, keeping what lies in its image."""
+    """Back-project the readings of a frame into the first camera; keep those inside its image."""
     T_first_frame = np.eye(4) if frame.index == first.index else _odometry(first, frame)
     if T_first_frame is None:
         return np.zeros((0, 3)), np.zeros((0, 3), np.float32)
@@ -100,7 +100,7 @@ def _points(frame: Frame, first: Frame) -> tuple[Points, NDArray[np.float32]]:
 
 
 def _odometry(first: Frame, other: Frame) -> Points | None:
-    """Align two frames; return T_first_other, or None where they do not fit together. No truth is read."""
+    """Align two frames; return T_first_other, or None if they do not match. Ground truth is not read."""
     small = [frame.resized(320, round(320 * frame.camera.height / frame.camera.width)) for frame in (first, other)]
     pyramids = [Pyramid.of(gray_of(frame.color), frame.depth_m, frame.camera) for frame in small]
     found = align(pyramids[0], pyramids[1], np.eye(4), iterations=20)
@@ -110,9 +110,9 @@ def _odometry(first: Frame, other: Frame) -> Points | None:
 def count_pairs(
     field: GaussianField, camera: Camera, options: RenderConfig, pixels: int, random: np.random.Generator
 ) -> tuple[float, float]:
-    """Estimate how many (pixel, splat) pairs add to the image seen from the origin, and the standard error of that.
+    """Estimate how many (pixel, splat) pairs contribute to the image from the origin, and the standard error.
 
-    The blend's own rule, in numpy, at `pixels` random pixels, scaled up to all of them; exact from pixels = all on.
+    Applies the rule of `blend` in numpy at `pixels` random pixels and scales up; exact if that is all pixels.
     """
     with torch.no_grad():
         p = reference.project(field.means, field.quats, field.scales, torch.eye(4), camera, options)
@@ -128,7 +128,7 @@ def count_pairs(
 
 
 def _pairs_at(u: int, v: int, splats: NDArray[np.float32], options: RenderConfig) -> int:
-    """Count the splats (rows u, v, l1, l2, l3, opacity, near to far) that add to pixel (u, v)."""
+    """Count the splats (rows u, v, l1, l2, l3, opacity, near to far) that contribute to pixel (u, v)."""
     dy = v - splats[:, 1]
     near = np.abs(splats[:, 4] * dy) < np.sqrt(2 * np.log(1 / options.alpha_min))
     dx, dy, (l1, l2, l3, opacity) = u - splats[near, 0], dy[near], splats[near, 2:].T

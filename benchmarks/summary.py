@@ -90,7 +90,7 @@ def coverage(results: Results) -> str:
 
 def loops(results: Results) -> str:
     """Give what closing loops does to the path under drift."""
-    ratio = results.cell("loops", "Goals", ("drift: ATE over that without loops, of means",), "measured")
+    ratio = results.cell("loops", "Goals", ("drift: ATE with loops / without, of means",), "measured")
     wrong = results.cell("loops", "Goals", ("drift: false loops closed, all seeds",), "measured")
     seeds = len(results.measured("loops")["seeds"])
     return f"ATE × {ratio} (rooms with drift, mean of {seeds} seeds); false loops closed: {wrong}"

@@ -1,7 +1,7 @@
-"""Lay the systems side by side: sequences × presets × seeds, each run alone on all threads (issue 5).
+"""Compare the systems: sequences × presets × seeds, each run alone on all threads (issue 5).
 
-Runs are made by `accuracy.py`, which reads what has been run before. Where the true surface is known, the run's own is
-then scored by `sigmasplat eval --mesh`. Writes benchmarks/results/systems-<machine>.json, prints a table a sequence.
+`accuracy.py` makes the runs and reuses finished ones. If the true surface is known, `sigmasplat eval --mesh` then
+scores the surface of the run. Writes benchmarks/results/systems-<machine>.json and prints a table for each sequence.
 
 example: python benchmarks/systems.py --sources synthetic --presets varsplat-fast sigma --seeds 0 1
 """
@@ -32,20 +32,20 @@ SURFACE = (
     "accuracy_m", "completion_m", "completion_ratio",
     "splats_accuracy_m", "splats_completion_m", "splats_chamfer_m", "floaters",
 )  # fmt: skip
-"""Figures taken from metrics.json beside those of `accuracy.figures_of`: its own, and those of `reconstruction`."""
+"""Figures of `reconstruction` in metrics.json, in addition to those of `accuracy.figures_of`."""
 
 
 @dataclass(frozen=True)
 class Options(accuracy.Options):
-    """Lay the systems side by side: sequences × presets × seeds, each run alone on all threads."""
+    """Compare the systems: sequences × presets × seeds, each run alone on all threads."""
 
-    sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = SOURCES
-    presets: Annotated[tuple[str, ...], arg(help="the systems, by their settings")] = PRESETS
-    name: Annotated[str, arg(help="name of the results; another one for other --set")] = "systems"
+    sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = SOURCES
+    presets: Annotated[tuple[str, ...], arg(help="presets of the systems to compare")] = PRESETS
+    name: Annotated[str, arg(help="name of the results; use another name with other --set")] = "systems"
 
 
 def refuse_unequal_input(presets: Sequence[str], settings: Sequence[str]) -> None:
-    """Raise ConfigError unless all presets, with the settings over them, take the frames in alike."""
+    """Raise ConfigError unless all presets, with these settings, have equal `input` settings."""
     changes = split_settings(settings)
     taken = {name: override(preset_of(name), changes).to_dict()["input"] for name in presets}
     first = presets[0]
@@ -53,20 +53,20 @@ def refuse_unequal_input(presets: Sequence[str], settings: Sequence[str]) -> Non
         for key, value in values.items():
             if value != taken[first][key]:
                 unequal = f"input.{key} is {taken[first][key]} in {first} and {value} in {name}"
-                raise ConfigError(f"{unequal}; give one for all: --set input.{key}={value}")
+                raise ConfigError(f"{unequal}; set one value for all: --set input.{key}={value}")
 
 
 def figures_of(metrics: dict[str, Any]) -> dict[str, float | None]:
-    """Pick a run's figures from its metrics.json; None where there is none."""
+    """Return a run's figures from its metrics.json; None for a missing one."""
     surface = metrics.get("reconstruction") or {}
     picked = {name: metrics.get(name) for name in COSTS} | {name: surface.get(name) for name in SURFACE}
     return accuracy.figures_of(metrics) | picked
 
 
 def with_surface(job: accuracy.Job, result: dict[str, Any], runs: Path, before: Sequence[str] = ()) -> dict[str, Any]:
-    """Return a job's result with all figures of its run, the surface scored first where that is due and possible.
+    """Return a job's result with all figures of its run; score the surface first if it is known and not scored yet.
 
-    A surface that cannot be scored is the result's `problem`. Words `before` the command may say where it runs.
+    If the surface cannot be scored, `problem` says why. `before` is put before the command, to choose cores.
     """
     if result["problem"]:
         return result
@@ -104,10 +104,10 @@ ROWS = (
     ("worst frame, ms", "worst_frame_s", 1e3),
     ("peak memory, MiB", "peak_mib", 1.0),
 )
-"""Title, name of the figure, factor; a row that no run has is left out."""
+"""Title, name of the figure, factor to the unit of the title; a row without any value is left out."""
 NOTE = (
-    "Mean ± standard deviation over the seeds. Frames/s: reading, tracking, mapping and loops, end to end; the final "
-    "map comes after and is `finish`. Worst frame: without the first, which makes the map, and without reading."
+    "Mean ± standard deviation over the seeds. Frames/s includes reading, tracking, mapping and loops; `finish` is the "
+    "time of the final map after the last frame. Worst frame: without the first frame, and without reading."
 )
 
 
@@ -120,17 +120,17 @@ def sections(measured: dict[str, Any]) -> list[Section]:
 
 
 def sequence(source: str, results: list[Result]) -> Section:
-    """Lay out the runs of one sequence."""
+    """Tabulate the runs of one sequence."""
     by_preset = {preset: runs for (_, preset), runs in groups(results).items()}
     rows = [["runs", *(str(len(runs)) for runs in by_preset.values())]]
     for title, figure, factor in ROWS:
         values = [[factor * value for value in values_of(runs, figure)] for runs in by_preset.values()]
         rows += [[title, *map(spread, values)]] if any(values) else []
-    return Section(source, ["", *by_preset], rows, NOTE)
+    return Section(source, ["figure", *by_preset], rows, NOTE)
 
 
 def main(options: Options) -> int:
-    """Run, score, write, print; exit code 1 if a job failed, 2 if the options mean nothing."""
+    """Run, score, write the results, print them; exit code 1 if a job failed, 2 if the options are invalid."""
     try:
         refuse_unequal_input(options.presets, options.settings)
         jobs = accuracy.jobs_of(options)

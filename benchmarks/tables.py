@@ -1,8 +1,8 @@
-"""Turn committed results into markdown, and keep the tables in the documents equal to them.
+"""Write committed results as markdown tables into the documents, and check that the documents are up to date.
 
 A document holds <!-- bench:NAME --> … <!-- /bench -->, or bench:NAME/SECTION for one table of several;
-`python benchmarks/tables.py` rewrites what stands between, in README.md and docs/*.md. NAME is that of the results
-(the newest of any machine) or the whole file name without .json; SECTION is a table's title, as in path-and-speed.
+`python benchmarks/tables.py` replaces the text between them, in README.md and docs/*.md. NAME is the name of results
+(the newest from any machine) or a file name without .json; SECTION is the title of a table, as in path-and-speed.
 bench:* shows all results, each under its own heading, and bench:contents lists these headings; bench:summary is the
 table of summary.py.
 """
@@ -30,13 +30,13 @@ SUBJECTS = {
     "Kernels": ("cpu", "versus", "gpu", "kernels"),
     "Long runs": ("long_run", "viewer_memory"),
 }
-"""Benchmarks by the subject under which their results are listed, in this order; any other follows at the end."""
+"""Benchmarks by the subject under which their results are listed, in this order; all others follow at the end."""
 BLOCK = re.compile(r"(<!-- bench:(?P<what>[\w./+-]+|\*) -->\n)(?P<body>.*?)(<!-- /bench -->)", re.DOTALL)
 
 
 @dataclass(frozen=True)
 class Section:
-    """One table: title, head, rows of text, and a line or two below."""
+    """One table: title, head, rows of text, and a note below."""
 
     title: str
     columns: Sequence[str]
@@ -44,14 +44,14 @@ class Section:
     note: str = ""
 
     def markdown(self) -> str:
-        """Write as a markdown table under a bold title; the first column is aligned left, the others right."""
+        """Return markdown under a bold title; the first column is left-aligned, the others right-aligned."""
         rule = ["---", *["---:"] * (len(self.columns) - 1)]
         lines = [f"| {' | '.join(row)} |" for row in (self.columns, rule, *self.rows)]
         return f"**{self.title}**\n\n" + "\n".join(lines) + "\n" + (f"\n{self.note}\n" if self.note else "")
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """Write a figure with so many significant digits and no exponent; a dash where there is none."""
+    """Write a figure with this number of significant digits and no exponent; a dash for a missing one."""
     if value is None or not math.isfinite(value):
         return "–"
     places = digits - 1 - math.floor(math.log10(abs(value))) if value else digits - 1
@@ -59,35 +59,35 @@ def significant(value: float | None, digits: int = 3) -> str:
 
 
 def headline(measured: dict[str, Any]) -> str:
-    """Say on what, when and from which code the figures are."""
+    """Return machine, commit, date and command of results as one line."""
     made_on, commit = measured["machine"], measured["commit"]
     code = f"commit {commit[:9]}{' with changes' if measured['dirty'] else ''}" if commit else "no commit"
     return f"{made_on['cpu']}, {made_on['cores']} cores · {code} · {measured['date'][:10]} · `{measured['command']}`"
 
 
 def sections(measured: dict[str, Any]) -> list[Section]:
-    """Return the tables of results, in the layout of the benchmark that made them."""
+    """Return the tables of results, in the layout of their benchmark."""
     made: list[Section] = layout(measured["benchmark"]).sections(measured)
     return made
 
 
 def layout(benchmark: str) -> ModuleType:
-    """Return the module that lays out a benchmark's results: <benchmark>_tables, else the benchmark itself."""
+    """Return the module that tabulates a benchmark's results: <benchmark>_tables, or the benchmark itself."""
     apart = record.ROOT / "benchmarks" / f"{benchmark}_tables.py"
     return importlib.import_module(apart.stem if apart.is_file() else benchmark)
 
 
 def table(measured: dict[str, Any], section: str | None = None) -> str:
-    """Write results as markdown: every table, or the one `section` names. Raises KeyError if there is none."""
+    """Write results as markdown: every table, or the one named `section`. Raises KeyError if that does not exist."""
     made = {record.slug(s.title): s for s in sections(measured)}
     if section is not None and section not in made:
-        raise KeyError(f"results {measured['name']!r} have no table {section!r} (there are {', '.join(made)})")
+        raise KeyError(f"results {measured['name']!r} have no table {section!r} (it has {', '.join(made)})")
     chosen = [s for name, s in made.items() if section in (None, name)]
     return "\n".join([f"{headline(measured)}\n", *(s.markdown() for s in chosen)])
 
 
 def compared(measured: Sequence[dict[str, Any]], source: str) -> str:
-    """Write results of one benchmark with different settings as one table, a row each, of one source's runs."""
+    """Write results of one benchmark with different settings as one table: one row each, for the runs of one source."""
     section: Section = layout(measured[0]["benchmark"]).compared(measured, source)
     made_on, commits = measured[0]["machine"], sorted({(m["commit"] or "no commit")[:9] for m in measured})
     dates = sorted({m["date"][:10] for m in measured})
@@ -132,7 +132,7 @@ def contents(folder: Path = record.RESULTS) -> str:
 
 
 def question(benchmark: str) -> str:
-    """Say what a benchmark asks, by the first line of its program, and link to what its figures mean."""
+    """Return the first line of a benchmark's docstring, and a link to the meaning of its figures."""
     program = f"{benchmark}.py"
     source = (record.ROOT / "benchmarks" / program).read_text(encoding="utf-8")
     asked = (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
@@ -150,9 +150,9 @@ WHOLE: dict[str, Callable[[Path], str]] = {"*": everything, "contents": contents
 
 
 def rewritten(text: str, folder: Path = record.RESULTS) -> tuple[str, list[str]]:
-    """Return a document with every block replaced by its table, and the names of blocks left as they were: no results.
+    """Return a document with every block replaced by its table, and the names of missing results.
 
-    `bench:NAME+NAME/SOURCE` compares several results; `bench:*` is all there are.
+    Blocks without results are not changed. `bench:NAME+NAME/SOURCE` compares several results.
     Raises KeyError for a table that the results do not have.
     """
     missing: list[str] = []
@@ -188,7 +188,7 @@ def main(check: Check = False) -> int:
             print(f"{path.name}: {problem.args[0]}", file=sys.stderr)
             return 2
         for name in missing:
-            print(f"{path.name}: no results {name!r} yet, the block is left as it is", file=sys.stderr)
+            print(f"{path.name}: no results {name!r} yet, the block is not changed", file=sys.stderr)
         wrong += len(missing) + (after != before)
         if after != before:
             print(f"{'out of date' if check else 'rewritten'}: {path.relative_to(record.ROOT)}")

@@ -1,8 +1,8 @@
-"""Hold tracking by alignment against the papers' descent and both against the truth: what issue 3 asks of tracking.
+"""Compare tracking by alignment with the papers' descent, and both with the ground truth (issue 3).
 
-pairs: one frame a few frames after a keyframe, by every method from the same guess; consistency: whether the covariance
-of a pose covers its error; sequence: whole runs, by `accuracy.py`, which reads what has been run before.
-Writes benchmarks/results/tracking-<machine>.json, prints tables; benchmarks/README.md says what each figure means.
+pairs: track a frame a few frames after a keyframe, by every method from the same guess. consistency: does the
+covariance of a pose cover its error? sequence: complete runs, made by `accuracy.py`, which reuses finished ones.
+Writes benchmarks/results/tracking-<machine>.json and prints tables; benchmarks/README.md says what each figure means.
 
 example: python benchmarks/tracking.py --experiments pairs consistency
 """
@@ -45,67 +45,82 @@ Matrix = NDArray[np.float64]
 Fit = Callable[[Frame, Matrix], PoseFit]
 Experiment = Literal["pairs", "consistency", "sequence"]
 RATES = {"TUM": (2e-3, 1e-2), "Replica": (2e-4, 2e-3)}
-"""The papers' learning rates of tracking by Adam, by the data they give them for: rotation, translation."""
+"""The papers' learning rates for tracking by Adam, by data set: rotation, translation."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Hold tracking by alignment against the papers' descent and both against the truth."""
+    """Compare tracking by alignment with the papers' descent, and both with the ground truth."""
 
-    experiments: Annotated[tuple[Experiment, ...], arg(help="which of them")] = ("pairs", "consistency", "sequence")
-    source: Annotated[str, arg(help="sequence of the pairs, name or path")] = field(default_factory=default_source)
-    starts: Annotated[int, arg(help="keyframes spread over it")] = 12
-    gaps: Annotated[tuple[int, ...], arg(help="frames from keyframe to the frame that is tracked")] = (1, 2, 5, 10)
-    before: Annotated[int, arg(help="frames that make the map at each start, itself included")] = 10
-    rooms: Annotated[tuple[str, ...], arg(help="sequences of the covariance, exact truth wanted")] = (
+    experiments: Annotated[tuple[Experiment, ...], arg(help="which ones to run")] = ("pairs", "consistency", "sequence")
+    source: Annotated[str, arg(help="sequence for the pairs: name or path")] = field(default_factory=default_source)
+    starts: Annotated[int, arg(help="number of keyframes, spread over the sequence")] = 12
+    gaps: Annotated[tuple[int, ...], arg(help="distances from the keyframe to the tracked frame, in frames")] = (
+        1,
+        2,
+        5,
+        10,
+    )
+    before: Annotated[int, arg(help="frames that make the map at each start, including the start")] = 10
+    rooms: Annotated[tuple[str, ...], arg(help="sequences for the covariance, with exact ground truth")] = (
         accuracy.SYNTHETIC,
         f"{accuracy.SYNTHETIC},noise=1",
     )
-    sources: Annotated[tuple[str, ...], arg(help="whole sequences, names or paths")] = ("redkitchen", "synthetic")
-    preset: Annotated[str, arg(help="settings to start from")] = default_preset()
-    iterations: Annotated[int, arg(help="of Adam, per frame")] = 60
-    rates: Annotated[tuple[str, ...], arg(help="whose learning rates Adam takes on whole sequences")] = tuple(RATES)
-    seeds: Annotated[tuple[int, ...], arg(help="starts of the random numbers, a map each")] = (0,)
+    sources: Annotated[tuple[str, ...], arg(help="sequences for complete runs: names or paths")] = (
+        "redkitchen",
+        "synthetic",
+    )
+    preset: Annotated[str, arg(help="preset to start from")] = default_preset()
+    iterations: Annotated[int, arg(help="Adam iterations per frame")] = 60
+    rates: Annotated[tuple[str, ...], arg(help="data sets whose learning rates Adam uses on complete runs")] = tuple(
+        RATES
+    )
+    seeds: Annotated[tuple[int, ...], arg(help="random seeds, one map for each")] = (0,)
     limit: Annotated[
-        int | None, arg(help="frames at most, of rooms and whole sequences", help_behavior_hint="(default: all)")
+        int | None,
+        arg(help="number of frames at most, of rooms and complete runs", help_behavior_hint="(default: all)"),
     ] = None
-    quick: Annotated[bool, arg(help="two minutes: few starts, short sequences; nothing is written")] = False
+    quick: Annotated[bool, arg(help="two minutes: few starts, short sequences, no results written")] = False
     name: Annotated[str, arg(help="name of the results")] = "tracking"
-    fresh: Annotated[bool, arg(help="run also the sequences that have been run before")] = False
+    fresh: Annotated[bool, arg(help="repeat runs that exist already")] = False
     runs: Annotated[Path, arg(help="folder of the run folders")] = accuracy.RUNS
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
     def config(self, seed: int) -> Config:
-        """Return a run's settings. Raises ConfigError on an unknown preset."""
+        """Return a run's settings. Raises ConfigError for an unknown preset."""
         return replace(preset_of(self.preset), seed=seed)
 
 
 def true_poses(source: Source, timestamps_s: Sequence[float]) -> Matrix:
-    """Return T_world_camera [N, 4, 4] at the times of frames, in the truth's world. Raises SourceError if one lacks."""
+    """Return true T_world_camera [N, 4, 4] at the times of frames. Raises SourceError if one is missing."""
     truth = source.truth()
     rows = associate(np.array(timestamps_s), truth.timestamps_s)[1] if truth else np.empty(0, np.intp)
     if truth is None or len(rows) < len(timestamps_s):
-        raise SourceError(f"{source.name}: {len(rows)} of {len(timestamps_s)} frames have a true pose; choose others")
+        raise SourceError(
+            f"{source.name}: {len(rows)} of {len(timestamps_s)} frames have a true pose; choose other frames"
+        )
     return truth.T_world_camera[rows]
 
 
 def relative_error(T_estimated: Matrix, T_true: Matrix) -> dict[str, float]:
-    """Return how far an estimated motion is from the true one."""
+    """Return the error of an estimated motion."""
     error = se3.inverse(T_true) @ T_estimated
     shift_m, angle_deg = float(np.linalg.norm(error[:3, 3])), float(np.degrees(se3.rotation_angle(error[:3, :3])))
     return {"translation_cm": round(100.0 * shift_m, 5), "rotation_deg": round(angle_deg, 6)}
 
 
 def spread(frames: int, options: Options) -> list[int]:
-    """Choose starts, evenly spread, with room for the frames before and after. Raises SourceError without room."""
+    """Choose evenly spread starts with enough frames before and after. Raises SourceError if there are too few."""
     first, last = options.before - 1, frames - 1 - max(options.gaps)
     if first > last:
-        raise SourceError(f"{frames} frames are too few: {options.before} to a start and {max(options.gaps)} after it")
+        raise SourceError(
+            f"{frames} frames are too few: {options.before} are needed up to a start and {max(options.gaps)} after it"
+        )
     return [int(start) for start in np.unique(np.linspace(first, last, options.starts).round())]
 
 
 def map_before(source: Source, start: int, before: int, config: Config) -> Slam:
-    """Run SLAM over the `before` frames up to `start`, the last a keyframe by the product's own rule unless lost."""
+    """Run SLAM over the `before` frames up to `start`, the last one a keyframe by the normal rule unless lost."""
     slam = Slam(config)
     for i in range(start - before + 1, start):
         slam.step(source.frame(i))
@@ -115,7 +130,7 @@ def map_before(source: Source, start: int, before: int, config: Config) -> Slam:
 
 
 def methods(slam: Slam, camera: Camera, iterations: int) -> dict[str, Fit]:
-    """Return each way to fit a frame's T_camera_world from a guess, on the map as it is after its last keyframe."""
+    """Return every method to fit a frame's T_camera_world from a guess, with the map after its last keyframe."""
     config, params, keyframe = slam.config.tracking, slam.field.params, slam.tracker.keyframe
     view = make_view(slam.config.backend, camera, slam.config.render)
     size = (view.sums.shape[1], view.sums.shape[2])
@@ -137,7 +152,7 @@ def methods(slam: Slam, camera: Camera, iterations: int) -> dict[str, Fit]:
 
 
 def measure_pairs(path: str, options: Options) -> dict[str, Any]:
-    """Fit the frames `gaps` after each start by every method from the start's own pose; keep every error and time."""
+    """Fit the frames `gaps` after each start by every method from the start's own pose; return every error and time."""
     source, found, lost = open_source(path), [], 0
     starts = spread(len(source), options)
     for seed, start in ((seed, start) for seed in options.seeds for start in starts):
@@ -165,7 +180,7 @@ def measure_pairs(path: str, options: Options) -> dict[str, Any]:
 def follow(source: Source, config: Config) -> tuple[Matrix, Matrix, Matrix, int]:
     """Track a sequence; return error twists [N, 6], covariances [N, 6, 6], frames since the keyframe [N], frames lost.
 
-    The twist is log(T_estimated · T_true⁻¹) of T_live_keyframe, (ρ, φ), m and rad: what the covariance is about.
+    The twist is log(T_estimated · T_true⁻¹) of T_live_keyframe, (ρ, φ), m and rad, as for the covariance.
     """
     slam, fits, followed, stamps = Slam(config), [], [], []
     track = slam.tracker.track
@@ -191,7 +206,7 @@ def follow(source: Source, config: Config) -> tuple[Matrix, Matrix, Matrix, int]
 
 
 def measure_consistency(path: str, options: Options) -> dict[str, Any]:
-    """Track a sequence per seed and hold every pose's covariance against its error: all frames, and by age."""
+    """Track a sequence with each seed; compare each pose's covariance with its error, for all frames and by age."""
     followed = [follow(open_source(path, limit=options.limit), options.config(seed)) for seed in options.seeds]
     twists, covariances, ages = (np.concatenate([run[k] for run in followed]) for k in range(3))
     if not len(twists):
@@ -202,7 +217,7 @@ def measure_consistency(path: str, options: Options) -> dict[str, Any]:
 
 
 def measure_sequences(options: Options) -> list[dict[str, Any]]:
-    """Run whole sequences by every method as `accuracy.py` does; a run that failed has its `problem`."""
+    """Run complete sequences by every method as `accuracy.py` does; a run that failed has a `problem`."""
     ways, jobs = {"align": ("tracking.method=align",)}, []
     for name in options.rates:
         rotation, translation = RATES[name]
@@ -218,7 +233,7 @@ def measure_sequences(options: Options) -> list[dict[str, Any]]:
 
 
 def measure(options: Options) -> dict[str, Any]:
-    """Carry out the experiments asked for, each in a fresh process; return the figures by experiment."""
+    """Run the chosen experiments, each in a fresh process; return the figures by experiment."""
     figures: dict[str, Any] = {}
     if "pairs" in options.experiments:
         figures["pairs"] = alone(measure_pairs, accuracy.located(options.source), options)
@@ -230,7 +245,7 @@ def measure(options: Options) -> dict[str, Any]:
 
 
 def main(options: Options) -> int:
-    """Measure, write, print; return the exit code."""
+    """Measure, write the results, print them; return the exit code."""
     if options.quick:
         options = replace(options, starts=min(options.starts, 3), limit=min(options.limit or 30, 30))
     name = Path(options.source).name

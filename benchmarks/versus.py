@@ -1,7 +1,7 @@
-"""Time the CPU kernels of this checkout beside those of another one, turn by turn: what did a change gain?
+"""Compare the speed of the CPU kernels of this checkout with those of another one, measured in turns.
 
-A machine's speed may halve from one hour to the next; taken in turns, two checkouts meet the same hours. Both need
-their kernels in place (make native). Writes benchmarks/results/versus-<machine>.json and prints its table.
+The speed of a machine can halve from one hour to the next; in turns, both checkouts run under the same conditions. Both
+need built kernels (make native). Writes benchmarks/results/versus-<machine>.json and prints its table.
 
 example: git worktree add ../before v0.1 && make -C ../before native && python benchmarks/versus.py ../before
 """
@@ -30,22 +30,22 @@ CHILD = Path(__file__).with_name("versus_works.py")
 
 @dataclass(frozen=True)
 class Options:
-    """Time the CPU kernels of this checkout beside those of another one."""
+    """Compare the speed of the CPU kernels of this checkout with those of another one."""
 
-    other: Annotated[tyro.conf.Positional[Path], arg(help="the other checkout, with its kernels built")]
+    other: Annotated[tyro.conf.Positional[Path], arg(help="the other checkout, with built kernels")]
     source: Annotated[str, arg(help="sequence whose depth becomes splats")] = field(default_factory=default_source)
-    frame: Annotated[int, arg(help="frame of it")] = 150
+    frame: Annotated[int, arg(help="frame of the sequence")] = 150
     splats: Annotated[int, arg(help="size of the map")] = 77_000
     width: Annotated[int, arg(help="width of the image, pixels")] = 320
-    threads: Annotated[tuple[int, ...], arg(help="numbers of threads; none = 1 and all cores")] = ()
-    rounds: Annotated[int, arg(help="turns of each checkout")] = 5
-    runs: Annotated[int, arg(help="runs of each piece of work in a turn, of which the least counts")] = 30
+    threads: Annotated[tuple[int, ...], arg(help="numbers of threads (default: 1 and all cores)")] = ()
+    rounds: Annotated[int, arg(help="number of turns of each checkout")] = 5
+    runs: Annotated[int, arg(help="runs of each operation in a turn; the shortest counts")] = 30
     name: Annotated[str, arg(help="name of the results")] = "versus"
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
 
 def turn(checkout: Path, request: dict[str, Any]) -> dict[str, float]:
-    """Measure a checkout in a fresh process; return the least time of each work, ms. Raises ValueError if it fails."""
+    """Measure a checkout in a fresh process; return the shortest time of each operation, ms. Raises ValueError."""
     threads = {name: str(request["threads"]) for name in ("OMP_NUM_THREADS", "SIGMASPLAT_THREADS")}
     ended = subprocess.run(
         [sys.executable, "-W", "ignore", str(CHILD), str(checkout), json.dumps(request)],
@@ -61,13 +61,13 @@ def turn(checkout: Path, request: dict[str, Any]) -> dict[str, float]:
 
 
 def measure_all(options: Options) -> dict[str, Any]:
-    """Let both checkouts take turns; return each turn's times by checkout and number of threads."""
+    """Measure both checkouts in turns; return the times of each turn by checkout and number of threads."""
     o, places = options, {"this": record.ROOT, "other": options.other}
     request = {"path": o.source, "index": o.frame, "splats": o.splats, "width": o.width, "runs": o.runs}
     turns = []
     for threads in o.threads or tuple(sorted({1, usable_cores()})):
         for number in range(o.rounds):
-            order = list(places.items())[:: 1 if number % 2 else -1]  # neither is always the first
+            order = list(places.items())[:: 1 if number % 2 else -1]  # alternate which is first
             found = {name: turn(place, {**request, "threads": threads}) for name, place in order}
             turns.append({"threads": threads, **found})
             print(f"{threads} threads, turn {number + 1} of {o.rounds}", file=sys.stderr, flush=True)
@@ -75,7 +75,7 @@ def measure_all(options: Options) -> dict[str, Any]:
 
 
 def described(checkout: Path) -> str | None:
-    """Return a checkout's commit, None where there is none."""
+    """Return a checkout's commit, None outside git."""
     ended = subprocess.run(["git", "-C", str(checkout), "rev-parse", "HEAD"], capture_output=True, text=True)
     return ended.stdout.strip() or None
 
@@ -86,7 +86,7 @@ def described(checkout: Path) -> str | None:
 def sections(measured: dict[str, Any]) -> list[Section]:
     """Return the table of results written by versus.py."""
     figures, config = measured["figures"], measured["config"]
-    header = ["threads", "work", "before, ms", "now, ms", "now / before", "turn by turn, median (least – most)"]
+    header = ["threads", "operation", "before, ms", "now, ms", "now / before", "ratio by turn, median (min – max)"]
     turns: list[dict[str, Any]] = figures["turns"]
     rows = [
         _row(threads, name, [t for t in turns if t["threads"] == threads])
@@ -94,7 +94,7 @@ def sections(measured: dict[str, Any]) -> list[Section]:
         for name in NAMES
     ]
     note = (
-        f"Before: commit {str(figures['other'])[:9]}. Least of {config['runs']} runs in each of {len(turns)} turns; "
+        f"Before: commit {str(figures['other'])[:9]}. Shortest of {config['runs']} runs in each of {len(turns)} turns; "
         f"{config['splats']} splats of {config['source']}, {config['width']} pixels wide."
     )
     return [Section("Beside another checkout", header, rows, note)]
@@ -113,7 +113,7 @@ def _row(threads: int, name: str, turns: list[dict[str, Any]]) -> list[str]:
 
 
 def main(options: Options) -> int:
-    """Measure, write, print; return the exit code."""
+    """Measure, write the results, print them; return the exit code."""
     return program.run("versus", options, measure_all, [0], refused=(ValueError,), source=Path(options.source).name)
 
 

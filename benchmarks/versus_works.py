@@ -1,6 +1,6 @@
-"""Time one checkout's CPU kernels, the main pieces of work on one scene: versus.py runs this in a process of its own.
+"""Time the main operations of one checkout's CPU kernels on one scene; versus.py runs this in its own process.
 
-Prints the least times, ms, as JSON. The works are those of the checkout itself, older or newer than this file.
+Prints the shortest times, ms, as JSON. The operations are those of the checkout, which can be older than this file.
 """
 
 import importlib
@@ -20,11 +20,11 @@ NAMES = (*WORKS.values(), MAPPING)
 
 
 def measure(path: str, index: int, splats: int, width: int, threads: int, runs: int) -> dict[str, float]:
-    """Return the least time of each work, ms."""
+    """Return the shortest time of each operation, ms."""
     scenes, works = importlib.import_module("scenes"), importlib.import_module("works")
     works.set_up("auto", threads)
     all_works = works.Works(scenes.make_scene(path, index, splats, width))
-    all_works.pose_only()  # leaves the loss that `backward` carries back
+    all_works.pose_only()  # leaves the loss gradient for `backward`
     least = {}
     for work, name in WORKS.items():
         all_works.forward()
@@ -33,12 +33,12 @@ def measure(path: str, index: int, splats: int, width: int, threads: int, runs: 
 
 
 def main(checkout: Path, request: dict[str, Any]) -> None:
-    """Import from a checkout, measure, print. Exits with a line where what is imported lies elsewhere."""
+    """Import from a checkout, measure, print. Exits with a message if a module is imported from elsewhere."""
     sys.path[:0] = [str(checkout / "benchmarks"), str(checkout / "src")]
     for name in ("works", "scenes", "sigmasplat.native._core"):
         found = Path(str(importlib.import_module(name).__file__)).resolve()
         if not found.is_relative_to(checkout):
-            sys.exit(f"{name} is not there, only {found}")
+            sys.exit(f"{name} is imported from {found}, not from the checkout")
     print(json.dumps(measure(**request)))
 
 

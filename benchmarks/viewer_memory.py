@@ -1,11 +1,11 @@
-"""Watch a run grow in the browser for a while, and ask whether the viewer's memory grows with it (issue 7).
+"""Measure whether the viewer's memory stays constant while a run grows (issue 7).
 
-A system is made up that grows as a real one does, without its work: frames, keyframes with pictures, submaps that are
-finished to disk, an active map that changes all the time. It is shown through the very watcher and stage of `sigmasplat
-run --view`, to one client in another process, which looks from ever new places; what is shown is changed every 4 s.
-Kept is the resident memory of the server's process at rest: every 15 s splats are shown in their colours and nothing
-new comes for 3 s, so that like is compared with like; and how much of it is in use, by glibc's own count. Writes
-benchmarks/results/viewer-memory-<machine>.json, prints tables. Linux only.
+A simulated system grows like a real one, but without its computations: frames, keyframes with images, submaps that are
+written to disk, an active map that changes continuously. The callback and viewer of `sigmasplat run --view` show it to
+one client in another process, whose viewpoint moves continuously; the view mode changes every 4 s. Every 15 s the
+splats are shown in their colours without updates for 3 s, so that measurements are comparable. Then the resident
+memory of the server's process is recorded, and the part of it in use according to glibc. Writes
+benchmarks/results/viewer-memory-<machine>.json and prints tables. Linux only.
 
 example: python benchmarks/viewer_memory.py --minutes 1
 """
@@ -37,10 +37,10 @@ from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step_result import Step
 from sigmasplat.viewer.live import LiveView
-from sigmasplat.viewer.snapshot import to_look_at
+from sigmasplat.viewer.snapshot import field_without_moments
 
 if TYPE_CHECKING:
-    from sigmasplat.viewer.app import Stage
+    from sigmasplat.viewer.app import ViewerApp
 
 arg = tyro.conf.arg
 STATM = Path("/proc/self/statm")
@@ -68,17 +68,17 @@ with connect(sys.argv[1], max_size=None, subprotocols=["viser-v" + viser.__versi
 
 @dataclass(frozen=True)
 class Options:
-    """Watch a run grow in the browser for a while, and ask whether the viewer's memory grows with it."""
+    """Measure whether the viewer's memory stays constant while a run grows."""
 
-    minutes: Annotated[float, arg(help="how long, at least 10 for a result")] = 10.0
-    frames_per_s: Annotated[float, arg(help="speed of the run that is made up")] = 20.0
-    splats: Annotated[int, arg(help="splats of each of its submaps")] = 60_000
+    minutes: Annotated[float, arg(help="duration; results are written from 10 minutes")] = 10.0
+    frames_per_s: Annotated[float, arg(help="frame rate of the simulated run")] = 20.0
+    splats: Annotated[int, arg(help="number of splats per simulated submap")] = 60_000
     name: Annotated[str, arg(help="name of the results")] = "viewer-memory"
-    out: Annotated[Path, arg(help="folder of the results; nothing is written below 10 minutes")] = record.RESULTS
+    out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
 
 class Growing:
-    """A system that grows by a frame at each call, every part of it real but the fits."""
+    """A system that grows by one frame per call. All its parts are real, but nothing is fitted."""
 
     def __init__(self, folder: Path, splats: int) -> None:
         self.slam, self.splats = Slam(store=DiskStore(folder)), splats
@@ -94,7 +94,7 @@ class Growing:
         self._begin()
 
     def __call__(self) -> Step:
-        """Add a frame; at times a keyframe, at times a submap."""
+        """Add a frame, regularly a keyframe, and regularly a submap."""
         slam, frame = self.slam, self.frames
         if frame and frame % SUBMAP_EVERY == 0:
             slam.store.save(*slam.mapper.finished(len(slam.store)))
@@ -113,10 +113,10 @@ class Growing:
         return step
 
     def _begin(self) -> None:
-        self.slam.mapper = Mapper(self.slam.config, self.random, to_look_at(self.field.params[:0], {}))
+        self.slam.mapper = Mapper(self.slam.config, self.random, field_without_moments(self.field.params[:0], {}))
 
     def _map(self, frame: int, pose: Any) -> None:
-        """Take note of a keyframe; move the splats, and show more of them, as mapping would."""
+        """Add a keyframe, move the splats and add some, as mapping does."""
         slam, grown = self.slam, int(self.splats * (0.5 + 0.5 * (frame % SUBMAP_EVERY) / SUBMAP_EVERY))
         color = self.random.random((CAMERA.height, CAMERA.width, 3), np.float32)
         seen = Frame(frame, 0.05 * frame, color, np.full((CAMERA.height, CAMERA.width), 2.0, np.float32), CAMERA)
@@ -125,20 +125,20 @@ class Growing:
         slam.atlas.keyframes[-1].append(pose)
         slam.keyframes.append(frame)
         self.field.params[:, :3] += 1e-3 * torch.sin(torch.tensor(frame))
-        slam.mapper.field = to_look_at(self.field.params[:grown], {})
+        slam.mapper.field = field_without_moments(self.field.params[:grown], {})
 
     def _pose(self, frames: int) -> Any:
-        """Return where the camera is after so many frames of a submap."""
+        """Return the camera's pose after `frames` frames of a submap."""
         return se3.exp(np.array([0.01 * frames, 0.0, 0.0, 0.0, 0.002 * frames, 0.0]))
 
 
 def resident_mib() -> float:
-    """Return the resident memory of this process."""
+    """Return the resident memory of this process in MiB."""
     return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 class Counts(ctypes.Structure):
-    """What glibc counts of its heap (mallinfo2, malloc.h), bytes; uordblks and hblkhd are in use."""
+    """glibc's heap statistics in bytes (mallinfo2, malloc.h); uordblks and hblkhd are in use."""
 
     _fields_ = [
         *((name, ctypes.c_size_t) for name in ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks")),
@@ -147,7 +147,7 @@ class Counts(ctypes.Structure):
 
 
 def in_use_mib() -> float:
-    """Return the memory that is allocated in this process; the rest of the resident one is code and holes."""
+    """Return the allocated memory of this process in MiB; the rest of the resident memory is code and free blocks."""
     mallinfo2 = ctypes.CDLL(None).mallinfo2
     mallinfo2.restype = Counts
     counts = mallinfo2()
@@ -155,48 +155,48 @@ def in_use_mib() -> float:
 
 
 def measure(options: Options) -> dict[str, Any]:
-    """Show the growing system for as long as asked; return the figures."""
-    from sigmasplat.viewer.app import Stage
+    """Show the growing system for the given time; return the figures."""
+    from sigmasplat.viewer.app import ViewerApp
     from sigmasplat.viewer.server import HOST, close, open_server
 
     server = open_server(HOST, 8780, "viewer memory")
-    stage = Stage(server)
+    viewer = ViewerApp(server)
     command = [sys.executable, "-c", CLIENT, f"ws://{HOST}:{server.get_port()}"]
     client = subprocess.Popen(command)
     try:
         with TemporaryDirectory(prefix="viewer-memory-") as folder:
             growing = Growing(Path(folder) / "submaps", options.splats)
-            return watch(growing, stage, options) | {"client_gone": client.poll() is not None}
+            return watch(growing, viewer, options) | {"client_gone": client.poll() is not None}
     finally:
         client.kill()
         client.wait()
-        stage.stop()
+        viewer.stop()
         close(server)
 
 
-def watch(growing: Growing, stage: "Stage", options: Options) -> dict[str, Any]:
-    """Step, and sample the memory; return what was found."""
-    from sigmasplat.viewer.panel import KINDS, SAYS
+def watch(growing: Growing, viewer: "ViewerApp", options: Options) -> dict[str, Any]:
+    """Run the system and sample the memory; return the figures."""
+    from sigmasplat.viewer.panel import MODE_LABELS, VIEW_MODES
 
     shown = 0
 
-    def show(moment: Any) -> None:
+    def show(snapshot: Any) -> None:
         nonlocal shown
         shown += 1
-        stage.show(moment)
+        viewer.show(snapshot)
 
     live, begun_s = LiveView(growing.slam, show, "growing"), time.monotonic()
     samples: list[dict[str, float]] = []
     while (now_s := time.monotonic() - begun_s) < 60.0 * options.minutes:
         live(growing())
         if now_s >= SAMPLE_S * (len(samples) + 1):
-            stage.panel.kind.value, stage.panel.colouring.value = SAYS["splats"], "colour"
-            show(live.moment())
+            viewer.panel.mode.value, viewer.panel.colouring.value = MODE_LABELS["splats"], "colour"
+            show(live.snapshot())
             time.sleep(REST_S)
             memory = {"resident_mib": resident_mib(), "in_use_mib": in_use_mib()}
-            samples.append({"s": now_s, **memory, "clients": len(stage.server.get_clients())})
-        stage.panel.kind.value = SAYS[KINDS[int(now_s / CHANGE_S) % len(KINDS)]]
-        stage.panel.colouring.value = ("colour", "σ")[int(now_s / CHANGE_S / len(KINDS)) % 2]
+            samples.append({"s": now_s, **memory, "clients": len(viewer.server.get_clients())})
+        viewer.panel.mode.value = MODE_LABELS[VIEW_MODES[int(now_s / CHANGE_S) % len(VIEW_MODES)]]
+        viewer.panel.colouring.value = ("colour", "σ")[int(now_s / CHANGE_S / len(VIEW_MODES)) % 2]
         time.sleep(max(0.0, growing.frames / options.frames_per_s - (time.monotonic() - begun_s)))
     return {
         "minutes": options.minutes, "frames": growing.frames, "keyframes": len(growing.slam.keyframes),
@@ -208,11 +208,11 @@ def watch(growing: Growing, stage: "Stage", options: Options) -> dict[str, Any]:
 
 
 MINUTES, LARGER = 10.0, 0.05
-"""Issue 7: flat over ten minutes of live updates."""
+"""Issue 7: constant over ten minutes of live updates."""
 
 
 def fifths(samples: list[dict[str, float]]) -> list[dict[str, float]]:
-    """Return of each fifth of the samples when it ended, s, and its resident memory, MiB."""
+    """Return for each fifth of the samples its end in s and its memory in MiB."""
     parts = [part for part in np.array_split(np.arange(len(samples)), 5) if len(part)]
     return [
         {
@@ -252,11 +252,11 @@ def sections(measured: dict[str, Any]) -> list[Section]:
             [f"{name}, last fifth / second", significant(ratio, 4), f"≤ {1 + LARGER:.2f}", _yes(ratio <= 1 + LARGER)]
             for name, ratio in ratios.items()
         ),
-        ["clients, least", f"{clients:.0f}", "≥ 1", _yes(clients >= 1)],
+        ["minimum number of clients", f"{clients:.0f}", "≥ 1", _yes(clients >= 1)],
     ]
     return [
-        Section("Memory", ["until", "MiB, median", "… most", "in use, median", "clients, least"], rows, note),
-        Section("Goals", ["", "found", "goal", "held"], held),
+        Section("Memory", ["until", "median, MiB", "maximum, MiB", "in use, MiB", "minimum clients"], rows, note),
+        Section("Goals", ["", "measured", "goal", "met"], held),
     ]
 
 
@@ -265,7 +265,7 @@ def _yes(held: bool) -> str:
 
 
 def main(options: Options) -> int:
-    """Measure, write, print; return the exit code."""
+    """Measure, write the results, print them; return the exit code."""
     return program.run("viewer_memory", options, measure, write=options.minutes >= MINUTES)
 
 

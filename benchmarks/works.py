@@ -1,4 +1,4 @@
-"""Name the pieces of work the CPU benchmark times, each as the product does it, on one scene."""
+"""Define the operations that the CPU benchmark times on one scene, each as the product runs it."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -32,7 +32,7 @@ STAGES = ("project", "sort", "blend", "blend backward", "project backward")
 
 @dataclass(frozen=True)
 class Timing:
-    """Median and least time of `runs` runs, milliseconds."""
+    """Median and shortest time of `runs` runs, milliseconds."""
 
     median_ms: float
     min_ms: float
@@ -40,16 +40,16 @@ class Timing:
 
     @staticmethod
     def of(seconds: list[float]) -> "Timing":
-        """Sum up single times."""
+        """Summarise single times."""
         return Timing(1e3 * float(np.median(seconds)), 1e3 * min(seconds), len(seconds))
 
     def plain(self) -> dict[str, float]:
-        """Return plain values, to the microsecond."""
+        """Return the values, rounded to microseconds."""
         return {name: round(value, 3) for name, value in asdict(self).items()}
 
 
 def timed(work: Callable[[], object], runs: int, warmups: int = 2) -> Timing:
-    """Time a piece of work by the wall clock, after a few runs that do not count."""
+    """Time an operation by the wall clock, after some warm-up runs."""
     for _ in range(warmups):
         work()
     seconds = []
@@ -61,16 +61,16 @@ def timed(work: Callable[[], object], runs: int, warmups: int = 2) -> Timing:
 
 
 def set_up(isa: str, threads: int) -> None:
-    """Choose instruction set and threads for what is made from now on, torch's threads included."""
+    """Set instruction set and threads for objects made from now on, and torch's threads."""
     _core.set_isa(isa)
     _core.set_threads(threads)
     torch.set_num_threads(threads)
 
 
 class Works:
-    """Everything a frame costs on one scene, on the instruction set active when this is made.
+    """All operations of a frame on one scene, with the instruction set active at construction.
 
-    The world is the scene's camera: rendering is at the identity. Each method is one piece of work, run once.
+    World coordinates are those of the camera, so the pose is the identity. Each method runs one operation once.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -101,7 +101,7 @@ class Works:
         )  # fmt: skip
 
     def forward(self) -> None:
-        """Render what a fit needs: colour, depth, σ² + c², alpha."""
+        """Render the maps a fit needs: colour, depth, σ² + c², alpha."""
         self.view.forward(self.params, np.eye(4))
 
     def forward_color_depth(self) -> None:
@@ -109,17 +109,17 @@ class Works:
         self.color_depth.forward(self.params, np.eye(4))
 
     def pose_only(self) -> None:
-        """Take one step's gradient of tracking by Adam: forward, loss, backward to the pose alone."""
+        """Compute the gradient of one step of tracking by Adam: forward, loss, backward to the pose only."""
         self.view.forward(self.params, np.eye(4))
         fits_of(self.view).tracking_loss(self.view, self.later, self.tracking, self.exposure)
         self.view.backward_pose(self.params)
 
     def backward(self) -> None:
-        """Carry the image gradients of the last loss to every parameter and the pose."""
+        """Propagate the image gradients of the last loss to every parameter and the pose."""
         self.view.backward(self.params, self.grad)
 
     def mapping_iterations(self, count: int) -> list[float]:
-        """Fit a copy of the field; return the seconds of each iteration, from one keyframe asked for to the next."""
+        """Fit a copy of the field; return the seconds of each iteration, from one request of a keyframe to the next."""
         field, keyframe, starts = GaussianField(self.params.clone()), Keyframe(0, self.target, np.eye(4)), []
 
         def ticking() -> Iterator[list[Keyframe]]:
@@ -132,7 +132,7 @@ class Works:
         return [end - start for start, end in pairwise(starts)]
 
     def ssim(self) -> None:
-        """Take SSIM and its gradient in the kernels, the target's half included, as each iteration does."""
+        """Compute SSIM and its gradient with the kernels, including the part of the target, as in each iteration."""
         c = self.scene.camera
         _core.ssim_target(self.target.color, self.target.depth, c.width, c.height, self.cache)
         _core.ssim(
@@ -140,25 +140,25 @@ class Works:
         )
 
     def ssim_torch(self) -> Tensor:
-        """Take SSIM and its gradient by the loss term's definition in torch."""
+        """Compute SSIM and its gradient with the definition of the loss term in torch."""
         image = self.target.image.clone().requires_grad_()
         losses.ssim(image, self.target.image, self.target.depth_image > 0).backward()  # type: ignore[no-untyped-call]
         return image
 
     def pyramid(self) -> None:
-        """Halve a live frame twice for tracking."""
+        """Build the image pyramid of a live frame for tracking."""
         Pyramid.of(gray_of(self.scene.later.color), self.scene.later.depth_m, self.scene.camera)
 
     def keyframe_reference(self) -> None:
-        """Make a keyframe the reference that later frames are aligned to: once per keyframe, its render included."""
+        """Make the reference of a keyframe for aligning later frames, including its render: once per keyframe."""
         keyframe_reference(self.params, self.view, self.image, np.eye(4), self.tracking)
 
     def track_align(self) -> None:
-        """Track the later frame by Gauss–Newton on the keyframe's image: what each frame costs, nothing rendered."""
+        """Track the later frame by Gauss–Newton on the keyframe's image, as for each frame; nothing is rendered."""
         fit_pose_align(self.keyframe, self.live, np.eye(4), self.tracking)
 
     def track_align_map(self) -> None:
-        """Track the later frame by Gauss–Newton on the map seen from the guess, its render included."""
+        """Track the later frame by Gauss–Newton on the map rendered at the guess, including this render."""
         reference = map_reference(self.params, self.view, np.eye(4), self.tracking)
         fit_pose_align(reference, self.live, np.eye(4), self.tracking)
 
@@ -180,14 +180,14 @@ ALWAYS = (
     "forward_all", "forward", "forward_color_depth", "pose_only", "backward", "ssim", "pyramid", "keyframe_reference",
     "track_align", "track_align_map",
 )  # fmt: skip
-"""What is timed on every instruction set and number of threads; mapping_iteration joins them."""
+"""Operations timed on every instruction set and number of threads, together with mapping_iteration."""
 ONCE = ("ssim_torch", "track_adam")
-"""What is timed on the widest instruction set and all threads only: it is slow and for comparison."""
+"""Slow operations for comparison, timed only on the widest instruction set with all threads."""
 
 
 def time_works(works: Works, runs: int, once: bool) -> dict[str, dict[str, float]]:
-    """Time every piece of work; `once` adds those that are timed in one configuration only."""
+    """Time every operation; `once` adds those that are timed in one configuration only."""
     found = {name: timed(getattr(works, name), runs).plain() for name in (*ALWAYS, *(ONCE if once else ()))}
-    # pose_only left its loss in the gradient planes, so backward carried a real one; mapping writes its own.
+    # pose_only leaves its loss in the gradient planes, so backward propagates a real one; mapping writes its own.
     found["mapping_iteration"] = Timing.of(works.mapping_iterations(runs + 2)[2:]).plain()
     return found

@@ -1,10 +1,10 @@
-"""Read a folder of .npz files as an RGB-D sequence: a whole dataset format in one file.
+"""Read a folder of .npz files as an RGB-D sequence: a complete dataset format in one file.
 
 camera.npz      width, height, fx, fy, cx, cy
 000000.npz …    t (seconds), color (uint8 [H, W, 3]), depth_m (float [H, W], 0 = no reading); T_world_camera if known
 
-Copy this file into src/sigmasplat/sources/, then `make install`, since .venv holds an installed copy; from then on
-`sigmasplat run FOLDER` knows the format, and nothing else is to be told.
+Copy this file into src/sigmasplat/sources/, then run `make install`, because .venv holds an installed copy. Then
+`sigmasplat run FOLDER` reads the format; nothing else is needed.
 """
 
 import zipfile
@@ -33,7 +33,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 class NpzFrames(Source):
-    """One frame per file, in the order of the names."""
+    """A sequence with one frame per file, in the order of the names."""
 
     def __init__(self, folder: Path, settings: InputConfig) -> None:
         """Open a folder. Raises SourceError if the camera cannot be read or there are no frames."""
@@ -48,13 +48,13 @@ class NpzFrames(Source):
         return len(self._paths)
 
     def frame(self, i: int) -> Frame:
-        """Read frame i; `Frame` itself refuses sizes that differ, NaN and negative depth."""
+        """Read frame i; `Frame` refuses different sizes, NaN and negative depth."""
         arrays = read(self._paths[self._checked_index(i)])
         depth_m = arrays["depth_m"].astype(np.float32)
         return Frame(i, float(arrays["t"]), color_from_bytes(arrays["color"]), depth_m, self.camera)
 
     def truth(self) -> Trajectory | None:
-        """Return the recorded poses, None unless every frame has one."""
+        """Return the recorded poses; None if a frame has no pose."""
         arrays = [read(path) for path in self._paths]
         if not all("T_world_camera" in frame for frame in arrays):
             return None

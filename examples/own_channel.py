@@ -1,10 +1,10 @@
-"""Give splats a channel of your own and see it from anywhere: labels painted in one picture, carried to other views.
+"""Add a render channel: learn labels of splats from one image and render them from other views.
 
 python examples/own_channel.py [STEPS]
 
-What a pixel gathers of each splat are columns of `features`; the kernel does not know what they mean. Here they are
-the probabilities of K labels. They are learnt from one labelled picture, the map held fixed, and looked at from another
-pose. Labels stand for whatever tells a picture's pixels apart: a segmenter's classes, a thermal camera, a click.
+The kernel blends the columns of `features`, whatever they mean. Here they are the probabilities of K labels. They are
+learned from one labelled image while the map is fixed, and rendered from another pose. Labels can come from a
+segmentation network, a thermal camera or a click.
 """
 
 import sys
@@ -26,9 +26,9 @@ OPTIONS = RenderConfig()
 def blended(
     field: GaussianField, features: Tensor, camera: Camera, T_camera_world: NDArray[np.float64]
 ) -> tuple[Tensor, Tensor]:
-    """Blend features [N, K] of splats into a picture [H, W, K], with alpha [H, W]; differentiable in both arguments.
+    """Blend features [N, K] of splats into an image [H, W, K], with alpha [H, W]; differentiable in both arguments.
 
-    The channels are Σ w·feature: divide by alpha for the mean of what is seen.
+    The channels are Σ w·feature: divide by alpha for the mean.
     """
     seen = cpu.project(field.means, field.quats, field.scales, torch.from_numpy(T_camera_world), camera, OPTIONS)
     maps = cpu.blend(*seen, field.opacities, features, None, camera, OPTIONS)
@@ -36,7 +36,7 @@ def blended(
 
 
 def seeded(frame: Frame) -> GaussianField:
-    """Put a splat on every second pixel that has a reading; its world is the frame's camera."""
+    """Put a splat on every second pixel with a reading, in the camera coordinates of the frame."""
     points = (torch.from_numpy(frame.camera.rays()) * torch.tensor(frame.depth_m)[..., None])[::2, ::2]
     colors, near = torch.tensor(frame.color)[::2, ::2], points[..., 2] > 0
     widths_m = points[near][:, 2] * 1.2 / frame.camera.fx
@@ -44,13 +44,13 @@ def seeded(frame: Frame) -> GaussianField:
 
 
 def label(color: NDArray[np.float32]) -> Tensor:
-    """Stand in for a segmenter: 0 dark, 1 warm, 2 the rest, [H, W]."""
+    """Return simple labels in place of a segmentation: 0 dark, 1 warm, 2 the rest, [H, W]."""
     r, _, b = np.moveaxis(color, -1, 0)
     return torch.from_numpy(np.where(color.max(-1) < 0.35, 0, np.where(r > b + 0.1, 1, 2)))
 
 
 def learnt(field: GaussianField, labels: Tensor, frame: Frame, T: NDArray[np.float64], steps: int) -> Tensor:
-    """Learn label probabilities [N, K] of splats from the labels [H, W] of one picture, by cross-entropy."""
+    """Learn label probabilities [N, K] of splats from the labels [H, W] of one image, by cross-entropy."""
     logits = torch.zeros(len(field), int(labels.max()) + 1, requires_grad=True)
     optimiser = torch.optim.Adam([logits], lr=0.3)
     for _ in range(steps):
@@ -64,9 +64,9 @@ def learnt(field: GaussianField, labels: Tensor, frame: Frame, T: NDArray[np.flo
 
 
 def main(steps: str = "40") -> float:
-    """Label one picture of the built-in room, view the labels from elsewhere; return the share that is right there."""
+    """Label one image of the built-in room, render the labels from another pose; return the share of correct pixels."""
     source = open_source("synthetic:frames=240,width=160,height=120")
-    poses = source.truth().T_world_camera  # to be short; a run's trajectory will do
+    poses = source.truth().T_world_camera  # for brevity; the trajectory of a run works too
     here, there = source.frame(0), source.frame(8)
     field = seeded(here)
     probabilities = learnt(field, label(here.color), here, np.eye(4), int(steps))
@@ -74,7 +74,7 @@ def main(steps: str = "40") -> float:
         sums, alpha = blended(field, probabilities, there.camera, se3.inverse(poses[8]) @ poses[0])
     covered = alpha > 0.9
     right = float((sums.argmax(2) == label(there.color))[covered].float().mean())
-    print(f"{right:.0%} of the labels are right where the map covers a view never labelled: {covered.sum()} pixels")
+    print(f"{right:.0%} of the labels are correct where the map covers the other view: {covered.sum()} pixels")
     return right
 
 

@@ -1,4 +1,4 @@
-"""Fit a map to one picture with a loss term of your own: `render` is differentiable, a term is one function.
+"""Fit a map to one image with your own loss term: `render` is differentiable, a term is one function.
 
 python examples/own_loss.py [STEPS]
 """
@@ -15,7 +15,7 @@ from sigmasplat.render import render
 
 @term
 def charbonnier(color: Tensor, color_target: Tensor, valid: Tensor) -> Tensor:
-    """Take mean √(r² + 10⁻⁶) of the colour residual over valid pixels: L1 without its corner."""
+    """Take mean √(r² + 10⁻⁶) of the colour residual over valid pixels: a smooth L1."""
     return mean_over(((color - color_target) ** 2 + 1e-6).sqrt(), valid)
 
 
@@ -23,7 +23,7 @@ WEIGHTS = {"charbonnier": 1.0, "depth": 1.0, "nll_color": 1e-4}
 
 
 def main(steps: str = "30") -> list[float]:
-    """Seed a splat on every fourth pixel in gray, then fit colour and all the rest; return the losses."""
+    """Put a gray splat on every fourth pixel, then fit all parameters; return the losses."""
     frame = open_source("synthetic:frames=120,width=80,height=60").frame(0)
     camera, depth_m = frame.camera, torch.tensor(frame.depth_m)
     points = torch.from_numpy(camera.rays())[::2, ::2] * depth_m[::2, ::2, None]

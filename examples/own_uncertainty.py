@@ -1,10 +1,9 @@
-"""Invent a per-pixel uncertainty, ask whether it is worth something, and let it weigh pixels in tracking.
+"""Define a per-pixel uncertainty, score it, and weight pixels with it in tracking.
 
 python examples/own_uncertainty.py [FRAMES]
 
-The one made here is of depth, m²: how far the splats along a ray lie from the surface they show together, and what the
-sensor adds, whose noise grows with z². It takes nothing that `render` does not give, so no kernel and no setting is to
-know of it.
+This one is a variance of depth, m²: the scatter of the splats along a ray about the rendered surface, plus the sensor
+noise, which grows with z². It uses only outputs of `render`, so no kernel and no setting has to change.
 """
 
 import sys
@@ -34,35 +33,35 @@ SENSOR_NOISE = 1.4e-3
 
 
 def seen(field: GaussianField, frame: Frame, T_camera_world: NDArray[np.float64]) -> tuple[Render, Tensor, Tensor]:
-    """Render twice; return the view, its surface [H, W] in metres and the variance of that [H, W], m².
+    """Render twice; return the view, its surface depth [H, W] in metres and the variance of this depth [H, W], m².
 
-    The first render finds the surface D = Σ w z / Σ w, the second gathers U = Σ w (z − D)² about it. Both say nothing
-    where alpha is low.
+    The first render gives the surface D = Σ w z / Σ w, the second U = Σ w (z − D)² about it. Both are meaningless where
+    alpha is low.
     """
     with torch.no_grad():
         first = render(field, frame.camera, T_camera_world)
         depth_m = first.depth / first.alpha.clamp(min=1e-6)
         second = render(field, frame.camera, T_camera_world, depth_reference=depth_m)
-    assert second.uncertainty is not None  # there is one wherever a reference was given
+    assert second.uncertainty is not None  # not None, because a reference was given
     return second, depth_m, second.uncertainty + (SENSOR_NOISE * depth_m**2) ** 2
 
 
 def judged(predicted: Tensor, view: Render, depth_m: Tensor, frame: Frame) -> dict[str, float]:
-    """Score a prediction [H, W] against the squared difference of surface and reading, on pixels that have both."""
+    """Score a prediction [H, W] with the squared difference of surface and reading, on pixels that have both."""
     reading_m = torch.from_numpy(np.array(frame.depth_m))
     both = (reading_m > 0) & (view.alpha > 0.5)
     return uncertainty.score(predicted[both].numpy(), ((depth_m - reading_m) ** 2)[both].numpy())
 
 
 def weighed(image: Pyramid, view: Render, variance: Tensor, config: TrackingConfig) -> Pyramid:
-    """Weigh a keyframe's depth by a variance [H, W] as tracking weighs it by V: w̃, and 1 where the map is thin."""
+    """Weight the depth of a keyframe by a variance [H, W], as tracking does with V: w̃, and 1 where alpha is low."""
     known = view.alpha > 0.95
     w = uncertainty_weights(variance[..., None], known, config.tau, config.weight_max)[..., 0]
     return image.weighed(None, torch.where(known, w, 1.0).numpy())
 
 
 def main(frames: str = "12") -> dict[str, float]:
-    """Map a stretch of the built-in room; score variances on a frame that was not mapped, and track it with ours."""
+    """Map some frames of the built-in room; score variances on a frame that was not mapped, and track it with ours."""
     config = override(preset("sigma"), SETTINGS)
     source = open_source("synthetic:frames=240,width=160,height=120,noise=1", limit=int(frames))
     slam, images = Slam(config), list(source)
@@ -83,7 +82,7 @@ def main(frames: str = "12") -> dict[str, float]:
     reference = Reference(weighed(keyframe, view, ours, config.tracking), poses[newest])
     fit = fit_pose_align(reference, live, poses[newest], config.tracking)
     apart_m = float(np.linalg.norm((fit.T_camera_world @ se3.inverse(poses[unseen]))[:3, 3]))
-    print(f"tracked with depth weighed by ours: {1000 * apart_m:.2f} mm from where the run has the frame")
+    print(f"tracked with depth weighted by ours: {1000 * apart_m:.2f} mm from the pose in the run")
     return {**found, "apart_m": apart_m, "agreement": fit.agreement}
 
 

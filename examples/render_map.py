@@ -1,11 +1,11 @@
-"""Draw a map's colour and uncertainty, side by side, as seen from one pose of its path.
+"""Render a map's colour and uncertainty, side by side, from one pose of its path.
 
 python examples/render_map.py RUN [PICTURE.png] [ROW]      RUN a run folder, ROW a row of its trajectory (default: 0)
-python examples/render_map.py MAP [PICTURE.png]            MAP a file: .ply, .compressed.ply, .splat, .spz; seen from
-                                                           where its world begins
+python examples/render_map.py MAP [PICTURE.png]            MAP a file: .ply, .compressed.ply, .splat, .spz; the view
+                                                           is from the origin of its coordinates
 
-Right is √V, V averaged over the channels: black = sure, bright = unsure. Where the map is empty (A < ½) V says nothing;
-those pixels are slate.
+The right half is √V, with V averaged over the channels: dark = certain, bright = uncertain. Where the map is empty
+(A < ½) V is meaningless; those pixels are slate gray.
 """
 
 import sys
@@ -23,7 +23,7 @@ from sigmasplat.model import se3
 from sigmasplat.render import render
 
 CAMERA = Camera(width=320, height=240, fx=260.0, fy=260.0, cx=159.5, cy=119.5)
-"""Any pinhole will do: the map is not tied to the camera that made it."""
+"""Any pinhole camera works; it need not be the one that recorded the map."""
 
 
 def main(run: str, picture: str = "view.png", row: str = "0") -> None:

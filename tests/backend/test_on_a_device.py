@@ -29,8 +29,8 @@ from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
 from sigmasplat.sources import SyntheticRoom
+from sigmasplat.viewer.layers import render_layer
 from sigmasplat.viewer.live import LiveView
-from sigmasplat.viewer.pictures import picture_of
 from sigmasplat.viewer.snapshot import Snapshot
 from splat_fields import OPTIONS, Gradients, exact_view, params_of, there_and_back
 from splat_scenes import assert_same_vector, scene
@@ -231,7 +231,7 @@ def test_what_is_written_is_read_as_from_the_host(device: torch.device, tmp_path
     assert {x.device.type for x in slam.checkpoint().values()} == {"cpu"}
     pieces = [piece.field.params for piece in shown[-1].pieces]
     assert pieces and all(params.device.type == "cpu" and 0 < len(params) <= 200 for params in pieces)
-    seen = picture_of(slam.field, ROOM.camera, np.eye(4), "U", slam.config.render, "cuda")
+    seen = render_layer(slam.field, ROOM.camera, np.eye(4), "U", slam.config.render, "cuda")
     assert seen.pixels.std() > 0
     write_state(tmp_path / "state", state_of(slam), CLASSES, fixed(slam))
     slam.step(ROOM.frame(FRAMES - 1))

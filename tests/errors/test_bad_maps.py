@@ -1,4 +1,4 @@
-"""Map files that cannot be used: one line that says what is wrong and what to do, whatever was given."""
+"""Map files that cannot be read: an error of one line that says what is wrong and what to do."""
 
 import gzip
 import io
@@ -49,42 +49,42 @@ PLY = b"ply\nformat binary_little_endian 1.0\n"
 CHUNK = "".join(f"property float {name}\n" for name in compressed_ply.LIMITS).encode()
 WORDS = "".join(f"property uint {name}\n" for name in compressed_ply.WORDS).encode()
 MISTAKES: dict[str, tuple[bytes, str]] = {
-    "nothing in it": (b"", "it is empty"),
+    "an empty file": (b"", "it is empty"),
     "a point cloud": (PLY + b"element vertex 1\nproperty float x\nend_header\n" + bytes(4), "no column y"),
     "a PLY of text": (b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "not binary"),
     "a mesh whose faces come first": (PLY + b"element face 1\nend_header\n", "first element is not 'vertex'"),
     "a PLY without columns": (PLY + b"element vertex 3\nend_header\n", "'vertex' has none"),
     "a count of a thousand digits": (PLY + b"element vertex " + b"9" * 5000 + b"\nend_header\n", "not 'vertex'"),
-    "more splats promised than any disk holds": (
+    "a count larger than any disk": (
         PLY + b"element vertex 999999999999999\nproperty float x\nend_header\n", "is truncated"
     ),
-    "chunks, but not of splats": (PLY + b"element chunk 0\nelement face 0\nend_header\n", "it has chunk, face, exp"),
+    "chunks without splats": (PLY + b"element chunk 0\nelement face 0\nend_header\n", "it has chunk, face, not"),
     "chunks without limits": (PLY + b"element chunk 0\nproperty float a\nelement vertex 0\n" + WORDS + b"end_header\n",
                               "no column min_x in 'chunk'"),
     "too few chunks": (PLY + b"element chunk 1\n" + CHUNK + b"element vertex 300\n" + WORDS + b"end_header\n",
-                       "1 chunks of 256 do not go with 300 splats"),
+                       "1 chunks of 256 do not match 300 splats"),
     "chunks with nan": (PLY + b"element chunk 1\n" + CHUNK + b"element vertex 1\n" + WORDS + b"end_header\n"
-                        + np.full(18, np.nan, "<f4").tobytes() + bytes(16), "limits of a chunk hold nan or inf"),
-    "another number of harmonics": (PLY + b"element chunk 0\n" + CHUNK + b"element vertex 0\n" + WORDS
+                        + np.full(18, np.nan, "<f4").tobytes() + bytes(16), "limits of a chunk have nan or inf"),
+    "a wrong number of harmonics": (PLY + b"element chunk 0\n" + CHUNK + b"element vertex 0\n" + WORDS
                                     + b"element sh 0\nproperty uchar f_rest_0\nend_header\n", "0 × 1 harmonics, exp"),
     "SuperSplat's SOG": (archive(), "a zip archive, perhaps SuperSplat's SOG"),
     "SPZ of version 4": (spz_header(4) + bytes(16), "SPZ of version 4 or without gzip; save it as SPZ version 3"),
-    "SPZ of a version to come": (gzip.compress(spz_header(9)), "SPZ version 9"),
+    "SPZ of a future version": (gzip.compress(spz_header(9)), "SPZ version 9"),
     "SPZ with harmonics of degree 4": (gzip.compress(spz_header(degree=4)), "harmonics of degree 4"),
-    "SPZ that promises more than it has": (gzip.compress(spz_header(count=1000)), "promises 1000 splats"),
-    "SPZ that promises terabytes": (gzip.compress(spz_header(count=0xFFFFFFFF)), "promises 4294967295 splats"),
-    "gzip of something else": (gzip.compress(b"a diary, and a long one"), "no SPZ file"),
+    "SPZ that is shorter than its header says": (gzip.compress(spz_header(count=1000)), "says 1000 splats"),
+    "SPZ whose header says terabytes": (gzip.compress(spz_header(count=0xFFFFFFFF)), "says 4294967295 splats"),
+    "gzip of other data": (gzip.compress(b"a diary, and a long one"), "not an SPZ file"),
     "a GLB model": (b"glTF" + bytes(60), "a GLB model"),
     "a Git LFS pointer": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
-    "the page of a failed download": (b"\n<!DOCTYPE html><html>404</html>", "a web page"),
-    "a picture": (b"\x89PNG\r\n\x1a\n" + bytes(56), "a picture"),
-    "any bytes": (bytes(range(256)), "no .splat file, or is damaged: splat 0"),
-    "text of an odd length": (b"hello", "5 bytes are no whole number of splats of 32"),
+    "a web page instead of a download": (b"\n<!DOCTYPE html><html>404</html>", "a web page"),
+    "an image": (b"\x89PNG\r\n\x1a\n" + bytes(56), "an image"),
+    "random bytes": (bytes(range(256)), "not a .splat file, or is damaged: splat 0"),
+    "text of an odd length": (b"hello", "5 bytes are not a multiple of 32"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_files_that_are_not_maps_are_refused_in_one_line(tmp_path: Path, mistake: str) -> None:
+def test_other_files_are_refused_with_one_line(tmp_path: Path, mistake: str) -> None:
     content, says = MISTAKES[mistake]
     (tmp_path / "given").write_bytes(content)
     assert says in refusal(tmp_path / "given")
@@ -96,8 +96,8 @@ def test_missing_files_and_folders(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", WRITERS)
-def test_truncation_is_noticed(tmp_path: Path, ending: str) -> None:
-    """Everywhere but between two splats of a .splat file, which says nowhere how many there are."""
+def test_truncated_files_are_refused(tmp_path: Path, ending: str) -> None:
+    """At every length, except between two splats of a .splat file, whose header has no count."""
     good = map_bytes(tmp_path, ending)
     assert len(read_any(tmp_path / f"good{ending}")) == 5
     for length in range(0, len(good), 7):
@@ -108,27 +108,27 @@ def test_truncation_is_noticed(tmp_path: Path, ending: str) -> None:
 
 
 @pytest.mark.parametrize("ending", WRITERS)
-def test_flipped_bytes_are_noticed_or_give_finite_splats(
+def test_flipped_bytes_are_refused_or_give_finite_splats(
     tmp_path: Path, ending: str, recwarn: pytest.WarningsRecorder
 ) -> None:
     good = map_bytes(tmp_path, ending)
-    noticed = 0
+    refused_count = 0
     for place in range(0, len(good), max(1, len(good) // 150)):
         (tmp_path / "flipped").write_bytes(good[:place] + bytes([good[place] ^ 0xFF]) + good[place + 1 :])
         try:
             field = read_any(tmp_path / "flipped")
         except SourceError:
-            noticed += 1
+            refused_count += 1
         else:
             assert torch.isfinite(field.params).all() and (field.quats.norm(dim=1) > 0).all()
-    assert noticed > (120 if ending == ".spz" else 10) and not recwarn.list
+    assert refused_count > (120 if ending == ".spz" else 10) and not recwarn.list
 
 
 @pytest.fixture
 def sigmasplat(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., str]:
-    """Run `sigmasplat` in a folder with map.ply, and map.spz, which has no σ; return its line of refusal."""
+    """Run `sigmasplat` in a folder with map.ply, and map.spz without σ; return its error line."""
     monkeypatch.chdir(tmp_path)
     for name in ("map.ply", "map.spz"):
         Path(name).write_bytes(map_bytes(tmp_path, Path(name).suffix))
@@ -157,20 +157,20 @@ def sigmasplat(
     [
         ("no.ply --out x.spz", "cannot read map no.ply"),
         ("no --out x.spz", "no run folder no"),
-        (". --out x.spz", "not a run folder of ours"),
-        ("map.ply --out x.obj", "cannot tell by the name x.obj what to write; end it in .ply,"),
+        (". --out x.spz", "not a run folder"),
+        ("map.ply --out x.obj", "unknown ending of x.obj; end it in .ply,"),
         ("map.ply --out x", "or give --format"),
         ("map.ply --out x.spz --format spt", "no format 'spt'; there are ply,"),
-        ("map.ply --out x.txt", "map.ply is a file; a map can be exported to formats of maps only"),
+        ("map.ply --out x.txt", "map.ply is a file, which can be exported only as another map"),
         ("map.ply --out map.spz", "map.spz exists"),
-        ("map.ply --out x.spz --plain", "--plain does not go with format spz; it goes with ply"),
-        ("map.ply --format trajectory --sigma-below 1", "--sigma-below does not go with format trajectory"),
+        ("map.ply --out x.spz --plain", "--plain cannot be used with format spz, only with ply"),
+        ("map.ply --format trajectory --sigma-below 1", "--sigma-below cannot be used with format trajectory"),
         ("map.ply --out x.spz --sigma-below -1", "--sigma-below must be finite and not negative, found -1"),
         ("map.ply --out x.spz --opacity-above nan", "--opacity-above must be finite and not negative, found nan"),
-        ("map.spz --out x.ply --sigma-below 1", "map.spz holds no σ"),
+        ("map.spz --out x.ply --sigma-below 1", "map.spz has no learned σ"),
         ("map.ply --out x.spz --sigma-below 0", "no splat of map.ply is left (median σ and opacity are "),
         ("map.ply --out no/x.spz", "cannot write no/x.spz"),
     ],
 )  # fmt: skip
-def test_export_refuses_in_a_line(sigmasplat: Callable[..., str], arguments: str, says: str) -> None:
+def test_export_refuses_with_one_line(sigmasplat: Callable[..., str], arguments: str, says: str) -> None:
     assert says in sigmasplat("export", *arguments.split())

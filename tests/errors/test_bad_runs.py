@@ -33,7 +33,7 @@ def test_an_existing_run_is_kept_by_default(tmp_path: Path) -> None:
 def test_a_folder_that_is_not_a_run_is_never_overwritten(tmp_path: Path, names: list[str]) -> None:
     for name in names:
         (tmp_path / name).write_text('{"model": "theirs"}')
-    assert "not a run folder of ours" in refused(tmp_path, overwrite=True)
+    assert "not a run folder" in refused(tmp_path, overwrite=True)
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
     assert all((tmp_path / name).read_text() == '{"model": "theirs"}' for name in names)
 
@@ -63,13 +63,13 @@ def test_output_that_cannot_be_made(tmp_path: Path) -> None:
 
 
 def test_opening_says_what_is_missing(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match=r"no run folder .*/nothing; `sigmasplat run` makes one"):
+    with pytest.raises(RunError, match=r"no run folder .*/nothing; `sigmasplat run` creates one"):
         RunFolder.open(tmp_path / "nothing")
     with pytest.raises(RunError, match=r"no config\.json and no run\.json"):
         RunFolder.open(tmp_path)
     run = make(tmp_path / "run")
     (run.path / "config.json").unlink()
-    with pytest.raises(RunError, match=r"not a run folder of ours: no config\.json$"):
+    with pytest.raises(RunError, match=r"not a run folder: no config\.json$"):
         RunFolder.open(run.path)
 
 
@@ -95,7 +95,7 @@ def test_damaged_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"metrics\.json is not JSON"):
         run.read_metrics()
     (run.path / "metrics.json").write_text("[1]")
-    with pytest.raises(RunError, match="does not hold named values"):
+    with pytest.raises(RunError, match="is not a JSON object"):
         run.read_metrics()
     for text, complaint in (("{", r"loops\.json is not JSON"), ("{}", "a list of loops"), ("[1]", "a list of loops")):
         (run.path / "loops.json").write_text(text)

@@ -39,7 +39,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["demo", "--frames", "0"], "--frames must be at least 1"),
         (["demo", "--frames", "3", "--set", "tracking.method=guess"], "must be one of adam, align"),
         (["eval", "/no/such/run"], "no run folder /no/such/run"),
-        (["eval", "."], "not a run folder of ours"),
+        (["eval", "."], "not a run folder"),
         (["export", "/no/such/run"], "no run folder /no/such/run"),
     ],
     ids=" ".join,
@@ -56,7 +56,7 @@ def test_an_existing_folder_is_not_touched(capsys: pytest.CaptureFixture[str], t
     (tmp_path / "thesis.tex").write_text("ten years of work")
     sequence = "synthetic:frames=2"
     assert "not empty" in refused(capsys, "run", sequence, "--out", str(tmp_path))
-    assert "not a run folder of ours" in refused(capsys, "run", sequence, "--out", str(tmp_path), "--overwrite")
+    assert "not a run folder" in refused(capsys, "run", sequence, "--out", str(tmp_path), "--overwrite")
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 

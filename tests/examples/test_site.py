@@ -67,7 +67,7 @@ def test_every_link_leads_to_a_page_that_is_made(site: ModuleType) -> None:
 def test_the_front_page_and_the_overview_are_the_readme(site: ModuleType) -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     first, rest = site.first_part(readme), site.overview(readme)
-    assert "make demo" in first and "docs/images/demo.png" in first and "## " not in first
+    assert "make demo" in first and "docs/images/scan.jpg" in first and "## " not in first
     assert rest.startswith("# Overview\n\n## ") and readme.endswith(rest.partition("\n\n## ")[2])
     assert site.FIRST_PART in (DOCS / "index.md").read_text(encoding="utf-8")
 

@@ -29,7 +29,7 @@ from sigmasplat.evaluation.paired_comparison import (
     sentence,
     spread,
 )
-from sigmasplat.io.machine import RUNNING, code_digest
+from sigmasplat.io.machine import INSTALLED, code_digest
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.presets import preset
 
@@ -177,7 +177,7 @@ def test_what_is_said_and_written_is_what_was_measured(tmp_path: Path, capsys: p
     assert "23% of figures that nothing changed but chance pass that bar" in said
 
     written = json.loads(out.read_text())
-    assert written["machine"]["cores"] and written["code"] == code_digest(Path(sigmasplat.__file__).parent, RUNNING)
+    assert written["machine"]["cores"] and written["code"] == code_digest(Path(sigmasplat.__file__).parent, INSTALLED)
     assert Config.from_dict(written["config"]) == ablation.common_config("sigma", (), 10.0)
     run = next(r for r in written["runs"] if (r["source"], r["variant"], r["seed"]) == ("hall", "+loop", 2))
     assert run["figures"]["ate_m"] == pytest.approx(0.0052)
@@ -232,11 +232,11 @@ def test_run_folders_stay_where_they_are_to_be_kept(tmp_path: Path) -> None:
 
 def test_code_is_identified_by_its_bytes(tmp_path: Path) -> None:
     (tmp_path / "kernel.so").write_bytes(b"1")
-    first = code_digest(tmp_path, RUNNING)
+    first = code_digest(tmp_path, INSTALLED)
     (tmp_path / "notes.txt").write_text("no code")
-    assert code_digest(tmp_path, RUNNING) == first
+    assert code_digest(tmp_path, INSTALLED) == first
     (tmp_path / "kernel.so").write_bytes(b"2")
-    assert code_digest(tmp_path, RUNNING) != first
+    assert code_digest(tmp_path, INSTALLED) != first
 
 
 def test_a_map_that_was_never_refined_has_one_psnr() -> None:

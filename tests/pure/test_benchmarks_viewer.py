@@ -1,4 +1,4 @@
-"""The benchmark of the viewer's memory: what it makes up grows as a run does, and the tables hold it to the goal."""
+"""The viewer memory benchmark: its simulated system grows like a run, and its tables compare with the goals."""
 
 import importlib
 import sys
@@ -28,7 +28,7 @@ def held(found: dict[str, Any]) -> list[str]:
     return [row[3] for row in viewer_memory.sections({"figures": found})[1].rows]
 
 
-def test_memory_is_held_to_staying_flat_with_a_client_for_ten_minutes() -> None:
+def test_the_goals_are_constant_memory_and_a_client_for_ten_minutes() -> None:
     settling = [100.0, 300.0, 400.0, 500.0]
     assert held(figures(settling + [500.0] * 16)) == ["yes"] * 4
     assert held(figures(settling + [500.0 + 5.0 * i for i in range(16)])) == ["yes", "**no**", "**no**", "yes"]
@@ -38,7 +38,7 @@ def test_memory_is_held_to_staying_flat_with_a_client_for_ten_minutes() -> None:
     assert [p["until_s"] for p in parts] == [15.0, 35.0, 55.0, 75.0, 95.0] and parts[0]["median_mib"] == 350.0
 
 
-def test_the_system_made_up_is_shown_as_a_real_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_simulated_system_is_shown_like_a_real_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("viser", reason="viser is not installed (pip install 'sigmasplat[viewer]')")
     viewer_memory = importlib.import_module("viewer_memory")
     monkeypatch.setattr(viewer_memory, "SUBMAP_EVERY", 20)
@@ -48,6 +48,6 @@ def test_the_system_made_up_is_shown_as_a_real_one(tmp_path: Path, monkeypatch: 
         live(growing())
     last = shown[-1]
     assert len(last.path) == 50 and len(last.path.keyframes) == 10 and [p.submap for p in last.pieces] == [0, 1, 2]
-    assert max(sum(len(p.field) for p in moment.pieces) for moment in shown) <= 500
+    assert max(sum(len(p.field) for p in snapshot.pieces) for snapshot in shown) <= 500
     assert np.flatnonzero(last.path.lost).tolist() == [0]
-    assert last.picture(0) is not None and last.picture(45) is not None
+    assert last.image(0) is not None and last.image(45) is not None

@@ -1,4 +1,4 @@
-"""Ways to fly: along a recorded path, calmed and at an even rate, and in a circle above a place."""
+"""Camera paths: a recorded path, smoothed and evenly resampled, and an orbit around a point."""
 
 from itertools import pairwise
 
@@ -8,35 +8,35 @@ from scipy.spatial.transform import Rotation
 
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.model import se3
-from sigmasplat.model.camera_path import looking, orbit, resampled
+from sigmasplat.model.camera_path import look_along, orbit, smooth_path
 from sigmasplat.model.trajectory import Trajectory
 
 WORLD = se3.exp(np.array([3.0, -2.0, 1.0, 1.9, 0.4, -0.3]))
 
 
 def turning(times: np.ndarray, rate: float = 1.0) -> Trajectory:
-    """Go along x at 1 m/s, turning about y."""
+    """Return a path along x at 1 m/s that rotates about y at `rate` rad/s."""
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     poses[:, :3, :3] = Rotation.from_rotvec(rate * np.outer(times, [0.0, 1.0, 0.0])).as_matrix()
     poses[:, 0, 3] = times
     return Trajectory(times, poses)
 
 
-def test_even_motion_stays_as_it_is_whatever_the_times() -> None:
-    """A path of even speed and turn, unevenly sampled, comes out at even times; the average ends short of its ends."""
+def test_a_path_of_constant_speed_is_unchanged_for_any_timestamps() -> None:
+    """The path is sampled at uneven times and returned at even times; smoothing shortens it at its ends."""
     times = np.sort(np.random.default_rng(0).uniform(0, 6, 60))
     times[[0, -1]] = 0.0, 6.0
-    found = resampled(turning(times), 61, calm_s=0.1)
+    found = smooth_path(turning(times), 61, smoothing_s=0.1)
     wanted = turning(np.linspace(0, 6, 61)).T_world_camera
     np.testing.assert_allclose(found[6:-6], wanted[6:-6], atol=2e-3)
-    np.testing.assert_allclose(resampled(turning(times), 61, calm_s=0.0), wanted, atol=2e-3)
+    np.testing.assert_allclose(smooth_path(turning(times), 61, smoothing_s=0.0), wanted, atol=2e-3)
 
 
-def test_trembling_is_taken_out_and_poses_stay_rigid() -> None:
+def test_camera_shake_is_smoothed_and_poses_stay_rigid() -> None:
     times = np.arange(0, 4, 1 / 30)
     calm, rng = turning(times), np.random.default_rng(1)
     shaken = np.stack([T @ se3.exp(rng.normal(0, 0.02, 6)) for T in calm.T_world_camera])
-    found = resampled(Trajectory(times, shaken), len(times))
+    found = smooth_path(Trajectory(times, shaken), len(times))
     assert all(se3.is_rigid(T, 1e-9) for T in found)
 
     def off(poses: np.ndarray) -> float:
@@ -46,25 +46,25 @@ def test_trembling_is_taken_out_and_poses_stay_rigid() -> None:
     assert off(found) < 0.4 * off(shaken)
 
 
-def test_full_turns_do_not_unwind() -> None:
-    """Three turns: quaternions change sign on the way, which must not average to nothing."""
+def test_several_full_turns_are_kept() -> None:
+    """In three turns the quaternions change sign, and averages of opposite signs must not cancel."""
     times = np.linspace(0, 12, 200)
-    found = resampled(turning(times, rate=np.pi / 2), 200, calm_s=0.1)
+    found = smooth_path(turning(times, rate=np.pi / 2), 200, smoothing_s=0.1)
     steps = [se3.rotation_angle(a[:3, :3].T @ b[:3, :3]) for a, b in pairwise(found[10:-10])]
     np.testing.assert_allclose(steps, np.pi / 2 * 12 / 199, rtol=0.02)
 
 
-def test_one_pose_or_equal_times_are_accepted_and_an_empty_path_is_not() -> None:
+def test_one_pose_or_equal_times_give_a_path_and_no_pose_or_no_image_is_an_error() -> None:
     one = turning(np.array([2.0]))
-    np.testing.assert_array_equal(resampled(one, 3), np.repeat(one.T_world_camera, 3, 0))
-    assert len(resampled(turning(np.array([0.0, 0.0, 1.0])), 5)) == 5
+    np.testing.assert_array_equal(smooth_path(one, 3), np.repeat(one.T_world_camera, 3, 0))
+    assert len(smooth_path(turning(np.array([0.0, 0.0, 1.0])), 5)) == 5
     for path, images in ((turning(np.empty(0)), 3), (one, 0)):
-        with pytest.raises(SigmaSplatError, match="no path of"):
-            resampled(path, images)
+        with pytest.raises(SigmaSplatError, match="cannot make a path of"):
+            smooth_path(path, images)
 
 
 @pytest.mark.parametrize("T", [np.eye(4), WORLD])
-def test_an_orbit_looks_at_its_middle_from_above_and_closes(T: np.ndarray) -> None:
+def test_an_orbit_is_a_closed_circle_that_looks_down_at_its_centre(T: np.ndarray) -> None:
     up, start, center = T[:3, :3] @ [0, 0, 1.0], T[:3, :3] @ [0.3, 1.0, 0.2], T[:3, :3] @ [1.0, 2.0, 0.5] + T[:3, 3]
     poses = orbit(center, up, start, 4.0, 8, elevation_rad=np.pi / 6)
     for pose in poses:
@@ -78,6 +78,6 @@ def test_an_orbit_looks_at_its_middle_from_above_and_closes(T: np.ndarray) -> No
     assert poses[0][:3, 2] @ start == pytest.approx(max(pose[:3, 2] @ start for pose in poses))
 
 
-def test_looking_is_a_camera_there() -> None:
-    T = looking(np.array([1.0, 2, 3]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]))
+def test_look_along_gives_position_and_axes() -> None:
+    T = look_along(np.array([1.0, 2, 3]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]))
     np.testing.assert_allclose(T, [[1, 0, 0, 1], [0, 0, 1, 2], [0, -1, 0, 3], [0, 0, 0, 1]], atol=1e-12)

@@ -1,4 +1,4 @@
-"""What doctor says of CUDA on machines that lack one thing or another."""
+"""What `doctor` reports about CUDA on machines where a part of it is missing."""
 
 import pytest
 
@@ -8,17 +8,17 @@ from sigmasplat.native.cuda import cubins
 from sigmasplat.render.cuda import launch as cuda_launch
 
 
-def said() -> dict[str, installation.Finding]:
-    return {finding.name: finding for finding in installation.cuda()}
+def cuda_findings() -> dict[str, installation.Finding]:
+    return {finding.name: finding for finding in installation.check_cuda()}
 
 
-def test_each_thing_that_is_missing_has_its_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_missing_part_has_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def none() -> str:
         raise BackendError("no NVRTC here")
 
     monkeypatch.setattr(cubins, "compiler_version", none)
     monkeypatch.setattr(cuda_launch, "missing", lambda: "torch finds no CUDA device")
-    found = said()
+    found = cuda_findings()
     assert found["NVRTC"].value == "missing: no NVRTC here"
     assert found["CUDA"].value == "not available: torch finds no CUDA device"
     assert all(finding.ok is None for finding in found.values()), "a machine without a GPU is healthy"
@@ -30,21 +30,18 @@ def test_a_driver_older_than_the_compiler_is_reported(
 ) -> None:
     driver = pytest.importorskip("cuda.bindings.driver", reason="needs pip install 'sigmasplat[gpu]'")
     monkeypatch.setattr(driver, "cuDriverGetVersion", lambda: (0, version))
-    monkeypatch.setattr(cubins, "compiler_version", lambda: "13.5")
-    monkeypatch.setattr(cuda_launch, "missing", lambda: "")
-    monkeypatch.setattr("torch.cuda.device_count", lambda: 0)
-    finding = said()["CUDA driver"]
+    finding = installation.check_driver("13.5")
     assert finding.ok is enough and (cubins.INSTALL_OLDER in finding.value) is not enough
 
 
-def test_the_cache_follows_the_users_choice(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_kernel_cache_is_below_xdg_cache_home(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
     assert str(cubins.cache_folder()) == "/somewhere/sigmasplat/kernels"
     monkeypatch.setenv("XDG_CACHE_HOME", "")
     assert str(cubins.cache_folder()).endswith("/.cache/sigmasplat/kernels")
 
 
-def test_tensors_elsewhere_are_refused() -> None:
+def test_tensors_on_another_device_are_refused() -> None:
     import torch
 
     with pytest.raises(BackendError, match="takes tensors on a CUDA device; these are on cpu"):

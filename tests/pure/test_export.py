@@ -1,4 +1,4 @@
-"""sigmasplat export: formats by ending or name, from runs and from maps, without doubtful splats where asked."""
+"""sigmasplat export: formats by ending or name, from runs and from maps, and filtering of splats."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from command_line import exit_code
-from sigmasplat.commands.export import FORMATS
-from sigmasplat.commands.export_formats import ExportOptions, Format, Origin, choose, listed, owners
+from sigmasplat.commands.export import ExportOptions
 from sigmasplat.config import Config
+from sigmasplat.exports.formats import FORMATS, ExportFormat, ExportSource, choose, listed, owners
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.splats import ply
 from sigmasplat.io.splats.any_format import read_any
@@ -21,7 +21,7 @@ from sigmasplat.model.trajectory import Trajectory
 
 @pytest.fixture
 def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """Run `sigmasplat export` beside a run, walk/, of ten splats and two poses; return what it prints in the end."""
+    """Run `sigmasplat export` beside a run, walk/, of ten splats and two poses; return the last line of its output."""
     monkeypatch.chdir(tmp_path)
     run = RunFolder.create(Path("walk"), Config(), "room")
     field = GaussianField.from_values(
@@ -38,16 +38,14 @@ def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
         assert exit_code("export", *arguments) == 0
         said = capsys.readouterr()
         *before, last = said.out.splitlines()
-        assert [line.split()[0] for line in before] == ["writing"] * (" splats" in last), (
-            "it says so before it takes long"
-        )
+        assert [line.split()[0] for line in before] == ["writing"] * (" splats" in last), "printed before a long step"
         return last
 
     return run_it
 
 
 @pytest.mark.parametrize("name", ["out.ply", "OUT.PLY", "out.compressed.ply", "out.splat", "out.spz"])
-def test_the_ending_says_what_is_written(export: Callable[..., str], name: str) -> None:
+def test_the_ending_selects_the_format(export: Callable[..., str], name: str) -> None:
     assert export("walk", "--out", name).startswith(f"{name}: 10 splats, 0.0 MB")
     assert len(read_any(Path(name))) == 10
     assert (Path(name).read_bytes().find(b"packed_position") > 0) == ("compressed" in name)
@@ -61,7 +59,7 @@ def test_a_map_is_exported_like_a_run(export: Callable[..., str]) -> None:
     assert sorted(first.means[:, 0].tolist()) == pytest.approx(sorted(last.means[:, 0].tolist()), abs=1e-3)
 
 
-def test_names_say_what_the_ending_does_not(export: Callable[..., str]) -> None:
+def test_the_format_can_be_given_by_name(export: Callable[..., str]) -> None:
     export("walk", "--out", "map.backup", "--format", "splat")
     assert Path("map.backup").stat().st_size == 320
     assert export("walk", "--format", "trajectory").startswith("walk.txt: 2 poses")
@@ -69,7 +67,7 @@ def test_names_say_what_the_ending_does_not(export: Callable[..., str]) -> None:
     assert export("walk").startswith("walk.ply: 10 splats")
 
 
-def test_doubtful_splats_are_dropped_and_counted(export: Callable[..., str]) -> None:
+def test_splats_outside_the_bounds_are_dropped_and_counted(export: Callable[..., str]) -> None:
     said = export("walk", "--out", "a.ply", "--sigma-below", "0.055", "--opacity-above", "0.1")
     assert said.startswith("a.ply: 4 splats; dropped 6 of 10: 5 for σ, 1 for opacity")
     kept = ply.read_field(Path("a.ply"))
@@ -77,28 +75,28 @@ def test_doubtful_splats_are_dropped_and_counted(export: Callable[..., str]) -> 
     assert "dropped 0 of 10" in export("walk", "--out", "b.ply", "--opacity-above", "0")
 
 
-def test_plain_leaves_out_what_3dgs_does_not_know(export: Callable[..., str]) -> None:
+def test_plain_writes_only_the_columns_of_3dgs(export: Callable[..., str]) -> None:
     export("walk", "--out", "a.ply", "--plain")
     header = Path("a.ply").read_bytes().partition(b"end_header")[0]
     assert header.count(b"property float ") == 62 and b"log_variance" not in header
 
 
-def test_every_format_can_be_distinguished() -> None:
+def test_every_format_can_be_selected_by_its_name_and_its_own_endings() -> None:
     names = [row.name for row in FORMATS]
     assert len(set(names)) == len(names)
     for row in FORMATS:
         assert row.endings and row.help and choose(FORMATS, row.name, None) is row
-        assert set(row.obeys) <= set(ExportOptions.__dataclass_fields__)
+        assert set(row.options) <= set(ExportOptions.__dataclass_fields__)
     for ending, row in owners(FORMATS).items():
         assert choose(FORMATS, None, Path(f"a{ending}")) is row
     assert len(listed(FORMATS)) == len(FORMATS)
 
 
 def test_the_first_format_with_an_ending_owns_it_and_longer_endings_win() -> None:
-    def nothing(origin: Origin, target: Path, options: ExportOptions) -> str:
+    def nothing(source: ExportSource, target: Path) -> str:
         return ""
 
-    first, second, longer = (Format(name, ends, "", nothing) for name, ends in
+    first, second, longer = (ExportFormat(name, ends, "", nothing) for name, ends in
                              (("one", (".x",)), ("two", (".x",)), ("three", (".y.x",))))  # fmt: skip
     rows = (first, second, longer)
     assert choose(rows, None, Path("a.x")) is first and choose(rows, None, Path("a.y.x")) is longer
@@ -106,10 +104,11 @@ def test_the_first_format_with_an_ending_owns_it_and_longer_endings_win() -> Non
     assert listed(rows)[1].startswith("--format")
 
 
-def test_names_of_exports_without_out(tmp_path: Path) -> None:
+def test_default_names_of_exports(tmp_path: Path) -> None:
     for name in ("room.compressed.ply", "room.v2.spz"):
         (tmp_path / name).touch()
     assert (
-        Origin(tmp_path / "room.compressed.ply").name == "room" and Origin(tmp_path / "room.v2.spz").name == "room.v2"
+        ExportSource(tmp_path / "room.compressed.ply").name == "room"
+        and ExportSource(tmp_path / "room.v2.spz").name == "room.v2"
     )
-    assert Origin(tmp_path / "walk.1").name == "walk.1"
+    assert ExportSource(tmp_path / "walk.1").name == "walk.1"

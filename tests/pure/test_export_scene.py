@@ -1,4 +1,4 @@
-"""`sigmasplat export` to what is no file of splats: by the name, with the options that belong to it, and no others."""
+"""`sigmasplat export` of paths, images, points, films and plans: names, and the options that each format accepts."""
 
 import json
 from pathlib import Path
@@ -13,15 +13,15 @@ from room_run import PATH, made_run
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Go where there is a run."""
+    """Work in a folder with a run, kitchen/."""
     made_run(tmp_path / "kitchen", submaps=True)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-def test_paths_are_written_by_name(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_name_selects_the_format_of_a_path(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code("export", "kitchen", "--out", "a.kitti.txt") == 0
-    assert np.loadtxt("a.kitti.txt").shape == (len(PATH), 12)
+    np.testing.assert_allclose(np.loadtxt("a.kitti.txt").reshape(-1, 3, 4), PATH.T_world_camera[:, :3], atol=1e-9)
     assert exit_code("export", "kitchen", "--out", "transforms.json") == 0
     assert len(json.loads((here / "transforms.json").read_text())["frames"]) == 5
     assert exit_code("export", "kitchen", "--format", "colmap", "--pictures") == 0
@@ -31,7 +31,7 @@ def test_paths_are_written_by_name(here: Path, capsys: pytest.CaptureFixture[str
     assert said[2:] == ["pictures …", "pictures 3/3", "kitchen-colmap: 3 views with their pictures"]
 
 
-def test_film_plan_and_points_show_the_map(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_film_plan_and_points_are_written_with_their_progress(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
     film = ("--out", "a.gif", "--size", "64", "--fps", "4", "--seconds", "0.5", "--path", "orbit")
     assert exit_code("export", "kitchen", *film) == 0
@@ -46,18 +46,18 @@ def test_film_plan_and_points_show_the_map(here: Path, capsys: pytest.CaptureFix
     assert "a.points.ply: " in said and " points, " in said
 
 
-def test_what_does_not_go_together_is_refused(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_of_other_formats_and_wrong_values_are_refused(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (here / "map.ply").write_bytes((here / "kitchen/map.ply").read_bytes())
     for arguments, words in (
         (
             ["kitchen", "--out", "a.gif", "--voxel-m", "0.1"],
-            "--voxel-m does not go with format video; it goes with points",
+            "--voxel-m cannot be used with format video, only with points",
         ),
-        (["kitchen", "--out", "a.kitti.txt", "--pictures"], "it goes with nerfstudio, colmap"),
-        (["kitchen", "--out", "a.gif", "--fps", "0"], "a film takes 1 to 120 images/s"),
+        (["kitchen", "--out", "a.kitti.txt", "--pictures"], "only with nerfstudio, colmap"),
+        (["kitchen", "--out", "a.gif", "--fps", "0"], "a film must have 1 to 120 images/s"),
         (["kitchen", "--format", "video", "--out", "a.avi"], "give a name that ends in .webm, .mp4, .gif, .webp"),
         (["kitchen", "--out", "missing/a.kitti.txt"], "choose a writable place"),
-        (["map.ply", "--out", "a.png"], "a map can be exported to formats of maps only"),
+        (["map.ply", "--out", "a.png"], "can be exported only as another map"),
     ):
         assert exit_code("export", *arguments) == 2
         said = capsys.readouterr().err.splitlines()

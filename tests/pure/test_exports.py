@@ -1,4 +1,4 @@
-"""Exports of a run made by hand: paths, pictures, points, films and the plan hold what the run holds."""
+"""Exports of a handmade run: views, images, points, films and the floor plan agree with the run."""
 
 import json
 from pathlib import Path
@@ -12,26 +12,20 @@ from box_room import CAMERA, HIGH, LOW, seer, splats
 from room_run import FRAMES, LOST, PATH, T_ROOM, WORLD, Walls, made_run, picture
 from sigmasplat.drawing.film import FilmScale, legend_strip
 from sigmasplat.errors import ConfigError, RunError
-from sigmasplat.exports import (
-    Recorded,
-    VideoOptions,
-    export_colmap,
-    export_kitti,
-    export_plan,
-    export_points,
-    export_transforms,
-    export_video,
-)
-from sigmasplat.exports.paths import map_points
-from sigmasplat.exports.video import from_above, sized
+from sigmasplat.exports.colmap import export_colmap
+from sigmasplat.exports.nerfstudio import export_nerfstudio
+from sigmasplat.exports.plan import export_plan
+from sigmasplat.exports.points import export_points, splat_points
+from sigmasplat.exports.run_reader import RunReader
+from sigmasplat.exports.video import VideoOptions, export_video, film_camera, orbit_view
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 
 
 @pytest.fixture(params=["submaps", "in one piece"])
-def recorded(tmp_path: Path, request: pytest.FixtureRequest) -> Recorded:
-    return Recorded(made_run(tmp_path / "run", request.param == "submaps"), Walls)
+def reader(tmp_path: Path, request: pytest.FixtureRequest) -> RunReader:
+    return RunReader(made_run(tmp_path / "run", request.param == "submaps"), Walls)
 
 
 def positions(path: Path) -> np.ndarray:
@@ -39,27 +33,20 @@ def positions(path: Path) -> np.ndarray:
     return np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
 
 
-def test_kitti_has_every_frame(recorded: Recorded, tmp_path: Path) -> None:
-    export_kitti(recorded, tmp_path / "poses.txt")
-    np.testing.assert_allclose(
-        np.loadtxt(tmp_path / "poses.txt").reshape(-1, 3, 4), PATH.T_world_camera[:, :3], atol=1e-9
-    )
-
-
-def test_paths_without_pictures_have_the_frames_that_were_not_lost(recorded: Recorded, tmp_path: Path) -> None:
+def test_views_without_images_are_all_frames_that_were_not_lost(reader: RunReader, tmp_path: Path) -> None:
     kept = [i for i in range(FRAMES) if i != LOST]
-    export_transforms(recorded, tmp_path / "out.json")
+    export_nerfstudio(reader, tmp_path / "out.json")
     np.testing.assert_allclose(positions(tmp_path / "out.json"), PATH.T_world_camera[kept, :3, 3], atol=1e-9)
-    export_colmap(recorded, tmp_path / "model")
+    export_colmap(reader, tmp_path / "model")
     names = (tmp_path / "model/sparse/0/images.txt").read_text().split("\n")[1:-1:2]
     assert [name.split()[-1] for name in names] == [f"frame-{i:06d}.png" for i in kept]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["model", "out.json", "run"]
 
 
-def test_pictures_are_the_keyframes_each_once(recorded: Recorded, tmp_path: Path) -> None:
+def test_images_are_those_of_the_keyframes_each_once(reader: RunReader, tmp_path: Path) -> None:
     out = tmp_path / "scene"
     out.mkdir()
-    export_transforms(recorded, out / "transforms.json", pictures=True)
+    export_nerfstudio(reader, out / "transforms.json", images=True)
     read = json.loads((out / "transforms.json").read_text())
     assert [frame["file_path"] for frame in read["frames"]] == [f"images/frame-{i:06d}.png" for i in (0, 2, 4)]
     np.testing.assert_allclose(positions(out / "transforms.json"), PATH.T_world_camera[[0, 2, 4], :3, 3], atol=1e-9)
@@ -69,64 +56,64 @@ def test_pictures_are_the_keyframes_each_once(recorded: Recorded, tmp_path: Path
         assert depth.dtype == np.uint16 and depth[0, 0] == 0
         np.testing.assert_allclose(depth * read["depth_unit_scale_factor"], picture(i).depth_m, atol=5.1e-4)
     assert (out / read["ply_file_path"]).is_file() and (read["w"], read["h"]) == (40, 30)
-    export_colmap(recorded, out, pictures=True)
+    export_colmap(reader, out, images=True)
     assert len((out / "sparse/0/images.txt").read_text().split("\n")) == 8
     assert sorted(p.name for p in (out / "images").iterdir()) == [f"frame-{i:06d}.png" for i in (0, 2, 4)]
 
 
-def test_points_of_the_map_are_thinned_evenly(recorded: Recorded) -> None:
-    points, colors = map_points(recorded, most=100)
+def test_splat_centres_are_thinned_evenly(reader: RunReader) -> None:
+    points, colors = splat_points(reader.run.read_map(), most=100)
     assert points.shape == colors.shape == (100, 3)
     in_room = points @ T_ROOM[:3, :3].T + T_ROOM[:3, 3]
     np.testing.assert_allclose(in_room[:, 2], 0.0, atol=1e-5)
     assert in_room[:, 1].min() < LOW[1] + 0.2 and in_room[:, 1].max() > HIGH[1] - 0.2
 
 
-def test_the_surface_has_normals_towards_the_room(recorded: Recorded, tmp_path: Path) -> None:
+def test_surface_normals_point_into_the_room(reader: RunReader, tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh", reason="the [dev] extra is not installed")
-    renderer = _from_any_submap(recorded)
-    count = export_points(recorded, tmp_path / "cloud.ply", voxel_m=0.05, renderer=renderer)
+    renderer = _from_any_submap(reader)
+    count = export_points(reader, tmp_path / "cloud.ply", voxel_m=0.05, renderer=renderer)
     cloud = trimesh.load(tmp_path / "cloud.ply")
     assert len(cloud.vertices) == count > 500
     rows = cloud.metadata["_ply_raw"]["vertex"]["data"]
     normals = np.stack([rows[name].ravel() for name in ("nx", "ny", "nz")], 1) @ T_ROOM[:3, :3].T
     at = cloud.vertices @ T_ROOM[:3, :3].T + T_ROOM[:3, 3]
     floor = (np.abs(at[:, 2]) < 0.02) & (np.abs(at[:, :2] - 0.3).max(1) < 0.8)
-    assert floor.sum() > 50 and np.quantile(normals[floor, 2], 0.1) > 0.9, "but where the surface ends"
+    assert floor.sum() > 50 and np.quantile(normals[floor, 2], 0.1) > 0.9, "except at the edges of the surface"
     assert np.abs(cloud.colors[:, :3].astype(int) - 128).max() <= 1
 
 
-def _from_any_submap(recorded: Recorded):
-    """Return a renderer that knows which submap it is asked to show by the number of calls; its world is the room's."""
+def _from_any_submap(reader: RunReader):
+    """Return a renderer of the room that tells the submaps apart by the number of calls."""
     anchors = [np.eye(4)] * 3
-    if len(recorded.run.submaps):
+    if len(reader.run.submaps):
         anchors = [PATH.T_world_camera[0], PATH.T_world_camera[0], PATH.T_world_camera[2], PATH.T_world_camera[2]]
     calls = iter(anchors)
     return lambda _, camera, T: seer(se3.inverse(next(calls)) @ WORLD, boxes=())(_, camera, T)
 
 
 @pytest.mark.parametrize("path", ["run", "orbit"])
-def test_films_go_along_the_path_or_round_it(recorded: Recorded, tmp_path: Path, path: str) -> None:
-    told: list[tuple[int, int]] = []
+def test_films_follow_the_path_or_an_orbit(reader: RunReader, tmp_path: Path, path: str) -> None:
+    calls: list[tuple[int, int]] = []
     options = VideoOptions(width_px=64, fps=5.0, seconds=1.0, path=path)
     count = export_video(
-        recorded, tmp_path / "film.gif", options, renderer=seer(WORLD), progress=lambda *at: told.append(at)
+        reader, tmp_path / "film.gif", options, renderer=seer(WORLD), progress=lambda *at: calls.append(at)
     )
     with Image.open(tmp_path / "film.gif") as film:
         assert (film.size, film.n_frames, count) == ((3 * 64, 48 + 40), 5, 5)
         first = np.asarray(film.convert("RGB"))
-    assert told == [(i, 5) for i in range(1, 6)]
+    assert calls == [(i, 5) for i in range(1, 6)]
     assert np.abs(first[8:40, 4:60].astype(int) - 128).max() < 12, "colour on the left"
     assert first[8:40, 64:128].std(axis=(0, 1)).max() > 10, "depth in the middle"
 
 
-def test_from_above_the_ceiling_is_gone_and_the_room_in_view() -> None:
+def test_the_orbit_view_removes_the_ceiling_and_shows_the_whole_room() -> None:
     high = GaussianField.from_values(torch.tensor([[0.0, 0.0, 2.4]]), torch.tensor([0.1]), torch.ones(1, 3))
     field = splats(WORLD)
     floor_splats = len(field)
     field.append(high.moved(torch.from_numpy(WORLD)))
-    kept, poses = from_above(field, PATH, CAMERA, 4, seer(WORLD))
-    assert len(kept) == floor_splats and len(field) == floor_splats + 1, "the map itself is left alone"
+    kept, poses = orbit_view(field, PATH, CAMERA, 4, seer(WORLD))
+    assert len(kept) == floor_splats and len(field) == floor_splats + 1, "the map itself is not changed"
     for T in poses:
         corners = np.array([[x, y, 0.0, 1.0] for x in (LOW[0], HIGH[0]) for y in (LOW[1], HIGH[1])])
         x, y, z, _ = np.linalg.inv(T) @ WORLD @ corners.T
@@ -134,7 +121,7 @@ def test_from_above_the_ceiling_is_gone_and_the_room_in_view() -> None:
         assert (np.abs(CAMERA.fx * x / z) < 80).all() and (np.abs(CAMERA.fy * y / z) < 75).all()
 
 
-def test_the_legend_of_a_film_can_be_read(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_texts_of_a_films_legend_do_not_overlap(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[tuple[str, tuple[float, float, float, float]]] = []
     plain = ImageDraw.ImageDraw.text
 
@@ -155,7 +142,7 @@ def test_the_legend_of_a_film_can_be_read(monkeypatch: pytest.MonkeyPatch) -> No
             assert inside, f"{word} leaves its panel at {width} px"
             for above, other in drawn[:i]:
                 clear = right + 2 < other[0] or other[2] + 2 < left or bottom <= other[1] or other[3] <= top
-                assert clear, f"{word} is written over {above} at {width} px"
+                assert clear, f"{word} overlaps {above} at {width} px"
         if width >= 128:
             words = " ".join(word for word, _ in drawn).split()
             assert words == ["colour", "depth", "0.8", "12.4", "m", "uncertainty", "0", "0.23"]
@@ -164,36 +151,36 @@ def test_the_legend_of_a_film_can_be_read(monkeypatch: pytest.MonkeyPatch) -> No
             assert ((colors.max(0) - colors.min(0)).max(1) > 60).sum() >= 20, "a colour bar"
 
 
-def test_film_options_that_make_no_film_are_refused() -> None:
+def test_film_options_out_of_range_are_refused() -> None:
     for wrong, words in (
         ({"width_px": 8}, "32 to 4096 pixels wide, found 8"),
         ({"fps": 0.0}, "1 to 120 images/s"),
-        ({"seconds": -1.0}, "at most an hour"),
+        ({"seconds": -1.0}, "last 0.04 s to 1 h"),
         ({"path": "up"}, "'run' or 'orbit', found 'up'"),
     ):
         with pytest.raises(ConfigError, match=words):
             VideoOptions(**wrong)
     assert VideoOptions().images(0.5) == 100 and VideoOptions(fps=10.0).images(500.0) == 600
     assert VideoOptions(path="orbit", fps=10.0).images(500.0) == 120
-    camera = sized(Camera(321, 241, 200.0, 200.0, 160.0, 120.0), 0)
+    camera = film_camera(Camera(321, 241, 200.0, 200.0, 160.0, 120.0), 0)
     assert (camera.width, camera.height) == (320, 240)
 
 
-def test_the_plan_is_a_picture_and_a_record(recorded: Recorded, tmp_path: Path) -> None:
-    plan = export_plan(recorded, tmp_path / "plan.png", renderer=seer(WORLD))
+def test_the_plan_is_an_image_and_a_json_file(reader: RunReader, tmp_path: Path) -> None:
+    plan = export_plan(reader, tmp_path / "plan.png", renderer=seer(WORLD))
     with Image.open(tmp_path / "plan.png") as drawn:
         assert drawn.format == "PNG" and drawn.size[0] > 700
     record = json.loads((tmp_path / "plan.json").read_text())
     assert len(record["cells"]) == plan.kind.shape[0] and len(plan.path_m) == FRAMES - 1, "without the lost frame"
     with pytest.raises(RunError, match=r"give a name that ends in \.png"):
-        export_plan(recorded, tmp_path / "plan.pdf")
+        export_plan(reader, tmp_path / "plan.pdf")
 
 
-def test_runs_that_hold_no_pose_are_refused(recorded: Recorded, tmp_path: Path) -> None:
-    log = recorded.run.path / "log.jsonl"
+def test_runs_without_a_pose_are_refused(reader: RunReader, tmp_path: Path) -> None:
+    log = reader.run.path / "log.jsonl"
     log.write_text(log.read_text().replace('"lost": false', '"lost": true'))
     with pytest.raises(RunError, match="was lost on every frame"):
-        export_transforms(recorded, tmp_path / "t.json")
-    (recorded.run.path / "trajectory.txt").unlink()
+        export_nerfstudio(reader, tmp_path / "t.json")
+    (reader.run.path / "trajectory.txt").unlink()
     with pytest.raises(RunError, match=r"no trajectory\.txt"):
-        export_kitti(Recorded(recorded.run, Walls), tmp_path / "poses.txt")
+        export_colmap(RunReader(reader.run, Walls), tmp_path / "model")

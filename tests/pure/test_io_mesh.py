@@ -1,4 +1,4 @@
-"""Meshes in files: what is written is read back, by us and by readers made here by hand; what is no mesh is refused."""
+"""Mesh files: they are read back by our reader and by handmade readers; other files are refused."""
 
 import json
 import struct
@@ -22,7 +22,7 @@ def some_mesh(colors: bool = True) -> Mesh:
 EMPTY = Mesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32))
 
 
-def test_ply_comes_back_as_it_was(tmp_path: Path) -> None:
+def test_ply_is_read_back_unchanged(tmp_path: Path) -> None:
     mesh = some_mesh()
     write_mesh(tmp_path / "a.ply", mesh)
     back = read_mesh(tmp_path / "a.ply")
@@ -42,7 +42,7 @@ def test_a_mesh_without_faces_or_colours_can_be_written(tmp_path: Path, ending: 
             assert len(read_mesh(tmp_path / "a.ply").faces) == len(mesh.faces)
 
 
-def test_ply_is_laid_out_as_its_header_says(tmp_path: Path) -> None:
+def test_ply_has_the_layout_of_its_header(tmp_path: Path) -> None:
     mesh = some_mesh()
     write_mesh(tmp_path / "a.ply", mesh)
     header, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
@@ -57,7 +57,7 @@ def test_ply_is_laid_out_as_its_header_says(tmp_path: Path) -> None:
     assert struct.unpack("<B3i", body[-13:]) == (3, *mesh.faces[-1])
 
 
-def test_obj_holds_the_same_numbers(tmp_path: Path) -> None:
+def test_obj_has_the_same_values(tmp_path: Path) -> None:
     mesh = some_mesh()
     write_mesh(tmp_path / "a.obj", mesh)
     words = [line.split() for line in (tmp_path / "a.obj").read_text().splitlines()]
@@ -67,7 +67,7 @@ def test_obj_holds_the_same_numbers(tmp_path: Path) -> None:
     np.testing.assert_array_equal(faces, mesh.faces + 1)
 
 
-def test_glb_holds_the_same_numbers_upright(tmp_path: Path) -> None:
+def test_glb_has_the_same_values_and_stands_upright(tmp_path: Path) -> None:
     mesh = some_mesh()
     write_mesh(tmp_path / "a.glb", mesh)
     data = (tmp_path / "a.glb").read_bytes()
@@ -87,13 +87,13 @@ def test_glb_holds_the_same_numbers_upright(tmp_path: Path) -> None:
     np.testing.assert_array_equal(arrays[1], mesh.faces)
     assert scene["accessors"][0]["max"] == pytest.approx(mesh.vertices.max(0).tolist())
     x, y, z, w = scene["nodes"][0]["rotation"]
-    assert (x, y, z, w) == (1, 0, 0, 0), "half a turn about x: down becomes −y, forward −z"
+    assert (x, y, z, w) == (1, 0, 0, 0), "a rotation by 180° about x: down becomes −y, forward −z"
 
 
 def by_hand(
     path: Path, order: str, rows: bytes, faces: bytes, extra: str = "", count: int = 3, number: int = 1
 ) -> Path:
-    """Write a PLY as other programs do: doubles, float colours, flags behind the list, comments."""
+    """Write a PLY as other programs do: doubles, float colours, flags after the list, comments."""
     header = (
         f"ply\nformat binary_{order}_endian 1.0\ncomment made by hand\nelement vertex {count}\nproperty double x\n"
         f"property double y\nproperty double z\n{extra}element face {number}\nproperty list uint8 uint32 vertex_index\n"
@@ -120,7 +120,7 @@ def refused(path: Path) -> str:
     return str(caught.value)
 
 
-def test_what_is_no_mesh_is_refused(tmp_path: Path) -> None:
+def test_other_files_are_refused(tmp_path: Path) -> None:
     write_mesh(tmp_path / "whole.ply", some_mesh())
     whole = (tmp_path / "whole.ply").read_bytes()
     path = tmp_path / "damaged.ply"
@@ -128,7 +128,7 @@ def test_what_is_no_mesh_is_refused(tmp_path: Path) -> None:
     for content, words in (
         (b"solid stl", "is not a PLY file"),
         (whole[:60], "no 'end_header'"),
-        (whole[:-1], "promises 80 of element face, found 79"),
+        (whole[:-1], "says 80 of element face, found 79"),
         (whole[:400], "element vertex"),
         (whole.replace(b"binary_little_endian", b"ascii"), "is not binary"),
         (whole.replace(b"property float y", b"property text y"), "cannot read the PLY's properties"),
@@ -146,7 +146,7 @@ def test_what_is_no_mesh_is_refused(tmp_path: Path) -> None:
     assert "nan or inf" in refused(by_hand(path, "little", nan, struct.pack("<B3IB", 3, 0, 1, 2, 0)))
 
 
-def test_names_and_places_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
+def test_unknown_endings_and_unwritable_folders_are_refused(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"a\.stl; give a name that ends in \.ply, \.obj, \.glb"):
         write_mesh(tmp_path / "a.stl", some_mesh())
     with pytest.raises(RunError, match="choose a writable place"):

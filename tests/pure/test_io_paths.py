@@ -1,4 +1,4 @@
-"""Paths in other programs' formats, read back here by readers that know nothing of ours; COLMAP's by its own too."""
+"""Paths in other programs' formats, checked by independent readers; COLMAP's also by its own reader."""
 
 import json
 from pathlib import Path
@@ -25,7 +25,7 @@ def some_path(n: int = 7) -> Trajectory:
 
 
 def seen_by_colmap(points: np.ndarray, line: list[str], camera: list[str]) -> np.ndarray:
-    """Project points as COLMAP's documents say: R, t to the camera, PINHOLE, the first pixel's centre at (½, ½)."""
+    """Project points as COLMAP documents it: R, t to the camera, PINHOLE, the first pixel's centre at (½, ½)."""
     w, x, y, z, *t = (float(word) for word in line[1:8])
     fx, fy, cx, cy = (float(word) for word in camera[4:])
     p = Rotation.from_quat([x, y, z, w]).apply(points) + t
@@ -38,7 +38,7 @@ def seen_by_us(points: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
 
 
 def ahead(T_world_camera: np.ndarray) -> np.ndarray:
-    """Return points before a camera, in the world."""
+    """Return points in front of a camera, in the world frame."""
     points = np.random.default_rng(3).uniform([-1, -1, 1], [1, 1, 4], (20, 3))
     return points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
 
@@ -54,7 +54,7 @@ def test_kitti_rows_are_the_matrices(tmp_path: Path) -> None:
 
 
 def test_transforms_are_opengl_cameras(tmp_path: Path) -> None:
-    """Points project as nerfstudio does it: x right, y up, looking along −z, pixels counted from the corner."""
+    """Project points as nerfstudio does: x right, y up, view along −z, pixels measured from the corner."""
     path, file = some_path(), tmp_path / "transforms.json"
     nerfstudio.write_transforms(
         file,
@@ -77,7 +77,7 @@ def test_transforms_are_opengl_cameras(tmp_path: Path) -> None:
         np.testing.assert_allclose(pixels - 0.5, seen_by_us(points, T), atol=1e-6)
 
 
-def test_transforms_without_pictures_name_none_of_depth(tmp_path: Path) -> None:
+def test_transforms_without_images_have_no_depth_entries(tmp_path: Path) -> None:
     path = some_path()
     nerfstudio.write_transforms(tmp_path / "t.json", CAMERA, NAMES, path.T_world_camera, path.timestamps_s.tolist())
     read = json.loads((tmp_path / "t.json").read_text())
@@ -91,7 +91,7 @@ def write_colmap(folder: Path) -> tuple[Trajectory, np.ndarray, np.ndarray]:
     return path, points, colors
 
 
-def test_colmap_text_follows_its_documentation(tmp_path: Path) -> None:
+def test_colmap_text_has_the_documented_layout(tmp_path: Path) -> None:
     path, points, colors = write_colmap(tmp_path)
     lines = {
         name: [line for line in (tmp_path / f"{name}.txt").read_text().split("\n") if not line.startswith("#")]

@@ -1,4 +1,4 @@
-"""The map file: round trip, the columns other programs look for, and maps of other programs."""
+"""The map file: round trip, the columns that other programs need, and maps of other programs."""
 
 import struct
 from pathlib import Path
@@ -21,18 +21,18 @@ def header_of(data: bytes) -> list[str]:
     return data[: data.index(b"end_header\n")].decode("ascii").splitlines()
 
 
-def test_what_is_written_is_read(tmp_path: Path) -> None:
+def test_a_map_is_read_back_unchanged(tmp_path: Path) -> None:
     field = random_field()
     write_field(tmp_path / "map.ply", field)
     back = read_field(tmp_path / "map.ply")
     torch.testing.assert_close(back.params, field.params, rtol=0, atol=1e-6)
     others = [i for i in range(17) if not 11 <= i < 14]
     assert torch.equal(back.params[:, others], field.params[:, others]), "only colours are converted"
-    assert [p.name for p in tmp_path.iterdir()] == ["map.ply"], "no temporary file stays"
+    assert [p.name for p in tmp_path.iterdir()] == ["map.ply"], "no temporary file remains"
 
 
 def test_layout_is_that_of_3dgs(tmp_path: Path) -> None:
-    """One splat, its bytes picked apart by hand: names, order, and the values a viewer expects."""
+    """The bytes of one splat: names, order, and the values that a viewer expects."""
     field = GaussianField.from_values(
         torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([[0.1, 0.2, 0.3]]), torch.tensor([[1.0, 0.5, 0.25]]),
         quats=torch.tensor([[0.5, 0.5, -0.5, 0.5]]), opacities=0.75, log_variances=-4.0,
@@ -54,15 +54,15 @@ def test_layout_is_that_of_3dgs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("harmonics", [False, True])
-def test_columns_are_found_by_a_reader_of_names(tmp_path: Path, harmonics: bool) -> None:
-    """As viewers read: offsets added up property by property, each value fetched by its name, others passed over."""
+def test_columns_are_found_by_a_reader_that_uses_names(tmp_path: Path, harmonics: bool) -> None:
+    """Read as viewers do: sum up the offsets of the properties, and find each value by its name."""
     field = random_field(4)
     if harmonics:
         field.carry("harmonics").params[:] = torch.arange(180.0).reshape(4, 45)
     write_field(tmp_path / "map.ply", field)
     header, _, data = (tmp_path / "map.ply").read_bytes().partition(b"end_header\n")
     names = [line.split()[2] for line in header.decode().splitlines() if line.startswith("property float ")]
-    assert len(data) == 4 * 4 * len(names), "float32 alone, nothing behind them"
+    assert len(data) == 4 * 4 * len(names), "only float32, and nothing after them"
     for i in range(4):
         row = dict(zip(names, struct.unpack_from(f"<{len(names)}f", data, 4 * len(names) * i), strict=True))
         params = field.params[i].tolist()
@@ -78,8 +78,8 @@ def test_columns_are_found_by_a_reader_of_names(tmp_path: Path, harmonics: bool)
 
 
 @pytest.mark.parametrize("harmonics", [False, True])
-def test_plain_files_have_the_record_of_the_3dgs_viewer(tmp_path: Path, harmonics: bool) -> None:
-    """As its own viewer reads: the number of splats from line 3, then records of 62 floats, names unseen."""
+def test_plain_files_have_the_fixed_layout_of_3dgs(tmp_path: Path, harmonics: bool) -> None:
+    """Read as its own viewer does: the number of splats in line 3, then records of 62 floats, without the names."""
     field = random_field(3)
     if harmonics:
         field.carry("harmonics").params[:] = torch.arange(135.0).reshape(3, 45)
@@ -97,8 +97,8 @@ def test_plain_files_have_the_record_of_the_3dgs_viewer(tmp_path: Path, harmonic
     assert (back.params[:, 14:] == -7.0).all() and torch.allclose(back.params[:, :14], field.params[:, :14], atol=1e-6)
 
 
-def test_harmonics_are_written_as_3dgs_does_and_read_back(tmp_path: Path) -> None:
-    """f_rest after f_dc: all fifteen of red, then green, then blue; the rest of the file as without."""
+def test_harmonics_are_written_as_in_3dgs_and_read_back(tmp_path: Path) -> None:
+    """f_rest follows f_dc: fifteen of red, then green, then blue; other columns are as without harmonics."""
     field = random_field(5)
     write_field(tmp_path / "plain.ply", field)
     k = torch.randn(5, 45, generator=torch.Generator().manual_seed(1))
@@ -129,18 +129,18 @@ def test_harmonics_of_lower_degrees_are_read(tmp_path: Path) -> None:
         assert k[0, :3].tolist() == [first, first + each, first + 2 * each] and k[0, 3 * each - 1] == first + given - 1
 
 
-def test_another_number_of_harmonics_is_refused(tmp_path: Path) -> None:
+def test_a_wrong_number_of_harmonics_is_refused(tmp_path: Path) -> None:
     for given in [1, 12, 46]:
         other_programs_ply(tmp_path / "other.ply", "<", rest=given)
         with pytest.raises(SourceError, match=f"has {given} columns f_rest, expected 0 or f_rest_0 to 8, 23 or 44"):
             read_field(tmp_path / "other.ply")
 
 
-def test_harmonics_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+def test_harmonics_with_nan_are_refused(tmp_path: Path) -> None:
     field = random_field()
     field.carry("harmonics").params[4, 44] = float("nan")
     write_field(tmp_path / "map.ply", field)
-    with pytest.raises(SourceError, match=r"splat 4 holds nan or inf \(1 of 50 splats do\)"):
+    with pytest.raises(SourceError, match=r"splat 4 has nan or inf \(1 of 50 splats do\)"):
         read_field(tmp_path / "map.ply")
 
 
@@ -159,7 +159,7 @@ def other_programs_ply(path: Path, order: str, drop: str = "", rows: int = 3, re
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_maps_of_other_programs_are_read_by_column_name(tmp_path: Path, order: str) -> None:
+def test_maps_of_other_programs_are_read_by_column_names(tmp_path: Path, order: str) -> None:
     other_programs_ply(tmp_path / "other.ply", order)
     field = read_field(tmp_path / "other.ply")
     assert field.means[1].tolist() == [4.125, 5.125, 6.125]
@@ -168,23 +168,23 @@ def test_maps_of_other_programs_are_read_by_column_name(tmp_path: Path, order: s
     assert field.params[2, 10] == 55.25 and (field.params[:, 14:] == -7.0).all()
 
 
-def test_an_empty_map_is_a_map(tmp_path: Path) -> None:
+def test_an_empty_map_can_be_written_and_read(tmp_path: Path) -> None:
     write_field(tmp_path / "map.ply", GaussianField.empty())
     assert len(read_field(tmp_path / "map.ply")) == 0
 
 
-def test_a_column_short_is_named(tmp_path: Path) -> None:
+def test_a_missing_column_is_named(tmp_path: Path) -> None:
     other_programs_ply(tmp_path / "other.ply", "<", drop="scale_1")
-    with pytest.raises(SourceError, match=r"other\.ply is no map of splats: no column scale_1"):
+    with pytest.raises(SourceError, match=r"other\.ply is not a map of splats: no column scale_1"):
         read_field(tmp_path / "other.ply")
 
 
-def test_values_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+def test_nan_and_inf_are_refused(tmp_path: Path) -> None:
     for value in [float("nan"), float("inf")]:
         field = random_field()
         field.params[7, 5] = value
         write_field(tmp_path / "map.ply", field)
-        with pytest.raises(SourceError, match=r"splat 7 holds nan or inf \(1 of 50 splats do\)"):
+        with pytest.raises(SourceError, match=r"splat 7 has nan or inf \(1 of 50 splats do\)"):
             read_field(tmp_path / "map.ply")
 
 
@@ -196,8 +196,8 @@ def test_a_zero_quaternion_is_refused(tmp_path: Path) -> None:
         read_field(tmp_path / "map.ply")
 
 
-def test_truncation_is_noticed_at_every_length(tmp_path: Path) -> None:
-    """Cut a good file anywhere: never a wrong map, never another kind of exception."""
+def test_truncation_is_refused_at_every_length(tmp_path: Path) -> None:
+    """Truncate a valid file at many places: each time SourceError is raised."""
     write_field(tmp_path / "map.ply", random_field(3))
     data = (tmp_path / "map.ply").read_bytes()
     for length in range(0, len(data), 13):
@@ -221,14 +221,14 @@ BINARY = b"ply\nformat binary_little_endian 1.0\n"
         (BINARY + b"element vertex 1\nproperty float x\nproperty float x\nend_header\n", "twice"),
     ],
 )  # fmt: skip
-def test_other_files_are_refused_in_one_line(tmp_path: Path, content: bytes, complaint: str) -> None:
+def test_other_files_are_refused_with_one_line(tmp_path: Path, content: bytes, complaint: str) -> None:
     (tmp_path / "x.ply").write_bytes(content)
     with pytest.raises(SourceError, match=complaint) as caught:
         read_field(tmp_path / "x.ply")
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_map_and_an_unwritable_place(tmp_path: Path) -> None:
+def test_a_missing_map_and_an_unwritable_folder_are_refused(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"cannot read map .*No such file"):
         read_field(tmp_path / "no.ply")
     with pytest.raises(RunError, match="cannot write"):

@@ -1,4 +1,4 @@
-"""Points and meshes in files, as trimesh, which is not ours, loads them."""
+"""Files of points and meshes, loaded by trimesh."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ trimesh = pytest.importorskip("trimesh", reason="the [dev] extra is not installe
 
 
 def ball() -> Mesh:
-    """Return a coloured ball of radius 0.5 m about (1, 2, 3)."""
+    """Return a coloured ball of radius 0.5 m with centre (1, 2, 3)."""
     made = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
     colors = np.random.default_rng(0).integers(0, 256, made.vertices.shape) / np.float32(255.0)
     return Mesh(
@@ -36,12 +36,12 @@ def test_points_are_loaded_with_normals_and_colours(tmp_path: Path, normals: boo
         np.testing.assert_allclose(found, mesh.normals(), atol=1e-6)
 
 
-def test_an_empty_point_cloud_can_be_written(tmp_path: Path) -> None:
+def test_a_file_without_points_can_be_written(tmp_path: Path) -> None:
     write_points(tmp_path / "a.ply", np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)))
     assert b"element vertex 0\n" in (tmp_path / "a.ply").read_bytes()
 
 
-def test_normals_of_a_ball_point_outwards_and_stray_vertices_have_none() -> None:
+def test_normals_of_a_ball_point_outwards_and_unused_vertices_have_none() -> None:
     mesh = ball()
     outwards = (mesh.vertices - np.array([1, 2, 3])) / 0.5
     assert (mesh.normals() * outwards).sum(1).min() > 0.995
@@ -56,7 +56,7 @@ def test_meshes_are_loaded_by_a_standard_loader(tmp_path: Path, ending: str) -> 
     mesh = ball()
     write_mesh(tmp_path / f"a.{ending}", mesh)
     loaded = trimesh.load(tmp_path / f"a.{ending}", process=False, maintain_order=True, force="mesh")
-    upright = mesh.vertices * ([1, -1, -1] if ending == "glb" else [1, 1, 1])  # glTF is y up
+    upright = mesh.vertices * ([1, -1, -1] if ending == "glb" else [1, 1, 1])  # in glTF y points up
     np.testing.assert_allclose(loaded.vertices, upright, atol=1e-5)
     np.testing.assert_array_equal(loaded.faces, mesh.faces)
     np.testing.assert_allclose(loaded.visual.vertex_colors[:, :3], np.rint(mesh.colors * 255), atol=1)

@@ -1,4 +1,4 @@
-"""The run folder: everything comes back as it went in, and an interruption at any moment leaves it readable."""
+"""The run folder: files are read back unchanged, and an interruption at any time leaves it readable."""
 
 import json
 from contextlib import suppress
@@ -14,7 +14,7 @@ from PIL import Image
 from sigmasplat.config import Config, InputConfig
 from sigmasplat.errors import RunError
 from sigmasplat.io import atomic
-from sigmasplat.io.json_files import plain
+from sigmasplat.io.json_files import to_json
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
@@ -27,20 +27,20 @@ def run(tmp_path: Path) -> RunFolder:
     return RunFolder.create(tmp_path / "out" / "run", CONFIG, "/data/room")
 
 
-def test_a_new_run_says_what_made_it(run: RunFolder) -> None:
+def test_a_new_run_records_how_it_was_made(run: RunFolder) -> None:
     facts = RunFolder.open(run.path).facts()
     assert facts["program"] == "sigmasplat" and facts["source"] == "/data/room" and facts["status"] == "running"
     assert facts["machine"]["cpu"] and facts["machine"]["cores"] >= 1 and facts["version"]
     assert run.config() == CONFIG and run.images.is_dir()
 
 
-def test_notes_are_added(run: RunFolder) -> None:
+def test_facts_are_added_to_run_json(run: RunFolder) -> None:
     run.note(status="complete", wall_s=12.5)
     facts = run.facts()
     assert facts["status"] == "complete" and facts["wall_s"] == 12.5 and facts["source"] == "/data/room"
 
 
-def test_everything_comes_back(run: RunFolder) -> None:
+def test_files_are_read_back_unchanged(run: RunFolder) -> None:
     path = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
     field = GaussianField(torch.randn(5, 17))
     run.write_trajectory(path)
@@ -51,7 +51,7 @@ def test_everything_comes_back(run: RunFolder) -> None:
     assert run.read_metrics() == {"ate": {"rmse_m": 0.01}, "psnr": None}
 
 
-def test_checkpoints_keep_bits_even_of_views(run: RunFolder) -> None:
+def test_checkpoints_keep_tensors_bit_for_bit_even_views(run: RunFolder) -> None:
     base = torch.randn(6, 4)
     tensors = {"rows": base[2:4], "params": base, "again": base, "turned": base.T, "ids": torch.arange(3)}
     run.write_checkpoint(tensors, {"step": "12"})
@@ -59,15 +59,15 @@ def test_checkpoints_keep_bits_even_of_views(run: RunFolder) -> None:
     assert metadata == {"step": "12"} and all(torch.equal(back[name], tensors[name]) for name in tensors)
 
 
-def test_the_log_grows_by_whole_lines(run: RunFolder) -> None:
+def test_the_log_grows_by_complete_lines(run: RunFolder) -> None:
     records = [{"index": i, "pose": np.eye(2) * i, "loss": np.float32(0.5), "bad": float("inf")} for i in range(3)]
     for i, record in enumerate(records):
         run.log(record)
-        assert len(run.read_log()) == i + 1, "each line is readable at once"
+        assert len(run.read_log()) == i + 1, "each line can be read immediately"
     assert run.read_log()[2] == {"index": 2, "pose": [[2.0, 0.0], [0.0, 2.0]], "loss": 0.5, "bad": None}
 
 
-def test_a_cut_off_last_line_is_passed_over_and_others_are_not(run: RunFolder) -> None:
+def test_an_incomplete_last_line_is_skipped_and_other_damage_is_an_error(run: RunFolder) -> None:
     run.log({"index": 0})
     log = run.path / "log.jsonl"
     log.write_text(log.read_text() + '{"index": 1, "sec')
@@ -91,10 +91,10 @@ def test_ctrl_c_while_writing_keeps_the_old_file(run: RunFolder, monkeypatch: py
             write()
     torch.testing.assert_close(run.read_map().params, old.params)
     assert torch.equal(run.read_checkpoint()[0]["a"], torch.ones(2))
-    assert not list(run.path.glob(".*")), "no half file stays"
+    assert not list(run.path.glob(".*")), "no partial file remains"
 
 
-def test_overwriting_removes_our_files_and_no_others(run: RunFolder) -> None:
+def test_overwriting_removes_only_the_files_of_a_run(run: RunFolder) -> None:
     run.log({"index": 0})
     run.write_image("view.png", Image.new("RGB", (4, 4)))
     (run.path / "notes.txt").write_text("mine")
@@ -104,14 +104,14 @@ def test_overwriting_removes_our_files_and_no_others(run: RunFolder) -> None:
 
 
 def leave_submaps(run: RunFolder) -> None:
-    """Put into submaps/ what a killed run leaves there, and two files of the user's."""
+    """Put the files of a killed run into submaps/, and two files of the user."""
     folder = run.submaps.folder
     folder.mkdir()
     for name in ("submap-00000.safetensors", ".submap-00001.safetensors.part", "submap-mine.safetensors", "a.txt"):
         (folder / name).write_text("")
 
 
-def test_overwriting_removes_loops_and_our_submaps_and_no_others(run: RunFolder) -> None:
+def test_overwriting_removes_loops_and_submaps_but_no_other_files(run: RunFolder) -> None:
     run.write_loops([{"query": 7}])
     leave_submaps(run)
     assert len(run.submaps) == 1
@@ -120,20 +120,20 @@ def test_overwriting_removes_loops_and_our_submaps_and_no_others(run: RunFolder)
     assert sorted(p.name for p in again.submaps.folder.iterdir()) == ["a.txt", "submap-mine.safetensors"]
 
 
-def test_loops_come_back_and_older_runs_have_an_empty_list(run: RunFolder) -> None:
+def test_loops_are_read_back_and_are_empty_without_a_file(run: RunFolder) -> None:
     assert run.read_loops() == []
     run.write_loops([{"query": 7, "database": 0, "chi2": float("nan"), "T": np.eye(2)}])
     assert run.read_loops() == [{"query": 7, "database": 0, "chi2": None, "T": [[1.0, 0.0], [0.0, 1.0]]}]
 
 
 KILLED_AT = ["mkdir", "write_text", "replace", "unlink"]
-"""What a new run calls while it claims a folder, in one order or another."""
+"""The functions that a new run calls while it prepares its folder."""
 
 
 @pytest.mark.parametrize("earlier", [False, True], ids=["fresh", "overwriting"])
 @pytest.mark.parametrize("call", KILLED_AT)
 @pytest.mark.parametrize("at", range(4))
-def test_a_run_killed_while_it_is_created_leaves_a_folder_that_can_be_overwritten(
+def test_a_run_killed_at_its_start_leaves_a_folder_that_can_be_overwritten(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, earlier: bool, call: str, at: int
 ) -> None:
     out = tmp_path / "run"
@@ -151,7 +151,7 @@ def test_a_run_killed_while_it_is_created_leaves_a_folder_that_can_be_overwritte
 
 
 def kill_at_call(monkeypatch: pytest.MonkeyPatch, call: str, at: int) -> None:
-    """End the program as kill -9 does, cleaning nothing up, at the at-th call of a function of files."""
+    """End the program without any clean-up, as kill -9 does, at a given call of a file function."""
     owner = atomic.os if call == "replace" else Path
     real, calls = getattr(owner, call), iter(range(1000))
 
@@ -164,13 +164,13 @@ def kill_at_call(monkeypatch: pytest.MonkeyPatch, call: str, at: int) -> None:
     monkeypatch.setattr(owner, call, counted)
 
 
-def test_a_folder_with_half_a_run_json_counts_as_empty(tmp_path: Path) -> None:
+def test_a_folder_with_a_partial_run_json_counts_as_empty(tmp_path: Path) -> None:
     (tmp_path / ".run.json.part").write_text('{"prog')
     assert RunFolder.create(tmp_path, CONFIG, "room").facts()["status"] == "running"
     assert not (tmp_path / ".run.json.part").exists()
 
 
-def test_plain_values_are_json() -> None:
+def test_values_are_converted_to_json() -> None:
     value = {"a": np.arange(2), "b": [torch.tensor(1.5), np.bool_(True)], "c": (Path("x"), None, float("nan"))}
-    back = json.loads(json.dumps(plain(value), allow_nan=False))
+    back = json.loads(json.dumps(to_json(value), allow_nan=False))
     assert back == {"a": [0, 1], "b": [1.5, True], "c": ["x", None, None]}

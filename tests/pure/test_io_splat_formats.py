@@ -1,4 +1,4 @@
-"""Compressed maps: how much of the picture is left at what size, and every byte where the formats' layouts say."""
+"""Compressed maps: image quality for their size, and every byte as the formats' layouts define it."""
 
 import gzip
 import itertools
@@ -14,7 +14,8 @@ import torch
 from room_map import psnr_db, room_map
 from sigmasplat.errors import RunError
 from sigmasplat.io.splats import any_format, compressed_ply, ply, splat, spz
-from sigmasplat.io.splats.values import SplatValues, from_smallest_three, morton_order, smallest_three
+from sigmasplat.io.splats.quaternions import from_smallest_three, smallest_three
+from sigmasplat.io.splats.values import SplatValues, morton_order
 from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.harmonics import count
 
@@ -29,7 +30,7 @@ COMPRESSED = [".compressed.ply", ".splat", ".spz"]
 
 
 def again(path: Path, field: GaussianField) -> GaussianField:
-    """Write a field as the path's ending says, and read it by content from a file without an ending."""
+    """Write a field in the format of the path's ending, and read it from a file without an ending."""
     ending = max((ending for ending in WRITERS if path.name.endswith(ending)), key=len)
     WRITERS[ending](path, field)
     return any_format.read_any(path.rename(path.with_name("map")))
@@ -49,7 +50,7 @@ def some(n: int = 300, degree: int = 0, seed: int = 0) -> GaussianField:
 
 
 def nearest(values: SplatValues, to: SplatValues) -> SplatValues:
-    """Bring values into the order of others, by position."""
+    """Reorder values like those of `to`, by position."""
     distances = np.linalg.norm(values.means[None] - to.means[:, None], axis=2)
     return values.ordered(distances.argmin(1))
 
@@ -73,8 +74,8 @@ def test_a_quarter_of_the_size_gives_nearly_the_same_render(tmp_path: Path, endi
     assert len(back) == len(field) and psnr_db(back, field) > 35.0
 
 
-def test_splat_files_give_nearly_the_same_render_where_colours_are_plain(tmp_path: Path) -> None:
-    """32 bytes a splat are what they are: 0.4 of a PLY without harmonics, an eighth of one with; harmonics are lost."""
+def test_splat_files_give_nearly_the_same_render_without_harmonics(tmp_path: Path) -> None:
+    """32 bytes per splat: 0.4 of a PLY without harmonics, an eighth of a PLY with them; harmonics are lost."""
     field = room_map()
     assert psnr_db(again(tmp_path / "a.splat", field), field) > 35.0
     assert (tmp_path / "map").stat().st_size == 32 * len(field)
@@ -85,14 +86,14 @@ def test_splat_files_give_nearly_the_same_render_where_colours_are_plain(tmp_pat
 
 
 @pytest.mark.parametrize("ending", COMPRESSED)
-def test_what_has_no_place_in_a_format_is_as_in_a_new_map(tmp_path: Path, ending: str) -> None:
+def test_values_that_a_format_cannot_hold_are_as_in_a_new_map(tmp_path: Path, ending: str) -> None:
     field = some()
     field.carry("correlations").params += 1.0
     back = again(tmp_path / f"a{ending}", field)
     assert (back.params[:, 14:17] == -7.0).all() and not back.extras
 
 
-def test_harmonics_come_back_to_half_a_step(tmp_path: Path) -> None:
+def test_harmonics_are_kept_to_half_a_quantisation_step(tmp_path: Path) -> None:
     for (ending, step), degree in itertools.product([(".compressed.ply", 8 / 256), (".spz", 1 / 128)], [1, 2, 3]):
         field = some(40, degree)
         back, was = SplatValues.of(again(tmp_path / f"a{ending}", field)), SplatValues.of(field)
@@ -101,7 +102,7 @@ def test_harmonics_come_back_to_half_a_step(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", list(WRITERS))
-def test_the_same_map_gives_the_same_bytes_and_no_more_files(tmp_path: Path, ending: str) -> None:
+def test_the_same_map_gives_the_same_bytes_and_no_other_files(tmp_path: Path, ending: str) -> None:
     for name in ("a", "b"):
         WRITERS[ending](tmp_path / f"{name}{ending}", some(300, 1))
     assert (tmp_path / f"a{ending}").read_bytes() == (tmp_path / f"b{ending}").read_bytes()
@@ -116,7 +117,7 @@ def test_maps_of_any_number_of_splats(tmp_path: Path) -> None:
 
 
 def test_extremes_stay_finite(tmp_path: Path) -> None:
-    """Opacities of 0 and 1, colours beyond 0 … 1, needles, splats all alike: nothing that a render could not take."""
+    """Opacities of 0 and 1, colours outside [0, 1], needles, identical splats: all values stay finite."""
     field = some(8)
     field.params[0, 10], field.params[1, 10] = 60.0, -60.0
     field.params[2, 11:14] = torch.tensor([-3.0, 0.0, 4.0])
@@ -128,8 +129,8 @@ def test_extremes_stay_finite(tmp_path: Path) -> None:
         assert back.opacities.max() > 0.998 and back.opacities.min() < 0.002
 
 
-def test_compressed_ply_as_its_layout_says(tmp_path: Path) -> None:
-    """Decode a file splat by splat, bit by bit, from the layout alone; more than one chunk, the last one not full."""
+def test_compressed_ply_has_the_documented_layout(tmp_path: Path) -> None:
+    """Decode a file splat by splat from the layout alone; it has two chunks, the last one incomplete."""
     field = some(300, 1)
     compressed_ply.write_field(tmp_path / "a.ply", field)
     header, _, data = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
@@ -171,7 +172,7 @@ def parts_11_10_11(word: int) -> tuple[float, float, float]:
 
 
 def test_compressed_ply_without_colour_limits_is_read(tmp_path: Path) -> None:
-    """As SuperSplat 1 wrote it: 12 limits a chunk, colours in 0 … 1; comments and another order of columns besides."""
+    """As SuperSplat 1 wrote it: 12 limits per chunk, colours in [0, 1]; with comments and another order of columns."""
     names = [n for n in compressed_ply.LIMITS if n[-2:] not in ("_r", "_g", "_b")]
     words = ["packed_color", "packed_scale", "packed_rotation", "packed_position"]
     header = ["ply", "format binary_little_endian 1.0", "comment Generated by another", "element chunk 1"]
@@ -188,7 +189,7 @@ def test_compressed_ply_without_colour_limits_is_read(tmp_path: Path) -> None:
     assert back.quats[0].tolist() == pytest.approx([0.0, 0.0, 1.0, 0.0], abs=1e-3)
 
 
-def test_splat_as_its_layout_says(tmp_path: Path) -> None:
+def test_splat_has_the_documented_layout(tmp_path: Path) -> None:
     field = GaussianField.from_values(
         torch.tensor([[9.0, 9.0, 9.0], [1.0, 2.0, 3.0]]), torch.tensor([[0.01] * 3, [0.1, 0.2, 0.3]]),
         torch.tensor([[0.0] * 3, [1.0, 0.5, 1.2]]), 
@@ -198,7 +199,7 @@ def test_splat_as_its_layout_says(tmp_path: Path) -> None:
     data = (tmp_path / "a.splat").read_bytes()
     assert len(data) == 64
     first = struct.unpack("<6f8B", data[:32])
-    assert first[:6] == pytest.approx((1.0, 2.0, 3.0, 0.1, 0.2, 0.3)), "what covers most comes first"
+    assert first[:6] == pytest.approx((1.0, 2.0, 3.0, 0.1, 0.2, 0.3)), "the splat that covers most comes first"
     assert first[6:] == (255, 128, 255, 204, 192, 192, 64, 192)
 
 
@@ -209,8 +210,8 @@ def test_splat_files_may_begin_with_any_bytes(tmp_path: Path) -> None:
         assert len(any_format.read_any(tmp_path / "b")) == 3
 
 
-def test_spz_as_its_layout_says(tmp_path: Path) -> None:
-    """Decode a file splat by splat; it holds the map turned by 180° about x, as `GaussianField.moved` turns maps."""
+def test_spz_has_the_documented_layout(tmp_path: Path) -> None:
+    """Decode a file splat by splat; its map is rotated by 180° about x, as by `GaussianField.moved`."""
     for degree in [0, 1, 2, 3]:
         field = some(50, degree)
         spz.write_field(tmp_path / "a.spz", field)
@@ -240,7 +241,7 @@ def test_spz_as_its_layout_says(tmp_path: Path) -> None:
 
 
 def test_spz_of_version_2_is_read(tmp_path: Path) -> None:
-    """Written by hand: rotations as three bytes, w left out; something behind the splats that we do not know."""
+    """A handmade file: rotations of three bytes without w, and an unknown extension after the splats."""
     body = b"".join(
         [
             struct.pack("<IIIBBBB", 0x5053474E, 2, 1, 0, 8, 2, 0),
@@ -259,7 +260,7 @@ def test_spz_of_version_2_is_read(tmp_path: Path) -> None:
     assert back.quats[0].tolist() == pytest.approx([w, 191 / 127.5 - 1, 1 - 128 / 127.5, 1 - 64 / 127.5], abs=1e-6)
 
 
-def test_spz_of_a_town_has_coarser_positions_not_wrong_ones(tmp_path: Path) -> None:
+def test_spz_of_a_large_map_has_coarser_positions(tmp_path: Path) -> None:
     field = some(100)
     field.params[:, :3] *= 20_000.0
     back, was = SplatValues.of(again(tmp_path / "a.spz", field)), SplatValues.of(field)
@@ -270,11 +271,13 @@ def test_morton_order_keeps_neighbours_together() -> None:
     points = np.stack(np.meshgrid(*[np.arange(8.0)] * 3), -1).reshape(-1, 3)[np.random.default_rng(0).permutation(512)]
     order = morton_order(points)
     assert sorted(order) == list(range(512))
-    assert all(np.ptp(points[order[i : i + 8]], axis=0).max() <= 1.0 for i in range(0, 512, 8)), "eights are cubes"
+    assert all(np.ptp(points[order[i : i + 8]], axis=0).max() <= 1.0 for i in range(0, 512, 8)), (
+        "each group of eight is a cube"
+    )
     assert morton_order(np.zeros((3, 3))).tolist() == [0, 1, 2] and len(morton_order(np.empty((0, 3)))) == 0
 
 
-def test_the_three_smallest_components_give_the_rotation() -> None:
+def test_the_smallest_three_components_determine_the_rotation() -> None:
     quats = np.random.default_rng(0).normal(size=(200, 4))
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     which, others = smallest_three(quats)

@@ -1,4 +1,4 @@
-"""Submaps on disk: they come back bit for bit, a part at a time, and damage is said in one line."""
+"""Submaps on disk: they are read back bit for bit and in parts, and damage is reported in one line."""
 
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ CAMERA = Camera(8, 6, 7.25, 7.5, 3.5 + 1 / 3, 2.5)
 
 
 def some_submap(index: int = 0, keyframes: int = 3, extras: tuple[str, ...] = ()) -> tuple[Submap, list[Picture]]:
-    """Make a submap of values with all their digits; its pictures differ."""
+    """Return a submap of random values, and different images for its keyframes."""
     rng = np.random.default_rng(index)
     torch.manual_seed(index)
     field = GaussianField(torch.randn(5, 17), extras={name: Rows(torch.randn(5, EXTRAS[name])) for name in extras})
@@ -47,7 +47,7 @@ def assert_same(found: Submap, wanted: Submap) -> None:
 
 
 @pytest.mark.parametrize("extras", [(), ("correlations",), tuple(EXTRAS)], ids=["plain", "one extra", "all extras"])
-def test_a_submap_comes_back_bit_for_bit(store: DiskStore, extras: tuple[str, ...]) -> None:
+def test_a_submap_is_read_back_bit_for_bit(store: DiskStore, extras: tuple[str, ...]) -> None:
     submap, pictures = some_submap(extras=extras)
     store.save(submap, pictures)
     assert_same(store.load(0), submap)
@@ -57,7 +57,7 @@ def test_a_submap_comes_back_bit_for_bit(store: DiskStore, extras: tuple[str, ..
         assert back.depth_m.dtype == np.float32 and np.array_equal(back.depth_m, picture.depth_m)
 
 
-def test_an_empty_submap_and_values_that_are_no_numbers_come_back(store: DiskStore) -> None:
+def test_an_empty_submap_and_nan_are_read_back(store: DiskStore) -> None:
     submap, pictures = some_submap(keyframes=1)
     params = torch.zeros(0, 17)
     store.save(Submap(0, GaussianField(params), submap.frames, submap.T_submap_camera, CAMERA), pictures)
@@ -68,7 +68,7 @@ def test_an_empty_submap_and_values_that_are_no_numbers_come_back(store: DiskSto
     assert torch.equal(store.load(1).field.params.isnan(), second.field.params.isnan())
 
 
-def test_disk_and_memory_answer_alike(store: DiskStore) -> None:
+def test_disk_and_memory_stores_behave_alike(store: DiskStore) -> None:
     kept: list[SubmapStore] = [store, MemoryStore()]
     for index in range(3):
         for where in kept:
@@ -79,14 +79,14 @@ def test_disk_and_memory_answer_alike(store: DiskStore) -> None:
         assert np.array_equal(kept[0].picture(index, index).color, kept[1].picture(index, index).color)
 
 
-def test_another_store_of_the_same_folder_sees_what_is_kept(store: DiskStore) -> None:
-    assert len(store) == 0 and not store.folder.exists(), "nothing is made before there is something to keep"
+def test_another_store_of_the_same_folder_has_the_same_submaps(store: DiskStore) -> None:
+    assert len(store) == 0 and not store.folder.exists(), "the folder is created with the first submap"
     store.save(*some_submap(0))
     assert len(DiskStore(store.folder)) == 1
     assert_same(DiskStore(store.folder).load(0), some_submap(0)[0])
 
 
-def test_what_is_loaded_is_memory_of_its_own(store: DiskStore) -> None:
+def test_loaded_submaps_do_not_share_memory(store: DiskStore) -> None:
     submap, pictures = some_submap()
     store.save(submap, pictures)
     first = store.load(0)
@@ -97,7 +97,7 @@ def test_what_is_loaded_is_memory_of_its_own(store: DiskStore) -> None:
     assert np.array_equal(store.picture(0, 0).color, pictures[0].color)
 
 
-def test_splats_that_are_views_of_one_tensor_can_be_kept(store: DiskStore) -> None:
+def test_splats_that_are_views_of_one_tensor_can_be_saved(store: DiskStore) -> None:
     base, (submap, pictures) = torch.randn(9, 62), some_submap()
     field = GaussianField(base[2:7, :17], extras={"harmonics": Rows(base[2:7, 17:])})
     store.save(Submap(0, field, submap.frames, submap.T_submap_camera[:, :, :], CAMERA), pictures)
@@ -106,9 +106,7 @@ def test_splats_that_are_views_of_one_tensor_can_be_kept(store: DiskStore) -> No
 
 
 @pytest.mark.parametrize("frozen", [True, False])
-def test_poses_that_may_not_be_written_can_be_kept(
-    store: DiskStore, frozen: bool, recwarn: pytest.WarningsRecorder
-) -> None:
+def test_read_only_poses_can_be_saved(store: DiskStore, frozen: bool, recwarn: pytest.WarningsRecorder) -> None:
     submap, pictures = some_submap()
     submap.T_submap_camera.flags.writeable = not frozen
     store.save(submap, pictures)
@@ -116,8 +114,8 @@ def test_poses_that_may_not_be_written_can_be_kept(
     assert not recwarn.list
 
 
-def test_pictures_are_read_one_by_one(store: DiskStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A picture reads its own rows of the file and nothing else; a submap reads no picture."""
+def test_images_are_read_one_by_one(store: DiskStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reading images reads only their rows of the file; reading a submap reads no image."""
     store.save(*some_submap())
     asked: list[tuple[str, object]] = []
     real = tensors.safe_open
@@ -158,7 +156,7 @@ def test_pictures_are_read_one_by_one(store: DiskStore, monkeypatch: pytest.Monk
     assert {name for name, _ in asked} == {"params", "frames", "T_submap_camera"}
 
 
-def test_submaps_are_kept_in_their_order_and_whole(store: DiskStore) -> None:
+def test_submaps_are_saved_in_order_and_complete(store: DiskStore) -> None:
     with pytest.raises(SigmaSplatError, match="submap 1 cannot be kept: the next one is 0"):
         store.save(*some_submap(1))
     store.save(*some_submap(0))
@@ -172,7 +170,7 @@ def test_submaps_are_kept_in_their_order_and_whole(store: DiskStore) -> None:
 
 def test_a_missing_submap_is_named(store: DiskStore) -> None:
     for read in (lambda: store.load(3), lambda: store.picture(3, 0)):
-        with pytest.raises(RunError, match=r"no submap 3 in .*submaps: there is no submap-00003\.safetensors"):
+        with pytest.raises(RunError, match=r"no submap 3 in .*submaps: submap-00003\.safetensors is missing"):
             read()
 
 
@@ -193,10 +191,10 @@ def test_a_file_cut_short_is_refused(store: DiskStore, keep: int) -> None:
         store.picture(0, 0)
 
 
-def test_a_file_that_lacks_something_is_refused(store: DiskStore) -> None:
-    """A safetensors file of another program: no splats, then no words, then words of another camera."""
+def test_an_incomplete_file_is_refused(store: DiskStore) -> None:
+    """Missing tensors, missing metadata, damaged metadata, and a camera with other fields."""
     store.save(*some_submap())
-    with tensors.opened(store.path(0), "submap") as file:
+    with tensors.open_tensors(store.path(0), "submap") as file:
         everything = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     for left_out, text in (
         ("params", {"camera": json.dumps(vars(CAMERA))}),
@@ -210,19 +208,19 @@ def test_a_file_that_lacks_something_is_refused(store: DiskStore) -> None:
         assert left_out in refused(store)
 
 
-def test_a_keyframe_that_is_not_there_is_refused(store: DiskStore) -> None:
+def test_a_missing_keyframe_is_refused(store: DiskStore) -> None:
     store.save(*some_submap(keyframes=2))
     with pytest.raises(RunError, match="is damaged"):
         store.picture(0, 2)
 
 
-def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+def test_an_unwritable_folder_is_named(tmp_path: Path) -> None:
     (tmp_path / "submaps").write_text("a file")
     with pytest.raises(RunError, match=r"cannot write .*submaps"):
         DiskStore(tmp_path / "submaps").save(*some_submap())
 
 
-def test_half_a_submap_does_not_count(store: DiskStore, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_incomplete_submap_does_not_count(store: DiskStore, monkeypatch: pytest.MonkeyPatch) -> None:
     store.save(*some_submap(0))
 
     def stop(*_: object) -> None:
@@ -234,13 +232,13 @@ def test_half_a_submap_does_not_count(store: DiskStore, monkeypatch: pytest.Monk
     assert [path.name for path in store.folder.iterdir()] == ["submap-00000.safetensors"] and len(store) == 1
 
 
-def test_files_are_as_readable_as_others(store: DiskStore, tmp_path: Path) -> None:
+def test_files_have_the_usual_permissions(store: DiskStore, tmp_path: Path) -> None:
     store.save(*some_submap())
     (tmp_path / "other").write_text("")
     assert store.path(0).stat().st_mode == (tmp_path / "other").stat().st_mode
 
 
-def test_clearing_removes_what_is_ours(store: DiskStore) -> None:
+def test_clearing_removes_only_submaps(store: DiskStore) -> None:
     store.clear()
     store.save(*some_submap(0))
     (store.folder / ".submap-00001.safetensors.part").write_text("")

@@ -1,4 +1,4 @@
-"""TUM text: what is written is read, and what is wrong is named with its line."""
+"""TUM text: paths are read back unchanged, and errors name the line."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ def test_round_trip_keeps_microseconds_and_nanometres(tmp_path: Path) -> None:
 
 
 def test_columns_are_those_of_tum(tmp_path: Path) -> None:
-    """A quarter turn about z by hand: qx qy qz qw = 0 0 √½ √½, w last."""
+    """A rotation by 90° about z: qx qy qz qw = 0 0 √½ √½, w last."""
     T = np.array([[0, -1, 0, 1.5], [1, 0, 0, -2], [0, 0, 1, 0.25], [0, 0, 0, 1.0]])
     write_trajectory(tmp_path / "t.txt", Trajectory(np.array([2.5]), T[None]))
     (line,) = [line for line in (tmp_path / "t.txt").read_text().splitlines() if not line.startswith("#")]
@@ -43,8 +43,8 @@ def test_columns_are_those_of_tum(tmp_path: Path) -> None:
         ("1 2 3", "bad.txt:3: 3 numbers, expected 8"),
         ("1 0 0 0 0 0 0 1 9", "bad.txt:3: 9 numbers, expected 8"),
         ("1 0 0 x 0 0 0 1", "bad.txt:3: not numbers"),
-        ("1 0 nan 0 0 0 0 1", "bad.txt:3: the pose holds nan or inf"),
-        ("1 0 0 inf 0 0 0 1", "bad.txt:3: the pose holds nan or inf"),
+        ("1 0 nan 0 0 0 0 1", "bad.txt:3: the pose has nan or inf"),
+        ("1 0 0 inf 0 0 0 1", "bad.txt:3: the pose has nan or inf"),
         ("1 0 0 0 0 0 0 0", "bad.txt:3: the quaternion is zero"),
     ],
 )

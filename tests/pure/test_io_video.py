@@ -1,4 +1,4 @@
-"""Films in files: as many images, of that size, rate and look, as were put in; nothing half-written is left."""
+"""Film files: number, size, rate and content of the images are kept; no partial file remains."""
 
 import sys
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ SIZE = (48, 96)
 
 
 def images(count: int = 9, size: tuple[int, int] = SIZE) -> list[np.ndarray]:
-    """Return pictures that grow brighter, red on the left and blue on the right."""
+    """Return images of increasing brightness, red on the left and blue on the right."""
     out = np.zeros((count, *size, 3), np.uint8)
     for i in range(count):
         out[i, :, : size[1] // 2, 0] = out[i, :, size[1] // 2 :, 2] = 60 + 15 * i
@@ -40,7 +40,9 @@ def read(path: Path) -> tuple[list[np.ndarray], float]:
 
 
 @pytest.mark.parametrize("ending", ["webm", "mp4", "gif", "webp"])
-def test_films_come_back_as_they_went_in(tmp_path: Path, ending: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_films_are_read_back_as_they_were_written(
+    tmp_path: Path, ending: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     if ending in ("webm", "mp4"):
         pytest.importorskip("cv2", reason="the [video] extra is not installed")
     write_video(tmp_path / f"a.{ending}", iter(images()), 20.0)
@@ -48,22 +50,24 @@ def test_films_come_back_as_they_went_in(tmp_path: Path, ending: str, capfd: pyt
     assert len(frames) == 9 and fps == pytest.approx(20.0)
     for found, wanted in zip(frames, images(), strict=True):
         assert found.shape == wanted.shape and np.abs(found.astype(int) - wanted)[:, 8:40].mean() < 6
-        assert found[:, :40, 0].mean() > found[:, :40, 2].mean(), "red is not blue"
+        assert found[:, :40, 0].mean() > found[:, :40, 2].mean(), "red and blue are not swapped"
     assert [path.name for path in tmp_path.iterdir()] == [f"a.{ending}"]
     assert capfd.readouterr().err == ""
 
 
-def test_webm_and_mp4_hold_vp9(tmp_path: Path) -> None:
+def test_webm_and_mp4_are_encoded_as_vp9(tmp_path: Path) -> None:
     cv2 = pytest.importorskip("cv2", reason="the [video] extra is not installed")
     for ending in ("webm", "mp4"):
         write_video(tmp_path / f"a.{ending}", images(3, (49, 97)), 25.0)
         film = cv2.VideoCapture(str(tmp_path / f"a.{ending}"))
         assert int(film.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").upper() in (b"VP90", b"VP09")
-        assert (film.get(cv2.CAP_PROP_FRAME_WIDTH), film.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (96, 48), "odd ones are cut"
+        assert (film.get(cv2.CAP_PROP_FRAME_WIDTH), film.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (96, 48), (
+            "odd sizes are cropped"
+        )
 
 
 @pytest.mark.parametrize("ending", ["mp4", "gif"])
-def test_a_film_that_breaks_off_leaves_nothing(tmp_path: Path, ending: str) -> None:
+def test_an_interrupted_film_leaves_no_file(tmp_path: Path, ending: str) -> None:
     if ending == "mp4":
         pytest.importorskip("cv2", reason="the [video] extra is not installed")
 
@@ -78,7 +82,7 @@ def test_a_film_that_breaks_off_leaves_nothing(tmp_path: Path, ending: str) -> N
     assert list(tmp_path.iterdir()) == []
 
 
-def test_other_names_and_a_missing_opencv_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_endings_and_a_missing_opencv_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(RunError, match=r"as a\.avi; give a name that ends in \.webm, \.mp4, \.gif, \.webp"):
         write_video(tmp_path / "a.avi", images(), 20.0)
     monkeypatch.setitem(sys.modules, "cv2", None)

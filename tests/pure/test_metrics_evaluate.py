@@ -1,4 +1,4 @@
-"""Evaluation with a world made by hand: a renderer whose errors are known, so every score can be foretold."""
+"""Evaluation of a hand-made run with a renderer of known errors, so that every score is known in advance."""
 
 import json
 from collections.abc import Callable
@@ -33,7 +33,7 @@ CONFIG = replace(Config(), name="hand-made", input=InputConfig(max_depth_m=4.0))
 
 
 class HandMade(Source):
-    """Textured frames 2 m away, without a reading in the left quarter, 9 m away at the right edge."""
+    """Textured frames at 2 m, without depth in the left quarter, at 9 m along the right edge."""
 
     def __init__(self, truth: Trajectory | None) -> None:
         super().__init__("hand-made", CAMERA)
@@ -66,7 +66,7 @@ WORLD = se3.exp(np.array([5.0, 6, 7, 0.5, 1.0, 1.5]))
 
 
 class KnownErrors:
-    """Render frame i, recognised by its pose, with a ramp of errors whose squares V predicts exactly."""
+    """Render frame i, recognised by its pose, with a ramp of errors. V equals the squared errors."""
 
     def __init__(self, training: float = 0.01, held_out: float = 0.04) -> None:
         self.offsets = {True: training, False: held_out}
@@ -99,7 +99,7 @@ def run(tmp_path: Path) -> RunFolder:
 
 
 def score(run: RunFolder, source: Source, **options: Any) -> dict[str, Any]:
-    """Evaluate without drawing strips unless asked: they are the slow part."""
+    """Evaluate; by default without view strips, which are slow to draw."""
     return evaluate(run, source, **{"renderer": KnownErrors(), "strips_per_kind": 0} | options)
 
 
@@ -119,10 +119,10 @@ def test_training_and_held_out_views_are_separate(run: RunFolder) -> None:
 
 def test_uncertainty_is_scored_on_held_out_views(run: RunFolder) -> None:
     scores = score(run, HandMade(None), renderer=KnownErrors(training=0.3))["uncertainty"]
-    assert scores["pixels"] == 15 * 36 * 32, "pixels with a reading only"
+    assert scores["pixels"] == 15 * 36 * 32, "only pixels with a depth reading"
     assert scores["spearman"] == pytest.approx(1.0, abs=1e-3) and scores["ause"] == pytest.approx(0.0, abs=1e-3)
     assert scores["mean_variance"] == pytest.approx(scores["mean_squared_error"], rel=1e-3)
-    assert scores["mean_variance"] < 0.01, "training views with their 0.3 would stand out"
+    assert scores["mean_variance"] < 0.01, "training views, with 0.3, do not count"
 
 
 def test_path_and_facts(run: RunFolder) -> None:
@@ -143,7 +143,7 @@ def test_path_and_facts(run: RunFolder) -> None:
     assert score(run, HandMade(None))["total_s"] == 12.5
 
 
-def test_the_worst_frame_is_not_the_first_and_the_map_has_a_size(run: RunFolder) -> None:
+def test_the_longest_frame_excludes_the_first_and_the_map_has_a_size(run: RunFolder) -> None:
     lines = [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
     lines[0]["seconds"], lines[7]["seconds"] = {"total": 9.0}, {"tracking": 0.1, "total": 0.7}
     (run.path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -222,12 +222,12 @@ def submap_of(frame: int) -> int:
 
 
 def anchors() -> np.ndarray:
-    """Return T_world_submap [3, 4, 4] as loops might have left them: not the poses of the first frames."""
+    """Return T_world_submap [3, 4, 4] as after loop closure: not the poses of the first frames."""
     return np.stack([np.eye(4), se3.exp(np.array([0.5, -0.2, 1, 0.1, 0.7, 0])), se3.exp(np.arange(6) / 5.0)])
 
 
 class KnownInSubmaps:
-    """Render like `KnownErrors`, in a submap with other errors and where its frame must lie in that submap."""
+    """Render like `KnownErrors`, but in a submap with other errors and at the pose of its frame in that submap."""
 
     def __init__(self) -> None:
         self.final, self.before = KnownErrors(), KnownErrors(training=0.02, held_out=0.06)
@@ -238,7 +238,9 @@ class KnownInSubmaps:
         if index < 0:
             return self.final(field, camera, T_camera_map)
         rendered = self.before(field, camera, T_camera_map @ se3.inverse(anchors()[index]))
-        assert not self.check_submap or submap_of(self.before.seen[-1]) == index, "the submap that the log says"
+        assert not self.check_submap or submap_of(self.before.seen[-1]) == index, (
+            "the submap of the frame, as in the log"
+        )
         return rendered
 
 
@@ -357,7 +359,7 @@ def never_finish_the_last(run: RunFolder) -> None:
 
 
 @pytest.mark.parametrize("lose", [lose_a_file, lose_the_anchors, never_finish_the_last])
-def test_submaps_that_were_not_all_kept_are_not_scored(cut_run: RunFolder, lose: Callable[[RunFolder], None]) -> None:
+def test_submaps_are_not_scored_if_one_is_missing(cut_run: RunFolder, lose: Callable[[RunFolder], None]) -> None:
     lose(cut_run)
     metrics = score(cut_run, HandMade(None), renderer=KnownInSubmaps())
     assert metrics["held_out"]["views"] == 15 and metrics["submaps"] == 3
@@ -366,7 +368,7 @@ def test_submaps_that_were_not_all_kept_are_not_scored(cut_run: RunFolder, lose:
     assert metrics["uncertainty"]["mean_squared_error"] == pytest.approx(square * 0.04**2, rel=1e-3)
 
 
-def test_runs_without_frames_or_of_two_sessions_are_refused(run: RunFolder) -> None:
+def test_an_empty_log_and_a_log_of_another_run_are_refused(run: RunFolder) -> None:
     run.write_trajectory(Trajectory(TIMES + 50, poses()))
     with pytest.raises(RunError, match="share no timestamps; are they of one run"):
         score(run, HandMade(None))

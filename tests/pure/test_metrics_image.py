@@ -45,7 +45,7 @@ def test_masked_pixels_do_not_count() -> None:
     assert ssim(a, b, inner) == pytest.approx(ssim_map(a, b)[8:20, 10:30].mean())
 
 
-def test_ends_of_the_scales() -> None:
+def test_scores_of_equal_images_and_of_no_pixels() -> None:
     a, _ = pair(2)
     assert ssim(a, a) == pytest.approx(1.0)
     assert psnr(a, a) == np.inf
@@ -55,7 +55,7 @@ def test_ends_of_the_scales() -> None:
         ssim(a[:10], a[:10])
 
 
-def test_depth_l1_counts_readings_of_both_only() -> None:
+def test_depth_l1_uses_pixels_with_both_readings() -> None:
     measured = np.array([[1.0, 0.0, 2.0, 3.0]], np.float32)
     rendered = np.array([[1.1, 5.0, 0.0, 2.7]], np.float32)
     assert depth_l1(rendered, measured) == pytest.approx(0.2, abs=1e-6)

@@ -1,4 +1,4 @@
-"""Scores of a surface by their laws: itself, shifted, halved, hidden; distances and depth found another way too."""
+"""Scores of meshes with a known result: identical, shifted, halved, hidden; distances and depth by another method."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ EMPTY = Mesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32))
 
 
 def grid(columns: int, rows: int, place: np.ndarray) -> Mesh:
-    """Cover the unit square with triangles and take each point (s, t) to `place`(s, t) [N, 3]."""
+    """Cover the unit square with triangles, and map each point (s, t) to `place`(s, t) [N, 3]."""
     s, t = np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1), indexing="ij")
     n = np.arange(s.size).reshape(s.shape)
     a, b, c, d = n[:-1, :-1].ravel(), n[1:, :-1].ravel(), n[1:, 1:].ravel(), n[:-1, 1:].ravel()
@@ -23,7 +23,7 @@ def grid(columns: int, rows: int, place: np.ndarray) -> Mesh:
 
 
 def ball(radius_m: float = 1.0) -> Mesh:
-    """Return a ball about the origin, its faces' corners exactly on it."""
+    """Return a sphere around the origin; the corners of its faces are exactly on it."""
 
     def place(s: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, ...]:
         level = radius_m * np.sin(np.pi * t)
@@ -33,12 +33,12 @@ def ball(radius_m: float = 1.0) -> Mesh:
 
 
 def wall(z_m: float, half_m: float = 0.6) -> Mesh:
-    """Return a square across the optical axis of the world's camera."""
+    """Return a square perpendicular to the z axis of the world."""
     return grid(30, 30, lambda s, t: ((2 * s - 1) * half_m, (2 * t - 1) * half_m, np.full_like(s, z_m)))
 
 
 def around(views: int = 12, distance_m: float = 3.0) -> np.ndarray:
-    """Return poses on all sides of the origin that look at it."""
+    """Return poses around the origin that look at it."""
     back = se3.exp(np.array([0, 0, -distance_m, 0, 0, 0]))
     turns = [np.array([0, 0, 0, 0, 2 * np.pi * k / views, 0]) for k in range(views)]
     turns += [np.array([0, 0, 0, side * np.pi / 2, 0, 0]) for side in (-1, 1)]
@@ -52,14 +52,14 @@ def scored(found: Mesh, truth: Mesh, poses: np.ndarray) -> MeshScores:
     return score(found, truth, CAMERA, poses, points=10_000, novel_views=3)
 
 
-def test_a_surface_scores_perfectly_against_itself() -> None:
+def test_a_surface_compared_with_itself_is_perfect() -> None:
     found = scored(ball(), ball(), around())
     assert found.accuracy_m < 1e-5 and found.completion_m < 1e-5 and found.depth_l1_m == 0.0
     shares = [found.completion_ratio, found.precision, found.recall, found.f1, found.depth_coverage]
-    assert shares == pytest.approx([1.0] * 5, abs=1e-3), "but for faces at the rim of what was seen"
+    assert shares == pytest.approx([1.0] * 5, abs=1e-3), "except for faces at the border of the visible part"
 
 
-def test_a_shift_along_the_normals_is_the_distance() -> None:
+def test_a_shift_along_the_normals_equals_the_distance() -> None:
     for shift_m, correct, complete in [(0.005, 1, 1), (0.02, 0, 1), (-0.02, 0, 1), (0.08, 0, 0)]:
         found = scored(ball(1.0 + shift_m), ball(), around())
         assert found.accuracy_m == pytest.approx(abs(shift_m), rel=0.03)
@@ -68,11 +68,11 @@ def test_a_shift_along_the_normals_is_the_distance() -> None:
         assert found.completion_ratio == pytest.approx(complete, abs=1e-3)
 
 
-def test_half_a_surface_is_half_complete_and_all_accurate() -> None:
+def test_half_a_surface_is_half_complete_and_fully_accurate() -> None:
     whole = ball()
     half = whole.with_faces(whole.corners.mean(1)[:, 0] > 0)
     found = scored(half, whole, around())
-    # A point is complete if it lies within the limit of the half: a zone of a sphere has the area of its height.
+    # A point is complete within the limit of the half. The area of a spherical zone is proportional to its height.
     assert found.completion_ratio == pytest.approx(0.5 + 0.05 / 2, abs=0.01)
     assert found.recall == pytest.approx(0.5 + 0.01 / 2, abs=0.01)
     assert found.accuracy_m < 1e-5 and found.precision > 0.999 and found.f1 == pytest.approx(2 / 3, abs=0.02)
@@ -82,27 +82,27 @@ def test_half_a_surface_is_half_complete_and_all_accurate() -> None:
     )
 
 
-def test_what_no_camera_saw_is_not_counted() -> None:
+def test_surfaces_that_no_camera_saw_do_not_count() -> None:
     front, hidden = wall(2.0), wall(3.0, half_m=0.5)
-    truth = Mesh.joined([front, hidden])
+    truth = Mesh.concatenated([front, hidden])
     assert scored(front, truth, AHEAD).completion_ratio == 1.0, "the wall behind is hidden"
-    assert scored(truth, front, AHEAD).accuracy_m < 1e-6, "and so is what was made up behind"
+    assert scored(truth, front, AHEAD).accuracy_m < 1e-6, "a surface behind it is hidden too"
     behind = around(2)[1]
     behind[2, 3] += 2.0
     seen = scored(front, truth, np.stack([AHEAD[0], behind]))
-    assert seen.completion_ratio < 0.7 and seen.completion_m > 0.3, "seen from the other side it counts"
-    aside = Mesh.joined([front, wall(2.0).moved(se3.exp(np.array([5.0, 0, 0, 0, 0, 0])))])
+    assert seen.completion_ratio < 0.7 and seen.completion_m > 0.3, "it counts if seen from the other side"
+    aside = Mesh.concatenated([front, wall(2.0).moved(se3.exp(np.array([5.0, 0, 0, 0, 0, 0])))])
     assert scored(front, aside, AHEAD).completion_ratio == scored(aside, front, AHEAD).precision == 1.0
 
 
-def test_what_is_made_up_in_front_is_counted() -> None:
+def test_a_false_surface_in_front_counts() -> None:
     front = wall(2.0)
-    found = scored(Mesh.joined([front, wall(1.5, half_m=0.6)]), front, AHEAD)
+    found = scored(Mesh.concatenated([front, wall(1.5, half_m=0.6)]), front, AHEAD)
     assert found.precision == pytest.approx(0.5, abs=0.02) and found.accuracy_m == pytest.approx(0.25, abs=0.01)
     assert found.recall == 1.0 and found.depth_l1_m > 0.3
 
 
-def test_depth_of_novel_views_is_taken_where_a_training_view_saw_the_surface() -> None:
+def test_depth_of_novel_views_uses_surfaces_that_a_training_view_saw() -> None:
     front = wall(2.0)
     nearer = scored(wall(1.9), front, AHEAD)
     assert nearer.depth_l1_m == pytest.approx(0.1, rel=0.2) and 0.9 < nearer.depth_coverage <= 1.0
@@ -110,12 +110,12 @@ def test_depth_of_novel_views_is_taken_where_a_training_view_saw_the_surface() -
     part = scored(left, front, AHEAD)
     assert part.depth_l1_m < 1e-6 and part.depth_coverage == pytest.approx(0.5, abs=0.15)
     aside = wall(2.0).moved(se3.exp(np.array([2.0, 0, 0, 0, 0, 0])))
-    unseen = score(front, Mesh.joined([front, aside]), CAMERA, AHEAD, points=1000, novel_views=8)
-    assert unseen.depth_coverage > 0.99, "novel views see the other wall, but no training view did"
+    unseen = score(front, Mesh.concatenated([front, aside]), CAMERA, AHEAD, points=1000, novel_views=8)
+    assert unseen.depth_coverage > 0.99, "novel views see the other wall, but no training view does"
 
 
-def test_novel_views_are_new_clear_and_repeatable() -> None:
-    truth, poses = Mesh.joined([wall(2.0), wall(0.35)]), around(3)
+def test_novel_views_differ_from_training_views_keep_their_distance_and_are_repeatable() -> None:
+    truth, poses = Mesh.concatenated([wall(2.0), wall(0.35)]), around(3)
     views = sample_novel_views(truth, CAMERA, np.concatenate([AHEAD, poses]), 8, seed=3)
     assert len(views) == 8
     for T, depth_m, face in views:
@@ -125,7 +125,7 @@ def test_novel_views_are_new_clear_and_repeatable() -> None:
     assert sample_novel_views(truth, CAMERA, np.empty((0, 4, 4)), 8, seed=3) == []
 
 
-def test_an_empty_result_is_reported() -> None:
+def test_an_empty_mesh_has_no_precision_and_zero_recall() -> None:
     found = scored(EMPTY, wall(2.0), AHEAD)
     assert np.isnan(found.accuracy_m) and np.isnan(found.precision) and np.isnan(found.depth_l1_m)
     assert found.completion_ratio == found.recall == found.depth_coverage == 0.0 and found.completion_m == np.inf
@@ -137,7 +137,7 @@ def test_the_same_meshes_get_the_same_scores() -> None:
     assert scored(found, ball(), around()) == scored(found, ball(), around())
 
 
-def test_distances_to_triangles_are_those_of_a_fine_net_of_points_on_them() -> None:
+def test_distances_to_triangles_equal_distances_to_dense_points_on_them() -> None:
     rng = np.random.default_rng(5)
     mesh = Mesh(rng.normal(size=(12, 3)).astype(np.float32), np.arange(12, dtype=np.int32).reshape(4, 3))
     points = 1.5 * rng.normal(size=(300, 3))
@@ -152,10 +152,10 @@ def test_distances_to_triangles_are_those_of_a_fine_net_of_points_on_them() -> N
 
 
 def test_depth_of_a_slanted_plane_is_exact_and_the_nearer_face_wins() -> None:
-    """The plane z = 2 + ½x, and a small square before it."""
+    """The plane z = 2 + ½x, and a small square in front of it."""
     plane = grid(20, 20, lambda s, t: (2 * s - 1, 2 * t - 1, 2 + 0.5 * (2 * s - 1)))
     square = wall(1.2, half_m=0.2)
-    depth_m, face = mesh_depth(Mesh.joined([plane, square]), CAMERA, np.eye(4))
+    depth_m, face = mesh_depth(Mesh.concatenated([plane, square]), CAMERA, np.eye(4))
     x, y = np.moveaxis(CAMERA.rays(), 2, 0)[:2].astype(float)
     expected = 2 / (1 - 0.5 * x)
     before = (np.abs(1.2 * x) < 0.199) & (np.abs(1.2 * y) < 0.199)
@@ -170,14 +170,14 @@ def test_depth_of_a_slanted_plane_is_exact_and_the_nearer_face_wins() -> None:
     assert (depth_m[face < 0] == 0).all() and (face < 0).any() and before.sum() > 100
 
 
-def test_faces_behind_or_at_the_camera_are_not_seen() -> None:
+def test_faces_behind_or_at_the_camera_are_not_visible() -> None:
     for mesh in (wall(-1.0), wall(0.01), EMPTY, wall(2.0).moved(se3.exp(np.array([9.0, 0, 0, 0, 0, 0])))):
         depth_m, face = mesh_depth(mesh, CAMERA, np.eye(4))
         assert not depth_m.any() and (face == -1).all()
 
 
-def test_points_are_seen_up_to_the_depth_and_a_little() -> None:
+def test_points_are_visible_up_to_the_depth_plus_a_tolerance() -> None:
     depth_m = np.full((60, 80), 2.0, np.float32)
-    depth_m[:, :40] = 0.0  # nothing there: seen through
+    depth_m[:, :40] = 0.0  # no surface: points behind are visible
     points = np.array([[0.3, 0, 1.0], [0.3, 0, 2.04], [0.3, 0, 2.06], [-0.3, 0, 9.0], [0.3, 0, -1.0], [9, 0, 1.0]])
     assert visible_points(points, depth_m, CAMERA, np.eye(4), 0.05).tolist() == [True, True, False, True, False, False]

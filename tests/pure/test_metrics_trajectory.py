@@ -1,4 +1,4 @@
-"""ATE and RPE against an oracle that takes another road: quaternion eigenvectors and scipy rotations, no SVD."""
+"""ATE and RPE against an independent implementation: quaternion eigenvectors and scipy rotations, no SVD."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ Array = np.ndarray
 
 
 def random_path(seed: int, n: int = 60, spread_m: float = 2.0) -> Trajectory:
-    """Wander: smooth positions, free rotations."""
+    """Return a random path: smooth positions, any rotations."""
     rng = np.random.default_rng(seed)
     poses = np.tile(np.eye(4), (n, 1, 1))
     poses[:, :3, :3] = Rotation.random(n, random_state=seed).as_matrix()
@@ -22,7 +22,7 @@ def random_path(seed: int, n: int = 60, spread_m: float = 2.0) -> Trajectory:
 
 
 def disturbed(path: Trajectory, seed: int, metres: float, radians: float) -> Trajectory:
-    """Add noise to each pose, then carry the whole path into another world."""
+    """Add noise to each pose, then transform the whole path to another world frame."""
     rng = np.random.default_rng(seed)
     poses = path.T_world_camera.copy()
     poses[:, :3, 3] += rng.normal(0, metres, (len(path), 3))
@@ -44,7 +44,7 @@ def horn(estimate: Array, truth: Array) -> tuple[Array, Array]:
     return R, truth.mean(0) - R @ estimate.mean(0)
 
 
-def test_ate_equals_the_oracle() -> None:
+def test_ate_equals_the_independent_implementation() -> None:
     for seed in range(5):
         truth = random_path(seed)
         estimate = disturbed(truth, seed + 100, 0.05, 0.02)
@@ -62,7 +62,7 @@ def test_ate_equals_the_oracle() -> None:
 
 
 @pytest.mark.parametrize("delta", [1, 7])
-def test_rpe_equals_the_oracle(delta: int) -> None:
+def test_rpe_equals_the_independent_implementation(delta: int) -> None:
     truth = random_path(3)
     estimate = disturbed(truth, 4, 0.03, 0.05)
     shifts, angles = [], []
@@ -80,7 +80,7 @@ def test_rpe_equals_the_oracle(delta: int) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_a_moved_copy_has_no_error(seed: int) -> None:
+def test_a_rigidly_transformed_copy_has_no_error(seed: int) -> None:
     truth = random_path(seed, n=20)
     moved = disturbed(truth, seed, 0.0, 0.0)
     assert ate(moved, truth).rmse_m < 1e-9
@@ -88,16 +88,16 @@ def test_a_moved_copy_has_no_error(seed: int) -> None:
     assert rpe(moved, truth).rotation_rmse_deg < 1e-5
 
 
-def test_a_mirrored_path_is_not_fitted_by_a_mirror() -> None:
-    """A reflection would fit perfectly; a rigid motion must not."""
+def test_a_mirrored_path_is_not_aligned_by_a_reflection() -> None:
+    """A reflection fits perfectly, but is not a rigid motion."""
     points = np.random.default_rng(0).normal(size=(30, 3))
     T = align_rigid(points * [1, 1, -1], points)
     assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
     assert np.linalg.norm((points * [1, 1, -1]) @ T[:3, :3].T + T[:3, 3] - points, axis=1).mean() > 0.1
 
 
-def test_alignment_keeps_scale() -> None:
-    """Twice the size is an error of SLAM, not of the gauge: each point is as far off as it is from the centre."""
+def test_alignment_does_not_change_the_scale() -> None:
+    """A wrong scale counts as an error: at twice the size, the error of a point is its distance from the centre."""
     line = np.zeros((11, 3))
     line[:, 0] = np.linspace(-0.5, 0.5, 11)
     identity = np.tile(np.eye(4), (11, 1, 1))
@@ -136,14 +136,14 @@ def test_poses_are_paired_by_time_not_by_row() -> None:
     np.testing.assert_array_equal(ours, theirs)
 
 
-def test_clocks_without_overlap_are_refused() -> None:
+def test_timestamps_without_overlap_are_refused() -> None:
     truth = random_path(1)
     late = Trajectory(truth.timestamps_s + 1e4, truth.T_world_camera)
     with pytest.raises(SourceError, match=r"share no timestamps within 0\.02 s: .* \(60 poses\)"):
         ate(late, truth)
 
 
-def test_a_single_pair_has_no_motion() -> None:
+def test_a_single_pair_has_no_relative_error() -> None:
     truth = random_path(1)
     one = Trajectory(truth.timestamps_s[:1], truth.T_world_camera[:1])
     assert ate(one, truth).rmse_m == pytest.approx(0.0, abs=1e-12)

@@ -8,13 +8,13 @@ from sigmasplat.metrics.uncertainty import ause, gaussian_nll, reliability, scor
 
 
 def noise(n: int = 40_000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Draw squared errors from the very Gaussians whose variances are predicted."""
+    """Draw squared errors from Gaussians with the predicted variances."""
     rng = np.random.default_rng(seed)
     variance = np.exp(rng.uniform(np.log(1e-4), np.log(1e-1), n))
     return variance, variance * rng.normal(size=n) ** 2
 
 
-def test_spearman_is_about_ranks() -> None:
+def test_spearman_depends_only_on_ranks() -> None:
     v = np.linspace(0.1, 2.0, 50)
     assert spearman(v, v**5) == pytest.approx(1.0)
     assert spearman(v, -np.exp(v)) == pytest.approx(-1.0)
@@ -30,17 +30,17 @@ def test_nll_is_the_gaussian_log_density_without_its_constant() -> None:
     assert gaussian_nll(v, e) == pytest.approx(expected)
 
 
-def test_nll_is_least_at_the_true_variance() -> None:
+def test_nll_is_lowest_at_the_true_variance() -> None:
     v, e = noise()
     for wrong in (v * 2, v / 2, np.full_like(v, e.mean())):
         assert gaussian_nll(v, e) < gaussian_nll(wrong, e)
 
 
-def test_rounding_below_zero_does_not_break_the_nll() -> None:
+def test_a_slightly_negative_variance_gives_a_finite_nll() -> None:
     assert np.isfinite(gaussian_nll(np.array([-1e-6, 0.0]), np.array([0.1, 0.0])))
 
 
-def test_reliability_rows_are_calibrated_for_true_variances() -> None:
+def test_reliability_is_calibrated_for_true_variances() -> None:
     v, e = noise()
     rows = reliability(v, e)
     assert [row.pixels for row in rows] == [4000] * 10
@@ -57,18 +57,18 @@ def test_sparsification_by_hand() -> None:
     np.testing.assert_allclose(sparsification(-e, e, 4) ** 2, [14 / 4, 14 / 3, 13 / 2, 9.0])
 
 
-def test_ause_ranks_rankings() -> None:
+def test_ause_is_lower_for_a_better_ranking() -> None:
     v, e = noise()
     shuffled = np.random.default_rng(1).permutation(v)
     assert ause(e, e) == 0.0
-    assert ause(np.sqrt(e), e) == 0.0, "only the order counts"
+    assert ause(np.sqrt(e), e) == 0.0, "only the order matters"
     assert 0.0 < ause(v, e) < ause(shuffled, e) < ause(-v, e)
-    # A chance order leaves the error where it was, so its area is the oracle's own drop.
+    # A random order does not reduce the error, so its area equals that of the oracle curve below the initial error.
     drop = 1.0 - sparsification(e, e).mean() / sparsification(e, e)[0]
     assert ause(shuffled, e) == pytest.approx(drop, abs=0.03)
     assert np.isnan(ause(np.empty(0), np.empty(0))) and np.isnan(ause(np.ones(3), np.zeros(3)))
 
 
-def test_the_score_of_zero_pixels_is_nan() -> None:
+def test_scores_without_pixels_are_nan() -> None:
     values = score(np.empty(0), np.empty(0))
     assert values["pixels"] == 0 and np.isnan(values["spearman"]) and values["reliability"] == []

@@ -129,7 +129,7 @@ def checkout(tmp_path: Path) -> Path:
 
 def code_of(package: Path) -> str:
     """Ask a copy of the package which code it is."""
-    return str(module_from(package / "io/machine.py").code())
+    return str(module_from(package / "io/machine.py").code_version())
 
 
 def test_code_is_the_checkouts_commit_then_the_builds_then_the_release(checkout: Path) -> None:
@@ -297,7 +297,7 @@ def test_doctor_says_why_the_kernels_do_not_load(
         raise problem
 
     monkeypatch.setattr(installation, "import_module", refuse)
-    finding = installation.kernels()
+    finding = installation.check_kernels()
     assert finding.ok is False and str(problem) in finding.value and finding.value.endswith(remedy)
 
 

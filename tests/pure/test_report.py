@@ -227,6 +227,41 @@ def test_the_page_is_complete_and_needs_no_other_file(metrics: dict[str, object]
     assert "<room> & more" in text and "</pre><script>" in text and "share no timestamps" in text
 
 
+class Tables(HTMLParser):
+    """Collect the classes of the elements around each table."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.classes: list[str] = []
+        self.around: list[list[str]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag == "table":
+            self.around.append([*self.classes])
+        if tag not in VOID:
+            self.classes.append(dict(attrs).get("class") or "")
+
+    def handle_endtag(self, tag: str) -> None:
+        self.classes.pop()
+
+
+def test_the_page_adapts_to_narrow_screens() -> None:
+    """Tables scroll inside their cards, commands wrap, columns fit a phone, and charts have a narrow version."""
+    loops, advice = [loop(7, True), loop(5, False)], [("Try this:", "sigmasplat run a-long-path")]
+    contents = Contents("t", "s", IN_SUBMAPS, STRIPS, {"submaps": "a caption"}, loops=loops, advice=advice,
+                        seconds={"align": 8.0})  # fmt: skip
+    page = build_report(contents)
+    reader = Tables()
+    reader.feed(page)
+    assert len(reader.around) >= 6 and all("card" in classes for classes in reader.around)
+    style = page[page.index("<style>") : page.index("</style>")]
+    for element, rule in ((".card", "overflow-x: auto"), ("pre", "white-space: pre-wrap")):
+        assert re.search(rf"^{re.escape(element)} {{[^}}]*{rule}", style, re.MULTILINE), element
+    widths = [int(px) for px in re.findall(r"minmax\((\d+)px", style)]
+    assert widths and max(widths) <= 376 // 2
+    assert "width=device-width" in page and "images/submaps-narrow-light.png" in page
+
+
 def test_the_page_shows_the_measured_figures() -> None:
     page = build_report(Contents("t", "s", METRICS))
     text = re.sub("<[^>]+>", " ", page)

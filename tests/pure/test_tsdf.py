@@ -214,7 +214,7 @@ def test_free_space_erases_what_one_image_saw_there() -> None:
 def test_small_parts_are_dropped() -> None:
     ball = sphere()
     crumb = Mesh(np.float32([[1, 0, 0], [1, 1, 0], [1, 0, 1]]), np.int32([[0, 1, 2]]))
-    both = Mesh.joined([ball, crumb])
+    both = Mesh.concatenated([ball, crumb])
     kept = both.without_small_parts(200)
     np.testing.assert_array_equal(kept.vertices, ball.vertices)
     np.testing.assert_array_equal(kept.faces, ball.faces)

@@ -1,4 +1,4 @@
-"""What the viewer shows, without a browser: splats within a budget, cuts by σ, paths, rendered layers."""
+"""The viewer's data, without a browser: splats within a budget, filtering by σ, paths, rendered layers."""
 
 import numpy as np
 import pytest
@@ -9,17 +9,26 @@ from sigmasplat.drawing import colormap
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.splat_filter import sigmas
 from sigmasplat.render import render
 from sigmasplat.viewer import lines
-from sigmasplat.viewer.pictures import Legend, legend_picture, picture_of, viewpoint
-from sigmasplat.viewer.snapshot import Path, Piece, Snapshot, thinned, within_budget
-from sigmasplat.viewer.splats import Cut, covariances, cut_of, joined, sigma_of, sigma_span, sigmas, splats_of
+from sigmasplat.viewer.layers import Legend, browser_camera, draw_legend, render_layer
+from sigmasplat.viewer.snapshot import Path, Piece, Snapshot, thin, within_budget
+from sigmasplat.viewer.splats import (
+    VisibilityFilter,
+    covariances,
+    merge_pieces,
+    sigma_range,
+    sorted_sigmas,
+    splat_arrays,
+    visibility_filter,
+)
 
 OPTIONS = RenderConfig()
 
 
 def field_of(count: int, seed: int = 0) -> GaussianField:
-    """Return splats before a camera at the origin, of random shapes, colours and σ²."""
+    """Return splats in front of a camera at the origin, with random shapes, colours and σ²."""
     random = np.random.default_rng(seed)
     tensor = lambda *shape, low=0.0, high=1.0: torch.tensor(random.uniform(low, high, shape), dtype=torch.float32)  # noqa: E731
     return GaussianField.from_values(
@@ -39,26 +48,26 @@ def path_of(frames: int, every: int = 5, lost: tuple[int, ...] = (), per_submap:
     return Path(poses, marks, np.arange(frames) // per_submap, tuple(range(0, frames, every)))
 
 
-def test_a_thinned_map_is_spread_over_the_whole_and_covers_as_much() -> None:
+def test_thinning_keeps_evenly_spread_splats_and_the_covered_area() -> None:
     field = field_of(1000)
-    few = thinned(field, 300)
+    few = thin(field, 300)
     area = lambda f: float(f.scales[:, :2].prod(1).sum())  # noqa: E731
     assert len(few) == 300 and area(few) == pytest.approx(area(field), rel=0.1)
     rows = [int((field.means == mean).all(1).nonzero()[0]) for mean in few.means]
     assert rows == sorted(set(rows)) and max(np.diff(rows)) <= 4 and rows[0] == 0 and rows[-1] >= 996
-    same = thinned(field, 1000)
+    same = thin(field, 1000)
     assert torch.equal(same.params, field.params) and same.params.data_ptr() != field.params.data_ptr()
-    assert len(thinned(field, 0)) == len(thinned(GaussianField.empty(), 5)) == 0
+    assert len(thin(field, 0)) == len(thin(GaussianField.empty(), 5)) == 0
 
 
-def test_pieces_within_the_budget_stay_the_same_objects_and_others_are_thinned_alike() -> None:
+def test_pieces_within_the_budget_are_unchanged_and_others_are_thinned_by_one_factor() -> None:
     pieces = [Piece(0, field_of(300)), Piece(1, field_of(100))]
     assert [p.field for p in within_budget(pieces, 400)] == [p.field for p in pieces]
     found = within_budget(pieces, 200)
     assert [len(p.field) for p in found] == [112, 37] and [p.submap for p in found] == [0, 1]
 
 
-def test_covariances_are_those_of_rotated_axes() -> None:
+def test_covariances_equal_rotated_squared_scales() -> None:
     field = field_of(20)
     found = covariances(field.quats.numpy(), field.scales.numpy())
     for covariance, quat, scale in zip(found, field.quats.numpy(), field.scales.numpy(), strict=True):
@@ -66,70 +75,74 @@ def test_covariances_are_those_of_rotated_axes() -> None:
         np.testing.assert_allclose(covariance, R @ np.diag(scale.astype(float) ** 2) @ R.T, rtol=1e-4, atol=1e-8)
 
 
-def test_the_cut_hides_the_share_asked_for_and_the_faint() -> None:
+def test_the_filter_hides_the_requested_share_and_splats_of_low_opacity() -> None:
     pieces = [Piece(0, field_of(600)), Piece(1, field_of(400, seed=1))]
-    ordered = sigmas(pieces)
+    ordered = sorted_sigmas(pieces)
     assert len(ordered) == 1000 and (np.diff(ordered) >= 0).all()
-    cut = cut_of(ordered, 0.25, 0.0)
-    kept = [cut.keeps(piece.field) for piece in pieces]
+    visible = visibility_filter(ordered, 0.25, 0.0)
+    kept = [visible.mask(piece.field) for piece in pieces]
     assert sum(int(k.sum()) for k in kept) == pytest.approx(750, abs=1)
     hidden = torch.cat([~k for k in kept])
     σ = torch.cat([p.field.variances.mean(1).sqrt() for p in pieces])
     assert σ[hidden].min() >= σ[~hidden].max()
-    faint = Cut(least_opacity=0.5).keeps(pieces[0].field)
+    faint = VisibilityFilter(min_opacity=0.5).mask(pieces[0].field)
     assert torch.equal(faint, pieces[0].field.opacities >= 0.5) and 0 < faint.sum() < 600
-    assert cut_of(ordered, 0.0, 0.0).keeps(pieces[0].field).all()
-    assert len(sigmas(())) == 0 and cut_of(sigmas(()), 0.5, 0.0) == Cut() and sigma_span(sigmas(())) == (0.0, 1.0)
+    assert visibility_filter(ordered, 0.0, 0.0).mask(pieces[0].field).all()
+    assert (
+        len(sorted_sigmas(())) == 0
+        and visibility_filter(sorted_sigmas(()), 0.5, 0.0) == VisibilityFilter()
+        and sigma_range(sorted_sigmas(())) == (0.0, 1.0)
+    )
 
 
-def test_splats_are_drawn_in_their_colours_or_in_those_of_sigma() -> None:
+def test_splats_are_coloured_by_their_own_colour_or_by_sigma() -> None:
     field = field_of(50)
-    plain = splats_of(field, "colour", (0.0, 1.0), Cut())
+    plain = splat_arrays(field, "colour", (0.0, 1.0), VisibilityFilter())
     np.testing.assert_array_equal(plain.colors, (field.colors.numpy() * 255).round().astype(np.uint8))
-    tinted = splats_of(field, "σ", (0.0, 0.3), Cut())
-    np.testing.assert_array_equal(tinted.colors, colormap.apply(sigma_of(field), 0.0, 0.3, colormap.INFERNO))
+    tinted = splat_arrays(field, "σ", (0.0, 0.3), VisibilityFilter())
+    np.testing.assert_array_equal(tinted.colors, colormap.apply(sigmas(field).numpy(), 0.0, 0.3, colormap.INFERNO))
     np.testing.assert_array_equal(tinted.centers, field.means.numpy())
-    doubtful, sure = int(sigma_of(field).argmax()), int(sigma_of(field).argmin())
-    assert tinted.colors[doubtful].sum() > tinted.colors[sure].sum() + 200
-    half = splats_of(field, "σ", (0.0, 0.3), Cut(float(np.median(sigma_of(field)))))
+    most, least = int(sigmas(field).numpy().argmax()), int(sigmas(field).numpy().argmin())
+    assert tinted.colors[most].sum() > tinted.colors[least].sum() + 200
+    half = splat_arrays(field, "σ", (0.0, 0.3), VisibilityFilter(float(np.median(sigmas(field).numpy()))))
     assert len(half) == len(half.covariances) == len(half.colors) == 25
 
 
-def test_what_is_rendered_is_what_is_shown_where_it_lies() -> None:
+def test_merged_pieces_hold_the_visible_splats_in_the_world_frame() -> None:
     T = se3.exp(np.array([1.0, 2.0, 3.0, 0.1, -0.2, 0.3]))
     pieces = (Piece(0, field_of(30)), Piece(1, field_of(20, seed=1), T))
-    cut = cut_of(sigmas(pieces), 0.4, 0.0)
-    whole = joined(pieces, cut)
-    moved = pieces[1].field.moved(torch.from_numpy(T)).means[cut.keeps(pieces[1].field)]
+    visible = visibility_filter(sorted_sigmas(pieces), 0.4, 0.0)
+    whole = merge_pieces(pieces, visible)
+    moved = pieces[1].field.moved(torch.from_numpy(T)).means[visible.mask(pieces[1].field)]
     torch.testing.assert_close(whole.means[-len(moved) :], moved)
     assert len(whole) == 30 and len(pieces[0].field) == 30
 
 
-def test_pieces_are_joined_as_fields_are_moved_and_appended() -> None:
-    """Also where one of them carries harmonics, which turn with it, and the other does not."""
+def test_merging_pieces_equals_moving_and_appending_fields() -> None:
+    """One field has harmonics, which rotate with it; the other has none."""
     T = se3.exp(np.array([1.0, 2.0, 3.0, 0.4, -0.5, 0.6]))
     first, second = field_of(30), field_of(20, seed=1)
     second.carry("harmonics").params += torch.randn(20, 45, generator=torch.Generator().manual_seed(0))
-    found = joined((Piece(0, first), Piece(1, second, T)), Cut())
+    found = merge_pieces((Piece(0, first), Piece(1, second, T)), VisibilityFilter())
     expected = first.moved(torch.eye(4))
     expected.append(second.moved(torch.from_numpy(T)))
     torch.testing.assert_close(found.params, expected.params)
     torch.testing.assert_close(found.extras["harmonics"].params, expected.extras["harmonics"].params)
-    few = thinned(second, 10)
+    few = thin(second, 10)
     assert torch.equal(few.extras["harmonics"].params, second.extras["harmonics"].params[::2])
 
 
-def test_the_timeline_shows_the_submaps_begun_by_then_and_the_final_map_whole() -> None:
+def test_the_timeline_shows_the_submaps_started_by_then_and_the_final_map_completely() -> None:
     pieces = tuple(Piece(i, field_of(3, seed=i)) for i in range(3))
     final = Piece(None, field_of(9))
-    moment = Snapshot("run", path_of(30), final, pieces)
-    assert moment.shown(True, 0) == (final,) and moment.shown(False, 29) == pieces
-    assert moment.shown(False, 9) == pieces[:1] and moment.shown(False, 10) == pieces[:2]
-    assert Snapshot("run", path_of(30), final).shown(False, 0) == (final,)
-    assert Snapshot("run", pieces=pieces).shown(True, 0) == pieces
+    snapshot = Snapshot("run", path_of(30), final, pieces)
+    assert snapshot.visible_pieces(True, 0) == (final,) and snapshot.visible_pieces(False, 29) == pieces
+    assert snapshot.visible_pieces(False, 9) == pieces[:1] and snapshot.visible_pieces(False, 10) == pieces[:2]
+    assert Snapshot("run", path_of(30), final).visible_pieces(False, 0) == (final,)
+    assert Snapshot("run", pieces=pieces).visible_pieces(True, 0) == pieces
 
 
-def test_the_path_is_drawn_up_to_a_frame_in_the_colours_of_its_submaps_lost_frames_red() -> None:
+def test_the_path_is_drawn_up_to_a_frame_in_submap_colours_with_lost_frames_in_red() -> None:
     path = path_of(30, lost=(5, 6))
     drawn = lines.path_segments(path, 12)
     np.testing.assert_array_equal(drawn.points[:, 0, 0], np.arange(12))
@@ -143,39 +156,39 @@ def test_the_path_is_drawn_up_to_a_frame_in_the_colours_of_its_submaps_lost_fram
     assert len(lines.path_segments(path_of(0), 0).points) == 0 == len(lines.path_segments(path_of(1), 0).points)
 
 
-def test_long_paths_and_many_keyframes_stay_bounded_and_steady() -> None:
+def test_long_paths_and_many_keyframes_are_reduced_without_large_changes_between_frames() -> None:
     drawn = lines.path_segments(path_of(10_000), 9_999, most=500)
     assert len(drawn.points) == 500 and drawn.points[-1, 1, 0] == 9_999
     np.testing.assert_array_equal(drawn.points[1:, 0], drawn.points[:-1, 1])
     path, before = path_of(3000, every=3), set[int]()
     for row in range(0, 3000, 30):
-        shown = set(lines.shown_keyframes(path, row, most=20))
+        shown = set(lines.keyframes_to_show(path, row, most=20))
         assert len(shown) <= 20 and max(shown) == row and min(shown) == 0
         newest_before = max(before, default=0)
         assert shown >= before - {newest_before} or len(shown) <= len(before)
         before = shown
-    assert lines.shown_keyframes(path_of(20), 12) == (0, 5, 10)
+    assert lines.keyframes_to_show(path_of(20), 12) == (0, 5, 10)
 
 
-def test_a_browsers_viewpoint_sees_as_far_up_as_it_says() -> None:
-    camera = viewpoint(np.radians(60.0), 1.5, 200)
+def test_a_browsers_camera_has_its_vertical_field_of_view() -> None:
+    camera = browser_camera(np.radians(60.0), 1.5, 200)
     assert (camera.width, camera.height) == (300, 200)
     assert np.degrees(2 * np.arctan(100 / camera.fy)) == pytest.approx(60.0) and camera.fx == camera.fy
     assert (camera.cx, camera.cy) == (149.5, 99.5)
 
 
-def test_layers_show_what_the_renderer_gives() -> None:
+def test_layers_show_the_maps_of_the_renderer() -> None:
     field, camera, T = field_of(400), Camera(40, 30, 30.0, 30.0, 19.5, 14.5), np.eye(4)
     T[2, 3] = -0.5
     seen = render(field, camera, se3.inverse(T))
-    shown = {n: picture_of(field, camera, T, n, OPTIONS, "auto") for n in ("colour", "depth", "V", "U", "opacity")}
+    shown = {n: render_layer(field, camera, T, n, OPTIONS, "auto") for n in ("colour", "depth", "V", "U", "opacity")}
     np.testing.assert_array_equal(shown["colour"].pixels, (seen.color.clamp(0, 1) * 255).round().numpy())
     assert shown["colour"].legend is None
     np.testing.assert_array_equal(shown["opacity"].pixels[..., 0], (seen.alpha * 255).double().round().numpy())
     covered = (seen.alpha > 0.5).numpy()
     for name in ("depth", "V", "U"):
-        bare = (shown[name].pixels == colormap.NO_READING).all(-1)
-        np.testing.assert_array_equal(bare, ~covered)
+        uncovered = (shown[name].pixels == colormap.NO_READING).all(-1)
+        np.testing.assert_array_equal(uncovered, ~covered)
     root = seen.variance.mean(2).clamp(min=0).sqrt().numpy()
     legend = shown["V"].legend
     assert legend is not None and legend.high == pytest.approx(np.percentile(root[covered], 99), rel=1e-5)
@@ -183,20 +196,20 @@ def test_layers_show_what_the_renderer_gives() -> None:
     assert depth is not None and 2.0 < depth.low < depth.high < 4.5 and depth.unit == " m"
 
 
-def test_u_is_the_spread_of_depth_about_the_maps_own() -> None:
-    """Two sheets behind one another: w₁ = a, w₂ = (1 − a) a at depths 1 and 2."""
+def test_u_is_the_spread_of_depth_about_the_rendered_depth() -> None:
+    """Two parallel sheets at depths 1 and 2: w₁ = a, w₂ = (1 − a) a."""
     a, z = 0.7, torch.tensor([1.0, 2.0])
     means = torch.stack([torch.zeros(2), torch.zeros(2), z], 1)
     scales = torch.tensor([[5.0, 5.0, 1e-4]] * 2)
     field = GaussianField.from_values(means, scales, torch.zeros(2, 3), opacities=a)
-    made = picture_of(field, Camera(8, 8, 100.0, 100.0, 3.5, 3.5), np.eye(4), "U", OPTIONS, "auto")
+    made = render_layer(field, Camera(8, 8, 100.0, 100.0, 3.5, 3.5), np.eye(4), "U", OPTIONS, "auto")
     w1, w2 = a, (1 - a) * a
     about = (w1 * 1 + w2 * 2) / (w1 + w2)
     expected = np.sqrt((w1 * (1 - about) ** 2 + w2 * (2 - about) ** 2) / (w1 + w2))
     assert made.legend is not None and made.legend.high == pytest.approx(expected, rel=1e-3)
 
 
-def test_a_legend_runs_from_end_to_end() -> None:
-    drawn = legend_picture(Legend(colormap.INFERNO, 0.0, 0.25, " m"))
+def test_a_legend_shows_the_palette_from_end_to_end() -> None:
+    drawn = draw_legend(Legend(colormap.INFERNO, 0.0, 0.25, " m"))
     np.testing.assert_array_equal(drawn[0, [0, -1]], colormap.INFERNO[[0, -1]])
     assert len(np.unique(drawn[20:].reshape(-1, 3), axis=0)) > 2

@@ -1,4 +1,4 @@
-"""Other pages of the same browser do not get at the viewer, by its address or by a name made to point there."""
+"""Other pages in the same browser cannot reach the viewer, neither by its address nor by a name that points to it."""
 
 import http.client
 import socket
@@ -13,27 +13,27 @@ from sigmasplat.viewer.server import HOST, close, open_server
 HERE = "127.0.0.1:8080"
 
 
-def test_only_pages_of_the_address_itself_are_the_viewers() -> None:
-    own = {  # by the page's origin and the address that it asked
-        (None, HERE): True,  # no browser
-        ("http://127.0.0.1:8080", HERE): True,
-        ("http://localhost:9000", "localhost:9000"): True,  # ssh -L 9000:127.0.0.1:8080
-        ("http://[::1]:8080", "[::1]:8080"): True,
-        ("http://192.168.1.5", "192.168.1.5"): True,
-        ("https://BOX.lan", "box.lan"): True,
-        (f"http://{socket.gethostname()}:8080", f"{socket.gethostname()}:8080"): True,
-        ("https://evil.example", HERE): False,
-        ("http://127.0.0.1:8888", HERE): False,  # another server of this machine
-        ("http://localhost:8080", HERE): False,
-        ("http://evil.example:8080", "evil.example:8080"): False,  # a name made to point here
-        ("http://box.lan.evil.example", "box.lan.evil.example"): False,
-        ("null", HERE): False,  # a file, a sandboxed frame
-        ("", HERE): False,
-        ("http://[::1", "[::1"): False,
-        ("file://127.0.0.1:8080", HERE): False,
-        ("http://127.0.0.1:8080", None): False,
-    }
-    assert {case: is_own_page(*case, "box.lan") for case in own} == own
+def test_only_pages_of_the_same_address_belong_to_the_viewer() -> None:
+    for origin, reached, own in [
+        (None, HERE, True),  # not a browser
+        ("http://127.0.0.1:8080", HERE, True),
+        ("http://localhost:9000", "localhost:9000", True),  # ssh -L 9000:127.0.0.1:8080
+        ("http://[::1]:8080", "[::1]:8080", True),
+        ("http://192.168.1.5", "192.168.1.5", True),
+        ("https://BOX.lan", "box.lan", True),
+        (f"http://{socket.gethostname()}:8080", f"{socket.gethostname()}:8080", True),
+        ("https://evil.example", HERE, False),
+        ("http://127.0.0.1:8888", HERE, False),  # another server on this machine
+        ("http://localhost:8080", HERE, False),
+        ("http://evil.example:8080", "evil.example:8080", False),  # a foreign name that points to this machine
+        ("http://box.lan.evil.example", "box.lan.evil.example", False),
+        ("null", HERE, False),  # a file, a sandboxed frame
+        ("", HERE, False),
+        ("http://[::1", "[::1", False),
+        ("file://127.0.0.1:8080", HERE, False),
+        ("http://127.0.0.1:8080", None, False),
+    ]:
+        assert is_own_page(origin, reached, "box.lan") is own
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def port() -> Iterator[int]:
     close(server)
 
 
-def test_a_websocket_of_another_page_is_refused_before_it_opens(port: int) -> None:
+def test_a_websocket_from_another_page_is_refused(port: int) -> None:
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
     from websockets.typing import Origin
@@ -58,20 +58,20 @@ def test_a_websocket_of_another_page_is_refused_before_it_opens(port: int) -> No
         assert refused.value.response.status_code == 403
 
 
-def test_the_viewers_page_itself_is_served(port: int) -> None:
+def test_the_viewers_own_page_is_served(port: int) -> None:
     connection = http.client.HTTPConnection(HOST, port)
     connection.request("GET", "/")
     assert connection.getresponse().status == 200
     connection.close()
 
 
-def test_other_websocket_servers_are_left_alone(port: int) -> None:
+def test_other_websocket_servers_are_not_changed(port: int) -> None:
     from websockets.asyncio import server
 
     assert server.serve.__module__ == "websockets.asyncio.server" and isinstance(server.serve, type)
 
 
-def test_a_viser_that_starts_otherwise_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_viser_version_that_cannot_be_restricted_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     viser = pytest.importorskip("viser", reason="viser is not installed (pip install 'sigmasplat[viewer]')")
     stopped = []
 

@@ -1,4 +1,4 @@
-"""What the viewer reads of run folders and of a run in work: the same map, path and pictures; a bounded rate."""
+"""Snapshots of run folders and of a running system: the same map, path and images; a bounded rate."""
 
 import shutil
 import socket
@@ -23,11 +23,11 @@ from sigmasplat.run import session
 from sigmasplat.run.protocols import CallbackList
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import SyntheticRoom, open_source
-from sigmasplat.viewer.finished import Shelf, ended, refuse_mapless, running
+from sigmasplat.viewer.finished import SubmapCache, check_has_map, finished_snapshot, running_snapshot
 from sigmasplat.viewer.live import ACTIVE_SHARE, LiveView
-from sigmasplat.viewer.server import free_port, is_private, open_server, url_of
+from sigmasplat.viewer.server import free_port, is_loopback, open_server, url_of
 from sigmasplat.viewer.snapshot import Snapshot
-from sigmasplat.viewer.splats import Cut, joined
+from sigmasplat.viewer.splats import VisibilityFilter, merge_pieces
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -43,7 +43,7 @@ def settings(**more: str) -> Config:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """Run a few frames in three submaps and evaluate them."""
+    """Run SLAM on a few frames in three submaps, and evaluate the run."""
     config = settings()
     source = open_source(ROOM, override(config, {"input.limit": str(FRAMES)}).input)
     run = RunFolder.create(tmp_path_factory.mktemp("view") / "run", config, "room")
@@ -52,8 +52,8 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     return run
 
 
-def test_a_run_that_has_ended_is_shown_as_it_was_written(finished: RunFolder) -> None:
-    shown = ended(finished)
+def test_a_finished_run_is_shown_as_it_was_written(finished: RunFolder) -> None:
+    shown = finished_snapshot(finished)
     assert shown.final is not None and torch.equal(shown.final.field.params, finished.read_map().params)
     np.testing.assert_array_equal(shown.path.T_world_camera, finished.read_trajectory().T_world_camera)
     log = finished.read_log()
@@ -67,43 +67,47 @@ def test_a_run_that_has_ended_is_shown_as_it_was_written(finished: RunFolder) ->
     assert shown.camera == finished.submaps.load(0).camera
 
 
-def test_pictures_of_keyframes_come_from_the_submaps_or_from_the_sequence(finished: RunFolder) -> None:
-    shown, source = ended(finished), open_source(ROOM)
+def test_keyframe_images_come_from_the_submaps_or_from_the_sequence(finished: RunFolder) -> None:
+    shown, source = finished_snapshot(finished), open_source(ROOM)
     for row in shown.path.keyframes:
-        picture = shown.picture(row)
+        picture = shown.image(row)
         assert picture is not None
         np.testing.assert_allclose(picture / 255.0, source.frame(row).color, atol=0.003)
     other = next(row for row in range(FRAMES) if row not in shown.path.keyframes)
-    assert shown.picture(other) is None
-    read = ended(finished, source).picture(other)
+    assert shown.image(other) is None
+    read = finished_snapshot(finished, source).image(other)
     assert read is not None
     np.testing.assert_allclose(read / 255.0, source.frame(other).color, atol=0.003)
 
 
-def test_a_run_that_goes_on_is_shown_by_its_log_and_finished_submaps(finished: RunFolder) -> None:
-    shelf = Shelf(finished)
-    shown = running(finished, shelf)
-    whole = joined(shown.pieces, Cut())
-    torch.testing.assert_close(whole.params, joined(ended(finished).pieces, Cut()).params, rtol=1e-5, atol=1e-5)
+def test_an_unfinished_run_is_shown_from_its_log_and_finished_submaps(finished: RunFolder) -> None:
+    cache = SubmapCache(finished)
+    shown = running_snapshot(finished, cache)
+    whole = merge_pieces(shown.pieces, VisibilityFilter())
+    torch.testing.assert_close(
+        whole.params, merge_pieces(finished_snapshot(finished).pieces, VisibilityFilter()).params, rtol=1e-5, atol=1e-5
+    )
     assert shown.live and shown.final is None and len(shown.path) == FRAMES
-    again = running(finished, shelf)
-    assert [a.field for a in again.pieces] == [b.field for b in shown.pieces]  # the very same: nothing is sent again
+    again = running_snapshot(finished, cache)
+    assert [a.field for a in again.pieces] == [
+        b.field for b in shown.pieces
+    ]  # the same objects, so nothing is sent again
     row = shown.path.keyframes[1]
-    np.testing.assert_array_equal(shown.picture(row), ended(finished).picture(row))  # type: ignore[arg-type]
-    assert sum(len(p.field) for p in running(finished, Shelf(finished, budget=500)).pieces) <= 500
+    np.testing.assert_array_equal(shown.image(row), finished_snapshot(finished).image(row))  # type: ignore[arg-type]
+    assert sum(len(p.field) for p in running_snapshot(finished, SubmapCache(finished, budget=500)).pieces) <= 500
 
 
-def test_a_run_just_begun_shows_nothing_yet_and_one_without_a_map_is_refused(tmp_path: Path) -> None:
+def test_a_new_run_shows_nothing_and_an_ended_run_without_a_map_is_refused(tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path / "run", settings(), "room")
-    shown = running(run, Shelf(run))
-    assert len(shown.path) == 0 and shown.pieces == () and shown.shown(True, 0) == ()
-    refuse_mapless(run)
+    shown = running_snapshot(run, SubmapCache(run))
+    assert len(shown.path) == 0 and shown.pieces == () and shown.visible_pieces(True, 0) == ()
+    check_has_map(run)
     run.note(status="failed")
     with pytest.raises(RunError, match="has no map to show"):
-        refuse_mapless(run)
+        check_has_map(run)
 
 
-def test_the_true_path_is_stored_aligned_and_gives_the_same_ate(finished: RunFolder) -> None:
+def test_the_stored_true_path_is_aligned_and_gives_the_same_ate(finished: RunFolder) -> None:
     aligned, path = read_trajectory(finished.path / TRUTH), finished.read_trajectory()
     assert len(aligned) == FRAMES
     np.testing.assert_allclose(aligned.timestamps_s, path.timestamps_s, atol=1e-8)
@@ -112,27 +116,27 @@ def test_the_true_path_is_stored_aligned_and_gives_the_same_ate(finished: RunFol
     T = open_source(ROOM).truth().T_world_camera  # type: ignore[union-attr]
     motion = se3.inverse(aligned.T_world_camera[0]) @ aligned.T_world_camera[5]
     np.testing.assert_allclose(motion, se3.inverse(T[0]) @ T[5], atol=1e-9)
-    shown = ended(finished).true_positions
+    shown = finished_snapshot(finished).true_positions
     np.testing.assert_array_equal(shown, aligned.T_world_camera[:, :3, 3])  # type: ignore[arg-type]
 
 
-class Unknown(SyntheticRoom):
-    """The room without its truth."""
+class RoomWithoutTruth(SyntheticRoom):
+    """The synthetic room without ground truth."""
 
     def truth(self) -> None:
         return None
 
 
-def test_a_truth_that_is_known_no_longer_is_removed(finished: RunFolder, tmp_path: Path) -> None:
+def test_an_evaluation_without_truth_removes_the_stored_true_path(finished: RunFolder, tmp_path: Path) -> None:
     copied = RunFolder(tmp_path / "run")
     shutil.copytree(finished.path, copied.path)
     assert (copied.path / TRUTH).is_file()
-    evaluate(copied, Unknown(frames=120, width=64, height=48), views_per_kind=1, strips_per_kind=0)
-    assert not (copied.path / TRUTH).exists() and ended(copied).true_positions is None
+    evaluate(copied, RoomWithoutTruth(frames=120, width=64, height=48), views_per_kind=1, strips_per_kind=0)
+    assert not (copied.path / TRUTH).exists() and finished_snapshot(copied).true_positions is None
 
 
 class Clock:
-    """A frame takes so long, and so does each look at the clock (the copy lies between two)."""
+    """A simulated clock: each frame takes `frame_s`, each reading `look_s`; the copy lies between two readings."""
 
     def __init__(self, frame_s: float, look_s: float = 0.0) -> None:
         self.now_s, self.frame_s, self.look_s = 0.0, frame_s, look_s
@@ -155,10 +159,10 @@ def live_run(tmp_path: Path, clock: Clock, budget: int = 300_000) -> tuple[list[
     return shown, slam
 
 
-def test_a_run_in_work_is_shown_at_a_bounded_rate_from_copies(tmp_path: Path) -> None:
+def test_a_running_system_is_shown_from_copies_at_a_bounded_rate(tmp_path: Path) -> None:
     shown, slam = live_run(tmp_path, Clock(0.5))
-    steps = shown[:-2]  # then the beginning of refinement, and the end
-    assert [len(s.path) for s in steps] == [1, 5, 9, 13]  # each 2 s, at half a second a frame
+    steps = shown[:-2]  # the last two show the start of refinement, and the end
+    assert [len(s.path) for s in steps] == [1, 5, 9, 13]  # every 2 s, at half a second per frame
     assert [p.submap for p in steps[-1].pieces] == list(range(len(steps[-1].pieces)))
     assert len(steps[-1].pieces) == int(steps[-1].path.submaps[-1]) + 1
     first = steps[0].pieces[0].field.params
@@ -169,32 +173,32 @@ def test_a_run_in_work_is_shown_at_a_bounded_rate_from_copies(tmp_path: Path) ->
     assert all(s.live and s.true_positions is None for s in shown)
 
 
-def test_the_live_map_is_the_systems_own_and_its_pictures_what_keyframes_saw(tmp_path: Path) -> None:
-    shown, slam = live_run(tmp_path, Clock(10.0))  # due at each frame
+def test_the_live_map_and_its_images_equal_those_of_the_system(tmp_path: Path) -> None:
+    shown, slam = live_run(tmp_path, Clock(10.0))  # a snapshot is due at each frame
     assert len(shown) == FRAMES + 2
     source = open_source(ROOM)
     before_final = shown[-2]
     kept = [slam.store.load(i).field.moved(torch.from_numpy(slam.atlas.anchors[i])).params for i in range(3)]
-    torch.testing.assert_close(joined(before_final.pieces, Cut()).params, torch.cat(kept))
+    torch.testing.assert_close(merge_pieces(before_final.pieces, VisibilityFilter()).params, torch.cat(kept))
     for row in slam.keyframes:
-        picture = shown[-1].picture(row)
+        picture = shown[-1].image(row)
         assert picture is not None
         np.testing.assert_allclose(picture / 255.0, source.frame(row).color, atol=0.003)
 
 
-def test_a_live_map_keeps_to_its_budget_and_a_slow_copy_comes_less_often(tmp_path: Path) -> None:
+def test_a_live_map_stays_within_its_budget_and_slow_copies_are_rarer(tmp_path: Path) -> None:
     shown, _ = live_run(tmp_path / "a", Clock(10.0), budget=600)
     assert len(shown) == FRAMES + 2
-    for moment in shown[:-1]:
-        assert sum(len(p.field) for p in moment.pieces) <= 600
-        if len(moment.pieces) == 1:
-            assert len(moment.pieces[0].field) <= 600 * ACTIVE_SHARE
+    for snapshot in shown[:-1]:
+        assert sum(len(p.field) for p in snapshot.pieces) <= 600
+        if len(snapshot.pieces) == 1:
+            assert len(snapshot.pieces[0].field) <= 600 * ACTIVE_SHARE
     assert shown[-1].final is not None and len(shown[-1].final.field) <= 600
-    slow, _ = live_run(tmp_path / "b", Clock(1.0, look_s=0.1))  # a tenth of a second: once in 5 s
+    slow, _ = live_run(tmp_path / "b", Clock(1.0, look_s=0.1))  # a copy takes 0.1 s, so it is made every 5 s
     assert [len(s.path) for s in slow[:-2]] == [1, 6, 11]
 
 
-def test_the_next_free_port_is_taken_and_nonsense_is_refused() -> None:
+def test_the_next_free_port_is_used_and_wrong_ports_and_hosts_are_refused() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -207,10 +211,10 @@ def test_the_next_free_port_is_taken_and_nonsense_is_refused() -> None:
         free_port("203.0.113.7", 0)
     assert url_of("127.0.0.1", 80) == url_of("0.0.0.0", 80) == "http://127.0.0.1:80"
     assert url_of("::1", 81) == "http://[::1]:81" and url_of("box.local", 82) == "http://box.local:82"
-    assert [is_private(h) for h in ("127.0.0.1", "localhost", "0.0.0.0", "10.0.0.2")] == [True, True, False, False]
+    assert [is_loopback(h) for h in ("127.0.0.1", "localhost", "0.0.0.0", "10.0.0.2")] == [True, True, False, False]
 
 
-def test_without_viser_one_line_says_what_to_install(
+def test_without_viser_the_error_names_the_package_to_install(
     finished: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)

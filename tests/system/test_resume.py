@@ -58,7 +58,7 @@ def without_times(run: Path) -> list[dict]:
 
 
 @pytest.mark.parametrize("name, after", [("sigma", 13), ("cgslam-fast", 7)])
-def test_a_killed_run_resumes_to_the_same_bytes(tmp_path: Path, name: str, after: int) -> None:
+def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path: Path, name: str, after: int) -> None:
     assert exit_code(*arguments(tmp_path / "whole", name)) == 0
     assert killed(tmp_path / "cut", name, after) < FRAMES
     assert RunFolder(tmp_path / "cut").facts()["status"] == "running"
@@ -75,7 +75,7 @@ def tiny() -> Config:
     return override(preset("sigma"), SETTINGS)
 
 
-def test_a_run_can_resume_at_every_frame(tmp_path: Path) -> None:
+def test_every_frame_is_a_place_to_go_on_from(tmp_path: Path) -> None:
     """Also right after a cut, where the next submap has one keyframe."""
     source, config = open_source(ROOM, tiny().input), tiny()
     whole = Slam(config)
@@ -96,19 +96,19 @@ def test_a_run_can_resume_at_every_frame(tmp_path: Path) -> None:
             assert np.array_equal(slam.trajectory().T_world_camera, whole.trajectory().T_world_camera)
 
 
-def test_the_frame_where_a_run_resumes_is_printed() -> None:
+def test_where_a_run_goes_on_is_told() -> None:
     assert where(FRAMES - 1, FRAMES) == "going on at frame 23 of 24"
     assert where(FRAMES, FRAMES) == "all 24 frames are done: making the final map again"
 
 
-def test_a_run_that_cannot_be_resumed_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_gone_on_with_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
     assert exit_code(*arguments(out, "sigma")) == 0
     assert exit_code("resume", str(out)) == 2
     assert "is complete" in capsys.readouterr().err
     RunFolder(out).note(status="interrupted")
     assert exit_code("resume", str(out)) == 2
-    assert "nothing to go on from" in capsys.readouterr().err
+    assert "nothing to resume" in capsys.readouterr().err
     (out / "state.safetensors").write_bytes(b"damaged")
     assert exit_code("resume", str(out)) == 2
     assert "is damaged" in capsys.readouterr().err
@@ -123,5 +123,5 @@ def test_a_state_holds_plain_data_only(tmp_path: Path) -> None:
     back = read_state(tmp_path / "s", (), {})
     assert back["a"] == tree["a"] and np.array_equal(back["b"][0], shared) and torch.equal(back[3], tree[3])
     assert np.shares_memory(*back["b"]), "what was shared stays shared"
-    with pytest.raises(RunError, match="nothing to go on from"):
+    with pytest.raises(RunError, match="nothing to resume"):
         read_state(tmp_path / "none", (), {})

@@ -1,4 +1,4 @@
-"""Ground truth stays out: a run neither asks for it nor depends on it; the evaluation alone does."""
+"""A run neither reads ground truth nor depends on it. Only the evaluation reads it."""
 
 from pathlib import Path
 
@@ -29,12 +29,12 @@ OPTIONS = [word for pair in SETTINGS.items() for word in ("--set", "=".join(pair
 LEFT = ("trajectory.txt", "map.ply", "checkpoint.safetensors")
 
 
-class Asked(Exception):
-    """Somebody asked for the truth."""
+class TruthWasRead(Exception):
+    """The ground truth was read."""
 
 
-class Secretive(Source):
-    """The first frames of a room whose truth may not be asked for."""
+class SourceWithoutTruth(Source):
+    """The first frames of a room; reading its ground truth raises unless a truth is given."""
 
     def __init__(self, truth: Trajectory | None = None) -> None:
         self._room, self._truth = SyntheticRoom(frames=120, width=64, height=48), truth
@@ -48,45 +48,45 @@ class Secretive(Source):
 
     def truth(self) -> Trajectory | None:
         if self._truth is None:
-            raise Asked
+            raise TruthWasRead
         return self._truth
 
     def true_surface(self) -> Mesh | None:
-        raise Asked
+        raise TruthWasRead
 
 
 def config() -> Config:
     return override(preset(default_preset()), SETTINGS)
 
 
-def test_slam_and_session_never_ask_for_the_truth(tmp_path: Path) -> None:
-    source, run = Secretive(), RunFolder.create(tmp_path / "run", config(), "room")
+def test_slam_and_session_never_read_the_truth(tmp_path: Path) -> None:
+    source, run = SourceWithoutTruth(), RunFolder.create(tmp_path / "run", config(), "room")
     outcome = session.record(Slam(config()), source, run)
     assert (outcome.status, outcome.frames, outcome.lost) == ("complete", FRAMES, 0)
     assert len(run.read_trajectory()) == FRAMES
 
 
-def test_the_command_line_asks_only_to_evaluate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sigmasplat.sources.open_source", lambda path, settings=None: Secretive())
+def test_the_command_line_reads_the_truth_only_to_evaluate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sigmasplat.sources.open_source", lambda path, settings=None: SourceWithoutTruth())
     assert exit_code("run", "room", "--out", str(tmp_path / "run"), "--no-eval", *OPTIONS) == 0
     assert exit_code("mesh", str(tmp_path / "run"), "--voxel-m", "0.1") == 0
-    with pytest.raises(Asked):
+    with pytest.raises(TruthWasRead):
         cli.main(["eval", str(tmp_path / "run")])
 
 
 def tum_folder(folder: Path, kind: str) -> Path:
-    """Write the same frames with the true path, another one, or none."""
+    """Write the same frames with the true path, with another path, or with none."""
     whole = SyntheticRoom(frames=120, width=64, height=48).truth()
     poses = whole.T_world_camera[:FRAMES]
     if kind == "another":
         poses = np.array([se3.exp(np.random.default_rng(i).normal(size=6)) for i in range(FRAMES)])
-    write_tum(Secretive(Trajectory(whole.timestamps_s[:FRAMES], poses)), folder)
+    write_tum(SourceWithoutTruth(Trajectory(whole.timestamps_s[:FRAMES], poses)), folder)
     if kind == "none":
         (folder / "groundtruth.txt").unlink()
     return folder
 
 
-def test_the_same_bytes_with_the_truth_with_another_and_with_none(tmp_path: Path) -> None:
+def test_the_truth_does_not_change_the_bytes_of_a_run(tmp_path: Path) -> None:
     found, errors_m = {}, {}
     for kind in ("true", "another", "none"):
         out = tmp_path / "runs" / kind

@@ -1,4 +1,4 @@
-"""The viewer in a real browser: headless Chromium, software WebGL. A finished run and a live one, by their pictures."""
+"""The viewer in a real browser (headless Chromium, software WebGL): screenshots of a finished run and of a live one."""
 
 import base64
 import io
@@ -34,7 +34,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium (apt-get install chromium)")
 
 WIDTH, HEIGHT, PANEL = 800, 600, 340
-"""The window, and how much of its right side the panel covers."""
+"""Size of the window, and width of the panel on its right side."""
 FLAGS = [
     "--headless=new", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
@@ -49,7 +49,7 @@ Pixels = NDArray[np.uint8]
 
 
 class Browser:
-    """A page in headless Chromium, driven over its DevTools protocol."""
+    """A page in headless Chromium, controlled through the DevTools protocol."""
 
     def __init__(self, process: subprocess.Popen[bytes], port: int) -> None:
         from websockets.sync.client import connect
@@ -69,22 +69,22 @@ class Browser:
                 return dict(answer["result"])
 
     def screenshot(self) -> Pixels:
-        """Return what the window shows [H, W, 3]."""
+        """Return the content of the window [H, W, 3]."""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
     def scene(self) -> Pixels:
-        """Return what shows beside the panel, without the notice of software WebGL above."""
+        """Return the part beside the panel, without the notice about software WebGL at the top."""
         return self.screenshot()[200:, : WIDTH - PANEL]
 
     def text(self) -> str:
-        """Return the page's words."""
-        words = "document.body ? document.body.innerText : ''"  # a page that has just been opened has no body yet
+        """Return the text of the page."""
+        words = "document.body ? document.body.innerText : ''"  # a newly opened page has no body yet
         found = self.call("Runtime.evaluate", expression=words, returnByValue=True)
         return str(found["result"]["value"])
 
     def choose(self, label: str, option: str) -> None:
-        """Choose an option of the dropdown beside a label, by mouse."""
+        """Select an option of a dropdown, found by its label, with the mouse."""
         beside = f"[...document.querySelectorAll('label')].find(l => l.innerText.trim() == {json.dumps(label)})"
         self._click(f"document.getElementById({beside}.htmlFor)")
         spoken = "[...document.querySelectorAll('[role=option]')].find(o => o.offsetParent && o.innerText.trim() == "
@@ -93,7 +93,7 @@ class Browser:
 
     def _there(self, expression: str) -> bool:
         found = self.call("Runtime.evaluate", expression=f"!!{expression}", returnByValue=True)
-        return bool(found["result"].get("value"))  # none where a part of the expression is not there yet
+        return bool(found["result"].get("value"))  # no value if a part of the expression does not exist yet
 
     def _click(self, expression: str) -> None:
         wait_for(lambda: self._there(expression))
@@ -110,7 +110,7 @@ def _pages(port: int) -> list[dict[str, str]]:
 
 @contextmanager
 def browser(url: str, profile: Path) -> Iterator[Browser]:
-    """Open a page in a Chromium of its own with an empty profile; never leave it behind."""
+    """Open a page in a new Chromium process with an empty profile; end the process in any case."""
     assert CHROMIUM is not None
     process = subprocess.Popen(
         [CHROMIUM, *FLAGS, f"--user-data-dir={profile}", url], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
@@ -127,7 +127,7 @@ def browser(url: str, profile: Path) -> Iterator[Browser]:
 
 @contextmanager
 def sigmasplat(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Run a command that shows something; give it and the address it printed."""
+    """Run a command that starts a viewer; yield the process and the address that it printed."""
     command = [sys.executable, "-u", "-m", "sigmasplat.cli", *arguments, "--port", "0"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
@@ -150,12 +150,12 @@ def wait_for(happened: Callable[[], bool]) -> None:
 
 
 def colours(pixels: Pixels) -> int:
-    """Count the colours, eight levels a channel."""
+    """Count the different colours, with eight levels per channel."""
     return len(np.unique((pixels // 32).reshape(-1, 3), axis=0))
 
 
 def likeness(pixels: Pixels, map_colours: NDArray[np.float64]) -> float:
-    """Return the share of the pixels that are not background and lie near a colour map."""
+    """Return the share of the non-background pixels whose colours are near a colour map."""
     ramp = colormap.apply(np.linspace(0, 1, 64), 0.0, 1.0, map_colours).astype(int)
     lit = pixels.reshape(-1, 3).astype(int)
     lit = lit[lit.max(1) > 60]
@@ -164,14 +164,14 @@ def likeness(pixels: Pixels, map_colours: NDArray[np.float64]) -> float:
 
 
 def keep(pixels: Pixels, name: str) -> None:
-    """Write a screenshot where $SIGMASPLAT_SCREENSHOTS says, to be looked at."""
+    """Write a screenshot to the folder $SIGMASPLAT_SCREENSHOTS, if it is set, for a person to look at."""
     if folder := os.environ.get("SIGMASPLAT_SCREENSHOTS"):
         Image.fromarray(pixels).save(Path(folder) / f"{name}.png")
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """Record a tiny run."""
+    """Record a very small run."""
     config = override(preset(default_preset()), QUICK)
     source = open_source("synthetic:frames=120,width=64,height=48", override(config, {"input.limit": "14"}).input)
     run = RunFolder.create(tmp_path_factory.mktemp("viewer") / "tiny", config, "room")
@@ -179,13 +179,13 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     return run
 
 
-def test_a_finished_run_shows_its_map_and_the_uncertainty_in_it(finished: RunFolder, tmp_path: Path) -> None:
+def test_a_finished_run_shows_its_map_and_its_uncertainty(finished: RunFolder, tmp_path: Path) -> None:
     with sigmasplat("view", str(finished.path)) as (process, url), browser(url, tmp_path / "profile") as page:
         assert url.startswith("http://127.0.0.1:")
         wait_for(lambda: "14 frames" in page.text() and colours(page.scene()) > 40)
         plain = page.screenshot()
         keep(plain, "finished")
-        page.choose("splats in", "σ")
+        page.choose("splat colour", "σ")
         wait_for(lambda: likeness(page.scene(), colormap.INFERNO) > 2 * likeness(scene_of(plain), colormap.INFERNO))
         keep(page.screenshot(), "sigma")
         by_sigma = page.scene()

@@ -1,4 +1,4 @@
-"""Examine the installation: versions, processor, kernels, and a small picture rendered twice."""
+"""Check the installation for `sigmasplat doctor`: versions, processor, kernels, CUDA, and a rendering self-test."""
 
 import os
 import platform
@@ -12,21 +12,21 @@ from sigmasplat import env
 from sigmasplat.io import machine
 
 MAX_DIFFERENCE = 1e-2
-"""Where rounding puts one splat on the other side of alpha_min, a pixel changes by up to 1/255."""
+"""If rounding moves a splat across the threshold alpha_min, a pixel changes by up to 1/255."""
 MEAN_DIFFERENCE = 1e-4
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the examination; `ok` is None for a plain fact."""
+    """One line of the output. `ok` is the result of a test, or None for plain information."""
 
     name: str
     value: str
     ok: bool | None = None
 
 
-def examine() -> Iterator[Finding]:
-    """Yield what there is to know, the tests last."""
+def check_installation() -> Iterator[Finding]:
+    """Yield the findings: information first, then the tests."""
     versions = ", ".join(f"{name} {_version(name)}" for name in ("torch", "numpy", "scipy"))
     switches = env.switches()
     yield Finding("sigmasplat", f"{machine.package_version()} on Python {platform.python_version()}")
@@ -34,42 +34,42 @@ def examine() -> Iterator[Finding]:
     yield Finding("processor", f"{machine.cpu_model()}, {machine.usable_cores()} cores usable")
     yield Finding("switches", f"threads={switches.threads or 'all'} isa={switches.isa} backend={switches.backend}")
     yield Finding("OMP_WAIT_POLICY", os.environ.get("OMP_WAIT_POLICY", "unset"))
-    native = kernels()
+    native = check_kernels()
     yield native
     if native.ok:
         yield self_test()
-    yield from cuda()
+    yield from check_cuda()
 
 
 def verdict(findings: list[Finding]) -> tuple[bool, str]:
-    """Return whether all tests passed, and a sentence saying so."""
+    """Return whether all tests passed, and a sentence with the result."""
     failed = [finding.name for finding in findings if finding.ok is False]
     if failed:
         return False, f"not healthy: {', '.join(failed)} failed; reinstall with `make demo`, or report this output"
-    return True, "healthy: the kernels draw what their definition says"
+    return True, "healthy: the compiled kernels agree with the reference renderer"
 
 
-def kernels() -> Finding:
-    """Load the compiled kernels and say which instruction set is used, of those this processor runs."""
+def check_kernels() -> Finding:
+    """Load the compiled kernels. Report the instruction set in use, and those that this processor supports."""
     try:
         core: Any = import_module("sigmasplat.render.cpu.operators") and import_module("sigmasplat.native._core")
     except ImportError as problem:
         return Finding("kernels", f"cannot be loaded ({problem}); {_remedy(problem)}", False)
     offered = ", ".join(core.supported_isas())
-    return Finding("kernels", f"{core.isa_name()} (this processor runs {offered}), {core.threads()} threads", True)
+    return Finding("kernels", f"{core.isa_name()} (processor supports {offered}), {core.threads()} threads", True)
 
 
 def _remedy(problem: ImportError) -> str:
-    """Say what makes the kernels load."""
+    """Return the command that fixes an import error of the kernels."""
     if problem.name == "torch":
         return "pip install torch"
-    if "libgomp" in str(problem):  # torch brings it, but under another name in some builds
+    if "libgomp" in str(problem):  # some builds of torch include it under another name
         return "sudo apt install libgomp1"
     return "install a wheel, or the sources with pip install ."
 
 
-def cuda() -> Iterator[Finding]:
-    """Say what there is of CUDA, and in one line each what is missing; a machine without a GPU is not unhealthy."""
+def check_cuda() -> Iterator[Finding]:
+    """Check NVRTC, driver and GPUs, one line each. Missing parts are not faults: a machine without a GPU is healthy."""
     import torch
 
     from sigmasplat.errors import BackendError
@@ -79,20 +79,20 @@ def cuda() -> Iterator[Finding]:
     try:
         compiler = cubins.compiler_version()
         cached = len(list(cubins.cache_folder().glob("*.cubin")))
-        yield Finding("NVRTC", f"{compiler}, {cached} programs compiled in {cubins.cache_folder()}")
+        yield Finding("NVRTC", f"{compiler}, {cached} compiled programs in {cubins.cache_folder()}")
     except BackendError as problem:
         yield Finding("NVRTC", f"missing: {problem}")
     missing = cuda_launch.missing()
     if missing:
         yield Finding("CUDA", f"not available: {missing}")
         return
-    yield from _drivers(cubins.compiler_version())
+    yield check_driver(cubins.compiler_version())
     for index in range(torch.cuda.device_count()):
         yield from _device(torch.device("cuda", index))
 
 
-def _drivers(compiler: str) -> Iterator[Finding]:
-    """Compare driver and compiler: a driver runs what compilers of its own major version make, or older ones."""
+def check_driver(compiler: str) -> Finding:
+    """Compare the versions of driver and compiler: the driver must have the same major version, or a newer one."""
     from cuda.bindings import driver
 
     from sigmasplat.native.cuda import cubins
@@ -100,11 +100,11 @@ def _drivers(compiler: str) -> Iterator[Finding]:
     version = driver.cuDriverGetVersion()[1]
     enough = version // 1000 >= int(compiler.split(".")[0])
     advice = "" if enough else f"; too old for NVRTC {compiler}: update it, or {cubins.INSTALL_OLDER}"
-    yield Finding("CUDA driver", f"for CUDA {version // 1000}.{version % 1000 // 10}{advice}", enough)
+    return Finding("CUDA driver", f"for CUDA {version // 1000}.{version % 1000 // 10}{advice}", enough)
 
 
 def _device(device: Any) -> Iterator[Finding]:
-    """Describe a GPU and render on it."""
+    """Describe a GPU, and run the self-test on it."""
     import torch
 
     from sigmasplat.errors import BackendError
@@ -120,7 +120,7 @@ def _device(device: Any) -> Iterator[Finding]:
 
 
 def self_test(device: Any = "cpu") -> Finding:
-    """Render a few hundred splats with a device's kernels and with their definition, and compare."""
+    """Render 300 splats with the kernels of a device and with the reference renderer, and compare the images."""
     import torch
 
     from sigmasplat.render.backend import backend_module
@@ -129,8 +129,8 @@ def self_test(device: Any = "cpu") -> Finding:
     started_s = time.perf_counter()
     name = "cpu" if str(device) == "cpu" else "cuda"
     with torch.no_grad():
-        ours, definition = _picture(backend_module(name), device).cpu(), _picture(reference)
-    difference = (ours - definition).abs()
+        ours, expected = _picture(backend_module(name), device).cpu(), _picture(reference)
+    difference = (ours - expected).abs()
     largest, mean = float(difference.max()), float(difference.mean())
     ok = bool(torch.isfinite(ours).all()) and largest < MAX_DIFFERENCE and mean < MEAN_DIFFERENCE
     seconds = time.perf_counter() - started_s
@@ -138,7 +138,7 @@ def self_test(device: Any = "cpu") -> Finding:
 
 
 def _picture(backend: Any, device: Any = "cpu") -> Any:
-    """Render a fixed cloud of splats: colour and alpha, [H, W, 4]."""
+    """Render a fixed random cloud of splats: colour and alpha, [H, W, 4]."""
     import torch
 
     from sigmasplat.config import RenderConfig

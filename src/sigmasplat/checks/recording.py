@@ -1,4 +1,4 @@
-"""Look a sequence over before a run: what it is, what it holds, what in it would spoil a map, and what to do."""
+"""Inspect a recording before a run: format, size, depth and poses; problems that degrade the map, and their fixes."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,16 +21,16 @@ from sigmasplat.sources.opening import format_of
 SAMPLES = 16
 SHOWN = 6
 USUAL_FOCAL = 0.9
-"""Focal length of many depth cameras, in image widths: a field of view of 58°. Good enough to look, not to map."""
+"""Typical focal length of depth cameras, in image widths: a field of view of 58°. Enough to inspect, not to map."""
 MANY_HOLES = 0.6
-"""A map starves where more of the pixels than this have no reading."""
-UNEVEN = 0.2
-"""Brightness that changes by more than this share of itself over the frames sampled asks for exposure in tracking."""
+"""If more than this share of the pixels has no depth, warn of holes in the map."""
+MAX_BRIGHTNESS_STEP = 0.2
+"""If the median change of brightness between sampled frames is larger than this share, suggest `tracking.exposure`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """What was found: rows of (what, found), warnings that name a remedy, and a contact sheet."""
+    """Results: rows of (name, value), warnings with a fix, a contact sheet, and the check of depth registration."""
 
     title: str
     rows: list[tuple[str, str]]
@@ -40,11 +40,11 @@ class Inspection:
 
 
 def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPLES) -> Inspection:
-    """Open a sequence and look at `samples` frames spread over it. Raises SourceError if it cannot be opened."""
+    """Open a recording and inspect `samples` frames, evenly spaced. Raises SourceError if it cannot be opened."""
     format_, (source, guessed) = format_of(path), _opened(path, settings)
     frames = _sampled(source, samples)
     if not frames:
-        raise SourceError(f"{source.name}: none of {samples} frames sampled can be read; look at the image files")
+        raise SourceError(f"{source.name}: none of {samples} sampled frames can be read; check the image files")
     agreement = edge_agreement(frames)
     warnings = [
         *guessed,
@@ -56,25 +56,25 @@ def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPL
         ("format", format_.name),
         *_size_rows(source, frames[0]),
         *_depth_rows(source, frames, settings),
-        ("colour–depth alignment", "no outline in depth" if agreement is None else agreement.sentence()),
-        ("poses", source.described_truth() or "none recorded: paths cannot be scored"),
-        ("left out", f"{len(source.skipped)} files (first: {source.skipped[0]})" if source.skipped else "nothing"),
+        ("colour–depth alignment", "unknown: no outlines in depth" if agreement is None else agreement.sentence()),
+        ("poses", source.described_truth() or "none: the error of the path cannot be measured"),
+        ("skipped", f"{len(source.skipped)} files (first: {source.skipped[0]})" if source.skipped else "nothing"),
         ("suggested preset", _suggested(format_.name)),
     ]
     return Inspection(source.name, rows, warnings, _sheet(frames), agreement)
 
 
 def _opened(path: str | Path, settings: InputConfig) -> tuple[Source, list[str]]:
-    """Open a sequence, with a usual camera and a warning where nothing is known of its own."""
+    """Open a recording. If its camera is unknown, use a typical one and warn."""
     try:
         return open_source(path, settings), []
     except CameraUnknown as problem:
         fx = round(USUAL_FOCAL * problem.size[0])
-        return open_source(path, settings, fx=float(fx)), [f"{problem}; here looked at as if fx were {fx} pixels"]
+        return open_source(path, settings, fx=float(fx)), [f"{problem}; this inspection assumes fx = {fx} pixels"]
 
 
 def _sampled(source: Source, samples: int) -> list[Frame]:
-    """Read frames spread evenly, leaving unreadable ones out."""
+    """Read evenly spaced frames. Unreadable ones are added to `source.skipped`."""
     frames = []
     for i in sorted({int(k) for k in np.linspace(0, len(source) - 1, min(samples, len(source))).round()}):
         try:
@@ -99,32 +99,32 @@ def _depth_rows(source: Source, frames: list[Frame], settings: InputConfig) -> l
     units = source.depth_units_per_metre
     readings = np.concatenate([frame.depth_m[frame.depth_m > 0] for frame in frames])
     if not len(readings):
-        return [("depth", "no reading in the frames sampled")]
+        return [("depth", "no depth reading in the sampled frames")]
     low, middle, high = np.percentile(readings, (1, 50, 99))
     used = ((readings >= settings.min_depth_m) & (readings <= settings.max_depth_m)).mean()
     return [
         ("depth unit", f"{units:g} per metre" if units else "metres"),
-        ("depth", f"{low:.2f} to {high:.2f} m, half below {middle:.2f} m; {used:.0%} within the run's limits"),
-        ("without reading", f"{_holes(frames):.0%} of the pixels"),
-        ("depth's camera", _depth_camera(source, settings)),
-        *_question(middle, settings),
+        ("depth", f"{low:.2f} to {high:.2f} m, median {middle:.2f} m; {used:.0%} within the limits of the run"),
+        ("without depth", f"{_holes(frames):.0%} of the pixels"),
+        ("depth camera", _depth_camera(source, settings)),
+        *_scale_question(middle, settings),
     ]
 
 
 def _depth_camera(source: Source, settings: InputConfig) -> str:
-    """Say whose pixels depth is in."""
+    """Describe whether depth is in the pixels of the colour camera."""
     if source.depth_registered:
-        return "its own: moved to the colour camera here"
+        return "separate; SigmaSplat registers depth to colour"
     if source.registrable and settings.register_depth == "off":
-        return "its own: not moved, as --register-depth off asks"
-    return "the colour camera's, as recorded"
+        return "separate; depth is not registered (--register-depth off)"
+    return "same as colour, according to the recording"
 
 
-def _question(middle_m: float, settings: InputConfig) -> list[tuple[str, str]]:
-    """Ask who gave a depth scale whether the distances that it makes are true; nothing where none was given."""
+def _scale_question(middle_m: float, settings: InputConfig) -> list[tuple[str, str]]:
+    """Ask whether the median depth is plausible if the user gave a depth scale; else nothing."""
     if not settings.depth_scale:
         return []
-    return [("your depth scale", f"half of what is seen is nearer than {middle_m:.2f} m: is that so?")]
+    return [("your depth scale", f"it gives a median depth of {middle_m:.2f} m: is this plausible?")]
 
 
 def _holes(frames: list[Frame]) -> float:
@@ -134,12 +134,12 @@ def _holes(frames: list[Frame]) -> float:
 def _depth_warnings(source: Source, frames: list[Frame], settings: InputConfig) -> list[str]:
     warnings = [warning] if (warning := depth_warning(source)) else []
     if _holes(frames) > MANY_HOLES:
-        warnings.append(f"{_holes(frames):.0%} of the pixels have no depth; the map will have holes there")
+        warnings.append(f"{_holes(frames):.0%} of the pixels have no depth; the map will have holes")
     beyond = np.mean([(frame.depth_m > settings.max_depth_m).mean() for frame in frames])
     if beyond > 0.2:
         warnings.append(
-            f"{beyond:.0%} of the pixels lie beyond {settings.max_depth_m:g} m and would not be used; "
-            "--set input.max_depth_m=METRES takes them in"
+            f"{beyond:.0%} of the pixels are beyond {settings.max_depth_m:g} m and are not used; "
+            "to use them: --set input.max_depth_m=METRES"
         )
     return warnings
 
@@ -148,9 +148,9 @@ def _registration_warnings(source: Source, agreement: EdgeAgreement | None) -> l
     if agreement is None or agreement.registered:
         return []
     remedy = (
-        "--register-depth on moves it there"
+        "--register-depth on registers it"
         if source.registrable and not source.depth_registered
-        else "give depth_camera and T_color_depth in calibration.json, or mend them if they are there"
+        else "give depth_camera and T_color_depth in calibration.json, or correct them"
     )
     return [f"depth is not registered to colour ({agreement.sentence()}); {remedy}"]
 
@@ -159,19 +159,19 @@ def _brightness_warnings(frames: list[Frame]) -> list[str]:
     brightness = np.array([frame.color.mean() for frame in frames])
     change = float(np.ptp(brightness) / max(float(brightness.mean()), 1e-6))
     steps = np.abs(np.diff(brightness)) / max(float(brightness.mean()), 1e-6)
-    if len(steps) and float(np.median(steps)) > UNEVEN:
-        return [f"brightness changes by {change:.0%}: automatic exposure? --set tracking.exposure=true follows it"]
+    if len(steps) and float(np.median(steps)) > MAX_BRIGHTNESS_STEP:
+        return [f"brightness changes by {change:.0%}; if exposure is automatic: --set tracking.exposure=true"]
     return []
 
 
 def _suggested(format_name: str) -> str:
-    """Name the preset for this machine, and those that hold the papers' numbers for this data set."""
+    """Return the default preset, and the presets with the settings of the papers for this data set."""
     papers = [name for name in list_presets() if name.endswith(f"-{format_name.lower()}") and name.count("-") == 1]
-    return default_preset() + (f" (papers' own numbers, slow on CPUs: {', '.join(papers)})" if papers else "")
+    return default_preset() + (f" (settings of the papers, slow on CPUs: {', '.join(papers)})" if papers else "")
 
 
 def _sheet(frames: list[Frame]) -> Image.Image:
-    """Draw colour, depth and depth's outlines on the image, a column a frame."""
+    """Draw colour, depth, and the image with depth outlines, one column per frame."""
     chosen = [frames[int(k)] for k in np.linspace(0, len(frames) - 1, min(SHOWN, len(frames))).round()]
     depths = np.concatenate([frame.depth_m.reshape(-1) for frame in chosen])
     low, high = colormap.value_range(depths, depths > 0)
@@ -187,5 +187,5 @@ def _sheet(frames: list[Frame]) -> Image.Image:
         for frame in chosen
     ]
     return contact_sheet.draw_contact_sheet(
-        columns, ("colour", f"depth, {low:.2f} to {high:.2f} m", "depth's outlines on the image")
+        columns, ("colour", f"depth, {low:.2f} to {high:.2f} m", "depth outlines on the image")
     )

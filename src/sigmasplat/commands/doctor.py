@@ -1,17 +1,17 @@
-"""Examine the installation: sigmasplat doctor."""
+"""Command `sigmasplat doctor`: check the installation."""
 
 OK, UNHEALTHY = 0, 1
 
 
 def doctor() -> int:
-    """Examine the installation: versions, processor, kernels, self-test.
+    """Check the installation: versions, processor, kernels, self-test.
 
-    exit code 1 if something is wrong; example: sigmasplat doctor
+    exit code 1 if a check fails; example: sigmasplat doctor
     """
-    from sigmasplat.checks.installation import Finding, examine, verdict
+    from sigmasplat.checks.installation import Finding, check_installation, verdict
 
     findings: list[Finding] = []
-    for finding in examine():
+    for finding in check_installation():
         findings.append(finding)
         mark = {True: "ok  ", False: "FAIL", None: "    "}[finding.ok]
         print(f"{mark} {finding.name:<16}{finding.value}", flush=True)

@@ -1,4 +1,4 @@
-"""Score a run: sigmasplat eval."""
+"""Command `sigmasplat eval`: score a run."""
 
 from typing import TYPE_CHECKING
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def evaluate_run(run: options.RunPath, mesh: options.WithMesh = False, moved_to: options.MovedSource = None) -> int:
-    """Score an earlier run again; replaces its metrics, pictures and report.
+    """Score an existing run again. This replaces its metrics, pictures and report.
 
     example: sigmasplat eval runs/kitchen-sigma
     """
@@ -27,7 +27,7 @@ def evaluate_run(run: options.RunPath, mesh: options.WithMesh = False, moved_to:
 
 
 def score(screen: "Screen", folder: "RunFolder", source: "Source", mesh: bool = False) -> None:
-    """Score the run, print the table, and where the report is: it exists even where the truth does not fit."""
+    """Score the run; print the scores and the path of the report, which exists even if the truth does not match."""
     from sigmasplat.evaluation.evaluate import evaluate
 
     try:

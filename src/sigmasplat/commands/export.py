@@ -1,31 +1,39 @@
-"""Write what a run made in other programs' formats: sigmasplat export."""
+"""Write a run or a map in other programs' formats: sigmasplat export."""
 
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from sigmasplat.commands import options
-from sigmasplat.commands.export_formats import ExportOptions, Format, Origin, choose, listed, refuse_unobeyed
-from sigmasplat.commands.export_scene import SCENE
-from sigmasplat.commands.export_splats import SPLATS
-from sigmasplat.commands.options import refuse_existing
+from sigmasplat.commands.options import prepare_torch, refuse_existing, source_of
+from sigmasplat.exports.formats import FORMATS, ExportSource, choose, listed, refuse_unused
 
 
-def _trajectory(origin: Origin, target: Path, _: ExportOptions) -> str:
-    from sigmasplat.io import trajectory
+@dataclass(frozen=True)
+class ExportOptions:
+    """Options that only some formats accept, under their names on the command line (`ExportFormat.options`)."""
 
-    path = origin.run().read_trajectory()
-    trajectory.write_trajectory(target, path)
-    return f"{len(path):,} poses"
+    sigma_below: options.SigmaBelow = None
+    opacity_above: options.OpacityAbove = None
+    plain: options.Plain = False
+    pictures: options.Pictures = False
+    voxel_m: options.VoxelM = 0.01
+    size: options.FilmSize = 0
+    fps: options.FilmRate = 25.0
+    seconds: options.FilmSeconds = None
+    path: options.FilmPath = "run"
+    cell_m: options.CellM = 0.05
+    source: options.MovedSource = None
+
+    def given(self) -> list[str]:
+        """Return the names of the options that differ from their defaults."""
+        return [option.name for option in fields(self) if getattr(self, option.name) != option.default]
 
 
-FORMATS = (*SPLATS, Format("trajectory", (".txt",), "the path as TUM text", _trajectory), *SCENE)
-"""What can be written, the first by default. A new one: a row here, or a module of rows beside `export_splats`."""
-
-
-DEFAULT_RUN_OPTIONS = ExportOptions()
-AskedFlat = Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
+DEFAULT_EXPORT_OPTIONS = ExportOptions()
+ExportOptionsFlat = Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
 
 
 def export(
@@ -33,7 +41,7 @@ def export(
     out: options.OutFile = None,
     format: options.Format = None,
     overwrite: options.Overwrite = False,
-    asked: AskedFlat = DEFAULT_RUN_OPTIONS,
+    asked: ExportOptionsFlat = DEFAULT_EXPORT_OPTIONS,
 ) -> int:
     """Write a run's map, or a map from a file, for viewers and other programs; or a run's path.
 
@@ -41,12 +49,14 @@ def export(
 
     example: sigmasplat export runs/kitchen-sigma --out kitchen.spz --sigma-below 0.02
     """
-    origin = Origin(run)
     chosen = choose(FORMATS, format, out)
-    refuse_unobeyed(chosen, FORMATS, asked)
-    target = out or Path(origin.name + chosen.endings[0])
+    refuse_unused(chosen, FORMATS, asked.given())
+    source = ExportSource(run, lambda folder: source_of(folder, asked.source))
+    target = out or Path(source.name + chosen.endings[0])
     refuse_existing(target, overwrite)
-    print(f"{target}: {chosen.write(origin, target, asked)}{_size(target)}")
+    prepare_torch()
+    content = chosen.write(source, target, **{name: getattr(asked, name) for name in chosen.options})
+    print(f"{target}: {content}{_size(target)}")
     return 0
 
 

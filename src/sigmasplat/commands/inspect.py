@@ -1,4 +1,4 @@
-"""Look a sequence over before a run: sigmasplat inspect."""
+"""Command `sigmasplat inspect`: check a recording before a run."""
 
 from pathlib import Path
 from typing import Annotated
@@ -23,9 +23,9 @@ def inspect(
     settings: options.Settings = (),
     out: SheetFile = None,
 ) -> int:
-    """Say what a sequence is and what in it would spoil a map; draw a contact sheet.
+    """Check a recording before a run: format, depth, poses, and problems; draws a contact sheet.
 
-    exit code 1 if it warns; example: sigmasplat inspect data/kitchen
+    exit code 1 if there are warnings; example: sigmasplat inspect data/kitchen
     """
     from rich.table import Table
 

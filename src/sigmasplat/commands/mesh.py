@@ -1,4 +1,4 @@
-"""Make a surface of a run's map: sigmasplat mesh."""
+"""Extract a surface from a run's map: sigmasplat mesh."""
 
 from sigmasplat.commands import options
 from sigmasplat.commands.options import prepare_torch, refuse_existing, source_of
@@ -11,17 +11,17 @@ def make_mesh(
     overwrite: options.Overwrite = False,
     moved_to: options.MovedSource = None,
 ) -> int:
-    """Make a surface of a run's map, coloured triangles, from what it shows at its keyframes.
+    """Extract a coloured triangle mesh from a run's map, by fusing renders at its keyframes.
 
     example: sigmasplat mesh runs/kitchen-sigma --out kitchen.glb
     """
     from sigmasplat.evaluation.reconstruct import reconstruct
-    from sigmasplat.io.mesh import check_name, write_mesh
+    from sigmasplat.io.mesh import check_ending, write_mesh
     from sigmasplat.io.runs import MESH, RunFolder
     from sigmasplat.run.terminal import Screen
 
     screen, folder, target = Screen(), RunFolder.open(run), out or run / MESH
-    check_name(target)
+    check_ending(target)
     refuse_existing(out, overwrite)
     source = source_of(folder, moved_to)
     prepare_torch()

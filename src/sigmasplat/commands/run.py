@@ -5,7 +5,7 @@ from pathlib import Path
 
 from sigmasplat.commands import options
 from sigmasplat.commands.options import configured, prepare_torch, source_of
-from sigmasplat.commands.run_and_score import announce, nothing_left_of, run_and_score, stage_for
+from sigmasplat.commands.run_and_score import announce, nothing_left_of, optional_viewer, run_and_score
 from sigmasplat.config.text import full_path
 from sigmasplat.errors import ConfigError
 from sigmasplat.presets import default_preset
@@ -67,13 +67,13 @@ def run(
         screen.warn(warning)
     if source.registrable and not source.depth_registered:
         screen.warn("depth stays in its own camera's pixels; --register-depth on moves it to colour (see inspect)")
-    with stage_for(screen, ways) as stage:
+    with optional_viewer(screen, ways) as viewer:
         folder = new_folder(out, config, source, overwrite, source_path=full_path(path))
         with nothing_left_of(folder):
             announce(screen, config.name, source, folder, record)
             prepare_torch()
             begun = Begun(Slam(config, folder.submaps))
-            return run_and_score(screen, begun, source, folder, ways, stage)
+            return run_and_score(screen, begun, source, folder, ways, viewer)
 
 
 def resume(
@@ -92,11 +92,11 @@ def resume(
     screen, folder = Screen(), RunFolder.open(run)
     source = source_of(folder, moved_to)
     prepare_torch()
-    with stage_for(screen, ways) as stage:
+    with optional_viewer(screen, ways) as viewer:
         begun = resumed(folder, source)
         folder.note(status="running")
         screen.say(f"{source.name}: {where(begun.next_index, len(source))} → {folder.path}")
-        return run_and_score(screen, begun, source, folder, ways, stage)
+        return run_and_score(screen, begun, source, folder, ways, viewer)
 
 
 def where(next_index: int, frames: int) -> str:

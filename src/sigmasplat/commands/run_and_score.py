@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from sigmasplat.commands.evaluate import score
 from sigmasplat.commands.options import RunOptions, source_of
-from sigmasplat.commands.view import on_stage, stay
+from sigmasplat.commands.view import keep_showing, serve_viewer
 
 if TYPE_CHECKING:
     from sigmasplat.io.runs import RunFolder
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from sigmasplat.run.terminal import Screen
     from sigmasplat.sources.base import Source
     from sigmasplat.sources.live import LiveSource
-    from sigmasplat.viewer.app import Stage
+    from sigmasplat.viewer.app import ViewerApp
 
 OK, INTERRUPTED = 0, 130
 
 
-def stage_for(screen: "Screen", ways: RunOptions) -> AbstractContextManager["Stage | None"]:
-    """Open the viewer's stage where one is asked for. Raises as `on_stage`."""
-    return on_stage(screen, ways.host, ways.port) if ways.view else nullcontext()
+def optional_viewer(screen: "Screen", ways: RunOptions) -> AbstractContextManager["ViewerApp | None"]:
+    """Start the viewer if it is asked for. Raises the same errors as `serve_viewer`."""
+    return serve_viewer(screen, ways.host, ways.port) if ways.view else nullcontext()
 
 
 @contextmanager
@@ -60,9 +60,14 @@ def announce(screen: "Screen", preset: str, source: "Source", folder: "RunFolder
 
 
 def run_and_score(
-    screen: "Screen", begun: "Begun", source: "Source", folder: "RunFolder", ways: RunOptions, stage: "Stage | None"
+    screen: "Screen",
+    begun: "Begun",
+    source: "Source",
+    folder: "RunFolder",
+    ways: RunOptions,
+    viewer: "ViewerApp | None",
 ) -> int:
-    """Run SLAM into the folder, live on the stage if there is one, then score it; return the exit code.
+    """Run SLAM into the folder, show it in the viewer if there is one, then score it; return the exit code.
 
     Raises KeyboardInterrupt where Ctrl-C came before the first frame was done.
     """
@@ -76,10 +81,10 @@ def run_and_score(
     keeper = Snapshots(begun.slam, folder, ways.save_every)
     with screen.steps(None if source.live else len(source), begun.next_index) as steps:
         watch: Callback = steps
-        if stage:
+        if viewer:
             from sigmasplat.viewer.live import LiveView
 
-            watch = CallbackList(steps, LiveView(begun.slam, stage.show, source.name))
+            watch = CallbackList(steps, LiveView(begun.slam, viewer.show, source.name))
         outcome = record(begun.slam, source, folder, watch, keeper, begun.next_index, begun.wall_s)
     if outcome.status == "interrupted" and not outcome.frames:
         raise KeyboardInterrupt  # there is nothing to tell of, nor to go on with
@@ -101,8 +106,8 @@ def run_and_score(
         score(screen, folder, source)
     else:
         screen.say(f"{outcome.counts()}: {folder.path}")
-    if stage:
-        stay(screen, stage, folder, source)
+    if viewer:
+        keep_showing(screen, viewer, folder, source)
     return OK
 
 

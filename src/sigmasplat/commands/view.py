@@ -8,30 +8,30 @@ from typing import TYPE_CHECKING
 from sigmasplat.commands import options
 from sigmasplat.commands.options import prepare_torch, source_of
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.viewer.server import HOST, PORT, close, is_private, open_server, url_of
+from sigmasplat.viewer.server import HOST, PORT, close, is_loopback, open_server, url_of
 
 if TYPE_CHECKING:
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.run.terminal import Screen
     from sigmasplat.sources.base import Source
-    from sigmasplat.viewer.app import Stage
+    from sigmasplat.viewer.app import ViewerApp
 
 
 def view(run: options.RunPath, host: options.Host = HOST, port: options.Port = PORT) -> int:
-    """Look at a run in the browser: map, path, uncertainty. A run that goes on is followed.
+    """Show a run in the browser: map, path, uncertainty. An unfinished run is updated until it ends.
 
     example: sigmasplat view runs/kitchen-sigma
     """
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.run.terminal import Screen
-    from sigmasplat.viewer.finished import follow, refuse_mapless
+    from sigmasplat.viewer.finished import check_has_map, follow_run
 
     folder = RunFolder.open(run)
-    refuse_mapless(folder)
+    check_has_map(folder)
     prepare_torch()
-    with on_stage(Screen(), host, port) as stage:
+    with serve_viewer(Screen(), host, port) as viewer:
         try:
-            follow(folder, stage.show, threading.Event(), source_where_it_was(folder))
+            follow_run(folder, viewer.show, threading.Event(), source_if_available(folder))
             threading.Event().wait()
         except KeyboardInterrupt:
             pass
@@ -39,41 +39,41 @@ def view(run: options.RunPath, host: options.Host = HOST, port: options.Port = P
 
 
 @contextmanager
-def on_stage(screen: "Screen", host: str, port: int) -> Iterator["Stage"]:
-    """Serve a stage to browsers, empty at first, and say where; close it at the end.
+def serve_viewer(screen: "Screen", host: str, port: int) -> Iterator["ViewerApp"]:
+    """Start an empty viewer and print its address; stop it at the end of the block.
 
-    Raises SigmaSplatError without viser or where the port cannot be had.
+    Raises SigmaSplatError if viser is missing or no port is free.
     """
     server = open_server(host, port, "SigmaSplat")
-    from sigmasplat.viewer.app import Stage
+    from sigmasplat.viewer.app import ViewerApp
 
-    stage, found = Stage(server), server.get_port()
+    viewer, found = ViewerApp(server), server.get_port()
     try:
         if port and found != port:
-            screen.say(f"port {port} is taken, so it is {found}")
-        if not is_private(host):
-            screen.warn(f"whoever reaches {host} can look at the run; leave out --host to keep it to this machine")
-        screen.say(f"viewer: {url_of(host, found)} (Ctrl-C ends it)")
-        yield stage
+            screen.say(f"port {port} is busy, using {found}")
+        if not is_loopback(host):
+            screen.warn(f"anyone who can reach {host} can view the run; omit --host to allow only this machine")
+        screen.say(f"viewer: {url_of(host, found)} (press Ctrl-C to stop)")
+        yield viewer
     finally:
-        stage.stop()
+        viewer.stop()
         close(server)
 
 
-def stay(screen: "Screen", stage: "Stage", folder: "RunFolder", source: "Source") -> None:
-    """Show a run that has ended until Ctrl-C."""
-    from sigmasplat.viewer.finished import ended
+def keep_showing(screen: "Screen", viewer: "ViewerApp", folder: "RunFolder", source: "Source") -> None:
+    """Keep showing a finished run until Ctrl-C."""
+    from sigmasplat.viewer.finished import finished_snapshot
 
     try:
-        stage.show(ended(folder, source))
-        screen.say("the run stays in the browser; Ctrl-C ends the viewer")
+        viewer.show(finished_snapshot(folder, source))
+        screen.say("the viewer keeps showing the run; press Ctrl-C to stop it")
         threading.Event().wait()
     except KeyboardInterrupt:
         pass
 
 
-def source_where_it_was(folder: "RunFolder") -> "Source | None":
-    """Open the sequence of a run for its pictures, None where it is not there any more."""
+def source_if_available(folder: "RunFolder") -> "Source | None":
+    """Open the sequence of a run for its images; return None if it cannot be opened."""
     try:
         return source_of(folder, None)
     except SigmaSplatError:

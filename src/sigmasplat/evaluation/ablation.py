@@ -21,7 +21,7 @@ from sigmasplat.config.text import full_path, override, split_settings
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.io import machine
 from sigmasplat.io.atomic import write_text
-from sigmasplat.io.machine import RUNNING, code_digest
+from sigmasplat.io.machine import INSTALLED, code_digest
 from sigmasplat.presets import preset as preset_of
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ class Study:
         return {
             "config": self.config.to_dict(),
             "limit": self.limit,
-            "code": code_digest(Path(sigmasplat.__file__).parent, RUNNING),
+            "code": code_digest(Path(sigmasplat.__file__).parent, INSTALLED),
             "machine": machine.describe(),
         }
 
@@ -153,7 +153,7 @@ class Results:
         self.runs.append(
             {
                 "source": job.source, "path": job.path, "variant": job.variant, "seed": job.seed,
-                "settings": VARIANTS[job.variant], "commit": machine.code(),
+                "settings": VARIANTS[job.variant], "commit": machine.code_version(),
                 "date": datetime.now(UTC).isoformat(timespec="seconds"), "wall_s": round(wall_s, 2),
                 "figures": figures_of(metrics), "metrics": dict(metrics),
             }

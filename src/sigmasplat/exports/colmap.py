@@ -1,8 +1,8 @@
-"""Write views and points as a sparse model in COLMAP's text format: cameras.txt, images.txt, points3D.txt.
+"""Write a run as a sparse model in COLMAP's text format: cameras.txt, images.txt, points3D.txt.
 
-Layout: COLMAP's documentation, "Output Format". Poses are world to camera, quaternions wxyz; the image's corner is
-(0, 0) and the first pixel's centre (½, ½), so the principal point is half a pixel more than ours. Points carry no
-tracks: no features were matched.
+Layout: COLMAP's documentation, "Output Format". Poses are world to camera, quaternions wxyz. The image's corner is
+(0, 0) and the first pixel's centre (½, ½), so the principal point is half a pixel larger than in `Camera`. Points have
+no tracks, because no features were matched.
 """
 
 from collections.abc import Sequence
@@ -11,22 +11,43 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.exports.points import color_bytes
-from sigmasplat.io.atomic import write_text
+from sigmasplat.exports.images import export_images, image_name
+from sigmasplat.exports.points import splat_points
+from sigmasplat.exports.run_reader import RunReader
+from sigmasplat.io.atomic import make_folder, write_text
+from sigmasplat.io.mesh import color_bytes
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.types import Matrix
+from sigmasplat.types import Matrix, Progress
 
+SPARSE = Path("sparse") / "0"
+"""The folder in which trainers that start from COLMAP look for a model."""
 Points = NDArray[np.floating]
+
+
+def export_colmap(
+    reader: RunReader, target: Path, images: bool = False, progress: Progress = lambda done, total: None
+) -> int:
+    """Write a sparse model to sparse/0 in a folder; return the number of views.
+
+    Views are all frames that were not lost; with `images` only the keyframes, whose images are written to images/.
+    Raises RunError.
+    """
+    make_folder(target / SPARSE)
+    frames = export_images(reader, target, False, progress) if images else reader.tracked_frames()
+    names = [image_name(frame) for frame in frames]
+    poses = reader.path.T_world_camera[frames]
+    write_model(target / SPARSE, reader.camera, names, poses, *splat_points(reader.run.read_map()))
+    return len(frames)
 
 
 def write_model(
     folder: Path, camera: Camera, names: Sequence[str], T_world_camera: Matrix, points: Points, colors: Points
 ) -> None:
-    """Write a model into an existing folder; every image is of the one camera.
+    """Write a model into an existing folder; all images have the same camera.
 
-    names: of the images [N], relative to the folder of images; T_world_camera [N, 4, 4]; points [P, 3] m in the world;
-    colors [P, 3] in [0, 1]. Raises RunError if not writable.
+    names: the images' file names [N], relative to their folder; T_world_camera [N, 4, 4]; points [P, 3] m in the world;
+    colors [P, 3] in [0, 1]. Raises RunError if the files cannot be written.
     """
     write_text(folder / "cameras.txt", _cameras(camera))
     write_text(folder / "images.txt", _images(names, T_world_camera))
@@ -39,7 +60,7 @@ def _cameras(c: Camera) -> str:
 
 
 def _images(names: Sequence[str], T_world_camera: Matrix) -> str:
-    """Return two lines an image; the second, for its features, is empty."""
+    """Return two lines per image; the second one, for features, is empty."""
     lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then POINTS2D as (X, Y, POINT3D_ID)"]
     for number, (name, T) in enumerate(zip(names, se3.inverse(T_world_camera), strict=True), 1):
         pose = (*se3.quaternion_from_rotation(T[:3, :3]), *T[:3, 3])
@@ -48,7 +69,7 @@ def _images(names: Sequence[str], T_world_camera: Matrix) -> str:
 
 
 def _points(points: Points, colors: Points) -> str:
-    """Return a line a point; its error is 0 and its track empty."""
+    """Return one line per point; its error is 0 and its track is empty."""
     rows = zip(points.tolist(), color_bytes(colors).tolist(), strict=True)
     lines = (f"{i} {x:.6f} {y:.6f} {z:.6f} {r} {g} {b} 0\n" for i, ((x, y, z), (r, g, b)) in enumerate(rows, 1))
     return "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n" + "".join(lines)

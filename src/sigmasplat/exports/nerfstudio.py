@@ -1,7 +1,8 @@
-"""Write views as nerfstudio's transforms.json, which instant-ngp and most trainers of radiance fields read.
+"""Write a run as nerfstudio's transforms.json, which instant-ngp and most trainers of radiance fields read.
 
-Layout: nerfstudio's documentation, "Data conventions". Cameras are OpenGL's, x right, y up, z backwards. The image's
-corner is (0, 0) and the first pixel's centre (½, ½), so the principal point is half a pixel more than ours.
+Layout: nerfstudio's documentation, "Data conventions". Cameras have OpenGL's axes: x right, y up, z backwards. The
+image's corner is (0, 0) and the first pixel's centre (½, ½), so the principal point is half a pixel larger than in
+`Camera`.
 """
 
 from collections.abc import Sequence
@@ -10,13 +11,40 @@ from typing import Any
 
 import numpy as np
 
+from sigmasplat.exports.images import DEPTHS, IMAGES, export_images, image_name
+from sigmasplat.exports.points import splat_points, write_points
+from sigmasplat.exports.run_reader import RunReader
 from sigmasplat.io.json_files import write_json
 from sigmasplat.model.camera import Camera
-from sigmasplat.types import Matrix
+from sigmasplat.types import Matrix, Progress
 
-OPENGL_FROM_OURS = np.diag([1.0, -1.0, -1.0, 1.0])
-"""T_gl_camera, and its own inverse."""
+POINTS = "points.ply"
+T_GL_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From `Camera`'s axes to OpenGL's; it is its own inverse."""
 MILLIMETRES = 0.001
+
+
+def export_nerfstudio(
+    reader: RunReader, target: Path, images: bool = False, progress: Progress = lambda done, total: None
+) -> int:
+    """Write transforms.json; return the number of views.
+
+    Views are all frames that were not lost; with `images` only the keyframes, whose images are written to images/ and
+    depths/ beside the file, with points.ply. The images' names are the same in both cases. Raises RunError.
+    """
+    frames = export_images(reader, target.parent, True, progress) if images else reader.tracked_frames()
+    if images:
+        write_points(target.parent / POINTS, *splat_points(reader.run.read_map()))
+    write_transforms(
+        target,
+        reader.camera,
+        [f"{IMAGES}/{image_name(frame)}" for frame in frames],
+        reader.path.T_world_camera[frames],
+        reader.path.timestamps_s[frames].tolist(),
+        depth_names=[f"{DEPTHS}/{image_name(frame)}" for frame in frames] if images else None,
+        points_name=POINTS if images else None,
+    )
+    return len(frames)
 
 
 def write_transforms(
@@ -29,13 +57,13 @@ def write_transforms(
     depth_names: Sequence[str] | None = None,
     points_name: str | None = None,
 ) -> None:
-    """Write views: names of their pictures relative to the file, T_world_camera [N, 4, 4], times.
+    """Write views: the images' file names relative to the file, T_world_camera [N, 4, 4], times.
 
-    depth_names: of 16-bit pictures in millimetres; points_name: of a PLY to begin from. Raises RunError if not
-    writable.
+    depth_names: 16-bit images in millimetres; points_name: a PLY with the initial points. Raises RunError if the file
+    cannot be written.
     """
     frames = [
-        {"file_path": name, "timestamp_s": float(t), "transform_matrix": T @ OPENGL_FROM_OURS}
+        {"file_path": name, "timestamp_s": float(t), "transform_matrix": T @ T_GL_CAMERA}
         for name, t, T in zip(names, timestamps_s, T_world_camera, strict=True)
     ]
     for frame, depth_name in zip(frames, depth_names or (), strict=bool(depth_names)):
@@ -46,7 +74,7 @@ def write_transforms(
 
 
 def _intrinsics(camera: Camera) -> dict[str, Any]:
-    """Return the camera in nerfstudio's words: a pinhole is OPENCV without distortion."""
+    """Return the camera in nerfstudio's terms: a pinhole is OPENCV without distortion."""
     return {
         "camera_model": "OPENCV", "w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy,
         "cx": camera.cx + 0.5, "cy": camera.cy + 0.5, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0,

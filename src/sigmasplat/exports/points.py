@@ -1,4 +1,4 @@
-"""Write a run's surface as points with normals and colours."""
+"""Write a run's surface as points with normals and colours; sample points from a map."""
 
 from pathlib import Path
 
@@ -6,41 +6,50 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.evaluation.reconstruct import Recording
-from sigmasplat.exports.recorded import Recorded
+from sigmasplat.exports.run_reader import RunReader
 from sigmasplat.io.atomic import replacing
+from sigmasplat.io.mesh import color_bytes
+from sigmasplat.model.field import GaussianField
 from sigmasplat.slam.fusion import VOXEL_M, Renderer
-from sigmasplat.types import Progress
+from sigmasplat.types import Matrix, Progress
+
+Points = NDArray[np.floating]
+
+MAX_POINTS = 100_000
+MIN_OPACITY = 0.5
 
 
 def export_points(
-    recorded: Recorded,
+    reader: RunReader,
     target: Path,
     *,
     voxel_m: float = VOXEL_M,
     renderer: Renderer | None = None,
     progress: Progress = lambda done, total: None,
 ) -> int:
-    """Fuse what the map shows at its keyframes and write the surface's points; return how many.
+    """Fuse the map's renders at its keyframes to a surface and write its vertices; return their number.
 
-    They are the vertices of the mesh that `surface.reconstruct` makes, about one per voxel that the surface crosses.
-    Raises RunError if the run has no map, checkpoint or keyframe, ConfigError unless voxel_m > 0.
+    They are the vertices of `evaluation.reconstruct`'s mesh, about one per voxel on the surface. Raises RunError if the
+    run has no map, checkpoint or keyframe, ConfigError unless voxel_m > 0.
     """
-    surface = Recording.at(recorded.run, recorded.camera).surface(voxel_m, renderer, progress)
+    surface = Recording.at(reader.run, reader.camera).surface(voxel_m, renderer, progress)
     colors = surface.vertices * 0.0 + 0.7 if surface.colors is None else surface.colors
     write_points(target, surface.vertices, colors, surface.normals())
     return len(surface.vertices)
 
 
-Points = NDArray[np.floating]
-
-
-def color_bytes(colors: Points) -> NDArray[np.uint8]:
-    """Turn colours in [0, 1] into bytes; beyond it the ends hold."""
-    return np.asarray(np.rint(np.clip(colors, 0.0, 1.0) * 255.0), np.uint8)
+def splat_points(field: GaussianField, most: int = MAX_POINTS) -> tuple[Matrix, Matrix]:
+    """Return the centres [P, 3] m and colours [P, 3] of the opaque splats, evenly thinned to `most`."""
+    rows = np.flatnonzero(field.opacities.numpy() >= MIN_OPACITY)
+    rows = rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)]
+    return field.means.numpy()[rows].astype(np.float64), field.colors.numpy()[rows].astype(np.float64)
 
 
 def write_points(path: Path, positions: Points, colors: Points, normals: Points | None = None) -> None:
-    """Write positions [N, 3], colors [N, 3] in [0, 1] and unit normals [N, 3]. Raises RunError if not writable."""
+    """Write a binary PLY of positions [N, 3], colors [N, 3] in [0, 1] and unit normals [N, 3].
+
+    Raises RunError if the file cannot be written.
+    """
     floats = ["x", "y", "z"] + ([] if normals is None else ["nx", "ny", "nz"])
     values = positions if normals is None else np.concatenate([positions, normals], 1)
     rows = np.zeros(len(positions), [(name, "<f4") for name in floats] + [(n, "u1") for n in ("red", "green", "blue")])

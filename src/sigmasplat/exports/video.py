@@ -1,4 +1,4 @@
-"""Render a run as a film: colour, depth and uncertainty side by side, along its own path or in a circle above it."""
+"""Render a run as a film: colour, depth and uncertainty side by side, along its path or on an orbit above the room."""
 
 import os
 import sys
@@ -17,13 +17,13 @@ from sigmasplat.drawing.colormap import Rgb
 from sigmasplat.drawing.film import FilmMaps, FilmScale, film_image, legend_strip
 from sigmasplat.env import install_extra
 from sigmasplat.errors import BackendError, ConfigError, RunError
-from sigmasplat.exports.recorded import Recorded
+from sigmasplat.exports.run_reader import RunReader
 from sigmasplat.floorplan.ground import floor_frame
 from sigmasplat.floorplan.surface_samples import SurfaceRenderer, sample_surfaces
 from sigmasplat.io.atomic import replacing
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.camera_path import orbit, resampled
+from sigmasplat.model.camera_path import orbit, smooth_path
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import FieldRenderer
@@ -31,18 +31,20 @@ from sigmasplat.types import Matrix, Progress
 
 SHORTEST_S, LONGEST_S, ORBIT_S = 4.0, 60.0, 12.0
 SAMPLES = 12
-"""Images that the film's scale is fitted to."""
-LOOKS = 20
-CUT_M = 0.1
-"""From above, what lies higher than this over the middle height of the camera is cut off: the ceiling, mostly."""
+"""Number of images from which the film's colour scale is computed."""
+SURFACE_VIEWS = 20
+CEILING_M = 0.1
+"""On an orbit, splats higher than this above the camera's median height are removed: mostly the ceiling."""
 
 
 @dataclass(frozen=True)
 class VideoOptions:
-    """How a film is made: width_px of each of its three panels (0: that of the run's images), images per second, length
-    (None: that of the path, 4 to 60 s; 12 s in a circle), which way the camera goes.
+    """The options of a film.
 
-    Raises ConfigError on sizes, rates or lengths that make no film.
+    width_px: width of each of the three panels (0: that of the run's images); fps: images per second; seconds: length
+    (None: that of the path, within 4 to 60 s; 12 s for an orbit); path: along the run's path or on an orbit.
+
+    Raises ConfigError on a size, rate or length out of range.
     """
 
     width_px: int = 0
@@ -55,66 +57,66 @@ class VideoOptions:
             raise ConfigError(f"a film's panels must be 32 to 4096 pixels wide, found {self.width_px}")
         if not 1.0 <= self.fps <= 120.0 or not (self.seconds is None or 0.04 <= self.seconds <= 3600.0):
             raise ConfigError(
-                f"a film takes 1 to 120 images/s and at most an hour, found {self.fps} and {self.seconds} s"
+                f"a film must have 1 to 120 images/s and last 0.04 s to 1 h, found {self.fps} and {self.seconds} s"
             )
         if self.path not in ("run", "orbit"):
-            raise ConfigError(f"a film goes along 'run' or 'orbit', found {self.path!r}")
+            raise ConfigError(f"a film's path must be 'run' or 'orbit', found {self.path!r}")
 
     def images(self, path_s: float) -> int:
-        """Return how many images the film has, for a path of so many seconds."""
+        """Return the number of images of the film, for a path that lasts `path_s` seconds."""
         usual = ORBIT_S if self.path == "orbit" else float(np.clip(path_s, SHORTEST_S, LONGEST_S))
         return max(1, round((self.seconds or usual) * self.fps))
 
 
 def export_video(
-    recorded: Recorded,
+    reader: RunReader,
     target: Path,
     options: VideoOptions | None = None,
     *,
     renderer: SurfaceRenderer | None = None,
     progress: Progress = lambda done, total: None,
 ) -> int:
-    """Write a film and return how many images it has; `progress` is told (images done, of how many).
+    """Write a film and return its number of images. Calls `progress(done, total)` after each image.
 
-    Raises RunError on a name that is no film's, or without a map or path; BackendError without OpenCV for .webm, .mp4.
+    Raises RunError on an unknown ending, or without a map or path; BackendError without OpenCV for .webm and .mp4.
     """
     options = options or VideoOptions()
-    check_name(target)
-    config, path = recorded.config, recorded.trusted_path()
+    check_ending(target)
+    config, path = reader.config, reader.tracked_path()
     renderer = renderer or FieldRenderer(config.render, config.backend)
-    field, camera = recorded.run.read_map(), sized(recorded.camera, options.width_px)
+    field, camera = reader.run.read_map(), film_camera(reader.camera, options.width_px)
     count = options.images(float(path.timestamps_s[-1] - path.timestamps_s[0]))
     if options.path == "orbit":
-        field, poses = from_above(field, path, camera, count, renderer)
+        field, poses = orbit_view(field, path, camera, count, renderer)
     else:
-        poses = resampled(path, count)
+        poses = smooth_path(path, count)
     show = partial(_show, renderer, field, camera)
     write_video(target, _images(show, poses, camera.width, progress), options.fps)
     return count
 
 
-def sized(camera: Camera, width_px: int) -> Camera:
-    """Return the camera at another width, both sides even, as films want them."""
+def film_camera(camera: Camera, width_px: int) -> Camera:
+    """Return the camera resized to a width (0: unchanged), with even width and height as codecs require."""
     width = (width_px or camera.width) // 2 * 2
     return camera.resized(width, max(2, round(camera.height * width / camera.width / 2) * 2))
 
 
-def from_above(
+def orbit_view(
     field: GaussianField, path: Trajectory, camera: Camera, images: int, renderer: SurfaceRenderer
 ) -> tuple[GaussianField, Matrix]:
-    """Return the map without its ceiling, and a circle of poses [images, 4, 4] above it that keeps it in view."""
-    sights = list(sample_surfaces(field, path, camera, renderer, LOOKS))
+    """Return the map without its ceiling, and poses [images, 4, 4] on a circle above it from which it is visible."""
+    sights = list(sample_surfaces(field, path, camera, renderer, SURFACE_VIEWS))
     T = floor_frame(sights)
     points = np.concatenate([sight.points for sight in sights]) @ T[:3, :3].T + T[:3, 3]
     low, high = np.quantile(points, [0.02, 0.98], axis=0)
-    cut_m = float(np.median(path.T_world_camera[:, :3, 3] @ T[2, :3] + T[2, 3])) + CUT_M
-    middle = np.append((low + high)[:2] / 2.0, min(cut_m, 0.8) / 2.0)
+    ceiling_m = float(np.median(path.T_world_camera[:, :3, 3] @ T[2, :3] + T[2, 3])) + CEILING_M
+    middle = np.append((low + high)[:2] / 2.0, min(ceiling_m, 0.8) / 2.0)
     half_view = np.arctan(min(camera.width / camera.fx, camera.height / camera.fy) / 2.0)
     radius_m = 0.85 * float(np.linalg.norm((high - low)[:2]) / 2.0 / np.sin(half_view))
     T_world_floor = se3.inverse(T)
     center = T_world_floor[:3, :3] @ middle + T_world_floor[:3, 3]
     kept = field.moved(torch.eye(4))  # a copy
-    kept.keep(torch.from_numpy(field.means.numpy().astype(np.float64) @ T[2, :3] + T[2, 3] < cut_m))
+    kept.keep(torch.from_numpy(field.means.numpy().astype(np.float64) @ T[2, :3] + T[2, 3] < ceiling_m))
     return kept, orbit(center, T[2, :3], T[1, :3], radius_m, images)
 
 
@@ -124,7 +126,7 @@ def _show(renderer: SurfaceRenderer, field: GaussianField, camera: Camera, T_wor
 
 
 def _images(show: Callable[[Matrix], FilmMaps], poses: Matrix, width: int, progress: Progress) -> Iterator[Rgb]:
-    """Yield a film's images, their colours fixed by a few of them."""
+    """Yield a film's images; a few of them determine the colour scale."""
     rows = np.unique(np.linspace(0, len(poses) - 1, min(SAMPLES, len(poses))).round().astype(int))
     scale = FilmScale.of([show(poses[row]) for row in rows])
     strip = legend_strip(scale, width)
@@ -134,32 +136,32 @@ def _images(show: Callable[[Matrix], FilmMaps], poses: Matrix, width: int, progr
 
 
 CODECS = {".webm": "VP90", ".mp4": "vp09"}
-PICTURES = {".gif": "GIF", ".webp": "WEBP"}
-ENDINGS = (*CODECS, *PICTURES)
+ANIMATIONS = {".gif": "GIF", ".webp": "WEBP"}
+ENDINGS = (*CODECS, *ANIMATIONS)
 NO_IMAGES = "a film needs at least one image, found none"
 
 
 def write_video(path: Path, images: Iterable[Rgb], fps: float) -> None:
-    """Write images uint8 RGB [H, W, 3], all of one size, as a film, as its name's ending says, in one step.
+    """Write images uint8 RGB [H, W, 3] of equal size as a film in the format of the path's ending, atomically.
 
-    Raises RunError on another ending, an unwritable place or where the codec is not there; BackendError without OpenCV.
+    Raises RunError on an unknown ending, an unwritable file or a missing codec; BackendError without OpenCV.
     """
-    check_name(path)
+    check_ending(path)
     kind = path.suffix.lower()
     with replacing(path) as temporary:
-        scratch = temporary.with_suffix(kind)  # OpenCV goes by the ending
+        scratch = temporary.with_suffix(kind)  # OpenCV selects the format by the ending
         try:
             if kind in CODECS:
                 _write_vp9(scratch, images, fps, CODECS[kind])
             else:
-                _write_pictures(scratch, iter(images), fps, PICTURES[kind])
+                _write_animation(scratch, iter(images), fps, ANIMATIONS[kind])
             os.replace(scratch, temporary)
         finally:
             scratch.unlink(missing_ok=True)
 
 
-def check_name(path: Path) -> None:
-    """Raise RunError unless a film can be written under this name, BackendError where OpenCV is missing for it."""
+def check_ending(path: Path) -> None:
+    """Raise RunError unless the path's ending is a film's, BackendError if it needs OpenCV, which is missing."""
     if path.suffix.lower() not in ENDINGS:
         raise RunError(f"cannot write a film as {path.name}; give a name that ends in {', '.join(ENDINGS)}")
     if path.suffix.lower() in CODECS:
@@ -177,7 +179,7 @@ def _opencv() -> Any:
 
 
 def _write_vp9(path: Path, images: Iterable[Rgb], fps: float, codec: str) -> None:
-    """Encode with VP9; odd sizes, which it cannot halve, lose their last row or column."""
+    """Encode with VP9, which needs even sizes: an odd last row or column is dropped."""
     cv2, writer, size = _opencv(), None, (0, 0)
     try:
         for image in images:
@@ -187,7 +189,7 @@ def _write_vp9(path: Path, images: Iterable[Rgb], fps: float, codec: str) -> Non
                     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*codec), fps, size)
                 if not writer.isOpened():
                     raise RunError(
-                        f"cannot write {path.name} with this OpenCV; write .gif or .webp, or a writable place"
+                        f"cannot write {path.name} with this OpenCV; choose .gif or .webp, or a writable place"
                     )
             writer.write(np.ascontiguousarray(image[: size[1], : size[0], ::-1]))
     finally:
@@ -199,7 +201,7 @@ def _write_vp9(path: Path, images: Iterable[Rgb], fps: float, codec: str) -> Non
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep the process's standard error silent: OpenCV warns there of a tag in .webm that it mends itself."""
+    """Silence the process's standard error, where OpenCV prints a harmless warning about a tag in .webm."""
     sys.stderr.flush()
     kept = os.dup(2)
     try:
@@ -211,8 +213,8 @@ def _quiet() -> Iterator[None]:
         os.close(kept)
 
 
-def _write_pictures(path: Path, images: Iterator[Rgb], fps: float, kind: str) -> None:
-    """Write an animation that repeats."""
+def _write_animation(path: Path, images: Iterator[Rgb], fps: float, kind: str) -> None:
+    """Write an animation that repeats endlessly."""
     first = next(images, None)
     if first is None:
         raise RunError(NO_IMAGES)

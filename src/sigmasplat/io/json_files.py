@@ -1,4 +1,4 @@
-"""Write values as JSON, whole files or a line at a time, and read them again."""
+"""Write and read JSON files, and files with one JSON value per line."""
 
 import json
 import math
@@ -12,22 +12,22 @@ from sigmasplat.errors import RunError
 from sigmasplat.io.atomic import write_text
 
 
-def plain(value: Any) -> Any:
-    """Turn a value into what JSON can hold: arrays and tensors to lists, nan and inf to None, paths to text."""
+def to_json(value: Any) -> Any:
+    """Convert a value to JSON's types: arrays and tensors to lists, nan and inf to None, paths to text."""
     if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_json(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [to_json(item) for item in value]
     if isinstance(value, np.ndarray | np.generic | Tensor):
-        return plain(value.tolist())
+        return to_json(value.tolist())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return str(value) if isinstance(value, Path) else value
 
 
 def write_json(path: Path, values: Any) -> None:
-    """Write a file in one step. Raises RunError if the place cannot be written."""
-    write_text(path, json.dumps(plain(values), indent=2, allow_nan=False) + "\n")
+    """Write a file atomically. Raises RunError if it cannot be written."""
+    write_text(path, json.dumps(to_json(values), indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: Path) -> Any:
@@ -39,8 +39,8 @@ def read_json(path: Path) -> Any:
 
 
 def append_line(path: Path, values: Any) -> None:
-    """Add a line; it is on its way to disk when this returns. Raises RunError if the place cannot be written."""
-    line = json.dumps(plain(values), allow_nan=False) + "\n"
+    """Append a line and flush it to the operating system. Raises RunError if the file cannot be written."""
+    line = json.dumps(to_json(values), allow_nan=False) + "\n"
     try:
         with path.open("a", encoding="utf-8") as file:
             file.write(line)
@@ -49,13 +49,13 @@ def append_line(path: Path, values: Any) -> None:
 
 
 def read_lines(path: Path) -> list[Any]:
-    """Read what each line holds; a last line cut off by an interruption is passed over.
+    """Read the value of each line; an incomplete last line, left by an interruption, is skipped.
 
     Raises RunError if the file cannot be read or another line is damaged.
     """
-    *whole, _cut_off = read_text(path).split("\n")
+    *complete, _incomplete = read_text(path).split("\n")
     values = []
-    for number, line in enumerate(whole, 1):
+    for number, line in enumerate(complete, 1):
         try:
             values.append(json.loads(line))
         except json.JSONDecodeError as problem:

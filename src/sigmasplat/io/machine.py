@@ -1,4 +1,4 @@
-"""Say on what and with what a run was made, for run.json and `doctor`."""
+"""Describe the machine and the code version of a run, for run.json and `doctor`."""
 
 import hashlib
 import os
@@ -9,12 +9,12 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-SOURCES, RUNNING = (".py", ".cpp", ".h"), (".py", ".h", ".so")
-"""Endings of what is written, and of what runs: compiled kernels with the headers that their text ships in."""
+SOURCES, INSTALLED = (".py", ".cpp", ".h"), (".py", ".h", ".so")
+"""Endings of source files, and of installed files: Python, compiled kernels, and the headers that CUDA compiles."""
 
 
 def package_version() -> str:
-    """Return the installed version, or 'unknown' when run from a bare checkout."""
+    """Return the installed version, or 'unknown' in a checkout that is not installed."""
     try:
         return metadata.version("sigmasplat")
     except metadata.PackageNotFoundError:
@@ -22,7 +22,7 @@ def package_version() -> str:
 
 
 def code_digest(folder: Path, endings: Sequence[str] = SOURCES) -> str:
-    """Digest the files of a folder with these endings, names and bytes: equal digests mean equal code."""
+    """Return a digest of the names and bytes of a folder's files with these endings: equal digests mean equal code."""
     digest = hashlib.sha256()
     for path in sorted(p for p in folder.rglob("*") if p.suffix in endings):
         digest.update(str(path.relative_to(folder)).encode() + b"\0" + path.read_bytes() + b"\0")
@@ -30,7 +30,7 @@ def code_digest(folder: Path, endings: Sequence[str] = SOURCES) -> str:
 
 
 def cpu_model() -> str:
-    """Return the processor's name as the kernel gives it, else the platform's word for it."""
+    """Return the processor's name from /proc/cpuinfo, else from Python's `platform`."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -44,16 +44,19 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def code() -> str:
-    """Return which code this is: the commit of the checkout that it runs from, else the one it was built of, either
-    with -dirty where files had changed since; where neither is known, the version."""
+def code_version() -> str:
+    """Return the commit of the checkout that runs, else the commit that the package was built from, else the version.
+
+    A commit ends in -dirty if files were changed since.
+    """
     package = Path(__file__).resolve().parents[1]
-    built_of = package / "commit.txt"
-    return _commit_of(package.parents[1]) or (built_of.is_file() and built_of.read_text().strip()) or package_version()
+    built_from = package / "commit.txt"
+    built_commit = built_from.is_file() and built_from.read_text().strip()
+    return _commit_of(package.parents[1]) or built_commit or package_version()
 
 
 def _commit_of(checkout: Path) -> str | None:
-    """Return the commit of a folder that is itself a checkout: a repository further up would be somebody else's."""
+    """Return the commit of a folder that is itself a checkout; a repository in a parent folder is not ours."""
     if not (checkout / ".git").exists():
         return None
     command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
@@ -65,7 +68,7 @@ def _commit_of(checkout: Path) -> str | None:
 
 
 def describe() -> dict[str, Any]:
-    """Return processor, cores, system and Python as plain values."""
+    """Return processor, cores, system and Python version."""
     return {
         "cpu": cpu_model(),
         "cores": usable_cores(),

@@ -1,4 +1,4 @@
-"""Write surfaces as PLY, OBJ or GLB, all with a colour per vertex; read PLY back."""
+"""Write surfaces as PLY, OBJ or GLB with a colour per vertex; read PLY."""
 
 import json
 import struct
@@ -10,50 +10,49 @@ from numpy.typing import NDArray
 
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.io.atomic import replacing
+from sigmasplat.io.binary import open_binary
 from sigmasplat.io.ply_elements import BYTE_ORDERS, MAX_HEADER_BYTES, PLY_TYPES
 from sigmasplat.model.mesh import Mesh
 
 Element = tuple[str, int, list[list[str]]]
 
 FLOAT32, UINT32, VERTEX_TARGET, INDEX_TARGET = 5126, 5125, 34962, 34963
-"""Numbers of the glTF 2.0 specification."""
+"""Constants of the glTF 2.0 specification."""
 
 
 def write_mesh(path: Path, mesh: Mesh) -> None:
-    """Write a mesh as its file's ending says, in one step. Raises RunError on another ending or an unwritable place."""
-    check_name(path)
+    """Write a mesh in the format of the path's ending, atomically. Raises RunError on an unknown ending or if the file
+    cannot be written."""
+    check_ending(path)
     content = _FORMATS[path.suffix.lower()](mesh)
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 
 
-def check_name(path: Path) -> None:
-    """Raise RunError unless a mesh can be written under this name."""
+def check_ending(path: Path) -> None:
+    """Raise RunError unless the path's ending is that of a mesh."""
     if path.suffix.lower() not in _FORMATS:
         raise RunError(f"cannot write a mesh as {path.name}; give a name that ends in {', '.join(_FORMATS)}")
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Read a binary PLY of triangles, of ours or of another program; colours as bytes or as floats in [0, 1].
+    """Read a binary PLY of triangles from SigmaSplat or another program; colours are bytes or floats in [0, 1].
 
-    Raises SourceError if it is missing, truncated, no such PLY, or holds values that are no mesh.
+    Raises SourceError if it is missing, truncated, not such a PLY, or not a valid mesh.
     """
-    try:
-        with path.open("rb") as file:
-            order, elements = _header(file, path)
-            rows = {name: _rows(file, path, order, name, count, fields) for name, count, fields in elements}
-    except OSError as problem:
-        raise SourceError(f"cannot read mesh {path}: {problem.strerror or problem}") from problem
+    with open_binary(path, "cannot read mesh") as file:
+        order, elements = _header(file, path)
+        rows = {name: _rows(file, path, order, name, count, fields) for name, count, fields in elements}
     vertices, faces = rows.get("vertex"), rows.get("face")
     if vertices is None or faces is None or not {"x", "y", "z"} <= set(vertices.dtype.names or ()):
-        raise SourceError(f"{path} is no mesh: it needs vertices with x, y, z and faces; is it a point cloud?")
+        raise SourceError(f"{path} is not a mesh: it needs vertices with x, y, z and faces; is it a point cloud?")
     corners = [name for name in ("vertex_indices", "vertex_index") if name in (faces.dtype.names or ())]
     if not corners or (faces[f"{corners[0]} count"] != 3).any():
         raise SourceError(f"{path}: not all faces are triangles; triangulate the mesh first")
     points = np.stack([vertices[name] for name in "xyz"], -1).astype(np.float32)
     chosen = faces[corners[0]].astype(np.int64)
     if not np.isfinite(points).all() or (chosen.size and not 0 <= chosen.min() <= chosen.max() < len(points)):
-        raise SourceError(f"{path}: the mesh holds nan or inf, or faces of vertices that do not exist")
+        raise SourceError(f"{path}: the mesh has nan or inf, or faces with vertices that do not exist")
     return Mesh(points, chosen.astype(np.int32), _colors(vertices))
 
 
@@ -67,7 +66,7 @@ def _colors(vertices: NDArray[np.void]) -> NDArray[np.float32] | None:
 
 
 def _header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
-    """Read up to end_header: byte order, and name, count and properties of each element. Raises SourceError."""
+    """Read the header: byte order, and name, count and properties of each element. Raises SourceError."""
     if file.readline(8).strip() != b"ply":
         raise SourceError(f"{path} is not a PLY file (its first line is not 'ply')")
     order, elements = "", list[Element]()
@@ -89,7 +88,7 @@ def _header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
 def _rows(
     file: BinaryIO, path: Path, order: str, name: str, count: int, properties: list[list[str]]
 ) -> NDArray[np.void]:
-    """Read one element; lists are taken to hold three values, and their lengths are kept as "NAME count"."""
+    """Read one element. Lists are read as three values each; their lengths are returned as column "NAME count"."""
     fields: list[tuple[str, str] | tuple[str, str, int]] = []
     for words in properties:
         kinds = [PLY_TYPES.get(word) for word in words[:-1] if word != "list"]
@@ -103,12 +102,12 @@ def _rows(
     data = file.read(count * row.itemsize)
     whole = np.frombuffer(data[: len(data) // max(row.itemsize, 1) * row.itemsize], row)
     if len(whole) < count and not any((whole[k] != 3).any() for k in row.names or () if k.endswith(" count")):
-        raise SourceError(f"{path} is truncated: its header promises {count} of element {name}, found {len(whole)}")
+        raise SourceError(f"{path} is truncated: its header says {count} of element {name}, found {len(whole)}")
     return whole
 
 
 def _ply(mesh: Mesh) -> bytes:
-    """Return a binary little-endian PLY: float x y z, uchar red green blue, faces as lists of int."""
+    """Return the mesh as binary little-endian PLY: float x y z, uchar red green blue, faces as lists of int."""
     columns = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
     vertices = np.zeros(len(mesh.vertices), np.dtype(columns))
     for k, name in enumerate("xyz"):
@@ -126,7 +125,7 @@ def _ply(mesh: Mesh) -> bytes:
 
 
 def _obj(mesh: Mesh) -> bytes:
-    """Return Wavefront text; the colour follows each vertex, as MeshLab and Blender read it."""
+    """Return the mesh as Wavefront OBJ; the colour follows each vertex, as MeshLab and Blender read it."""
     rows = np.concatenate([mesh.vertices.astype(np.float64), _bytes(mesh) / 255.0], 1)
     vertices = ("v %.5f %.5f %.5f %.4f %.4f %.4f\n" * len(rows)) % tuple(rows.ravel().tolist())
     faces = ("f %d %d %d\n" * len(mesh.faces)) % tuple((mesh.faces + 1).ravel().tolist())
@@ -134,7 +133,7 @@ def _obj(mesh: Mesh) -> bytes:
 
 
 def _glb(mesh: Mesh) -> bytes:
-    """Return binary glTF 2.0, turned so that the camera's y, down, becomes glTF's −y."""
+    """Return the mesh as binary glTF 2.0, rotated by 180° about x, since glTF's y axis points up."""
     arrays = [mesh.vertices.astype("<f4"), (_bytes(mesh) / np.float32(255.0)).astype("<f4"), mesh.faces.astype("<u4")]
     starts = np.cumsum([0, *(array.nbytes for array in arrays)]).tolist()
     views = [
@@ -161,8 +160,12 @@ def _glb(mesh: Mesh) -> bytes:
 
 
 def _bytes(mesh: Mesh) -> NDArray[np.uint8]:
-    """Return the colours as bytes [V, 3]; gray where the mesh has none."""
-    colors = np.full(mesh.vertices.shape, 0.7, np.float32) if mesh.colors is None else mesh.colors
+    """Return the vertices' colours as bytes [V, 3]; gray if the mesh has no colours."""
+    return color_bytes(np.full(mesh.vertices.shape, 0.7, np.float32) if mesh.colors is None else mesh.colors)
+
+
+def color_bytes(colors: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Convert colours in [0, 1] to bytes; values outside are clipped."""
     return np.asarray(np.rint(np.clip(colors, 0.0, 1.0) * 255.0), np.uint8)
 
 

@@ -1,4 +1,4 @@
-"""Read the elements of a binary PLY file: its header, then the rows of one element after the other."""
+"""Read the header of a binary PLY file, and the rows of its elements."""
 
 import os
 import re
@@ -24,7 +24,7 @@ BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 @dataclass(frozen=True)
 class Element:
-    """One kind of row: name, how many there are (−1 where the header does not say), byte order, properties' words."""
+    """A kind of row: name, number of rows (−1 if the header is wrong), byte order, and the words of its properties."""
 
     name: str
     count: int
@@ -32,7 +32,7 @@ class Element:
     properties: tuple[tuple[str, ...], ...]
 
     def row_type(self, path: Path) -> np.dtype[np.void]:
-        """Return the type of a row. Raises SourceError if it holds lists, unknown types or a name twice."""
+        """Return the numpy type of a row. Raises SourceError on lists, unknown types or duplicate names."""
         unknown = [" ".join(words) for words in self.properties if len(words) != 2 or words[0] not in PLY_TYPES]
         names = [words[-1] for words in self.properties]
         if unknown or not names or len(set(names)) < len(names):
@@ -41,20 +41,18 @@ class Element:
         return np.dtype([(name, self.order + PLY_TYPES[kind]) for kind, name in self.properties])
 
     def read(self, file: BinaryIO, path: Path) -> NDArray[np.void]:
-        """Read the rows, which come next in the file. Raises SourceError if the file ends before they do."""
+        """Read the rows from the file's current position. Raises SourceError if the file is too short."""
         row_type = self.row_type(path)
         size = self.count * row_type.itemsize
         left = os.fstat(file.fileno()).st_size - file.tell()
         if left < size:
             what = "splats" if self.name == "vertex" else f"rows of '{self.name}'"
-            raise SourceError(
-                f"{path} is truncated: its header promises {self.count} {what} = {size} bytes, found {left}"
-            )
+            raise SourceError(f"{path} is truncated: its header says {self.count} {what} = {size} bytes, found {left}")
         return np.frombuffer(file.read(size), row_type)
 
 
 def read_header(file: BinaryIO, path: Path) -> list[Element]:
-    """Read up to end_header: the elements in the order of their rows. Raises SourceError if it is no binary PLY."""
+    """Read the header: the elements in the order of their rows. Raises SourceError if it is not a binary PLY."""
     if file.readline(8).strip() != b"ply":
         raise SourceError(f"{path} is not a PLY file (its first line is not 'ply')")
     lines = _header_lines(file, path)
@@ -72,7 +70,7 @@ def read_header(file: BinaryIO, path: Path) -> list[Element]:
 
 
 def _header_lines(file: BinaryIO, path: Path) -> list[list[str]]:
-    """Return the words of each header line but comments. Raises SourceError if end_header does not come."""
+    """Return the words of each header line except comments. Raises SourceError without 'end_header'."""
     lines: list[list[str]] = []
     while file.tell() < MAX_HEADER_BYTES and (raw := file.readline(MAX_HEADER_BYTES)):
         words = raw.decode("ascii", "replace").split()

@@ -1,4 +1,4 @@
-"""Keep everything a run leaves behind in one folder that is valid at every moment."""
+"""Write and read the folder of a run, which is valid at any time."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,48 +14,48 @@ from sigmasplat.io.atomic import replacing, write_text
 from sigmasplat.io.json_files import append_line, read_json, read_lines, write_json
 from sigmasplat.io.splats import ply
 from sigmasplat.io.submaps import DiskStore
-from sigmasplat.io.tensors import opened, write_tensors
+from sigmasplat.io.tensors import open_tensors, write_tensors
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 
 PROGRAM = "sigmasplat"
 TRUTH = "truth.txt"
-"""What an evaluation adds where the truth is known: the true path in the run's world."""
+"""The true path in the run's world, written by an evaluation if the truth is known."""
 MESH = "mesh.ply"
-"""What `sigmasplat mesh` adds."""
+"""The surface, written by `sigmasplat mesh`."""
 STATE = "state.safetensors"
-"""What an unfinished run goes on from."""
+"""The state from which an unfinished run resumes."""
 FILES = (
     "config.json", "trajectory.txt", "map.ply", "checkpoint.safetensors", "log.jsonl", "loops.json", "metrics.json",
     "profile.json", "report.html", TRUTH,
 )  # fmt: skip
-"""What a run may hold besides run.json, which says that the folder is ours and is never absent."""
-HALF_BORN = ".run.json.part"
-"""All that is left where a run was killed before it had its run.json."""
+"""Files that a run may have in addition to run.json, which always exists and identifies the folder as ours."""
+PARTIAL_RUN_JSON = ".run.json.part"
+"""The only file of a run that was killed before its run.json was complete."""
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """One run on disk: config.json, run.json (source, version, machine, status), log.jsonl (a line per frame),
+    """One run on disk: config.json, run.json (source, version, machine, status), log.jsonl (one line per frame),
     trajectory.txt, map.ply, checkpoint.safetensors, loops.json, profile.json, metrics.json, report.html, images/,
     submaps/.
 
-    Every file but the log is replaced whole; the log grows by whole lines. So an interrupted run can still be read.
+    Files are replaced atomically, and the log grows by complete lines, so an interrupted run can still be read.
     """
 
     path: Path
 
     @staticmethod
     def create(path: Path, config: Config, source_name: str, overwrite: bool = False) -> "RunFolder":
-        """Start a run in a new or empty folder; with `overwrite`, remove the files of an earlier run of ours first.
+        """Start a run in a new or empty folder; with `overwrite`, remove the files of an earlier run first.
 
-        Raises RunError if the place holds anything else or cannot be written.
+        Raises RunError if the folder has other content or cannot be written.
         """
         run = RunFolder(Path(path))
         facts = {
             "program": PROGRAM,
             "version": machine.package_version(),
-            "code": machine.code(),
+            "code": machine.code_version(),
             "source": source_name,
             "machine": machine.describe(),
             "status": "running",
@@ -70,24 +70,24 @@ class RunFolder:
 
     @staticmethod
     def open(path: Path) -> "RunFolder":
-        """Open the folder of an earlier run. Raises RunError if it is none, saying what is missing."""
+        """Open the folder of an existing run. Raises RunError, with the missing files, if it is not one."""
         run = RunFolder(Path(path))
         if not run.path.is_dir():
-            raise RunError(f"no run folder {path}; `sigmasplat run` makes one")
+            raise RunError(f"no run folder {path}; `sigmasplat run` creates one")
         missing = [name for name in ("config.json", "run.json") if not (run.path / name).is_file()]
         if missing:
-            raise RunError(f"{path} is not a run folder of ours: no {' and no '.join(missing)}")
+            raise RunError(f"{path} is not a run folder: no {' and no '.join(missing)}")
         run._refuse_unless_ours()
         return run
 
     def _claim(self, overwrite: bool, facts: dict[str, Any]) -> None:
-        """Make the folder, put run.json in first, and clear out what an earlier run of ours left. Raises RunError.
+        """Create the folder, write run.json first, then remove the files of an earlier run. Raises RunError.
 
-        In this order a run that is killed at any moment leaves a folder that the next one may have.
+        With this order, a run that is killed at any time leaves a folder that the next run can overwrite.
         """
         if self.path.exists() and not self.path.is_dir():
             raise RunError(f"output {self.path} is a file; give a folder")
-        if self.path.is_dir() and any(entry.name != HALF_BORN for entry in self.path.iterdir()):
+        if self.path.is_dir() and any(entry.name != PARTIAL_RUN_JSON for entry in self.path.iterdir()):
             self._refuse_to_clear(overwrite)
         self.path.mkdir(parents=True, exist_ok=True)
         write_json(self.path / "run.json", facts)
@@ -95,24 +95,24 @@ class RunFolder:
         self.images.mkdir(exist_ok=True)
 
     def _refuse_to_clear(self, overwrite: bool) -> None:
-        """Raise RunError unless the folder is an earlier run's of ours that may be overwritten."""
+        """Raise RunError unless the folder is that of an earlier run and may be overwritten."""
         if not overwrite:
             raise RunError(
                 f"output {self.path} exists and is not empty; give another --out, or --overwrite to replace its run"
             )
         try:
             if not (self.path / "run.json").is_file():
-                raise RunError(f"{self.path} is not a run folder of ours: no run.json")
+                raise RunError(f"{self.path} is not a run folder: no run.json")
             self._refuse_unless_ours()
         except RunError as problem:
             raise RunError(f"not overwriting {self.path}: {problem}; give another --out") from problem
 
     def _refuse_unless_ours(self) -> None:
         if self.facts().get("program") != PROGRAM:
-            raise RunError(f"{self.path} is not a run folder of ours: run.json was written by another program")
+            raise RunError(f"{self.path} is not a run folder: run.json was written by another program")
 
     def _clear(self) -> None:
-        """Remove an earlier run's files, and no others: what the user put beside them stays."""
+        """Remove the files of an earlier run, and keep files that the user added."""
         for name in (*FILES, MESH, STATE):
             (self.path / name).unlink(missing_ok=True)
         for picture in self.images.glob("*.png"):
@@ -121,17 +121,17 @@ class RunFolder:
 
     @property
     def images(self) -> Path:
-        """Return the folder of pictures, images/."""
+        """Return the folder of images, images/."""
         return self.path / "images"
 
     @property
     def submaps(self) -> DiskStore:
-        """Return the store of finished submaps, submaps/; a run in one piece leaves it empty."""
+        """Return the store of finished submaps, submaps/; it is empty if the run has a single map."""
         return DiskStore(self.path / "submaps")
 
     @property
     def state(self) -> Path:
-        """Return where an unfinished run's state is, to go on from."""
+        """Return the path of the state from which an unfinished run resumes."""
         return self.path / STATE
 
     def config(self) -> Config:
@@ -139,7 +139,7 @@ class RunFolder:
         return Config.load(self.path / "config.json")
 
     def facts(self) -> dict[str, Any]:
-        """Read run.json: source, version, machine, status and what `note` added. Raises RunError if it is damaged."""
+        """Read run.json: source, version, machine, status and facts of `note`. Raises RunError if it is damaged."""
         return self._read_values("run.json")
 
     def note(self, **facts: Any) -> None:
@@ -147,26 +147,26 @@ class RunFolder:
         write_json(self.path / "run.json", self.facts() | facts)
 
     def log(self, record: dict[str, Any]) -> None:
-        """Append one line to log.jsonl; it is on its way to disk when this returns. Raises RunError if not writable."""
+        """Append one line to log.jsonl. Raises RunError if the file cannot be written."""
         append_line(self.path / "log.jsonl", record)
 
     def read_log(self) -> list[dict[str, Any]]:
-        """Read the lines of log.jsonl; a last line cut off by an interruption is passed over.
+        """Read the lines of log.jsonl; an incomplete last line, left by an interruption, is skipped.
 
         Raises RunError if it is missing or another line is damaged.
         """
         return read_lines(self._existing("log.jsonl"))
 
     def write_loops(self, records: list[dict[str, Any]]) -> None:
-        """Write loops.json: every pair of submaps tried, with the latest verdict."""
+        """Write loops.json: all tried pairs of submaps with their latest results."""
         write_json(self.path / "loops.json", records)
 
     def read_loops(self) -> list[dict[str, Any]]:
-        """Read loops.json, empty where a run has none. Raises RunError if it is damaged."""
+        """Read loops.json; the list is empty if there is no such file. Raises RunError if it is damaged."""
         path = self.path / "loops.json"
         loops = read_json(path) if path.is_file() else []
         if not isinstance(loops, list) or not all(isinstance(loop, dict) for loop in loops):
-            raise RunError(f"{path} does not hold a list of loops")
+            raise RunError(f"{path} is not a list of loops")
         return loops
 
     def write_trajectory(self, trajectory: Trajectory) -> None:
@@ -195,11 +195,11 @@ class RunFolder:
 
     def read_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, str]]:
         """Read checkpoint.safetensors: tensors and text. Raises RunError if it is missing or damaged."""
-        with opened(self._existing("checkpoint.safetensors"), "checkpoint") as file:
+        with open_tensors(self._existing("checkpoint.safetensors"), "checkpoint") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
 
     def read_odometry(self) -> Trajectory | None:
-        """Return the path as tracking alone has it, without loops; None where the run kept none or has no loop.
+        """Return the path of tracking alone, without loop closure; None if the run has no such path or no loop.
 
         Raises RunError if the checkpoint is missing or damaged.
         """
@@ -242,5 +242,5 @@ class RunFolder:
     def _read_values(self, name: str) -> dict[str, Any]:
         values = read_json(self._existing(name))
         if not isinstance(values, dict):
-            raise RunError(f"{self.path / name} does not hold named values")
+            raise RunError(f"{self.path / name} is not a JSON object")
         return values

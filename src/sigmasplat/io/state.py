@@ -1,6 +1,6 @@
-"""Write a tree of living objects and read it back, every bit as it was: what a run needs to go on after a stop.
+"""Write a tree of objects and read it back bit for bit, so that a stopped run can resume.
 
-Plain data only, no pickles: a file can make nothing but numbers, text and the classes that its reader names.
+No pickles are used: reading a file can only create numbers, text, and instances of the classes that the reader names.
 """
 
 import dataclasses
@@ -14,18 +14,19 @@ import torch
 from torch import Tensor
 
 from sigmasplat.errors import RunError
-from sigmasplat.io.tensors import opened, write_tensors
+from sigmasplat.io.tensors import open_tensors, write_tensors
 
 INLINE = 64
-"""Arrays of at most so many numbers stand in the text: poses are many, and each tensor of a file costs a header."""
+"""Arrays with at most this many numbers are stored in the text, since there are many poses and each tensor needs a
+header."""
 VERSION = "1"
 
 
 def write_state(path: Path, tree: Any, classes: Iterable[type], fixed: Mapping[str, Any]) -> None:
     """Write a tree of dataclasses, named tuples, lists, tuples, dicts, arrays, tensors, numbers, text and None.
 
-    `fixed` are objects that the reader has already, by name: they are referred to, not written. Raises RunError if the
-    place cannot be written, TypeError on anything else in the tree.
+    fixed: objects by name that the reader already has; only their names are written. Raises RunError if the file cannot
+    be written, TypeError on any other type in the tree.
     """
     encoder = _Encoder({c.__name__: c for c in classes}, {id(value): name for name, value in fixed.items()})
     text = json.dumps(encoder.encode(tree))
@@ -33,10 +34,10 @@ def write_state(path: Path, tree: Any, classes: Iterable[type], fixed: Mapping[s
 
 
 def read_state(path: Path, classes: Iterable[type], fixed: Mapping[str, Any]) -> Any:
-    """Read what `write_state` wrote. Raises RunError if it is missing, damaged, or of another version."""
+    """Read a file of `write_state`. Raises RunError if it is missing, damaged, or of another version."""
     if not path.is_file():
-        raise RunError(f"there is nothing to go on from: no {path}")
-    with opened(path, "state") as file:
+        raise RunError(f"nothing to resume: no {path}")
+    with open_tensors(path, "state") as file:
         facts = file.metadata() or {}
         if facts.get("version") != VERSION:
             raise RunError(f"{path} was written by another version ({facts.get('version')}); run it again")
@@ -45,7 +46,8 @@ def read_state(path: Path, classes: Iterable[type], fixed: Mapping[str, Any]) ->
 
 
 class _Encoder:
-    """Turns objects into JSON values; large arrays go beside them, each once, so that what is shared stays shared."""
+    """Converts objects to JSON values. Large arrays are collected as tensors, each once, so that shared arrays stay
+    shared."""
 
     def __init__(self, classes: Mapping[str, type], fixed: Mapping[int, str]) -> None:
         self.classes, self.fixed = classes, fixed
@@ -75,14 +77,14 @@ class _Encoder:
     def _array(self, value: Tensor | np.ndarray[Any, Any]) -> Any:
         kind = "tensor" if isinstance(value, Tensor) else "array"
         array = value.detach().cpu().numpy() if isinstance(value, Tensor) else value
-        there = {"device": "cuda"} if isinstance(value, Tensor) and value.is_cuda else {}
+        device = {"device": "cuda"} if isinstance(value, Tensor) and value.is_cuda else {}
         if array.size <= INLINE:
-            return {kind: array.tolist(), "type": str(array.dtype), "shape": list(array.shape)} | there
+            return {kind: array.tolist(), "type": str(array.dtype), "shape": list(array.shape)} | device
         if id(value) not in self.seen:
             name = str(len(self.tensors))
             self.tensors[name] = torch.tensor(array)
-            self.seen[id(value)] = name, value  # kept, so that its id is not given to another
-        return {kind: self.seen[id(value)][0]} | there
+            self.seen[id(value)] = name, value  # keeps the object alive, so that its id is not used again
+        return {kind: self.seen[id(value)][0]} | device
 
 
 class _Decoder:
@@ -115,7 +117,7 @@ class _Decoder:
 
 
 def _fields(value: Any) -> dict[str, Any]:
-    """Return what an object is made of: a dataclass's fields, those that it is made with, or a named tuple's."""
+    """Return the fields of a named tuple, or those of a dataclass that its constructor takes."""
     if dataclasses.is_dataclass(value):
         return {field.name: getattr(value, field.name) for field in dataclasses.fields(value) if field.init}
     named: dict[str, Any] = value._asdict()

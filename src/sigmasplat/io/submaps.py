@@ -1,4 +1,4 @@
-"""Page finished submaps to disk, one file each, read again in parts."""
+"""Store finished submaps on disk, one file each, which can be read in parts."""
 
 import json
 import re
@@ -12,21 +12,22 @@ import numpy as np
 import torch
 
 from sigmasplat.errors import RunError
-from sigmasplat.io.tensors import opened, write_tensors
+from sigmasplat.io.atomic import make_folder
+from sigmasplat.io.tensors import open_tensors, write_tensors
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import EXTRAS, GaussianField, Rows
 from sigmasplat.model.submap import Picture, Submap, refuse_misfit
 
 OURS = re.compile(r"submap-\d{5,}\.safetensors")
 UNFINISHED = re.compile(rf"\.{OURS.pattern}\.part")
-"""Left by a run that was killed while it wrote a submap."""
+"""A file left by a run that was killed while it wrote a submap."""
 
 
 class DiskStore:
-    """Submaps as files in a folder (`model.submap.SubmapStore`): splats, keyframe poses, and the pictures beside them.
+    """A `model.submap.SubmapStore` in a folder: one file per submap with its splats, keyframe poses and images.
 
-    The folder is made with the first one. Pictures are read one at a time, so that memory does not grow with what is
-    kept. Adam's state is not kept: nothing trains a finished submap.
+    The folder is created with the first submap. Images are read one at a time, so that memory does not grow with their
+    number. Adam's state is not stored, because a finished submap is not optimised.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -36,11 +37,11 @@ class DiskStore:
         return len(self._named(OURS))
 
     def path(self, index: int) -> Path:
-        """Return where a submap is kept."""
+        """Return the path of a submap's file."""
         return self.folder / f"submap-{index:05d}.safetensors"
 
     def save(self, submap: Submap, pictures: list[Picture]) -> None:
-        """Write a submap. Raises SigmaSplatError if it does not fit, RunError if it cannot be written."""
+        """Write a submap. Raises SigmaSplatError if it is inconsistent, RunError if it cannot be written."""
         refuse_misfit(submap, pictures, len(self))
         tensors = {
             "params": submap.field.params,
@@ -50,15 +51,12 @@ class DiskStore:
             "colors": torch.from_numpy(np.stack([picture.color for picture in pictures])),
             "depths_m": torch.from_numpy(np.stack([picture.depth_m for picture in pictures])),
         }
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as problem:
-            raise RunError(f"cannot write {self.folder}: {problem.strerror or problem}") from problem
+        make_folder(self.folder)
         text = {"index": str(submap.index), "camera": json.dumps(asdict(submap.camera))}
         write_tensors(self.path(submap.index), tensors, text)
 
     def load(self, index: int) -> Submap:
-        """Read a submap without its pictures. Raises RunError if it is missing or damaged."""
+        """Read a submap without its images. Raises RunError if it is missing or damaged."""
         with self._opened(index) as file:
             extras = {n: Rows(file.get_tensor(f"extra.{n}")) for n in EXTRAS if f"extra.{n}" in file.keys()}  # noqa: SIM118
             return Submap(
@@ -70,25 +68,25 @@ class DiskStore:
             )
 
     def picture(self, index: int, keyframe: int) -> Picture:
-        """Read what one keyframe saw. Raises RunError if the submap is missing or damaged."""
+        """Read the images of one keyframe. Raises RunError if the submap is missing or damaged."""
         with self._opened(index) as file:
             color, depth_m = (file.get_slice(name)[keyframe] for name in ("colors", "depths_m"))
             return Picture(color.numpy(), depth_m.numpy())
 
-    def keep(self, count: int) -> None:
-        """Remove all but the first `count` submaps, also one half written."""
+    def truncate(self, count: int) -> None:
+        """Remove all submaps except the first `count`, and incomplete files."""
         for path in [self.path(index) for index in range(count, len(self))] + self._named(UNFINISHED):
             path.unlink(missing_ok=True)
 
     def clear(self) -> None:
-        """Remove every submap, also one half written, and nothing else; the folder too where that leaves it empty."""
+        """Remove all submaps and incomplete files, and the folder if it is then empty; other files are kept."""
         for path in self._named(OURS) + self._named(UNFINISHED):
             path.unlink()
         if self.folder.is_dir() and not any(self.folder.iterdir()):
             self.folder.rmdir()
 
     def _named(self, pattern: re.Pattern[str]) -> list[Path]:
-        """List the files whose names are of a pattern."""
+        """Return the files whose names match a pattern."""
         entries = self.folder.iterdir() if self.folder.is_dir() else ()
         return [path for path in entries if pattern.fullmatch(path.name)]
 
@@ -96,6 +94,6 @@ class DiskStore:
     def _opened(self, index: int) -> Iterator[Any]:
         path = self.path(index)
         if not path.is_file():
-            raise RunError(f"no submap {index} in {self.folder}: there is no {path.name}; run it again")
-        with opened(path, "submap") as file:
+            raise RunError(f"no submap {index} in {self.folder}: {path.name} is missing; run it again")
+        with open_tensors(path, "submap") as file:
             yield file

@@ -1,4 +1,4 @@
-"""Write and read named tensors with text beside them (safetensors), whole or not at all."""
+"""Write and read named tensors with text metadata (safetensors), completely or not at all."""
 
 import os
 from collections.abc import Iterator, Mapping
@@ -15,20 +15,20 @@ from sigmasplat.io.atomic import replacing
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: dict[str, str]) -> None:
-    """Write a file in one step. Raises RunError if the place cannot be written."""
+    """Write a file atomically. Raises RunError if it cannot be written."""
     with replacing(path) as temporary:
         try:
-            save_file(_apart(tensors), temporary, text)
-        except SafetensorError as problem:  # also where the disk is full
+            save_file(_without_shared_memory(tensors), temporary, text)
+        except SafetensorError as problem:  # also if the disk is full
             raise RunError(f"cannot write {path}: {problem}; choose a writable place") from problem
-        temporary.chmod(0o666 & ~_umask())  # safetensors makes it private
+        temporary.chmod(0o666 & ~_umask())  # safetensors lets only the owner read it
 
 
 @contextmanager
-def opened(path: Path, what: str) -> Iterator[Any]:
-    """Open a file to read tensors or parts of them (`safe_open`); `what` names it in errors.
+def open_tensors(path: Path, what: str) -> Iterator[Any]:
+    """Open a file to read tensors or parts of them (`safe_open`); errors call it `what`.
 
-    Raises RunError where it is damaged, also by what the block cannot find or use in it.
+    Raises RunError if it is damaged, also if the block does not find a tensor or cannot use it.
     """
     try:
         with safe_open(path, "pt") as file:
@@ -37,8 +37,8 @@ def opened(path: Path, what: str) -> Iterator[Any]:
         raise RunError(f"{what} {path} is damaged: {problem}") from problem
 
 
-def _apart(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Copy what shares memory with another tensor, which safetensors refuses, and nothing else: pictures are large."""
+def _without_shared_memory(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Copy tensors that share memory with another one, which safetensors refuses; others are not copied."""
     out: dict[str, Tensor] = {}
     taken: set[int] = set()
     for name, tensor in tensors.items():

@@ -1,4 +1,4 @@
-"""Read and write paths as TUM text: one pose per line, `t tx ty tz qx qy qz qw` (seconds, metres, T_world_camera)."""
+"""Read and write paths as TUM text, one pose per line: `t tx ty tz qx qy qz qw` (seconds, metres, T_world_camera)."""
 
 from pathlib import Path
 
@@ -13,7 +13,10 @@ COLUMNS = "t tx ty tz qx qy qz qw"
 
 
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
-    """Write T_world_camera as TUM text: nanoseconds and 12 significant digits. Raises RunError if not writable."""
+    """Write T_world_camera as TUM text with nanoseconds and 12 significant digits.
+
+    Raises RunError if the file cannot be written.
+    """
     lines = [f"# {COLUMNS} (seconds, metres, camera to world)"]
     for t, T in zip(trajectory.timestamps_s, trajectory.T_world_camera, strict=True):
         w, x, y, z = se3.quaternion_from_rotation(T[:3, :3])
@@ -22,17 +25,17 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Read TUM text; empty lines and lines from # on are passed over.
+    """Read TUM text; empty lines and comments after # are skipped.
 
-    Raises SourceError, naming file and line, if it is missing, not text, empty, or holds a line without eight finite
-    numbers or with a zero quaternion.
+    Raises SourceError with file and line if it is missing, not text, empty, or if a line does not have eight finite
+    numbers or has a zero quaternion.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as problem:
         raise SourceError(f"cannot read trajectory {path}: {problem}") from problem
-    bare = ((number, line.split("#")[0].strip()) for number, line in enumerate(lines, 1))
-    rows = [_parse(line, f"{path}:{number}") for number, line in bare if line]
+    stripped = ((number, line.split("#")[0].strip()) for number, line in enumerate(lines, 1))
+    rows = [_parse(line, f"{path}:{number}") for number, line in stripped if line]
     if not rows:
         raise SourceError(f"no poses in {path} (expected lines of '{COLUMNS}')")
     table = np.array(rows)
@@ -43,7 +46,7 @@ def read_trajectory(path: Path) -> Trajectory:
 
 
 def _parse(line: str, where: str) -> list[float]:
-    """Turn one line into eight numbers. Raises SourceError that names the place."""
+    """Parse a line into eight numbers. Raises SourceError with the place `where`."""
     try:
         values = [float(word) for word in line.split()]
     except ValueError as problem:
@@ -51,13 +54,16 @@ def _parse(line: str, where: str) -> list[float]:
     if len(values) != 8:
         raise SourceError(f"{where}: {len(values)} numbers, expected 8: '{COLUMNS}'")
     if not np.isfinite(values).all():
-        raise SourceError(f"{where}: the pose holds nan or inf; remove the line: {line[:60]!r}")
+        raise SourceError(f"{where}: the pose has nan or inf; remove the line: {line[:60]!r}")
     if np.linalg.norm(values[4:]) < 1e-6:
-        raise SourceError(f"{where}: the quaternion is zero, which is no rotation; identity is '0 0 0 1'")
+        raise SourceError(f"{where}: the quaternion is zero, which is not a rotation; identity is '0 0 0 1'")
     return values
 
 
 def write_kitti_poses(path: Path, trajectory: Trajectory) -> None:
-    """Write T_world_camera with 12 significant digits. Raises RunError if not writable."""
+    """Write T_world_camera as KITTI text, 3×4 matrices with 12 significant digits.
+
+    Raises RunError if the file cannot be written.
+    """
     rows = (T[:3].ravel().tolist() for T in trajectory.T_world_camera)
     write_text(path, "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows))

@@ -1,4 +1,4 @@
-"""Make paths for a camera to fly: along a recorded one, calmed and at an even rate, or in a circle above a place."""
+"""Make camera paths: a recorded one, smoothed and resampled at an even rate, or an orbit around a point."""
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -8,33 +8,34 @@ from sigmasplat.errors import SigmaSplatError
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.types import Matrix
 
-CALM_S = 0.25
-"""Standard deviation of the average that takes a hand's tremble out of a path."""
+SMOOTHING_S = 0.25
+"""Standard deviation of the Gaussian that removes camera shake."""
 FINE_HZ = 120.0
 ORBIT_ELEVATION_RAD = np.deg2rad(50.0)
 
 
-def resampled(trajectory: Trajectory, images: int, calm_s: float = CALM_S) -> Matrix:
-    """Return T_world_camera [images, 4, 4] at even times from the first pose to the last, averaged over about `calm_s`.
+def smooth_path(trajectory: Trajectory, images: int, smoothing_s: float = SMOOTHING_S) -> Matrix:
+    """Return T_world_camera [images, 4, 4] at even times from the first to the last pose, without camera shake.
 
-    Between poses it goes straight and turns evenly. Raises SigmaSplatError without a pose, or unless images ≥ 1.
+    Poses are interpolated linearly (rotations: slerp) and smoothed with a Gaussian of `smoothing_s`. Raises
+    SigmaSplatError without a pose, or unless images ≥ 1.
     """
     if not len(trajectory) or images < 1:
-        raise SigmaSplatError(f"no path of {images} images can be made of {len(trajectory)} poses")
+        raise SigmaSplatError(f"cannot make a path of {images} images from {len(trajectory)} poses")
     times, first = np.unique(trajectory.timestamps_s, return_index=True)
     poses = trajectory.T_world_camera[first]
     if len(times) == 1:
         return np.repeat(poses, images, axis=0)
     fine = np.linspace(times[0], times[-1], max(2, round((times[-1] - times[0]) * FINE_HZ) + 1, images))
-    width = calm_s / (fine[1] - fine[0])
+    width = smoothing_s / (fine[1] - fine[0])
     positions = np.stack([np.interp(fine, times, poses[:, k, 3]) for k in range(3)], 1)
     quaternions = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(fine).as_quat()
-    turned_over = np.cumsum(np.r_[0, (quaternions[1:] * quaternions[:-1]).sum(1) < 0]) % 2
-    quaternions *= np.where(turned_over, -1.0, 1.0)[:, None]  # q and −q are one rotation, but do not average
+    flipped = np.cumsum(np.r_[0, (quaternions[1:] * quaternions[:-1]).sum(1) < 0]) % 2
+    quaternions *= np.where(flipped, -1.0, 1.0)[:, None]  # q and −q are the same rotation, but must not be averaged
     values = np.concatenate([positions, quaternions], 1)
-    calm = gaussian_filter1d(values, width, axis=0, mode="nearest") if width > 0 else values
-    wanted = np.linspace(0, len(fine) - 1, images)
-    values = np.stack([np.interp(wanted, np.arange(len(fine)), calm[:, k]) for k in range(7)], 1)
+    smooth = gaussian_filter1d(values, width, axis=0, mode="nearest") if width > 0 else values
+    times = np.linspace(0, len(fine) - 1, images)
+    values = np.stack([np.interp(times, np.arange(len(fine)), smooth[:, k]) for k in range(7)], 1)
     out = np.tile(np.eye(4), (images, 1, 1))
     out[:, :3, :3] = Rotation.from_quat(values[:, 3:]).as_matrix()
     out[:, :3, 3] = values[:, :3]
@@ -44,21 +45,22 @@ def resampled(trajectory: Trajectory, images: int, calm_s: float = CALM_S) -> Ma
 def orbit(
     center: Matrix, up: Matrix, start: Matrix, radius_m: float, images: int, elevation_rad: float = ORBIT_ELEVATION_RAD
 ) -> Matrix:
-    """Return T_world_camera [images, 4, 4] once round a point, looking at it from above at `radius_m`.
+    """Return T_world_camera [images, 4, 4] of one circle around a point, looking down at it from `radius_m` away.
 
-    up: unit vector; start: a direction, from whose side the first image looks; the last image is one step before it.
+    up: unit vector; start: horizontal direction in which the first image looks. The last image is one step before the
+    first one.
     """
     ahead = start - (start @ up) * up
     ahead /= np.linalg.norm(ahead)
-    aside = np.cross(ahead, up)
+    sideways = np.cross(ahead, up)
     angle = 2.0 * np.pi * np.arange(images)[:, None] / images
-    outward = -(np.cos(angle) * ahead + np.sin(angle) * aside)
+    outward = -(np.cos(angle) * ahead + np.sin(angle) * sideways)
     outward = np.cos(elevation_rad) * outward + np.sin(elevation_rad) * up
-    return np.stack([looking(center + radius_m * out, -out, up) for out in outward])
+    return np.stack([look_along(center + radius_m * out, -out, up) for out in outward])
 
 
-def looking(position: Matrix, forward: Matrix, up: Matrix) -> Matrix:
-    """Return T_world_camera at a position, looking along a unit vector, `up` being up in its image."""
+def look_along(position: Matrix, forward: Matrix, up: Matrix) -> Matrix:
+    """Return T_world_camera at a position, looking along the unit vector `forward`; `up` points up in the image."""
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
     T = np.eye(4)

@@ -1,4 +1,4 @@
-"""Hold a surface of triangles: sample it, move it, keep parts of it."""
+"""Represent a triangle mesh: sample it, move it, select parts of it."""
 
 from dataclasses import dataclass, replace
 
@@ -17,7 +17,7 @@ Indices = NDArray[np.int32]
 class Mesh:
     """Triangles: vertices [V, 3] m, world frame; faces [F, 3], counter-clockwise from outside; colors [V, 3] in [0, 1].
 
-    Raises SigmaSplatError on shapes that disagree, values that are not finite, faces of vertices that do not exist.
+    Raises SigmaSplatError on inconsistent shapes, values that are not finite, or faces with unknown vertices.
     """
 
     vertices: Floats
@@ -32,11 +32,11 @@ class Mesh:
         if not np.isfinite(v).all() or not (c is None or np.isfinite(c).all()):
             raise SigmaSplatError("a mesh needs finite vertices and colors, found NaN or inf")
         if f.size and (f.min() < 0 or f.max() >= len(v)):
-            raise SigmaSplatError(f"a mesh of {len(v)} vertices has faces of vertices {f.min()} to {f.max()}")
+            raise SigmaSplatError(f"a mesh with {len(v)} vertices has faces with vertices {f.min()} to {f.max()}")
 
     @staticmethod
-    def joined(parts: "list[Mesh]") -> "Mesh":
-        """Put meshes side by side in one, without colours; nothing is welded."""
+    def concatenated(parts: "list[Mesh]") -> "Mesh":
+        """Combine meshes without colours into one; vertices are not merged."""
         starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
         faces = [part.faces + np.int32(start) for part, start in zip(parts, starts, strict=False)]
         vertices = [part.vertices for part in parts]
@@ -54,7 +54,7 @@ class Mesh:
         return 0.5 * np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
     def normals(self) -> NDArray[np.float64]:
-        """Return unit normals of the vertices [V, 3], outwards: the mean of their faces' by area; 0 without a face."""
+        """Return outward unit normals of the vertices [V, 3], area-weighted means of their faces'; 0 without a face."""
         a, b, c = np.moveaxis(self.corners, 1, 0)
         across = np.cross(b - a, c - a)
         sums = np.stack(
@@ -64,23 +64,23 @@ class Mesh:
         return np.asarray(np.divide(sums, length, out=np.zeros_like(sums), where=length > 0).T)
 
     def sampled(self, points: int, seed: int) -> NDArray[np.float64]:
-        """Draw points [points, 3] evenly over the area; none where there is no area."""
+        """Draw random points [points, 3], uniform over the area; no points if the area is 0."""
         rng, areas = np.random.default_rng(seed), self.areas()
         if not float(areas.sum()) > 0.0:
             return np.empty((0, 3))
         chosen = rng.choice(len(areas), points, p=areas / areas.sum())
         a, b, c = np.moveaxis(self.vertices[self.faces[chosen]].astype(np.float64), 1, 0)
         s, t = rng.uniform(size=(2, points, 1))
-        s, t = np.where(s + t > 1.0, 1.0 - s, s), np.where(s + t > 1.0, 1.0 - t, t)  # folded back into the triangle
+        s, t = np.where(s + t > 1.0, 1.0 - s, s), np.where(s + t > 1.0, 1.0 - t, t)  # mirrored back into the triangle
         return np.asarray(a + s * (b - a) + t * (c - a))
 
     def moved(self, T_new_old: NDArray[np.float64]) -> "Mesh":
-        """Return the mesh carried by a rigid 4×4 transform."""
+        """Return the mesh moved by a rigid 4×4 transform."""
         vertices = self.vertices @ T_new_old[:3, :3].T + T_new_old[:3, 3]
         return replace(self, vertices=vertices.astype(np.float32))
 
     def with_faces(self, keep: NDArray[np.bool_]) -> "Mesh":
-        """Keep the faces that a mask [F] marks, and the vertices they use, in their order."""
+        """Return the faces selected by a mask [F] with the vertices they use, in the same order."""
         faces = self.faces[keep]
         used = np.zeros(len(self.vertices), bool)
         used[faces] = True
@@ -88,7 +88,7 @@ class Mesh:
         return Mesh(self.vertices[used], number[faces], None if self.colors is None else self.colors[used])
 
     def without_small_parts(self, vertices: int) -> "Mesh":
-        """Drop connected parts of fewer than so many vertices (VarSplat §7: 200), and vertices without a face."""
+        """Remove connected parts of fewer than `vertices` vertices (VarSplat §7: 200), and vertices without a face."""
         if not len(self.faces):
             return self.with_faces(np.zeros(0, bool))
         start, end = self.faces[:, [0, 1]].ravel(), self.faces[:, [1, 2]].ravel()

@@ -76,4 +76,4 @@ def _take_back(run: RunFolder, frames: int, submaps: int) -> None:
             f"the state speaks of {frames} and {submaps}; run it again"
         )
     write_text(log, "".join(lines[:frames]))
-    run.submaps.keep(submaps)
+    run.submaps.truncate(submaps)

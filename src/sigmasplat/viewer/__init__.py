@@ -1,1 +1,1 @@
-"""Show a run in the browser, while it goes on or afterwards: a consumer that no stage of SLAM knows."""
+"""Show a run in the browser, live or after it has ended. SLAM does not depend on it."""

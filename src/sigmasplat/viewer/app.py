@@ -1,4 +1,4 @@
-"""Bring what is known of a run and what the controls ask for onto the screen: one thread, at a bounded rate."""
+"""Draw the newest snapshot of a run as the controls ask, in one thread and at a bounded rate."""
 
 import contextlib
 import ctypes
@@ -11,232 +11,248 @@ import viser
 from sigmasplat.drawing.colormap import INFERNO
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.viewer import lines
-from sigmasplat.viewer.panel import Panel, Wanted
-from sigmasplat.viewer.pictures import Legend, Picture, legend_picture, picture_of, viewpoint
-from sigmasplat.viewer.scene import Scene, look, look_first, pose_of
+from sigmasplat.viewer.layers import LayerImage, Legend, browser_camera, draw_legend, render_layer
+from sigmasplat.viewer.panel import ControlPanel, ControlState
+from sigmasplat.viewer.scene import ViserScene, camera_pose, move_camera, set_initial_camera
 from sigmasplat.viewer.snapshot import BUDGET, Piece, Snapshot, within_budget
-from sigmasplat.viewer.splats import Cut, Floats, cut_of, joined, sigma_span, sigmas, splats_of
+from sigmasplat.viewer.splats import (
+    Floats,
+    VisibilityFilter,
+    merge_pieces,
+    sigma_range,
+    sorted_sigmas,
+    splat_arrays,
+    visibility_filter,
+)
 
 REST_S, LIVE_REST_S = 0.05, 0.5
-"""After each drawing, so that neither SLAM nor the machine is kept busy by a mouse."""
+"""Pause after each drawing, so that mouse moves do not keep the CPU busy and do not slow SLAM down."""
 ROWS, LIVE_ROWS = 480, 240
-"""Height of the pictures that are rendered here."""
+"""Height in pixels of the images that SigmaSplat renders."""
 BACK_M, UP_M = 0.7, 0.25
-"""Where the camera that follows another is, behind and above it."""
+"""Position of the following camera: behind and above the camera of the run."""
 
 
-def give_back_memory() -> None:
-    """Return to the system what was allocated for a while: arrays of tens of MB, made again and again by several
-    threads, leave holes that glibc keeps; in minutes they add up to hundreds of MB. Elsewhere nothing is done."""
+def release_memory() -> None:
+    """Return freed memory to the operating system; does nothing where libc has no `malloc_trim`.
+
+    Several threads repeatedly allocate arrays of tens of MB. glibc keeps the freed memory, which adds up to hundreds of
+    MB within minutes.
+    """
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
-class Same:
-    """A thing that equals nothing but itself, kept until it is compared: an id alone may be another's by then."""
+class IdentityKey:
+    """Compares objects by identity. It keeps the object alive, because a freed object's id can be used again."""
 
     def __init__(self, thing: object) -> None:
         self.thing = thing
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Same) and self.thing is other.thing
+        return isinstance(other, IdentityKey) and self.thing is other.thing
 
     __hash__ = None  # type: ignore[assignment]
 
 
-class Stage:
-    """Shows moments. `show` and the controls only leave word; a thread of its own does the work, the newest only."""
+class ViewerApp:
+    """Shows snapshots in the browser. `show` and the controls only set a flag; a thread draws the newest snapshot."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self.server = server
-        self.panel = Panel(server, self.changed, self._look_from)
-        self.scene = Scene(server, self._clicked)
-        self._moment: Snapshot | None = None
+        self.panel = ControlPanel(server, self.changed, self._look_from)
+        self.scene = ViserScene(server, self._clicked)
+        self._snapshot: Snapshot | None = None
         self._drawn: dict[Any, Any] = {}
-        self._sigmas: tuple[list[Same], Floats] = ([], sigmas(()))
-        self._joined: tuple[Any, Any] = (None, None)
-        self._word, self._stop = threading.Event(), threading.Event()
+        self._sigmas: tuple[list[IdentityKey], Floats] = ([], sorted_sigmas(()))
+        self._merged: tuple[Any, Any] = (None, None)
+        self._wake, self._stop = threading.Event(), threading.Event()
         server.on_client_connect(self._welcome)
-        server.on_client_disconnect(lambda client: self._drawn.pop(("picture", client.client_id), None))
+        server.on_client_disconnect(lambda client: self._drawn.pop(("layer", client.client_id), None))
         self._thread = threading.Thread(target=self._work, name="viewer", daemon=True)
         self._thread.start()
 
-    def show(self, moment: Snapshot) -> None:
-        """Show this from now on; returns at once."""
-        self._moment = moment
+    def show(self, snapshot: Snapshot) -> None:
+        """Show a snapshot from now on; returns immediately."""
+        self._snapshot = snapshot
         self.changed()
 
     def changed(self) -> None:
-        """Draw again what has changed."""
-        self._word.set()
+        """Ask the thread to redraw what has changed."""
+        self._wake.set()
 
     def stop(self) -> None:
-        """End the thread; the server goes on."""
+        """End the thread; the server keeps running."""
         self._stop.set()
-        self._word.set()
+        self._wake.set()
         self._thread.join()
 
     def _work(self) -> None:
         trimmed: Snapshot | None = None
         while True:
-            self._word.wait()
+            self._wake.wait()
             if self._stop.is_set():
                 return
-            self._word.clear()
-            moment = self._moment
-            if moment is not None:
+            self._wake.clear()
+            snapshot = self._snapshot
+            if snapshot is not None:
                 try:
-                    self._draw(moment)
-                    if moment is not trimmed:
-                        trimmed = moment
-                        give_back_memory()
-                except Exception as problem:  # a viewer that fails must not end the run that it shows
+                    self._draw(snapshot)
+                    if snapshot is not trimmed:
+                        trimmed = snapshot
+                        release_memory()
+                except Exception as problem:  # an error in the viewer must not end the run
                     print(f"viewer: {type(problem).__name__}: {problem}", file=sys.stderr)
-                self._stop.wait(LIVE_REST_S if moment.live else REST_S)
+                self._stop.wait(LIVE_REST_S if snapshot.live else REST_S)
 
-    def _draw(self, moment: Snapshot) -> None:
-        path = moment.path
-        whole, parts = moment.final is not None, bool(moment.pieces)
-        self.panel.offer(len(path), moment.live, moment.true_positions is not None, whole, parts)
-        wanted = self.panel.wanted()
-        pieces = moment.shown(wanted.whole, wanted.row)
+    def _draw(self, snapshot: Snapshot) -> None:
+        path = snapshot.path
+        has_final, has_submaps = snapshot.final is not None, bool(snapshot.pieces)
+        self.panel.adapt(len(path), snapshot.live, snapshot.true_positions is not None, has_final and has_submaps)
+        controls = self.panel.state()
+        pieces = snapshot.visible_pieces(controls.final_map, controls.row)
         ordered = self._sigmas_of(pieces)
-        cut = cut_of(ordered, wanted.hidden_share, wanted.least_opacity)
-        span = sigma_span(ordered)
+        visible = visibility_filter(ordered, controls.hidden_share, controls.min_opacity)
+        span = sigma_range(ordered)
         with self.server.atomic():
-            self._draw_path(moment, wanted)
-            self._draw_splats(pieces, wanted, span, cut)
-        self._draw_keyframes(moment, wanted)
-        self._say(moment, wanted, pieces, cut)
-        self._follow(moment, wanted)
-        legend = Legend(INFERNO, *span, "") if wanted.kind == "splats" and wanted.colouring == "σ" else None
+            self._draw_path(snapshot, controls)
+            self._draw_splats(pieces, controls, span, visible)
+        self._draw_keyframes(snapshot, controls)
+        self._show_texts(snapshot, controls, pieces, visible)
+        self._follow(snapshot, controls)
+        legend = Legend(INFERNO, *span, "") if controls.mode == "splats" and controls.colouring == "σ" else None
         for client in self.server.get_clients().values():
-            legend = self._draw_picture(client, moment, wanted, pieces, cut) or legend
+            legend = self._draw_layer(client, snapshot, controls, pieces, visible) or legend
         if self._is_new("legend", legend and legend[1:]):
-            self.panel.show_legend(None if legend is None else legend_picture(legend))
+            self.panel.show_legend(None if legend is None else draw_legend(legend))
 
     def _is_new(self, what: Any, state: Any) -> bool:
-        """Tell whether something is not drawn in this state yet, and take note that it is now."""
+        """Return whether something was not drawn in this state before, and remember the state."""
         if what in self._drawn and self._drawn[what] == state:
             return False
         self._drawn[what] = state
         return True
 
     def _sigmas_of(self, pieces: tuple[Piece, ...]) -> Floats:
-        fields = [Same(piece.field) for piece in pieces]
+        fields = [IdentityKey(piece.field) for piece in pieces]
         if self._sigmas[0] != fields:
-            self._sigmas = (fields, sigmas(pieces))
+            self._sigmas = (fields, sorted_sigmas(pieces))
         return self._sigmas[1]
 
-    def _draw_path(self, moment: Snapshot, wanted: Wanted) -> None:
-        path, row = moment.path, wanted.row
-        if self._is_new("first look", len(path) > 0) and len(path):
-            look_first(self.server, path.T_world_camera[0], BACK_M, UP_M)
-        if self._is_new("path", (Same(path), row, wanted.path)):
-            self.scene.show_lines("path", lines.path_segments(path, row) if wanted.path else None)
-            self.scene.show_lost(lines.lost_points(path, row if wanted.path else -1))
-            here = path.T_world_camera[min(row, len(path) - 1)] if len(path) else None
-            self.scene.show_here(moment.camera, here)
-        known = moment.true_positions
-        if self._is_new("true path", (Same(known), wanted.true_path)):
-            shown = known is not None and wanted.true_path
-            self.scene.show_lines("truth", lines.true_segments(known) if shown and known is not None else None)
+    def _draw_path(self, snapshot: Snapshot, controls: ControlState) -> None:
+        path, row = snapshot.path, controls.row
+        if self._is_new("initial camera", len(path) > 0) and len(path):
+            set_initial_camera(self.server, path.T_world_camera[0], BACK_M, UP_M)
+        if self._is_new("path", (IdentityKey(path), row, controls.path)):
+            self.scene.show_lines("path", lines.path_segments(path, row) if controls.path else None)
+            self.scene.show_lost(lines.lost_points(path, row if controls.path else -1))
+            current = path.T_world_camera[min(row, len(path) - 1)] if len(path) else None
+            self.scene.show_current_camera(snapshot.camera, current)
+        truth = snapshot.true_positions
+        if self._is_new("true path", (IdentityKey(truth), controls.true_path)):
+            shown = truth is not None and controls.true_path
+            self.scene.show_lines("truth", lines.truth_segments(truth) if shown and truth is not None else None)
 
-    def _draw_splats(self, pieces: tuple[Piece, ...], wanted: Wanted, span: tuple[float, float], cut: Cut) -> None:
-        if wanted.layer is not None:
+    def _draw_splats(
+        self, pieces: tuple[Piece, ...], controls: ControlState, span: tuple[float, float], visible: VisibilityFilter
+    ) -> None:
+        if controls.layer is not None:
             pieces = ()
-        ends = span if wanted.colouring == "σ" else None  # its own colours do not depend on the range
-        state = ([(p.name, Same(p.field)) for p in pieces], wanted.colouring, ends, cut)
+        ends = span if controls.colouring == "σ" else None  # the splats' own colours do not depend on the range of σ
+        state = ([(p.name, IdentityKey(p.field)) for p in pieces], controls.colouring, ends, visible)
         if self._is_new("splats", state):
-            few = within_budget(pieces, BUDGET)  # a final map may be larger; it is rendered whole, but sent thinned
-            drawn = {p.name: (splats_of(p.field, wanted.colouring, span, cut), p.T_world_piece) for p in few}
+            sent = within_budget(pieces, BUDGET)  # a large final map is rendered completely, but sent thinned
+            drawn = {p.name: (splat_arrays(p.field, controls.colouring, span, visible), p.T_world_piece) for p in sent}
             self.scene.show_splats(drawn)
         else:
             self.scene.place_splats({piece.name: piece.T_world_piece for piece in pieces})
 
-    def _draw_keyframes(self, moment: Snapshot, wanted: Wanted) -> None:
-        path = moment.path
-        if self._is_new("keyframes", (Same(path), wanted.row, wanted.keyframes, wanted.thumbnails)):
-            rows = lines.shown_keyframes(path, wanted.row) if wanted.keyframes else ()
+    def _draw_keyframes(self, snapshot: Snapshot, controls: ControlState) -> None:
+        path = snapshot.path
+        if self._is_new("keyframes", (IdentityKey(path), controls.row, controls.keyframes, controls.thumbnails)):
+            rows = lines.keyframes_to_show(path, controls.row) if controls.keyframes else ()
             poses = {row: path.T_world_camera[row] for row in rows}
-            self.scene.show_keyframes(moment.camera, poses, moment.picture if wanted.thumbnails else None)
+            self.scene.show_keyframes(snapshot.camera, poses, snapshot.image if controls.thumbnails else None)
 
-    def _draw_picture(
-        self, client: viser.ClientHandle, moment: Snapshot, wanted: Wanted, pieces: tuple[Piece, ...], cut: Cut
-    ) -> Legend | None:
-        """Render the layer asked for from where a browser looks, and put it behind its scene; return its legend."""
-        key, c = ("picture", client.client_id), client.camera
-        if wanted.layer is None:
+    def _draw_layer(
+        self, client: viser.ClientHandle, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...],
+        visible: VisibilityFilter,
+    ) -> Legend | None:  # fmt: skip
+        """Render the selected layer from a browser's viewpoint as the background of its scene; return its legend."""
+        key, c = ("layer", client.client_id), client.camera
+        if controls.layer is None:
             if self._drawn.pop(key, None) is not None:
                 client.scene.set_background_image(None)
             return None
-        pose, splats = pose_of(c), ([(Same(p.field), p.T_world_piece.tobytes()) for p in pieces], cut)
-        state = (wanted.layer, pose.tobytes(), c.fov, c.aspect, splats)
+        pose, splats = camera_pose(c), ([(IdentityKey(p.field), p.T_world_piece.tobytes()) for p in pieces], visible)
+        state = (controls.layer, pose.tobytes(), c.fov, c.aspect, splats)
         drawn = self._drawn.get(key)
         if drawn is None or drawn[0] != state:
-            if self._joined[0] != splats:
-                self._joined = (splats, joined(pieces, cut))
-            camera = viewpoint(c.fov, c.aspect, LIVE_ROWS if moment.live else ROWS)
-            made: Picture = picture_of(self._joined[1], camera, pose, wanted.layer, moment.options, moment.backend)
+            if self._merged[0] != splats:
+                self._merged = (splats, merge_pieces(pieces, visible))
+            camera = browser_camera(c.fov, c.aspect, LIVE_ROWS if snapshot.live else ROWS)
+            made: LayerImage = render_layer(
+                self._merged[1], camera, pose, controls.layer, snapshot.options, snapshot.backend
+            )
             if client.client_id not in self.server.get_clients():
-                return None  # it hung up meanwhile
+                return None  # the client has disconnected meanwhile
             client.scene.set_background_image(made.pixels, "jpeg", jpeg_quality=85)
             drawn = self._drawn[key] = (state, made.legend)
         legend: Legend | None = drawn[1]
         return legend
 
-    def _say(self, moment: Snapshot, wanted: Wanted, pieces: tuple[Piece, ...], cut: Cut) -> None:
-        path = moment.path
-        splats, kept = sum(len(p.field) for p in pieces), sum(int(cut.keeps(p.field).sum()) for p in pieces)
+    def _show_texts(
+        self, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...], visible: VisibilityFilter
+    ) -> None:
+        path = snapshot.path
+        splats, kept = sum(len(p.field) for p in pieces), sum(int(visible.mask(p.field).sum()) for p in pieces)
         submaps = int(path.submaps[-1]) + 1 if len(path) else 0
         facts = (
-            f"**{moment.title}** ({moment.status})  \n{len(path)} frames, {len(path.keyframes)} keyframes, "
+            f"**{snapshot.title}** ({snapshot.status})  \n{len(path)} frames, {len(path.keyframes)} keyframes, "
             f"{int(path.lost.sum())} lost, {submaps} submap{'s' * (submaps != 1)}  \n"
             f"{kept:,} of {splats:,} splats shown"
         )
-        cut_text = "" if cut.most_sigma == float("inf") else f"hidden: σ above {cut.most_sigma:.3g}"
-        self.panel.say(facts, cut_text, _frame_text(moment, wanted.row))
+        hidden = "" if visible.max_sigma == float("inf") else f"hidden: σ above {visible.max_sigma:.3g}"
+        self.panel.show_texts(facts, hidden, _frame_text(snapshot, controls.row))
 
-    def _follow(self, moment: Snapshot, wanted: Wanted) -> None:
-        path = moment.path
-        if wanted.follow and moment.live and len(path) and self._is_new("followed", Same(path)):
+    def _follow(self, snapshot: Snapshot, controls: ControlState) -> None:
+        path = snapshot.path
+        if controls.follow and snapshot.live and len(path) and self._is_new("followed", IdentityKey(path)):
             for client in self.server.get_clients().values():
-                look(client, path.T_world_camera[-1], BACK_M, UP_M)
+                move_camera(client, path.T_world_camera[-1], BACK_M, UP_M)
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(lambda _: self.changed())
         self.changed()
 
     def _clicked(self, row: int, client: viser.ClientHandle) -> None:
-        moment = self._moment
-        if moment is None or row >= len(moment.path):
+        snapshot = self._snapshot
+        if snapshot is None or row >= len(snapshot.path):
             return
-        self._go(client, row)
+        self._go(client, snapshot, row)
         try:
-            picture = moment.picture(row)
+            image = snapshot.image(row)
         except SigmaSplatError as problem:
-            self.panel.show_picture(f"frame {row}: {problem}", None)
+            self.panel.show_image(f"frame {row}: {problem}", None)
             return
-        nothing = "" if picture is not None else ": nobody kept what it saw"
-        self.panel.show_picture(f"frame {row}{nothing}", picture)
+        missing = "" if image is not None else ": its image was not kept"
+        self.panel.show_image(f"frame {row}{missing}", image)
 
     def _look_from(self, client: viser.ClientHandle) -> None:
-        moment = self._moment
-        if moment is not None and len(moment.path):
-            self._go(client, min(self.panel.wanted().row, len(moment.path) - 1))
+        snapshot = self._snapshot
+        if snapshot is not None and len(snapshot.path):
+            self._go(client, snapshot, min(self.panel.state().row, len(snapshot.path) - 1))
 
-    def _go(self, client: viser.ClientHandle, row: int) -> None:
-        """Send a browser where a frame was seen from, and clear the pictures before it out of the way."""
-        moment = self._moment
-        assert moment is not None
+    def _go(self, client: viser.ClientHandle, snapshot: Snapshot, row: int) -> None:
+        """Move a browser's camera to the pose of a frame; hide the thumbnails, which would cover the view."""
         self.panel.thumbnails.value = False
-        look(client, moment.path.T_world_camera[row])
+        move_camera(client, snapshot.path.T_world_camera[row])
         self.changed()
 
 
-def _frame_text(moment: Snapshot, row: int) -> str:
-    """Say what the timeline's frame is."""
-    path = moment.path
+def _frame_text(snapshot: Snapshot, row: int) -> str:
+    """Describe the frame selected on the timeline."""
+    path = snapshot.path
     if not len(path):
         return "no frame yet"
     row = min(row, len(path) - 1)

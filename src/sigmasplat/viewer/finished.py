@@ -1,4 +1,4 @@
-"""Read what is shown of a run folder: of a run that has ended, or of one that goes on in another process."""
+"""Read snapshots from a run folder, either finished or still written by another process."""
 
 import threading
 from collections.abc import Callable
@@ -16,92 +16,104 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.sources.base import Source
 from sigmasplat.types import Matrix
-from sigmasplat.viewer.snapshot import BUDGET, CAMERA, Path, Piece, Snapshot, bare, thinned, within_budget
+from sigmasplat.viewer.snapshot import (
+    BUDGET,
+    DEFAULT_CAMERA,
+    Path,
+    Piece,
+    Snapshot,
+    thin,
+    within_budget,
+    without_moments,
+)
 
 EVERY_S = 2.0
 Log = list[dict[str, Any]]
 Show = Callable[[Snapshot], None]
 
 
-def ended(run: RunFolder, source: Source | None = None, budget: int = BUDGET) -> Snapshot:
-    """Return what there is of a run that has ended; `source` gives pictures of keyframes that the run did not keep.
+def finished_snapshot(run: RunFolder, source: Source | None = None, budget: int = BUDGET) -> Snapshot:
+    """Read the snapshot of a finished run; `source` provides keyframe images that the run did not keep.
 
-    Raises RunError if it stopped before it had a map.
+    Raises RunError if the run stopped before it had a map.
     """
     path, final, tensors = run.read_trajectory(), run.read_map(), run.read_checkpoint()[0]
     log, config, true_file = run.read_log(), run.config(), run.path / TRUTH
-    kept = min(len(path), len(log))
-    keyframes = tuple(row for row in tensors["keyframes"].tolist() if row < kept)
-    shelf = Shelf(run, budget)
-    shelf.take_all(np.asarray(tensors["T_world_submap"], np.float64))
-    pieces = list(shelf.pieces.values())
+    frames = min(len(path), len(log))
+    keyframes = tuple(row for row in tensors["keyframes"].tolist() if row < frames)
+    cache = SubmapCache(run, budget)
+    cache.load_all(np.asarray(tensors["T_world_submap"], np.float64))
+    pieces = list(cache.pieces.values())
     if pieces and len(pieces) < len(tensors["T_world_submap"]):
         active = GaussianField(tensors["params"])
-        pieces.append(Piece(len(pieces), thinned(active, budget), np.asarray(tensors["T_world_submap"][-1])))
+        pieces.append(Piece(len(pieces), thin(active, budget), np.asarray(tensors["T_world_submap"][-1])))
     return Snapshot(
         run.path.resolve().name,
-        Path(path.T_world_camera[:kept], *_marks(log[:kept]), keyframes),
-        Piece(None, bare(final)),
+        Path(path.T_world_camera[:frames], *_lost_and_submaps(log[:frames]), keyframes),
+        Piece(None, without_moments(final)),
         within_budget(pieces, budget),
         read_trajectory(true_file).T_world_camera[:, :3, 3] if true_file.is_file() else None,
-        _camera(run, shelf, source),
-        partial(_picture, shelf, log, run, source),
+        _camera(run, cache, source),
+        partial(_image, cache, log, run, source),
         config.render,
         config.backend,
         status=str(run.facts().get("status")),
     )
 
 
-def running(run: RunFolder, shelf: "Shelf") -> Snapshot:
-    """Return what a run has written so far: the log's path, and the submaps finished, which lie where the log has
-    their first keyframes. `shelf` keeps what has been read before."""
+def running_snapshot(run: RunFolder, cache: "SubmapCache") -> Snapshot:
+    """Read the snapshot of an unfinished run: the path of its log, and its finished submaps.
+
+    A submap has the logged pose of its first keyframe. `cache` holds the submaps that were read before.
+    """
     log = run.read_log() if (run.path / "log.jsonl").is_file() else []
     config, poses = run.config(), [np.array(record["T_world_camera"], np.float64) for record in log]
-    shelf.take(poses)
-    path = Path(
-        np.array(poses).reshape(-1, 4, 4), *_marks(log), tuple(r for r, x in enumerate(log) if x["is_keyframe"])
-    )
+    cache.load_new(poses)
+    keyframes = tuple(row for row, record in enumerate(log) if record["is_keyframe"])
+    path = Path(np.array(poses).reshape(-1, 4, 4), *_lost_and_submaps(log), keyframes)
     return Snapshot(
-        run.path.resolve().name, path, None, tuple(shelf.pieces.values()), None, shelf.camera or CAMERA, shelf.picture,
-        config.render, config.backend, live=True, status="running",
+        run.path.resolve().name, path, None, tuple(cache.pieces.values()), None, cache.camera or DEFAULT_CAMERA,
+        cache.image, config.render, config.backend, live=True, status="running",
     )  # fmt: skip
 
 
-def follow(run: RunFolder, show: Show, stop: threading.Event, source: Source | None = None) -> None:
-    """Show a run folder; while its run goes on, again and again, and at last as it has ended. Returns then, or once
-    `stop` is set. Raises RunError where a run that has ended has no map."""
-    shelf = Shelf(run)
+def follow_run(run: RunFolder, show: Show, stop: threading.Event, source: Source | None = None) -> None:
+    """Show an unfinished run repeatedly until it ends, then show the finished run and return.
+
+    Returns earlier if `stop` is set. Raises RunError if the run has ended without a map.
+    """
+    cache = SubmapCache(run)
     while run.facts().get("status") == "running":
-        show(running(run, shelf))
+        show(running_snapshot(run, cache))
         if stop.wait(EVERY_S):
             return
-    show(ended(run, source))
+    show(finished_snapshot(run, source))
 
 
-class Shelf:
-    """Keep the finished submaps of a run as they are read, within a budget of splats, and find their pictures."""
+class SubmapCache:
+    """The finished submaps of a run that have been read so far, within a budget of splats, and their images."""
 
     def __init__(self, run: RunFolder, budget: int = BUDGET) -> None:
         self.store, self.budget = run.submaps, budget
         self.pieces: dict[int, Piece] = {}
         self.camera: Camera | None = None
-        self._places: dict[int, tuple[int, int]] = {}
+        self._keyframes: dict[int, tuple[int, int]] = {}
 
-    def take(self, T_world_camera: list[Matrix]) -> None:
-        """Read the submaps not read before, whose first keyframes have a pose."""
+    def load_new(self, T_world_camera: list[Matrix]) -> None:
+        """Read the submaps that were not read before and whose first keyframe has a pose."""
         for index in range(len(self.pieces), len(self.store)):
             self._add(index, lambda first: T_world_camera[first] if first < len(T_world_camera) else None)
 
-    def take_all(self, T_world_submap: NDArray[np.float64]) -> None:
-        """Read all submaps that lie somewhere."""
+    def load_all(self, T_world_submap: NDArray[np.float64]) -> None:
+        """Read all submaps that have a pose."""
         for index in range(min(len(self.store), len(T_world_submap))):
             self._add(index, lambda first, T=T_world_submap[index]: T)  # type: ignore[misc]
 
-    def picture(self, row: int) -> Rgb | None:
-        """Return what the keyframe at a row of the path saw, where its submap is here."""
-        if row not in self._places:
+    def image(self, row: int) -> Rgb | None:
+        """Return the image of the keyframe at a row of the path, or None if its submap was not read."""
+        if row not in self._keyframes:
             return None
-        return self.store.picture(*self._places[row]).color
+        return self.store.picture(*self._keyframes[row]).color
 
     def _add(self, index: int, anchor_of: Callable[[int], Matrix | None]) -> None:
         submap = self.store.load(index)
@@ -109,30 +121,30 @@ class Shelf:
         if T_world_submap is None or index != len(self.pieces):
             return
         self.camera = submap.camera
-        self.pieces[index] = Piece(index, thinned(submap.field, self.budget), T_world_submap)
+        self.pieces[index] = Piece(index, thin(submap.field, self.budget), T_world_submap)
         fitting = within_budget(tuple(self.pieces.values()), self.budget)
         self.pieces = dict(zip(self.pieces, fitting, strict=True))
         for k, row in enumerate(submap.frames):
-            self._places.setdefault(row, (index, k))
+            self._keyframes.setdefault(row, (index, k))
 
 
-def _marks(log: Log) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Return which frames were lost, and their submaps."""
+def _lost_and_submaps(log: Log) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Return whether each frame is lost [F], and its submap [F]."""
     lost = np.array([bool(record.get("lost")) for record in log], np.bool_)
     return lost, np.array([record.get("submap", 0) for record in log], np.int64)
 
 
-def _camera(run: RunFolder, shelf: Shelf, source: Source | None) -> Camera:
-    """Return the camera of the images that the run worked on, as far as it can be told."""
-    if shelf.camera:
-        return shelf.camera
+def _camera(run: RunFolder, cache: SubmapCache, source: Source | None) -> Camera:
+    """Return the camera at the run's working resolution, or a default if it is not known."""
+    if cache.camera:
+        return cache.camera
     settings = run.config().input
-    return source.camera.prepared(settings.width, settings.crop_px) if source else CAMERA
+    return source.camera.prepared(settings.width, settings.crop_px) if source else DEFAULT_CAMERA
 
 
-def _picture(shelf: Shelf, log: Log, run: RunFolder, source: Source | None, row: int) -> Rgb | None:
-    """Return what a keyframe saw: from its submap, else from the sequence where it still is."""
-    kept = shelf.picture(row)
+def _image(cache: SubmapCache, log: Log, run: RunFolder, source: Source | None, row: int) -> Rgb | None:
+    """Return the image of a keyframe from its submap, else from the sequence if it is available."""
+    kept = cache.image(row)
     if kept is not None or source is None or row >= len(log):
         return kept
     s = run.config().input
@@ -143,7 +155,7 @@ def _picture(shelf: Shelf, log: Log, run: RunFolder, source: Source | None, row:
     return (frame.color * 255.0).round().astype(np.uint8)
 
 
-def refuse_mapless(run: RunFolder) -> None:
+def check_has_map(run: RunFolder) -> None:
     """Raise RunError if a run has ended without a map."""
     if run.facts().get("status") != "running" and not (run.path / "map.ply").is_file():
         raise RunError(f"run {run.path} has no map to show: it stopped before its first frame; run it again")

@@ -1,4 +1,4 @@
-"""Lay out the path, the truth and lost frames as coloured segments and points; choose the keyframes to show."""
+"""Turn the path, the true path and the lost frames into coloured segments and points; choose the keyframes to show."""
 
 from typing import NamedTuple
 
@@ -12,10 +12,10 @@ from sigmasplat.viewer.snapshot import Path
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
-MOST_SEGMENTS = 5000
-MOST_KEYFRAMES = 100
+MAX_SEGMENTS = 5000
+MAX_KEYFRAMES = 100
 SUBMAP_COLOURS = (DARK.curves[ACCENT], DARK.curves[GREEN])
-"""Neighbours differ."""
+"""Used alternately, so that neighbouring submaps differ."""
 TRUTH_COLOUR = DARK.curves[BLUE]
 LOST_COLOUR = (255, 60, 60)
 
@@ -27,33 +27,35 @@ class Segments(NamedTuple):
     colors: Bytes
 
 
-def path_segments(path: Path, row: int, most: int = MOST_SEGMENTS) -> Segments:
-    """Return the path up to frame `row`, each submap in another colour than the one before, red where it was lost.
+def path_segments(path: Path, row: int, most: int = MAX_SEGMENTS) -> Segments:
+    """Return the path up to frame `row`, in alternating colours per submap, red at lost frames.
 
-    Long paths are drawn with at most about `most` segments, evenly chosen.
+    A long path is reduced to about `most` evenly spaced segments.
     """
     count = min(row + 1, len(path))
-    rows = evenly(count, most + 1)
+    rows = evenly_spaced(count, most + 1)
     colors = np.array(SUBMAP_COLOURS, np.uint8)[path.submaps[rows] % len(SUBMAP_COLOURS)]
     colors[path.lost[rows]] = LOST_COLOUR
-    return _joined(path.T_world_camera[rows, :3, 3], colors)
+    return _segments(path.T_world_camera[rows, :3, 3], colors)
 
 
-def true_segments(positions: Matrix, most: int = MOST_SEGMENTS) -> Segments:
-    """Return the true path [M, 3], world."""
-    rows = evenly(len(positions), most + 1)
-    return _joined(positions[rows], np.tile(np.array(TRUTH_COLOUR, np.uint8), (len(rows), 1)))
+def truth_segments(positions: Matrix, most: int = MAX_SEGMENTS) -> Segments:
+    """Return segments of the true path [M, 3] m in the world, at most about `most`."""
+    rows = evenly_spaced(len(positions), most + 1)
+    return _segments(positions[rows], np.tile(np.array(TRUTH_COLOUR, np.uint8), (len(rows), 1)))
 
 
-def lost_points(path: Path, row: int, most: int = MOST_SEGMENTS) -> Floats:
-    """Return where the frames up to `row` that were lost are believed to be [L, 3] m."""
+def lost_points(path: Path, row: int, most: int = MAX_SEGMENTS) -> Floats:
+    """Return the estimated positions [L, 3] m of the lost frames up to `row`, at most `most`."""
     rows = np.flatnonzero(path.lost[: row + 1])
-    return np.asarray(path.T_world_camera[rows[evenly(len(rows), most)], :3, 3], np.float32)
+    return np.asarray(path.T_world_camera[rows[evenly_spaced(len(rows), most)], :3, 3], np.float32)
 
 
-def shown_keyframes(path: Path, row: int, most: int = MOST_KEYFRAMES) -> tuple[int, ...]:
-    """Return the rows of at most `most` keyframes up to frame `row`: every 2ᵏ-th and the last, so that those shown
-    stay the same while more come."""
+def keyframes_to_show(path: Path, row: int, most: int = MAX_KEYFRAMES) -> tuple[int, ...]:
+    """Return the rows of at most `most` keyframes up to frame `row`: every 2ᵏ-th one and the last.
+
+    With a power of two most of the keyframes shown stay the same while new ones are added.
+    """
     rows = [keyframe for keyframe in path.keyframes if keyframe <= row]
     stride = 1
     while len(rows) / stride > most - 1:
@@ -61,12 +63,12 @@ def shown_keyframes(path: Path, row: int, most: int = MOST_KEYFRAMES) -> tuple[i
     return tuple(sorted({*rows[::stride], *rows[-1:]}))
 
 
-def evenly(count: int, most: int) -> NDArray[np.int64]:
-    """Choose at most `most` of `count` rows, first and last among them."""
+def evenly_spaced(count: int, most: int) -> NDArray[np.int64]:
+    """Return at most `most` evenly spaced rows of `count`, including the first and the last."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(np.int64))
 
 
-def _joined(positions: Matrix, colors: Bytes) -> Segments:
-    """Join neighbours [n, 3]; a segment has the colours of its ends."""
+def _segments(positions: Matrix, colors: Bytes) -> Segments:
+    """Return the segments between neighbouring positions [n, 3]; a segment has the colours of its ends."""
     pairs = [np.stack([values[:-1], values[1:]], 1) for values in (positions, colors)]
     return Segments(np.asarray(pairs[0], np.float32), np.asarray(pairs[1], np.uint8))

@@ -1,4 +1,4 @@
-"""Watch a run from inside its process and show it: a copy of what has changed, at a bounded rate."""
+"""Take snapshots of a running system from inside its process, at a bounded rate."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -9,18 +9,20 @@ from sigmasplat.drawing.colormap import Rgb
 from sigmasplat.run.protocols import LoopResult, StepResult
 from sigmasplat.slam.slam import Slam
 from sigmasplat.viewer.finished import Show
-from sigmasplat.viewer.snapshot import BUDGET, CAMERA, Path, Piece, Snapshot, bare, thinned, within_budget
+from sigmasplat.viewer.snapshot import BUDGET, DEFAULT_CAMERA, Path, Piece, Snapshot, thin, within_budget
 
 EVERY_S = 2.0
-MOST_SHARE = 0.02
-"""Of a run's time at most this is spent on copies for the viewer: where one takes long, the next comes later."""
+MAX_TIME_SHARE = 0.02
+"""Maximum share of the run's time spent on copies for the viewer: a slow copy delays the next one."""
 ACTIVE_SHARE = 1 / 3
-"""Of the budget, for the submap that is being mapped; the others share the rest."""
+"""Share of the budget for the active submap; the finished ones use the rest."""
 
 
 class LiveView:
-    """A watcher (`protocols.Watcher`) that shows moments of a system. It copies in the run's own thread, between two
-    frames, so that nothing is read while it changes; all else is left to who shows them."""
+    """A `protocols.Callback` that shows snapshots of a system.
+
+    It copies the map between two frames, in the thread of the run, so that no data change while they are read.
+    """
 
     def __init__(
         self, slam: Slam, show: Show, title: str, budget: int = BUDGET, every_s: float = EVERY_S,
@@ -29,63 +31,63 @@ class LiveView:
         self.slam, self.show, self.title, self.budget, self.every_s = slam, show, title, budget, every_s
         self._clock, self._due_s = clock, 0.0
         self._finished: tuple[Piece, ...] = ()
-        self._places: dict[int, tuple[int, int]] = {}
+        self._keyframes: dict[int, tuple[int, int]] = {}
 
     def __call__(self, step: StepResult) -> None:
-        """Show how things are after a step, if it is time."""
+        """Show a snapshot after a step if one is due."""
         started_s = self._clock()
         if started_s >= self._due_s:
-            self.show(self.moment())
+            self.show(self.snapshot())
             ended_s = self._clock()
-            self._due_s = ended_s + max(self.every_s, (ended_s - started_s) / MOST_SHARE)
+            self._due_s = ended_s + max(self.every_s, (ended_s - started_s) / MAX_TIME_SHARE)
 
     def finishing(self, done: int, total: int) -> None:
-        """Show the path and map that refinement starts from, the last submap finished."""
+        """Show the path and map before refinement, when the last submap is finished."""
         if done == 0 and len(self.slam.store) == len(self.slam.atlas.anchors):
-            self.show(self.moment())
+            self.show(self.snapshot())
 
     def last_loops(self, loops: Sequence[LoopResult]) -> None:
-        """Show the map as it is in the end."""
-        self.show(self.moment(finished=True))
+        """Show the final map."""
+        self.show(self.snapshot(finished=True))
 
-    def moment(self, finished: bool = False) -> Snapshot:
-        """Copy what is shown of the system as it is now; once it is finished, the final map too."""
+    def snapshot(self, finished: bool = False) -> Snapshot:
+        """Copy the current state of the system; include the final map if it is finished."""
         slam = self.slam
         lost = np.array([step.lost for step in slam.steps], np.bool_)
         submaps = np.array([step.submap for step in slam.steps], np.int64)
         path = Path(slam.atlas.T_world_camera(), lost, submaps, tuple(slam.keyframes))
-        self._take_finished()
-        final = Piece(None, thinned(bare(slam.field), self.budget)) if finished else None
+        self._add_finished()
+        final = Piece(None, thin(slam.field, self.budget)) if finished else None
         keyframes = slam.mapper.keyframes
         return Snapshot(
             self.title, path, final, (*self._finished, *self._active()), None,
-            keyframes[0].target.camera if keyframes else CAMERA, self.picture, slam.config.render, slam.config.backend,
-            live=True, status="running",
+            keyframes[0].target.camera if keyframes else DEFAULT_CAMERA, self.image, slam.config.render,
+            slam.config.backend, live=True, status="running",
         )  # fmt: skip
 
-    def picture(self, row: int) -> Rgb | None:
-        """Return what the keyframe at a row of the path saw; None where it is too long ago."""
+    def image(self, row: int) -> Rgb | None:
+        """Return the image of the keyframe at a row of the path, or None if it is no longer kept."""
         for keyframe in tuple(self.slam.mapper.keyframes):
             if keyframe.index == row:
                 return keyframe.target.picture().color
-        if row not in self._places:
+        if row not in self._keyframes:
             return None
-        return self.slam.store.picture(*self._places[row]).color
+        return self.slam.store.picture(*self._keyframes[row]).color
 
     def _active(self) -> tuple[Piece, ...]:
-        """Return a copy of the submap that is being mapped, where it has begun."""
+        """Return a copy of the active submap, if there is one."""
         slam, number = self.slam, len(self.slam.store)
         if number >= len(slam.atlas.anchors):
             return ()
-        copied = thinned(bare(slam.mapper.field), int(self.budget * ACTIVE_SHARE))
+        copied = thin(slam.mapper.field, int(self.budget * ACTIVE_SHARE))
         return (Piece(number, copied, slam.atlas.anchors[number].copy()),)
 
-    def _take_finished(self) -> None:
-        """Read the submaps finished since the last time, and put all where they lie now: loops move them."""
+    def _add_finished(self) -> None:
+        """Load the newly finished submaps, and update the poses of all submaps, since loops change them."""
         slam, most = self.slam, int(self.budget * (1.0 - ACTIVE_SHARE))
         for index in range(len(self._finished), len(slam.store)):
             submap = slam.store.load(index)
-            self._finished = (*self._finished, Piece(index, thinned(submap.field, most)))
-            self._places |= {row: (index, k) for k, row in enumerate(submap.frames)}
+            self._finished = (*self._finished, Piece(index, thin(submap.field, most)))
+            self._keyframes |= {row: (index, k) for k, row in enumerate(submap.frames)}
         placed = [Piece(p.submap, p.field, slam.atlas.anchors[i].copy()) for i, p in enumerate(self._finished)]
         self._finished = within_budget(placed, most)

@@ -1,4 +1,4 @@
-"""Keep other pages of the same browser out: they may open websockets to any address, and read what comes back."""
+"""Refuse other pages in the same browser: any page may open a websocket to any address and read the answers."""
 
 import ipaddress
 import socket
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 
 def is_own_page(origin: str | None, reached: str | None, host: str) -> bool:
-    """Tell whether a request with these headers, Origin and Host, comes from a page of the viewer at `host`, or from
-    no page at all (no Origin).
+    """Return whether a request with the headers Origin and Host comes from a page of the viewer at `host`.
 
-    The page's address must be the one that the request goes to, and that an IP address or a name of the viewer's: any
-    other name may be made to point here by whoever owns it.
+    Also true without an Origin: the client is not a browser. The page's address must equal the requested one, and it
+    must be an IP address or a name of the viewer's host: the owner of any other name can point that name to this
+    machine.
     """
     if origin is None:
         return True
@@ -43,25 +43,25 @@ def _is_ip(name: str) -> bool:
 
 @contextmanager
 def own_pages_only(host: str) -> Iterator[list[str]]:
-    """Answer 403 to requests of other pages, in websocket servers that are started meanwhile; list where they listen.
+    """Make websocket servers that start within the block answer other pages with 403; yield the list of their hosts.
 
-    viser starts one and lets nobody say how, so websockets' `serve` stands in for itself until it has.
+    viser starts such a server and has no option for this, so `serve` of websockets is replaced within the block.
     """
     from websockets.asyncio import server
 
-    plain, kept = server.serve, list[str]()
+    original, hosts = server.serve, list[str]()
 
     def serve(*args: Any, process_request: "Answer", **more: Any) -> "server.serve":
         def answer(connection: "ServerConnection", request: "Request") -> "Response | None":
             if not is_own_page(request.headers.get("Origin"), request.headers.get("Host"), host):
-                return connection.respond(403, "this page is not the viewer's\n")
+                return connection.respond(403, "this page does not belong to the viewer\n")
             return process_request(connection, request)
 
-        kept.append(host)
-        return plain(*args, process_request=answer, **more)
+        hosts.append(host)
+        return original(*args, process_request=answer, **more)
 
     server.serve = serve  # type: ignore[assignment, misc]
     try:
-        yield kept
+        yield hosts
     finally:
-        server.serve = plain  # type: ignore[misc]
+        server.serve = original  # type: ignore[misc]

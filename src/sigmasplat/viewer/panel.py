@@ -1,4 +1,4 @@
-"""Lay out the controls beside the scene, and say what they ask for."""
+"""Lay out the controls beside the scene and read their state."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,31 +8,31 @@ import numpy as np
 import viser
 
 from sigmasplat.drawing.colormap import NO_READING, Rgb
-from sigmasplat.viewer.pictures import LEGEND_SIZE, Layer
+from sigmasplat.viewer.layers import LEGEND_SIZE, Layer
 from sigmasplat.viewer.splats import Colouring
 
-Kind = Literal["splats", "colour", "depth", "V", "U", "opacity"]
-KINDS: tuple[Kind, ...] = ("splats", "colour", "depth", "V", "U", "opacity")
-SAYS: dict[Kind, str] = {
+ViewMode = Literal["splats", "colour", "depth", "V", "U", "opacity"]
+VIEW_MODES: tuple[ViewMode, ...] = ("splats", "colour", "depth", "V", "U", "opacity")
+MODE_LABELS: dict[ViewMode, str] = {
     "splats": "splats, drawn by the browser",
     "colour": "colour, rendered by SigmaSplat",
     "depth": "depth",
-    "V": "V: variance of colour, as root",
-    "U": "U: variance of depth, as root",
+    "V": "√V: standard deviation of colour",
+    "U": "√U: standard deviation of depth",
     "opacity": "opacity",
 }
-WHOLE, PARTS = "final map", "submaps"
+FINAL_MAP, SUBMAPS = "final map", "submaps"
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What the controls ask for."""
+class ControlState:
+    """The values of the controls at one time."""
 
-    kind: Kind
+    mode: ViewMode
     colouring: Colouring
-    whole: bool
+    final_map: bool
     hidden_share: float
-    least_opacity: float
+    min_opacity: float
     row: int
     path: bool
     keyframes: bool
@@ -42,13 +42,12 @@ class Wanted:
 
     @property
     def layer(self) -> Layer | None:
-        """Return the layer to render on this side; None where the browser draws splats."""
-        return None if self.kind == "splats" else self.kind
+        """Return the layer that SigmaSplat renders, or None if the browser draws splats."""
+        return None if self.mode == "splats" else self.mode
 
 
-class Panel:
-    """The controls. `changed` is called after each change; `look_from` with the browser whose user asked to go to the
-    timeline's frame."""
+class ControlPanel:
+    """The controls. Calls `changed()` after each change, and `look_from(client)` after a click on "look from here"."""
 
     def __init__(
         self, server: viser.ViserServer, changed: Callable[[], None], look_from: Callable[[viser.ClientHandle], None]
@@ -56,55 +55,61 @@ class Panel:
         gui = server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(214, 90, 30))
         self.facts = gui.add_markdown("waiting for the first frame")
-        self.caption = gui.add_markdown("Click on a keyframe to go there and see what it saw.")
-        self.picture = gui.add_image(np.full((3, 4, 3), NO_READING, np.uint8), visible=False, jpeg_quality=90)
-        self._map(gui)
-        self._path(gui)
+        self.caption = gui.add_markdown("Click a keyframe to move there and see its image.")
+        self.image = gui.add_image(np.full((3, 4, 3), NO_READING, np.uint8), visible=False, jpeg_quality=90)
+        self._add_map_controls(gui)
+        self._add_path_controls(gui)
         self.look.on_click(lambda event: look_from(event.client) if event.client else None)
         for control in self._controls():
             control.on_update(lambda _: changed())
 
-    def _map(self, gui: viser.GuiApi) -> None:
+    def _add_map_controls(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("Map"):
-            self.kind = gui.add_dropdown("show", tuple(SAYS[kind] for kind in KINDS))
+            self.mode = gui.add_dropdown("show", tuple(MODE_LABELS[mode] for mode in VIEW_MODES))
             self.colouring = gui.add_dropdown(
-                "splats in", ("colour", "σ"), hint="their own colours, or σ: how doubtful their colour is, dark = sure"
+                "splat colour",
+                ("colour", "σ"),
+                hint="the splats' own colours, or σ of their colour: bright = uncertain",
             )
             self.part = gui.add_dropdown(
-                "of", (WHOLE, PARTS), hint="the map as it was made in the end, or the submaps that it was made of"
+                "map", (FINAL_MAP, SUBMAPS), hint="the final map, or the submaps from which it was made"
             )
             self.legend = gui.add_image(np.zeros((*LEGEND_SIZE[::-1], 3), np.uint8), visible=False, format="png")
             self.hidden = gui.add_slider(
-                "hide doubtful", 0, 99, 1, 0, hint="hide this share of the splats, in percent: those of the largest σ"
+                "hide uncertain", 0, 99, 1, 0, hint="hide this percentage of the splats: those with the largest σ"
             )
-            self.faint = gui.add_slider("hide fainter than", 0.0, 0.99, 0.01, 0.0, hint="opacity")
-            self.cut = gui.add_markdown("")
+            self.min_opacity = gui.add_slider(
+                "minimum opacity", 0.0, 0.99, 0.01, 0.0, hint="hide splats with a lower opacity"
+            )
+            self.hidden_text = gui.add_markdown("")
 
-    def _path(self, gui: viser.GuiApi) -> None:
+    def _add_path_controls(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("Path"):  # Any: mypy takes `value` for read-only
-            self.row: Any = gui.add_slider("frame", 0, 1, 1, 1, hint="the path up to here, the submaps begun by then")
+            self.row: Any = gui.add_slider(
+                "frame", 0, 1, 1, 1, hint="show the path up to this frame and the submaps started by then"
+            )
             self.frame = gui.add_markdown("")
             self.look = gui.add_button("look from here")
             self.follow = gui.add_checkbox("follow the camera", False, visible=False)
             self.path = gui.add_checkbox("path", True)
             self.keyframes = gui.add_checkbox("keyframes", True)
-            self.thumbnails: Any = gui.add_checkbox("what they saw", True)
-            self.true_path = gui.add_checkbox("truth", True, visible=False)
+            self.thumbnails: Any = gui.add_checkbox("keyframe images", True)
+            self.true_path = gui.add_checkbox("ground truth", True, visible=False)
 
     def _controls(self) -> tuple[Any, ...]:
         return (
-            self.kind, self.colouring, self.part, self.hidden, self.faint, self.row, self.follow, self.path,
+            self.mode, self.colouring, self.part, self.hidden, self.min_opacity, self.row, self.follow, self.path,
             self.keyframes, self.thumbnails, self.true_path,
         )  # fmt: skip
 
-    def wanted(self) -> Wanted:
-        """Return what is asked for now."""
-        return Wanted(
-            next(kind for kind in KINDS if SAYS[kind] == self.kind.value),
+    def state(self) -> ControlState:
+        """Return the current values of the controls."""
+        return ControlState(
+            next(mode for mode in VIEW_MODES if MODE_LABELS[mode] == self.mode.value),
             "σ" if self.colouring.value == "σ" else "colour",
-            self.part.value == WHOLE,
+            self.part.value == FINAL_MAP,
             self.hidden.value / 100.0,
-            float(self.faint.value),
+            float(self.min_opacity.value),
             int(self.row.value),
             self.path.value,
             self.keyframes.value,
@@ -113,8 +118,8 @@ class Panel:
             self.follow.value,
         )
 
-    def offer(self, frames: int, live: bool, truth_known: bool, whole: bool, parts: bool) -> None:
-        """Fit the controls to what there is; the timeline stays at its end while frames are added."""
+    def adapt(self, frames: int, live: bool, truth_known: bool, can_choose_map: bool) -> None:
+        """Adapt the controls to the snapshot; a timeline at its end stays there while frames are added."""
         last = max(frames - 1, 1)
         at_end = self.row.value >= self.row.max
         if last != self.row.max:
@@ -123,21 +128,21 @@ class Panel:
             self.row.max = last
             if at_end:
                 self.row.value = last
-        self.follow.visible, self.true_path.visible, self.part.visible = live, truth_known, whole and parts
+        self.follow.visible, self.true_path.visible, self.part.visible = live, truth_known, can_choose_map
 
-    def say(self, facts: str, cut: str, frame: str) -> None:
-        """Show texts: of the whole run, of what is cut off, of the timeline's frame."""
-        self.facts.content, self.cut.content, self.frame.content = facts, cut, frame
+    def show_texts(self, facts: str, hidden: str, frame: str) -> None:
+        """Show texts about the run, about the hidden splats, and about the selected frame."""
+        self.facts.content, self.hidden_text.content, self.frame.content = facts, hidden, frame
 
     def show_legend(self, pixels: Rgb | None) -> None:
-        """Show what colours mean, None where they are the scene's own."""
+        """Show the colour legend, or hide it if None."""
         if pixels is not None:
             self.legend.image = pixels
         self.legend.visible = pixels is not None
 
-    def show_picture(self, caption: str, pixels: Rgb | None) -> None:
-        """Show what a keyframe saw."""
+    def show_image(self, caption: str, pixels: Rgb | None) -> None:
+        """Show the image of a keyframe, or the caption alone if None."""
         self.caption.content = caption
         if pixels is not None:
-            self.picture.image = pixels
-        self.picture.visible = pixels is not None
+            self.image.image = pixels
+        self.image.visible = pixels is not None

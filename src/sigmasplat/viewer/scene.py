@@ -1,4 +1,4 @@
-"""Keep viser's scene as it should be: nodes are replaced or changed in place under fixed names, never heaped up."""
+"""Update viser's scene: nodes have fixed names and are changed in place or replaced, so their number is bounded."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -13,31 +13,31 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.types import Matrix
 from sigmasplat.viewer.lines import LOST_COLOUR, Bytes, Floats, Segments
-from sigmasplat.viewer.splats import Splats
+from sigmasplat.viewer.splats import SplatArrays
 
 FRUSTUM_M, THUMBNAIL_PX = 0.08, 160
 LINE_PX, FRUSTUM_PX, DOT_M = {"path": 4.0, "truth": 2.0}, 1.0, 0.03
-KEYFRAME_COLOUR, HERE_COLOUR = (112, 120, 130), (255, 210, 60)
+KEYFRAME_COLOUR, CURRENT_COLOUR = (112, 120, 130), (255, 210, 60)
 AHEAD_M = 1.0
-"""A camera that is sent somewhere turns about the point so far before it."""
+"""Distance in front of a moved camera of the point that the mouse rotates it about."""
 
 Clicked = Callable[[int, viser.ClientHandle], None]
 
 
-class Scene:
-    """What all browsers see alike."""
+class ViserScene:
+    """The part of the scene that all browsers share."""
 
     def __init__(self, server: viser.ViserServer, clicked: Clicked) -> None:
-        """Start empty; `clicked` is told the row of a keyframe and the browser whose user clicked on it."""
+        """Start with an empty scene; a click on a keyframe calls `clicked(row, client)`."""
         self.server, self.clicked = server, clicked
         self._splats: dict[str, viser.GaussianSplatHandle] = {}
         self._keyframes: dict[int, viser.CameraFrustumHandle] = {}
-        self._pictured = True
+        self._with_images = True
         self._marks: dict[str, Any] = {}
         server.scene.set_up_direction("-y")
 
-    def show_splats(self, splats: Mapping[str, tuple[Splats, Matrix]]) -> None:
-        """Show these pieces, by name, each at T_world_piece, and no others."""
+    def show_splats(self, splats: Mapping[str, tuple[SplatArrays, Matrix]]) -> None:
+        """Show exactly these pieces, by name, each at its T_world_piece."""
         drawn = {name: part for name, part in splats.items() if len(part[0])}
         for name in self._splats.keys() - drawn.keys():
             self._splats.pop(name).remove()
@@ -50,22 +50,26 @@ class Scene:
         self.place_splats({name: T for name, (_, T) in drawn.items()})
 
     def place_splats(self, T_world_piece: Mapping[str, Matrix]) -> None:
-        """Move pieces that are shown."""
+        """Move the visible pieces to their poses."""
         for name, T in T_world_piece.items():
             if name in self._splats:
                 _place(self._splats[name], T)
 
     def show_lines(self, name: Literal["path", "truth"], segments: Segments | None) -> None:
-        """Show line segments under a name, None for none."""
+        """Show line segments under a name, or remove them if None."""
         if segments is None or not len(segments.points):
             self._drop(name)
             return
         self._marks[name] = self.server.scene.add_line_segments(
-            f"/{name}", segments.points, linear(segments.colors), thickness=LINE_PX[name], thickness_units="screen"
+            f"/{name}",
+            segments.points,
+            srgb_to_linear(segments.colors),
+            thickness=LINE_PX[name],
+            thickness_units="screen",
         )
 
     def show_lost(self, points: Floats) -> None:
-        """Mark positions [L, 3] of lost frames."""
+        """Mark the positions [L, 3] of lost frames."""
         if not len(points):
             self._drop("lost")
             return
@@ -73,27 +77,28 @@ class Scene:
             "/lost", points, LOST_COLOUR, point_size=DOT_M, point_shape="circle"
         )
 
-    def show_here(self, camera: Camera, T_world_camera: Matrix | None) -> None:
-        """Show the camera of the frame that the timeline stands at."""
+    def show_current_camera(self, camera: Camera, T_world_camera: Matrix | None) -> None:
+        """Show the camera of the frame selected on the timeline."""
         if T_world_camera is None:
-            self._drop("here")
+            self._drop("current")
             return
-        if "here" not in self._marks:
-            self._marks["here"] = self._frustum("/here", camera, 1.5 * FRUSTUM_M, HERE_COLOUR, None)
-        _place(self._marks["here"], T_world_camera)
+        if "current" not in self._marks:
+            self._marks["current"] = self._frustum("/current", camera, 1.5 * FRUSTUM_M, CURRENT_COLOUR, None)
+        _place(self._marks["current"], T_world_camera)
 
     def show_keyframes(
-        self, camera: Camera, T_world_camera: Mapping[int, Matrix], picture: Callable[[int], Rgb | None] | None
+        self, camera: Camera, T_world_camera: Mapping[int, Matrix], image: Callable[[int], Rgb | None] | None
     ) -> None:
-        """Show the frusta of these keyframes, by row, and no others; what they saw in them where it is given."""
-        pictured = picture is not None
-        gone = self._keyframes.keys() if pictured != self._pictured else self._keyframes.keys() - T_world_camera.keys()
-        for row in tuple(gone):
+        """Show exactly the frusta of these keyframes, by row, with thumbnails unless `image` is None."""
+        with_images = image is not None
+        all_change = with_images != self._with_images
+        removed = self._keyframes.keys() if all_change else self._keyframes.keys() - T_world_camera.keys()
+        for row in tuple(removed):
             self._keyframes.pop(row).remove()
-        self._pictured = pictured
+        self._with_images = with_images
         for row, T in T_world_camera.items():
             if row not in self._keyframes:
-                small = thumbnail(picture(row)) if picture else None
+                small = thumbnail(image(row)) if image else None
                 frustum = self._frustum(f"/keyframes/{row}", camera, FRUSTUM_M, KEYFRAME_COLOUR, small)
                 frustum.on_click(partial(self._pass_on, row))
                 self._keyframes[row] = frustum
@@ -116,42 +121,42 @@ class Scene:
             self._marks.pop(name).remove()
 
 
-def look(client: viser.ClientHandle, T_world_camera: Matrix, back_m: float = 0.0, up_m: float = 0.0) -> None:
-    """Send a browser's camera to a pose, or to a place behind and above it."""
+def move_camera(client: viser.ClientHandle, T_world_camera: Matrix, back_m: float = 0.0, up_m: float = 0.0) -> None:
+    """Move a browser's camera to a pose, or to a position behind and above it."""
     position = T_world_camera @ np.array([0.0, -up_m, -back_m, 1.0])
     with client.atomic():
         client.camera.position = position[:3]
         client.camera.look_at = (T_world_camera @ np.array([0.0, 0.0, AHEAD_M, 1.0]))[:3]
 
 
-def look_first(server: viser.ViserServer, T_world_camera: Matrix, back_m: float, up_m: float) -> None:
-    """Say where browsers that open the page later look from."""
+def set_initial_camera(server: viser.ViserServer, T_world_camera: Matrix, back_m: float, up_m: float) -> None:
+    """Set the camera of browsers that open the page later."""
     server.initial_camera.position = (T_world_camera @ np.array([0.0, -up_m, -back_m, 1.0]))[:3]
     server.initial_camera.look_at = (T_world_camera @ np.array([0.0, 0.0, AHEAD_M, 1.0]))[:3]
 
 
-def pose_of(camera: viser.CameraHandle) -> Matrix:
-    """Return T_world_camera [4, 4] of a browser."""
+def camera_pose(camera: viser.CameraHandle) -> Matrix:
+    """Return T_world_camera [4, 4] of a browser's camera."""
     T = np.eye(4)
     T[:3, :3] = se3.rotation_from_quaternion(camera.wxyz)
     T[:3, 3] = camera.position
     return T
 
 
-def linear(colors: Bytes) -> Bytes:
-    """Return sRGB colours as shares of light, 0 … 255: viser takes the colours of a line's ends for that."""
+def srgb_to_linear(colors: Bytes) -> Bytes:
+    """Convert sRGB colours to linear ones, 0 to 255, which viser expects for lines."""
     return (255.0 * (colors / 255.0) ** 2.2).round().astype(np.uint8)
 
 
-def thumbnail(picture: Rgb | None) -> Rgb | None:
-    """Return a picture at most `THUMBNAIL_PX` wide."""
-    if picture is None:
+def thumbnail(image: Rgb | None) -> Rgb | None:
+    """Return an image scaled down to at most `THUMBNAIL_PX` on each side."""
+    if image is None:
         return None
-    small = Image.fromarray(picture)
+    small = Image.fromarray(image)
     small.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX))
     return np.asarray(small)
 
 
 def _place(node: Any, T_world_node: Matrix) -> None:
-    """Move a node where it is not there already."""
+    """Set the pose of a node."""
     node.wxyz, node.position = se3.quaternion_from_rotation(T_world_node[:3, :3]), T_world_node[:3, 3]

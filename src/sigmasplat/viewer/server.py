@@ -1,4 +1,4 @@
-"""Open the port that the viewer listens on: this machine's own by default, the next one where it is taken."""
+"""Start the viewer's server, by default for this machine only, on the requested port or the next free one."""
 
 import contextlib
 import errno
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 HOST, PORT = "127.0.0.1", 8080
 ATTEMPTS = 100
-TAKEN = (errno.EADDRINUSE,)
+PORT_BUSY = (errno.EADDRINUSE,)
 
 
 def open_server(host: str, port: int, title: str) -> "ViserServer":
-    """Start viser's server on the first free port from `port` on, for its own pages only (`origin`).
+    """Start viser's server on the first free port from `port` upwards; it accepts requests of its own pages only.
 
-    Raises SigmaSplatError without viser or a port, or with a viser that cannot be kept to its own pages.
+    Raises SigmaSplatError if viser is missing or cannot be restricted to its own pages, or if no port is free.
     """
     try:
         import viser
@@ -32,34 +32,35 @@ def open_server(host: str, port: int, title: str) -> "ViserServer":
         ) from problem
 
     class LocalServer(viser.ViserServer):
-        """Shows nothing to anyone outside: viser would open a public tunnel for whoever asks a server for one."""
+        """Refuses to share: viser would open a public tunnel if a page asked for one."""
 
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None
 
     found = free_port(host, port)
-    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # a browser that hangs up is no news
-    with own_pages_only(host) as kept, contextlib.redirect_stdout(io.StringIO()):  # its banner: our line says where
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # do not log clients that disconnect
+    with own_pages_only(host) as restricted, contextlib.redirect_stdout(io.StringIO()):  # no banner of viser
         server = LocalServer(host=host, port=found, label=title, verbose=False)
-    if not kept:
+    if not restricted:
         close(server)
         raise SigmaSplatError(
-            f"viser {viser.__version__} would show the run to any page open in the browser; install viser==1.1.1, with "
-            "which this was tried"
+            f"viser {viser.__version__} would show the run to any page open in the browser; install viser==1.1.1, the "
+            "tested version"
         )
     return server
 
 
 def close(server: "ViserServer") -> None:
-    """Stop a server without its word of farewell."""
+    """Stop a server without its closing message."""
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
 
 
 def free_port(host: str, port: int) -> int:
-    """Return the first free port of a host from `port` on, 0 for any.
+    """Return the first free port of a host from `port` upwards; 0 means any.
 
-    Raises ConfigError if there is no such port, SigmaSplatError if none is free or the host is not this machine's.
+    Raises ConfigError if the number is out of range, SigmaSplatError if no port is free or the host's address does not
+    belong to this machine.
     """
     if not 0 <= port <= 65535:
         raise ConfigError(f"--port must be from 0 to 65535, found {port}")
@@ -72,20 +73,20 @@ def free_port(host: str, port: int) -> int:
         except PermissionError:
             continue
         except OSError as problem:
-            if problem.errno not in TAKEN:
+            if problem.errno not in PORT_BUSY:
                 raise SigmaSplatError(
                     f"cannot listen on {host} ({problem.strerror or problem}); give an address of this machine as "
-                    f"--host, {HOST} for none but yourself"
+                    f"--host, or {HOST} to allow only this machine"
                 ) from problem
     raise SigmaSplatError(f"no free port from {port} to {candidate}; give another --port")
 
 
 def url_of(host: str, port: int) -> str:
-    """Return what to open in a browser on this machine."""
+    """Return the address to open in a browser on this machine."""
     reached = {"0.0.0.0": HOST, "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
     return f"http://{reached}:{port}"
 
 
-def is_private(host: str) -> bool:
-    """Tell whether an address is one that other machines do not reach."""
+def is_loopback(host: str) -> bool:
+    """Return whether an address can be reached from this machine only."""
     return host in ("localhost", "::1") or host.startswith("127.")

@@ -1,4 +1,4 @@
-"""Hold what is shown of a run at one moment: path, keyframes, map. Data alone: no browser, no file."""
+"""Hold the state of a run that the viewer shows at one time: path, keyframes, map. Needs no browser and no file."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field as dataclass_field, replace
@@ -15,15 +15,18 @@ from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.types import Matrix
 
 BUDGET = 300_000
-"""Splats that a browser is given at most: 10 MB, and what it sorts at each move of the camera."""
-CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-"""Shape of the frusta where a run does not say what its camera was."""
+"""Maximum number of splats sent to a browser: 10 MB, which it sorts after each camera move."""
+DEFAULT_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+"""Gives the frusta their shape if the run's camera is not known."""
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A part of the map: splats in a frame of their own, and T_world_piece, where that lies. Splats that change come
-    as another field; the same object stays as it was. submap: its number, None for the map as a whole."""
+    """A part of the map: splats in their own frame, and the pose T_world_piece of that frame.
+
+    submap: its number, or None for the final map. If splats change, the piece gets a new field object; an unchanged
+    object means unchanged splats.
+    """
 
     submap: int | None
     field: GaussianField
@@ -31,14 +34,14 @@ class Piece:
 
     @property
     def name(self) -> str:
-        """Return what the piece is called in the scene."""
+        """Return the piece's name in the scene."""
         return "map" if self.submap is None else f"submap-{self.submap}"
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Poses of all frames so far: T_world_camera [F, 4, 4], which were lost bool [F], their submaps [F], and the rows
-    of the frames that are keyframes, growing."""
+    """The frames so far: poses T_world_camera [F, 4, 4], whether each is lost bool [F], its submap [F], and the rows of
+    the keyframes in ascending order."""
 
     T_world_camera: Matrix
     lost: NDArray[np.bool_]
@@ -54,65 +57,74 @@ NO_PATH = Path(np.empty((0, 4, 4)), np.empty(0, np.bool_), np.empty(0, np.int64)
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A run at one moment. final: the map in one piece once it is made; pieces: the submaps side by side; together with
-    final they may be absent. true_positions [M, 3] m, in the run's world, where an evaluation has stored them.
-    picture: gives what the keyframe at a row of the path saw, None where nobody kept it."""
+    """The state of a run at one time.
+
+    final: the final map, None before it is made; pieces: the submaps, which may be missing if there is a final map.
+    true_positions [M, 3] m in the run's world, None unless an evaluation has stored them. image(row) returns the image
+    of the keyframe at a row of the path, or None if it was not kept.
+    """
 
     title: str
     path: Path = NO_PATH
     final: Piece | None = None
     pieces: tuple[Piece, ...] = ()
     true_positions: Matrix | None = None
-    camera: Camera = CAMERA
-    picture: Callable[[int], Rgb | None] = lambda row: None
+    camera: Camera = DEFAULT_CAMERA
+    image: Callable[[int], Rgb | None] = lambda row: None
     options: RenderConfig = dataclass_field(default_factory=RenderConfig)
     backend: str = "auto"
     live: bool = False
     status: str = ""
 
-    def shown(self, whole: bool, row: int) -> tuple[Piece, ...]:
-        """Return the pieces to show: the final map, if it is asked for and there, else the submaps begun by frame
-        `row` of the path."""
-        if self.final is not None and (whole or not self.pieces):
+    def visible_pieces(self, final_map: bool, row: int) -> tuple[Piece, ...]:
+        """Return the final map if it exists and is asked for, else the submaps started up to frame `row`."""
+        if self.final is not None and (final_map or not self.pieces):
             return (self.final,)
         if not len(self.path):
             return self.pieces
-        until = int(self.path.submaps[np.clip(row, 0, len(self.path) - 1)])
-        return tuple(piece for piece in self.pieces if piece.submap is None or piece.submap <= until)
+        last = int(self.path.submaps[np.clip(row, 0, len(self.path) - 1)])
+        return tuple(piece for piece in self.pieces if piece.submap is None or piece.submap <= last)
 
 
-def to_look_at(params: Tensor, extras: Mapping[str, Tensor]) -> GaussianField:
-    """Return parameter rows [N, 17] with extras as a field that nothing will fit: its moments are one shared zero, not
-    three times the memory."""
-    moments = [values.new_zeros(()).expand_as(values) for values in (params, *extras.values())]
-    rows = {n: Rows(values, zero, zero) for (n, values), zero in zip(extras.items(), moments[1:], strict=True)}
+def field_without_moments(params: Tensor, attributes: Mapping[str, Tensor]) -> GaussianField:
+    """Return a field of parameter rows [N, 17] and attributes that is not optimised.
+
+    Adam's moments are views of a single zero, which saves two thirds of the memory.
+    """
+    moments = [values.new_zeros(()).expand_as(values) for values in (params, *attributes.values())]
+    rows = {n: Rows(values, zero, zero) for (n, values), zero in zip(attributes.items(), moments[1:], strict=True)}
     return GaussianField(params, moments[0], moments[0], extras=rows)
 
 
-def bare(splats: GaussianField) -> GaussianField:
-    """Return the splats without what only a fit needs; parameters are shared, not copied."""
-    return to_look_at(splats.params, {name: rows.params for name, rows in splats.extras.items()})
+def without_moments(splats: GaussianField) -> GaussianField:
+    """Return the splats without Adam's moments; parameters are shared, not copied."""
+    return field_without_moments(splats.params, {name: rows.params for name, rows in splats.extras.items()})
 
 
-def thinned(splats: GaussianField, most: int) -> GaussianField:
-    """Return at most so many splats in memory of their own, the host's, evenly spread over the rows, each as much wider
-    as keeps the area covered."""
+def thin(splats: GaussianField, most: int) -> GaussianField:
+    """Return a copy on the host of at most `most` splats, spread evenly over the rows.
+
+    The remaining splats are enlarged, so that the covered area stays the same.
+    """
     n = len(splats)
     rows = torch.arange(n) if n <= most else (torch.arange(max(most, 0)) * n).div(most, rounding_mode="floor")
     rows = rows.to(splats.params.device)
-    few = to_look_at(
+    kept = field_without_moments(
         splats.params[rows].cpu(), {name: extra.params[rows].cpu() for name, extra in splats.extras.items()}
     )
-    if len(few):
-        few.params[:, COLUMNS["log_scales"]] += 0.5 * float(np.log(n / len(few)))
-    return few
+    if len(kept):
+        kept.params[:, COLUMNS["log_scales"]] += 0.5 * float(np.log(n / len(kept)))
+    return kept
 
 
 def within_budget(pieces: Sequence[Piece], budget: int) -> tuple[Piece, ...]:
-    """Return the pieces with at most `budget` splats together: as they are where they fit, else each thinned by the
-    same share, to three quarters of the budget, so that the next ones do not thin them all again."""
+    """Return the pieces with at most `budget` splats in total.
+
+    Pieces that fit are returned unchanged. Otherwise each one is thinned by the same factor, to three quarters of the
+    budget in total, so that the next pieces do not cause another thinning immediately.
+    """
     total = sum(len(piece.field) for piece in pieces)
     if total <= budget:
         return tuple(pieces)
     share = 0.75 * budget / total
-    return tuple(replace(piece, field=thinned(piece.field, int(share * len(piece.field)))) for piece in pieces)
+    return tuple(replace(piece, field=thin(piece.field, int(share * len(piece.field)))) for piece in pieces)

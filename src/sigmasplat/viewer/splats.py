@@ -1,4 +1,4 @@
-"""Turn a field into what a browser draws: centres, covariances, colours, opacities; choose and colour splats by σ."""
+"""Turn a field into the arrays that a browser draws; select and colour splats by σ."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,17 +12,18 @@ from torch import Tensor
 from sigmasplat.drawing import colormap
 from sigmasplat.model import harmonics, se3
 from sigmasplat.model.field import COLUMNS, EXTRAS, GaussianField, left_factor, quaternion_of, transformed
-from sigmasplat.viewer.snapshot import Piece, to_look_at
+from sigmasplat.model.splat_filter import sigmas
+from sigmasplat.viewer.snapshot import Piece, field_without_moments
 
 Colouring = Literal["colour", "σ"]
 Floats = NDArray[np.float32]
 
-SEEN_OPACITY = 0.1
-"""Fainter splats do not count where a range of σ is looked for."""
+MIN_VISIBLE_OPACITY = 0.1
+"""Splats with a lower opacity are ignored when the range of σ is computed."""
 
 
 @dataclass(frozen=True, eq=False)
-class Splats:
+class SplatArrays:
     """N splats to draw: centers [N, 3] m and covariances [N, 3, 3] m² in the piece's frame, colors [N, 3] uint8,
     opacities [N]."""
 
@@ -36,64 +37,60 @@ class Splats:
 
 
 @dataclass(frozen=True)
-class Cut:
-    """What is hidden: splats whose σ is above `most_sigma`, and those fainter than `least_opacity`."""
+class VisibilityFilter:
+    """Hides splats whose σ is above `max_sigma` or whose opacity is below `min_opacity`."""
 
-    most_sigma: float = float("inf")
-    least_opacity: float = 0.0
+    max_sigma: float = float("inf")
+    min_opacity: float = 0.0
 
-    def keeps(self, field: GaussianField) -> Tensor:
-        """Tell which splats are shown, bool [N]."""
-        return (torch.from_numpy(sigma_of(field)) <= self.most_sigma) & (field.opacities >= self.least_opacity)
-
-
-def sigma_of(field: GaussianField) -> Floats:
-    """Return σ of each splat [N]: the root of the mean of σ² over the channels, in colour steps (VarSplat §1)."""
-    return np.asarray(field.variances.mean(1).sqrt(), np.float32)
+    def mask(self, field: GaussianField) -> Tensor:
+        """Return which splats are shown, bool [N]."""
+        return (sigmas(field) <= self.max_sigma) & (field.opacities >= self.min_opacity)
 
 
-def sigmas(pieces: Sequence[Piece]) -> Floats:
-    """Return σ, growing, of all splats that can be seen; of all there are if none can."""
-    found = [sigma_of(piece.field)[(piece.field.opacities >= SEEN_OPACITY).numpy()] for piece in pieces]
+def sorted_sigmas(pieces: Sequence[Piece]) -> Floats:
+    """Return σ of all visible splats in ascending order; of all splats if none is visible."""
+    found = [sigmas(piece.field)[piece.field.opacities >= MIN_VISIBLE_OPACITY].numpy() for piece in pieces]
     if not sum(map(len, found)):
-        found = [sigma_of(piece.field) for piece in pieces]
+        found = [sigmas(piece.field).numpy() for piece in pieces]
     return np.sort(np.concatenate([np.empty(0, np.float32), *found]))
 
 
-def cut_of(ordered: Floats, hidden_share: float, least_opacity: float) -> Cut:
-    """Return the cut that hides this share of the splats, those of the largest σ; `ordered` as `sigmas` gives it."""
+def visibility_filter(ordered: Floats, hidden_share: float, min_opacity: float) -> VisibilityFilter:
+    """Return the filter that hides this share of the splats, those with the largest σ; `ordered` is sorted."""
     if hidden_share <= 0.0 or not len(ordered):
-        return Cut(least_opacity=least_opacity)
-    return Cut(float(np.quantile(ordered, max(1.0 - hidden_share, 0.0))), least_opacity)
+        return VisibilityFilter(min_opacity=min_opacity)
+    return VisibilityFilter(float(np.quantile(ordered, max(1.0 - hidden_share, 0.0))), min_opacity)
 
 
-def sigma_span(ordered: Floats) -> tuple[float, float]:
-    """Return the range of σ that the palette is spread over: from 0 to all but the extremes."""
+def sigma_range(ordered: Floats) -> tuple[float, float]:
+    """Return the range of σ that the palette covers: from 0 to a high percentile."""
     return 0.0, colormap.value_range(ordered, np.ones(len(ordered), bool))[1]
 
 
-def splats_of(field: GaussianField, colouring: Colouring, span: tuple[float, float], cut: Cut) -> Splats:
-    """Return the splats that the cut keeps, in their own colours or in those of σ over `span`."""
-    kept = cut.keeps(field)
-    chosen = to_look_at(field.params[kept], {})
+def splat_arrays(
+    field: GaussianField, colouring: Colouring, span: tuple[float, float], visible: VisibilityFilter
+) -> SplatArrays:
+    """Return the visible splats in their own colours, or coloured by σ over the range `span`."""
+    chosen = field_without_moments(field.params[visible.mask(field)], {})
     if colouring == "σ":
-        colors = colormap.apply(sigma_of(chosen), *span, colormap.INFERNO)
+        colors = colormap.apply(sigmas(chosen).numpy(), *span, colormap.INFERNO)
     else:
         colors = np.asarray((chosen.colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8))
-    return Splats(
+    return SplatArrays(
         chosen.means.numpy(), covariances(chosen.quats.numpy(), chosen.scales.numpy()), colors, chosen.opacities.numpy()
     )
 
 
 def covariances(quats_wxyz: Floats, scales: Floats) -> Floats:
-    """Return R diag(s²) Rᵀ [N, 3, 3] of rotations [N, 4], w first, any norm, and scales s [N, 3] m."""
+    """Return R diag(s²) Rᵀ [N, 3, 3] for quaternions [N, 4] wxyz of any norm and scales s [N, 3] m."""
     spread = se3.rotation_from_quaternion(np.asarray(quats_wxyz, np.float64)) * scales[:, None, :]
     return np.asarray(spread @ spread.transpose(0, 2, 1), np.float32)
 
 
-def joined(pieces: Sequence[Piece], cut: Cut) -> GaussianField:
-    """Return the splats of all pieces that the cut keeps, in the world."""
-    parts = [(piece, cut.keeps(piece.field)) for piece in pieces]
+def merge_pieces(pieces: Sequence[Piece], visible: VisibilityFilter) -> GaussianField:
+    """Return the visible splats of all pieces as one field in the world frame."""
+    parts = [(piece, visible.mask(piece.field)) for piece in pieces]
     params = [piece.field.params[kept] for piece, kept in parts] or [GaussianField.empty().params]
     names = {name for piece, _ in parts for name in piece.field.extras}
     extras: dict[str, list[Tensor]] = {name: [] for name in sorted(names)}
@@ -102,18 +99,18 @@ def joined(pieces: Sequence[Piece], cut: Cut) -> GaussianField:
         _move(rows, T)
         for name, all_rows in extras.items():
             all_rows.append(_moved_extra(piece.field, name, T)[kept])
-    return to_look_at(torch.cat(params), {name: torch.cat(all_rows) for name, all_rows in extras.items()})
+    return field_without_moments(torch.cat(params), {name: torch.cat(all_rows) for name, all_rows in extras.items()})
 
 
 def _move(params: Tensor, T_world_piece: Tensor) -> None:
-    """Carry parameter rows to the world, in place: `GaussianField.moved` without the optimiser's state."""
+    """Transform parameter rows to the world in place: `GaussianField.moved` without the optimiser's state."""
     means, quats, R = params[:, COLUMNS["means"]], params[:, COLUMNS["quats"]], T_world_piece[:3, :3]
     params[:, COLUMNS["means"]] = transformed(means, R) + T_world_piece[:3, 3]
     params[:, COLUMNS["quats"]] = transformed(quats, left_factor(quaternion_of(R)))
 
 
 def _moved_extra(field: GaussianField, name: str, T_world_piece: Tensor) -> Tensor:
-    """Return what splats carry besides in the world, 0 where this piece has none of it."""
+    """Return an attribute of the splats in the world frame; zeros if this piece does not have it."""
     if name not in field.extras:
         return field.params.new_zeros(len(field), EXTRAS[name])
     values = field.extras[name].params

@@ -1,11 +1,11 @@
-"""Read and write splats as SuperSplat's compressed PLY: 16 bytes each, and 72 for each chunk of 256.
+"""Read and write splats as SuperSplat's compressed PLY: 16 bytes per splat, and 72 bytes per chunk of 256 splats.
 
-Elements: `chunk`, least and largest of positions, log scales and colours of 256 splats; `vertex`, four words that say
-where between these a splat lies; `sh`, only where colours depend on the direction, a byte for each of f_rest_0…, in the
-order of 3DGS's PLY. Bits from the top: packed_position and packed_scale 11, 10, 11; packed_rotation 2 for which of w,
-x, y, z is largest and 10 for each other one; packed_color 8 each for red, green, blue, and opacity, which has no range
-of its own. Early files have no colours in their chunks: 0 … 1 is the range then. Splats lie in Morton order, so that
-chunks are small. σ² and correlations have no place in the format: they are lost. Layout: PlayCanvas's splat-transform,
+Elements: `chunk`, minimum and maximum of positions, log scales and colours of 256 splats; `vertex`, four words with a
+splat's values relative to these limits; `sh`, only for view-dependent colours, one byte for each of f_rest_0…, in the
+order of 3DGS's PLY. Bits from the highest: packed_position and packed_scale 11, 10, 11; packed_rotation 2 for the index
+of the largest of w, x, y, z and 10 for each other one; packed_color 8 each for red, green, blue and opacity, which is
+stored directly. Chunks of early files have no colour limits; they are 0 and 1. Splats are in Morton order, so that
+chunks are small. The format cannot hold σ² and correlations. Layout: PlayCanvas's splat-transform,
 write-compressed-ply.ts, compressed-chunk.ts and decompress-ply.ts.
 """
 
@@ -16,16 +16,10 @@ from numpy.typing import NDArray
 
 from sigmasplat.errors import SourceError
 from sigmasplat.io.atomic import replacing
+from sigmasplat.io.binary import open_binary
 from sigmasplat.io.ply_elements import Element, read_header
-from sigmasplat.io.splats.values import (
-    Doubles,
-    SplatValues,
-    from_smallest_three,
-    morton_order,
-    opacities_of,
-    opacity_bytes,
-    smallest_three,
-)
+from sigmasplat.io.splats.quaternions import Doubles, from_smallest_three, smallest_three
+from sigmasplat.io.splats.values import SplatValues, morton_order, opacities_of, opacity_bytes
 from sigmasplat.model.field import GaussianField
 
 CHUNK = 256
@@ -36,12 +30,12 @@ WORDS = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 REST, HARMONICS = "f_rest_", (9, 24, 45)
 LOG_SCALE_LIMIT = 20.0
 SH_RANGE = 8.0
-"""A harmonic's byte spans −4 … 4."""
+"""The byte of a harmonic covers −4 to 4."""
 XYZ_BITS, ROTATION_BITS, COLOR_BITS = (11, 10, 11), (10, 10, 10), (8, 8, 8)
 
 
 def write_field(path: Path, field: GaussianField) -> None:
-    """Write the splats, in one step. Raises RunError if the place is not writable."""
+    """Write the splats atomically. Raises RunError if the file cannot be written."""
     values = SplatValues.of(field)
     values = values.ordered(morton_order(values.means))
     log_scales = np.clip(values.log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
@@ -65,15 +59,12 @@ def write_field(path: Path, field: GaussianField) -> None:
 def read_field(path: Path) -> GaussianField:
     """Read a compressed PLY; σ² becomes exp(−7).
 
-    Raises SourceError if it is missing, truncated, not a compressed PLY of splats, or holds nan or inf.
+    Raises SourceError if it is missing, truncated, not a compressed PLY of splats, or has nan or inf.
     """
-    try:
-        with path.open("rb") as file:
-            elements = read_header(file, path)
-            _check(elements, path)
-            chunks, splats, *rest = (element.read(file, path) for element in elements)
-    except OSError as problem:
-        raise SourceError(f"cannot read map {path}: {problem.strerror or problem}") from problem
+    with open_binary(path, "cannot read map") as file:
+        elements = read_header(file, path)
+        _check(elements, path)
+        chunks, splats, *rest = (element.read(file, path) for element in elements)
     low, high = _limits(chunks, len(splats), path)
     position, rotation, scale, color = (splats[name].astype(np.uint32) for name in WORDS)
     parts = [_unpacked(position, XYZ_BITS), _unpacked(scale, XYZ_BITS), _unpacked(color >> np.uint32(8), COLOR_BITS)]
@@ -85,25 +76,25 @@ def read_field(path: Path) -> GaussianField:
 
 
 def is_compressed(elements: list[Element]) -> bool:
-    """Say whether a PLY with these elements is a compressed one."""
+    """Return whether a PLY with these elements is a compressed one."""
     return bool(elements) and elements[0].name == "chunk"
 
 
 def _ranges(part: Doubles) -> tuple[Doubles, Doubles]:
-    """Return least and largest values [C, 3] of each chunk, as the float32 that the file holds."""
+    """Return the minima and maxima [C, 3] of each chunk, rounded to float32 as in the file."""
     chunks = range(0, len(part), CHUNK)
     low, high = (np.array([f(part[i : i + CHUNK], axis=0) for i in chunks]).reshape(-1, 3) for f in (np.min, np.max))
     return low.astype(np.float32).astype(np.float64), high.astype(np.float32).astype(np.float64)
 
 
 def _within(part: Doubles, low: Doubles, high: Doubles) -> Doubles:
-    """Say where between its chunk's ends each value lies, 0 to 1; 0 where the ends meet."""
+    """Return each value relative to its chunk's limits, in [0, 1]; 0 if the limits are equal."""
     low, span = (np.repeat(values, CHUNK, axis=0)[: len(part)] for values in (low, high - low))
     return (part - low) / np.where(span > 0.0, span, 1.0)
 
 
 def _packed(part: Doubles, bits: tuple[int, int, int]) -> NDArray[np.uint32]:
-    """Pack three numbers of 0 to 1 into one word [N], the first on top."""
+    """Pack three numbers in [0, 1] into one word [N], the first one in the highest bits."""
     word = np.zeros(len(part), np.uint32)
     for column, width in enumerate(bits):
         steps = (1 << width) - 1
@@ -112,7 +103,7 @@ def _packed(part: Doubles, bits: tuple[int, int, int]) -> NDArray[np.uint32]:
 
 
 def _unpacked(word: NDArray[np.uint32], bits: tuple[int, int, int]) -> Doubles:
-    """Take three numbers of 0 to 1 out of each word: [N, 3]."""
+    """Unpack three numbers in [0, 1] from each word: [N, 3]."""
     part = np.empty((len(word), 3))
     for column, width in reversed(list(enumerate(bits))):
         steps = (1 << width) - 1
@@ -132,12 +123,12 @@ def _header(elements: dict[str, tuple[str, list[str]]], count: int, harmonics: i
 
 
 def _by_channel(sh: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Turn columns 3·i + channel into the file's: all of red, of green, of blue."""
+    """Reorder columns 3·i + channel to the file's order: all of red, then green, then blue."""
     return sh.reshape(len(sh), sh.shape[1] // 3, 3).swapaxes(1, 2).reshape(sh.shape)
 
 
 def _harmonics(rest: list[NDArray[np.void]], count: int) -> Doubles:
-    """Return harmonics [N, 3·k], columns 3·i + channel; bytes stand for the middles of their steps, the ends for ±4."""
+    """Return harmonics [N, 3·k], columns 3·i + channel: bytes decode to the middle of their step, 0 and 255 to ∓4."""
     if not rest:
         return np.empty((count, 0))
     each = len(rest[0].dtype.names or ()) // 3
@@ -146,34 +137,34 @@ def _harmonics(rest: list[NDArray[np.void]], count: int) -> Doubles:
 
 
 def _limits(chunks: NDArray[np.void], count: int, path: Path) -> tuple[Doubles, Doubles]:
-    """Return least and largest position, log scale and colour of each splat's chunk, each [3, N, 3].
+    """Return the minima and maxima of position, log scale and colour of each splat's chunk, each [3, N, 3].
 
-    Raises SourceError where they are not finite.
+    Raises SourceError unless all are finite.
     """
     given = [chunks[name].astype(np.float64) for name in LIMITS if name in (chunks.dtype.names or ())]
     if len(given) < len(LIMITS):
         given[len(WITHOUT_COLORS) :] = [np.full(len(chunks), value) for value in (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)]
     table = np.stack(given, axis=1)
     if not np.isfinite(table).all():
-        raise SourceError(f"{path} is damaged: the limits of a chunk hold nan or inf")
+        raise SourceError(f"{path} is damaged: the limits of a chunk have nan or inf")
     each = np.repeat(table, CHUNK, axis=0)[:count].reshape(count, 3, 2, 3)
     return each[:, :, 0].swapaxes(0, 1), each[:, :, 1].swapaxes(0, 1)
 
 
 def _check(elements: list[Element], path: Path) -> None:
-    """Raise SourceError unless the elements are those of a compressed PLY, and there are chunks for all splats."""
+    """Raise SourceError unless the elements are those of a compressed PLY with one chunk per 256 splats."""
     names = [element.name for element in elements]
     if names not in (["chunk", "vertex"], ["chunk", "vertex", "sh"]):
         raise SourceError(
-            f"{path} is no compressed PLY of splats: it has {', '.join(names)}, expected chunk, vertex and perhaps sh"
+            f"{path} is not a compressed PLY of splats: it has {', '.join(names)}, not chunk, vertex, optionally sh"
         )
     for element, required in zip(elements, (WITHOUT_COLORS, WORDS, [f"{REST}0"]), strict=False):
         missing = [name for name in required if name not in (element.row_type(path).names or ())]
         if missing:
-            raise SourceError(f"{path} is no compressed PLY of splats: no column {missing[0]} in '{element.name}'")
+            raise SourceError(f"{path} is not a compressed PLY of splats: no column {missing[0]} in '{element.name}'")
     chunks, count = elements[0].count, elements[1].count
     if count < 0 or chunks != -(-count // CHUNK):
-        raise SourceError(f"{path} is damaged: {chunks} chunks of {CHUNK} do not go with {count} splats")
+        raise SourceError(f"{path} is damaged: {chunks} chunks of {CHUNK} do not match {count} splats")
     for sh in elements[2:]:
         given = set(sh.row_type(path).names or ())
         if sh.count != count or len(given) not in HARMONICS or given != {f"{REST}{i}" for i in range(len(given))}:

@@ -1,11 +1,11 @@
-"""Read and write splats as the field's standard 3DGS PLY, which SuperSplat and other viewers open.
+"""Read and write splats as 3DGS PLY, the standard format, which SuperSplat and other viewers open.
 
-Columns: x y z, nx ny nz (0), f_dc_0..2 = (colour − ½)/C0, f_rest_0..44 where colours depend on the direction (all
-harmonics of red, of green, of blue), opacity (logit), scale_0..2 (log metres), rot_0..3 (wxyz), and ours at the end:
-log_variance_0..2. Readers that look columns up by name pass over extra ones: SuperSplat and splat-transform
-(PlayCanvas), antimatter15/splat, nianticlabs/spz. Readers that know one record of 62 floats by heart and no names take
-ours for garbage: the viewer that came with 3DGS (SIBR), 3DGS.cpp, older Unity importers. For these there is `plain`:
-those 62 columns, f_rest 0 where a map has none. No comments either way: SIBR counts the splats from line 3.
+Columns: x y z, nx ny nz (0), f_dc_0..2 = (colour − ½)/C0, f_rest_0..44 for view-dependent colours (all harmonics of
+red, then green, then blue), opacity (logit), scale_0..2 (log metres), rot_0..3 (wxyz), and our own at the end:
+log_variance_0..2. Readers that find columns by name skip these: SuperSplat and splat-transform (PlayCanvas),
+antimatter15/splat, nianticlabs/spz. Readers that assume the fixed 62-float layout and ignore the names would read
+garbage: the original 3DGS viewer (SIBR), 3DGS.cpp, older Unity importers. `plain` writes exactly these 62 columns, with
+f_rest 0 if a map has no harmonics. The header has no comments, because SIBR expects the number of splats in line 3.
 """
 
 from pathlib import Path
@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from sigmasplat.errors import SourceError
 from sigmasplat.io.atomic import replacing
+from sigmasplat.io.binary import open_binary
 from sigmasplat.io.ply_elements import read_header
-from sigmasplat.io.splats.values import SH_C0, check_values, refuse_not_finite
+from sigmasplat.io.splats.values import SH_C0, check_finite, check_values
 from sigmasplat.model.field import COLUMNS, EXTRAS, INITIAL_LOG_VARIANCE, GaussianField, Rows
 from sigmasplat.model.harmonics import DEGREES, count
 
@@ -35,9 +36,9 @@ REST = "f_rest_"
 
 
 def write_field(path: Path, field: GaussianField, *, plain: bool = False) -> None:
-    """Write the splats as binary little-endian 3DGS PLY, in one step; `plain`: in 3DGS's own 62 columns, without σ².
+    """Write the splats as binary little-endian 3DGS PLY atomically; `plain`: only 3DGS's 62 columns, without σ².
 
-    Raises RunError if the place is not writable.
+    Raises RunError if the file cannot be written.
     """
     params = field.params.detach().cpu().numpy().astype(np.float32)
     harmonics = _by_channel(field)
@@ -69,19 +70,16 @@ def _by_channel(field: GaussianField) -> NDArray[np.float32]:
 
 
 def read_field(path: Path) -> GaussianField:
-    """Read a 3DGS PLY of ours or of another program; missing log_variance becomes −7.
+    """Read a 3DGS PLY of SigmaSplat or another program; a missing log_variance becomes −7.
 
-    Raises SourceError if it is missing, not a binary PLY of splats, truncated, holds nan, inf or a zero quaternion, or
-    f_rest of another number than 9, 24 or 45.
+    Raises SourceError if it is missing, not a binary PLY of splats, truncated, has nan, inf or a zero quaternion, or if
+    the number of f_rest columns is not 0, 9, 24 or 45.
     """
-    try:
-        with path.open("rb") as file:
-            elements = read_header(file, path)
-            if not elements or elements[0].name != "vertex" or elements[0].count < 0:
-                raise SourceError(f"{path}: the PLY's first element is not 'vertex', so it is not a map of splats")
-            rows = elements[0].read(file, path)
-    except OSError as problem:
-        raise SourceError(f"cannot read map {path}: {problem.strerror or problem}") from problem
+    with open_binary(path, "cannot read map") as file:
+        elements = read_header(file, path)
+        if not elements or elements[0].name != "vertex" or elements[0].count < 0:
+            raise SourceError(f"{path}: the PLY's first element is not 'vertex', so it is not a map of splats")
+        rows = elements[0].read(file, path)
     field, harmonics = GaussianField(torch.from_numpy(_params(rows, path))), _harmonics(rows, path)
     if harmonics is not None:
         field.extras["harmonics"] = Rows(torch.from_numpy(harmonics))
@@ -89,7 +87,7 @@ def read_field(path: Path) -> GaussianField:
 
 
 def _harmonics(rows: NDArray[np.void], path: Path) -> NDArray[np.float32] | None:
-    """Gather harmonics [N, 45] from f_rest, which lower degrees have fewer of; None without. Raises SourceError."""
+    """Return harmonics [N, 45] from f_rest, 0 above the file's degree; None if there are none. Raises SourceError."""
     given = sum(name.startswith(REST) for name in rows.dtype.names or ())
     names, each = [f"{REST}{i}" for i in range(given)], given // 3
     if not names:
@@ -100,17 +98,18 @@ def _harmonics(rows: NDArray[np.void], path: Path) -> NDArray[np.float32] | None
     harmonics = np.zeros((len(rows), EXTRAS["harmonics"]), np.float32)
     for i, name in enumerate(names):
         harmonics[:, 3 * (i % each) + i // each] = rows[name]
-    refuse_not_finite(harmonics, path)
+    check_finite(harmonics, path)
     return harmonics
 
 
 def _params(rows: NDArray[np.void], path: Path) -> NDArray[np.float32]:
-    """Gather a field's columns [N, 17] from the rows of a PLY. Raises SourceError on missing or unusable values."""
+    """Return a field's parameters [N, 17] from the rows of a PLY. Raises SourceError on missing or invalid values."""
     present = set(rows.dtype.names or ())
     required = [name for group, names in PLY_COLUMNS.items() if group != "log_variances" for name in names]
     missing = [name for name in required if name not in present]
     if missing:
-        raise SourceError(f"{path} is no map of splats: no column {', '.join(missing)} (compressed, or a point cloud?)")
+        columns = ", ".join(missing)
+        raise SourceError(f"{path} is not a map of splats: no column {columns} (compressed, or a point cloud?)")
     params = np.full((len(rows), 17), INITIAL_LOG_VARIANCE, np.float32)
     for group, names in PLY_COLUMNS.items():
         for column, name in zip(range(17)[COLUMNS[group]], names, strict=True):

@@ -1,11 +1,11 @@
-"""Read and write splats as `.splat`, the web's plain format: 32 bytes each, no header.
+"""Read and write splats as `.splat`, a simple format of web viewers: 32 bytes per splat, no header.
 
-Three float32 of position (metres), three of scale (metres, not their logarithms), a byte each of red, green, blue and
-opacity (255ths), a byte each of the unit quaternion wxyz (128 = 0, ±128 = ±1). The splats that cover most lie first, so
-that viewers show something before the rest has come. Colours are clipped to 0 … 1; harmonics, σ² and correlations have
-no place in the format: they are lost. Layout: antimatter15/splat, convert.py and main.js.
+Three float32 of position (metres), three of scale (metres, not logarithms), one byte each of red, green, blue and
+opacity (0 to 255), one byte each of the unit quaternion wxyz (128 = 0, ±128 = ±1). The splats that cover most come
+first, so that viewers show an image before the download is complete. Colours are clipped to [0, 1]. The format cannot
+hold harmonics, σ² and correlations. Layout: antimatter15/splat, convert.py and main.js.
 
-There is nothing to recognise such a file by, but its length and that nearly any other bytes make no unit quaternions.
+Such a file can be recognised only by its length and by its unit quaternions, which other data rarely contain.
 """
 
 from pathlib import Path
@@ -15,17 +15,19 @@ from numpy.typing import NDArray
 
 from sigmasplat.errors import SourceError
 from sigmasplat.io.atomic import replacing
-from sigmasplat.io.splats.values import SplatValues, opacities_of, opacity_bytes, unit
+from sigmasplat.io.binary import open_binary
+from sigmasplat.io.splats.quaternions import unit
+from sigmasplat.io.splats.values import SplatValues, opacities_of, opacity_bytes
 from sigmasplat.model.field import GaussianField
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 3), ("opacity", "u1"), ("quat", "u1", 4)])
 SMALLEST_SCALE_M = 1e-12
 UNIT = (0.9, 1.1)
-"""Norms that a unit quaternion can have after rounding to bytes, with room for other writers' ways of rounding."""
+"""Range of the norm of a unit quaternion after rounding to bytes, with a margin for other writers' rounding."""
 
 
 def write_field(path: Path, field: GaussianField) -> None:
-    """Write the splats, in one step. Raises RunError if the place is not writable."""
+    """Write the splats atomically. Raises RunError if the file cannot be written."""
     values = SplatValues.of(field)
     cover = values.log_scales.sum(1) + np.log(np.maximum(values.opacities, np.finfo(np.float64).tiny))
     values = values.ordered(np.argsort(-cover, kind="stable"))
@@ -42,15 +44,13 @@ def write_field(path: Path, field: GaussianField) -> None:
 def read_field(path: Path) -> GaussianField:
     """Read a .splat file; σ² becomes exp(−7).
 
-    Raises SourceError if it is missing, empty, of another length than whole splats, or holds what no splats do.
+    Raises SourceError if it is missing, empty, if its length is not a multiple of 32, or if a splat is not valid.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as problem:
-        raise SourceError(f"cannot read map {path}: {problem.strerror or problem}") from problem
+    with open_binary(path, "cannot read map") as file:
+        data = file.read()
     if not data or len(data) % ROW.itemsize:
-        what = f"{len(data)} bytes are no whole number of splats of {ROW.itemsize}" if data else "it is empty"
-        raise SourceError(f"{path} is no .splat file, or is truncated: {what}")
+        what = f"{len(data)} bytes are not a multiple of {ROW.itemsize}" if data else "it is empty"
+        raise SourceError(f"{path} is not a .splat file, or is truncated: {what}")
     rows = np.frombuffer(data, ROW)
     quats = (rows["quat"] - 128.0) / 128.0
     _check(rows, np.linalg.norm(quats, axis=1), path)
@@ -65,11 +65,11 @@ def read_field(path: Path) -> GaussianField:
 
 
 def _check(rows: NDArray[np.void], norms: NDArray[np.float64], path: Path) -> None:
-    """Raise SourceError at the first splat that is none."""
+    """Raise SourceError at the first splat that is not valid."""
     finite = np.isfinite(rows["mean"]).all(1) & np.isfinite(rows["scale"]).all(1) & (rows["scale"] >= 0.0).all(1)
     bad = np.flatnonzero(~(finite & (norms > UNIT[0]) & (norms < UNIT[1])))
     if len(bad):
         raise SourceError(
-            f"{path} is no .splat file, or is damaged: splat {bad[0]} is no finite position, scale and rotation "
-            f"({len(bad)} of {len(rows)} splats are none)"
+            f"{path} is not a .splat file, or is damaged: splat {bad[0]} has no valid position, scale and rotation "
+            f"({len(bad)} of {len(rows)} splats are invalid)"
         )

@@ -1,13 +1,13 @@
-"""Read and write splats as Niantic's SPZ: 19 or 20 bytes each before gzip, read by web, game and phone viewers.
+"""Read and write splats as Niantic's SPZ: 19 or 20 bytes per splat before gzip; web, game and phone viewers read it.
 
 A gzip stream. Header of 16 bytes: magic NGSP, version, number of splats, degree of the harmonics, fractional bits of
-positions, flags, 0. Then one kind of value after the other, for all splats: positions (24-bit fixed point), opacities
-(255ths), colours (f_dc · 0.15 + ½ in 255ths), log scales (sixteenths from −10), rotations, harmonics (128ths from 128).
-Rotations in version 2: x, y, z in a byte each, w ≥ 0 follows; in version 3: which of x, y, z, w is largest in 2 bits,
-sign and 9 bits of each other one. Version 4 is no gzip stream and not read here. Axes are x right, y up, z back: the
-writer turns maps by 180° about x, the reader turns them back. Splats lie in Morton order: gzip saves more where
-neighbours are alike. σ² and correlations have no place in the format: they are lost. Layout: nianticlabs/spz, README.md
-and load-spz.cc.
+positions, flags, 0. Then each kind of value for all splats: positions (24-bit fixed point), opacities (0 to 255),
+colours (f_dc · 0.15 + ½, 0 to 255), log scales (steps of 1/16 from −10), rotations, harmonics (steps of 1/128, 128 is
+0). Rotations in version 2: one byte each of x, y, z, while w ≥ 0 follows from them; in version 3: 2 bits for the index
+of the largest of x, y, z, w, then sign and 9 bits of each other one. Version 4 is not a gzip stream and cannot be read.
+Axes are x right, y up, z back: the writer rotates maps by 180° about x, the reader rotates them back. Splats are in
+Morton order, because gzip compresses similar neighbours better. The format cannot hold σ² and correlations. Layout:
+nianticlabs/spz, README.md and load-spz.cc.
 """
 
 import gzip
@@ -23,41 +23,33 @@ from numpy.typing import NDArray
 
 from sigmasplat.errors import SourceError
 from sigmasplat.io.atomic import replacing
-from sigmasplat.io.splats.values import (
-    SH_C0,
-    Doubles,
-    SplatValues,
-    from_smallest_three,
-    morton_order,
-    opacities_of,
-    opacity_bytes,
-    smallest_three,
-    unit,
-)
+from sigmasplat.io.binary import open_binary
+from sigmasplat.io.splats.quaternions import Doubles, from_smallest_three, smallest_three, unit
+from sigmasplat.io.splats.values import SH_C0, SplatValues, morton_order, opacities_of, opacity_bytes
 from sigmasplat.model.field import EXTRAS, GaussianField
 from sigmasplat.model.harmonics import DEGREES, count, turned
 
 MAGIC = b"NGSP"
 HEADER = struct.Struct("<4sIIBBBB")
 WRITTEN, READ = 3, (2, 3)
-"""Version written, versions read."""
+"""The version that is written, and those that can be read."""
 FRACTIONAL_BITS = 12
-"""Positions to a quarter of a millimetre, up to 2 km away; larger maps have coarser steps."""
+"""Positions have steps of a quarter of a millimetre up to 2 km from the origin; larger maps have coarser steps."""
 LARGEST_FIXED = (1 << 23) - 1
 COLOR_SCALE = 0.15
 LOG_SCALE_START, LOG_SCALE_STEPS = -10.0, 16.0
 MAGNITUDES = (1 << 9) - 1
 DEFLATE_RATIO = 1032
-"""Deflate makes nothing smaller than by this factor."""
-MOST_BEHIND = 1 << 20
-"""Bytes read behind the splats, where extensions lie."""
+"""Maximum compression ratio of Deflate."""
+MAX_EXTENSION_BYTES = 1 << 20
+"""Maximum number of bytes read after the splats, where a file may have extensions."""
 R_RUB_RDF = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
-"""Takes our axes to the format's, and back."""
+"""Rotates our axes to the format's; it is its own inverse."""
 
 
 def write_field(path: Path, field: GaussianField) -> None:
-    """Write the splats, in one step. Raises RunError if the place is not writable."""
-    values = _turned(SplatValues.of(field))
+    """Write the splats atomically. Raises RunError if the file cannot be written."""
+    values = _rotated(SplatValues.of(field))
     values = values.ordered(morton_order(values.means))
     bits = _fractional_bits(values.means)
     colors = (values.colors - 0.5) / SH_C0 * COLOR_SCALE + 0.5
@@ -75,15 +67,12 @@ def write_field(path: Path, field: GaussianField) -> None:
 
 
 def read_field(path: Path) -> GaussianField:
-    """Read an SPZ file of version 2 or 3; σ² becomes exp(−7). What follows the splats is passed over.
+    """Read an SPZ file of version 2 or 3; σ² becomes exp(−7). Extensions after the splats are skipped.
 
-    Raises SourceError if it is missing, damaged, truncated, of another version or degree, or not SPZ.
+    Raises SourceError if it is missing, damaged, truncated, of an unsupported version or degree, or not SPZ.
     """
-    try:
-        with path.open("rb") as file:
-            version, size, degree, bits, body = _unzipped(file, path)
-    except OSError as problem:
-        raise SourceError(f"cannot read map {path}: {problem.strerror or problem}") from problem
+    with open_binary(path, "cannot read map") as file:
+        version, size, degree, bits, body = _unzipped(file, path)
     widths = _widths(version, degree)
     parts = np.split(np.frombuffer(body, "u1"), np.cumsum([size * width for width in widths])[:-1])
     positions, opacities, colors, scales, rotations, harmonics = (
@@ -97,11 +86,11 @@ def read_field(path: Path) -> GaussianField:
         (colors / 255.0 - 0.5) / COLOR_SCALE * SH_C0 + 0.5,
         (harmonics - 128.0) / 128.0,
     )
-    return _turned(values).field(path)
+    return _rotated(values).field(path)
 
 
-def _turned(values: SplatValues) -> SplatValues:
-    """Turn a map by 180° about x, there or back: of means, quaternions and harmonics only signs change."""
+def _rotated(values: SplatValues) -> SplatValues:
+    """Rotate a map by 180° about x, which is its own inverse; only signs of means, quaternions and harmonics change."""
     xyz = R_RUB_RDF.diagonal().numpy()
     ones = torch.ones(1, EXTRAS["harmonics"], dtype=torch.float64)
     signs = turned(ones, R_RUB_RDF).round().numpy()[:, : values.harmonics.shape[1]]
@@ -110,18 +99,18 @@ def _turned(values: SplatValues) -> SplatValues:
 
 
 def _widths(version: int, degree: int) -> list[int]:
-    """Return bytes of a splat's position, opacity, colour, scale, rotation and harmonics."""
+    """Return the number of bytes of a splat's position, opacity, colour, scale, rotation and harmonics."""
     return [9, 1, 3, 3, 4 if version == 3 else 3, 3 * count(degree)]
 
 
 def _unzipped(file: BinaryIO, path: Path) -> tuple[int, int, int, int, bytes]:
-    """Return version, number of splats, degree, fractional bits, and what follows the header. Raises SourceError."""
+    """Return version, number of splats, degree, fractional bits, and the data after the header. Raises SourceError."""
     packed_size = path.stat().st_size
     try:
         stream = gzip.GzipFile(fileobj=file)
         header = stream.read(HEADER.size)
         if len(header) < HEADER.size or not header.startswith(MAGIC):
-            raise SourceError(f"{path} is no SPZ file: what it holds, unzipped, does not begin with a header of NGSP")
+            raise SourceError(f"{path} is not an SPZ file: its unzipped content does not start with NGSP")
         _, version, size, degree, bits, _flags, _ = HEADER.unpack(header)
         if version not in READ or degree > DEGREES:
             raise SourceError(
@@ -130,16 +119,16 @@ def _unzipped(file: BinaryIO, path: Path) -> tuple[int, int, int, int, bytes]:
             )
         needed = size * sum(_widths(version, degree))
         body = stream.read(needed) if needed <= packed_size * DEFLATE_RATIO else b""
-        stream.read(MOST_BEHIND)  # on to the end of the stream, whose checksum tells of damage
+        stream.read(MAX_EXTENSION_BYTES)  # to the end of the stream, where gzip compares the checksum
     except (EOFError, gzip.BadGzipFile, zlib.error) as problem:
         raise SourceError(f"{path} is damaged or truncated: {problem}; copy or download it again") from problem
     if len(body) < needed:
-        raise SourceError(f"{path} is truncated: its header promises {size} splats = {needed} bytes, found {len(body)}")
+        raise SourceError(f"{path} is truncated: its header says {size} splats = {needed} bytes, found {len(body)}")
     return version, size, degree, bits, body
 
 
 def _fractional_bits(means: Doubles) -> int:
-    """Return how many bits of 24 lie behind the point: fewer than usual where positions would not fit otherwise."""
+    """Return the number of fractional bits of the 24-bit positions: fewer than the default if positions are large."""
     farthest = float(np.abs(means).max(initial=0.0))
     fitting = int(np.floor(np.log2(LARGEST_FIXED / farthest))) if farthest else FRACTIONAL_BITS
     return max(0, min(FRACTIONAL_BITS, fitting))
@@ -150,13 +139,13 @@ def _bytes(values: Doubles) -> bytes:
 
 
 def _fixed(positions: NDArray[np.uint8]) -> NDArray[np.int32]:
-    """Return 24-bit integers with a sign, lowest byte first [N, 9], as int32 [N, 3]."""
+    """Convert signed 24-bit integers, lowest byte first [N, 9], to int32 [N, 3]."""
     low, middle, high = (positions[:, i::3].astype(np.int32) for i in range(3))
     return low | middle << 8 | (high ^ 128) - 128 << 16
 
 
 def _packed_rotations(quats: Doubles) -> NDArray[np.uint32]:
-    """Pack unit quaternions wxyz [N, 4] as version 3 does: words [N]."""
+    """Pack unit quaternions wxyz [N, 4] into words [N] of version 3."""
     which, others = smallest_three(np.roll(quats, -1, axis=1))
     word = which.astype("<u4")
     for part in others.T:
@@ -166,7 +155,7 @@ def _packed_rotations(quats: Doubles) -> NDArray[np.uint32]:
 
 
 def _smallest_three(rotations: NDArray[np.uint8]) -> Doubles:
-    """Unpack the rotations of version 3 [N, 4]: unit quaternions wxyz [N, 4]."""
+    """Unpack the rotations of version 3, bytes [N, 4], to unit quaternions wxyz [N, 4]."""
     word = np.ascontiguousarray(rotations).view("<u4")[:, 0]
     others = np.empty((len(word), 3))
     for column in (2, 1, 0):
@@ -177,7 +166,7 @@ def _smallest_three(rotations: NDArray[np.uint8]) -> Doubles:
 
 
 def _first_three(rotations: NDArray[np.uint8]) -> Doubles:
-    """Unpack the rotations of version 2 [N, 3]: unit quaternions wxyz [N, 4]."""
+    """Unpack the rotations of version 2, bytes [N, 3], to unit quaternions wxyz [N, 4]."""
     xyz = rotations / 127.5 - 1.0
     w = np.sqrt(np.maximum(1.0 - (xyz**2).sum(1), 0.0))
     return unit(np.column_stack([w, xyz]))

@@ -1,4 +1,4 @@
-"""Turn fields into the plain arrays that splat files are packed from, and such arrays into fields."""
+"""Convert fields to the arrays that splat files are packed from, and back."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,21 +8,21 @@ import torch
 from numpy.typing import NDArray
 
 from sigmasplat.errors import SourceError
+from sigmasplat.io.splats.quaternions import Doubles, unit
 from sigmasplat.model.field import COLUMNS, EXTRAS, INITIAL_LOG_VARIANCE, WIDTH, GaussianField, Rows
 from sigmasplat.model.harmonics import DEGREES, count
 
 SH_C0 = 0.28209479177387814
-"""Y₀₀ = 1/(2√π): the value of the constant spherical harmonic."""
-Doubles = NDArray[np.float64]
+"""Y₀₀ = 1/(2√π): the constant spherical harmonic."""
 MORTON_BITS, ROUNDING = 20, 1e-6
 
 
 @dataclass(frozen=True)
 class SplatValues:
-    """N splats as float64 arrays; what has no place in other programs' formats (σ², correlations) is not among them.
+    """N splats as float64 arrays, without σ² and correlations, which other programs' formats cannot hold.
 
-    means [N, 3] metres; quats [N, 4] unit length, wxyz; log_scales [N, 3] log metres; opacities [N] in [0, 1]; colors
-    [N, 3]; harmonics [N, 3·k] of the lowest degree that holds them all, k = 0, 3, 8 or 15 of each channel, columns
+    means [N, 3] m; quats [N, 4] wxyz, unit length; log_scales [N, 3] log metres; opacities [N] in [0, 1];
+    colors [N, 3]; harmonics [N, 3·k] of the lowest sufficient degree: k = 0, 3, 8 or 15 per channel, columns
     3·i + channel.
     """
 
@@ -35,7 +35,7 @@ class SplatValues:
 
     @staticmethod
     def of(field: GaussianField) -> "SplatValues":
-        """Take the values out of a field."""
+        """Return the values of a field."""
         params = field.params.detach().cpu().double()
         part = {name: params[:, columns].numpy() for name, columns in COLUMNS.items()}
         opacities = torch.sigmoid(params[:, 10]).numpy()
@@ -52,11 +52,11 @@ class SplatValues:
         return [3 * count(degree) for degree in range(DEGREES + 1)].index(self.harmonics.shape[1])
 
     def ordered(self, rows: NDArray[np.intp]) -> "SplatValues":
-        """Return the splats chosen by an index array, in its order."""
+        """Return the splats selected by an index array, in its order."""
         return SplatValues(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
     def field(self, path: Path) -> GaussianField:
-        """Make a field of values read from `path`, with the initial σ². Raises SourceError if some are not finite."""
+        """Return a field of the values read from `path`, with initial σ². Raises SourceError unless all are finite."""
         params = np.full((len(self), WIDTH), INITIAL_LOG_VARIANCE, np.float32)
         for name in ("means", "quats", "log_scales", "colors"):
             params[:, COLUMNS[name]] = getattr(self, name)
@@ -71,7 +71,7 @@ class SplatValues:
 
 
 def _harmonics(field: GaussianField) -> Doubles:
-    """Return a field's harmonics without the degrees that are 0 throughout, or no more than rounding left there."""
+    """Return a field's harmonics without the highest degrees that are 0 up to rounding."""
     if "harmonics" not in field.extras:
         return np.empty((len(field), 0))
     values = field.extras["harmonics"].params.detach().cpu().double().numpy()
@@ -80,17 +80,17 @@ def _harmonics(field: GaussianField) -> Doubles:
 
 
 def opacity_bytes(opacities: Doubles) -> NDArray[np.uint8]:
-    """Round opacities to 255ths."""
+    """Convert opacities in [0, 1] to bytes."""
     return np.round(opacities * 255.0).astype(np.uint8)
 
 
 def opacities_of(values: NDArray[np.uint8]) -> Doubles:
-    """Turn 255ths into opacities; 0 and 255 become the middle of what was rounded to them, since logits are finite."""
+    """Convert bytes to opacities; 0 and 255 become slightly larger and smaller, so that logits are finite."""
     return np.clip(values / 255.0, 0.25 / 255.0, 1.0 - 0.25 / 255.0)
 
 
 def morton_order(points: Doubles) -> NDArray[np.intp]:
-    """Return the rows of points [N, 3] in Morton order: what is close in space lies close in the file."""
+    """Return the rows of points [N, 3] in Morton order: points that are close in space are close in the file."""
     if not len(points):
         return np.empty(0, np.intp)
     low = points.min(0)
@@ -103,41 +103,16 @@ def morton_order(points: Doubles) -> NDArray[np.intp]:
     return np.argsort(code, kind="stable")
 
 
-def smallest_three(quats: Doubles) -> tuple[NDArray[np.intp], Doubles]:
-    """Split unit quaternions [N, 4] into which component is largest [N] and the other three [N, 3], in order.
-
-    Signs are such that the largest is positive: it then follows from the others, which lie in ±1/√2.
-    """
-    which = np.abs(quats).argmax(1)
-    rows = np.arange(len(quats))
-    positive = quats * np.where(quats[rows, which] < 0.0, -1.0, 1.0)[:, None]
-    return which, positive[np.arange(4) != which[:, None]].reshape(-1, 3)
-
-
-def from_smallest_three(which: NDArray[np.intp], others: Doubles) -> Doubles:
-    """Put unit quaternions [N, 4] together again."""
-    quats: Doubles = np.empty((len(which), 4))
-    quats[np.arange(4) != which[:, None]] = others.ravel()
-    quats[np.arange(len(which)), which] = np.sqrt(np.maximum(1.0 - (others**2).sum(1), 0.0))
-    return unit(quats)
-
-
-def unit(quats: Doubles) -> Doubles:
-    """Return quaternions [N, 4] of length 1."""
-    lengths: Doubles = np.linalg.norm(quats, axis=1, keepdims=True)
-    return quats / lengths
-
-
 def check_values(params: NDArray[np.float32], path: Path) -> None:
     """Raise SourceError at the first splat with nan, inf or a zero quaternion."""
-    refuse_not_finite(params, path)
+    check_finite(params, path)
     zero = np.flatnonzero(np.linalg.norm(params[:, COLUMNS["quats"]], axis=1) == 0)
     if len(zero):
-        raise SourceError(f"{path}: splat {zero[0]} has a zero quaternion, which is no rotation")
+        raise SourceError(f"{path}: splat {zero[0]} has a zero quaternion, which is not a rotation")
 
 
-def refuse_not_finite(values: NDArray[np.float32], path: Path) -> None:
-    """Raise SourceError at the first splat whose row of values [N, m] holds nan or inf."""
+def check_finite(values: NDArray[np.float32], path: Path) -> None:
+    """Raise SourceError at the first splat whose row of values [N, m] has nan or inf."""
     bad = np.flatnonzero(~np.isfinite(values).all(1))
     if len(bad):
-        raise SourceError(f"{path}: splat {bad[0]} holds nan or inf ({len(bad)} of {len(values)} splats do)")
+        raise SourceError(f"{path}: splat {bad[0]} has nan or inf ({len(bad)} of {len(values)} splats do)")

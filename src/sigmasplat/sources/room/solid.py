@@ -18,7 +18,7 @@ Doubles = NDArray[np.float64]
 
 def triangulate(shapes: Sequence[Shape]) -> Mesh:
     """Return the outsides of all shapes as one mesh, in the room's frame; where shapes meet, nothing is cut away."""
-    return Mesh.joined([_placed(shape, *patch) for shape in shapes for patch in _PATCHES[shape.kind](shape)])
+    return Mesh.concatenated([_placed(shape, *patch) for shape in shapes for patch in _PATCHES[shape.kind](shape)])
 
 
 def _placed(shape: Shape, unit: Doubles, faces: NDArray[np.int32]) -> Mesh:

@@ -1,4 +1,4 @@
-"""Render the map from the browser's viewpoint with our own renderer, and colour the maps that it gives."""
+"""Render the map from a browser's viewpoint with SigmaSplat's renderer, and draw one layer of it in colours."""
 
 from typing import Literal, NamedTuple
 
@@ -24,7 +24,7 @@ LEGEND_SIZE, LEGEND_BAR, INK, PAPER = (280, 34), 14, (233, 237, 242), (36, 40, 4
 
 
 class Legend(NamedTuple):
-    """What a palette [K, 3] stands for: its ends, and their unit."""
+    """A palette [K, 3], the values at its two ends, and their unit."""
 
     palette: NDArray[np.float64]
     low: float
@@ -32,26 +32,26 @@ class Legend(NamedTuple):
     unit: str
 
 
-class Picture(NamedTuple):
-    """Pixels uint8 [H, W, 3], and what their colours mean where they are not the scene's own."""
+class LayerImage(NamedTuple):
+    """Pixels uint8 [H, W, 3], and their legend unless they show the scene's own colours."""
 
     pixels: colormap.Rgb
     legend: Legend | None = None
 
 
-def viewpoint(fov: float, aspect: float, height: int) -> Camera:
-    """Return the camera of a browser: vertical field of view in radians, width over height, rows of the image."""
+def browser_camera(fov: float, aspect: float, height: int) -> Camera:
+    """Return a browser's camera from its vertical field of view (radians), width / height, and the image's height."""
     width, f = max(round(height * aspect), 1), 0.5 * height / np.tan(0.5 * fov)
     return Camera(width, height, float(f), float(f), 0.5 * (width - 1), 0.5 * (height - 1))
 
 
-def picture_of(
+def render_layer(
     field: GaussianField, camera: Camera, T_world_camera: Matrix, layer: Layer, options: RenderConfig, backend: str
-) -> Picture:
-    """Render a field and show one layer of what comes out: colour; depth D̂/A, m; V as a root, mean over channels, in
-    colour steps (VarSplat §1); U about that depth as a root, m (CG-SLAM eq. 10); opacity A.
+) -> LayerImage:
+    """Render a field and draw one layer of the result.
 
-    All but colour and opacity are shown where A > ½ only.
+    Layers: colour; depth D̂/A in m; V: √V averaged over the channels, colours being 0 to 1 (VarSplat §1); U: √U about
+    that depth, in m (CG-SLAM eq. 10); opacity A. Depth, V and U are drawn only where A > ½.
     """
     T_camera_world = se3.inverse(T_world_camera)
     with torch.no_grad():
@@ -60,9 +60,9 @@ def picture_of(
         covered = alpha > COVERED_ALPHA
         depth_m = np.where(covered, _array(seen.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0).astype(np.float32)
         if layer == "colour":
-            return Picture((seen.color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy())
+            return LayerImage((seen.color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy())
         if layer == "opacity":
-            return Picture(colormap.apply(alpha, 0.0, 1.0, GREY), Legend(GREY, 0.0, 1.0, ""))
+            return LayerImage(colormap.apply(alpha, 0.0, 1.0, GREY), Legend(GREY, 0.0, 1.0, ""))
         if layer == "depth":
             return _mapped(depth_m, covered, colormap.value_range(depth_m, covered), colormap.VIRIDIS, " m")
         if layer == "V":
@@ -73,8 +73,8 @@ def picture_of(
         return _from_zero(about, covered, " m")
 
 
-def legend_picture(legend: Legend) -> colormap.Rgb:
-    """Draw a palette with the values of its ends, uint8 [34, 280, 3]."""
+def draw_legend(legend: Legend) -> colormap.Rgb:
+    """Draw a palette and the values at its ends, uint8 [34, 280, 3]."""
     width, height = LEGEND_SIZE
     image = Image.new("RGB", LEGEND_SIZE, PAPER)
     ramp = colormap.apply(np.tile(np.linspace(0.0, 1.0, width), (LEGEND_BAR, 1)), 0.0, 1.0, legend.palette)
@@ -90,11 +90,11 @@ def _array(values: Tensor) -> Floats:
     return np.asarray(values.cpu(), np.float32)
 
 
-def _from_zero(values: Floats, valid: NDArray[np.bool_], unit: str) -> Picture:
+def _from_zero(values: Floats, valid: NDArray[np.bool_], unit: str) -> LayerImage:
     return _mapped(values, valid, (0.0, colormap.value_range(values, valid)[1]), colormap.INFERNO, unit)
 
 
 def _mapped(
     values: Floats, valid: NDArray[np.bool_], ends: tuple[float, float], colours: NDArray[np.float64], unit: str
-) -> Picture:
-    return Picture(colormap.apply_masked(values, valid, *ends, colours), Legend(colours, *ends, unit))
+) -> LayerImage:
+    return LayerImage(colormap.apply_masked(values, valid, *ends, colours), Legend(colours, *ends, unit))

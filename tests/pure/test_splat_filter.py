@@ -1,4 +1,4 @@
-"""Doubtful splats: σ as documented, bounds that keep what they say, counts that add up."""
+"""Filtering splats by σ and opacity: σ as documented, correct masks and counts."""
 
 import math
 
@@ -10,7 +10,7 @@ from sigmasplat.model.field import GaussianField
 
 
 def three() -> GaussianField:
-    """σ 0.1, 0.2, 0.3 and opacities 0.9, 0.5, 0.1."""
+    """Return splats with σ 0.1, 0.2, 0.3 and opacities 0.9, 0.5, 0.1."""
     return GaussianField.from_values(
         torch.zeros(3, 3),
         torch.ones(3),
@@ -26,7 +26,7 @@ def test_sigma_is_the_root_of_the_mean_variance() -> None:
     assert splat_filter.sigmas(field).tolist() == pytest.approx([math.sqrt(0.1), 0.2, 0.3])
 
 
-def test_bounds_filter_splats() -> None:
+def test_bounds_select_splats_and_count_the_others() -> None:
     for bounds, kept, by_sigma, by_opacity in [
         ({}, [True, True, True], 0, 0),
         ({"sigma_below": 0.25}, [True, True, False], 1, 0),
@@ -34,9 +34,9 @@ def test_bounds_filter_splats() -> None:
         ({"sigma_below": 0.25, "opacity_above": 0.7}, [True, False, False], 1, 1),
         ({"sigma_below": 0.0}, [False, False, False], 3, 0),
     ]:
-        sure = splat_filter.sure(three(), **bounds)
-        assert (sure.rows.tolist(), sure.by_sigma, sure.by_opacity) == (kept, by_sigma, by_opacity)
-        assert sure.dropped == kept.count(False)
+        found = splat_filter.filter_splats(three(), **bounds)
+        assert (found.kept.tolist(), found.by_sigma, found.by_opacity) == (kept, by_sigma, by_opacity)
+        assert found.dropped == kept.count(False)
 
 
 def test_a_new_map_has_no_learned_variance() -> None:

@@ -1,0 +1,284 @@
+"""List the formats of `sigmasplat export`. A new format is one function and one row of `FORMATS`, at the end.
+
+Imports that load torch are inside the functions, so that `sigmasplat export --help` is fast.
+"""
+
+import inspect
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sigmasplat.errors import ConfigError, RunError
+
+if TYPE_CHECKING:
+    from sigmasplat.exports.run_reader import RunReader
+    from sigmasplat.io.runs import RunFolder
+    from sigmasplat.model.field import GaussianField
+    from sigmasplat.sources.base import Source
+    from sigmasplat.types import Progress
+
+
+def _no_sequence(run: "RunFolder") -> "Source":
+    raise RunError(f"run {run.path} kept no submaps, and its sequence was not given")
+
+
+@dataclass(frozen=True)
+class ExportSource:
+    """What is exported: a run folder, or a file that holds a map.
+
+    open_sequence: opens the sequence of a run, for keyframe images that the run did not keep.
+    """
+
+    path: Path
+    open_sequence: "Callable[[RunFolder], Source]" = _no_sequence
+
+    @property
+    def name(self) -> str:
+        """Return the default name of exports: the run's name, or the file's name without its ending."""
+        path = self.path.resolve()
+        return path.stem.removesuffix(".compressed") if path.is_file() else path.name
+
+    def run(self) -> "RunFolder":
+        """Open the run. Raises RunError if there is no run, or if the source is a map."""
+        from sigmasplat.io.runs import RunFolder
+
+        if self.path.is_file():
+            raise RunError(f"{self.path} is a file, which can be exported only as another map; give a run folder")
+        return RunFolder.open(self.path)
+
+    def reader(self) -> "RunReader":
+        """Open the run to read its path, camera and keyframe images. Raises RunError as `run` does."""
+        from sigmasplat.exports.run_reader import RunReader
+
+        run = self.run()
+        return RunReader(run, lambda: self.open_sequence(run))
+
+    def field(self) -> "GaussianField":
+        """Read the map. Raises RunError if there is no run, SourceError if the map cannot be read."""
+        from sigmasplat.io.splats.any_format import read_any
+
+        is_map = self.path.is_file() or (not self.path.exists() and self.path.suffix != "")
+        return read_any(self.path) if is_map else self.run().read_map()
+
+
+@dataclass(frozen=True)
+class ExportFormat:
+    """A row of the table: the name for --format, the endings that select it, a line of help, and its writer.
+
+    The first row with an ending owns it. An export without --out gets the first ending. `write(source, target, …)`
+    writes the target, a file or folder that does not exist or may be replaced, and returns a short description of its
+    content. Its keyword-only parameters are the options of the command line that the format accepts. reads_sequence:
+    the format also accepts --source.
+    """
+
+    name: str
+    endings: tuple[str, ...]
+    help: str
+    write: Callable[..., str]
+    reads_sequence: bool = False
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Return the names of the writer's options."""
+        parameters = inspect.signature(self.write).parameters.values()
+        return tuple(p.name for p in parameters if p.kind is p.KEYWORD_ONLY)
+
+    def accepts(self, option: str) -> bool:
+        """Return whether an option of the command line can be used with this format."""
+        return option in self.options or (option == "source" and self.reads_sequence)
+
+
+def owners(formats: tuple[ExportFormat, ...]) -> dict[str, ExportFormat]:
+    """Return the format that each ending selects: the first one with that ending."""
+    endings: dict[str, ExportFormat] = {}
+    for row in formats:
+        for ending in row.endings:
+            endings.setdefault(ending, row)
+    return endings
+
+
+def listed(formats: tuple[ExportFormat, ...]) -> list[str]:
+    """Return a line of help for each format: the endings that select it, its name and its description."""
+    own = owners(formats)
+    endings = (", ".join(ending for ending in row.endings if own[ending] is row) or "--format" for row in formats)
+    return [f"{ending:<15} {row.name}: {row.help}" for ending, row in zip(endings, formats, strict=True)]
+
+
+def choose(formats: tuple[ExportFormat, ...], name: str | None, out: Path | None) -> ExportFormat:
+    """Return the format with this name, else the one that the ending of `out` selects, else the first one.
+
+    Raises ConfigError if the name or the ending is unknown.
+    """
+    if name is not None:
+        named = [row for row in formats if row.name == name]
+        if not named:
+            raise ConfigError(f"no format '{name}'; there are {', '.join(row.name for row in formats)}")
+        return named[0]
+    if out is None:
+        return formats[0]
+    endings = owners(formats)
+    fitting = [ending for ending in endings if out.name.lower().endswith(ending)]
+    if not fitting:
+        raise ConfigError(f"unknown ending of {out}; end it in {', '.join(endings)}, or give --format")
+    return endings[max(fitting, key=len)]
+
+
+def refuse_unused(chosen: ExportFormat, formats: tuple[ExportFormat, ...], given: list[str]) -> None:
+    """Raise ConfigError if an option is given that the format does not accept."""
+    for option in given:
+        if not chosen.accepts(option):
+            others = ", ".join(row.name for row in formats if row.accepts(option))
+            raise ConfigError(
+                f"--{option.replace('_', '-')} cannot be used with format {chosen.name}, only with {others}"
+            )
+
+
+@contextmanager
+def _counting(title: str) -> "Iterator[Progress]":
+    from sigmasplat.run.terminal import Screen
+
+    with Screen().counting(title) as progress:
+        yield progress
+
+
+def _ply(
+    source: ExportSource, target: Path, *, sigma_below: float | None, opacity_above: float | None, plain: bool
+) -> str:
+    from sigmasplat.io.splats import ply
+
+    return _write_splats(source, sigma_below, opacity_above, lambda field: ply.write_field(target, field, plain=plain))
+
+
+def _compressed_ply(
+    source: ExportSource, target: Path, *, sigma_below: float | None, opacity_above: float | None
+) -> str:
+    from sigmasplat.io.splats import compressed_ply
+
+    return _write_splats(source, sigma_below, opacity_above, lambda field: compressed_ply.write_field(target, field))
+
+
+def _splat(source: ExportSource, target: Path, *, sigma_below: float | None, opacity_above: float | None) -> str:
+    from sigmasplat.io.splats import splat
+
+    return _write_splats(source, sigma_below, opacity_above, lambda field: splat.write_field(target, field))
+
+
+def _spz(source: ExportSource, target: Path, *, sigma_below: float | None, opacity_above: float | None) -> str:
+    from sigmasplat.io.splats import spz
+
+    return _write_splats(source, sigma_below, opacity_above, lambda field: spz.write_field(target, field))
+
+
+def _write_splats(
+    source: ExportSource,
+    sigma_below: float | None,
+    opacity_above: float | None,
+    write: "Callable[[GaussianField], None]",
+) -> str:
+    """Write the splats within the bounds; return how many were written and dropped.
+
+    Raises ConfigError on a meaningless bound, RunError if no splat is left.
+    """
+    from sigmasplat.model.splat_filter import filter_splats, has_learned_variance, sigmas
+
+    for option, bound in (("--sigma-below", sigma_below), ("--opacity-above", opacity_above)):
+        if bound is not None and not 0.0 <= bound < float("inf"):
+            raise ConfigError(f"{option} must be finite and not negative, found {bound}")
+    field = source.field()
+    if sigma_below is not None and len(field) and not has_learned_variance(field):
+        raise ConfigError(
+            f"{source.path} has no learned σ, so --sigma-below cannot be used; runs and their PLY have it"
+        )
+    result, total = filter_splats(field, sigma_below=sigma_below, opacity_above=opacity_above), len(field)
+    if total and result.dropped == total:
+        medians = f"{sigmas(field).median():.3g} and {field.opacities.median():.3g}"
+        raise RunError(f"no splat of {source.path} is left (median σ and opacity are {medians}); use weaker bounds")
+    field.keep(result.kept)
+    print(f"writing {len(field):,} splats …", flush=True)
+    write(field)
+    if sigma_below is None and opacity_above is None:
+        return f"{len(field):,} splats"
+    reasons = f"{result.by_sigma:,} for σ, {result.by_opacity:,} for opacity"
+    return f"{len(field):,} splats; dropped {result.dropped:,} of {total:,}: {reasons}"
+
+
+def _trajectory(source: ExportSource, target: Path) -> str:
+    from sigmasplat.io.trajectory import write_trajectory
+
+    path = source.run().read_trajectory()
+    write_trajectory(target, path)
+    return f"{len(path):,} poses"
+
+
+def _kitti(source: ExportSource, target: Path) -> str:
+    """Write the poses of all frames, including lost ones, since the line number is the frame number."""
+    from sigmasplat.io.trajectory import write_kitti_poses
+
+    path = source.run().read_trajectory()
+    write_kitti_poses(target, path)
+    return f"{len(path):,} poses"
+
+
+def _nerfstudio(source: ExportSource, target: Path, *, pictures: bool) -> str:
+    from sigmasplat.exports.nerfstudio import export_nerfstudio
+
+    return _export_views(export_nerfstudio, source, target, pictures)
+
+
+def _colmap(source: ExportSource, target: Path, *, pictures: bool) -> str:
+    from sigmasplat.exports.colmap import export_colmap
+
+    return _export_views(export_colmap, source, target, pictures)
+
+
+def _export_views(
+    export: "Callable[[RunReader, Path, bool, Progress], int]", source: ExportSource, target: Path, pictures: bool
+) -> str:
+    reader = source.reader()
+    if not pictures:
+        return f"{export(reader, target, False, lambda done, total: None):,} views, no pictures (--pictures)"
+    with _counting("pictures") as progress:
+        return f"{export(reader, target, True, progress):,} views with their pictures"
+
+
+def _points(source: ExportSource, target: Path, *, voxel_m: float) -> str:
+    from sigmasplat.exports.points import export_points
+
+    with _counting("surface") as progress:
+        return f"{export_points(source.reader(), target, voxel_m=voxel_m, progress=progress):,} points"
+
+
+def _video(source: ExportSource, target: Path, *, size: int, fps: float, seconds: float | None, path: str) -> str:
+    from sigmasplat.exports.video import VideoOptions, export_video
+
+    options = VideoOptions(size, fps, seconds, path)  # type: ignore[arg-type]
+    with _counting("film") as progress:
+        count = export_video(source.reader(), target, options, progress=progress)
+    return f"{count:,} images, {count / fps:.1f} s"
+
+
+def _plan(source: ExportSource, target: Path, *, cell_m: float) -> str:
+    from sigmasplat.exports.plan import export_plan
+
+    with _counting("floor plan") as progress:
+        plan = export_plan(source.reader(), target, cell_m=cell_m, progress=progress)
+    regions = "nowhere to scan again" if not plan.regions else f"{len(plan.regions)} places to scan again"
+    return f"{regions}, also in {target.with_suffix('.json').name}"
+
+
+FORMATS = (
+    ExportFormat("ply", (".ply",), "3DGS PLY with σ², for every viewer", _ply),
+    ExportFormat("compressed-ply", (".compressed.ply",), "SuperSplat's, a fifth of the size", _compressed_ply),
+    ExportFormat("splat", (".splat",), "32 bytes per splat, for web viewers", _splat),
+    ExportFormat("spz", (".spz",), "Niantic's, less than a fifth of the size", _spz),
+    ExportFormat("trajectory", (".txt",), "the path as TUM text", _trajectory),
+    ExportFormat("kitti", (".kitti.txt",), "the path as KITTI text, one line per frame", _kitti, True),
+    ExportFormat("nerfstudio", (".json",), "views as nerfstudio's transforms.json", _nerfstudio, True),
+    ExportFormat("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap, True),
+    ExportFormat("points", (".points.ply",), "the surface as points with normals", _points, True),
+    ExportFormat("video", (".webm", ".mp4", ".gif", ".webp"), "a film of colour, depth and uncertainty", _video, True),
+    ExportFormat("plan", (".plan.png", ".png"), "a floor plan with regions to scan again", _plan, True),
+)
+"""All formats. The first one is the default."""

@@ -1,0 +1,85 @@
+"""The comparison with other systems: same frames, same score, and no missing pose goes uncounted."""
+
+import importlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sigmasplat.errors import ConfigError
+from sigmasplat.io.trajectory import write_trajectory
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.sources import open_source
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+sys.path.append(str(BENCHMARKS))
+peers = importlib.import_module("peers")
+ROOM = "synthetic:frames=6,width=64,height=48"
+
+
+def run(system: str, source: str, ate_m: float | None, **rest: Any) -> dict[str, Any]:
+    return {"system": system, "source": source, "problem": None, "frames": 6, "ate_m": ate_m, **rest}
+
+
+@pytest.mark.parametrize("program", ["peers"])
+def test_the_program_explains_itself(program: str) -> None:
+    command = [sys.executable, BENCHMARKS / f"{program}.py", "--help"]
+    answer = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert "example: " in answer.stdout
+
+
+def test_frames_without_a_pose_are_counted_and_not_scored(tmp_path: Path) -> None:
+    source = open_source(ROOM)
+    truth = source.truth()
+    assert truth is not None
+    times, poses = truth.timestamps_s, truth.T_world_camera.copy()
+    poses[:, :3, 3] += 1.0  # the rigid fit removes it
+    poses[2] = np.nan
+    write_trajectory(tmp_path / "other.txt", peers.path_of(times, poses))
+    options = peers.Options((ROOM,), paths=(f"Other={ROOM}={tmp_path / 'other.txt'}",))
+    (result,) = peers.read_paths(options)
+    assert (result["system"], result["frames"], result["without_pose"]) == ("Other", 6, 1)
+    assert result["ate_m"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_path_without_system_or_sequence_is_refused() -> None:
+    with pytest.raises(ConfigError, match="SYSTEM=SEQUENCE=FILE"):
+        peers.read_paths(peers.Options((ROOM,), paths=("poses.txt",)))
+
+
+def test_rotations_of_other_systems_are_made_exact() -> None:
+    skewed = np.eye(4)
+    skewed[0, 1] = 1e-3
+    path = peers.path_of(np.zeros(1), skewed[None])
+    assert isinstance(path, Trajectory) and len(path) == 1
+
+
+def test_another_system_gets_the_frames_and_its_failure_is_reported(tmp_path: Path) -> None:
+    peers.write_frames(open_source(ROOM), 3, tmp_path)
+    color, depth = np.load(tmp_path / "color.npy"), np.load(tmp_path / "depth.npy")
+    assert color.shape == (3, 48, 64, 3) and color.dtype == np.uint8
+    assert depth.shape == (3, 48, 64) and depth.dtype == np.float32 and depth.max() > 0.5
+    assert {"fx", "fy", "cx", "cy", "width", "height"} <= set(json.loads((tmp_path / "camera.json").read_text()))
+    absent = peers.Peer("Absent", "absent")
+    found = peers.run_peer(absent, "room", ROOM, tmp_path, peers.Options(), Path(sys.executable))
+    assert "peer_absent.py" in found["problem"] and "ate_m" not in found
+
+
+def test_the_table_marks_what_is_quoted_and_where_poses_are_missing() -> None:
+    runs = [
+        run(peers.OURS, "redkitchen", 0.02, without_pose=0),
+        run(peers.OURS, "redkitchen", 0.04, without_pose=0),
+        run(peers.OURS, "hololens", 0.3, without_pose=2),
+        run("Open3D, dense SLAM", "redkitchen", None, problem="no memory"),
+    ]
+    measured = {"figures": {"runs": runs, "quoted": list(peers.QUOTED)}}
+    table, failed = peers.sections(measured)
+    rows = {row[0]: row for row in table.rows}
+    assert all(len(row) == len(table.columns) for row in table.rows)
+    assert rows[peers.OURS][1].startswith("3.00 ± ") and rows[peers.OURS][3] == "hololens 2 of 6"
+    assert rows["RTAB-Map 0.23 †"][1:4] == ["5.20", "10.2", "hololens 63 %"]
+    assert failed.rows == [["redkitchen, Open3D, dense SLAM", "no memory"]]

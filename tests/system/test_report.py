@@ -1,0 +1,79 @@
+"""The report of a real run: it fits a phone, and its floor plan equals the exported one."""
+
+import html
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from sigmasplat import cli
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+FLAGS = [
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-dev-shm-usage",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-proxy-server",
+    "--hide-scrollbars", "--virtual-time-budget=10000", "--dump-dom",
+]  # fmt: skip
+SETTINGS = {
+    "input.width": "64", "mapping.first_iterations": "20", "mapping.iterations": "5", "final.iterations": "5",
+    "submaps.distance_m": "0", "submaps.angle_deg": "0", "submaps.uncertainty_m": "0", "submaps.frames": "6",
+}  # fmt: skip
+PHONE_PX = 400
+# Shows the page in a frame as wide as a phone. Writes the width of its content, and elements whose content is cut off.
+FRAME = """<!doctype html>
+<iframe id=frame width={width} height=3000 style="border: 0" srcdoc="{page}"></iframe><p id=out>
+<script>frame.onload = () => {{
+  const page = frame.contentDocument;
+  for (const details of page.querySelectorAll("details")) details.open = true;
+  const cut = [...page.querySelectorAll("pre, figure, li, p, h1")]
+    .filter(element => element.scrollWidth > element.clientWidth + 1).map(element => element.outerHTML.slice(0, 200));
+  out.textContent = JSON.stringify({{width: page.documentElement.scrollWidth, cut}});
+}}</script>"""
+
+
+def sigmasplat(*arguments: str) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(arguments)
+    assert not ended.value.code
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a tiny run of the synthetic room, with several submaps, and its report."""
+    folder = tmp_path_factory.mktemp("report") / "a-run-with-a-rather-long-name-of-its-folder-to-see-that-commands-wrap"
+    options = [word for pair in SETTINGS.items() for word in ("--set", "=".join(pair))]
+    sigmasplat(
+        "run", "synthetic:frames=120,width=64,height=48", "--limit", "14", "--out", str(folder), *options
+    )  # fmt: skip
+    return folder
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium (apt-get install chromium)")
+def test_the_report_fits_a_phone(run: Path, tmp_path: Path) -> None:
+    assert CHROMIUM is not None
+    frame = tmp_path / "frame.html"
+    frame.write_text(FRAME.format(width=PHONE_PX, page=html.escape((run / "report.html").read_text())))
+    command = [CHROMIUM, *FLAGS, f"--user-data-dir={tmp_path / 'profile'}", frame.as_uri()]
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=120).stdout
+    measured = re.search(r"<p id=\"out\">(\{.*\})", shown)
+    assert measured, shown[-500:]
+    assert json.loads(html.unescape(measured[1])) == {"width": PHONE_PX, "cut": []}
+
+
+def test_the_report_and_the_exported_plan_have_the_same_regions(run: Path, tmp_path: Path) -> None:
+    sigmasplat("export", str(run), "--out", str(tmp_path / "plan.png"))
+    exported = json.loads((tmp_path / "plan.json").read_text())["scan_again"]
+    page = (run / "report.html").read_text()
+    items = re.findall(r"<li class=(\w+)><b>(\d+)</b><span>\w+: (.*?) · ([\d.]+) m² · (.*?) the start", page)
+    listed = [(why, int(number), html.unescape(found), area) for why, number, found, area, _ in items]
+    assert listed == [
+        (region["why"], number, region["found"], f"{region['area_m2']:.2f}")
+        for number, region in enumerate(exported, 1)
+    ]
+    places = [re.findall(r"[\d.]+", place) for *_, place in items]
+    assert places == [[f"{abs(value):.1f}" for value in region["center_m"]] for region in exported]
+    assert listed
