@@ -1,4 +1,4 @@
-# Two stages: the first has a compiler and makes a wheel, the second installs it without one.
+# Two stages: the first one has a compiler and builds a wheel, the second one installs the wheel without a compiler.
 #   docker build -t sigmasplat .
 #   docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/data" sigmasplat run kitchen
 ARG PYTHON=3.11
@@ -8,12 +8,12 @@ RUN apt-get update && apt-get install --yes --no-install-recommends g++ && rm -r
 WORKDIR /build
 COPY pyproject.toml CMakeLists.txt constraints.txt LICENSE README.md ./
 COPY src src
-# pip before 25.3 reads the first name for what it builds with, later ones the second.
+# pip before 25.3 takes the constraints of build tools from the first variable, later versions from the second.
 RUN PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt \
     pip wheel --no-cache-dir --no-deps --wheel-dir wheels .
 
 FROM python:${PYTHON}-slim
-# EXTRAS=viewer,video adds optional parts; TORCH_INDEX is where torch comes from, here without CUDA's gigabytes.
+# EXTRAS=viewer,video adds extras. TORCH_INDEX is the index for torch; the default has no CUDA libraries.
 ARG EXTRAS=""
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 COPY constraints.txt /tmp/sigmasplat/

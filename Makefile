@@ -1,17 +1,17 @@
-# make demo   install into .venv and run SLAM on the built-in synthetic room
-# make install install into .venv; again after a change to the sources
-# make test   install with the development tools, then lint, types, tests
-# make native compile the kernels beside their sources, for work with PYTHONPATH=src
-# make docs   the documentation as a site in site/, to be read from the disk
-# make gpu    every check and measurement that needs an NVIDIA GPU (benchmarks/GPU.md)
-# make wheel  a wheel in dist/ that runs where no compiler is; PYTHON=python3.12 for another Python
-# make sdist  the sources as one archive in dist/
-# make clean  remove .venv and everything built
+# make demo     install into .venv and run SLAM on the synthetic room
+# make install  install into .venv; run it again after a change to the sources
+# make test     install with the development tools, then run lint, type checks and tests
+# make native   compile the kernels into the source tree, to work with PYTHONPATH=src
+# make docs     build the documentation as a site in site/, which can be read without a server
+# make gpu      run all checks and measurements that need an NVIDIA GPU (benchmarks/GPU.md)
+# make wheel    build a wheel in dist/ that needs no compiler; PYTHON=python3.12 for another Python
+# make sdist    pack the sources as one archive in dist/
+# make clean    remove .venv and all build results
 #
-# PYTHON=python3.12    another interpreter
-# TORCH_INDEX=URL      where torch comes from if it answers; PyTorch's own index has the build without gigabytes of CUDA
-# PIP_ARGS="…"         extra pip options
-# PYTEST_ARGS="…"      extra pytest options, for instance -k trajectory -x; -n 0 runs the tests in one process
+# PYTHON=python3.12    use another interpreter
+# TORCH_INDEX=URL      index for torch, used if it answers; the default has the build without gigabytes of CUDA
+# PIP_ARGS="…"         additional pip options
+# PYTEST_ARGS="…"      additional pytest options, for instance -k trajectory -x; -n 0 for one process
 
 PYTHON ?= python3
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
@@ -24,11 +24,11 @@ PACKAGED := pyproject.toml CMakeLists.txt constraints.txt LICENSE README.md \
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet $(PIP_ARGS) -c constraints.txt
 
 refuse = { echo "make: $(1)" >&2; exit 1; }
-# Debian keeps ensurepip in python3-venv; with python3-pip alone, that pip fills the new environment.
+# On Debian, ensurepip is in python3-venv. With python3-pip alone, that pip installs pip into the new environment.
 venv_without_ensurepip = { $(PYTHON) -m venv --clear --without-pip $(VENV) && \
 	$(PYTHON) -m pip --python $(BIN)/python install --quiet $(PIP_ARGS) pip; }
 
-# A Python other than the one of .venv builds wheels in an environment of its own.
+# Wheels for another Python than that of .venv are built in a separate environment.
 version_of = $(shell $(1) -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)
 same_python = $(filter $(call version_of,$(PYTHON)),$(or $(call version_of,$(BIN)/python),$(call version_of,$(PYTHON))))
 WHEEL_VENV = $(if $(same_python),$(VENV),build/venv-$(or $(call version_of,$(PYTHON)),missing))
@@ -48,8 +48,8 @@ lint: install-dev
 types: install-dev
 	$(BIN)/mypy --strict src
 
-# One after the other even under -j, so that the closing line of pytest is the last one. One worker per core: each takes
-# half of the files in their order, so a fixture of a file is made once, and the first to finish helps the other.
+# In sequence even under -j, so that the summary of pytest is the last line. One worker per core: each starts with a
+# contiguous half of the tests, so that most fixtures of a file are made once; the first to finish takes over tests.
 pytest: lint types
 	$(BIN)/pytest -n auto --maxprocesses 8 --dist worksteal $(PYTEST_ARGS)
 
@@ -57,13 +57,13 @@ install: $(VENV)/installed
 install-dev: $(VENV)/installed-dev
 
 $(VENV)/installed: $(VENV)/build-tools $(VENV)/torch $(PACKAGED)
-	@echo "installing sigmasplat into $(VENV) (the first time a few minutes)"
+	@echo "installing sigmasplat into $(VENV) (takes a few minutes the first time)"
 	$(INSTALL) --no-build-isolation .
 	@touch $@
 
-# The development install is a full install too: it spares `make demo` its own.
+# The development install includes the full install, so that `make demo` need not repeat it.
 $(VENV)/installed-dev: $(VENV)/build-tools $(VENV)/torch $(PACKAGED)
-	@echo "installing sigmasplat[dev] into $(VENV) (the first time a few minutes)"
+	@echo "installing sigmasplat[dev] into $(VENV) (takes a few minutes the first time)"
 	$(INSTALL) --no-build-isolation '.[dev]'
 	@touch $@ $(VENV)/installed
 
@@ -77,7 +77,7 @@ $(VENV)/created:
 		|| $(call refuse,cannot make $(VENV): sudo apt install python3-venv)
 	@touch $@
 
-# PyPI's torch for Linux brings CUDA. An index that does not answer is left out: pip would try again for minutes.
+# PyPI's torch for Linux brings CUDA. An index that does not answer is not given to pip, which would retry for minutes.
 answers = $(PYTHON) -c 'import sys, urllib.request as u; u.urlopen(sys.argv[1], timeout=5)' $(1)/torch/ >/dev/null 2>&1
 
 $(VENV)/torch: $(VENV)/created
@@ -89,7 +89,7 @@ $(VENV)/torch: $(VENV)/created
 	fi
 	@touch $@
 
-# In the environment itself, not in pip's throw-away one: then a later install compiles only what changed.
+# The build tools are in .venv, not in pip's temporary environment: then a later install compiles only what changed.
 $(VENV)/build-tools: $(VENV)/created
 	@echo "installing the build tools into $(VENV)"
 	$(INSTALL) scikit-build-core nanobind cmake ninja
@@ -107,7 +107,7 @@ docs: $(VENV)/installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "documentation: site/index.html"
 
-# The tools alone: the API is read from the sources, so nothing is compiled and no torch is needed.
+# Only the tools: the API is read from the sources, so that neither a compiler nor torch is needed.
 $(VENV)/installed-docs: pyproject.toml constraints.txt | $(VENV)/created
 	@echo "installing the documentation's tools into $(VENV)"
 	$(INSTALL) $$($(BIN)/python -c 'import tomllib; project = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
@@ -117,8 +117,8 @@ $(VENV)/installed-docs: pyproject.toml constraints.txt | $(VENV)/created
 wheel:
 	@$(MAKE) --no-print-directory wheel-here VENV=$(WHEEL_VENV)
 
-# auditwheel reads which C library the module needs and names the wheel after it (manylinux_2_27). OpenMP's runtime stays
-# out: torch brings it (CMakeLists.txt says how it is found).
+# auditwheel finds the C library that the module needs and names the wheel after it (manylinux_2_27). OpenMP's runtime is
+# excluded, because torch contains it (CMakeLists.txt explains how it is found).
 wheel-here: $(VENV)/wheel-tools
 	rm -rf build/raw-wheel
 	$(BIN)/python -m pip wheel --disable-pip-version-check --quiet . --no-deps --no-build-isolation -w build/raw-wheel

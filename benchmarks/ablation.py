@@ -21,7 +21,7 @@ from sigmasplat.commands import options as described
 from sigmasplat.commands.bench import DEFAULT_PRESET, Ablation
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.evaluation.ablation import COMPARED, NAMES, WITHOUT_VARIANCE
-from sigmasplat.evaluation.paired_comparison import FIGURES, columns, effects, passed_by_chance, rows
+from sigmasplat.evaluation.paired_comparison import FIGURES, columns, paired_differences, passed_by_chance, rows
 
 arg = tyro.conf.arg
 SYNTHETIC = "synthetic:frames=240,overrun=20,noise=1,drift=6,seed={seed}"
@@ -113,7 +113,7 @@ def effects_of(by_source: dict[str, Runs], seeds: int) -> Section:
     laid_out = []
     for source, runs in by_source.items():
         for changed, against in compared(runs):
-            found = {effect.figure.name: effect for effect in effects(runs, changed, against)}
+            found = {effect.figure.name: effect for effect in paired_differences(runs, changed, against)}
             cells = [found[figure.name].written() if figure.name in found else "–" for figure in JUDGED]
             bold = [figure.name in found and found[figure.name].verdict in ("helps", "harms") for figure in JUDGED]
             shown = [f"**{cell}**" if stands_out else cell for cell, stands_out in zip(cells, bold, strict=True)]
@@ -130,7 +130,7 @@ def verdicts(by_source: dict[str, Runs]) -> Section:
     for changed, against in dict.fromkeys(pair for runs in by_source.values() for pair in compared(runs)):
         helped, harmed, neither = [], [], []
         for source, runs in by_source.items():
-            found = effects(runs, changed, against)
+            found = paired_differences(runs, changed, against)
             helped += [f"{source}: {effect.figure.title}" for effect in found if effect.verdict == "helps"]
             harmed += [f"{source}: {effect.figure.title}" for effect in found if effect.verdict == "harms"]
             stands_out = any(effect.verdict in ("helps", "harms") for effect in found)
@@ -145,7 +145,7 @@ def verdict_counts(measured: dict[str, Any], changed: str, against: str) -> Coun
     runs = measured["figures"]["runs"]
     sources = dict.fromkeys(run["source"] for run in runs)
     by_source = [[run for run in runs if run["source"] == source] for source in sources]
-    return Counter(effect.verdict for found in by_source for effect in effects(found, changed, against))
+    return Counter(effect.verdict for found in by_source for effect in paired_differences(found, changed, against))
 
 
 def compared(runs: Runs) -> list[tuple[str, str]]:

@@ -141,7 +141,13 @@ def goals(measured: dict[str, Any]) -> Section:
 
 def failures(results: list[Result]) -> Section:
     """List the runs that failed, with the last line they printed."""
+    return failed_runs(
+        results, lambda r: ", ".join((r["job"]["source"], r["job"]["preset"], f"seed {r['job']['seed']}"))
+    )
+
+
+def failed_runs(results: list[Result], name: Callable[[Result], str]) -> Section:
+    """List the results that have a `problem`, each with its name and the last line it printed."""
     failed = [result for result in results if result["problem"] is not None]
-    names = [", ".join((r["job"]["source"], r["job"]["preset"], f"seed {r['job']['seed']}")) for r in failed]
-    rows = [[name, str(result["problem"]).replace("|", "/")] for name, result in zip(names, failed, strict=True)]
+    rows = [[name(result), str(result["problem"]).replace("|", "/")] for result in failed]
     return Section("Failed", ["run", "last line"], rows)

@@ -106,7 +106,7 @@ def score(runs: dict[str, Slam], rows: Sequence[int], frames: Sequence[Frame]) -
 
 def with_correlations(field: GaussianField) -> GaussianField:
     """Return the field with correlations, zeros if it has none, so that V is rendered completely."""
-    field.carry("correlations")
+    field.get_or_create("correlations")
     return field
 
 
@@ -139,7 +139,7 @@ def figures(run: Slam, field: GaussianField, sums: NDArray[np.float64], seen: li
     count, diagonal, full, *second = sums.sum(0)
     deviations = np.sqrt(second[:CHANNELS])
     errors = second[CHANNELS:] / np.array([deviations[a] * deviations[b] for a, b in ((0, 1), (0, 2), (1, 2))])
-    correlations = correlations_of(field.extras["correlations"].params).abs().mean(0)
+    correlations = correlations_of(field.attributes["correlations"].params).abs().mean(0)
     scores = views.mean_scores([view.scores() for view in seen])
     judged = views.score_uncertainty([views.sample_pixels(view) for view in seen]) or {}
     return {

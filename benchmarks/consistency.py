@@ -25,7 +25,15 @@ from tables import Section
 
 import sigmasplat
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.evaluation.paired_comparison import Effect, Figure, best, by_seed, deviation, passed_by_chance, rows
+from sigmasplat.evaluation.paired_comparison import (
+    Figure,
+    PairedDifference,
+    best,
+    by_seed,
+    deviation,
+    passed_by_chance,
+    rows,
+)
 from sigmasplat.io.machine import INSTALLED, code_digest
 from sigmasplat.report.tables import number
 
@@ -208,7 +216,7 @@ def effects_of(scenes: Scenes, variants: list[str]) -> Section:
 def _effect(figure: Figure, changes: list[float]) -> str:
     if not changes:
         return "–"
-    effect = Effect(figure, statistics.fmean(changes), deviation(changes))
+    effect = PairedDifference(figure, statistics.fmean(changes), deviation(changes))
     worse = sum(figure.better * change < 0 for change in changes)
     return f"{_marked(effect.written(), effect.verdict in ('helps', 'harms'))}, {worse}/{len(changes)}"
 

@@ -67,7 +67,7 @@ def measure(path: str, options: Options) -> dict[str, Any]:
 def hops_of(slam: Slam, path: Matrix, known: dict[int, Matrix]) -> dict[str, Any]:
     """Return each hop: its last frame, its submap, the uncertainty there, whether a submap ended, the true error, m."""
     hops = []
-    for before, after in pairwise(slam.keyframes):
+    for before, after in pairwise(slam.keyframe_indices):
         if before not in known or after not in known:
             continue
         estimate, truth = (se3.inverse(p[before]) @ p[after] for p in (path, known))

@@ -73,11 +73,11 @@ class GpuWorks:
 
     def __init__(self, scene: Scene, device: torch.device) -> None:
         self.scene, self.device = scene, device
-        self.field = scene.field.on(device)
+        self.field = scene.field.copy_to(device)
         self.params, self.grad = self.field.params, torch.zeros_like(self.field.params)
         self.all, self.color_depth = (CudaView(scene.camera, RENDER, on, device) for on in (True, False))
         size = (scene.camera.height, scene.camera.width)
-        self.target, self.later = (Target.of(frame, size).on(device) for frame in (scene.frame, scene.later))
+        self.target, self.later = (Target.of(frame, size).to(device) for frame in (scene.frame, scene.later))
         for view in (self.all, self.color_depth):
             for plane in (view.g_sums, view.g_alpha, view.g_moment):
                 plane.fill_(1e-3)
@@ -163,7 +163,7 @@ def time_gsplat(scene: Scene, runs: int, device: torch.device) -> dict[str, Any]
 def _time_gsplat(scene: Scene, runs: int, device: torch.device) -> dict[str, Any]:
     import gsplat
 
-    f, c = scene.field.on(device), scene.camera
+    f, c = scene.field.copy_to(device), scene.camera
     leaves = [x.detach().clone().requires_grad_() for x in (f.means, f.quats, f.scales, f.opacities, f.colors)]
     K = torch.tensor([[[c.fx, 0.0, c.cx + 0.5], [0.0, c.fy, c.cy + 0.5], [0.0, 0.0, 1.0]]], device=device)
     at = torch.eye(4, device=device)[None]

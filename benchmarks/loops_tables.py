@@ -3,7 +3,7 @@
 import statistics
 from typing import Any
 
-from accuracy_tables import spread, values_of
+from accuracy_tables import failed_runs, spread, values_of
 from tables import Section, significant
 
 Rows = list[dict[str, Any]]
@@ -134,9 +134,4 @@ def _row(what: str, values: list[Any], goal: str, held: bool) -> list[str]:
 
 def failures(jobs: Rows) -> Section:
     """List the runs that failed, with the last line they printed."""
-    rows = [
-        [f"{job['source']}, {job['way']}, seed {job['seed']}", job["problem"].replace("|", "/")]
-        for job in jobs
-        if job["problem"] is not None
-    ]
-    return Section("Failed", ["run", "last line"], rows)
+    return failed_runs(jobs, lambda job: f"{job['source']}, {job['way']}, seed {job['seed']}")

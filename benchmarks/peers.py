@@ -26,7 +26,7 @@ from tables import Section
 from sigmasplat.errors import ConfigError, SigmaSplatError, SourceError
 from sigmasplat.io.atomic import write_text
 from sigmasplat.io.trajectory import read_trajectory
-from sigmasplat.metrics.trajectory import ate, paired
+from sigmasplat.metrics.trajectory import ate, pair_poses
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, preset as preset_of
 from sigmasplat.sources import open_source
@@ -79,6 +79,7 @@ class Options:
     """Run SigmaSplat and other RGB-D systems on the same frames and score every path with the same evaluation."""
 
     sources: Annotated[tuple[str, ...], arg(help="names in the data folder, or paths")] = SOURCES
+    systems: Annotated[tuple[str, ...], arg(help="the other systems")] = tuple(p.method or p.package for p in PEERS)
     seeds: Annotated[tuple[int, ...], arg(help="starts of SigmaSplat's random numbers, a run each")] = (0,)
     open3d: Annotated[Path | None, arg(help="a Python with open3d", help_behavior_hint="(default: left out)")] = None
     orbslam3: Annotated[
@@ -140,7 +141,7 @@ def score(path: Trajectory, source: Source, limit: int | None) -> dict[str, Any]
         raise SourceError(f"{source.name} has no true poses")
     frames = frames_in(source, limit)
     times_s = np.array([source.timestamp_s(i) for i in range(frames)])
-    known, _ = paired(Trajectory(times_s, np.tile(np.eye(4), (frames, 1, 1))), path)
+    known, _ = pair_poses(Trajectory(times_s, np.tile(np.eye(4), (frames, 1, 1))), path)
     found = ate(path, truth)
     return {"frames": frames, "without_pose": frames - len(known), "ate_m": found.rmse_m, "ate_max_m": found.max_m}
 
@@ -189,7 +190,8 @@ def finished(peer: Peer, path: str, options: Options) -> tuple[Path, Result, Res
 def run_peers(options: Options) -> list[Result]:
     """Run the other systems whose Python is given, sequence by sequence."""
     pythons = {"open3d": options.open3d, "orbslam3": options.orbslam3}
-    chosen = [(peer, python) for peer in PEERS if (python := pythons[peer.package])]
+    wanted = [peer for peer in PEERS if (peer.method or peer.package) in options.systems]
+    chosen = [(peer, python) for peer in wanted if (python := pythons[peer.package])]
     made = []
     for name in options.sources:
         path = accuracy.located(name)
@@ -265,7 +267,7 @@ def main(options: Options) -> int:
         return 2
     names = {Path(name).name for name in options.sources}
     figures = {"runs": runs, "quoted": [figure for figure in QUOTED if figure["source"] in names]}
-    config = {n: v for n, v in asdict(options).items() if n in ("sources", "limit", "paths")}
+    config = {n: v for n, v in asdict(options).items() if n in ("sources", "systems", "limit", "paths")}
     measured = record.results("peers", figures, name=options.name, seeds=options.seeds, config=config)
     print(record.write(measured, options.out), file=sys.stderr)
     print(tables.table(measured))

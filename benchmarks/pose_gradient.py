@@ -20,7 +20,7 @@ import program
 import record
 import tracking
 import tyro
-from accuracy_tables import PLACE, spread, values_of
+from accuracy_tables import PLACE, failed_runs, spread, values_of
 from cpu import alone
 from localise import WAYS, Search, disturbed, localise, shares, view_dependence
 from numpy.typing import NDArray
@@ -294,9 +294,7 @@ def harmonics_of(measured: Rows) -> str:
 
 def failures(jobs: Rows) -> Section:
     """List the runs that failed, with the last line they printed."""
-    failed = [job for job in jobs if job["problem"] is not None]
-    rows = [[f"{j['source']}, {j['way']}, seed {j['seed']}", j["problem"].replace("|", "/")] for j in failed]
-    return Section("Failed", ["run", "last line"], rows)
+    return failed_runs(jobs, lambda job: f"{job['source']}, {job['way']}, seed {job['seed']}")
 
 
 def sections(measured: dict[str, Any]) -> list[Section]:

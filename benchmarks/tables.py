@@ -23,6 +23,7 @@ import tyro
 
 SUBJECTS = {
     "Whole runs": ("accuracy", "systems"),
+    "Other systems": ("peers",),
     "Effect of σ²": ("ablation", "color_covariance"),
     "Camera tracking": ("tracking", "pose_gradient"),
     "Loops and submaps": ("loops", "drift_rule"),

@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
-from accuracy_tables import PLACE, spread, values_of
+from accuracy_tables import PLACE, failed_runs, spread, values_of
 from numpy.typing import NDArray
 from scipy.stats import chi2
 from tables import Section, significant
@@ -179,12 +179,7 @@ def succeeded(jobs: Rows, source: str, method: str) -> Rows:
 
 def failures(jobs: Rows) -> Section:
     """List the runs that failed, with the last line they printed."""
-    rows = [
-        [f"{job['source']}, {named(job['method'])}, seed {job['seed']}", job["problem"].replace("|", "/")]
-        for job in jobs
-        if job["problem"] is not None
-    ]
-    return Section("Failed", ["run", "last line"], rows)
+    return failed_runs(jobs, lambda job: f"{job['source']}, {named(job['method'])}, seed {job['seed']}")
 
 
 def goals(figures: dict[str, Any]) -> Section:

@@ -122,8 +122,8 @@ class Growing:
         seen = Frame(frame, 0.05 * frame, color, np.full((CAMERA.height, CAMERA.width), 2.0, np.float32), CAMERA)
         target = Target.of(seen, (CAMERA.height, CAMERA.width))
         slam.mapper.keyframes.append(Keyframe(frame, target, pose, not slam.mapper.keyframes))
-        slam.atlas.keyframes[-1].append(pose)
-        slam.keyframes.append(frame)
+        slam.atlas.keyframe_poses[-1].append(pose)
+        slam.keyframe_indices.append(frame)
         self.field.params[:, :3] += 1e-3 * torch.sin(torch.tensor(frame))
         slam.mapper.field = field_without_moments(self.field.params[:grown], {})
 
@@ -199,7 +199,7 @@ def watch(growing: Growing, viewer: "ViewerApp", options: Options) -> dict[str, 
         viewer.panel.colouring.value = ("colour", "σ")[int(now_s / CHANGE_S / len(VIEW_MODES)) % 2]
         time.sleep(max(0.0, growing.frames / options.frames_per_s - (time.monotonic() - begun_s)))
     return {
-        "minutes": options.minutes, "frames": growing.frames, "keyframes": len(growing.slam.keyframes),
+        "minutes": options.minutes, "frames": growing.frames, "keyframes": len(growing.slam.keyframe_indices),
         "submaps": len(growing.slam.store), "updates": shown, "samples": samples,
     }  # fmt: skip
 

@@ -22,8 +22,9 @@ from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model.field import GaussianField
 from sigmasplat.native import _core
 from sigmasplat.presets import default_preset, preset
-from sigmasplat.render.cpu import operators as cpu
+from sigmasplat.render.cpu import operators as _operators  # noqa: F401 # applies the switches before anybody sets them
 from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.kernel_params import view_params
 
 RENDER = RenderConfig()
 ADAM_ITERATIONS = 60
@@ -82,7 +83,7 @@ class Works:
         self.weights = torch.zeros(2, *size)
         self.target, self.later = (Target.of(f, (size[0], size[1])) for f in (scene.frame, scene.later))
         self.reference = self.target.depth.contiguous()
-        self.numbers = cpu.view_numbers(scene.camera, np.eye(4), RENDER)
+        self.numbers = view_params(scene.camera, np.eye(4), RENDER)
         self.grad = torch.zeros_like(self.params)
         chosen = preset(default_preset())
         self.tracking, self.mapping = chosen.tracking, chosen.mapping

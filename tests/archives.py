@@ -1,4 +1,4 @@
-"""Archives for tests, honest and hostile."""
+"""Archives for tests, valid and malicious."""
 
 import io
 import stat
@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 def tar_gz(files: Mapping[str, bytes], *strange: tarfile.TarInfo) -> bytes:
-    """Return a .tar.gz of files, and of entries without content."""
+    """Return a .tar.gz with files and with entries without content."""
     packed = io.BytesIO()
     with tarfile.open(fileobj=packed, mode="w:gz") as tar:
         for name, content in files.items():
@@ -22,14 +22,14 @@ def tar_gz(files: Mapping[str, bytes], *strange: tarfile.TarInfo) -> bytes:
 
 
 def entry(kind: bytes, name: str = "odd", leads_to: str = "") -> tarfile.TarInfo:
-    """Return an entry of a tar that is no file."""
+    """Return a tar entry that is not a file."""
     made = tarfile.TarInfo(name)
     made.type, made.linkname = kind, leads_to
     return made
 
 
 def zipped(files: Mapping[str, bytes], links: Mapping[str, str] | None = None) -> bytes:
-    """Return a .zip of files, and of symbolic links."""
+    """Return a .zip with files and symbolic links."""
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as made:
         for name, content in files.items():
@@ -42,6 +42,6 @@ def zipped(files: Mapping[str, bytes], links: Mapping[str, str] | None = None) -
 
 
 def folder_content(folder: Path, below: str = "") -> dict[str, bytes]:
-    """Return the files below a folder, by their path in it."""
+    """Return the content of the files below a folder by relative path."""
     found = {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     return {f"{below}{name}": content for name, content in found.items()}

@@ -1,7 +1,7 @@
-"""Stand in for pyrealsense2: the part of its interface that is used, in front of a room made in code.
+"""A fake pyrealsense2: the part of its interface that is used, filming the synthetic room.
 
 Names, arguments and units as in pyrealsense2 2.59: depth as whole numbers of `get_depth_scale()` metres, times in
-milliseconds, frame numbers that go on while nobody looks, RuntimeError where no frame comes.
+milliseconds, frame numbers that increase while no frame is read, RuntimeError if no frame arrives.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ distortion = Enum(
 
 
 class Device:
-    """A camera on the desk: what it sees, how long it stays plugged in, what else happens when a frame is asked for."""
+    """The simulated camera: its images, when it is unplugged, and other events when a frame is requested."""
 
     def __init__(self, width: int = 80, height: int = 60, scale_m: float = 0.0005) -> None:
         self.room = SyntheticRoom(frames=60, width=width, height=height, noise=False)
@@ -40,7 +40,7 @@ class Device:
         self.seen = cache(lambda number: self.room.frame(number % len(self.room)))
 
     def module(self) -> ModuleType:
-        """Return what `import pyrealsense2` is to give."""
+        """Return the module for `import pyrealsense2`."""
         made = ModuleType("pyrealsense2")
         names = {"stream": stream, "format": format_, "distortion": distortion}
         for name, value in names.items():
@@ -78,7 +78,7 @@ class _Pipeline:
             raise RuntimeError("No device connected")
         self.device.started += 1
         sensor = SimpleNamespace(get_depth_scale=lambda: self.device.scale_m)
-        # Depth is seen from the colour camera's place: where the SDK would turn it, it comes turned already.
+        # Depth is rendered from the colour camera, so that aligning does not change it.
         same = SimpleNamespace(rotation=list(np.eye(3).T.reshape(-1)), translation=[0.0, 0.0, 0.0])
         profile = SimpleNamespace(get_intrinsics=self.device.intrinsics, get_extrinsics_to=lambda other: same)
         return SimpleNamespace(
@@ -117,7 +117,7 @@ class _Frames:
         return self._frame(np.rint(self.device.seen(self.number).color * 255).astype(np.uint8))
 
     def get_depth_frame(self) -> Any:
-        assert self.aligned or not self.device.must_align, "depth has colour's pixels only after align.process()"
+        assert self.aligned or not self.device.must_align, "depth is aligned to colour only after align.process()"
         return self._frame(np.rint(self.device.seen(self.number).depth_m / self.device.scale_m).astype(np.uint16))
 
     def _frame(self, data: np.ndarray) -> Any:

@@ -1,4 +1,4 @@
-"""A file server on 127.0.0.1 for tests: well behaved, or misbehaving as told, a request at a time."""
+"""A file server on 127.0.0.1 for tests; each request can be answered correctly or with a chosen fault."""
 
 import threading
 import time
@@ -10,7 +10,7 @@ ETAG = '"one"'
 
 
 class Request(BaseHTTPRequestHandler):
-    """One request; `server.files` holds what there is, `server.acts` what to do with the next requests."""
+    """One request; `server.files` are the files, `server.acts` the behaviour for the next requests."""
 
     protocol_version = "HTTP/1.1"
     server: "FileServer"
@@ -19,7 +19,7 @@ class Request(BaseHTTPRequestHandler):
         self.server.ranges.append(self.headers.get("Range", ""))
         act = self.server.acts.pop(0) if self.server.acts else whole
         self.close_connection = True
-        with suppress(BrokenPipeError, ConnectionResetError):  # the client has had enough
+        with suppress(BrokenPipeError, ConnectionResetError):  # the client closed the connection
             act(self)
 
     def body(self) -> bytes:
@@ -32,7 +32,7 @@ class Request(BaseHTTPRequestHandler):
         self.end_headers()
 
     def log_message(self, *arguments: object) -> None:
-        """Say nothing."""
+        """Log nothing."""
 
 
 class FileServer(ThreadingHTTPServer):
@@ -65,7 +65,7 @@ def serving() -> Iterator[FileServer]:
 
 
 def _span(request: Request, etag: str) -> int | None:
-    """Return the first byte asked for, None for all: no range, or one of another version."""
+    """Return the first requested byte, None for the whole file: no range, or of another version."""
     asked = request.headers.get("Range", "")
     if not asked or request.headers.get("If-Range", etag) != etag:
         return None
@@ -73,7 +73,7 @@ def _span(request: Request, etag: str) -> int | None:
 
 
 def _open(request: Request, etag: str = ETAG) -> bytes:
-    """Send the head of a proper answer; return the body to follow."""
+    """Send the headers of a correct response; return its body."""
     body = request.body()
     start = _span(request, etag)
     if start is None:
@@ -85,7 +85,7 @@ def _open(request: Request, etag: str = ETAG) -> bytes:
 
 
 def whole(request: Request) -> None:
-    """Answer as a server should: ranges, versions, 404."""
+    """Answer correctly: ranges, versions, 404."""
     if request.path not in request.server.files:
         return status(404)(request)
     request.wfile.write(_open(request))
@@ -97,25 +97,25 @@ def drop_after(count: int) -> Act:
 
 
 def other_version(request: Request) -> None:
-    """Answer as a server whose file has been replaced."""
+    """Answer with another version of the file."""
     request.wfile.write(_open(request, '"two"'))
 
 
 def without_ranges(request: Request) -> None:
-    """Send all of it whatever was asked for."""
+    """Send the whole file even if a range was requested."""
     request.start(Content_Length=len(request.body()), ETag=ETAG)
     request.wfile.write(request.body())
 
 
 def wrong_range(request: Request) -> None:
-    """Send another part than was asked for."""
+    """Send another range than requested."""
     body = request.body()
     request.start(206, Content_Length=3, Content_Range=f"bytes 0-2/{len(body)}", ETag=ETAG)
     request.wfile.write(body[:3])
 
 
 def says_length(change: int) -> Act:
-    """Announce a length that is off by `change`."""
+    """Send a Content-Length that is wrong by `change`."""
 
     def act(request: Request) -> None:
         request.start(Content_Length=len(request.body()) + change)
@@ -130,13 +130,13 @@ def status(code: int, **headers: object) -> Act:
 
 
 def web_page(request: Request) -> None:
-    """Answer as a hotel's network does."""
+    """Answer with a login page."""
     request.start(Content_Type="text/html; charset=utf-8", Content_Length=5)
     request.wfile.write(b"login")
 
 
 def trickle(seconds: float) -> Act:
-    """Send a byte now and then, for so long."""
+    """Send single bytes slowly for some seconds."""
 
     def act(request: Request) -> None:
         body, until = _open(request), time.monotonic() + seconds
@@ -149,12 +149,12 @@ def trickle(seconds: float) -> Act:
 
 
 def silence(seconds: float) -> Act:
-    """Answer nothing for so long."""
+    """Send no answer for some seconds."""
     return lambda request: time.sleep(seconds)
 
 
 def chunked(broken: bool) -> Act:
-    """Send it in chunks, without saying how long it is; the last chunk may be missing."""
+    """Send the file in chunks without Content-Length; if `broken`, the last chunk is missing."""
 
     def act(request: Request) -> None:
         body = request.body()
@@ -168,7 +168,7 @@ def chunked(broken: bool) -> Act:
 
 
 def endless(request: Request) -> None:
-    """Say nothing of length, and end by closing."""
+    """Send no length; close the connection at the end."""
     request.start(Connection="close")
     request.wfile.write(request.body())
 

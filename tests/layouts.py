@@ -1,8 +1,8 @@
-"""Write a few frames in the layout of each data set, by hand: no code under test is involved."""
+"""Write a few frames in the layout of each data set, independent of the code under test."""
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ SMALL_CAMERA = Camera(32, 24, 30.0, 31.0, 15.25, 11.75)
 
 @dataclass(frozen=True)
 class Sample:
-    """What is written: color uint8 [N, H, W, 3], depth in mm uint16 [N, H, W], T_world_camera [N, 4, 4]."""
+    """The content to write: color uint8 [N, H, W, 3], depth in mm uint16 [N, H, W], T_world_camera [N, 4, 4]."""
 
     color: np.ndarray
     depth_mm: np.ndarray
@@ -26,7 +26,7 @@ class Sample:
 
 
 def sample(size: tuple[int, int] = SMALL) -> Sample:
-    """Make smooth colours, depths from 0 (no reading) to 5 m, and poses that turn about all axes."""
+    """Make smooth colours, depths from 0 (no reading) to 5 m, and poses that rotate about all axes."""
     width, height = size
     u, v = np.meshgrid(np.arange(width) / width, np.arange(height) / height)
     i = np.arange(FRAMES)[:, None, None]
@@ -48,12 +48,11 @@ def save(path: Path, pixels: np.ndarray, **options: Any) -> None:
     Image.fromarray(pixels).save(path, **options)
 
 
-def save_frames(folder: Path, s: Sample, names: tuple[str, str], first: int = 0) -> None:
-    """Save colour and depth under names like "color/{:06d}.png", numbered from `first`; JPEG as exactly as it can."""
-    for n, images in enumerate(zip(s.color, s.depth_mm, strict=True), first):
-        for name, pixels in zip(names, images, strict=True):
-            jpeg = {"quality": 100, "subsampling": 0} if name.lower().endswith(".jpg") else {}
-            save(folder / name.format(n), pixels, **jpeg)
+def save_pairs(folder: Path, s: Sample, names: Iterable[str]) -> None:
+    """Write color/NAME.png and depth/NAME.png of every frame."""
+    for name, color, depth_mm in zip(names, s.color, s.depth_mm, strict=True):
+        save(folder / f"color/{name}.png", color)
+        save(folder / f"depth/{name}.png", depth_mm)
 
 
 def save_text(path: Path, text: str) -> None:
@@ -76,7 +75,7 @@ def tum_line(t: float | int, T: np.ndarray) -> str:
 
 
 def write_tum(folder: Path, s: Sample, units: int = 5) -> Path:
-    """Write lists with real-looking times, depth 4 ms late; depth in units of 1/(1000 · units) m."""
+    """Write lists with realistic times, depth 4 ms late; depth has the unit 1/(1000 · units) m."""
     times = [1305031102.175304 + 0.033 * n for n in range(FRAMES)]
     for n, t in enumerate(times):
         save(folder / f"rgb/{t:.6f}.png", s.color[n])
@@ -98,7 +97,7 @@ T_M = np.array([[1.0157, 0.1828, -0.2389], [0.0009, -0.8431, -0.6413], [-0.3009,
 
 
 def bonn(place: Path, s: Sample) -> Path:
-    """Record the markers: T_camera = T_ROS T_markers T_ROS T_m, T_m's rotation without its scale."""
+    """Write marker poses: T_camera = T_ROS T_markers T_ROS T_m, with the rotation of T_m without its scale."""
     u, _, vt = np.linalg.svd(T_M)
     T_m = np.eye(4)
     T_m[:3, :3], T_m[:3, 3] = u @ vt, [0.0113, -0.0098, 0.0111]
@@ -108,7 +107,9 @@ def bonn(place: Path, s: Sample) -> Path:
 
 def replica(place: Path, s: Sample) -> Path:
     folder = place / "room0"
-    save_frames(folder, s, ("results/frame{:06d}.jpg", "results/depth{:06d}.png"))
+    for n in range(FRAMES):
+        save(folder / f"results/frame{n:06d}.jpg", s.color[n], quality=100, subsampling=0)
+        save(folder / f"results/depth{n:06d}.png", s.depth_mm[n])
     save_text(folder / "traj.txt", "".join(rows(T).replace("\n", " ").strip() + "\n" for T in s.T_world_camera))
     c = SMALL_CAMERA
     camera = {"w": 32, "h": 24, "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy, "scale": 1000.0}
@@ -124,10 +125,10 @@ def intrinsic(c: Camera) -> np.ndarray:
 
 
 def scannet(place: Path, s: Sample) -> Path:
-    """Colour has twice depth's pixels, as the same camera sees it; frame 2 has no pose."""
+    """Colour has twice the width of depth and the same camera; frame 2 has no pose."""
     folder = place / "scene0000_00"
     for n in range(FRAMES):
-        name = str(n * 7)  # every so many frames, unpadded: 7 comes before 14
+        name = str(n * 7)  # not padded: 7 comes before 14
         save(folder / f"color/{name}.jpg", s.color[n].repeat(2, 0).repeat(2, 1), quality=100, subsampling=0)
         save(folder / f"depth/{name}.png", s.depth_mm[n])
         T = np.full((4, 4), -np.inf) if n == 2 else s.T_world_camera[n]
@@ -140,7 +141,7 @@ def scannet(place: Path, s: Sample) -> Path:
 
 
 def scannet_frames(place: Path, s: Sample) -> Path:
-    """The layout of SensReader/c++: one folder, an information file."""
+    """The layout of SensReader/c++: one folder with an information file."""
     folder = place / "scene0001_00"
     for n in range(FRAMES):
         stem = folder / f"frame-{n:06d}"
@@ -166,9 +167,11 @@ def opengl(T: np.ndarray) -> list[list[float]]:
 
 
 def scannetpp(place: Path, s: Sample) -> Path:
-    """Frame 3 is a test view; training photographs are listed out of order in the file."""
+    """Frame 3 is a test view; the training photographs are not listed in order."""
     dslr = place / "0a5c013435" / "dslr"
-    save_frames(dslr, s, ("undistorted_images/DSC{:05d}.JPG", "undistorted_depths/DSC{:05d}.png"))
+    for n in range(FRAMES):
+        save(dslr / f"undistorted_images/DSC{n:05d}.JPG", s.color[n], quality=100, subsampling=0)
+        save(dslr / f"undistorted_depths/DSC{n:05d}.png", s.depth_mm[n])
     frames = [
         {"file_path": f"DSC{n:05d}.JPG", "transform_matrix": opengl(s.T_world_camera[n]), "is_bad": False}
         for n in range(FRAMES)
@@ -192,10 +195,12 @@ def seven_scenes(place: Path, s: Sample) -> Path:
 
 
 def icl_nuim(place: Path, s: Sample) -> Path:
-    """The true path is in the mirrored world: y of the camera and of the world point up."""
+    """The ground truth is in the mirrored world: y of camera and world points up."""
     folder = place / "living_room_traj2_frei_png"
     mirror = np.diag([1.0, -1.0, 1.0, 1.0])
-    save_frames(folder, replace(s, depth_mm=s.depth_mm * 5), ("rgb/{}.png", "depth/{}.png"), first=1)
+    for n in range(FRAMES):
+        save(folder / f"rgb/{n + 1}.png", s.color[n])
+        save(folder / f"depth/{n + 1}.png", s.depth_mm[n] * 5)
     numbers = range(1, FRAMES + 1)
     save_text(folder / "associations.txt", "".join(f"{n} depth/{n}.png {n} rgb/{n}.png\n" for n in numbers))
     poses = zip(numbers, mirror @ s.T_world_camera @ mirror, strict=True)
@@ -205,7 +210,7 @@ def icl_nuim(place: Path, s: Sample) -> Path:
 
 def open3d(place: Path, s: Sample) -> Path:
     folder = place / "lounge"
-    save_frames(folder, s, ("color/{:06d}.png", "depth/{:06d}.png"), first=1)
+    save_pairs(folder, s, (f"{n + 1:06d}" for n in range(FRAMES)))
     K = intrinsic(SMALL_CAMERA)[:3, :3]
     fields = {"width": 32, "height": 24, "intrinsic_matrix": K.T.ravel().tolist(), "depth_scale": 1000.0, "fps": 15.0}
     save_text(folder / "camera_intrinsic.json", json.dumps(fields))
@@ -215,7 +220,7 @@ def open3d(place: Path, s: Sample) -> Path:
 
 
 def redwood(place: Path, s: Sample) -> Path:
-    """Names carry number and microseconds; colour begins one frame earlier, which has no depth."""
+    """Names contain number and microseconds; colour starts one frame earlier, without depth."""
     folder = place / "00021"
     for n in range(-1, FRAMES):
         save(folder / f"rgb/{n + 2:07d}-{33333 * (n + 1):012d}.jpg", s.color[max(n, 0)], quality=100, subsampling=0)
@@ -226,11 +231,12 @@ def redwood(place: Path, s: Sample) -> Path:
 
 
 def nerfstudio(place: Path, s: Sample) -> Path:
-    """Frames 0 … 3 are named 8, 9, 10, 11, and are listed in the alphabet's order."""
+    """Frames 0 … 3 are named 8, 9, 10, 11, and are listed in alphabetical order."""
     folder = place / "capture"
-    save_frames(folder, s, ("images/frame_{}.png", "depths/frame_{}.png"), first=8)
     frames = []
     for n in range(FRAMES):
+        save(folder / f"images/frame_{n + 8}.png", s.color[n])
+        save(folder / f"depths/frame_{n + 8}.png", s.depth_mm[n])
         names = {"file_path": f"images/frame_{n + 8}.png", "depth_file_path": f"depths/frame_{n + 8}.png"}
         frames.append(names | {"transform_matrix": opengl(s.T_world_camera[n])})
     frames.sort(key=lambda frame: frame["file_path"])
@@ -240,7 +246,7 @@ def nerfstudio(place: Path, s: Sample) -> Path:
 
 def plain(place: Path, s: Sample) -> Path:
     folder = place / "my_kitchen"
-    save_frames(folder, s, ("color/{}.png", "depth/{}.png"), first=8)
+    save_pairs(folder, s, (f"{n + 8}" for n in range(FRAMES)))
     c = SMALL_CAMERA
     fields = {"fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy, "width": 32, "height": 24, "depth_scale": 1000}
     save_text(folder / "calibration.json", json.dumps(fields))
@@ -251,7 +257,7 @@ def plain(place: Path, s: Sample) -> Path:
 
 @dataclass(frozen=True)
 class Layout:
-    """How a data set is laid out, and what must be read of it.
+    """The layout of a data set, and the expected result of reading it.
 
     exact: whether colour is stored without loss; train: the frames that make the sequence; posed: those with truth.
     """

@@ -1,4 +1,4 @@
-"""Write small recordings in the layouts of phones and robots, by hand and through other libraries' writers."""
+"""Write small recordings of phones and robots, directly or with other libraries."""
 
 import json
 import struct
@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 
 FRAMES = 4
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Turns camera axes from ours to OpenGL's, and back."""
+"""Converts camera axes between ours and OpenGL's."""
 
 
 @dataclass
 class Scene:
-    """What a camera saw: colours [N, H, W, 3] bytes, depths [N, h, w] mm, poses [N, 4, 4], times [N] s."""
+    """The content of a recording: colours [N, H, W, 3] bytes, depths [N, h, w] mm, poses [N, 4, 4], times [N] s."""
 
     colors: np.ndarray
     depths_mm: np.ndarray
@@ -28,7 +28,7 @@ class Scene:
 
 
 def scene(size: tuple[int, int] = (32, 24), depth_size: tuple[int, int] | None = None, seed: int = 0) -> Scene:
-    """Make frames of smooth colour (videos and JPEG can carry it) and depth of 1 to 3 m with holes."""
+    """Create frames with smooth colour (compressible as video or JPEG) and depth of 1 to 3 m with holes."""
     rng = np.random.default_rng(seed)
     (width, height), (w, h) = size, depth_size or size
     coarse = rng.integers(30, 220, (FRAMES, 3, 4, 3), np.uint8)
@@ -79,7 +79,7 @@ def write_stray(folder: Path, seen: Scene, fx: float = 40.0, per_frame: bool = F
 
 
 def metadata(seen: Scene, **changes: Any) -> dict[str, Any]:
-    """Make Record3D's metadata: K by columns, poses as qx qy qz qw x y z in OpenGL's axes."""
+    """Return Record3D's metadata: K by columns, poses as qx qy qz qw x y z in OpenGL's axes."""
     height, width = seen.colors.shape[1:3]
     poses = seen.poses @ OPENGL
     return {
@@ -91,7 +91,7 @@ def metadata(seen: Scene, **changes: Any) -> dict[str, Any]:
 
 
 def r3d_members(seen: Scene, **changes: Any) -> dict[str, bytes]:
-    """Make the files of a .r3d: LZFSE of float metres with NaN for no reading, and of confidence."""
+    """Return the files of a .r3d: LZFSE of float metres with NaN for no reading, and of confidence."""
     import lzfse
 
     members = {"metadata": json.dumps(metadata(seen, **changes)).encode()}
@@ -114,7 +114,7 @@ def write_zip(path: Path, members: dict[str, bytes]) -> Path:
 
 
 def write_exr_export(folder: Path, seen: Scene, **changes: Any) -> Path:
-    """Write Record3D's export of pictures and EXR files."""
+    """Write Record3D's export of colour images and EXR files."""
     import OpenEXR
 
     for part in ("rgb", "depth"):
@@ -129,7 +129,7 @@ def write_exr_export(folder: Path, seen: Scene, **changes: Any) -> Path:
 
 @dataclass
 class Recorder:
-    """Collects messages of a bag, then writes them: ROS 1, ROS 2 with SQLite, or ROS 2 with MCAP."""
+    """Collects messages, then writes a bag: ROS 1, ROS 2 with SQLite, or ROS 2 with MCAP."""
 
     ros1: bool = False
     messages: list[tuple[str, str, int, Any]] = field(default_factory=list)
@@ -143,7 +143,7 @@ class Recorder:
             self.store.register(get_types_from_msg(fields, "tf2_msgs/msg/TFMessage"))
 
     def make(self, kind: str, **fields: Any) -> Any:
-        """Make a message; what is not given is zero or empty."""
+        """Create a message; missing fields are zero or empty."""
         return self.store.types[kind](**fields)
 
     def header(self, time_s: float, frame: str) -> Any:
@@ -156,7 +156,7 @@ class Recorder:
 
     def image(self, topic: str, time_s: float, array: np.ndarray, encoding: str, frame: str, late_s: float = 0.0,
               pad: int = 0, big: bool = False) -> None:  # fmt: skip
-        """Add an image, recorded `late_s` after its header's time, its rows padded, its numbers of either order."""
+        """Add an image, recorded `late_s` after its header's time, with padded rows or big-endian numbers."""
         height, width = array.shape[:2]
         rows = np.ascontiguousarray(array.byteswap() if big else array).reshape(height, -1).view(np.uint8)
         data = np.pad(rows, ((0, 0), (0, pad)), constant_values=7)
@@ -187,7 +187,7 @@ class Recorder:
         self.add(topic, time_s, message)
 
     def moved(self, T: np.ndarray) -> Any:
-        """Make a geometry_msgs/Transform."""
+        """Create a geometry_msgs/Transform."""
         x, y, z, w = xyzw(T)
         return self.make(
             "geometry_msgs/msg/Transform",
@@ -204,7 +204,7 @@ class Recorder:
         return stamped
 
     def pose(self, time_s: float, T: np.ndarray, norm: float = 1.0) -> Any:
-        """Make a PoseStamped."""
+        """Create a PoseStamped."""
         x, y, z, w = xyzw(T) * norm
         pose = self.make(
             "geometry_msgs/msg/Pose",
@@ -230,12 +230,12 @@ class Recorder:
 
 
 def compressed_depth(depth_mm: np.ndarray) -> bytes:
-    """Make compressed_depth_image_transport's bytes of 16UC1: 12 bytes that mean nothing, then a PNG."""
+    """Encode 16UC1 as compressed_depth_image_transport does: 12 unused bytes, then a PNG."""
     return struct.pack("<iff", 0, 100.0, 10.0) + encoded(depth_mm, "PNG")
 
 
 def quantised_depth(depth_m: np.ndarray, a: float = 10_000.0, b: float = -90.0) -> bytes:
-    """Make its bytes of 32FC1: the PNG holds a / depth + b."""
+    """Encode 32FC1 as compressed_depth_image_transport does: the PNG holds a / depth + b."""
     with np.errstate(divide="ignore"):
         levels = np.where(depth_m > 0, a / depth_m + b, 0.0)
     return struct.pack("<iff", 0, a, b) + encoded(np.rint(levels).astype(np.uint16), "PNG")
@@ -246,7 +246,7 @@ CAMERA_TOPICS = ("/camera/color/image_raw", "/camera/aligned_depth_to_color/imag
 
 
 def aligned(recorder: Recorder, seen: Scene) -> Recorder:
-    """Add what a RealSense gives with aligned depth: colour 4 ms before depth, recorded later than the headers say."""
+    """Add the topics of a RealSense with aligned depth: colour 4 ms before depth, recorded after the header times."""
     size = seen.colors.shape[2], seen.colors.shape[1]
     for color, depth, t in zip(seen.colors, seen.depths_mm, seen.times_s, strict=True):
         recorder.image(CAMERA_TOPICS[0], t, color, "rgb8", "camera_color_optical_frame", late_s=0.05)

@@ -50,7 +50,7 @@ def room_map(degree: int = 0) -> GaussianField:
     if degree:
         k = torch.zeros(len(field), 45)
         k[:, : 3 * count(degree)] = 0.1 * torch.randn(len(field), 3 * count(degree), generator=random)
-        field.extras["harmonics"] = Rows(k)
+        field.attributes["harmonics"] = Rows(k)
     return field
 
 

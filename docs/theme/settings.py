@@ -1,7 +1,7 @@
-"""Write docs/settings.md, every setting with what its source says of it: PYTHONPATH=src python docs/theme/settings.py.
+"""Write docs/settings.md, a table of all settings: PYTHONPATH=src python docs/theme/settings.py.
 
-Sentences are read from the sources of `config`, types and values are those that the program has. A test holds the page
-to what this makes.
+The descriptions are the docstrings in `config`; types and values are those of the program. A test compares the page
+with the output of this script.
 """
 
 import ast
@@ -15,32 +15,31 @@ ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "settings.md"
 HEAD = """# Settings
 
-Every setting that `--set SECTION.NAME=VALUE` changes, on the command line of `demo`, `run`, `inspect` and `bench`.
-A run's `config.json` says which it used. *Default* holds where a preset says nothing; *`{preset}`* is the default
-preset's value where it differs, which a run without `--preset` gets. … goes on from the row above. Units are in the
-names: `_m` metres, `_deg` degrees, `_px` pixels, `_s` seconds. `lr_` is a learning rate, `weight_` a weight of the
-loss.
+`--set SECTION.NAME=VALUE` changes a setting of `demo`, `run`, `inspect` and `bench`. The `config.json` of a run holds
+all settings that it used. *Default* is the value if the preset does not set one. *`{preset}`* is the value of the
+default preset, shown if it differs. Units are in the names: `_m` metres, `_deg` degrees, `_px` pixels, `_s` seconds.
+`lr_` is a learning rate, `weight_` the weight of a loss. "Ours" marks what is in neither paper.
 
-Made from [`config/`](../src/sigmasplat/config/) by `docs/theme/settings.py`. Back to the [README](../README.md).
+Generated from [`config/`](../src/sigmasplat/config/) by `docs/theme/settings.py`. Back to the [README](../README.md).
 """
 
 
 def sentences(body: list[ast.stmt]) -> dict[str, str]:
-    """Return the text that stands below a field, as the literal after it, by the field's name."""
+    """Return the docstring below each field, by the name of the field."""
     said = {_field(node): _text(below) for node, below in itertools.pairwise(body)}
     return {name: " ".join(text.split()) for name, text in said.items() if name and text}
 
 
 def classes() -> dict[str, ast.ClassDef]:
-    """Return the classes that the modules of `config` define, by name."""
+    """Return the classes of the modules in `config`, by name."""
     trees = [ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "src/sigmasplat/config").glob("*.py")]
     return {node.name: node for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)}
 
 
 def table(defaults: Any, chosen: Any, preset_name: str, prefix: str = "") -> str:
-    """Write one section: a row per field of a dataclass that is no section itself."""
+    """Return the table of one section: a row per field that is not a section itself."""
     said, kinds = sentences(classes()[type(defaults).__name__].body), get_type_hints(type(defaults))
-    rows = [f"| setting | takes | default | `{preset_name}` | does |", "|---|---|---|---|---|"]
+    rows = [f"| setting | takes | default | `{preset_name}` | meaning |", "|---|---|---|---|---|"]
     for name in (field.name for field in dataclasses.fields(defaults)):
         value, other = getattr(defaults, name), getattr(chosen, name)
         if not dataclasses.is_dataclass(value):
@@ -51,7 +50,7 @@ def table(defaults: Any, chosen: Any, preset_name: str, prefix: str = "") -> str
 
 
 def page() -> str:
-    """Return the whole document."""
+    """Return the whole page."""
     from sigmasplat.config import Config
     from sigmasplat.presets import default_preset, preset
 
@@ -71,7 +70,7 @@ def _field(node: ast.stmt) -> str:
 
 
 def _text(node: ast.stmt) -> str:
-    """Return a statement that is a text and nothing else; "" for any other."""
+    """Return the text of a string statement, "" for any other statement."""
     match node:
         case ast.Expr(value=ast.Constant(value=str(text))):
             return text

@@ -1,4 +1,4 @@
-"""RGB-D SLAM on 3D Gaussians that knows how sure it is.
+"""RGB-D SLAM on 3D Gaussian splats, with uncertainty.
 
 from sigmasplat import Slam, open_source
 
@@ -11,7 +11,7 @@ slam.finish()
 from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
-from sigmasplat import env as env  # before torch: it sets how OpenMP's threads wait
+from sigmasplat import env as env  # must precede torch: it sets how idle OpenMP threads wait
 
 if TYPE_CHECKING:
     from sigmasplat.config import Config as Config
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from sigmasplat.slam.slam import Slam as Slam
     from sigmasplat.sources import open_source as open_source
 
-# Looked up at first use, so that `import sigmasplat` and `sigmasplat --help` do not load torch. The function `render`
-# is not among them: `sigmasplat.render` is the folder it lives in (`from sigmasplat.render import render`).
+# Imported at first use, so that `import sigmasplat` and `sigmasplat --help` do not load torch. The function `render` is
+# not here, because `sigmasplat.render` is its package: use `from sigmasplat.render import render`.
 _HOMES = {
     "Camera": "sigmasplat.model.camera",
     "Config": "sigmasplat.config",
@@ -55,5 +55,5 @@ def __dir__() -> list[str]:
 def _version() -> str:
     try:
         return metadata.version("sigmasplat")
-    except metadata.PackageNotFoundError:  # a bare checkout on PYTHONPATH
+    except metadata.PackageNotFoundError:  # a checkout on PYTHONPATH, not installed
         return "unknown"

@@ -1,4 +1,4 @@
-"""Run the command line: python -m sigmasplat, the same as sigmasplat."""
+"""Run the command line: python -m sigmasplat is the same program as sigmasplat."""
 
 from sigmasplat.cli import main
 

@@ -1,4 +1,4 @@
-"""Offer the command line: a table of commands, and how each ends."""
+"""Run the command line: a table of commands, and their exit codes."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -21,11 +21,11 @@ from sigmasplat.config.text import nearest
 from sigmasplat.errors import ConfigError, SigmaSplatError
 
 REFUSED, INTERRUPTED = 2, 130
-DESCRIPTION = """RGB-D SLAM on 3D Gaussians that knows how sure it is.
+DESCRIPTION = """RGB-D SLAM on 3D Gaussian splats, with uncertainty.
 
 Start with: sigmasplat demo, then: sigmasplat run PATH.
 
-sigmasplat --version    show which release this is, and exit"""
+sigmasplat --version    print the version and exit"""
 
 COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo,
@@ -44,13 +44,13 @@ COMMANDS: dict[str, Callable[..., int]] = {
 
 
 def _refuse_unknown(command: str) -> None:
-    """Raise ConfigError on what is neither a command nor an option."""
+    """Raise ConfigError unless the word is a command or an option."""
     if command not in COMMANDS and not command.startswith("-"):
-        raise ConfigError(f"no command '{command}'{nearest(command, COMMANDS)}; there are {', '.join(COMMANDS)}")
+        raise ConfigError(f"no command '{command}'{nearest(command, COMMANDS)}; the commands are {', '.join(COMMANDS)}")
 
 
-def _obey(arguments: Sequence[str]) -> int:
-    """Run the command that the arguments name; return the exit code."""
+def _run_command(arguments: Sequence[str]) -> int:
+    """Run the command in the arguments and return its exit code."""
     code: int = tyro.extras.subcommand_cli_from_dict(
         COMMANDS, prog="sigmasplat", description=DESCRIPTION, args=arguments, config=(tyro.conf.FlagCreatePairsOff,)
     )
@@ -58,7 +58,7 @@ def _obey(arguments: Sequence[str]) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run a command and exit: 0 done, 1 unhealthy (doctor), 2 refused (one line says why), 130 interrupted."""
+    """Run a command and exit: 0 done, 1 problems found (doctor, inspect), 2 refused with one line, 130 interrupted."""
     given = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if given == ["--version"]:
         print(f"sigmasplat {sigmasplat.__version__}")
@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         env.switches()
         _refuse_unknown(given[0])
-        code = _obey(given)
+        code = _run_command(given)
     except SigmaSplatError as problem:
         print(f"sigmasplat: {problem}", file=sys.stderr)
         code = REFUSED

@@ -1,10 +1,10 @@
-"""Read the environment switches, once; imported before anything that loads OpenMP.
+"""Read the environment variables, once. This module must be imported before anything that loads OpenMP.
 
 | variable | values | meaning |
 |---|---|---|
-| SIGMASPLAT_THREADS | whole number ≥ 0 | threads of the kernels and of torch; 0 or unset = all cores |
-| SIGMASPLAT_ISA | auto, avx512, avx2, baseline | instruction set of the CPU kernels; auto = the widest there is |
-| SIGMASPLAT_BACKEND | auto, cpu, cuda, reference | renderer where the settings say auto |
+| SIGMASPLAT_THREADS | whole number ≥ 0 | number of threads of the kernels and of torch; 0 or unset = all cores |
+| SIGMASPLAT_ISA | auto, avx512, avx2, baseline | instruction set of the CPU kernels; auto = the widest supported one |
+| SIGMASPLAT_BACKEND | auto, cpu, cuda, reference | renderer if the setting `backend` is auto |
 """
 
 import os
@@ -19,13 +19,13 @@ from sigmasplat.errors import ConfigError
 Isa = Literal["auto", "avx512", "avx2", "baseline"]
 Backend = Literal["auto", "cpu", "cuda", "reference"]
 
-# libgomp reads this when it is loaded: idle threads then sleep instead of spinning, on a busy machine 5× faster.
+# libgomp reads this when it is loaded. Idle threads then sleep instead of spinning: 5× faster on a busy machine.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 @dataclass(frozen=True)
 class Switches:
-    """What the environment asks for."""
+    """The values of the environment variables."""
 
     threads: int = 0
     """0 = all cores."""
@@ -35,12 +35,12 @@ class Switches:
 
 @cache
 def switches() -> Switches:
-    """Return the switches of this process, read at the first call. Raises ConfigError on a value that means nothing."""
+    """Return the switches of this process, read at the first call. Raises ConfigError on an invalid value."""
     return read(os.environ)
 
 
 def read(environment: Mapping[str, str]) -> Switches:
-    """Read the switches from a mapping such as `os.environ`; unset and empty mean the default. Raises ConfigError."""
+    """Read the switches from a mapping such as `os.environ`; unset or empty means the default. Raises ConfigError."""
     return Switches(
         threads=_whole_number(environment, "SIGMASPLAT_THREADS"),
         isa=cast(Isa, _choice(environment, "SIGMASPLAT_ISA", get_args(Isa))),
@@ -63,5 +63,5 @@ def _choice(environment: Mapping[str, str], name: str, allowed: tuple[str, ...])
 
 
 def install_extra(extra: str) -> str:
-    """Return the command that installs an optional dependency into the Python that runs."""
+    """Return the command that installs an optional dependency into the running Python."""
     return f"{sys.executable} -m pip install 'sigmasplat[{extra}]'"

@@ -1,25 +1,25 @@
-"""Name every error a user can cause: one family, one line each, exit code 2 at the command line."""
+"""Define the errors that a user can cause. On the command line each is one line and exit code 2."""
 
 
 class SigmaSplatError(Exception):
-    """Say what was wrong, what was found and what to do, in one line."""
+    """Base class; the message says in one line what is wrong, what was found and what to do."""
 
 
 class SourceError(SigmaSplatError):
-    """Refuse an input sequence: missing, unreadable, inconsistent or of unknown format."""
+    """An input sequence is missing, unreadable, inconsistent or of unknown format."""
 
 
 class ConfigError(SigmaSplatError):
-    """Refuse a setting: unknown name, value out of range, settings that contradict each other."""
+    """A setting has an unknown name, a value out of range, or contradicts another one."""
 
 
 class RunError(SigmaSplatError):
-    """Refuse a run folder: not writable, already there, or not one of ours."""
+    """A run folder is not writable, already exists, or was not made by SigmaSplat."""
 
 
 class BackendError(SigmaSplatError):
-    """Refuse a compute backend that this machine or this build does not have."""
+    """This machine or this build does not support the requested compute backend."""
 
 
 class DownloadError(SigmaSplatError):
-    """Refuse or give up a download: no such set, no connection, damaged, unsafe to unpack, no room."""
+    """A download failed: unknown data set, no connection, damaged or unsafe archive, or disk full."""

@@ -1,6 +1,7 @@
 """Give every backend test the same two operators, `.project` and `.blend`, with the reference's signatures."""
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial, wraps
 from pathlib import Path
@@ -54,7 +55,6 @@ def on_the_cpu(emulator: Emulator) -> Iterator[Emulator]:
     with emulator.standing_in(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(Raster, "empty", rubbish)
         emulator.order = 0
-        emulator.launches.clear()
         yield emulator
         emulator.order = 0
 
@@ -141,15 +141,42 @@ def _cuda(request: pytest.FixtureRequest) -> Backend:
 MAKERS = {"reference": _reference, "cpu": _cpu, "emulated": _emulated, "cuda": _cuda}
 
 
+@pytest.fixture(params=["cpu", "cuda"])
+def kernels(request: pytest.FixtureRequest) -> str:
+    """Name kernels that views and steps run on: the CPU's, and CUDA's emulated on the CPU."""
+    if request.param == "cuda":
+        request.getfixturevalue("on_the_cpu")
+    else:
+        pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+    return str(request.param)
+
+
+@pytest.fixture(params=["avx512", "avx2", "baseline", "cuda"])
+def every_kernels(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Do the same, with the CPU's kernels of each instruction set in turn."""
+    if request.param == "cuda":
+        request.getfixturevalue("on_the_cpu")
+        yield "cuda"
+        return
+    with instruction_set(request.param):
+        yield "cpu"
+
+
 @pytest.fixture(params=["avx512", "avx2", "baseline"])
 def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Run the kernels of one instruction set; skipped where this processor has it not."""
+    """Run the kernels of one instruction set; skipped where the processor does not support it."""
+    with instruction_set(request.param):
+        yield request.param
+
+
+@contextmanager
+def instruction_set(name: str) -> Iterator[None]:
     core = pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
-    if request.param not in core.supported_isas():
-        pytest.skip(f"this processor does not run {request.param}")
+    if name not in core.supported_isas():
+        pytest.skip(f"this processor does not run {name}")
     before = core.isa_name()
-    core.set_isa(request.param)
-    yield request.param
+    core.set_isa(name)
+    yield
     core.set_isa(before)
 
 

@@ -36,13 +36,12 @@ class Emulator:
     """A `Launcher` for tensors on the CPU; `order` is that of the threads between two barriers (emulation.h)."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.order, self.launches = folder, 0, list[str]()
+        self.folder, self.order = folder, 0
         self._libraries: dict[int, ctypes.CDLL] = {}
 
     def __call__(self, features: int, kernel: str, blocks: int, *arguments: Argument) -> None:
         memory = laid_out(arguments)
-        self.launches.append(kernel)
-        run = self._library(features).emulate
+        run = self.library(features).emulate
         problem = run(kernel.encode(), blocks, THREADS, ctypes.c_void_p(memory.buffer_info()[0]), self.order)
         assert problem is None, f"{kernel}: {problem.decode()}"
 
@@ -54,7 +53,7 @@ class Emulator:
             patch.setattr(cuda_launch, "this_device", lambda: torch.device("cpu"))
             yield
 
-    def _library(self, features: int) -> ctypes.CDLL:
+    def library(self, features: int) -> ctypes.CDLL:
         if features not in self._libraries:
             path = self.folder / f"emulated-{features}.so"
             library = ctypes.CDLL(str(_built(path, features)))

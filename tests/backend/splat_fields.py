@@ -10,10 +10,13 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
+from sigmasplat.render.cpu.view import CpuView
+from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.reference.view import ReferenceView
 from splat_scenes import Scene, make
 
 OPTIONS = RenderConfig()
+CPU = torch.device("cpu")
 BIG = Camera(101, 75, 90.0, 92.0, 52.3, 34.8)
 """Several tiles each way, a multiple of none; with `CROWD` splats several units of work, the last one ragged."""
 CROWD = 2003
@@ -69,9 +72,16 @@ def there_and_back(view: Any, params: Tensor, T_camera_world: Any) -> tuple[Tens
     return maps_of(view), rows, torch.as_tensor(twist.copy())
 
 
+def view_on(kernels: str, camera: Camera, variance: bool = True) -> CpuView | CudaView:
+    """Make a view on kernels under test: "cuda" (emulated on the CPU), else the CPU's."""
+    if kernels == "cuda":
+        return CudaView(camera, OPTIONS, variance, CPU)
+    return CpuView(camera, OPTIONS, variance)
+
+
 def exact_view(camera: Camera, variance: bool) -> ReferenceView:
     """Make a reference view that computes in float64 when given float64 rows."""
     view = ReferenceView(camera, OPTIONS, variance)
-    for name in ("sums", "alpha", "g_sums", "g_alpha"):
+    for name in ("sums", "alpha", "g_sums", "g_alpha", "moment", "g_moment", "g_median_depth"):
         setattr(view, name, getattr(view, name).double())
     return view

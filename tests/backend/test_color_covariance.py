@@ -38,14 +38,14 @@ def field_of(s: Scene, seed: int = 0) -> GaussianField:
     """Write a scene as a field, float32, with correlations of every size."""
     field = GaussianField(params_of(s))
     drawn = np.random.default_rng(seed).normal(size=(len(field), 3))
-    field.carry("correlations").params = torch.as_tensor(drawn).float()
+    field.get_or_create("correlations").params = torch.as_tensor(drawn).float()
     return field
 
 
 def double(field: GaussianField) -> GaussianField:
     """Return a field in float64."""
-    extras = {name: Rows(rows.params.double()) for name, rows in field.extras.items()}
-    return GaussianField(field.params.double(), steps=field.steps, extras=extras)
+    attributes = {name: Rows(rows.params.double()) for name, rows in field.attributes.items()}
+    return GaussianField(field.params.double(), steps=field.steps, attributes=attributes)
 
 
 def matrices(six: Tensor) -> Any:
@@ -90,7 +90,7 @@ def test_law_of_total_covariance(backend: Any, kind: str) -> None:
     every_weight = torch.eye(len(exact), dtype=torch.float64)
     w = reference.blend(*p, exact.opacities, every_weight, None, s.camera, OPTIONS).sums.numpy()
     c = exact.colors.numpy()
-    own = matrices(covariances_of(exact.variances, exact.extras["correlations"].params))
+    own = matrices(covariances_of(exact.variances, exact.attributes["correlations"].params))
     mean = w @ c
     want = np.einsum("hwn,nij->hwij", w, own + c[:, :, None] * c[:, None]) - mean[..., None] * mean[..., None, :]
     got = backend.render(field, s.camera, T, options=OPTIONS)
@@ -114,7 +114,7 @@ def test_moving_field_and_camera_together_changes_nothing(backend: Any) -> None:
     s = scene("random", 40)
     field, move = field_of(s), torch.as_tensor(se3.exp(np.array([0.3, -0.2, 0.5, 0.4, -0.6, 0.2])))
     moved = field.moved(move)
-    moved.extras = field.extras
+    moved.attributes = field.attributes
     T = s.T_camera_world @ torch.as_tensor(se3.inverse(move.numpy()))
     a, b = (backend.render(f, s.camera, pose) for f, pose in ((field, s.T_camera_world), (moved, T)))
     assert a.covariance is not None and b.covariance is not None
@@ -135,7 +135,7 @@ def test_gradient_through_the_renderer_equals_finite_differences(what: str) -> N
     s = scene("random", 12, SMALL)
     field = double(field_of(s))
     field.params[:, COLUMNS["log_variances"]] = torch.as_tensor(np.random.default_rng(2).uniform(-4, -2, (12, 3)))
-    leaf = field.params if what == "log_variances" else field.extras["correlations"].params
+    leaf = field.params if what == "log_variances" else field.attributes["correlations"].params
     columns = COLUMNS[what] if what in COLUMNS else slice(0, 3)
     leaf.requires_grad_()
     nll_seen(field, s, "reference").backward()
@@ -157,7 +157,7 @@ def test_gradients_of_both_backends_agree() -> None:
     s = scene("random", 60)
     gradients = []
     for name, field in (("cpu", field_of(s)), ("reference", double(field_of(s)))):
-        leaves = (field.params.requires_grad_(), field.extras["correlations"].params.requires_grad_())
+        leaves = (field.params.requires_grad_(), field.attributes["correlations"].params.requires_grad_())
         gradients.append(torch.autograd.grad(nll_seen(field, s, name), leaves))
     for got, want in zip(*gradients, strict=True):
         assert_same_vector(got, want, 2e-3)
@@ -166,8 +166,8 @@ def test_gradients_of_both_backends_agree() -> None:
 def wide_views(s: Scene) -> tuple[CovarianceView, CovarianceView]:
     """Make the view of a scene with correlations on the kernels, and its definition in float64."""
     field = field_of(s)
-    exact = CovarianceView(exact_view(s.camera, True), double(field).extras["correlations"])
-    return CpuCovarianceView(CpuView(s.camera, OPTIONS), field.extras["correlations"]), exact
+    exact = CovarianceView(exact_view(s.camera, True), double(field).attributes["correlations"])
+    return CpuCovarianceView(CpuView(s.camera, OPTIONS), field.attributes["correlations"]), exact
 
 
 @pytest.mark.parametrize("kind", ["random", "needles", "off_screen", "huge"])
@@ -232,10 +232,10 @@ def test_mapping_moves_correlations_only_where_it_is_asked_to(name: str) -> None
         seen = Keyframe(0, target, se3.inverse(s.T_camera_world.numpy()))
         config = MappingConfig(color_covariance=kind, weight_nll_color=1e-2, lr_pose_translation=1e-3)
         fit_field(field, view, [[seen]] * 3, config)
-        assert ("correlations" in field.extras) == (kind == "full")
+        assert ("correlations" in field.attributes) == (kind == "full")
         assert not torch.equal(field.params, before) and seen.T_world_camera[0, 3] != -s.T_camera_world[0, 3]
         if kind == "full":
-            rows, visible = field.extras["correlations"], view_sees(s, field)
+            rows, visible = field.attributes["correlations"], view_sees(s, field)
             assert bool(rows.params[visible].any()) and not rows.params[~visible].any()
             assert float(rows.params.abs().max()) < 3.1 * config.lr_log_variances
 
@@ -246,11 +246,11 @@ def test_view_dependent_colour_is_fitted_under_it_too() -> None:
     config = MappingConfig(color_covariance="full", weight_nll_color=1e-2)
     for correlated in (0.0, 1.0):
         field, view = GaussianField(params_of(s)), make_view("cpu", s.camera, OPTIONS)
-        field.carry("correlations").params += correlated
+        field.get_or_create("correlations").params += correlated
         target = target_of(s.camera, tuple(view.alpha.shape))
         fit_field(field, view, [[Keyframe(0, target, se3.inverse(s.T_camera_world.numpy()))]] * 3, config, degree=1)
-        assert bool((field.extras["correlations"].params == correlated).all())
-        assert bool(field.extras["harmonics"].params.any())
+        assert bool((field.attributes["correlations"].params == correlated).all())
+        assert bool(field.attributes["harmonics"].params.any())
         fitted.append(field.params[:, COLUMNS["log_variances"]])
     assert not torch.equal(*fitted)
 
@@ -265,7 +265,7 @@ def view_sees(s: Scene, field: GaussianField) -> Tensor:
 def test_frozen_colours_stay_and_the_others_move() -> None:
     s = scene("random", 60, WIDE)
     field = field_of(s)
-    view = CpuCovarianceView(CpuView(s.camera, OPTIONS), field.extras["correlations"])
+    view = CpuCovarianceView(CpuView(s.camera, OPTIONS), field.attributes["correlations"])
     step, before, field.steps = FullCovarianceStep(view, CompiledImages(view)), field.params.clone(), 1
     target = target_of(s.camera, tuple(view.alpha.shape))
     step.forward(field, s.T_camera_world.numpy(), target, WEIGHTS)
@@ -279,7 +279,7 @@ def test_frozen_colours_stay_and_the_others_move() -> None:
 
 def test_it_finds_how_the_channels_of_noise_go_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """A black wall, all of whose V is its own: red and green of the noise go together, blue against both."""
-    monkeypatch.setitem(adam.EXTRA_RATES, "correlations", ("log_variances", 1.0))
+    monkeypatch.setitem(adam.ATTRIBUTE_RATES, "correlations", ("log_variances", 1.0))
     camera, rng = Camera(40, 30, 40.0, 40.0, 19.5, 14.5), np.random.default_rng(4)
     R = np.array([[1.0, 0.8, -0.5], [0.8, 1.0, -0.6], [-0.5, -0.6, 1.0]])
     noise = rng.normal(size=(12, 30, 40, 3)) @ np.linalg.cholesky(0.05**2 * R).T
@@ -292,6 +292,6 @@ def test_it_finds_how_the_channels_of_noise_go_together(monkeypatch: pytest.Monk
     off = dict.fromkeys(("means", "quats", "log_scales", "opacity_logits", "colors"), 0.0)
     config = replace(MappingConfig(color_covariance="full"), **{f"lr_{k}": v for k, v in off.items()})
     fit_field(wall, view, [[keyframe] for keyframe in seen] * 30, replace(config, lr_log_variances=2e-2))
-    r, want = correlations_of(wall.extras["correlations"].params)[0], torch.tensor([0.8, -0.5, -0.6])
+    r, want = correlations_of(wall.attributes["correlations"].params)[0], torch.tensor([0.8, -0.5, -0.6])
     assert float((r - want).abs().max()) < 0.04
     assert wall.variances[0].sqrt().tolist() == pytest.approx([0.05] * 3, rel=0.2)

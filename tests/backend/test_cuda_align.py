@@ -23,7 +23,7 @@ from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources import SyntheticRoom
-from test_cuda_step import Watch
+from splat_fits import Watch
 
 _core = pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -40,7 +40,6 @@ def on_the_cpu(emulator: Emulator, monkeypatch: pytest.MonkeyPatch) -> Iterator[
     monkeypatch.setattr(torch, "empty", rubbish)
     with emulator.standing_in():
         emulator.order = 0
-        emulator.launches.clear()
         yield emulator
         emulator.order = 0
 
@@ -169,12 +168,11 @@ def test_two_images_are_aligned_as_on_the_cpu(size: tuple[int, int], weighed: bo
 
 @pytest.mark.parametrize("stops", [(0.0, 0.0), (1e-4, 0.0), (0.0, 3e-2)], ids=["never", "update", "plateau"])
 @pytest.mark.parametrize("iterations", [0, 1, 5])
-def test_steps_end_as_on_the_cpu(iterations: int, stops: tuple[float, float], on_the_cpu: Emulator) -> None:
+def test_steps_end_as_on_the_cpu(iterations: int, stops: tuple[float, float]) -> None:
     reference, live = seen(10), seen(12)
     theirs = align(reference, live, np.eye(4), iterations, 0.3, *stops)
     ours = align(there(reference), there(live), np.eye(4), iterations, 0.3, *stops)
     assert_same(ours, theirs)
-    assert on_the_cpu.launches.count("take_align_step") == iterations * len(live.cameras)
     assert stops != (0.0, 0.0) or ours.steps == iterations * len(live.cameras)
     assert ours.depth_m == pytest.approx(theirs.depth_m, rel=1e-6)
 
@@ -217,13 +215,13 @@ def test_the_host_waits_once_for_a_pose_and_once_for_its_covariance() -> None:
     reference, live = there(seen(10, 48, 36, True)), there(seen(12, 48, 36))
     with Watch() as watch:
         found = align(reference, live, np.eye(4), 2)
-        assert watch.reads == [("align.py", "cpu"), ("align.py", "numpy")]
+        assert watch.reads == 2, "one copy, and that as an array"
         found.covariance  # noqa: B018
-    assert watch.reads == [("align.py", "cpu"), ("align.py", "numpy")] * 2
+    assert watch.reads == 4
 
 
 def test_halving_makes_no_host_wait() -> None:
     gray, depth, weight = torch.rand(3, 60, 80)
     with Watch() as watch:
         Pyramid.of(gray, depth, Camera(80, 60, 70.0, 70.0, 39.5, 29.5), weight, backend="cuda")
-    assert watch.reads == []
+    assert watch.reads == 0

@@ -29,9 +29,9 @@ from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda import launch as cuda_launch, stages as cuda_stages
 from sigmasplat.render.cuda.view import CudaView
 from splat_fields import OPTIONS, crowd, exact_view, params_of, there_and_back
+from splat_fits import RATES, WEIGHTS, target_of
 from splat_scenes import KINDS, WIDE, assert_same_vector, scene
 from splat_wall import CAMERA, TRUTH, seen_from, wall
-from test_compiled_loss import RATES, WEIGHTS, target_of
 from test_cuda_options import FULL, correlated, fitted, wide_views
 
 REASON = cuda_launch.missing()
@@ -76,7 +76,7 @@ def test_render_goes_where_the_tensors_are() -> None:
 def test_a_step_is_taken() -> None:
     s = crowd()
     field, view = GaussianField(params_of(s).cuda()), CudaView(s.camera, OPTIONS)
-    target = target_of(s.camera, (s.camera.height, s.camera.width)).on(field.params.device)
+    target = target_of(s.camera, (s.camera.height, s.camera.width)).to(field.params.device)
     step, before, losses = CudaStep(view), field.params.clone(), []
     for field.steps in range(1, 21):
         step.forward(field, s.T_camera_world.numpy(), target, WEIGHTS)
@@ -89,7 +89,7 @@ def test_a_step_is_taken() -> None:
 def test_ten_planes_agree(kind: str) -> None:
     s = scene(kind, 60)
     (field, double), T = correlated(s), s.T_camera_world.numpy()
-    field = field.on(cuda_launch.this_device())
+    field = field.copy_to(cuda_launch.this_device())
     got, want = wide_views(s, field, double, cuda_launch.this_device())
     _, rows, twist = there_and_back(got, field.params, T)
     _, want_rows, want_twist = there_and_back(want, double.params, T)
@@ -115,8 +115,8 @@ def test_fits_are_those_of_the_cpu(images: int, degree: int, full: bool) -> None
 @pytest.mark.parametrize(("images", "degree", "full"), OF_FITS)
 def test_torch_waits_for_no_part_of_an_iteration(images: int, degree: int, full: bool) -> None:
     s, device = crowd(), cuda_launch.this_device()
-    field, view = GaussianField(params_of(s)).on(device), CudaView(s.camera, OPTIONS)
-    target = target_of(s.camera, (s.camera.height, s.camera.width)).on(device)
+    field, view = GaussianField(params_of(s)).copy_to(device), CudaView(s.camera, OPTIONS)
+    target = target_of(s.camera, (s.camera.height, s.camera.width)).to(device)
     weights = {**FULL, "nll_color_full": 1e-2 * full, "median_depth": 0.0 if full else 0.3}
     step, T = step_for(field, view, weights, degree), s.T_camera_world.numpy()
     for watched in (False, True):  # the first one compiles, makes room, and counts pairs
@@ -163,7 +163,7 @@ OFF = np.array([0.012, -0.015, 0.01, 0.012, -0.008, 0.015])
 def followed(config: TrackingConfig, iterations: int, room: int | None = None, way: Any = descend_on_device) -> Descent:
     """Descend from beside the place that a wall was seen from."""
     view = CudaView(CAMERA, OPTIONS)
-    params, target = wall().cuda(), seen_from(make_view("reference", CAMERA, OPTIONS), TRUTH).on(view.alpha.device)
+    params, target = wall().cuda(), seen_from(make_view("reference", CAMERA, OPTIONS), TRUTH).to(view.alpha.device)
     view.raster.capacity = room
     found: Descent = way(params, view, target, se3.exp(OFF) @ TRUTH, config, iterations)
     return found
@@ -197,7 +197,7 @@ def test_a_descent_stops_where_the_loop_stops() -> None:
 def test_the_tracking_loss_is_as_defined(average: Any) -> None:
     s, config, exposure = crowd(), dataclasses.replace(TRACKING, average=average), torch.tensor([0.12, -0.03])
     view = CudaView(s.camera, OPTIONS)
-    target = target_of(s.camera, (s.camera.height, s.camera.width)).on(view.alpha.device)
+    target = target_of(s.camera, (s.camera.height, s.camera.width)).to(view.alpha.device)
     view.forward(params_of(s).cuda(), s.T_camera_world.numpy())
     got = CudaTrackingLoss(view, target, config, torch.stack([exposure[0].exp(), exposure[1]]).cuda()).launch().sum(0)
     planes = view.g_sums.cpu()

@@ -25,8 +25,8 @@ from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import SyntheticRoom
 from splat_fields import OPTIONS, params_of
+from splat_fits import target_of
 from splat_scenes import assert_same_vector, scene
-from test_compiled_loss import target_of
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 

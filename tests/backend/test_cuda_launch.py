@@ -76,7 +76,7 @@ class Driver:
         if self.contexts[-1:] != [CONTEXT]:
             return (Result.CUDA_ERROR_INVALID_CONTEXT,)
         features, kernel = self.kernels[function]
-        run = self.emulator._library(features).emulate
+        run = self.emulator.library(features).emulate
         assert run(kernel.encode(), blocks, threads, ctypes.c_void_p(parameters), 0) is None
         return (self.answer,)
 

@@ -130,7 +130,7 @@ def test_every_stage_of_a_view_is_counted(measured: Device, emulator: Emulator) 
         np.testing.assert_allclose((plain.seconds - before) * 1000, [1, 3, 1, 2, 1])
         before = plain.seconds
         field = GaussianField(params_of(s), steps=1)
-        from test_compiled_loss import RATES
+        from splat_fits import RATES
 
         CudaStep(plain).splats(field, RATES, {}, 0)
         np.testing.assert_allclose((plain.seconds - before) * 1000, [0, 0, 0, 2, 3])

@@ -2,6 +2,7 @@
 differences."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -165,7 +166,7 @@ def test_alignment_pulls_both_sides_and_only_where_there_is_a_median() -> None:
     median.requires_grad_()
     valid = torch.ones(4, 4, dtype=torch.bool)
     valid[1] = False
-    value = losses.alignment(depth, median, valid)
+    value = losses.median_depth(depth, median, valid)
     value.backward()
     assert float(value.detach()) == pytest.approx(0.5 * 8 / 12), "a mean over valid pixels"
     assert depth.grad is not None and median.grad is not None
@@ -208,9 +209,7 @@ def keyframes_of(s: Scene, view: View, turns: tuple[float, ...]) -> list[Keyfram
 def test_a_batch_descends_the_mean_loss(backend: type) -> None:
     """Adam's first moment is 0.1 of the gradient: that of a batch is the mean of those of its images alone."""
     s = scene("random", 60, WIDE)
-    config = MappingConfig(
-        **{f"weight_{n}": w for n, w in WEIGHTS.items() if n != "nll_color_full"} | {"weight_isotropy_ratio": 0.0}
-    )
+    config = replace(CG, weight_isotropy_ratio=0.0)
     view = backend(s.camera, OPTIONS)
     keyframes, alone = keyframes_of(s, view, (0.0, 0.2, -0.3)), []
     for keyframe in keyframes:

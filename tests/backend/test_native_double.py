@@ -13,7 +13,7 @@ from splat_scenes import KINDS, Scene, scene, twist_gradient
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 from sigmasplat.native import _core
-from sigmasplat.render.kernel_params import view_numbers
+from sigmasplat.render.kernel_params import view_params
 
 Array = NDArray[np.float64]
 PARTS = {"mean": slice(0, 3), "quat": slice(3, 7), "scale": slice(7, 10), "rho": slice(10, 13), "phi": slice(13, 16)}
@@ -33,7 +33,7 @@ def native(s: Scene, T: Array, shape: Array, g: Array) -> tuple[Array, Array]:
     """Project rows of (mean, quat, scale) [N, 10]; return footprints (u, v, z, l1, l2, l3) and gradients [N, 16]."""
     footprint, gradient = np.empty((len(shape), 6)), np.empty((len(shape), 16))
     columns = [np.ascontiguousarray(shape[:, PARTS[name]]) for name in ("mean", "quat", "scale")]
-    _core.project_double(view_numbers(s.camera, T, s.options, np.float64), *columns, g, footprint, gradient)
+    _core.project_double(view_params(s.camera, T, s.options, np.float64), *columns, g, footprint, gradient)
     return footprint, gradient
 
 

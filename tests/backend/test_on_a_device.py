@@ -4,6 +4,7 @@ On a true device where there is one, else on what stands in for it (stand_in.py)
 """
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +34,9 @@ from sigmasplat.viewer.layers import render_layer
 from sigmasplat.viewer.live import LiveView
 from sigmasplat.viewer.snapshot import Snapshot
 from splat_fields import OPTIONS, Gradients, exact_view, params_of, there_and_back
+from splat_fits import target_of
 from splat_scenes import assert_same_vector, scene
 from stand_in import StandIn
-from test_compiled_loss import target_of
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -59,7 +60,7 @@ def test_render_and_its_gradient_lie_on_the_device(device: torch.device) -> None
     field, T = GaussianField(params_of(s)), s.T_camera_world.float()
     found = []
     for where, backend in ((device, "auto"), (torch.device("cpu"), "cpu")):
-        there = field.on(where)
+        there = field.copy_to(where)
         there.params.requires_grad_()
         pose = T.to(where, copy=True).requires_grad_()
         seen = render(there, s.camera, pose, s.ref_depth.float().to(where), backend=backend)
@@ -91,7 +92,7 @@ def test_a_render_takes_field_and_pose_from_either_side(
 def test_a_renderer_brings_a_field_once(stand_in: StandIn) -> None:
     s = scene("random", 60)
     one, other = GaussianField(params_of(s)), GaussianField(params_of(s))
-    other.carry("harmonics").params.fill_(0.01)
+    other.get_or_create("harmonics").params.fill_(0.01)
     show, T = FieldRenderer(OPTIONS, "cuda"), s.T_camera_world.numpy()
     seen = [show(field, s.camera, T) for field in (one, other) * 3]
     sent = [copy.numbers for copy in stand_in.copies if copy.to_device and copy.numbers > 16]
@@ -157,12 +158,15 @@ def waits_of(stand_in: StandIn, do: Any) -> list[tuple[str, str]]:
     return sorted((counts[1] - counts[0]).elements())
 
 
-def test_a_mapping_iteration_waits_once(stand_in: StandIn) -> None:
+@pytest.mark.parametrize(("images", "degree", "full"), [(1, 0, False), (3, 0, False), (1, 3, False), (1, 0, True)])
+def test_a_mapping_iteration_waits_once(stand_in: StandIn, images: int, degree: int, full: bool) -> None:
     s = scene("random", 60)
     view, field = CudaView(s.camera, OPTIONS), GaussianField(params_of(s).to("cuda"))
-    keyframe = Keyframe(0, target_of(s.camera, tuple(view.alpha.shape)), se3.inverse(s.T_camera_world.double().numpy()))
-    waits = waits_of(stand_in, lambda n: fit_field(field, view, [[keyframe]] * n, MAPPING))
-    assert [reason for _, reason in waits] == ["fetching"], "twist and loss, together"
+    target, pose = target_of(s.camera, tuple(view.alpha.shape)), se3.inverse(s.T_camera_world.double().numpy())
+    keyframes = [Keyframe(k, target, pose) for k in range(images)]
+    config = replace(MAPPING, color_covariance="full", weight_alignment=0.0, weight_moment=0.0) if full else MAPPING
+    waits = waits_of(stand_in, lambda n: fit_field(field, view, [keyframes] * n, config, degree=degree))
+    assert [reason for _, reason in waits] == ["fetching"], "twists and losses of all images, together"
 
 
 QUICK = {
@@ -217,7 +221,7 @@ def test_a_field_does_not_travel(stand_in: StandIn) -> None:
         slam.step(ROOM.frame(i))
         size = 2 * len(slam.mapper.field)
         large.append([copy.by for copy in stand_in.copies if copy.numbers > size and copy.by != "target.py"])
-    assert len(slam.keyframes) == 3 and len(slam.field) > 1500 and len(slam.store) == 0
+    assert len(slam.keyframe_indices) == 3 and len(slam.field) > 1500 and len(slam.store) == 0
     assert large[0] == ["field.py"] * 3, "what a seed is, and Adam's moments"
     assert not any(large[1:])
 

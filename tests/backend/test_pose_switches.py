@@ -42,7 +42,7 @@ def shiny(s: Scene, dtype: torch.dtype = torch.float64) -> GaussianField:
     """Make a scene's field with harmonics."""
     params = params_of(s)
     k = torch.as_tensor(np.random.default_rng(8).normal(0, 0.2, (len(params), 45))).float()
-    return GaussianField(params.to(dtype), steps=1, extras={"harmonics": Rows(k.to(dtype))})
+    return GaussianField(params.to(dtype), steps=1, attributes={"harmonics": Rows(k.to(dtype))})
 
 
 def loss_of(seen: Render) -> Tensor:
@@ -75,7 +75,7 @@ def composed(s: Scene, T_mean: Tensor, T_covariance: Tensor, T_depth: Tensor, T_
     )
     radii = reference.project(f.means, f.quats, f.scales, s.T_camera_world, s.camera, s.options).radii
     position = torch.as_tensor(se3.inverse(T_color.numpy())[:3, 3])
-    colors = view_colors(f.colors, f.extras["harmonics"].params, f.means, position)
+    colors = view_colors(f.colors, f.attributes["harmonics"].params, f.means, position)
     features = features_of(colors, z, f.variances)
     b = reference.blend(means2d, conics, z, radii, f.opacities, features, s.ref_depth, s.camera, s.options)
     median = torch.where(b.median_id >= 0, z[b.median_id.clamp(min=0).long()], 0.0)
@@ -138,7 +138,7 @@ def test_a_direction_that_is_off_leaves_the_fields_gradient_complete() -> None:
     s, found = scene("random", 12, SMALL), []
     for moves in (ALL, (True, True, True, False)):
         field = shiny(s)
-        leaves = [field.params.requires_grad_(), field.extras["harmonics"].params.requires_grad_()]
+        leaves = [field.params.requires_grad_(), field.attributes["harmonics"].params.requires_grad_()]
         T = s.T_camera_world.clone().requires_grad_()
         seen = render(field, s.camera, T, s.ref_depth, options_of(moves), "reference")
         found.append(torch.autograd.grad(loss_of(seen), leaves))
@@ -201,9 +201,9 @@ def turns_by_kernels(s: Scene, p: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
     """Do the same by the kernels' own arithmetic, compiled in double."""
     pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
     from sigmasplat.native import _core
-    from sigmasplat.render.kernel_params import view_numbers
+    from sigmasplat.render.kernel_params import view_params
 
-    numbers = view_numbers(s.camera, s.T_camera_world.numpy(), options_of(SINGLE[1]), np.float64)
+    numbers = view_params(s.camera, s.T_camera_world.numpy(), options_of(SINGLE[1]), np.float64)
     footprint, out = np.empty((len(p), 6)), np.empty((len(p), 16))
     on_conics = np.concatenate([np.zeros((len(p), 3)), g.numpy()], 1)
     shape = [np.ascontiguousarray(x.numpy()) for x in (s.means, s.quats, s.scales)]

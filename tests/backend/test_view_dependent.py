@@ -35,7 +35,7 @@ def shiny(s: Scene, dtype: torch.dtype = torch.float64) -> GaussianField:
     """Make a scene's field with harmonics, halfway through a fit."""
     params = params_of(s)
     k = torch.as_tensor(np.random.default_rng(8).normal(0, 0.2, (len(params), 45))).float()
-    return GaussianField(params.to(dtype), steps=1, extras={"harmonics": Rows(k.to(dtype))})
+    return GaussianField(params.to(dtype), steps=1, attributes={"harmonics": Rows(k.to(dtype))})
 
 
 def draw_gradients(view: View) -> None:
@@ -58,7 +58,7 @@ def gradients(field: GaussianField, view: View, T: np.ndarray, degree: int) -> t
     step.forward(field, T, target_of(view), {})
     draw_gradients(view)
     twist, _ = step.splats(field, DESCENT, {}, 0)
-    return field.moment1 * 10, field.extras["harmonics"].moment1 * 10, torch.as_tensor(twist)
+    return field.moment1 * 10, field.attributes["harmonics"].moment1 * 10, torch.as_tensor(twist)
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
@@ -73,8 +73,8 @@ def test_gradients_are_those_of_finite_differences(degree: int) -> None:
     def value(rows: Tensor, k: Tensor, twist: Tensor) -> float:
         field = shiny(s)
         field.params += rows
-        field.extras["harmonics"].params += k
-        field.extras["harmonics"].params[:, 3 * count(degree) :] = 0.0
+        field.attributes["harmonics"].params += k
+        field.attributes["harmonics"].params[:, 3 * count(degree) :] = 0.0
         seen = render(field, SMALL, torch.as_tensor(se3.exp(twist.numpy()) @ T), options=OPTIONS, backend="reference")
         second = seen.variance + seen.color**2
         return float((torch.cat([seen.color, seen.depth[..., None], second], -1) * weights).sum())
@@ -120,7 +120,7 @@ def shiny_wall(n: int = 120) -> GaussianField:
     field = GaussianField.from_values(*values, opacities=0.9)
     k = torch.zeros(n, 45)
     k[:, :9] = torch.as_tensor(rng.normal(0, 0.4, (n, 9)))
-    field.extras["harmonics"] = Rows(k)
+    field.attributes["harmonics"] = Rows(k)
     return field
 
 
@@ -153,7 +153,7 @@ def test_harmonics_learn_a_colour_that_depends_on_the_view() -> None:
         field.params[:, COLUMNS["colors"]] = 0.5
         fit = fit_field(field, view, [[keyframes[i % 6]] for i in range(120)], config, repeat(rates), degree=degree)
         losses.append(np.mean(fit.losses[-6:]))
-        assert ("harmonics" in field.extras) == (degree > 0)
+        assert ("harmonics" in field.attributes) == (degree > 0)
         assert torch.equal(field.params[:, :11], true.params[:, :11])
     assert losses[1] < 0.85 * losses[0] and losses[2] < 0.55 * losses[0]
 
@@ -172,9 +172,9 @@ def test_fits_agree_on_both_backends() -> None:
     # Shapes are left out: of balls, a rotation's gradient is rounding, and Adam's first steps follow its sign.
     colors = COLUMNS["colors"]
     for x, y in ((a.colors - true.params[:, colors], b.colors - true.params[:, colors]),
-                 (a.extras["harmonics"].params, b.extras["harmonics"].params)):  # fmt: skip
+                 (a.attributes["harmonics"].params, b.attributes["harmonics"].params)):  # fmt: skip
         assert 0 < float((x - y).norm()) < 0.1 * float(y.norm())
-    assert a.extras["harmonics"].steps == 10 and losses_a[-1] < losses_a[4]
+    assert a.attributes["harmonics"].steps == 10 and losses_a[-1] < losses_a[4]
 
 
 def test_frozen_colours_keep_their_harmonics_too() -> None:
@@ -185,7 +185,7 @@ def test_frozen_colours_keep_their_harmonics_too() -> None:
     fit_field(field, view, [[seen_from(true, np.eye(4), view)]], MappingConfig(), frozen_colors=60, degree=3)
     for now, then in (
         (field.colors, before.colors),
-        (field.extras["harmonics"].params, before.extras["harmonics"].params),
+        (field.attributes["harmonics"].params, before.attributes["harmonics"].params),
     ):
         assert torch.equal(now[:60], then[:60]) and not torch.equal(now[60:], then[60:])
 

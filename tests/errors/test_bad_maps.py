@@ -22,7 +22,7 @@ WRITERS = {".ply": ply, ".compressed.ply": compressed_ply, ".splat": splat, ".sp
 
 def map_bytes(folder: Path, ending: str, n: int = 5) -> bytes:
     field = GaussianField(torch.randn(n, 17, generator=torch.Generator().manual_seed(0)))
-    field.carry("harmonics").params[:] = 0.25
+    field.get_or_create("harmonics").params[:] = 0.25
     WRITERS[ending].write_field(folder / f"good{ending}", field)  # type: ignore[attr-defined]
     return (folder / f"good{ending}").read_bytes()
 

@@ -1,4 +1,4 @@
-"""Run folders that cannot be used: one line that says what is wrong and how to go on, and nothing lost."""
+"""Run folders that cannot be used: one line that says what is wrong and what to do, and nothing is deleted."""
 
 from pathlib import Path
 
@@ -23,14 +23,14 @@ def refused(path: Path, overwrite: bool = False) -> str:
     return str(caught.value)
 
 
-def test_an_existing_run_is_kept_by_default(tmp_path: Path) -> None:
+def test_an_existing_run_is_kept_without_overwrite(tmp_path: Path) -> None:
     make(tmp_path / "run").log({"index": 0})
     assert "--overwrite" in refused(tmp_path / "run")
     assert len(RunFolder.open(tmp_path / "run").read_log()) == 1
 
 
 @pytest.mark.parametrize("names", [["photo.jpg"], ["config.json"], ["run.json"], ["config.json", "run.json"]])
-def test_a_folder_that_is_not_a_run_is_never_overwritten(tmp_path: Path, names: list[str]) -> None:
+def test_a_folder_of_another_program_is_never_overwritten(tmp_path: Path, names: list[str]) -> None:
     for name in names:
         (tmp_path / name).write_text('{"model": "theirs"}')
     assert "not a run folder" in refused(tmp_path, overwrite=True)
@@ -38,8 +38,8 @@ def test_a_folder_that_is_not_a_run_is_never_overwritten(tmp_path: Path, names: 
     assert all((tmp_path / name).read_text() == '{"model": "theirs"}' for name in names)
 
 
-def test_a_run_without_settings_is_ours_to_overwrite(tmp_path: Path) -> None:
-    """As one leaves it that was killed before it wrote them."""
+def test_a_run_without_settings_can_be_overwritten(tmp_path: Path) -> None:
+    """A run that was killed before it wrote its settings leaves such a folder."""
     run = make(tmp_path / "run")
     (run.path / "config.json").unlink()
     assert "--overwrite" in refused(run.path)
@@ -73,7 +73,7 @@ def test_opening_says_what_is_missing(tmp_path: Path) -> None:
         RunFolder.open(run.path)
 
 
-def test_reading_what_was_never_written(tmp_path: Path) -> None:
+def test_reading_a_missing_file_is_refused(tmp_path: Path) -> None:
     run = make(tmp_path / "run")
     for name, read in {
         "trajectory.txt": run.read_trajectory,
@@ -109,7 +109,7 @@ def test_damaged_files_are_named(tmp_path: Path) -> None:
         run.config()
 
 
-def test_a_folder_that_vanished_while_running(tmp_path: Path) -> None:
+def test_a_run_folder_deleted_during_the_run_is_reported(tmp_path: Path) -> None:
     run = RunFolder(tmp_path / "gone")
     with pytest.raises(RunError, match=r"cannot write .*log\.jsonl"):
         run.log({"index": 0})
@@ -119,7 +119,7 @@ def test_a_folder_that_vanished_while_running(tmp_path: Path) -> None:
         run.write_checkpoint({"a": torch.ones(2)}, {})
 
 
-def test_a_full_disk_is_one_line_and_no_half_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_gives_one_line_and_no_partial_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = make(tmp_path / "run")
 
     def full(tensors: object, path: Path, text: object) -> None:

@@ -1,4 +1,4 @@
-"""Every way an input sequence can be wrong: one line that says what, where and what to do."""
+"""Errors in an input sequence: one line that says what is wrong, where, and what to do."""
 
 import json
 
@@ -12,7 +12,7 @@ from sigmasplat.sources.opening import formats
 
 
 def refusal(path, **options) -> str:
-    """Open and read a bad sequence; return the one line it is refused with."""
+    """Open and read a bad sequence; return the error message."""
     with pytest.raises(SigmaSplatError) as caught:
         list(open_source(path, **options))
     message = str(caught.value)
@@ -105,7 +105,7 @@ def test_all_images_damaged(tiny_tum):
     assert "no pair of colour and depth can be read" in refusal(tiny_tum)
 
 
-def test_sizes_of_colour_and_depth_that_differ(tiny_tum):
+def test_different_sizes_of_colour_and_depth(tiny_tum):
     for i in range(4):
         Image.fromarray(np.full((12, 16), 2000, np.uint16)).save(tiny_tum / f"depth/{i}.png")
     message = refusal(tiny_tum)
@@ -130,7 +130,7 @@ def test_depth_in_one_frame_is_enough(tiny_tum):
     assert len(list(open_source(tiny_tum))) == 4
 
 
-def test_a_colour_picture_as_depth(tiny_tum):
+def test_a_colour_image_as_depth(tiny_tum):
     for i in range(4):
         Image.fromarray(np.zeros((24, 32, 3), np.uint8)).save(tiny_tum / f"depth/{i}.png")
     assert "not a depth image" in refusal(tiny_tum)
@@ -138,7 +138,7 @@ def test_a_colour_picture_as_depth(tiny_tum):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0])
 @pytest.mark.parametrize("suffix", ["npy", "tiff"])
-def test_float_depth_that_is_no_distance(tiny_tum, bad, suffix):
+def test_float_depth_that_is_not_a_distance(tiny_tum, bad, suffix):
     depth = np.full((24, 32), 1.5, np.float32)
     depth[3, 4] = bad
     path = tiny_tum / f"depth/1.{suffix}"
@@ -160,10 +160,10 @@ def test_float_depth_that_is_no_distance(tiny_tum, bad, suffix):
         ("0.1 0 0 0 0 0 0 0", "not rigid"),
         ("0.1 0 0 0 0 0 0 2", "not rigid"),
         ("0.1 0 0 0 0 0 1", "found 7 values"),
-        ("0.1 a b c 0 0 0 1", "numbers wanted"),
+        ("0.1 a b c 0 0 0 1", "expected numbers"),
     ],
 )
-def test_a_bad_true_pose_is_named_by_file_and_line(tiny_tum, line, words):
+def test_a_bad_ground_truth_pose_is_named_by_file_and_line(tiny_tum, line, words):
     (tiny_tum / "groundtruth.txt").write_text(f"# t\n0.0 0 0 0 0 0 0 1\n{line}\n")
     message = refusal(tiny_tum)
     assert "groundtruth.txt:3" in message and words in message
@@ -207,7 +207,7 @@ def test_a_bad_calibration_names_file_and_field(tiny_tum, changes, words):
 
 
 @pytest.mark.parametrize("text", ["{", "[1, 2]", "\x00"])
-def test_a_calibration_that_is_no_json_object(tiny_tum, text):
+def test_a_calibration_that_is_not_a_json_object(tiny_tum, text):
     (tiny_tum / "calibration.json").write_text(text)
     assert "calibration.json" in refusal(tiny_tum)
 
@@ -219,4 +219,4 @@ def test_a_bad_option_of_the_synthetic_room(option):
 
 @pytest.mark.parametrize("options", [{"stride": 0}, {"limit": -1}, {"stride": -1}])
 def test_a_bad_stride_or_limit(tiny_tum, options):
-    assert "stride and limit" in refusal(tiny_tum, **options)
+    assert "input.stride must be at least 1 and input.limit" in refusal(tiny_tum, **options)

@@ -13,7 +13,7 @@ from sigmasplat.errors import ConfigError
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Run a command that must be refused; return its one line."""
+    """Run a command that must be refused and return its message."""
     with pytest.raises(SystemExit) as left:
         cli.main(arguments)
     said = capsys.readouterr()
@@ -27,9 +27,9 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["rnu", "data/kitchen"], "no command 'rnu' (did you mean run?); there are demo, "),
+        (["rnu", "data/kitchen"], "no command 'rnu' (did you mean run?); the commands are demo, "),
         (["evaluate", "--help"], "no command 'evaluate' (did you mean eval?)"),
-        (["xyzzy"], "no command 'xyzzy'; there are demo, inspect, run, resume, view, eval, mesh, export, download, be"),
+        (["xyzzy"], "no command 'xyzzy'; the commands are demo, inspect, run, resume, view, eval, mesh, export, down"),
         (["run", "/no/such/place"], "/no/such/place"),
         (["run", "."], "unknown format"),
         (["run", "/no/such/place", "--preset", "quick"], "no preset 'quick'"),
@@ -79,7 +79,7 @@ def _sigmasplat(*arguments: str, **environment: str) -> subprocess.CompletedProc
 def test_the_version_is_listed_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
         cli.main(["--help"])
-    assert left.value.code == 0 and "sigmasplat --version    show which release" in capsys.readouterr().out
+    assert left.value.code == 0 and "sigmasplat --version    print the version" in capsys.readouterr().out
     with pytest.raises(SystemExit) as left:
         cli.main(["--version"])
     assert left.value.code == 0 and capsys.readouterr().out.startswith("sigmasplat ")
@@ -104,7 +104,9 @@ def test_help_has_an_example_and_loads_no_torch(arguments: list[str]) -> None:
     ["run x --fx 57O", "run x --limit many", "run x --stride 1.5", "run x --seed None", "run x --register-depth None",
      "inspect x --depth-scale 1OOO", "export x --sigma-below small"],
 )  # fmt: skip
-def test_the_error_on_a_mistyped_number_is_plain(mistyped: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_message_for_a_mistyped_number_has_no_parser_types(
+    mistyped: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
         cli.main(mistyped.split())
     told = capsys.readouterr().err
@@ -114,13 +116,13 @@ def test_the_error_on_a_mistyped_number_is_plain(mistyped: str, capsys: pytest.C
 
 
 @pytest.mark.parametrize("command", ["run", "inspect", "export", "bench", "mesh", "eval", "resume", "demo"])
-def test_help_shows_no_none(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_does_not_show_none(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         cli.main([command, "--help"])
     assert "None" not in capsys.readouterr().out
 
 
-def test_what_is_taken_is_what_was_given() -> None:
+def test_input_options_become_settings() -> None:
     assert InputOptions().settings() == InputOptions(register_depth="auto").settings() == {}
     given = InputOptions(limit=3, start=1.5, fx=570.5, strict=True, register_depth="off").settings()
     assert given == {"input.limit": "3", "input.start_s": "1.5", "input.fx": "570.5", "input.strict": "True",

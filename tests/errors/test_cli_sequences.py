@@ -1,4 +1,4 @@
-"""Bad sequences at the command line, end to end: one line, exit code 2, nothing written, nothing lost."""
+"""Bad sequences on the command line, end to end: one line, exit code 2, nothing written, nothing deleted."""
 
 import json
 from collections.abc import Callable
@@ -27,7 +27,7 @@ def contents(folder: Path) -> dict[str, str]:
 
 @pytest.fixture
 def refused(tiny_tum: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """Run a command that must be refused; return its one line. Nothing may be written, the sequence stays as it is."""
+    """Run a command that must be refused and return its message. It must not write any file or change the sequence."""
     place = tiny_tum.parent
     monkeypatch.chdir(place)
 
@@ -82,7 +82,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
     "blank depth": (blank_depth, ("depth is zero or unreadable in all 4 frames", "check the depth files")),
     "sizes differ": (half_size_depth, ("is 32×24 but", "is 16×12", "register depth to colour")),
     "no overlap in time": (later_depth, ("0.000 … 0.300 s", "100.000 … 103.000 s", "one recording?")),
-    "pose not finite": (pose_line("0.1 nan 0 0 0 0 0 1"), ("groundtruth.txt:2", "not finite", "drop the line")),
+    "pose not finite": (pose_line("0.1 nan 0 0 0 0 0 1"), ("groundtruth.txt:2", "not finite", "delete the line")),
     "pose not rigid": (pose_line("0.1 0 0 0 0 0 0 2"), ("groundtruth.txt:2", "not rigid", "length 2")),
 }
 
@@ -103,7 +103,7 @@ def test_a_missing_folder_is_refused(refused: Callable[..., str], tiny_tum: Path
     assert "is a file of unknown format" in refused(str(tiny_tum / "rgb.txt"))
 
 
-def test_a_replica_pose_that_is_no_motion_is_refused(refused: Callable[..., str], tiny_tum: Path) -> None:
+def test_a_replica_pose_that_is_not_rigid_is_refused(refused: Callable[..., str], tiny_tum: Path) -> None:
     results = tiny_tum.parent / "replica" / "results"
     results.mkdir(parents=True)
     for i in range(2):
@@ -123,20 +123,20 @@ def truncate(path: Path) -> None:
 
 
 @pytest.mark.parametrize("part", ["rgb", "depth"])
-def test_a_truncated_image_is_passed_over_and_counted(
+def test_a_truncated_image_is_skipped_and_counted(
     part: str, tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     truncate(tiny_tum / part / "2.png")
     assert exit_code("run", str(tiny_tum), "--out", str(tmp_path / "run"), *QUICK) == 0
     err = capsys.readouterr().err
-    assert err.count("1 unreadable image passed over") == 1 and f"{part}/2.png" in err and "Traceback" not in err
+    assert err.count("1 unreadable image skipped") == 1 and f"{part}/2.png" in err and "Traceback" not in err
     run = RunFolder.open(tmp_path / "run")
     assert [record["index"] for record in run.read_log()] == [0, 1, 3]
     skipped = run.facts()["skipped"]
     assert len(skipped) == 1 and f"{part}/2.png" in skipped[0] and run.read_metrics()["skipped"] == skipped
 
 
-def test_strict_stops_at_a_truncated_image_and_keeps_what_was_done(
+def test_strict_stops_at_a_truncated_image_and_keeps_the_results(
     tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     truncate(tiny_tum / "rgb/2.png")
@@ -154,10 +154,10 @@ def scaled(folder: Path, units_per_metre: float) -> None:
     (folder / "calibration.json").write_text(json.dumps(fields))
 
 
-def test_a_wrong_depth_unit_is_warned_of_with_the_median(
+def test_the_warning_of_a_wrong_depth_unit_has_the_median(
     tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The files hold millimetres; 16 cm are outside what a room has but within what is mapped."""
+    """The files are in millimetres; 16 cm is too small for a room but within the depth range of mapping."""
     scaled(tiny_tum, 12_500.0)
     assert exit_code("run", str(tiny_tum), "--no-eval", "--out", str(tmp_path / "run"), *QUICK) == 0
     err = capsys.readouterr().err
@@ -167,7 +167,7 @@ def test_a_wrong_depth_unit_is_warned_of_with_the_median(
     assert RunFolder.open(tmp_path / "run").facts()["status"] == "complete"
 
 
-def test_a_unit_that_leaves_no_usable_depth_is_warned_of_and_refused(
+def test_a_depth_unit_without_usable_depth_is_refused_after_a_warning(
     tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scaled(tiny_tum, 1.0)
@@ -175,10 +175,10 @@ def test_a_unit_that_leaves_no_usable_depth_is_warned_of_and_refused(
     warning, refusal = [line for line in capsys.readouterr().err.splitlines() if ": " in line[:13]]
     assert warning.startswith("warning: ") and "median depth is 2000 m" in warning
     assert refusal.startswith("sigmasplat: frame 0 has no depth reading") and "check the depth scale" in refusal
-    assert not (tmp_path / "run").exists(), "nothing came of it"
+    assert not (tmp_path / "run").exists(), "the run has no results"
 
 
-def test_truth_of_another_time_is_reported_after_the_results_are_written(
+def test_truth_of_another_time_is_reported_after_all_results_are_written(
     tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tiny_tum / "groundtruth.txt").write_text("".join(f"{500 + i} {i} 0 0 0 0 0 1\n" for i in range(4)))
@@ -190,10 +190,12 @@ def test_truth_of_another_time_is_reported_after_the_results_are_written(
     assert (run.path / "report.html").stat().st_size > 1000
 
 
-# ---- the place the results go to
+# ---- output folder
 
 
-def test_an_earlier_run_is_kept_by_default(tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_earlier_run_is_replaced_only_with_overwrite(
+    tiny_tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "run"
     command = ["run", str(tiny_tum), "--out", str(out), "--no-eval", *QUICK]
     assert exit_code(*command) == 0
@@ -208,7 +210,7 @@ def test_an_earlier_run_is_kept_by_default(tiny_tum: Path, tmp_path: Path, capsy
     assert len(RunFolder.open(out).read_log()) == 2 and (out / "notes.txt").read_text() == "mine"
 
 
-def test_a_refused_sequence_spares_the_run_it_would_have_replaced(tiny_tum: Path, tmp_path: Path) -> None:
+def test_a_refused_sequence_does_not_delete_the_earlier_run(tiny_tum: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     command = ["run", str(tiny_tum), "--out", str(out), "--no-eval", *QUICK]
     assert exit_code(*command) == 0
@@ -218,7 +220,7 @@ def test_a_refused_sequence_spares_the_run_it_would_have_replaced(tiny_tum: Path
     assert contents(out) == before
 
 
-def test_without_out_a_taken_name_is_numbered(tiny_tum: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_out_an_existing_name_gets_a_number(tiny_tum: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tiny_tum.parent)
     for _ in range(2):
         assert exit_code("run", str(tiny_tum), "--limit", "1", "--no-eval", *QUICK) == 0
@@ -234,7 +236,7 @@ def test_output_that_cannot_be_written_is_refused(place: str, refused: Callable[
 
 
 def test_the_undamaged_sequence_runs(tiny_tum: Path, tmp_path: Path) -> None:
-    """Else every refusal above proves nothing."""
+    """Without this, the refusals above would prove nothing."""
     assert exit_code("run", str(tiny_tum), "--strict", "--out", str(tmp_path / "run"), *QUICK) == 0
     run = RunFolder.open(tmp_path / "run")
     assert isinstance(run.read_trajectory(), Trajectory) and run.facts()["skipped"] == []

@@ -1,4 +1,4 @@
-"""sigmasplat download: what can go wrong is one line, exit code 2; at the end stands the command to run next."""
+"""sigmasplat download: each error is one line with exit code 2; a success ends with the next command."""
 
 import hashlib
 import socket
@@ -19,7 +19,7 @@ DESK = "rgbd_dataset_freiburg1_desk"
 
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch, tiny_tum: Path) -> Iterator[FileServer]:
-    """Serve a tiny recording as the catalogue's set `tiny`, recording `desk`."""
+    """Serve a tiny recording as data set `tiny`, recording `desk`."""
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     monkeypatch.chdir(tiny_tum.parent)
     with serving() as server:
@@ -39,7 +39,7 @@ def wait(monkeypatch: pytest.MonkeyPatch, retry: RetryPolicy) -> None:
 
 
 def said(capsys: pytest.CaptureFixture[str], code: int, *arguments: str) -> tuple[str, str]:
-    """Run sigmasplat download; return what it said on standard output and standard error."""
+    """Run sigmasplat download; return its standard output and standard error."""
     with pytest.raises(SystemExit) as left:
         cli.main(["download", *arguments])
     spoken = capsys.readouterr()
@@ -48,7 +48,7 @@ def said(capsys: pytest.CaptureFixture[str], code: int, *arguments: str) -> tupl
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Run a command that must be refused; return its one line."""
+    """Run a command that must fail; return its error line."""
     line = said(capsys, 2, *arguments)[1]
     assert line.startswith("sigmasplat: ") and line.count("\n") == 1
     return line
@@ -62,7 +62,7 @@ def test_a_recording_can_be_run_afterwards(server: FileServer, capsys: pytest.Ca
     assert any(line.startswith("download desk.tgz ") and line.endswith("kB") for line in lines), lines
     assert lines[-1] == "next: sigmasplat run data/tiny/desk" and err == ""
     again, _ = said(capsys, 0, "tiny", "desk")
-    assert again.splitlines() == ["data/tiny/desk is there already; --overwrite downloads it again", lines[-1]]
+    assert again.splitlines() == ["data/tiny/desk exists already; --overwrite downloads it again", lines[-1]]
     assert len(server.ranges) == 1
 
 
@@ -96,10 +96,10 @@ def test_offline(server: FileServer, capsys: pytest.CaptureFixture[str], monkeyp
 @pytest.mark.parametrize(
     ("first", "says"),
     [
-        ([acts.status(404)], "/desk.tgz cannot be had (HTTP 404 Not Found); it may have moved or want a login"),
+        ([acts.status(404)], "/desk.tgz is not available (HTTP 404 Not Found); it may have moved or require a login"),
         ([acts.status(403)], "(HTTP 403 Forbidden)"),
-        ([acts.status(503)] * 2, "is busy or out of order (HTTP 503 Service Unavailable); try later"),
-        ([acts.drop_after(700), acts.drop_after(0)], "broke off after 700 of "),
+        ([acts.status(503)] * 2, "is busy or out of service (HTTP 503 Service Unavailable); try later"),
+        ([acts.drop_after(700), acts.drop_after(0)], "closed the connection after 700 of "),
         ([acts.web_page], "answers with a web page, not the file; is there a login page in between?"),
         ([acts.says_length(-50)], "desk.tgz is damaged ("),
     ],
@@ -111,37 +111,39 @@ def test_servers_that_fail(first: list[Act], says: str, server: FileServer, caps
     assert not Path("data/tiny/desk").exists() and not Path("data/tiny/desk.tgz").exists()
 
 
-def test_a_server_that_sends_hardly_anything(
+def test_a_server_that_is_too_slow(
     server: FileServer, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wait(monkeypatch, RetryPolicy(timeout_s=0.5, max_attempts=1))
     server.acts = [acts.trickle(2.0)]
-    assert "hardly anything comes from 127.0.0.1" in refused(capsys, "tiny", "desk")
+    assert "127.0.0.1 sends too slowly" in refused(capsys, "tiny", "desk")
 
 
-def test_damaged_on_the_disk(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_damaged_on_disk(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
     said(capsys, 0, "tiny", "desk", "--keep-archive")
     Path("data/tiny/desk.tgz").write_bytes(b"rotten")
     line = refused(capsys, "tiny", "desk", "--overwrite")
-    assert "data/tiny/desk.tgz was damaged and is removed" in line and hashlib.sha256(b"rotten").hexdigest() in line
+    assert (
+        "data/tiny/desk.tgz was damaged and has been removed" in line and hashlib.sha256(b"rotten").hexdigest() in line
+    )
     assert Path("data/tiny/desk/rgb.txt").is_file() and not Path("data/tiny/desk.tgz").exists()
 
 
-def test_recordings_that_cannot_be_run_are_reported(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "downloaded, but not to be run as it is: unknown format: data/tiny/bare" in refused(capsys, "tiny", "bare")
+def test_an_unreadable_download_is_reported(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "downloaded, but it cannot be run: unknown format: data/tiny/bare" in refused(capsys, "tiny", "bare")
 
 
-def test_a_folder_of_another_program_is_kept(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_foreign_folder(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
     Path("data/tiny/desk").mkdir(parents=True)
-    assert "data/tiny/desk exists and was not made by this command" in refused(capsys, "tiny", "desk", "--overwrite")
+    assert "data/tiny/desk exists and was not created by this command" in refused(capsys, "tiny", "desk", "--overwrite")
 
 
-def test_an_out_that_is_a_file(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
+def test_out_is_a_file(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
     Path("data").write_text("")
-    assert "cannot make data/tiny: " in refused(capsys, "tiny", "desk")
+    assert "cannot create data/tiny: " in refused(capsys, "tiny", "desk")
 
 
-def test_all_names_are_looked_up_first(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
+def test_all_names_are_checked_before_the_download(server: FileServer, capsys: pytest.CaptureFixture[str]) -> None:
     assert "no recording 'dsk' in tiny; did you mean desk?" in refused(capsys, "tiny", "desk", "dsk")
     assert server.ranges == []
 
@@ -152,5 +154,5 @@ def test_ctrl_c(server: FileServer, capsys: pytest.CaptureFixture[str], monkeypa
 
     monkeypatch.setattr("sigmasplat.download.downloader.fetch", interrupted)
     out, err = said(capsys, 130, "tiny", "desk")
-    assert out.splitlines()[-1] == "what has come is kept; the same command goes on with it"
+    assert out.splitlines()[-1] == "the part downloaded so far is kept; the same command resumes the download"
     assert err == "sigmasplat: interrupted\n"

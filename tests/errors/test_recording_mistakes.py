@@ -1,4 +1,4 @@
-"""What users of phones, robots and cameras get wrong most often: one line each that says what, where and what to do."""
+"""Frequent mistakes with phones, robots and cameras: one line that says what is wrong, where, and what to do."""
 
 import json
 import sys
@@ -35,7 +35,7 @@ Mistake = tuple[Callable[[Path], Any], dict[str, Any], tuple[str, ...]]
 
 
 def refusal(path: Any, **options: Any) -> str:
-    """Open and read a bad recording; return the one line it is refused with."""
+    """Open and read a bad recording; return the error message."""
     with pytest.raises(SigmaSplatError) as caught:
         list(open_source(path, **options))
     message = str(caught.value)
@@ -60,22 +60,22 @@ STRAY: dict[str, Mistake] = {
     "only depth was copied": (stray(lambda f: (f / "rgb.mp4").unlink()), {}, ("no video in", "rgb.mp4", "copy the")),
     "a phone without LiDAR": (stray(emptied("depth")), {}, ("no depth images in", "depth/000000.png", "LiDAR")),
     "no poses copied": (stray(lambda f: (f / "odometry.csv").unlink()), {}, ("odometry.csv is missing", "copy")),
-    "video cut short": (
+    "truncated video": (
         stray(lambda f: (f / "rgb.mp4").write_bytes((f / "rgb.mp4").read_bytes()[:300])), {},
         ("rgb.mp4", "unreadable video", "copy it again"),
     ),
     "an app of 2021": (
         stray(lambda f: (f / "odometry.csv").write_text("0.1, 0.2, 0.3, 0, 0, 0, 1\n")), {},
-        ("odometry.csv: columns timestamp, frame", "found 0.1, 0.2", "2022 or later"),
+        ("odometry.csv: expected columns timestamp, frame", "found 0.1, 0.2", "2022 or later"),
     ),
     "no camera": (stray(lambda f: (f / "camera_matrix.csv").unlink()), {}, ("camera unknown", "--fx PIXELS")),
-    "camera matrix cut short": (
+    "truncated camera matrix": (
         stray(lambda f: (f / "camera_matrix.csv").write_text("40, 0, 16\n0, 40")), {},
-        ("camera_matrix.csv: a 3×3 matrix", "copy it again"),
+        ("camera_matrix.csv: expected a 3×3 matrix", "copy it again"),
     ),
-    "a line that is no pose": (
+    "a line that is not a pose": (
         stray(lambda f: (f / "odometry.csv").write_text((f / "odometry.csv").read_text() + "\n1000.2, 9, nan\n")), {},
-        (f"odometry.csv:{FRAMES + 2}", "9 numbers wanted"),
+        (f"odometry.csv:{FRAMES + 2}", "expected 9 numbers"),
     ),
 }  # fmt: skip
 
@@ -110,14 +110,18 @@ def without(ending: str) -> Callable[[dict[str, bytes]], object]:
 
 
 RECORD3D: dict[str, Mistake] = {
-    "the copy was cut short": (cut_zip, {}, ("desk.r3d", "not a whole archive", "copy it again")),
-    "pictures only": (r3d(without(".depth")), {}, ("no depth images in", "rgbd/0.depth", "export it as")),
-    "pictures and depth do not match": (export_without_depth, {}, ("no depth images in", "depth/0.exr")),
+    "a truncated copy": (cut_zip, {}, ("desk.r3d", "not a complete zip archive", "copy it again")),
+    "only colour": (r3d(without(".depth")), {}, ("no depth images in", "rgbd/0.depth", "export it as")),
+    "colour and depth do not match": (export_without_depth, {}, ("no depth images in", "depth/0.exr")),
     "no camera": (r3d(K=None), {}, ("camera unknown", "--fx PIXELS")),
     "metadata damaged": (r3d(lambda m: m.update(metadata=b"{")), {}, ("metadata", "not readable as JSON")),
-    "metadata missing": (r3d(lambda m: m.pop("metadata")), {}, ("metadata", "unreadable in its archive")),
-    "sizes wrong": (r3d(dw=99), {}, ("rgbd/0.depth", "not 99×24 values in LZFSE")),
-    "a pose that is none": (r3d(poses=[[0, 0, 0, 2, 1, 2, i] for i in range(FRAMES)]), {}, ("pose 0", "not rigid")),
+    "metadata missing": (r3d(lambda m: m.pop("metadata")), {}, ("metadata", "cannot be read from its archive")),
+    "sizes wrong": (r3d(dw=99), {}, ("rgbd/0.depth", "not 99×24 LZFSE-compressed values")),
+    "a pose that is not rigid": (
+        r3d(poses=[[0, 0, 0, 2, 1, 2, i] for i in range(FRAMES)]),
+        {},
+        ("pose 0", "not rigid"),
+    ),
     "K as a matrix": (r3d(K=[[40, 0, 0], [0, 40, 0], [16, 12, 1]]), {}, ('field "K"', "9 finite numbers")),
 }
 
@@ -184,7 +188,7 @@ def cut_bag(place: Path) -> Path:
 
 
 def never_closed(place: Path) -> Path:
-    """As rosbag leaves it where it was killed: the index's place is 0."""
+    """A bag whose recorder was killed: the position of the index is 0."""
     path = bag(aligned)(place)
     data = path.read_bytes()
     start = data.index(b"index_pos=") + len(b"index_pos=")
@@ -221,7 +225,7 @@ ROS: dict[str, Mistake] = {
         bag(lambda r, s: apart(r, s, info=False)), {}, ("/camera/depth/image has no camera_info", "--calibration FILE")
     ),
     "no tf": (
-        bag(apart), {}, ("where the depth camera (depth_optical) is", "(color_optical)", "/tf_static", "--calibration")
+        bag(apart), {}, ("no transform from the depth camera (depth_optical)", "(color_optical)", "/tf_static")
     ),
     "clocks that differ": (
         bag(lambda r, s: apart(r, s, frame="color_optical", later_s=50.0)), {},
@@ -229,10 +233,10 @@ ROS: dict[str, Mistake] = {
     ),
     "a fisheye lens": (bag(fisheye), {}, ("lens model equidistant", "image_rect_color")),
     "depth as RVL": (bag(rvl), {}, ("depth", "RVL", "republish")),
-    "poses that are none": (bag(lost_pose), {}, ("/pose at 1000.000 s", "not rigid")),
-    "recording cut short": (cut_bag, {}, ("walk.bag: unreadable bag", "rosbag reindex")),
+    "poses that are not rigid": (bag(lost_pose), {}, ("/pose at 1000.000 s", "not rigid")),
+    "a truncated recording": (cut_bag, {}, ("walk.bag: unreadable bag", "rosbag reindex")),
     "recorder killed": (never_closed, {}, ("not indexed", "rosbag reindex")),
-    "half of the folder copied": (half_copied, {}, ("walk: unreadable bag", ".db3", "copy it again")),
+    "only half of the folder copied": (half_copied, {}, ("walk: unreadable bag", ".db3", "copy it again")),
 }  # fmt: skip
 
 
@@ -251,14 +255,14 @@ def test_one_line_says_what_to_do(
 @pytest.mark.parametrize(
     ("path", "says"),
     [
-        ("realsense", ("no RealSense camera gives 640×480 at 30 frames/s", "No device connected", "USB 3")),
-        ("realsense:size=5", ("option 'size=5' not understood", "width, height, fps, serial")),
-        ("realsense:width=wide", ("option 'width=wide' not understood",)),
-        ("realsense:fps=0", ("option 'fps=0' not understood",)),
-        ("realsense:width", ("option 'width' not understood",)),
+        ("realsense", ("no RealSense camera provides 640×480 at 30 frames/s", "No device connected", "USB 3")),
+        ("realsense:size=5", ("unknown option 'size=5'", "width, height, fps, serial")),
+        ("realsense:width=wide", ("unknown option 'width=wide'",)),
+        ("realsense:fps=0", ("unknown option 'fps=0'",)),
+        ("realsense:width", ("unknown option 'width'",)),
     ],
 )
-def test_a_camera_that_is_not_there(path: str, says: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_camera_or_unknown_option(path: str, says: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     device = Device()
     device.plugged_in = False
     monkeypatch.setitem(sys.modules, "pyrealsense2", device.module())
@@ -286,7 +290,7 @@ def test_a_missing_package_is_named_with_its_extra(
     assert f"pip install 'sigmasplat[{extra}]'" in refusal(path)
 
 
-def test_a_damaged_image_in_the_middle_is_passed_over_by_name(tmp_path: Path) -> None:
+def test_a_damaged_image_is_skipped_and_named(tmp_path: Path) -> None:
     def spoil(members: dict[str, bytes]) -> None:
         members["rgbd/1.depth"] = members["rgbd/1.depth"][:40]
         members["rgbd/2.jpg"] = b"no picture"
@@ -296,7 +300,7 @@ def test_a_damaged_image_in_the_middle_is_passed_over_by_name(tmp_path: Path) ->
     assert "rgbd/1.depth" in source.skipped[0] and "rgbd/2.jpg" in source.skipped[1]
 
 
-def test_a_damaged_message_is_passed_over_by_topic_and_time(tmp_path: Path) -> None:
+def test_a_damaged_message_is_skipped_and_named(tmp_path: Path) -> None:
     def fill(recorder: Recorder, seen: Scene) -> None:
         aligned(recorder, seen)
         recorder.messages[4][3].data = recorder.messages[4][3].data[:100]
@@ -306,8 +310,8 @@ def test_a_damaged_message_is_passed_over_by_topic_and_time(tmp_path: Path) -> N
     assert "camera/color/image_raw at 1000.067 s: unreadable image" in source.skipped[0]
 
 
-def test_a_calibration_of_the_user_replaces_the_missing_one(tmp_path: Path) -> None:
-    """What the messages advise works."""
+def test_the_users_camera_replaces_a_missing_one(tmp_path: Path) -> None:
+    """The fix suggested by the error message works."""
     assert open_source(bag(only(*CAMERA_TOPICS))(tmp_path), fx=33.0).camera.fx == 33.0
     camera = dict(zip(("fx", "fy", "cx", "cy"), FOCAL, strict=True))
     inner = camera | {"width": 16, "height": 12}

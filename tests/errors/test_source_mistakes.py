@@ -1,4 +1,4 @@
-"""The likeliest mistakes with each data set: one line each that says what was wrong and what to do."""
+"""The most likely mistakes with each data set: one line that says what is wrong and what to do."""
 
 import json
 import re
@@ -28,7 +28,7 @@ def without(*patterns: str) -> Damage:
 
 
 def with_text(name: str, text: str) -> Damage:
-    """Put another text into a file."""
+    """Replace the text of a file."""
 
     def damage(folder: Path) -> None:
         path = next(iter(folder.glob(name)), folder / name)
@@ -38,7 +38,7 @@ def with_text(name: str, text: str) -> Damage:
 
 
 def redrawn(pattern: str, draw: Callable[[Image.Image], Image.Image]) -> Damage:
-    """Put other images in the place of some."""
+    """Replace images by others."""
 
     def damage(folder: Path) -> None:
         for path in folder.glob(pattern):
@@ -55,17 +55,17 @@ def resized(pattern: str, size: tuple[int, int] = (20, 14)) -> Damage:
 
 
 def painted(pattern: str) -> Damage:
-    """Put 8-bit colour pictures where depth should be."""
+    """Replace depth by 8-bit colour images."""
     return redrawn(pattern, lambda image: Image.new("RGB", image.size, (90, 40, 10)))
 
 
 def blank(pattern: str) -> Damage:
-    """Make every depth pixel 0."""
+    """Set every depth pixel to 0."""
     return redrawn(pattern, lambda image: Image.fromarray(np.zeros(image.size[::-1], np.uint16)))
 
 
 def renumbered(pattern: str) -> Damage:
-    """Give the images numbers of another recording."""
+    """Rename the images to the numbers of another recording."""
 
     def damage(folder: Path) -> None:
         for path in sorted(folder.glob(pattern)):
@@ -87,7 +87,7 @@ def fields(name: str, change: Callable[[dict], object]) -> Damage:
 
 
 def packed(pattern: str, archive: str) -> Damage:
-    """Leave an archive where its content should be."""
+    """Replace files by an archive that is not unpacked."""
 
     def damage(folder: Path) -> None:
         without(pattern)(folder)
@@ -134,21 +134,21 @@ SCALED_ROWS = "2 0 0 0\n0 2 0 0\n0 0 2 0\n0 0 0 1\n"
 LISTS = ("RGB-only download", "no depth images in")
 MISTAKES: dict[str, dict[str, tuple[Damage, tuple[str, ...]]]] = {
     "scannet": {
-        "not extracted": (packed("*", "scene0000_00.sens"), ("still packed", "SensReader")),
-        "colour alone": (without("depth"), (*LISTS, "depth/*.png")),
+        "not extracted": (packed("*", "scene0000_00.sens"), ("not extracted", "SensReader")),
+        "only colour": (without("depth"), (*LISTS, "depth/*.png")),
         "no matrices": (without("intrinsic"), ("camera unknown", "calibration.json", "--fx")),
-        "depth's matrix left out": (without("intrinsic/*_depth.txt"), ("depth camera's matrix is missing",)),
-        "a matrix cut short": (with_text("intrinsic/i*_color.txt", "1170 0 647"), ("intrinsic_color.txt", "4×4")),
-        "other frames in depth": (renumbered("depth/*"), ("no number is shared", "one recording")),
-        "a pose that is none": (with_text("pose/7.txt", SCALED_ROWS), ("7.txt", "not a rigid")),
-        "depth as a picture": (painted("depth/*"), ("not a depth image",)),
+        "no matrix of depth": (without("intrinsic/*_depth.txt"), ("depth camera's matrix is missing",)),
+        "a truncated matrix": (with_text("intrinsic/i*_color.txt", "1170 0 647"), ("intrinsic_color.txt", "4×4")),
+        "other frames in depth": (renumbered("depth/*"), ("no number in common", "one recording")),
+        "a pose that is not rigid": (with_text("pose/7.txt", SCALED_ROWS), ("7.txt", "not a rigid")),
+        "depth as a colour image": (painted("depth/*"), ("not a depth image",)),
     },
     "scannet_frames": {
-        "colour alone": (without("*.depth.pgm"), LISTS),
-        "depth alone": (without("*.color.jpg"), ("no colour images in",)),
+        "only colour": (without("*.depth.pgm"), LISTS),
+        "only depth": (without("*.color.jpg"), ("no colour images in",)),
         "a matrix damaged": (with_text("_info.txt", "m_calibrationColorIntrinsic = 1 2 3"), ("_info.txt", "4×4")),
         "an empty information file": (with_text("_info.txt", ""), ("camera unknown",)),
-        "a pose cut short": (with_text("frame-000001.pose.txt", "1 0 0"), ("frame-000001.pose.txt", "4×4")),
+        "a truncated pose": (with_text("frame-000001.pose.txt", "1 0 0"), ("frame-000001.pose.txt", "4×4")),
     },
     "scannetpp": {
         "images not undistorted": (without("dslr/undistorted_images"), ("no undistorted_images/", "dslr.undistort")),
@@ -165,52 +165,52 @@ MISTAKES: dict[str, dict[str, tuple[Damage, tuple[str, ...]]]] = {
     },
     "seven_scenes": {
         "not unzipped": (sequence_packed, ("seq-01.zip", "unzip")),
-        "a scene of several": (second_sequence, ("holds 2 sequences", "seq-01, seq-02", "give one")),
-        "colour alone": (without("*.depth.png"), LISTS),
-        "a pose cut short": (with_text("frame-000001.pose.txt", "1 0 0"), ("frame-000001.pose.txt", "4×4")),
+        "a scene with several sequences": (second_sequence, ("holds 2 sequences", "seq-01, seq-02", "give one")),
+        "only colour": (without("*.depth.png"), LISTS),
+        "a truncated pose": (with_text("frame-000001.pose.txt", "1 0 0"), ("frame-000001.pose.txt", "4×4")),
         "images made smaller": (resized("*.png", (320, 240)), ("320×240", "640×480", "calibration")),
-        "depth as a picture": (painted("*.depth.png"), ("not a depth image",)),
+        "depth as a colour image": (painted("*.depth.png"), ("not a depth image",)),
     },
     "icl_nuim": {
         "text depth": (text_depth, ("text depth", "frei_png")),
         "depth not downloaded": (without("depth"), ("no pair of colour and depth", "is missing")),
-        "a list that is none": (with_text("associations.txt", "1 rgb/1.png\n"), ("associations.txt:1", "wanted")),
+        "a damaged list": (with_text("associations.txt", "1 rgb/1.png\n"), ("associations.txt:1", "expected")),
         "an empty list": (with_text("associations.txt", "# nothing\n"), ("lists no images",)),
-        "a pose cut short": (with_text("*.gt.freiburg", "1 0 0 0\n"), ("gt.freiburg:1", "tx ty tz")),
+        "a truncated pose": (with_text("*.gt.freiburg", "1 0 0 0\n"), ("gt.freiburg:1", "tx ty tz")),
         "depth blank": (blank("depth/*"), ("depth is zero",)),
     },
     "open3d": {
-        "colour alone": (without("depth"), LISTS),
-        "depth alone": (without("color"), ("no colour images in",)),
-        "intrinsics of nobody": (
+        "only colour": (without("depth"), LISTS),
+        "only depth": (without("color"), ("no colour images in",)),
+        "no intrinsics": (
             fields("camera_intrinsic.json", lambda f: f.pop("intrinsic_matrix")), ("intrinsic_matrix", "9 numbers"),
         ),
-        "intrinsics of another size": (
+        "intrinsics for another size": (
             fields("camera_intrinsic.json", lambda f: f.update(width=640, height=480)), ("32×24", "640×480"),
         ),
-        "the log cut short": (with_text("trajectory.log", "0 0 1\n1 0 0 0\n"), ("trajectory.log", "cut short")),
-        "the log is no motion": (with_text("trajectory.log", "0 0 1\n" + SCALED_ROWS), ("log:1", "not a rigid")),
-        "other frames in depth": (renumbered("depth/*"), ("no number is shared",)),
+        "a truncated log": (with_text("trajectory.log", "0 0 1\n1 0 0 0\n"), ("trajectory.log", "truncated")),
+        "a log that is not rigid": (with_text("trajectory.log", "0 0 1\n" + SCALED_ROWS), ("log:1", "not a rigid")),
+        "other frames in depth": (renumbered("depth/*"), ("no number in common",)),
     },
     "redwood": {
-        "colour alone": (without("depth"), LISTS),
+        "only colour": (without("depth"), LISTS),
         "another recording's depth": (
             another_time,
-            ("no colour image has depth within",),
+            ("no colour image of", "has depth within"),
         ),
         "images made smaller": (resized("*/*.[jp][pn]g", (320, 240)), ("320×240", "640×480")),
-        "a log of words": (with_text("00021.log", "0 0 1\n1 0 0 x\n"), ("00021.log:2", "numbers wanted")),
-        "depth as a picture": (painted("depth/*"), ("not a depth image",)),
+        "a log of words": (with_text("00021.log", "0 0 1\n1 0 0 x\n"), ("00021.log:2", "expected numbers")),
+        "depth as a colour image": (painted("depth/*"), ("not a depth image",)),
     },
     "bonn": {
-        "colour alone": (without("depth", "depth.txt"), LISTS),
-        "depth's list empty": (with_text("depth.txt", "# none\n"), ("depth.txt", "lists no images")),
-        "truth cut short": (with_text("groundtruth.txt", "1 2 3\n"), ("groundtruth.txt:1", "tx ty tz")),
-        "truth empty": (with_text("groundtruth.txt", "# none\n"), ("holds no poses",)),
+        "only colour": (without("depth", "depth.txt"), LISTS),
+        "an empty depth list": (with_text("depth.txt", "# none\n"), ("depth.txt", "lists no images")),
+        "truncated ground truth": (with_text("groundtruth.txt", "1 2 3\n"), ("groundtruth.txt:1", "tx ty tz")),
+        "empty ground truth": (with_text("groundtruth.txt", "# none\n"), ("holds no poses",)),
         "images made smaller": (resized("*/*.png", (320, 240)), ("320×240", "640×480")),
     },
     "nerfstudio": {
-        "colour alone": (
+        "only colour": (
             fields("transforms.json", lambda f: [frame.pop("depth_file_path") for frame in f["frames"]]),
             ("depth_file_path", "export"),
         ),
@@ -226,15 +226,15 @@ MISTAKES: dict[str, dict[str, tuple[Damage, tuple[str, ...]]]] = {
     },
     "plain": {
         "no camera": (without("calibration.json"), ("camera unknown", "--fx")),
-        "colour alone": (without("depth"), ("holds images but no depth", "docs/data.md#without-depth")),
+        "only colour": (without("depth"), ("holds images but no depth", "docs/data.md#without-depth")),
         "an empty depth folder": (without("depth/*"), LISTS),
-        "depth alone": (without("color"), ("no colour images in",)),
+        "only depth": (without("color"), ("no colour images in",)),
         "sizes differ": (resized("depth/*"), ("20×14", "32×24", "depth_camera")),
-        "a frame lost and names that differ": (
+        "a missing frame and different names": (
             one_lost,
-            ("no number is shared",),
+            ("no number in common",),
         ),
-        "depth as a picture": (painted("depth/*"), ("not a depth image",)),
+        "depth as a colour image": (painted("depth/*"), ("not a depth image",)),
         "depth blank": (blank("depth/*"), ("depth is zero",)),
     },
 }  # fmt: skip
@@ -258,6 +258,6 @@ def test_a_mistake_gives_one_clear_line(name, damage, words, tmp_path):
         assert word in message
 
 
-def test_every_format_has_its_five():
+def test_every_format_has_five_mistakes():
     assert all(len(mistakes) >= 5 for mistakes in MISTAKES.values())
-    assert {"tum", "replica"} == LAYOUTS.keys() - MISTAKES.keys(), "theirs are in test_bad_sources.py"
+    assert {"tum", "replica"} == LAYOUTS.keys() - MISTAKES.keys(), "tested in test_bad_sources.py"

@@ -86,10 +86,10 @@ def left_and_right(folder: Path) -> None:
 CASES = {
     video: "a video",
     phone_recording: "video: movie.mp4",
-    photos: "images in ",
-    photos_in_a_subfolder: "100ANDRO",
-    raw_photos: "images in ",
-    colmap: "images",
+    photos: "(images)",
+    photos_in_a_subfolder: "images in DCIM/100ANDRO",
+    raw_photos: "(images)",
+    colmap: "(images in images)",
     one_photo: "a single image",
     euroc: "stereo or multi-camera images in cam0, cam1",
     kitti: "stereo or multi-camera images in image_2, image_3",
@@ -98,7 +98,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("layout", CASES, ids=lambda layout: layout.__name__)
-def test_images_without_depth_are_named_and_the_documents_help(layout, tmp_path):
+def test_images_without_depth_are_named_with_a_link_to_the_documents(layout, tmp_path):
     path = layout(tmp_path) or tmp_path
     message = refusal(path)
     assert message.startswith(f"{path} holds images but no depth (") and CASES[layout] in message

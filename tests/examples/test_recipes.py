@@ -99,3 +99,23 @@ def test_a_rule_is_a_function_and_a_descriptor_a_class(package: Path, run: Calla
         "slam.finish()\n"
         "assert all(step.is_keyframe for step in steps) and len(slam.atlas.anchors) > 1\n"
     )
+
+
+def test_an_attribute_of_splats_is_a_name_a_width_and_a_rate(package: Path, run: Callable[[str], None]) -> None:
+    replace(
+        package / "model" / "field.py",
+        'ATTRIBUTES = {"correlations": 3,',
+        'ATTRIBUTES = {"heat": 2, "correlations": 3,',
+    )
+    rates = package / "fit" / "adam.py"
+    replace(rates, 'ATTRIBUTE_RATES = {"correlations"', 'ATTRIBUTE_RATES = {"heat": ("colors", 0.5), "correlations"')
+    run(
+        "import torch\n"
+        "from sigmasplat.model.field import GaussianField\n"
+        "field = GaussianField.from_values(torch.rand(5, 3), torch.full((5,), 0.1), torch.rand(5, 3))\n"
+        "field.get_or_create('heat')\n"
+        "field.attributes['heat'].params[:, 1] = torch.arange(5.0)\n"
+        "field.append(GaussianField.from_values(torch.rand(2, 3), torch.full((2,), 0.1), torch.rand(2, 3)))\n"
+        "field.keep(torch.tensor([False, True, False, False, True, True, False]))\n"
+        "assert field.attributes['heat'].params[:, 1].tolist() == [1.0, 4.0, 0.0]\n"
+    )

@@ -1,4 +1,4 @@
-"""The ablation: variants differ by one weight, nothing is run twice or lost, and words follow from the numbers."""
+"""The ablation: variants differ by one weight, no run is repeated or lost, and verdicts follow from the figures."""
 
 import importlib
 import json
@@ -18,15 +18,15 @@ from sigmasplat.config import Config
 from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.evaluation import ablation
-from sigmasplat.evaluation.ablation import COMPARED, NAMES, WITHOUT_VARIANCE, Job, Results, Study, carry_out
+from sigmasplat.evaluation.ablation import COMPARED, NAMES, WITHOUT_VARIANCE, Job, Results, Study, run_jobs
 from sigmasplat.evaluation.paired_comparison import (
     FIGURES,
     best,
     columns,
-    effects,
+    described,
     figures_of,
+    paired_differences,
     passed_by_chance,
-    sentence,
     spread,
 )
 from sigmasplat.io.machine import INSTALLED, code_digest
@@ -48,7 +48,7 @@ def flat(config: Config) -> dict[str, Any]:
 def metrics(
     ate_m: float | None = 0.01, before: float | None = None, after: float = 25.0, **more: Any
 ) -> dict[str, Any]:
-    """Return metrics as an evaluation leaves them."""
+    """Return metrics as an evaluation writes them."""
     return {
         "ate": None if ate_m is None else {"rmse_m": ate_m},
         "held_out": {"psnr_db": after, "depth_l1_m": 0.02},
@@ -58,7 +58,7 @@ def metrics(
 
 
 class MadeUpRuns:
-    """Stand in for SLAM: remember the jobs, score each by `ate_m`, stop by `stop_at`."""
+    """Replace SLAM: record the jobs, return `ate_m` of the variant, stop at job `stop_at`."""
 
     def __init__(self, ate_m: Mapping[str, float] | None = None, stop_at: int | None = None) -> None:
         self.ate_m, self.stop_at = ate_m or {}, stop_at
@@ -75,7 +75,7 @@ class MadeUpRuns:
 
 
 def runs_of(**ate_m: list[float | None]) -> list[dict[str, Any]]:
-    """Return runs whose variants, named by letters, have these ATEs in metres at seeds 0, 1, …"""
+    """Return runs of variants named by letters, with these ATEs in metres at seeds 0, 1, …"""
     return [
         {"variant": variant, "seed": seed, "figures": figures_of(metrics(value)), "path": "x", "source": "x"}
         for variant, values in ate_m.items()
@@ -83,7 +83,7 @@ def runs_of(**ate_m: list[float | None]) -> list[dict[str, Any]]:
     ]
 
 
-def test_each_variant_switches_on_one_weight_more_and_nothing_else() -> None:
+def test_each_variant_enables_one_more_weight_and_nothing_else() -> None:
     study = Study(("room",), BASE, seeds=1, without_variance=True)
     settings = {job.variant: flat(job.config) for job in study.jobs("room")}
     assert list(settings) == [WITHOUT_VARIANCE, *NAMES]
@@ -99,7 +99,7 @@ def test_each_variant_switches_on_one_weight_more_and_nothing_else() -> None:
     assert {name for pair in COMPARED for name in pair} == set(settings)
 
 
-def test_one_tau_for_every_weight_and_the_users_settings_for_all() -> None:
+def test_tau_is_the_same_for_every_weight_and_settings_apply_to_all() -> None:
     config = ablation.common_config("varsplat-tum", ("mapping.iterations=7",), 20.0)
     assert (config.tracking.tau, config.loops.tau, config.registration.tau) == (20.0, 20.0, 20.0)
     assert config.mapping.iterations == 7
@@ -117,9 +117,9 @@ def test_one_tau_for_every_weight_and_the_users_settings_for_all() -> None:
         (["synthetic", "--seeds", "0"], "--seeds must be at least 1, found 0"),
         (["synthetic", "--limit", "0"], "--limit must be at least 1, found 0"),
         (["synthetic", "--tau", "0"], "--tau must be above 0, found 0"),
-        (["synthetic", "--set", "loops.tau=5"], "the ablation sets loops.tau itself"),
-        (["synthetic", "--set", "tracking.uncertainty=off"], "the ablation sets tracking.uncertainty itself"),
-        (["synthetic", "--set", "seed=5"], "the ablation sets seed itself"),
+        (["synthetic", "--set", "loops.tau=5"], "the ablation itself sets loops.tau"),
+        (["synthetic", "--set", "tracking.uncertainty=off"], "the ablation itself sets tracking.uncertainty"),
+        (["synthetic", "--set", "seed=5"], "the ablation itself sets seed"),
         (["synthetic", "--set", "mapping.weight_nll_color=0"], "learns no variance"),
         (["synthetic", "--preset", "loopsplat-fast"], "loopsplat-fast learns no variance"),
         (["synthetic", "--preset", "quick"], "no preset 'quick'"),
@@ -146,7 +146,7 @@ def test_help_has_an_example_and_loads_no_torch(arguments: list[str]) -> None:
     assert "example: sigmasplat bench ablation" in answer.stdout
 
 
-def test_seeds_make_worlds_and_are_the_same_for_all_variants(tmp_path: Path) -> None:
+def test_all_variants_of_a_seed_run_on_the_same_scene(tmp_path: Path) -> None:
     (tmp_path / "kitchen").mkdir()
     study = Study(("synthetic:seed={seed}", str(tmp_path / "kitchen")), BASE, seeds=2)
     made, real = (study.jobs(source) for source in study.sources)
@@ -158,7 +158,7 @@ def test_seeds_make_worlds_and_are_the_same_for_all_variants(tmp_path: Path) -> 
     assert len({job.folder for job in [*made, *real]}) == len({job.key for job in [*made, *real]}) == 20
 
 
-def test_what_is_said_and_written_is_what_was_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_printed_and_stored_results_are_those_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "ablation.json"
     runner = MadeUpRuns({"+loop": 0.005, "+registration": 0.005, "+final": 0.006})
     assert Ablation(("room", "hall"), out=out, without_variance=True).run(runner) == 0
@@ -171,10 +171,10 @@ def test_what_is_said_and_written_is_what_was_measured(tmp_path: Path, capsys: p
     assert laid_out["+loop"][0] == laid_out["+registration"][0] == "* 0.51 ± 0.01"
     assert laid_out["+final"][0] == "0.61 ± 0.01"
     assert "+tracking against none: no figure differs in any run\n" in said
-    on_the_rest = "no effect beyond the spread of the seeds on PSNR before, PSNR after and depth L1"
+    on_the_rest = "no effect beyond the spread over seeds on PSNR before, PSNR after and depth L1"
     assert f"+loop against +tracking: helps ATE (−0.50 ± 0.00 cm); {on_the_rest}\n" in said
     assert f"+final against +registration: harms ATE (+0.10 ± 0.00 cm); {on_the_rest}\n" in said
-    assert "23% of figures that nothing changed but chance pass that bar" in said
+    assert "passes this threshold in 23% of cases" in said
 
     written = json.loads(out.read_text())
     assert written["machine"]["cores"] and written["code"] == code_digest(Path(sigmasplat.__file__).parent, INSTALLED)
@@ -186,7 +186,7 @@ def test_what_is_said_and_written_is_what_was_measured(tmp_path: Path, capsys: p
     assert override(Config.from_dict(written["config"]), run["settings"] | {"seed": "2"}) == job.config
 
 
-def test_an_interrupted_ablation_goes_on_where_it_stopped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_interrupted_ablation_resumes_where_it_left_off(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command, first, second = Ablation(("room",), out=tmp_path / "a.json"), MadeUpRuns(stop_at=4), MadeUpRuns()
     with pytest.raises(KeyboardInterrupt):
         command.run(first)
@@ -199,17 +199,17 @@ def test_an_interrupted_ablation_goes_on_where_it_stopped(tmp_path: Path, capsys
     assert not list(tmp_path.glob(".*"))
 
 
-def test_runs_are_deleted_only_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_are_dropped_only_with_overwrite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "a.json"
     Ablation(("room",), seeds=1, out=out).run(MadeUpRuns())
     before = out.read_text()
     for other in ({"tau": 20.0}, {"limit": 5}, {"settings": ("mapping.iterations=3",)}):
-        with pytest.raises(RunError, match=r"holds runs \(5\) with other settings or code.* --overwrite"):
+        with pytest.raises(RunError, match=r"contains 5 runs of other settings, other code.* --overwrite"):
             Ablation(("room",), seeds=1, out=out, **other).run(MadeUpRuns())
-    with pytest.raises(RunError, match="that are not asked for now"):
+    with pytest.raises(RunError, match="that this command does not ask for"):
         Ablation(("hall",), seeds=1, out=out).run(MadeUpRuns())
     monkeypatch.setattr(ablation, "code_digest", lambda folder, endings: "another")
-    with pytest.raises(RunError, match="with other settings or code"):
+    with pytest.raises(RunError, match="of other settings, other code"):
         Ablation(("room",), seeds=1, out=out).run(MadeUpRuns())
     assert out.read_text() == before
     assert Ablation(("room",), seeds=1, out=out, overwrite=True).run(again := MadeUpRuns()) == 0
@@ -217,20 +217,20 @@ def test_runs_are_deleted_only_on_request(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("text", ["ten years of work", "[]", '{"runs": []}'])
-def test_another_programs_file_is_not_touched(text: str, tmp_path: Path) -> None:
+def test_a_file_of_another_program_is_not_changed(text: str, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(RunError, match=r"a\.json.*give another --out"):
         Ablation(("room",), out=tmp_path / "a.json", overwrite=True).run(MadeUpRuns())
     assert (tmp_path / "a.json").read_text() == text
 
 
-def test_run_folders_stay_where_they_are_to_be_kept(tmp_path: Path) -> None:
+def test_run_folders_stay_only_in_the_keep_folder(tmp_path: Path) -> None:
     study, runner = Study(("room",), BASE, seeds=2), MadeUpRuns()
-    carry_out(study.jobs("room"), Results(tmp_path / "a.json", study), runner, tmp_path / "kept", lambda job: None)
+    run_jobs(study.jobs("room"), Results(tmp_path / "a.json", study), runner, tmp_path / "kept", lambda job: None)
     assert sorted(tmp_path.joinpath("kept").iterdir()) == sorted(runner.folders) and len(set(runner.folders)) == 10
 
 
-def test_code_is_identified_by_its_bytes(tmp_path: Path) -> None:
+def test_the_code_digest_depends_on_code_files_only(tmp_path: Path) -> None:
     (tmp_path / "kernel.so").write_bytes(b"1")
     first = code_digest(tmp_path, INSTALLED)
     (tmp_path / "notes.txt").write_text("no code")
@@ -239,7 +239,7 @@ def test_code_is_identified_by_its_bytes(tmp_path: Path) -> None:
     assert code_digest(tmp_path, INSTALLED) != first
 
 
-def test_a_map_that_was_never_refined_has_one_psnr() -> None:
+def test_a_map_without_refinement_has_one_psnr() -> None:
     assert figures_of(metrics(None, before=None, after=24.5)) == {
         "ate_m": None, "psnr_before_db": None, "psnr_db": 24.5, "depth_l1_m": 0.02, "loops": 1, "lost": 0,
         "frames_per_s": 12.5,
@@ -249,36 +249,38 @@ def test_a_map_that_was_never_refined_has_one_psnr() -> None:
     assert [f.title for f in columns(refined)][1:3] == ["PSNR before", "PSNR after"]
 
 
-def test_an_effect_is_judged_seed_by_seed() -> None:
-    """Worlds differ by far more than the variants do; at equal seeds the same 1 mm is gained each time."""
+def test_differences_are_judged_at_equal_seeds() -> None:
+    """Scenes differ far more than variants; at equal seeds the gain is 1 mm each time."""
     runs = runs_of(a=[0.01, 0.05, 0.09], b=[0.009, 0.0491, 0.0889], c=[0.02, 0.03, 0.10], d=[0.011, 0.0511, 0.0911])
-    ate = {name: effects(runs, name, "a")[0] for name in "bcd"}
+    ate = {name: paired_differences(runs, name, "a")[0] for name in "bcd"}
     differences = 100 * np.subtract([0.009, 0.0491, 0.0889], [0.01, 0.05, 0.09])
     assert ate["b"].mean == pytest.approx(differences.mean()) and ate["b"].deviation == pytest.approx(
         differences.std(ddof=1)
     )
     assert [ate[name].verdict for name in "bcd"] == ["helps", "within the spread", "harms"]
     assert ate["b"].written() == "−0.10 ± 0.01 cm"
-    assert sentence(effects(runs, "c", "a")) == "no effect beyond the spread of the seeds"
-    assert sentence(effects(runs, "a", "a")) == "no figure differs in any run"
-    assert sentence(effects(runs, "nobody", "a")) == "nothing to compare"
+    assert described(paired_differences(runs, "c", "a")) == "no effect beyond the spread over seeds"
+    assert described(paired_differences(runs, "a", "a")) == "no figure differs in any run"
+    assert described(paired_differences(runs, "nobody", "a")) == "nothing to compare"
 
 
 def test_one_seed_and_missing_figures_are_not_judged() -> None:
     runs = runs_of(a=[0.01], b=[0.02])
-    assert sentence(effects(runs, "b", "a")) == "one seed has no spread to judge by"
+    assert described(paired_differences(runs, "b", "a")) == "one seed is not enough to judge"
     runs = runs_of(a=[0.01, None, 0.03], b=[0.02, 0.01, None])
-    assert effects(runs, "b", "a")[0].deviation is None and effects(runs, "b", "a")[0].mean == pytest.approx(1.0)
+    assert paired_differences(runs, "b", "a")[0].deviation is None and paired_differences(runs, "b", "a")[
+        0
+    ].mean == pytest.approx(1.0)
 
 
-def test_the_share_passed_by_chance_is_that_of_noise() -> None:
+def test_the_probability_of_passing_by_chance_matches_noise() -> None:
     for seeds in (2, 3, 6):
         noise = np.random.default_rng(seeds).normal(size=(100_000, seeds))
         passed = np.abs(noise.mean(1)) > noise.std(1, ddof=1)
         assert passed_by_chance(seeds) == pytest.approx(passed.mean(), abs=0.005)
 
 
-def test_the_best_is_marked_by_what_is_printed() -> None:
+def test_the_best_printed_mean_is_marked() -> None:
     ate, loops, speed = FIGURES[0], FIGURES[4], FIGURES[6]
     assert best({"a": 1.234, "b": 1.231, "c": 1.26}, ate) == {"a", "b"}
     assert best({"a": 1.234, "b": 1.231}, ate) == set()
@@ -287,7 +289,7 @@ def test_the_best_is_marked_by_what_is_printed() -> None:
     assert spread([1.0, 2.0], 2) == "1.50 ± 0.71"
 
 
-def test_real_runs_leave_figures_and_kept_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_real_runs_leave_figures_and_their_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
     room, out = "synthetic:frames=120,width=64,height=48,seed={seed}", tmp_path / "a.json"
     quick = ("input.width=64", "mapping.first_iterations=6", "mapping.iterations=4", "final.iterations=5")
@@ -302,10 +304,10 @@ def test_real_runs_leave_figures_and_kept_folders(tmp_path: Path, capsys: pytest
     folders = [RunFolder.open(path) for path in sorted((tmp_path / "kept").iterdir())]
     weights = sorted((c.tracking.uncertainty, c.loops.uncertainty) for c in (folder.config() for folder in folders))
     assert weights == [(False, False), (True, False), (True, True), (True, True), (True, True)]
-    assert "one seed has no spread to judge by" in capsys.readouterr().out
+    assert "one seed is not enough to judge" in capsys.readouterr().out
 
 
-def test_committed_results_are_laid_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_committed_results_become_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(record, "data_root", lambda: tmp_path)
     (tmp_path / "livingroom").mkdir()
     options = bench_ablation.Options(
@@ -338,9 +340,7 @@ def test_committed_results_are_laid_out(tmp_path: Path, monkeypatch: pytest.Monk
     assert missing == [] and "| +loop | **0.51 ± 0.01** |" in text
 
 
-def test_the_benchmark_explains_itself_and_refuses_in_a_line(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_the_benchmark_has_help_and_refuses_in_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     program = Path(bench_ablation.__file__)
     answer = subprocess.run([sys.executable, program, "--help"], capture_output=True, text=True, timeout=60)
     assert answer.returncode == 0 and "--no-reference" in answer.stdout, answer.stderr

@@ -25,7 +25,7 @@ def two_submaps() -> tuple[Atlas, list[np.ndarray]]:
         atlas.begin_submap(anchor if submap else None)
         for frame in range(2):
             T_submap_camera = motion(10 * submap + frame)
-            atlas.keyframes[-1].append(motion(50 + frame) if frame else np.eye(4))
+            atlas.keyframe_poses[-1].append(motion(50 + frame) if frame else np.eye(4))
             atlas.place_frame(T_submap_camera)
             world.append(anchor @ T_submap_camera)
     return atlas, world
@@ -50,7 +50,7 @@ def test_moving_an_anchor_moves_its_own_frames_and_keyframes_and_no_others() -> 
 def test_a_frame_follows_its_keyframe() -> None:
     atlas, world = two_submaps()
     moved = motion(5)
-    atlas.keyframes[1][1] = moved @ atlas.keyframes[1][1]
+    atlas.keyframe_poses[1][1] = moved @ atlas.keyframe_poses[1][1]
     assert np.allclose(atlas.T_world_camera()[3], atlas.anchors[1] @ moved @ se3.inverse(atlas.anchors[1]) @ world[3])
 
 

@@ -455,7 +455,11 @@ def test_alignment_is_held_to_the_better_rates_of_each_column() -> None:
     figures = {"pairs": {"source": "x", "starts": [3], "lost": 0, "pairs": found}}
     made = laid_out("tracking", figures)
     assert [row[2:] for row in made["Ratios"].rows] == [["1.05", "1.05", "40.0"], ["1.20", "0.500", "13.3"]]
-    held = {row[0].removeprefix("Gauss–Newton, ").replace(", 2 apart:", ""): row[3] for row in made["Goals"].rows}
+    names = [
+        row[0].removeprefix("Gauss–Newton, ").replace(", 2 frames after the keyframe:", "")
+        for row in made["Goals"].rows
+    ]
+    held = dict(zip(names, (row[3] for row in made["Goals"].rows), strict=True))
     assert held == {
         "keyframe translation error / Adam's": "yes", "keyframe rotation error / Adam's": "yes",
         "keyframe time / Adam's": "yes", "map translation error / Adam's": "**no**",
@@ -486,7 +490,29 @@ def test_whole_runs_are_held_to_adam_by_the_better_rates(tmp_path: Path, monkeyp
         ["s", "Adam, TUM's rates", "2", "3"],
         ["s", "Adam, Replica's rates", "2", "1"],
     ]
-    assert list(made["Goals"].rows) == [["s: ATE, cm, against the better Adam's", "2.50", "≤ 1.00", "**no**"]]
+    assert list(made["Goals"].rows) == [["s: ATE, cm; goal: that of the better Adam", "2.50", "≤ 1.00", "**no**"]]
     failed = [{**job, "problem": "a | b"} for job in jobs[:2]] + jobs[2:]
     made = laid_out("tracking", {"sequence": failed})
     assert "Goals" not in made and len(made["Failed"].rows) == 2
+
+
+def test_the_summary_copies_cells_of_tables_and_names_what_is_missing(tmp_path: Path) -> None:
+    summary = importlib.import_module("summary")
+    measured = results("accuracy", {"jobs": [job_result("synthetic", 0, ate_m=0.00512), job_result("livingroom", 0)]})
+    record.write(measured, tmp_path)
+    found = summary.Results(tmp_path)
+    assert found.cell("accuracy", "Path and speed", ("synthetic", "sigma"), "ATE, cm") == "0.512"
+    with pytest.raises(KeyError, match="redkitchen"):
+        found.cell("accuracy", "Path and speed", ("redkitchen", "sigma"), "ATE, cm")
+    with pytest.raises(KeyError, match="systems"):
+        found.cell("systems", "synthetic", ("finish, s",), "sigma")
+    assert found.goals() == (1, 1)  # synthetic: ATE
+
+
+def test_results_are_listed_by_subject_and_unknown_benchmarks_come_last(tmp_path: Path) -> None:
+    for benchmark, name in (("unheard", "a"), ("versus", "versus"), ("accuracy", "b"), ("accuracy", "accuracy")):
+        record.write(results(benchmark, {}, name=name), tmp_path)
+    listed = {subject: list(names) for subject, names in tables.by_subject(tmp_path).items()}
+    assert listed == {"Whole runs": ["accuracy", "b"], "Kernels": ["versus"], "Other results": ["a"]}
+    assert list(listed) == ["Whole runs", "Kernels", "Other results"]
+    assert "[accuracy](#accuracy), [b](#b)" in tables.contents(tmp_path)

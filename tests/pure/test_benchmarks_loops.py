@@ -204,7 +204,7 @@ def test_memory_that_is_taken_is_seen(monkeypatch: pytest.MonkeyPatch, tmp_path:
     np.frombuffer(taken, np.uint8)[:: mmap.PAGESIZE] = 1
     assert long_run.resident_mib() - before == pytest.approx(64, abs=8)
     monkeypatch.setattr(long_run, "STATM", tmp_path / "none")
-    with pytest.raises(SourceError, match="which this system has not"):
+    with pytest.raises(SourceError, match="which this system does not have"):
         long_run.resident_mib()
 
 

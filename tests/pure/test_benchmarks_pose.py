@@ -35,7 +35,7 @@ def shiny_corner(n: int = 900) -> GaussianField:
     field = GaussianField.from_values(*values, opacities=0.95)
     k = torch.zeros(n, 45)
     k[:, :9] = torch.as_tensor(rng.normal(0, 0.3, (n, 9)))
-    field.extras["harmonics"] = Rows(k)
+    field.attributes["harmonics"] = Rows(k)
     return field
 
 

@@ -1,4 +1,4 @@
-"""The command line end to end with a make-believe SLAM: what is written, said and returned, also when cut short."""
+"""The command line end to end with a fake SLAM: files, output and exit codes, also of interrupted runs."""
 
 import io
 import json
@@ -31,7 +31,7 @@ from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render.cuda import stages as cuda_stages
-from sigmasplat.run import session
+from sigmasplat.run.session import Session
 from sigmasplat.run.terminal import Screen
 from sigmasplat.sources.base import Source
 
@@ -64,7 +64,7 @@ class Corridor(Source):
 
 @dataclass
 class MadeUpLoop:
-    """A pair of submaps tried, as slam.loops makes it."""
+    """A tested pair of submaps, as of SLAM."""
 
     query: int
     database: int
@@ -78,7 +78,7 @@ class MadeUpLoop:
 
 @dataclass
 class MadeUpStep:
-    """A step as slam.slam makes it."""
+    """A step, as of SLAM."""
 
     index: int
     timestamp_s: float
@@ -93,8 +93,8 @@ class MadeUpStep:
 
 
 class MadeUpSlam:
-    """Walk 10 cm a frame; `at` runs something at a frame or step of finishing, `lost` names frames without tracking,
-    `tried` says which loops a frame or the end brings; `every` so many frames a submap begins."""
+    """Moves 10 cm per frame. `at`: functions to call at a frame or at a step of the final map; `lost`: frames without
+    tracking; `tried`: loops tested at a frame or at the end; a new submap starts after `every` frames."""
 
     at: dict[int | str, Callable[[], None]]
     lost: set[int]
@@ -140,10 +140,10 @@ class MadeUpSlam:
 
 @pytest.fixture
 def corridor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Corridor:
-    """Put a made-up source, SLAM and evaluation in place of the real ones, and work in an empty folder."""
+    """Replace source, SLAM and evaluation by fakes, and work in an empty folder."""
     source = Corridor()
-    # First: it imports the real SLAM, and would keep the made-up one for good. A made-up one has no state to keep.
-    monkeypatch.setattr("sigmasplat.run.resume.Snapshots.keep", lambda *ignored: None)
+    # This line must be the first: it imports `resume` with the real SLAM. The fake has no state to save.
+    monkeypatch.setattr("sigmasplat.run.resume.StateFile.save", lambda *ignored: None)
     module = ModuleType("sigmasplat.slam.slam")
     module.Slam = MadeUpSlam  # type: ignore[attr-defined]
     scores = ModuleType("sigmasplat.evaluation.evaluate")
@@ -160,7 +160,7 @@ def corridor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Corridor:
 
 
 def evaluate(run: RunFolder, source: Source, *, mesh: bool, progress: Callable[[int, int], None]) -> dict[str, Any]:
-    """Stand in for the evaluation."""
+    """Replace the evaluation."""
     progress(1, 1)
     log = run.read_log()
     lost = [record["index"] for record in log if record["lost"]]
@@ -170,7 +170,7 @@ def evaluate(run: RunFolder, source: Source, *, mesh: bool, progress: Callable[[
     return metrics
 
 
-def test_run_leaves_a_whole_run_folder(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_writes_all_files(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code("run", "corridor", "--set", "tracking.tau=7", "--set", "mapping.every=2", "--seed", "4") == 0
     run = RunFolder.open(Path("runs/my-corridor-sigma"))
     config = run.config()
@@ -195,7 +195,7 @@ def test_run_leaves_a_whole_run_folder(corridor: Corridor, capsys: pytest.Captur
     assert "LOST" not in said
 
 
-def test_a_second_run_takes_another_folder(corridor: Corridor) -> None:
+def test_a_second_run_gets_a_numbered_folder(corridor: Corridor) -> None:
     for _ in range(3):
         assert exit_code("run", "corridor", "--no-eval") == 0
     names = sorted(path.name for path in Path("runs").iterdir())
@@ -209,7 +209,7 @@ def test_overwrite_replaces_the_default_folder(corridor: Corridor) -> None:
     assert len(RunFolder.open(Path("runs/my-corridor-sigma")).read_log()) == 6
 
 
-def test_lost_frames_are_reported(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
+def test_lost_frames_are_printed(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     MadeUpSlam.lost = {2, 3, 5}
     assert exit_code("run", "corridor") == 0
     said = capsys.readouterr().out
@@ -239,7 +239,7 @@ def test_a_second_ctrl_c_stops_at_once(corridor: Corridor) -> None:
     def twice() -> None:
         first = signal.getsignal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
-        while signal.getsignal(signal.SIGINT) is first:  # not heard yet: two at once would be one
+        while signal.getsignal(signal.SIGINT) is first:  # not handled yet: two signals at once would count as one
             time.sleep(0.001)
         signal.raise_signal(signal.SIGINT)
         time.sleep(1.0)
@@ -265,18 +265,18 @@ def test_a_crash_keeps_its_traceback_and_names_the_folder(corridor: Corridor) ->
 
 
 @pytest.mark.parametrize("problem", [ZeroDivisionError("a bug"), SigmaSplatError("no depth"), KeyboardInterrupt()])
-def test_a_run_that_fails_before_its_first_frame_leaves_nothing(corridor: Corridor, problem: BaseException) -> None:
+def test_a_run_that_fails_before_its_first_frame_leaves_no_folder(corridor: Corridor, problem: BaseException) -> None:
     def fail() -> None:
         raise problem
 
     MadeUpSlam.at = {0: fail}
     with pytest.raises((SystemExit, ZeroDivisionError)) as left:
         cli.main(["run", "corridor"])
-    assert not getattr(left.value, "__notes__", []), "there is no folder to name"
+    assert not getattr(left.value, "__notes__", []), "no folder exists"
     assert not any(Path().iterdir()), "not even runs/"
 
 
-def test_what_is_in_the_folder_keeps_it(corridor: Corridor) -> None:
+def test_a_failed_run_keeps_a_folder_with_files_of_the_user(corridor: Corridor) -> None:
     def fail() -> None:
         Path("mine/notes.txt").write_text("the user's")
         raise SigmaSplatError("no depth")
@@ -289,18 +289,20 @@ def test_what_is_in_the_folder_keeps_it(corridor: Corridor) -> None:
 CLOSED, REFUSED, LAST = MadeUpLoop(7, 0, True), MadeUpLoop(7, 2, False), MadeUpLoop(8, 1, True, 0.0149, 0.1206)
 
 
-def test_submaps_and_loops_are_saved_and_printed(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
+def test_submaps_and_loops_are_stored_and_printed(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     MadeUpSlam.every = 2
     MadeUpSlam.tried = {4: [CLOSED, REFUSED], "end": [LAST]}
-    told_while_running: list[list[dict[str, Any]]] = []
-    MadeUpSlam.at = {5: lambda: told_while_running.append(RunFolder.open(Path("mine")).read_loops())}
+    stored_while_running: list[list[dict[str, Any]]] = []
+    MadeUpSlam.at = {5: lambda: stored_while_running.append(RunFolder.open(Path("mine")).read_loops())}
     assert exit_code("run", "corridor", "--no-eval", "--out", "mine") == 0
     run, log = RunFolder.open(Path("mine")), RunFolder.open(Path("mine")).read_log()
     assert [record["submap"] for record in log] == [0, 0, 1, 1, 2, 2]
     assert [len(record.get("loops", [])) for record in log] == [0, 0, 0, 0, 2, 0]
     assert log[4]["loops"][1] == {"query": 7, "database": 2, "accepted": False, "residual": 0.02149,
                                   "translation_m": 0.043, "chi2": None}  # fmt: skip
-    assert [[loop["database"] for loop in loops] for loops in told_while_running] == [[0, 2]], "a killed run has them"
+    assert [[loop["database"] for loop in loops] for loops in stored_while_running] == [[0, 2]], (
+        "a killed run has stored them"
+    )
     assert [loop["database"] for loop in run.read_loops()] == [0, 2, 1]
     said = capsys.readouterr().out
     assert "frame 4: loop closed between submaps 7 and 0 (residual 0.021, moved 4.3 cm)" in said
@@ -312,16 +314,18 @@ def test_submaps_and_loops_are_saved_and_printed(corridor: Corridor, capsys: pyt
     assert isinstance(store, DiskStore) and store.folder == Path("mine/submaps")
 
 
-def test_loops_take_their_latest_verdict_to_the_end(corridor: Corridor) -> None:
+def test_loops_are_stored_with_their_latest_verdict(corridor: Corridor) -> None:
     loop = MadeUpLoop(7, 0, True)
     MadeUpSlam.tried = {2: [loop]}
     MadeUpSlam.at = {4: lambda: setattr(loop, "accepted", False)}
     assert exit_code("run", "corridor", "--no-eval", "--out", "mine") == 0
     assert not RunFolder.open(Path("mine")).read_loops()[0]["accepted"]
-    assert RunFolder.open(Path("mine")).read_log()[2]["loops"][0]["accepted"], "the log says what was known then"
+    assert RunFolder.open(Path("mine")).read_log()[2]["loops"][0]["accepted"], "the log has the verdict of that time"
 
 
-def test_the_time_of_finishing_is_not_that_of_the_frames(corridor: Corridor, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_time_of_the_final_map_is_separate_from_that_of_the_frames(
+    corridor: Corridor, monkeypatch: pytest.MonkeyPatch
+) -> None:
     now_s = [0.0]
 
     def pass_time(seconds: float) -> Callable[[], None]:
@@ -335,17 +339,17 @@ def test_the_time_of_finishing_is_not_that_of_the_frames(corridor: Corridor, mon
     assert sum(RunFolder.open(Path("mine")).read_profile().values()) == pytest.approx(5.0)
 
 
-@pytest.mark.parametrize("asked", [True, False])
-def test_stages_on_a_device_are_measured_where_a_profile_is_asked_for(corridor: Corridor, asked: bool) -> None:
+@pytest.mark.parametrize("profile", [True, False])
+def test_stages_on_a_device_are_measured_only_with_profile(corridor: Corridor, profile: bool) -> None:
     seen = []
     MadeUpSlam.at = {1: lambda: seen.append(cuda_stages.measured())}
-    assert exit_code("run", "corridor", "--no-eval", "--out", "mine", *["--profile"] * asked) == 0
+    assert exit_code("run", "corridor", "--no-eval", "--out", "mine", *["--profile"] * profile) == 0
     cuda_stages.measure(False)
-    assert seen == [asked]
+    assert seen == [profile]
 
 
 @pytest.mark.parametrize("moment", ["loops", "finish 1"])
-def test_ctrl_c_while_finishing_keeps_everything(
+def test_ctrl_c_during_the_final_map_keeps_all_results(
     corridor: Corridor, capsys: pytest.CaptureFixture[str], moment: str
 ) -> None:
     MadeUpSlam.at = {moment: lambda: signal.raise_signal(signal.SIGINT)}
@@ -360,13 +364,13 @@ def test_ctrl_c_while_finishing_keeps_everything(
     assert not (run.path / "metrics.json").exists()
 
 
-def test_ctrl_c_when_all_is_done_changes_nothing(corridor: Corridor) -> None:
+def test_ctrl_c_after_the_last_step_changes_nothing(corridor: Corridor) -> None:
     MadeUpSlam.at = {"finish 2": lambda: signal.raise_signal(signal.SIGINT)}
     assert exit_code("run", "corridor", "--no-eval", "--out", "mine") == 0
     assert RunFolder.open(Path("mine")).facts()["status"] == "complete"
 
 
-def test_an_interrupted_run_is_not_finished(corridor: Corridor) -> None:
+def test_a_run_interrupted_between_frames_makes_no_final_map(corridor: Corridor) -> None:
     MadeUpSlam.at = {3: lambda: signal.raise_signal(signal.SIGINT)}
     MadeUpSlam.tried = {2: [CLOSED]}
     assert exit_code("run", "corridor", "--out", "cut") == 130
@@ -374,7 +378,7 @@ def test_an_interrupted_run_is_not_finished(corridor: Corridor) -> None:
     assert MadeUpSlam.latest.finished == 0 and "finish_s" not in run.facts() and len(run.read_loops()) == 1
 
 
-def test_a_crash_while_finishing_keeps_everything(corridor: Corridor) -> None:
+def test_a_crash_during_the_final_map_keeps_all_results(corridor: Corridor) -> None:
     def crash() -> None:
         raise ZeroDivisionError("a bug")
 
@@ -387,7 +391,7 @@ def test_a_crash_while_finishing_keeps_everything(corridor: Corridor) -> None:
     assert len(run.read_trajectory()) == 6 and len(run.read_map()) == 2 and run.read_checkpoint()[0]
 
 
-def test_the_results_show_what_refinement_brought(
+def test_the_results_show_psnr_before_and_after_refinement(
     corridor: Corridor, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert exit_code("run", "corridor", "--out", "one") == 0
@@ -406,13 +410,13 @@ def test_the_results_show_what_refinement_brought(
     assert "Submaps 4" in rows and "Loops closed 3 of 7 tried" in rows
 
 
-def test_a_terminal_gets_bars(corridor: Corridor) -> None:
+def test_a_terminal_shows_progress_bars(corridor: Corridor) -> None:
     out = io.StringIO()
     screen = Screen(Console(file=out, force_terminal=True, width=120))
     MadeUpSlam.tried = {4: [CLOSED]}
     folder = RunFolder.create(Path("direct"), Config(), "corridor")
-    with screen.steps(6) as watch:
-        session.record(MadeUpSlam(Config()), corridor, folder, watch)
+    with screen.steps(6) as callback:
+        Session(MadeUpSlam(Config()), corridor, folder, callback).execute()
     said = out.getvalue()
     assert "SLAM" in said and "6/6" in said and "final map" in said and "2/2" in said and "loop closed" in said
 
@@ -420,13 +424,15 @@ def test_a_terminal_gets_bars(corridor: Corridor) -> None:
 def test_unreadable_images_are_counted(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     corridor.broken = {1, 4}
     assert exit_code("run", "corridor", "--no-eval", "--out", "some") == 0
-    assert "2 unreadable images passed over (first: 1.png is truncated)" in capsys.readouterr().err
+    assert "2 unreadable images skipped (first: 1.png is truncated)" in capsys.readouterr().err
     facts = json.loads(Path("some/run.json").read_text())
     assert facts["skipped"] == ["1.png is truncated", "4.png is truncated"]
     assert [record["index"] for record in RunFolder.open(Path("some")).read_log()] == [0, 2, 3, 5]
 
 
-def test_strict_damage_is_one_line_and_nothing_is_lost(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
+def test_strict_stops_with_one_line_and_keeps_the_results(
+    corridor: Corridor, capsys: pytest.CaptureFixture[str]
+) -> None:
     corridor.broken, corridor.strict = {3}, True
     assert exit_code("run", "corridor", "--out", "strict") == 2
     assert capsys.readouterr().err.strip() == "sigmasplat: 3.png is truncated"
@@ -435,7 +441,7 @@ def test_strict_damage_is_one_line_and_nothing_is_lost(corridor: Corridor, capsy
     assert len(run.read_trajectory()) == 3
 
 
-def test_a_wrong_depth_unit_is_warned_of(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_depth_unit_gives_a_warning(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     corridor.depth_m = 2000.0
     assert exit_code("run", "corridor", "--no-eval") == 0
     err = capsys.readouterr().err
@@ -457,7 +463,8 @@ def test_eval_and_export_read_what_run_wrote(corridor: Corridor, capsys: pytest.
     assert exit_code("export", "mine", "--overwrite", "--format", "ply") == 0
 
 
-def test_record_needs_no_screen(corridor: Corridor) -> None:
-    outcome = session.record(MadeUpSlam(Config()), corridor, RunFolder.create(Path("direct"), Config(), "corridor"))
+def test_a_session_runs_without_a_terminal(corridor: Corridor) -> None:
+    folder = RunFolder.create(Path("direct"), Config(), "corridor")
+    outcome = Session(MadeUpSlam(Config()), corridor, folder).execute()
     assert (outcome.status, outcome.frames, outcome.lost) == ("complete", 6, 0)
     assert outcome.wall_s > 0

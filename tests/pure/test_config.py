@@ -1,4 +1,4 @@
-"""Settings: what --set accepts, what the environment may say, what a config.json brings back."""
+"""Settings: values that --set and the environment accept, and saving to config.json."""
 
 import dataclasses
 import os
@@ -30,7 +30,7 @@ def test_override_converts_to_each_type() -> None:
     assert type(tracking.iterations) is int
     assert type(tracking.tau) is float
     assert (config.seed, config.backend) == (7, "reference")
-    assert preset("varsplat-fast").seed == 0, "the preset itself stays as it is"
+    assert preset("varsplat-fast").seed == 0, "the preset itself is not changed"
 
 
 def test_override_reaches_every_setting() -> None:
@@ -119,14 +119,14 @@ def _python(code: str, **environment: str) -> str:
 def test_import_sets_the_wait_policy_and_loads_no_torch() -> None:
     code = "import sigmasplat, os, sys; print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules)"
     assert _python(code) == "passive False"
-    assert _python(code, OMP_WAIT_POLICY="active") == "active False", "the user's own choice stays"
+    assert _python(code, OMP_WAIT_POLICY="active") == "active False", "the value of the user is kept"
 
 
-def test_a_bad_switch_does_not_break_the_import() -> None:
+def test_an_invalid_switch_does_not_break_the_import() -> None:
     assert _python("import sigmasplat; print('in')", SIGMASPLAT_ISA="sse9") == "in"
 
 
-def test_the_public_names_are_there() -> None:
+def test_the_public_names_exist() -> None:
     import sigmasplat
 
     missing = []

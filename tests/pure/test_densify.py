@@ -11,7 +11,7 @@ from sigmasplat.fit.densify_stats import DensifyStats
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import COLUMNS, EXTRAS, WIDTH, GaussianField
+from sigmasplat.model.field import ATTRIBUTES, COLUMNS, WIDTH, GaussianField
 from sigmasplat.render.reference import operators as reference
 from sigmasplat.slam.densify import clone, densify_mask, multiply, split, too_large
 
@@ -21,16 +21,20 @@ KEPT = [k for k in range(WIDTH) if k not in MOVED]
 
 
 def aged(n: int = 6) -> GaussianField:
-    """Make n different splats with Adam's state and both extras, ids from 50 on."""
+    """Make n different splats with Adam's state and both attributes, ids from 50 on."""
     torch.manual_seed(0)
     field = GaussianField(torch.randn(n, WIDTH))
     field.moment1, field.moment2 = torch.randn(n, WIDTH), torch.rand(n, WIDTH)
     field.last_step, field.steps = torch.full((n,), 9, dtype=torch.int32), 9
-    for name, width in EXTRAS.items():
-        extra = field.carry(name)
-        extra.params, extra.moment1, extra.moment2 = torch.randn(n, width), torch.randn(n, width), torch.rand(n, width)
-        extra.last_step, extra.steps = torch.full((n,), 9, dtype=torch.int32), 9
-    field.ids, field.born = torch.arange(50, 50 + n), 50 + n
+    for name, width in ATTRIBUTES.items():
+        attribute = field.get_or_create(name)
+        attribute.params, attribute.moment1, attribute.moment2 = (
+            torch.randn(n, width),
+            torch.randn(n, width),
+            torch.rand(n, width),
+        )
+        attribute.last_step, attribute.steps = torch.full((n,), 9, dtype=torch.int32), 9
+    field.ids, field.next_id = torch.arange(50, 50 + n), 50 + n
     return field
 
 
@@ -41,8 +45,8 @@ def mask(n: int, *rows: int) -> Tensor:
 
 
 def assert_at_rest(field: GaussianField, first: int) -> None:
-    """Hold rows from `first` on to be as new, in the field and its extras."""
-    for rows in (field, *field.extras.values()):
+    """Hold rows from `first` on to be as new, in the field and its attributes."""
+    for rows in (field, *field.attributes.values()):
         assert not rows.moment1[first:].any() and not rows.moment2[first:].any() and not rows.last_step[first:].any()
         assert len(rows) == len(rows.moment1) == len(rows.moment2) == len(rows.last_step) == len(field)
         assert rows.steps == 9
@@ -52,7 +56,7 @@ def assert_untouched(field: GaussianField, before: GaussianField, rows: list[int
     """Hold the first rows of a field to be those rows of another, with all they carry."""
     n = len(rows)
     assert field.ids[:n].tolist() == before.ids[rows].tolist()
-    for now, then in ((field, before), *((field.extras[name], before.extras[name]) for name in EXTRAS)):
+    for now, then in ((field, before), *((field.attributes[name], before.attributes[name]) for name in ATTRIBUTES)):
         for a, b in zip(now.state(), then.state(), strict=True):
             assert torch.equal(a[:n], b[rows])
 
@@ -62,11 +66,11 @@ def test_a_split_replaces_its_splat_by_two_that_inherit_all_but_place_and_size()
     split(field, mask(6, 1, 4), np.random.default_rng(0))
     assert len(field) == 8
     assert_untouched(field, before, [0, 2, 3, 5])
-    assert field.ids[4:].tolist() == [56, 57, 58, 59] and field.born == 60
+    assert field.ids[4:].tolist() == [56, 57, 58, 59] and field.next_id == 60
     parents = [1, 1, 4, 4]
     assert torch.equal(field.params[4:][:, KEPT], before.params[parents][:, KEPT])
-    for name in EXTRAS:
-        assert torch.equal(field.extras[name].params[4:], before.extras[name].params[parents])
+    for name in ATTRIBUTES:
+        assert torch.equal(field.attributes[name].params[4:], before.attributes[name].params[parents])
     torch.testing.assert_close(field.scales[4:], before.scales[parents] / 1.6)
     assert_at_rest(field, 4)
     assert len({tuple(row.tolist()) for row in field.means}) == 8, "no two in one place"
@@ -110,7 +114,7 @@ def test_a_clone_stands_where_its_splat_does() -> None:
         clone(field, rows)
         assert_untouched(field, before, list(range(6)))
         assert torch.equal(field.params[6:], before.params[[3, 5]])
-        assert torch.equal(field.extras["harmonics"].params[6:], before.extras["harmonics"].params[[3, 5]])
+        assert torch.equal(field.attributes["harmonics"].params[6:], before.attributes["harmonics"].params[[3, 5]])
         assert field.ids[6:].tolist() == [56, 57]
         assert_at_rest(field, 6)
         field.params[6:] += 1.0
@@ -121,7 +125,7 @@ def test_nothing_hot_nothing_changed() -> None:
     field, before = aged(), aged()
     split(field, mask(6), np.random.default_rng(0))
     clone(field, mask(6))
-    assert len(field) == 6 and field.born == 56
+    assert len(field) == 6 and field.next_id == 56
     assert_untouched(field, before, list(range(6)))
     empty = GaussianField.empty()
     split(empty, mask(0), np.random.default_rng(0))

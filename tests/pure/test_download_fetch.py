@@ -1,4 +1,4 @@
-"""Whatever the server does, the file is whole in the end or not there; what came is not asked for again."""
+"""For every behaviour of the server, the file is complete or absent, and no byte is requested twice."""
 
 import resource
 from collections.abc import Iterator
@@ -27,21 +27,21 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[FileServer]:
 
 
 def fetched(server: FileServer, target: Path, retry: RetryPolicy = HASTY) -> list[tuple[int, int]]:
-    """Fetch /a.tgz; return what the progress was told."""
-    told: list[tuple[int, int]] = []
-    fetch(server.url("/a.tgz"), target, lambda *counts: told.append(counts), lambda *sizes: None, retry)
-    return told
+    """Fetch /a.tgz; return the calls of progress."""
+    calls: list[tuple[int, int]] = []
+    fetch(server.url("/a.tgz"), target, lambda *counts: calls.append(counts), lambda *sizes: None, retry)
+    return calls
 
 
 def left_in(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def test_a_file_comes_whole_and_alone(server: FileServer, tmp_path: Path) -> None:
-    told = fetched(server, tmp_path / "a.tgz")
+def test_a_file_is_downloaded_completely(server: FileServer, tmp_path: Path) -> None:
+    calls = fetched(server, tmp_path / "a.tgz")
     assert (tmp_path / "a.tgz").read_bytes() == BODY
     assert left_in(tmp_path) == {"a.tgz"}
-    assert told[-1] == (len(BODY), len(BODY)) and told == sorted(told)
+    assert calls[-1] == (len(BODY), len(BODY)) and calls == sorted(calls)
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_a_file_comes_whole_and_alone(server: FileServer, tmp_path: Path) -> Non
     ],
     ids=lambda first: str(len(first)),
 )
-def test_the_file_is_complete_in_spite_of_errors(first: list[Act], server: FileServer, tmp_path: Path) -> None:
+def test_the_file_is_complete_after_failures(first: list[Act], server: FileServer, tmp_path: Path) -> None:
     server.acts = list(first)
     server.files["/moved.tgz"] = BODY
     fetched(server, tmp_path / "a.tgz")
@@ -69,30 +69,30 @@ def test_the_file_is_complete_in_spite_of_errors(first: list[Act], server: FileS
 
 
 @pytest.mark.parametrize("slow", [acts.trickle(5.0), acts.silence(0.8)], ids=["trickle", "silence"])
-def test_the_file_is_complete_although_one_try_was_slow(slow: Act, server: FileServer, tmp_path: Path) -> None:
+def test_the_file_is_complete_after_a_slow_attempt(slow: Act, server: FileServer, tmp_path: Path) -> None:
     server.acts = [acts.drop_after(3000), slow]
     fetched(server, tmp_path / "a.tgz", IMPATIENT)
     assert (tmp_path / "a.tgz").read_bytes() == BODY
     assert len(server.ranges) >= 3 and server.ranges[1] == "bytes=3000-"
 
 
-def test_a_broken_download_continues(server: FileServer, tmp_path: Path) -> None:
+def test_a_download_resumes_after_a_break(server: FileServer, tmp_path: Path) -> None:
     server.acts = [acts.drop_after(3000), acts.drop_after(2500)]
     fetched(server, tmp_path / "a.tgz")
     assert server.ranges == ["", "bytes=3000-", "bytes=5500-"]
 
 
-def test_a_later_call_goes_on_too(server: FileServer, tmp_path: Path) -> None:
+def test_a_later_call_resumes(server: FileServer, tmp_path: Path) -> None:
     server.acts = [acts.drop_after(3000), acts.status(503), acts.status(503), acts.status(503)]
     with pytest.raises(DownloadError, match=r"3,000 bytes are kept"):
         fetched(server, tmp_path / "a.tgz")
     assert not (tmp_path / "a.tgz").exists()
-    told = fetched(server, tmp_path / "a.tgz")
+    calls = fetched(server, tmp_path / "a.tgz")
     assert (tmp_path / "a.tgz").read_bytes() == BODY
-    assert server.ranges[-1] == "bytes=3000-" and told[0][0] > 3000
+    assert server.ranges[-1] == "bytes=3000-" and calls[0][0] > 3000
 
 
-def test_ctrl_c_keeps_what_came(server: FileServer, tmp_path: Path) -> None:
+def test_ctrl_c_keeps_the_partial_file(server: FileServer, tmp_path: Path) -> None:
     def interrupt(done: int, total: int) -> None:
         raise KeyboardInterrupt
 
@@ -105,7 +105,7 @@ def test_ctrl_c_keeps_what_came(server: FileServer, tmp_path: Path) -> None:
     assert server.ranges[-1].startswith("bytes=")
 
 
-def test_two_versions_are_never_joined(server: FileServer, tmp_path: Path) -> None:
+def test_two_versions_of_a_file_are_never_joined(server: FileServer, tmp_path: Path) -> None:
     server.acts = [acts.drop_after(3000), acts.status(404)]
     with pytest.raises(DownloadError):
         fetched(server, tmp_path / "a.tgz")
@@ -126,7 +126,7 @@ def test_a_part_of_unknown_origin_is_not_used(note: str | None, server: FileServ
     assert (tmp_path / "a.tgz").read_bytes() == BODY
 
 
-def test_a_part_that_is_whole_is_not_asked_for_again(server: FileServer, tmp_path: Path) -> None:
+def test_a_complete_part_is_not_requested_again(server: FileServer, tmp_path: Path) -> None:
     url = server.url("/a.tgz")
     (tmp_path / "a.tgz.part").write_bytes(BODY)
     (tmp_path / "a.tgz.part.json").write_text(f'{{"url": "{url}", "version": "", "size_bytes": {len(BODY)}}}')
@@ -135,16 +135,21 @@ def test_a_part_that_is_whole_is_not_asked_for_again(server: FileServer, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("act", "says"),
+    ("answers", "says"),
     [
-        (acts.drop_after(500), r"broke off after 500 of 10,240 bytes; 500 bytes are kept"),
-        (acts.status(503), r"busy or out of order \(HTTP 503 Service Unavailable\)"),
-        (acts.chunked(broken=True), r"the connection to 127.0.0.1 broke \(IncompleteRead"),
+        (
+            [acts.drop_after(500), acts.drop_after(0), acts.drop_after(0)],
+            r"closed the connection after 500 of 10,240 bytes; 500 bytes are kept",
+        ),
+        ([acts.status(503)] * 3, r"busy or out of service \(HTTP 503 Service Unavailable\)"),
+        ([acts.chunked(broken=True)] * 3, r"the connection to 127.0.0.1 broke \(IncompleteRead"),
     ],
     ids=["drops", "503", "chunks"],
 )
-def test_patience_ends(act: Act, says: str, server: FileServer, tmp_path: Path) -> None:
-    server.acts = [act, act, act] if "broke off" not in says else [act, acts.drop_after(0), acts.drop_after(0)]
+def test_the_download_fails_after_the_last_retry(
+    answers: list[Act], says: str, server: FileServer, tmp_path: Path
+) -> None:
+    server.acts = list(answers)
     with pytest.raises(DownloadError, match=says):
         fetched(server, tmp_path / "a.tgz", replace(HASTY, progress_bytes=2**20))
     assert server.acts == [] and not (tmp_path / "a.tgz").exists()
@@ -153,12 +158,12 @@ def test_patience_ends(act: Act, says: str, server: FileServer, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("act", "says"),
     [
-        (acts.trickle(5.0), r"hardly anything comes from 127.0.0.1; \d+ bytes are kept"),
+        (acts.trickle(5.0), r"127.0.0.1 sends too slowly; \d+ bytes are kept"),
         (acts.silence(0.8), r"127.0.0.1 does not answer properly \(TimeoutError"),
     ],
     ids=["trickle", "silence"],
 )
-def test_slowness_is_noticed(act: Act, says: str, server: FileServer, tmp_path: Path) -> None:
+def test_a_slow_server_is_an_error(act: Act, says: str, server: FileServer, tmp_path: Path) -> None:
     server.acts = [act]
     with pytest.raises(DownloadError, match=says):
         fetched(server, tmp_path / "a.tgz", replace(IMPATIENT, max_attempts=1))
@@ -167,15 +172,15 @@ def test_slowness_is_noticed(act: Act, says: str, server: FileServer, tmp_path: 
 @pytest.mark.parametrize(
     ("act", "says"),
     [
-        (acts.status(404), r"/a.tgz cannot be had \(HTTP 404 Not Found\)"),
+        (acts.status(404), r"/a.tgz is not available \(HTTP 404 Not Found\)"),
         (acts.status(403), r"HTTP 403 Forbidden"),
         (acts.web_page, r"answers with a web page"),
         (acts.endless, r"does not say how long the file is"),
-        (acts.sends_on("ftp://127.0.0.1/a.tgz"), r"sends on to ftp://127.0.0.1/a.tgz, which is not https"),
+        (acts.sends_on("ftp://127.0.0.1/a.tgz"), r"redirects to ftp://127.0.0.1/a.tgz, which is not https"),
     ],
     ids=["404", "403", "html", "no length", "ftp"],
 )
-def test_some_answers_are_final(act: Act, says: str, server: FileServer, tmp_path: Path) -> None:
+def test_some_errors_are_not_retried(act: Act, says: str, server: FileServer, tmp_path: Path) -> None:
     server.acts = [act]
     with pytest.raises(DownloadError, match=says):
         fetched(server, tmp_path / "a.tgz")
@@ -183,17 +188,17 @@ def test_some_answers_are_final(act: Act, says: str, server: FileServer, tmp_pat
     assert left_in(tmp_path) == set()
 
 
-def test_a_size_may_be_refused_before_a_byte_is_written(server: FileServer, tmp_path: Path) -> None:
-    def accept(size_bytes: int | None, here_bytes: int) -> None:
-        assert (size_bytes, here_bytes) == (len(BODY), 0)
+def test_a_size_can_be_refused_before_writing(server: FileServer, tmp_path: Path) -> None:
+    def check_size(size_bytes: int | None, downloaded_bytes: int) -> None:
+        assert (size_bytes, downloaded_bytes) == (len(BODY), 0)
         raise DownloadError("too large")
 
     with pytest.raises(DownloadError, match="too large"):
-        fetch(server.url("/a.tgz"), tmp_path / "a.tgz", lambda *counts: None, accept, HASTY)
+        fetch(server.url("/a.tgz"), tmp_path / "a.tgz", lambda *counts: None, check_size, HASTY)
     assert not (tmp_path / "a.tgz.part").exists()
 
 
-def test_two_processes_do_not_write_one_file(server: FileServer, tmp_path: Path) -> None:
+def test_two_processes_cannot_write_one_file(server: FileServer, tmp_path: Path) -> None:
     with open_partial(tmp_path / "a.tgz") as part:
         part.add(b"mine")
         with pytest.raises(DownloadError, match="another process"):
@@ -201,7 +206,7 @@ def test_two_processes_do_not_write_one_file(server: FileServer, tmp_path: Path)
     assert (tmp_path / "a.tgz.part").read_bytes() == b"mine"
 
 
-def test_a_full_disk_is_an_error(server: FileServer, tmp_path: Path) -> None:
+def test_a_full_disk_is_reported(server: FileServer, tmp_path: Path) -> None:
     """The system's limit on the size of a file stands for the disk: what fits is written, then writing fails."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (5000, limits[1]))
@@ -213,7 +218,7 @@ def test_a_full_disk_is_an_error(server: FileServer, tmp_path: Path) -> None:
     assert not (tmp_path / "a.tgz").exists() and (tmp_path / "a.tgz.part").stat().st_size == 5000
 
 
-def test_nobody_listens(tmp_path: Path, server: FileServer) -> None:
+def test_an_unreachable_server_is_reported(tmp_path: Path, server: FileServer) -> None:
     with pytest.raises(DownloadError, match=r"cannot connect to 127.0.0.1 .*refused"):
         fetch("http://127.0.0.1:1/a.tgz", tmp_path / "a.tgz", lambda *c: None, lambda *s: None, RetryPolicy())
     assert left_in(tmp_path) == set()

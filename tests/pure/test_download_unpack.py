@@ -1,4 +1,4 @@
-"""What honest archives hold comes out; hostile ones write nothing outside their folder, and end soon."""
+"""Valid archives are unpacked completely; malicious ones write nothing outside their folder and are stopped early."""
 
 import io
 import tarfile
@@ -18,7 +18,7 @@ PLENTY = 2**24
 
 
 def unpacked(content: bytes, name: str, folder: Path, bytes_: int = PLENTY, files: int = 99) -> dict[str, bytes]:
-    """Unpack an archive in `folder`/inside; return what is there."""
+    """Unpack an archive to `folder`/inside; return its files."""
     folder.mkdir(exist_ok=True)
     archive = folder / name
     archive.write_bytes(content)
@@ -27,26 +27,26 @@ def unpacked(content: bytes, name: str, folder: Path, bytes_: int = PLENTY, file
 
 
 @pytest.mark.parametrize(("pack", "name"), [(tar_gz, "a.tgz"), (tar_gz, "a.TAR.GZ"), (zipped, "a.zip")])
-def test_what_went_in_comes_out(pack: Callable[..., bytes], name: str, tmp_path: Path) -> None:
+def test_all_files_are_unpacked(pack: Callable[..., bytes], name: str, tmp_path: Path) -> None:
     assert unpacked(pack(FILES), name, tmp_path) == FILES
 
 
 @pytest.mark.parametrize(("pack", "name"), [(tar_gz, "a.tgz"), (zipped, "a.zip")])
 def test_progress_reaches_the_end(pack: Callable[..., bytes], name: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(pack(FILES))
-    told: list[tuple[int, int]] = []
-    unpack(tmp_path / name, tmp_path / "inside", Budget(PLENTY, 99), lambda *counts: told.append(counts))
-    assert told[-1][0] == told[-1][1] > 0 and told == sorted(told)
-    assert told.count(told[-1]) == 1, "the end is told once"
+    calls: list[tuple[int, int]] = []
+    unpack(tmp_path / name, tmp_path / "inside", Budget(PLENTY, 99), lambda *counts: calls.append(counts))
+    assert calls[-1][0] == calls[-1][1] > 0 and calls == sorted(calls)
+    assert calls.count(calls[-1]) == 1, "the end is reported once"
 
 
-def test_a_desktops_litter_stays_behind(tmp_path: Path) -> None:
+def test_desktop_files_are_left_out(tmp_path: Path) -> None:
     litter = {"Thumbs.db": b"1", "__MACOSX/rgb/1.png": b"2", "rgb/._1.png": b"3", "rgb/.DS_Store": b"4"}
     for i, (pack, name) in enumerate(((tar_gz, "a.tgz"), (zipped, "a.zip"))):
         assert unpacked(pack(FILES | litter), name, tmp_path / str(i)) == FILES
 
 
-def test_windows_separators_and_dots_are_understood(tmp_path: Path) -> None:
+def test_windows_separators_and_dots_are_supported(tmp_path: Path) -> None:
     assert unpacked(zipped({"seq\\1.txt": b"1", "./seq//2.txt": b"2"}), "a.zip", tmp_path) == {
         "seq/1.txt": b"1",
         "seq/2.txt": b"2",
@@ -58,8 +58,10 @@ HOSTILE_NAMES = ["../evil", "a/../../evil", "/tmp/evil", "..\\evil", "C:\\evil",
 
 @pytest.mark.parametrize("name", HOSTILE_NAMES)
 @pytest.mark.parametrize(("pack", "archive"), [(tar_gz, "a.tgz"), (zipped, "a.zip")])
-def test_no_name_leads_out(pack: Callable[..., bytes], archive: str, name: str, tmp_path: Path) -> None:
-    with pytest.raises(ArchiveError, match="leads out of its folder"):
+def test_names_that_leave_the_folder_are_refused(
+    pack: Callable[..., bytes], archive: str, name: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ArchiveError, match="leaves the folder"):
         unpacked(pack({"good": b"1", name: b"evil"}), archive, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {archive, "inside"}
     assert "evil" not in str(list((tmp_path / "inside").rglob("*")))
@@ -67,7 +69,7 @@ def test_no_name_leads_out(pack: Callable[..., bytes], archive: str, name: str, 
 
 @given(parts=st.lists(st.sampled_from(["..", ".", "", "a", "/", "\\", "b\\..\\..", "C:", "~"]), min_size=1, max_size=6))
 @settings(max_examples=60, deadline=None)
-def test_whatever_the_name_nothing_lands_outside(parts: list[str], tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_no_name_writes_outside_the_folder(parts: list[str], tmp_path_factory: pytest.TempPathFactory) -> None:
     folder = tmp_path_factory.mktemp("names")
     content = tar_gz({"/".join(parts) + "x": b"1"})
     with suppress(ArchiveError):
@@ -88,19 +90,19 @@ def test_whatever_the_name_nothing_lands_outside(parts: list[str], tmp_path_fact
     ],
     ids=["symlink", "symlink up", "hard link", "hard link inside", "character device", "block device", "pipe"],
 )
-def test_only_files_and_folders_are_made(strange: tarfile.TarInfo, tmp_path: Path) -> None:
-    with pytest.raises(ArchiveError, match="'odd', which is no plain file or folder"):
+def test_only_files_and_folders_are_created(strange: tarfile.TarInfo, tmp_path: Path) -> None:
+    with pytest.raises(ArchiveError, match="'odd', which is not a plain file or folder"):
         unpacked(tar_gz(FILES, strange), "a.tgz", tmp_path)
     assert not (tmp_path / "inside/odd").exists() and not (tmp_path / "inside/odd").is_symlink()
 
 
 def test_a_link_in_a_zip_is_refused_before_anything_is_written(tmp_path: Path) -> None:
-    with pytest.raises(ArchiveError, match="'way', which is no plain file or folder"):
+    with pytest.raises(ArchiveError, match="'way', which is not a plain file or folder"):
         unpacked(zipped(FILES | {"way/evil": b"1"}, links={"way": "/tmp"}), "a.zip", tmp_path)
     assert folder_content(tmp_path / "inside") == {}
 
 
-def test_a_file_twice_is_refused(tmp_path: Path) -> None:
+def test_a_duplicate_file_is_refused(tmp_path: Path) -> None:
     twice = io.BytesIO()
     with zipfile.ZipFile(twice, "w") as made, pytest.warns(UserWarning, match="Duplicate"):
         made.writestr("a", b"1")
@@ -112,18 +114,18 @@ def test_a_file_twice_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("pack", "name"), [(tar_gz, "bomb.tgz"), (zipped, "bomb.zip")])
-def test_bombs_end_soon(pack: Callable[..., bytes], name: str, tmp_path: Path) -> None:
+def test_archive_bombs_are_stopped(pack: Callable[..., bytes], name: str, tmp_path: Path) -> None:
     bomb = pack({"zeros": bytes(2**23)})
     assert len(bomb) < 2**14
-    with pytest.raises(ArchiveError, match=r"more bytes than such a recording can have|grows 1\d\d\d-fold"):
+    with pytest.raises(ArchiveError, match=r"more bytes than expected|grows 1\d\d\d-fold"):
         unpacked(bomb, name, tmp_path, bytes_=2**20)
     assert sum(map(len, folder_content(tmp_path / "inside").values())) <= 2**20
-    with pytest.raises(ArchiveError, match="more files than such a recording can have"):
+    with pytest.raises(ArchiveError, match="more files than expected"):
         unpacked(pack({str(i): b"" for i in range(20)}), name, tmp_path / "files", files=10)
     assert len(folder_content(tmp_path / "files/inside")) <= 10
 
 
-def test_a_zip_that_lies_about_its_sizes_is_damaged(tmp_path: Path) -> None:
+def test_a_zip_with_wrong_sizes_is_damaged(tmp_path: Path) -> None:
     honest = zipped({"zeros": bytes(50_000)})
     lying = honest.replace((50_000).to_bytes(4, "little"), (5).to_bytes(4, "little"))
     assert lying != honest
@@ -153,7 +155,7 @@ def test_damage_after_the_last_file_is_noticed(tmp_path: Path) -> None:
         unpacked(content[:-8] + bytes(4) + content[-4:], "a.tgz", tmp_path)
 
 
-def test_other_things_are_no_archives(tmp_path: Path) -> None:
+def test_other_files_are_not_archives(tmp_path: Path) -> None:
     for name in ("page.tgz", "page.zip"):
         with pytest.raises(ArchiveError, match="is damaged"):
             unpacked(b"<html>login</html>" * 99, name, tmp_path / name[5:])

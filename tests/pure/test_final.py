@@ -10,14 +10,14 @@ from scipy.spatial import cKDTree
 
 from sigmasplat.config import Config, FinalConfig, MappingConfig, RenderConfig
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.fit.adam import EXTRA_RATES
+from sigmasplat.fit.adam import ATTRIBUTE_RATES
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.model.submap import MemoryStore, Picture, Submap
 from sigmasplat.render import render
 from sigmasplat.render.reference.view import ReferenceView
-from sigmasplat.slam.final import Keyframes, final_map, merged, survivors
+from sigmasplat.slam.final import KeyframeReader, final_map, merged, survivors
 from sigmasplat.slam.fusion import FusionView, count_keyframes, fuse, fusion_views
 
 CAMERA = Camera(20, 15, 16.0, 16.0, 9.5, 7.0)
@@ -126,9 +126,9 @@ def test_one_submap_is_left_as_it_is() -> None:
     store = MemoryStore()
     whole = make_store()
     store.save(whole.submaps[0], whole.pictures[0])
-    store.submaps[0].field.extras["harmonics"] = Rows(torch.ones(len(store.submaps[0].field), 45))
+    store.submaps[0].field.attributes["harmonics"] = Rows(torch.ones(len(store.submaps[0].field), 45))
     field = refined(store, config())
-    assert torch.equal(field.params, store.submaps[0].field.params) and set(field.extras) == {"harmonics"}
+    assert torch.equal(field.params, store.submaps[0].field.params) and set(field.attributes) == {"harmonics"}
     field.params += 1.0
     assert float(store.submaps[0].field.means[:, 2].max()) < 2.0, "the submap's own memory is not touched"
 
@@ -231,11 +231,11 @@ def around(angle: float) -> np.ndarray:
 def test_view_dependent_colour_is_learned_in_refinement(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures of a wall that is brighter the more it is seen from the right: harmonic 3, −x, has to say so."""
     shiny, plain, path = wall(-1.4, 1.6), wall(-1.4, 1.6), [around(a) for a in np.linspace(-0.8, 0.8, 5)]
-    shiny.extras["harmonics"] = Rows(torch.zeros(len(shiny), 45))
-    shiny.extras["harmonics"].params[:, 6:9] = 0.5
+    shiny.attributes["harmonics"] = Rows(torch.zeros(len(shiny), 45))
+    shiny.attributes["harmonics"].params[:, 6:9] = 0.5
     store = MemoryStore()
     store.save(Submap(0, plain, (0, 1, 2, 3, 4), np.array(path), CAMERA), [look(pose, shiny) for pose in path])
-    monkeypatch.setitem(EXTRA_RATES, "harmonics", ("colors", 1.0))  # 40 steps are few at a twentieth
+    monkeypatch.setitem(ATTRIBUTE_RATES, "harmonics", ("colors", 1.0))  # 40 steps are few at a twentieth
     errors = []
     for degree in (0, 1):
         settings = config(iterations=40, sh_degree=degree, sh_every=1)
@@ -243,7 +243,7 @@ def test_view_dependent_colour_is_learned_in_refinement(monkeypatch: pytest.Monk
         field = refined(store, replace(settings, mapping=only_colors))
         off = [look(around(a), field).color / 255.0 - look(around(a), shiny).color / 255.0 for a in (-0.6, 0.6)]
         errors.append(np.abs(off).mean())
-    learned = field.extras["harmonics"].params[:, :9].reshape(-1, 3, 3).mean((0, 2))
+    learned = field.attributes["harmonics"].params[:, :9].reshape(-1, 3, 3).mean((0, 2))
     assert errors[1] < 0.7 * errors[0], errors
     assert learned[2] > 0.1 and learned[2] > 3 * learned[:2].abs().max(), learned
 
@@ -253,7 +253,7 @@ def test_pictures_are_read_when_drawn_and_kept_while_there_is_room(monkeypatch: 
     monkeypatch.setattr(store, "picture", lambda s, k: read.append((s, k)) or store.pictures[s][k])
     view = ReferenceView(CAMERA, CONFIG.render)
     monkeypatch.setattr("sigmasplat.slam.final.CACHE_BYTES", 2 * 16 * 20 * 15)
-    keyframes = Keyframes(store, ANCHORS, view)
+    keyframes = KeyframeReader(store, ANCHORS, view)
     assert len(keyframes) == 6 and not read
     for i in (0, 5, 0, 5, 3, 0):
         found = keyframes[i]

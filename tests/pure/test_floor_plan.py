@@ -33,7 +33,7 @@ UPRIGHT = np.eye(4)
 
 
 def patch(low: tuple[float, float], high: tuple[float, float]):
-    """Return a function of places [..., 3]: are they over this rectangle of the floor?"""
+    """Return a function that tests whether points [..., 3] are above this rectangle of the floor."""
 
     def inside(at: np.ndarray) -> np.ndarray:
         return ((at[..., :2] > low) & (at[..., :2] < high)).all(-1) & (at[..., 2] < 0.3)
@@ -54,13 +54,13 @@ def plain_plan() -> FloorPlan:
 
 
 def kind_at(plan: FloorPlan, x: float, y: float) -> int:
-    """Return what is at a place of the room; the plan's origin lies below the first camera, at (0, 0.3)."""
+    """Return the kind of the cell at x, y of the room. The plan has its origin below the first camera, at (0, 0.3)."""
     column, row = np.floor((np.array([x, y - 0.3]) - plan.origin_m) / plan.cell_m).astype(int)
     return int(plan.kind[row, column])
 
 
 def test_the_floor_is_found_in_any_world_frame() -> None:
-    """The frame takes the room's axes: z up from the floor, y where the first camera looks, below that camera."""
+    """The frame has the axes of the room: z up from the floor, y in the viewing direction of the first camera."""
     for T_world_room in (UPRIGHT, WORLD):
         samples = list(
             sample_surfaces(splats(T_world_room), walk(T_world_room), CAMERA, seer(T_world_room), max_poses=8)
@@ -102,9 +102,9 @@ def test_walls_and_objects_are_at_their_true_places() -> None:
     y = plan.origin_m[1] + (rows + 0.5) * CELL_M + 0.3
     for found, true in ((x.min(), LOW[0]), (x.max(), HIGH[0]), (y.min(), LOW[1]), (y.max(), HIGH[1])):
         assert abs(found - true) <= CELL_M
-    assert kind_at(plan, PILLAR[0][0] + 0.01, 0.7) == WALL, "the pillar's near side"
+    assert kind_at(plan, PILLAR[0][0] + 0.01, 0.7) == WALL, "near side of the pillar"
     assert kind_at(plan, -1.7, 0.0) == OBJECT and kind_at(plan, CHEST[1][0] + 0.12, 0.0) == FREE
-    assert kind_at(plan, 0.0, 0.6) == FLOOR_UNOBSERVED, "too near below the camera"
+    assert kind_at(plan, 0.0, 0.6) == FLOOR_UNOBSERVED, "below the camera"
     assert kind_at(plan, 1.1, 0.7) == UNOBSERVED, "inside the pillar"
     assert kind_at(plan, HIGH[0] + 0.15, 0.0) == UNOBSERVED, "beyond the wall"
     assert plan.area_m2(UNOBSERVED, FLOOR_UNOBSERVED, FREE, OBJECT, WALL) == pytest.approx(plan.kind.size * CELL_M**2)
@@ -127,7 +127,7 @@ def test_uncertain_and_thin_regions_are_found_within_a_cell(T_world_room: np.nda
     for why, x, y, area_m2, words in (
         ("unsure", -1.0, -1.0, 0.16, "depth ± 12"),
         ("thin", 0.85, -1.05, 0.25, "surface 30 % transparent"),
-        ("unsure", -1.2, 1.2, 0.16, "σ of colour 10.0 times"),
+        ("unsure", -1.2, 1.2, 0.16, "colour uncertainty 10.0 times"),
     ):
         here = [
             r for r in plan.regions if r.why == why and np.abs(np.subtract(r.center_m, (x, y - 0.3))).max() < CELL_M
@@ -143,7 +143,7 @@ def test_a_certain_map_has_only_unobserved_regions_such_as_behind_the_pillar() -
     hidden = np.array([(x, y + 0.3) for x, y in (r.center_m for r in plan.regions if r.found == "not observed")])
     behind = (hidden > PILLAR[0][:2]).all(1)
     assert behind.any(), hidden
-    assert (np.linalg.norm(hidden[~behind], axis=1) < 0.3).all(), "and where the camera turned round, looking outwards"
+    assert (np.linalg.norm(hidden[~behind], axis=1) < 0.3).all(), "the others are around the camera"
     floor = next(r for r in plan.regions if r.found == "floor not observed")
     assert np.linalg.norm(np.add(floor.center_m, (0.0, 0.3))) < 0.8, "around the camera"
     assert kind_at(plan, floor.center_m[0], floor.center_m[1] + 0.3) == FLOOR_UNOBSERVED

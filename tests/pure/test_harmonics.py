@@ -8,7 +8,7 @@ from torch import Tensor
 from sigmasplat.errors import ConfigError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import EXTRAS, GaussianField, Rows
+from sigmasplat.model.field import ATTRIBUTES, GaussianField, Rows
 from sigmasplat.model.harmonics import basis, count, turned, view_colors
 from sigmasplat.render import render
 
@@ -63,7 +63,7 @@ def test_degree_1_is_written_out() -> None:
 
 
 def test_there_is_no_fourth_degree() -> None:
-    assert [count(degree) for degree in range(4)] == [0, 3, 8, 15] and EXTRAS["harmonics"] == 3 * count(3)
+    assert [count(degree) for degree in range(4)] == [0, 3, 8, 15] and ATTRIBUTES["harmonics"] == 3 * count(3)
     for degree in (-1, 4):
         with pytest.raises(ConfigError, match=f"degrees 0 to 3, found {degree}"):
             count(degree)
@@ -122,8 +122,8 @@ def shiny_field(n: int = 40, seed: int = 0) -> GaussianField:
         torch.as_tensor(rng.random((n, 3))).float(),
     )
     field = GaussianField.from_values(means, scales, colors, opacities=0.7)
-    field.extras["harmonics"] = Rows(torch.as_tensor(rng.normal(0, 0.3, (n, 45))).float(), steps=4)
-    field.extras["correlations"] = Rows(torch.as_tensor(rng.normal(0, 0.3, (n, 3))).float())
+    field.attributes["harmonics"] = Rows(torch.as_tensor(rng.normal(0, 0.3, (n, 45))).float(), steps=4)
+    field.attributes["correlations"] = Rows(torch.as_tensor(rng.normal(0, 0.3, (n, 3))).float())
     return field
 
 
@@ -138,7 +138,7 @@ def test_field_and_camera_that_move_together_see_the_same(seed: int) -> None:
     for a, b in ((before.color, after.color), (before.variance, after.variance)):
         assert float((a - b).norm()) < 1e-4 * float(a.norm())
     unturned = field.moved(torch.as_tensor(M))
-    unturned.extras["harmonics"] = field.extras["harmonics"]
+    unturned.attributes["harmonics"] = field.attributes["harmonics"]
     off = render(unturned, CAMERA, torch.as_tensor(se3.inverse(M)).float(), backend="reference").color - before.color
     assert float(off.norm()) > 0.05 * float(before.color.norm()), "the harmonics matter"
 
@@ -156,13 +156,13 @@ def test_turning_does_not_depend_on_where_memory_lies() -> None:
 def test_what_is_moved_shares_no_memory_and_keeps_every_extra() -> None:
     field = shiny_field()
     moved = field.moved(torch.eye(4))
-    assert set(moved.extras) == {"harmonics", "correlations"} and moved.extras["harmonics"].steps == 4
-    assert torch.equal(moved.extras["correlations"].params, field.extras["correlations"].params)
-    for extra in moved.extras.values():
-        extra.params += 1.0
-        extra.moment1 += 1.0
-    assert float(field.extras["correlations"].params.max()) < 3.0
-    assert torch.count_nonzero(field.extras["correlations"].moment1) == 0
+    assert set(moved.attributes) == {"harmonics", "correlations"} and moved.attributes["harmonics"].steps == 4
+    assert torch.equal(moved.attributes["correlations"].params, field.attributes["correlations"].params)
+    for attribute in moved.attributes.values():
+        attribute.params += 1.0
+        attribute.moment1 += 1.0
+    assert float(field.attributes["correlations"].params.max()) < 3.0
+    assert torch.count_nonzero(field.attributes["correlations"].moment1) == 0
 
 
 def test_a_render_shows_what_the_camera_sees() -> None:
@@ -170,9 +170,9 @@ def test_a_render_shows_what_the_camera_sees() -> None:
     field, T = shiny_field(), se3.exp(np.array([0.1, -0.2, 0.3, 0.1, 0.2, -0.1]))
     position = torch.as_tensor(se3.inverse(T)[:3, 3]).float()
     painted = GaussianField(field.params.clone())
-    painted.params[:, 11:14] = view_colors(field.colors, field.extras["harmonics"].params, field.means, position)
-    field.extras.pop("correlations")
-    leaf = field.extras["harmonics"].params.requires_grad_()
+    painted.params[:, 11:14] = view_colors(field.colors, field.attributes["harmonics"].params, field.means, position)
+    field.attributes.pop("correlations")
+    leaf = field.attributes["harmonics"].params.requires_grad_()
     seen, want = (render(f, CAMERA, torch.as_tensor(T), backend="reference") for f in (field, painted))
     torch.testing.assert_close(seen.color, want.color, rtol=0, atol=1e-6)
     torch.testing.assert_close(seen.variance, want.variance, rtol=0, atol=1e-5)

@@ -58,9 +58,9 @@ def test_without_outlines_or_edges_the_result_is_unknown(frames):
 def test_outlines_are_on_the_near_side_and_not_on_the_far_border_of_a_shadow():
     depth = np.full((20, 40), 3.0, np.float32)
     depth[:, 20:30] = 1.0
-    depth[:, 16:20] = 0.0  # the shadow beside it
+    depth[:, 16:20] = 0.0  # shadow of the object
     found = outlines(depth)[10]
-    assert found[20] and found[29], "the object's own borders"
+    assert found[20] and found[29], "borders of the object"
     assert not found[10:20].any() and not found[30:].any()
 
 
@@ -94,12 +94,12 @@ def damage(folder, value, share):
     "value, share, words",
     [(2000, 0.8, "80% of the pixels have no depth"), (20, 0, "depth's scale looks wrong"), (9500, 0, "beyond 8 m")],
 )
-def test_depth_that_degrades_a_map_is_warned_of(tiny_tum, value, share, words):
+def test_depth_that_degrades_a_map_gives_a_warning(tiny_tum, value, share, words):
     damage(tiny_tum, value, share)
     assert any(words in warning for warning in inspect_source(tiny_tum, InputConfig()).warnings)
 
 
-def test_changing_brightness_is_warned_of(tiny_tum):
+def test_changing_brightness_gives_a_warning(tiny_tum):
     for i, path in enumerate(sorted((tiny_tum / "rgb").iterdir())):
         Image.fromarray(np.full((24, 32, 3), 60 + 120 * (i % 2), np.uint8)).save(path)
     assert any("tracking.exposure" in warning for warning in inspect_source(tiny_tum, InputConfig()).warnings)
@@ -173,7 +173,7 @@ def test_unregistered_depth_of_a_real_recording_is_detected(data_folder):
     assert inspect_source(folder, InputConfig(register_depth="on")).warnings == []
 
 
-def test_the_comparison_works_at_any_size(frames):
+def test_the_comparison_works_at_any_image_size(frames):
     small = [frame.resized(200, 150) for frame in frames]
     assert edge_agreement(small).score > 0.9
     assert isinstance(small[0].camera, Camera)

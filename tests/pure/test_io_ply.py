@@ -58,7 +58,7 @@ def test_columns_are_found_by_a_reader_that_uses_names(tmp_path: Path, harmonics
     """Read as viewers do: sum up the offsets of the properties, and find each value by its name."""
     field = random_field(4)
     if harmonics:
-        field.carry("harmonics").params[:] = torch.arange(180.0).reshape(4, 45)
+        field.get_or_create("harmonics").params[:] = torch.arange(180.0).reshape(4, 45)
     write_field(tmp_path / "map.ply", field)
     header, _, data = (tmp_path / "map.ply").read_bytes().partition(b"end_header\n")
     names = [line.split()[2] for line in header.decode().splitlines() if line.startswith("property float ")]
@@ -82,7 +82,7 @@ def test_plain_files_have_the_fixed_layout_of_3dgs(tmp_path: Path, harmonics: bo
     """Read as its own viewer does: the number of splats in line 3, then records of 62 floats, without the names."""
     field = random_field(3)
     if harmonics:
-        field.carry("harmonics").params[:] = torch.arange(135.0).reshape(3, 45)
+        field.get_or_create("harmonics").params[:] = torch.arange(135.0).reshape(3, 45)
     write_field(tmp_path / "map.ply", field, plain=True)
     lines, _, data = (tmp_path / "map.ply").read_bytes().partition(b"end_header\n")
     assert lines.splitlines()[2] == b"element vertex 3" and len(data) == 3 * 62 * 4
@@ -102,7 +102,7 @@ def test_harmonics_are_written_as_in_3dgs_and_read_back(tmp_path: Path) -> None:
     field = random_field(5)
     write_field(tmp_path / "plain.ply", field)
     k = torch.randn(5, 45, generator=torch.Generator().manual_seed(1))
-    field.extras["harmonics"] = Rows(k)
+    field.attributes["harmonics"] = Rows(k)
     write_field(tmp_path / "shiny.ply", field)
     plain, shiny = ((tmp_path / name).read_bytes() for name in ("plain.ply", "shiny.ply"))
     names = [line.split()[2] for line in header_of(shiny) if line.startswith("property float")]
@@ -117,13 +117,13 @@ def test_harmonics_are_written_as_in_3dgs_and_read_back(tmp_path: Path) -> None:
     for channel, harmonic in ((0, 0), (1, 0), (2, 14), (1, 7)):
         assert (tables[1][f"f_rest_{15 * channel + harmonic}"] == k[:, 3 * harmonic + channel].numpy()).all()
     back = read_field(tmp_path / "shiny.ply")
-    assert torch.equal(back.extras["harmonics"].params, k) and not read_field(tmp_path / "plain.ply").extras
+    assert torch.equal(back.attributes["harmonics"].params, k) and not read_field(tmp_path / "plain.ply").attributes
 
 
 def test_harmonics_of_lower_degrees_are_read(tmp_path: Path) -> None:
     for given, each in [(9, 3), (24, 8), (45, 15)]:
         other_programs_ply(tmp_path / "other.ply", "<", rest=given)
-        k = read_field(tmp_path / "other.ply").extras["harmonics"].params
+        k = read_field(tmp_path / "other.ply").attributes["harmonics"].params
         assert k.shape == (3, 45) and torch.count_nonzero(k[:, 3 * each :]) == 0
         first = 10  # column of f_rest_0, whose value in row 0 is its number
         assert k[0, :3].tolist() == [first, first + each, first + 2 * each] and k[0, 3 * each - 1] == first + given - 1
@@ -138,7 +138,7 @@ def test_a_wrong_number_of_harmonics_is_refused(tmp_path: Path) -> None:
 
 def test_harmonics_with_nan_are_refused(tmp_path: Path) -> None:
     field = random_field()
-    field.carry("harmonics").params[4, 44] = float("nan")
+    field.get_or_create("harmonics").params[4, 44] = float("nan")
     write_field(tmp_path / "map.ply", field)
     with pytest.raises(SourceError, match=r"splat 4 has nan or inf \(1 of 50 splats do\)"):
         read_field(tmp_path / "map.ply")

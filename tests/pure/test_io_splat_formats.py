@@ -45,7 +45,7 @@ def some(n: int = 300, degree: int = 0, seed: int = 0) -> GaussianField:
     if degree:
         k = torch.zeros(n, 45)
         k[:, : 3 * count(degree)] = (0.3 * torch.randn(n, 3 * count(degree), generator=random)).clamp(-0.99, 0.99)
-        field.extras["harmonics"] = Rows(k)
+        field.attributes["harmonics"] = Rows(k)
     return field
 
 
@@ -81,16 +81,16 @@ def test_splat_files_give_nearly_the_same_render_without_harmonics(tmp_path: Pat
     assert (tmp_path / "map").stat().st_size == 32 * len(field)
     shiny = room_map(3)
     dull = again(tmp_path / "b.splat", shiny)
-    del shiny.extras["harmonics"]
-    assert not dull.extras and psnr_db(dull, shiny) > 35.0
+    del shiny.attributes["harmonics"]
+    assert not dull.attributes and psnr_db(dull, shiny) > 35.0
 
 
 @pytest.mark.parametrize("ending", COMPRESSED)
 def test_values_that_a_format_cannot_hold_are_as_in_a_new_map(tmp_path: Path, ending: str) -> None:
     field = some()
-    field.carry("correlations").params += 1.0
+    field.get_or_create("correlations").params += 1.0
     back = again(tmp_path / f"a{ending}", field)
-    assert (back.params[:, 14:17] == -7.0).all() and not back.extras
+    assert (back.params[:, 14:17] == -7.0).all() and not back.attributes
 
 
 def test_harmonics_are_kept_to_half_a_quantisation_step(tmp_path: Path) -> None:

@@ -13,17 +13,19 @@ from sigmasplat.io import tensors
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import EXTRAS, GaussianField, Rows
+from sigmasplat.model.field import ATTRIBUTES, GaussianField, Rows
 from sigmasplat.model.submap import MemoryStore, Picture, Submap, SubmapStore
 
 CAMERA = Camera(8, 6, 7.25, 7.5, 3.5 + 1 / 3, 2.5)
 
 
-def some_submap(index: int = 0, keyframes: int = 3, extras: tuple[str, ...] = ()) -> tuple[Submap, list[Picture]]:
+def some_submap(index: int = 0, keyframes: int = 3, attributes: tuple[str, ...] = ()) -> tuple[Submap, list[Picture]]:
     """Return a submap of random values, and different images for its keyframes."""
     rng = np.random.default_rng(index)
     torch.manual_seed(index)
-    field = GaussianField(torch.randn(5, 17), extras={name: Rows(torch.randn(5, EXTRAS[name])) for name in extras})
+    field = GaussianField(
+        torch.randn(5, 17), attributes={name: Rows(torch.randn(5, ATTRIBUTES[name])) for name in attributes}
+    )
     poses = np.stack([se3.exp(rng.normal(size=6)) for _ in range(keyframes)])
     pictures = [
         Picture(rng.integers(0, 256, (6, 8, 3), dtype=np.uint8), rng.uniform(0, 4, (6, 8)).astype(np.float32))
@@ -41,14 +43,16 @@ def assert_same(found: Submap, wanted: Submap) -> None:
     assert (found.index, found.frames, found.camera) == (wanted.index, wanted.frames, wanted.camera)
     assert found.T_submap_camera.dtype == np.float64 and np.array_equal(found.T_submap_camera, wanted.T_submap_camera)
     assert found.field.params.dtype == torch.float32 and torch.equal(found.field.params, wanted.field.params)
-    assert set(found.field.extras) == set(wanted.field.extras)
-    for name, extra in wanted.field.extras.items():
-        assert torch.equal(found.field.extras[name].params, extra.params)
+    assert set(found.field.attributes) == set(wanted.field.attributes)
+    for name, attribute in wanted.field.attributes.items():
+        assert torch.equal(found.field.attributes[name].params, attribute.params)
 
 
-@pytest.mark.parametrize("extras", [(), ("correlations",), tuple(EXTRAS)], ids=["plain", "one extra", "all extras"])
-def test_a_submap_is_read_back_bit_for_bit(store: DiskStore, extras: tuple[str, ...]) -> None:
-    submap, pictures = some_submap(extras=extras)
+@pytest.mark.parametrize(
+    "attributes", [(), ("correlations",), tuple(ATTRIBUTES)], ids=["plain", "one attribute", "all attributes"]
+)
+def test_a_submap_is_read_back_bit_for_bit(store: DiskStore, attributes: tuple[str, ...]) -> None:
+    submap, pictures = some_submap(attributes=attributes)
     store.save(submap, pictures)
     assert_same(store.load(0), submap)
     for k, picture in enumerate(pictures):
@@ -99,10 +103,10 @@ def test_loaded_submaps_do_not_share_memory(store: DiskStore) -> None:
 
 def test_splats_that_are_views_of_one_tensor_can_be_saved(store: DiskStore) -> None:
     base, (submap, pictures) = torch.randn(9, 62), some_submap()
-    field = GaussianField(base[2:7, :17], extras={"harmonics": Rows(base[2:7, 17:])})
+    field = GaussianField(base[2:7, :17], attributes={"harmonics": Rows(base[2:7, 17:])})
     store.save(Submap(0, field, submap.frames, submap.T_submap_camera[:, :, :], CAMERA), pictures)
     assert torch.equal(store.load(0).field.params, base[2:7, :17])
-    assert torch.equal(store.load(0).field.extras["harmonics"].params, base[2:7, 17:])
+    assert torch.equal(store.load(0).field.attributes["harmonics"].params, base[2:7, 17:])
 
 
 @pytest.mark.parametrize("frozen", [True, False])

@@ -57,7 +57,7 @@ def walked(closer: LoopCloser, alike: bool = True) -> Atlas:
         if k:
             closer.submap_begun(k, drift, np.diag([1e4] * 6))
         atlas.begin_submap(drift if k else None)
-        atlas.keyframes[-1] = [np.eye(4), np.eye(4)]
+        atlas.keyframe_poses[-1] = [np.eye(4), np.eye(4)]
         field = GaussianField.from_values(torch.zeros(3, 3), torch.ones(3), torch.zeros(3, 3))
         submap = Submap(k, field, (2 * k, 2 * k + 1), np.stack([np.eye(4)] * 2), CAMERA)
         picture = Picture(np.zeros((3, 4, 3), np.uint8), np.ones((3, 4), np.float32))

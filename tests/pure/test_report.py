@@ -6,10 +6,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFont
 
 from sigmasplat.drawing import colormap, plot
 from sigmasplat.drawing.view_panels import GAP, HEAD, PANEL_WIDTH, draw_view_strip, view_panels
+from sigmasplat.floorplan.rescan import RescanMaps, RescanRegion, find_rescan_regions
 from sigmasplat.metrics.scored_view import ScoredView
 from sigmasplat.report import charts
 from sigmasplat.report.html import Contents, build_report
@@ -62,6 +63,28 @@ def test_scores_of_a_view_use_pixels_with_a_depth_reading() -> None:
     np.testing.assert_allclose(view.uncertainty, 0.04)
 
 
+def test_the_font_has_every_character_of_the_panels() -> None:
+    font = ImageFont.load_default(20)
+    texts = [word for panel in view_panels(some_view()) for word in (panel.title, panel.caption, *panel.ends)]
+    texts += [region.sentence("sq m") for region in regions_of_every_kind()]
+    assert {text.split(":")[0] for text in texts} >= {"unseen", "thin", "unsure"}
+    missing = bytes(font.getmask("\uffff"))
+    assert not [c for c in sorted({*"".join(texts)} - {" "}) if bytes(font.getmask(c)) == missing]
+
+
+def regions_of_every_kind() -> list[RescanRegion]:
+    """Return regions of maps with an uncertain patch, a thin one, and cells that were not observed."""
+    observed = np.zeros((40, 40), bool)
+    observed[2:-2, 2:-2] = True
+    observed[20:24, 20:24] = False
+    floor_unobserved = np.zeros_like(observed)
+    floor_unobserved[30:34, 4:8] = True
+    color, depth, alpha = np.full((3, 40, 40), [[[0.01]], [[0.01]], [[1.0]]])
+    color[5:10, 5:10], depth[5:10, 5:10], alpha[5:10, 20:25] = 0.1, 0.2, 0.5
+    maps = RescanMaps(~observed, floor_unobserved, observed & ~floor_unobserved, color, depth, alpha)
+    return find_rescan_regions(maps, 0.05, np.zeros(2))
+
+
 def test_a_strip_shows_the_five_panels_of_a_view() -> None:
     view = some_view()
     for word, shown in zip(("input", "colour", "depth", "V", "error"), view_panels(view), strict=True):
@@ -76,7 +99,7 @@ def test_a_strip_shows_the_five_panels_of_a_view() -> None:
     shown = Image.fromarray((view.recorded * 255).round().astype(np.uint8)).resize((320, 240), Image.Resampling.LANCZOS)
     np.testing.assert_allclose(panel(0), np.asarray(shown, float))
     assert (panel(2)[-70:] == colormap.NO_READING).all(), "no surface there"
-    assert (panel(4)[:70] == colormap.NO_READING).all(), "no reading there"
+    assert (panel(4)[:70] == colormap.NO_READING).all(), "no depth reading"
     # V is the same at every mapped pixel: one colour, and the bar ends at its root, 0.2.
     assert len(np.unique(panel(3)[:150].reshape(-1, 3), axis=0)) == 1 and view_panels(view)[3].ends[1] == "0.200"
 
@@ -90,7 +113,7 @@ def test_ticks_are_round_and_few() -> None:
 
 
 def test_both_axes_of_a_path_have_one_scale() -> None:
-    """A 2 m × 2 m square walked once: the curve's extent in pixels is square too, its colour the estimate's."""
+    """A path around a 2 m × 2 m square is also a square in pixels, in the colour of the estimate."""
     corners = np.array([[0, 0, 0], [2, 0, 0], [2, 0, 2], [0, 0, 2], [0, 0, 0.0]])
     laid_out = charts.trajectory_charts(corners, None)
     image = np.asarray(plot.draw_charts(laid_out[:1], plot.LIGHT, (600, 400))).astype(int)
@@ -122,7 +145,7 @@ def colours_near(image: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
 
 @pytest.mark.parametrize("theme", [plot.LIGHT, plot.DARK], ids=lambda theme: theme.name)
 def test_submaps_have_colours_and_loops_are_lines(theme: plot.Theme) -> None:
-    """Around a 4 m square, a submap a side: the first and the last meet, the accepted loop crosses the middle."""
+    """A path around a 4 m square with one submap per side. The accepted loop is a line through the middle."""
     side = np.linspace(0, 4, 11)[:-1]
     nought = np.zeros(10)
     x, z = np.concatenate([side, nought + 4, 4 - side, nought]), np.concatenate([nought, side, nought + 4, 4 - side])
@@ -135,7 +158,7 @@ def test_submaps_have_colours_and_loops_are_lines(theme: plot.Theme) -> None:
     for place in charts.SUBMAP_COLOURS:
         assert len(colours_near(blank, theme.curves[place])) > 100
     assert len(colours_near(blank, theme.curves[plot.ACCENT])) == 0
-    # The accepted one runs along x = 2 m, a column of the picture, the refused one along z = 2 m, a row.
+    # The accepted loop is the column x = 2 m of the picture, the refused loop is the row z = 2 m.
     changed = np.argwhere((image != blank).any(-1))
     changed = changed[changed[:, 0] > 40]  # below the legend
     accepted = colours_near(image[40:], theme.curves[plot.ACCENT])
@@ -164,7 +187,7 @@ def test_a_long_run_has_few_labels() -> None:
 
 
 def test_a_loop_line_joins_the_positions_of_its_frames() -> None:
-    """Frames of loops count from the run's start; some have no pose, so that rows and frames differ."""
+    """Frames of loops are rows of the whole log. Some frames have no pose, so row and position differ."""
     log = [{"row": row, "index": 10 * row, "submap": row // 4} for row in (0, 1, 3, 4, 5, 7, 8)]
     estimate = np.stack([[record["row"], 0.0, 0.0] for record in log])
     loops = [{"query_frame": 8, "database_frame": 1, "accepted": True},
@@ -176,7 +199,7 @@ def test_a_loop_line_joins_the_positions_of_its_frames() -> None:
 
 
 class Balance(HTMLParser):
-    """Note tags that close what was not open, and every address used."""
+    """Collect tags that are closed without being open, and all addresses."""
 
     def __init__(self) -> None:
         super().__init__()

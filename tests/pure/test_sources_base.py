@@ -18,7 +18,7 @@ from sigmasplat.sources.files.prefetch import read_ahead
 
 
 class Counting(Source):
-    """Ten frames whose colour is their number; those in `broken` cannot be read."""
+    """Ten frames whose colour is their index; frames in `broken` cannot be read."""
 
     def __init__(self, broken: tuple[int, ...] = (), strict: bool = False) -> None:
         super().__init__("counting", Camera(2, 2, 1.0, 1.0, 0.5, 0.5), strict)
@@ -45,7 +45,7 @@ def test_read_ahead_keeps_order_and_ends_its_thread():
     assert reading_threads() == 0
 
 
-def test_read_ahead_raises_the_producers_error_after_the_items_before_it():
+def test_read_ahead_raises_the_producers_error_after_the_earlier_items():
     def items():
         yield from range(3)
         raise ValueError("third")
@@ -58,7 +58,7 @@ def test_read_ahead_raises_the_producers_error_after_the_items_before_it():
     assert reading_threads() == 0
 
 
-def test_read_ahead_stops_producing_when_the_consumer_leaves():
+def test_read_ahead_stops_when_the_consumer_stops():
     made = []
 
     def items():
@@ -84,7 +84,7 @@ def test_read_ahead_works_ahead_while_the_consumer_is_busy():
 
     stream = read_ahead(items(), 4)
     next(stream)
-    assert all(made.acquire(timeout=5) for _ in range(5)), "four more must be made without being asked for"
+    assert all(made.acquire(timeout=5) for _ in range(5)), "four more items are computed ahead"
     stream.close()
 
 
@@ -117,7 +117,7 @@ def test_subset_strides_limits_and_renumbers():
         part.frame(3)
 
 
-def test_subset_takes_a_span_of_time_then_strides():
+def test_subset_selects_a_time_span_before_the_stride():
     part = Subset(Counting(), InputConfig(start_s=0.15, end_s=0.75, stride=2))
     assert [f.timestamp_s for f in part] == [0.2, 0.4, 0.6]
     assert part.timestamp_s(1) == 0.4
@@ -134,7 +134,7 @@ def test_association_of_known_lists():
     assert associate(color, depth, 0.02).tolist() == [[0, 3], [1, 2], [2, 0]]
 
 
-def test_association_serves_the_closest_pair_first():
+def test_association_pairs_the_closest_first():
     # 0.012 is nearest to 0.010 for both first entries, but belongs to the second one, which is nearer.
     assert associate(np.array([0.0, 0.013]), np.array([0.012]), 0.02).tolist() == [[1, 0]]
 
@@ -145,7 +145,7 @@ times = st.lists(st.floats(0, 1, allow_nan=False), max_size=25).map(lambda v: np
 @settings(max_examples=80, deadline=None)
 @given(times, times)
 def test_association_equals_greedy_search_over_all_pairs(first, second):
-    """Oracle: sort the full N×M table of gaps and take greedily."""
+    """Oracle: sort the full N×M table of differences and choose greedily."""
     table = sorted((abs(a - b), i, j) for i, a in enumerate(first) for j, b in enumerate(second) if abs(a - b) < 0.05)
     used_i, used_j, expected = set(), set(), set()
     for _, i, j in table:

@@ -1,4 +1,4 @@
-"""Each data set's layout, written by hand and read back: format, camera, colour, depth, times and true path."""
+"""Write each data set's layout by hand and read it back: format, camera, colour, depth, times and ground truth."""
 
 import json
 
@@ -37,13 +37,13 @@ def test_round_trip(layout, tmp_path):
 @each_layout
 def test_recognition_is_unambiguous(layout, tmp_path):
     folder = layout.write(tmp_path, sample(layout.size))
-    knowing = [known for known in formats() if known.recognises(str(folder))]
-    assert knowing[0].name == layout.format == format_of(folder).name
-    assert [known.name for known in knowing if known.priority == knowing[0].priority] == [layout.format]
+    matching = [known for known in formats() if known.recognises(str(folder))]
+    assert matching[0].name == layout.format == format_of(folder).name
+    assert [known.name for known in matching if known.priority == matching[0].priority] == [layout.format]
 
 
 @each_layout
-def test_the_folder_above_says_which_folder_to_give(layout, tmp_path):
+def test_the_parent_folder_lists_the_sequences_in_it(layout, tmp_path):
     folder = layout.write(tmp_path, sample(layout.size))
     outer = tmp_path if folder.parent == tmp_path else folder.parent.parent
     with pytest.raises(Exception, match=r"holds sequences: .*; give the path of one of them") as caught:
@@ -52,7 +52,7 @@ def test_the_folder_above_says_which_folder_to_give(layout, tmp_path):
 
 
 @each_layout
-def test_the_users_camera_wins_in_every_format(layout, tmp_path):
+def test_the_users_camera_overrides_every_format(layout, tmp_path):
     folder = layout.write(tmp_path, sample(layout.size))
     known = open_source(folder, **layout.options)
     halved = open_source(folder, depth_scale=2 * known.depth_units_per_metre, fx=2 * known.camera.fx, **layout.options)
@@ -68,7 +68,7 @@ def test_the_users_camera_wins_in_every_format(layout, tmp_path):
     assert (own.camera.fx * scale, own.camera.fy * scale) == (77.0, 78.0) and own.depth_units_per_metre == 250.0
 
 
-def test_the_documents_show_every_format():
+def test_the_documents_list_every_format():
     rows = (ROOT / "docs" / "data.md").read_text(encoding="utf-8")
     assert [known.name for known in formats() if f"| {known.name} |" not in rows] == []
 
@@ -76,7 +76,7 @@ def test_the_documents_show_every_format():
 # ScanNet
 
 
-def test_a_colour_image_as_scannet_has_it_is_worked_on_at_depths_width(tmp_path):
+def test_scannet_is_processed_at_the_width_of_depth(tmp_path):
     folder = layouts.scannet(tmp_path, sample())
     color, depth = Camera(1296, 968, 1170.19, 1170.19, 647.75, 483.75), Camera(640, 480, 571.62, 571.62, 319.5, 239.5)
     for kind, camera in (("color", color), ("depth", depth)):
@@ -87,15 +87,15 @@ def test_a_colour_image_as_scannet_has_it_is_worked_on_at_depths_width(tmp_path)
     source = open_source(folder)
     assert source.depth_registered and source.camera == color.resized(640, 478)
     assert (source.frame(1).depth_m[20:-20, 20:-20] == 2.0).all()
-    for n in range(FRAMES):  # an exporter may have made colour small; its matrix is the large one's
+    for n in range(FRAMES):  # an exporter may have resized colour without its matrix
         layouts.save(folder / f"color/{n * 7}.jpg", np.full((480, 640, 3), 99, np.uint8))
     assert open_source(folder).camera == color.resized(640, 480)
 
 
-def test_extrinsics_of_scannet_take_a_common_frame_to_each_camera(tmp_path):
+def test_scannet_extrinsics_transform_a_common_frame_to_each_camera(tmp_path):
     folder = layouts.scannet(tmp_path, sample())
     E_color, E_depth = np.eye(4), np.eye(4)
-    E_color[2, 3], E_depth[2, 3] = 0.25, -0.25  # the colour camera sits half a metre behind the depth camera
+    E_color[2, 3], E_depth[2, 3] = 0.25, -0.25  # the colour camera is half a metre behind the depth camera
     layouts.save_text(folder / "intrinsic/extrinsic_color.txt", layouts.rows(E_color))
     layouts.save_text(folder / "intrinsic/extrinsic_depth.txt", layouts.rows(E_depth))
     for n in range(FRAMES):
@@ -110,7 +110,7 @@ def test_scannet_frames_25k_keeps_its_matrices_in_the_scenes_folder(tmp_path):
     assert open_source(folder).camera == SMALL_CAMERA
 
 
-def test_a_scene_without_any_pose_has_no_truth(tmp_path):
+def test_a_scene_without_poses_has_no_ground_truth(tmp_path):
     folder = layouts.scannet(tmp_path, sample())
     for path in (folder / "pose").iterdir():
         path.write_text(layouts.rows(np.full((4, 4), -np.inf)))
@@ -131,7 +131,7 @@ def test_test_views_are_separate_with_poses_in_the_same_world(tmp_path):
     assert open_source("synthetic:frames=2").test_views() is None
 
 
-def test_without_lists_photographs_come_by_name(tmp_path):
+def test_without_lists_photographs_are_sorted_by_name(tmp_path):
     scene = layouts.scannetpp(tmp_path, sample())
     (scene / "dslr/train_test_lists.json").unlink()
     truth = open_source(scene).truth().T_world_camera
@@ -146,15 +146,15 @@ def test_the_only_sequence_of_a_scene_is_opened(tmp_path):
     assert open_source(folder.parent).name == "seq-01"
 
 
-def test_registering_seven_scenes_moves_depth_and_the_true_path_to_the_colour_camera(tmp_path):
+def test_registering_seven_scenes_converts_depth_and_the_true_path_to_the_colour_camera(tmp_path):
     written = sample(layouts.VGA)
     folder = layouts.seven_scenes(tmp_path, written)
     for n in range(FRAMES):
         layouts.save(folder / f"frame-{n:06d}.depth.png", np.full((480, 640), 2000, np.uint16))
     raw, moved = open_source(folder), open_source(folder, register_depth="on")
     assert not raw.depth_registered and moved.depth_registered and moved.camera.fx == 528.12
-    assert raw.registrable and moved.registrable, "so that whoever finds depth beside its colour knows what mends it"
-    # Where the depth camera's middle pixel lies in the world, seen from the registered frame at the true path.
+    assert raw.registrable and moved.registrable, "so that the report can suggest --register-depth"
+    # The world position of the depth camera's middle pixel, computed from the registered frame and the true path.
     point = written.T_world_camera[1] @ [0.0, 0.0, 2.0, 1.0]
     x, y, z, _ = np.linalg.inv(moved.truth().T_world_camera[1]) @ point
     c = moved.camera
@@ -163,7 +163,7 @@ def test_registering_seven_scenes_moves_depth_and_the_true_path_to_the_colour_ca
     assert (u, v) != pytest.approx((320, 240), abs=3.0) and z == pytest.approx(2.007, abs=2e-3)
 
 
-def test_registered_depth_of_red_kitchen_is_that_of_the_registered_copy(data_folder):
+def test_registered_depth_of_red_kitchen_equals_the_registered_copy(data_folder):
     raw = open_source(data_folder("redkitchen_raw"), register_depth="on")
     copy = open_source(data_folder("redkitchen"))
     times = [copy.timestamp_s(i) for i in range(len(copy))]
@@ -173,7 +173,7 @@ def test_registered_depth_of_red_kitchen_is_that_of_the_registered_copy(data_fol
         a, b = raw.frame(i), copy.frame(j)
         seen = (a.depth_m > 0) & (b.depth_m > 0)
         assert np.array_equal(a.color, b.color) and seen.mean() > 0.98 * (b.depth_m > 0).mean()
-        assert np.median(np.abs(a.depth_m - b.depth_m)[seen]) < 5e-4, "half a millimetre: depth's own step"
+        assert np.median(np.abs(a.depth_m - b.depth_m)[seen]) < 5e-4, "half a millimetre, the resolution of depth"
         near = np.abs(copy.truth().timestamps_s - raw.timestamp_s(i)).argmin()
         assert np.abs(raw.truth().T_world_camera[i] - copy.truth().T_world_camera[near]).max() < 2e-4
 
@@ -181,7 +181,7 @@ def test_registered_depth_of_red_kitchen_is_that_of_the_registered_copy(data_fol
 # ICL-NUIM
 
 
-def test_icl_nuims_negative_focal_length_and_ours_see_the_same_points_in_the_mirror(tmp_path):
+def test_icl_nuims_negative_focal_length_equals_ours_in_the_mirrored_world(tmp_path):
     written = sample(layouts.VGA)
     folder = layouts.icl_nuim(tmp_path, written)
     source = open_source(folder)
@@ -214,11 +214,11 @@ def transformed(folder, **changes):
     path.write_text(json.dumps({key: value for key, value in fields.items() if value is not None}))
 
 
-def test_the_first_pixels_corner_not_its_centre_is_nerfstudios_origin(tmp_path):
+def test_nerfstudios_origin_is_the_corner_of_the_first_pixel(tmp_path):
     folder = layouts.nerfstudio(tmp_path, sample())
     transformed(folder, cx=16.0, cy=12.0)
     camera = open_source(folder).camera
-    assert (camera.cx, camera.cy) == (15.5, 11.5), "the middle of 32×24 pixels"
+    assert (camera.cx, camera.cy) == (15.5, 11.5), "the centre of 32×24 pixels"
 
 
 def test_an_opengl_camera_looks_along_minus_z_with_y_up(tmp_path):
@@ -230,7 +230,7 @@ def test_an_opengl_camera_looks_along_minus_z_with_y_up(tmp_path):
     assert top.tolist() == [0.0, 1.0, -2.0, 1.0]
 
 
-def test_intrinsics_in_every_frame_and_a_field_of_view(tmp_path):
+def test_intrinsics_per_frame_or_as_field_of_view(tmp_path):
     folder = layouts.nerfstudio(tmp_path, sample())
     fields = json.loads((folder / "transforms.json").read_text())
     keys = ("fl_x", "fl_y", "cx", "cy", "w", "h")
@@ -242,7 +242,7 @@ def test_intrinsics_in_every_frame_and_a_field_of_view(tmp_path):
     assert (camera.fx, camera.fy, camera.cx) == pytest.approx((32.0, 32.0, 15.5))
 
 
-def test_smaller_depth_is_seen_by_the_same_camera_and_the_unit_is_the_files(tmp_path):
+def test_smaller_depth_has_the_same_camera_and_the_unit_of_the_file(tmp_path):
     folder = layouts.nerfstudio(tmp_path, sample())
     for path in (folder / "depths").iterdir():
         Image.fromarray(np.full((12, 16), 200, np.uint16)).save(path)
@@ -252,7 +252,7 @@ def test_smaller_depth_is_seen_by_the_same_camera_and_the_unit_is_the_files(tmp_
     assert (source.frame(0).depth_m == 2.0).all() and source.depth_units_per_metre == 100.0
 
 
-def test_distortion_is_removed_and_a_frame_without_pose_or_depth_is_accepted(tmp_path):
+def test_distortion_is_removed_and_frames_may_lack_pose_or_depth(tmp_path):
     folder = layouts.nerfstudio(tmp_path, sample())
     frames = json.loads((folder / "transforms.json").read_text())["frames"]
     named = {frame["file_path"]: frame for frame in frames}
@@ -268,7 +268,7 @@ def test_distortion_is_removed_and_a_frame_without_pose_or_depth_is_accepted(tmp
 
 
 @pytest.mark.parametrize("names", [("color", "depth"), ("rgb", "depth"), ("images", "depths"), ("image", "depth")])
-def test_folders_go_by_several_names(names, tmp_path):
+def test_folders_may_have_several_names(names, tmp_path):
     folder = layouts.plain(tmp_path, sample())
     (folder / "color").rename(folder / "c")
     (folder / "depth").rename(folder / names[1])
@@ -289,7 +289,7 @@ def test_pairs_by_number_and_by_order(color, depth, kept, tmp_path):
     assert depths == pytest.approx(sample().depth_mm[kept, -1, -1] / 1000)
 
 
-def test_names_that_are_times_are_times(tmp_path):
+def test_names_with_a_decimal_point_are_times(tmp_path):
     folder = layouts.plain(tmp_path, sample())
     for n in range(FRAMES):
         for part in ("color", "depth"):
@@ -297,7 +297,7 @@ def test_names_that_are_times_are_times(tmp_path):
     assert [frame.timestamp_s for frame in open_source(folder)] == [12.5, 12.75, 13.0, 13.25]
 
 
-def test_a_plain_folder_with_a_focal_length_alone(tmp_path):
+def test_a_plain_folder_needs_only_a_focal_length(tmp_path):
     folder = layouts.plain(tmp_path, sample())
     (folder / "calibration.json").unlink()
     source = open_source(folder, fx=30.0)
@@ -305,7 +305,7 @@ def test_a_plain_folder_with_a_focal_length_alone(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["started recording\n", ""])
-def test_a_log_that_holds_no_poses_is_not_taken_for_a_path(text, tmp_path):
+def test_a_log_without_poses_is_not_a_path(text, tmp_path):
     folder = layouts.open3d(tmp_path, sample())
     (folder / "trajectory.log").unlink()
     (folder / "capture.log").write_text(text)
@@ -314,7 +314,7 @@ def test_a_log_that_holds_no_poses_is_not_taken_for_a_path(text, tmp_path):
     assert format_of(folder).name == "plain folder"
 
 
-def test_a_log_of_odometry_is_no_truth(tmp_path):
+def test_a_log_of_odometry_is_not_ground_truth(tmp_path):
     folder = layouts.open3d(tmp_path, sample())
     (folder / "trajectory.log").rename(folder / "odometry.log")
     assert open_source(folder).truth() is None

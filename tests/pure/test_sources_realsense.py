@@ -1,4 +1,4 @@
-"""The live camera, through a stand-in for its SDK: what is taken, recorded, left out, and how it ends."""
+"""The live camera with a fake SDK: frames, recording, dropped frames, and how a sequence ends."""
 
 import sys
 from pathlib import Path
@@ -28,7 +28,7 @@ def opened(**settings: object) -> LiveSource:
     return source
 
 
-def test_frames_are_the_cameras(device: Device) -> None:
+def test_frames_equal_those_of_the_camera(device: Device) -> None:
     source = opened(limit=3)
     frames = list(source)
     assert source.camera == device.room.camera and source.depth_units_per_metre == 2000.0
@@ -46,13 +46,13 @@ def test_options_reach_the_camera(device: Device) -> None:
     assert device.asked[0] == ("depth", 848, 480, "z16", 60) and device.serial == "0123"
 
 
-def test_a_camera_nobody_iterates_is_stopped(device: Device) -> None:
+def test_an_unused_camera_is_stopped(device: Device) -> None:
     source = opened()
     del source
     assert (device.started, device.stopped) == (1, 1)
 
 
-def test_every_frame_taken_is_recorded_at_once(device: Device, tmp_path: Path) -> None:
+def test_every_frame_is_recorded_immediately(device: Device, tmp_path: Path) -> None:
     source = opened(limit=5)
     source.record_to(tmp_path / "recording")
     live = []
@@ -67,26 +67,26 @@ def test_every_frame_taken_is_recorded_at_once(device: Device, tmp_path: Path) -
         assert np.abs(one.depth_m - other.depth_m).max() <= 0.5 / 5000 + 1e-6  # TUM's unit
 
 
-def test_a_recording_is_not_written_over(device: Device, tmp_path: Path) -> None:
+def test_a_recording_is_not_overwritten(device: Device, tmp_path: Path) -> None:
     (tmp_path / "rgb.txt").write_text("")
     with pytest.raises(RunError, match="already holds a sequence"):
         opened(limit=1).record_to(tmp_path)
 
 
-def test_frames_missed_are_counted_and_the_newest_wins(device: Device) -> None:
+def test_dropped_frames_are_counted_and_the_newest_is_used(device: Device) -> None:
     device.missed_between = 2
     source = opened(limit=4)
     times = [frame.timestamp_s for frame in source]
     assert np.diff(times) == pytest.approx([3 / 30] * 3)
-    assert source.dropped >= 2 * 3  # one more set may have been taken ahead
+    assert source.dropped >= 2 * 3  # one more set may be read ahead
 
 
-def test_a_colour_image_given_twice_is_taken_once(device: Device) -> None:
+def test_a_repeated_colour_image_is_used_once(device: Device) -> None:
     device.repeats = 2
     assert np.diff([frame.timestamp_s for frame in opened(limit=4)]) == pytest.approx([1 / 30] * 3)
 
 
-def test_depth_is_registered_here_on_demand(device: Device) -> None:
+def test_depth_is_registered_by_option(device: Device) -> None:
     device.must_align = False
     source = opened(limit=1, register_depth="on")
     frame = next(iter(source))
@@ -107,7 +107,7 @@ def test_unplugging_ends_the_sequence_with_a_reason(device: Device, tmp_path: Pa
     source = opened()
     source.record_to(tmp_path / "recording")
     assert len(list(source)) == 4
-    assert "no frame came for 5 s (Frame didn't arrive within 5000)" in source.ending and "\n" not in source.ending
+    assert "no frame for 5 s (Frame didn't arrive within 5000)" in source.ending and "\n" not in source.ending
     assert len(open_source(tmp_path / "recording")) == 4 and device.stopped == 1
 
 
@@ -117,7 +117,7 @@ def test_a_camera_that_delivers_nothing_is_an_error(device: Device) -> None:
         list(opened())
 
 
-def test_its_lens_is_taken_out(device: Device) -> None:
+def test_lens_distortion_is_removed(device: Device) -> None:
     device.coefficients = [0.1, -0.05, 0.001, -0.002, 0.01]
     with_lens = next(iter(opened(limit=1)))
     plain = next(iter(opened(limit=1, undistort=False)))
@@ -129,11 +129,11 @@ def test_its_lens_is_taken_out(device: Device) -> None:
 
 
 @pytest.mark.parametrize("ask", [len, lambda s: s.frame(0), lambda s: s.timestamp_s(0), depth_warning])
-def test_what_only_a_recording_can_do_says_so(device: Device, ask: object) -> None:
+def test_operations_that_need_a_recording_raise(device: Device, ask: object) -> None:
     with pytest.raises(SourceError, match="run it, then read the folder"):
         ask(opened())  # type: ignore[operator]
 
 
-def test_what_was_done_before_recording_is_not_done_again() -> None:
+def test_a_recording_is_not_subsampled_or_rectified_again() -> None:
     given = InputConfig(stride=3, limit=9, start_s=1.0, fx=5.0, depth_scale=9.0, crop_px=4, width=320, strict=True)
     assert recording_settings(given) == InputConfig(crop_px=4, width=320, strict=True)

@@ -1,4 +1,4 @@
-"""Replica layout: images by number, 4×4 poses, cameras from cam_params.json or the known one."""
+"""Replica layout: images by number, 4×4 poses, the camera from cam_params.json or as published."""
 
 import json
 
@@ -43,14 +43,14 @@ def test_reading(replica):
     assert truth[2, :3, 3].tolist() == [2, 2, 3] and truth[2, 1, 0] == 1.0
 
 
-def test_camera_file_in_the_folder_itself_wins(replica):
+def test_the_camera_file_in_the_folder_overrides_the_parents(replica):
     own = {"camera": PARAMS["camera"] | {"fx": 99.0, "scale": 13107.0}}
     (replica / "cam_params.json").write_text(json.dumps(own))
     source = open_source(replica)
     assert source.camera.fx == 99.0 and source.frame(0).depth_m[0, 0] == 1.0
 
 
-def test_without_camera_file_the_known_replica_camera_is_taken_and_the_size_must_fit(replica):
+def test_without_camera_file_the_published_camera_is_used_and_the_size_must_match(replica):
     (replica.parent / "cam_params.json").unlink()
     with pytest.raises(SourceError, match="20×12 but the calibration is for 1200×680"):
         open_source(replica)
@@ -76,7 +76,7 @@ def test_rgb_only_download(replica):
     [
         ("nan " * 16, r"traj\.txt:2: not a finite rigid pose"),
         ("2 0 0 0  0 2 0 0  0 0 2 0  0 0 0 1", r"traj\.txt:2: not a finite rigid pose"),
-        ("1 2 3", r"traj\.txt:2: 16 numbers"),
+        ("1 2 3", r"traj\.txt:2: expected 16 numbers"),
     ],
 )
 def test_a_bad_pose_is_named_by_its_line(replica, line, match):
@@ -89,5 +89,5 @@ def test_a_bad_pose_is_named_by_its_line(replica, line, match):
 
 def test_fewer_poses_than_images(replica):
     (replica / "traj.txt").write_text((replica / "traj.txt").read_text().splitlines()[0])
-    with pytest.raises(SourceError, match="1 poses, but images go up to number 2"):
+    with pytest.raises(SourceError, match="1 poses, but the last image has number 2"):
         open_source(replica)

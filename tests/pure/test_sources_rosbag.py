@@ -49,7 +49,7 @@ def written(tmp_path: Path, kind: str, fill: "object" = aligned) -> tuple[Path, 
 
 
 @pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap", "bare mcap", "bare sqlite3"])
-def test_every_kind_of_bag_gives_the_same_exact_frames(tmp_path: Path, kind: str) -> None:
+def test_every_kind_of_bag_gives_equal_frames(tmp_path: Path, kind: str) -> None:
     path, seen = written(tmp_path, kind)
     source = open_source(path)
     assert (source.name, len(source), source.skipped) == ("walk", FRAMES, [])
@@ -59,12 +59,12 @@ def test_every_kind_of_bag_gives_the_same_exact_frames(tmp_path: Path, kind: str
         assert frame.timestamp_s == pytest.approx(t, abs=1e-6)
         assert np.array_equal(np.rint(frame.color * 255), color)
         assert np.array_equal(frame.depth_m, metres(depth))
-    assert np.array_equal(source.frame(1).depth_m, metres(seen.depths_mm[1]))  # back again, after the end
+    assert np.array_equal(source.frame(1).depth_m, metres(seen.depths_mm[1]))  # read backwards after the end
 
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])
 def test_encodings(tmp_path: Path, kind: str) -> None:
-    """Blue before red, an alpha channel, padded rows, numbers the other way round, float metres with NaN."""
+    """BGR order, an alpha channel, padded rows, big-endian numbers, float metres with NaN."""
 
     def fill(recorder: Recorder, seen: Scene) -> None:
         rgba = np.concatenate([seen.colors, np.full((*seen.colors.shape[:3], 1), 9, np.uint8)], -1)
@@ -102,13 +102,13 @@ def test_compressed_images(tmp_path: Path, kind: str) -> None:
 
     path, seen = written(tmp_path, kind, fill)
     for i, frame in enumerate(open_source(path)):
-        # 1/depth in steps of 1/a: 3 m come back within 9/10000 m
+        # 1/depth has steps of 1/a: 3 m is restored within 9/10000 m
         assert np.abs(frame.depth_m - metres(seen.depths_mm[i])).max() < (1e-3 if i % 2 else 1e-9)
         assert np.abs(frame.color - seen.colors[i] / 255).max() < (0.06 if i % 2 else 1e-6)
 
 
 def raw_depth(recorder: Recorder, seen: Scene, linked: str = "/tf_static") -> None:
-    """Add a coarser depth camera beside the colour camera, and the transforms from both to the device."""
+    """Add a smaller depth camera beside the colour camera, and the transforms from both to the device."""
     for color, depth, t in zip(seen.colors, seen.depths_mm[:, ::2, ::2], seen.times_s, strict=True):
         recorder.image("/camera/color/image_raw", t, color, "rgb8", COLOR_FRAME)
         recorder.image("/camera/depth/image_rect_raw", t, depth, "16UC1", DEPTH_FRAME)
@@ -133,7 +133,7 @@ def test_raw_depth_is_registered_by_the_transforms(tmp_path: Path, kind: str, li
 
 
 def test_one_optical_frame_means_registered(tmp_path: Path) -> None:
-    """As in TUM's bags, whose depth has a camera_info of its own all the same."""
+    """TUM's bags are like this, although their depth has its own camera_info."""
 
     def fill(recorder: Recorder, seen: Scene) -> None:
         for color, depth, t in zip(seen.colors, seen.depths_mm, seen.times_s, strict=True):
@@ -148,7 +148,7 @@ def test_one_optical_frame_means_registered(tmp_path: Path) -> None:
     assert np.array_equal(source.frame(2).depth_m, metres(seen.depths_mm[2]))
 
 
-def test_the_best_topic_is_taken_and_another_on_demand(tmp_path: Path) -> None:
+def test_the_best_topic_is_used_or_the_requested_one(tmp_path: Path) -> None:
     def fill(recorder: Recorder, seen: Scene) -> None:
         aligned(recorder, seen)
         raw_depth(recorder, seen)
@@ -179,7 +179,7 @@ def test_the_best_topic_is_taken_and_another_on_demand(tmp_path: Path) -> None:
     ],
 )
 def test_lenses(tmp_path: Path, model: str, lens: tuple[float, ...]) -> None:
-    """The recorded lens is OpenCV's: its own function puts points where ours does, and images lose that distortion."""
+    """The recorded distortion is OpenCV's: its function distorts points as ours does, and is removed from images."""
     cv2 = pytest.importorskip("cv2")
 
     def fill(recorder: Recorder, seen: Scene) -> None:
@@ -195,7 +195,7 @@ def test_lenses(tmp_path: Path, model: str, lens: tuple[float, ...]) -> None:
     np.testing.assert_allclose(distort(points, np.array(lens)), theirs[:, 0], atol=1e-12)
 
 
-def test_without_headers_times_are_those_of_recording(tmp_path: Path) -> None:
+def test_without_header_times_the_recording_times_are_used(tmp_path: Path) -> None:
     def fill(recorder: Recorder, seen: Scene) -> None:
         aligned(recorder, seen)
         for _, kind, _, message in recorder.messages:
@@ -204,13 +204,13 @@ def test_without_headers_times_are_those_of_recording(tmp_path: Path) -> None:
 
     path, seen = written(tmp_path, "sqlite3", fill)
     source = open_source(path, color_topic=CAMERA_TOPICS[0])
-    # Colour was received 50 ms after it was taken, depth 16 ms: within 0.02 s lie the depths of a frame later.
+    # Colour is received 50 ms late, depth 16 ms: by recording time, colour pairs with the depth of the next frame.
     assert [f.timestamp_s for f in source] == pytest.approx(list(seen.times_s[:-1] + 0.05), abs=1e-6)
     assert np.array_equal(source.frame(0).depth_m, metres(seen.depths_mm[1]))
 
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])
-def test_the_one_pose_topic_is_the_truth(tmp_path: Path, kind: str) -> None:
+def test_the_only_pose_topic_is_the_ground_truth(tmp_path: Path, kind: str) -> None:
     def fill(recorder: Recorder, seen: Scene) -> None:
         aligned(recorder, seen)
         for t, T in zip(seen.times_s, seen.poses, strict=True):
@@ -224,7 +224,7 @@ def test_the_one_pose_topic_is_the_truth(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize("linked", [True, False])
-def test_poses_of_a_body_are_moved_to_the_camera_or_left(tmp_path: Path, linked: bool) -> None:
+def test_poses_of_a_body_are_converted_to_the_camera_or_ignored(tmp_path: Path, linked: bool) -> None:
     def fill(recorder: Recorder, seen: Scene) -> None:
         aligned(recorder, seen)
         for t, T in zip(seen.times_s, seen.poses, strict=True):
@@ -243,7 +243,7 @@ def test_poses_of_a_body_are_moved_to_the_camera_or_left(tmp_path: Path, linked:
     np.testing.assert_allclose(truth.T_world_camera, seen.poses, atol=1e-9)
 
 
-def test_two_pose_topics_are_no_truth(tmp_path: Path) -> None:
+def test_two_pose_topics_give_no_ground_truth(tmp_path: Path) -> None:
     def fill(recorder: Recorder, seen: Scene) -> None:
         aligned(recorder, seen)
         for topic in ("/odom/a", "/odom/b"):
@@ -255,7 +255,7 @@ def test_two_pose_topics_are_no_truth(tmp_path: Path) -> None:
 
 
 def sdk_bag(path: Path, seen: Scene) -> Path:
-    """Write what RealSense's SDK 2.57 wrote from a software device here: its topics, its four bytes after an image."""
+    """Write the topics that RealSense's SDK 2.57 writes, with its four extra bytes after an image."""
     recorder = Recorder(ros1=True)
     stream = "/device_0/sensor_{}/{}_0"
     color, depth = stream.format(1, "Color"), stream.format(0, "Depth")
@@ -294,13 +294,13 @@ def test_a_realsense_sdks_bag(tmp_path: Path) -> None:
         np.testing.assert_allclose(source.frame(2).depth_m, moved, atol=1e-6)
 
 
-def test_a_part_of_a_bag_is_taken_by_time(tmp_path: Path) -> None:
+def test_a_time_span_of_a_bag_can_be_selected(tmp_path: Path) -> None:
     path, _ = written(tmp_path, "mcap")
     assert len(open_source(path, start_s=0.03, end_s=0.09)) == 2
 
 
-def test_a_bag_keeps_no_messages(tmp_path: Path) -> None:
-    """What is kept of a message is where it is: three numbers."""
+def test_a_bag_keeps_no_messages_in_memory(tmp_path: Path) -> None:
+    """Only the position of each message is kept: three numbers."""
     path, _ = written(tmp_path, "mcap")
     bag = Bag(path)
     entries = bag.index(*CAMERA_TOPICS)[CAMERA_TOPICS[0]]
@@ -308,7 +308,7 @@ def test_a_bag_keeps_no_messages(tmp_path: Path) -> None:
     assert bag.read(CAMERA_TOPICS[0], entries[3]).height == 24
 
 
-def test_messages_with_the_same_time_are_distinguished(tmp_path: Path) -> None:
+def test_messages_with_equal_times_are_distinguished(tmp_path: Path) -> None:
     def fill(recorder: Recorder, seen: Scene) -> None:
         aligned(recorder, seen)
         recorder.messages = [(topic, kind, 5 * 10**9, message) for topic, kind, _, message in recorder.messages]
@@ -318,13 +318,13 @@ def test_messages_with_the_same_time_are_distinguished(tmp_path: Path) -> None:
         assert np.array_equal(np.rint(frame.color * 255), color)
 
 
-def test_a_bag_that_moved_still_opens(tmp_path: Path) -> None:
+def test_a_moved_bag_can_be_opened(tmp_path: Path) -> None:
     path, _ = written(tmp_path, "sqlite3")
     shutil.move(path, tmp_path / "elsewhere")
     assert len(open_source(tmp_path / "elsewhere")) == FRAMES
 
 
-def test_without_the_package_one_line_says_which(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_is_named_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, _ = written(tmp_path, "ros1")
     monkeypatch.setitem(__import__("sys").modules, "rosbags.rosbag1", None)
     with pytest.raises(SourceError, match=r"pip install 'sigmasplat\[ros\]'"):

@@ -1,4 +1,4 @@
-"""The synthetic room: geometry, agreement of its views, determinism, sensor faults."""
+"""The synthetic room: geometry, consistency of views, determinism, sensor noise."""
 
 from itertools import pairwise
 
@@ -36,12 +36,12 @@ def shape(kind, center, half, yaw_rad=0.0):
 
 
 @pytest.mark.parametrize(("i", "j"), [(0, 4), (60, 66), (130, 120)])
-def test_two_views_agree_on_the_surfaces_both_see(i, j):
-    """A wrong pose direction, axis, focal length or a ray length instead of z moves points by far more than this."""
+def test_two_views_agree_on_common_surfaces(i, j):
+    """Wrong pose directions, axes, focal lengths, or ray length instead of z give much larger errors."""
     behind_m, near = agreement(SyntheticRoom(width=160, height=120), i, j)
     assert near.mean() > 0.9
     assert np.median(np.abs(behind_m[near])) < 0.004
-    assert (behind_m < -0.05).mean() < 0.02, "nothing seen before may float in front of what is seen now"
+    assert (behind_m < -0.05).mean() < 0.02, "points of one view must not be in front of the other view's surface"
 
 
 def test_two_views_agree_across_rooms():
@@ -74,7 +74,7 @@ def test_depth_is_along_the_axis_not_along_the_ray():
     assert (hit == 0).all() and np.abs(t - 2.0).max() < 1e-5
 
 
-def test_entry_points_and_normals_worked_by_hand():
+def test_entry_points_and_normals_computed_by_hand():
     for kind, half, yaw_rad, direction, entry, normal in [
         ("ball", (1, 1, 1), 0.0, (1, 0, 0), 4.0, (-1, 0, 0)),
         ("ball", (2, 1, 1), 0.0, (1, 0, 0), 3.0, (-1, 0, 0)),
@@ -95,15 +95,15 @@ def test_entry_points_and_normals_worked_by_hand():
         assert normals[:, 0] == pytest.approx(np.array(normal), abs=2e-3)
 
 
-def test_a_ray_that_passes_by_or_starts_behind_misses():
+def test_rays_beside_or_away_from_a_shape_miss():
     for kind in ("box", "ball", "drum"):
         solid = shape(kind, (5, 0, 0), (1, 1, 1))
         rays = np.array([[1, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32)  # columns: beside, backwards, upwards
         assert np.isinf(solid.first_hit(np.zeros((3, 1), np.float32), rays)).all()
 
 
-def test_windows_hide_nothing():
-    """The image windows are only a saving: casting every shape at every pixel finds the same surfaces."""
+def test_image_windows_do_not_change_the_result():
+    """The image windows only save time: casting every shape at every pixel gives the same surfaces."""
     view, room = build_scene(1, 0), SyntheticRoom(frames=8, width=80, height=60)
     for T in room.truth().T_world_camera[::3]:
         pixels = np.indices((60, 80), np.float32).reshape(2, -1)[::-1]
@@ -114,7 +114,7 @@ def test_windows_hide_nothing():
         assert np.array_equal(hit, hit_all) and np.array_equal(t, t_all)
 
 
-def test_every_ray_meets_the_room():
+def test_every_ray_hits_the_room():
     for rooms in (1, 2):
         source = SyntheticRoom(frames=9, width=48, height=36, rooms=rooms, seed=3)
         for i in range(9):
@@ -133,7 +133,7 @@ def test_same_seed_same_bytes_in_any_order():
     assert other.frame(2).color.tobytes() != forwards[0].color.tobytes()
 
 
-def test_the_walk_is_smooth_closed_and_rigid():
+def test_the_camera_path_is_smooth_closed_and_rigid():
     for frames, loops, rooms in [(200, 1, 1), (400, 2, 1), (600, 1, 2), (900, 1, 3)]:
         T = camera_path(frames, loops, rooms, seed=1)
         assert all(se3.is_rigid(pose, 1e-9) for pose in T)
@@ -147,7 +147,7 @@ def test_the_walk_is_smooth_closed_and_rigid():
             assert np.abs(T[:half, 2, 3] - T[half:, 2, 3]).max() > 0.2, "loops run at different heights"
 
 
-def test_exposure_swings_by_eight_percent_and_back():
+def test_exposure_varies_by_eight_percent():
     room, steady = (SyntheticRoom(frames=9, width=32, height=24, exposure_change=e) for e in (True, False))
     dark = steady.frame(2).color < 0.9
     gain = room.frame(2).color[dark].mean() / steady.frame(2).color[dark].mean()
@@ -155,8 +155,8 @@ def test_exposure_swings_by_eight_percent_and_back():
     assert np.array_equal(room.frame(8).color, room.frame(0).color)
 
 
-def test_the_mirror_shows_another_colour_from_another_place():
-    """The panel and the sphere are the surfaces whose colour depends on the viewpoint; depth is the panel's own."""
+def test_the_mirror_changes_colour_with_the_viewpoint():
+    """The colour of panel and sphere depends on the viewpoint; depth is that of the panel."""
     view, camera = build_scene(1, 0), Camera(40, 30, 40.0, 40.0, 19.5, 14.5)
     mirror = next(s for s in view.shapes if s.material.mirror > 0.5)
     seen = []
@@ -183,7 +183,7 @@ def test_sensor_noise_grows_with_the_square_of_depth():
         spread = (read[read > 0] - depth_m).std()
         assert spread == pytest.approx(0.0012 + 0.0019 * (depth_m - 0.4) ** 2, rel=0.05)
         assert spread == pytest.approx(float(noise_sigma_m(wall)[0, 0]), rel=0.05)
-        assert 0.005 < (read == 0).mean() < 0.1, "speckles and patches, but few"
+        assert 0.005 < (read == 0).mean() < 0.1, "few speckles and patches"
 
 
 def test_sensor_loses_grazing_surfaces_edges_and_far_ones():
@@ -193,7 +193,7 @@ def test_sensor_loses_grazing_surfaces_edges_and_far_ones():
     step[:, 80:] = 1.0
     lost = measured_depth(step, camera, rng) == 0
     assert lost[:, 79:81].mean() > 0.6 and lost[:, 20:60].mean() < 0.1
-    down = camera.rays()[..., 1]  # a floor 10 cm below the eye, seen at less than 4°
+    down = camera.rays()[..., 1]  # a floor 10 cm below the camera, seen at less than 4°
     floor = np.where(down > 0.02, 0.1 / np.maximum(down, 1e-6), 5.0).astype(np.float32)
     band = (down > 0.025) & (down < 0.06)
     assert (measured_depth(floor, camera, rng)[band] == 0).mean() > 0.95
@@ -211,19 +211,19 @@ def drift_errors(indices, seed=0, deviation=0.01):
     return np.stack([drifted_depth(wall, i, seed, deviation) / 2.0 - 1.0 for i in indices])
 
 
-def test_drift_has_its_deviation_and_no_bias_over_walks():
+def test_drift_has_the_requested_deviation_and_no_bias():
     errors = np.stack([drift_errors([1000], seed)[0] for seed in range(400)])
     assert errors.std() == pytest.approx(0.01, rel=0.08)
     assert np.abs(errors.mean(0)).max() < 0.004
     other = np.stack([drift_errors([130], seed)[0] for seed in range(400)])
-    assert other.std() == pytest.approx(0.01, rel=0.08), "as large between knots as at them"
+    assert other.std() == pytest.approx(0.01, rel=0.08), "equal between and at the knots"
 
 
 def test_drift_is_smooth_over_frames_and_over_the_image():
     errors = drift_errors(range(3 * DRIFT_KNOT_FRAMES))
     assert np.abs(np.diff(errors, axis=0)).max() < 15 * 0.01 / DRIFT_KNOT_FRAMES
     assert max(np.abs(np.diff(errors, axis=axis)).max() for axis in (1, 2)) < 0.01 / 2
-    assert np.abs(errors[-1] - errors[0]).max() > 0.005, "yet another one after a while"
+    assert np.abs(errors[-1] - errors[0]).max() > 0.005, "different after some time"
 
 
 def test_drift_is_proportional_to_depth_and_leaves_holes():
@@ -234,7 +234,7 @@ def test_drift_is_proportional_to_depth_and_leaves_holes():
     np.testing.assert_allclose(drifted_depth(2 * depth_m, 77, 1, 0.02), 2 * read, rtol=1e-6)
 
 
-def test_drift_changes_depth_alone_and_is_the_same_in_any_order():
+def test_drift_changes_only_depth_and_is_independent_of_order():
     options = {"frames": 12, "width": 64, "height": 48, "rooms": 2, "overrun": 20}
     plain_room, room = SyntheticRoom(**options), SyntheticRoom(**options, drift=6)
     for i in (7, 2):
@@ -245,14 +245,14 @@ def test_drift_changes_depth_alone_and_is_the_same_in_any_order():
     assert np.array_equal(room.truth().T_world_camera, plain_room.truth().T_world_camera)
 
 
-def test_what_is_seen_again_can_be_laid_onto_what_was_seen():
-    """Depths agree if they are within 5 cm or 5 %; else no registration would believe the loop."""
+def test_depths_of_a_revisit_agree_well_enough_for_a_loop():
+    """Depths agree within 5 cm or 5 %, which loop registration requires."""
     for seed in range(40):
         first, last = drift_errors([60, 660], seed, 0.006)
         assert (np.abs(first - last) < 0.05).mean() > 0.98
 
 
-def test_an_overrun_repeats_the_walks_beginning():
+def test_an_overrun_repeats_the_start_of_the_path():
     for rooms, pace in [(1, 200), (2, 600), (3, 900)]:
         turn, walk = camera_path(pace + 1, 1, rooms, 1), camera_path(round(1.25 * pace) + 1, 1, rooms, 1, overrun=0.25)
         np.testing.assert_allclose(walk[: pace + 1], turn, atol=1e-9)
@@ -260,8 +260,8 @@ def test_an_overrun_repeats_the_walks_beginning():
 
 
 @pytest.mark.parametrize(("options", "frame", "position_m", "depth_m", "color"), GOLDEN)
-def test_sequences_stay_what_they_were(options, frame, position_m, depth_m, color):
-    """Figures of other runs are compared with these: a few pixels, read when the options were made."""
+def test_sequences_do_not_change_between_versions(options, frame, position_m, depth_m, color):
+    """Reported results depend on these sequences: a few pixels, stored when the options were added."""
     room = open_source(f"synthetic:width=64,height=48,{options}")
     seen = room.frame(frame)
     np.testing.assert_allclose(room.truth().T_world_camera[frame][:3, 3], position_m, atol=1e-6)
@@ -276,7 +276,7 @@ def test_texture_noise_is_smooth_and_fades_under_large_pixels():
     assert np.abs(noise(u, u, np.full_like(u, 0.1), 0.1, seed=1)).max() == 0
 
 
-def test_options_below_nought_are_refused():
+def test_negative_options_are_refused():
     for option in ["drift", "overrun", "seed"]:
         with pytest.raises(SourceError, match=f"{option} must be at least 0, found -1"):
             open_source(f"synthetic:frames=7,{option}=-1")

@@ -1,4 +1,4 @@
-"""TUM layout: reading, calibration, lens, truth, writing; and the real recordings where present."""
+"""TUM layout: reading, calibration, distortion, ground truth, writing; and real recordings if present."""
 
 import json
 
@@ -29,7 +29,7 @@ def test_a_hand_written_folder_is_read(tiny_tum):
     assert depth_warning(source) is None
 
 
-def test_truth_is_kept_whole_with_the_file_order_of_the_quaternion(tiny_tum):
+def test_ground_truth_is_complete_and_its_quaternions_are_xyzw(tiny_tum):
     (tiny_tum / "groundtruth.txt").write_text("# t\n5.5 1 2 3 0 0 0.6 0.8\n6.5 4 5 6 0 0 0 1\n")
     truth = open_source(tiny_tum).truth()
     assert truth.timestamps_s.tolist() == [5.5, 6.5]
@@ -38,12 +38,12 @@ def test_truth_is_kept_whole_with_the_file_order_of_the_quaternion(tiny_tum):
     assert truth.T_world_camera[0, :3, 0] == pytest.approx([0.28, 0.96, 0.0])
 
 
-def test_without_groundtruth_there_is_no_truth(tiny_tum):
+def test_without_groundtruth_txt_truth_is_none(tiny_tum):
     (tiny_tum / "groundtruth.txt").unlink()
     assert open_source(tiny_tum).truth() is None
 
 
-def test_colour_without_depth_in_time_is_left_out_with_a_reason(tiny_tum):
+def test_colour_without_depth_is_left_out_with_a_reason(tiny_tum):
     with (tiny_tum / "rgb.txt").open("a") as file:
         file.write("9.0 rgb/0.png\n")
     source = open_source(tiny_tum)
@@ -51,7 +51,7 @@ def test_colour_without_depth_in_time_is_left_out_with_a_reason(tiny_tum):
     assert source.skipped == [f"{tiny_tum}/rgb/0.png: no depth within 0.02 s"]
 
 
-def test_the_sensors_overflow_mark_is_no_reading(tiny_tum):
+def test_65535_means_no_reading(tiny_tum):
     depth = np.full((24, 32), 1500, np.uint16)
     depth[0, 0], depth[1, 1] = 65535, 0
     Image.fromarray(depth).save(tiny_tum / "depth/0.png")
@@ -59,50 +59,48 @@ def test_the_sensors_overflow_mark_is_no_reading(tiny_tum):
     assert read[0, 0] == 0 and read[1, 1] == 0 and read[2, 2] == 1.5
 
 
-def test_float_depth_is_metres_already(tiny_tum):
+def test_float_depth_is_in_metres(tiny_tum):
     np.save(tiny_tum / "depth/0.npy", np.full((24, 32), 1.25, np.float32))
     (tiny_tum / "depth.txt").write_text((tiny_tum / "depth.txt").read_text().replace("0.png", "0.npy", 1))
     assert (open_source(tiny_tum).frame(0).depth_m == 1.25).all()
 
 
-def test_the_camera_follows_from_the_name_of_the_folder(tmp_path):
-    camera = {
-        "rgbd_dataset_freiburg1_desk": "1",
-        "rgbd_dataset_freiburg2_xyz": "2",
-        "freiburg3_long_office": "3",
-        "fr1": "1",
-        "fr3_office": "3",
-        "tum-fr2": "2",
-        "afr1ca": None,
-        "office": None,
-    }
-    assert {name: freiburg_calibration(tmp_path / name) for name in camera} == {
-        name: FREIBURG.get(number) for name, number in camera.items()
-    }
+def test_the_folders_name_selects_the_camera(tmp_path):
+    for name, expected in [
+        ("rgbd_dataset_freiburg1_desk", "1"),
+        ("rgbd_dataset_freiburg2_xyz", "2"),
+        ("freiburg3_long_office", "3"),
+        ("fr1", "1"),
+        ("fr3_office", "3"),
+        ("tum-fr2", "2"),
+        ("afr1ca", None),
+        ("office", None),
+    ]:
+        assert freiburg_calibration(tmp_path / name) == (FREIBURG[expected] if expected else None)
 
 
-def test_calibration_beside_the_data_wins_over_the_folders_name(tiny_tum):
+def test_calibration_json_overrides_the_folders_name(tiny_tum):
     renamed = tiny_tum.rename(tiny_tum.with_name("freiburg1_desk"))
     assert open_source(renamed).camera.fx == 30.0
 
 
 @pytest.mark.parametrize("name", ["1", "2"])
 def test_undistort_inverts_distort_over_the_image(name):
-    """Ideal points of the field of view where the lens model is one-to-one: back to 1e-9 of the focal length."""
+    """Ideal points where the lens model is one-to-one are restored to 1e-9 of the focal length."""
     camera, coefficients = FREIBURG[name].camera, np.array(FREIBURG[name].distortion)
     points = camera.rays()[40:-40:20, 50:-50:20, :2].reshape(-1, 2).astype(float)
     assert np.abs(undistort(distort(points, coefficients), coefficients) - points).max() < 1e-9
     assert np.abs(distort(undistort(points, coefficients), coefficients) - points).max() < 1e-9
 
 
-def test_distortion_of_a_point_worked_by_hand():
+def test_distortion_of_a_point_computed_by_hand():
     # x = 0.5, y = 0, r² = 0.25, k1 = 0.4, p2 = 0.01, p1 = 0.02: x(1 + 0.1) + p2(r² + 2x²), y: p1 r²
     point = distort(np.array([0.5, 0.0]), np.array([0.4, 0, 0.02, 0.01, 0]))
     assert point == pytest.approx([0.55 + 0.01 * 0.75, 0.02 * 0.25])
 
 
 def test_undistorted_image_shows_the_ideal_scene():
-    """Film a smooth scene, defined over ideal rays, through the lens; taking the lens out must give the scene back."""
+    """Render a smooth scene with distortion; undistorting it must give the scene without distortion."""
     camera = Camera(160, 120, 129.3, 129.1, 79.6, 63.8)
 
     def scene(ideal):
@@ -114,10 +112,12 @@ def test_undistorted_image_shows_the_ideal_scene():
     lens = Undistortion(camera, FR1)
     interior = np.s_[15:-15, 15:-15]
     assert np.abs(lens.color(filmed) - scene(rays))[interior].max() < 4e-3
-    assert np.abs(filmed - scene(rays))[interior].max() > 2e-2, "the lens must matter, or the test shows nothing"
+    assert np.abs(filmed - scene(rays))[interior].max() > 2e-2, (
+        "the distortion must be visible for the test to be meaningful"
+    )
 
 
-def test_undistorted_depth_is_picked_and_moves_with_the_colour():
+def test_undistorted_depth_is_not_interpolated_and_moves_with_colour():
     camera = Camera(160, 120, 129.3, 129.1, 79.6, 63.8)
     near = np.zeros((120, 160), bool)
     near[:, 70:] = True
@@ -143,14 +143,14 @@ def test_a_written_source_reads_back(tmp_path):
         write_tum(room, tmp_path / "out")
 
 
-def test_depth_in_millimetres_read_as_metres_is_warned_of_with_a_guess(tiny_tum):
+def test_depth_in_the_wrong_unit_gives_a_warning_with_a_suggestion(tiny_tum):
     calibration = json.loads((tiny_tum / "calibration.json").read_text())
     (tiny_tum / "calibration.json").write_text(json.dumps(calibration | {"depth_scale": 1.0}))
     warning = depth_warning(open_source(tiny_tum))
     assert "2000 m" in warning and "1000 (millimetres)" in warning and "2.00 m" in warning
 
 
-def test_depth_far_too_small_is_warned_of(tiny_tum):
+def test_depth_that_is_far_too_small_gives_a_warning(tiny_tum):
     calibration = json.loads((tiny_tum / "calibration.json").read_text())
     (tiny_tum / "calibration.json").write_text(json.dumps(calibration | {"depth_scale": 100000.0}))
     assert "0.02 m" in depth_warning(open_source(tiny_tum))
@@ -175,7 +175,7 @@ def test_real_sequences_open(data_folder, name, frames, focal_px, median_m):
 
 
 def test_real_views_agree_through_the_true_poses(data_folder):
-    """Carry a view's points into a later view by the recorded poses: most land on the surface it measured."""
+    """Transform points of one view to a later view with the recorded poses: most must lie on its surface."""
     source = open_source(data_folder("livingroom"))
     behind_m, visible = agreement(source, 0, 6)
     assert visible.mean() > 0.7

@@ -13,7 +13,7 @@ from sigmasplat.model.splat_filter import sigmas
 from sigmasplat.render import render
 from sigmasplat.viewer import lines
 from sigmasplat.viewer.layers import Legend, browser_camera, draw_legend, render_layer
-from sigmasplat.viewer.snapshot import Path, Piece, Snapshot, thin, within_budget
+from sigmasplat.viewer.snapshot import CameraPath, Piece, Snapshot, thin, within_budget
 from sigmasplat.viewer.splats import (
     VisibilityFilter,
     covariances,
@@ -41,11 +41,11 @@ def field_of(count: int, seed: int = 0) -> GaussianField:
     )
 
 
-def path_of(frames: int, every: int = 5, lost: tuple[int, ...] = (), per_submap: int = 10) -> Path:
+def path_of(frames: int, every: int = 5, lost: tuple[int, ...] = (), per_submap: int = 10) -> CameraPath:
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, 0, 3] = np.arange(frames)
     marks = np.isin(np.arange(frames), lost)
-    return Path(poses, marks, np.arange(frames) // per_submap, tuple(range(0, frames, every)))
+    return CameraPath(poses, marks, np.arange(frames) // per_submap, tuple(range(0, frames, every)))
 
 
 def test_thinning_keeps_evenly_spread_splats_and_the_covered_area() -> None:
@@ -122,14 +122,14 @@ def test_merging_pieces_equals_moving_and_appending_fields() -> None:
     """One field has harmonics, which rotate with it; the other has none."""
     T = se3.exp(np.array([1.0, 2.0, 3.0, 0.4, -0.5, 0.6]))
     first, second = field_of(30), field_of(20, seed=1)
-    second.carry("harmonics").params += torch.randn(20, 45, generator=torch.Generator().manual_seed(0))
+    second.get_or_create("harmonics").params += torch.randn(20, 45, generator=torch.Generator().manual_seed(0))
     found = merge_pieces((Piece(0, first), Piece(1, second, T)), VisibilityFilter())
     expected = first.moved(torch.eye(4))
     expected.append(second.moved(torch.from_numpy(T)))
     torch.testing.assert_close(found.params, expected.params)
-    torch.testing.assert_close(found.extras["harmonics"].params, expected.extras["harmonics"].params)
+    torch.testing.assert_close(found.attributes["harmonics"].params, expected.attributes["harmonics"].params)
     few = thin(second, 10)
-    assert torch.equal(few.extras["harmonics"].params, second.extras["harmonics"].params[::2])
+    assert torch.equal(few.attributes["harmonics"].params, second.attributes["harmonics"].params[::2])
 
 
 def test_the_timeline_shows_the_submaps_started_by_then_and_the_final_map_completely() -> None:

@@ -19,8 +19,8 @@ from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.trajectory import read_trajectory
 from sigmasplat.model import se3
 from sigmasplat.presets import default_preset, preset
-from sigmasplat.run import session
-from sigmasplat.run.protocols import CallbackList
+from sigmasplat.run.protocols import CallbackList, NullCallback
+from sigmasplat.run.session import Session
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import SyntheticRoom, open_source
 from sigmasplat.viewer.finished import SubmapCache, check_has_map, finished_snapshot, running_snapshot
@@ -47,7 +47,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     config = settings()
     source = open_source(ROOM, override(config, {"input.limit": str(FRAMES)}).input)
     run = RunFolder.create(tmp_path_factory.mktemp("view") / "run", config, "room")
-    session.record(Slam(config, run.submaps), source, run)
+    Session(Slam(config, run.submaps), source, run).execute()
     evaluate(run, source, views_per_kind=1, strips_per_kind=0)
     return run
 
@@ -150,7 +150,7 @@ def live_run(tmp_path: Path, clock: Clock, budget: int = 300_000) -> tuple[list[
     config, source, shown = settings(), open_source(ROOM), list[Snapshot]()
     slam = Slam(config, DiskStore(tmp_path / "submaps"))
     view = LiveView(slam, shown.append, "room", budget, every_s=2.0, clock=clock)
-    watch = CallbackList(session.NullCallback(), view)
+    watch = CallbackList(NullCallback(), view)
     for i in range(FRAMES):
         clock.now_s += clock.frame_s
         watch(slam.step(source.frame(i)))
@@ -180,7 +180,7 @@ def test_the_live_map_and_its_images_equal_those_of_the_system(tmp_path: Path) -
     before_final = shown[-2]
     kept = [slam.store.load(i).field.moved(torch.from_numpy(slam.atlas.anchors[i])).params for i in range(3)]
     torch.testing.assert_close(merge_pieces(before_final.pieces, VisibilityFilter()).params, torch.cat(kept))
-    for row in slam.keyframes:
+    for row in slam.keyframe_indices:
         picture = shown[-1].image(row)
         assert picture is not None
         np.testing.assert_allclose(picture / 255.0, source.frame(row).color, atol=0.003)

@@ -35,7 +35,7 @@ def keyframe(
     depth = np.broadcast_to(np.asarray(depth_m, np.float32), (CAMERA.height, CAMERA.width)).copy()
     target = Target.of(Frame(0, 0.0, np.zeros((*depth.shape, 3), np.float32), depth, CAMERA), PADDED)
     T = np.eye(4) if T_world_camera is None else T_world_camera
-    return Keyframe(index, target, T, seen=None if seen is None else np.array(seen, np.int64))
+    return Keyframe(index, target, T, visible_ids=None if seen is None else np.array(seen, np.int64))
 
 
 def shared(newest: Keyframe, older: Keyframe) -> float:

@@ -1,4 +1,4 @@
-"""A run that is stopped from outside, politely or not: what lies in its folder afterwards can be read or is refused."""
+"""Runs stopped by Ctrl-C or killed: their folders can be read afterwards, or are refused with one line."""
 
 import os
 import signal
@@ -28,7 +28,7 @@ PATIENCE_S = 90.0
 
 @contextmanager
 def running(out: Path, *more: str, room: str = ROOM) -> Iterator[subprocess.Popen[str]]:
-    """Start a run in a process of its own, with more settings; never leave it behind."""
+    """Start a run in a separate process, with additional settings; kill it at the end."""
     settings = [word for setting in (*QUICK, *more) for word in ("--set", setting)]
     command = [sys.executable, "-m", "sigmasplat.cli", "run", room, "--out", str(out), *settings]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ)
@@ -43,17 +43,17 @@ def wait_for(process: subprocess.Popen[str], happened: Callable[[], bool]) -> No
     deadline_s = time.monotonic() + PATIENCE_S
     while not happened():
         assert process.poll() is None, f"ended too early: {process.communicate()}"
-        assert time.monotonic() < deadline_s, "nothing happened"
+        assert time.monotonic() < deadline_s, "timeout"
         time.sleep(0.01)
 
 
 def lines(out: Path) -> int:
-    """Count the whole lines of the log."""
+    """Count the complete lines of the log."""
     log = out / "log.jsonl"
     return log.read_text().count("\n") if log.exists() else 0
 
 
-def test_ctrl_c_leaves_a_run_to_work_with(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ctrl_c_leaves_a_usable_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
     with running(out) as process:
         wait_for(process, lambda: lines(out) >= 3)
@@ -77,7 +77,7 @@ def test_ctrl_c_leaves_a_run_to_work_with(tmp_path: Path, capsys: pytest.Capture
     capsys.readouterr()
 
 
-def test_ctrl_c_among_submaps_leaves_them_and_the_map_of_all(tmp_path: Path) -> None:
+def test_ctrl_c_with_submaps_keeps_them_and_writes_their_map(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with running(out, "submaps.frames=8", "loops.min_interval=1") as process:
         wait_for(process, lambda: len(RunFolder(out).submaps) >= 2)
@@ -99,7 +99,7 @@ def test_ctrl_c_among_submaps_leaves_them_and_the_map_of_all(tmp_path: Path) -> 
     ]
 
 
-def test_ctrl_c_while_the_final_map_is_made_keeps_everything(tmp_path: Path) -> None:
+def test_ctrl_c_during_refinement_keeps_the_unrefined_map(tmp_path: Path) -> None:
     out = tmp_path / "run"
 
     def all_frozen() -> bool:
@@ -150,7 +150,7 @@ def test_a_killed_run_is_read_or_refused_in_one_line(
 
 
 @pytest.mark.parametrize("moment", ["folder", "log"])
-def test_a_killed_run_can_be_run_again(tmp_path: Path, moment: str) -> None:
+def test_a_killed_run_can_be_repeated_with_overwrite(tmp_path: Path, moment: str) -> None:
     out = tmp_path / "run"
     with running(out) as process:
         wait_for(process, out.exists if moment == "folder" else lambda: lines(out) >= 1)

@@ -1,4 +1,4 @@
-"""A run on a live camera: Ctrl-C or a pulled plug ends it, and what was seen can be read again."""
+"""Runs on a live camera: Ctrl-C or unplugging ends them, and the recording can be read again."""
 
 import signal
 import sys
@@ -29,44 +29,46 @@ def device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Device:
     return made
 
 
-def test_ctrl_c_ends_it_and_it_is_finished_and_scored(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ctrl_c_ends_the_frames_and_the_run_is_finished_and_scored(
+    device: Device, capsys: pytest.CaptureFixture[str]
+) -> None:
     device.missed_between = 1
     device.on_frame = lambda number: signal.raise_signal(signal.SIGINT) if number == 2 * (WARM_UP_FRAMES + 6) else None
     assert exit_code("run", "realsense", "--out", "run", "--stride", "1", *QUICK) == 0
     said = capsys.readouterr()
-    assert "until Ctrl-C" in said.out and "were left out while SLAM was busy" in said.out
+    assert "until Ctrl-C" in said.out and "were dropped because SLAM was slower" in said.out
     run = RunFolder.open(Path("run"))
     facts, log = run.facts(), run.read_log()
     assert facts["status"] == "complete" and facts["finish_s"] >= 0
     assert facts["source_path"] == str(Path("run/recording").resolve())
     recorded = open_source(facts["source_path"], run.config().input)
-    assert 4 <= len(log) <= len(recorded) <= len(log) + 2  # at most what was taken ahead
+    assert 4 <= len(log) <= len(recorded) <= len(log) + 2  # at most two frames were read ahead
     assert [line["timestamp_s"] for line in log] == pytest.approx(
         [recorded.timestamp_s(i) for i in range(len(log))], abs=1e-6
     )
     metrics = run.read_metrics()
     assert metrics["frames"] == len(log) and metrics["ate"] is None and metrics["training"]["psnr_db"] > 5
-    assert exit_code("eval", "run") == 0  # no camera is asked for again
+    assert exit_code("eval", "run") == 0  # does not open a camera
     assert device.started == device.stopped == 1
 
 
-def test_a_pulled_plug_is_one_line_and_a_valid_run(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unplugged_camera_gives_one_line_and_a_valid_run(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.frames_until_unplugged = WARM_UP_FRAMES + 5
     assert exit_code("run", "realsense", "--out", "run", "--record", "seen", "--no-eval", *QUICK) == 0
     said = capsys.readouterr()
-    assert said.err.count("\n") == 1 and "no frame came for 5 s" in said.err
+    assert said.err.count("\n") == 1 and "no frame for 5 s" in said.err
     assert RunFolder.open(Path("run")).facts()["status"] == "complete"
     assert len(open_source("seen")) == 5
 
 
-def test_no_camera_is_one_line_and_nothing_written(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_camera_gives_one_line_and_no_files(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.plugged_in = False
     assert exit_code("run", "realsense") == 2
-    assert capsys.readouterr().err.startswith("sigmasplat: no RealSense camera gives 640×480")
+    assert capsys.readouterr().err.startswith("sigmasplat: no RealSense camera provides 640×480")
     assert not Path("runs").exists()
 
 
-def test_a_recording_is_kept_when_the_run_is_made_anew(device: Device) -> None:
+def test_a_repeated_run_keeps_the_earlier_recording(device: Device) -> None:
     for count in (2, 3):
         more = ("--overwrite", "--no-eval", "--limit", str(count))
         assert exit_code("run", "realsense", "--out", "run", *more, *QUICK) == 0

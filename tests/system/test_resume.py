@@ -1,4 +1,4 @@
-"""A run that was stopped or killed goes on where it was, and ends as if nothing had happened: the same bytes."""
+"""A stopped or killed run resumes where it left off, and ends with the same bytes as an uninterrupted run."""
 
 import os
 import signal
@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from command_line import exit_code
-from sigmasplat.commands.run import where
+from sigmasplat.commands.run import resume_line
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
 from sigmasplat.errors import RunError
@@ -40,7 +40,7 @@ def arguments(out: Path, name: str) -> list[str]:
 
 
 def killed(out: Path, name: str, after: int) -> int:
-    """Run in a process of its own and kill it without warning once so many frames are logged; return how many were."""
+    """Run in a separate process, kill it when `after` frames are logged, and return how many were logged."""
     process = subprocess.Popen(
         [sys.executable, "-m", "sigmasplat.cli", *arguments(out, name)], env=os.environ, stdout=subprocess.DEVNULL
     )
@@ -58,7 +58,7 @@ def without_times(run: Path) -> list[dict]:
 
 
 @pytest.mark.parametrize("name, after", [("sigma", 13), ("cgslam-fast", 7)])
-def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path: Path, name: str, after: int) -> None:
+def test_a_resumed_run_gives_the_same_bytes(tmp_path: Path, name: str, after: int) -> None:
     assert exit_code(*arguments(tmp_path / "whole", name)) == 0
     assert killed(tmp_path / "cut", name, after) < FRAMES
     assert RunFolder(tmp_path / "cut").facts()["status"] == "running"
@@ -75,8 +75,8 @@ def tiny() -> Config:
     return override(preset("sigma"), SETTINGS)
 
 
-def test_every_frame_is_a_place_to_go_on_from(tmp_path: Path) -> None:
-    """Also right after a cut, where the next submap has one keyframe."""
+def test_slam_can_resume_from_every_frame(tmp_path: Path) -> None:
+    """Also directly after a new submap has started, when it has one keyframe."""
     source, config = open_source(ROOM, tiny().input), tiny()
     whole = Slam(config)
     seen = []
@@ -85,23 +85,25 @@ def test_every_frame_is_a_place_to_go_on_from(tmp_path: Path) -> None:
         write_state(tmp_path / f"{frame.index}.st", state_of(whole), CLASSES, fixed(whole))
         seen.append(whole.mapper.field.params.clone())
     for begun in (0, 4, 8, 9, 15):
-        slam = Slam(config, whole.store)  # finished submaps never change; there are more than there were
+        slam = Slam(config, whole.store)  # finished submaps never change; the store has more than at that frame
         slam.prepare(whole.view.camera)
         restore(slam, read_state(tmp_path / f"{begun}.st", CLASSES, fixed(slam)))
         assert torch.equal(slam.mapper.field.params, seen[begun])
-        if len(slam.atlas.anchors) == len(whole.atlas.anchors):  # else the store has the submaps to come
+        if len(slam.atlas.anchors) == len(whole.atlas.anchors):  # else the store has later submaps too
             for frame in list(source)[begun + 1 :]:
                 slam.step(frame)
             assert torch.equal(slam.mapper.field.params, seen[-1])
             assert np.array_equal(slam.trajectory().T_world_camera, whole.trajectory().T_world_camera)
 
 
-def test_where_a_run_goes_on_is_told() -> None:
-    assert where(FRAMES - 1, FRAMES) == "going on at frame 23 of 24"
-    assert where(FRAMES, FRAMES) == "all 24 frames are done: making the final map again"
+def test_the_resume_line_has_the_frame() -> None:
+    assert resume_line(FRAMES - 1, FRAMES) == "resuming at frame 23 of 24"
+    assert resume_line(FRAMES, FRAMES) == "all 24 frames are done: making the final map again"
 
 
-def test_what_cannot_be_gone_on_with_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_runs_that_cannot_be_resumed_are_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "run"
     assert exit_code(*arguments(out, "sigma")) == 0
     assert exit_code("resume", str(out)) == 2
@@ -114,7 +116,7 @@ def test_what_cannot_be_gone_on_with_is_refused_in_one_line(tmp_path: Path, caps
     assert "is damaged" in capsys.readouterr().err
 
 
-def test_a_state_holds_plain_data_only(tmp_path: Path) -> None:
+def test_a_state_contains_plain_data_only(tmp_path: Path) -> None:
     with pytest.raises(TypeError, match="cannot hold"):
         write_state(tmp_path / "s", {"a": object()}, (), {})
     shared = np.arange(100.0)
@@ -122,6 +124,6 @@ def test_a_state_holds_plain_data_only(tmp_path: Path) -> None:
     write_state(tmp_path / "s", tree, (), {})
     back = read_state(tmp_path / "s", (), {})
     assert back["a"] == tree["a"] and np.array_equal(back["b"][0], shared) and torch.equal(back[3], tree[3])
-    assert np.shares_memory(*back["b"]), "what was shared stays shared"
+    assert np.shares_memory(*back["b"]), "shared arrays stay shared"
     with pytest.raises(RunError, match="nothing to resume"):
         read_state(tmp_path / "none", (), {})

@@ -1,4 +1,4 @@
-"""Surfaces out of runs: of a map whose view is known exactly, of a tiny real run, and of the room itself."""
+"""Surfaces of runs: of a map with exactly known renders, of a tiny real run, and of the synthetic room itself."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,7 @@ from command_line import exit_code
 from sigmasplat.config import Config, InputConfig
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.evaluation.evaluate import evaluate
-from sigmasplat.evaluation.reconstruct import Recording, reconstruct
+from sigmasplat.evaluation.reconstruct import FusionInput, reconstruct
 from sigmasplat.io.mesh import read_mesh
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.metrics.reconstruction import distances
@@ -28,14 +28,14 @@ from sigmasplat.sources import SyntheticRoom, open_source
 from sigmasplat.sources.base import Source
 
 CAMERA = Camera(96, 72, 80.0, 80.0, 47.5, 35.5)
-"""The run works at half its size."""
+"""The run works at half this size."""
 CONFIG = replace(Config(), name="hand-made", input=InputConfig(width=48, max_depth_m=4.0))
 KEYFRAMES, WALL_M, VOXEL_M = [0, 2, 4], 2.0, 0.05
 WORLD = se3.exp(np.array([5.0, 6, 7, 0.5, 1.0, 1.5]))
 
 
 def poses() -> np.ndarray:
-    """Return six poses before a wall at z = 2 m, frames 1, 3 and 5 of them far to the side."""
+    """Return six poses in front of a wall at z = 2 m; frames 1, 3 and 5 are far to the side."""
     T = [se3.exp(np.array([0.1 * i, 0.03 * i * i, 0.02 * i, 0.0, 0.03 * i, 0.0])) for i in range(6)]
     for i in (1, 3, 5):
         T[i][0, 3] += 30.0
@@ -43,7 +43,7 @@ def poses() -> np.ndarray:
 
 
 class WallAhead(Source):
-    """A wall before the camera; it knows its true surface and path, in a frame of their own."""
+    """A wall in front of the camera, with true surface and path in another frame."""
 
     def __init__(self, known: bool = True) -> None:
         super().__init__("wall", CAMERA)
@@ -69,7 +69,7 @@ class WallAhead(Source):
 
 
 class KnownView:
-    """Show the wall, `off_m` too near, thin on the left and too far away at the top; remember from where."""
+    """Renders the wall `off_m` too close, with low alpha on the left and too far away at the top; stores the poses."""
 
     def __init__(self, off_m: float = 0.0) -> None:
         self.off_m, self.seen = off_m, list[np.ndarray]()
@@ -104,29 +104,29 @@ def write_checkpoint(run: RunFolder, keyframes: list[int], **more: torch.Tensor)
     run.write_checkpoint(tensors | {"keyframes": torch.tensor(keyframes, dtype=torch.int64)}, {})
 
 
-def test_the_surface_is_where_the_map_shows_it_at_its_keyframes(run: RunFolder) -> None:
+def test_the_surface_is_where_keyframes_render_it(run: RunFolder) -> None:
     renderer, told = KnownView(), list[tuple[int, int]]()
     mesh = reconstruct(run, CAMERA, voxel_m=VOXEL_M, renderer=renderer, progress=lambda *at: told.append(at))
     np.testing.assert_allclose(renderer.seen, poses()[KEYFRAMES], atol=1e-12)
     assert told == [(1, 3), (2, 3), (3, 3)]
     assert len(mesh.vertices) > 200 and np.abs(mesh.vertices[:, 2] - WALL_M).max() < 0.1 * VOXEL_M, "depth is D / A"
     np.testing.assert_allclose(mesh.colors, 0.4, atol=1e-5)
-    # Thin alpha on the left and readings beyond max_depth_m at the top are no surface: the first camera's left edge is
-    # outermost in x, its sixth row from above in y.
+    # Low alpha on the left and depth beyond max_depth_m at the top give no surface. So the first camera limits the
+    # surface: its left edge in x, its sixth row from the top in y.
     camera = CAMERA.resized(48, 36)
     assert mesh.vertices[:, 0].min() > (11 - camera.cx) / camera.fx * WALL_M - VOXEL_M
     assert mesh.vertices[:, 1].min() > (5 - camera.cy) / camera.fy * WALL_M - VOXEL_M
 
 
 def submap_of(index: int, T_world_submap: np.ndarray, frames: tuple[int, ...]) -> tuple[Submap, list[Picture]]:
-    """Make a submap of keyframes of the run, as many splats in it as says its number."""
+    """Make a submap of keyframes of the run, with `index` + 1 splats."""
     camera, T = CAMERA.resized(48, 36), np.array([se3.inverse(T_world_submap) @ poses()[i] for i in frames])
     picture = Picture(np.zeros((36, 48, 3), np.uint8), np.zeros((36, 48), np.float32))
     return Submap(index, GaussianField(torch.ones(index + 1, 17)), frames, T, camera), [picture] * len(frames)
 
 
-def test_with_submaps_each_keyframe_sees_its_own(run: RunFolder) -> None:
-    """Rendered in the submap's frame, placed by its anchor: the same surface as of the run in one piece."""
+def test_each_keyframe_renders_its_own_submap(run: RunFolder) -> None:
+    """Rendered in the submap's frame and placed by its anchor, the surface is that of the run without submaps."""
     whole = reconstruct(run, CAMERA, voxel_m=VOXEL_M, renderer=KnownView())
     anchors = [np.eye(4), se3.exp(np.array([0.3, -0.1, 0.2, 0.1, 0.4, 0.0]))]
     for index, frames in enumerate(((0, 2), (4,))):
@@ -137,10 +137,10 @@ def test_with_submaps_each_keyframe_sees_its_own(run: RunFolder) -> None:
         seen.append((len(field), T_camera_submap))
         return show(field, camera, T_camera_submap @ se3.inverse(anchors[len(field) - 1]))
 
-    with pytest.raises(RunError, match="has 2 submaps, its checkpoint places 0; run it again"):
+    with pytest.raises(RunError, match="has 2 submaps, but its checkpoint has poses of 0; run it again"):
         reconstruct(run, CAMERA, renderer=renderer)
     write_checkpoint(run, KEYFRAMES, T_world_submap=torch.from_numpy(np.stack(anchors)))
-    (run.path / "map.ply").unlink()  # which nothing asks for
+    (run.path / "map.ply").unlink()  # it must not be needed
     mesh = reconstruct(run, CAMERA, voxel_m=VOXEL_M, renderer=renderer, progress=lambda *at: told.append(at))
     assert [splats for splats, _ in seen] == [1, 1, 2] and told == [(1, 3), (2, 3), (3, 3)]
     np.testing.assert_allclose(seen[2][1], se3.inverse(poses()[4]) @ anchors[1], atol=1e-9)
@@ -152,12 +152,14 @@ def test_evaluation_scores_the_mesh_in_the_truths_frame(run: RunFolder) -> None:
     found = evaluate(run, WallAhead(), renderer=KnownView(off_m=0.005), strips_per_kind=0, mesh=True)["reconstruction"]
     assert found["accuracy_m"] == pytest.approx(0.005, rel=0.05) and found["precision"] > 0.999
     assert found["depth_l1_m"] == pytest.approx(0.005, rel=0.2)
-    assert 0.5 < found["recall"] < found["completion_ratio"] < 0.9, "the map is thin on the left and far off at the top"
+    assert 0.5 < found["recall"] < found["completion_ratio"] < 0.9, (
+        "the map has low alpha on the left and is too far away at the top"
+    )
     assert run.read_metrics()["reconstruction"].items() >= {n: v for n, v in found.items() if np.isfinite(v)}.items()
     page = (run.path / "report.html").read_text()
     assert "Surface F1 at 1 cm" in page and "Completion ratio (&lt; 5 cm), %" in page
     off = read_mesh(run.path / "mesh.ply").vertices[:, 2] - (WALL_M - 0.005)
-    assert np.abs(off).max() < 0.004 and np.median(np.abs(off)) < 1e-5, "in the run's own world"
+    assert np.abs(off).max() < 0.004 and np.median(np.abs(off)) < 1e-5, "in the world of the run"
 
 
 def test_evaluation_scores_the_splats_in_the_truths_frame(run: RunFolder) -> None:
@@ -165,23 +167,23 @@ def test_evaluation_scores_the_splats_in_the_truths_frame(run: RunFolder) -> Non
     params[:, :3] = torch.tensor([[0.0, 0.0, 1.7], [0.3, 0.1, WALL_M], [1.0, 1.0, 9.0]])
     run.write_map(GaussianField(params))
     found = evaluate(run, WallAhead(), renderer=KnownView(), strips_per_kind=0, mesh=True)["reconstruction"]
-    assert found["splats_accuracy_m"] == pytest.approx(0.15, rel=1e-4), "the third is hidden"
+    assert found["splats_accuracy_m"] == pytest.approx(0.15, rel=1e-4), "the third one is hidden"
     assert found["floaters"] == pytest.approx(2 / 3)
     assert found["splats_chamfer_m"] == pytest.approx((0.15 + found["splats_completion_m"]) / 2, rel=1e-4)
     page = (run.path / "report.html").read_text()
     assert "66.67" in page and "15.00" in page
 
 
-def test_without_a_known_surface_there_is_a_mesh_and_no_score(run: RunFolder) -> None:
+def test_without_a_true_surface_the_mesh_has_no_score(run: RunFolder) -> None:
     metrics = evaluate(run, WallAhead(known=False), renderer=KnownView(), strips_per_kind=0, mesh=True)
     assert metrics["reconstruction"] is None and (run.path / "mesh.ply").exists()
     (run.path / "mesh.ply").unlink()
     metrics = evaluate(run, WallAhead(), renderer=KnownView(), strips_per_kind=0)
-    assert metrics["reconstruction"] is None and not (run.path / "mesh.ply").exists(), "only where asked for"
+    assert metrics["reconstruction"] is None and not (run.path / "mesh.ply").exists(), "only on request"
     assert "Surface" not in (run.path / "report.html").read_text()
 
 
-def test_runs_without_keyframes_and_voxels_without_size_are_refused(run: RunFolder) -> None:
+def test_no_keyframes_and_zero_voxels_are_refused(run: RunFolder) -> None:
     with pytest.raises(ConfigError, match="a voxel must be above 0"):
         reconstruct(run, CAMERA, voxel_m=0.0, renderer=KnownView())
     write_checkpoint(run, [])
@@ -194,16 +196,16 @@ def test_runs_without_keyframes_and_voxels_without_size_are_refused(run: RunFold
 
 def test_the_working_camera_is_that_of_prepared_frames(run: RunFolder) -> None:
     frame = WallAhead().frame(0).prepared(48, 0.1, 4.0)
-    assert Recording.of(run, CAMERA).camera == frame.camera
+    assert FusionInput.of(run, CAMERA).camera == frame.camera
 
 
 def test_a_cropped_run_has_the_cropped_camera(run: RunFolder) -> None:
     replace(CONFIG, input=replace(CONFIG.input, crop_px=3)).save(run.path / "config.json")
     frame = WallAhead().frame(0).prepared(48, 0.1, 4.0, 3)
-    assert Recording.of(run, CAMERA).camera == frame.camera and frame.camera.width == 42
+    assert FusionInput.of(run, CAMERA).camera == frame.camera and frame.camera.width == 42
 
 
-def test_the_command_makes_the_surface_of_a_real_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_makes_a_mesh_of_a_real_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
     room, out = "synthetic:frames=120,width=64,height=48", str(tmp_path / "run")
     small = ["--set", "mapping.first_iterations=30", "--set", "mapping.iterations=8", "--set", "input.width=64",
@@ -232,8 +234,8 @@ def test_the_command_makes_the_surface_of_a_real_run(tmp_path: Path, capsys: pyt
         assert len(said) == 1 and words in said[0]
 
 
-def test_the_rooms_triangles_are_where_its_rays_hit() -> None:
-    """Every reading of a noiseless frame lies on the true surface, and nothing of that is before a reading."""
+def test_the_triangles_of_the_room_match_its_depth() -> None:
+    """Every depth of a noiseless frame is on the true surface, and no part of the surface is in front of it."""
     from sigmasplat.render.mesh import mesh_depth
 
     room = SyntheticRoom(frames=40, width=96, height=72, seed=1)
@@ -253,7 +255,7 @@ def test_the_rooms_triangles_are_where_its_rays_hit() -> None:
 
 
 @pytest.mark.parametrize("kind", ["box", "ball", "drum"])
-def test_the_rooms_shapes_are_closed_and_face_outwards(kind: str) -> None:
+def test_the_shapes_of_the_room_are_closed_and_face_outwards(kind: str) -> None:
     from sigmasplat.sources.room.furnish import furnish_rooms
     from sigmasplat.sources.room.solid import triangulate
 

@@ -15,7 +15,7 @@ from sigmasplat.model.frame import Frame
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, preset
-from sigmasplat.run import session
+from sigmasplat.run.session import Session
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import SyntheticRoom
 from sigmasplat.sources.base import Source
@@ -61,7 +61,7 @@ def config() -> Config:
 
 def test_slam_and_session_never_read_the_truth(tmp_path: Path) -> None:
     source, run = SourceWithoutTruth(), RunFolder.create(tmp_path / "run", config(), "room")
-    outcome = session.record(Slam(config()), source, run)
+    outcome = Session(Slam(config()), source, run).execute()
     assert (outcome.status, outcome.frames, outcome.lost) == ("complete", FRAMES, 0)
     assert len(run.read_trajectory()) == FRAMES
 

@@ -24,7 +24,7 @@ from sigmasplat.config.text import override
 from sigmasplat.drawing import colormap
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.presets import default_preset, preset
-from sigmasplat.run.session import record
+from sigmasplat.run.session import Session
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import open_source
 
@@ -175,7 +175,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     config = override(preset(default_preset()), QUICK)
     source = open_source("synthetic:frames=120,width=64,height=48", override(config, {"input.limit": "14"}).input)
     run = RunFolder.create(tmp_path_factory.mktemp("viewer") / "tiny", config, "room")
-    record(Slam(config, run.submaps), source, run)
+    Session(Slam(config, run.submaps), source, run).execute()
     return run
 
 

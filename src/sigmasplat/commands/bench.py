@@ -1,4 +1,4 @@
-"""Offer measurements that take many runs: sigmasplat bench ablation; torch loads where it is needed."""
+"""Measure over many runs: sigmasplat bench ablation. torch is loaded only when a run needs it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ import tyro
 from sigmasplat.commands import options
 from sigmasplat.commands.options import prepare_torch
 from sigmasplat.errors import ConfigError
-from sigmasplat.evaluation.ablation import COMPARED, Job, Results, Runner, Study, carry_out, common_config, perform
+from sigmasplat.evaluation.ablation import COMPARED, Job, Results, Runner, Study, common_config, run_job, run_jobs
 from sigmasplat.presets import default_preset
 
 if TYPE_CHECKING:
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 
 DEFAULT_PRESET = default_preset()
 WIDTH = 132
-"""Columns of a table where there is no terminal to fit it to."""
+"""Width of a table in characters if the output is not a terminal."""
 BEST = "best of its column"
 
 
 @dataclass(frozen=True)
 class Ablation:
-    """Switch on the weights of σ² one by one (tracking, loops, registration, final map); say which helps.
+    """Enable the weights of σ² one by one (tracking, loops, registration, final map) and compare the results.
 
-    Runs that FILE already holds are not made again.
+    Runs that FILE already contains are not repeated.
 
     example: sigmasplat bench ablation data/kitchen synthetic:seed={seed} --limit 300
     """
@@ -46,7 +46,7 @@ class Ablation:
     keep: options.Keep = None
 
     def study(self) -> Study:
-        """Return what is to be compared. Raises ConfigError on settings that mean nothing."""
+        """Return what to compare. Raises ConfigError on invalid values."""
         if not self.sources:
             raise ConfigError("no SOURCE given; give one or more folders of sequences")
         for name, value in (("seeds", self.seeds), ("limit", self.limit)):
@@ -56,9 +56,9 @@ class Ablation:
         return Study(tuple(dict.fromkeys(self.sources)), config, self.seeds, self.limit, self.without_variance)
 
     def run(self, runner: Runner | None = None) -> int:
-        """Run what has not been run, print a table a sequence, write FILE after every run; return 0.
+        """Make the missing runs, write FILE after each run, print a table for each sequence, and return 0.
 
-        `runner` takes the place of a whole run of SLAM and its evaluation. Raises SigmaSplatError.
+        `runner` replaces the SLAM run and its evaluation. Raises SigmaSplatError.
         """
         from sigmasplat.run.terminal import Screen
 
@@ -67,15 +67,15 @@ class Ablation:
         if runner is None:
             check_sources(study, screen)
             prepare_torch()
-            runner = partial(perform, screen=screen)
+            runner = partial(run_job, screen=screen)
         results.write()
         jobs = [job for source in study.sources for job in study.jobs(source)]
         try:
             for source in study.sources:
-                carry_out(study.jobs(source), results, runner, self.keep, partial(_tell, screen, jobs, results))
+                run_jobs(study.jobs(source), results, runner, self.keep, partial(_announce, screen, jobs, results))
                 show(screen, study, source, results.of(source))
         except BaseException:
-            screen.say(f"{len(results.runs)} of {len(jobs)} runs are in {self.out}; the same command goes on there")
+            screen.say(f"{len(results.runs)} of {len(jobs)} runs are in {self.out}; the same command makes the others")
             raise
         screen.say(f"{len(jobs)} runs: {self.out}")
         return 0
@@ -87,7 +87,7 @@ def bench(
         tyro.conf.arg(name="", prefix_name=False),
     ],
 ) -> int:
-    """Measure over many runs: what each use of uncertainty is worth.
+    """Measure over many runs what each use of uncertainty contributes.
 
     example: sigmasplat bench ablation data/kitchen --seeds 5
     """
@@ -96,7 +96,7 @@ def bench(
 
 
 def check_sources(study: Study, screen: "Screen") -> None:
-    """Open every sequence once, so that a wrong path is said now and not hours later; warn of wrong depth units.
+    """Open every sequence once, so that a wrong path fails now and not after hours; warn of wrong depth units.
 
     Raises SourceError.
     """
@@ -112,17 +112,17 @@ def check_sources(study: Study, screen: "Screen") -> None:
 
 
 def show(screen: "Screen", study: Study, source: str, runs: Sequence[dict[str, Any]]) -> None:
-    """Print a sequence's table and, in words, which weight helps."""
+    """Print a sequence's table and the verdict on each weight."""
     if not screen.out.is_terminal:
         screen.out.width = WIDTH
     screen.out.print(table(study, source, runs))
-    for line in said(study.variants, runs, study.seeds):
+    for line in verdict_lines(study.variants, runs, study.seeds):
         screen.say(line)
     screen.say("")
 
 
 def table(study: Study, source: str, runs: Sequence[dict[str, Any]]) -> "Table":
-    """Lay out mean ± standard deviation over seeds, a row a variant, the best of a column starred."""
+    """Return mean ± standard deviation over seeds, one row per variant; * marks the best of a column."""
     from rich.table import Table
 
     from sigmasplat.evaluation.paired_comparison import columns, rows
@@ -137,25 +137,28 @@ def table(study: Study, source: str, runs: Sequence[dict[str, Any]]) -> "Table":
     return made
 
 
-def said(variants: Sequence[str], runs: Sequence[dict[str, Any]], seeds: int) -> list[str]:
-    """Say of each variant what it does against the one before, and how much that means."""
-    from sigmasplat.evaluation.paired_comparison import effects, passed_by_chance, sentence
+def verdict_lines(variants: Sequence[str], runs: Sequence[dict[str, Any]], seeds: int) -> list[str]:
+    """Return a line per pair of variants: which figures change, and how likely such a change is by chance."""
+    from sigmasplat.evaluation.paired_comparison import described, paired_differences, passed_by_chance
 
     pairs = [(changed, against) for changed, against in COMPARED if {changed, against} <= set(variants)]
-    lines = [f"{changed} against {against}: {sentence(effects(runs, changed, against))}" for changed, against in pairs]
+    lines = [
+        f"{changed} against {against}: {described(paired_differences(runs, changed, against))}"
+        for changed, against in pairs
+    ]
     if seeds < 2:
         return lines
     share = f"{passed_by_chance(seeds):.0%}"
     return [
         *lines,
-        f"Helps and harms: the mean difference at equal seeds is beyond one standard deviation of the {seeds} "
-        f"differences. {share} of figures that nothing changed but chance pass that bar.",
+        f"helps, harms: the mean difference at equal seeds is larger than one standard deviation of the {seeds} "
+        f"differences. A change without any effect passes this threshold in {share} of cases by chance.",
     ]
 
 
-def _tell(screen: "Screen", jobs: Sequence[Job], results: Results, job: Job) -> None:
-    """Print which run begins, and how long the rest may take by the runs so far."""
-    taken = [run["wall_s"] for run in results.runs]
-    left_min = sum(taken) / len(taken) * (len(jobs) - len(taken)) / 60 if taken else None
+def _announce(screen: "Screen", jobs: Sequence[Job], results: Results, job: Job) -> None:
+    """Print which run starts, and the time left as estimated from the runs so far."""
+    durations_s = [run["wall_s"] for run in results.runs]
+    left_min = sum(durations_s) / len(durations_s) * (len(jobs) - len(durations_s)) / 60 if durations_s else None
     rest = "" if left_min is None else f" (about {max(left_min, 1):.0f} min left)"
-    screen.say(f"[{len(taken) + 1}/{len(jobs)}] {job.source}, {job.variant}, seed {job.seed}{rest}")
+    screen.say(f"[{len(durations_s) + 1}/{len(jobs)}] {job.source}, {job.variant}, seed {job.seed}{rest}")

@@ -1,4 +1,4 @@
-"""Print what makes a shell complete our commands and options: sigmasplat completion."""
+"""Print the script for tab completion in a shell: sigmasplat completion."""
 
 import subprocess
 import sys
@@ -6,7 +6,8 @@ import sys
 from sigmasplat.commands import options
 from sigmasplat.presets import list_presets
 
-# tyro's script offers commands and options, and one empty word where it knows none: files are then what one wants.
+# tyro's script offers commands and options. Elsewhere it offers one empty word, which is removed here, so that bash
+# completes file names.
 BASH = """
 _sigmasplat() {{
   _tyro_sigmasplat
@@ -19,11 +20,11 @@ complete -o bashdefault -o default -F _sigmasplat sigmasplat
 
 
 def completion(shell: options.Shell) -> int:
-    """Print the shell's completion script; load it with source <(sigmasplat completion bash).
+    """Print a script for tab completion; load it with: source <(sigmasplat completion bash)
 
     example: sigmasplat completion bash > ~/.local/share/bash-completion/completions/sigmasplat
     """
-    # A process of its own: tyro prints the script of the whole command line, and exits.
+    # tyro prints the script and exits, so it runs in a separate process.
     command = [sys.executable, "-m", "sigmasplat", "--tyro-print-completion", shell]
     print(subprocess.run(command, capture_output=True, text=True, check=True).stdout, end="")
     if shell == "bash":

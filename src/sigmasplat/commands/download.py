@@ -16,12 +16,18 @@ SetName = Annotated[
 Names = Annotated[
     tuple[str, ...],
     tyro.conf.Positional,
-    arg(metavar="NAME", help="recordings of the set; list SET names them", help_behavior_hint="(none where it is one)"),
+    arg(
+        metavar="NAME",
+        help="names of recordings; `download list SET` lists them",
+        help_behavior_hint="(none if there is only one)",
+    ),
 ]
-DataFolder = Annotated[Path, arg(metavar="DIR", help="data folder")]
-ListOnly = Annotated[bool, arg(name="list", help="tell what there is, download nothing", help_behavior_hint="")]
-Overwrite = Annotated[bool, arg(help="download again what is there already", help_behavior_hint="")]
-KeepArchive = Annotated[bool, arg(help="keep the archives beside what was in them", help_behavior_hint="")]
+DataFolder = Annotated[Path, arg(metavar="DIR", help="folder for the data sets")]
+ListOnly = Annotated[
+    bool, arg(name="list", help="list data sets or recordings, download nothing", help_behavior_hint="")
+]
+Overwrite = Annotated[bool, arg(help="download existing recordings again", help_behavior_hint="")]
+KeepArchive = Annotated[bool, arg(help="keep the archives after unpacking", help_behavior_hint="")]
 
 
 def download(
@@ -32,7 +38,7 @@ def download(
     overwrite: Overwrite = False,
     keep_archive: KeepArchive = False,
 ) -> int:
-    """Download recordings of a public data set: resumed where it broke off, checked, unpacked safely.
+    """Download recordings of a public data set: resumable, verified, safely unpacked.
 
     example: sigmasplat download tum fr1/desk
     """
@@ -41,40 +47,42 @@ def download(
 
     screen = Screen()
     if list_only or dataset == "list":
-        _tell_what_there_is(screen, names if dataset == "list" else (dataset,))
+        _list(screen, names if dataset == "list" else (dataset,))
         return 0
-    for public, name in [find_recording(dataset, name) for name in names or ("",)]:
-        target = _obtained(screen, public, name, out, overwrite, keep_archive)
-        start = target / public.recordings[name].start
-        _refuse_unknown(start)
+    for public_set, name in [find_recording(dataset, name) for name in names or ("",)]:
+        target = _download(screen, public_set, name, out, overwrite, keep_archive)
+        start = target / public_set.recordings[name].start
+        _check_readable(start)
         screen.say(f"next: sigmasplat run {start}")
     return 0
 
 
-def _tell_what_there_is(screen: "Screen", set_names: tuple[str, ...]) -> None:
+def _list(screen: "Screen", set_names: tuple[str, ...]) -> None:
     from sigmasplat.download import describe_recordings, describe_sets
 
     for line in (line for name in set_names for line in describe_recordings(name)) if set_names else describe_sets():
         screen.say(line)
 
 
-def _obtained(screen: "Screen", public: "PublicSet", name: str, out: Path, overwrite: bool, keep_archive: bool) -> Path:
+def _download(
+    screen: "Screen", public_set: "PublicSet", name: str, out: Path, overwrite: bool, keep_archive: bool
+) -> Path:
     from sigmasplat.download import download_recording
 
     try:
         with screen.transfers() as progress:
-            return download_recording(public, name, out, progress, screen.say, overwrite, keep_archive)
+            return download_recording(public_set, name, out, progress, screen.say, overwrite, keep_archive)
     except KeyboardInterrupt:
-        screen.say("what has come is kept; the same command goes on with it")
+        screen.say("the part downloaded so far is kept; the same command resumes the download")
         raise
 
 
-def _refuse_unknown(folder: Path) -> None:
-    """Raise DownloadError if what came cannot be opened as a sequence."""
+def _check_readable(folder: Path) -> None:
+    """Raise DownloadError if the downloaded folder cannot be opened as a sequence."""
     from sigmasplat.errors import DownloadError, SourceError
     from sigmasplat.sources import open_source
 
     try:
         open_source(folder)
     except SourceError as problem:
-        raise DownloadError(f"downloaded, but not to be run as it is: {problem}") from problem
+        raise DownloadError(f"downloaded, but it cannot be run: {problem}") from problem

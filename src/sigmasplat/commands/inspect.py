@@ -19,7 +19,7 @@ SheetFile = Annotated[
 
 def inspect(
     path: options.SourcePath,
-    taken: options.InputOptionsFlat = options.DEFAULT_INPUT_OPTIONS,
+    input_options: options.InputOptionsFlat = options.DEFAULT_INPUT_OPTIONS,
     settings: options.Settings = (),
     out: SheetFile = None,
 ) -> int:
@@ -34,7 +34,7 @@ def inspect(
     from sigmasplat.run.terminal import Screen
 
     screen = Screen()
-    found = inspect_source(path, configured(default_preset(), settings, None, taken).input)
+    found = inspect_source(path, configured(default_preset(), settings, None, input_options).input)
     table = Table(title=found.title, show_header=False)
     for name, value in found.rows:
         table.add_row(name, value)

@@ -1,4 +1,4 @@
-"""Describe the options of the command line: type, placeholder, one line of help each; and turn them into values."""
+"""Define the options of the command line (type, placeholder, one line of help) and convert them to values."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -22,7 +22,7 @@ arg = tyro.conf.arg
 
 
 def _number(read: Callable[[str], float]) -> tyro.constructors.PrimitiveConstructorSpec[float | None]:
-    """Describe a number that may be left out, None then: what is given is read as a number, and never as None."""
+    """Describe an optional number: None if it is not given; a given text is always read as a number, never as None."""
     return tyro.constructors.PrimitiveConstructorSpec(
         nargs=1,
         metavar="NUMBER",
@@ -34,74 +34,81 @@ def _number(read: Callable[[str], float]) -> tyro.constructors.PrimitiveConstruc
 
 Whole = Annotated[int | None, _number(int)]
 Number = Annotated[float | None, _number(float)]
-PresetName = Annotated[str, arg(metavar="NAME", help=f"settings to start from: {', '.join(families())}")]
-Shell = Annotated[Literal["bash", "zsh"], tyro.conf.Positional, arg(metavar="{bash,zsh}", help="the shell you type in")]
+PresetName = Annotated[str, arg(metavar="NAME", help=f"preset of settings to start from: {', '.join(families())}")]
+Shell = Annotated[
+    Literal["bash", "zsh"], tyro.conf.Positional, arg(metavar="{bash,zsh}", help="the shell that you use")
+]
 Settings = Annotated[
     tuple[str, ...],
     tyro.conf.UseAppendAction,
-    arg(name="set", metavar="SECTION.NAME=VALUE", help="change one setting"),
+    arg(name="set", metavar="SECTION.NAME=VALUE", help="change one setting; docs/settings.md lists them"),
 ]
-Seed = Annotated[Whole, arg(metavar="N", help="start of all random numbers", help_behavior_hint="(default: 0)")]
+Seed = Annotated[Whole, arg(metavar="N", help="seed of all random numbers", help_behavior_hint="(default: 0)")]
 RunPath = Annotated[Path, tyro.conf.Positional, arg(metavar="RUN", help="run folder")]
 OutFolder = Annotated[
     Path | None,
     arg(metavar="DIR", aliases=["--output"], help="run folder", help_behavior_hint="(default: a new one in runs/)"),
 ]
 DemoFolder = Annotated[Path, arg(metavar="DIR", aliases=["--output"], help="run folder")]
-Frames = Annotated[int, arg(metavar="N", help="length of the walk through the room")]
+Frames = Annotated[int, arg(metavar="N", help="number of frames")]
 SourcePath = Annotated[
-    str, tyro.conf.Positional, arg(metavar="PATH", help="a recording, synthetic[:frames=N], or realsense: the camera")
+    str,
+    tyro.conf.Positional,
+    arg(metavar="PATH", help="a recording, synthetic[:frames=N] for the synthetic room, or realsense for the camera"),
 ]
 SourcePaths = Annotated[
     tuple[str, ...],
     tyro.conf.Positional,
     arg(
         metavar="SOURCE",
-        help="folders of sequences, or synthetic[:frames=N,…]; {seed} in one becomes the seed's number",
+        help="sequences: folders or synthetic[:frames=N,…]; {seed} is replaced by the seed",
         help_behavior_hint="(at least one)",
     ),
 ]
-Seeds = Annotated[int, arg(metavar="N", help="runs of each variant, with seeds 0, 1, … N − 1")]
-Tau = Annotated[float, arg(metavar="T", help="τ of every weight, one for all data")]
+Seeds = Annotated[int, arg(metavar="N", help="number of runs of each variant, with seeds 0 to N − 1")]
+Tau = Annotated[float, arg(metavar="T", help="τ, the same for every weight and sequence")]
 WithoutVariance = Annotated[
-    bool, arg(help="run also without learning any variance, for reference", help_behavior_hint="")
+    bool, arg(help="also run without learning any variance, as a reference", help_behavior_hint="")
 ]
-AblationFile = Annotated[Path, arg(metavar="FILE", help="JSON file to write, and to go on with where it stopped")]
+AblationFile = Annotated[Path, arg(metavar="FILE", help="JSON file of the results; an existing one is continued")]
 DropRuns = Annotated[
-    bool, arg(name="overwrite", help="drop runs in FILE that were made otherwise", help_behavior_hint="")
+    bool,
+    arg(name="overwrite", help="drop runs in FILE that have other settings, code or machine", help_behavior_hint=""),
 ]
 Keep = Annotated[
-    Path | None, arg(metavar="DIR", help="keep the run folders here", help_behavior_hint="(default: removed)")
+    Path | None,
+    arg(metavar="DIR", help="keep the run folders in DIR", help_behavior_hint="(default: they are removed)"),
 ]
-Overwrite = Annotated[bool, arg(help="replace what is there", help_behavior_hint="")]
-Limit = Annotated[Whole, arg(metavar="N", help="take at most N frames", help_behavior_hint="(default: all)")]
-Profile = Annotated[bool, arg(help="print where the time went", help_behavior_hint="")]
-SaveEvery = Annotated[
-    float, arg(metavar="S", help="seconds between savings of the state that `resume` goes on from; 0 = at the end only")
-]
+Overwrite = Annotated[bool, arg(help="replace an earlier result", help_behavior_hint="")]
+Limit = Annotated[Whole, arg(metavar="N", help="use at most N frames", help_behavior_hint="(default: all)")]
+Profile = Annotated[bool, arg(help="print the time spent in each stage", help_behavior_hint="")]
+SaveEvery = Annotated[float, arg(metavar="S", help="save the state for `resume` every S seconds; 0 = at the end only")]
 View = Annotated[
-    bool, arg(help="show the run in the browser while it goes on, and until Ctrl-C", help_behavior_hint="")
+    bool, arg(help="show the run in the browser while it runs, and afterwards until Ctrl-C", help_behavior_hint="")
 ]
-Host = Annotated[str, arg(metavar="ADDRESS", help="where the viewer listens; by default only this machine reaches it")]
-Port = Annotated[int, arg(metavar="N", help="port of the viewer, or the next free one; 0 = any")]
-Evaluate = Annotated[bool, arg(name="eval", help="make no metrics and no report", help_behavior_hint="")]
+Host = Annotated[
+    str, arg(metavar="ADDRESS", help="address that the viewer listens on; the default allows this machine only")
+]
+Port = Annotated[int, arg(metavar="N", help="port of the viewer; if it is busy, the next free one is used; 0 = any")]
+Evaluate = Annotated[bool, arg(name="eval", help="do not score the run: no metrics, no report", help_behavior_hint="")]
 MovedSource = Annotated[
     str | None,
     arg(
         name="source",
         metavar="PATH",
-        help="the sequence, if it has moved",
-        help_behavior_hint="(default: where it was)",
+        help="path of the sequence if it has moved",
+        help_behavior_hint="(default: its path in the run)",
     ),
 ]
 OutFile = Annotated[
-    Path | None, arg(metavar="FILE", help="file to write", help_behavior_hint="(default: RUN's name, here)")
+    Path | None,
+    arg(metavar="FILE", help="file to write", help_behavior_hint="(default: named after RUN, in this folder)"),
 ]
 Record = Annotated[
     Path | None,
     arg(
         metavar="DIR",
-        help="where to record what a live camera sees",
+        help="folder for the recording of a live camera",
         help_behavior_hint="(default: recording/ in the run folder)",
     ),
 ]
@@ -109,79 +116,110 @@ MeshFile = Annotated[
     Path | None,
     arg(metavar="FILE", help="file to write: .ply, .obj or .glb", help_behavior_hint="(default: mesh.ply in RUN)"),
 ]
-VoxelM = Annotated[float, arg(metavar="M", help="edge of a voxel in metres; distances are truncated at four of them")]
+VoxelM = Annotated[float, arg(metavar="M", help="edge of a voxel in metres; the truncation distance is 4 voxels")]
 WithMesh = Annotated[
     bool,
-    arg(name="mesh", help="make mesh.ply too, and score it where the true surface is known", help_behavior_hint=""),
+    arg(name="mesh", help="also write mesh.ply, and score it if the true surface is known", help_behavior_hint=""),
 ]
-RunOrMap = Annotated[Path, tyro.conf.Positional, arg(metavar="RUN", help="run folder, or a file that holds a map")]
+RunOrMap = Annotated[Path, tyro.conf.Positional, arg(metavar="RUN", help="run folder or map file")]
 Format = Annotated[
     str | None,
-    arg(metavar="NAME", help="what to write", help_behavior_hint="(default: by the ending of FILE, else ply)"),
+    arg(metavar="NAME", help="format to write", help_behavior_hint="(default: by the ending of FILE, else ply)"),
 ]
 SigmaBelow = Annotated[
     Number,
-    arg(
-        metavar="S", help="keep splats whose σ is below this, colours being 0 to 1", help_behavior_hint="(default: all)"
-    ),
+    arg(metavar="S", help="keep only splats with σ below S, for colours 0 to 1", help_behavior_hint="(default: all)"),
 ]
 OpacityAbove = Annotated[
     Number,
-    arg(metavar="A", help="keep splats whose opacity is above this", help_behavior_hint="(default: all)"),
+    arg(metavar="A", help="keep only splats with opacity above A", help_behavior_hint="(default: all)"),
 ]
 Plain = Annotated[
-    bool, arg(help="PLY in 3DGS's own 62 columns, without σ², for readers that know no others", help_behavior_hint="")
+    bool,
+    arg(
+        help="write PLY with only the 62 columns of 3DGS, without σ², for readers that accept no others",
+        help_behavior_hint="",
+    ),
 ]
 Pictures = Annotated[
-    bool, arg(help="write the keyframes' pictures too, and take only these as views", help_behavior_hint="")
+    bool, arg(help="also write the images of the keyframes, and export only keyframes as views", help_behavior_hint="")
 ]
-CellM = Annotated[float, arg(metavar="M", help="edge of the floor plan's cells in metres")]
+CellM = Annotated[float, arg(metavar="M", help="cell size of the floor plan in metres")]
 FilmSize = Annotated[
-    int, arg(metavar="PX", help="width of each of a film's panels", help_behavior_hint="(default: the run's images')")
+    int,
+    arg(
+        metavar="PX",
+        help="width of each panel of a video in pixels",
+        help_behavior_hint="(default: that of the run's images)",
+    ),
 ]
-FilmRate = Annotated[float, arg(metavar="N", help="images per second of a film")]
+FilmRate = Annotated[float, arg(metavar="N", help="images per second of a video")]
 FilmSeconds = Annotated[
     Number,
-    arg(metavar="S", help="length of a film", help_behavior_hint="(default: the path's, 4 to 60; orbit 12)"),
+    arg(
+        metavar="S",
+        help="length of a video in seconds",
+        help_behavior_hint="(default: that of the path, 4 to 60; orbit: 12)",
+    ),
 ]
-FilmPath = Annotated[Literal["run", "orbit"], arg(help="a film goes along the run's path, or round the room above it")]
+FilmPath = Annotated[
+    Literal["run", "orbit"], arg(help="camera path of a video: along the run's path, or in a circle above the room")
+]
 
 
 @dataclass(frozen=True)
 class InputOptions:
-    """What is taken of a sequence: shorthands of the settings input.*, which --set reaches too."""
+    """Options that select and calibrate the input: short forms of the settings input.* of --set."""
 
     limit: Limit = None
-    stride: Annotated[Whole, arg(metavar="N", help="take every N-th frame", help_behavior_hint="")] = None
-    start: Annotated[Number, arg(metavar="S", help="begin S seconds in", help_behavior_hint="")] = None
-    end: Annotated[Number, arg(metavar="S", help="stop S seconds in", help_behavior_hint="")] = None
-    strict: Annotated[bool, arg(help="stop at an unreadable image, do not pass it over", help_behavior_hint="")] = False
-    calibration: Annotated[
-        Path | None, arg(metavar="FILE", help="calibration.json in place of the recorded one", help_behavior_hint="")
-    ] = None
-    fx: Annotated[Number, arg(metavar="PX", help="focal length; fy too, if not given", help_behavior_hint="")] = None
-    fy: Annotated[Number, arg(metavar="PX", help="focal length, vertical", help_behavior_hint="")] = None
-    cx: Annotated[Number, arg(metavar="PX", help="principal point", help_behavior_hint="")] = None
-    cy: Annotated[Number, arg(metavar="PX", help="principal point", help_behavior_hint="")] = None
-    depth_scale: Annotated[Number, arg(metavar="UNITS", help="PNG units of depth per metre", help_behavior_hint="")] = (
+    stride: Annotated[Whole, arg(metavar="N", help="use every N-th frame", help_behavior_hint="")] = None
+    start: Annotated[Number, arg(metavar="S", help="start S seconds after the first frame", help_behavior_hint="")] = (
         None
     )
-    color_topic: Annotated[str | None, arg(metavar="NAME", help="topic of a ROS bag", help_behavior_hint="")] = None
-    depth_topic: Annotated[str | None, arg(metavar="NAME", help="topic of a ROS bag", help_behavior_hint="")] = None
+    end: Annotated[Number, arg(metavar="S", help="stop S seconds after the first frame", help_behavior_hint="")] = None
+    strict: Annotated[bool, arg(help="stop at an unreadable image instead of skipping it", help_behavior_hint="")] = (
+        False
+    )
+    calibration: Annotated[
+        Path | None,
+        arg(metavar="FILE", help="calibration.json to use instead of the recorded calibration", help_behavior_hint=""),
+    ] = None
+    fx: Annotated[
+        Number,
+        arg(
+            metavar="PX",
+            help="horizontal focal length in pixels; also the vertical one unless --fy is given",
+            help_behavior_hint="",
+        ),
+    ] = None
+    fy: Annotated[Number, arg(metavar="PX", help="vertical focal length in pixels", help_behavior_hint="")] = None
+    cx: Annotated[Number, arg(metavar="PX", help="column of the principal point in pixels", help_behavior_hint="")] = (
+        None
+    )
+    cy: Annotated[Number, arg(metavar="PX", help="row of the principal point in pixels", help_behavior_hint="")] = None
+    depth_scale: Annotated[
+        Number, arg(metavar="UNITS", help="units of the depth images per metre", help_behavior_hint="")
+    ] = None
+    color_topic: Annotated[
+        str | None, arg(metavar="NAME", help="ROS bag: topic of the colour images", help_behavior_hint="")
+    ] = None
+    depth_topic: Annotated[
+        str | None, arg(metavar="NAME", help="ROS bag: topic of the depth images", help_behavior_hint="")
+    ] = None
     register_depth: Annotated[
         Literal["auto", "on", "off"],
-        arg(help="move depth into the colour camera; auto: where the recording says that it has one of its own"),
+        arg(help="register depth to the colour camera; auto: if the recording has a separate depth camera"),
     ] = "auto"
 
     def settings(self) -> dict[str, str]:
-        """Return what was given, by the settings' names. Raises ConfigError on numbers that mean nothing."""
+        """Return the given options by the names of their settings. Raises ConfigError on invalid numbers."""
         for name in ("limit", "stride"):
             if (value := getattr(self, name)) is not None and value < 1:
                 raise ConfigError(f"--{name} must be at least 1, found {value}")
         names = {"start": "start_s", "end": "end_s"}
         given = {field.name: getattr(self, field.name) for field in fields(self)}
         given["register_depth"] = None if self.register_depth == "auto" else self.register_depth
-        given["calibration"] = self.calibration and self.calibration.resolve()  # a later eval may start elsewhere
+        given["calibration"] = self.calibration and self.calibration.resolve()  # a later eval may run in another folder
         return {
             f"input.{names.get(name, name)}": str(value) for name, value in given.items() if value not in (None, False)
         }
@@ -193,7 +231,7 @@ InputOptionsFlat = Annotated[InputOptions, arg(name=""), tyro.conf.OmitArgPrefix
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a run is carried through: scored or not, kept how often, shown where."""
+    """Options of run and resume: scoring, profile, saving, viewer."""
 
     evaluate: Evaluate = True
     profile: Profile = False
@@ -208,33 +246,33 @@ RunOptionsFlat = Annotated[RunOptions, arg(name=""), tyro.conf.OmitArgPrefixes]
 
 
 def configured(
-    preset: str, settings: Sequence[str], seed: int | None, taken: InputOptions = DEFAULT_INPUT_OPTIONS
+    preset: str, settings: Sequence[str], seed: int | None, input_options: InputOptions = DEFAULT_INPUT_OPTIONS
 ) -> Config:
-    """Return a preset's settings with those of --set, the shorthands and --seed in place. Raises ConfigError."""
-    given = split_settings(settings) | taken.settings()
+    """Return a preset's settings, changed by --set, the input options and --seed. Raises ConfigError."""
+    given = split_settings(settings) | input_options.settings()
     config = override(preset_of(preset), given)
     return config if seed is None else override(config, {"seed": str(seed)})
 
 
 def source_of(folder: "RunFolder", moved_to: str | None) -> "Source":
-    """Open the sequence that a run was made of. Raises RunError if the run does not say where it was."""
+    """Open the sequence of a run. Raises RunError if the run does not contain its path."""
     from sigmasplat.sources import open_source
 
     facts = folder.facts()
     path = moved_to or facts.get("source_path")
     if not path:
-        raise RunError(f"run {folder.path} does not say where its sequence was; give --source PATH")
+        raise RunError(f"run {folder.path} does not contain the path of its sequence; give --source PATH")
     return open_source(path, folder.config().input)
 
 
 def refuse_existing(target: Path | None, overwrite: bool) -> None:
-    """Raise RunError if there is something at `target` that may not be overwritten."""
+    """Raise RunError if `target` exists and may not be overwritten."""
     if target and target.exists() and not overwrite:
         raise RunError(f"{target} exists; give another --out, or --overwrite to replace it")
 
 
 def prepare_torch() -> None:
-    """Give torch as many threads as the environment gives the kernels."""
+    """Limit torch to the threads that the environment gives the kernels."""
     import torch
 
     if env.switches().threads:

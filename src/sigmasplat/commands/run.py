@@ -1,15 +1,33 @@
-"""Run SLAM on a sequence, on a camera, or on the built-in room: sigmasplat demo | run | resume."""
+"""Run SLAM on a sequence, a camera or the synthetic room: sigmasplat demo | run | resume.
 
+The order of a run: open the source, start the viewer, create the run folder, run the session (`run/session.py`), score.
+"""
+
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sigmasplat.commands import options
+from sigmasplat.commands.evaluate import score
 from sigmasplat.commands.options import configured, prepare_torch, source_of
-from sigmasplat.commands.run_and_score import announce, nothing_left_of, optional_viewer, run_and_score
+from sigmasplat.commands.view import keep_showing, serve_viewer
 from sigmasplat.config.text import full_path
 from sigmasplat.errors import ConfigError
 from sigmasplat.presets import default_preset
 
+if TYPE_CHECKING:
+    from sigmasplat.config import Config
+    from sigmasplat.io.runs import RunFolder
+    from sigmasplat.run.protocols import Callback
+    from sigmasplat.run.resume import StartPoint
+    from sigmasplat.run.session import Outcome
+    from sigmasplat.run.terminal import Screen
+    from sigmasplat.sources.base import Source
+    from sigmasplat.viewer.app import ViewerApp
+
+OK, INTERRUPTED = 0, 130
 DEFAULT_PRESET = default_preset()
 DEMO_FOLDER, DEMO_FRAMES = Path("runs/demo"), 120
 
@@ -21,15 +39,15 @@ def demo(
     out: options.DemoFolder = DEMO_FOLDER,
     seed: options.Seed = None,
 ) -> int:
-    """Run SLAM on a room made in code, against exact truth; replaces the last demo.
+    """Run SLAM on a synthetic room and score it against the exact truth; replaces the last demo.
 
     example: sigmasplat demo --frames 40
     """
     if frames < 1:
         raise ConfigError(f"--frames must be at least 1, found {frames}")
-    whole_walk = max(frames, DEMO_FRAMES)  # fewer frames are a part of the walk: a hurried one loses the tracker
-    taken = options.InputOptions(limit=frames)
-    return run(f"synthetic:frames={whole_walk}", preset, settings, out, overwrite=True, taken=taken, seed=seed)
+    whole_walk = max(frames, DEMO_FRAMES)  # fewer frames are a part of this walk: squeezed into a few, it is too fast
+    limit = options.InputOptions(limit=frames)
+    return run(f"synthetic:frames={whole_walk}", preset, settings, out, overwrite=True, input_options=limit, seed=seed)
 
 
 def run(
@@ -38,52 +56,39 @@ def run(
     settings: options.Settings = (),
     out: options.OutFolder = None,
     overwrite: options.Overwrite = False,
-    taken: options.InputOptionsFlat = options.DEFAULT_INPUT_OPTIONS,
+    input_options: options.InputOptionsFlat = options.DEFAULT_INPUT_OPTIONS,
     seed: options.Seed = None,
     record: options.Record = None,
-    ways: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
+    run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
 ) -> int:
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
     example: sigmasplat run data/kitchen --limit 200 --set input.width=480
     """
-    from sigmasplat.run.resume import Begun
-    from sigmasplat.run.session import new_folder
+    from sigmasplat.run.resume import StartPoint
+    from sigmasplat.run.session import new_folder, removed_on_early_failure
     from sigmasplat.run.terminal import Screen
     from sigmasplat.slam.slam import Slam
-    from sigmasplat.sources import open_source
-    from sigmasplat.sources.camera.depth_units import depth_warning
-    from sigmasplat.sources.live import LiveSource, recording_settings
 
-    screen, config = Screen(), configured(preset, settings, seed, taken)
-    source = open_source(path, config.input)
-    if isinstance(source, LiveSource):
-        config = replace(config, input=recording_settings(config.input))
-        if record:
-            source.record_to(record)
-    elif record:
-        raise ConfigError("--record is for a live camera; the sequence is recorded already")
-    elif warning := depth_warning(source):
-        screen.warn(warning)
-    if source.registrable and not source.depth_registered:
-        screen.warn("depth stays in its own camera's pixels; --register-depth on moves it to colour (see inspect)")
-    with optional_viewer(screen, ways) as viewer:
+    screen, config = Screen(), configured(preset, settings, seed, input_options)
+    source, config = _opened(screen, path, config, record)
+    with _viewer(screen, run_options) as viewer:
         folder = new_folder(out, config, source, overwrite, source_path=full_path(path))
-        with nothing_left_of(folder):
-            announce(screen, config.name, source, folder, record)
+        with removed_on_early_failure(folder):
+            _announce(screen, config.name, source, folder, record)
             prepare_torch()
-            begun = Begun(Slam(config, folder.submaps))
-            return run_and_score(screen, begun, source, folder, ways, viewer)
+            start = StartPoint(Slam(config, folder.submaps))
+            return _run_and_score(screen, start, source, folder, run_options, viewer)
 
 
 def resume(
     run: options.RunPath,
     moved_to: options.MovedSource = None,
-    ways: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
+    run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
 ) -> int:
-    """Go on with a run that was stopped or killed, where its state was last kept.
+    """Resume a run that was stopped or killed, from its last saved state.
 
-    The result is the same, byte for byte, as if it had not been stopped. example: sigmasplat resume runs/kitchen-sigma
+    The result is byte for byte that of an uninterrupted run. example: sigmasplat resume runs/kitchen-sigma
     """
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.run.resume import resume as resumed
@@ -92,15 +97,132 @@ def resume(
     screen, folder = Screen(), RunFolder.open(run)
     source = source_of(folder, moved_to)
     prepare_torch()
-    with optional_viewer(screen, ways) as viewer:
-        begun = resumed(folder, source)
+    with _viewer(screen, run_options) as viewer:
+        start = resumed(folder, source)
         folder.note(status="running")
-        screen.say(f"{source.name}: {where(begun.next_index, len(source))} → {folder.path}")
-        return run_and_score(screen, begun, source, folder, ways, viewer)
+        screen.say(f"{source.name}: {resume_line(start.next_index, len(source))} → {folder.path}")
+        return _run_and_score(screen, start, source, folder, run_options, viewer)
 
 
-def where(next_index: int, frames: int) -> str:
-    """Say where a run goes on."""
+def resume_line(next_index: int, frames: int) -> str:
+    """Return the text that says where a run resumes."""
     if next_index >= frames:
         return f"all {frames} frames are done: making the final map again"
-    return f"going on at frame {next_index} of {frames}"
+    return f"resuming at frame {next_index} of {frames}"
+
+
+def _opened(screen: "Screen", path: str, config: "Config", record: Path | None) -> tuple["Source", "Config"]:
+    """Open the source and warn of doubtful depth; the settings of a live camera become those of its recording."""
+    from sigmasplat.sources import open_source
+    from sigmasplat.sources.camera.depth_units import depth_warning
+    from sigmasplat.sources.live import LiveSource, recording_settings
+
+    source = open_source(path, config.input)
+    if isinstance(source, LiveSource):
+        config = replace(config, input=recording_settings(config.input))
+        if record:
+            source.record_to(record)
+    elif record:
+        raise ConfigError("--record is for a live camera only; this sequence is already a recording")
+    elif warning := depth_warning(source):
+        screen.warn(warning)
+    if source.registrable and not source.depth_registered:
+        screen.warn("depth and colour come from different cameras; --register-depth on aligns them (see inspect)")
+    return source, config
+
+
+def _viewer(screen: "Screen", run_options: options.RunOptions) -> AbstractContextManager["ViewerApp | None"]:
+    """Start the viewer if it is requested. Raises as `serve_viewer`."""
+    return serve_viewer(screen, run_options.host, run_options.port) if run_options.view else nullcontext()
+
+
+def _announce(screen: "Screen", preset: str, source: "Source", folder: "RunFolder", record: Path | None) -> None:
+    """Print what runs and where; record a live camera to `record` or into the run folder, to be read again later."""
+    from sigmasplat.run.session import unused_path
+    from sigmasplat.sources.live import LiveSource
+
+    if not isinstance(source, LiveSource):
+        screen.say(f"{source.name}: {len(source)} frames, {preset} → {folder.path}")
+        return
+    recording = record or unused_path(folder.path / "recording")
+    if not record:
+        source.record_to(recording)
+    folder.note(source_path=str(recording.resolve()))
+    screen.say(f"{source.name}: until Ctrl-C, {preset} → {folder.path}, recorded to {recording}")
+
+
+def _run_and_score(
+    screen: "Screen",
+    start: "StartPoint",
+    source: "Source",
+    folder: "RunFolder",
+    run_options: options.RunOptions,
+    viewer: "ViewerApp | None",
+) -> int:
+    """Run the session, then score it, and keep showing it in the viewer until Ctrl-C; return the exit code.
+
+    Raises KeyboardInterrupt if Ctrl-C came before the first frame was done.
+    """
+    from sigmasplat.render.cuda import stages as cuda_stages
+    from sigmasplat.run.resume import StateFile
+    from sigmasplat.run.session import Session
+    from sigmasplat.sources.live import LiveSource
+
+    cuda_stages.measure(run_options.profile)
+    state = StateFile(start.slam, folder, run_options.save_every)
+    with _progress(screen, start, source, viewer) as callback:
+        outcome = Session(start.slam, source, folder, callback, state, start.next_index, start.wall_s).execute()
+    if outcome.status == "interrupted" and not outcome.frames:
+        raise KeyboardInterrupt  # the folder holds no results, and nothing to resume from
+    if run_options.profile:
+        screen.profile(folder.read_profile())
+    _warn_of_skipped_frames(screen, source)
+    if outcome.status == "interrupted":
+        _say_interrupted(screen, outcome, folder)
+        return INTERRUPTED
+    if isinstance(source, LiveSource):
+        source = source_of(folder, None)  # what follows reads the recording
+    if run_options.evaluate:
+        score(screen, folder, source)
+    else:
+        screen.say(f"{outcome.summary()}: {folder.path}")
+    if viewer:
+        keep_showing(screen, viewer, folder, source)
+    return OK
+
+
+@contextmanager
+def _progress(
+    screen: "Screen", start: "StartPoint", source: "Source", viewer: "ViewerApp | None"
+) -> Iterator["Callback"]:
+    """Yield the callback that shows the session on the terminal, and in the viewer if there is one."""
+    from sigmasplat.run.protocols import CallbackList
+
+    with screen.steps(None if source.live else len(source), start.next_index) as steps:
+        if viewer is None:
+            yield steps
+            return
+        from sigmasplat.viewer.live import LiveView
+
+        yield CallbackList(steps, LiveView(start.slam, viewer.show, source.name))
+
+
+def _warn_of_skipped_frames(screen: "Screen", source: "Source") -> None:
+    """Print how many frames are missing from the run, and why."""
+    from sigmasplat.sources.live import LiveSource
+
+    if source.skipped:
+        images = "image" if len(source.skipped) == 1 else "images"
+        screen.warn(f"{len(source.skipped)} unreadable {images} skipped (first: {source.skipped[0]})")
+    if isinstance(source, LiveSource) and source.ending:
+        screen.warn(source.ending)
+    if isinstance(source, LiveSource) and source.dropped:
+        screen.say(f"{source.dropped} frames of the camera were dropped because SLAM was slower")
+
+
+def _say_interrupted(screen: "Screen", outcome: "Outcome", folder: "RunFolder") -> None:
+    """Print what an interrupted run has kept, and how to resume it."""
+    screen.say(
+        f"interrupted after {outcome.summary()}; the trajectory, map and checkpoint so far are in {folder.path}; "
+        f"to resume: sigmasplat resume {folder.path}"
+    )

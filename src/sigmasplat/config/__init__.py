@@ -1,7 +1,9 @@
-"""Hold every setting of a run: frozen dataclasses with units in the names; values of systems live in `presets`."""
+"""Define every setting of a run: frozen dataclasses with units in the names. The values of each system are in
+`presets`."""
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -20,15 +22,16 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Config:
-    """A whole run. Every value has a working default; `presets.preset` fills in those of the published systems."""
+    """All settings of a run. Every value has a working default; `presets.preset` returns those of a published
+    system."""
 
     name: str = "custom"
-    """What the settings are called, in reports and folder names: the preset's name."""
+    """Name of these settings in reports and folder names: the name of the preset."""
     seed: int = 0
-    """Start of all random numbers; another one tells how much a result owes to chance."""
+    """Seed of all random numbers. Runs with other seeds show how much a result depends on chance."""
     backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
-    """What renders: auto = what SIGMASPLAT_BACKEND says, else cpu; cuda needs an NVIDIA GPU; reference is the slow
-    definition in plain torch, for machines without the compiled kernels."""
+    """Renderer: auto = the value of SIGMASPLAT_BACKEND if it is set, else cpu; cuda needs an NVIDIA GPU; reference is
+    slow plain torch, for machines without the compiled kernels."""
     input: InputConfig = field(default_factory=InputConfig)
     render: RenderConfig = field(default_factory=RenderConfig)
     seeding: SeedConfig = field(default_factory=SeedConfig)
@@ -40,17 +43,22 @@ class Config:
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     final: FinalConfig = field(default_factory=FinalConfig)
 
+    def changed(self, **sections: Mapping[str, Any]) -> "Config":
+        """Return the settings with some values replaced, as in config.changed(mapping={"every": 5})."""
+        new = {name: dataclasses.replace(getattr(self, name), **values) for name, values in sections.items()}
+        return dataclasses.replace(self, **new)
+
     def to_dict(self) -> dict[str, Any]:
-        """Return plain nested values, as written to a run's config.json."""
+        """Return the settings as nested dicts, as in a run's config.json."""
         return dataclasses.asdict(self)
 
     def save(self, path: Path) -> None:
-        """Write as JSON."""
+        """Write the settings as JSON."""
         path.write_text(json.dumps(self.to_dict(), indent=2) + "\n")
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "Config":
-        """Rebuild from nested values. Raises ConfigError on an unknown name."""
+        """Make settings from nested dicts. Raises ConfigError on an unknown name."""
         sections: dict[str, Any] = {}
         known = {f.name: f for f in dataclasses.fields(Config)}
         for name, value in values.items():
@@ -70,7 +78,7 @@ class Config:
 
     @staticmethod
     def load(path: Path) -> "Config":
-        """Read a config.json. Raises ConfigError if it is missing, not JSON, or names unknown settings."""
+        """Read a config.json. Raises ConfigError if it is missing, not JSON, or has unknown settings."""
         try:
             return Config.from_dict(json.loads(path.read_text()))
         except (OSError, json.JSONDecodeError) as problem:

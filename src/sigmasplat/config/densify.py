@@ -1,4 +1,4 @@
-"""Settings of how splats are judged, thinned and multiplied while they are fitted."""
+"""Settings of pruning, splitting and cloning splats during mapping."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -6,29 +6,33 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class DensifyConfig:
-    """What happens to single splats halfway through a keyframe's steps, and after them (CG-SLAM §4, 5)."""
+    """How splats are pruned, split and cloned, halfway through the steps of a keyframe and after them (CG-SLAM §4,
+    5)."""
 
     uncertain_m2: float = 0.0
-    """A splat is uncertain when the depths it is held against, over the window, scatter about its own by more than this
-    (ν > τ, CG-SLAM eq. 13): halfway it fades, and goes at the end unless it has come back. 0 = off."""
+    """A splat is uncertain if the depth readings at its pixels over the window deviate from its own depth by a mean
+    square above this (ν > τ, CG-SLAM eq. 13). It fades halfway through the steps of a keyframe, and is removed at the
+    end unless it has recovered; 0 = off."""
     owner: Literal["dominant", "median"] = "dominant"
-    """Which splat of a pixel is held against its reading: the one of largest weight (paper), or the one at median depth
-    (CG-SLAM's code)."""
+    """Which splat of a pixel is compared with its depth reading: the one with the largest weight (paper), or the one at
+    the median depth (CG-SLAM's code)."""
     faded_opacity: float = 0.07
-    """The opacity of a faded splat: above `render.alpha_min`, so that it is still seen and may come back (ours)."""
+    """Opacity of a faded splat. It is above `render.alpha_min`, so that the splat is still drawn and can recover
+    (ours)."""
     least_opacity: float = 15.0 / 255.0
-    """… and has come back when it is no longer uncertain, and not fainter than this (CG-SLAM's α_min)."""
+    """A faded splat has recovered if it is no longer uncertain and has at least this opacity (CG-SLAM's α_min)."""
     split_gradient: float = 0.0
-    """A splat is hot when the loss pulls at its mean by more than this, in the newest keyframe's images, per half image
-    size (3DGS); 0 = off: nothing is split or cloned."""
+    """A splat is densified if the mean gradient of the loss with respect to its 2D position in the newest keyframe is
+    at least this, per half image size (3DGS); 0 = no splat is split or cloned for its gradient."""
     split_scale_m: float = 0.05
-    """A hot splat larger than this is split in two …"""
+    """A densified splat larger than this is split in two."""
     split_radius_px: float = 0.0
-    """Also split is what spans more than this (three standard deviations) in the newest keyframe's image: splats that a
-    camera comes close to were made for a view from afar (ours); 0 = off."""
+    """A splat whose radius (three standard deviations) in the newest keyframe's image exceeds this is split in two as
+    well: it was made for a view from farther away (ours). 0 = off."""
     clone: bool = False
-    """… a smaller one is doubled (3DGS; CG-SLAM's code does not)."""
+    """Whether a densified splat that is too small to be split is cloned (3DGS; not in CG-SLAM's code)."""
     most_scale_m: float = 0.0
-    """Splats larger than this go; 0 = off."""
+    """Splats larger than this are removed; 0 = off."""
     most_radius_px: float = 0.0
-    """Splats whose three standard deviations span more than this in the newest keyframe go; 0 = off."""
+    """Splats whose radius (three standard deviations) in the newest keyframe's image exceeds this are removed; 0 =
+    off."""

@@ -1,4 +1,4 @@
-"""Settings of what is taken from a recording, whatever its format: which frames, whose cameras, which pixels."""
+"""Settings of the input, for every format: which frames, which calibration, which pixels."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -8,54 +8,58 @@ from sigmasplat.errors import ConfigError
 
 @dataclass(frozen=True)
 class InputConfig:
-    """What is taken from the source. Raises ConfigError on values that mean nothing."""
+    """Which frames of the source are used, and how. Raises ConfigError on invalid values."""
 
     stride: int = 1
-    """Every so many frames one is taken."""
+    """Use every N-th frame."""
     limit: int = 0
-    """At most so many frames; 0 = all."""
+    """Maximum number of frames; 0 = all."""
     start_s: float = 0.0
-    """Seconds after the recording's first frame at which to begin."""
+    """Start this many seconds after the first frame of the recording."""
     end_s: float = 0.0
-    """… and to stop; 0 = at its end."""
+    """Stop this many seconds after the first frame of the recording; 0 = at its end."""
     strict: bool = False
-    """Whether an unreadable image ends the sequence instead of being passed over."""
+    """Whether an unreadable image stops the run. If off, such images are skipped and counted."""
 
     color_topic: str = ""
-    """The topic of a ROS bag that colour is taken of; empty = found by what it holds."""
+    """Topic of the colour images in a ROS bag; empty = detected from the messages."""
     depth_topic: str = ""
-    """… and depth."""
+    """Topic of the depth images in a ROS bag; empty = detected from the messages."""
 
     calibration: str = ""
-    """A calibration.json to use in place of what the recording says of its cameras."""
+    """Path of a calibration.json that replaces the calibration of the recording; empty = as recorded."""
     fx: float = 0.0
-    """The colour camera's focal length in pixels, in place of the recording's; 0 = as recorded."""
+    """Horizontal focal length of the colour camera in pixels; 0 = as recorded."""
     fy: float = 0.0
-    """… and the vertical one; 0 = as recorded, or as fx where nothing is."""
+    """Vertical focal length of the colour camera in pixels; 0 = as recorded, or equal to fx if nothing is recorded."""
     cx: float = 0.0
-    """Column of its principal point, pixels; 0 = as recorded, or the image's centre where nothing is."""
+    """Column of the colour camera's principal point in pixels; 0 = as recorded, or the image centre if nothing is
+    recorded."""
     cy: float = 0.0
-    """… and its row."""
+    """Row of the colour camera's principal point in pixels; 0 = as recorded, or the image centre if nothing is
+    recorded."""
     depth_scale: float = 0.0
-    """PNG units per metre, in place of the recording's; 0 = as recorded."""
+    """Units of the depth images per metre; 0 = as recorded."""
 
     register_depth: Literal["auto", "on", "off"] = "auto"
-    """Whether depth is moved into the colour camera's pixels; auto: where the recording says that cameras differ."""
+    """Whether depth is registered to the pixels of the colour camera; auto = if the recording has a separate depth
+    camera."""
     undistort: bool = True
-    """Whether lenses are taken out, where they are known."""
+    """Whether lens distortion is removed, if it is known."""
     width: int = 0
-    """Working image width in pixels, height in proportion; 0 keeps the source's size."""
+    """Width of the working images in pixels, height in proportion; 0 = as in the source."""
     crop_px: int = 0
-    """Pixels dropped at every edge, after resizing: where an undistorted image or a sensor's depth has none."""
+    """Pixels removed at each edge after resizing, for undistorted images or sensors without depth at the edges."""
     min_depth_m: float = 0.1
-    """Nearer readings are none: what a sensor says below its range is noise."""
+    """Smaller depth readings are ignored: below its range a sensor returns noise."""
     max_depth_m: float = 8.0
-    """Farther ones are none either: errors grow with the square of the depth."""
+    """Larger depth readings are ignored: their errors grow with the square of the depth."""
 
     def __post_init__(self) -> None:
         if self.stride < 1 or self.limit < 0:
-            raise ConfigError(f"stride and limit must be at least 1, found stride={self.stride}, limit={self.limit}")
-        if self.start_s < 0 or (self.end_s and self.end_s <= self.start_s):
             raise ConfigError(
-                f"input.start_s and input.end_s must span some time, found {self.start_s:g} to {self.end_s:g} s"
+                "input.stride must be at least 1 and input.limit at least 0, "
+                f"found stride={self.stride}, limit={self.limit}"
             )
+        if self.start_s < 0 or (self.end_s and self.end_s <= self.start_s):
+            raise ConfigError(f"input.end_s must be after input.start_s, found {self.start_s:g} to {self.end_s:g} s")

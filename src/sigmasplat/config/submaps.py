@@ -1,4 +1,4 @@
-"""Settings of what is done submap by submap: cutting, loops, registration, the final map."""
+"""Settings of the work per submap: when to start a new one, loops, registration, the final map."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -6,107 +6,114 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class SubmapConfig:
-    """When the active submap is finished and the next one begun: asked at each keyframe (VarSplat §2)."""
+    """When the active submap ends and the next one starts; checked at each keyframe (VarSplat §2)."""
 
     distance_m: float = 0.0
-    """Farther than this from the submap's first pose; 0 = off, as below. With all four off the map is one submap."""
+    """A new submap starts if the camera is farther than this from the submap's first pose; 0 = off. If all four rules
+    are off, the map is one submap."""
     angle_deg: float = 0.0
-    """… or turned by more than this from it."""
+    """A new submap starts if the camera has rotated by more than this from the submap's first pose; 0 = off."""
     frames: int = 0
-    """… or so many frames after it."""
+    """A new submap starts this many frames after the first one of the active submap; 0 = off."""
     uncertainty_m: float = 0.0
-    """… or tracking has lost so much of its hold: standard deviation of the camera's position in the submap, summed up
-    from keyframe to keyframe (`slam.drift`)."""
+    """A new submap starts if the standard deviation of the camera's position in the submap, accumulated from keyframe
+    to keyframe, exceeds this (`slam.drift`); 0 = off."""
     inherit: bool = False
-    """Begin the next submap with copies of the splats in view, and map them like any; off = from nothing (paper)."""
+    """Whether a new submap starts with copies of the splats in view, which are then mapped like any others; off = it
+    starts empty (paper)."""
 
 
 @dataclass(frozen=True)
 class LoopConfig:
-    """Which submaps may show one place (VarSplat §4)."""
+    """Which submaps may show the same place (VarSplat §4)."""
 
     close: bool = True
-    """Whether loops are looked for at all."""
+    """Whether loops are searched and closed."""
     descriptor: Literal["grid", "netvlad"] = "grid"
-    """grid: built in (`slam.descriptors.OrientationGrid`); netvlad: from the file `weights`."""
+    """Image descriptor: grid = built in (`slam.loop_closure.descriptors.OrientationGrid`); netvlad = with the weights
+    of the file `weights`."""
     weights: str = ""
-    """The file of NetVLAD's weights that descriptor=netvlad needs; read at the start."""
+    """File of NetVLAD weights, needed by descriptor=netvlad; read at the start."""
     min_similarity: float = 0.5
-    """A submap's own views are this share alike: which of their similarities is the threshold."""
+    """Sets the similarity that a loop must exceed: the k-th highest one of a keyframe within its own submap, with k =
+    this share of the submap's keyframes."""
     min_interval: int = 2
-    """Submaps nearer than this in the sequence are neighbours, not loops."""
+    """Submaps that are fewer than this many submaps apart are neighbours, and not tested as loops."""
     similarity_floor: float = 0.0
-    """No pair less alike than this is tried, however unlike a submap's own views are."""
+    """Pairs of keyframes with a similarity of at most this are never tested."""
     near_m: float = 0.0
-    """Keyframes nearer than this by the poses known so far are tried too, however they look; 0 = off (paper)."""
+    """Keyframes closer than this by the current poses are tested too, whatever their similarity; 0 = off (paper)."""
     near_deg: float = 30.0
-    """… and turned by less than this."""
+    """Maximum rotation between the keyframes of a pair that `near_m` selects."""
     most: int = 4
-    """At most so many pairs are registered per finished submap, the most alike first; 0 = no limit."""
+    """Maximum number of pairs registered per finished submap, the most similar first; 0 = no limit."""
     uncertainty: bool = True
-    """Gate similarity by the variance-weighted opacity ratio; off = LoopSplat."""
+    """Whether similarity is multiplied by a gate from the variance-weighted opacity ratio; off = LoopSplat."""
     tau: float = 10.0
-    """τ of the weights of that ratio's splats by their σ²; smaller tells sure splats from doubtful ones more
-    sharply."""
+    """τ of the splat weights in that opacity ratio, computed from σ². A smaller τ separates certain from uncertain
+    splats more sharply."""
     weight_max: float = 3.0
-    """… and their bounds: no splat counts more than this many times, or less than 1 / this."""
+    """Bounds of the splat weights in the opacity ratio: at most this, at least 1 / this."""
 
 
 @dataclass(frozen=True)
 class RegistrationConfig:
-    """How two submaps are laid onto each other, and when that is believed (VarSplat §5)."""
+    """How two submaps are registered, and when the result is accepted (VarSplat §5)."""
 
     keyframes: int = 2
-    """Of each submap so many keyframes are localised in the other one."""
+    """Number of keyframes of each submap that are localised in the other one."""
     iterations: int = 100
-    """Adam's steps per keyframe at most, after it has been aligned; each is a render."""
+    """Maximum number of Adam steps per keyframe, after alignment; each step is a render."""
     lr_rotation: float = 1.5e-2
-    """Rate of rotation in those steps, as `tracking.lr_rotation`."""
+    """Learning rate of rotation in registration, as `tracking.lr_rotation`."""
     lr_translation: float = 5e-3
-    """Rate of translation in them, metres per step."""
+    """Learning rate of translation in registration, metres per step."""
     plateau_stop: float = 1e-4
-    """They end when a step changes the loss by less than this share of it; 0 = when they are all done."""
+    """The steps of registration end when one changes the loss by less than this share of it; 0 = run every
+    iteration."""
     exposure: bool = True
-    """Whether a factor and an offset of the colour are fitted too: submaps may be of differently exposed images."""
+    """Whether a factor and an offset of the colour are fitted too, because submaps may differ in exposure."""
     weight_color: float = 0.95
-    """λ_c of their loss; depth has 1 − λ_c."""
+    """λ_c, the weight of the colour loss in registration; the depth loss has 1 − λ_c."""
     uncertainty: bool = True
-    """Weigh pixels by the other submap's V; off = LoopSplat."""
+    """Whether pixels are weighted by the V of the other submap; off = LoopSplat."""
     tau: float = 50.0
-    """τ of those weights, as `tracking.tau`."""
+    """τ of the pixel weights in registration, as `tracking.tau`."""
     weight_max: float = 3.0
-    """… and their bounds: no pixel counts more than this many times, or less than 1 / this."""
+    """Bounds of the pixel weights in registration: at most this, at least 1 / this."""
     overlap_least: float = 0.2
-    """Refused where fewer of the splats than this have a neighbour within `overlap_m` in the other submap."""
+    """A loop is rejected if less than this share of the splats has a neighbour within `overlap_m` in the other
+    submap."""
     overlap_m: float = 0.1
-    """How near a neighbour is that counts, metres; about what two maps of one wall may lie apart."""
+    """Maximum distance of such a neighbour in metres: about the distance between two maps of the same wall."""
     agreement_least: float = 0.8
-    """A localisation counts if this share of the surfaces in common agrees in depth …"""
+    """A localisation is valid only if at least this share of the common surface agrees in depth."""
     share_least: float = 0.3
-    """… and the other submap explains this share of the readings."""
+    """A localisation is valid only if the other submap explains at least this share of its depth readings."""
     spread_m: float = 0.1
-    """Refused unless two localisations that count, at least, lie within this of one of them, metres …"""
+    """A loop is rejected unless at least two valid localisations are within this distance of one of them, in metres."""
     spread_deg: float = 5.0
-    """… and are turned by no more than this against it."""
+    """A loop is rejected unless at least two valid localisations differ from one of them by at most this rotation."""
 
 
 @dataclass(frozen=True)
 class FinalConfig:
-    """The global map, made of all submaps once the frames have ended (VarSplat §7)."""
+    """The global map, made from all submaps after the last frame (VarSplat §7)."""
 
     seed_from: Literal["submaps", "mesh"] = "submaps"
-    """submaps: their splats as they are; mesh: new ones on the fused surface (paper)."""
+    """Initial splats of the final map: submaps = the splats of the submaps; mesh = new splats on the fused surface
+    (paper)."""
     iterations: int = 0
-    """Steps of refinement over all keyframes; 0 = none."""
+    """Number of refinement steps over all keyframes; 0 = no refinement."""
     sh_degree: int = 0
-    """Degree of view-dependent colour reached in refinement, 0 to 3."""
+    """Degree of view-dependent colour reached during refinement, 0 to 3."""
     sh_every: int = 1000
-    """One degree more each so many steps."""
+    """Number of refinement steps after which the degree of view-dependent colour rises by one."""
     spacing_m: float = 0.02
-    """Distance of splats seeded on the mesh."""
+    """Distance between the splats seeded on the mesh."""
     prune_every: int = 500
-    """Each so many steps splats that have faded go."""
+    """Number of refinement steps between removals of splats with low opacity (`prune_opacity`)."""
     prune_opacity: float = 0.005
-    """Those no more opaque than this, 0 to 1."""
+    """Splats with at most this opacity, 0 to 1, are removed during refinement."""
     uncertainty: bool = True
-    """Merge by variance, keep σ² and its likelihood in refinement; off = paper."""
+    """Whether variance is used to merge submaps and still learned during refinement; off = paper."""

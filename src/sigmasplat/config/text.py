@@ -1,4 +1,4 @@
-"""Change settings by text, as on the command line: SECTION.NAME=VALUE."""
+"""Change settings given as text, as on the command line: SECTION.NAME=VALUE."""
 
 import dataclasses
 import difflib
@@ -12,9 +12,9 @@ from sigmasplat.errors import ConfigError
 
 
 def override(config: Config, settings: Mapping[str, str]) -> Config:
-    """Return the settings with some replaced, as in {"tracking.iterations": "60", "seed": "1"}; text becomes its type.
+    """Return the settings with some replaced, as in {"tracking.iterations": "60", "seed": "1"}; text is converted.
 
-    Raises ConfigError on an unknown name (saying which there are), text that is not of the type, a negative number.
+    Raises ConfigError on an unknown name (and lists the known ones), text of another type, or a negative number.
     """
     for name, text in settings.items():
         section, _, field = name.rpartition(".")
@@ -30,37 +30,37 @@ def override(config: Config, settings: Mapping[str, str]) -> Config:
 
 
 def split_settings(settings: Iterable[str]) -> dict[str, str]:
-    """Split SECTION.NAME=VALUE at the equals sign; of a name given twice the last counts. Raises ConfigError."""
+    """Split SECTION.NAME=VALUE at the equals sign; the last value of a name given twice is used. Raises ConfigError."""
     pairs = [setting.partition("=") for setting in settings]
     for name, equals, _ in pairs:
         if not equals:
-            raise ConfigError(f"a setting is SECTION.NAME=VALUE, found {name!r}")
+            raise ConfigError(f"a setting must be SECTION.NAME=VALUE, found {name!r}")
     return {name.strip(): value for name, _, value in pairs}
 
 
 def differences(config: Config, base: Config) -> list[str]:
-    """Return the settings of one configuration that differ from another's, but for its name, as SECTION.NAME=VALUE."""
+    """Return the settings of `config` that differ from those of `base`, except its name, as SECTION.NAME=VALUE."""
     ours, theirs = _flat(dataclasses.asdict(config)), _flat(dataclasses.asdict(base))
     return [f"{name}={value}" for name, value in ours.items() if value != theirs[name] and name != "name"]
 
 
 def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Name nested values SECTION.NAME."""
+    """Return nested values by the name SECTION.NAME."""
     inner = {key: value if isinstance(value, Mapping) else None for key, value in values.items()}
     flat = {key: value for key, value in values.items() if inner[key] is None}
     return flat | {f"{key}.{name}": item for key, section in inner.items() if section for name, item in section.items()}
 
 
 def _replaced(section: Any, field: str, name: str, text: str) -> Any:
-    """Return a section with one value replaced; `name` is how the user called it."""
+    """Return a section with one value replaced; `name` is the full name that the user gave."""
     types = {known: kind for known, kind in get_type_hints(type(section)).items() if not dataclasses.is_dataclass(kind)}
     if field not in types:
-        raise ConfigError(f"unknown setting {name!r}{nearest(field, types)}; there are {', '.join(types)}")
+        raise ConfigError(f"unknown setting {name!r}{nearest(field, types)}; known: {', '.join(types)}")
     return dataclasses.replace(section, **{field: _converted(name, types[field], text.strip())})
 
 
 def _converted(name: str, kind: Any, text: str) -> Any:
-    """Turn text into a setting's type. Raises ConfigError."""
+    """Convert text to a setting's type. Raises ConfigError."""
     if get_origin(kind) is Literal:
         return _chosen(name, {str(value): value for value in get_args(kind)}, text)
     if kind is bool:
@@ -94,11 +94,11 @@ def _chosen(name: str, allowed: Mapping[str, Any], text: str) -> Any:
 
 
 def nearest(name: str, known: Mapping[str, Any] | list[str]) -> str:
-    """Suggest the known name that a misspelt one resembles."""
+    """Return a suggestion for a misspelt name, "" if no known name is similar."""
     close = difflib.get_close_matches(name, list(known), 1)
     return f" (did you mean {close[0]}?)" if close else ""
 
 
 def full_path(path: str) -> str:
-    """Return the absolute path of an existing file, any other text (the name of a built-in sequence) unchanged."""
+    """Return the absolute path of an existing file; other text, such as the name of a built-in sequence, unchanged."""
     return str(Path(path).resolve()) if Path(path).exists() else path

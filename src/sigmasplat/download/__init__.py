@@ -1,4 +1,4 @@
-"""Download public data sets: a catalogue of values, a fetcher that resumes, an unpacker that trusts no archive."""
+"""Download public data sets: catalogue, resumable downloads, and safe unpacking of archives."""
 
 from sigmasplat.download.downloader import download_recording
 from sigmasplat.download.lookup import describe_recordings, describe_sets, find_recording

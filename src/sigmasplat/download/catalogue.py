@@ -1,10 +1,9 @@
-"""List the public data sets: addresses, sizes, terms.
+"""List the public data sets: addresses, sizes, licences.
 
 Addresses are those that the download scripts of public SLAM repositories use (MASt3R-SLAM's and monodepth2's for TUM,
 NICE-SLAM's and pySLAM's download_replica.sh, cuVSLAM's download_icl_nuim.sh, hloc's README for 7-Scenes, WildGS-SLAM's
-download_bonn.sh, Open3D's RedwoodIndoor*.cpp). None of the sets but Open3D's publishes checksums: those of TUM and
-7-Scenes here were recorded alike by two projects that do not know each other. Other sizes are
-rough.
+download_bonn.sh, Open3D's RedwoodIndoor*.cpp). Only Open3D publishes checksums: those of TUM and 7-Scenes here were
+recorded by two independent projects with equal results. Other sizes are approximate.
 """
 
 from collections.abc import Mapping
@@ -27,7 +26,7 @@ TUM_SIZES_MB: Mapping[str, int | None] = {
     **{"fr2/flowerbouquet_brownbackground": None, "fr2/metallic_sphere": None, "fr2/metallic_sphere2": None},
     **{"fr3/cabinet": 490, "fr3/large_cabinet": 450, "fr3/teddy": 1230},
 }
-"""The static scenes with published truth; those with people walking about are another benchmark."""
+"""The static scenes with published ground truth, without the dynamic scenes."""
 
 TUM_EXACT = {
     "fr1/xyz": (448_204_271, "sha256:a0236d97b8c30cd93b653656d2b6c293ff7c982a4130ef2a1a8beecdb124ef98"),
@@ -73,7 +72,7 @@ REDWOOD_MD5 = {
         "698f2f09da7d2ed3fcb604889e6f8479",
     ),
 }
-"""Of colour, depth with a Kinect's noise, and the path."""
+"""Of colour, depth with Kinect noise, and the path."""
 REDWOOD_URL = "https://github.com/isl-org/open3d_downloads/releases/download/augmented-icl-nuim"
 
 
@@ -172,7 +171,7 @@ SETS: Mapping[str, PublicSet | RestrictedSet] = {
         prefix="rgbd_bonn_",
     ),
     "redwood": PublicSet(
-        title="Redwood, ICL-NUIM rooms with longer paths and a Kinect's noise",
+        title="Redwood, ICL-NUIM rooms with longer paths and Kinect noise",
         page="http://redwood-data.org/indoor/dataset.html",
         licence="terms and citation on its page",
         folder="redwood",

@@ -1,4 +1,4 @@
-"""Obtain a recording: download what it is made of, check and unpack it, all or nothing."""
+"""Download a recording: fetch, verify and unpack its archives, completely or not at all."""
 
 import json
 import shutil
@@ -18,21 +18,21 @@ from sigmasplat.download.verify import verify
 from sigmasplat.errors import DownloadError
 
 MARKER = ".sigmasplat-download.json"
-"""Written last into a folder of ours: one that has it is whole."""
+"""File written last to a downloaded folder; it marks the folder as complete."""
 SIZE_MARGIN = 3.0
-"""How much more an archive may hold than archives of its kind do."""
+"""Factor on the expected unpacked size of an archive."""
 ROUGH_SIZE_RANGE = (0.5, 1.5)
-"""Between which multiples of a rough size a download may be."""
+"""Accepted size of a download, relative to an approximate size."""
 FileProgress = Callable[[str, int, int], None]
-"""Shows what is being done, bytes done, and in all (0: not known)."""
+"""Called with the current action, bytes done, and bytes in total (0: unknown)."""
 Log = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class DownloadJob:
-    """What all archives of a recording have in common; archive_folder: where they are put."""
+    """The parameters shared by all archives of a recording; archive_folder: where they are stored."""
 
-    public: PublicSet
+    public_set: PublicSet
     archive_folder: Path
     progress: FileProgress
     log: Log
@@ -40,7 +40,7 @@ class DownloadJob:
 
 
 def download_recording(
-    public: PublicSet,
+    public_set: PublicSet,
     name: str,
     out: Path,
     progress: FileProgress,
@@ -49,43 +49,43 @@ def download_recording(
     keep_archive: bool = False,
     retry: RetryPolicy | None = None,
 ) -> Path:
-    """Return the folder of a recording of a set below `out`, downloaded unless it is there already.
+    """Download a recording of a data set, unless it exists already; return its folder below `out`.
 
-    `log` gets the terms and the size first. What was downloaded is kept on errors and on Ctrl-C, and the next call
-    goes on with it; nothing half unpacked is left. Raises DownloadError; RunError if the disk cannot be written.
+    `log` receives the licence and the size first. Downloaded parts are kept on errors and on Ctrl-C, and the next call
+    resumes; incomplete folders are removed. Raises DownloadError; RunError if the disk cannot be written.
     """
-    recording = public.recordings[name]
-    target = out / public.folder / recording.folder
+    recording = public_set.recordings[name]
+    target = out / public_set.folder / recording.folder
     if target.exists() or target.is_symlink():
         if not (target / MARKER).is_file():
-            raise DownloadError(f"{target} exists and was not made by this command; move it, or give another --out")
+            raise DownloadError(f"{target} exists and was not created by this command; move it, or give another --out")
         if not overwrite:
-            log(f"{target} is there already; --overwrite downloads it again")
+            log(f"{target} exists already; --overwrite downloads it again")
             return target
-    log(f"{public.title} {name}".rstrip() + f": {format_size(recording.size_bytes)} → {target}")
-    log(f"terms: {public.licence} ({public.page}); by downloading you accept them")
-    job = DownloadJob(public, target.parent, progress, log, retry or RetryPolicy())
+    log(f"{public_set.title} {name}".rstrip() + f": {format_size(recording.size_bytes)} → {target}")
+    log(f"terms: {public_set.licence} ({public_set.page}); by downloading you accept them")
+    job = DownloadJob(public_set, target.parent, progress, log, retry or RetryPolicy())
     with _created(target.parent):
         _download(job, name, target, keep_archive)
     return target
 
 
 def _download(job: DownloadJob, name: str, target: Path, keep_archive: bool) -> None:
-    """Download a recording's archives and unpack them to `target`."""
-    public, recording = job.public, job.public.recordings[name]
+    """Download the archives of a recording and unpack them to `target`."""
+    public_set, recording = job.public_set, job.public_set.recordings[name]
     archives = [_verified_file(job, archive) for archive in recording.archives]
     with _replacing(target) as fresh:
         for archive, path in zip(recording.archives, archives, strict=True):
             _unpack_file(job, archive, path, fresh / archive.into)
         _check_layout(fresh / recording.start, recording, archives)
-        marks = {"title": public.title, "recording": name, "licence": public.licence, "page": public.page}
+        marks = {"title": public_set.title, "recording": name, "licence": public_set.licence, "page": public_set.page}
         (fresh / MARKER).write_text(json.dumps(marks | {"from": [a.url for a in recording.archives]}, indent=1) + "\n")
     for path in [] if keep_archive else archives:
         path.unlink(missing_ok=True)
 
 
 def _verified_file(job: DownloadJob, archive: RemoteFile) -> Path:
-    """Return an archive on disk, downloaded unless it is there, its checksum right."""
+    """Return the path of a verified archive, downloaded unless it exists."""
     path = job.archive_folder / archive.name
     if not path.exists():
         progress = partial(job.progress, f"download {archive.name}")
@@ -94,30 +94,30 @@ def _verified_file(job: DownloadJob, archive: RemoteFile) -> Path:
     return path
 
 
-def _check_size(job: DownloadJob, archive: RemoteFile, size_bytes: int | None, here_bytes: int) -> None:
-    """Raise DownloadError if what the server has to offer cannot be the archive, or there is no room for it."""
+def _check_size(job: DownloadJob, archive: RemoteFile, size_bytes: int | None, downloaded_bytes: int) -> None:
+    """Raise DownloadError if the size of the server's file is not plausible, or the disk has no space for it."""
     expected = archive.size_bytes
     if size_bytes is not None and expected is not None:
         low, high = (1.0, 1.0) if archive.checksum else ROUGH_SIZE_RANGE
         if not low * expected <= size_bytes <= high * expected:
             sizes = f"{size_bytes:,} bytes, not {'' if archive.checksum else 'about '}{expected:,}"
-            raise DownloadError(f"the server's {archive.name} has {sizes}; has the set changed, is it another file?")
+            raise DownloadError(f"the server's {archive.name} has {sizes}; did the data set change?")
     likely = size_bytes if size_bytes is not None else expected or 0
-    if likely > job.public.max_bytes:
-        raise DownloadError(f"the server's {archive.name} has {likely:,} bytes, too many to be what was asked for")
+    if likely > job.public_set.max_bytes:
+        raise DownloadError(f"the server's {archive.name} has {likely:,} bytes, too many for this data set")
     if expected is None:
         job.log(f"{archive.name}: {format_size(size_bytes)}")
-    _check_disk_space(job.archive_folder, likely - here_bytes + int(likely * job.public.disk_ratio))
+    _check_disk_space(job.archive_folder, likely - downloaded_bytes + int(likely * job.public_set.disk_ratio))
 
 
 def _unpack_file(job: DownloadJob, archive: RemoteFile, path: Path, into: Path) -> None:
-    """Unpack an archive, and those in it; copy what is none. An archive that is no good is removed."""
-    public, size_bytes = job.public, path.stat().st_size
-    _check_disk_space(job.archive_folder, int(size_bytes * public.disk_ratio))
+    """Unpack an archive and its nested archives, or copy a plain file. A damaged archive is removed."""
+    public_set, size_bytes = job.public_set, path.stat().st_size
+    _check_disk_space(job.archive_folder, int(size_bytes * public_set.disk_ratio))
     if not is_archive(path.name):
         shutil.copyfile(path, into)
         return
-    budget = Budget(int(SIZE_MARGIN * public.disk_ratio * size_bytes) + 2**20, public.max_files)
+    budget = Budget(int(SIZE_MARGIN * public_set.disk_ratio * size_bytes) + 2**20, public_set.max_files)
     try:
         unpack(path, into, budget, partial(job.progress, f"unpack {path.name}"))
         _remove_wrapper_folder(into)
@@ -126,11 +126,11 @@ def _unpack_file(job: DownloadJob, archive: RemoteFile, path: Path, into: Path) 
             inner.unlink()
     except ArchiveError as problem:
         path.unlink(missing_ok=True)
-        raise ArchiveError(f"{problem}; {path} is removed, run it again to download it anew") from problem
+        raise ArchiveError(f"{problem}; {path} has been removed, run it again to download it") from problem
 
 
 def _remove_wrapper_folder(folder: Path) -> None:
-    """Where a folder holds one folder and nothing else, move what is in that up."""
+    """If a folder contains only one folder, replace it by that folder."""
     entries = list(folder.iterdir())
     if len(entries) != 1 or not entries[0].is_dir():
         return
@@ -142,12 +142,14 @@ def _remove_wrapper_folder(folder: Path) -> None:
 def _check_layout(start: Path, recording: PublicRecording, archives: list[Path]) -> None:
     if not start.is_dir() or not any(start.iterdir()):
         names = ", ".join(path.name for path in archives)
-        raise DownloadError(f"{names} does not hold {recording.start or 'anything'}; its layout has changed")
+        raise DownloadError(
+            f"{names} does not hold {recording.start or 'anything'}; the layout of the data set has changed"
+        )
 
 
 @contextmanager
 def _replacing(target: Path) -> Iterator[Path]:
-    """Yield a folder beside `target` that takes its place if the block succeeds, and is removed if not."""
+    """Yield a temporary folder beside `target`; it replaces `target` if the block succeeds, else it is removed."""
     fresh, old = (target.with_name(f".{target.name}.{word}") for word in ("unpacking", "old"))
     try:
         _remove(fresh)
@@ -168,7 +170,7 @@ def _replacing(target: Path) -> Iterator[Path]:
 
 @contextmanager
 def _created(folder: Path) -> Iterator[None]:
-    """Make a folder, and those above it; if the block fails, take back which of them were made and are still empty."""
+    """Create a folder with its parents; if the block fails, remove those created here that are still empty."""
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         _make_folder(folder)
@@ -190,11 +192,13 @@ def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as problem:
-        raise DownloadError(f"cannot make {folder}: {problem.strerror or problem}; give another --out") from problem
+        raise DownloadError(f"cannot create {folder}: {problem.strerror or problem}; give another --out") from problem
 
 
 def _check_disk_space(folder: Path, needed_bytes: int) -> None:
     free_bytes = shutil.disk_usage(folder).free
     if needed_bytes > free_bytes:
         room = f"{decimal(needed_bytes)} needed, {decimal(free_bytes)} free"
-        raise DownloadError(f"not enough room in {folder}: {room}; make room, or give --out on another disk")
+        raise DownloadError(
+            f"not enough disk space in {folder}: {room}; free some space, or give --out on another disk"
+        )

@@ -1,4 +1,4 @@
-"""Say what a public data set is made of."""
+"""Define the entries of the catalogue of public data sets."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,11 +8,11 @@ from urllib.parse import urlsplit
 
 @dataclass(frozen=True)
 class RemoteFile:
-    """A file on a server: an archive, or a plain file where its name ends otherwise.
+    """A file on a server: an archive, recognised by its name, or a plain file.
 
-    size_bytes: of the download, None where nobody says; checksum: "sha256:…" or "md5:…", "" where none is known, and
-    then the size is rough; into: where it is unpacked, below the recording's folder (a plain file: its new name);
-    nested: whether it holds archives in turn.
+    size_bytes: of the download, None if not published; checksum: "sha256:…" or "md5:…", or "" if unknown, and then the
+    size is approximate; into: the folder it is unpacked to, below the recording's folder (for a plain file: its name);
+    nested: whether it contains further archives.
     """
 
     url: str
@@ -23,13 +23,13 @@ class RemoteFile:
 
     @property
     def name(self) -> str:
-        """Name the file as the server does."""
+        """Return the file name on the server."""
         return PurePosixPath(urlsplit(self.url).path).name
 
 
 @dataclass(frozen=True)
 class PublicRecording:
-    """What is downloaded at once: `folder` is made of `archives`; `start`, below it, is a sequence to begin with."""
+    """One download: the contents of `archives` form `folder`; `start` is the first sequence below it."""
 
     folder: str
     archives: tuple[RemoteFile, ...]
@@ -37,18 +37,18 @@ class PublicRecording:
 
     @property
     def size_bytes(self) -> int | None:
-        """Add up the downloads; None where one of them is unknown."""
+        """Return the total size of the downloads, None if one of them is unknown."""
         sizes = [archive.size_bytes for archive in self.archives]
         return None if None in sizes else sum(size or 0 for size in sizes)
 
 
 @dataclass(frozen=True)
 class PublicSet:
-    """A data set that may be downloaded without asking.
+    """A data set that can be downloaded without registration.
 
-    folder: below the data folder; recordings: by short name, "" where there is one only; max_bytes: no archive is
-    larger; max_files: none holds more; disk_ratio: bytes on disk while unpacking, for each byte of the archive;
-    prefix: what may stand before a short name.
+    folder: below the data folder; recordings: by short name, "" if there is only one; max_bytes, max_files: limits on
+    the size of an archive and the number of files in it; disk_ratio: bytes on disk during unpacking, per byte of the
+    archive; prefix: optional prefix of the short names.
     """
 
     title: str
@@ -64,7 +64,7 @@ class PublicSet:
 
 @dataclass(frozen=True)
 class RestrictedSet:
-    """A data set whose owners want to be asked: where."""
+    """A data set available only on request; page: where to apply."""
 
     title: str
     page: str

@@ -1,4 +1,4 @@
-"""Fetch a file over HTTP: resumed where it broke, tried again, and under its own name only once it is whole."""
+"""Fetch a file over HTTP, with resume and retries; the file gets its final name only when it is complete."""
 
 import http.client
 import socket
@@ -23,15 +23,16 @@ CHUNK_BYTES = 2**18
 RETRIED_CODES = {408, 425, 429, 500, 502, 503, 504}
 RANGE_NOT_SATISFIABLE = 416
 CheckSize = Callable[[int | None, int], None]
-"""Asked with the size that the server names (None: none) and the bytes that are here; raises to refuse."""
+"""Called with the size from the server (None: unknown) and the bytes already here; raises to refuse the download."""
 
 
 @dataclass(frozen=True)
 class RetryPolicy:
-    """How long to wait, and how often to try.
+    """How long to wait for the server, and how often to retry.
 
-    timeout_s: without an answer, or with fewer than `min_bytes_per_s`; max_attempts: in a row that brought less than
-    `progress_bytes`; first_wait_s: before the next one, doubled up to max_wait_s.
+    timeout_s: limit on the time without an answer, or with fewer than `min_bytes_per_s`; max_attempts: limit on
+    consecutive attempts that gain less than `progress_bytes`; first_wait_s: wait before a retry, doubled up to
+    max_wait_s.
     """
 
     timeout_s: float = 30.0
@@ -43,24 +44,24 @@ class RetryPolicy:
 
 
 class _TransferError(Exception):
-    """A try failed; another may not. hopeless: not where nothing has come yet (no network, no such host)."""
+    """A failed attempt that can be retried; hopeless: not before any byte has arrived (no network, no such host)."""
 
     def __init__(self, why: str, wait_s: float = 0.0, hopeless: bool = False) -> None:
         super().__init__(why)
         self.wait_s, self.hopeless = wait_s, hopeless
 
 
-def fetch(url: str, target: Path, progress: "Progress", accept: CheckSize, retry: RetryPolicy) -> None:
-    """Download `url` to `target`, going on with what an earlier call left in `target`.part.
+def fetch(url: str, target: Path, progress: "Progress", check_size: CheckSize, retry: RetryPolicy) -> None:
+    """Download `url` to `target`; resume from `target`.part if an earlier call left one.
 
-    What has come is kept on Ctrl-C and on every error. Raises DownloadError.
+    The part downloaded so far is kept on Ctrl-C and on every error. Raises DownloadError.
     """
     with open_partial(target) as part:
         failures = 0
         while True:
             before = part.size_bytes
             try:
-                _continue(url, part, progress, accept, retry)
+                _continue(url, part, progress, check_size, retry)
                 break
             except _TransferError as broken:
                 gained = part.size_bytes - before
@@ -72,36 +73,38 @@ def fetch(url: str, target: Path, progress: "Progress", accept: CheckSize, retry
 
 
 def _resume_hint(part: PartialFile) -> str:
-    return f"; {part.size_bytes:,} bytes are kept, run it again to go on" if part.size_bytes else ""
+    return f"; {part.size_bytes:,} bytes are kept, run it again to resume" if part.size_bytes else ""
 
 
-def _wait_s(failures: int, asked_s: float, retry: RetryPolicy) -> float:
+def _wait_s(failures: int, requested_s: float, retry: RetryPolicy) -> float:
     waited = retry.first_wait_s * 2.0 ** max(failures - 1, 0)
-    return min(max(waited, asked_s), retry.max_wait_s)
+    return min(max(waited, requested_s), retry.max_wait_s)
 
 
-def _continue(url: str, part: PartialFile, progress: "Progress", accept: CheckSize, retry: RetryPolicy) -> None:
-    """Ask for what is missing and write it. Raises _Broken if not all of it comes."""
-    origin = part.origin(url)
-    if origin and origin.size_bytes == part.size_bytes:
+def _continue(url: str, part: PartialFile, progress: "Progress", check_size: CheckSize, retry: RetryPolicy) -> None:
+    """Request the missing bytes and write them. Raises _Broken if not all of it comes."""
+    version = part.version_of(url)
+    if version and version.size_bytes == part.size_bytes:
         return
-    with _request(url, origin, part, retry) as response:
-        size_bytes = _prepare(url, response, part, origin)
-        accept(size_bytes, part.size_bytes)
+    with _request(url, version, part, retry) as response:
+        size_bytes = _prepare(url, response, part, version)
+        check_size(size_bytes, part.size_bytes)
         _receive(response, part, size_bytes, progress, retry)
     if size_bytes is not None and part.size_bytes != size_bytes:
         if part.size_bytes > size_bytes:
             part.restart()
-        raise _TransferError(f"{_host(url)} broke off after {part.size_bytes:,} of {size_bytes:,} bytes")
+        raise _TransferError(f"{_host(url)} closed the connection after {part.size_bytes:,} of {size_bytes:,} bytes")
 
 
-def _request(url: str, origin: RemoteVersion | None, part: PartialFile, retry: RetryPolicy) -> http.client.HTTPResponse:
-    """Send the request; return the response, its body unread."""
+def _request(
+    url: str, version: RemoteVersion | None, part: PartialFile, retry: RetryPolicy
+) -> http.client.HTTPResponse:
+    """Send the request; return the response before its body is read."""
     headers = {"User-Agent": "sigmasplat", "Accept-Encoding": "identity"}
-    if origin and part.size_bytes:
+    if version and part.size_bytes:
         headers["Range"] = f"bytes={part.size_bytes}-"
-        if origin.version:
-            headers["If-Range"] = origin.version
+        if version.version:
+            headers["If-Range"] = version.version
     request = urllib.request.Request(url, headers=headers)
     try:
         opener = urllib.request.build_opener(_SafeRedirect())
@@ -124,9 +127,9 @@ def _http_error(url: str, refusal: urllib.error.HTTPError, part: PartialFile) ->
     if refusal.code in RETRIED_CODES:
         after = refusal.headers.get("Retry-After", "")
         return _TransferError(
-            f"{_host(url)} is busy or out of order ({why}); try later", float(after) if after.isdigit() else 0
+            f"{_host(url)} is busy or out of service ({why}); try later", float(after) if after.isdigit() else 0
         )
-    return DownloadError(f"{url} cannot be had ({why}); it may have moved or want a login")
+    return DownloadError(f"{url} is not available ({why}); it may have moved or require a login")
 
 
 def _connection_error(url: str, reason: object) -> Exception:
@@ -142,21 +145,21 @@ def _connection_error(url: str, reason: object) -> Exception:
 
 
 def _prepare(
-    url: str, response: http.client.HTTPResponse, part: PartialFile, origin: RemoteVersion | None
+    url: str, response: http.client.HTTPResponse, part: PartialFile, version: RemoteVersion | None
 ) -> int | None:
-    """Make `part` ready for the body to come; return the size of the whole file, None where the server names none."""
+    """Prepare `part` for the body; return the size of the whole file, None if the server does not send it."""
     headers = response.headers
     if headers.get_content_type() == "text/html":
         raise DownloadError(f"{_host(url)} answers with a web page, not the file; is there a login page in between?")
-    if response.status == http.client.PARTIAL_CONTENT and origin and part.size_bytes:
+    if response.status == http.client.PARTIAL_CONTENT and version and part.size_bytes:
         start, size_bytes = _content_range(headers.get("Content-Range", ""))
-        if start == part.size_bytes and size_bytes in (None, origin.size_bytes):
-            return origin.size_bytes
+        if start == part.size_bytes and size_bytes in (None, version.size_bytes):
+            return version.size_bytes
         part.restart()
-        raise _TransferError(f"{_host(url)} answered with another part of the file than was asked for")
+        raise _TransferError(f"{_host(url)} sent another part of the file than requested")
     part.restart()
     length = headers.get("Content-Length", "")
-    if not length.isdigit() and not response.chunked:  # the end could not be told from a broken connection
+    if not length.isdigit() and not response.chunked:  # the end would look like a broken connection
         raise DownloadError(f"{_host(url)} does not say how long the file is, so it could not be known to be whole")
     size_bytes = int(length) if length.isdigit() else None
     part.begin(RemoteVersion(url, _version(headers), size_bytes))
@@ -164,13 +167,13 @@ def _prepare(
 
 
 def _version(headers: Message) -> str:
-    """Return what may stand in If-Range: a strong ETag, or the date."""
+    """Return the value for If-Range: a strong ETag, or the date."""
     etag = str(headers.get("ETag", ""))
     return etag if etag.startswith('"') else str(headers.get("Last-Modified", ""))
 
 
 def _content_range(value: str) -> tuple[int, int | None]:
-    """Read "bytes 10-99/100": the first byte and the size of the whole; (-1, None) if it says something else."""
+    """Parse "bytes 10-99/100": first byte and total size; (-1, None) for any other format."""
     unit, _, rest = value.partition(" ")
     span, _, size = rest.partition("/")
     start = span.partition("-")[0]
@@ -186,7 +189,7 @@ def _receive(
     progress: "Progress",
     retry: RetryPolicy,
 ) -> None:
-    """Write the body as it comes. Raises _Broken if the connection fails or hardly anything comes."""
+    """Write the body as it arrives. Raises _TransferError if the connection fails or is too slow."""
     host = response.geturl()
     since_s, since_bytes = time.monotonic(), part.size_bytes
     while True:
@@ -201,17 +204,17 @@ def _receive(
         passed_s = time.monotonic() - since_s
         if passed_s >= retry.timeout_s:
             if part.size_bytes - since_bytes < retry.min_bytes_per_s * passed_s:
-                raise _TransferError(f"hardly anything comes from {_host(host)}")
+                raise _TransferError(f"{_host(host)} sends too slowly")
             since_s, since_bytes = time.monotonic(), part.size_bytes
 
 
 class _SafeRedirect(urllib.request.HTTPRedirectHandler):
-    """Follow redirects, but not from https to something that anybody on the way could change."""
+    """Follow redirects, but not from https to an address without encryption."""
 
     def redirect_request(self, req, fp, code, msg, headers, newurl):  # type: ignore[no-untyped-def]
-        """Return the request to follow. Raises DownloadError if its address is less safe."""
+        """Return the redirected request. Raises DownloadError if it leaves https."""
         if urlsplit(newurl).scheme not in {"https", urlsplit(req.full_url).scheme}:
-            raise DownloadError(f"{_host(req.full_url)} sends on to {newurl}, which is not https; not followed")
+            raise DownloadError(f"{_host(req.full_url)} redirects to {newurl}, which is not https; not followed")
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 

@@ -1,7 +1,7 @@
-"""Keep what has come of a file so far, and know which version of the file it is a part of.
+"""Store a partial download, and the version of the remote file it belongs to.
 
-NAME.part        the bytes so far
-NAME.part.json   {"url", "version", "size_bytes"}: where they came from
+NAME.part        the bytes downloaded so far
+NAME.part.json   {"url", "version", "size_bytes"} of the remote file
 """
 
 import fcntl
@@ -18,7 +18,7 @@ from sigmasplat.errors import DownloadError
 
 @dataclass(frozen=True)
 class RemoteVersion:
-    """Where a file comes from; version: its ETag or date, "" if the server names neither."""
+    """A version of a remote file; version: its ETag or date, "" if the server sends neither."""
 
     url: str
     version: str
@@ -26,7 +26,7 @@ class RemoteVersion:
 
 
 class PartialFile:
-    """The part of `target` that is on disk: open for writing, and nobody else's while it is."""
+    """The downloaded part of `target`, open for writing and locked against other processes."""
 
     def __init__(self, target: Path, file: FileIO) -> None:
         self.target, self._file = target, file
@@ -34,31 +34,31 @@ class PartialFile:
 
     @property
     def size_bytes(self) -> int:
-        """Count the bytes so far."""
+        """Return the number of bytes downloaded so far."""
         return self._file.tell()
 
-    def origin(self, url: str) -> RemoteVersion | None:
-        """Return where the bytes so far came from; None, and no bytes, where that was not `url` or is not known."""
+    def version_of(self, url: str) -> RemoteVersion | None:
+        """Return the version of the bytes so far; if it is unknown or not of `url`, delete them and return None."""
         try:
-            origin = RemoteVersion(**json.loads(self._note.read_text(encoding="utf-8")))
+            version = RemoteVersion(**json.loads(self._note.read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError):
-            origin = None
-        too_many = origin and origin.size_bytes is not None and self.size_bytes > origin.size_bytes
-        if origin is None or origin.url != url or too_many:
+            version = None
+        too_many = version and version.size_bytes is not None and self.size_bytes > version.size_bytes
+        if version is None or version.url != url or too_many:
             self.restart()
             return None
-        return origin
+        return version
 
     def restart(self) -> None:
-        """Forget what has come so far."""
+        """Delete the bytes so far."""
         self._note.unlink(missing_ok=True)
         self._file.seek(0)
         self._file.truncate()
 
-    def begin(self, origin: RemoteVersion) -> None:
-        """Note where the bytes to come are from."""
+    def begin(self, version: RemoteVersion) -> None:
+        """Record the version of the following bytes."""
         with _writing(self.target):
-            self._note.write_text(json.dumps(asdict(origin)), encoding="utf-8")
+            self._note.write_text(json.dumps(asdict(version)), encoding="utf-8")
 
     def add(self, chunk: bytes) -> None:
         """Write a chunk. Raises DownloadError if the disk is full."""
@@ -68,7 +68,7 @@ class PartialFile:
                 rest = rest[_write_some(self._file, rest) :]
 
     def finish(self) -> None:
-        """Put the file in place under its own name: it is whole."""
+        """Rename the complete file to its final name."""
         with _writing(self.target):
             self._file.flush()
             os.fsync(self._file.fileno())
@@ -78,11 +78,11 @@ class PartialFile:
 
 @contextmanager
 def open_partial(target: Path) -> Iterator[PartialFile]:
-    """Open the part of `target` that is there, or an empty one. Raises DownloadError if another process writes it."""
+    """Open the existing part of `target`, or an empty one. Raises DownloadError if another process writes it."""
     with _writing(target):
         file = target.with_name(f"{target.name}.part").open("ab", buffering=0)
     with file:
-        with suppress(OSError):  # a file system without locks: then nobody is kept out
+        with suppress(OSError):  # a file system without locks
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as problem:
@@ -96,7 +96,7 @@ def open_partial(target: Path) -> Iterator[PartialFile]:
 
 
 def _write_some(file: FileIO, chunk: memoryview) -> int:
-    """Write as much of a chunk as fits into one call; return how much."""
+    """Write as much of a chunk as one call accepts; return the number of bytes."""
     return file.write(chunk)
 
 
@@ -106,8 +106,10 @@ def _note_path(target: Path) -> Path:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Turn what may go wrong in writing into one line."""
+    """Convert OSError to DownloadError."""
     try:
         yield
     except OSError as problem:
-        raise DownloadError(f"cannot write {path}: {problem.strerror or problem}; what has come is kept") from problem
+        raise DownloadError(
+            f"cannot write {path}: {problem.strerror or problem}; the part downloaded so far is kept"
+        ) from problem

@@ -1,6 +1,6 @@
-"""Unpack an archive that nobody vouches for: files and folders below one folder, and no more of them than expected.
+"""Unpack an untrusted archive: only files and folders below one folder, within a budget.
 
-Links, devices, absolute names, names that lead out, and archives that grow without end are refused.
+Links, devices, absolute names, names that leave the folder, and archives that expand too much are refused.
 """
 
 import gzip
@@ -22,44 +22,44 @@ if TYPE_CHECKING:
 
 CHUNK_BYTES = 2**20
 MAX_RATIO, RATIO_CHECKED_ABOVE_BYTES = 200, 2**20
-"""No file of more than a MiB in a zip shrinks that much: images are compressed already, text to a fifth."""
+"""Largest compression ratio of a file above a MiB in a zip; images hardly compress, text to a fifth."""
 DESKTOP_FILES = {"__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini"}
 
 
 class ArchiveError(DownloadError):
-    """Refuse an archive that is damaged or unsafe."""
+    """The archive is damaged or unsafe."""
 
 
 @dataclass
 class Budget:
-    """What may still be written: bytes and files."""
+    """Bytes and files that may still be written."""
 
     bytes: int
     files: int
 
     def spend_bytes(self, count: int) -> None:
-        """Take note of bytes to be written. Raises BadArchive if they are too many."""
+        """Subtract bytes to be written. Raises ArchiveError if the budget is exceeded."""
         self.bytes -= count
         if self.bytes < 0:
-            raise ArchiveError("holds more bytes than such a recording can have")
+            raise ArchiveError("holds more bytes than expected for this data set")
 
     def spend_file(self) -> None:
-        """Take note of a file or folder to be made. Raises BadArchive if they are too many."""
+        """Subtract a file or folder to be created. Raises ArchiveError if the budget is exceeded."""
         self.files -= 1
         if self.files < 0:
-            raise ArchiveError("holds more files than such a recording can have")
+            raise ArchiveError("holds more files than expected for this data set")
 
 
 def is_archive(name: str) -> bool:
-    """Tell archives from other files by their name."""
+    """Return whether a file is an archive, by its name."""
     return name.lower().endswith((".zip", ".tgz", ".tar.gz"))
 
 
 def unpack(archive: Path, folder: Path, budget: Budget, progress: "Progress") -> None:
-    """Unpack a .tar.gz or .zip below `folder`, which is made; progress(done, total) counts the archive's bytes.
+    """Unpack a .tar.gz or .zip to `folder`, which is created; progress(done, total) counts the archive's bytes.
 
-    Raises BadArchive if it is damaged, unsafe or beyond the budget, DownloadError if the disk is full; what was written
-    until then stays, so give a folder to throw away.
+    Raises ArchiveError if the archive is damaged, unsafe or exceeds the budget, DownloadError if the disk is full.
+    Files written before the error remain, so use a temporary folder.
     """
     with _naming_archive(archive):
         folder.mkdir(parents=True, exist_ok=True)
@@ -74,11 +74,11 @@ def _naming_archive(archive: Path) -> Iterator[None]:
     try:
         yield
     except ArchiveError as problem:
-        raise ArchiveError(f"{archive.name} {problem}; refused, nothing of it is kept") from problem
+        raise ArchiveError(f"{archive.name} {problem}; it is refused, and no file of it is kept") from problem
     except (tarfile.TarError, zipfile.BadZipFile, gzip.BadGzipFile, zlib.error, EOFError) as problem:
-        raise ArchiveError(f"{archive.name} is damaged ({problem}); nothing of it is kept") from problem
-    except (NotImplementedError, RuntimeError) as problem:  # a way to compress that Python lacks; encrypted
-        raise ArchiveError(f"{archive.name} cannot be read ({problem}); nothing of it is kept") from problem
+        raise ArchiveError(f"{archive.name} is damaged ({problem}); no file of it is kept") from problem
+    except (NotImplementedError, RuntimeError) as problem:  # unsupported compression, or encrypted
+        raise ArchiveError(f"{archive.name} cannot be read ({problem}); no file of it is kept") from problem
     except OSError as problem:
         raise DownloadError(f"cannot unpack {archive}: {problem.strerror or problem}; is the disk full?") from problem
 
@@ -98,15 +98,15 @@ def _unpack_tar(archive: Path, folder: Path, budget: Budget, progress: "Progress
                     assert source is not None
                     _copy(source, place, member.size)
                 else:
-                    raise ArchiveError(f"holds {member.name!r}, which is no plain file or folder")
+                    raise ArchiveError(f"holds {member.name!r}, which is not a plain file or folder")
                 progress(min(packed.tell(), size_bytes - 1), size_bytes)
-        while stream.read(CHUNK_BYTES):  # to the end, where the checksum of the whole stream is
+        while stream.read(CHUNK_BYTES):  # read to the end: the checksum of the stream is there
             pass
     progress(size_bytes, size_bytes)
 
 
 class _BudgetedStream(io.RawIOBase):
-    """Read a stream on account of a budget."""
+    """Read a stream and subtract its bytes from a budget."""
 
     def __init__(self, stream: gzip.GzipFile, budget: Budget) -> None:
         self._stream, self._budget = stream, budget
@@ -121,7 +121,7 @@ class _BudgetedStream(io.RawIOBase):
 def _unpack_zip(archive: Path, folder: Path, budget: Budget, progress: "Progress") -> None:
     with zipfile.ZipFile(archive) as zipped:
         entries = zipped.infolist()
-        for entry in entries:  # what it says of itself, before a byte is written
+        for entry in entries:  # check the headers before anything is written
             budget.spend_file()
             budget.spend_bytes(entry.file_size)
             _check_entry(entry)
@@ -142,7 +142,7 @@ def _unpack_zip(archive: Path, folder: Path, budget: Budget, progress: "Progress
 def _check_entry(entry: zipfile.ZipInfo) -> None:
     kind = stat.S_IFMT(entry.external_attr >> 16)
     if kind not in {0, stat.S_IFREG, stat.S_IFDIR}:
-        raise ArchiveError(f"holds {entry.filename!r}, which is no plain file or folder")
+        raise ArchiveError(f"holds {entry.filename!r}, which is not a plain file or folder")
     if entry.file_size > RATIO_CHECKED_ABOVE_BYTES and entry.file_size > MAX_RATIO * entry.compress_size:
         raise ArchiveError(
             f"holds {entry.filename!r}, which grows {entry.file_size // max(entry.compress_size, 1)}-fold"
@@ -150,13 +150,13 @@ def _check_entry(entry: zipfile.ZipInfo) -> None:
 
 
 def _target_path(folder: Path, name: str) -> Path | None:
-    """Return where an entry goes, None where it is litter of a desktop. Raises BadArchive if that is out of `folder`.
+    """Return the path for an entry, None for a desktop's own files. Raises ArchiveError if it is not below `folder`.
 
-    Windows' separators are understood.
+    Windows separators are supported.
     """
     parts = name.replace("\\", "/").split("/")
     if name.startswith(("/", "\\")) or ".." in parts or "\0" in name or parts[0].endswith(":"):
-        raise ArchiveError(f"holds {name!r}, a name that leads out of its folder")
+        raise ArchiveError(f"holds {name!r}, a name that leaves the folder")
     kept = [part for part in parts if part not in {"", "."}]
     if not kept:
         return folder
@@ -171,7 +171,7 @@ def _make_folder(place: Path | None) -> None:
 
 
 def _copy(source: IO[bytes], place: Path | None, size_bytes: int) -> None:
-    """Copy as many bytes as are announced. Raises BadArchive if there are others, or something is there already."""
+    """Copy a file. Raises ArchiveError if its size differs from `size_bytes`, or the path already exists."""
     if place is None:
         return
     with _refusing_duplicates(place):
@@ -182,7 +182,7 @@ def _copy(source: IO[bytes], place: Path | None, size_bytes: int) -> None:
                 left -= len(chunk)
                 file.write(chunk)
     if left:
-        raise ArchiveError(f"is damaged: {place.name} is not as long as it says")
+        raise ArchiveError(f"is damaged: {place.name} does not have the size in its header")
 
 
 @contextmanager

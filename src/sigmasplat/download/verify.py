@@ -1,4 +1,4 @@
-"""Compare a downloaded file with its checksum: the published one, or the one it had when it first came."""
+"""Compare a downloaded file with its checksum: the published one, or that of the first download."""
 
 import hashlib
 from pathlib import Path
@@ -14,10 +14,10 @@ CHUNK_BYTES = 2**20
 
 
 def verify(path: Path, published: str, progress: "Progress") -> str:
-    """Return "algorithm:digest" of a file that is as it should be.
+    """Return "algorithm:digest" of a file whose checksum is correct.
 
-    `published` is such a text, or "": then the digest is compared with that in `path`.sha256, which is written if there
-    is none yet. Raises DownloadError, the file removed, if they differ.
+    `published` is the expected "algorithm:digest". If it is "", the digest is compared with `path`.sha256, which is
+    written at the first call. If they differ, the file is removed. Raises DownloadError.
     """
     algorithm = published.partition(":")[0] or "sha256"
     found = f"{algorithm}:{_digest(path, algorithm, progress)}"
@@ -25,14 +25,14 @@ def verify(path: Path, published: str, progress: "Progress") -> str:
     wanted = published or _recorded_checksum(record)
     if wanted and found != wanted:
         path.unlink()
-        raise DownloadError(f"{path} was damaged and is removed; {_advice(record, published, found, wanted)}")
+        raise DownloadError(f"{path} was damaged and has been removed; {_advice(record, published, found, wanted)}")
     if not wanted:
         write_text(record, f"{found.partition(':')[2]}  {path.name}\n")
     return found
 
 
 def _digest(path: Path, algorithm: str, progress: "Progress") -> str:
-    digest = hashlib.new(algorithm, usedforsecurity=False)  # MD5 is all that some publish: against damage, not malice
+    digest = hashlib.new(algorithm, usedforsecurity=False)  # some publish only MD5: detects damage, not attacks
     done, total = 0, path.stat().st_size
     with path.open("rb") as file:
         while chunk := file.read(CHUNK_BYTES):
@@ -43,7 +43,7 @@ def _digest(path: Path, algorithm: str, progress: "Progress") -> str:
 
 
 def _recorded_checksum(record: Path) -> str:
-    """Read a line as sha256sum writes it; "" if there is none."""
+    """Return the checksum from a file in the format of sha256sum, "" if there is no file."""
     words = record.read_text(encoding="utf-8").split() if record.is_file() else []
     return f"sha256:{words[0]}" if words else ""
 
@@ -51,4 +51,4 @@ def _recorded_checksum(record: Path) -> str:
 def _advice(record: Path, published: str, found: str, wanted: str) -> str:
     if published:
         return f"its checksum is {found}, not {wanted}; run it again"
-    return f"it was another one last time (then {wanted}, now {found}); run it again, or delete {record} to accept it"
+    return f"its checksum has changed (before {wanted}, now {found}); run it again, or delete {record} to accept it"

@@ -16,7 +16,7 @@ PANEL_WIDTH, GAP, HEAD, FOOT = 320, 10, 34, 38
 
 @dataclass(frozen=True, eq=False)
 class ViewPanel:
-    """One panel of a strip: title, uint8 pixels, and either a colour bar (palette, two labels) or a line of text."""
+    """One panel of a strip: title, uint8 pixels, and a colour bar (palette, labels of its ends) or a line of text."""
 
     title: str
     pixels: colormap.Rgb
@@ -54,7 +54,7 @@ def view_panels(view: ScoredView) -> list[ViewPanel]:
             "rendered colour", _bytes(view.rendered), f"PSNR {score['psnr_db']:.1f} dB · SSIM {score['ssim']:.3f}"
         ),
         _coloured("rendered depth", view.rendered_depth_m, mapped, depth_range, colormap.VIRIDIS, " m"),
-        _coloured("uncertainty √V", deviation, mapped, _from_zero(deviation, mapped), colormap.INFERNO),
+        _coloured("uncertainty, root of V", deviation, mapped, _from_zero(deviation, mapped), colormap.INFERNO),
         _coloured("error, RMS", error, view.valid, _from_zero(error, view.valid), colormap.INFERNO),
     ]
 

@@ -1,1 +1,1 @@
-"""Score runs against the ground truth, and compare runs."""
+"""Score runs against the ground truth and compare runs."""

@@ -1,7 +1,7 @@
-"""Switch on the weights of σ² one after the other, over sequences and seeds, and keep what every run was worth.
+"""Enable the weights of σ² one by one, over sequences and seeds, and store the metrics of every run.
 
-The likelihood that trains σ² is on in every variant but the one without variance: so each has a map of V, and they
-differ by nothing but its use. Seed k stands for the same world and the same random numbers in every variant.
+The likelihood that trains σ² is enabled in every variant except the one without variance. So each of these variants has
+a map of V, and they differ only in how V is used. Seed k gives the same scene and random numbers in every variant.
 """
 
 import json
@@ -35,20 +35,20 @@ WITHOUT_VARIANCE = "without variance"
 VARIANTS: dict[str, dict[str, str]] = {
     name: {weight: str(i < used) for i, weight in enumerate(WEIGHTS)} for used, name in enumerate(NAMES)
 }
-"""Settings of each variant: in order, each weight on from its own variant onwards; the last is beyond the paper."""
+"""Settings of each variant. Each variant enables one more weight; the last weight, +final, is not in the paper."""
 VARIANTS[WITHOUT_VARIANCE] = VARIANTS["none"] | {"mapping.weight_nll_color": "0", "mapping.weight_nll_depth": "0"}
 COMPARED = (
     ("none", WITHOUT_VARIANCE), ("+tracking", "none"), ("+loop", "+tracking"), ("+registration", "+loop"),
     ("+registration", "none"), ("+final", "+registration"),
 )  # fmt: skip
-"""Which variant is judged against which."""
+"""Pairs (variant, baseline) to compare."""
 MADE_BY = "sigmasplat bench ablation"
 SEED = "{seed}"
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run: the sequence as asked for and as opened, the variant, the seed, all settings."""
+    """One run: the sequence as given and as opened, the variant, the seed, all settings."""
 
     source: str
     path: str
@@ -58,7 +58,7 @@ class Job:
 
     @property
     def key(self) -> tuple[str, str, int]:
-        """Return what tells the runs of one file apart."""
+        """Return what identifies a run in the file."""
         return self.path, self.variant, self.seed
 
     @property
@@ -68,12 +68,12 @@ class Job:
 
 
 Runner = Callable[[Job, Path], Mapping[str, Any]]
-"""Carries out a job in a new folder and returns the run's metrics."""
+"""Runs a job in a new folder and returns the run's metrics."""
 
 
 @dataclass(frozen=True)
 class Study:
-    """What is to be compared: sequences, each with every variant and seeds 0, 1, …; settings common to all."""
+    """What to compare: sequences, each with every variant and seeds 0, 1, …, and the settings that all runs share."""
 
     sources: Sequence[str]
     config: Config
@@ -87,7 +87,7 @@ class Study:
         return [*[WITHOUT_VARIANCE] * self.without_variance, *NAMES]
 
     def jobs(self, source: str) -> list[Job]:
-        """List the runs of a sequence, all variants of a seed before the next seed; {seed} becomes the number."""
+        """List the runs of a sequence, seed by seed with all variants; {seed} is replaced by the number."""
         return [
             Job(
                 source, full_path(source.replace(SEED, str(seed))), variant, seed,
@@ -97,8 +97,8 @@ class Study:
             for variant in self.variants
         ]  # fmt: skip
 
-    def circumstances(self) -> dict[str, Any]:
-        """Return what must be equal for runs to be of one ablation: settings, length, code, machine."""
+    def conditions(self) -> dict[str, Any]:
+        """Return what all runs of an ablation must share: settings, length, code, machine."""
         return {
             "config": self.config.to_dict(),
             "limit": self.limit,
@@ -108,46 +108,52 @@ class Study:
 
 
 def common_config(preset: str, settings: Sequence[str], tau: float) -> Config:
-    """Return a preset's settings with those of --set, and one τ in every weight.
+    """Return a preset's settings, changed by --set, with the same τ for every weight.
 
-    Raises ConfigError on a setting that the ablation changes itself, and where no variance would be learned.
+    Raises ConfigError for a setting that the ablation itself changes, or if no variance would be learned.
     """
     given = split_settings(settings)
     for name in sorted(RESERVED & given.keys()):
-        raise ConfigError(f"the ablation sets {name} itself; leave it out (τ is --tau, the number of seeds --seeds)")
+        raise ConfigError(
+            f"the ablation itself sets {name}; remove it (use --tau for τ, --seeds for the number of seeds)"
+        )
     if not tau > 0:
         raise ConfigError(f"--tau must be above 0, found {tau:g}")
     config = override(preset_of(preset), given | dict.fromkeys(TAUS, str(tau)))
     if not config.mapping.weight_nll_color:
-        raise ConfigError(f"{preset} learns no variance: mapping.weight_nll_color is 0; give a preset where it is not")
+        raise ConfigError(
+            f"{preset} learns no variance, because mapping.weight_nll_color is 0; choose a preset that learns one"
+        )
     return config
 
 
 class Results:
-    """The JSON file of an ablation: circumstances, then one entry a run; replaced whole after each of them."""
+    """The JSON file of an ablation: the conditions, then one entry per run; rewritten after each run."""
 
     def __init__(self, path: Path, study: Study, overwrite: bool = False) -> None:
-        """Take up a file where it stopped, or start one, in memory; `overwrite` drops runs that are not of the study.
+        """Read the file if it exists; `overwrite` drops its runs that do not belong to the study.
 
-        Raises RunError where runs would be dropped without it, or the file is not one of ours.
+        Raises RunError if such runs exist and `overwrite` is off, or if the file is not an ablation's.
         """
         self.path = path
-        self.head = json.loads(json.dumps({"made_by": MADE_BY} | study.circumstances()))
+        self.head = json.loads(json.dumps({"made_by": MADE_BY} | study.conditions()))
         planned = {job.key for source in study.sources for job in study.jobs(source)}
-        there = _read(path) if path.exists() else {"runs": []}
-        same = all(there.get(name) == value for name, value in self.head.items())
-        self.runs = [run for run in there["runs"] if same and _key(run) in planned]
-        dropped = len(there["runs"]) - len(self.runs)
+        stored = _read(path) if path.exists() else {"runs": []}
+        same = all(stored.get(name) == value for name, value in self.head.items())
+        self.runs = [run for run in stored["runs"] if same and _key(run) in planned]
+        dropped = len(stored["runs"]) - len(self.runs)
         if dropped and not overwrite:
-            reason = "that are not asked for now" if same else "with other settings or code, or from another machine"
-            raise RunError(f"{path} holds runs ({dropped}) {reason}; give another --out, or --overwrite to drop them")
+            reason = (
+                "that this command does not ask for" if same else "of other settings, other code or another machine"
+            )
+            raise RunError(f"{path} contains {dropped} runs {reason}; give another --out, or --overwrite to drop them")
 
     def find(self, job: Job) -> dict[str, Any] | None:
-        """Return a job's finished run, None if there is none."""
+        """Return the stored run of a job, or None."""
         return next((run for run in self.runs if _key(run) == job.key), None)
 
     def add(self, job: Job, metrics: Mapping[str, Any], wall_s: float) -> None:
-        """Keep a run and write the file. Raises RunError if it cannot be written."""
+        """Add a run and write the file. Raises RunError if it cannot be written."""
         from sigmasplat.evaluation.paired_comparison import figures_of
 
         self.runs.append(
@@ -174,22 +180,22 @@ def _key(run: Mapping[str, Any]) -> tuple[str, str, int]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Read an ablation's file. Raises RunError if it is none."""
+    """Read the file of an ablation. Raises RunError if it cannot be read or is another file."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as problem:
-        raise RunError(f"cannot go on with {path}: {problem}; give another --out") from problem
+        raise RunError(f"cannot read {path}: {problem}; give another --out") from problem
     if not isinstance(found, dict) or found.get("made_by") != MADE_BY or not isinstance(found.get("runs"), list):
-        raise RunError(f"{path} is not the file of an ablation; give another --out")
+        raise RunError(f"{path} is not a file of sigmasplat bench ablation; give another --out")
     return found
 
 
-def carry_out(
-    jobs: Sequence[Job], results: Results, runner: Runner, keep: Path | None, tell: Callable[[Job], None]
+def run_jobs(
+    jobs: Sequence[Job], results: Results, runner: Runner, keep: Path | None, announce: Callable[[Job], None]
 ) -> None:
-    """Run the jobs that have no result yet, in order, and keep each at once; run folders stay only in `keep`."""
+    """Run the jobs without a stored result in order, and store each result at once; run folders stay only in `keep`."""
     for job in (job for job in jobs if results.find(job) is None):
-        tell(job)
+        announce(job)
         start = time.perf_counter()
         with _folder(job, keep) as folder:
             metrics = runner(job, folder)
@@ -198,7 +204,7 @@ def carry_out(
 
 @contextmanager
 def _folder(job: Job, keep: Path | None) -> Iterator[Path]:
-    """Yield where a job's run folder may be made."""
+    """Yield the path for a job's run folder."""
     if keep:
         yield keep / job.folder
         return
@@ -206,20 +212,20 @@ def _folder(job: Job, keep: Path | None) -> Iterator[Path]:
         yield Path(temporary) / job.folder
 
 
-def perform(job: Job, folder: Path, screen: "Screen") -> dict[str, Any]:
-    """Run SLAM as a job says, score the run, and return its metrics.
+def run_job(job: Job, folder: Path, screen: "Screen") -> dict[str, Any]:
+    """Run SLAM with a job's settings, score the run, and return its metrics.
 
-    Raises KeyboardInterrupt where Ctrl-C ended the run early: half a run is no result.
+    Raises KeyboardInterrupt if Ctrl-C stopped the run: its metrics would not be comparable.
     """
     from sigmasplat.evaluation.evaluate import evaluate
-    from sigmasplat.run.session import new_folder, record
+    from sigmasplat.run.session import Session, new_folder
     from sigmasplat.slam.slam import Slam
     from sigmasplat.sources import open_source
 
     source = open_source(job.path, job.config.input)
     run = new_folder(folder, job.config, source, True, source_path=job.path)
-    with screen.steps(len(source)) as watch:
-        outcome = record(Slam(job.config, run.submaps), source, run, watch)
+    with screen.steps(len(source)) as callback:
+        outcome = Session(Slam(job.config, run.submaps), source, run, callback).execute()
     if outcome.status == "interrupted":
         raise KeyboardInterrupt
     with screen.counting("evaluation") as progress:

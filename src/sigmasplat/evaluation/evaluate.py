@@ -1,4 +1,4 @@
-"""Score a finished run: the only place that reads ground truth. Writes metrics.json, images/ and report.html."""
+"""Score a finished run; only this folder reads ground truth. Writes metrics.json, images/ and report.html."""
 
 from functools import partial
 from typing import Any
@@ -6,16 +6,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.config import Config, FinalConfig, InputConfig
+from sigmasplat.config import Config, FinalConfig
 from sigmasplat.errors import RunError
 from sigmasplat.evaluation import reconstruct
 from sigmasplat.evaluation.novel_views import score_novel_views
+from sigmasplat.evaluation.view_selection import evenly_spread, working_frame
 from sigmasplat.io.runs import TRUTH, RunFolder
 from sigmasplat.io.trajectory import write_trajectory
 from sigmasplat.metrics import views
 from sigmasplat.metrics.trajectory import aligned_truth, associate, score_path, truth_in_estimate
 from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import FieldRenderer
 from sigmasplat.report import charts
@@ -25,7 +25,7 @@ from sigmasplat.sources.base import Source
 from sigmasplat.types import Progress
 
 SAME_TIME_S = 1e-4
-"""Log and trajectory hold the same timestamps up to printing."""
+"""Log and trajectory hold the same timestamps up to rounding."""
 
 Log = list[dict[str, Any]]
 
@@ -42,22 +42,24 @@ def evaluate(
 ) -> dict[str, Any]:
     """Score trajectory, map and uncertainty of a run against its source, and return the metrics written.
 
-    Training views are the run's keyframes, held-out views the frames that no map was fitted to; of each at most
-    `views_per_kind`, evenly spread. Both are rendered at the estimated poses, at the run's working resolution, with the
-    run's render settings unless a `renderer` is given; and, where the run kept its submaps, in the submap that each
-    frame belongs to as well, as it was before the final map was made. `progress` is told (views done, of how many).
-    With `mesh` the keyframes are fused into mesh.ply, which is scored where the source knows its true surface.
-    Raises RunError if the run stopped before it had a map; SourceError if the truth shares no timestamps with the run,
-    after everything else has been written.
+    Training views are the run's keyframes; held-out views are the frames that no map was fitted to. At most
+    `views_per_kind` of each are scored, evenly spread. They are rendered from the final map at the estimated poses and
+    the run's working resolution, with the run's render settings unless a `renderer` is given. If the run kept its
+    submaps, each view is also rendered from the submap of its frame, as it was before the final map was made.
+    Calls `progress(done, total)` with views. With `mesh` the keyframes are fused into mesh.ply, which is scored if the
+    source knows its true surface.
+
+    Raises RunError if the run stopped before it had a map; SourceError if truth and run share no timestamps, after
+    everything else has been written.
     """
     records = run.read_log()
     if not records:
-        raise RunError(f"run {run.path} has an empty log.jsonl: it stopped before its first frame; run it again")
+        raise RunError(f"run {run.path} stopped before its first frame: its log.jsonl is empty; run it again")
     path, field = run.read_trajectory(), run.read_map()
     log = _posed(records, path, run)
     truth = source.truth()
     path_scores, problem = score_path(path, run.read_odometry(), truth)
-    chosen = {kind: _spread(records, views_per_kind) for kind, records in _kinds(log).items()}
+    chosen = {kind: evenly_spread(records, views_per_kind) for kind, records in _kinds(log).items()}
     strips, config, loops = ViewStrips(run, strips_per_kind), run.config(), run.read_loops()
     standard = renderer is None
     renderer = renderer or FieldRenderer(config.render, config.backend)
@@ -69,10 +71,10 @@ def evaluate(
         found = reconstruct.fuse_and_score(run, source.camera, source.true_surface(), known, renderer, progress)
         metrics["reconstruction"] = found
     metrics["test_views"] = None
-    apart = source.test_views()
-    if apart is not None and truth is not None and problem is None:
-        world = apart.truth(), truth_in_estimate(*_positions(log), truth)
-        metrics["test_views"] = score_novel_views(apart, *world, field, config.input, renderer, strips, views_per_kind)
+    novel = source.test_views()
+    if novel is not None and truth is not None and problem is None:
+        poses = novel.truth(), truth_in_estimate(*_positions(log), truth)
+        metrics["test_views"] = score_novel_views(novel, *poses, field, config.input, renderer, strips, views_per_kind)
     run.write_metrics(metrics)
     plots = _draw_plots(run, log, None if problem else truth, loops)
     warnings = [str(problem)] if problem else []
@@ -84,9 +86,9 @@ def evaluate(
 
 
 def _anchors(run: RunFolder, records: Log, final: FinalConfig) -> NDArray[np.float64] | None:
-    """Return T_world_submap [S, 4, 4] where the run kept all submaps that its frames belong to, else None.
+    """Return T_world_submap [S, 4, 4] if the run kept the submaps of all its frames, else None.
 
-    None too where there is one and the final map is that one as it was.
+    Returns None too if there is one submap and the final map is an unchanged copy of it.
     """
     count = _submaps(records)
     if len(run.submaps) != count or (count == 1 and final.seed_from == "submaps" and not final.iterations):
@@ -96,7 +98,7 @@ def _anchors(run: RunFolder, records: Log, final: FinalConfig) -> NDArray[np.flo
 
 
 def _submaps(log: Log) -> int:
-    """Count submaps; runs of before there were any are in one piece."""
+    """Count submaps; the log of an old version does not name any, which counts as one."""
     return 1 + max(int(record.get("submap", 0)) for record in log)
 
 
@@ -108,7 +110,7 @@ def _posed(log: Log, path: Trajectory, run: RunFolder) -> Log:
     times = np.array([record["timestamp_s"] for record in log], np.float64)
     rows, poses = associate(times, path.timestamps_s, SAME_TIME_S)
     if not len(rows):
-        raise RunError(f"run {run.path}: trajectory.txt and log.jsonl share no timestamps; are they of one run?")
+        raise RunError(f"run {run.path}: trajectory.txt and log.jsonl share no timestamps; do they belong to one run?")
     return [
         log[row] | {"T_world_camera": path.T_world_camera[pose], "row": int(row)}
         for row, pose in zip(rows, poses, strict=True)
@@ -116,29 +118,23 @@ def _posed(log: Log, path: Trajectory, run: RunFolder) -> Log:
 
 
 def _kinds(log: Log) -> dict[str, Log]:
-    """Split the frames by whether the map was fitted to them."""
+    """Split the frames by whether a map was fitted to them."""
     return {
         "held-out": [record for record in log if not record["is_keyframe"]],
         "training": [record for record in log if record["is_keyframe"]],
     }
 
 
-def _spread(records: Log, most: int) -> Log:
-    """Choose at most `most` records, evenly spread, first and last among them."""
-    rows = np.unique(np.linspace(0, len(records) - 1, min(most, len(records))).round().astype(int))
-    return [records[row] for row in rows]
-
-
 def _score_views(
     config: Config, source: Source, maps: views.MapSources, chosen: dict[str, Log], strips: ViewStrips,
     renderer: views.Renderer, progress: Progress,
 ) -> dict[str, Any]:  # fmt: skip
-    """Render and score the chosen views in the final map and in their submaps; average per kind and map; judge V."""
+    """Render the chosen views from the final map and from their submaps; average scores per kind and map; judge V."""
     scores = {kind: views.ViewScores(keep_samples=kind == "held-out") for kind in chosen}
     before = {kind: views.ViewScores(keep_samples=kind == "held-out") for kind in chosen}
-    shown = {(kind, r["index"]) for kind, records in chosen.items() for r in _spread(records, strips.per_kind)}
+    shown = {(kind, r["index"]) for kind, records in chosen.items() for r in evenly_spread(records, strips.per_kind)}
     total = sum(len(records) for records in chosen.values())
-    frame_of = partial(_prepared, source, config.input)
+    frame_of = partial(working_frame, source, config.input)
     for done, (final, in_submap) in enumerate(views.render_views(frame_of, maps, chosen, renderer), 1):
         scores[final.kind].add(final)
         if (final.kind, final.index) in shown:
@@ -161,19 +157,13 @@ def _score_views(
     }
 
 
-def _prepared(source: Source, settings: InputConfig, index: int) -> Frame:
-    """Read a frame as the run worked on it."""
-    s = settings
-    return source.frame(index).prepared(s.width, s.min_depth_m, s.max_depth_m, s.crop_px)
-
-
 def _keeps_variance(final: FinalConfig) -> bool:
-    """Tell whether σ² of the final map means something: learnt on while it was refined, or the submaps' own."""
+    """Return whether σ² of the final map is valid: still learned during refinement, or taken over from the submaps."""
     return final.uncertainty if final.iterations else final.seed_from == "submaps"
 
 
 def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField, loops: Log) -> dict[str, Any]:
-    """Return what can be counted: frames, keyframes, lost frames, splats, size, speed."""
+    """Return counts, size and speed of the run."""
     lost = [record["index"] for record in log if record.get("lost")]
     return {
         "source": source.name,
@@ -195,19 +185,19 @@ def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField, loops
 
 
 def _frames_per_s(run: RunFolder, log: Log) -> float | None:
-    """Return the speed end to end: by the wall clock (run.json, wall_s) if noted, else by the frames' own times."""
+    """Return the end-to-end speed, by wall_s of run.json if it is there, else by the sum of the frames' times."""
     seconds = run.facts().get("wall_s") or sum(charts.frame_seconds(record) for record in log)
     return len(log) / seconds if seconds else None
 
 
 def _total_s(run: RunFolder) -> float | None:
-    """Return the seconds of all frames and of finishing together, None where run.json does not note both."""
+    """Return the seconds of all frames plus the final map, or None if run.json does not have both."""
     frames_s, finish_s = (run.facts().get(key) for key in ("wall_s", "finish_s"))
     return None if frames_s is None or finish_s is None else float(frames_s + finish_s)
 
 
 def _worst_frame_s(log: Log) -> float | None:
-    """Return the longest time of a frame after the run's first, which makes the map; None where none was timed."""
+    """Return the longest time of a frame except the first, which creates the map; None if no frame was timed."""
     return max((charts.frame_seconds(record) for record in log if record["row"]), default=0.0) or None
 
 
@@ -226,12 +216,12 @@ def _draw_plots(run: RunFolder, log: Log, truth: Trajectory | None, loops: Log) 
         rows, aligned = aligned_truth(times, estimate, truth)
         known = np.full_like(estimate, np.nan)
         known[rows] = aligned.T_world_camera[:, :3, 3]
-    _keep_truth(run, aligned)
+    _write_truth(run, aligned)
     return write_charts(run, charts.run_charts(log, estimate, known, loops))
 
 
-def _keep_truth(run: RunFolder, aligned: Trajectory | None) -> None:
-    """Write truth.txt for those who show a run; remove an earlier one where no truth is known."""
+def _write_truth(run: RunFolder, aligned: Trajectory | None) -> None:
+    """Write truth.txt for the viewer and exports; delete an old one if the truth is not known."""
     if aligned is None:
         (run.path / TRUTH).unlink(missing_ok=True)
     else:

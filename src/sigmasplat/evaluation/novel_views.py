@@ -1,4 +1,4 @@
-"""Score views that a data set keeps apart from its walk: photographs from places that no frame was taken at."""
+"""Score novel views: test photographs of a data set, taken from poses that no frame of the sequence has."""
 
 from typing import Any
 
@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
+from sigmasplat.evaluation.view_selection import evenly_spread, working_frame
 from sigmasplat.metrics import views
 from sigmasplat.metrics.trajectory import associate
 from sigmasplat.model import se3
@@ -19,7 +20,7 @@ KIND = "test"
 
 
 def score_novel_views(
-    apart: Source,
+    test_views: Source,
     poses: Trajectory | None,
     T_estimate_truth: NDArray[np.float64],
     field: GaussianField,
@@ -28,25 +29,24 @@ def score_novel_views(
     strips: ViewStrips,
     most: int,
 ) -> dict[str, Any] | None:
-    """Render the final map at the true poses of at most `most` views, taken to the estimate's world by the ATE's fit.
+    """Render the final map at the true poses of at most `most` test views, and return their mean scores.
 
-    Returns their mean scores (`views.mean_scores`), and draws a few; None where no poses are known. The path's error
-    counts against them, as it does in the papers. Unreadable views and those without a pose are left out.
+    `T_estimate_truth`, the alignment of the ATE, transforms the poses to the estimate's world. So errors of the path
+    lower these scores, as in the papers. Adds a few views to the strips. Unreadable views and those without a pose are
+    skipped. Returns the scores as `views.mean_scores` does, or None if no poses are known.
     """
     if poses is None:
         return None
-    seen = []
-    for i in np.unique(np.linspace(0, len(apart) - 1, min(most, len(apart))).round().astype(int)).tolist():
+    rendered = []
+    for i in evenly_spread(range(len(test_views)), most):
         try:
-            frame = apart.frame(i).prepared(
-                settings.width, settings.min_depth_m, settings.max_depth_m, settings.crop_px
-            )  # fmt: skip
+            frame = working_frame(test_views, settings, i)
         except SourceError:
             continue
         rows, found = associate(np.array([frame.timestamp_s]), poses.timestamps_s)
         if len(rows):
             T_camera_world = se3.inverse(T_estimate_truth @ poses.T_world_camera[found[0]])
-            seen.append(views.scored_view(frame, renderer(field, frame.camera, T_camera_world), KIND))
-    for view in seen[:: max(1, len(seen) // max(strips.per_kind, 1))][: strips.per_kind]:
+            rendered.append(views.scored_view(frame, renderer(field, frame.camera, T_camera_world), KIND))
+    for view in rendered[:: max(1, len(rendered) // max(strips.per_kind, 1))][: strips.per_kind]:
         strips.add(view)
-    return views.mean_scores([view.scores() for view in seen])
+    return views.mean_scores([view.scores() for view in rendered])

@@ -1,4 +1,4 @@
-"""Compare runs that differ by one switch: mean and spread over seeds, and which effects stand out of the spread."""
+"""Compare runs that differ in one setting, at equal seeds: mean and spread of the differences, and a verdict."""
 
 import math
 import statistics
@@ -11,13 +11,16 @@ from scipy.stats import t as student
 from sigmasplat.report.tables import number
 
 Run = Mapping[str, Any]
-"""A run as the file of an ablation holds it: `variant`, `seed`, and `figures` by name, None where there is none."""
+"""A run as the file of an ablation stores it: `variant`, `seed`, and `figures` by name, None for a missing value."""
 Verdict = Literal["helps", "harms", "within the spread", "unknown"]
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A number of a run and how it is shown: value × factor in its unit; `better` is +1 or −1, 0 where neither is."""
+    """A figure of a run and how it is shown: value × factor in `unit`.
+
+    `better` is +1 if larger is better, −1 if smaller is better, and 0 if neither is.
+    """
 
     name: str
     title: str
@@ -43,12 +46,12 @@ FIGURES = (
     Figure("lost", "lost", "", -1, digits=1, judged=False),
     Figure("frames_per_s", "frames/s", "", +1, digits=1, judged=False),
 )
-"""PSNR and depth are of held-out views, before and after the refinement of the whole map; judged are those of quality,
-the others are counts and cost."""
+"""PSNR and depth L1 are of held-out views; PSNR before and after the refinement of the final map. Figures of quality
+are judged, counts and speed are not."""
 
 
 def figures_of(metrics: Mapping[str, Any]) -> dict[str, float | None]:
-    """Pick a run's figures from its metrics; None where there is none."""
+    """Return a run's figures, taken from its metrics; None for a missing one."""
     held_out, submaps = metrics.get("held_out") or {}, metrics.get("held_out_submaps") or {}
     return {
         "ate_m": (metrics.get("ate") or {}).get("rmse_m"),
@@ -62,25 +65,25 @@ def figures_of(metrics: Mapping[str, Any]) -> dict[str, float | None]:
 
 
 def columns(runs: Sequence[Run]) -> list[Figure]:
-    """List the figures to show of runs: where no map was refined there is one PSNR, not two."""
+    """List the figures to show; if no final map was refined, there is one PSNR instead of two."""
     if any(run["figures"][BEFORE] is not None for run in runs):
         return list(FIGURES)
     return [replace(f, title="PSNR") if f.name == AFTER else f for f in FIGURES if f.name != BEFORE]
 
 
 def by_seed(runs: Sequence[Run], variant: str, figure: Figure) -> dict[int, float]:
-    """Collect a figure of a variant's runs in its unit, by seed, leaving out runs that have none."""
+    """Return a figure of a variant's runs in its unit, by seed; runs without it are left out."""
     found = {run["seed"]: run["figures"][figure.name] for run in runs if run["variant"] == variant}
     return {seed: figure.factor * value for seed, value in found.items() if value is not None}
 
 
 def deviation(values: Sequence[float]) -> float | None:
-    """Return the sample standard deviation; None of fewer than two."""
+    """Return the sample standard deviation, None for fewer than two values."""
     return statistics.stdev(values) if len(values) > 1 else None
 
 
 def spread(values: Sequence[float], digits: int) -> str:
-    """Write mean ± standard deviation; a whole number that never differs as it is, a dash without values."""
+    """Format mean ± standard deviation; a whole number that never varies as it is, a dash without values."""
     if not values:
         return "–"
     mean, std = statistics.fmean(values), deviation(values)
@@ -90,7 +93,7 @@ def spread(values: Sequence[float], digits: int) -> str:
 
 
 def best(means: Mapping[str, float], figure: Figure) -> set[str]:
-    """Name the variants whose mean is best as printed; none where all are alike or neither way is better."""
+    """Return the variants with the best printed mean; empty if all are equal or the figure has no better direction."""
     printed = {variant: round(mean, figure.digits) for variant, mean in means.items()}
     if not figure.better or len(set(printed.values())) < 2:
         return set()
@@ -101,7 +104,7 @@ def best(means: Mapping[str, float], figure: Figure) -> set[str]:
 def rows(
     runs: Sequence[Run], variants: Sequence[str], mark: Callable[[str], str], figures: Sequence[Figure]
 ) -> list[list[str]]:
-    """Lay out a row per variant, its name and each figure's mean ± standard deviation; `mark` marks the best."""
+    """Return a row per variant: its name and each figure's mean ± standard deviation; `mark` marks the best."""
     laid_out = [[variant] for variant in variants]
     for figure in figures:
         values = {variant: list(by_seed(runs, variant, figure).values()) for variant in variants}
@@ -113,10 +116,10 @@ def rows(
 
 
 @dataclass(frozen=True)
-class Effect:
-    """What a change does to a figure: mean and standard deviation of its differences, seed by seed, in its unit.
+class PairedDifference:
+    """How a change affects a figure: mean and standard deviation of the differences at equal seeds, in its unit.
 
-    Equal seeds mean equal worlds and equal random numbers, so what they have in common cancels.
+    Runs with the same seed see the same scene and random numbers, so what these contribute cancels in the difference.
     """
 
     figure: Figure
@@ -130,7 +133,7 @@ class Effect:
 
     @property
     def verdict(self) -> Verdict:
-        """Judge by the mean against one standard deviation; unknown of a single seed."""
+        """Compare the mean with one standard deviation; "unknown" for a single seed."""
         if self.deviation is None:
             return "unknown"
         if abs(self.mean) <= self.deviation:
@@ -138,7 +141,7 @@ class Effect:
         return "helps" if self.mean * self.figure.better > 0 else "harms"
 
     def written(self) -> str:
-        """Write the difference with its sign, ± its standard deviation, and the unit; 0 alone where nothing changed."""
+        """Format the difference with its sign, ± standard deviation and unit; only 0 if nothing changed."""
         if self.unchanged:
             return "0"
         sign = "+" if self.mean > 0 else ""
@@ -146,41 +149,44 @@ class Effect:
         return f"{sign}{number(self.mean, self.figure.digits)}{std} {self.figure.unit}".rstrip()
 
 
-def effects(runs: Sequence[Run], changed: str, against: str) -> list[Effect]:
-    """Return what one variant does to each judged figure against another, over the seeds that both have."""
+def paired_differences(runs: Sequence[Run], changed: str, against: str) -> list[PairedDifference]:
+    """Return how one variant differs from another in each judged figure, over the seeds that both have."""
     found = []
     for figure in (figure for figure in columns(runs) if figure.judged):
         base, other = by_seed(runs, against, figure), by_seed(runs, changed, figure)
         differences = [other[seed] - base[seed] for seed in base if seed in other]
         if differences:
-            found.append(Effect(figure, statistics.fmean(differences), deviation(differences)))
+            found.append(PairedDifference(figure, statistics.fmean(differences), deviation(differences)))
     return found
 
 
-def sentence(found: Sequence[Effect]) -> str:
-    """Say in words what a change does."""
+def described(found: Sequence[PairedDifference]) -> str:
+    """Describe in words how a change affects the figures."""
     if not found:
         return "nothing to compare"
-    if all(effect.unchanged for effect in found):
+    if all(difference.unchanged for difference in found):
         return "no figure differs in any run"
-    if any(effect.deviation is None for effect in found):
-        return "one seed has no spread to judge by"
+    if any(difference.deviation is None for difference in found):
+        return "one seed is not enough to judge"
     parts = []
     for verdict in ("helps", "harms"):
         named = [f"{e.figure.title} ({e.written()})" for e in found if e.verdict == verdict]
-        parts += [f"{verdict} {listed(named)}"] if named else []
+        parts += [f"{verdict} {joined(named)}"] if named else []
     rest = [e.figure.title for e in found if e.verdict == "within the spread"]
     if rest:
-        where = f" on {listed(rest)}" if parts else ""
-        parts.append(f"no effect beyond the spread of the seeds{where}")
+        where = f" on {joined(rest)}" if parts else ""
+        parts.append(f"no effect beyond the spread over seeds{where}")
     return "; ".join(parts)
 
 
-def listed(words: Sequence[str]) -> str:
-    """Join words: a, b and c."""
+def joined(words: Sequence[str]) -> str:
+    """Join words as in: a, b and c."""
     return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:])))
 
 
 def passed_by_chance(seeds: int) -> float:
-    """Return how often a change that does nothing looks as if it did: |mean| > one sample deviation, normal noise."""
+    """Return the probability that a change without effect is judged to have one: |mean| > one sample deviation.
+
+    Differences are assumed to be normally distributed.
+    """
     return float(2 * student.sf(math.sqrt(seeds), seeds - 1))

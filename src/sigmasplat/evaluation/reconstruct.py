@@ -1,6 +1,6 @@
-"""Make a surface of a run's map: render depth and colour at every keyframe, fuse, cut, clean (VarSplat §7).
+"""Extract a surface from a run's map: render depth and colour at every keyframe, fuse, mesh, clean (VarSplat §7).
 
-What is fused is the map's own view, never a recorded image nor the truth.
+Only images rendered from the map are fused, never a recorded image or the ground truth.
 """
 
 from collections.abc import Iterable
@@ -26,8 +26,8 @@ from sigmasplat.types import Progress
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
-    """What surfaces need of a run, read once: settings, checkpoint, and the camera of the images it worked on."""
+class FusionInput:
+    """What fusion needs from a run, read once: settings, checkpoint, and the camera of its working images."""
 
     run: RunFolder
     config: Config
@@ -35,23 +35,23 @@ class Recording:
     camera: Camera
 
     @staticmethod
-    def of(run: RunFolder, camera: Camera) -> "Recording":
-        """Read a run; `camera` is the source's. Raises RunError if it has no checkpoint or no keyframe."""
+    def of(run: RunFolder, camera: Camera) -> "FusionInput":
+        """Read a run; `camera` is the source's camera. Raises RunError if it has no checkpoint or no keyframe."""
         settings = run.config().input
-        return Recording.at(run, camera.prepared(settings.width, settings.crop_px))
+        return FusionInput.at(run, camera.prepared(settings.width, settings.crop_px))
 
     @staticmethod
-    def at(run: RunFolder, camera: Camera) -> "Recording":
-        """Read a run; `camera` is of the images it worked on. Raises RunError as `of` does."""
+    def at(run: RunFolder, camera: Camera) -> "FusionInput":
+        """Read a run; `camera` is that of its working images. Raises RunError as `of` does."""
         config, (checkpoint, _) = run.config(), run.read_checkpoint()
         if not {"keyframes", "T_world_camera"} <= set(checkpoint) or not len(checkpoint["keyframes"]):
             raise RunError(f"run {run.path} has no keyframes in its checkpoint; run it again")
-        return Recording(run, config, checkpoint, camera)
+        return FusionInput(run, config, checkpoint, camera)
 
-    def standpoints(self) -> tuple[Iterable[FusionView], int]:
-        """Return the keyframes, each before its own submap, or before the map of a run in one piece, and their number.
+    def views(self) -> tuple[Iterable[FusionView], int]:
+        """Return a view of each keyframe's own submap, or of the one map of a run without submaps, and their number.
 
-        Raises RunError if there is no map, or the checkpoint does not know where the submaps are.
+        Raises RunError if there is no map, or if the checkpoint lacks the pose of a submap.
         """
         submaps, tensors = self.run.submaps, self.checkpoint
         if not len(submaps):
@@ -60,14 +60,15 @@ class Recording:
         anchors = np.asarray(tensors.get("T_world_submap", np.empty((0, 4, 4))), np.float64)
         if len(anchors) < len(submaps):
             raise RunError(
-                f"run {self.run.path} has {len(submaps)} submaps, its checkpoint places {len(anchors)}; run it again"
+                f"run {self.run.path} has {len(submaps)} submaps, but its checkpoint has poses of {len(anchors)}; "
+                "run it again"
             )
         return fusion_views(submaps, list(anchors)), count_keyframes(submaps)
 
     def surface(self, voxel_m: float, renderer: Renderer | None, progress: Progress) -> Mesh:
-        """Fuse the keyframes. Raises RunError as `standpoints` does, ConfigError unless voxel_m > 0."""
-        standpoints, total = self.standpoints()
-        return fuse(standpoints, total, self.config, voxel_m=voxel_m, renderer=renderer, progress=progress)
+        """Fuse the keyframes. Raises RunError as `views` does, ConfigError unless voxel_m > 0."""
+        views, total = self.views()
+        return fuse(views, total, self.config, voxel_m=voxel_m, renderer=renderer, progress=progress)
 
 
 def reconstruct(
@@ -78,12 +79,12 @@ def reconstruct(
     renderer: Renderer | None = None,
     progress: Progress = lambda done, total: None,
 ) -> Mesh:
-    """Fuse what the run's map shows at its keyframes into a mesh in the run's world; `camera` is the source's.
+    """Fuse renders of the run's map at its keyframes into a mesh in the run's world; `camera` is the source's.
 
-    `progress` is told (keyframes done, of how many). Raises RunError if the run has no map, no checkpoint or no
+    Calls `progress(done, total)` with keyframes. Raises RunError if the run has no map, no checkpoint or no
     keyframe; ConfigError unless voxel_m > 0.
     """
-    return Recording.of(run, camera).surface(voxel_m, renderer, progress)
+    return FusionInput.of(run, camera).surface(voxel_m, renderer, progress)
 
 
 def fuse_and_score(
@@ -94,34 +95,34 @@ def fuse_and_score(
     renderer: Renderer | None = None,
     progress: Progress = lambda done, total: None,
 ) -> dict[str, Any] | None:
-    """Write the run's mesh.ply and return its scores; None unless both the true surface and the true path are known."""
-    recording = Recording.of(run, camera)
-    mesh = recording.surface(VOXEL_M, renderer, progress)
+    """Write the run's mesh.ply and return its scores, or None if the true surface or the true path is unknown."""
+    fusion_input = FusionInput.of(run, camera)
+    mesh = fusion_input.surface(VOXEL_M, renderer, progress)
     write_mesh(run.path / MESH, mesh)
     if true_surface is None or true_path is None:
         return None
-    return score(recording, mesh, true_surface, true_path, progress)
+    return score(fusion_input, mesh, true_surface, true_path, progress)
 
 
 def score(
-    recording: Recording,
+    fusion_input: FusionInput,
     mesh: Mesh,
     true_surface: Mesh,
     true_path: Trajectory,
     progress: Progress = lambda done, total: None,
 ) -> dict[str, float]:
-    """Score a run's mesh and its splats against the true surface, aligned as its path is for the ATE.
+    """Score a run's mesh and its splats against the true surface, after the same alignment as for the ATE.
 
-    Training views are the true poses of the keyframes. Raises SourceError if path and truth share no timestamps.
+    The training views are the true poses of the keyframes. Raises SourceError if path and truth share no timestamps.
     """
-    path, tensors = recording.run.read_trajectory(), recording.checkpoint
+    path, tensors = fusion_input.run.read_trajectory(), fusion_input.checkpoint
     ours, theirs = pair_poses(path, true_path)
     T_truth_world = align_rigid(ours[:, :3, 3], theirs[:, :3, 3])
     _, rows = associate(tensors["timestamps_s"][tensors["keyframes"]].numpy(), true_path.timestamps_s)
     views = true_path.T_world_camera[rows]
-    seen = (true_surface, recording.camera, views)
-    of_mesh = reconstruction.score(mesh.moved(T_truth_world), *seen, progress=progress)
-    field = recording.run.read_map()
+    reference = (true_surface, fusion_input.camera, views)
+    of_mesh = reconstruction.score(mesh.moved(T_truth_world), *reference, progress=progress)
+    field = fusion_input.run.read_map()
     centers = field.means.numpy().astype(np.float64) @ T_truth_world[:3, :3].T + T_truth_world[:3, 3]
-    of_splats = score_splats(centers, field.opacities.numpy().astype(np.float64), *seen)
+    of_splats = score_splats(centers, field.opacities.numpy().astype(np.float64), *reference)
     return asdict(of_mesh) | asdict(of_splats)

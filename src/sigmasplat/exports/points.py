@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.evaluation.reconstruct import Recording
+from sigmasplat.evaluation.reconstruct import FusionInput
 from sigmasplat.exports.run_reader import RunReader
 from sigmasplat.io.atomic import replacing
 from sigmasplat.io.mesh import color_bytes
@@ -32,7 +32,7 @@ def export_points(
     They are the vertices of `evaluation.reconstruct`'s mesh, about one per voxel on the surface. Raises RunError if the
     run has no map, checkpoint or keyframe, ConfigError unless voxel_m > 0.
     """
-    surface = Recording.at(reader.run, reader.camera).surface(voxel_m, renderer, progress)
+    surface = FusionInput.at(reader.run, reader.camera).surface(voxel_m, renderer, progress)
     colors = surface.vertices * 0.0 + 0.7 if surface.colors is None else surface.colors
     write_points(target, surface.vertices, colors, surface.normals())
     return len(surface.vertices)

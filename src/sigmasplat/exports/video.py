@@ -105,9 +105,9 @@ def orbit_view(
     field: GaussianField, path: Trajectory, camera: Camera, images: int, renderer: SurfaceRenderer
 ) -> tuple[GaussianField, Matrix]:
     """Return the map without its ceiling, and poses [images, 4, 4] on a circle above it from which it is visible."""
-    sights = list(sample_surfaces(field, path, camera, renderer, SURFACE_VIEWS))
-    T = floor_frame(sights)
-    points = np.concatenate([sight.points for sight in sights]) @ T[:3, :3].T + T[:3, 3]
+    samples = list(sample_surfaces(field, path, camera, renderer, SURFACE_VIEWS))
+    T = floor_frame(samples)
+    points = np.concatenate([sample.points for sample in samples]) @ T[:3, :3].T + T[:3, 3]
     low, high = np.quantile(points, [0.02, 0.98], axis=0)
     ceiling_m = float(np.median(path.T_world_camera[:, :3, 3] @ T[2, :3] + T[2, 3])) + CEILING_M
     middle = np.append((low + high)[:2] / 2.0, min(ceiling_m, 0.8) / 2.0)

@@ -9,19 +9,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import MappingConfig
-from sigmasplat.model.field import COLUMNS, EXTRAS, WIDTH, Rows
+from sigmasplat.model.field import ATTRIBUTES, COLUMNS, WIDTH, Rows
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
-EXTRA_RATES = {"correlations": ("log_variances", 0.03), "harmonics": ("colors", 1.0 / 20.0)}
-"""The rate of an extra, as a share of that of some columns (harmonics: 3DGS's; correlations: ours, from 0.1 on they fit
-the errors of single pixels, and likelihood on held-out frames falls)."""
+ATTRIBUTE_RATES = {"correlations": ("log_variances", 0.03), "harmonics": ("colors", 1.0 / 20.0)}
+"""The rate of an attribute, as a share of the rate of some columns (harmonics: 3DGS's; correlations: ours, from 0.1 on
+they fit the errors of single pixels, and likelihood on held-out frames falls)."""
 ROWS_AT_ONCE = 8192
-"""So many rows and what is worked out of them fit the processor's cache."""
+"""This many rows and their intermediate results fit the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rates:
-    """Learning rates [m], one per column of `GaussianField.params` or of an extra; 0 freezes a column."""
+    """Learning rates [m], one per column of `GaussianField.params` or of an attribute; 0 freezes a column."""
 
     per_column: Tensor
 
@@ -43,10 +43,10 @@ class Rates:
                 rates.per_column[COLUMNS["means"]] *= (config.lr_means_first / config.lr_means) ** left
             yield rates
 
-    def of_extra(self, name: str) -> "Rates":
-        """Return the rates of an extra of a field that has these ones."""
-        columns, share = EXTRA_RATES[name]
-        return Rates(self.per_column.new_full((EXTRAS[name],), share * float(self.per_column[COLUMNS[columns]][0])))
+    def of_attribute(self, name: str) -> "Rates":
+        """Return the rates of an attribute of a field that has these ones."""
+        columns, share = ATTRIBUTE_RATES[name]
+        return Rates(self.per_column.new_full((ATTRIBUTES[name],), share * float(self.per_column[COLUMNS[columns]][0])))
 
 
 def adam_step(field: Rows, grad: Tensor, rates: Rates, visible: Tensor) -> None:
@@ -113,7 +113,7 @@ class VectorAdam:
 
     @staticmethod
     def of(size: int) -> "VectorAdam":
-        """Start at rest on so many numbers."""
+        """Start at rest on `size` numbers."""
         return VectorAdam(np.zeros(size), np.zeros(size))
 
     def step(self, gradient: NDArray[np.float64], rates: NDArray[np.float64]) -> NDArray[np.float64]:

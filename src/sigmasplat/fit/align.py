@@ -18,14 +18,15 @@ from sigmasplat.model import se3
 from sigmasplat.types import Matrix
 
 HUBER_GRAY = (0.02, 0.05, 0.1, 0.2)
-"""Width of the gray residual's quadratic part, from the finest level up: far from the answer all of them are large."""
+"""Width of the gray residual's quadratic part, from the finest level up: far from the solution all residuals are
+large."""
 HUBER_DEPTH_RELATIVE = (0.003, 0.006, 0.012, 0.05)
-"""The same for depth, times z² (m): from a structured-light sensor's noise (Khoshelham & Elberink 2012) up."""
+"""The same for depth, times z² (m); the finest is a structured-light sensor's noise (Khoshelham & Elberink 2012)."""
 DEPTH_GATES_M = (0.1, 0.3, 0.8, 2.0)
-"""Depth residuals beyond are other surfaces; from the finest level up."""
+"""Larger depth residuals belong to other surfaces; from the finest level up."""
 MIN_PIXELS = 60
 DEGENERATE = 1e-5
-"""A direction with less than this share of the best one's information is not decided by the images."""
+"""A direction with less than this share of the best one's information is undetermined."""
 UNKNOWN_M = 1.0
 """Standard deviation given to such a direction, metres (of shift at the usual depth)."""
 
@@ -33,7 +34,7 @@ UNKNOWN_M = 1.0
 @dataclass(frozen=True, eq=False)
 class Alignment:
     """T_live_reference; agreement: share of overlapping pixels whose depths agree; overlap: share of reference pixels
-    that land on a live reading; degenerate: how many directions of motion the images say nothing about; cost per pixel;
+    that land on a live reading; degenerate: number of undetermined directions of motion; cost per pixel;
     steps taken; depth_m: mean depth of the reference."""
 
     T_live_reference: Matrix
@@ -47,12 +48,13 @@ class Alignment:
 
     @cached_property
     def covariance(self) -> Matrix:
-        """Estimate the covariance [6, 6] of the left twist (ρ, φ), m and rad, when asked for: 13 steps' time.
+        """Estimate the covariance [6, 6] of the left twist (ρ, φ), m and rad, on first access; costs as much as 13
+        steps.
 
-        D⁻¹ S D⁻ᵀ: S sums the pull's outer products cell by cell, for residuals of neighbouring pixels err together
-        (cluster-robust sandwich estimator, Liang & Zeger 1986); D is how the pull really changes within half a pixel,
-        for H, built of noisy image gradients, is several times too steep. A degenerate direction has `UNKNOWN_M` of
-        deviation. Infinite where nothing was in common.
+        D⁻¹ S D⁻ᵀ: S sums outer products of the gradient cell by cell, as residuals of neighbouring pixels are
+        correlated (cluster-robust sandwich estimator, Liang & Zeger 1986); D is the measured change of the gradient
+        within half a pixel, as H, built of noisy image gradients, is several times too steep. A degenerate direction
+        has `UNKNOWN_M` of deviation. Infinite without common pixels.
         """
         half_rad = 0.5 / self.pair.reference.cameras[0].fx
         steps = np.repeat([half_rad * self.depth_m, half_rad], 3)
@@ -94,8 +96,8 @@ class Pair:
 
 @dataclass(eq=False)
 class Normal:
-    """The normal equations of one step, as `_core.align_step` writes them: information H and pull b of a left twist,
-    S = Σ b_c b_cᵀ over cells c of the image."""
+    """The normal equations of one step, as `_core.align_step` writes them: information H and gradient b by a left
+    twist, S = Σ b_c b_cᵀ over cells c of the image."""
 
     H: Matrix
     b: Matrix
@@ -119,13 +121,13 @@ def align(
     update_stop: float = 1e-4,
     plateau_stop: float = 0.0,
 ) -> Alignment:
-    """Find the motion that lays the reference onto the live image, from a first guess.
+    """Find the motion from the reference to the live image, from a first guess.
 
     Each level takes up to `iterations` Gauss–Newton steps with Huber weights and ends below `update_stop` (m, rad), or
-    when the cost has changed by less than `plateau_stop` of it (0 = off). If the finest does neither its best iterate
-    stands. Directions the images say nothing about keep the guess.
-    weight_color in [0, 1] balances gray against depth, each in units of its Huber width.
-    Raises BackendError without the compiled kernels, or where one image lies on a device and the other does not.
+    when the cost has changed by less than `plateau_stop` of it (0 = off). If the finest level does neither, its best
+    iterate is returned. Undetermined directions keep the guess. weight_color in [0, 1] balances gray against depth,
+    each in units of its Huber width. Raises BackendError without the compiled kernels, or where only one image is on a
+    device.
     """
     if reference.kernels is not live.kernels:
         raise BackendError("one image to align lies on a device, the other does not; make both for the same view")
@@ -146,7 +148,7 @@ def align(
 
 
 def _axes(n: Normal, depth_m: float) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Split the information into principal directions, rotations measured by the shift they make at the usual depth.
+    """Split the information into principal directions, rotations measured by the shift they cause at the mean depth.
 
     Returns (directions as columns [6, 6], which ones the images decide [6]) (Zhang et al. 2016).
     """
@@ -156,7 +158,7 @@ def _axes(n: Normal, depth_m: float) -> tuple[Matrix, NDArray[np.bool_]]:
 
 
 def _slope(around: Sequence[Normal], steps: Matrix) -> Matrix:
-    """Differentiate the pull by the twist, by central differences: steps [6] ahead and behind; symmetric."""
+    """Differentiate the gradient by the twist, by central differences: steps [6] ahead and behind; symmetric."""
     pulls = np.stack([n.b for n in around])
     D = ((pulls[::2] - pulls[1::2]) / (2.0 * steps[:, None])).T
     return np.asarray(0.5 * (D + D.T))

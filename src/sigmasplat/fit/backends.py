@@ -20,7 +20,7 @@ from sigmasplat.fit.cuda.view_dependent import CudaViewDependentStep
 from sigmasplat.fit.descent import descend
 from sigmasplat.fit.fused_terms import fused_terms
 from sigmasplat.fit.interface import DeviceFits, MappingStep, Twist, Weights
-from sigmasplat.fit.mapping_step import TorchStep
+from sigmasplat.fit.mapping_step import OwnTermsStep, TorchStep
 from sigmasplat.fit.reference_maps import reference_arrays, reference_maps
 from sigmasplat.fit.view_dependent import ViewDependentStep
 from sigmasplat.model.field import GaussianField
@@ -94,7 +94,7 @@ def fits_of(on: OnBackend) -> DeviceFits:
 def step_for(field: GaussianField, view: View, weights: Weights, degree: int) -> MappingStep:
     """Make the step that fits a field on a view; degree: of view-dependent colour.
 
-    The device's kernels compute the loss where they have every term that has weight; else the whole loss runs in torch.
+    The device's kernels compute the terms that they have; autograd computes the others beside them.
     Raises ConfigError where full colour covariance meets terms that its view has no maps for.
     """
     full = bool(weights["nll_color_full"])
@@ -102,10 +102,13 @@ def step_for(field: GaussianField, view: View, weights: Weights, degree: int) ->
         raise ConfigError(
             "mapping.color_covariance full goes without weight_alignment and weight_moment; set both to 0"
         )
-    used = {name for name, weight in weights.items() if weight} - {"nll_color_full"}
-    fits = fits_of(view) if used <= fused_terms(view.backend) else TORCH
+    fits = fits_of(view)
     if full:
-        step = fits.covariance_step(make_covariance_view(view, field.carry("correlations")))
+        step = fits.covariance_step(make_covariance_view(view, field.get_or_create("correlations")))
     else:
         step = fits.mapping_step(view)
+    used = frozenset(name for name, weight in weights.items() if weight) - {"nll_color_full"}
+    own = used - fused_terms(view.backend)
+    if own and fits is not TORCH:
+        step = OwnTermsStep(step, own)
     return fits.view_dependent_step(step, degree) if degree else step

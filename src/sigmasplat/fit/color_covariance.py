@@ -1,6 +1,6 @@
-"""Fit how the colour channels of a splat vary together: one mapping step under the full colour covariance.
+"""Fit the full colour covariance of splats: one mapping step.
 
-Beyond the paper, which has one variance a channel. Tracking and all else that reads V go on reading its diagonal.
+This goes beyond the paper, which has one variance per channel. Tracking and everything else read the diagonal of V.
 """
 
 from typing import Protocol
@@ -22,7 +22,7 @@ COLORS, SCALES = COLUMNS["colors"], COLUMNS["log_scales"]
 
 
 class ImageTerms(Protocol):
-    """What is needed of another step: the gradient of the image terms that it knows."""
+    """The part of another step that this one uses: the gradient of the image terms."""
 
     def images(self, target: Target, weights: Weights) -> float | Tensor:
         """Write the gradient of the image terms to the first seven gradient planes; return the loss."""
@@ -30,10 +30,11 @@ class ImageTerms(Protocol):
 
 
 class FullCovarianceStep:
-    """One mapping step with `nll_color_full` in place of `nll_color`; `others` does the other terms on the same view.
+    """One mapping step with `nll_color_full` in place of `nll_color`; `others` computes the other terms on the same
+    view.
 
-    V's gradient reaches what the diagonal's does, all that V is made of: variances, correlations, colours, and the
-    weights of splats in a pixel.
+    The gradient of V reaches everything that V depends on: variances, correlations, colours, and the weights of splats
+    in a pixel.
     """
 
     def __init__(self, view: CorrelationView, others: ImageTerms) -> None:
@@ -76,7 +77,7 @@ class FullCovarianceStep:
         """
         grad, cost = torch.zeros_like(field.params), 0.0
         twist = self._wide.backward(field.params, grad, grad2d)
-        correlations, correlation_rates = self._wide.correlations, rates.of_extra("correlations")
+        correlations, correlation_rates = self._wide.correlations, rates.of_attribute("correlations")
         correlations.steps += 1
         visible = self._wide.visible(len(field)).nonzero().squeeze(1)
         for rows in torch.split(visible, ROWS_AT_ONCE):

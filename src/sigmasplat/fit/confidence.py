@@ -6,15 +6,15 @@ from torch import Tensor
 
 @torch.no_grad()
 def uncertainty_weights(variance: Tensor, mask: Tensor, tau: float, weight_max: float, eps: float = 1e-6) -> Tensor:
-    """Weigh pixels by how sure the map is of their colour (VarSplat §3, w̃), [H, W, 3], stop-gradient.
+    """Weigh pixels by the certainty of the map's colour (VarSplat §3, w̃), [H, W, 3], stop-gradient.
 
     w̃ = clamp(exp(−(log(V+ε) − median)/τ), 1/weight_max, weight_max) per channel, with V [H, W, 3] ≥ 0 up to rounding
-    and the median of log(V+ε) over mask [H, W] (of an even count the lower middle one). Every pixel gets a weight, the
-    mask chooses whose median; an empty mask gives weight 1 everywhere.
+    and the median of log(V+ε) over mask [H, W] (of an even count the lower middle one). Every pixel gets a weight; the
+    mask only selects the pixels of the median. An empty mask gives weight 1 everywhere.
     """
     log_variance, n = (variance.clamp(min=0.0) + eps).log(), mask.sum()
     known_first = torch.where(mask[..., None], log_variance, torch.inf).flatten(0, -2).sort(0).values
-    # Looked up by a tensor: on a device no host waits for the number of pixels.
+    # Indexed by a tensor: on a device the host does not wait for the number of pixels.
     median = known_first.index_select(0, (n - 1).clamp(min=0)[None] // 2)
     weights = torch.exp((median - log_variance) / tau).clamp(1.0 / weight_max, weight_max)
     return torch.where(n > 0, weights, 1.0)
@@ -22,7 +22,7 @@ def uncertainty_weights(variance: Tensor, mask: Tensor, tau: float, weight_max: 
 
 @torch.no_grad()
 def outlier_mask(error: Tensor, valid: Tensor, factor: float) -> Tensor:
-    """Tell which valid pixels agree: |error| ≤ factor × its median over them, bool [H, W] (VarSplat §3, CG-SLAM §6).
+    """Return which valid pixels agree: |error| ≤ factor × its median over them, bool [H, W] (VarSplat §3, CG-SLAM §6).
 
     error [H, W] of depth or colour, any sign; factor 0 = off. The bound itself passes, so that a perfect render
     (median 0) keeps its perfect pixels; NaN never passes.

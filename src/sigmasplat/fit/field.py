@@ -9,6 +9,7 @@ from torch import Tensor
 
 from sigmasplat.config import MappingConfig
 from sigmasplat.errors import BackendError
+from sigmasplat.fit import losses
 from sigmasplat.fit.adam import Rates, settle
 from sigmasplat.fit.backends import fits_of, step_for
 from sigmasplat.fit.interface import FitStats, Twist
@@ -40,9 +41,12 @@ class FieldFit:
 
 def loss_weights(config: MappingConfig) -> dict[str, float]:
     """List the mapping loss as (term, weight): VarSplat §2, 0.8 L1 + 0.2 (1 − SSIM) + depth + L_reg + NLL; CG-SLAM
-    eq. 18, with alignment, isotropy as a ratio, and U."""
+    eq. 18, with the median depth, isotropy as a ratio, and U.
+
+    Any other term of `fit.losses` has the weight `weight_<term>` of the settings, where there is such a field.
+    """
     full = config.color_covariance == "full"
-    return {
+    weights = {
         "l1": config.weight_l1,
         "ssim": config.weight_ssim,
         "depth": config.weight_depth,
@@ -54,6 +58,8 @@ def loss_weights(config: MappingConfig) -> dict[str, float]:
         "median_depth": config.weight_alignment,
         "moment": config.weight_moment,
     }
+    own = {name: getattr(config, f"weight_{name}", 0.0) for name in losses.TERMS if name not in weights}
+    return weights | own
 
 
 def fit_field(
@@ -90,8 +96,8 @@ def fit_field(
             if pose_rates.any() and keyframe.movable and not keyframe.fixed:
                 keyframe.move(twist, pose_rates)
     fits_of(view).settle(field, rates)
-    for name, extra in field.extras.items():
-        settle(extra, rates.of_extra(name))
+    for name, attribute in field.attributes.items():
+        settle(attribute, rates.of_attribute(name))
     return fit
 
 
@@ -119,7 +125,7 @@ class _Steps:
         costs, shape, twists = list[float | Tensor](), list[float | Tensor](), list[Twist]()
         for keyframe in batch:
             with stopwatch.stage("forward"):
-                target = keyframe.target.on(self.field.params.device)
+                target = keyframe.target.to(self.field.params.device)
                 self.step.forward(self.field, se3.inverse(keyframe.T_world_camera), target, self.weights)
             with stopwatch.stage("loss"):
                 costs.append(self.step.images(target, self.weights))

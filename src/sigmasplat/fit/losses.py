@@ -1,10 +1,10 @@
-"""Write each loss term once: a function of the maps it names.
+"""The loss terms: each is a function of the maps that it names.
 
 A term is a function registered by `@term`; its name is what a weight is given to, its parameters are the maps it takes.
 `total` hands each term its maps by those names, so a new term is one function (and a weight).
 
 Maps: color, color_target [H, W, 3] in [0, 1]; depth, depth_target [H, W] m; variance [H, W, 3] (V, VarSplat §1);
-covariance [H, W, 6] (V with what lies beside its diagonal: rr, gg, bb, rg, rb, gb); moment [H, W] m² (U, CG-SLAM
+covariance [H, W, 6] (V with its off-diagonal: rr, gg, bb, rg, rb, gb); moment [H, W] m² (U, CG-SLAM
 eq. 10); median_depth [H, W] m, 0 = none (CG-SLAM eq. 8); valid [H, W] bool, pixels with a depth reading; scales
 [N, 3] m.
 Every image term is a mean over valid pixels (and channels), SSIM over all pixels of the masked images; without valid
@@ -138,9 +138,9 @@ def gaussian_nll(residual: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
 def nll_color_full(color: Tensor, color_target: Tensor, covariance: Tensor, valid: Tensor) -> Tensor:
     """Take the Gaussian NLL of colours [H, W, 3] under the full V [H, W, 6]; trains V only, as `nll_color` does.
 
-    Mean over valid pixels × 3 of ½ rᵀ (V+εI)⁻¹ r + ½ log det (V+εI), so that it is `nll_color` where nothing lies
-    beside the diagonal. V+εI = L diag(d) Lᵀ, L with ones on its diagonal: then it is ½ y²/d + ½ log d with L y = r. No
-    d of a true covariance is below ε: one that is by rounding is put there.
+    Mean over valid pixels × 3 of ½ rᵀ (V+εI)⁻¹ r + ½ log det (V+εI), so that it equals `nll_color` for a diagonal V.
+    V+εI = L diag(d) Lᵀ, L with ones on its diagonal: then it is ½ y²/d + ½ log d with L y = r. No d of a true
+    covariance is below ε: one that is by rounding is put there.
     """
     r1, r2, r3 = masked((color - color_target).detach(), valid).unbind(-1)
     d1, v2, v3 = (masked(covariance[..., :3], valid, fill=1.0).clamp(min=0.0) + NLL_EPS).unbind(-1)
@@ -165,6 +165,6 @@ def moment(moment: Tensor, valid: Tensor) -> Tensor:
 def median_depth(depth: Tensor, median_depth: Tensor, valid: Tensor) -> Tensor:
     """Take mean |D̂ − D̂m| of depths [H, W] m over valid [H, W], m; 0 without a median (CG-SLAM eq. 16).
 
-    A median is where a splat takes half the light. Both sides are pulled: surfaces come to lie there.
+    The median is the depth of the splat that takes half the light. Both depths get a gradient.
     """
     return masked((depth - median_depth).abs(), valid & (median_depth > 0)).sum() / valid.sum().clamp(min=1)

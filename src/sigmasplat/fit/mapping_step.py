@@ -6,7 +6,7 @@ from torch import Tensor
 from sigmasplat.fit import losses
 from sigmasplat.fit.adam import Rates, adam_step
 from sigmasplat.fit.fused_terms import SHAPE_TERMS
-from sigmasplat.fit.interface import Weights
+from sigmasplat.fit.interface import MappingStep, Weights
 from sigmasplat.fit.target import Target
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.render.channels import variance_of
@@ -32,6 +32,34 @@ def shape_gradient(log_scales: Tensor, weights: Weights, of_all: float, of_visib
     if not cost.requires_grad:
         return torch.zeros_like(log_scales), 0.0
     return torch.autograd.grad(cost, leaf)[0], float(cost.detach())
+
+
+def image_gradients(view: View, target: Target, weights: Weights) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+    """Return the loss of the image terms, and each of the view's gradient planes with its gradient, by autograd.
+
+    Terms of the splats are left out, and terms of the variance on a view without it.
+    """
+    v, (h, w) = view, target.depth_image.shape
+    used = {n: x for n, x in weights.items() if n not in SHAPE_TERMS and (len(v.sums) >= 7 or "nll" not in n)}
+    planes = {"sums": (v.sums, v.g_sums)}
+    if used.get("moment"):
+        planes["moment"] = v.moment, v.g_moment
+    if used.get("median_depth"):
+        planes["median_depth"] = v.layers.median_depth, v.g_median_depth
+    leaves = {name: values.detach().clone().requires_grad_() for name, (values, _) in planes.items()}
+    sums = leaves["sums"][:, :h, :w].movedim(0, -1)
+    maps: dict[str, Tensor] = {name: leaf[:h, :w] for name, leaf in leaves.items() if name != "sums"} | {
+        "color": sums[..., :3],
+        "depth": sums[..., 3],
+        "color_target": target.image,
+        "depth_target": target.depth_image,
+        "valid": target.depth_image > 0,
+    }
+    if len(v.sums) >= 7:
+        maps["variance"] = variance_of(sums)
+    loss = losses.total(used, maps)
+    found = torch.autograd.grad(loss, list(leaves.values()), materialize_grads=True)
+    return loss.detach(), [(plane, value) for (_, plane), value in zip(planes.values(), found, strict=True)]
 
 
 class GradientAccumulator:
@@ -74,29 +102,10 @@ class TorchStep:
 
     def images(self, target: Target, weights: Weights) -> float:
         """Write the gradient of every image term to the view's gradient planes; return the loss."""
-        v, (h, w) = self.view, target.depth_image.shape
-        used = {n: x for n, x in weights.items() if n not in SHAPE_TERMS and (len(v.sums) >= 7 or "nll" not in n)}
-        planes = {"sums": (v.sums, v.g_sums)}
-        if used.get("moment"):
-            planes["moment"] = v.moment, v.g_moment
-        if used.get("median_depth"):
-            planes["median_depth"] = v.layers.median_depth, v.g_median_depth
-        leaves = {name: values.detach().clone().requires_grad_() for name, (values, _) in planes.items()}
-        sums = leaves["sums"][:, :h, :w].movedim(0, -1)
-        maps: dict[str, Tensor] = {name: leaf[:h, :w] for name, leaf in leaves.items() if name != "sums"} | {
-            "color": sums[..., :3],
-            "depth": sums[..., 3],
-            "color_target": target.image,
-            "depth_target": target.depth_image,
-            "valid": target.depth_image > 0,
-        }
-        if len(v.sums) >= 7:
-            maps["variance"] = variance_of(sums)
-        loss = losses.total(used, maps)
-        found = torch.autograd.grad(loss, list(leaves.values()), materialize_grads=True)
-        for (_, gradient), value in zip(planes.values(), found, strict=True):
-            gradient.copy_(value)
-        return float(loss.detach())
+        loss, gradients = image_gradients(self.view, target, weights)
+        for plane, gradient in gradients:
+            plane.copy_(gradient)
+        return float(loss)
 
     def splats(
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
@@ -112,3 +121,21 @@ class TorchStep:
     def accumulator(self, field: GaussianField) -> GradientAccumulator:
         """Make room for the gradient of several images."""
         return GradientAccumulator(self.view, field)
+
+
+class OwnTermsStep:
+    """A device's fused step, and beside it the image terms that its kernels do not have, by autograd."""
+
+    def __init__(self, fused: MappingStep, own: frozenset[str]) -> None:
+        self._fused, self._own = fused, own
+        self.view, self.forward, self.splats, self.accumulator = (
+            fused.view, fused.forward, fused.splats, fused.accumulator,
+        )  # fmt: skip
+
+    def images(self, target: Target, weights: Weights) -> float | Tensor:
+        """Write the gradient of every image term to the view's gradient planes; return the loss."""
+        fused = self._fused.images(target, {n: w for n, w in weights.items() if n not in self._own})
+        own, gradients = image_gradients(self.view, target, {n: w for n, w in weights.items() if n in self._own})
+        for plane, gradient in gradients:
+            plane.add_(gradient)
+        return fused + own

@@ -1,4 +1,5 @@
-"""The numbers of a pose that descent moves, additively: from numbers to pose, from a twist's gradient to theirs."""
+"""The parameters of a pose that descent changes additively: from parameters to pose, from a twist's gradient to
+theirs."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -47,9 +48,9 @@ class QuaternionMotion:
         return motion @ self.guess
 
     def gradient(self, numbers: Vector, twist: Vector) -> Vector:
-        """The motion's rotation turns the pose about the motion's translation t, so it feels g = g_φ − t × g_ρ.
+        """The motion's rotation turns the pose about the motion's translation t, so its gradient is g = g_φ − t × g_ρ.
 
-        A quaternion q feels that as 2 (0, g) ⊗ q / |q|².
+        By a quaternion q that is 2 (0, g) ⊗ q / |q|².
         """
         q, t = numbers[:4], numbers[4:]
         g = twist[3:] - np.cross(t, twist[:3])

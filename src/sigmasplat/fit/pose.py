@@ -20,7 +20,7 @@ from sigmasplat.types import Matrix
 class PoseFit:
     """T_camera_world; agreement: share of pixels seen by both map and sensor whose depths agree; overlap: share of
     sensor readings where the map has a surface; first and last loss; iterations; alignment: what found it, or None;
-    degenerate: how many directions of motion the images say nothing about (there the guess stays); exposure
+    degenerate: number of undetermined directions of motion (those keep the guess); exposure
     (a, b) of exp(a)·Ĉ + b."""
 
     T_camera_world: Matrix
@@ -45,10 +45,10 @@ def fit_pose_adam(
     """Descend L_track by Adam (`fit.descent`), on a CUDA device without the host; the best iterate wins.
 
     params [N, 17] and σ² are frozen (VarSplat §3). Ends early when a step is below `update_stop`, or when it changed
-    the loss by less than `plateau_stop` of it. Without common pixels the guess comes back. Raises BackendError where a
-    CUDA device cannot number its pairs of splats and tiles.
+    the loss by less than `plateau_stop` of it. Without common pixels the guess is returned. Raises BackendError where a
+    CUDA device has too many pairs of splats and tiles.
     """
-    params, target = params.to(view.sums.device), target.on(view.sums.device)
+    params, target = params.to(view.sums.device), target.to(view.sums.device)
     found = fits_of(view).descend(params, view, target, T_camera_world, config, iterations)
     view.forward(params, found.T_camera_world)
     agree, overlap = agreement(PoseMaps.of(view), target)

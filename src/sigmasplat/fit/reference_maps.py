@@ -11,15 +11,15 @@ from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.render.view import View
 
 ALIGN_ALPHA = 0.95
-"""Align only where the map is this opaque: there C/A and D/A are the surface's own."""
+"""Align only where the map is this opaque, so that C/A and D/A are those of the surface."""
 
 
 def reference_maps(view: View, config: TrackingConfig, moment: Tensor | None) -> ReferenceMaps:
     """Read a reference off a view's last forward pass: w̃ averaged over the channels, and the same form of U where its
     moment is given. The maps are tensors where the view's planes are.
 
-    Where the map is thin V says nothing and the weight is 1, as for depth where there is no U. A view without variance
-    gives no w̃: then gray has no weight.
+    Where the map is thin V has no meaning and the weight is 1, as for depth where there is no U. A view without
+    variance gives no w̃: then gray has no weight.
     """
     maps = PoseMaps.of(view)
     opaque, divisor = maps.alpha > ALIGN_ALPHA, maps.alpha.clamp(min=0.5)

@@ -1,4 +1,4 @@
-"""What live images are aligned to: the map rendered somewhere, or a keyframe's own image, weighed by the map's V."""
+"""References for alignment: the rendered map, or a keyframe's own image weighed by the map's V."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from sigmasplat.types import Matrix
 
 @dataclass(eq=False)
 class Reference:
-    """An image with depth and pixel weights to align others to, and where it was seen from, T_camera_world [4, 4]."""
+    """An image with depth and pixel weights to align others to, and its pose T_camera_world [4, 4]."""
 
     pyramid: Pyramid
     T_camera_world: Matrix
@@ -30,8 +30,8 @@ def live_image(view: View, color: Image, depth_m: Image, target: Target) -> Pyra
 def map_reference(params: Tensor, view: View, T_camera_world: Matrix, config: TrackingConfig) -> Reference:
     """Render the map as a reference: gray C/A and depth D/A m where it is opaque, weighed by w̃ (VarSplat §3).
 
-    params: rows [N, 17]; T_camera_world [4, 4]: where it is seen from. With depth weighed by U it is rendered twice: U
-    is about the surface that the first render finds.
+    params: rows [N, 17]; T_camera_world [4, 4]: the pose to render from. With depth weighed by U it is rendered
+    twice, as U is about the surface that the first render finds.
     """
     fits = fits_of(view)
     view.forward(params, T_camera_world)

@@ -1,4 +1,4 @@
-"""Lay a frame out as a fit wants it: image planes padded like the view's, with what can be computed once."""
+"""Lay a frame out for a fit: image planes padded like the view's."""
 
 from dataclasses import dataclass, field as dataclass_field
 
@@ -16,21 +16,22 @@ from sigmasplat.model.submap import Picture
 
 @dataclass(eq=False)
 class Target:
-    """What a view should look like: color [3, rows, columns], depth [rows, columns] m (0 = no reading or padding)."""
+    """The image that a view should render: color [3, rows, columns], depth [rows, columns] m (0 = no reading or
+    padding)."""
 
     camera: Camera
     color: Tensor
     depth: Tensor
     valid_pixels: int
-    _there: "Target | None" = dataclass_field(default=None, init=False, repr=False)
+    _on_device: "Target | None" = dataclass_field(default=None, init=False, repr=False)
 
-    def on(self, device: torch.device) -> "Target":
-        """Return the target on a device; one such copy is kept."""
+    def to(self, device: torch.device) -> "Target":
+        """Return the target on a device; the last copy is kept."""
         if self.depth.device == device:
             return self
-        if self._there is None or self._there.depth.device != device:
-            self._there = Target(self.camera, self.color.to(device), self.depth.to(device), self.valid_pixels)
-        return self._there
+        if self._on_device is None or self._on_device.depth.device != device:
+            self._on_device = Target(self.camera, self.color.to(device), self.depth.to(device), self.valid_pixels)
+        return self._on_device
 
     @staticmethod
     def of(frame: Frame, size: tuple[int, int]) -> "Target":
@@ -52,13 +53,13 @@ class Target:
         return self.depth[: self.camera.height, : self.camera.width]
 
     def picture(self) -> Picture:
-        """Return what was seen, colour in 256 steps as a camera delivers it."""
+        """Return the image, colour in 256 steps as a camera delivers it."""
         color = (self.image.numpy() * 255.0).round().clip(0, 255).astype(np.uint8)
         return Picture(np.ascontiguousarray(color), self.depth_image.numpy().copy())
 
     @staticmethod
     def of_picture(picture: Picture, camera: Camera, size: tuple[int, int]) -> "Target":
-        """Lay out what an earlier keyframe saw."""
+        """Lay out an earlier keyframe's picture."""
         return Target.of(Frame(0, 0.0, picture.unit_color, picture.depth_m, camera), size)
 
 
@@ -76,7 +77,7 @@ class Keyframe:
     movable: bool = True
     motion: VectorAdam = dataclass_field(default_factory=lambda: VectorAdam.of(6))
     visible_ids: NDArray[np.int64] | None = None
-    """Sorted ids of the splats that dominate a pixel of it; None where nobody asked."""
+    """Sorted ids of the splats that dominate a pixel of it; None where they were not computed."""
     descriptor: NDArray[np.float32] | None = None
 
     def move(self, gradient: NDArray[np.float64], rates: NDArray[np.float64]) -> None:

@@ -1,4 +1,4 @@
-"""The papers' tracking loss: which pixels count and how much, the loss and its gradient on a view's planes."""
+"""The papers' tracking loss: the weights of pixels, the loss and its gradient on a view's planes."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from sigmasplat.render.view import View
 
 @dataclass(eq=False)
 class PoseMaps:
-    """A render of the map laid beside a target: what both pose fits and the tracker's judgement read."""
+    """The maps of a render that pose fits compare with a target."""
 
     color: Tensor
     depth: Tensor
@@ -32,7 +32,7 @@ class PoseMaps:
 
 
 def agreement(maps: PoseMaps, target: Target) -> tuple[float, float]:
-    """Measure how well a render explains a depth image: (share of common pixels within 5 % or 5 cm, common share)."""
+    """Return how well a render explains a depth image: (share of common pixels within 5 % or 5 cm, common share)."""
     common = (maps.alpha > 0.5) & (target.depth_image > 0)
     surface = maps.depth / maps.alpha.clamp(min=0.5)
     close = (surface - target.depth_image).abs() < (0.05 * target.depth_image).clamp(min=0.05)
@@ -66,9 +66,9 @@ def pixel_weights(maps: PoseMaps, target: Target, color_error: Tensor, config: T
 
 
 def per_value(weight: float, mask: Tensor, channels: int, average: str) -> float:
-    """Return what an error counts in the mean: of an image's pixels all channels together, of those kept each alone.
+    """Return the weight of one error in the mean: over an image's pixels, or over the kept pixels and channels.
 
-    Without a kept pixel it counts nothing.
+    Without a kept pixel it is 0.
     """
     n = mask.numel() if average == "image" else channels * int(mask.sum())
     return weight / n if n else 0.0

@@ -1,4 +1,4 @@
-"""Fit colours that depend on where they are seen from: one mapping step with harmonics (VarSplat §7, refinement)."""
+"""Fit view-dependent colours: one mapping step with spherical harmonics (VarSplat §7, refinement)."""
 
 from typing import Protocol
 
@@ -19,7 +19,7 @@ COLORS, MEANS, SCALES = (COLUMNS[name] for name in ("colors", "means", "log_scal
 
 
 class ImageStep(Protocol):
-    """What is needed of another step: its view, and the gradient of the image terms."""
+    """The part of another step that this one uses: its view, and the gradient of the image terms."""
 
     @property
     def view(self) -> View: ...
@@ -30,30 +30,29 @@ class ImageStep(Protocol):
 
 
 class ViewDependentStep:
-    """One mapping step of a field whose colours depend on the direction they are seen from, up to a degree 1 to 3.
+    """One mapping step of a field with view-dependent colours of degree 1 to 3.
 
-    The view knows nothing of it: it renders rows that hold the colours as this camera sees them, and hands back the
-    gradient of those.
+    The view renders rows that hold the colours as this camera sees them, and returns the gradient of those rows.
     """
 
     def __init__(self, base: ImageStep, degree: int) -> None:
         self.base, self.view, self.degree = base, base.view, degree
         self.width = 3 * count(degree)
-        self._rows, self._R, self._position = torch.empty(0), torch.empty(0), torch.empty(0)
+        self.rows, self._R, self._position = torch.empty(0), torch.empty(0), torch.empty(0)
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
-        """Render the field, as it looks from there, to the view's planes."""
+        """Render the field, with the colours seen from that pose, to the view's planes."""
         self._R, t = (
             torch.as_tensor(part).to(field.params) for part in (T_camera_world[:3, :3], T_camera_world[:3, 3])
         )
         self._position = -(self._R * t[:, None]).sum(0)
-        self._rows, harmonics = field.params.clone(), field.carry("harmonics").params
+        self.rows, harmonics = field.params.clone(), field.get_or_create("harmonics").params
         ahead = field.means @ self._R[2] + t[2] > 0
         for rows in torch.split(ahead.nonzero().squeeze(1), ROWS_AT_ONCE):
             own, k = field.params.index_select(0, rows), harmonics.index_select(0, rows)
             own[:, COLORS] = view_colors(own[:, COLORS], k, own[:, MEANS], self._position, self.degree)
-            self._rows.index_copy_(0, rows, own)
-        render_for(self.view, self._rows, T_camera_world, target, weights)
+            self.rows.index_copy_(0, rows, own)
+        render_for(self.view, self.rows, T_camera_world, target, weights)
 
     def images(self, target: Target, weights: Weights) -> float | Tensor:
         """Write the gradient of every image term to the view's gradient planes; return the loss."""
@@ -67,9 +66,9 @@ class ViewDependentStep:
         Returns the pose twist [6] and the cost of the shape terms. grad2d [N] is filled as by `View.backward`.
         """
         grad, cost = torch.zeros_like(field.params), 0.0
-        twist = self.view.backward(self._rows, grad, grad2d)
-        harmonics = self._begin(field.carry("harmonics"))
-        harmonic_rates = Rates(rates.of_extra("harmonics").per_column[: self.width])
+        twist = self.view.backward(self.rows, grad, grad2d)
+        harmonics = self._begin(field.get_or_create("harmonics"))
+        harmonic_rates = Rates(rates.of_attribute("harmonics").per_column[: self.width])
         visible = self.view.visible(len(field)).nonzero().squeeze(1)
         for rows in torch.split(visible, ROWS_AT_ONCE):
             g, own, k = (x.index_select(0, rows) for x in (grad, field.params, harmonics.params))

@@ -88,7 +88,7 @@ def _reasons(maps: RescanMaps, cell_m: float) -> list[tuple[str, Mask, Callable[
 
     def describe_uncertainty(at: Mask) -> str:
         depth = f"depth ± {100.0 * np.nanmean(maps.depth_sigma_m[at]):.1f} cm"
-        color = f"σ of colour {np.nanmean(maps.color_sigma[at]) / median_sigma:.1f} times the median"
+        color = f"colour uncertainty {np.nanmean(maps.color_sigma[at]) / median_sigma:.1f} times the median"
         return ", ".join(words for words, cause in ((depth, unsure_depth), (color, unsure_color)) if cause[at].any())
 
     return [

@@ -14,7 +14,7 @@ from sigmasplat.io.binary import open_binary
 from sigmasplat.io.ply_elements import BYTE_ORDERS, MAX_HEADER_BYTES, PLY_TYPES
 from sigmasplat.model.mesh import Mesh
 
-Element = tuple[str, int, list[list[str]]]
+ElementHeader = tuple[str, int, list[list[str]]]
 
 FLOAT32, UINT32, VERTEX_TARGET, INDEX_TARGET = 5126, 5125, 34962, 34963
 """Constants of the glTF 2.0 specification."""
@@ -65,11 +65,11 @@ def _colors(vertices: NDArray[np.void]) -> NDArray[np.float32] | None:
     return np.clip(colors / np.float32(scale), 0.0, 1.0).astype(np.float32)
 
 
-def _header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
+def _header(file: BinaryIO, path: Path) -> tuple[str, list[ElementHeader]]:
     """Read the header: byte order, and name, count and properties of each element. Raises SourceError."""
     if file.readline(8).strip() != b"ply":
         raise SourceError(f"{path} is not a PLY file (its first line is not 'ply')")
-    order, elements = "", list[Element]()
+    order, elements = "", list[ElementHeader]()
     while file.tell() < MAX_HEADER_BYTES and (raw := file.readline(MAX_HEADER_BYTES)):
         words = raw.decode("ascii", "replace").split()
         if words == ["end_header"] and order:

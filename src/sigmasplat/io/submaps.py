@@ -15,7 +15,7 @@ from sigmasplat.errors import RunError
 from sigmasplat.io.atomic import make_folder
 from sigmasplat.io.tensors import open_tensors, write_tensors
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import EXTRAS, GaussianField, Rows
+from sigmasplat.model.field import ATTRIBUTES, GaussianField, Rows
 from sigmasplat.model.submap import Picture, Submap, refuse_misfit
 
 OURS = re.compile(r"submap-\d{5,}\.safetensors")
@@ -47,7 +47,7 @@ class DiskStore:
             "params": submap.field.params,
             "T_submap_camera": torch.tensor(submap.T_submap_camera, dtype=torch.float64),
             "frames": torch.tensor(submap.frames, dtype=torch.int64),
-            **{f"extra.{name}": extra.params for name, extra in submap.field.extras.items()},
+            **{f"extra.{name}": attribute.params for name, attribute in submap.field.attributes.items()},
             "colors": torch.from_numpy(np.stack([picture.color for picture in pictures])),
             "depths_m": torch.from_numpy(np.stack([picture.depth_m for picture in pictures])),
         }
@@ -58,10 +58,10 @@ class DiskStore:
     def load(self, index: int) -> Submap:
         """Read a submap without its images. Raises RunError if it is missing or damaged."""
         with self._opened(index) as file:
-            extras = {n: Rows(file.get_tensor(f"extra.{n}")) for n in EXTRAS if f"extra.{n}" in file.keys()}  # noqa: SIM118
+            attributes = {n: Rows(file.get_tensor(f"extra.{n}")) for n in ATTRIBUTES if f"extra.{n}" in file.keys()}  # noqa: SIM118
             return Submap(
                 index,
-                GaussianField(file.get_tensor("params"), extras=extras),
+                GaussianField(file.get_tensor("params"), attributes=attributes),
                 tuple(file.get_tensor("frames").tolist()),
                 file.get_tensor("T_submap_camera").numpy(),
                 Camera(**json.loads(file.metadata()["camera"])),

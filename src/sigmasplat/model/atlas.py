@@ -23,33 +23,33 @@ class Atlas:
 
     anchors: T_world_submap of each submap, the first one the identity; closing a loop changes only these.
     odometry: the same poses from tracking alone; no loop changes them.
-    keyframes: T_submap_camera of each submap's keyframes; those of the last submap change while it is mapped.
+    keyframe_poses: T_submap_camera of each submap's keyframes; those of the last submap change while it is mapped.
     places: one per frame.
     """
 
     anchors: list[Matrix] = field(default_factory=list)
     odometry: list[Matrix] = field(default_factory=list)
-    keyframes: list[list[Matrix]] = field(default_factory=list)
+    keyframe_poses: list[list[Matrix]] = field(default_factory=list)
     places: list[Place] = field(default_factory=list)
 
     def begin_submap(self, T_before_submap: Matrix | None = None) -> None:
         """Append a submap at its pose in the submap before; the first submap's frame is the world."""
         for chain in (self.anchors, self.odometry):
             chain.append(np.eye(4) if T_before_submap is None else se3.orthonormalise(chain[-1] @ T_before_submap))
-        self.keyframes.append([])
+        self.keyframe_poses.append([])
 
     def place_frame(self, T_submap_camera: Matrix) -> None:
         """Append a frame, relative to the newest keyframe of the last submap."""
-        T_keyframe_camera = se3.inverse(self.keyframes[-1][-1]) @ T_submap_camera
-        place = Place(len(self.anchors) - 1, len(self.keyframes[-1]) - 1, se3.orthonormalise(T_keyframe_camera))
+        T_keyframe_camera = se3.inverse(self.keyframe_poses[-1][-1]) @ T_submap_camera
+        place = Place(len(self.anchors) - 1, len(self.keyframe_poses[-1]) - 1, se3.orthonormalise(T_keyframe_camera))
         self.places.append(place)
 
     def T_world_camera(self, loops: bool = True) -> Matrix:
         """Return the poses of all frames [F, 4, 4]; without `loops` those of tracking alone."""
         anchors = self.anchors if loops else self.odometry
-        poses = [anchors[s] @ self.keyframes[s][k] @ T_keyframe_camera for s, k, T_keyframe_camera in self.places]
+        poses = [anchors[s] @ self.keyframe_poses[s][k] @ T_keyframe_camera for s, k, T_keyframe_camera in self.places]
         return np.array(poses).reshape(-1, 4, 4)
 
     def T_world_keyframe(self, submap: int) -> Matrix:
         """Return the poses of a submap's keyframes [K, 4, 4]."""
-        return np.array([self.anchors[submap] @ T for T in self.keyframes[submap]]).reshape(-1, 4, 4)
+        return np.array([self.anchors[submap] @ T for T in self.keyframe_poses[submap]]).reshape(-1, 4, 4)

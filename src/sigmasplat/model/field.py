@@ -19,8 +19,8 @@ COLUMNS: dict[str, slice] = {
 WIDTH = 17
 INITIAL_LOG_VARIANCE = -7.0
 """s₀ (VarSplat §1)."""
-EXTRAS = {"correlations": 3, "harmonics": 45}
-"""What splats may carry besides, and how many numbers of each. correlations: unbounded, 0 = none, their tanh are the
+ATTRIBUTES = {"correlations": 3, "harmonics": 45}
+"""Optional attributes of splats, and how many columns each has. correlations: unbounded, 0 = none, their tanh are the
 partial correlations of the colour channels red–green, red–blue, green–blue (`model.color_covariance`). harmonics:
 spherical ones of degrees 1 to 3, one by one in the order of `model.harmonics.basis`, red, green and blue of each:
 columns 3·i + channel."""
@@ -52,13 +52,13 @@ class Rows:
         """Return copies of params, both moments and last_step."""
         return self.params.clone(), self.moment1.clone(), self.moment2.clone(), self.last_step.clone()
 
-    def on(self, device: torch.device) -> "Rows":
+    def copy_to(self, device: torch.device) -> "Rows":
         """Return copies of these rows on a device."""
         params, moment1, moment2, last_step = (x.to(device, copy=True) for x in self._tensors)
         return Rows(params, moment1, moment2, last_step, self.steps)
 
     def take(self, other: "Rows") -> None:
-        """Take the state of the same rows over, from whatever device they lie on."""
+        """Copy the state of the same rows from another, from any device."""
         for mine, theirs in zip(self._tensors, other._tensors, strict=True):
             mine.copy_(theirs)
         self.steps = other.steps
@@ -68,7 +68,7 @@ class Rows:
         return self.params, self.moment1, self.moment2, self.last_step
 
     def join(self, other: "Rows") -> None:
-        """Add another's rows, wherever they lie, at the end, their optimiser state with them."""
+        """Append another's rows, from any device, with their optimiser state."""
         more = zip(self._tensors, other._tensors, strict=True)
         self.params, self.moment1, self.moment2, self.last_step = (
             torch.cat([mine, theirs.to(mine.device)]) for mine, theirs in more
@@ -86,20 +86,20 @@ class GaussianField(Rows):
 
     means: metres, world (or submap) frame; quats: wxyz, any positive norm; log_scales: log metres; opacity_logits:
     logit of opacity; colors: RGB in [0, 1]; log_variances: log σ² of observed colour about `colors` (VarSplat §3,
-    s_i). `extras` holds what only some maps need, by its name in `EXTRAS`, rows of the same splats. `ids` [N] int64
-    name splats for as long as they live, whatever row they move to; `born` is the next one free.
+    s_i). `attributes` holds what only some maps need, by its name in `ATTRIBUTES`, rows of the same splats. `ids` [N]
+    int64 identify splats whatever row they move to; `next_id` is the id of the next new splat.
     """
 
-    extras: dict[str, Rows] = dataclass_field(default_factory=dict)
+    attributes: dict[str, Rows] = dataclass_field(default_factory=dict)
     ids: Tensor = dataclass_field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
-    born: int = 0
+    next_id: int = 0
 
     def __post_init__(self) -> None:
         if self.params.ndim != 2 or self.params.shape[1] != WIDTH:
             raise SigmaSplatError(f"a field needs params [N, {WIDTH}], found {tuple(self.params.shape)}")
         super().__post_init__()
         if len(self.ids) != len(self.params) or self.ids.device != self.params.device:
-            self.ids, self.born = torch.arange(len(self.params), device=self.params.device), len(self.params)
+            self.ids, self.next_id = torch.arange(len(self.params), device=self.params.device), len(self.params)
 
     @staticmethod
     def empty() -> "GaussianField":
@@ -163,46 +163,46 @@ class GaussianField(Rows):
         """Return appearance variances σ² [N, 3] (VarSplat §1)."""
         return self.params[:, COLUMNS["log_variances"]].exp()
 
-    def carry(self, name: str) -> Rows:
-        """Return an extra by its name, zeros where the field had none yet."""
-        if name not in self.extras:
-            self.extras[name] = Rows(self.params.new_zeros(len(self), EXTRAS[name]))
-        return self.extras[name]
+    def get_or_create(self, name: str) -> Rows:
+        """Return an attribute by its name; one that the field does not have yet is created as zeros."""
+        if name not in self.attributes:
+            self.attributes[name] = Rows(self.params.new_zeros(len(self), ATTRIBUTES[name]))
+        return self.attributes[name]
 
     def append(self, other: "GaussianField") -> None:
-        """Add another field's splats, wherever they lie, at the end, with new ids; extras that only one has are 0 for
-        the other's."""
-        for name in {**self.extras, **other.extras}:
-            self.carry(name).join(other.carry(name))
-        self.ids = torch.cat([self.ids, torch.arange(self.born, self.born + len(other), device=self.ids.device)])
-        self.born += len(other)
+        """Append another field's splats, from any device, with new ids; an attribute that only one field has is 0 for
+        the other's splats."""
+        for name in {**self.attributes, **other.attributes}:
+            self.get_or_create(name).join(other.get_or_create(name))
+        self.ids = torch.cat([self.ids, torch.arange(self.next_id, self.next_id + len(other), device=self.ids.device)])
+        self.next_id += len(other)
         self.join(other)
 
-    def on(self, device: torch.device) -> "GaussianField":
-        """Return a copy of the field on a device, its extras and ids with it."""
-        extras = {name: extra.on(device) for name, extra in self.extras.items()}
+    def copy_to(self, device: torch.device) -> "GaussianField":
+        """Return a copy of the field on a device, its attributes and ids with it."""
+        attributes = {name: attribute.copy_to(device) for name, attribute in self.attributes.items()}
         params, moment1, moment2, last_step = (x.to(device, copy=True) for x in self._tensors)
         return GaussianField(
-            params, moment1, moment2, last_step, self.steps, extras, self.ids.to(device), self.born
+            params, moment1, moment2, last_step, self.steps, attributes, self.ids.to(device), self.next_id
         )  # fmt: skip
 
-    def at(self, device: torch.device) -> "GaussianField":
-        """Return the field itself where it lies on a device, else a copy of it there."""
-        return self if self.params.device == device else self.on(device)
+    def to(self, device: torch.device) -> "GaussianField":
+        """Return the field itself if it is on a device already, else a copy on it."""
+        return self if self.params.device == device else self.copy_to(device)
 
     def keep(self, rows: Tensor) -> None:
         """Keep the splats chosen by a bool mask [N] or an index tensor, drop the others."""
         if rows.dtype == torch.bool:
-            rows = rows.nonzero().squeeze(1)  # once for all: where rows lie on a device the host waits for their number
-        for part in (self, *self.extras.values()):
+            rows = rows.nonzero().squeeze(1)  # once for all parts: on a device the host waits for the number of rows
+        for part in (self, *self.attributes.values()):
             part.choose(rows)
         self.ids = self.ids[rows]
 
     def moved(self, T_new_old: Tensor) -> "GaussianField":
-        """Return the field carried by a rigid 4×4 transform: positions and rotations move, shapes and looks stay.
+        """Return the field moved by a rigid 4×4 transform: positions and rotations change, shapes and colours do not.
 
-        Looks that depend on the direction turn with it, and so do Adam's moments (the second ones as if a gradient's
-        components were independent).
+        View-dependent colours rotate with it, and so do Adam's moments (the second ones as if the components of a
+        gradient were independent).
         """
         T = T_new_old.to(self.params)
         params, moment1, moment2, last_step = self.state()
@@ -211,10 +211,12 @@ class GaussianField(Rows):
             for rows, by in ((params, matrix), (moment1, matrix), (moment2, matrix**2)):
                 rows[:, columns] = transformed(rows[:, columns], by)
         params[:, COLUMNS["means"]] += T[:3, 3]
-        extras = {name: Rows(*extra.state(), extra.steps) for name, extra in self.extras.items()}
-        if "harmonics" in extras:
-            extras["harmonics"].params = harmonics.turned(extras["harmonics"].params, T[:3, :3])
-        return GaussianField(params, moment1, moment2, last_step, self.steps, extras, self.ids.clone(), self.born)
+        attributes = {name: Rows(*attribute.state(), attribute.steps) for name, attribute in self.attributes.items()}
+        if "harmonics" in attributes:
+            attributes["harmonics"].params = harmonics.turned(attributes["harmonics"].params, T[:3, :3])
+        return GaussianField(
+            params, moment1, moment2, last_step, self.steps, attributes, self.ids.clone(), self.next_id
+        )
 
 
 def quaternion_of(R: Tensor) -> Tensor:

@@ -53,7 +53,7 @@ def view_colors(
 ) -> Tensor:
     """Return the colours [N, 3] that splats show a camera: `colors` + Σ Y(direction from camera to splat) · k.
 
-    harmonics [N, 45], columns as `model.field.EXTRAS` says; means [N, 3] and camera_position [3] in one frame, metres.
+    harmonics [N, 45], columns: `model.field.ATTRIBUTES`; means [N, 3] and camera_position [3] in one frame, metres.
     Not clamped: a colour may leave [0, 1].
     """
     n = count(degree)

@@ -77,7 +77,7 @@ struct Descent {
 
 inline void begin_level(Descent& d, int level) {
     d.level = level;
-    if (level < 0) return;                 // it was the finest: what it leaves stands
+    if (level < 0) return;                 // the finest level is done: its result is final
     d.best = d.previous = UNKNOWN_COST;
     d.taken = 0;
     d.degenerate = 6;

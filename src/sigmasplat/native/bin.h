@@ -53,7 +53,7 @@ struct Scratch {                                      // one thread's tile
 
 // The feature counts compiled in; a count between them is padded with zeros.
 constexpr int feature_slots(int k) { return k <= 4 ? 4 : k <= 7 ? 7 : k <= 11 ? 11 : 16; }
-// Floats of a row; the shortest fill a cache line, so that none lies across two.
+// Floats of a row; the shortest fill a cache line, so that no row crosses two lines.
 constexpr int floats_of_row(int k) { return k <= 8 ? 16 : GEOMETRY + (k + 3) / 4 * 4; }
 template <int K> constexpr int row_floats = floats_of_row(K);
 template <class F> SIGMA_INLINE void with_features(int k, F f) {   // K is compiled in: colour + depth pays for no variance

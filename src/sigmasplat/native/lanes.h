@@ -128,7 +128,7 @@ SIGMA_INLINE vf exp2(vf x) {
 }
 SIGMA_INLINE vf exp(vf x) { return exp2(x * 1.4426950408889634f); }
 
-// 2^x for x in [-100, 0], without `exp2`'s clamps, for a live alpha lies in [1/255, 1] (relative error 8e-8 before rounding).
+// 2^x for x in [-100, 0], without `exp2`'s clamps, as a live alpha is in [1/255, 1] (relative error 8e-8 before rounding).
 // What rounds x adds, and adders wait while the multipliers are what an alpha waits for; outside the range it is any number.
 SIGMA_INLINE vf exp2_alpha(vf x) {
     const vf shifted = x + 12582912.f, f = x - (shifted - 12582912.f);      // 1.5·2²³: its last bits hold round(x)

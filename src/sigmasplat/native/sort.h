@@ -14,7 +14,7 @@ SIGMA_INLINE bool insertion_sort(uint64_t* a, int n, int limit) {
     }
     return true;
 }
-// Sort by `bits` bits of the depth above `low`, from bit `shift` on, keeping the order of equals: PASSES digits, the least first.
+// Sort by `bits` bits of the depth above `low`, from bit `shift` on, stable: PASSES digits, the least first.
 template <int PASSES> static void radix_sort(uint64_t* a, uint64_t* spare, int n, uint32_t low, int shift, int bits) {
     const int digit = (bits + PASSES - 1) / PASSES;
     const uint32_t mask = (1u << digit) - 1;
@@ -33,7 +33,7 @@ template <int PASSES> static void radix_sort(uint64_t* a, uint64_t* spare, int n
     }
     if (from != a) memcpy(a, from, size_t(n) * sizeof *a);
 }
-// Sort (depth bits << 32 | splat) by depth, keeping the order of equals.
+// Sort (depth bits << 32 | splat) by depth; stable.
 static void sort_tile(uint64_t* a, uint64_t* spare, int n) {
     if (n <= 24) {
         insertion_sort(a, n, 24 * 24);

@@ -154,7 +154,7 @@ static void view_forward(Context* context, const float* view_numbers, const floa
     if (seconds) { seconds[0] += t1 - t0; seconds[1] += t2 - t1; seconds[2] += omp_get_wtime() - t2; }
 }
 
-// ∂L/∂(median depth) is felt by the depth of one splat a pixel; in the pixels' order, so that sums do not depend on threads.
+// ∂L/∂(median depth) goes to the depth of one splat per pixel; in the pixels' order, so that sums do not depend on threads.
 static const float* gather_median(Render& r, OutputGradients g) {
     if (!g.median_depth) return nullptr;
     float* sums = r.median_gradient.reserve(r.n + W);
@@ -250,7 +250,7 @@ static void view_backward(Context* context, const float* params, OutputGradients
     if (seconds) { seconds[0] += t1 - t0; seconds[1] += omp_get_wtime() - t1; }
 }
 
-// Backward and one Adam step in one go: no gradient row reaches memory. Splats out of view wait (adam.h), and feel no isotropy
+// Backward and one Adam step in one go: no gradient row reaches memory. Splats out of view wait (adam.h), and get no isotropy
 // term: |s − mean(s)| is a mean over all splats, max(s)/min(s) − 1 over those in view. Returns what both cost, weighted.
 static double view_step(Context* context, float* params, OutputGradients g, AdamState state, AdamOptions options,
                         StepOptions terms, float* pull, double* g_twist, double* seconds) {

@@ -1,4 +1,4 @@
-"""Give the settings of the systems by name: values only, a module for each system."""
+"""Provide the presets by name. A preset is a set of values; each system has its own module."""
 
 import dataclasses
 
@@ -12,17 +12,17 @@ PRESETS = {name: dataclasses.replace(config, name=name) for presets in SYSTEMS f
 
 
 def default_preset() -> str:
-    """Name the preset used where none is asked for: the one sized for a machine without a GPU."""
+    """Return the name of the default preset, which is sized for a machine without a GPU."""
     return "sigma"
 
 
 def list_presets() -> list[str]:
-    """List every preset's name."""
+    """List the names of all presets."""
     return sorted(PRESETS)
 
 
 def families() -> list[str]:
-    """List the presets' names in short, the default first: a pattern for each group of names that begin alike."""
+    """List the families of presets, the default first: a name, or a pattern such as varsplat-* for several names."""
     groups: dict[str, list[str]] = {}
     for name in [default_preset(), *list_presets()]:
         groups.setdefault(name.partition("-")[0], []).append(name)
@@ -30,18 +30,18 @@ def families() -> list[str]:
 
 
 def preset(name: str) -> Config:
-    """Return a preset's settings. Raises ConfigError on an unknown name, saying which are like it, or all there are."""
+    """Return the settings of a preset. Raises ConfigError on an unknown name, with similar names or all names."""
     if name not in PRESETS:
-        raise ConfigError(f"no preset {name!r}{_alike(name) or _any(name)}")
+        raise ConfigError(f"no preset {name!r}{_similar(name) or _all(name)}")
     return PRESETS[name]
 
 
-def _alike(name: str) -> str:
-    """Name the presets that begin or end with a name, empty where none does."""
-    alike = [known for known in list_presets() if known.endswith(f"-{name}") or known.startswith(f"{name}-")]
-    return f"; there are {', '.join(alike)} (and {len(PRESETS) - len(alike)} others)" if alike else ""
+def _similar(name: str) -> str:
+    """Return text with the presets that begin or end with a name, "" if there are none."""
+    similar = [known for known in list_presets() if known.endswith(f"-{name}") or known.startswith(f"{name}-")]
+    return f"; known: {', '.join(similar)} (and {len(PRESETS) - len(similar)} others)" if similar else ""
 
 
-def _any(name: str) -> str:
-    """Name the preset nearest to a name, and all."""
-    return f"{nearest(name, PRESETS)}; there are {', '.join(list_presets())}"
+def _all(name: str) -> str:
+    """Return text with the preset closest to a name, and all presets."""
+    return f"{nearest(name, PRESETS)}; known: {', '.join(list_presets())}"

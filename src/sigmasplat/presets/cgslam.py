@@ -1,12 +1,12 @@
-"""Hold CG-SLAM's settings: values only.
+"""Presets of CG-SLAM.
 
 `cgslam-*` follow the paper (ECCV 2024, arXiv 2403.16095), `cgslam-light-*` are its half-resolution variant.
-`cgslam-loops-*` are the paper's with VarSplat's submaps, loops and final map; `cgslam-fast` and `cgslam-loops-fast` are
-ours, sized for two CPU cores.
+`cgslam-loops-*` add the submaps, loops and final map of VarSplat to the paper's settings. `cgslam-fast` and
+`cgslam-loops-fast` are ours, sized for two CPU cores.
 
-The paper gives the loss weights, iterations, intervals, window, rates of poses, ψ and τ. Where it is silent the numbers
-are the code's: α_min, near plane, crops, masks, rates of splats, when they are split or dropped. Ours are
-`primitives.faded_opacity` and what happens at which step to splats that are uncertain.
+From the paper: loss weights, iterations, intervals, window, learning rates of poses, ψ and τ. From the code, where the
+paper gives no values: α_min, near plane, crops, masks, learning rates of splats, and when splats are split or removed.
+Ours: `primitives.faded_opacity`, and the steps at which uncertain splats fade and are removed.
 """
 
 import dataclasses
@@ -15,7 +15,6 @@ from sigmasplat.config import (
     Config,
     DensifyConfig,
     FinalConfig,
-    InputConfig,
     LoopConfig,
     MappingConfig,
     RegistrationConfig,
@@ -29,7 +28,7 @@ from sigmasplat.presets import varsplat
 PAPER = Config(
     render=RenderConfig(alpha_min=15.0 / 255.0, near_m=0.2),
     seeding=SeedConfig(
-        first_uniform=10_000_000,  # more than any image has: every pixel with a reading
+        first_uniform=10_000_000,  # more pixels than any image has: every pixel with a reading
         first_gradient=0,
         first_edges=False,
         later_max=0,
@@ -55,7 +54,7 @@ PAPER = Config(
         poses_from="half",
         prune_opacity=0.005,
         window=4,
-        covisibility="splats",  # both take NetVLAD's, whose weights are a download, and the paper for its speed alone
+        covisibility="splats",  # paper and code use NetVLAD, the paper only for its speed; its weights are a download
         frames_per_step=0,
     ),
     primitives=DensifyConfig(
@@ -77,108 +76,80 @@ PAPER = Config(
     registration=RegistrationConfig(uncertainty=False),
     final=FinalConfig(uncertainty=False),
 )
-"""What is common to all of the paper's."""
+"""What the data sets share."""
 
 
 def sized(config: Config, extent: float, first: float = 3e-4, last: float = 2.5e-4, log_scales: float = 1e-4) -> Config:
-    """Multiply what the code gives in units of the scene's extent by it: rates of means and scales, sizes of splats."""
-    mapping = dataclasses.replace(
-        config.mapping, lr_means_first=first * extent, lr_means=last * extent, lr_log_scales=log_scales * extent
+    """Set the values that the code gives in units of the scene's extent: rates of means and scales, sizes of splats."""
+    return config.changed(
+        mapping={"lr_means_first": first * extent, "lr_means": last * extent, "lr_log_scales": log_scales * extent},
+        primitives={"split_scale_m": 0.01 * extent, "most_scale_m": 0.1 * extent},
     )
-    primitives = dataclasses.replace(config.primitives, split_scale_m=0.01 * extent, most_scale_m=0.1 * extent)
-    return dataclasses.replace(config, mapping=mapping, primitives=primitives)
 
 
 def color_share(color: float, depth: float) -> float:
-    """Return λ1 / (λ1 + λ2): Adam does not feel the scale of a loss."""
+    """Return λ1 / (λ1 + λ2); Adam does not depend on the scale of a loss."""
     return color / (color + depth)
 
 
-# The extent is the code's for six of Replica's eight scenes; for TUM and ScanNet the median of its scenes'. No reading
-# is cut off as too far, as in the code: the PNGs end at 10, 13 and 66 m.
+# The extent is the code's value for six of Replica's eight scenes; for TUM and ScanNet it is the median of the code's
+# scenes. As in the code, max_depth_m removes no reading: the PNGs end at 10, 13 and 66 m.
 REPLICA = sized(
-    dataclasses.replace(
-        PAPER,
-        input=InputConfig(max_depth_m=10.0),
-        mapping=dataclasses.replace(
-            PAPER.mapping,
-            every=30,
-            iterations=60,
-            weight_l1=0.7,
-            weight_depth=0.25,
-            weight_alignment=0.25,
-            weight_moment=0.15,
-        ),
-        tracking=dataclasses.replace(PAPER.tracking, iterations=15, weight_color=color_share(0.2, 1.0)),
+    PAPER.changed(
+        input={"max_depth_m": 10.0},
+        mapping={
+            "every": 30, "iterations": 60, "weight_l1": 0.7, "weight_depth": 0.25, "weight_alignment": 0.25,
+            "weight_moment": 0.15,
+        },
+        tracking={"iterations": 15, "weight_color": color_share(0.2, 1.0)},
     ),
     5.0,
-)
+)  # fmt: skip
 TUM = sized(
-    dataclasses.replace(
-        PAPER,
-        input=InputConfig(max_depth_m=13.5, crop_px=8),
-        mapping=dataclasses.replace(
-            PAPER.mapping,
-            every=15,
-            iterations=50,  # the paper says 40 to 50
-            weight_l1=1.0,
-            weight_depth=0.8,
-            weight_alignment=0.5,
-            weight_moment=0.5,
-        ),
-        tracking=dataclasses.replace(PAPER.tracking, iterations=25, weight_color=color_share(1.0, 0.6)),
+    PAPER.changed(
+        input={"max_depth_m": 13.5, "crop_px": 8},
+        mapping={
+            "every": 15, "iterations": 50,  # the paper says 40 to 50
+            "weight_l1": 1.0, "weight_depth": 0.8, "weight_alignment": 0.5, "weight_moment": 0.5,
+        },
+        tracking={"iterations": 25, "weight_color": color_share(1.0, 0.6)},
     ),
     3.0,
-)
-SCANNET = sized(dataclasses.replace(TUM, input=InputConfig(max_depth_m=66.0, crop_px=10)), 2.0)
+)  # fmt: skip
+SCANNET = sized(TUM.changed(input={"max_depth_m": 66.0, "crop_px": 10}), 2.0)
 DATASETS = {"replica": REPLICA, "tum": TUM, "scannet": SCANNET}
 
-# Half of 1200 and of 640. The crop comes afterwards and takes as many pixels as before, as the code does on TUM.
+# Half of 1200 and of 640. The images are cropped afterwards by as many pixels as before, as in the code for TUM.
 LIGHT_WIDTHS = {"replica": 600, "tum": 320, "scannet": 320}
 
 
 def _with_loops(config: Config, like: Config) -> Config:
-    """Take submaps, loops, registration and final map from settings of VarSplat's, with no weight of V."""
+    """Take submaps, loops, registration and final map from a VarSplat preset, without the weights of V."""
     plain = varsplat.without_variance(like)
     return dataclasses.replace(
         config, submaps=like.submaps, loops=plain.loops, registration=plain.registration, final=plain.final
     )
 
 
-# Two CPU cores: VarSplat's numbers for these, and of them other only what is CG-SLAM's. Loss weights: the paper's for
-# Replica, with its ν and window; but one keyframe of the window a step, and no splitting.
+# For two CPU cores: the values of VarSplat's preset for these, except what is specific to CG-SLAM. Loss weights, ν and
+# window are the paper's for Replica; but each step uses one keyframe of the window, and no splats are split.
 FAST = dataclasses.replace(
-    varsplat.FAST,
-    mapping=dataclasses.replace(
-        varsplat.without_variance(varsplat.FAST).mapping,
-        weight_l1=0.7,
-        weight_ssim=0.1,
-        weight_depth=0.25,
-        weight_alignment=0.25,
-        weight_isotropy=0.0,
-        weight_isotropy_ratio=0.1,
-        weight_moment=0.15,
-        poses="all",
-        poses_from="half",
-        window=4,
-        covisibility="splats",
-        frames_per_step=1,
+    varsplat.without_variance(varsplat.FAST).changed(
+        mapping={
+            "weight_l1": 0.7, "weight_ssim": 0.1, "weight_depth": 0.25, "weight_alignment": 0.25,
+            "weight_isotropy": 0.0, "weight_isotropy_ratio": 0.1, "weight_moment": 0.15, "poses": "all",
+            "poses_from": "half", "window": 4, "covisibility": "splats", "frames_per_step": 1,
+        },
+        primitives={"uncertain_m2": 0.025, "faded_opacity": 0.07},
+        tracking={"align_depth_by": "U", "uncertainty": True},
     ),
-    primitives=dataclasses.replace(varsplat.FAST.primitives, uncertain_m2=0.025, faded_opacity=0.07),
-    tracking=dataclasses.replace(varsplat.FAST.tracking, align_depth_by="U"),
-    submaps=SubmapConfig(),
-    loops=PAPER.loops,
-    registration=PAPER.registration,
-    final=PAPER.final,
-)
+    submaps=PAPER.submaps, loops=PAPER.loops, registration=PAPER.registration, final=PAPER.final,
+)  # fmt: skip
 
 PRESETS = {
     **{f"cgslam-{name}": config for name, config in DATASETS.items()},
     **{
-        f"cgslam-light-{name}": dataclasses.replace(
-            config, input=dataclasses.replace(config.input, width=LIGHT_WIDTHS[name])
-        )
-        for name, config in DATASETS.items()
+        f"cgslam-light-{name}": config.changed(input={"width": LIGHT_WIDTHS[name]}) for name, config in DATASETS.items()
     },
     **{f"cgslam-loops-{name}": _with_loops(config, varsplat.DATASETS[name]) for name, config in DATASETS.items()},
     "cgslam-fast": FAST,

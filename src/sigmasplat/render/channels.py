@@ -1,4 +1,4 @@
-"""Lay out what pixels gather of splats, and read variances off it."""
+"""The channels that pixels sum over splats, and the variances computed from the sums."""
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ COVARIANCE_PLANES = 10
 
 
 def features_of(colors: Tensor, z: Tensor, variances: Tensor) -> Tensor:
-    """Stack what a pixel gathers of each splat: (r, g, b, z, σ² + c² ×3), [N, 7]."""
+    """Stack the channels of each splat: (r, g, b, z, σ² + c² ×3), [N, 7]."""
     return torch.cat([colors, z[:, None], variances + colors**2], 1)
 
 
@@ -20,7 +20,7 @@ def variance_of(sums: Tensor) -> Tensor:
 
 
 def covariance_features(colors: Tensor, z: Tensor, variances: Tensor, correlations: Tensor) -> Tensor:
-    """Stack what a pixel gathers where colours vary together: (r, g, b, z, Σ + c cᵀ ×6), [N, 10], as `features_of`."""
+    """Stack the channels of splats with correlated colours: (r, g, b, z, Σ + c cᵀ ×6), [N, 10], as `features_of`."""
     return torch.cat([colors, z[:, None], covariances_of(variances, correlations) + outer(colors)], 1)
 
 

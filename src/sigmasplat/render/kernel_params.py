@@ -1,4 +1,4 @@
-"""Lay out camera, pose and switches as every kernel reads them."""
+"""Lay out camera, pose and switches as all kernels read them."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +8,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.render.reference.operators import FRUSTUM_MARGIN
 
 
-def view_numbers(
+def view_params(
     camera: Camera, T_camera_world: NDArray[np.floating], options: RenderConfig, dtype: type = np.float32
 ) -> NDArray[np.floating]:
     """Lay out camera, pose and switches as the kernels' `View` (native/splat.h)."""

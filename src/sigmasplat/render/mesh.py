@@ -1,4 +1,4 @@
-"""See a mesh from a camera: depth and the face at each pixel."""
+"""Render a mesh from a camera: depth and the face at each pixel."""
 
 import numpy as np
 from numpy.typing import NDArray

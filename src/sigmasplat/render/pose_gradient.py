@@ -9,7 +9,7 @@ from torch import Tensor
 def pose_gradient(T_camera_world: Tensor, twist: NDArray[np.float64] | Tensor) -> Tensor:
     """Express a left-twist gradient (ρ, φ) as a [4, 4] matrix gradient with the same value along every rigid motion.
 
-    <G, [φ]× R | φ×t + ρ> = ρ·g_ρ + φ·g_φ for G = (½ [g_φ − t × g_ρ]× R | g_ρ). It lies where T_camera_world does.
+    <G, [φ]× R | φ×t + ρ> = ρ·g_ρ + φ·g_φ for G = (½ [g_φ − t × g_ρ]× R | g_ρ). It is on the device of T_camera_world.
     """
     T = T_camera_world.detach().double()
     g = torch.as_tensor(twist).to(T)

@@ -1,4 +1,4 @@
-"""See a field from a camera: two kernels, and algebra on what they gather (DESIGN §3)."""
+"""Render a field from a camera: two kernels, and algebra on their sums (DESIGN §3)."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ from sigmasplat.render.cuda import launch as cuda_launch
 
 @dataclass(frozen=True, eq=False)
 class Render:
-    """What a camera sees of a field, all [H, W] or [H, W, 3], covariance [H, W, 6].
+    """The maps that a camera sees of a field, all [H, W] or [H, W, 3], covariance [H, W, 6].
 
     color Ĉ = Σ w c; depth D̂ = Σ w z (m, not divided by alpha); alpha A = Σ w; variance V = Σ w (σ² + c²) − Ĉ², the law
     of total variance (VarSplat §1); uncertainty U = Σ w (z − D)² about a reference depth D (m², CG-SLAM eq. 10), None
     without one; median_depth: z where half the light is gone, 0 where it never is (CG-SLAM eq. 8); median_id,
-    dominant_id: the splat of that depth, the splat of largest weight, −1 = none; covariance: V with what lies beside
-    its diagonal, in the order rr, gg, bb, rg, rb, gb, None where the field has no `correlations`.
+    dominant_id: the splat of that depth, the splat of largest weight, −1 = none; covariance: V with its
+    off-diagonal, in the order rr, gg, bb, rg, rb, gb, None where the field has no `correlations`.
     """
 
     color: Tensor
@@ -42,19 +42,19 @@ class Render:
 
 def _colors_from(field: GaussianField, T_camera_world: Tensor) -> Tensor:
     """Return the colours [N, 3] that a camera sees."""
-    if "harmonics" not in field.extras:
+    if "harmonics" not in field.attributes:
         return field.colors
     T = T_camera_world.to(field.params)
     position = -(T[:3, :3] * T[:3, 3:]).sum(0)
-    return view_colors(field.colors, field.extras["harmonics"].params, field.means, position)
+    return view_colors(field.colors, field.attributes["harmonics"].params, field.means, position)
 
 
 def _features_from(field: GaussianField, z: Tensor, T_camera_world: Tensor) -> Tensor:
     """Return what a pixel gathers of each splat, [N, 7], or [N, 10] where colours vary together."""
     colors = _colors_from(field, T_camera_world)
-    if "correlations" not in field.extras:
+    if "correlations" not in field.attributes:
         return features_of(colors, z, field.variances)
-    return covariance_features(colors, z, field.variances, field.extras["correlations"].params)
+    return covariance_features(colors, z, field.variances, field.attributes["correlations"].params)
 
 
 def _on_device(field: GaussianField, backend: str) -> GaussianField:
@@ -62,8 +62,8 @@ def _on_device(field: GaussianField, backend: str) -> GaussianField:
     if backend_name(backend, field.params.device) != "cuda" or field.params.device.type != "cpu":
         return field
     device = cuda_launch.this_device()
-    extras = {name: Rows(extra.params.to(device)) for name, extra in field.extras.items()}
-    return GaussianField(field.params.to(device), extras=extras)
+    attributes = {name: Rows(attribute.params.to(device)) for name, attribute in field.attributes.items()}
+    return GaussianField(field.params.to(device), attributes=attributes)
 
 
 def render(
@@ -97,13 +97,13 @@ def render(
         b.median_id,
         b.dominant_id,
         b.dominant_weight,
-        covariance_of(b.sums[..., :3], b.sums[..., 4:]) if "correlations" in field.extras else None,
+        covariance_of(b.sums[..., :3], b.sums[..., 4:]) if "correlations" in field.attributes else None,
     )
 
 
 class FieldRenderer:
-    """Renders with the same settings again and again. The two fields shown last, which may not change meanwhile, are
-    brought to a device once."""
+    """Renders with the same settings repeatedly. The two fields rendered last must not change meanwhile; each is copied
+    to a device once."""
 
     def __init__(self, options: RenderConfig, backend: str) -> None:
         self.options, self.backend = options, backend

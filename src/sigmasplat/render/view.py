@@ -1,7 +1,7 @@
-"""Render the same view again and again without allocating: raw parameter rows to image planes, and gradients back.
+"""Render one camera repeatedly without allocating: raw parameter rows to image planes, and gradients back.
 
-The loops of `fit` live on this. Planes are padded to whole tiles: [rows, columns] ≥ [H, W]; what lies outside the image
-is defined but means nothing, and a loss masks it (targets have depth 0 there).
+The loops of `fit` use this. Planes are padded to whole tiles: [rows, columns] ≥ [H, W]. Values outside the image are
+defined but have no meaning, and a loss masks them (targets have depth 0 there).
 """
 
 from typing import NamedTuple, Protocol
@@ -19,8 +19,8 @@ from sigmasplat.types import Matrix
 
 
 class Layers(NamedTuple):
-    """Which splats make a pixel, planes [rows, columns]: int32 rows of the splat at median depth (CG-SLAM eq. 8) and of
-    the one of largest weight, −1 = none; their weights; median_depth in m, 0 = none."""
+    """The splats that determine a pixel, planes [rows, columns]: int32 rows of the splat at median depth (CG-SLAM eq.
+    8) and of the one of largest weight, −1 = none; their weights; median_depth in m, 0 = none."""
 
     median_id: Tensor
     median_weight: Tensor
@@ -67,17 +67,17 @@ class View(Protocol):
     layers: "Layers"
     g_moment: Tensor
     g_median_depth: Tensor
-    """Gradients of `moment` and of the layers' median depth: felt where the last forward pass made those."""
+    """Gradients of `moment` and of the layers' median depth: used if the last forward pass rendered those."""
 
     @property
     def seconds(self) -> NDArray[np.float64]:
-        """Return the time spent so far in project, sort, blend, blend backward, project backward."""
+        """Return the seconds spent so far in project, sort, blend, blend backward, project backward."""
 
     def forward(
         self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
     ) -> None:
-        """Render parameter rows [N, 17] at a pose into `sums` and `alpha`; with a depth [H, W] m into `moment` too, and
-        if asked to into `layers`."""
+        """Render parameter rows [N, 17] at a pose into `sums` and `alpha`; with a depth [H, W] m into `moment` too,
+        with layers=True into `layers` too."""
 
     def backward(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Matrix:
         """Carry the gradient planes to parameter rows, written to g_params [N, 17]; return the pose twist [6] (ρ, φ; m,
@@ -87,7 +87,7 @@ class View(Protocol):
         """Carry the gradient planes of colour and depth to the pose alone; return the twist (ρ, φ) [6]."""
 
     def visible(self, n: int) -> Tensor:
-        """Tell which of the n splats of the last forward pass reach the image, bool [n]."""
+        """Return which of the n splats of the last forward pass reach the image, bool [n]."""
 
 
 class CorrelationView(View, Protocol):

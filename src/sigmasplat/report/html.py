@@ -179,9 +179,9 @@ def _strips(contents: Contents) -> str:
     if not any(contents.strips.values()):
         return ""
     explanation = (
-        "<p class=soft>Rendered at the estimated poses. V is the variance of colour along each ray that the map itself "
-        "predicts. √V and the RMS error have separate colour scales. Where both pictures look alike, V predicts the "
-        "error well. Slate pixels: no depth reading, or no surface in the map.</p>"
+        "<p class=soft>Images are rendered at the estimated poses. V is the variance of colour along each ray that the "
+        "map predicts. The root of V and the RMS error have separate colour scales. Where both look alike, V predicts "
+        "the error well. Slate pixels: no depth reading, or no surface in the map.</p>"
     )
     parts = ["<h2>Views</h2>", explanation]
     for kind, strips in contents.strips.items():
@@ -226,7 +226,7 @@ def _figure(contents: Contents, name: str, title: str) -> str:
 
 
 def _tables(metrics: dict[str, Any]) -> str:
-    """Show all scores of pictures, path, surface and uncertainty."""
+    """Show all scores of images, path, surface and uncertainty."""
     body = "".join(
         f"<div class=card><h3>{title}</h3>{_table(rows)}</div>"
         for title, rows in tables.score_tables(metrics)

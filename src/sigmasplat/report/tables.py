@@ -70,13 +70,13 @@ def score_tables(metrics: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
 def submap_sentence(metrics: dict[str, Any]) -> str:
     """Describe how many submaps and loops there are, and how long the final map took."""
     loops, finish_s = metrics.get("loops") or {}, metrics.get("finish_s")
-    tried = f"{loops.get('tried', 0)} loops between them were tried, {loops.get('accepted', 0)} were accepted."
+    tried = f"Loops between them: {loops.get('tried', 0)} tried, {loops.get('accepted', 0)} accepted."
     after = f" The final map took {number(finish_s, 1)} s after the last frame." if finish_s is not None else ""
     return f"The map has {metrics['submaps']} submaps. {tried}{after}"
 
 
 def loop_rows(loops: list[dict[str, Any]]) -> list[list[str]]:
-    """List loops: submaps, frames, similarity, fit, correction of the relative pose, verdict."""
+    """Return one row per loop: submaps, frames, similarity, quality of fit, correction of the pose, verdict."""
     head = [
         "submaps",
         "frames",

@@ -1,1 +1,1 @@
-"""Run a sequence through SLAM into a run folder; resume, profile, show progress."""
+"""Run SLAM on a sequence into a run folder; resume a run, measure its stages, show its progress."""

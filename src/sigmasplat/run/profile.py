@@ -1,4 +1,4 @@
-"""Say where a run's time went: the kernels, the loss, the optimiser, alignment, input and the rest."""
+"""Sum a run's time by stage: kernels, loss, optimiser, alignment, input and the rest."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -12,14 +12,15 @@ STAGES: dict[str, tuple[str, ...]] = {
     "optimiser": ("project_backward",),
     "prepare": ("prepare",),
 }
-"""Stages that a step's log line counts by itself, and the counters each adds up."""
+"""Stages that the log measures directly, and the counters that make up each."""
 
 
 def profile(steps: Iterable[Mapping[str, Any]], wall_s: float) -> dict[str, float]:
-    """Add up log lines' seconds by stage; the stages sum to wall_s.
+    """Sum the seconds of log lines by stage; all stages together give wall_s.
 
-    backward: from pixels to splats; optimiser: on from there to parameters, and Adam, in one pass; align: tracking
-    without its renders; other: seeding, pruning and Python; io: waiting for frames and writing the log.
+    backward: gradients from pixels to splats; optimiser: gradients from splats to parameters and the Adam step, in one
+    pass; align: tracking without its renders; other: seeding, pruning and Python; io: waiting for frames and writing
+    the log.
     """
     lines = [step["seconds"] for step in steps]
     total = {stage: sum(line.get(name, 0.0) for line in lines for name in names) for stage, names in STAGES.items()}
@@ -31,6 +32,6 @@ def profile(steps: Iterable[Mapping[str, Any]], wall_s: float) -> dict[str, floa
 
 
 def shares(seconds: Mapping[str, float]) -> list[tuple[str, float, float]]:
-    """List (stage, seconds, share of the whole), largest first."""
+    """Return (stage, seconds, share of the total) of each stage, largest first."""
     whole = sum(seconds.values()) or 1.0
     return sorted(((name, s, s / whole) for name, s in seconds.items()), key=lambda row: -row[1])

@@ -1,4 +1,4 @@
-"""Say what a session asks of the system that it runs and of those who watch it."""
+"""Define what a session needs from the SLAM system, from callbacks and from checkpointers."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
@@ -14,7 +14,7 @@ from sigmasplat.types import Progress
 
 
 class LoopResult(Protocol):
-    """What a session reads of a pair of submaps that may be a loop (slam.loops.Loop)."""
+    """What a session reads of a tested pair of submaps (slam.loop_closure.closer.Loop)."""
 
     @property
     def query(self) -> int: ...
@@ -30,7 +30,7 @@ class LoopResult(Protocol):
 
 
 class StepResult(Protocol):
-    """What a session reads of a step (slam.slam.Step)."""
+    """What a session reads of a step (slam.step_result.Step)."""
 
     @property
     def index(self) -> int: ...
@@ -55,7 +55,7 @@ class StepResult(Protocol):
 
 
 class SlamSystem(Protocol):
-    """What a session needs of a system (slam.slam.Slam)."""
+    """What a session needs from the system that it runs (slam.slam.Slam)."""
 
     @property
     def field(self) -> GaussianField: ...
@@ -68,20 +68,20 @@ class SlamSystem(Protocol):
 
 
 class Callback(Protocol):
-    """Is told how a session goes."""
+    """Is called while a session runs."""
 
     def __call__(self, step: StepResult) -> None:
-        """Take note of a step."""
+        """Handle a step."""
 
     def finishing(self, done: int, total: int) -> None:
-        """Take note of how far the final map is."""
+        """Handle the progress of the final map."""
 
     def last_loops(self, loops: Sequence[LoopResult]) -> None:
-        """Take note of the loops tried after the last step."""
+        """Handle the loops tried after the last step."""
 
 
 class NullCallback:
-    """Takes note of nothing."""
+    """Does nothing."""
 
     def __call__(self, step: StepResult) -> None: ...
     def finishing(self, done: int, total: int) -> None: ...
@@ -89,22 +89,43 @@ class NullCallback:
 
 
 class CallbackList:
-    """Several watchers, told one after the other."""
+    """Calls several callbacks in order."""
 
-    def __init__(self, *watchers: Callback) -> None:
-        self.watchers = watchers
+    def __init__(self, *callbacks: Callback) -> None:
+        self.callbacks = callbacks
 
     def __call__(self, step: StepResult) -> None:
-        """Take note of a step."""
-        for watcher in self.watchers:
-            watcher(step)
+        """Pass on a step."""
+        for callback in self.callbacks:
+            callback(step)
 
     def finishing(self, done: int, total: int) -> None:
-        """Take note of how far the final map is."""
-        for watcher in self.watchers:
-            watcher.finishing(done, total)
+        """Pass on the progress of the final map."""
+        for callback in self.callbacks:
+            callback.finishing(done, total)
 
     def last_loops(self, loops: Sequence[LoopResult]) -> None:
-        """Take note of the loops tried after the last step."""
-        for watcher in self.watchers:
-            watcher.last_loops(loops)
+        """Pass on the loops tried after the last step."""
+        for callback in self.callbacks:
+            callback.last_loops(loops)
+
+
+class Checkpointer(Protocol):
+    """Saves the state that a stopped run resumes from (resume.StateFile)."""
+
+    def after_frame(self, index: int, wall_s: float) -> None:
+        """Save the state after source frame `index` if it is time to."""
+
+    def save(self, index: int, wall_s: float) -> None:
+        """Save the state after source frame `index`, `wall_s` seconds into the run."""
+
+    def delete(self) -> None:
+        """Delete the saved state."""
+
+
+class NullCheckpointer:
+    """Saves nothing."""
+
+    def after_frame(self, index: int, wall_s: float) -> None: ...
+    def save(self, index: int, wall_s: float) -> None: ...
+    def delete(self) -> None: ...

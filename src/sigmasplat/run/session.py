@@ -1,48 +1,79 @@
-"""Take a sequence through SLAM into a run folder that is valid however the run ends."""
+"""Run SLAM on a sequence and keep the results in a run folder that stays readable however the run ends.
+
+In order: a new folder; for each frame a step, a line of the log, the callback and now and then a checkpoint; the final
+map; the results. The command (`commands/run.py`) opens the source before that and scores the run afterwards.
+"""
 
 import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any
 
 from sigmasplat.config import Config
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.run.profile import profile
-from sigmasplat.run.protocols import Callback, NullCallback, SlamSystem, StepResult
+from sigmasplat.run.protocols import (
+    Callback,
+    Checkpointer,
+    NullCallback,
+    NullCheckpointer,
+    SlamSystem,
+    StepResult,
+)
 from sigmasplat.sources.base import Source
 
 RUNS = Path("runs")
 
 
 def new_folder(out: Path | None, config: Config, source: Source, overwrite: bool = False, **facts: Any) -> RunFolder:
-    """Start a run folder and note facts in its run.json; without `out` it is runs/SOURCE-PRESET, numbered where taken.
+    """Create a run folder and write facts to its run.json; the default is runs/SOURCE-PRESET, numbered if it exists.
 
-    Raises RunError if it cannot be written, or holds something and may not be overwritten.
+    Raises RunError if it cannot be written, or if it is not empty and may not be overwritten.
     """
     plain_name = "".join(c if c.isalnum() or c in "._-" else "-" for c in source.name).strip("-.") or "run"
     default = RUNS / f"{plain_name}-{config.name}"
-    folder = RunFolder.create(out or (default if overwrite else free(default)), config, source.name, overwrite)
+    folder = RunFolder.create(out or (default if overwrite else unused_path(default)), config, source.name, overwrite)
     folder.note(**facts)
     return folder
 
 
-def free(wanted: Path) -> Path:
-    """Return the path itself, or with -2, -3, … the first that holds nothing."""
-    taken, number = wanted, 1
-    while taken.exists() and not (taken.is_dir() and not any(taken.iterdir())):
+def unused_path(wanted: Path) -> Path:
+    """Return the path itself, or the first of path-2, path-3, … that does not exist or is an empty folder."""
+    path, number = wanted, 1
+    while path.exists() and not (path.is_dir() and not any(path.iterdir())):
         number += 1
-        taken = wanted.with_name(f"{wanted.name}-{number}")
-    return taken
+        path = wanted.with_name(f"{wanted.name}-{number}")
+    return path
+
+
+@contextmanager
+def removed_on_early_failure(run: RunFolder) -> Iterator[None]:
+    """Remove a new run folder if the block fails before the run has results.
+
+    The folder stays if it holds a log, a recording or a file of the user's. An empty runs/ is removed too.
+    """
+    try:
+        yield
+    except BaseException:
+        # run.json goes last: it marks the folder as ours, so that after a kill in between --overwrite still accepts it.
+        written_first = [run.path / "config.json", run.path / "run.json"]
+        if {*run.path.rglob("*")} <= {run.images, *written_first}:
+            for file in written_first:
+                file.unlink(missing_ok=True)
+            for folder in (run.images, run.path, RUNS):
+                with suppress(OSError):
+                    folder.rmdir()
+        raise
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a session ended: status complete or interrupted; wall_s covers the frames, not what is done after them."""
+    """How a session ended: "complete" or "interrupted", and its counts. wall_s covers the frames, not the final map."""
 
     status: str
     frames: int
@@ -52,137 +83,129 @@ class Outcome:
     loops_closed: int = 0
     loops_refused: int = 0
 
-    def counts(self) -> str:
-        """Say in words what was done."""
+    def summary(self) -> str:
+        """Return the counts as text."""
         line = f"{self.frames} frames, {self.lost} lost, {self.frames / self.wall_s:.1f} frames/s"
         if self.submaps > 1:
             line += f", {self.submaps} submaps, loops: {self.loops_closed} closed, {self.loops_refused} refused"
         return line
 
 
-class Checkpointer(Protocol):
-    """Keeps what a run needs to go on after a stop (snapshots.Snapshots)."""
+@dataclass(eq=False)
+class Session:
+    """A run of SLAM on a source, from its frame `first_index` on; a resumed run has already taken `wall_s` seconds."""
 
-    def after_frame(self, index: int, wall_s: float) -> None: ...
-    def keep(self, index: int, wall_s: float) -> None: ...
-    def drop(self) -> None: ...
-
-
-def record(
-    slam: SlamSystem,
-    source: Source,
-    run: RunFolder,
-    watch: Callback | None = None,
-    keeper: Checkpointer | None = None,
-    first: int = 0,
-    spent_s: float = 0.0,
-) -> Outcome:
-    """Track and map every frame, a log line each, and finish; then write trajectory, map, loops and checkpoint.
-
-    A session that goes on begins at the source's frame `first`, `spent_s` seconds having been spent before.
-
-    These are written also where the session is cut short. The first Ctrl-C ends it after the frame in work, or where
-    finishing next tells how far it is; a second one at once: all end as "interrupted", and frames cut short are not
-    finished. A live sequence has no other end: there the first Ctrl-C ends the frames, and they are finished. Any other
-    exception leaves the same files, marks the run "failed", and carries the run folder's path in a note.
-    """
-    tally, watch, keeper = _Tally.of(run, first, spent_s), watch or NullCallback(), keeper or _Unkept()
-    status = "failed"
-    try:
-        with interrupt_asked() as asked:
-            complete = _follow(slam, source, run, watch, keeper, tally, asked)
-            if complete:
-                _finish(slam, run, watch, asked)
-            status = "complete" if complete else "interrupted"
-    except KeyboardInterrupt:
-        status = "interrupted"
-    except Exception as problem:
-        if tally.frames:
-            problem.add_note(f"the run up to frame {tally.frames} is in {run.path}")
-        raise
-    finally:
-        _save(slam, run, tally)
-        run.note(status=status, wall_s=tally.wall_s, skipped=source.skipped)
-    if status == "complete":
-        keeper.drop()
-    closed = sum(loop.accepted for loop in slam.loops)
-    return Outcome(
-        status, tally.frames, tally.lost, tally.wall_s, tally.submaps, closed, len(slam.loops) - closed
-    )  # fmt: skip
-
-
-@dataclass
-class _Tally:
-    frames: int = 0
-    lost: int = 0
-    submaps: int = 1
+    slam: SlamSystem
+    source: Source
+    run: RunFolder
+    callback: Callback = field(default_factory=NullCallback)
+    checkpointer: Checkpointer = field(default_factory=NullCheckpointer)
+    first_index: int = 0
     wall_s: float = 0.0
-    first: int = 0
+    frames: int = field(default=0, init=False)
+    lost: int = field(default=0, init=False)
+    submaps: int = field(default=1, init=False)
 
-    @staticmethod
-    def of(run: RunFolder, first: int, spent_s: float) -> "_Tally":
-        """Begin where an earlier session of the run stopped."""
-        log = run.read_log() if first else []
-        lost, submaps = sum(line["lost"] for line in log), 1 + (log[-1]["submap"] if log else 0)
-        return _Tally(len(log), lost, submaps, spent_s, first)
+    def execute(self) -> Outcome:
+        """Process all frames, make the final map, and write trajectory, map, loops and checkpoint.
 
+        The results are written also if the session is cut short. The first Ctrl-C stops after the current frame, or at
+        the next progress report of the final map; a second one stops at once. Both end as "interrupted", and a session
+        interrupted between frames makes no final map. A live source has no other end than Ctrl-C: the first one ends
+        its frames, and the final map is made. Any other exception marks the run as "failed" and gets a note with the
+        path of the run folder.
+        """
+        if self.first_index:
+            self._count_earlier_frames()
+        status = "failed"
+        try:
+            with interrupt_event() as interrupt:
+                complete = self._process_frames(interrupt)
+                if complete:
+                    self._finish(interrupt)
+                status = "complete" if complete else "interrupted"
+        except KeyboardInterrupt:
+            status = "interrupted"
+        except Exception as problem:
+            if self.frames:
+                problem.add_note(f"the run up to frame {self.frames} is in {self.run.path}")
+            raise
+        finally:
+            self._write_results()
+            self.run.note(status=status, wall_s=self.wall_s, skipped=self.source.skipped)
+        if status == "complete":
+            self.checkpointer.delete()
+        return self._outcome(status)
 
-class _Unkept:
-    def after_frame(self, index: int, wall_s: float) -> None: ...
-    def keep(self, index: int, wall_s: float) -> None: ...
-    def drop(self) -> None: ...
+    def _count_earlier_frames(self) -> None:
+        """Take the counts of a resumed run from its log."""
+        log = self.run.read_log()
+        self.frames, self.lost = len(log), sum(line["lost"] for line in log)
+        self.submaps = 1 + (log[-1]["submap"] if log else 0)
 
+    def _process_frames(self, interrupt: threading.Event) -> bool:
+        """Step through the frames until they end or Ctrl-C stops them; return whether all frames were processed."""
+        earlier_s, started_s, frame = self.wall_s, time.perf_counter(), None
+        try:
+            for frame in self.source.frames_from(self.first_index):
+                step = self.slam.step(frame)
+                self._log(step)
+                self.wall_s = earlier_s + time.perf_counter() - started_s
+                self.callback(step)
+                self.checkpointer.after_frame(frame.index, self.wall_s)
+                if interrupt.is_set():
+                    break
+        finally:
+            self.wall_s = earlier_s + time.perf_counter() - started_s
+        if frame is not None:
+            self.checkpointer.save(frame.index, self.wall_s)
+        if self.source.live:
+            interrupt.clear()  # this Ctrl-C has ended the live frames; the next one interrupts the final map
+        return not interrupt.is_set()
 
-def _follow(
-    slam: SlamSystem,
-    source: Source,
-    run: RunFolder,
-    watch: Callback,
-    keeper: Checkpointer,
-    tally: _Tally,
-    asked: threading.Event,
-) -> bool:
-    """Step through the frames until they end or Ctrl-C asked to stop; return whether it was the frames that ended."""
-    started_s, spent_s, frame = time.perf_counter(), tally.wall_s, None
-    try:
-        for frame in source.frames_from(tally.first):
-            step = slam.step(frame)
-            run.log(log_line(step))
-            if step.loops:
-                _write_loops(slam, run)
-            tally.frames += 1
-            tally.lost += step.lost
-            tally.submaps = step.submap + 1
-            tally.wall_s = spent_s + time.perf_counter() - started_s
-            watch(step)
-            keeper.after_frame(frame.index, tally.wall_s)
-            if asked.is_set():
-                break
-    finally:
-        tally.wall_s = spent_s + time.perf_counter() - started_s
-    if frame is not None:
-        keeper.keep(frame.index, tally.wall_s)
-    if source.live:
-        asked.clear()  # Ctrl-C is how a live sequence ends; the next one cuts its finishing short
-    return not asked.is_set()
+    def _log(self, step: StepResult) -> None:
+        """Append the step to log.jsonl, update loops.json if loops were tried, and count the frame."""
+        self.run.log(log_line(step))
+        if step.loops:
+            self._write_loops()
+        self.frames += 1
+        self.lost += step.lost
+        self.submaps = step.submap + 1
 
+    def _finish(self, interrupt: threading.Event) -> None:
+        """Make the final map and write how long it took. Raises KeyboardInterrupt after Ctrl-C."""
 
-def _finish(slam: SlamSystem, run: RunFolder, watch: Callback, asked: threading.Event) -> None:
-    """Make the final map and note how long it took. Raises KeyboardInterrupt if Ctrl-C asks to stop."""
+        def progress(done: int, total: int) -> None:
+            self.callback.finishing(done, total)
+            if interrupt.is_set():
+                raise KeyboardInterrupt
 
-    def progress(done: int, total: int) -> None:
-        watch.finishing(done, total)
-        if asked.is_set():
-            raise KeyboardInterrupt
+        before, started_s = len(self.slam.loops), time.perf_counter()
+        self.slam.finish(progress)
+        self.run.note(finish_s=time.perf_counter() - started_s)
+        self.callback.last_loops(self.slam.loops[before:])
 
-    before, started_s = len(slam.loops), time.perf_counter()
-    slam.finish(progress)
-    run.note(finish_s=time.perf_counter() - started_s)
-    watch.last_loops(slam.loops[before:])
+    def _write_results(self) -> None:
+        """Write the results of the frames so far. The map is the last file because it takes longest."""
+        if self.frames == 0:
+            return
+        self.run.write_trajectory(self.slam.trajectory())
+        self._write_loops()
+        self.run.write_checkpoint(self.slam.checkpoint(), {"frames": str(self.frames)})
+        self.run.write_profile(profile(self.run.read_log(), self.wall_s))
+        self.run.write_map(self.slam.field)
+
+    def _write_loops(self) -> None:
+        self.run.write_loops([loop.record() for loop in self.slam.loops])
+
+    def _outcome(self, status: str) -> Outcome:
+        closed = sum(loop.accepted for loop in self.slam.loops)
+        refused = len(self.slam.loops) - closed
+        return Outcome(status, self.frames, self.lost, self.wall_s, self.submaps, closed, refused)
 
 
 def log_line(step: StepResult) -> dict[str, Any]:
-    """Return a step as the record of log.jsonl: T_world_camera as 4 rows, times in seconds; loops if any were tried."""
+    """Return a step as a record of log.jsonl: T_world_camera as 4 rows, times in seconds, loops if any were tried."""
     line = {
         "index": step.index,
         "timestamp_s": step.timestamp_s,
@@ -197,38 +220,23 @@ def log_line(step: StepResult) -> dict[str, Any]:
     return line | {"loops": [loop.record() for loop in step.loops]} if step.loops else line
 
 
-def _save(slam: SlamSystem, run: RunFolder, tally: _Tally) -> None:
-    """Write what the frames so far have made, the map last: it takes longest."""
-    if tally.frames == 0:
-        return
-    run.write_trajectory(slam.trajectory())
-    _write_loops(slam, run)
-    run.write_checkpoint(slam.checkpoint(), {"frames": str(tally.frames)})
-    run.write_profile(profile(run.read_log(), tally.wall_s))
-    run.write_map(slam.field)
-
-
-def _write_loops(slam: SlamSystem, run: RunFolder) -> None:
-    run.write_loops([loop.record() for loop in slam.loops])
-
-
 @contextmanager
-def interrupt_asked() -> Iterator[threading.Event]:
-    """Turn the first Ctrl-C into an event, so that no step is cut in half; the next one acts as ever.
+def interrupt_event() -> Iterator[threading.Event]:
+    """Turn the first Ctrl-C into an event, so that no step is cut in half; the next one raises KeyboardInterrupt.
 
-    Outside the main thread, where signals cannot be handled, the event is never set.
+    Outside the main thread signals cannot be handled, and the event is never set.
     """
-    asked = threading.Event()
+    interrupt = threading.Event()
     if threading.current_thread() is not threading.main_thread():
-        yield asked
+        yield interrupt
         return
 
-    def ask(signum: int, frame: FrameType | None) -> None:
-        asked.set()
+    def on_signal(signum: int, frame: FrameType | None) -> None:
+        interrupt.set()
         signal.signal(signal.SIGINT, earlier)
 
-    earlier = signal.signal(signal.SIGINT, ask)
+    earlier = signal.signal(signal.SIGINT, on_signal)
     try:
-        yield asked
+        yield interrupt
     finally:
         signal.signal(signal.SIGINT, earlier)

@@ -1,4 +1,4 @@
-"""Show a run on a terminal, or as plain lines where there is none."""
+"""Show a run on a terminal, or as plain lines if the output is not a terminal."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -26,9 +26,9 @@ from sigmasplat.types import Progress
 
 PLAIN_LINES_EVERY_S = 10.0
 Show = Callable[[int, int | None, str], None]
-"""Shows how much is done, of how many (None: as said at the beginning), and a text."""
+"""Shows (done, total, text); total None: as given at the start."""
 Begin = Callable[[str, int | None], Show]
-"""Begins to count something, of how many (None: not known yet)."""
+"""Starts a counter with (title, total); total None: not known yet."""
 
 
 class Screen:
@@ -48,14 +48,17 @@ class Screen:
 
     @contextmanager
     def steps(self, total: int | None, done: int = 0) -> Iterator["_StepShow"]:
-        """Show a session, total None where its length is not known: a bar with frames/s, splats and lost frames; a line
-        where tracking is lost or a loop closed; a bar for the final map."""
+        """Show a session of `total` frames, None if unknown.
+
+        One bar shows frames/s, splats and lost frames, another one the final map. Lost tracking and closed loops are
+        printed as lines.
+        """
         with self._counters() as begin:
             yield _StepShow(self.say, begin, total, done)
 
     @contextmanager
     def counting(self, title: str) -> Iterator[Progress]:
-        """Show a count (done, total)."""
+        """Show a counter; the yielded function takes (done, total)."""
         with self._counters() as begin:
             show = begin(title, None)
             show(0, None, "")
@@ -63,7 +66,7 @@ class Screen:
 
     @contextmanager
     def transfers(self) -> Iterator[Callable[[str, int, int], None]]:
-        """Show what is copied, a bar each: (title, bytes done, bytes in all; 0 where not known)."""
+        """Show a bar per file transfer; the yielded function takes (title, bytes done, bytes in total or 0)."""
         shows: dict[str, Show] = {}
         with self._counters(of_bytes=True) as begin:
 
@@ -85,7 +88,7 @@ class Screen:
             yield partial(_bar, bars)
 
     def results(self, metrics: dict[str, Any]) -> None:
-        """Print the figures of first interest as a table, and plainly where tracking was lost."""
+        """Print the main figures as a table, and the frames on which tracking was lost."""
         table = Table("", "value", "")
         table.columns[1].justify = "right"
         for name, value, unit in _figures(metrics):
@@ -95,10 +98,10 @@ class Screen:
         if lost:
             frames = metrics.get("frames")
             where = format_ranges(lost)
-            self.say(f"tracking was LOST on {len(lost)} of {frames} frames: {where}; do not trust those poses")
+            self.say(f"tracking was LOST on {len(lost)} of {frames} frames: {where}; their poses are unreliable")
 
     def profile(self, seconds: Mapping[str, float]) -> None:
-        """Print where the time went, a stage a line."""
+        """Print the time of each stage."""
         table = Table("stage", "seconds", "share")
         for column in table.columns[1:]:
             column.justify = "right"
@@ -112,7 +115,7 @@ def _console(stderr: bool) -> Console:
 
 
 def _figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Return the report's headline with the training views' PSNR after that of the held-out ones."""
+    """Return the main figures of the report, with the PSNR of training views added after that of held-out views."""
     rows = headline(metrics)
     kinds = {"PSNR, training": metrics.get("training") or {}}
     if metrics.get("training_submaps"):
@@ -123,45 +126,45 @@ def _figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
 
 
 def _bar(bars: Bars, title: str, total: int | None) -> Show:
-    """Add a bar to those shown."""
+    """Add a bar."""
     task = bars.add_task(title, total=total, text="")
     return lambda done, known, text: bars.update(task, completed=done, total=known or total, text=text)
 
 
 class _StepShow:
-    """Turn steps into text for a bar, and losses and loops into lines."""
+    """Callback that shows steps as text of a bar, and lost tracking and loops as lines."""
 
     def __init__(self, say: Callable[[str], None], begin: Begin, total: int | None, done: int = 0) -> None:
         self.say, self.begin, self.show = say, begin, begin("SLAM", total)
         self.show_final: Show | None = None
         self.started_s = time.perf_counter()
-        self.done, self.lost, self.before = done, 0, done
+        self.done, self.lost, self.earlier = done, 0, done
         self.lost_since: int | None = None
 
     def __call__(self, step: StepResult) -> None:
         self.done += 1
         self.lost += step.lost
-        self._tell_losses(step)
-        self._tell_loops(f"frame {step.index}", step.loops)
-        speed = (self.done - self.before) / max(time.perf_counter() - self.started_s, 1e-9)
+        self._print_lost(step)
+        self._print_loops(f"frame {step.index}", step.loops)
+        speed = (self.done - self.earlier) / max(time.perf_counter() - self.started_s, 1e-9)
         self.show(self.done, None, f"{speed:.1f} frames/s  {step.splats:,} splats  {self.lost} lost")
 
     def finishing(self, done: int, total: int) -> None:
-        """Show how far the final map is."""
+        """Show the progress of the final map."""
         self.show_final = self.show_final or self.begin("final map", total)
         self.show_final(done, total, "")
 
     def last_loops(self, loops: Sequence[LoopResult]) -> None:
-        """Tell the loops closed after the last frame."""
-        self._tell_loops("at the end", loops)
+        """Print the loops closed after the last frame."""
+        self._print_loops("at the end", loops)
 
-    def _tell_loops(self, when: str, loops: Sequence[LoopResult]) -> None:
+    def _print_loops(self, when: str, loops: Sequence[LoopResult]) -> None:
         for loop in loops:
             if loop.accepted:
                 figures = f"residual {loop.residual:.3f}, moved {100.0 * loop.translation_m:.1f} cm"
                 self.say(f"{when}: loop closed between submaps {loop.query} and {loop.database} ({figures})")
 
-    def _tell_losses(self, step: StepResult) -> None:
+    def _print_lost(self, step: StepResult) -> None:
         where = f"frame {step.index} (t = {step.timestamp_s:.3f} s)"
         if step.lost and self.lost_since is None:
             self.lost_since = step.index
@@ -172,7 +175,7 @@ class _StepShow:
 
 
 class _PlainShow:
-    """Print a line where nothing is done yet, now and then, and at the end."""
+    """Print a line at the start, every few seconds, and at the end."""
 
     def __init__(
         self, say: Callable[[str], None], written: Callable[[int], str], title: str, total: int | None

@@ -67,9 +67,9 @@ def too_large(
     most_scale_m: float,
     most_radius_px: float,
 ) -> Tensor:
-    """Tell which splats [N] are larger than `most_scale_m`, or than `most_radius_px` in the image (3 σ), 0 = off.
+    """Return which splats [N] are larger than `most_scale_m`, or than `most_radius_px` in the image (3 σ); 0 = off.
 
-    In the image are those before the camera whose centres the image shows.
+    The second limit applies to splats in front of the camera whose centres are inside the image.
     """
     if not (most_scale_m > 0 or most_radius_px > 0):
         return torch.zeros(len(field), dtype=torch.bool, device=field.params.device)
@@ -85,8 +85,8 @@ def too_large(
 
 def _copies(field: GaussianField, rows: Tensor) -> GaussianField:
     """Copy rows with what they carry besides, Adam's state at rest."""
-    extras = {name: Rows(extra.params[rows]) for name, extra in field.extras.items()}
-    return GaussianField(field.params[rows], extras=extras)
+    attributes = {name: Rows(attribute.params[rows]) for name, attribute in field.attributes.items()}
+    return GaussianField(field.params[rows], attributes=attributes)
 
 
 def _scatter(field: GaussianField, random: np.random.Generator) -> None:

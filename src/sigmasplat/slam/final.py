@@ -1,5 +1,5 @@
-"""Make one map of all submaps once the frames have ended: merge them, or seed anew on their surface; refine it over
-every keyframe (VarSplat §7)."""
+"""The final map: merge all submaps, or seed new splats on their surface, and refine over all keyframes (VarSplat
+§7)."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -26,7 +26,7 @@ from sigmasplat.slam.fusion import count_keyframes, fuse, fusion_views
 from sigmasplat.types import Matrix, Progress
 
 CACHE_BYTES = 64 << 20
-"""Of pictures laid out for the fit; the others are read again when drawn."""
+"""Memory for prepared pictures; other pictures are read again when they are drawn."""
 
 
 def final_map(
@@ -37,24 +37,23 @@ def final_map(
     random: np.random.Generator,
     progress: Progress = lambda done, total: None,
 ) -> GaussianField:
-    """Return the map in the world, of submaps at `anchors` (T_world_submap [4, 4] each), refined through `view`.
+    """Return the map in the world, made of submaps at `anchors` (T_world_submap [4, 4] each) and refined with `view`.
 
-    `progress` is told (steps of refinement done, of how many). Memory holds this map, one submap and some pictures.
-    Raises SigmaSplatError if there is no submap, one without an anchor, or one of another camera than the view's;
-    ConfigError on settings out of range.
+    Calls `progress(steps done, total)`. Memory holds this map, one submap and some pictures. Raises SigmaSplatError if
+    there is no submap, a submap has no anchor, or its camera is not the view's; ConfigError on settings out of range.
     """
     _refuse_misfits(store, anchors, config.final)
     seed = seeded_on_surface if config.final.seed_from == "mesh" else merged
     field = seed(store, anchors, config)
     if not config.final.iterations:
         return field
-    there = field.at(view.sums.device)
-    refine(there, Keyframes(store, anchors, view), config, view, random, progress)
-    return there.at(field.params.device)
+    on_device = field.to(view.sums.device)
+    refine(on_device, KeyframeReader(store, anchors, view), config, view, random, progress)
+    return on_device.to(field.params.device)
 
 
 def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix], final: FinalConfig) -> None:
-    """Raise SigmaSplatError or ConfigError on what no final map can be made of."""
+    """Raise SigmaSplatError or ConfigError if no final map can be made."""
     if not 0 < len(store) <= len(anchors):
         raise SigmaSplatError(f"no final map without submaps and their anchors: {len(store)} and {len(anchors)} given")
     count(final.sh_degree)
@@ -67,22 +66,25 @@ def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix], final: FinalC
 
 
 def merged(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> GaussianField:
-    """Join all submaps' splats in the world (anchors: T_world_submap [4, 4]), without doubles (`survivors`)."""
+    """Merge the splats of all submaps in the world (anchors: T_world_submap [4, 4]), without duplicates
+    (`survivors`)."""
     field, owner = GaussianField.empty(), list[NDArray[np.int64]]()
     for index in range(len(store)):
         part = _in_world(store, anchors, index)
         owner.append(np.full(len(part), index))
         field.append(part)
-    unsteady = _log_variance(field) if config.final.uncertainty else None
-    keep = survivors(field.means.numpy(), np.concatenate(owner), unsteady, config.final.spacing_m)
+    log_variance = _log_variance(field) if config.final.uncertainty else None
+    keep = survivors(field.means.numpy(), np.concatenate(owner), log_variance, config.final.spacing_m)
     field.keep(torch.from_numpy(keep))
     return field
 
 
 def _in_world(store: SubmapStore, anchors: Sequence[Matrix], index: int) -> GaussianField:
-    """Return a submap's splats in the world, their optimiser state left behind."""
+    """Return a submap's splats in the world, without optimiser state."""
     part = store.load(index).field.moved(torch.from_numpy(anchors[index]))
-    return GaussianField(part.params, extras={name: Rows(extra.params) for name, extra in part.extras.items()})
+    return GaussianField(
+        part.params, attributes={name: Rows(attribute.params) for name, attribute in part.attributes.items()}
+    )
 
 
 def _log_variance(field: GaussianField) -> NDArray[np.float64]:
@@ -93,20 +95,20 @@ def _log_variance(field: GaussianField) -> NDArray[np.float64]:
 def survivors(
     means: NDArray[np.floating],
     owner: NDArray[np.int64],
-    unsteady: NDArray[np.float64] | None,
+    log_variance: NDArray[np.float64] | None,
     spacing_m: float,
 ) -> NDArray[np.bool_]:
-    """Tell which splats stay, bool [N], so that each voxel of `spacing_m` keeps those of one submap only.
+    """Return which splats to keep, bool [N]: in each voxel of `spacing_m` only the splats of one submap.
 
-    means [N, 3] m, world; owner [N]: which submap each is of. It is the submap whose splats there are steadier, by the
-    mean of `unsteady` [N] (log σ²); without that, and of equals, the earlier one.
+    means [N, 3] m, world; owner [N]: the submap of each splat; log_variance [N]: log σ². The submap with the lowest
+    mean log σ² in the voxel is kept; without log_variance, or between equal means, the earlier submap.
     """
     submaps = int(owner.max(initial=0)) + 1
     _, voxel = np.unique(packed(np.floor(means / spacing_m).astype(np.int64)), return_inverse=True)
     pairs, pair = np.unique(voxel * submaps + owner, return_inverse=True)
     place, score = pairs // submaps, np.zeros(len(pairs))
-    if unsteady is not None:
-        score += np.bincount(pair, unsteady) / np.bincount(pair)
+    if log_variance is not None:
+        score += np.bincount(pair, log_variance) / np.bincount(pair)
     order = np.lexsort((pairs % submaps, score, place))
     _, first = np.unique(place[order], return_index=True)
     return np.isin(pair, order[first])
@@ -116,10 +118,10 @@ def survivors(
 
 
 def seeded_on_surface(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> GaussianField:
-    """Place splats on the surface that the submaps show, `spacing_m` apart and as large (VarSplat §7).
+    """Place splats on the fused surface of the submaps, with distance and size `spacing_m` (VarSplat §7).
 
-    anchors: T_world_submap [4, 4] of each submap. Their σ² is the nearest submap splat's, with `final.uncertainty` off
-    the initial one. Raises SigmaSplatError if no surface is shown.
+    anchors: T_world_submap [4, 4] of each submap. A splat gets the σ² of the nearest submap splat, or the initial σ² if
+    `final.uncertainty` is off. Raises SigmaSplatError if there is no surface.
     """
     final = config.final
     mesh = fuse(fusion_views(store, anchors), count_keyframes(store), config, weigh=final.uncertainty)
@@ -146,7 +148,8 @@ def thinned_vertices(mesh: Mesh, spacing_m: float) -> tuple[Matrix, Matrix]:
 
 
 def nearest_log_variances(points: Matrix, store: SubmapStore, anchors: Sequence[Matrix]) -> Tensor:
-    """Return log σ² [M, 3] of the splat nearest to each point [M, 3] m, of submaps at T_world_submap [4, 4] each."""
+    """Return log σ² [M, 3] of the splat nearest to each point [M, 3] m; anchors: T_world_submap [4, 4] of each
+    submap."""
     found, distance = torch.full((len(points), 3), INITIAL_LOG_VARIANCE), np.full(len(points), np.inf)
     for index in range(len(store)):
         part = _in_world(store, anchors, index)
@@ -162,8 +165,8 @@ def nearest_log_variances(points: Matrix, store: SubmapStore, anchors: Sequence[
 # ---- refinement ----
 
 
-class Keyframes:
-    """All keyframes of all submaps where they are in the world; a picture is read from the store when it is asked for.
+class KeyframeReader:
+    """All keyframes of all submaps with their poses in the world; pictures are read from the store on demand.
 
     anchors: T_world_submap [4, 4] of each submap; `poses`: T_world_camera [4, 4] of each keyframe. Raises
     SigmaSplatError if there is none, or a submap's camera is not the view's.
@@ -199,15 +202,15 @@ class Keyframes:
 
 def refine(
     field: GaussianField,
-    keyframes: Keyframes,
+    keyframes: KeyframeReader,
     config: Config,
     view: View,
     random: np.random.Generator,
     progress: Progress,
 ) -> list[float]:
-    """Fit the field to keyframes drawn evenly, poses fixed; prune now and then; return each step's loss (no unit).
+    """Fit the field to keyframes drawn uniformly, with fixed poses; prune regularly; return the loss of each step.
 
-    Colours gain a degree of view dependence each `sh_every` steps.
+    Every `sh_every` steps, colours gain one degree of view dependence.
     """
     final, mapping, losses = config.final, refinement(config), list[float]()
     drawn = _draw(keyframes, final.iterations, random, progress)
@@ -223,15 +226,15 @@ def refine(
 
 
 def refinement(config: Config) -> MappingConfig:
-    """Return mapping's settings as refinement uses them: poses fixed; with `final.uncertainty` off no likelihood."""
+    """Return the mapping settings for refinement: fixed poses, and no likelihood if `final.uncertainty` is off."""
     fixed = replace(config.mapping, lr_pose_translation=0.0, lr_pose_rotation=0.0)
     return fixed if config.final.uncertainty else replace(fixed, weight_nll_color=0.0, weight_nll_depth=0.0)
 
 
 def _draw(
-    keyframes: Keyframes, steps: int, random: np.random.Generator, progress: Progress
+    keyframes: KeyframeReader, steps: int, random: np.random.Generator, progress: Progress
 ) -> Iterator[Sequence[Keyframe]]:
-    """Draw keyframes evenly, one a step, telling before each how many were drawn."""
+    """Draw one keyframe per step, uniformly; call `progress` before each."""
     for step in range(steps):
         progress(step, steps)
         yield [keyframes[int(random.integers(len(keyframes)))]]

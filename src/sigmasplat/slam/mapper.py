@@ -1,5 +1,5 @@
-"""Grow and adjust the map at keyframes: seed what is new, fit the field in two halves, drop, fade and multiply splats
-between them (VarSplat §2; CG-SLAM §4, 5, 7)."""
+"""Mapping at a keyframe: seed new splats, fit the field in two halves; densify, fade and prune splats in between
+(VarSplat §2; CG-SLAM §4, 5, 7)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field as dataclass_field
@@ -28,7 +28,7 @@ from sigmasplat.slam.window import choose_window, dominating
 
 @dataclass(eq=False)
 class Mapper:
-    """Owns the active submap's field and keyframes; nobody else writes them. Poses are in the submap's frame."""
+    """Owns the field and the keyframes of the active submap. Poses are in the submap's frame."""
 
     config: Config
     random: np.random.Generator
@@ -43,12 +43,12 @@ class Mapper:
         T_world_camera: NDArray[np.float64],
         descriptor: NDArray[np.float32] | None = None,
     ) -> FieldFit:
-        """Take in one keyframe: seed, choose which ones to look at, fit in two halves with a clearing after each.
+        """Map one keyframe: seed, choose the window of keyframes, fit, densify and prune, fit again, prune again.
 
-        What begins with splats inherited knows its first keyframe from before, and only takes note of it.
+        A submap that inherits splats has mapped its first keyframe before; this keyframe is only added to the list.
         """
-        self.field = self.field.at(view.sums.device)  # the one place that says where the active field lies
-        c, born, begun = self.config.mapping, self.field.born, len(self.field) > 0
+        self.field = self.field.to(view.sums.device)  # the active field stays on the view's device
+        c, first_new, begun = self.config.mapping, self.field.next_id, len(self.field) > 0
         self.keyframes.append(Keyframe(index, target, T_world_camera, not self.keyframes, descriptor=descriptor))
         if begun and len(self.keyframes) == 1:
             return FieldFit()
@@ -58,17 +58,17 @@ class Mapper:
         window = self._window(view)
         stats = DensifyStats.of(self.keyframes[-1], len(self.field), self.field.params.device)
         self._choose_movable(c.poses_from == "start")
-        fit = self._fit(view, window, steps // 2, rates, born, stats)
-        self._multiply(view, stats)
+        fit = self._fit(view, window, steps // 2, rates, first_new, stats)
+        self._densify(view, stats)
         self._prune(view)
-        doubted = self._doubt(view, window)
+        faded = self._fade_uncertain(view, window)
         self._choose_movable(True)
-        fit.join(self._fit(view, window, steps - steps // 2, rates, born, None))
-        self._prune(view, self._unconvinced(view, window, doubted))
+        fit.join(self._fit(view, window, steps - steps // 2, rates, first_new, None))
+        self._prune(view, self._still_uncertain(view, window, faded))
         return fit
 
     def _window(self, view: View) -> list[Keyframe]:
-        """Choose the keyframes to look at, the newest first; without a window all of them."""
+        """Return the keyframes to fit, the newest first; all of them if `mapping.window` is 0."""
         c = self.config.mapping
         if not c.window:
             return self.keyframes[::-1]
@@ -84,14 +84,14 @@ class Mapper:
         window: list[Keyframe],
         steps: int,
         rates: Iterator[Rates],
-        born: int,
+        first_new: int,
         stats: DensifyStats | None,
     ) -> FieldFit:
-        """Fit the field to the window; splats with ids below `born` are the old ones."""
+        """Fit the field to the window; splats with ids below `first_new` are the old ones."""
         c = self.config.mapping
         together, history = c.frames_per_step or len(window), c.keyframe_history
         batches = draw_keyframes(window[::-1], steps, c.newest_probability, history, self.random, together)
-        frozen = int((self.field.ids < born).sum()) if c.freeze_old_colors else 0
+        frozen = int((self.field.ids < first_new).sum()) if c.freeze_old_colors else 0
         wanted = stats if self.config.primitives.split_gradient > 0 else None
         return fit_field(self.field, view, batches, c, rates, frozen, stats=wanted)
 
@@ -101,19 +101,20 @@ class Mapper:
             keyframe.movable = poses and (self.config.mapping.poses == "all" or keyframe is self.keyframes[-1])
 
     def finished(self, index: int) -> tuple[Submap, list[Picture]]:
-        """Return what has been mapped as a finished submap, which rests in the host's memory, and what its keyframes
-        saw."""
+        """Return the finished submap in host memory, and the pictures of its keyframes."""
         poses = np.stack([keyframe.T_world_camera for keyframe in self.keyframes])
         frames = tuple(keyframe.index for keyframe in self.keyframes)
         pictures = [keyframe.target.picture() for keyframe in self.keyframes]
         here = torch.device("cpu")
-        params, *extras = (rows.params.to(here, copy=True) for rows in (self.field, *self.field.extras.values()))
-        field = GaussianField(params, extras=dict(zip(self.field.extras, map(Rows, extras), strict=True)))
+        params, *attributes = (
+            rows.params.to(here, copy=True) for rows in (self.field, *self.field.attributes.values())
+        )
+        field = GaussianField(params, attributes=dict(zip(self.field.attributes, map(Rows, attributes), strict=True)))
         return Submap(index, field, frames, poses, self.keyframes[0].target.camera), pictures
 
     def successor(self, view: View, T_submap_camera: NDArray[np.float64]) -> "Mapper":
         """Return the mapper of the next submap, whose frame is the camera at T_submap_camera: empty, or with copies of
-        the splats in view from there (`submaps.inherit`)."""
+        the splats that this camera sees (`submaps.inherit`)."""
         field = GaussianField.empty()
         if self.config.submaps.inherit:
             T_new_old = se3.inverse(T_submap_camera)
@@ -123,6 +124,7 @@ class Mapper:
         return Mapper(self.config, self.random, field)
 
     def _seed(self, view: View, target: Target, T_world_camera: NDArray[np.float64]) -> None:
+        """Add splats where the map does not explain the keyframe, within the budget."""
         c = self.config.seeding
         if len(self.field) == 0:
             wanted = target.depth_image.numpy() > 0
@@ -138,7 +140,7 @@ class Mapper:
             new.keep(torch.from_numpy(self.random.permutation(len(new))[: max(room, 0)].copy()).sort().values)
         self.field.append(new)
 
-    def _multiply(self, view: View, stats: DensifyStats) -> None:
+    def _densify(self, view: View, stats: DensifyStats) -> None:
         """Split and clone the splats with the largest gradient in the newest keyframe, and split those too large in it,
         within the budget."""
         p, most = self.config.primitives, self.config.seeding.max_splats
@@ -150,28 +152,28 @@ class Mapper:
             coarse[coarse.nonzero()[max(most - len(self.field), 0) if most else len(coarse) :]] = False
             split(self.field, coarse, self.random)
 
-    def _judges(self, window: list[Keyframe]) -> list[Keyframe]:
-        """Return the keyframes that splats are held against: the window's; without one the newest."""
+    def _judging_keyframes(self, window: list[Keyframe]) -> list[Keyframe]:
+        """Return the keyframes that splats are judged by: those of the window, or the newest if there is no window."""
         return window if self.config.mapping.window else window[:1]
 
-    def _doubt(self, view: View, window: list[Keyframe]) -> Tensor:
-        """Fade the splats that the window's readings contradict; return their ids."""
+    def _fade_uncertain(self, view: View, window: list[Keyframe]) -> Tensor:
+        """Fade the splats that contradict the depth readings of the window; return their ids."""
         p = self.config.primitives
         if not p.uncertain_m2:
             return self.field.ids[:0]
-        nu, _ = splat_uncertainty(self.field, view, self._judges(window), p.owner)
+        nu, _ = splat_uncertainty(self.field, view, self._judging_keyframes(window), p.owner)
         return fade(self.field, nu > p.uncertain_m2, p.faded_opacity)
 
-    def _unconvinced(self, view: View, window: list[Keyframe], doubted: Tensor) -> Tensor:
-        """Tell which splats [N] were faded before and have not come back."""
+    def _still_uncertain(self, view: View, window: list[Keyframe], faded: Tensor) -> Tensor:
+        """Return which faded splats did not recover, bool [N]."""
         p = self.config.primitives
-        if not len(doubted):
+        if not len(faded):
             return torch.zeros_like(self.field.ids, dtype=torch.bool)
-        nu, _ = splat_uncertainty(self.field, view, self._judges(window), p.owner)
-        return still_uncertain(self.field, doubted, nu, p.uncertain_m2, p.least_opacity)
+        nu, _ = splat_uncertainty(self.field, view, self._judging_keyframes(window), p.owner)
+        return still_uncertain(self.field, faded, nu, p.uncertain_m2, p.least_opacity)
 
     def _prune(self, view: View, also: Tensor | None = None) -> None:
-        """Drop splats that have faded or grown too large, and those of `also` [N]."""
+        """Remove splats that are too faint or too large, and those marked in `also` [N]."""
         p, T_camera_world = self.config.primitives, se3.inverse(self.keyframes[-1].T_world_camera)
         gone = self.field.opacities <= self.config.mapping.prune_opacity
         gone |= too_large(self.field, T_camera_world, view.camera, p.most_scale_m, p.most_radius_px)

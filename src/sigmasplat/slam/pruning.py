@@ -50,7 +50,7 @@ def _owned(view: View, keyframe: Keyframe, owner: str) -> tuple[Tensor, Tensor, 
         "median": (layers.median_id, layers.median_weight),
     }[owner]
     rows, weight = (plane[: camera.height, : camera.width] for plane in (ids, weights))
-    reading = keyframe.target.on(rows.device).depth_image
+    reading = keyframe.target.to(rows.device).depth_image
     judged = ((rows >= 0) & (reading > 0)).nonzero(as_tuple=True)
     return rows[judged].long(), weight[judged].double(), reading[judged].double()
 
@@ -77,7 +77,7 @@ def still_uncertain(
     faded: their ids; ids that no longer exist are ignored. uncertainty [N] m²: `splat_uncertainty` of now. A faded
     splat seldom owns a pixel, so opacity decides; in a few dozen steps it does not fall from 0.07 to 1/255.
     """
-    named = torch.zeros(field.born, dtype=torch.bool, device=field.ids.device)
+    named = torch.zeros(field.next_id, dtype=torch.bool, device=field.ids.device)
     named[faded] = True
     faint = field.opacities < least_opacity
     return named[field.ids] & (faint | (uncertainty > uncertain_m2))

@@ -62,7 +62,7 @@ class Slam:
         self.descriptor = make_descriptor(self.config.loops)
         self.closer = LoopCloser(self.config, self.store)
         self.steps: list[Step] = []
-        self.keyframes: list[int] = []
+        self.keyframe_indices: list[int] = []
         self._view: View | None = None
         self._final: GaussianField | None = None
         self._timer = StepTimer()
@@ -113,7 +113,7 @@ class Slam:
             return self._final
         active = self.mapper.field
         if not len(self.store):
-            return active.at(HOST)
+            return active.to(HOST)
         merged = GaussianField.empty()
         for index in range(len(self.store)):
             merged.append(self.store.load(index).field.moved(torch.from_numpy(self.atlas.anchors[index])))
@@ -144,7 +144,7 @@ class Slam:
             "timestamps_s": torch.from_numpy(path.timestamps_s),
             "T_world_camera": torch.from_numpy(path.T_world_camera),
             "T_world_camera_odometry": torch.from_numpy(self.atlas.T_world_camera(loops=False)),
-            "keyframes": torch.tensor(self.keyframes, dtype=torch.int64),
+            "keyframes": torch.tensor(self.keyframe_indices, dtype=torch.int64),
             "T_world_submap": torch.from_numpy(np.array(self.atlas.anchors).reshape(-1, 4, 4)),
             "frame_submap": torch.tensor([place.submap for place in self.atlas.places], dtype=torch.int64),
         }
@@ -210,11 +210,11 @@ class Slam:
         with self._timer.stage("map"):
             fit = self.mapper.map(self.view, index, seen.target, T_submap_camera, descriptor)
         self._timer.add(fit.seconds, prefix="map_")
-        if self.keyframes[-1:] != [index]:  # a keyframe that two submaps share counts once
-            self.keyframes.append(index)
-        self.atlas.keyframes[-1] = [keyframe.T_world_camera for keyframe in self.mapper.keyframes]
-        self.tracker.keep_keyframe(self.mapper.field, self.view, seen.live, self.atlas.keyframes[-1][-1])
-        return self.atlas.keyframes[-1][-1]
+        if self.keyframe_indices[-1:] != [index]:  # a keyframe that two submaps share counts once
+            self.keyframe_indices.append(index)
+        self.atlas.keyframe_poses[-1] = [keyframe.T_world_camera for keyframe in self.mapper.keyframes]
+        self.tracker.keep_keyframe(self.mapper.field, self.view, seen.live, self.atlas.keyframe_poses[-1][-1])
+        return self.atlas.keyframe_poses[-1][-1]
 
     def _submap_ends(self, T_submap_camera: Matrix) -> bool:
         since, moved_m = len(self.steps) - self.mapper.keyframes[0].index, self.drift.position_m(T_submap_camera)

@@ -1,4 +1,4 @@
-"""Everything SLAM remembers from frame to frame, as one tree: put back, the next frame finds all as it was."""
+"""The state of SLAM between two frames as one tree, to save and to restore."""
 
 from typing import Any
 
@@ -22,27 +22,27 @@ CLASSES: tuple[type, ...] = (
     Atlas, Camera, Drift, Edge, GaussianField, Keyframe, Loop, LoopCloser, Mapper, Place, Pyramid, Reference, Rows,
     SubmapDescriptor, Step, Target, Tracker, VectorAdam,
 )  # fmt: skip
-"""What a state is made of."""
+"""The classes that a state may contain."""
 
 
-REMEMBERED = ("atlas", "mapper", "tracker", "drift", "steps", "keyframes", "closer")
-"""The attributes of `Slam` that change from frame to frame, but for its random numbers."""
+REMEMBERED = ("atlas", "mapper", "tracker", "drift", "steps", "keyframe_indices", "closer")
+"""The attributes of `Slam` that change from frame to frame, except its random numbers."""
 
 
 def fixed(slam: Slam) -> dict[str, Any]:
-    """Name what a state refers to and does not hold: settings, where submaps are kept, the renderer, random numbers."""
+    """Return the objects that a state refers to but does not contain: settings, store, view, random numbers."""
     c = slam.config
     return {"config": c, "tracking": c.tracking, "store": slam.store, "view": slam.view, "random": slam.random}
 
 
 def state_of(slam: Slam) -> dict[str, Any]:
-    """Return the tree, to be read before the next step. There must have been a frame."""
+    """Return the state; write it before the next step. At least one frame must have been processed."""
     remembered = {name: getattr(slam, name) for name in REMEMBERED}
     return {"numbers": slam.random.bit_generator.state, "submaps": len(slam.store)} | remembered
 
 
 def restore(slam: Slam, state: dict[str, Any]) -> None:
-    """Put a tree, read with `fixed(slam)`, into a system that is `prepare`d for the same camera."""
+    """Restore a state, read with `fixed(slam)`, in a system that is `prepare`d for the same camera."""
     slam.random.bit_generator.state = state["numbers"]
     for name in REMEMBERED:
         setattr(slam, name, state[name])

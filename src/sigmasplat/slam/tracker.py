@@ -1,4 +1,4 @@
-"""Follow the camera: guess, fit the pose against the frozen map, judge, and try again from elsewhere if it failed."""
+"""Tracking: predict the pose, fit it to the fixed map, judge the fit, and retry from other poses if it is doubtful."""
 
 import dataclasses
 from dataclasses import dataclass, field as dataclass_field
@@ -19,12 +19,12 @@ from sigmasplat.slam.rules import is_lost, jumped
 from sigmasplat.types import Matrix
 
 DOUBT = 0.7
-"""Below this share of its usual agreement a pose is doubted and other starts are tried."""
+"""A pose is doubtful if its agreement × overlap falls below this share of the usual value."""
 
 
 @dataclass(eq=False)
 class Tracker:
-    """Remembers the last two poses, the last image, the newest keyframe, and how well tracking usually goes."""
+    """Keeps the last pose, the velocity, the last image, the reference keyframe, and statistics of recent fits."""
 
     config: TrackingConfig
     previous: Matrix = dataclass_field(default_factory=lambda: np.eye(4))
@@ -42,9 +42,9 @@ class Tracker:
         self.last_image = live
 
     def track(self, field: GaussianField, view: View, target: Target, live: Pyramid) -> PoseFit:
-        """Find T_camera_world of a frame; `self.lost` says afterwards whether to believe it.
+        """Estimate T_camera_world of a frame; `self.lost` then says whether tracking failed.
 
-        A lost frame keeps the best guess there is (odometry, else the last pose), and the velocity is forgotten.
+        A lost frame gets the best available guess (odometry, else the last pose), and the velocity is reset.
         """
         predicted = self.previous @ self.velocity if self.config.motion_model else self.previous
         fit = self._fit(field, view, target, live, predicted)
@@ -66,7 +66,7 @@ class Tracker:
     def _fit(
         self, field: GaussianField, view: View, target: Target, live: Pyramid, guess: Matrix, patience: int = 1
     ) -> PoseFit:
-        """Fit from a guess of T_world_camera; patience: how many times the usual iterations descent may take."""
+        """Fit from an initial T_world_camera; patience: factor on the number of iterations of gradient descent."""
         T_camera_world = se3.inverse(guess)
         if self.config.method == "adam":
             config = self.config if self.started else _without_motion(self.config)
@@ -82,9 +82,9 @@ class Tracker:
         return worse or jumped(fit.first_loss, self.first_losses, self.config.reinit_factor)
 
     def _retry(self, field: GaussianField, view: View, target: Target, live: Pyramid, fit: PoseFit) -> PoseFit:
-        """Start again from odometry with twice the iterations (VarSplat §3), and from standing still; keep the best.
+        """Retry from odometry with twice the iterations (VarSplat §3), and from the last pose; return the best fit.
 
-        Aligning also tries the map seen from there: it knows more than the newest keyframe.
+        With alignment, also try the map rendered at these poses: it contains more than the newest keyframe.
         """
         odometry = self._odometry(view, live)
         starts = [self.previous] if odometry is None else [odometry, self.previous]
@@ -99,7 +99,7 @@ class Tracker:
         return best
 
     def _odometry(self, view: View, live: Pyramid) -> Matrix | None:
-        """Align the last image to this one; None if they do not fit together either."""
+        """Align the last image to this one and return T_world_camera; None if this fails too."""
         if self.last_image is None or (self.config.method == "adam" and not fits_of(view).aligns):
             return None  # alignment needs the compiled kernels
         guesses = (se3.inverse(self.velocity), np.eye(4))
@@ -113,15 +113,15 @@ class Tracker:
         return np.asarray(self.previous @ se3.inverse(best.T_live_reference))
 
     def keep_keyframe(self, field: GaussianField, view: View, live: Pyramid, T_world_camera: Matrix) -> None:
-        """Take note of a freshly mapped keyframe: where mapping left its pose, and its image as the next reference."""
+        """Use a keyframe that was just mapped: its refined pose, and its image as the reference of the next frames."""
         self.previous = T_world_camera
-        if self.config.method == "align" or fits_of(view).aligns:  # else nothing could align to it
+        if self.config.method == "align" or fits_of(view).aligns:  # otherwise nothing aligns to it
             self.keyframe = keyframe_reference(field.params, view, live, se3.inverse(T_world_camera), self.config)
 
     def hop_covariance(self, fit: PoseFit, live: Pyramid) -> Matrix | None:
         """Estimate the covariance [6, 6] of a fit's left twist to the newest keyframe; None without the kernels.
 
-        A pose found by descent is judged by how sharply the keyframe's image would pull it back.
+        For a pose found by gradient descent, the covariance is that of an alignment to the keyframe's image.
         """
         if fit.alignment is not None or self.keyframe is None:
             return fit.covariance

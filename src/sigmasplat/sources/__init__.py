@@ -1,4 +1,4 @@
-"""Read RGB-D sequences: one file per format, all of them a `Source`; `open_source` guesses which."""
+"""Read RGB-D sequences: one module per format, each returns a `Source`; `open_source` recognises the format."""
 
 from sigmasplat.sources.base import Source
 from sigmasplat.sources.opening import open_source

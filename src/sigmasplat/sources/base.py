@@ -1,4 +1,4 @@
-"""Say what every input sequence offers, whatever its format."""
+"""Define the interface of an input sequence, the same for every format."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -17,14 +17,14 @@ from sigmasplat.sources.files.prefetch import read_ahead
 
 
 class Source(ABC):
-    """An RGB-D sequence: frames in order of time, one camera, perhaps a true path.
+    """An RGB-D sequence: frames in order of time, one camera, and the ground-truth path if it is known.
 
-    name: for titles; camera: the pinhole of every frame; skipped: files left out, each with the reason;
-    strict: whether an unreadable image ends the sequence instead of being passed over;
-    depth_units_per_metre: what whole-number depth was divided by, None where depth is metres already;
-    depth_registered: whether depth was moved into the colour camera here, instead of coming so; registrable: whether it
-    could be, its camera being known;
-    live: whether frames come from a camera as they are taken, once, and nobody knows how many (LiveSource).
+    name: for titles; camera: the pinhole camera of every frame; skipped: files left out, each with the reason;
+    strict: whether an unreadable image raises an error instead of being skipped;
+    depth_units_per_metre: divisor of whole-number depth, None if depth is stored in metres;
+    depth_registered: whether the source itself moved depth to the colour camera; registrable: whether it could do so,
+    because the depth camera is known;
+    live: whether frames come from a live camera: each only once, and their number is unknown (LiveSource).
     """
 
     name: str
@@ -43,26 +43,26 @@ class Source(ABC):
 
     @abstractmethod
     def __len__(self) -> int:
-        """Count the frames, unreadable ones included."""
+        """Return the number of frames, including unreadable ones."""
 
     @abstractmethod
     def frame(self, i: int) -> Frame:
-        """Read frame i, 0 ≤ i < len. Raises SourceError if its files cannot be read, IndexError past the end."""
+        """Read frame i, 0 ≤ i < len. Raises SourceError if its files cannot be read, IndexError if i is too large."""
 
     def timestamp_s(self, i: int) -> float:
-        """Return the time of frame i; formats that know it without reading the frame say so here. Raises as `frame`."""
+        """Return the time of frame i; formats may override this to avoid reading it. Raises as `frame`."""
         return self.frame(i).timestamp_s
 
     def depth_of(self, i: int) -> NDArray[np.float32]:
-        """Read the depth of frame i, m [H, W]; formats that need no colour for it do without. Raises as `frame`."""
+        """Read the depth of frame i, m [H, W]; formats override this to avoid reading colour. Raises as `frame`."""
         return self.frame(i).depth_m
 
     @abstractmethod
     def truth(self) -> Trajectory | None:
-        """Return the true path as recorded, on its own timestamps and in its own world frame; None if there is none."""
+        """Return the ground-truth path as recorded, with its own timestamps and world frame; None if it is unknown."""
 
     def described_truth(self) -> str | None:
-        """Say in words how much true path there is, without giving it away; None if there is none."""
+        """Describe the size of the ground-truth path in words, not the path itself; None if it is unknown."""
         path = self.truth()
         if path is None:
             return None
@@ -70,27 +70,27 @@ class Source(ABC):
         return f"{len(path)} true poses, {length_m:.1f} m long"
 
     def test_views(self) -> "Source | None":
-        """Return views kept apart for scoring, off the path; their truth is in `truth`'s world. None if none are."""
+        """Return test views away from the camera path, with poses in `truth`'s world frame; None without them."""
         return None
 
     def true_surface(self) -> Mesh | None:
-        """Return the true surface in `truth`'s world frame, hidden parts too, faces of a few cm; None if not known."""
+        """Return the true surface in `truth`'s world frame, with hidden parts, faces of a few cm; None if unknown."""
         return None
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames in order, decoded a few ahead in a background thread.
+        """Yield the frames in order; a background thread decodes a few frames ahead.
 
-        An unreadable frame is noted in `skipped` and passed over, or raised where `strict`. Raises SourceError if not
-        one frame can be read.
+        An unreadable frame is skipped and listed in `skipped`, or raises SourceError if `strict`. Raises SourceError
+        if no frame can be read.
         """
         return self.frames_from(0)
 
     def frames_from(self, first: int) -> Iterator[Frame]:
-        """Yield the frames from index `first` on, as iteration does."""
+        """Yield the frames from index `first`, in the same way as iteration."""
         return read_ahead(self._readable(first))
 
     def _readable(self, first: int) -> Iterator[Frame]:
-        found = first > 0  # then there were some before
+        found = first > 0  # an earlier pass has read some
         for i in range(first, len(self)):
             try:
                 frame = self.frame(i)
@@ -105,20 +105,20 @@ class Source(ABC):
     def _skip(self, error: SourceError) -> None:
         if self.strict:
             raise error
-        if str(error) not in self.skipped:  # a second pass over the frames meets the same damage
+        if str(error) not in self.skipped:  # a second pass finds the same damage
             self.skipped.append(str(error))
 
     def _checked_index(self, i: int) -> int:
         if not 0 <= i < len(self):
-            raise IndexError(f"{self.name}: frame {i} asked for, there are {len(self)}")
+            raise IndexError(f"{self.name}: frame {i} requested, there are {len(self)}")
         return i
 
 
 class Subset(Source):
-    """Frames of another source: of a span of time, every `stride`-th, at most `limit`; indices count those kept."""
+    """Part of another source: a time span, every `stride`-th frame, at most `limit`; frames are numbered from 0."""
 
     def __init__(self, whole: Source, settings: InputConfig) -> None:
-        """Raises SourceError if no frame is left."""
+        """Select the frames. Raises SourceError if no frame is left."""
         super().__init__(whole.name, whole.camera, whole.strict)
         self.skipped = whole.skipped
         self.depth_units_per_metre = whole.depth_units_per_metre
@@ -135,23 +135,23 @@ class Subset(Source):
         return len(self._indices)
 
     def frame(self, i: int) -> Frame:
-        """Read the i-th frame kept."""
+        """Read the i-th selected frame."""
         return replace(self._whole.frame(self._indices[self._checked_index(i)]), index=i)
 
     def timestamp_s(self, i: int) -> float:
-        """Return the time of the i-th frame kept."""
+        """Return the time of the i-th selected frame."""
         return self._whole.timestamp_s(self._indices[self._checked_index(i)])
 
     def depth_of(self, i: int) -> NDArray[np.float32]:
-        """Read the depth of the i-th frame kept."""
+        """Read the depth of the i-th selected frame."""
         return self._whole.depth_of(self._indices[self._checked_index(i)])
 
     def truth(self) -> Trajectory | None:
-        """Return the true path of the whole source: it is kept by time, not by frame."""
+        """Return the ground-truth path of the whole source; it has its own timestamps."""
         return self._whole.truth()
 
     def test_views(self) -> Source | None:
-        """Return the views kept apart of the whole source."""
+        """Return the test views of the whole source."""
         return self._whole.test_views()
 
     def true_surface(self) -> Mesh | None:
@@ -160,7 +160,7 @@ class Subset(Source):
 
 
 def _within(whole: Source, settings: InputConfig) -> range:
-    """Return the frames of the span of time that the settings ask for, counted from the first frame's time."""
+    """Return the frames between start_s and end_s, seconds after the first frame."""
     if not settings.start_s and not settings.end_s:
         return range(len(whole))
     begin_s = whole.timestamp_s(0)

@@ -1,10 +1,10 @@
-"""Read the Bonn RGB-D Dynamic Dataset: TUM's lists, a camera of its own, a true path of the markers on it.
+"""Read the Bonn RGB-D Dynamic Dataset: TUM's lists, another camera, and ground truth of the motion-capture markers.
 
 rgbd_bonn_NAME/rgb.txt  depth.txt  groundtruth.txt  rgb/  depth/        recognised by `bonn` in the folder's path
 
-The data set's page gives the camera's numbers and how its motion-capture poses T become those of the camera:
-T_world_camera = T_ROS · T · T_ROS · T_m (there used for the first pose of a run, to bring a model to the laser scan).
-The T_m there is no rigid motion, its axes are 1.059 long; here its rotation is taken, and its offset as it is.
+The data set's page publishes the intrinsics, and how to convert the motion-capture poses T to camera poses:
+T_world_camera = T_ROS · T · T_ROS · T_m (used there for the first pose of a run, to align a model with the laser scan).
+The published T_m is not rigid: its axes have length 1.059. Here its rotation is orthonormalised, its offset unchanged.
 """
 
 from pathlib import Path
@@ -33,17 +33,17 @@ T_MARKERS_CAMERA = se3.orthonormalise(
 
 
 def camera_trajectory(markers: Trajectory) -> Trajectory:
-    """Turn the recorded path of the markers into that of the camera."""
+    """Convert the recorded path of the markers to the path of the camera."""
     return Trajectory(markers.timestamps_s, T_ROS @ markers.T_world_camera @ T_ROS @ T_MARKERS_CAMERA)
 
 
 def open_bonn(folder: Path, settings: InputConfig) -> RecordedSource:
-    """Open a folder; raises SourceError as a TUM folder does."""
+    """Open a folder. Raises SourceError as `open_tum`."""
     return open_tum(folder, settings, camera=BONN, camera_path=camera_trajectory)
 
 
 def recognises(path: str) -> bool:
-    """Tell whether it is a TUM folder under a name of Bonn's."""
+    """Return whether it is a TUM folder whose path contains "bonn"."""
     folder = Path(path)
     lists = (folder / "rgb.txt").is_file() or (folder / "depth.txt").is_file()
     return lists and any("bonn" in part.lower() for part in folder.resolve().parts[-3:])

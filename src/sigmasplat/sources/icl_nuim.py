@@ -1,12 +1,12 @@
-"""Read ICL-NUIM's TUM-compatible sequences, and other folders whose frames one association file lists.
+"""Read ICL-NUIM's TUM-compatible sequences, and other folders with an association file.
 
 rgb/0.png  depth/0.png  associations.txt     lines "number depth/0.png number rgb/0.png", depth first; depth · 5000
 livingRoom0.gt.freiburg, traj0.gt.freiburg   lines "number tx ty tz qx qy qz qw", the image's number
 
-The scenes were rendered with a camera whose y points up, in a left-handed world: hence fy = −480 in the published K.
-The PNG images are stored the right way up, so a camera with y down sees them with fy = +480. What is left is that the
-true path lives in the mirrored world. With F = diag(1, −1, 1, 1) it becomes T_ours = F · T · F, a rigid motion again:
-the reflection about the xz plane (nvidia-isaac/cuVSLAM converts likewise, and its scores confirm it).
+The scenes were rendered with a camera whose y axis points up, in a left-handed world: hence fy = −480 in the published
+K. The PNG images are stored upright, so fy = +480 for a camera with y down. The ground-truth path is still in the
+mirrored world. With F = diag(1, −1, 1, 1), T_ours = F · T · F is its reflection about the xz plane, a rigid motion
+(nvidia-isaac/cuVSLAM converts it in the same way, and its scores confirm it).
 """
 
 from pathlib import Path
@@ -32,10 +32,12 @@ MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 def open_icl_nuim(folder: Path, settings: InputConfig) -> RecordedSource:
-    """Open a folder; raises SourceError if its list, images or true poses cannot be used."""
+    """Open a folder. Raises SourceError if its list, images or ground-truth poses cannot be used."""
     path = _list_in(folder)
     if path is None:
-        raise SourceError(f"{folder}: text depth is not read; take the set's TUM-compatible PNGs (…_frei_png.tar.gz)")
+        raise SourceError(
+            f"{folder}: text depth is not supported; take the set's TUM-compatible PNGs (…_frei_png.tar.gz)"
+        )
     images = _images(path)
     truth_path = next(iter(sorted(folder.glob("*.gt.freiburg"))), None)
     rendered = truth_path is not None or "frei_png" in folder.resolve().name
@@ -48,19 +50,19 @@ def open_icl_nuim(folder: Path, settings: InputConfig) -> RecordedSource:
 
 
 def _images(path: Path) -> list[ImagePair]:
-    """Read the list; which of the two columns is depth, the names say."""
+    """Read the list; the path with "depth" in it is the depth image."""
     images = []
     for line, words in read_lines(path):
         if len(words) != 4 or ("depth" in words[1]) == ("depth" in words[3]):
             raise SourceError(
-                f"{path}:{line}: 'time depth/image time rgb/image' wanted, found {' '.join(words)[:60]!r}"
+                f"{path}:{line}: expected 'time depth/image time rgb/image', found {' '.join(words)[:60]!r}"
             )
         times = parse_numbers(path, line, [words[0], words[2]])
         color, depth = (3, 1) if "depth" in words[1] else (1, 3)
         images.append(ImagePair(times[color // 2], path.parent / words[color], path.parent / words[depth]))
     if not images:
         raise SourceError(f"{path}: lists no images")
-    if all(image.timestamp_s.is_integer() for image in images):  # numbers of frames, not seconds
+    if all(image.timestamp_s.is_integer() for image in images):  # frame numbers, not seconds
         images = [ImagePair(i.timestamp_s / FRAMES_PER_SECOND, i.color, i.depth) for i in images]
     return sorted(images, key=lambda image: image.timestamp_s)
 

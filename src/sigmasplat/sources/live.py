@@ -1,4 +1,4 @@
-"""Take frames from a camera as it delivers them, and record each one, so that it can be read again afterwards."""
+"""Read frames from a live camera and record each one, so that the sequence can be read again."""
 
 from abc import abstractmethod
 from collections.abc import Iterator
@@ -16,14 +16,14 @@ from sigmasplat.sources.tum import TumWriter
 
 
 class _NoLength(SourceError, TypeError):
-    """Say that there is no length: list() asks for one, and goes on without where a TypeError says no."""
+    """The length is unknown. It is a TypeError too, because list() accepts a missing length only as TypeError."""
 
 
 class LiveSource(Source):
-    """A camera: its frames come once, and end when whoever iterates stops, the limit is reached, or the camera goes.
+    """A live camera. Frames come once, until the consumer stops, the limit is reached, or the camera fails.
 
-    dropped: frames that the camera delivered while the last one was still being worked on; the newest wins;
-    ending: why the camera ended the sequence by itself, "" as long as it did not.
+    dropped: number of frames that arrived while the previous one was processed; only the newest is used;
+    ending: why the camera stopped, "" if it did not.
     """
 
     live = True
@@ -36,30 +36,30 @@ class LiveSource(Source):
         self.ending = ""
 
     def record_to(self, folder: Path) -> None:
-        """Write every frame taken to a new TUM folder. Raises RunError if it holds a sequence or cannot be written."""
+        """Record every frame to a new TUM folder. Raises RunError if it holds a sequence or cannot be written."""
         self._writer = TumWriter(folder, self.camera)
 
     def __len__(self) -> int:
-        """Raises SourceError: nobody knows."""
+        """Raise SourceError: the length is unknown."""
         raise _NoLength(self._once())
 
     def frame(self, i: int) -> Frame:
-        """Raises SourceError: frames come once."""
+        """Raise SourceError: frames come only once, in order."""
         raise SourceError(self._once())
 
     def truth(self) -> Trajectory | None:
-        """Return None: a camera does not know where it is."""
+        """Return None: a live camera has no ground truth."""
         return None
 
     def frames_from(self, first: int) -> Iterator[Frame]:
-        """Yield frames as they come, at most one ahead. Raises SourceError if the camera delivers none."""
+        """Yield frames as they arrive, at most one ahead. Raises SourceError if the camera delivers no frame."""
         if first:
             raise SourceError(self._once())
         return read_ahead(self._recorded(), 1)
 
     @abstractmethod
     def captured(self) -> Iterator[Frame]:
-        """Yield the camera's newest frame again and again, with its index among them; stop the camera in the end."""
+        """Yield the newest frame repeatedly, numbered from 0; stop the camera at the end."""
 
     def _recorded(self) -> Iterator[Frame]:
         for index, frame in enumerate(self._wanted()):
@@ -71,7 +71,7 @@ class LiveSource(Source):
                 return
 
     def _wanted(self) -> Iterator[Frame]:
-        """Keep every stride-th frame of the span of time that the settings ask for, counted from the first."""
+        """Yield every stride-th frame between start_s and end_s, seconds after the first frame."""
         begin_s: float | None = None
         for count, frame in enumerate(self.captured()):
             begin_s = frame.timestamp_s if begin_s is None else begin_s
@@ -82,11 +82,11 @@ class LiveSource(Source):
                 yield frame
 
     def _once(self) -> str:
-        return f"{self.name}: a live camera gives its frames once; run it, then read the folder it was recorded to"
+        return f"{self.name}: a live camera delivers each frame once; run it, then read the folder with its recording"
 
 
 def recording_settings(settings: InputConfig) -> InputConfig:
-    """Return the settings to read a recording with: what was done to the frames before they were written is done."""
+    """Return the settings for reading the recording of a run, whose frames are already selected and rectified."""
     return InputConfig(
         strict=settings.strict, width=settings.width, crop_px=settings.crop_px,
         min_depth_m=settings.min_depth_m, max_depth_m=settings.max_depth_m,

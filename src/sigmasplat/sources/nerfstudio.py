@@ -1,9 +1,9 @@
 """Read a nerfstudio folder with depth: transforms.json whose frames name colour and depth images.
 
-transforms.json        `sources/transforms.py`; depth_unit_scale_factor, metres per unit, 0.001 where absent
-images/…  depths/…     where file_path and depth_file_path say, from the folder; in the order of the names' numbers
+transforms.json        see `sources/files/transforms.py`; depth_unit_scale_factor is metres per unit, default 0.001
+images/…  depths/…     file_path and depth_file_path, relative to the folder, ordered by the numbers in the names
 
-Depth of another size than colour (as phones have it) is taken to be seen by the same camera, at its size.
+If depth has another size than colour (as on phones), both are assumed to share one camera.
 """
 
 from dataclasses import replace
@@ -26,11 +26,11 @@ from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
 
 NAME = "transforms.json"
 METRES_PER_UNIT = 0.001
-"""nerfstudio's own default of depth_unit_scale_factor."""
+"""nerfstudio's default of depth_unit_scale_factor."""
 
 
 def open_nerfstudio(folder: Path, settings: InputConfig) -> RecordedSource:
-    """Open a folder; raises SourceError if its file, images or camera cannot be used."""
+    """Open a folder. Raises SourceError if its JSON file, images or camera cannot be used."""
     path = folder / NAME
     fields = read_json_object(path)
     named = sorted(read_frames(path, fields), key=lambda frame: natural_key(frame["file_path"]))
@@ -47,7 +47,7 @@ def open_nerfstudio(folder: Path, settings: InputConfig) -> RecordedSource:
 
 
 def _files(folder: Path, frame: Fields) -> tuple[Path, Path]:
-    """Return the frame's colour and depth file; instant-ngp leaves the ending of colour out."""
+    """Return the colour and the depth file of a frame; instant-ngp omits the file ending of colour."""
     color, depth = folder / frame["file_path"], folder / frame["depth_file_path"]
     bare = not color.suffix and not color.is_file()
     return (color.with_suffix(".png") if bare else color), depth

@@ -1,10 +1,10 @@
-"""Read a plain folder of colour and depth images, asked last: what somebody's own camera left behind.
+"""Read a plain folder of colour and depth images; this format is tried last.
 
-color|colour|rgb|image|images/   depth|depths/     paired by the same name, else by the number in it, else by order
+color|colour|rgb|image|images/   depth|depths/     paired by name, else by the number in it, else by order
 calibration.json                                   fx fy cx cy [width height depth_scale …], or --fx on the command line
-groundtruth.txt                                    optional: "t tx ty tz qx qy qz qw" on the images' times
+groundtruth.txt                                    optional: "t tx ty tz qx qy qz qw", t as for the images
 
-Names that are times in seconds, as 12.033333.png, are taken so; else frames are 1/30 s apart. Depth in mm unless said.
+Names such as 12.033333.png are times in seconds; otherwise frames are 1/30 s apart. Depth is in mm by default.
 """
 
 from itertools import pairwise
@@ -33,7 +33,7 @@ COLOR_NAME, DEPTH_NAME = "color|rgb|images/*", "depth/*"
 
 
 def open_plain(folder: Path, settings: InputConfig) -> RecordedSource:
-    """Open a folder; raises SourceError if images cannot be paired or the camera is not known."""
+    """Open a folder. Raises SourceError if images cannot be paired or the camera is unknown."""
     colors = list_images(first_subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
     depth_folder = first_subfolder(folder, DEPTH_FOLDERS)
     if depth_folder is None and (problem := without_depth(folder)):
@@ -49,7 +49,7 @@ def open_plain(folder: Path, settings: InputConfig) -> RecordedSource:
 
 
 def _pairs(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[tuple[Path, Path]], list[str]]:
-    """Pair by name, else by number, else by order where there are as many of both."""
+    """Pair images by name, else by number, else by order if both kinds have the same count."""
     stems, depth_stems = {path.stem: path for path in colors}, {path.stem: path for path in depths}
     if stems.keys() & depth_stems.keys():
         names, skipped = pair_images(folder, stems, depth_stems, COLOR_NAME, DEPTH_NAME)
@@ -60,14 +60,14 @@ def _pairs(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[t
     if colors and depths and (len(color_by_number), len(depth_by_number)) != (len(colors), len(depths)):
         raise SourceError(
             f"{folder}: {len(colors)} colour and {len(depths)} depth images share no names, and their numbers are not "
-            "all different; name both alike"
+            "unique; give each pair the same name"
         )
     keys, skipped = pair_images(folder, color_by_number, depth_by_number, COLOR_NAME, DEPTH_NAME)
     return [(color_by_number[n], depth_by_number[n]) for n in keys], skipped
 
 
 def _times_s(paths: list[Path]) -> list[float]:
-    """Return the times that the names are, where all have a decimal point and rise; else the convention's."""
+    """Return the times in the names if all have a decimal point and increase; else frames are 1/30 s apart."""
     try:
         times = [float(path.stem) for path in paths]
     except ValueError:

@@ -1,8 +1,8 @@
-"""Take frames from an Intel RealSense camera through its SDK, pyrealsense2 (Apache-2.0).
+"""Read frames from a live Intel RealSense camera through its SDK, pyrealsense2 (Apache-2.0).
 
-"realsense" or "realsense:width=848,height=480,fps=30,serial=012345678901". Intrinsics, lens and depth unit are the
-device's. The SDK moves depth into the colour camera's pixels, but leaves the numbers as they are: distances along the
-depth camera's axis, some millimetres off. With input.register_depth=on it is done here, exactly and more slowly.
+"realsense" or "realsense:width=848,height=480,fps=30,serial=012345678901". Intrinsics, lens distortion and depth unit
+come from the device. The SDK moves depth to the colour camera's pixels, but keeps the distances along the axis of the
+depth camera, which differ by some millimetres. With input.register_depth=on depth is registered exactly, but slower.
 """
 
 import weakref
@@ -28,14 +28,14 @@ from sigmasplat.sources.opening import Format
 OPTIONS = {"width": 640, "height": 480, "fps": 30}
 TIMEOUT_MS = 5000
 WARM_UP_FRAMES = 15
-"""So many frames are let go by at first, while the exposure settles."""
+"""Number of first frames to skip, until the exposure is stable."""
 
 
 class RealSense(LiveSource):
-    """A camera that has been started."""
+    """A RealSense camera that is running."""
 
     def __init__(self, sdk: Any, pipeline: Any, profile: Any, settings: InputConfig) -> None:
-        """Raises SourceError if the settings ask for what the camera does not tell."""
+        """Read the calibration. Raises SourceError if the settings need more than the camera provides."""
         scale_m = float(profile.get_device().first_depth_sensor().get_depth_scale())
         color, depth = (
             profile.get_stream(kind).as_video_stream_profile() for kind in (sdk.stream.color, sdk.stream.depth)
@@ -55,33 +55,33 @@ class RealSense(LiveSource):
         self._stop = weakref.finalize(self, pipeline.stop)
 
     def captured(self) -> Iterator[Frame]:
-        """Yield the newest frame again and again. Raises SourceError if none comes at all."""
+        """Yield the newest frame repeatedly. Raises SourceError if no frame arrives at all."""
         align = self._sdk.align(self._sdk.stream.color)
         last: int | None = None
         index = 0
         try:
-            for frames in self._delivered():
+            for frames in self._framesets():
                 pair = frames if self._rectified.moves_depth else align.process(frames)
                 color, depth = pair.get_color_frame(), pair.get_depth_frame()
-                # Where only depth is new the SDK gives the last colour image again.
+                # If only depth is new, the SDK repeats the last colour image.
                 if not color or not depth or color.get_frame_number() == last:
                     continue
                 number = color.get_frame_number()
                 self.dropped += max(number - last - 1, 0) if last is not None else 0
                 last = number
-                yield self._framed(index, color, depth)
+                yield self._to_frame(index, color, depth)
                 index += 1
         finally:
             self._stop()
 
-    def _delivered(self) -> Iterator[Any]:
-        """Yield sets of frames until none comes any more."""
+    def _framesets(self) -> Iterator[Any]:
+        """Yield sets of frames until no more arrive."""
         count = 0
         while True:
             try:
                 frames = self._pipeline.wait_for_frames(TIMEOUT_MS)
             except RuntimeError as error:
-                problem = f"{self.name}: no frame came for {TIMEOUT_MS / 1000:g} s ({error}); is the camera plugged in?"
+                problem = f"{self.name}: no frame for {TIMEOUT_MS / 1000:g} s ({error}); is the camera plugged in?"
                 if count <= WARM_UP_FRAMES:
                     raise SourceError(problem) from error
                 self.ending = problem
@@ -90,7 +90,7 @@ class RealSense(LiveSource):
             if count > WARM_UP_FRAMES:
                 yield frames
 
-    def _framed(self, index: int, color: Any, depth: Any) -> Frame:
+    def _to_frame(self, index: int, color: Any, depth: Any) -> Frame:
         pixels = color_from_bytes(np.array(color.get_data(), np.uint8))
         units = np.asarray(depth.get_data()).astype(np.float32)
         rgb, depth_m = self._rectified(pixels, units / np.float32(self.depth_units_per_metre))
@@ -99,7 +99,7 @@ class RealSense(LiveSource):
 
 
 def open_realsense(text: str, settings: InputConfig) -> RealSense:
-    """Start the camera. Raises SourceError if the SDK or the camera is missing, or cannot do what is asked."""
+    """Start the camera. Raises SourceError if the SDK or camera is missing, or the stream mode is not supported."""
     options = _parsed(text)
     sdk = import_optional("pyrealsense2", "realsense", "the RealSense camera")
     pipeline, wanted = sdk.pipeline(), sdk.config()
@@ -112,8 +112,8 @@ def open_realsense(text: str, settings: InputConfig) -> RealSense:
         profile = pipeline.start(wanted)
     except RuntimeError as error:
         raise SourceError(
-            f"no RealSense camera gives {width}×{height} at {fps} frames/s ({error}); plug it into a USB 3 port, close "
-            "other programs that use it, or try realsense:width=848,height=480,fps=30"
+            f"no RealSense camera provides {width}×{height} at {fps} frames/s ({error}); plug it into a USB 3 port, "
+            "close other programs that use it, or try realsense:width=848,height=480,fps=30"
         ) from error
     try:
         return RealSense(sdk, pipeline, profile, settings)
@@ -123,18 +123,18 @@ def open_realsense(text: str, settings: InputConfig) -> RealSense:
 
 
 def _parsed(text: str) -> dict[str, Any]:
-    """Read the options after the colon. Raises SourceError on any that is none."""
+    """Read the options after the colon. Raises SourceError on an unknown option."""
     options: dict[str, Any] = {**OPTIONS, "serial": ""}
     for part in filter(None, text.partition(":")[2].split(",")):
         key, _, value = (word.strip() for word in part.partition("="))
         if key not in options or not value or (key in OPTIONS and not (value.isdigit() and int(value))):
-            raise SourceError(f"realsense: option {part!r} not understood; there are {', '.join(options)}")
+            raise SourceError(f"realsense: unknown option {part!r}; the options are {', '.join(options)}")
         options[key] = int(value) if key in OPTIONS else value
     return options
 
 
 def _optics(sdk: Any, intrinsics: Any) -> tuple[Camera, Distortion | None]:
-    """Return camera and lens, in OpenCV's order; Brown–Conrady of the SDK's three kinds projects alike (rsutil.h)."""
+    """Return intrinsics and distortion in OpenCV's order; the SDK's three Brown–Conrady models are equal (rsutil.h)."""
     i = intrinsics
     camera = Camera(i.width, i.height, i.fx, i.fy, i.ppx, i.ppy)
     values = tuple(float(v) for v in intrinsics.coeffs)
@@ -143,13 +143,13 @@ def _optics(sdk: Any, intrinsics: Any) -> tuple[Camera, Distortion | None]:
         return camera, None
     if intrinsics.model not in known:
         raise SourceError(
-            f"realsense: lens model {intrinsics.model} of the colour camera is not known; give --calibration FILE"
+            f"realsense: lens model {intrinsics.model} of the colour camera is not supported; give --calibration FILE"
         )
     return camera, values
 
 
 def _transform(extrinsics: Any) -> NDArray[np.float64]:
-    """Return the 4×4 of the SDK's extrinsics, whose rotation goes by columns."""
+    """Return the SDK's extrinsics as a 4×4 matrix; the SDK stores the rotation by columns."""
     T = np.eye(4)
     T[:3, :3] = np.array(extrinsics.rotation, np.float64).reshape(3, 3).T
     T[:3, 3] = extrinsics.translation

@@ -1,12 +1,12 @@
-"""Read what the app Record3D records with an iPhone: .r3d files, and folders of its export "EXR + RGB".
+"""Read iPhone recordings of the app Record3D: .r3d files, and folders of its export "EXR + RGB".
 
 .r3d is a zip: metadata (JSON)   rgbd/0.jpg   rgbd/0.depth, rgbd/0.conf: LZFSE of float32 metres and of bytes
 the export:    metadata.json     rgb/0.jpg    depth/0.exr
 
 metadata: w, h, dw, dh (sizes in pixels), K (3×3 by columns), fps, frameTimestamps (seconds), perFrameIntrinsicCoeffs
 (fx, fy, cx, cy), poses (qx, qy, qz, qw, x, y, z of the camera, in OpenGL's axes). Layout: marek-simonik/record3d,
-issues 7 and 27; nerfstudio, record3d_utils.py. Depth is the colour camera's view on a coarser grid; confidence is 0, 1,
-2, and readings of 0 are left out.
+issues 7 and 27; nerfstudio, record3d_utils.py. Depth has fewer pixels than colour, but the same camera; confidence is
+0, 1 or 2, and readings with confidence 0 are ignored.
 """
 
 import json
@@ -21,23 +21,20 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
-from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.camera.calibration import Calibration, build_camera, json_number, resolve_calibration
 from sigmasplat.sources.files.archive import Archive
 from sigmasplat.sources.files.images import decode_color, depth_to_metres, image_size
 from sigmasplat.sources.files.optional import import_optional
+from sigmasplat.sources.files.poses import FLIP_YZ, rigid_transform
 from sigmasplat.sources.opening import Format
-from sigmasplat.sources.recorded import ImagePair, RecordedSource, Size
+from sigmasplat.sources.recorded import ImagePair, RecordedSource, Size, first_readable
 from sigmasplat.sources.stray_scanner import with_coarser_depth
-
-FLIPPED = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Takes our camera axes (y down, z forward) to OpenGL's (y up, z backward)."""
 
 
 @dataclass(frozen=True)
 class R3dImagePair(ImagePair):
-    """One frame of a .r3d: three members of the archive."""
+    """One frame of a .r3d file: three members of the archive."""
 
     archive: Archive
     number: int
@@ -49,7 +46,7 @@ class R3dImagePair(ImagePair):
         return decode_color(self.color, self.archive.read(f"rgbd/{self.number}.jpg"))
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
-        """Read depth in metres [H, W], 0 where the phone had no confidence. Raises SourceError naming the member."""
+        """Read depth in metres [H, W], 0 at confidence 0. Raises SourceError naming the member."""
         depth_m = self._unpacked("depth", np.float32)
         depth_m = np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0)
         name = f"rgbd/{self.number}.conf"
@@ -67,13 +64,15 @@ class R3dImagePair(ImagePair):
         where, data = self.archive.path / name, self.archive.read(name)
         try:
             return np.frombuffer(self.lzfse.decompress(data), kind).reshape(height, width)
-        except (self.lzfse.error, ValueError, MemoryError) as error:  # it asks for memory without end where cut short
-            raise SourceError(f"{where}: not {width}×{height} values in LZFSE ({error}); export it again") from error
+        except (self.lzfse.error, ValueError, MemoryError) as error:  # truncated data asks for endless memory
+            raise SourceError(
+                f"{where}: not {width}×{height} LZFSE-compressed values ({error}); export it again"
+            ) from error
 
 
 @dataclass(frozen=True)
 class ExrImagePair(ImagePair):
-    """One frame of the export: a picture and an EXR file."""
+    """One frame of the export: a colour image and an EXR file."""
 
     openexr: Any
 
@@ -92,22 +91,22 @@ class ExrImagePair(ImagePair):
     def _opened(self) -> Any:
         try:
             return self.openexr.File(str(self.depth), separate_channels=True)
-        except Exception as error:  # the library raises whatever its C++ does
+        except Exception as error:  # the library passes on any C++ exception
             raise SourceError(f"{self.depth}: unreadable EXR file ({error}); export it again") from error
 
 
 def open_record3d(path: Path, settings: InputConfig) -> RecordedSource:
-    """Open a .r3d file, an unpacked one, or an export; raises SourceError if metadata or images cannot be used."""
+    """Open a .r3d file, packed or unpacked, or an export. Raises SourceError if metadata or images cannot be used."""
     archive = Archive(path)
     name = "metadata.json" if "metadata.json" in archive else "metadata"
     metadata = _metadata(archive, name)
-    native = archive.numbered("rgbd", "depth")
-    colors = archive.numbered("rgbd", "jpg") if native else archive.numbered("rgb", "jpg|png")
-    depths = native or archive.numbered("depth", "exr")
+    native = archive.by_number("rgbd", "depth")
+    colors = archive.by_number("rgbd", "jpg") if native else archive.by_number("rgb", "jpg|png")
+    depths = native or archive.by_number("depth", "exr")
     numbers = sorted(colors.keys() & depths.keys())
     if not numbers:
         raise SourceError(
-            f"no depth images in {path} (looked for rgbd/0.depth and depth/0.exr beside the pictures); "
+            f"no depth images in {path} (looked for rgbd/0.depth and depth/0.exr beside the images); "
             "export it as Shareable/Internal format (.r3d) or EXR + RGB"
         )
     times_s = _times_s(path / name, metadata, numbers)
@@ -121,7 +120,7 @@ def open_record3d(path: Path, settings: InputConfig) -> RecordedSource:
         openexr = import_optional("OpenEXR", "iphone", f"{path}: depth of Record3D")
         images = [ExrImagePair(*pair, openexr) for pair in pairs]
     calibration = _calibration(path, path / name, metadata, images, settings)
-    skipped = [f"{path / colors[n]}: no depth {n} beside it" for n in sorted(colors.keys() - depths.keys())]
+    skipped = [f"{path / colors[n]}: no depth image {n}" for n in sorted(colors.keys() - depths.keys())]
     truth = _truth(path / name, metadata, numbers, times_s)
     return RecordedSource(path.resolve().stem, images, calibration, settings, truth, skipped)
 
@@ -137,7 +136,7 @@ def _metadata(archive: Archive, name: str) -> dict[str, Any]:
 
 
 def _depth_size(path: Path, metadata: dict[str, Any]) -> Size:
-    """Return (width, height) of depth; files of before metadata said it have a LiDAR's 256×192, turned as colour is."""
+    """Return (width, height) of depth; older files lack it and have the LiDAR's 256×192, rotated like colour."""
     width, height = (int(json_number(path, metadata, key)) for key in ("w", "h"))
     wide = (256, 192) if width > height else (192, 256)
     return int(json_number(path, metadata, "dw", wide[0])), int(json_number(path, metadata, "dh", wide[1]))
@@ -146,8 +145,8 @@ def _depth_size(path: Path, metadata: dict[str, Any]) -> Size:
 def _calibration(
     path: Path, where: Path, metadata: dict[str, Any], images: Sequence[ImagePair], settings: InputConfig
 ) -> Calibration:
-    """Read the camera, scaled to the pictures: exports hold them larger than metadata says."""
-    size, depth_size = _first_sizes(images)
+    """Read the camera, scaled to the image size, which is larger in exports than in the metadata."""
+    size, depth_size = first_readable(images, lambda pair: pair.sizes())
     width, height = (int(json_number(where, metadata, key, value)) for key, value in zip(("w", "h"), size, strict=True))
     focal = _rows(where, metadata, "perFrameIntrinsicCoeffs", 4)
     if focal is not None and len(focal):
@@ -159,18 +158,8 @@ def _calibration(
     return with_coarser_depth(resolve_calibration(path, recorded, size, settings, 1.0), depth_size)
 
 
-def _first_sizes(images: Sequence[ImagePair]) -> tuple[Size, Size]:
-    problem: SourceError | None = None
-    for image in images:
-        try:
-            return image.sizes()
-        except SourceError as error:
-            problem = problem or error
-    raise SourceError(f"no pair of colour and depth can be read (first: {problem})")
-
-
 def _times_s(where: Path, metadata: dict[str, Any], numbers: list[int]) -> NDArray[np.float64]:
-    """Return the frames' times, of a steady rate where none are recorded. Raises SourceError."""
+    """Return the times of the frames, from the frame rate if times are not recorded. Raises SourceError."""
     times = metadata.get("frameTimestamps")
     if isinstance(times, list) and len(times) > numbers[-1]:
         values = [json_number(where, {"frameTimestamps": times[n]}, "frameTimestamps") for n in numbers]
@@ -181,22 +170,16 @@ def _times_s(where: Path, metadata: dict[str, Any], numbers: list[int]) -> NDArr
 def _truth(
     where: Path, metadata: dict[str, Any], numbers: list[int], times_s: NDArray[np.float64]
 ) -> Trajectory | None:
-    """Return ARKit's path: not the truth, but what the phone believed of itself; the front camera has none."""
+    """Return ARKit's path: an estimate by the phone, not ground truth; the front camera has none."""
     poses = _rows(where, metadata, "poses", 7)
     if poses is None or len(poses) <= numbers[-1] or np.ptp(poses, 0).max() == 0:
         return None
-    T = np.tile(np.eye(4), (len(numbers), 1, 1))
-    lengths = np.linalg.norm(poses[:, :4], axis=1)
-    if (np.abs(lengths - 1.0) > 1e-2).any():
-        n = int(np.argmax(np.abs(lengths - 1.0)))
-        raise SourceError(f"{where}: pose {n} is not rigid: its quaternion has length {lengths[n]:.4g}, not 1")
-    T[:, :3, :3] = se3.rotation_from_quaternion(poses[numbers][:, [3, 0, 1, 2]])
-    T[:, :3, 3] = poses[numbers, 4:]
-    return Trajectory(times_s, T @ FLIPPED)
+    T = np.stack([rigid_transform(f"{where}, pose {n}", poses[n, 4:], poses[n, [3, 0, 1, 2]]) for n in numbers])
+    return Trajectory(times_s, T @ FLIP_YZ)
 
 
 def _rows(where: Path, metadata: dict[str, Any], key: str, count: int) -> NDArray[np.float64] | None:
-    """Read rows of `count` numbers, None where there are none. Raises SourceError naming file and field."""
+    """Read rows of `count` numbers, None if the field is missing. Raises SourceError naming file and field."""
     if not metadata.get(key):
         return None
     try:
@@ -204,7 +187,7 @@ def _rows(where: Path, metadata: dict[str, Any], key: str, count: int) -> NDArra
     except (TypeError, ValueError):
         rows = np.zeros(0)
     if rows.ndim != 2 or rows.shape[1] != count or not np.isfinite(rows).all():
-        raise SourceError(f'{where}: field "{key}" is no list of {count} finite numbers each; export it again')
+        raise SourceError(f'{where}: field "{key}" is not a list of rows with {count} finite numbers; export it again')
     return rows
 
 

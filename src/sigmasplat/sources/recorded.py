@@ -1,8 +1,9 @@
-"""Read sequences that lie as image files on disk: a format says which files belong together, this reads them."""
+"""Read recorded sequences: a format lists the image pairs, this module reads and rectifies them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +19,16 @@ from sigmasplat.sources.camera.rectification import Rectification, check_image_s
 from sigmasplat.sources.files.images import color_from_bytes, image_size, read_color, read_depth
 
 Size = tuple[int, int]
+File = TypeVar("File")
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
 class ImagePair:
     """The colour and the depth file of one frame, and its time in seconds.
 
-    Formats whose images are no files by themselves (members of an archive, frames of a video, messages of a bag) derive
-    from this and read in their own way; the paths then only name the images in messages.
+    Formats whose images are not separate files (members of an archive, frames of a video, messages of a bag) derive
+    from this class and override the readers; the paths then only name the images in error messages.
     """
 
     timestamp_s: float
@@ -41,12 +44,12 @@ class ImagePair:
         return read_depth(self.depth, units_per_metre)
 
     def sizes(self) -> tuple[Size, Size]:
-        """Return (width, height) of colour and of depth in pixels. Raises SourceError naming the one unreadable."""
+        """Return (width, height) of colour and of depth in pixels. Raises SourceError naming the unreadable file."""
         return image_size(self.color), image_size(self.depth)
 
 
 class RecordedSource(Source):
-    """Pairs of image files, brought into one pinhole camera."""
+    """A sequence of image pairs, rectified to one pinhole camera."""
 
     def __init__(
         self,
@@ -58,10 +61,10 @@ class RecordedSource(Source):
         skipped: Sequence[str] = (),
         test: Source | None = None,
     ) -> None:
-        """Take the files in order of time; `truth` is of the colour camera; `skipped` are files left out, with reasons.
+        """Store image pairs in order of time; `truth` is the path of the colour camera; `skipped` lists files left out.
 
-        test: views kept apart for scoring.
-        Raises SourceError if the first images do not fit the calibration, or none has a depth reading.
+        test: separate test views.
+        Raises SourceError if the first images do not match the calibration, or no image has a depth reading.
         """
         self._rectified = Rectification(name, calibration, settings)
         super().__init__(name, self._rectified.camera, settings.strict)
@@ -81,7 +84,7 @@ class RecordedSource(Source):
         return self._images[self._checked_index(i)].timestamp_s
 
     def frame(self, i: int) -> Frame:
-        """Read frame i: colour and depth of one camera, lens taken out."""
+        """Read frame i: colour and depth of one camera, lens distortion removed."""
         files = self._images[self._checked_index(i)]
         color = color_from_bytes(files.read_color())
         depth_m = files.read_depth(self.depth_units_per_metre)
@@ -91,40 +94,37 @@ class RecordedSource(Source):
         return Frame(i, files.timestamp_s, color, depth_m, self.camera)
 
     def depth_of(self, i: int) -> NDArray[np.float32]:
-        """Read the depth of frame i without its colour, as `frame` does."""
+        """Read the depth of frame i as `frame` does, without reading colour."""
         files = self._images[self._checked_index(i)]
         depth_m, camera = files.read_depth(self.depth_units_per_metre), self._rectified.calibration.camera
         check_image_sizes(self._rectified, files.color, (camera.width, camera.height), files.depth, depth_m.shape[::-1])
         return self._rectified.depth(depth_m)
 
     def truth(self) -> Trajectory | None:
-        """Return the recorded path, all of it, on its own timestamps."""
+        """Return the whole recorded path with its own timestamps."""
         return self._truth
 
     def test_views(self) -> Source | None:
-        """Return the views kept apart, None if there are none."""
+        """Return the separate test views, None without them."""
         return self._test
 
     def _refuse_sizes_of_first(self) -> None:
-        """Stop before the run where every frame would be refused for its size."""
-        problem: SourceError | None = None
-        for files in self._images:
-            try:
-                size, depth_size = files.sizes()
-            except SourceError as error:
-                problem = problem or error
-                continue
-            check_image_sizes(self._rectified, files.color, size, files.depth, depth_size)
-            return
-        raise SourceError(f"no pair of colour and depth can be read (first: {problem})")
+        """Raise SourceError before a run if the image sizes do not match the calibration."""
+        files, (size, depth_size) = first_readable(self._images, lambda pair: (pair, pair.sizes()))
+        check_image_sizes(self._rectified, files.color, size, files.depth, depth_size)
 
 
 def first_size(paths: Sequence[Path]) -> tuple[int, int]:
     """Return (width, height) of the first image whose header can be read. Raises SourceError if none can."""
+    return first_readable(paths, image_size)
+
+
+def first_readable(files: Iterable[File], read: Callable[[File], Value]) -> Value:
+    """Return `read` of the first file for which it raises no SourceError. Raises SourceError if it fails for all."""
     problem: SourceError | None = None
-    for path in paths:
+    for file in files:
         try:
-            return image_size(path)
+            return read(file)
         except SourceError as error:
             problem = problem or error
     raise SourceError(f"no pair of colour and depth can be read (first: {problem})")

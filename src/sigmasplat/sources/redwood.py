@@ -2,11 +2,11 @@
 
 color|rgb|image/000000.jpg  depth/000000.png              paired by the number in the name
 rgb/0000001-000000033000.jpg  depth/0000001-0000….png     Redwood: number and time in µs; paired by time
-intrinsic.json | camera_intrinsic.json                    width, height, intrinsic_matrix (9 numbers, by columns);
-                                                          depth_scale and fps where Open3D's recorders wrote them
-trajectory.log | NAME.log                                 per pose "number number number" and 4 rows, camera to world
+intrinsic.json | camera_intrinsic.json                    width, height, intrinsic_matrix (9 numbers by columns);
+                                                          and depth_scale, fps if written by Open3D's recorders
+trajectory.log | NAME.log                                 per pose three numbers and 4 matrix rows, camera to world
 
-Without an intrinsic file the camera is the PrimeSense's factory one, which Redwood's were recorded with; depth in mm.
+Without an intrinsic file, PrimeSense's factory values are used (Redwood's camera); depth in mm.
 """
 
 import re
@@ -27,7 +27,7 @@ from sigmasplat.sources.camera.calibration import (
     read_json_object,
     resolve_calibration,
 )
-from sigmasplat.sources.files.association import associate
+from sigmasplat.sources.files.association import MAX_GAP_S, associate, no_pairs
 from sigmasplat.sources.files.folders import (
     COLOR_ENDINGS,
     COLOR_FOLDERS,
@@ -44,13 +44,12 @@ from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
 from sigmasplat.sources.tum import parse_numbers, read_lines
 
 INTRINSIC_NAMES = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
-MAX_GAP_S = 0.02
 
 _TIMED = re.compile(r"([0-9]+)-([0-9]{9,})")
 
 
 def open_redwood(folder: Path, settings: InputConfig) -> RecordedSource:
-    """Open a folder; raises SourceError if images, camera or trajectory cannot be used."""
+    """Open a folder. Raises SourceError if images, camera or trajectory cannot be used."""
     path = _intrinsic_file(folder)
     fields = read_json_object(path) if path else {}
     rate = check_positive(path or folder, "fps", json_number(path or folder, fields, "fps", FRAMES_PER_SECOND))
@@ -64,13 +63,13 @@ def open_redwood(folder: Path, settings: InputConfig) -> RecordedSource:
 
 
 def _timed(folder: Path, colors: list[Path], depths: list[Path]) -> tuple[list[ImagePair], list[str]] | None:
-    """Pair images that carry their time in the name, None if they do not."""
+    """Pair images by the time in their names, None if the names contain no time."""
     if not (colors and depths and all(_TIMED.fullmatch(path.stem) for path in colors + depths)):
         return None
     times_s = [np.array([int(path.stem.split("-")[1]) * 1e-6 for path in paths]) for paths in (colors, depths)]
-    pairs = associate(times_s[0], times_s[1], MAX_GAP_S)
+    pairs = associate(times_s[0], times_s[1])
     if not len(pairs):
-        raise SourceError(f"{folder}: no colour image has depth within {MAX_GAP_S:g} s; are both from one recording?")
+        raise no_pairs(folder, {"colour": times_s[0], "depth": times_s[1]})
     skipped = [f"{path}: no depth within {MAX_GAP_S:g} s" for i, path in enumerate(colors) if i not in pairs[:, 0]]
     return [ImagePair(float(times_s[1][j]), colors[i], depths[j]) for i, j in pairs], skipped
 
@@ -85,7 +84,7 @@ def _recorded(path: Path, fields: dict[str, object]) -> Calibration:
     """Build the camera from Open3D's JSON. Raises SourceError naming file and field."""
     values = fields.get("intrinsic_matrix")
     if not isinstance(values, list) or len(values) != 9:
-        raise SourceError(f'{path}: field "intrinsic_matrix" is {values!r}, 9 numbers by columns are wanted')
+        raise SourceError(f'{path}: field "intrinsic_matrix" is {values!r}, expected 9 numbers by columns')
     fx, fy, cx, cy = (json_number(path, {"intrinsic_matrix": values[i]}, "intrinsic_matrix") for i in (0, 4, 6, 7))
     width, height = (int(json_number(path, fields, key)) for key in ("width", "height"))
     units = check_positive(path, "depth_scale", json_number(path, fields, "depth_scale", MM_PER_METRE))
@@ -93,13 +92,13 @@ def _recorded(path: Path, fields: dict[str, object]) -> Calibration:
 
 
 def _truth(folder: Path, images: list[ImagePair]) -> Trajectory | None:
-    """Read the log: its first number counts the depth images in order, from 0."""
+    """Read the log; the first number of a pose is the index of its depth image, from 0."""
     path = _log_in(folder)
     if path is None:
         return None
     rows = [(line, parse_numbers(path, line, words)) for line, words in read_lines(path)]
     if len(rows) % 5 or any(len(row) != (3 if i % 5 == 0 else 4) for i, (_, row) in enumerate(rows)):
-        raise SourceError(f"{path}: each pose takes 5 lines, three numbers and 4 rows of 4; is the file cut short?")
+        raise SourceError(f"{path}: each pose needs 5 lines: three numbers, then 4 rows of 4; is the file truncated?")
     depths = list_images(folder / "depth", DEPTH_ENDINGS)
     times = {image.depth: image.timestamp_s for image in images}
     timed = []
@@ -113,7 +112,7 @@ def _truth(folder: Path, images: list[ImagePair]) -> Trajectory | None:
 
 
 def _log_in(folder: Path) -> Path | None:
-    """Return trajectory.log, else the one log that begins as a trajectory does and is not of somebody's odometry."""
+    """Return trajectory.log, else the only log that starts like a trajectory and is not odometry."""
     if (folder / "trajectory.log").is_file():
         return folder / "trajectory.log"
     logs = [path for path in folder.glob("*.log") if "odom" not in path.name and _begins_as_trajectory(path)]
@@ -131,7 +130,7 @@ def _intrinsic_file(folder: Path) -> Path | None:
 
 
 def recognises(path: str) -> bool:
-    """Tell whether there are image folders, and a camera, a trajectory or names as Open3D and Redwood write them."""
+    """Return whether there are image folders with a camera file, a trajectory, or names with times as in Redwood."""
     folder = Path(path)
     colors = first_subfolder(folder, COLOR_FOLDERS)
     if colors is None and not (folder / "depth").is_dir():

@@ -1,4 +1,4 @@
-"""Read the Replica renderings in the layout NICE-SLAM made common.
+"""Read the Replica renderings in the layout of NICE-SLAM.
 
 results/frame000000.jpg  results/depth000000.png  traj.txt     one row-major camera-to-world 4×4 per line
 cam_params.json                                                here or in the parent folder
@@ -20,7 +20,7 @@ from sigmasplat.sources.recorded import ImagePair, RecordedSource
 
 
 def open_replica(folder: Path, settings: InputConfig) -> RecordedSource:
-    """Open a folder; raises SourceError if images, calibration or true poses cannot be used."""
+    """Open a folder. Raises SourceError if images, calibration or ground-truth poses cannot be used."""
     colors, depths = _numbered(folder, "frame"), _numbered(folder, "depth")
     numbers, skipped = pair_images(folder, colors, depths, "results/frame*.jpg", "results/depth*.png")
     images = [ImagePair(n / FRAMES_PER_SECOND, colors[n], depths[n]) for n in numbers]
@@ -32,7 +32,7 @@ def open_replica(folder: Path, settings: InputConfig) -> RecordedSource:
 
 
 def _numbered(folder: Path, stem: str) -> dict[int, Path]:
-    """Map the number in each `results/<stem>NNN.*` image to its path."""
+    """Map the number in the name of each `results/<stem>NNN.*` image to its path."""
     found = {}
     for path in sorted((folder / "results").glob(f"{stem}*")):
         match = re.fullmatch(rf"{stem}(\d+)\.(jpg|jpeg|png|npy|tiff?)", path.name.lower())
@@ -49,13 +49,13 @@ def _calibration(folder: Path) -> Calibration:
 
 
 def _truth(path: Path, numbers: list[int]) -> Trajectory | None:
-    """Read the poses of the numbered frames. Raises SourceError naming the line that is no rigid pose."""
+    """Read the poses of the given frames. Raises SourceError naming the line whose pose is not rigid."""
     if not path.is_file():
         return None
     lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
     if numbers[-1] >= len(lines):
         raise SourceError(
-            f"{path}: {len(lines)} poses, but images go up to number {numbers[-1]}; is the file cut short?"
+            f"{path}: {len(lines)} poses, but the last image has number {numbers[-1]}; is the file truncated?"
         )
     poses = []
     for number in numbers:
@@ -71,7 +71,7 @@ def _matrix(where: str, line: str) -> np.ndarray[tuple[int, ...], np.dtype[np.fl
         return np.array([float(word) for word in line.split()]).reshape(4, 4)
     except ValueError as error:
         raise SourceError(
-            f"{where}: 16 numbers (row-major camera-to-world) wanted, found {line.strip()[:80]!r}"
+            f"{where}: expected 16 numbers (row-major camera-to-world), found {line.strip()[:80]!r}"
         ) from error
 
 

@@ -1,20 +1,18 @@
-"""Read RGB-D recordings of robots: ROS 1 bags, ROS 2 bags, MCAP files, and what RealSense's SDK records.
+"""Read ROS 1 bags, ROS 2 bags, MCAP files, and recordings of RealSense's SDK.
 
-Topics are found by what they hold, or chosen with input.color_topic and input.depth_topic. The bag is gone through once
-for the times; images are read when they are asked for.
+Topics are found by their content, or chosen with input.color_topic and input.depth_topic. Opening reads the bag once
+for the timestamps; images are read on demand.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
-from sigmasplat.errors import SourceError
-from sigmasplat.sources.files.association import associate
+from sigmasplat.sources.files.association import MAX_GAP_S, associate, no_pairs
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, Size
 from sigmasplat.sources.ros.bag import Bag, Entry, is_bag
@@ -23,14 +21,12 @@ from sigmasplat.sources.ros.images import decode_color_message, decode_depth_mes
 from sigmasplat.sources.ros.topics import color_topic, depth_topic
 from sigmasplat.sources.ros.truth import read_truth
 
-MAX_GAP_S = 0.02
-"""Colour and depth of one camera at 30 Hz are never further apart."""
 Times = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class BagImagePair(ImagePair):
-    """A pair of messages; the paths name topic and time below the bag."""
+    """A pair of messages; the paths contain bag, topic and time."""
 
     bag: Bag
     topics: tuple[str, str]
@@ -54,7 +50,7 @@ class BagImagePair(ImagePair):
 
 
 def open_bag(path: Path, settings: InputConfig) -> RecordedSource:
-    """Open a bag; raises SourceError if it is damaged, its topics are not clear, or its cameras are not known."""
+    """Open a bag. Raises SourceError if it is damaged, its topics are ambiguous, or its cameras are unknown."""
     bag = Bag(path)
     color, depth = color_topic(bag, settings.color_topic), depth_topic(bag, settings.depth_topic)
     calibration = read_bag_calibration(bag, color, depth, settings)
@@ -62,7 +58,7 @@ def open_bag(path: Path, settings: InputConfig) -> RecordedSource:
     entries = found[color.name], found[depth.name]
     pairs, recorded_time = _paired(entries)
     if not len(pairs):
-        raise SourceError(_no_overlap(path, (color.name, depth.name), entries))
+        raise no_pairs(path, {name: _times_s(found[name], True) for name in (color.name, depth.name)})
     truth = read_truth(bag, color.frame, recorded_time)
     topics = (color.name, depth.name)
     color_s, depth_s = (_times_s(part, recorded_time) for part in entries)
@@ -78,20 +74,20 @@ def open_bag(path: Path, settings: InputConfig) -> RecordedSource:
 
 
 def _paired(entries: tuple[Sequence[Entry], Sequence[Entry]]) -> tuple[NDArray[np.intp], bool]:
-    """Pair colour with depth by the headers' times, or by those of recording where that finds more.
+    """Pair colour with depth by header time, or by recording time if that finds more pairs.
 
-    Some drivers leave headers empty, or take the times of two sensors from two clocks.
+    Some drivers leave the headers empty, or use a different clock for each sensor.
     """
     clocks = (False, True) if _headers_have_times(entries) else (True,)
     found = []
     for recorded in clocks:
         color_s, depth_s = (_times_s(part, recorded) for part in entries)
-        found.append((associate(color_s, depth_s, MAX_GAP_S), recorded))
+        found.append((associate(color_s, depth_s), recorded))
     return max(found, key=lambda answer: len(answer[0]))
 
 
 def _headers_have_times(entries: tuple[Sequence[Entry], Sequence[Entry]]) -> bool:
-    """Tell whether the headers hold times at all."""
+    """Return whether the headers contain times."""
     return all(part[0].stamp_ns != part[-1].stamp_ns or len(part) == 1 for part in entries)
 
 
@@ -101,12 +97,6 @@ def _times_s(entries: Sequence[Entry], recorded: bool) -> Times:
 
 def _message_path(path: Path, topic: str, time_s: float) -> Path:
     return path / f"{topic.lstrip('/')} at {time_s:.3f} s"
-
-
-def _no_overlap(path: Path, topics: tuple[str, str], entries: tuple[Sequence[Entry], Sequence[Entry]]) -> str:
-    times = partial(_times_s, recorded=True)
-    spans = [f"{n} {times(e).min():.3f} … {times(e).max():.3f} s" for n, e in zip(topics, entries, strict=True)]
-    return f"no colour image of {path} has depth within {MAX_GAP_S:g} s ({', '.join(spans)}); one recording?"
 
 
 FORMAT = Format(

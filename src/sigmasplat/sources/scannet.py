@@ -1,13 +1,13 @@
-"""Read ScanNet scenes after extraction from their .sens files, in either layout that its SensReader writes.
+"""Read ScanNet scenes extracted from .sens files, in both layouts of SensReader.
 
-color/0.jpg  depth/0.png  pose/0.txt                         SensReader/python; names are numbers, padded or not
+color/0.jpg  depth/0.png  pose/0.txt                         SensReader/python; also 000000.jpg
 intrinsic/intrinsic_color.txt  intrinsic_depth.txt  extrinsic_color.txt  extrinsic_depth.txt
-intrinsics_color.txt  intrinsics_depth.txt                   … in the scene's folder, as in scannet_frames_25k
+intrinsics_color.txt  intrinsics_depth.txt                   or in the scene's folder, as in scannet_frames_25k
 frame-000000.color.jpg  .depth.pgm  .pose.txt  _info.txt     SensReader/c++; also 3RScan's, BundleFusion's (info.txt)
 
-Depth (640×480, mm) has a camera of its own and is registered to colour (1296×968), which is worked on at depth's width.
-Extrinsics take a common frame to each camera, so T_color_depth = E_color · E_depth⁻¹ (as BundleFusion uses them).
-Poses are camera to world; where tracking was lost they are −inf: such a frame stays, without truth.
+Depth (640×480, mm) has its own camera. It is registered to colour (1296×968), and the working width is depth's.
+Extrinsics transform a common frame to each camera: T_color_depth = E_color · E_depth⁻¹ (as in BundleFusion).
+Poses are camera to world, and −inf where tracking was lost: these frames are kept, without ground truth.
 """
 
 from pathlib import Path
@@ -44,17 +44,17 @@ from sigmasplat.sources.tum import parse_numbers
 from sigmasplat.types import Matrix
 
 COLOR_SIZE, DEPTH_SIZE = (1296, 968), (640, 480)
-"""Width and height of ScanNet's recordings; the published matrices are for these, whatever was done to the images."""
+"""Width and height of ScanNet's recordings. The published matrices are for these sizes, even if images are resized."""
 
 INFO_NAMES = ("_info.txt", "info.txt")
 
 
 def open_scannet(folder: Path, settings: InputConfig) -> RecordedSource:
-    """Open a scene's folder; raises SourceError if images, cameras or poses cannot be used."""
+    """Open a scene's folder. Raises SourceError if images, cameras or poses cannot be used."""
     files = _files(folder)
     if not files["color"] and not files["depth"] and (packed := sorted(folder.glob("*.sens"))):
         raise SourceError(
-            f"{packed[0]} is still packed; extract color, depth, pose and intrinsic from it with ScanNet's SensReader"
+            f"{packed[0]} is not extracted; extract color, depth, pose and intrinsic from it with ScanNet's SensReader"
         )
     keys, skipped = pair_images(folder, files["color"], files["depth"], "color/*.jpg", "depth/*.png")
     images = [ImagePair(n / FRAMES_PER_SECOND, files["color"][n], files["depth"][n]) for n in keys]
@@ -76,23 +76,23 @@ def _files(folder: Path) -> FrameFiles:
 
 
 def _recorded(folder: Path, size: tuple[int, int], depth_size: tuple[int, int]) -> Calibration | None:
-    """Build the two cameras from the scene's matrices, None where there are none. Raises SourceError if one is bad."""
+    """Build both cameras from the scene's matrices, None if they are missing. Raises SourceError if one is damaged."""
     where, found, units = _matrices(folder)
     if "color_intrinsic" not in found:
         return None
     camera = _camera(where["color_intrinsic"], found["color_intrinsic"], size, COLOR_SIZE)
     if "depth_intrinsic" not in found:
-        raise SourceError(f"{where['color_intrinsic']}: the depth camera's matrix is missing beside it; extract it too")
+        raise SourceError(f"{where['color_intrinsic']}: the depth camera's matrix is missing; extract it too")
     depth_camera = _camera(where["depth_intrinsic"], found["depth_intrinsic"], depth_size, DEPTH_SIZE)
     ends = [found.get(f"{kind}_extrinsic", np.eye(4)) for kind in ("color", "depth")]
     if not all(se3.is_rigid(T) for T in ends):
-        raise SourceError(f"{folder}: extrinsics of colour or depth are no rigid motions; delete or mend them")
+        raise SourceError(f"{folder}: the extrinsics of colour or depth are not rigid; correct or delete them")
     T_color_depth = ends[0] @ se3.inverse(ends[1])
     return Calibration(camera, units, depth_camera=depth_camera, T_color_depth=T_color_depth)
 
 
 def _matrices(folder: Path) -> tuple[dict[str, Path], dict[str, Matrix], float]:
-    """Return each matrix's file and value by `{color|depth}_{intrinsic|extrinsic}`, and depth units per metre."""
+    """Return file and value of each matrix by `{color|depth}_{intrinsic|extrinsic}`, and depth units per metre."""
     where, found, units = {}, {}, MM_PER_METRE
     for info in (folder / name for name in INFO_NAMES if (folder / name).is_file()):
         entries = dict(_entry(line) for line in info.read_text("utf-8", "replace").splitlines() if "=" in line)
@@ -119,13 +119,13 @@ def _entry(line: str) -> tuple[str, str]:
 
 
 def _camera(path: Path, K: Matrix, size: tuple[int, int], published: tuple[int, int]) -> Camera:
-    """Build the camera of images of `size`: the matrix's own if its centre fits, else resized as they were."""
+    """Build the camera for images of `size`; if the principal point does not fit it, resize the published camera."""
     own = size if abs(2 * K[0, 2] - size[0]) < 0.2 * size[0] else published
     return build_camera(path, *own, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]).resized(*size)
 
 
 def recognises(path: str) -> bool:
-    """Tell whether it is an extracted scene, or one that should have been."""
+    """Return whether it is a scene, extracted or not."""
     folder = Path(path)
     has_info = any((folder / name).is_file() for name in INFO_NAMES)
     if any(folder.glob("*.sens")) or (has_info and has_frame_files(folder)):

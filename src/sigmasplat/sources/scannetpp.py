@@ -1,12 +1,12 @@
-"""Read ScanNet++ scenes: the undistorted photographs of the DSLR, depth rendered from the laser scan.
+"""Read ScanNet++ scenes: undistorted DSLR photographs, depth rendered from the laser scan.
 
-dslr/nerfstudio/transforms_undistorted.json     one pinhole; `frames` and `test_frames` (`sources/transforms.py`)
+dslr/nerfstudio/transforms_undistorted.json     `frames` and `test_frames` (see `files/transforms.py`)
 dslr/undistorted_images/DSC00001.JPG            from the data set's toolbox, `dslr.undistort`
-dslr/undistorted_depths/DSC00001.png            16 bits, mm: rendered and undistorted (Nik-V9/scannetpp, for SplaTAM)
-dslr/train_test_lists.json                      optional {"train": […], "test": […]}: which photographs, in which order
+dslr/undistorted_depths/DSC00001.png            16 bits, mm, rendered, undistorted (Nik-V9/scannetpp)
+dslr/train_test_lists.json                      optional {"train": […], "test": […]}: names in order
 
-The sequence is the training photographs. The test ones were taken apart from the walk, not along it, so they are no
-frames to be tracked: `test_views()` gives them with their poses. SplaTAM's and LoopSplat's loaders read this layout.
+The sequence contains the training photographs. The test photographs are not taken along the path, so they cannot be
+tracked: `test_views()` returns them with their poses. SplaTAM and similar systems read the same layout.
 """
 
 from pathlib import Path
@@ -25,7 +25,7 @@ IMAGES, DEPTHS, LISTS = "undistorted_images", "undistorted_depths", "train_test_
 
 
 def open_scannetpp(scene: Path, settings: InputConfig) -> RecordedSource:
-    """Open a scene's folder or its `dslr`; raises SourceError if its file, images or camera cannot be used."""
+    """Open a scene's folder or its `dslr`. Raises SourceError if its JSON file, images or camera cannot be used."""
     dslr = _dslr(scene)
     fields = read_json_object(dslr / TRANSFORMS)
     _refuse_missing_folders(dslr)
@@ -49,12 +49,12 @@ def _source(
 
 
 def _chosen(dslr: Path, fields: Fields, split: str, key: str) -> list[Fields]:
-    """Return a split's frames in the order of the list where there is one, else of their names."""
+    """Return the frames of a split, in the order of train_test_lists.json if it exists, else of their names."""
     frames = {frame["file_path"]: frame for frame in read_frames(dslr / TRANSFORMS, fields, key)}
     lists = read_json_object(dslr / LISTS) if (dslr / LISTS).is_file() else {}
     names = lists.get(split, sorted(frames))
     if not isinstance(names, list) or not names:
-        raise SourceError(f"{dslr / LISTS}: {split!r} is {str(names)[:60]}, a list of file names is wanted")
+        raise SourceError(f"{dslr / LISTS}: {split!r} is {str(names)[:60]}, expected a list of file names")
     absent = [str(name) for name in names if str(name) not in frames]
     if absent:
         raise SourceError(f"{dslr / LISTS}: {absent[0]} of {split!r} is not among the {key} of {TRANSFORMS.name}")
@@ -65,7 +65,9 @@ def _refuse_missing_folders(dslr: Path) -> None:
     for part, made_by in ((IMAGES, "the toolbox's `python -m dslr.undistort`"), (DEPTHS, "a depth renderer")):
         if not (dslr / part).is_dir():
             there = ", ".join(sorted(entry.name for entry in dslr.iterdir() if entry.is_dir()))
-            raise SourceError(f"{dslr}: no {part}/ (found {there}); make it with {made_by}, for the undistorted camera")
+            raise SourceError(
+                f"{dslr}: no {part}/ (found {there}); create it with {made_by}, for the undistorted camera"
+            )
 
 
 def _dslr(scene: Path) -> Path:

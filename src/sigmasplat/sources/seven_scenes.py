@@ -1,11 +1,11 @@
-"""Read the 7-Scenes sequences as published: three files a frame, depth not registered to colour.
+"""Read the 7-Scenes sequences as published: three files per frame, depth not registered to colour.
 
 seq-01/frame-000000.color.png  .depth.png  .pose.txt      (also .color.jpg); depth in mm, 0 and 65535 = no reading
 SCENE/seq-01/ seq-02/ …                                   the scene's folder, if it holds one sequence
 
-The poses are those of the depth camera. As published, colour is taken to be seen by it too, which is off by up to some
-centimetres near by: so do those who report numbers on this data. With register_depth=on depth is moved to the colour
-camera, and so is the true path: T_world_color = T_world_depth · T_depth_color.
+The poses are those of the depth camera. By default colour is assumed to have the same camera, as in published results;
+the error is up to some centimetres for near surfaces. With register_depth=on, depth is moved to the colour camera, and
+the ground-truth path is converted: T_world_color = T_world_depth · T_depth_color.
 """
 
 from dataclasses import replace
@@ -30,7 +30,7 @@ from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
 
 
 def open_seven_scenes(folder: Path, settings: InputConfig) -> RecordedSource:
-    """Open a sequence's folder, or a scene's with one sequence; raises SourceError if it cannot be used."""
+    """Open the folder of a sequence, or of a scene with one sequence. Raises SourceError if it cannot be used."""
     if not has_frame_files(folder):
         folder = _only_sequence(folder)
     files = frame_files(folder)
@@ -54,11 +54,11 @@ def _calibration(folder: Path, images: list[ImagePair], settings: InputConfig) -
 
 
 def _only_sequence(scene: Path) -> Path:
-    """Return the one sequence of a scene. Raises SourceError unless there is one."""
+    """Return the only sequence of a scene. Raises SourceError unless there is exactly one."""
     sequences = [path for path in sorted(scene.glob("seq-*")) if path.is_dir() and has_frame_files(path)]
     packed = [path.name for path in sorted(scene.glob("seq-*.zip"))]
     if not sequences and packed:
-        raise SourceError(f"{scene}: the sequences are still packed ({', '.join(packed[:3])}); unzip them first")
+        raise SourceError(f"{scene}: the sequences are not unpacked ({', '.join(packed[:3])}); unzip them first")
     if len(sequences) != 1:
         names = ", ".join(path.name for path in sequences)
         raise SourceError(f"{scene} holds {len(sequences)} sequences ({names}); give one, as {sequences[0]}")
@@ -66,7 +66,7 @@ def _only_sequence(scene: Path) -> Path:
 
 
 def recognises(path: str) -> bool:
-    """Tell whether it is a sequence without a camera file of its own, or a scene of such."""
+    """Return whether it is a sequence without a camera file, or a scene with such sequences."""
     folder = Path(path)
     if has_frame_files(folder):
         return not any((folder / name).is_file() for name in ("_info.txt", "info.txt"))

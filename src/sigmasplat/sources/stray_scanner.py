@@ -1,11 +1,11 @@
-"""Read what the app Stray Scanner records with an iPhone's LiDAR (layout: strayrobots/scanner, docs/format.md).
+"""Read LiDAR recordings of the iPhone app Stray Scanner (layout: strayrobots/scanner, docs/format.md).
 
-rgb.mp4                       depth/000000.png    16-bit millimetres, coarser than colour, same camera
-camera_matrix.csv   3×3       confidence/000000.png   0, 1, 2: readings of 0 are left out
+rgb.mp4                       depth/000000.png    16-bit millimetres, fewer pixels, same camera
+camera_matrix.csv   3×3       confidence/000000.png   0, 1 or 2: readings with 0 are ignored
 odometry.csv        timestamp, frame, x, y, z, qx, qy, qz, qw [, fx, fy, cx, cy]
 
-The app turns ARKit's camera axes into ours before it writes a pose (OdometryEncoder.swift), and numbers frame, depth
-and pose alike. Files of 2021, whose odometry.csv has no header, are not read.
+The app converts ARKit's camera axes to ours before it writes a pose (OdometryEncoder.swift). Frame, depth and pose
+share one number. Recordings of 2021, whose odometry.csv has no header, are not supported.
 """
 
 import csv
@@ -20,13 +20,12 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.camera.calibration import Calibration, build_camera, resolve_calibration
+from sigmasplat.sources.camera.calibration import MM_PER_METRE, Calibration, build_camera, resolve_calibration
 from sigmasplat.sources.files.images import guard_decoding, image_size, read_depth
 from sigmasplat.sources.files.video import Video
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, Size, first_size
 
-UNITS_PER_METRE = 1000.0
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 INTRINSICS = ("fx", "fy", "cx", "cy")
 Rows = dict[int, dict[str, float]]
@@ -34,7 +33,7 @@ Rows = dict[int, dict[str, float]]
 
 @dataclass(frozen=True)
 class StrayImagePair(ImagePair):
-    """A frame of the video, a depth image, and how sure the phone was of each reading."""
+    """A frame of the video, a depth image, and the confidence of each reading."""
 
     video: Video
     number: int
@@ -45,7 +44,7 @@ class StrayImagePair(ImagePair):
         return self.video.frame(self.number)
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
-        """Read depth in metres [H, W], 0 where the phone had no confidence. Raises SourceError naming the file."""
+        """Read depth in metres [H, W], 0 at confidence 0. Raises SourceError naming the file."""
         depth_m = read_depth(self.depth, units_per_metre)
         if not self.confidence.is_file():
             return depth_m
@@ -61,13 +60,13 @@ class StrayImagePair(ImagePair):
         return self.video.size, image_size(self.depth)
 
 
-def open_stray(folder: Path, settings: InputConfig) -> RecordedSource:
-    """Open a folder; raises SourceError if video, depth, camera or poses cannot be used."""
+def open_stray_scanner(folder: Path, settings: InputConfig) -> RecordedSource:
+    """Open a folder. Raises SourceError if video, depth, camera or poses cannot be used."""
     video_path, depths = folder / "rgb.mp4", _numbered(folder / "depth")
     if not video_path.is_file():
         raise SourceError(f"no video in {folder} (looked for rgb.mp4); copy the whole folder from the phone")
     if not depths:
-        raise SourceError(f"no depth images in {folder} (looked for depth/000000.png, …); has the phone a LiDAR?")
+        raise SourceError(f"no depth images in {folder} (looked for depth/000000.png, …); does the phone have a LiDAR?")
     rows, video = _odometry(folder / "odometry.csv"), Video(video_path)
     numbers = [n for n in sorted(depths) if n in rows and n < video.count]
     if not numbers:
@@ -87,7 +86,7 @@ def open_stray(folder: Path, settings: InputConfig) -> RecordedSource:
 
 
 def with_coarser_depth(calibration: Calibration, depth_size: Size) -> Calibration:
-    """Return the calibration of a phone, whose depth is the colour camera's view on a coarser grid."""
+    """Return the calibration of a phone whose depth has fewer pixels than colour, but the same camera."""
     if depth_size == (calibration.camera.width, calibration.camera.height) or calibration.depth_camera:
         return calibration
     camera, lens = calibration.camera.resized(*depth_size), calibration.distortion
@@ -99,14 +98,14 @@ def _numbered(folder: Path) -> dict[int, Path]:
 
 
 def _odometry(path: Path) -> Rows:
-    """Read the lines of odometry.csv by frame. Raises SourceError naming file and line."""
+    """Read odometry.csv as rows by frame number. Raises SourceError naming file and line."""
     if not path.is_file():
-        raise SourceError(f"{path} is missing: it holds the times of the frames; copy the whole folder from the phone")
+        raise SourceError(f"{path} is missing: it holds the times of the frames; copy the whole folder again")
     with path.open(newline="", encoding="utf-8") as file:
         lines = [[word.strip() for word in line] for line in csv.reader(file) if line]
     if not lines or not set(POSE) <= set(lines[0]):
         raise SourceError(
-            f"{path}: columns {', '.join(POSE)} wanted in the first line, "
+            f"{path}: expected columns {', '.join(POSE)} in the first line, "
             f"found {', '.join(lines[0] if lines else [])}; "
             "record with a Stray Scanner of 2022 or later"
         )
@@ -121,22 +120,22 @@ def _row(where: str, names: list[str], words: list[str]) -> dict[str, float]:
     try:
         row = {name: float(word) for name, word in zip(names, words, strict=True)}
     except ValueError as error:
-        raise SourceError(f"{where}: {len(names)} numbers wanted, found {','.join(words)[:80]!r}") from error
+        raise SourceError(f"{where}: expected {len(names)} numbers, found {','.join(words)[:80]!r}") from error
     if not np.isfinite(list(row.values())).all():
-        raise SourceError(f"{where}: not finite: {','.join(words)[:80]!r}; drop the line")
+        raise SourceError(f"{where}: not finite: {','.join(words)[:80]!r}; delete the line")
     return row
 
 
 def _calibration(folder: Path, rows: Rows, size: Size, depth_size: Size, settings: InputConfig) -> Calibration:
-    """Read the camera: the middle of the values of all frames where they are there, since focus moves them a little."""
+    """Read the camera: the median of all frames if they have intrinsics, because autofocus changes them slightly."""
     path = folder / "camera_matrix.csv"
     recorded = None
     if rows and set(INTRINSICS) <= set(next(iter(rows.values()))):
         focal = np.median([[row[name] for name in INTRINSICS] for row in rows.values()], 0)
-        recorded = Calibration(build_camera(folder / "odometry.csv", *size, focal.tolist()), UNITS_PER_METRE)
+        recorded = Calibration(build_camera(folder / "odometry.csv", *size, focal.tolist()), MM_PER_METRE)
     elif path.is_file():
-        recorded = Calibration(build_camera(path, *size, _matrix(path)), UNITS_PER_METRE)
-    return with_coarser_depth(resolve_calibration(folder, recorded, size, settings, UNITS_PER_METRE), depth_size)
+        recorded = Calibration(build_camera(path, *size, _matrix(path)), MM_PER_METRE)
+    return with_coarser_depth(resolve_calibration(folder, recorded, size, settings, MM_PER_METRE), depth_size)
 
 
 def _matrix(path: Path) -> list[float]:
@@ -146,14 +145,14 @@ def _matrix(path: Path) -> list[float]:
             [[float(word) for word in line.split(",")] for line in path.read_text().split("\n") if line.strip()]
         )
     except (OSError, ValueError) as error:
-        raise SourceError(f"{path}: a 3×3 matrix of numbers wanted ({error}); copy it again") from error
+        raise SourceError(f"{path}: expected a 3×3 matrix of numbers ({error}); copy it again") from error
     if rows.shape != (3, 3):
-        raise SourceError(f"{path}: a 3×3 matrix wanted, found {rows.shape}; copy it again")
+        raise SourceError(f"{path}: expected a 3×3 matrix, found {rows.shape}; copy it again")
     return [float(v) for v in (rows[0, 0], rows[1, 1], rows[0, 2], rows[1, 2])]
 
 
 def _truth(rows: Rows, numbers: list[int]) -> Trajectory | None:
-    """Return ARKit's path: not the truth, but what the phone believed of itself."""
+    """Return ARKit's path: an estimate by the phone, not ground truth."""
     poses = np.tile(np.eye(4), (len(numbers), 1, 1))
     for T, n in zip(poses, numbers, strict=True):
         row = rows[n]
@@ -171,5 +170,5 @@ FORMAT = Format(
     "Stray Scanner",
     "rgb.mp4, depth/ and odometry.csv",
     _recognises,
-    lambda path, settings: open_stray(Path(path), settings),
+    lambda path, settings: open_stray_scanner(Path(path), settings),
 )

@@ -1,4 +1,4 @@
-"""Film the built-in room: exact depth and poses, any length and size, the same bytes from the same seed."""
+"""Render the synthetic room: exact depth and poses, any length and size, the same bytes for the same seed."""
 
 from typing import Any
 
@@ -26,17 +26,17 @@ EXPOSURE_SWING = 0.08
 class SyntheticRoom(Source):
     """A furnished room (or several), ray-cast frame by frame.
 
-    frames, width, height: of the sequence, pixels; seed: looks of the room, start of the walk and all noise;
-    noise: whether depth and colour have a sensor's faults; loops: turns of the walk; exposure_change: whether the
-    picture's gain swings by ±8 % over the sequence; rooms: how many, joined by doorways; overrun: how far the walk goes
-    on past its start, percent of a turn; drift: how far the depth's calibration wanders (`room.sensor.drifted_depth`),
-    tenths of a percent of the depth, standard deviation.
+    frames, width, height: length and image size, pixels; seed: appearance of the room, start of the path and all noise;
+    noise: whether depth and colour have sensor noise; loops: rounds of the path; exposure_change: whether the image
+    gain varies by ±8 % over the sequence; rooms: number of rooms, joined by doorways; overrun: how far the path
+    continues past its start, percent of a round; drift: standard deviation of the depth calibration's slow drift
+    (`room.sensor.drifted_depth`), tenths of a percent of the depth.
 
-    A walk with loops to close: frames=720,rooms=2,overrun=20,noise=1,drift=6. A turn of 600 frames is the calm pace;
-    its way back sees nothing from where the way out saw it, so that the path goes astray unchecked for a whole turn,
-    and the 120 frames beyond it see the first 120 again. The drift takes the path 15 to 30 cm off, many times what
-    noise alone does, while the two visits' depths agree within 2 % nearly everywhere.
-    Frame i depends on these and on i alone, never on what was read before.
+    A path with loops to close: frames=720,rooms=2,overrun=20,noise=1,drift=6. A round of 600 frames is a slow pace. The
+    way back looks in other directions than the way out, so drift accumulates over a whole round; the last 120 frames
+    see the views of the first 120 again. The path error is then 15 to 30 cm, many times that of noise alone, while the
+    depths of both visits agree within 2 % nearly everywhere.
+    Frame i depends only on these options and on i, not on frames read before.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class SyntheticRoom(Source):
         overrun: int = 0,
         drift: int = 0,
     ) -> None:
-        """Plan the walk; nothing is drawn yet. Raises SourceError unless counts and sizes are ≥ 1, the rest ≥ 0."""
+        """Compute the camera path, no image yet. Raises SourceError unless counts and sizes are ≥ 1, the rest ≥ 0."""
         counts = {"frames": frames, "width": width, "height": height, "loops": loops, "rooms": rooms}
         for key, value in counts.items():
             if value < 1:
@@ -71,7 +71,7 @@ class SyntheticRoom(Source):
         return len(self._T_world_camera)
 
     def frame(self, i: int) -> Frame:
-        """Draw frame i, colour in steps of 1/255 as a camera delivers it."""
+        """Render frame i; colour has steps of 1/255, as from a camera."""
         T_world_camera = self._T_world_camera[self._checked_index(i)]
         color, depth_m = render_scene(build_scene(self._rooms, self._seed), self.camera, T_world_camera)
         color = np.clip(color * np.float32(self._gain(i)), 0.0, 1.0)
@@ -88,25 +88,23 @@ class SyntheticRoom(Source):
         return Trajectory(np.arange(len(self)) / FRAMES_PER_SECOND, self._T_world_camera.copy())
 
     def true_surface(self) -> Mesh:
-        """Return the outsides of all shapes, those against a wall or inside another shape too, in the room's frame."""
+        """Return the surfaces of all shapes in the room's frame, including hidden parts."""
         return triangulate([shape for shapes in furnish_rooms(self._rooms, self._seed) for shape in shapes])
 
     def _gain(self, i: int) -> float:
-        """Return the exposure of frame i: one slow swing over the sequence, back at its start with the camera."""
+        """Return the exposure gain of frame i: one sine period over the sequence."""
         if not self._exposure_change:
             return 1.0
         return 1.0 + EXPOSURE_SWING * float(np.sin(2 * np.pi * i / max(len(self) - 1, 1)))
 
 
 def open_synthetic(text: str) -> SyntheticRoom:
-    """Build a room from "synthetic" or "synthetic:frames=200,seed=1,noise=1". Raises SourceError on any other."""
+    """Build a room from "synthetic" or "synthetic:frames=200,seed=1,noise=1". Raises SourceError on other options."""
     options: dict[str, Any] = {}
     for part in filter(None, text.partition(":")[2].split(",")):
         key, _, value = (word.strip() for word in part.partition("="))
         if key not in _OPTIONS or not value.lstrip("-").isdigit():
-            raise SourceError(
-                f"synthetic room: option {part!r} not understood; whole numbers for {', '.join(_OPTIONS)}"
-            )
+            raise SourceError(f"synthetic room: unknown option {part!r}; give whole numbers for {', '.join(_OPTIONS)}")
         options[key] = int(value)
     for key in ("noise", "exposure_change"):
         if key in options:

@@ -1,7 +1,7 @@
 """Read and write sequences in the layout of the TUM RGB-D benchmark.
 
 rgb.txt  depth.txt  groundtruth.txt     lines of "t path" or "t tx ty tz qx qy qz qw", comments after #
-calibration.json                        ours: fx fy cx cy width height depth_scale [distortion]; wins where present
+calibration.json                        optional: fx fy cx cy width height depth_scale [distortion]
 """
 
 import json
@@ -26,34 +26,34 @@ from sigmasplat.sources.camera.calibration import (
     freiburg_calibration,
     resolve_calibration,
 )
-from sigmasplat.sources.files.association import associate
+from sigmasplat.sources.files.association import MAX_GAP_S, associate, no_pairs
 from sigmasplat.sources.files.images import UINT16_MAX
+from sigmasplat.sources.files.poses import rigid_transform
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
 
-MAX_GAP_S = 0.02
-"""Colour and depth of a Kinect at 30 Hz are never further apart; TUM's own tool uses the same number."""
-
 
 def open_tum(
-    folder: Path, settings: InputConfig, max_gap_s: float = MAX_GAP_S, camera: Calibration | None = None,
+    folder: Path,
+    settings: InputConfig,
+    camera: Calibration | None = None,
     camera_path: Callable[[Trajectory], Trajectory] | None = None,
-) -> RecordedSource:  # fmt: skip
-    """Open a folder; raises SourceError if its lists, images, calibration or true poses cannot be used.
+) -> RecordedSource:
+    """Open a folder. Raises SourceError if its lists, images, calibration or ground-truth poses cannot be used.
 
-    camera: the recording's, where it is known otherwise than by the folder's name;
-    camera_path: turns the recorded path into the camera's, where it is another body's.
+    camera: the calibration, if it does not follow from the folder's name;
+    camera_path: converts the recorded path to the camera's path, if another body was recorded.
     """
     color_times_s, colors = read_list(folder / "rgb.txt")
     depth_times_s, depths = _depth_list(folder)
-    pairs = associate(color_times_s, depth_times_s, max_gap_s)
+    pairs = associate(color_times_s, depth_times_s)
     if not len(pairs):
-        raise SourceError(_no_overlap(folder, color_times_s, depth_times_s, max_gap_s))
+        raise no_pairs(folder, {"rgb.txt": color_times_s, "depth.txt": depth_times_s})
     images = [ImagePair(float(color_times_s[i]), colors[i], depths[j]) for i, j in pairs]
     paired = set(pairs[:, 0].tolist())
-    skipped = [f"{path}: no depth within {max_gap_s:g} s" for i, path in enumerate(colors) if i not in paired]
+    skipped = [f"{path}: no depth within {MAX_GAP_S:g} s" for i, path in enumerate(colors) if i not in paired]
     truth_path = folder / "groundtruth.txt"
-    # Read at once: a broken truth should stop the run before it starts, not its evaluation an hour later.
+    # Read now: damaged ground truth must stop the run before it starts, not its evaluation an hour later.
     truth = read_poses(truth_path) if truth_path.is_file() else None
     if truth and camera_path:
         truth = camera_path(truth)
@@ -65,23 +65,31 @@ def open_tum(
 
 
 def write_tum(source: Source, folder: str | Path) -> None:
-    """Write any source as a TUM folder: PNG images, lists, calibration.json and, where known, the true path.
+    """Write any source as a TUM folder: PNG images, lists, calibration.json and the ground-truth path, if known.
 
-    Depth keeps 1/5000 m; readings past 13.1 m do not fit 16 bits and become 0 (no reading).
+    Depth has steps of 1/5000 m; readings above 13.1 m do not fit 16 bits and become 0 (no reading).
     Raises RunError if the folder already holds a sequence or cannot be written.
     """
     folder = Path(folder)
+    _create_folder(folder, source.camera)
+    try:
+        _write_truth(source.truth(), folder / "groundtruth.txt")
+        stems = [write_images(frame, folder) for frame in source]
+        for part in ("depth", "rgb"):  # rgb.txt last: it marks a complete folder
+            (folder / f"{part}.txt").write_text("# timestamp path\n" + "".join(f"{s} {part}/{s}.png\n" for s in stems))
+    except OSError as error:
+        raise RunError(f"cannot write the sequence to {folder} ({error})") from error
+
+
+def _create_folder(folder: Path, camera: Camera) -> None:
+    """Create an empty TUM folder with calibration.json. Raises RunError if it holds a sequence or cannot be written."""
     if (folder / "rgb.txt").exists():
         raise RunError(f"{folder} already holds a sequence (rgb.txt); give another folder")
     try:
         for part in ("rgb", "depth"):
             (folder / part).mkdir(parents=True, exist_ok=True)
-        calibration = asdict(source.camera) | {"depth_scale": TUM_UNITS_PER_METRE}
+        calibration = asdict(camera) | {"depth_scale": TUM_UNITS_PER_METRE}
         (folder / "calibration.json").write_text(json.dumps(calibration, indent=1) + "\n")
-        _write_truth(source.truth(), folder / "groundtruth.txt")
-        stems = [write_images(frame, folder) for frame in source]
-        for part in ("depth", "rgb"):  # rgb.txt last: a folder that has it is complete
-            (folder / f"{part}.txt").write_text("# timestamp path\n" + "".join(f"{s} {part}/{s}.png\n" for s in stems))
     except OSError as error:
         raise RunError(f"cannot write the sequence to {folder} ({error})") from error
 
@@ -106,26 +114,12 @@ def _depth_list(folder: Path) -> tuple[NDArray[np.float64], list[Path]]:
     raise SourceError(f"no depth images in {folder} (looked for {looked_for}); is this the RGB-only download?")
 
 
-def _no_overlap(folder: Path, color_s: NDArray[np.float64], depth_s: NDArray[np.float64], max_gap_s: float) -> str:
-    spans = [f"{name} {t.min():.3f} … {t.max():.3f} s" for name, t in (("rgb.txt", color_s), ("depth.txt", depth_s))]
-    return f"no colour image of {folder} has depth within {max_gap_s:g} s ({', '.join(spans)}); one recording?"
-
-
-FORMAT = Format(
-    "TUM",
-    "rgb.txt and depth.txt",
-    lambda path: (Path(path) / "rgb.txt").is_file() or (Path(path) / "depth.txt").is_file(),
-    lambda path, settings: open_tum(Path(path), settings),
-    priority=1,
-)
-
-
 def read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
     """Read "t path" lines: timestamps [N] seconds and image paths. Raises SourceError naming file and line."""
     times, paths = [], []
     for line, words in read_lines(path):
         if len(words) < 2:
-            raise SourceError(f"{path}:{line}: 'timestamp path' wanted, found {' '.join(words)!r}")
+            raise SourceError(f"{path}:{line}: expected 'timestamp path', found {' '.join(words)!r}")
         times.append(parse_numbers(path, line, words[:1])[0])
         paths.append(path.parent / " ".join(words[1:]))
     if not paths:
@@ -138,17 +132,18 @@ def read_poses(path: Path) -> Trajectory:
     times, poses = [], []
     for line, words in read_lines(path):
         if len(words) != 8:
-            raise SourceError(f"{path}:{line}: 't tx ty tz qx qy qz qw' wanted, found {len(words)} values")
-        t, *translation_quaternion = parse_numbers(path, line, words)
+            raise SourceError(f"{path}:{line}: expected 't tx ty tz qx qy qz qw', found {len(words)} values")
+        t, *values = parse_numbers(path, line, words)
         times.append(t)
-        poses.append(_pose(path, line, np.array(translation_quaternion)))
+        x, y, z, qx, qy, qz, qw = values
+        poses.append(rigid_transform(f"{path}:{line}", [x, y, z], [qw, qx, qy, qz]))
     if not poses:
-        raise SourceError(f"{path}: holds no poses; fill it or delete it")
+        raise SourceError(f"{path}: holds no poses; delete it or add poses")
     return Trajectory(np.array(times), np.stack(poses))
 
 
 def read_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield (line number from 1, words) of every line that says something."""
+    """Yield (line number from 1, words) of every line that is not empty or a comment."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -164,41 +159,22 @@ def parse_numbers(path: Path, line: int, words: list[str]) -> list[float]:
     try:
         values = [float(word) for word in words]
     except ValueError as error:
-        raise SourceError(f"{path}:{line}: numbers wanted, found {' '.join(words)!r}") from error
+        raise SourceError(f"{path}:{line}: expected numbers, found {' '.join(words)!r}") from error
     if not np.isfinite(values).all():
-        raise SourceError(f"{path}:{line}: not finite: {' '.join(words)!r}; drop the line")
+        raise SourceError(f"{path}:{line}: not finite: {' '.join(words)!r}; delete the line")
     return values
 
 
-def _pose(path: Path, line: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Build T_world_camera from tx ty tz qx qy qz qw; only a unit quaternion is a rotation."""
-    norm = float(np.linalg.norm(values[3:]))
-    if abs(norm - 1.0) > 1e-2:
-        raise SourceError(f"{path}:{line}: the pose is not rigid: its quaternion has length {norm:.4g}, not 1")
-    T = np.eye(4)
-    T[:3, :3] = se3.rotation_from_quaternion(values[[6, 3, 4, 5]])
-    T[:3, 3] = values[:3]
-    return T
-
-
 class TumWriter:
-    """Adds frames to a new TUM folder: both images first, then a line in each list."""
+    """Writes frames to a new TUM folder: both images first, then a line in each list."""
 
     def __init__(self, folder: Path, camera: Camera) -> None:
-        """Raises RunError if the folder already holds a sequence or cannot be written."""
+        """Create the folder. Raises RunError if it already holds a sequence or cannot be written."""
         self.folder = folder
-        if (folder / "rgb.txt").exists():
-            raise RunError(f"{folder} already holds a sequence (rgb.txt); give another folder")
-        try:
-            for part in ("rgb", "depth"):
-                (folder / part).mkdir(parents=True, exist_ok=True)
-            calibration = asdict(camera) | {"depth_scale": TUM_UNITS_PER_METRE}
-            (folder / "calibration.json").write_text(json.dumps(calibration, indent=1) + "\n")
-        except OSError as error:
-            raise RunError(f"cannot write the sequence to {folder} ({error})") from error
+        _create_folder(folder, camera)
 
     def add(self, frame: Frame) -> None:
-        """Write one more frame; times must grow. Raises RunError if the folder cannot be written."""
+        """Write one more frame; timestamps must increase. Raises RunError if the folder cannot be written."""
         try:
             stem = write_images(frame, self.folder)
             for part in ("depth", "rgb"):
@@ -209,7 +185,7 @@ class TumWriter:
 
 
 def write_images(frame: Frame, folder: Path) -> str:
-    """Write rgb/T.png and depth/T.png, 1/5000 m, and return T; readings past 13.1 m do not fit and become 0."""
+    """Write rgb/T.png and depth/T.png, 1/5000 m, and return T; readings above 13.1 m do not fit and become 0."""
     stem = f"{frame.timestamp_s:.6f}"
     units = np.rint(frame.depth_m * TUM_UNITS_PER_METRE)
     depth = np.where(units < UINT16_MAX, units, 0).astype(np.uint16)
@@ -217,3 +193,12 @@ def write_images(frame: Frame, folder: Path) -> str:
     Image.fromarray(color).save(folder / "rgb" / f"{stem}.png", compress_level=1)
     Image.fromarray(depth).save(folder / "depth" / f"{stem}.png", compress_level=1)
     return stem
+
+
+FORMAT = Format(
+    "TUM",
+    "rgb.txt and depth.txt",
+    lambda path: (Path(path) / "rgb.txt").is_file() or (Path(path) / "depth.txt").is_file(),
+    lambda path, settings: open_tum(Path(path), settings),
+    priority=1,
+)

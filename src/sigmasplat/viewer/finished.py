@@ -19,7 +19,7 @@ from sigmasplat.types import Matrix
 from sigmasplat.viewer.snapshot import (
     BUDGET,
     DEFAULT_CAMERA,
-    Path,
+    CameraPath,
     Piece,
     Snapshot,
     thin,
@@ -29,7 +29,7 @@ from sigmasplat.viewer.snapshot import (
 
 EVERY_S = 2.0
 Log = list[dict[str, Any]]
-Show = Callable[[Snapshot], None]
+ShowSnapshot = Callable[[Snapshot], None]
 
 
 def finished_snapshot(run: RunFolder, source: Source | None = None, budget: int = BUDGET) -> Snapshot:
@@ -49,7 +49,7 @@ def finished_snapshot(run: RunFolder, source: Source | None = None, budget: int 
         pieces.append(Piece(len(pieces), thin(active, budget), np.asarray(tensors["T_world_submap"][-1])))
     return Snapshot(
         run.path.resolve().name,
-        Path(path.T_world_camera[:frames], *_lost_and_submaps(log[:frames]), keyframes),
+        CameraPath(path.T_world_camera[:frames], *_lost_and_submaps(log[:frames]), keyframes),
         Piece(None, without_moments(final)),
         within_budget(pieces, budget),
         read_trajectory(true_file).T_world_camera[:, :3, 3] if true_file.is_file() else None,
@@ -70,14 +70,14 @@ def running_snapshot(run: RunFolder, cache: "SubmapCache") -> Snapshot:
     config, poses = run.config(), [np.array(record["T_world_camera"], np.float64) for record in log]
     cache.load_new(poses)
     keyframes = tuple(row for row, record in enumerate(log) if record["is_keyframe"])
-    path = Path(np.array(poses).reshape(-1, 4, 4), *_lost_and_submaps(log), keyframes)
+    path = CameraPath(np.array(poses).reshape(-1, 4, 4), *_lost_and_submaps(log), keyframes)
     return Snapshot(
         run.path.resolve().name, path, None, tuple(cache.pieces.values()), None, cache.camera or DEFAULT_CAMERA,
         cache.image, config.render, config.backend, live=True, status="running",
     )  # fmt: skip
 
 
-def follow_run(run: RunFolder, show: Show, stop: threading.Event, source: Source | None = None) -> None:
+def follow_run(run: RunFolder, show: ShowSnapshot, stop: threading.Event, source: Source | None = None) -> None:
     """Show an unfinished run repeatedly until it ends, then show the finished run and return.
 
     Returns earlier if `stop` is set. Raises RunError if the run has ended without a map.

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.drawing.plot import ACCENT, BLUE, DARK, GREEN
 from sigmasplat.types import Matrix
-from sigmasplat.viewer.snapshot import Path
+from sigmasplat.viewer.snapshot import CameraPath
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
@@ -27,7 +27,7 @@ class Segments(NamedTuple):
     colors: Bytes
 
 
-def path_segments(path: Path, row: int, most: int = MAX_SEGMENTS) -> Segments:
+def path_segments(path: CameraPath, row: int, most: int = MAX_SEGMENTS) -> Segments:
     """Return the path up to frame `row`, in alternating colours per submap, red at lost frames.
 
     A long path is reduced to about `most` evenly spaced segments.
@@ -45,13 +45,13 @@ def truth_segments(positions: Matrix, most: int = MAX_SEGMENTS) -> Segments:
     return _segments(positions[rows], np.tile(np.array(TRUTH_COLOUR, np.uint8), (len(rows), 1)))
 
 
-def lost_points(path: Path, row: int, most: int = MAX_SEGMENTS) -> Floats:
+def lost_points(path: CameraPath, row: int, most: int = MAX_SEGMENTS) -> Floats:
     """Return the estimated positions [L, 3] m of the lost frames up to `row`, at most `most`."""
     rows = np.flatnonzero(path.lost[: row + 1])
     return np.asarray(path.T_world_camera[rows[evenly_spaced(len(rows), most)], :3, 3], np.float32)
 
 
-def keyframes_to_show(path: Path, row: int, most: int = MAX_KEYFRAMES) -> tuple[int, ...]:
+def keyframes_to_show(path: CameraPath, row: int, most: int = MAX_KEYFRAMES) -> tuple[int, ...]:
     """Return the rows of at most `most` keyframes up to frame `row`: every 2ᵏ-th one and the last.
 
     With a power of two most of the keyframes shown stay the same while new ones are added.

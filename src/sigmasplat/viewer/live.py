@@ -8,8 +8,8 @@ import numpy as np
 from sigmasplat.drawing.colormap import Rgb
 from sigmasplat.run.protocols import LoopResult, StepResult
 from sigmasplat.slam.slam import Slam
-from sigmasplat.viewer.finished import Show
-from sigmasplat.viewer.snapshot import BUDGET, DEFAULT_CAMERA, Path, Piece, Snapshot, thin, within_budget
+from sigmasplat.viewer.finished import ShowSnapshot
+from sigmasplat.viewer.snapshot import BUDGET, DEFAULT_CAMERA, CameraPath, Piece, Snapshot, thin, within_budget
 
 EVERY_S = 2.0
 MAX_TIME_SHARE = 0.02
@@ -25,7 +25,7 @@ class LiveView:
     """
 
     def __init__(
-        self, slam: Slam, show: Show, title: str, budget: int = BUDGET, every_s: float = EVERY_S,
+        self, slam: Slam, show: ShowSnapshot, title: str, budget: int = BUDGET, every_s: float = EVERY_S,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:  # fmt: skip
         self.slam, self.show, self.title, self.budget, self.every_s = slam, show, title, budget, every_s
@@ -55,7 +55,7 @@ class LiveView:
         slam = self.slam
         lost = np.array([step.lost for step in slam.steps], np.bool_)
         submaps = np.array([step.submap for step in slam.steps], np.int64)
-        path = Path(slam.atlas.T_world_camera(), lost, submaps, tuple(slam.keyframes))
+        path = CameraPath(slam.atlas.T_world_camera(), lost, submaps, tuple(slam.keyframe_indices))
         self._add_finished()
         final = Piece(None, thin(slam.field, self.budget)) if finished else None
         keyframes = slam.mapper.keyframes

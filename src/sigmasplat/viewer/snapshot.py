@@ -39,7 +39,7 @@ class Piece:
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
+class CameraPath:
     """The frames so far: poses T_world_camera [F, 4, 4], whether each is lost bool [F], its submap [F], and the rows of
     the keyframes in ascending order."""
 
@@ -52,7 +52,7 @@ class Path:
         return len(self.T_world_camera)
 
 
-NO_PATH = Path(np.empty((0, 4, 4)), np.empty(0, np.bool_), np.empty(0, np.int64), ())
+EMPTY_PATH = CameraPath(np.empty((0, 4, 4)), np.empty(0, np.bool_), np.empty(0, np.int64), ())
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class Snapshot:
     """
 
     title: str
-    path: Path = NO_PATH
+    path: CameraPath = EMPTY_PATH
     final: Piece | None = None
     pieces: tuple[Piece, ...] = ()
     true_positions: Matrix | None = None
@@ -93,12 +93,12 @@ def field_without_moments(params: Tensor, attributes: Mapping[str, Tensor]) -> G
     """
     moments = [values.new_zeros(()).expand_as(values) for values in (params, *attributes.values())]
     rows = {n: Rows(values, zero, zero) for (n, values), zero in zip(attributes.items(), moments[1:], strict=True)}
-    return GaussianField(params, moments[0], moments[0], extras=rows)
+    return GaussianField(params, moments[0], moments[0], attributes=rows)
 
 
 def without_moments(splats: GaussianField) -> GaussianField:
     """Return the splats without Adam's moments; parameters are shared, not copied."""
-    return field_without_moments(splats.params, {name: rows.params for name, rows in splats.extras.items()})
+    return field_without_moments(splats.params, {name: rows.params for name, rows in splats.attributes.items()})
 
 
 def thin(splats: GaussianField, most: int) -> GaussianField:
@@ -110,7 +110,7 @@ def thin(splats: GaussianField, most: int) -> GaussianField:
     rows = torch.arange(n) if n <= most else (torch.arange(max(most, 0)) * n).div(most, rounding_mode="floor")
     rows = rows.to(splats.params.device)
     kept = field_without_moments(
-        splats.params[rows].cpu(), {name: extra.params[rows].cpu() for name, extra in splats.extras.items()}
+        splats.params[rows].cpu(), {name: extra.params[rows].cpu() for name, extra in splats.attributes.items()}
     )
     if len(kept):
         kept.params[:, COLUMNS["log_scales"]] += 0.5 * float(np.log(n / len(kept)))

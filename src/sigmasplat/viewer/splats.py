@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sigmasplat.drawing import colormap
 from sigmasplat.model import harmonics, se3
-from sigmasplat.model.field import COLUMNS, EXTRAS, GaussianField, left_factor, quaternion_of, transformed
+from sigmasplat.model.field import ATTRIBUTES, COLUMNS, GaussianField, left_factor, quaternion_of, transformed
 from sigmasplat.model.splat_filter import sigmas
 from sigmasplat.viewer.snapshot import Piece, field_without_moments
 
@@ -92,14 +92,16 @@ def merge_pieces(pieces: Sequence[Piece], visible: VisibilityFilter) -> Gaussian
     """Return the visible splats of all pieces as one field in the world frame."""
     parts = [(piece, visible.mask(piece.field)) for piece in pieces]
     params = [piece.field.params[kept] for piece, kept in parts] or [GaussianField.empty().params]
-    names = {name for piece, _ in parts for name in piece.field.extras}
-    extras: dict[str, list[Tensor]] = {name: [] for name in sorted(names)}
+    names = {name for piece, _ in parts for name in piece.field.attributes}
+    attributes: dict[str, list[Tensor]] = {name: [] for name in sorted(names)}
     for (piece, kept), rows in zip(parts, params, strict=False):
         T = torch.from_numpy(piece.T_world_piece).to(rows)
         _move(rows, T)
-        for name, all_rows in extras.items():
+        for name, all_rows in attributes.items():
             all_rows.append(_moved_extra(piece.field, name, T)[kept])
-    return field_without_moments(torch.cat(params), {name: torch.cat(all_rows) for name, all_rows in extras.items()})
+    return field_without_moments(
+        torch.cat(params), {name: torch.cat(all_rows) for name, all_rows in attributes.items()}
+    )
 
 
 def _move(params: Tensor, T_world_piece: Tensor) -> None:
@@ -111,7 +113,7 @@ def _move(params: Tensor, T_world_piece: Tensor) -> None:
 
 def _moved_extra(field: GaussianField, name: str, T_world_piece: Tensor) -> Tensor:
     """Return an attribute of the splats in the world frame; zeros if this piece does not have it."""
-    if name not in field.extras:
-        return field.params.new_zeros(len(field), EXTRAS[name])
-    values = field.extras[name].params
+    if name not in field.attributes:
+        return field.params.new_zeros(len(field), ATTRIBUTES[name])
+    values = field.attributes[name].params
     return harmonics.turned(values, T_world_piece[:3, :3]) if name == "harmonics" else values

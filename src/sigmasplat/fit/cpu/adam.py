@@ -5,7 +5,7 @@ from sigmasplat.model.field import Rows
 
 
 def settle(field: Rows, rates: Rates) -> None:
-    """Do what `fit.adam.settle` does, for rows of a field's 17 columns."""
+    """Settle rows of a field's 17 columns as `fit.adam.settle` does."""
     from sigmasplat.native import _core
 
     _core.adam_settle(

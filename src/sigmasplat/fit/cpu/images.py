@@ -20,7 +20,7 @@ Half = Image | None
 
 
 def halve(averaged: tuple[Half, Half], depth: Half) -> tuple[Half, Half, Half]:
-    """Do what `ImageKernels.halve` says."""
+    """Implement `ImageKernels.halve`."""
     first, second = (None if image is None else np.asarray(_quarter(image).mean(0)) for image in averaged)
     return first, second, None if depth is None else _half_depth(depth)
 
@@ -32,14 +32,14 @@ def _quarter(image: Image) -> Image:
 
 
 def _half_depth(depth: Image) -> Image:
-    """Average 2×2 cells that lie on one surface; a cell with a hole or a step has no reading."""
+    """Average 2×2 cells of one surface; a cell with a hole or a depth step gets no reading."""
     cells = _quarter(depth)
     near, far = cells.min(0), cells.max(0)
     return np.where((near > 0) & (far - near < 0.05), cells.mean(0), np.float32(0.0))
 
 
 def readings_of(finest: Image, coarsest: Image) -> Matrix:
-    """Do what `ImageKernels.readings_of` says."""
+    """Implement `ImageKernels.readings_of`."""
     read = coarsest[coarsest > 0]
     return np.array([float(read.mean()) if len(read) else 1.0, float((finest > 0).sum())])
 
@@ -62,7 +62,7 @@ def align(levels: Sequence[LevelPlanes], readings: Matrix, T_live_reference: Mat
 
 
 def normal_equations(level: LevelPlanes, motions: Sequence[Matrix]) -> Matrix:
-    """Do what `ImageKernels.normal_equations` says."""
+    """Implement `ImageKernels.normal_equations`."""
     from sigmasplat.native import _core
 
     rows, laid_out = np.zeros((len(motions), NORMAL_TERMS)), _laid_out(level)

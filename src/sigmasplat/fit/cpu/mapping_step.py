@@ -59,7 +59,7 @@ class CompiledStep(CompiledImages):
     def splats(
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Matrix, float]:
-        """Do what `TorchStep.splats` does in one pass, without a gradient row in memory."""
+        """Step as `TorchStep.splats` does, in one pass without gradient rows in memory."""
         twist, v = np.zeros(6), self.view
         cost = v.raster.step(
             field.params, field.moment1, field.moment2, field.last_step, v.g_sums, *v.depth_gradients(),

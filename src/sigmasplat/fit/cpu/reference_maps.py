@@ -11,7 +11,7 @@ from sigmasplat.render.cpu.view import CpuView
 
 
 def reference_maps(view: CpuView, config: TrackingConfig, moment: Tensor | None) -> ReferenceMaps:
-    """Do what `fit.reference_maps.reference_maps` does; the maps are arrays."""
+    """Compute `fit.reference_maps.reference_maps` in the kernels; the maps are arrays."""
     from sigmasplat.native import _core
 
     weighed, by_U = config.uncertainty and len(view.sums) == 7, config.uncertainty and moment is not None

@@ -11,7 +11,7 @@ from sigmasplat.render.cpu.view import CpuView
 
 
 def tracking_gradient(view: CpuView, target: Target, config: TrackingConfig, exposure: Tensor) -> tuple[float, Tensor]:
-    """Do what `fit.tracking_loss.tracking_gradient` does."""
+    """Compute `fit.tracking_loss.tracking_gradient` in the kernels."""
     from sigmasplat.native import _core
 
     g_exposure, camera = np.zeros(2), view.camera

@@ -15,7 +15,7 @@ from sigmasplat.types import Matrix
 CELL = 16
 """Pixels of a cell each way, a block of threads (native/align_pixel.h)."""
 MOTIONS = 13
-"""At most so many motions are linearised in one launch."""
+"""The most motions that one launch linearises."""
 PINHOLE = np.dtype([("size", "i4", 2), ("intrinsics", "f4", 4)])
 LOOP = np.dtype(
     [
@@ -69,20 +69,20 @@ class CudaLevel:
 
 
 def _workspace(motions: int, cells: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Make room for the sums of every cell, and for counting the blocks that have stored theirs."""
+    """Allocate the sums of every cell, and the counter of blocks that have stored theirs."""
     of_cells = torch.empty(motions * cells, NORMAL_TERMS, dtype=torch.float64, device=device)
     return of_cells, torch.zeros(motions, dtype=torch.int32, device=device)
 
 
 def normal_equations(level: LevelPlanes, motions: Sequence[Matrix]) -> Matrix:
-    """Do what `ImageKernels.normal_equations` says. The host waits once."""
+    """Implement `ImageKernels.normal_equations`. The host waits once."""
     return CudaLevel(*level).normal_equations(np.stack(motions))
 
 
 def align(planes: Sequence[LevelPlanes], readings: Tensor, T_live_reference: Matrix, rules: AlignRules) -> AlignedPose:
     """Align from the coarsest level, the last, to the finest. The host waits once.
 
-    Every step there may be is launched; those of a level that has settled come to nothing.
+    All steps are launched; those of a level that has converged do nothing.
     """
     device, r, levels = readings.device, rules, [CudaLevel(*level) for level in planes]
     loop = (r.iterations, r.update_stop, r.plateau_stop, 0.0, r.degenerate_share, r.min_pixels)

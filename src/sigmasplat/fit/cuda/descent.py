@@ -1,8 +1,8 @@
 """Descend the tracking loss as `fit.descent` does, on a CUDA device alone (native/cuda/track.cuh, descend.cuh).
 
-An iteration is launched and not waited for: loss, gradient, pose, stop rules and what was best stay on the device. The
-host looks at them now and then, at what was true some iterations ago. That it launches too many by then does no harm:
-where the descent has stopped they change nothing.
+An iteration is launched without waiting: loss, gradient, pose, stop rules and the best iterate stay on the device. The
+host reads the state of some iterations ago now and then. Iterations launched after the descent has stopped change
+nothing.
 """
 
 import numpy as np
@@ -27,9 +27,9 @@ MEDIANS, PASSES, DIGITS = 5, 3, 2048
 MOST_BLOCKS = 512
 """Blocks that share an image's pixels."""
 LOOK = 8
-"""So many iterations are launched at once; meanwhile the host looks at what those before led to."""
+"""Iterations launched at once; meanwhile the host reads the result of those before."""
 GRAPH_FROM = 12
-"""With fewer iterations to go a graph is not worth its making."""
+"""With fewer remaining iterations a graph does not pay off."""
 STATE = np.dtype(
     [
         ("numbers", "f8", 7), ("moment1", "f8", 9), ("moment2", "f8", 9), ("exposure", "f8", 2),
@@ -43,9 +43,9 @@ STATE = np.dtype(
 def descend_on_device(
     params: Tensor, view: CudaView, target: Target, T_camera_world: Matrix, config: TrackingConfig, iterations: int
 ) -> Descent:
-    """Do what `descend` does. Raises BackendError where pairs of splats and tiles cannot be numbered."""
+    """Descend as `descend` does. Raises BackendError where there are too many pairs of splats and tiles."""
     if view.raster.capacity is None:
-        view.forward(params, T_camera_world)  # says how many pairs to expect
+        view.forward(params, T_camera_world)  # measures how many pairs to expect
     return CudaDescent(params, view, target, T_camera_world, config).run(iterations)
 
 
@@ -58,9 +58,9 @@ class CudaTrackingLoss:
         self._errors = c.outlier_factor > 0 or c.outlier_factor_color > 0
         self._weigh, self._kept = c.uncertainty and len(view.sums) == 7, c.average == "kept"
         self._tally = empty(MEDIANS * PASSES * DIGITS + 2, dtype=torch.int32)
-        self._selection = (self._tally, empty(MEDIANS, PASSES, 2, dtype=torch.int32))
+        self.selection = (self._tally, empty(MEDIANS, PASSES, 2, dtype=torch.int32))
         images = (view.sums, view.alpha, target.color, target.depth, pixels, self.blocks * THREADS)
-        self._given = (images, np.array(tracking_params(c, c.alpha_above), np.float32), exposure, self._selection)
+        self._given = (images, np.array(tracking_params(c, c.alpha_above), np.float32), exposure, self.selection)
 
     def launch(self) -> Tensor:
         """Write the gradient to the view's planes; return loss and gradient by (a, b), to be added up [blocks, 3]."""
@@ -96,8 +96,8 @@ class CudaDescent:
         self.loss = CudaTrackingLoss(view, target, config, self._shown[16:])
 
     def run(self, iterations: int) -> Descent:
-        """Take so many steps, fewer where a rule stops them. Where there was not room for all pairs, make it and go on
-        from the step that was not taken."""
+        """Take at most this many steps. Where there was not room for all pairs, make room and continue from the step
+        that was not taken."""
         work, left, at_once, look = self.iterate, iterations, 1, _Look(self._state)
         while left:
             for _ in range(min(at_once, left)):
@@ -128,7 +128,7 @@ class CudaDescent:
         return repeatable(self.iterate, self.view.alpha.device)
 
     def _make_room(self, iterations: int) -> "tuple[int, _Look]":
-        """Make room for the pairs that were missing; return how many steps are to be taken yet."""
+        """Make room for the missing pairs; return how many steps remain."""
         now = _Look(self._state).read()
         self.view.raster.expect(int(now["missing"]))
         self._state[-1] = 0
@@ -136,21 +136,21 @@ class CudaDescent:
 
 
 class _Look:
-    """A descent's state as it is now in the device's order of work, on its way to the host; nobody waits."""
+    """A copy to the host of a descent's state at this point of the device's queue; the host does not wait."""
 
     def __init__(self, state: Tensor) -> None:
-        self._here = torch.empty(state.shape, dtype=state.dtype, pin_memory=state.is_cuda)
-        self._here.copy_(state, non_blocking=state.is_cuda)
-        self._arrived: torch.cuda.Event | None = None
+        self._on_host = torch.empty(state.shape, dtype=state.dtype, pin_memory=state.is_cuda)
+        self._on_host.copy_(state, non_blocking=state.is_cuda)
+        self._copied: torch.cuda.Event | None = None
         if state.is_cuda:
-            self._arrived = torch.cuda.Event()  # type: ignore[no-untyped-call]
-            self._arrived.record(torch.cuda.current_stream(state.device))
+            self._copied = torch.cuda.Event()  # type: ignore[no-untyped-call]
+            self._copied.record(torch.cuda.current_stream(state.device))
 
     def read(self) -> np.void:
         """Return the state as a `STATE`. Waits until it has arrived."""
-        if self._arrived is not None:
-            self._arrived.synchronize()
-        state: np.void = np.frombuffer(self._here.numpy().tobytes(), STATE)[0]
+        if self._copied is not None:
+            self._copied.synchronize()
+        state: np.void = np.frombuffer(self._on_host.numpy().tobytes(), STATE)[0]
         return state
 
 

@@ -16,7 +16,7 @@ Half = Tensor | None
 
 
 def halve(averaged: tuple[Half, Half], depth: Half) -> tuple[Half, Half, Half]:
-    """Do what `ImageKernels.halve` says."""
+    """Implement `ImageKernels.halve`."""
     given = (*averaged, depth)
     one = next((image for image in given if image is not None), None)
     if one is None:
@@ -32,7 +32,7 @@ def halve(averaged: tuple[Half, Half], depth: Half) -> tuple[Half, Half, Half]:
 
 
 def readings_of(finest: Tensor, coarsest: Tensor) -> Tensor:
-    """Do what `ImageKernels.readings_of` says; the result stays on the device."""
+    """Implement `ImageKernels.readings_of`; the result stays on the device."""
     read = coarsest > 0
     n = read.sum()
     mean = torch.where(read, coarsest, 0.0).double().sum() / n.clamp(min=1)
@@ -41,7 +41,7 @@ def readings_of(finest: Tensor, coarsest: Tensor) -> Tensor:
 
 def live_planes(view: View, color: Plane, depth_m: Plane, target: Target) -> tuple[Tensor, Tensor]:
     """Return gray and depth [H, W] of a frame on the view's device, from the target's copy there."""
-    on_device, (h, w) = target.on(view.sums.device), depth_m.shape
+    on_device, (h, w) = target.to(view.sums.device), depth_m.shape
     return luma(on_device.color[:, :h, :w]), on_device.depth_image
 
 

@@ -23,7 +23,7 @@ CHANNELS = 3
 
 
 class CudaStep:
-    """The image terms, the way back and Adam's step on a device. The host waits for none of it until `to_host`.
+    """The image terms, the backward pass and Adam's step on a device. The host does not wait until `to_host`.
 
     On a view of ten planes it fits the full colour covariance, as `FullCovarianceStep` does.
     """
@@ -76,14 +76,14 @@ class CudaStep:
     def splats(
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Do what `TorchStep.splats` does, or `FullCovarianceStep.splats`; twist and cost stay on the device."""
+        """Step as `TorchStep.splats` or `FullCovarianceStep.splats` does; twist and cost stay on the device."""
         view, gradient = self.view, torch.empty_like(field.params)
-        twist, visible = view.backward_there(field.params, gradient, grad2d), view.raster.visible
+        twist, visible = view.backward_on_device(field.params, gradient, grad2d), view.raster.visible
         cost = add_shape_gradient(view, visible, field, gradient, weights, frozen_colors)
         step_rows(view, visible, field, gradient, rates)
         if isinstance(view, CudaCovarianceView):
             view.correlations.steps += 1
-            step_rows(view, visible, view.correlations, view.g_correlations, rates.of_extra("correlations"))
+            step_rows(view, visible, view.correlations, view.g_correlations, rates.of_attribute("correlations"))
         return twist, cost
 
     def accumulator(self, field: GaussianField) -> Accumulator:

@@ -9,13 +9,13 @@ from torch import Tensor
 from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates
 from sigmasplat.fit.fused_terms import SHAPE_TERMS, kernel_weights
 from sigmasplat.fit.interface import Twist, Weights
-from sigmasplat.model.field import EXTRAS, GaussianField, Rows
+from sigmasplat.model.field import ATTRIBUTES, GaussianField, Rows
 from sigmasplat.render.cuda.launch import blocks_for
 from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.types import Matrix
 
-MOST_COLUMNS = max(EXTRAS.values())
-"""Of rows that the kernel steps."""
+MOST_COLUMNS = max(ATTRIBUTES.values())
+"""The most columns of a row that the Adam kernel steps."""
 
 
 def add_shape_gradient(
@@ -34,7 +34,7 @@ def add_shape_gradient(
 
 
 def step_rows(view: CudaView, visible: Tensor, rows: Rows, gradient: Tensor, rates: Rates) -> None:
-    """Do what `adam_step` does for rows in view (uint8 [N]); gradient [N, m] and rates are of the first m columns."""
+    """Step rows in view (uint8 [N]) as `adam_step` does; gradient [N, m] and rates are those of the first m columns."""
     used, step = gradient.shape[1], rows.steps
     per_column = np.zeros(MOST_COLUMNS, np.float32)
     per_column[:used] = rates.per_column.numpy()
@@ -57,7 +57,7 @@ def to_host(twists: Sequence[Twist], costs: Sequence[float | Tensor]) -> tuple[l
 
 
 class CudaAccumulator:
-    """Does what `GradientAccumulator` does, on a device alone: the host waits for nothing."""
+    """`GradientAccumulator` on a device; the host does not wait."""
 
     def __init__(self, view: CudaView, field: GaussianField) -> None:
         self._view = view
@@ -66,7 +66,7 @@ class CudaAccumulator:
 
     def add(self, field: GaussianField, share: float, grad2d: Tensor | None = None) -> Tensor:
         """Add the view's gradient planes at their share of the mean; return the image's own pose twist [6]."""
-        twist = self._view.backward_there(field.params, self._rows, grad2d)
+        twist = self._view.backward_on_device(field.params, self._rows, grad2d)
         self.visible |= self._view.raster.visible
         self.grad.add_(self._rows, alpha=share)
         return twist

@@ -18,22 +18,22 @@ from sigmasplat.types import Matrix
 
 
 class CudaViewDependentStep:
-    """Does what `ViewDependentStep` does, on a device. The host waits for none of it until `to_host`."""
+    """`ViewDependentStep` on a device. The host does not wait until `to_host`."""
 
     def __init__(self, base: CudaStep, degree: int) -> None:
         self.base, self.view, self.degree = base, base.view, degree
         self.width = 3 * count(degree)
-        self._rows, self._eye = torch.empty(0), np.zeros(15, np.float32)
+        self.rows, self._eye = torch.empty(0), np.zeros(15, np.float32)
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
-        """Render the field, as it looks from there, to the view's planes."""
-        harmonics, n = field.carry("harmonics").params, len(field)
-        self._rows, self._eye = field.params.clone(), _eye(T_camera_world)
+        """Render the field, with the colours seen from that pose, to the view's planes."""
+        harmonics, n = field.get_or_create("harmonics").params, len(field)
+        self.rows, self._eye = field.params.clone(), _eye(T_camera_world)
         with self.view.stages.of("project"):
             self.view.raster.launch_fit(
-                "show_colors", blocks_for(n), self._rows, harmonics, n, self.degree, harmonics.shape[1], self._eye
+                "show_colors", blocks_for(n), self.rows, harmonics, n, self.degree, harmonics.shape[1], self._eye
             )
-        render_for(self.view, self._rows, T_camera_world, target, weights)
+        render_for(self.view, self.rows, T_camera_world, target, weights)
 
     def images(self, target: Target, weights: Weights) -> Tensor:
         """Write the gradient of every image term to the view's gradient planes; return the loss, on the device."""
@@ -42,16 +42,16 @@ class CudaViewDependentStep:
     def splats(
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Do what `ViewDependentStep.splats` does; twist and cost stay on the device."""
-        view, gradient, harmonics = self.view, torch.empty_like(field.params), field.carry("harmonics")
-        twist, visible = view.backward_there(self._rows, gradient, grad2d), view.raster.visible
+        """Step as `ViewDependentStep.splats` does; twist and cost stay on the device."""
+        view, gradient, harmonics = self.view, torch.empty_like(field.params), field.get_or_create("harmonics")
+        twist, visible = view.backward_on_device(self.rows, gradient, grad2d), view.raster.visible
         cost = add_shape_gradient(view, visible, field, gradient, weights, frozen_colors)
         on_harmonics, on_camera = self._through_colors(field, visible, gradient)
         if view.options.color_pose_gradient:
             twist[:3] += on_camera
         step_rows(view, visible, field, gradient, rates)
         harmonics.steps += 1
-        of_harmonics = Rates(rates.of_extra("harmonics").per_column[: self.width])
+        of_harmonics = Rates(rates.of_attribute("harmonics").per_column[: self.width])
         step_rows(view, visible, harmonics, on_harmonics, of_harmonics)
         return twist, cost
 
@@ -62,7 +62,7 @@ class CudaViewDependentStep:
     def _through_colors(self, field: GaussianField, visible: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
         """Carry the gradient of shown colours, in rows [N, 17], to the harmonics [N, width], returned, and by the
         directions to the means, in the same rows, and to the camera's translation, returned [3]."""
-        raster, n, harmonics = self.view.raster, len(field), field.carry("harmonics").params
+        raster, n, harmonics = self.view.raster, len(field), field.get_or_create("harmonics").params
         found, partial = raster.empty(n, self.width), raster.empty(blocks_for(n), 3, dtype=torch.float64)
         with self.view.stages.of("project_backward"):
             raster.launch_fit(

@@ -19,7 +19,7 @@ from sigmasplat.io.atomic import replacing
 from sigmasplat.io.binary import open_binary
 from sigmasplat.io.ply_elements import read_header
 from sigmasplat.io.splats.values import SH_C0, check_finite, check_values
-from sigmasplat.model.field import COLUMNS, EXTRAS, INITIAL_LOG_VARIANCE, GaussianField, Rows
+from sigmasplat.model.field import ATTRIBUTES, COLUMNS, INITIAL_LOG_VARIANCE, GaussianField, Rows
 from sigmasplat.model.harmonics import DEGREES, count
 
 PLY_COLUMNS: dict[str, list[str]] = {
@@ -42,7 +42,7 @@ def write_field(path: Path, field: GaussianField, *, plain: bool = False) -> Non
     """
     params = field.params.detach().cpu().numpy().astype(np.float32)
     harmonics = _by_channel(field)
-    rest = [f"{REST}{i}" for i in range(EXTRAS["harmonics"] if plain else harmonics.shape[1])]
+    rest = [f"{REST}{i}" for i in range(ATTRIBUTES["harmonics"] if plain else harmonics.shape[1])]
     ours = [] if plain else PLY_COLUMNS["log_variances"]
     names_in_file = [*BEFORE_HARMONICS, *rest, *AFTER_HARMONICS, *ours]
     rows = np.zeros(len(params), np.dtype([(name, "<f4") for name in names_in_file]))
@@ -63,9 +63,9 @@ def write_field(path: Path, field: GaussianField, *, plain: bool = False) -> Non
 
 def _by_channel(field: GaussianField) -> NDArray[np.float32]:
     """Return a field's harmonics in the file's order [N, 45], or [N, 0]."""
-    if "harmonics" not in field.extras:
+    if "harmonics" not in field.attributes:
         return np.empty((len(field), 0), np.float32)
-    values = field.extras["harmonics"].params.detach().cpu().numpy().astype(np.float32)
+    values = field.attributes["harmonics"].params.detach().cpu().numpy().astype(np.float32)
     return values.reshape(len(field), -1, 3).swapaxes(1, 2).reshape(values.shape)
 
 
@@ -82,7 +82,7 @@ def read_field(path: Path) -> GaussianField:
         rows = elements[0].read(file, path)
     field, harmonics = GaussianField(torch.from_numpy(_params(rows, path))), _harmonics(rows, path)
     if harmonics is not None:
-        field.extras["harmonics"] = Rows(torch.from_numpy(harmonics))
+        field.attributes["harmonics"] = Rows(torch.from_numpy(harmonics))
     return field
 
 
@@ -95,7 +95,7 @@ def _harmonics(rows: NDArray[np.void], path: Path) -> NDArray[np.float32] | None
     known = [3 * count(degree) for degree in range(1, DEGREES + 1)]
     if given not in known or not set(names) <= set(rows.dtype.names or ()):
         raise SourceError(f"{path} has {given} columns f_rest, expected 0 or f_rest_0 to 8, 23 or 44 (degree 1 to 3)")
-    harmonics = np.zeros((len(rows), EXTRAS["harmonics"]), np.float32)
+    harmonics = np.zeros((len(rows), ATTRIBUTES["harmonics"]), np.float32)
     for i, name in enumerate(names):
         harmonics[:, 3 * (i % each) + i // each] = rows[name]
     check_finite(harmonics, path)

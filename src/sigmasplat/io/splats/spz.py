@@ -26,7 +26,7 @@ from sigmasplat.io.atomic import replacing
 from sigmasplat.io.binary import open_binary
 from sigmasplat.io.splats.quaternions import Doubles, from_smallest_three, smallest_three, unit
 from sigmasplat.io.splats.values import SH_C0, SplatValues, morton_order, opacities_of, opacity_bytes
-from sigmasplat.model.field import EXTRAS, GaussianField
+from sigmasplat.model.field import ATTRIBUTES, GaussianField
 from sigmasplat.model.harmonics import DEGREES, count, turned
 
 MAGIC = b"NGSP"
@@ -92,7 +92,7 @@ def read_field(path: Path) -> GaussianField:
 def _rotated(values: SplatValues) -> SplatValues:
     """Rotate a map by 180° about x, which is its own inverse; only signs of means, quaternions and harmonics change."""
     xyz = R_RUB_RDF.diagonal().numpy()
-    ones = torch.ones(1, EXTRAS["harmonics"], dtype=torch.float64)
+    ones = torch.ones(1, ATTRIBUTES["harmonics"], dtype=torch.float64)
     signs = turned(ones, R_RUB_RDF).round().numpy()[:, : values.harmonics.shape[1]]
     quats = values.quats * np.array([1.0, *xyz])
     return replace(values, means=values.means * xyz, quats=quats, harmonics=values.harmonics * signs)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.errors import SourceError
 from sigmasplat.io.splats.quaternions import Doubles, unit
-from sigmasplat.model.field import COLUMNS, EXTRAS, INITIAL_LOG_VARIANCE, WIDTH, GaussianField, Rows
+from sigmasplat.model.field import ATTRIBUTES, COLUMNS, INITIAL_LOG_VARIANCE, WIDTH, GaussianField, Rows
 from sigmasplat.model.harmonics import DEGREES, count
 
 SH_C0 = 0.28209479177387814
@@ -64,17 +64,17 @@ class SplatValues:
         check_values(params, path)
         field = GaussianField(torch.from_numpy(params))
         if self.degree:
-            harmonics = np.zeros((len(self), EXTRAS["harmonics"]), np.float32)
+            harmonics = np.zeros((len(self), ATTRIBUTES["harmonics"]), np.float32)
             harmonics[:, : self.harmonics.shape[1]] = self.harmonics
-            field.extras["harmonics"] = Rows(torch.from_numpy(harmonics))
+            field.attributes["harmonics"] = Rows(torch.from_numpy(harmonics))
         return field
 
 
 def _harmonics(field: GaussianField) -> Doubles:
     """Return a field's harmonics without the highest degrees that are 0 up to rounding."""
-    if "harmonics" not in field.extras:
+    if "harmonics" not in field.attributes:
         return np.empty((len(field), 0))
-    values = field.extras["harmonics"].params.detach().cpu().double().numpy()
+    values = field.attributes["harmonics"].params.detach().cpu().double().numpy()
     needed = int(np.flatnonzero((np.abs(values) > ROUNDING).any(0)).max(initial=-1)) + 1
     return values[:, : next(n for n in (3 * count(degree) for degree in range(DEGREES + 1)) if n >= needed)]
 

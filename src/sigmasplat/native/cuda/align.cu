@@ -104,7 +104,7 @@ inline void store_cell(const AlignLevel& L, const AlignOptions& o, const double*
     stored[thread] = value;
 }
 
-// Store a cell's share; the block that comes last adds up all cells, in their order, to `total`, and is told so.
+// Store a cell's share; the block that comes last adds up all cells, in their order, to `total`, and learns that it was the last.
 // arrived: 0, and left at 0. Every thread must come.
 inline bool add_cells(const AlignLevel& L, const AlignOptions& o, const double* T, int cell, double* of_cells, unsigned* arrived,
                       double* total) {

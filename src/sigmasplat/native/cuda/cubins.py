@@ -30,7 +30,7 @@ ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120"
 """What the tests compile for; any other that NVRTC knows is compiled when a device asks for it."""
 INSTALL = install_extra("gpu")
 INSTALL_OLDER = "pip install 'cuda-bindings<13' nvidia-cuda-nvrtc-cu12"
-"""For drivers that know CUDA 12 only."""
+"""For drivers that support CUDA 12 only."""
 
 
 class Compiled(NamedTuple):
@@ -46,7 +46,7 @@ def cache_folder() -> Path:
 
 
 def compiler_version() -> str:
-    """Say which NVRTC there is. Raises BackendError if there is none."""
+    """Return the version of NVRTC. Raises BackendError if it is not installed."""
     try:
         from cuda.bindings import nvrtc
 
@@ -121,7 +121,7 @@ def _said(log: str) -> str:
 
 
 def _options(features: int, architecture: str) -> list[str]:
-    """Return what the compiler is told. Without contraction rounding is what the text says, on every device."""
+    """Return the compiler's options. Without contraction the rounding is the same on every device."""
     return [
         f"--gpu-architecture={architecture}",
         "--std=c++17",

@@ -5,7 +5,7 @@ namespace sigmasplat {
 
 struct Pairs { const long long* total; long long room; };   // of tiles and splats: how many there were, how many were listed
 
-// Where there were more pairs than room, let no splat have any: the way back then reads no record that nobody wrote.
+// Where there were more pairs than room, set every splat's count to 0: the backward pass then reads no unwritten record.
 KERNEL drop_pairs(Pairs pairs, int n, int* counts) {
     const int i = thread_number();
     if (i < n && *pairs.total > pairs.room) counts[i] = 0;

@@ -32,7 +32,7 @@ constexpr int PARAMS = 17;                            // columns of GaussianFiel
 
 struct Box { short x0, y0, x1, y1; };                 // tiles, inclusive
 
-struct Frame {                             // what every kernel knows of the image, passed by value
+struct Frame {                             // the image, as every kernel takes it, by value
     int width, height, tiles_x, tiles_y;
     float log_alpha_min, stop;             // log2 of alpha_min; transmittance_stop
 };

@@ -63,7 +63,7 @@ KERNEL mapping_losses(LossPlanes p, int pixels, int variance, float per_pixel, L
 }
 
 // Store, block by block, what `nll_color_full` sums up to over valid pixels; add its gradient to the colours' planes and those of the
-// variances' second moments, and write it to the three planes of what lies beside the diagonal: sums [10, H, W], `weight` over values.
+// variances' second moments, and write it to the three off-diagonal planes: sums [10, H, W], `weight` over values.
 // V + εI = L diag(d) Lᵀ as in fit/losses.py, and back through it line by line; r is detached.
 KERNEL nll_color_full(const float* sums, const float* target, const float* depth, int pixels, float weight, float* on_sums, double* costs) {
     const int at = thread_number();

@@ -170,7 +170,7 @@ inline void blend_tile_backward(const Frame& frame, const float* rows, const Lis
             __syncthreads();
         }
     }
-    for (int k = first * RECORD + t; k < count * RECORD; k += THREADS)   // behind what is opaque nothing is felt
+    for (int k = first * RECORD + t; k < count * RECORD; k += THREADS)   // no gradient behind opaque splats
         records[size_t(slots[begin + k / RECORD]) * RECORD + k % RECORD] = 0.f;
 }
 
@@ -261,7 +261,7 @@ inline void chain(const View<float>& view, const Splat& s, const float* m, int m
     project_backward(view, s.shape, view.near_m, g, out);
 }
 
-// on_median [n] or null: ∂L/∂(median depth), felt by one splat a pixel. pull [n] or null: |∂L/∂mean| per half image size.
+// on_median [n] or null: ∂L/∂(median depth), for one splat per pixel. pull [n] or null: |∂L/∂mean| per half image size.
 KERNEL chain_params(View<float> view, const float* pose, const float* params, const int* counts, const float* sums,
                     const float* on_median, int n, int record, int moment, float* on_params, float* pull, double* twists) {
     const int i = thread_number();

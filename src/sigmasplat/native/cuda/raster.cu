@@ -111,7 +111,7 @@ struct Lists {
     long long n, capacity;
 };
 
-struct Planes {                            // [K, H, W] and [H, W]; those not asked for are null
+struct Planes {                            // [K, H, W] and [H, W]; those not requested are null
     float *sums, *moment, *alpha;
     int* median_id; float* median_weight;
     int* dominant_id; float* dominant_weight;

@@ -1,4 +1,4 @@
-// Sums over the threads of a block, in a fixed order: the same bytes every time, and nobody adds to another's number.
+// Sums over the threads of a block, in a fixed order: the same bytes every time, without atomics.
 #pragma once
 
 #define KERNEL extern "C" __global__ void __launch_bounds__(256)

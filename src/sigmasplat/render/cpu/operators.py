@@ -11,7 +11,7 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.errors import BackendError
 from sigmasplat.model.camera import Camera
 from sigmasplat.native import _core
-from sigmasplat.render.kernel_params import view_numbers as view_numbers
+from sigmasplat.render.kernel_params import view_params
 from sigmasplat.render.pose_gradient import pose_gradient
 from sigmasplat.render.reference.operators import Blended, Projection
 
@@ -19,7 +19,10 @@ FEATURES_AT_ONCE = 16
 
 
 def apply_switches(asked: env.Switches) -> None:
-    """Set the kernels' instruction set and threads. Raises BackendError if this machine has not what is asked for."""
+    """Set the kernels' instruction set and threads.
+
+    Raises BackendError if the requested instruction set is not supported.
+    """
     offered = _core.supported_isas()
     if asked.isa not in ("auto", *offered):
         raise BackendError(
@@ -60,7 +63,7 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, quats, scales, T, camera, options):  # type: ignore[no-untyped-def]
         m, q, s = _float32("means", means), _float32("quats", quats), _float32("scales", scales)
-        view = view_numbers(camera, T.detach().double().numpy(), options)
+        view = view_params(camera, T.detach().double().numpy(), options)
         n = len(m)
         means2d, conics, z, radii = m.new_empty(n, 2), m.new_empty(n, 3), m.new_empty(n), m.new_empty(n, 2)
         _core.project_forward(view, m, q, s, means2d, conics, z, radii)

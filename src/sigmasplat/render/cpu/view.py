@@ -6,7 +6,7 @@ from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
-from sigmasplat.render.kernel_params import view_numbers
+from sigmasplat.render.kernel_params import view_params
 from sigmasplat.render.view import NO_LAYERS, Layers
 from sigmasplat.types import Matrix
 
@@ -35,13 +35,13 @@ class CpuView:
     def forward(
         self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
     ) -> None:
-        """Render rows [N, 17] as `View.forward` says: planes [K, rows, columns], m and m², padded to whole tiles."""
+        """Render rows [N, 17] as `View.forward` does: planes [K, rows, columns], m and m², padded to whole tiles."""
         o, reference_depth, moment = self.options, None, None
         if depth_reference is not None:
             self._reference[: self.camera.height, : self.camera.width] = depth_reference
             reference_depth, moment = self._reference, self.moment
         self._made = (depth_reference is not None, layers)
-        view, planes = view_numbers(self.camera, T_camera_world, o), self.layers if layers else NO_LAYERS
+        view, planes = view_params(self.camera, T_camera_world, o), self.layers if layers else NO_LAYERS
         self.raster.view_forward(
             view, params, self._k, o.alpha_min, o.transmittance_stop, reference_depth,
             self.sums, moment, self.alpha, *planes, self.seconds[:3],
@@ -68,7 +68,7 @@ class CpuView:
         return twist
 
     def visible(self, n: int) -> Tensor:
-        """Tell which of the n splats last rendered reach the image, bool [n]."""
+        """Return which of the n splats last rendered reach the image, bool [n]."""
         seen = torch.empty(n, dtype=torch.uint8)
         self.raster.visible(seen)
         return seen.bool()

@@ -6,7 +6,7 @@ from torch import Tensor
 from sigmasplat.model.field import COLUMNS, Rows
 from sigmasplat.render.channels import COVARIANCE_PLANES, covariance_features
 from sigmasplat.render.cuda.view import CudaView
-from sigmasplat.render.kernel_params import view_numbers
+from sigmasplat.render.kernel_params import view_params
 from sigmasplat.types import Matrix
 
 
@@ -22,14 +22,14 @@ class CudaCovarianceView(CudaView):
     def forward(
         self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
     ) -> None:
-        r, n, here = self.raster, len(params), self._here(params)
-        self._numbers = view_numbers(self.camera, T_camera_world, self.options)
+        r, n, rows = self.raster, len(params), self._on_device(params)
+        self._params = view_params(self.camera, T_camera_world, self.options)
         self._made = (depth_reference is not None, layers)
         if depth_reference is not None:
             self._reference.copy_(depth_reference)
         r.prepare(n, COVARIANCE_PLANES, self.camera, self.options)
         with self.stages.of("project"):
-            self._project([here[:, columns].contiguous() for columns in COLUMNS.values()])
+            self._project([rows[:, columns].contiguous() for columns in COLUMNS.values()])
         with self.stages.of("sort"):
             r.bin()
         with self.stages.of("blend"):
@@ -40,7 +40,7 @@ class CudaCovarianceView(CudaView):
         r, (means, quats, log_scales, *looks) = self.raster, parts
         self._shapes = means, quats, log_scales.exp()
         means2d, conics, z, radii = r.empty(r.n, 2), r.empty(r.n, 3), r.empty(r.n), r.empty(r.n, 2)
-        r.each_splat("project_splats", self._numbers, None, *self._shapes, r.n, means2d, conics, z, radii)
+        r.each_splat("project_splats", self._params, None, *self._shapes, r.n, means2d, conics, z, radii)
         self._leaves = [x.detach().requires_grad_() for x in (*looks, self.correlations.params, z)]
         logits, colors, log_variances, correlations, depths = self._leaves
         features = covariance_features(colors, depths, log_variances.exp(), correlations)
@@ -48,8 +48,8 @@ class CudaCovarianceView(CudaView):
         self._seen = means2d, conics, z, radii
         r.each_splat("pack_given", *self._seen, *self._looks, r.n, COVARIANCE_PLANES, r.frame, r.packed)
 
-    def backward_there(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Tensor:
-        *gradients, twist, on_means2d = self._carry_there(self.g_sums, self.g_alpha, *self._made)
+    def backward_on_device(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Tensor:
+        *gradients, twist, on_means2d = self._carry_on_device(self.g_sums, self.g_alpha, *self._made)
         *gradients, self.g_correlations = gradients
         for columns, gradient in zip(COLUMNS.values(), gradients, strict=True):
             g_params[:, columns] = gradient
@@ -61,9 +61,9 @@ class CudaCovarianceView(CudaView):
     def backward_pose(self, params: Tensor) -> Matrix:
         g_sums = torch.zeros_like(self.g_sums)
         g_sums[:4] = self.g_sums[:4]
-        return self._carry_there(g_sums, torch.zeros_like(self.alpha), False, False)[-2].cpu().numpy()
+        return self._carry_on_device(g_sums, torch.zeros_like(self.alpha), False, False)[-2].cpu().numpy()
 
-    def _carry_there(self, g_sums: Tensor, g_alpha: Tensor, moment: bool, layers: bool) -> tuple[Tensor, ...]:
+    def _carry_on_device(self, g_sums: Tensor, g_alpha: Tensor, moment: bool, layers: bool) -> tuple[Tensor, ...]:
         """Carry gradient planes to the columns of the rows, the correlations, the twist, and the means on the image."""
         r, (_, conics, z, radii) = self.raster, self._seen
         on_moment, reference_depth = (self.g_moment, self._reference) if moment else (None, None)
@@ -82,7 +82,7 @@ class CudaCovarianceView(CudaView):
             on_image[2].add_(on_z + self._on_median() if layers else on_z)
             on_shapes, twists = [torch.empty_like(x) for x in self._shapes], r.twists()
             r.each_splat(
-                "project_splats_backward", self._numbers, None, *self._shapes, radii, *on_image, r.n,
+                "project_splats_backward", self._params, None, *self._shapes, radii, *on_image, r.n,
                 *on_shapes, twists,
             )  # fmt: skip
             means, quats, scales = on_shapes

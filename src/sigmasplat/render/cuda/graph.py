@@ -17,10 +17,10 @@ Work = Callable[[], None]
 
 
 def repeatable(work: Work, device: torch.device) -> Work:
-    """Return what does some work again: a graph of it, not run yet; the work itself where there are no such graphs, or
-    where somebody measures stages, whose events a graph would not know.
+    """Return a function that repeats some work: a graph of it that has not run yet, or the work itself where graphs are
+    not available or stages are measured, whose events a graph would not contain.
 
-    Where recording fails one warning says why, and nothing is recorded on that device any more.
+    If recording fails, one warning says why, and no more graphs are recorded on that device.
     """
     return work if device.type != "cuda" or measured() else _recorder(device).record(work)
 

@@ -31,7 +31,7 @@ class Launcher(Protocol):
 
 
 def blocks_for(threads: int) -> int:
-    """Return how many blocks hold so many threads."""
+    """Return how many blocks hold this many threads."""
     return -(-threads // THREADS)
 
 
@@ -136,7 +136,7 @@ def _checked(found: tuple[Any, ...], failure: str) -> Any:
 
 
 def missing() -> str | None:
-    """Say in one line what keeps the CUDA backend from running here, and what to do; None where nothing does."""
+    """Return in one line why the CUDA backend cannot run here and what to do about it; None if it can run."""
     if torch.version.cuda is None:
         return f"torch {torch.__version__} is built without CUDA; install one that is (https://pytorch.org)"
     if not torch.cuda.is_available():

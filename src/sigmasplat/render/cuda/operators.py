@@ -18,7 +18,7 @@ from sigmasplat.native.cuda.cubins import FEATURE_COUNTS
 from sigmasplat.render.cuda import launch as cuda_launch
 from sigmasplat.render.cuda.launch import blocks_for
 from sigmasplat.render.cuda.raster import Planes, Raster
-from sigmasplat.render.kernel_params import view_numbers
+from sigmasplat.render.kernel_params import view_params
 from sigmasplat.render.pose_gradient import pose_gradient
 from sigmasplat.render.reference.operators import Blended, Projection
 
@@ -38,10 +38,10 @@ def _apply(function: type[torch.autograd.Function], *inputs: Any) -> Any:
 
 
 def _view(T: Tensor, camera: Camera, options: RenderConfig) -> tuple[NDArray[np.floating], Tensor | None]:
-    """Return the kernels' `View` by value, and the pose where it lies on a device: then no host waits for it."""
+    """Return the kernels' `View` by value, and the pose if it is on a device: then the host does not wait for it."""
     if T.device.type == "cpu":
-        return view_numbers(camera, T.detach().double().numpy(), options), None
-    return view_numbers(camera, np.eye(4), options), T.detach().float().contiguous()
+        return view_params(camera, T.detach().double().numpy(), options), None
+    return view_params(camera, np.eye(4), options), T.detach().float().contiguous()
 
 
 class _Project(torch.autograd.Function):

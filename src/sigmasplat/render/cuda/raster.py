@@ -26,7 +26,7 @@ GEOMETRY = 8
 MOMENTS = 6
 """Sums of a record before those of the features (native/cuda/gradients.cuh)."""
 SPARE = 1.25
-"""Room is made for so many times the pairs seen."""
+"""Room is made for this many times the pairs of the last image."""
 MOST_PAIRS = 2**31 - 1
 
 
@@ -44,7 +44,7 @@ class Planes(NamedTuple):
 
 
 def program_for(features: int) -> int:
-    """Return the feature count of the program that blends so many."""
+    """Return the feature count of the program that blends this many."""
     return next(count for count in FEATURE_COUNTS if count >= features)
 
 
@@ -58,7 +58,7 @@ class Raster:
         self.n = 0
 
     def prepare(self, n: int, used: int, camera: Camera, options: RenderConfig) -> None:
-        """Make room for n splats with so many features."""
+        """Allocate for n splats with `used` features."""
         self.n, self.used, self.features = n, used, program_for(used)
         self.tiles_x, self.tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
         self.frame = _frame(camera, options, self.tiles_x, self.tiles_y)
@@ -97,7 +97,7 @@ class Raster:
             self._list()
 
     def bin_within(self) -> None:
-        """Do the same with what room there is, and tell the host nothing."""
+        """Do the same within the room there is; the host learns nothing of it."""
         self._order_splats()
         self._list()
 

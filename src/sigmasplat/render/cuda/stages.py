@@ -1,4 +1,4 @@
-"""Measure the stages of renders on a CUDA device by events on its stream; nobody waits until the times are read."""
+"""Measure the stages of renders on a CUDA device by events on its stream; the host waits only when times are read."""
 
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -22,7 +22,7 @@ def measure(asked: bool = True) -> None:
 
 
 def measured() -> bool:
-    """Tell whether anybody asked to measure."""
+    """Return whether stages are measured."""
     return _asked
 
 
@@ -38,7 +38,7 @@ class Event(Protocol):
 class Stages:
     """Times between pairs of events on the current stream, by stage. Pairs that have passed are added up on the way.
 
-    Where nobody asked to `measure` there are no events, and all stages take 0 s.
+    Unless `measure` was called there are no events, and all stages take 0 s.
     """
 
     def __init__(self, event: Callable[[], Event] | None = None) -> None:
@@ -48,7 +48,7 @@ class Stages:
         self._seconds = np.zeros(len(STAGES))
 
     def of(self, stage: str) -> AbstractContextManager[None]:
-        """Book what a block of code has the device do under a stage."""
+        """Add the device's time for a block of code to a stage."""
         return self._between(stage) if _asked else nullcontext()
 
     @contextmanager

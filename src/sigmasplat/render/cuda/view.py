@@ -9,7 +9,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.render.cuda import launch as cuda_launch
 from sigmasplat.render.cuda.raster import Planes, Raster
 from sigmasplat.render.cuda.stages import Stages
-from sigmasplat.render.kernel_params import view_numbers
+from sigmasplat.render.kernel_params import view_params
 from sigmasplat.render.view import Layers
 from sigmasplat.types import Matrix
 
@@ -17,8 +17,8 @@ from sigmasplat.types import Matrix
 class CudaView:
     """A view on the CUDA kernels: `View` with planes of exactly the image's size, on a device.
 
-    A backward pass ends by reading the twist, the one moment that the host waits for the device. Its `seconds` stay 0
-    where nobody asked to `measure` them (render/cuda/stages.py); to read them is to wait for the device.
+    A backward pass ends by reading the twist, the only time the host waits for the device. Its `seconds` stay 0 unless
+    `measure` (render/cuda/stages.py) was called; reading them waits for the device.
     """
 
     backend = "cuda"
@@ -37,7 +37,7 @@ class CudaView:
         )
         self.layers = Layers.of(*size, device)
         self._made = (False, False)
-        self._numbers = view_numbers(camera, np.eye(4), options)
+        self._params = view_params(camera, np.eye(4), options)
         self.stages = Stages()
 
     @property
@@ -47,22 +47,22 @@ class CudaView:
     def forward(
         self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
     ) -> None:
-        params = self._here(params)
+        params = self._on_device(params)
         r, n = self.raster, len(params)
-        self._numbers = view_numbers(self.camera, T_camera_world, self.options)
+        self._params = view_params(self.camera, T_camera_world, self.options)
         if depth_reference is not None:
             self._reference.copy_(depth_reference)
         self._made = (depth_reference is not None, layers)
         r.prepare(n, len(self.sums), self.camera, self.options)
         with self.stages.of("project"):
-            r.each_splat("pack_view", self._numbers, None, params, n, r.frame, r.packed)
+            r.each_splat("pack_view", self._params, None, params, n, r.frame, r.packed)
         with self.stages.of("sort"):
             r.bin()
         with self.stages.of("blend"):
             r.blend(self._planes, self._reference if depth_reference is not None else None)
 
-    def _here(self, params: Tensor) -> Tensor:
-        """Return rows as the kernels read them, brought here from wherever they lie."""
+    def _on_device(self, params: Tensor) -> Tensor:
+        """Return rows on this device, contiguous, as the kernels read them."""
         return params.detach().to(self.raster.device).contiguous()
 
     @property
@@ -72,10 +72,10 @@ class CudaView:
         return Planes(self.sums, self.moment if moment else None, self.alpha, *ids)
 
     def backward(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Matrix:
-        return self.backward_there(params, g_params, grad2d).cpu().numpy()
+        return self.backward_on_device(params, g_params, grad2d).cpu().numpy()
 
-    def backward_there(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Tensor:
-        """Do the same, and leave the twist on the device: no host waits."""
+    def backward_on_device(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Tensor:
+        """Do what `backward` does and leave the twist on the device; the host does not wait."""
         (moment, layers), r = self._made, self.raster
         on_moment, reference = (self.g_moment, self._reference) if moment else (None, None)
         with self.stages.of("blend_backward"):
@@ -83,8 +83,8 @@ class CudaView:
         with self.stages.of("project_backward"):
             on_median, twists = self._on_median() if layers else None, r.twists()
             r.each_splat(
-                "chain_params", self._numbers, None, self._here(params), r.counts, sums, on_median, r.n, sums.shape[1],
-                at, g_params, grad2d, twists,
+                "chain_params", self._params, None, self._on_device(params), r.counts, sums, on_median, r.n,
+                sums.shape[1], at, g_params, grad2d, twists,
             )  # fmt: skip
             return twists.sum(0)
 
@@ -103,17 +103,17 @@ class CudaView:
         with self.stages.of("project_backward"):
             twists = r.twists()
             r.each_splat(
-                "chain_pose", self._numbers, None, self._here(params), r.counts, sums, r.n, sums.shape[1], twists
+                "chain_pose", self._params, None, self._on_device(params), r.counts, sums, r.n, sums.shape[1], twists
             )
         return twists.sum(0).cpu().numpy()
 
     def follow(self, params: Tensor, pose: Tensor) -> None:
         """Render rows [N, 17] to `sums` and `alpha` from T_camera_world float32 [4, 4] on the device; no host waits."""
-        params = self._here(params)
+        params = self._on_device(params)
         r, n, self._made = self.raster, len(params), (False, False)
         with self.stages.of("project"):
             r.prepare(n, len(self.sums), self.camera, self.options)
-            r.each_splat("pack_view", self._numbers, pose, params, n, r.frame, r.packed)
+            r.each_splat("pack_view", self._params, pose, params, n, r.frame, r.packed)
         with self.stages.of("sort"):
             r.bin_within()
         with self.stages.of("blend"):
@@ -128,8 +128,8 @@ class CudaView:
         with self.stages.of("blend_backward"):
             sums = r.pose_gradients_within(self._planes, self.g_sums)
         with self.stages.of("project_backward"):
-            twists, rows = r.twists(), self._here(params)
-            r.each_splat("chain_pose", self._numbers, pose, rows, r.counts, sums, r.n, sums.shape[1], twists)
+            twists, rows = r.twists(), self._on_device(params)
+            r.each_splat("chain_pose", self._params, pose, rows, r.counts, sums, r.n, sums.shape[1], twists)
         return twists
 
     def visible(self, n: int) -> Tensor:

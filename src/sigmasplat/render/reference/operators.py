@@ -1,4 +1,4 @@
-"""Define both kernels in plain torch: slow, exact, readable, any float type. Compiled backends are tested against it.
+"""Define both kernels in plain torch: slow, exact, readable, any float type. Compiled backends are tested against this.
 
 Pixel centres lie at integer coordinates, (u, v) = (column, row). Depth is z along the optical axis in metres.
 """
@@ -13,7 +13,7 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
 
 ALPHA_MAX = 0.99
-"""No splat is more opaque than this, so that light always passes and the backward pass may divide by 1 − α (3DGS)."""
+"""No splat is more opaque than this, so that the backward pass may divide by 1 − α (3DGS)."""
 FRUSTUM_MARGIN = 0.15
 """The projection is linearised no further outside the image than this share of its size (3DGS's factor 1.3)."""
 PAIRS_AT_ONCE = 1 << 22
@@ -33,7 +33,7 @@ class Projection(NamedTuple):
 
 
 class Blended(NamedTuple):
-    """What the pixels gather, with w = α·T the weight of a splat at a pixel."""
+    """Sums over splats at each pixel, with w = α·T the weight of a splat at a pixel."""
 
     sums: Tensor
     """[H, W, K] Σ w f."""
@@ -46,7 +46,7 @@ class Blended(NamedTuple):
     median_weight: Tensor
     """[H, W] its w, detached; 0 = none."""
     dominant_id: Tensor
-    """[H, W] int32, the splat of largest w, the nearer of equals; −1 = none."""
+    """[H, W] int32, the splat of largest w, the nearest if several; −1 = none."""
     dominant_weight: Tensor
     """[H, W] its w, detached; 0 = none."""
 

@@ -31,7 +31,7 @@ class ReferenceView:
     def forward(
         self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
     ) -> None:
-        """Render rows [N, 17] as `View.forward` says: planes [K, H, W], m and m²; nothing is padded."""
+        """Render rows [N, 17] as `View.forward` does: planes [K, H, W], m and m²; nothing is padded."""
         self._leaf = params.detach().clone().requires_grad_()
         self._twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
         T = torch.linalg.matrix_exp(twist_matrix(self._twist)) @ torch.as_tensor(T_camera_world)
@@ -67,7 +67,7 @@ class ReferenceView:
         return np.asarray(g_twist.numpy(), np.float64)
 
     def visible(self, n: int) -> Tensor:
-        """Tell which splats last rendered reach the image, bool [n]."""
+        """Return which splats last rendered reach the image, bool [n]."""
         return self._visible
 
 
@@ -78,7 +78,7 @@ def grad2d_of(g_means2d: Tensor, camera: Camera) -> Tensor:
 
 
 def reaches(p: reference.Projection, opacities: Tensor, camera: Camera, options: RenderConfig) -> Tensor:
-    """Tell which splats' bounds of alpha ≥ alpha_min overlap the image, bool [N]: those a view can feel."""
+    """Return which splats can change a view, bool [N]: those whose bounds of alpha ≥ alpha_min overlap the image."""
     reach = (2.0 * (opacities / options.alpha_min).log()).clamp(min=0.0).sqrt()[:, None] * p.radii.detach()
     low, high = p.means2d.detach() - reach, p.means2d.detach() + reach
     inside = ((high >= 0) & (low <= low.new_tensor([camera.width - 1.0, camera.height - 1.0]))).all(1)

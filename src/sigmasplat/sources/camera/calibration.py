@@ -1,4 +1,4 @@
-"""Know the cameras of the public data sets, and read the calibration that lies beside a recording."""
+"""List the cameras of the public data sets, and read the calibration of a recording."""
 
 import json
 import re
@@ -20,12 +20,12 @@ Distortion = tuple[float, ...]
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What is known of a recording's cameras.
+    """The cameras of a recording.
 
-    camera, distortion: of the colour image, None for no lens; depth_units_per_metre: of whole-number depth;
-    depth_camera, depth_distortion: of depth images that are not registered to colour, None where they are;
-    T_color_depth [4, 4]: takes points of the depth camera to the colour camera, metres;
-    register_by_default: whether such depth is moved to colour unless the settings say otherwise.
+    camera, distortion: of the colour image, None for no distortion; depth_units_per_metre: of whole-number depth;
+    depth_camera, depth_distortion: of depth images that are not registered to colour, None if they are registered;
+    T_color_depth [4, 4]: transforms points of the depth camera to the colour camera, metres;
+    register_by_default: whether unregistered depth is moved to colour if input.register_depth is "auto".
     """
 
     camera: Camera
@@ -38,7 +38,7 @@ class Calibration:
 
 
 class CameraUnknown(SourceError):
-    """A recording that says nothing of its camera, nor does the user; `size` is (width, height) of its images."""
+    """Neither the recording nor the user gives a focal length; `size` is (width, height) of the images."""
 
     def __init__(self, size: tuple[int, int], message: str) -> None:
         super().__init__(message)
@@ -47,7 +47,7 @@ class CameraUnknown(SourceError):
 
 TUM_UNITS_PER_METRE = 5000.0
 
-# The numbers published with the TUM RGB-D benchmark (repeated in CG-SLAM's loaders), 640×480.
+# The values published with the TUM RGB-D benchmark (CG-SLAM's loaders use the same), 640×480.
 FREIBURG = {
     "1": Calibration(
         Camera(640, 480, 517.3, 516.5, 318.6, 255.3), TUM_UNITS_PER_METRE, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
@@ -62,9 +62,9 @@ REPLICA = Calibration(Camera(1200, 680, 600.0, 600.0, 599.5, 339.5), 6553.5)
 
 MM_PER_METRE = 1000.0
 
-# 585, 320, 240 are the numbers of the 7-Scenes page; they are the depth camera's, and so are the published poses. The
-# colour camera and where it sits were fitted to the RedKitchen sequence, by maximising the agreement of neighbouring
-# images (andyzeng/tsdf-fusion-python, data/; the fit is that of shared/data/redkitchen/calibration.json).
+# 585, 320, 240 are the values of the 7-Scenes page. They belong to the depth camera, and so do the published poses. The
+# colour camera and its position were fitted to the RedKitchen sequence by maximising the agreement of neighbouring
+# images (andyzeng/tsdf-fusion-python, data/; the fit is in shared/data/redkitchen/calibration.json).
 SEVEN_SCENES = Calibration(Camera(640, 480, 585.0, 585.0, 320.0, 240.0), MM_PER_METRE)
 SEVEN_SCENES_COLOR = Calibration(
     Camera(640, 480, 528.12, 528.12, 318.96, 232.91),
@@ -83,19 +83,19 @@ SEVEN_SCENES_COLOR = Calibration(
 # Published as fy = −480, for a camera whose y points up; ours points down (`sources/icl_nuim.py`).
 ICL_NUIM = Calibration(Camera(640, 480, 481.2, 480.0, 319.5, 239.5), TUM_UNITS_PER_METRE)
 
-# The numbers of the page of the Bonn RGB-D Dynamic Dataset.
+# The values of the page of the Bonn RGB-D Dynamic Dataset.
 BONN = Calibration(
     Camera(640, 480, 542.822841, 542.57687, 315.59352, 237.756098),
     TUM_UNITS_PER_METRE,
     (0.039903, -0.099343, -0.00073, -0.000144, 0.0),
 )
 
-# Factory numbers of the PrimeSense cameras, which the Redwood recordings were made with (Open3D's PrimeSenseDefault).
+# Factory values of the PrimeSense cameras, used for the Redwood recordings (Open3D's PrimeSenseDefault).
 PRIMESENSE = Calibration(Camera(640, 480, 525.0, 525.0, 319.5, 239.5), MM_PER_METRE)
 
 
 def freiburg_calibration(folder: Path) -> Calibration | None:
-    """Return the TUM camera that a folder's name gives away (`freiburg1` or `fr1` in it or a parent), else None."""
+    """Return the TUM camera named by the folder or a parent (`freiburg1` or `fr1` in the name), else None."""
     for part in reversed(folder.resolve().parts):
         match = re.search(r"freiburg([123])|(?:^|[^a-z0-9])fr([123])(?:[^0-9]|$)", part.lower())
         if match:
@@ -106,8 +106,8 @@ def freiburg_calibration(folder: Path) -> Calibration | None:
 def read_calibration(path: Path, size: tuple[int, int], default_units_per_metre: float) -> Calibration:
     """Read `calibration.json`: fx, fy, cx, cy; optional width, height, depth_scale (PNG units per metre), distortion.
 
-    Where depth is not registered to colour: depth_camera, an object of the same fields, and T_color_depth, 4 rows.
-    `size` (width, height) in pixels stands in where the file gives none. Raises SourceError naming file and field.
+    For depth that is not registered to colour: depth_camera, an object of the same fields, and T_color_depth, 4 rows.
+    `size` (width, height) in pixels is the default for a missing size. Raises SourceError naming file and field.
     """
     fields = read_json_object(path)
     units = json_number(path, fields, "depth_scale", default_units_per_metre)
@@ -118,7 +118,7 @@ def read_calibration(path: Path, size: tuple[int, int], default_units_per_metre:
     if inner is None:
         return calibration
     if not isinstance(inner, dict):
-        raise SourceError(f'{path}: field "depth_camera" is {inner!r}, an object with fx, fy, cx, cy is wanted')
+        raise SourceError(f'{path}: field "depth_camera" is {inner!r}, expected an object with fx, fy, cx, cy')
     camera, lens = _camera(path, inner, size), _distortion(path, inner)
     return replace(
         calibration, depth_camera=camera, depth_distortion=lens, T_color_depth=_rigid_transform(path, fields)
@@ -128,10 +128,10 @@ def read_calibration(path: Path, size: tuple[int, int], default_units_per_metre:
 def resolve_calibration(
     folder: Path, recorded: Calibration | None, size: tuple[int, int], settings: InputConfig, default_units: float
 ) -> Calibration:
-    """Return what is known of the cameras: the settings' words, else calibration.json's, else the recording's.
+    """Return the calibration to use: from the settings, else from calibration.json, else from the recording.
 
-    `folder` is the recording, which may be a file too; `size` (width, height) is the colour image's. Raises SourceError
-    if no focal length is known.
+    `folder` is the recording, a folder or a file; `size` (width, height) is that of the colour image. Raises
+    CameraUnknown if no focal length is given.
     """
     beside = folder / "calibration.json"
     if settings.calibration or beside.is_file():
@@ -140,7 +140,7 @@ def resolve_calibration(
         place = "a file for --calibration" if folder.is_file() else beside
         raise CameraUnknown(
             size,
-            f"camera unknown: {folder} says nothing of it; write {place} with fx, fy, cx, cy, "
+            f"camera unknown: {folder} has no intrinsics; write {place} with fx, fy, cx, cy, "
             "depth_scale (PNG units per metre), or give --fx PIXELS (and --fy, --cx, --cy, --depth-scale)",
         )
     if recorded is None:
@@ -167,31 +167,31 @@ def read_json_object(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise SourceError(f"{path}: not readable as JSON ({error}); mend it") from error
+        raise SourceError(f"{path}: not readable as JSON ({error}); correct it") from error
     if not isinstance(content, dict):
         raise SourceError(f"{path}: holds a {type(content).__name__}, not an object with fx, fy, cx, cy")
     return content
 
 
 def json_number(path: Path, fields: dict[str, Any], key: str, default: float | None = None) -> float:
-    """Take one finite number from a JSON object. Raises SourceError naming file and field."""
+    """Return one finite number of a JSON object. Raises SourceError naming file and field."""
     value = fields.get(key, default)
     if value is None:
         raise SourceError(f'{path}: field "{key}" is missing (found {", ".join(sorted(fields)) or "nothing"}); add it')
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise SourceError(f'{path}: field "{key}" is {value!r}, a finite number is wanted')
+        raise SourceError(f'{path}: field "{key}" is {value!r}, expected a finite number')
     return float(value)
 
 
 def check_positive(path: Path, key: str, value: float) -> float:
-    """Return a number that must be above 0. Raises SourceError naming file and field."""
+    """Return a number that must be positive. Raises SourceError naming file and field."""
     if value <= 0:
         raise SourceError(f'{path}: field "{key}" is {value:g}, it must be above 0')
     return value
 
 
 def build_camera(path: Path, width: int, height: int, focal: list[float]) -> Camera:
-    """Build a camera from numbers of a file. Raises SourceError naming the file if they make none."""
+    """Build a camera from values of a file. Raises SourceError naming the file if they are not valid."""
     try:
         return Camera(width, height, *focal)
     except ConfigError as error:
@@ -206,13 +206,13 @@ def _camera(path: Path, fields: dict[str, Any], size: tuple[int, int]) -> Camera
 
 
 def _rigid_transform(path: Path, fields: dict[str, Any]) -> NDArray[np.float64]:
-    """Read T_color_depth, identity where absent. Raises SourceError unless it is a rigid 4×4."""
+    """Read T_color_depth, identity if absent. Raises SourceError unless it is a rigid 4×4 matrix."""
     try:
         T = np.array(fields.get("T_color_depth", np.eye(4)), np.float64)
     except (ValueError, TypeError):
         T = np.zeros(0)
     if T.shape != (4, 4) or not se3.is_rigid(T):
-        raise SourceError(f'{path}: field "T_color_depth" is no rigid 4×4 matrix in rows, metres')
+        raise SourceError(f'{path}: field "T_color_depth" is not a rigid 4×4 matrix by rows, metres')
     return T
 
 
@@ -221,6 +221,6 @@ def _distortion(path: Path, fields: dict[str, Any]) -> tuple[float, ...] | None:
     if values is None:
         return None
     if not isinstance(values, list) or len(values) not in (4, 5):
-        raise SourceError(f'{path}: field "distortion" is {values!r}, [k1, k2, p1, p2, k3] is wanted')
+        raise SourceError(f'{path}: field "distortion" is {values!r}, expected [k1, k2, p1, p2, k3]')
     numbers = [json_number(path, {"distortion": v}, "distortion") for v in [*values, 0.0][:5]]
     return tuple(numbers) if any(numbers) else None

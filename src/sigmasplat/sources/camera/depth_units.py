@@ -1,4 +1,4 @@
-"""Look at a few depth images before a run, to catch a wrong unit or a sensor that saw nothing."""
+"""Check a few depth images before a run for a wrong unit or missing readings."""
 
 from collections.abc import Iterable
 
@@ -8,13 +8,13 @@ from sigmasplat.errors import SourceError
 from sigmasplat.sources.base import Source
 
 PLAUSIBLE_MEDIAN_M = (0.2, 15.0)
-"""Indoor sequences have their median depth well inside; a wrong power of ten lies outside."""
+"""The median depth of indoor sequences is well inside this range; with a wrong power of ten it is outside."""
 
 KNOWN_UNITS_PER_METRE = {1000.0: "millimetres", 5000.0: "TUM's unit", 6553.5: "Replica's unit", 1.0: "metres"}
 
 
 def depth_warning(source: Source, samples: int = 5) -> str | None:
-    """Return a line saying that the depth's scale looks wrong, with the median found and a guess; None if plausible.
+    """Return a warning if the depth scale looks wrong, with the median and a suggestion; None if it is plausible.
 
     The median is over all readings of `samples` frames spread evenly; unreadable frames are left out.
     """
@@ -32,7 +32,7 @@ def depth_warning(source: Source, samples: int = 5) -> str | None:
 
 
 def refuse_without_depth(source: Source, samples: int = 5) -> None:
-    """Raise SourceError if no frame has a depth reading; reads a few frames, and all of them where those are blank."""
+    """Raise SourceError if no frame has a depth reading; reads a few frames, and all frames only if those are blank."""
     if _frame_medians_m(source, _spread(len(source), samples)):
         return
     if not _frame_medians_m(source, range(len(source)), stop_at=1):
@@ -55,7 +55,7 @@ def _spread(count: int, samples: int) -> list[int]:
 
 
 def _frame_medians_m(source: Source, indices: Iterable[int], stop_at: int | None = None) -> list[float]:
-    """Return the median reading of each frame that can be read and has one."""
+    """Return the median reading of each frame that is readable and not blank."""
     medians: list[float] = []
     for i in indices:
         if stop_at is not None and len(medians) >= stop_at:
@@ -63,14 +63,14 @@ def _frame_medians_m(source: Source, indices: Iterable[int], stop_at: int | None
         try:
             depth_m = source.depth_of(i)
         except SourceError:
-            continue  # iterating the source reports it; here only the readable frames matter
+            continue  # reported when the source is iterated
         if (depth_m > 0).any():
             medians.append(float(np.median(depth_m[depth_m > 0])))
     return medians
 
 
 def _unit_guess(median_m: float, units_per_metre: float | None) -> str:
-    """Name the known unit that brings the median nearest to an indoor 2 m, if one does."""
+    """Suggest the known unit whose median is nearest to 2 m, typical for indoors."""
     raw = median_m * (units_per_metre or 1.0)
     guesses = {units: raw / units for units in KNOWN_UNITS_PER_METRE if 0.4 <= raw / units <= 8.0}
     if not guesses:

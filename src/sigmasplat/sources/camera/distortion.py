@@ -1,4 +1,4 @@
-"""Take the lens out of an image: radial-tangential distortion, forward, inverse and as a remap table."""
+"""Remove lens distortion: radial-tangential model, forward, inverse and as a remap table."""
 
 from functools import cached_property
 
@@ -11,9 +11,9 @@ Points = NDArray[np.float64]
 
 
 def distort(points: Points, coefficients: Points) -> Points:
-    """Map ideal image points [..., 2] (x/z, y/z) to where the lens puts them.
+    """Map ideal image points [..., 2] (x/z, y/z) to distorted image points.
 
-    Coefficients k1, k2, p1, p2, k3 [, k4, k5, k6], the last three of the rational model's denominator (OpenCV's order).
+    Coefficients k1, k2, p1, p2, k3 [, k4, k5, k6], the last three for the rational model (OpenCV's order).
     """
     k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(coefficients, (0, 8 - len(coefficients)))
     x, y = points[..., 0], points[..., 1]
@@ -29,7 +29,7 @@ def distort(points: Points, coefficients: Points) -> Points:
 
 
 def undistort(points: Points, coefficients: Points, iterations: int = 50) -> Points:
-    """Invert `distort` by fixed-point iteration; it converges for lenses whose image does not fold over."""
+    """Invert `distort` by fixed-point iteration; it converges if the distortion is monotonic within the image."""
     ideal = points.copy()
     for _ in range(iterations):
         ideal = ideal + (points - distort(ideal, coefficients))
@@ -37,11 +37,11 @@ def undistort(points: Points, coefficients: Points, iterations: int = 50) -> Poi
 
 
 class Undistortion:
-    """Resample images of a lens camera as the pinhole with the same focal lengths and principal point sees them.
+    """Resample distorted images to the pinhole camera with the same focal lengths and principal point.
 
-    Depth is resampled with the colour: TUM's depth is registered to the *distorted* colour image, pixel by pixel, so
-    moving one without the other would shear them apart by up to 20 pixels in the corners (the CG-SLAM release
-    undistorts colour only). Colour is interpolated, depth is picked, since between a near and a far surface lies none.
+    Depth is resampled together with colour: TUM's depth is registered to the *distorted* colour image, so undistorting
+    colour alone would misalign them by up to 20 pixels in the corners (the CG-SLAM release undistorts colour only).
+    Colour is interpolated. Depth takes the nearest reading, because a mean of a near and a far surface is no surface.
     """
 
     def __init__(self, camera: Camera, coefficients: Points) -> None:
@@ -50,14 +50,14 @@ class Undistortion:
 
     @cached_property
     def _source_uv(self) -> NDArray[np.float32]:
-        """Where in the recorded image each ideal pixel lies, [H·W, 2] pixels."""
+        """Position of each ideal pixel in the recorded image, [H·W, 2] pixels."""
         c = self.camera
         lens = distort(c.rays()[..., :2].astype(np.float64), self.coefficients)
         return (lens * [c.fx, c.fy] + [c.cx, c.cy]).reshape(-1, 2).astype(np.float32)
 
     @cached_property
     def _corners(self) -> tuple[list[NDArray[np.intp]], list[NDArray[np.float32]]]:
-        """Flat indices and weights of the four recorded pixels around each ideal one; clamped at the border."""
+        """Flat indices and weights of the four recorded pixels around each ideal pixel; clamped to the image."""
         width, height = self.camera.width, self.camera.height
         u = self._source_uv[:, 0].clip(0, width - 1)
         v = self._source_uv[:, 1].clip(0, height - 1)
@@ -75,13 +75,13 @@ class Undistortion:
         return np.where(inside, uv[:, 1] * width + uv[:, 0], 0), inside
 
     def color(self, recorded: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Resample colour [H, W, 3] bilinearly; what the lens never saw repeats the border (its depth is 0: masked)."""
+        """Resample colour [H, W, 3] bilinearly; outside the recorded image edge pixels repeat (depth is 0)."""
         flat = recorded.reshape(-1, 3)
         indices, weights = self._corners
         total = sum((flat[i] * w for i, w in zip(indices, weights, strict=True)), np.zeros_like(flat))
         return np.clip(total, 0.0, 1.0).astype(np.float32).reshape(recorded.shape)
 
     def depth(self, recorded_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Resample depth [H, W] by the nearest reading; 0 where the lens never saw."""
+        """Resample depth [H, W] by the nearest reading; 0 outside the recorded image."""
         index, inside = self._nearest
         return np.where(inside, recorded_m.reshape(-1)[index], 0.0).astype(np.float32).reshape(recorded_m.shape)

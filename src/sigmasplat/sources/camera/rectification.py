@@ -1,4 +1,4 @@
-"""Bring the images of a recording into one pinhole camera: lenses out, depth registered to colour."""
+"""Rectify the images of a recording to one pinhole camera: lens distortion removed, depth registered to colour."""
 
 from pathlib import Path
 
@@ -16,20 +16,20 @@ Image = NDArray[np.float32]
 
 
 def registers_depth(calibration: Calibration, settings: InputConfig) -> bool:
-    """Tell whether depth is moved to the colour camera: where the cameras are known, and unless the settings say no."""
+    """Return whether depth is moved to the colour camera: if the depth camera is known and the settings allow it."""
     wanted = calibration.register_by_default if settings.register_depth == "auto" else settings.register_depth == "on"
     return wanted and calibration.depth_camera is not None
 
 
 class Rectification:
-    """Turn recorded colour and depth into images of `camera`, as the settings ask.
+    """Convert recorded colour and depth to images of `camera`, as the settings say.
 
-    Registered depth has the colour image's pixels and lens. Depth of a camera of its own is taken out of its lens,
-    then moved to the colour camera, which is made no finer than the depth camera is, or the images worked on.
+    Registered depth has the colour image's pixels and distortion. Depth of a separate camera is undistorted, then moved
+    to the colour camera, whose width is reduced to that of the depth camera or the working width, the larger of both.
     """
 
     def __init__(self, name: str, calibration: Calibration, settings: InputConfig) -> None:
-        """Raises SourceError where depth is to be registered and the calibration does not say how."""
+        """Prepare the remap tables. Raises SourceError if depth must be registered but the depth camera is unknown."""
         self.calibration = calibration
         lens = calibration.distortion if settings.undistort else None
         depth_lens = calibration.depth_distortion if settings.undistort else None
@@ -44,7 +44,7 @@ class Rectification:
             self._registration = DepthRegistration(depth_camera, self.camera, calibration.T_color_depth)
 
     def _depth_camera(self, name: str, settings: InputConfig) -> Camera | None:
-        """Return the camera that depth is to be moved from, None where it stays as it is."""
+        """Return the camera that depth is moved from, None if depth is not moved."""
         known = self.calibration.depth_camera
         if settings.register_depth == "on" and known is None:
             raise SourceError(
@@ -55,7 +55,7 @@ class Rectification:
 
     @property
     def moves_depth(self) -> bool:
-        """Tell whether depth is moved to the colour camera."""
+        """Return whether depth is moved to the colour camera."""
         return self._registration is not None
 
     @property
@@ -69,7 +69,7 @@ class Rectification:
         return self._color_lens.color(color) if self._color_lens else color, self.depth(depth_m)
 
     def depth(self, depth_m: Image) -> Image:
-        """Return depth [H, W] of `camera` from the recorded one."""
+        """Return depth [H, W] of `camera` from recorded depth."""
         if self._depth_lens:
             depth_m = self._depth_lens.depth(depth_m)
         return self._registration(depth_m) if self._registration else depth_m
@@ -78,12 +78,12 @@ class Rectification:
 def check_image_sizes(
     rectification: Rectification, color: Path, color_size: tuple[int, ...], depth: Path, depth_size: tuple[int, ...]
 ) -> None:
-    """Raise SourceError where an image's (width, height) is not that of its camera."""
+    """Raise SourceError if the (width, height) of an image is not that of its camera."""
     c = rectification.calibration.camera
     if tuple(color_size) != tuple(depth_size) and not rectification.moves_depth:
         raise SourceError(
             f"{color} is {color_size[0]}×{color_size[1]} but {depth} is {depth_size[0]}×{depth_size[1]}; "
-            "register depth to colour and give both one size, or name depth_camera in calibration.json"
+            "register depth to colour at the same size, or give depth_camera in calibration.json"
         )
     for what, path, size, wanted in (
         ("colour", color, color_size, (c.width, c.height)),
@@ -92,7 +92,7 @@ def check_image_sizes(
         if tuple(size) != wanted:
             raise SourceError(
                 f"{path} is {size[0]}×{size[1]} but the calibration is for {wanted[0]}×{wanted[1]}; "
-                f"take images of that size, or mend the {what} camera's calibration"
+                f"take images of that size, or correct the calibration of the {what} camera"
             )
 
 
@@ -101,5 +101,5 @@ def _undistortion(camera: Camera, coefficients: tuple[float, ...] | None) -> Und
 
 
 def _limited_width(color: Camera, width: int) -> Camera:
-    """Return the colour camera at no more than so many pixels across."""
+    """Return the colour camera with at most `width` pixels per row."""
     return color if color.width <= width else color.resized(width, round(color.height * width / color.width))

@@ -1,4 +1,4 @@
-"""Read the files of a recording that lies packed in a zip, or unpacked in a folder."""
+"""Read the files of a recording from a zip archive, or from the unpacked folder."""
 
 import re
 import zipfile
@@ -9,10 +9,10 @@ from sigmasplat.errors import SourceError
 
 
 class Archive:
-    """The recording's files by their names below its top; nothing is unpacked to disk."""
+    """The files of a zip archive or of its unpacked folder, by relative name; nothing is unpacked to disk."""
 
     def __init__(self, path: Path) -> None:
-        """Raises SourceError if a file is no whole zip."""
+        """List the files. Raises SourceError if a file is not a complete zip archive."""
         self.path, self._zip = path, None
         if path.is_dir():
             self.names = [str(entry.relative_to(path)) for part in ("*", "*/*") for entry in path.glob(part)]
@@ -20,20 +20,22 @@ class Archive:
         try:
             self._zip = zipfile.ZipFile(path)
         except (OSError, zipfile.BadZipFile) as error:
-            raise SourceError(f"{path}: not a whole archive ({error}); copy it again") from error
+            raise SourceError(f"{path}: not a complete zip archive ({error}); copy it again") from error
         self.names = self._zip.namelist()
 
     def __contains__(self, name: str) -> bool:
         return name in self.names
 
     def read(self, name: str) -> bytes:
-        """Return a file's bytes. Raises SourceError naming it if it is missing or damaged."""
+        """Return the bytes of a file. Raises SourceError naming it if it is missing or damaged."""
         try:
             return (self.path / name).read_bytes() if self._zip is None else self._zip.read(name)
         except (OSError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
-            raise SourceError(f"{self.path / name}: unreadable in its archive ({error}); copy it again") from error
+            raise SourceError(
+                f"{self.path / name}: cannot be read from its archive ({error}); copy it again"
+            ) from error
 
-    def numbered(self, folder: str, endings: str) -> dict[int, str]:
-        """Map the number in each name folder/N.ending to the name, in order of number; endings as a|b."""
+    def by_number(self, folder: str, endings: str) -> dict[int, str]:
+        """Map N to each name folder/N.ending, in order of N; `endings` is a regular expression such as "jpg|png"."""
         found = [(re.fullmatch(rf"{folder}/(\d+)\.({endings})", name), name) for name in self.names]
         return dict(sorted((int(match.group(1)), name) for match, name in found if match))

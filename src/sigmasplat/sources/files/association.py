@@ -1,16 +1,24 @@
-"""Pair events of two clocks by time."""
+"""Pair two lists of timestamps."""
+
+from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sigmasplat.errors import SourceError
+
 Times = NDArray[np.float64]
 
+MAX_GAP_S = 0.02
+"""Largest time difference of a colour and a depth image of one camera at 30 Hz; TUM's own tool uses the same."""
 
-def associate(first_s: Times, second_s: Times, tolerance_s: float = 0.02) -> NDArray[np.intp]:
+
+def associate(first_s: Times, second_s: Times, tolerance_s: float = MAX_GAP_S) -> NDArray[np.intp]:
     """Pair timestamps [N] and [M], seconds, that differ by less than `tolerance_s`; return indices [K, 2] by time.
 
-    Every index is used at most once and the closest pairs are served first; neither list need be sorted. Ties go to
-    the earlier entry of the first list, then of the second, so the answer does not depend on the sort's whims.
+    Every index is used at most once, and the closest pairs are chosen first. The lists may be unsorted. Ties go to the
+    earlier entry of the first list, then of the second, so the result does not depend on the sorting algorithm.
     """
     rows, columns = _candidates(first_s, second_s, tolerance_s)
     gaps_s = np.abs(first_s[rows] - second_s[columns])
@@ -25,8 +33,16 @@ def associate(first_s: Times, second_s: Times, tolerance_s: float = 0.02) -> NDA
     return np.array(pairs, np.intp).reshape(-1, 2)
 
 
+def no_pairs(path: Path, times_s: Mapping[str, Times]) -> SourceError:
+    """Return the error for a recording in which no colour image has depth; `times_s` of colour and depth by name."""
+    spans = ", ".join(f"{name} {t.min():.3f} … {t.max():.3f} s" for name, t in times_s.items())
+    return SourceError(
+        f"no colour image of {path} has depth within {MAX_GAP_S:g} s ({spans}); are both from one recording?"
+    )
+
+
 def _candidates(first_s: Times, second_s: Times, tolerance_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """List all index pairs strictly within the tolerance."""
+    """Return all index pairs that differ by less than the tolerance."""
     order = np.argsort(second_s, kind="stable")
     ordered = second_s[order]
     low = np.searchsorted(ordered, first_s - tolerance_s, "left")

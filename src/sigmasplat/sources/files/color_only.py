@@ -50,7 +50,8 @@ def _describe(path: Path) -> str | None:
     if stereo := _stereo_folders(folders):
         return f"stereo or multi-camera images in {', '.join(stereo[:4])}"
     if folders:
-        return f"images in {max(folders, key=lambda folder: len(folders[folder]))}"
+        folder = max(folders, key=lambda folder: len(folders[folder]))
+        return "images" if folder == path else f"images in {folder.relative_to(path)}"
     return f"video: {videos[0].name}" if videos else None
 
 

@@ -1,4 +1,4 @@
-"""Find the image files of a recording and say which colour belongs to which depth."""
+"""Find the image files of a recording and pair colour with depth."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -8,7 +8,7 @@ from typing import TypeVar
 from sigmasplat.errors import SourceError
 
 FRAMES_PER_SECOND = 30.0
-"""Recordings that carry no time get this rate by convention."""
+"""Frame rate of recordings without timestamps, by convention."""
 
 COLOR_FOLDERS = ("color", "colour", "rgb", "image", "images")
 DEPTH_FOLDERS = ("depth", "depths")
@@ -19,12 +19,12 @@ Key = TypeVar("Key", int, str)
 
 
 def first_subfolder(folder: Path, names: Iterable[str]) -> Path | None:
-    """Return the first of the named folders that is there, None if none is."""
+    """Return the first of the named subfolders that exists, None if none does."""
     return next((folder / name for name in names if (folder / name).is_dir()), None)
 
 
 def list_images(folder: Path | None, endings: Sequence[str]) -> list[Path]:
-    """List a folder's images in the order of the numbers in their names: 2.png comes before 10.png."""
+    """Return the images of a folder in the order of the numbers in their names: 2.png before 10.png."""
     if folder is None or not folder.is_dir():
         return []
     found = (path for path in folder.iterdir() if path.suffix.lower() in endings and not path.name.startswith("."))
@@ -32,12 +32,12 @@ def list_images(folder: Path | None, endings: Sequence[str]) -> list[Path]:
 
 
 def natural_key(path: Path | str) -> list[tuple[int, str]]:
-    """Return a key that sorts names by their numbers' size: digits as numbers, the rest as text."""
+    """Return a sort key that compares digits in a name as numbers and the rest as text."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", str(path)) if part]
 
 
 def index_by_number(paths: Iterable[Path]) -> dict[int, Path]:
-    """Map the last number in each file's name to its path, ascending; names without one are left out."""
+    """Map the last number in each file name to its path, ascending; names without a number are left out."""
     numbers = ((re.findall(r"[0-9]+", path.stem), path) for path in paths)
     return dict(sorted((int(found[-1]), path) for found, path in numbers if found))
 
@@ -47,20 +47,20 @@ def pair_images(
 ) -> tuple[list[Key], list[str]]:
     """Return the keys that colour and depth share, in the order of colour, and why the other images are left out.
 
-    The names say where each was looked for. Raises SourceError if one kind is missing or no key is shared.
+    color_name, depth_name: file patterns for messages. Raises SourceError if one kind is missing or no key is shared.
     """
     if not depths:
         raise SourceError(f"no depth images in {folder} (looked for {depth_name}); is this the RGB-only download?")
     if not colors:
-        raise SourceError(f"no colour images in {folder} (looked for {color_name}); is the download whole?")
+        raise SourceError(f"no colour images in {folder} (looked for {color_name}); is the download complete?")
     keys = [key for key in colors if key in depths]
     if not keys:
         first = f"{next(iter(colors.values())).name} and {next(iter(depths.values())).name}"
         raise SourceError(
-            f"{folder}: no number is shared by {color_name} and {depth_name} (found {first}); "
+            f"{folder}: {color_name} and {depth_name} have no number in common (found {first}); "
             "are both from one recording?"
         )
-    return keys, [f"{colors[key]}: no {depth_name} of its number" for key in colors if key not in depths]
+    return keys, [f"{colors[key]}: no {depth_name} with its number" for key in colors if key not in depths]
 
 
 FrameFiles = dict[str, dict[int, Path]]
@@ -69,7 +69,7 @@ _NAME = re.compile(r"frame-([0-9]+)\.(?:(color)\.(?:png|jpe?g)|(depth)\.(?:png|p
 
 
 def frame_files(folder: Path) -> FrameFiles:
-    """Map "color", "depth" and "pose" to the files of each kind by number, ascending."""
+    """Map "color", "depth" and "pose" to the frame-N files of each kind by number, ascending."""
     found: FrameFiles = {"color": {}, "depth": {}, "pose": {}}
     for path in sorted(folder.glob("frame-*")):
         match = _NAME.fullmatch(path.name.lower())
@@ -80,5 +80,5 @@ def frame_files(folder: Path) -> FrameFiles:
 
 
 def has_frame_files(folder: Path) -> bool:
-    """Tell whether there is at least one such colour or depth image."""
+    """Return whether there is at least one frame-N file."""
     return any(_NAME.fullmatch(path.name.lower()) for path in folder.glob("frame-*"))

@@ -1,4 +1,4 @@
-"""Read colour and depth images; whatever a file does wrong becomes one line that names it."""
+"""Read colour and depth images; every problem becomes a SourceError that names the file."""
 
 import io
 import struct
@@ -15,18 +15,18 @@ from sigmasplat.errors import SourceError
 Value = TypeVar("Value")
 
 UINT16_MAX = 65535
-"""Several sensors write the largest 16-bit number where they saw nothing."""
+"""Several sensors write the largest 16-bit number for no reading."""
 
 _COLOR_OF_BYTE = (np.arange(256) / 255.0).astype(np.float32)
 
 
 def color_from_bytes(values: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Turn 8-bit colour into float32 in [0, 1], same shape."""
+    """Convert 8-bit colour to float32 in [0, 1], same shape."""
     return _COLOR_OF_BYTE[values]
 
 
 def read_color(path: Path) -> NDArray[np.uint8]:
-    """Read an image as 8-bit RGB [H, W, 3]. Raises SourceError naming a missing, cut short or corrupt file."""
+    """Read an image as 8-bit RGB [H, W, 3]. Raises SourceError naming a missing, truncated or damaged file."""
     return _guard_reading(path, lambda: _decode(path, "RGB"))
 
 
@@ -36,7 +36,7 @@ def decode_color(path: Path, data: bytes) -> NDArray[np.uint8]:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) in pixels from the header alone. Raises SourceError if the file is no image."""
+    """Return (width, height) in pixels from the file header. Raises SourceError if the file is not an image."""
     if path.suffix == ".npy":
         height, width = _guard_reading(path, lambda: np.load(path, mmap_mode="r").shape[:2])
         return int(width), int(height)
@@ -46,7 +46,7 @@ def image_size(path: Path) -> tuple[int, int]:
 def read_depth(path: Path, units_per_metre: float) -> NDArray[np.float32]:
     """Read depth along the optical axis as float32 metres [H, W], 0 = no reading.
 
-    Whole numbers (16-bit PNG, integer .npy) are divided by `units_per_metre`; floats (.tiff, .npy) are metres already.
+    Whole numbers (16-bit PNG, integer .npy) are divided by `units_per_metre`; floats (.tiff, .npy) are in metres.
     Raises SourceError if the file is unreadable, not a single-channel depth image, negative, or holds NaN or inf.
     """
     return depth_to_metres(
@@ -55,10 +55,10 @@ def read_depth(path: Path, units_per_metre: float) -> NDArray[np.float32]:
 
 
 def depth_to_metres(path: Path, raw: NDArray[Any], units_per_metre: float) -> NDArray[np.float32]:
-    """Turn a depth image as stored into float32 metres, as `read_depth` says; `path` names it. Raises SourceError."""
+    """Convert a stored depth image to float32 metres, as `read_depth` does; `path` names it. Raises SourceError."""
     if raw.ndim != 2 or raw.dtype == np.uint8 or raw.dtype.kind not in "iuf":
         raise SourceError(
-            f"{path}: not a depth image (found {raw.dtype} {raw.shape}); 16-bit PNG or float metres wanted"
+            f"{path}: not a depth image (found {raw.dtype} {raw.shape}); expected 16-bit PNG or float metres"
         )
     if raw.dtype.kind == "f":
         return _checked_metres(path, raw.astype(np.float32))
@@ -86,14 +86,14 @@ def _header_size(path: Path) -> tuple[int, int]:
 
 
 def _guard_reading(path: Path, read: Callable[[], Value]) -> Value:
-    """Run a reader of a file. Raises SourceError if the file is missing or unreadable."""
+    """Call a reader of a file. Raises SourceError if the file is missing or unreadable."""
     if not path.is_file():
-        raise SourceError(f"{path}: the image is missing; download it again or drop it from the list")
+        raise SourceError(f"{path}: the image is missing; download it again or remove it from the list")
     return guard_decoding(path, read)
 
 
 def guard_decoding(path: Path, read: Callable[[], Value]) -> Value:
-    """Run a decoder; those fail in many ways on damaged bytes, and all become a SourceError that names `path`."""
+    """Call a decoder. Raises SourceError naming `path` for any of the exceptions that damaged data can cause."""
     try:
         return read()
     except (OSError, ValueError, SyntaxError, EOFError, IndexError, KeyError, TypeError, struct.error) as error:

@@ -1,10 +1,11 @@
-"""Read camera poses that lie as matrices in files; whatever is wrong with one becomes a line that names it."""
+"""Read camera poses stored as matrices; every problem becomes a SourceError that names the file."""
 
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
@@ -12,14 +13,17 @@ from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.types import Matrix
 
 RIGID_TOLERANCE = 1e-2
-"""Published poses are rounded, or products of many; what is this near a rotation is made one."""
+"""Published poses are rounded; a matrix within this tolerance of a rotation is orthonormalised."""
+
+QUATERNION_TOLERANCE = 1e-2
+"""Largest deviation of a recorded quaternion's length from 1."""
 
 FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Takes points of a camera with y down and z forward to the same camera with y up and z backward (OpenGL)."""
+"""Transforms camera axes with y down and z forward to axes with y up and z backward (OpenGL)."""
 
 
 def read_matrix(path: Path) -> Matrix:
-    """Read 3×4 or 4×4 numbers in rows as [4, 4]; they need not be finite. Raises SourceError naming the file."""
+    """Read 3×4 or 4×4 numbers by rows as [4, 4]; they may be infinite. Raises SourceError naming the file."""
     try:
         text = path.read_text(encoding="utf-8")
         return to_matrix(str(path), [float(word) for word in text.replace(",", " ").split()])
@@ -28,13 +32,13 @@ def read_matrix(path: Path) -> Matrix:
 
 
 def to_matrix(where: str, values: Any) -> Matrix:
-    """Shape 12 or 16 numbers as [4, 4]. Raises SourceError naming the place if they are not so many numbers."""
+    """Shape 12 or 16 numbers as [4, 4]. Raises SourceError naming `where` for any other count."""
     try:
         flat = np.array(values, np.float64).reshape(-1)
     except (ValueError, TypeError):
         flat = np.zeros(0)
     if len(flat) not in (12, 16):
-        raise SourceError(f"{where}: a 4×4 matrix in rows is wanted, found {_described(values)}")
+        raise SourceError(f"{where}: expected a 4×4 matrix by rows, found {_described(values)}")
     return np.vstack([flat[:12].reshape(3, 4), flat[12:].reshape(-1, 4) if len(flat) == 16 else [[0, 0, 0, 1]]])
 
 
@@ -43,24 +47,35 @@ def _described(values: Any) -> str:
 
 
 def checked_pose(where: str, T: Matrix) -> Matrix | None:
-    """Return a camera-to-world pose, None where it is not finite: so recordings mark frames without one.
+    """Return a camera-to-world pose, None if it is not finite, which marks a frame without a pose.
 
-    Raises SourceError naming the place if the matrix is finite but no rigid motion.
+    Raises SourceError naming `where` if the matrix is finite but not rigid.
     """
     if not np.isfinite(T).all():
         return None
     if not se3.is_rigid(T, RIGID_TOLERANCE):
         numbers = " ".join(f"{value:.3g}" for value in T.reshape(-1)[:12])
-        raise SourceError(f"{where}: not a rigid camera-to-world pose: {numbers}; drop it or mend its rotation")
+        raise SourceError(f"{where}: not a rigid camera-to-world pose: {numbers}; delete it or correct its rotation")
     return T if se3.is_rigid(T) else se3.orthonormalise(T)
 
 
+def rigid_transform(where: str, position: ArrayLike, quaternion_wxyz: ArrayLike) -> Matrix:
+    """Build a transform [4, 4]. Raises SourceError naming `where` unless it is finite with a unit quaternion."""
+    q, T = np.array(quaternion_wxyz, np.float64), np.eye(4)
+    T[:3, 3] = position
+    norm = float(np.linalg.norm(q))
+    if not np.isfinite(T).all() or not abs(norm - 1.0) < QUATERNION_TOLERANCE:
+        raise SourceError(f"{where}: the pose is not rigid: its quaternion has length {norm:.4g}, not 1")
+    T[:3, :3] = se3.rotation_from_quaternion(q)
+    return T
+
+
 def build_trajectory(timed: Iterable[tuple[float, Matrix | None]]) -> Trajectory | None:
-    """Build the path of the frames (time in seconds, T_world_camera) that have a pose, None if none has."""
+    """Build the path of the frames (time in seconds, T_world_camera) that have a pose, None if no frame has one."""
     known = [(t, T) for t, T in timed if T is not None]
     return Trajectory(np.array([t for t, _ in known]), np.stack([T for _, T in known])) if known else None
 
 
 def read_pose_files(timed: Iterable[tuple[float, Path]]) -> Trajectory | None:
-    """Read one pose file per frame, given with its time; a file that is not there is a pose not known."""
+    """Read one pose file per frame, given with its time; a missing file means an unknown pose."""
     return build_trajectory((t, checked_pose(str(path), read_matrix(path))) for t, path in timed if path.is_file())

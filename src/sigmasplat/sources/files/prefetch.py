@@ -1,4 +1,4 @@
-"""Produce items one step ahead of their consumer, in one background thread."""
+"""Compute items ahead of their consumer, in one background thread."""
 
 import queue
 import threading
@@ -11,7 +11,7 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class _Result(Generic[Item]):
-    """One produced item, or the exception that ended production, or neither at the end."""
+    """One item, or the exception that ended the producer, or neither at the end."""
 
     item: Item | None = None
     error: BaseException | None = None
@@ -21,9 +21,9 @@ class _Result(Generic[Item]):
 def read_ahead(items: Iterable[Item], length: int = 4) -> Iterator[Item]:
     """Yield `items` in order while a thread computes up to `length` of them in advance.
 
-    Decoding an image costs ~50 ms and leaves the interpreter lock, so it hides behind the tracking of the frame before.
-    An exception of the producer is raised here at the place of the item it replaces. The thread ends with the items,
-    or as soon as the consumer closes or drops this generator.
+    Decoding an image takes ~50 ms and releases the interpreter lock, so it runs in parallel with tracking.
+    An exception of the producer is raised here in place of the item. The thread ends after the last item,
+    or as soon as the consumer closes or deletes this generator.
     """
     results: queue.Queue[_Result[Item]] = queue.Queue(maxsize=length)
     stop = threading.Event()
@@ -36,7 +36,7 @@ def read_ahead(items: Iterable[Item], length: int = 4) -> Iterator[Item]:
             raise result.error
     finally:
         stop.set()
-        _drain(results)  # makes room, so a producer blocked in put() wakes, sees `stop` and ends
+        _drain(results)  # frees space, so that a producer blocked in put() wakes up and sees `stop`
         thread.join()
 
 
@@ -48,7 +48,7 @@ def _produce(items: Iterable[Item], results: "queue.Queue[_Result[Item]]", stop:
             results.put(_Result(item=item))
             if stop.is_set():
                 return
-    except BaseException as error:  # handed to the consumer's thread, which raises it
+    except BaseException as error:  # passed to the consumer's thread, which raises it
         results.put(_Result(error=error, last=True))
     else:
         results.put(_Result(last=True))

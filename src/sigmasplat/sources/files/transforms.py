@@ -1,9 +1,9 @@
-"""Understand the transforms.json of instant-ngp and nerfstudio: one camera, poses with OpenGL axes.
+"""Read the transforms.json of instant-ngp and nerfstudio: one camera, poses with OpenGL axes.
 
-fl_x fl_y cx cy w h [k1 k2 k3 p1 p2] [camera_model]     at the top or, all the same, in every frame
+fl_x fl_y cx cy w h [k1 k2 k3 p1 p2] [camera_model]     at the top, or equal in every frame
 frames: file_path, depth_file_path, transform_matrix    camera to world; camera x right, y up, z backward
 
-There the centre of the first pixel is at (½, ½), ours is at (0, 0): half a pixel is taken off cx and cy.
+In these files the centre of the first pixel is at (½, ½), in ours at (0, 0): half a pixel is subtracted from cx and cy.
 """
 
 from collections.abc import Sequence
@@ -21,31 +21,33 @@ Fields = dict[str, Any]
 
 PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 CAMERA_TOLERANCE_PX = 0.5
-"""Cameras of two frames whose numbers differ by less are one camera."""
+"""Two frames have the same camera if their intrinsics differ by less than this."""
 
 
 def read_frames(path: Path, fields: Fields, key: str = "frames") -> list[Fields]:
-    """Return the frames of a file. Raises SourceError if there are none, or one names no image."""
+    """Return the frames of a file. Raises SourceError if there are none, or one has no image path."""
     frames = fields.get(key)
     if not isinstance(frames, list) or not frames:
-        raise SourceError(f'{path}: no list "{key}" with at least one frame; is it a file of nerfstudio\'s?')
+        raise SourceError(f'{path}: no list "{key}" with at least one frame; was it written by nerfstudio?')
     for frame in frames:
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-            raise SourceError(f'{path}: a frame has no "file_path" (found {str(frame)[:60]}); mend it')
+            raise SourceError(f'{path}: a frame has no "file_path" (found {str(frame)[:60]}); correct it')
     return frames
 
 
 def read_camera(
     path: Path, fields: Fields, frames: Sequence[Fields], size: tuple[int, int], units: float
 ) -> Calibration:
-    """Build the one camera of all frames; `size` (width, height) stands in where the file gives none.
+    """Build the camera shared by all frames; `size` (width, height) is the default for a missing size.
 
-    Raises SourceError naming the field that is missing, the frame that differs, or a lens that is no pinhole's.
+    Raises SourceError naming a missing field, a frame with other intrinsics, or a lens that is not a pinhole's.
     """
     first = {**fields, **frames[0]}
     model = str(first.get("camera_model", "OPENCV")).upper()
     if model not in PINHOLE_MODELS or first.get("is_fisheye"):
-        raise SourceError(f"{path}: camera_model is {model}; only pinholes are read, undistort the images first")
+        raise SourceError(
+            f"{path}: camera_model is {model}; only pinhole cameras are supported, undistort the images first"
+        )
     for frame in frames[1:]:
         for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
             if key not in first:
@@ -54,7 +56,7 @@ def read_camera(
             if abs(a - b) > CAMERA_TOLERANCE_PX:
                 raise SourceError(
                     f"{path}: the frames have several cameras ({key} {a:g} and {b:g}, {frame['file_path']}); "
-                    "one pinhole for all is wanted: undistort to one, or leave the others out"
+                    "all frames must have one camera: undistort the images to one camera, or remove the others"
                 )
     width, height = (int(json_number(path, first, key, size[i])) for i, key in enumerate(("w", "h")))
     camera = build_camera(path, width, height, _focal(path, first, width, height))
@@ -62,7 +64,7 @@ def read_camera(
 
 
 def read_pose(path: Path, frame: Fields) -> Matrix | None:
-    """Return T_world_camera in our axes, None where the frame has none. Raises SourceError if it is not rigid."""
+    """Return T_world_camera in our axes, None if the frame has no pose. Raises SourceError if it is not rigid."""
     values = frame.get("transform_matrix")
     if values is None:
         return None
@@ -72,7 +74,7 @@ def read_pose(path: Path, frame: Fields) -> Matrix | None:
 
 
 def _focal(path: Path, fields: Fields, width: int, height: int) -> list[float]:
-    """Return fx, fy, cx, cy; a file may give the field of view instead."""
+    """Return fx, fy, cx, cy; a file may give the field of view instead of the focal length."""
     if "fl_x" not in fields and "camera_angle_x" in fields:
         fx = 0.5 * width / float(np.tan(0.5 * json_number(path, fields, "camera_angle_x")))
     else:
@@ -85,5 +87,5 @@ def _focal(path: Path, fields: Fields, width: int, height: int) -> list[float]:
 def _lens(path: Path, fields: Fields) -> Distortion | None:
     k1, k2, p1, p2, k3, k4 = (json_number(path, fields, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3", "k4"))
     if k4:
-        raise SourceError(f"{path}: the lens has a k4 of {k4:g}, which is not known here; undistort the images first")
+        raise SourceError(f"{path}: the lens has k4 = {k4:g}, which is not supported; undistort the images first")
     return (k1, k2, p1, p2, k3) if any((k1, k2, p1, p2, k3)) else None

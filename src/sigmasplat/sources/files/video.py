@@ -1,4 +1,4 @@
-"""Read the frames of a video file, each exactly, through OpenCV."""
+"""Read the frames of a video file in exact order through OpenCV."""
 
 import threading
 from pathlib import Path
@@ -12,12 +12,12 @@ from sigmasplat.sources.files.optional import import_optional
 
 
 class Video:
-    """An open video. Reading on is quick; reading back begins again at the start, for phones do not film at a steady
-    rate, and jumping to a frame by number then lands beside it. Safe to read from several threads.
+    """An open video. Reading forwards is fast. Reading backwards restarts at the first frame, because seeking by frame
+    number is not exact in videos with a variable frame rate, as from phones. Safe to use from several threads.
     """
 
     def __init__(self, path: Path) -> None:
-        """Raises SourceError if OpenCV is missing or cannot read the file."""
+        """Open the file. Raises SourceError if OpenCV is missing or cannot read it."""
         self.path, self._lock = path, threading.Lock()
         self._cv2 = import_optional("cv2", "iphone", f"{path}: a video")
         self._open()
@@ -35,7 +35,7 @@ class Video:
             while self._next <= i:
                 if not self._capture.grab():
                     raise SourceError(
-                        f"{self.path}: ends after {self._next} frames, frame {i} asked for; copy it again"
+                        f"{self.path}: ends after {self._next} frames, but frame {i} was requested; copy it again"
                     )
                 self._next += 1
             read, bgr = self._capture.retrieve()
@@ -48,9 +48,7 @@ class Video:
         self._next = 0
         self._capture: Any = self._cv2.VideoCapture(str(self.path))
         if not self._capture.isOpened():
-            raise SourceError(
-                f"{self.path}: unreadable video; copy it again (OpenCV reads no HEVC where it lacks FFmpeg)"
-            )
+            raise SourceError(f"{self.path}: unreadable video; copy it again (OpenCV needs FFmpeg to read HEVC)")
         self._capture.set(
             self._cv2.CAP_PROP_ORIENTATION_AUTO, 0
-        )  # pixels as they were filmed: depth is not turned either
+        )  # keep the recorded orientation: depth is not rotated either

@@ -1,1 +1,1 @@
-"""Make a furnished room in code: shapes, textures, light, a camera's walk and a depth sensor's faults."""
+"""Render a synthetic room: shapes, textures, light, a camera path, and sensor noise."""

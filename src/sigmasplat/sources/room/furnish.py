@@ -1,7 +1,7 @@
-"""Build the room and put things into it.
+"""Build the rooms and their furniture.
 
-A room spans x ∈ [−2.5, 2.5], y ∈ [−2, 2], z ∈ [0, 2.6] m about its own center; further rooms follow along x, PITCH_M
-apart, through doorways at y = 0. Everything above 1.1 m within 1.2 m of the center line is left free for the camera.
+A room spans x ∈ [−2.5, 2.5], y ∈ [−2, 2], z ∈ [0, 2.6] m about its centre. Further rooms follow along x, PITCH_M apart,
+with doorways at y = 0. The space above 1.1 m within 1.2 m of the centre line is free for the camera.
 """
 
 from dataclasses import dataclass, field
@@ -39,7 +39,7 @@ SOFAS: tuple[Color, ...] = ((0.20, 0.40, 0.46), (0.56, 0.26, 0.22), (0.30, 0.36,
 
 @dataclass
 class Room:
-    """Collect the shapes of one room; `place` takes coordinates of the room and mirrors every second room in x."""
+    """The shapes of one room; `place` takes room coordinates and mirrors every second room in x."""
 
     number: int
     seed: int
@@ -53,7 +53,7 @@ class Room:
         material: Material | Texture,
         yaw_rad: float = 0.0,
     ) -> None:
-        """Add a shape: center and half extents in metres; a bare texture means a matt surface."""
+        """Add a shape: centre and half extents in metres; a texture alone means a matt material."""
         side = -1.0 if self.number % 2 else 1.0
         x, y, z = center
         made = material if isinstance(material, Material) else Material(material)
@@ -61,12 +61,12 @@ class Room:
         self.shapes.append(Shape(kind, at, np.array(half, np.float32), side * yaw_rad, made))
 
     def pick(self, choices: int) -> int:
-        """Choose one of so many looks: by the seed in the first room, another one in each room after it."""
+        """Return which of several variants to use: by the seed, and different in neighbouring rooms."""
         return (self.seed + self.number) % choices
 
 
 def furnish_rooms(rooms: int, seed: int) -> list[list[Shape]]:
-    """Build a row of furnished rooms; return the shapes of each, shared walls in the room before them."""
+    """Build a row of furnished rooms; return the shapes of each, a shared wall with the earlier room."""
     built = []
     for number in range(rooms):
         room = Room(number, seed)
@@ -81,7 +81,7 @@ def _shell(room: Room, rooms: int) -> None:
     """Build floor, ceiling and walls; door walls are shared with the next room."""
     seed, half = room.seed * 10 + room.number, WALL_M / 2
     ground, figure = WALLPAPERS[room.pick(len(WALLPAPERS))]
-    span_x, middle_z = PITCH_M / 2, HEIGHT_M / 2  # neighbours meet inside the wall they share
+    span_x, middle_z = PITCH_M / 2, HEIGHT_M / 2  # neighbouring rooms meet inside the shared wall
     place = room.place
     place("box", (0, 0, -half), (span_x, HALF_Y_M + WALL_M, half), wood((0.58, 0.42, 0.28), seed=seed))
     place(
@@ -92,7 +92,7 @@ def _shell(room: Room, rooms: int) -> None:
     place("box", (0, -HALF_Y_M - half, middle_z), (span_x, half, middle_z), south)
     bare = plain((0.84, 0.82, 0.78), 0.006, 0.5, seed)  # the nearly textureless wall
     bricks = brick((0.66, 0.42, 0.34), (0.80, 0.77, 0.72), seed)
-    away = -1.0 if room.number % 2 else 1.0  # the place's x of the wall towards the next room
+    away = -1.0 if room.number % 2 else 1.0  # x of the wall towards the next room, before mirroring
     _wall(room, away * (HALF_X_M + half), bare if away > 0 else bricks, room.number < rooms - 1)
     if room.number == 0:
         _wall(room, -HALF_X_M - half, bricks, False)
@@ -111,7 +111,7 @@ def _wall(room: Room, x: float, texture: Texture, door: bool) -> None:
 
 
 def _north_wall(room: Room, seed: int) -> None:
-    """Put bookshelf, sofa, painting and floor lamp along the papered wall."""
+    """Add bookshelf, sofa, painting and floor lamp along the wall with wallpaper."""
     place = room.place
     _bookshelf(room, -1.62, seed)
     cloth = SOFAS[room.pick(len(SOFAS))]
@@ -130,7 +130,7 @@ def _north_wall(room: Room, seed: int) -> None:
 
 
 def _bookshelf(room: Room, x: float, seed: int) -> None:
-    """Stand a shelf with four boards of books; each board holds three groups of different height."""
+    """Add a bookshelf with four boards; each board holds three groups of books of different height."""
     timber = wood((0.46, 0.31, 0.19), 0.11, seed)
     upright = wood((0.44, 0.30, 0.18), 0.2, seed + 1)
     room.place("box", (x, 1.97, 0.95), (0.62, 0.02, 0.95), upright)
@@ -149,7 +149,7 @@ def _bookshelf(room: Room, x: float, seed: int) -> None:
 
 
 def _south_wall(room: Room, seed: int) -> None:
-    """Put window, sideboard with a vase, and the mirror along the two-tone wall."""
+    """Add window, sideboard with a vase, and mirror along the two-tone wall."""
     place = room.place
     place("box", (-0.85, -1.985, 1.6), (0.72, 0.02, 0.5), Material(sky(0.5), glow=1.0))
     white = plain((0.93, 0.92, 0.89), 0.02)
@@ -175,7 +175,7 @@ def _south_wall(room: Room, seed: int) -> None:
 
 
 def _corners(room: Room, seed: int) -> None:
-    """Put a plant, crates and a small painting near the side walls, the door's way left free."""
+    """Add a plant, crates and small paintings near the side walls; the doorways stay free."""
     place = room.place
     place("drum", (-2.1, -1.5, 0.2), (0.19, 0.19, 0.2), checks((0.70, 0.42, 0.30), (0.78, 0.52, 0.38), 0.08, seed))
     place("drum", (-2.1, -1.5, 0.6), (0.022, 0.022, 0.25), plain((0.36, 0.26, 0.16)))
@@ -193,7 +193,7 @@ def _corners(room: Room, seed: int) -> None:
 
 
 def _middle(room: Room, seed: int) -> None:
-    """Put rug, table, chairs, the things on the table and the ceiling lamp in the middle."""
+    """Add rug, table, chairs, objects on the table and the ceiling lamp in the middle."""
     place, turn = room.place, 0.25
     place(
         "drum",
@@ -240,7 +240,7 @@ def _chair(room: Room, x: float, y: float, yaw_rad: float, seed: int) -> None:
     for sx in (-1, 1):
         for sy in (-1, 1):
             leg_x, leg_y = _rotated(0.175 * sx, 0.175 * sy, yaw_rad)
-            height = 0.36 if sx < 0 else 0.21  # the back's posts reach up to carry it
+            height = 0.36 if sx < 0 else 0.21  # the posts of the back are taller
             room.place("box", (x + leg_x, y + leg_y, height), (0.02, 0.02, height), timber, yaw_rad)
 
 

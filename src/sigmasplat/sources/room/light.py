@@ -1,4 +1,4 @@
-"""Light the room: how much of lamp, window and surroundings each place sees, worked out once on a lattice."""
+"""Light the room: visible share of lamp, window and surroundings, computed once on a lattice."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from sigmasplat.sources.room.textures import Floats
 
 CELL_M = 0.14
 AMBIENT_REACH_M = 0.7
-"""Surfaces further away than this darken nothing around them."""
+"""Largest distance at which a surface reduces the ambient light."""
 
 LAMP_M = (0.0, 0.0, HEIGHT_M - 0.16)
 WINDOW_M = (-0.85, -HALF_Y_M + 0.1, 1.6)
@@ -23,14 +23,14 @@ AMBIENT_COLOR = np.array([[0.46], [0.47], [0.48]], np.float32)
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Shares in [0, 1] of surroundings, lamp and window seen from a lattice over one room: shares [3, X, Y, Z]."""
+    """Visible shares in [0, 1] of surroundings, lamp and window on a lattice over one room: shares [3, X, Y, Z]."""
 
     room_x_m: float
     side: float
     shares: Floats
 
     def at(self, points: Floats, normals: Floats) -> tuple[Floats, Floats]:
-        """Return the light falling on surfaces, RGB [3, N], and the shares of lamp and window seen from them [2, N]."""
+        """Return the light on surface points, RGB [3, N], and the visible shares of lamp and window [2, N]."""
         ambient, lamp, window = self._shares_at(points + np.float32(0.6 * CELL_M) * normals)
         total = AMBIENT_COLOR * (0.35 + 0.65 * ambient)
         total = total + LAMP_COLOR * (lamp * _lamp_light(self.lamp - points, normals, 1.6))
@@ -39,12 +39,12 @@ class Light:
 
     @property
     def lamp(self) -> Floats:
-        """Return the lamp's place [3, 1], metres."""
+        """Return the position of the lamp [3, 1], metres."""
         return self._place(LAMP_M)
 
     @property
     def window(self) -> Floats:
-        """Return the window's middle [3, 1], metres."""
+        """Return the centre of the window [3, 1], metres."""
         return self._place(WINDOW_M)
 
     def _place(self, at: tuple[float, float, float]) -> Floats:
@@ -58,7 +58,7 @@ class Light:
 
 
 def _lamp_light(towards: Floats, normals: Floats, reach_m: float) -> Floats:
-    """Return what a lamp `towards` [3, N] away sheds on a surface: cosine, wrapped a little, over growing distance."""
+    """Return the light of a lamp at offset `towards` [3, N]: softened cosine, falling with distance."""
     distance2 = dot(towards, towards)
     cosine = dot(towards, normals) / np.sqrt(distance2 + 1e-6)
     wrapped = np.maximum((cosine + 0.15) / 1.15, 0.0)
@@ -66,7 +66,7 @@ def _lamp_light(towards: Floats, normals: Floats, reach_m: float) -> Floats:
 
 
 def light_room(number: int, shapes: Sequence[Shape]) -> Light:
-    """Work out the light in one room from the shapes in it."""
+    """Compute the light in one room from its shapes."""
     side = -1.0 if number % 2 else 1.0
     light = Light(number * PITCH_M, side, np.zeros((3, 1, 1, 1), np.float32))
     counts = [int(np.ceil(span / CELL_M)) for span in (PITCH_M + WALL_M, 2 * HALF_Y_M, HEIGHT_M)]
@@ -87,7 +87,7 @@ def _ambient_share(points: Floats, shapes: Sequence[Shape]) -> Floats:
 
 
 def _lamp_share(points: Floats, shapes: Sequence[Shape], light: Light, which: int) -> Floats:
-    """Return the share of a lamp's (or window's) sample points that each lattice point sees."""
+    """Return the share of sample points of the lamp (0) or window (1) visible from each lattice point."""
     center, spread = ((light.lamp, (0.45, 0.45, 0.0)), (light.window, (0.6, 0.0, 0.42)))[which]
     signs = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1) if y == z or which == 0]
     targets = [center + np.array([[s[k] * spread[k]] for k in range(3)], np.float32) for s in signs[:4]]
@@ -95,7 +95,7 @@ def _lamp_share(points: Floats, shapes: Sequence[Shape], light: Light, which: in
 
 
 def _free(points: Floats, segments: Floats, shapes: Sequence[Shape]) -> Floats:
-    """Return 1 where the segment from a point is free of shapes, 0 where one is in its way, [N]."""
+    """Return 1 if no shape blocks the segment from a point, else 0, [N]."""
     free = np.ones(points.shape[1], np.float32)
     low, high = np.minimum(points, points + segments), np.maximum(points, points + segments)
     for shape in shapes:
@@ -114,7 +114,7 @@ def _inside_any(points: Floats, shapes: Sequence[Shape]) -> np.ndarray[tuple[int
 
 
 def _filled(shares: Floats, solid: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> Floats:
-    """Give places inside solids the light of the nearest free place, lest their darkness leaks out at the surface."""
+    """Give points inside solids the light of the nearest free point, so that surfaces are not too dark."""
     if solid.all() or not solid.any():
         return shares
     nearest = distance_transform_edt(solid, return_distances=False, return_indices=True)

@@ -1,4 +1,4 @@
-"""Colour the things that are looked at rather than lived on: books, paintings, rugs, leaves, sky."""
+"""Textures with pictures: books, paintings, rugs, leaves, sky."""
 
 import numpy as np
 
@@ -36,7 +36,7 @@ PALETTES: tuple[tuple[Color, ...], ...] = (  # from the foreground up to the sky
 
 
 def books(spine_m: float, seed: int = 0) -> Texture:
-    """Stand books side by side along u: hashed colours, a dark gap between them, a pale label on each."""
+    """Return a texture of books side by side along u: random colours, dark gaps, pale labels."""
 
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         number = np.floor(u / np.float32(spine_m))
@@ -52,7 +52,7 @@ def books(spine_m: float, seed: int = 0) -> Texture:
 
 
 def painting(half_u_m: float, half_v_m: float, seed: int, frame: Color = (0.32, 0.22, 0.12)) -> Texture:
-    """Hang a landscape of warped colour bands with a sun, in a frame."""
+    """Return a texture of a framed landscape: warped colour bands with a sun."""
     rng = np.random.default_rng(seed)
     bands = np.sort(rng.uniform(-0.8, 0.8, 4)).astype(np.float32)
     colors = np.array(PALETTES[int(rng.integers(len(PALETTES)))], np.float32)
@@ -73,7 +73,7 @@ def painting(half_u_m: float, half_v_m: float, seed: int, frame: Color = (0.32, 
 
 
 def rug(radius_m: float, a: Color, b: Color, c: Color, seed: int = 0) -> Texture:
-    """Knot a round rug: rings, petals and pile."""
+    """Return a texture of a round rug: rings, petals and pile."""
 
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         r = np.hypot(u, v).astype(np.float32) / np.float32(radius_m)
@@ -89,7 +89,7 @@ def rug(radius_m: float, a: Color, b: Color, c: Color, seed: int = 0) -> Texture
 
 
 def leaves(seed: int = 0) -> Texture:
-    """Dapple a ball of foliage."""
+    """Return a texture of foliage."""
 
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         light = 0.5 + 0.5 * noise(u, v, pixel_m, 0.05, seed) + 0.25 * noise(u, v, pixel_m, 0.025, seed + 1)
@@ -99,7 +99,7 @@ def leaves(seed: int = 0) -> Texture:
 
 
 def sky(half_v_m: float) -> Texture:
-    """Show what a window shows: a bright sky over a line of hills."""
+    """Return a texture of the view from a window: a bright sky over hills."""
 
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         height = smoothstep(0.5 + v / np.float32(2 * half_v_m))

@@ -1,4 +1,4 @@
-"""Take a picture of the room: colour without jagged edges, exact depth."""
+"""Render the room: antialiased colour, exact depth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ SUBPIXELS = np.array([[-0.375, -0.125, 0.375, 0.125], [-0.125, 0.375, 0.125, -0.
 
 @dataclass(frozen=True, eq=False)
 class RoomScene:
-    """Rooms in a row: all shapes, and each room's light."""
+    """Rooms in a row: all shapes, and the light of each room."""
 
     shapes: Sequence[Shape]
     lights: Sequence[Light]
@@ -38,7 +38,7 @@ class RoomScene:
 
 @lru_cache(maxsize=4)
 def build_scene(rooms: int, seed: int) -> RoomScene:
-    """Furnish and light the rooms (about a second each); kept, since they depend on nothing else."""
+    """Build and light the rooms, about a second per room; the result is cached."""
     built = furnish_rooms(rooms, seed)
     neighbours = [built[max(k - 1, 0)] + built[k] if k else built[k] for k in range(rooms)]
     lights = [light_room(k, shapes) for k, shapes in enumerate(neighbours)]
@@ -46,19 +46,19 @@ def build_scene(rooms: int, seed: int) -> RoomScene:
 
 
 def render_scene(
-    view: RoomScene, camera: Camera, T_world_camera: NDArray[np.float64]
+    scene: RoomScene, camera: Camera, T_world_camera: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return colour [H, W, 3] in [0, 1] and exact depth [H, W] in metres along the optical axis.
 
-    Each pixel's center decides its depth. Its colour is that of the center too, save where a neighbour shows another
-    shape or another face: there four rays are averaged, so that no edge is jagged.
+    Depth and colour are those of the ray through the pixel centre. Where a neighbour shows another shape or face, the
+    colour is the mean of four rays (antialiasing).
     """
-    windows = image_windows(view.shapes, se3.inverse(T_world_camera), camera)
+    windows = image_windows(scene.shapes, se3.inverse(T_world_camera), camera)
     v, u = np.indices((camera.height, camera.width), np.float32).reshape(2, -1)
-    color, depth_m, faces = _colors(view, _rays(camera, T_world_camera, np.stack([u, v])), windows, camera.fx)
+    color, depth_m, faces = _colors(scene, _rays(camera, T_world_camera, np.stack([u, v])), windows, camera.fx)
     edges = np.flatnonzero(_edges(faces.reshape(camera.height, camera.width)))
     pixels = np.stack([u[edges], v[edges]])[:, :, None] + SUBPIXELS[:, None, :]
-    fine, _, _ = _colors(view, _rays(camera, T_world_camera, pixels.reshape(2, -1)), windows, 2 * camera.fx)
+    fine, _, _ = _colors(scene, _rays(camera, T_world_camera, pixels.reshape(2, -1)), windows, 2 * camera.fx)
     color[:, edges] = fine.reshape(3, -1, 4).mean(-1)
     size = (camera.height, camera.width)
     return color.T.reshape(*size, 3), depth_m.reshape(size)
@@ -73,7 +73,7 @@ def _rays(camera: Camera, T_world_camera: NDArray[np.float64], pixels: Floats) -
 
 
 def _edges(faces: Indices) -> NDArray[np.bool_]:
-    """Mark pixels with a neighbour, left, right, above or below, of another face."""
+    """Mark pixels with a neighbour (left, right, above or below) on another face."""
     marked = np.zeros(faces.shape, bool)
     across, down = faces[:, 1:] != faces[:, :-1], faces[1:] != faces[:-1]
     marked[:, 1:] |= across
@@ -85,8 +85,8 @@ def _edges(faces: Indices) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What rays met: parameter t [N] (inf for nothing), number of the face [N], normals [3, N], paint [3, N] as shown
-    on a screen, and glow, mirror and gloss [N] of the material."""
+    """Ray hits: parameter t [N] (inf for a miss), face number [N], normals [3, N], paint [3, N] in display values, and
+    glow, mirror and gloss [N] of the material."""
 
     t: Floats
     faces: Indices
@@ -97,14 +97,14 @@ class Hits:
     gloss: Floats
 
 
-def _intersect(view: RoomScene, rays: Rays, windows: Windows | None, focal_px: float) -> Hits:
-    """Find what each ray meets and how it is painted there."""
-    t, hit = cast_rays(view.shapes, rays, windows)
+def _intersect(scene: RoomScene, rays: Rays, windows: Windows | None, focal_px: float) -> Hits:
+    """Return the nearest hit of each ray, with the surface properties."""
+    t, hit = cast_rays(scene.shapes, rays, windows)
     n = len(t)
     normals, paint, (glow, mirror, gloss) = np.zeros((3, n), np.float32), np.zeros((3, n), np.float32), np.zeros((3, n))
     faces = np.full(n, -1, np.intp)
     for k in np.unique(hit[hit >= 0]):
-        at, shape = np.flatnonzero(hit == k), view.shapes[k]
+        at, shape = np.flatnonzero(hit == k), scene.shapes[k]
         directions, origins = rays.directions[:, at], rays.origins[:, at] if rays.origins.shape[1] > 1 else rays.origins
         normals[:, at], u, v = surface_at(shape, origins + directions * t[at])
         paint[:, at] = shape.material.texture(u, v, _pixel_m(directions, normals[:, at], t[at], focal_px))
@@ -124,36 +124,38 @@ def _face_number(shape: Shape, normals: Floats) -> Indices:
     """Tell the smooth parts of one shape apart [N]: six faces of a box, caps and side of a drum, one part of a ball."""
     if shape.kind == "ball":
         return np.zeros(normals.shape[1], np.intp)
-    n = np.rint(shape.turned(normals)).astype(np.intp) + 1
+    n = np.rint(shape.to_local_axes(normals)).astype(np.intp) + 1
     return np.asarray(n[2] if shape.kind == "drum" else n[0] + 3 * n[1] + 9 * n[2])
 
 
 def _colors(
-    view: RoomScene, rays: Rays, windows: Windows | None, focal_px: float, bounces: int = 1
+    scene: RoomScene, rays: Rays, windows: Windows | None, focal_px: float, bounces: int = 1
 ) -> tuple[Floats, Floats, Indices]:
-    """Return each ray's colour [3, N], parameter of its hit [N], and a number for the shape and face it hit [N]."""
-    hits = _intersect(view, rays, windows, focal_px)
+    """Return the colour of each ray [3, N], the parameter of its hit [N], and its face number [N]."""
+    hits = _intersect(scene, rays, windows, focal_px)
     points = rays.origins + rays.directions * np.where(np.isfinite(hits.t), hits.t, 0.0)
     mirrored = rays.directions - 2.0 * dot(hits.normals, rays.directions) * hits.normals
-    falling, highlight = _light(view, points, hits, normalised(mirrored))
-    # A screen shows about the square root of light: paint is squared to light, the sum rooted back.
+    falling, highlight = _light(scene, points, hits, normalised(mirrored))
+    # Display values are about the square root of light, so paint is squared first and the sum is rooted.
     linear = hits.paint**2 * (hits.glow + (1.0 - hits.glow) * falling) + highlight
     shiny = np.flatnonzero(hits.mirror)
     if len(shiny) and bounces:
         away = Rays(points[:, shiny] + np.float32(2e-3) * hits.normals[:, shiny], mirrored[:, shiny])
-        reflected, _, _ = _colors(view, away, None, 0.5 * focal_px, bounces - 1)
+        reflected, _, _ = _colors(scene, away, None, 0.5 * focal_px, bounces - 1)
         share = hits.mirror[shiny]
         linear[:, shiny] = (1.0 - share) * linear[:, shiny] + share * reflected**2
     return np.sqrt(np.clip(linear, 0.0, 1.0)).astype(np.float32), hits.t, hits.faces
 
 
-def _light(view: RoomScene, points: Floats, hits: Hits, mirrored: Floats) -> tuple[Floats, Floats]:
-    """Return the light on points [3, N] and the highlight towards the viewer [N], room by room."""
+def _light(scene: RoomScene, points: Floats, hits: Hits, mirrored: Floats) -> tuple[Floats, Floats]:
+    """Return the light on points [3, N] and the highlight towards the camera [N], room by room."""
     falling, highlight = np.zeros_like(points), np.zeros(points.shape[1], np.float32)
-    in_front_x = points[0] + np.float32(0.05) * hits.normals[0]  # a shared wall's far face belongs to the next room
-    room = np.clip(np.floor((in_front_x + HALF_X_M) / PITCH_M), 0, len(view.lights) - 1)
+    in_front_x = (
+        points[0] + np.float32(0.05) * hits.normals[0]
+    )  # the far face of a shared wall belongs to the next room
+    room = np.clip(np.floor((in_front_x + HALF_X_M) / PITCH_M), 0, len(scene.lights) - 1)
     for k in np.unique(room):
-        at, light = np.flatnonzero(room == k), view.lights[int(k)]
+        at, light = np.flatnonzero(room == k), scene.lights[int(k)]
         falling[:, at], shares = light.at(points[:, at], hits.normals[:, at])
         glossy = np.flatnonzero(hits.gloss[at])
         for lamp, share in zip((light.lamp, light.window), shares[:, glossy], strict=True):

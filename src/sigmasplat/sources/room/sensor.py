@@ -1,4 +1,4 @@
-"""Spoil perfect images the way a structured-light sensor does."""
+"""Add the noise of a structured-light sensor to exact images."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,18 +12,18 @@ JITTER_PX = 0.6
 RANGE_M = (0.35, 7.0)
 COLOR_SIGMA = 0.008
 DRIFT_KNOT_FRAMES = 300
-"""The calibration is another one, by chance, each so many frames; between them it changes smoothly."""
+"""Frames between the random values of the calibration drift; it is a spline between them."""
 
 
 def noise_sigma_m(depth_m: Image) -> Image:
-    """Return the spread of a Kinect's reading at a depth, metres: 1.2 mm + 1.9 mm/m² (z − 0.4 m)² (Nguyen 2012)."""
+    """Return the standard deviation of Kinect depth, metres: 1.2 mm + 1.9 mm/m² (z − 0.4 m)² (Nguyen 2012)."""
     return (0.0012 + 0.0019 * (depth_m - 0.4) ** 2).astype(np.float32)
 
 
 def measured_depth(depth_m: Image, camera: Camera, rng: np.random.Generator) -> Image:
-    """Return what a sensor reads of true depth [H, W]: edges that wander, noise that grows with z², holes as 0.
+    """Return noisy sensor depth for true depth [H, W]: jittered edges, noise that grows with z², holes as 0.
 
-    Holes: grazing surfaces, a rim along jumps in depth, random patches and speckles, and what is out of range.
+    Holes: grazing surfaces, a rim along depth discontinuities, random patches and speckles, and out-of-range depth.
     """
     seen = _jittered(depth_m, rng)
     noisy = seen + rng.standard_normal(seen.shape, np.float32) * noise_sigma_m(seen)
@@ -33,16 +33,15 @@ def measured_depth(depth_m: Image, camera: Camera, rng: np.random.Generator) -> 
 
 
 def drifted_depth(depth_m: Image, i: int, seed: int, deviation: float) -> Image:
-    """Return true depth [H, W] as read at frame i by a sensor whose calibration wanders as it warms up.
+    """Return the depth [H, W] read at frame i by a sensor whose calibration drifts as it warms up.
 
-    The relative error is a polynomial of second degree over the image: scale, tilts, bowl, saddle and twist, each a
-    smooth random process over the frames, independent of the others; `deviation` is the standard deviation of them
-    together, over image and time. It depends on seed and i alone, and is the same on equal surfaces seen soon after
-    each other: poses agree from frame to frame and go astray together, as they do with a real sensor.
+    The relative error is a polynomial of second degree over the image. Each coefficient is an independent smooth random
+    process over the frames; `deviation` is the standard deviation of their sum, over image and time. The error depends
+    only on seed and i, and changes slowly: neighbouring frames agree while the path drifts, as with a real sensor.
     """
     height, width = depth_m.shape
     v, u = np.linspace(-1.0, 1.0, height)[:, None], np.linspace(-1.0, 1.0, width)
-    # Legendre's polynomials: each of mean square 1, orthogonal, so that their variances add up.
+    # Legendre polynomials: orthogonal, each with mean square 1, so that their variances add up.
     one, tilt_u, tilt_v = np.ones((height, width)), np.sqrt(3.0) * u, np.sqrt(3.0) * v
     shapes = (one, tilt_u, tilt_v, tilt_u * tilt_v, *(np.sqrt(1.25) * (3.0 * x**2 - 1.0) for x in (u, v)))
     error = sum(_smooth_process(i, (seed, k, 8)) * shape for k, shape in enumerate(shapes)) / np.sqrt(len(shapes))
@@ -50,7 +49,7 @@ def drifted_depth(depth_m: Image, i: int, seed: int, deviation: float) -> Image:
 
 
 def _smooth_process(i: int, seed: tuple[int, ...]) -> float:
-    """Return a random process of mean 0 and variance 1 at frame i: a cubic spline between normal numbers."""
+    """Return a smooth random process of mean 0 and variance 1 at frame i: a cubic spline of normal numbers."""
     knot, s = divmod(i / DRIFT_KNOT_FRAMES, 1.0)
     weights = np.array([(1 - s) ** 3, 3 * s**3 - 6 * s**2 + 4, -3 * s**3 + 3 * s**2 + 3 * s + 1, s**3])
     normals = [np.random.default_rng((*seed, int(knot) + k)).standard_normal() for k in range(4)]
@@ -58,19 +57,19 @@ def _smooth_process(i: int, seed: tuple[int, ...]) -> float:
 
 
 def measured_color(color: Image, rng: np.random.Generator) -> Image:
-    """Return colour [H, W, 3] with the noise of a small camera."""
+    """Return colour [H, W, 3] with image noise."""
     return np.clip(color + COLOR_SIGMA * rng.standard_normal(color.shape, np.float32), 0.0, 1.0)
 
 
 def _jittered(depth_m: Image, rng: np.random.Generator) -> Image:
-    """Read every pixel a fraction of a pixel off: silhouettes fray, surfaces hardly change."""
+    """Sample every pixel at a random offset below a pixel: edges become noisy, surfaces hardly change."""
     v, u = np.indices(depth_m.shape, np.float32)
     offsets = rng.normal(0.0, JITTER_PX, (2, *depth_m.shape)).astype(np.float32)
     return np.asarray(map_coordinates(depth_m, [v + offsets[0], u + offsets[1]], order=0, mode="nearest"))
 
 
 def _grazing(depth_m: Image, camera: Camera) -> NDArray[np.bool_]:
-    """Find surfaces seen at less than about 10°: the light pattern is stretched past recognition."""
+    """Mark surfaces seen at less than about 10°, where the light pattern is too distorted."""
     points = camera.rays() * depth_m[..., None]
     along_v, along_u = np.gradient(points, axis=0), np.gradient(points, axis=1)
     normal = np.cross(along_u, along_v)
@@ -80,13 +79,13 @@ def _grazing(depth_m: Image, camera: Camera) -> NDArray[np.bool_]:
 
 
 def _rims(depth_m: Image, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Find most pixels beside a jump in depth: the projector's shadow."""
+    """Mark most pixels beside a depth discontinuity: the shadow of the projector."""
     jump = maximum_filter(depth_m, 3) - minimum_filter(depth_m, 3) > 0.06 * depth_m
     return np.asarray(jump & (rng.random(depth_m.shape) < 0.8))
 
 
 def _patches(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Find a few random patches and single speckles, about 1.5 % of the image."""
+    """Mark a few random patches and single pixels, about 1.5 % of the image."""
     height, width = shape
     coarse = rng.random((height // 8 + 2, width // 8 + 2)).astype(np.float32)
     clouds = zoom(coarse, 8, order=1)[:height, :width]

@@ -1,7 +1,7 @@
-"""Intersect rays with boxes, balls and drums, many rays at a time.
+"""Intersect many rays with boxes, balls and drums (ellipsoids and elliptic cylinders).
 
-Every shape is a unit shape stretched by `half`, turned by `yaw_rad` about the vertical and moved to `center`; a ray is
-taken into that unit space, where its parameter t stays the same. The room's frame: metres, z up, floor at z = 0.
+Every shape is a unit shape scaled by `half`, rotated by `yaw_rad` about the vertical and moved to `center`. A ray is
+transformed to the unit shape; its parameter t stays the same. The room's frame: metres, z up, floor at z = 0.
 Rays are stored as [3, N] so that each coordinate is contiguous.
 """
 
@@ -19,7 +19,7 @@ Indices = NDArray[np.intp]
 Kind = Literal["box", "ball", "drum"]
 
 MIN_RAY_PARAMETER = 1e-3
-"""Ray parameters below this are the surface that the ray starts on."""
+"""Hits with a smaller ray parameter are on the surface where the ray starts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,22 +32,22 @@ class Shape:
     yaw_rad: float
     material: Material
 
-    def turned(self, vectors: Floats) -> Floats:
-        """Rotate room vectors [3, ...] into the shape's axes."""
+    def to_local_axes(self, vectors: Floats) -> Floats:
+        """Rotate room vectors [3, ...] to the shape's axes."""
         return _rotated_about_z(vectors, -self.yaw_rad)
 
-    def to_room(self, vectors: Floats) -> Floats:
-        """Rotate vectors [3, ...] of the shape's axes into the room."""
+    def to_room_axes(self, vectors: Floats) -> Floats:
+        """Rotate vectors [3, ...] from the shape's axes to the room."""
         return _rotated_about_z(vectors, self.yaw_rad)
 
     def local(self, points: Floats) -> Floats:
-        """Return room points [3, N] in the shape's axes about its center, metres."""
-        return self.turned(points - self.center[:, None])
+        """Return room points [3, N] in the shape's frame, metres."""
+        return self.to_local_axes(points - self.center[:, None])
 
     def first_hit(self, origins: Floats, directions: Floats) -> Floats:
-        """Return the ray parameter [N] at which rays enter, inf where they miss; origins [3, 1] or [3, N]."""
+        """Return the ray parameter [N] where rays enter, inf for a miss; origins [3, 1] or [3, N]."""
         o = self.local(origins) / self.half[:, None]
-        d = self.turned(directions) / self.half[:, None]
+        d = self.to_local_axes(directions) / self.half[:, None]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             enter, leave = _INTERVALS[self.kind](o, d)
             hit = (enter < leave) & (enter > MIN_RAY_PARAMETER)
@@ -56,17 +56,17 @@ class Shape:
     def corners(self) -> NDArray[np.float64]:
         """Return the 8 corners of the bounding box, room frame [8, 3]."""
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
-        return (self.to_room((signs * self.half).T).T + self.center).astype(np.float64)
+        return (self.to_room_axes((signs * self.half).T).T + self.center).astype(np.float64)
 
 
 def dot(a: Floats, b: Floats) -> Floats:
-    """Return the inner products [N] of vectors [2 or 3, N], coordinate by coordinate: quicker than a sum over axis."""
+    """Return the inner products [N] of vectors [2 or 3, N], by coordinate, which is faster than a sum over the axis."""
     total: Floats = a[0] * b[0] + a[1] * b[1]
     return total if len(a) == 2 else total + a[2] * b[2]
 
 
 def normalised(v: Floats) -> Floats:
-    """Return vectors [3, N] at length 1."""
+    """Return unit vectors [3, N]."""
     return (v / np.maximum(np.sqrt(dot(v, v)), 1e-9)).astype(np.float32)
 
 
@@ -78,14 +78,14 @@ def _rotated_about_z(v: Floats, angle_rad: float) -> Floats:
 
 
 def _slab(o: Floats, d: Floats) -> tuple[Floats, Floats]:
-    """Interval of t for which |o + t d| ≤ 1, one coordinate."""
+    """Return the interval of t with |o + t d| ≤ 1 for one coordinate."""
     per_unit = 1.0 / np.where(d == 0.0, np.float32(1e-9), d)
     middle, half = -o * per_unit, np.abs(per_unit)
     return middle - half, middle + half
 
 
 def _within_unit(o: Floats, d: Floats) -> tuple[Floats, Floats]:
-    """Interval of t for which the norm of o + t d is ≤ 1, from the point of closest approach: it cancels least."""
+    """Return the interval of t with ‖o + t d‖ ≤ 1, about the closest point for accuracy."""
     a = np.maximum(dot(d, d), 1e-12)
     middle = -dot(o, d) / a
     nearest = o + middle * d
@@ -117,19 +117,19 @@ def surface_at(shape: Shape, points: Floats) -> tuple[Floats, Floats, Floats]:
     if shape.kind == "box":
         axis = np.abs(unit).argmax(0)
         normal = np.where(np.arange(3)[:, None] == axis, np.sign(unit), 0.0).astype(np.float32)
-        return shape.to_room(normal), np.where(axis == 0, p[1], p[0]), np.where(axis == 2, p[1], p[2])
+        return shape.to_room_axes(normal), np.where(axis == 0, p[1], p[0]), np.where(axis == 2, p[1], p[2])
     around = (np.arctan2(unit[1], unit[0]) * shape.half[0]).astype(np.float32)
     if shape.kind == "ball":
-        return shape.to_room(normalised(unit / shape.half[:, None])), around, p[2]
+        return shape.to_room_axes(normalised(unit / shape.half[:, None])), around, p[2]
     cap = np.abs(unit[2]) > np.hypot(unit[0], unit[1])
     side = unit / shape.half[:, None] * np.array([[1.0], [1.0], [0.0]], np.float32)
     normal = np.where(cap, np.sign(unit[2]) * np.array([[0.0], [0.0], [1.0]]), normalised(side)).astype(np.float32)
-    return shape.to_room(normal), np.where(cap, p[0], around), np.where(cap, p[1], p[2])
+    return shape.to_room_axes(normal), np.where(cap, p[0], around), np.where(cap, p[1], p[2])
 
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays from origins [3, 1] or [3, N] along directions [3, N]; pixels [2, N] where they pass a camera's image."""
+    """Rays from origins [3, 1] or [3, N] along directions [3, N]; pixels [2, N]: their image coordinates."""
 
     origins: Floats
     directions: Floats
@@ -142,7 +142,7 @@ Windows = list[tuple[float, float, float, float] | None]
 def cast_rays(shapes: Sequence[Shape], rays: Rays, windows: Windows | None = None) -> tuple[Floats, Indices]:
     """Return the nearest hit of each ray: its parameter [N] (inf: none) and the index of the shape [N] (−1: none).
 
-    `windows`, from `image_windows`, spares the shapes the pixels that cannot see them.
+    `windows`, from `image_windows`, limits each shape to the pixels where it can be visible.
     """
     n = rays.directions.shape[1]
     nearest, index = np.full(n, np.inf, np.float32), np.full(n, -1, np.intp)
@@ -165,7 +165,7 @@ def _inside(pixels: Floats, window: tuple[float, float, float, float]) -> Indice
 
 
 def image_windows(shapes: Sequence[Shape], T_camera_world: NDArray[np.float64], camera: Camera) -> Windows:
-    """Bound each shape in the image: (u0, v0, u1, v1) pixels, None where it cannot be seen."""
+    """Return the bounding box of each shape in the image: (u0, v0, u1, v1) pixels, None if it is not visible."""
     return [_window(shape.corners() @ T_camera_world[:3, :3].T + T_camera_world[:3, 3], camera) for shape in shapes]
 
 
@@ -173,7 +173,7 @@ def _window(corners: NDArray[np.float64], camera: Camera) -> tuple[float, float,
     z = corners[:, 2]
     if z.max() < 0.01:
         return None
-    if z.min() < 0.01:  # reaches behind the camera: its outline is not bounded by its corners' projections
+    if z.min() < 0.01:  # partly behind the camera: the projected corners do not bound it
         return -1.0, -1.0, camera.width, camera.height
     u = camera.fx * corners[:, 0] / z + camera.cx
     v = camera.fy * corners[:, 1] / z + camera.cy

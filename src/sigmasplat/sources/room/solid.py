@@ -1,4 +1,4 @@
-"""Cover the room's shapes with triangles: its true surface, hidden faces and all."""
+"""Triangulate the room's shapes: the true surface, including hidden faces."""
 
 from collections.abc import Sequence
 
@@ -9,21 +9,21 @@ from sigmasplat.model.mesh import Mesh
 from sigmasplat.sources.room.shapes import Shape
 
 EDGE_M = 0.05
-"""Faces are no longer than this along a shape's axes, so that a face is either seen or hidden."""
+"""Longest face along a shape's axes; small faces are either visible or hidden."""
 MIN_SIDES = 48
-"""Faces around a ball or a drum: a ball of 13 cm is then true to 0.3 mm."""
+"""Faces around a ball or a drum; the error of a ball of 13 cm is then 0.3 mm."""
 
 Doubles = NDArray[np.float64]
 
 
 def triangulate(shapes: Sequence[Shape]) -> Mesh:
-    """Return the outsides of all shapes as one mesh, in the room's frame; where shapes meet, nothing is cut away."""
+    """Return the surfaces of all shapes as one mesh in the room's frame; overlapping parts are kept."""
     return Mesh.concatenated([_placed(shape, *patch) for shape in shapes for patch in _PATCHES[shape.kind](shape)])
 
 
 def _placed(shape: Shape, unit: Doubles, faces: NDArray[np.int32]) -> Mesh:
-    """Stretch, turn and move points [N, 3] of the unit shape; faces without area, as at a ball's poles, are dropped."""
-    points = shape.to_room((unit * shape.half).T.astype(np.float32)).T + shape.center
+    """Scale, rotate and move points [N, 3] of the unit shape; drop faces without area, as at the poles of a ball."""
+    points = shape.to_room_axes((unit * shape.half).T.astype(np.float32)).T + shape.center
     mesh = Mesh(points.astype(np.float32), faces)
     return mesh.with_faces(mesh.areas() > 1e-12)
 
@@ -33,7 +33,7 @@ def _cells(length_m: float) -> int:
 
 
 def _grid(columns: int, rows: int) -> tuple[Doubles, Doubles, NDArray[np.int32]]:
-    """Return s, t [N] over the unit square and faces [F, 3], counter-clockwise where s runs right and t up."""
+    """Return s, t [N] over the unit square and faces [F, 3], counter-clockwise with s to the right and t up."""
     s, t = np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1), indexing="ij")
     number = np.arange(s.size, dtype=np.int32).reshape(s.shape)
     a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
@@ -55,7 +55,7 @@ def _box(shape: Shape) -> list[tuple[Doubles, NDArray[np.int32]]]:
 
 
 def _ball(shape: Shape) -> list[tuple[Doubles, NDArray[np.int32]]]:
-    """Return a ball, from the south pole to the north pole."""
+    """Return the surface of a ball."""
     around = max(MIN_SIDES, _cells(2 * np.pi * float(shape.half.max())))
     s, t, faces = _grid(around, around // 2)
     longitude, latitude = 2 * np.pi * s, np.pi * (t - 0.5)
@@ -64,7 +64,7 @@ def _ball(shape: Shape) -> list[tuple[Doubles, NDArray[np.int32]]]:
 
 
 def _drum(shape: Shape) -> list[tuple[Doubles, NDArray[np.int32]]]:
-    """Return a drum's side and caps."""
+    """Return the side and the caps of a drum."""
     radius = float(shape.half[:2].max())
     around = max(MIN_SIDES, _cells(2 * np.pi * radius))
     s, t, faces = _grid(around, _cells(2 * shape.half[2]))

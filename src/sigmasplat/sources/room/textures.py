@@ -1,8 +1,8 @@
-"""Colour surfaces by formula, without detail finer than a pixel.
+"""Procedural textures without detail below the size of a pixel.
 
 A texture maps surface coordinates u, v [N] and the pixel's width on the surface [N], all metres, to RGB [3, N] in
-[0, 1] as shown on a screen. Every pattern fades to its mean as the pixel outgrows it, so that a distant surface does
-not sparkle: noise that changes with the viewpoint could be explained by no map.
+[0, 1], display values. Every pattern fades to its mean when the pixel becomes larger than the pattern. Otherwise
+distant surfaces would alias, and no map can explain noise that changes with the viewpoint.
 """
 
 from collections.abc import Callable
@@ -19,8 +19,8 @@ Color = tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """How a surface looks: texture; glow = light of its own (1 = lit by nothing else); mirror = share of the reflected
-    ray; gloss = strength of a lamp's highlight."""
+    """Appearance of a surface: texture; glow = emitted share (1 = no other light); mirror = share of the reflected ray;
+    gloss = strength of highlights."""
 
     texture: Texture
     glow: float = 0.0
@@ -29,7 +29,7 @@ class Material:
 
 
 def hash_cell(i: Floats, j: Floats | int, seed: int) -> Floats:
-    """Give each integer cell (i, j) a number in [0, 1), the same on every machine."""
+    """Return a pseudo-random number in [0, 1) for each integer cell (i, j), equal on every machine."""
     a = np.atleast_1d(np.asarray(i, np.int32)).view(np.uint32) * np.uint32(0x9E3779B1)
     b = np.atleast_1d(np.asarray(j, np.int32)).view(np.uint32) * np.uint32(0x85EBCA77)
     h = a ^ b ^ np.uint32((seed * 0xC2B2AE3D + 0x27D4EB2F) & 0xFFFFFFFF)
@@ -39,13 +39,13 @@ def hash_cell(i: Floats, j: Floats | int, seed: int) -> Floats:
 
 
 def smoothstep(x: Floats) -> Floats:
-    """Rise from 0 at x ≤ 0 to 1 at x ≥ 1 with no kink."""
+    """Return a smooth step from 0 at x ≤ 0 to 1 at x ≥ 1."""
     x = np.clip(x, 0.0, 1.0)
     return (x * x * (3.0 - 2.0 * x)).astype(np.float32)
 
 
 def detail_visibility(detail_m: float, pixel_m: Floats) -> Floats:
-    """Return how much of a pattern with details of this size survives under pixels of that size, 1 … 0."""
+    """Return the contrast, 1 … 0, that remains of details of this size for pixels of that size."""
     return smoothstep(2.0 - 2.0 * pixel_m / np.float32(detail_m))
 
 
@@ -60,18 +60,18 @@ def noise(u: Floats, v: Floats, pixel_m: Floats, cell_m: float, seed: int) -> Fl
 
 
 def draw_line(distance_m: Floats, width_m: float, pixel_m: Floats) -> Floats:
-    """Draw a line: 1 on it, 0 away from it; a line thinner than a pixel keeps its share of it."""
+    """Return the coverage of a line: 1 on it, 0 away from it, partial if it is thinner than a pixel."""
     soft = np.maximum(np.float32(width_m), pixel_m)
     return smoothstep(1.0 - np.abs(distance_m) / soft) * (np.float32(width_m) / soft)
 
 
 def step(x_m: Floats, pixel_m: Floats, soft_m: float = 0.004) -> Floats:
-    """Rise from 0 to 1 around x = 0 within a pixel's width."""
+    """Return a step from 0 to 1 at x = 0, one pixel wide."""
     return smoothstep(0.5 + x_m / np.maximum(2 * pixel_m, np.float32(soft_m)))
 
 
 def mix(a: Color | Floats, b: Color | Floats, share: Floats) -> Floats:
-    """Blend two colours by the share [N] of the second, [3, N]."""
+    """Blend two colours by the share [N] of the second; returns [3, N]."""
     first, second = _column(a), _column(b)
     return (first + (second - first) * share).astype(np.float32)
 
@@ -82,7 +82,7 @@ def _column(color: Color | Floats) -> Floats:
 
 
 def plain(color: Color, grain: float = 0.03, cell_m: float = 0.09, seed: int = 0) -> Texture:
-    """Paint one colour with a little cloudiness, `grain` = its amplitude."""
+    """Return a texture of one colour with weak noise of amplitude `grain`."""
 
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         clouds = 0.6 * noise(u, v, pixel_m, cell_m, seed) + 0.4 * noise(u, v, pixel_m, 0.37 * cell_m, seed + 1)
@@ -92,7 +92,7 @@ def plain(color: Color, grain: float = 0.03, cell_m: float = 0.09, seed: int = 0
 
 
 def wood(color: Color, plank_m: float = 0.14, seed: int = 0, length_m: float = 1.1) -> Texture:
-    """Lay planks along u: each of its own tone, with grain and dark seams."""
+    """Return a texture of planks along u: each with its own tone, grain and dark seams."""
 
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         row = np.floor(v / np.float32(plank_m))
@@ -111,7 +111,7 @@ def wood(color: Color, plank_m: float = 0.14, seed: int = 0, length_m: float = 1
 
 
 def wallpaper(ground: Color, figure: Color, period_m: float, seed: int = 0) -> Texture:
-    """Print wide stripes and a lattice of soft flowers over a faintly clouded ground."""
+    """Return a texture of wide stripes and a lattice of soft flowers with weak noise."""
 
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         k = np.float32(2 * np.pi / period_m)
@@ -125,7 +125,7 @@ def wallpaper(ground: Color, figure: Color, period_m: float, seed: int = 0) -> T
 
 
 def brick(color: Color, mortar: Color, seed: int = 0, width_m: float = 0.26, height_m: float = 0.09) -> Texture:
-    """Lay bricks in half bond, each of its own tone."""
+    """Return a texture of bricks in half bond, each with its own tone."""
 
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         row = np.floor(v / np.float32(height_m))
@@ -142,7 +142,7 @@ def brick(color: Color, mortar: Color, seed: int = 0, width_m: float = 0.26, hei
 
 
 def two_tone(upper: Color, lower: Color, height_m: float, seed: int = 0) -> Texture:
-    """Paint a wall in two colours that meet in a pale band at v = `height_m`, over plaster."""
+    """Return a texture of a wall in two colours with a pale band between them at v = `height_m`."""
 
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         plaster = 0.04 * noise(u, v, pixel_m, 0.3, seed) + 0.05 * noise(u, v, pixel_m, 0.06, seed + 1)
@@ -155,7 +155,7 @@ def two_tone(upper: Color, lower: Color, height_m: float, seed: int = 0) -> Text
 
 
 def checks(a: Color, b: Color, size_m: float, seed: int = 0) -> Texture:
-    """Weave soft-edged checks of two colours."""
+    """Return a texture of soft checks in two colours."""
 
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         k = np.float32(np.pi / size_m)
@@ -167,7 +167,7 @@ def checks(a: Color, b: Color, size_m: float, seed: int = 0) -> Texture:
 
 
 def weave(a: Color, b: Color, period_m: float, seed: int = 0) -> Texture:
-    """Weave cloth: two crossing ribs and worn patches."""
+    """Return a texture of cloth: two crossing ribs and worn patches."""
 
     def texture(u: Floats, v: Floats, pixel_m: Floats) -> Floats:
         k = np.float32(2 * np.pi / period_m)

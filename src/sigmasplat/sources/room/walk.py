@@ -1,4 +1,4 @@
-"""Walk a camera through the room on a smooth closed path."""
+"""Plan a smooth closed camera path through the rooms."""
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -8,18 +8,18 @@ from sigmasplat.sources.room.furnish import HALF_X_M, PITCH_M
 from sigmasplat.types import Matrix
 
 PATH_SAMPLES = 4000
-"""Steps in which a path is measured."""
+"""Samples for measuring the length of a path."""
 YAW_SMOOTHING_M = 0.9
-"""Standard deviation, along the way, of the average that smooths where the camera looks."""
+"""Standard deviation, along the path, of the Gaussian that smooths the viewing direction."""
 
 
 def camera_path(frames: int, loops: int, rooms: int, seed: int, overrun: float = 0.0) -> Matrix:
-    """Return T_world_camera [frames, 4, 4], camera x right, y down, z forward; the last pose is the first one again,
-    or `overrun` turns beyond it: what was seen at the start is then seen again from the same places.
+    """Return T_world_camera [frames, 4, 4], camera x right, y down, z forward. The last pose equals the first, or is
+    `overrun` rounds beyond it, where the views of the start are seen again from the same places.
 
-    One room: an ellipse, looking across it, one turn per loop, each loop at another height: at 200 frames a loop 1.4 to
-    2.8 cm and under 2° a frame. Several rooms: there and back through the doorways, looking ahead; 300 frames a room
-    keep that pace, those of the overrun not counted.
+    One room: an ellipse, looking across it, one round per loop, each loop at another height; at 200 frames per loop the
+    motion is 1.4 to 2.8 cm and below 2° per frame. Several rooms: through the doorways and back, looking ahead; the
+    pace is equal at 300 frames per room, without the overrun.
     """
     u = np.arange(frames) / max(frames - 1, 1)
     phase = 2 * np.pi * np.random.default_rng((seed, 3)).uniform()
@@ -33,14 +33,14 @@ def camera_path(frames: int, loops: int, rooms: int, seed: int, overrun: float =
 
 
 def _ellipse(loop: Matrix, phase: float) -> tuple[Matrix, Matrix]:
-    """Circle the middle of the room, looking across it: yaw turns evenly, the camera stays behind the middle."""
+    """Return positions and yaw on an ellipse about the room's centre, looking across it; yaw changes evenly."""
     yaw_rad = 2 * np.pi * loop + phase
     ahead = np.stack([0.85 * np.cos(yaw_rad), 0.65 * np.sin(yaw_rad), np.zeros_like(yaw_rad)], -1)
     return -ahead, yaw_rad
 
 
 def _corridor(loop: Matrix, rooms: int) -> tuple[Matrix, Matrix]:
-    """Go through all rooms and back at even speed on a closed spline, narrow at the doors and wide in the rooms."""
+    """Return positions and yaw on a closed spline through all rooms and back, at constant speed."""
     doors = [HALF_X_M + k * PITCH_M for k in range(rooms - 1)]
     out: list[tuple[float, float]] = [(0.0, -0.75)]
     for k, x in enumerate(doors):
@@ -63,7 +63,7 @@ def _corridor(loop: Matrix, rooms: int) -> tuple[Matrix, Matrix]:
 
 
 def _smooth_yaw(ahead: Matrix, length_m: float) -> Matrix:
-    """Return the yaw of a closed path's directions, evenly spaced, averaged over `CALM_M` so that turns begin early."""
+    """Return the yaw of a closed path's directions, evenly spaced, smoothed so that turns begin early."""
     turn = np.linspace(0.0, 2 * np.pi, len(ahead))
     wobble = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])) - turn
     calm = gaussian_filter1d(wobble[:-1], YAW_SMOOTHING_M / length_m * PATH_SAMPLES, mode="wrap")
@@ -71,7 +71,7 @@ def _smooth_yaw(ahead: Matrix, length_m: float) -> Matrix:
 
 
 def _pose(position: Matrix, yaw_rad: float, pitch_rad: float, roll_rad: float) -> Matrix:
-    """Look along yaw (from +x about z) and pitch (up positive), rolled about the viewing direction."""
+    """Return the pose with this yaw (from +x about z), pitch (up is positive) and roll about the viewing direction."""
     forward = np.array([np.cos(pitch_rad) * np.cos(yaw_rad), np.cos(pitch_rad) * np.sin(yaw_rad), np.sin(pitch_rad)])
     right = np.array([np.sin(yaw_rad), -np.cos(yaw_rad), 0.0])
     down = np.cross(forward, right)

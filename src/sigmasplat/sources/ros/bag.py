@@ -1,4 +1,4 @@
-"""Read ROS bags without ROS: topics, messages in order, one message again; through the rosbags package (Apache-2.0).
+"""Read topics and messages of ROS bags without ROS, through the rosbags package (Apache-2.0).
 
 ROS 1 is one file that starts with "#ROSBAG V2.0"; ROS 2 is a folder with metadata.yaml, or one of its storage files:
 MCAP (starts with 89 "MCAP0"), SQLite (.db3).
@@ -24,7 +24,7 @@ ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0", b"\x89MCAP0", b"SQLite f
 
 @dataclass(frozen=True)
 class Topic:
-    """A name, the type of its messages (as sensor_msgs/msg/Image) and how many there are."""
+    """A topic: name, message type (such as sensor_msgs/msg/Image) and number of messages."""
 
     name: str
     msgtype: str
@@ -33,7 +33,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Entry:
-    """Where a message is: when it was recorded, and which of those recorded then; `stamp_ns` is its header's."""
+    """Position of a message: recording time and index among messages of that time; `stamp_ns`: its header's time."""
 
     recorded_ns: int
     place: int
@@ -41,17 +41,17 @@ class Entry:
 
 
 class Bag:
-    """An open recording; nothing is kept of it but the list of topics. Safe to read from several threads."""
+    """An open bag; only the list of topics is kept in memory. Safe to read from several threads."""
 
     def __init__(self, path: Path) -> None:
-        """Raises SourceError if the rosbags package is missing, or the file is damaged."""
+        """Open the bag. Raises SourceError if the rosbags package is missing, or the file is damaged."""
         self.path, self._lock = path, threading.Lock()
         self.ros1 = path.is_file() and _magic(path).startswith(ROS1_MAGIC)
         reader = import_optional(
             "rosbags.rosbag1" if self.ros1 else "rosbags.rosbag2", "ros", f"{path}: a ROS bag"
         ).Reader
         typesys = import_optional("rosbags.typesys", "ros", f"{path}: a ROS bag")
-        # Messages of the common types never changed; what a bag says of its own types is not needed, and may be wrong.
+        # The common message types never changed; the type definitions stored in a bag are not needed and may be wrong.
         self._types = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if self.ros1 else typesys.Stores.LATEST)
         if TRANSFORMS not in self._types.fielddefs:
             fields = "geometry_msgs/TransformStamped[] transforms"
@@ -65,19 +65,19 @@ class Bag:
         }
 
     def topics_of_type(self, *types: str) -> list[Topic]:
-        """Return the topics of these types that have messages, in order of name."""
+        """Return the topics of these message types that have messages, sorted by name."""
         return [topic for _, topic in sorted(self.topics.items()) if topic.msgtype in types and topic.count]
 
     def first_message(self, name: str) -> Message:
-        """Read a topic's first message. Raises SourceError if it is damaged."""
+        """Read the first message of a topic. Raises SourceError if it is damaged."""
         return next(self.messages(name))
 
     def messages(self, name: str) -> Iterator[Message]:
-        """Read a topic's messages in order of recording. Raises SourceError if one is damaged."""
+        """Read the messages of a topic in recording order. Raises SourceError if one is damaged."""
         return (self._decoded(name, raw) for _, _, raw in self._raw([name]))
 
     def index(self, *names: str) -> dict[str, list[Entry]]:
-        """Go once through topics whose messages have headers. Raises SourceError if the bag is damaged."""
+        """Return the entries of topics whose messages have headers. Raises SourceError if the bag is damaged."""
         found: dict[str, list[Entry]] = {name: [] for name in names}
         for name, recorded_ns, raw in self._raw(names):
             earlier = found[name]
@@ -94,14 +94,14 @@ class Bag:
     def _raw(
         self, names: Sequence[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[str, int, bytes]]:
-        """Yield name, time of recording and bytes of the messages of some topics."""
+        """Yield topic name, recording time and bytes of each message of the topics."""
         connections = [connection for connection in self._reader.connections if connection.topic in names]
         items = self._guarded(lambda: self._reader.messages(connections, start_ns, stop_ns))
         while (item := self._guarded(lambda: next(items, None))) is not None:
             yield item[0].topic, item[1], item[2]
 
     def _stamp_ns(self, raw: bytes) -> int:
-        """Read the time of a header: ROS 1 begins with a sequence number, CDR with four bytes that tell the order."""
+        """Read the time of a header: ROS 1 starts with a sequence number, CDR with four bytes for the byte order."""
         order = "<" if self.ros1 or raw[1] & 1 else ">"
         seconds, nanoseconds = struct.unpack_from(f"{order}II", raw, 4)
         return int(seconds) * 10**9 + int(nanoseconds)
@@ -113,22 +113,22 @@ class Bag:
         msgtype = TRANSFORMS if msgtype == "tf/msg/tfMessage" else msgtype  # its name before ROS Hydro
         try:
             return self._types.deserialize_ros1(raw, msgtype)
-        except Exception:  # RealSense's SDK appends the depth unit to images, four bytes that the type does not have
+        except Exception:  # RealSense's SDK appends the depth unit to images, four bytes that are not in the type
             return self._guarded(lambda: self._types.deserialize_ros1(raw[:-4], msgtype))
 
     def _guarded(self, call: Callable[[], Value]) -> Value:
-        """Call the library; it fails in many ways on damaged files, and all of them mean: this bag is unreadable."""
+        """Call the library. Raises SourceError for any of the exceptions that damaged bags can cause."""
         try:
             return call()
         except Exception as error:
             raise SourceError(
-                f"{self.path}: unreadable bag ({error}); copy it again, or if its recording was cut short mend it with "
-                "rosbag reindex, ros2 bag reindex or mcap recover"
+                f"{self.path}: unreadable bag ({error}); copy it again, or if its recording was interrupted repair it "
+                "with rosbag reindex, ros2 bag reindex or mcap recover"
             ) from error
 
 
 def is_bag(path: Path) -> bool:
-    """Tell whether a ROS bag lies at a path, by its first bytes; a folder, by its metadata.yaml."""
+    """Return whether a path is a ROS bag: a file by its first bytes, a folder by its metadata.yaml."""
     if path.is_dir():
         metadata = path / "metadata.yaml"
         return metadata.is_file() and b"rosbag2_bagfile_information" in metadata.read_bytes()[:4096]
@@ -136,7 +136,7 @@ def is_bag(path: Path) -> bool:
 
 
 def list_topics(topics: Iterable[Topic], most: int = 12) -> str:
-    """Write topics for a message: names, types, counts."""
+    """Format topics for an error message: names, types, counts."""
     words: Sequence[str] = [f"{t.name} ({t.msgtype.replace('/msg/', '/')}, {t.count})" for t in topics]
     return ", ".join(words[:most]) + (f", … {len(words)} topics" if len(words) > most else "") or "no topic"
 

@@ -1,7 +1,7 @@
-"""Find out from a bag's messages what is known of its cameras: intrinsics, lenses, where depth is to colour, its unit.
+"""Read the calibration from a bag: intrinsics, distortion, the depth camera's pose, and the depth unit.
 
-sensor_msgs/CameraInfo lies beside the images (camera_info). Drivers say where cameras are in /tf_static or /tf, by the
-frames that images name. RealSense's SDK before version 2.58 instead has topics of its own, /device_0/sensor_0/Depth_0/…
+Intrinsics are in sensor_msgs/CameraInfo beside the images (camera_info). Camera poses are in /tf_static or /tf, between
+the frames that the images name. RealSense's SDK before version 2.58 uses its own topics /device_0/sensor_0/Depth_0/…
 (librealsense, ros_file_format.h): info/camera_info, tf/N (a geometry_msgs/Transform from a reference to the stream) and
 option/Depth_Units/value of the sensor.
 """
@@ -15,41 +15,45 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.sources.camera.calibration import Calibration, Distortion, build_camera, resolve_calibration
+from sigmasplat.sources.camera.calibration import (
+    MM_PER_METRE,
+    Calibration,
+    Distortion,
+    build_camera,
+    resolve_calibration,
+)
 from sigmasplat.sources.ros.bag import Bag, Message
-from sigmasplat.sources.ros.tf import lookup_transform, rigid_transform
+from sigmasplat.sources.ros.tf import lookup_transform, transform_of
 from sigmasplat.sources.ros.topics import ImageTopic
 from sigmasplat.types import Matrix
 
-UNITS_PER_METRE = 1000.0
-"""Whole-number depth of ROS is millimetres (REP 118)."""
 BROWN_CONRADY = ("", "plumb_bob", "brown conrady", "inverse brown conrady", "modified brown conrady", "none")
 RATIONAL = "rational_polynomial"
 
 
 @dataclass(frozen=True)
 class Optics:
-    """A camera and its lens, None for no lens."""
+    """Intrinsics and lens distortion, None for no distortion."""
 
     camera: Camera
     lens: Distortion | None
 
 
 def read_bag_calibration(bag: Bag, color: ImageTopic, depth: ImageTopic, settings: InputConfig) -> Calibration:
-    """Return what is known of the cameras, the settings' words in place of the bag's.
+    """Return the calibration of a bag; the settings override it.
 
-    Raises SourceError if the colour camera is unknown, or depth has a camera of its own and the bag does not say where.
+    Raises SourceError if the colour camera is unknown, or if the pose of a separate depth camera is unknown.
     """
     optics = read_optics(bag, color)
     units = depth_units(bag, depth)
     recorded = Calibration(optics.camera, units, optics.lens) if optics else None
     calibration = resolve_calibration(bag.path, recorded, color.size, settings, units)
-    told = settings.calibration or calibration.depth_camera or settings.register_depth == "off"
-    if told or is_registered(color, depth):
+    decided = settings.calibration or calibration.depth_camera or settings.register_depth == "off"
+    if decided or is_registered(color, depth):
         return calibration
     depth_optics = read_optics(bag, depth)
     if depth_optics is None and depth.size == color.size:
-        return calibration  # nothing says otherwise; `inspect` compares edges
+        return calibration  # assumed to be registered; `inspect` compares edges
     if depth_optics is None:
         raise SourceError(
             f"{bag.path}: {depth.name} has no camera_info, so it cannot be registered to {color.name}; record it too, "
@@ -64,12 +68,12 @@ def read_bag_calibration(bag: Bag, color: ImageTopic, depth: ImageTopic, setting
 
 
 def is_registered(color: ImageTopic, depth: ImageTopic) -> bool:
-    """Tell whether depth has the colour image's pixels: its name says so, or both are in one optical frame."""
+    """Return whether depth is registered to colour: by its topic name, or by an equal optical frame."""
     return depth.registered or (bool(depth.frame) and depth.frame == color.frame and not _sdk_stream(depth))
 
 
 def read_optics(bag: Bag, topic: ImageTopic) -> Optics | None:
-    """Read the CameraInfo of an image topic; None where there is none, or it is not filled in. Raises SourceError."""
+    """Read the CameraInfo of an image topic; None if it is missing or empty. Raises SourceError if it is damaged."""
     infos = {info.name for info in bag.topics_of_type("sensor_msgs/msg/CameraInfo")}
     names = (f"{topic.camera}/camera_info", f"{topic.base.removesuffix('/image/data')}/info/camera_info")
     found = [name for name in names if name in infos]
@@ -88,13 +92,13 @@ def read_optics(bag: Bag, topic: ImageTopic) -> Optics | None:
 
 
 def depth_units(bag: Bag, depth: ImageTopic) -> float:
-    """Return the whole numbers per metre: of the SDK's option where it was recorded, else millimetres."""
+    """Return the depth units per metre: from the SDK's option if it was recorded, else for millimetres."""
     sensor = "/".join(depth.name.split("/")[:3])
     name = f"{sensor}/option/Depth_Units/value"
     if name not in bag.topics or not bag.topics[name].count:
-        return UNITS_PER_METRE
+        return MM_PER_METRE  # ROS depth as whole numbers is in millimetres (REP 118)
     metres = float(bag.first_message(name).data)
-    return round(1.0 / metres, 3) if metres > 0 else UNITS_PER_METRE
+    return round(1.0 / metres, 3) if metres > 0 else MM_PER_METRE
 
 
 def _color_depth(bag: Bag, color: ImageTopic, depth: ImageTopic) -> Matrix:
@@ -103,15 +107,15 @@ def _color_depth(bag: Bag, color: ImageTopic, depth: ImageTopic) -> Matrix:
         found = lookup_transform(bag, color.frame, depth.frame)
     if found is None:
         raise SourceError(
-            f"{bag.path}: nothing says where the depth camera ({depth.frame or depth.name}) is to the colour camera "
-            f"({color.frame or color.name}); record /tf_static or an aligned depth topic too, "
+            f"{bag.path}: no transform from the depth camera ({depth.frame or depth.name}) to the colour camera "
+            f"({color.frame or color.name}); record /tf_static or an aligned depth topic, "
             "or give --calibration FILE with depth_camera and T_color_depth"
         )
     return found
 
 
 def _sdk_stream(topic: ImageTopic) -> str:
-    """Return the SDK's name of a stream, as /device_0/sensor_0/Depth_0, or "" where the bag is of another kind."""
+    """Return the SDK's name of a stream, such as /device_0/sensor_0/Depth_0, or "" for other bags."""
     return topic.base.removesuffix("/image/data") if topic.base.startswith("/device_") else ""
 
 
@@ -124,30 +128,30 @@ def _sdk_color_depth(bag: Bag, color: ImageTopic, depth: ImageTopic) -> Matrix |
 
 
 def _sdk_pose(bag: Bag, stream: str) -> Matrix | None:
-    """Return T_stream_reference, None where the bag is not the SDK's."""
+    """Return T_stream_reference, None if the bag is not from the SDK."""
     found = bag.topics_of_type("geometry_msgs/msg/Transform")
     names = [topic.name for topic in found if topic.name.startswith(f"{stream}/tf/")]
     if not (stream and names):
         return None
     message = bag.first_message(names[0])
-    return rigid_transform(f"{bag.path}: {names[0]}", message.translation, message.rotation)
+    return transform_of(f"{bag.path}: {names[0]}", message.translation, message.rotation)
 
 
 def _lens(where: str, info: Message) -> Distortion | None:
-    """Return the lens in OpenCV's order. Raises SourceError if it is of a model that is not known."""
+    """Return the distortion in OpenCV's order. Raises SourceError for an unsupported model."""
     values = [float(v) for v in _field(info, "d")]
     if not any(values):
         return None
     model = info.distortion_model.lower()
     if model not in (*BROWN_CONRADY, RATIONAL) or len(values) < 4:
         raise SourceError(
-            f"{where}: lens model {info.distortion_model} is not known (plumb_bob and {RATIONAL} are); "
+            f"{where}: lens model {info.distortion_model} is not supported (plumb_bob and {RATIONAL} are); "
             "record the rectified images (image_rect_color), or give --calibration FILE"
         )
     return tuple([*values, 0.0][: 8 if model == RATIONAL else 5])
 
 
 def _field(message: Message, name: str) -> Iterable[float]:
-    """Read a field that ROS 1 writes in capitals and ROS 2 in small letters."""
+    """Read a field whose name is in capitals in ROS 1 and in lower case in ROS 2."""
     values: Iterable[float] = getattr(message, name if hasattr(message, name) else name.upper())
     return values

@@ -1,8 +1,8 @@
-"""Turn image messages of ROS into arrays: sensor_msgs/Image and sensor_msgs/CompressedImage.
+"""Decode image messages of ROS: sensor_msgs/Image and sensor_msgs/CompressedImage.
 
-Raw encodings as in sensor_msgs' image_encodings.hpp. Compressed depth as image_transport's compressed_depth plugin
-writes it: 12 bytes of header (format, two quantisation parameters a and b), then a PNG; of 16UC1 the PNG holds the
-numbers themselves, of 32FC1 it holds a / depth + b.
+Raw encodings are those of sensor_msgs' image_encodings.hpp. Compressed depth is that of image_transport's plugin
+compressed_depth: a header of 12 bytes (format, two quantisation parameters a and b), then a PNG. For 16UC1 the PNG
+holds the values, for 32FC1 it holds a / depth + b.
 """
 
 import io
@@ -29,13 +29,13 @@ COLOR_ORDER = {
     "bgra8": (2, 1, 0),
     "8UC4": (2, 1, 0),
 }
-"""Where red, green and blue are in a pixel."""
+"""Positions of red, green and blue in a pixel."""
 DEPTH_TYPE = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 HEADER_BYTES = 12
 
 
 def image_kind(message: Message) -> ImageKind:
-    """Tell what an image message holds; "" for what is neither colour nor depth, as infrared."""
+    """Return the kind of an image message; "" if it is neither colour nor depth, such as infrared."""
     if hasattr(message, "encoding"):
         return "colour" if message.encoding in COLOR_ORDER else "depth" if message.encoding in DEPTH_TYPE else ""
     text = message.format
@@ -54,7 +54,7 @@ def message_size(path: Path, message: Message) -> tuple[int, int]:
 
 
 def decode_color_message(path: Path, message: Message) -> NDArray[np.uint8]:
-    """Return 8-bit RGB [H, W, 3]. Raises SourceError naming `path` if the message is damaged or no colour image."""
+    """Return 8-bit RGB [H, W, 3]. Raises SourceError naming `path` if the message is damaged or not colour."""
     if not hasattr(message, "encoding"):
         return decode_color(path, message.data.tobytes())
     if message.encoding not in COLOR_ORDER:
@@ -66,7 +66,7 @@ def decode_color_message(path: Path, message: Message) -> NDArray[np.uint8]:
 def decode_depth_message(path: Path, message: Message, units_per_metre: float) -> NDArray[np.float32]:
     """Return depth in metres [H, W], 0 = no reading; whole numbers are divided by `units_per_metre`.
 
-    Raises SourceError naming `path` if the message is damaged or no depth image.
+    Raises SourceError naming `path` if the message is damaged or not a depth image.
     """
     if not hasattr(message, "encoding"):
         return _decompressed(path, message, units_per_metre)
@@ -78,7 +78,7 @@ def decode_depth_message(path: Path, message: Message, units_per_metre: float) -
 
 def _decompressed(path: Path, message: Message, units_per_metre: float) -> NDArray[np.float32]:
     if "rvl" in message.format.lower():
-        raise SourceError(f"{path}: depth is compressed as RVL, which is not read; republish it as PNG or raw")
+        raise SourceError(f"{path}: depth is compressed as RVL, which is not supported; republish it as PNG or raw")
     data = message.data.tobytes()
     has_header = "compressedDepth" in message.format
     raw = guard_decoding(path, lambda: np.asarray(Image.open(io.BytesIO(data[HEADER_BYTES * has_header :]))))
@@ -90,7 +90,7 @@ def _decompressed(path: Path, message: Message, units_per_metre: float) -> NDArr
 
 
 def _pixels(path: Path, message: Message, kind: str, channels: int) -> NDArray[Any]:
-    """Return [H, W, channels]: rows may be padded, and numbers of either byte order."""
+    """Return [H, W, channels]; rows may be padded, and both byte orders are supported."""
     dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
     row = message.width * channels * dtype.itemsize
     if len(message.data) != message.height * message.step or message.step < row:
@@ -103,10 +103,12 @@ def _pixels(path: Path, message: Message, kind: str, channels: int) -> NDArray[A
 
 
 def _without_nan(depth_m: NDArray[Any]) -> NDArray[np.float32]:
-    """Return float depth with 0 where ROS has NaN (no reading) or infinity (beyond range), as REP 117 has it."""
+    """Return float depth with 0 for NaN (no reading) and infinity (out of range), see REP 117."""
     filled: NDArray[np.float32] = np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
     return filled
 
 
 def _encoding(path: Path, what: str, found: str, known: dict[str, Any]) -> SourceError:
-    return SourceError(f"{path}: {what} is encoded as {found}, which is not read; there are {', '.join(known)}")
+    return SourceError(
+        f"{path}: {what} is encoded as {found}, which is not supported; supported are {', '.join(known)}"
+    )

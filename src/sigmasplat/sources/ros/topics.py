@@ -1,4 +1,4 @@
-"""Choose the topics of a bag that hold colour and depth: by what the messages hold, then by how topics are named."""
+"""Choose the colour and the depth topic of a bag: by message content, then by topic name."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,14 +9,14 @@ from sigmasplat.sources.ros.bag import Bag, list_topics
 from sigmasplat.sources.ros.images import COMPRESSED, RAW, ImageKind, image_kind, message_size
 
 REGISTERED_NAMES = ("aligned_depth_to_color", "depth_registered", "depth_to_rgb")
-"""Names that drivers give to depth that has the colour image's pixels (RealSense; OpenNI, Kinect; Azure Kinect)."""
+"""Parts of topic names for depth registered to colour (RealSense; OpenNI, Kinect; Azure Kinect)."""
 NOT_DEPTH_NAMES = ("infra", "/ir/", "confidence")
-"""Names of 16-bit images that are no depth."""
+"""Parts of topic names for 16-bit images that are not depth."""
 
 
 @dataclass(frozen=True)
 class ImageTopic:
-    """A topic of images: what they hold, the optical frame they are in, and (width, height) of the first."""
+    """A topic of images: their kind, optical frame, and (width, height) of the first image."""
 
     name: str
     kind: ImageKind
@@ -25,31 +25,31 @@ class ImageTopic:
 
     @property
     def base(self) -> str:
-        """The topic without the ending that image_transport adds for a compressed copy."""
+        """The topic name without the suffix that image_transport adds to compressed images."""
         return self.name.removesuffix("/compressedDepth").removesuffix("/compressed")
 
     @property
     def camera(self) -> str:
-        """The name space in which a driver puts all images of one camera."""
+        """The name space of all images of one camera."""
         return self.base.rpartition("/")[0]
 
     @property
     def registered(self) -> bool:
-        """Whether its name says that it has the colour image's pixels."""
+        """Whether its name says that depth is registered to colour."""
         return any(words in self.name for words in REGISTERED_NAMES)
 
 
 def color_topic(bag: Bag, requested: str) -> ImageTopic:
-    """Return the topic requested for, or the one of colour images. Raises SourceError if there is none, or several."""
+    """Return the requested topic, or the only one with colour images. Raises SourceError if it is ambiguous."""
     found = [topic_by_name(bag, requested)] if requested else image_topics(bag, "colour")
     best = _preferred(found, lambda topic: not any(word in topic.name.lower() for word in ("color", "rgb")))
     return _one_camera(bag, "colour", best, "color")
 
 
 def depth_topic(bag: Bag, requested: str) -> ImageTopic:
-    """Return the topic requested for, or the one of depth, registered to colour if there is one.
+    """Return the requested topic, or the only one with depth; depth registered to colour is preferred.
 
-    Raises SourceError if there is none, or several.
+    Raises SourceError if there is no such topic or more than one.
     """
     if requested:
         return _one_camera(bag, "depth", [topic_by_name(bag, requested)], "depth")
@@ -60,13 +60,13 @@ def depth_topic(bag: Bag, requested: str) -> ImageTopic:
 
 
 def image_topics(bag: Bag, kind: ImageKind) -> list[ImageTopic]:
-    """Return the topics whose first message holds this kind. Raises SourceError if the bag is damaged."""
+    """Return the topics whose first message is of this kind. Raises SourceError if the bag is damaged."""
     found = [_described(bag, topic.name) for topic in bag.topics_of_type(RAW, COMPRESSED)]
     return [topic for topic in found if topic.kind == kind]
 
 
 def topic_by_name(bag: Bag, name: str) -> ImageTopic:
-    """Return a topic by its name. Raises SourceError if it is none of images."""
+    """Return a topic by name. Raises SourceError if it does not exist or holds no images."""
     topics = {topic.name: topic for topic in bag.topics_of_type(RAW, COMPRESSED)}
     if name not in topics:
         raise SourceError(
@@ -83,12 +83,12 @@ def _described(bag: Bag, name: str) -> ImageTopic:
 
 
 def _preferred(topics: list[ImageTopic], worse: Callable[[ImageTopic], bool]) -> list[ImageTopic]:
-    """Keep those that are not worse; all where every one is."""
+    """Return the topics that are not worse, or all topics if every one is."""
     return [topic for topic in topics if not worse(topic)] or topics
 
 
 def _one_camera(bag: Bag, what: str, topics: list[ImageTopic], option: str) -> ImageTopic:
-    """Return the one camera's topic: rectified before raw, uncompressed before compressed."""
+    """Return the topic of the only camera: rectified before raw, uncompressed before compressed."""
     if not topics or any(topic.kind != what for topic in topics):
         raise SourceError(
             f"{bag.path}: no {what} images in {topics[0].name if topics else 'any topic'}; "

@@ -1,11 +1,11 @@
-"""Find the true path in a bag: the one topic of poses."""
+"""Read the ground-truth path of a bag from its only topic of poses."""
 
 import numpy as np
 
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.ros.bag import Bag, Message
-from sigmasplat.sources.ros.tf import lookup_transform, rigid_transform
+from sigmasplat.sources.ros.tf import lookup_transform, transform_of
 from sigmasplat.types import Matrix
 
 POSE_TYPES = (
@@ -17,11 +17,11 @@ POSE_TYPES = (
 
 
 def read_truth(bag: Bag, camera_frame: str, recorded_time: bool) -> Trajectory | None:
-    """Return the path of the colour camera where exactly one topic holds poses, else None.
+    """Return the path of the colour camera if exactly one topic holds poses, else None.
 
-    Where the messages name the body that moves, the bag's static transforms take the poses to the camera, and there is
-    no truth where they do not lead there; where they do not (PoseStamped), the poses are taken to be the camera's.
-    `recorded_time`: whether times are those of recording, not of the headers. Raises SourceError on a damaged pose.
+    If the messages name the moving body, the bag's static transforms convert its poses to the camera; without such a
+    transform the result is None. If they name no body (PoseStamped), the poses are assumed to be the camera's.
+    `recorded_time`: use recording times instead of header times. Raises SourceError on a damaged pose.
     """
     topics = bag.topics_of_type(*POSE_TYPES)
     if len(topics) != 1 or topics[0].count < 2:
@@ -42,6 +42,6 @@ def read_truth(bag: Bag, camera_frame: str, recorded_time: bool) -> Trajectory |
 
 def _pose(where: str, message: Message) -> Matrix:
     if hasattr(message, "transform"):
-        return rigid_transform(where, message.transform.translation, message.transform.rotation)
+        return transform_of(where, message.transform.translation, message.transform.rotation)
     pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
-    return rigid_transform(where, pose.position, pose.orientation)
+    return transform_of(where, pose.position, pose.orientation)
