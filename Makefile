@@ -11,7 +11,7 @@
 # PYTHON=python3.12    use another interpreter
 # TORCH_INDEX=URL      index for torch, used if it answers; the default has the build without gigabytes of CUDA
 # PIP_ARGS="…"         additional pip options
-# PYTEST_ARGS="…"      additional pytest options, for instance -k trajectory -x
+# PYTEST_ARGS="…"      additional pytest options, for instance -k trajectory -x; -n 0 for one process
 
 PYTHON ?= python3
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
@@ -48,9 +48,10 @@ lint: install-dev
 types: install-dev
 	$(BIN)/mypy --strict src
 
-# In sequence even under -j, so that the summary of pytest is the last line.
+# In sequence even under -j, so that the summary of pytest is the last line. One worker per core: each starts with a
+# contiguous half of the tests, so that most fixtures of a file are made once; the first to finish takes over tests.
 pytest: lint types
-	$(BIN)/pytest $(PYTEST_ARGS)
+	$(BIN)/pytest -n auto --maxprocesses 8 --dist worksteal $(PYTEST_ARGS)
 
 install: $(VENV)/installed
 install-dev: $(VENV)/installed-dev

@@ -177,11 +177,11 @@ def ratios(figures: Figures) -> Section:
 
 def growth(figures: Figures) -> Section:
     """Tabulate the exponents of the growth of time with splats and with pixels."""
-    rows: dict[str, list[str]] = {}
-    for text, _, value in _exponents(figures):
-        rows.setdefault(text, []).append(significant(value))
-    titles = [title for title, work in COLUMNS if work in GROWING]
-    return Section("Growth, exponent", ["from → to", *titles], [[text, *values] for text, values in rows.items()])
+    found: dict[str, dict[str, float]] = {}
+    for text, work, value in _exponents(figures):
+        found.setdefault(text, {})[work] = value
+    rows = [[text, *(significant(values.get(work)) for work in GROWING)] for text, values in found.items()]
+    return Section("Growth, exponent", ["from → to", *(TITLES[work] for work in GROWING)], rows)
 
 
 def _exponents(figures: Figures) -> Iterator[tuple[str, str, float]]:

@@ -6,6 +6,10 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
+# Workers of pytest-xdist share the cores; numpy and torch read this when they are imported.
+if workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 0)):
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // workers)))
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -15,6 +19,9 @@ import sigmasplat  # noqa: F401 - before any test imports torch: idle OpenMP thr
 # A shell that starts tests in the background has them ignore Ctrl-C, which some of them are about.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Their assertions explain themselves as those of tests do.
+pytest.register_assert_rewrite("benchmark_results", "command_line")
 
 TINY_SIZE = (32, 24)  # width, height
 TINY_DEPTH_M = 2.0

@@ -30,8 +30,9 @@ print(_core.isa_name(), _core.threads())
 
 def shown(**environment: str) -> str:
     """Ask a new process which kernels it runs, on how many threads."""
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith("SIGMASPLAT_")}
     answer = subprocess.run(
-        [sys.executable, "-c", SHOW], env=os.environ | environment, capture_output=True, text=True, timeout=60
+        [sys.executable, "-c", SHOW], env=inherited | environment, capture_output=True, text=True, timeout=60
     )
     assert answer.returncode == 0, answer.stderr
     return answer.stdout.strip()

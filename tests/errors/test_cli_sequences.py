@@ -15,7 +15,7 @@ from sigmasplat.model.trajectory import Trajectory
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
-SETTINGS = ("input.width=32", "mapping.first_iterations=3", "mapping.iterations=2")
+SETTINGS = ("input.width=32", "mapping.first_iterations=3", "mapping.iterations=2", "final.iterations=2")
 QUICK = [word for setting in SETTINGS for word in ("--set", setting)]
 
 

@@ -37,40 +37,31 @@ def with_text(name: str, text: str) -> Damage:
     return damage
 
 
-def resized(pattern: str, size: tuple[int, int] = (20, 14)) -> Damage:
-    """Resize images, as an export tool might do."""
+def redrawn(pattern: str, draw: Callable[[Image.Image], Image.Image]) -> Damage:
+    """Replace images by others."""
 
     def damage(folder: Path) -> None:
         for path in folder.glob(pattern):
             with Image.open(path) as image:
-                pixels = image.resize(size, Image.Resampling.NEAREST)
-            pixels.save(path)
+                other = draw(image)
+            other.save(path)
 
     return damage
+
+
+def resized(pattern: str, size: tuple[int, int] = (20, 14)) -> Damage:
+    """Make images another size, as a viewer or an exporter might have."""
+    return redrawn(pattern, lambda image: image.resize(size, Image.Resampling.NEAREST))
 
 
 def painted(pattern: str) -> Damage:
     """Replace depth by 8-bit colour images."""
-
-    def damage(folder: Path) -> None:
-        for path in folder.glob(pattern):
-            with Image.open(path) as image:
-                size = image.size
-            Image.new("RGB", size, (90, 40, 10)).save(path.with_suffix(".png"))
-
-    return damage
+    return redrawn(pattern, lambda image: Image.new("RGB", image.size, (90, 40, 10)))
 
 
 def blank(pattern: str) -> Damage:
     """Set every depth pixel to 0."""
-
-    def damage(folder: Path) -> None:
-        for path in folder.glob(pattern):
-            with Image.open(path) as image:
-                size = image.size
-            Image.fromarray(np.zeros(size[::-1], np.uint16)).save(path)
-
-    return damage
+    return redrawn(pattern, lambda image: Image.fromarray(np.zeros(image.size[::-1], np.uint16)))
 
 
 def renumbered(pattern: str) -> Damage:

@@ -4,17 +4,19 @@ import ast
 import dataclasses
 import importlib
 import re
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
 
+from changed_settings import changed_settings
 from documents import DOCUMENTS, ROOT, prose
 from sigmasplat.config import Config
 from sigmasplat.presets import list_presets, preset
 
 PACKAGE = ROOT / "src" / "sigmasplat"
 SECTIONS = [f.name for f in dataclasses.fields(Config) if dataclasses.is_dataclass(getattr(Config(), f.name))]
-each_document = pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
+FOLDERS = sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))
 
 
 def anchors(path: Path) -> set[str]:
@@ -23,53 +25,65 @@ def anchors(path: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-@each_document
-def test_links_lead_somewhere(path: Path) -> None:
-    for target in re.findall(r"\]\(([^)\s]+)\)", prose(path)):
-        if target.startswith("http"):
-            continue
+def broken_links(path: Path) -> list[str]:
+    targets = [target for target in re.findall(r"\]\(([^)\s]+)\)", prose(path)) if not target.startswith("http")]
+    broken = list[str]()
+    for target in targets:
         file, _, anchor = target.partition("#")
         linked = (path.parent / file).resolve() if file else path
-        assert linked.exists(), f"{path.name} links to {target}, which does not exist"
-        assert not anchor or anchor in anchors(linked), f"{path.name}: no heading for {target}"
+        if not linked.exists() or (anchor and anchor not in anchors(linked)):
+            broken.append(target)
+    return broken
 
 
-@each_document
-def test_named_tests_files_and_settings_exist(path: Path) -> None:
+def test_links_lead_somewhere() -> None:
+    found = {str(path): broken_links(path) for path in DOCUMENTS}
+    assert {path: links for path, links in found.items() if links} == {}
+
+
+def unknown_names(path: Path) -> list[str]:
+    """Return the tests, files, settings and presets that a document names and that do not exist."""
     text = prose(path)
-    for file, name in re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text):
-        assert f"def {name}(" in (ROOT / file).read_text(encoding="utf-8"), f"{path.name} names {file}::{name}"
-    for name in re.findall(r"`((?:config|native|model|render|fit|slam|sources|io|metrics)/[\w/]+\.\w+)`", text):
-        assert (PACKAGE / name).is_file(), f"{path.name} names {name}"
-    for section, name in re.findall(rf"`({'|'.join(SECTIONS)})\.([a-z]\w+)`", text):
-        known = {*vars(getattr(Config(), section)), "py", "json"}
-        logged = {"agreement", "overlap", "first_loss", "loss", "iterations"} if path.name == "runs.md" else set()
-        assert name in known | logged or (PACKAGE / section / f"{name}.py").is_file(), f"{path.name}: {section}.{name}"
-    for name in re.findall(r"`((?:varsplat|loopsplat|cgslam)-[a-z0-9-]*[a-z0-9])`", text):
-        assert name in list_presets(), f"{path.name} names {name}"
+    tests = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text)
+    files = re.findall(rf"`((?:{'|'.join(FOLDERS)})/[\w/]+\.\w+)`", text)
+    settings = re.findall(rf"`({'|'.join(SECTIONS)})\.([a-z]\w+)`", text)
+    presets = re.findall(r"`((?:varsplat|loopsplat|cgslam)-[a-z0-9-]*[a-z0-9])`", text)
+    logged = {"agreement", "overlap", "first_loss", "loss", "iterations"} if path.name == "runs.md" else set()
+
+    def is_known(section: str, name: str) -> bool:
+        known = {*vars(getattr(Config(), section)), "py", "json"} | logged
+        return name in known or (PACKAGE / section / f"{name}.py").is_file()
+
+    return [
+        *(f"{file}::{name}" for file, name in tests if f"def {name}(" not in (ROOT / file).read_text(encoding="utf-8")),
+        *(file for file in files if not (PACKAGE / file).is_file()),
+        *(f"{section}.{name}" for section, name in settings if not is_known(section, name)),
+        *(name for name in presets if name not in list_presets()),
+    ]
 
 
-@pytest.mark.parametrize("document", ["varsplat.md", "cgslam.md"])
-def test_the_equations_functions_exist(document: str) -> None:
+def test_named_tests_files_settings_and_presets_exist() -> None:
+    found = {str(path): unknown_names(path) for path in DOCUMENTS}
+    assert {path: names for path, names in found.items() if names} == {}
+
+
+def test_the_functions_beside_equations_exist() -> None:
     """Every function beside a file in the papers' documents is defined there."""
-    text = (ROOT / "docs" / document).read_text(encoding="utf-8")
-    pairs = re.findall(r"`([\w/]+\.py)` ((?:`\w+`(?:, )?)+)", text)
-    assert len(pairs) > 15
-    for file, names in pairs:
-        tree = ast.parse((PACKAGE / file).read_text(encoding="utf-8"))
-        defined = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
-        assert set(re.findall(r"\w+", names)) <= defined, f"{document}: {file} {names}"
+    for document in ("varsplat.md", "cgslam.md"):
+        text = (ROOT / "docs" / document).read_text(encoding="utf-8")
+        pairs = re.findall(r"`([\w/]+/\w+\.py)` ((?:`\w+`(?:, )?)+)", text)
+        assert len(pairs) > 15
+        for file, names in pairs:
+            tree = ast.parse((PACKAGE / file).read_text(encoding="utf-8"))
+            defined = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+            assert set(re.findall(r"\w+", names)) <= defined, f"{document}: {file} {names}"
 
 
 def test_the_fast_presets_table_is_whole() -> None:
     """docs/varsplat.md says of every number in which fast differs from the paper's what it is, and why."""
-    tum, fast = preset("varsplat-tum").to_dict(), preset("varsplat-fast").to_dict()
+    tum, fast = preset("varsplat-tum"), preset("varsplat-fast")
     differing = {
-        f"{section}.{name}": (str(value), str(fast[section][name]))
-        for section, values in tum.items()
-        if isinstance(values, dict)
-        for name, value in values.items()
-        if fast[section][name] != value
+        name: tuple(str(attrgetter(name)(config)) for config in (tum, fast)) for name in changed_settings(tum, fast)
     }
     text = (ROOT / "docs" / "varsplat.md").read_text(encoding="utf-8")
     table = text.partition("**`varsplat-fast` compared with `varsplat-tum`**")[2].partition("ScanNet++")[0]

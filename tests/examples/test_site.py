@@ -3,7 +3,6 @@
 import ast
 import dataclasses
 import importlib
-import importlib.util
 import re
 import sys
 from types import ModuleType, SimpleNamespace
@@ -12,6 +11,7 @@ import pytest
 
 import sigmasplat
 from documents import DOCUMENTS, ROOT
+from module_files import module_from
 from sigmasplat.config import Config
 
 DOCS = ROOT / "docs"
@@ -21,12 +21,7 @@ NOT_DOCUMENTED = {"native", "commands", "cli", "report", "viewer", "__init__", "
 
 
 def theme(name: str) -> ModuleType:
-    """Load docs/theme/NAME.py."""
-    spec = importlib.util.spec_from_file_location(f"docs_{name}", DOCS / "theme" / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return module_from(DOCS / "theme" / f"{name}.py")
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +137,7 @@ def test_the_page_of_settings_is_that_of_the_sources() -> None:
     assert sorted(rows) == sorted({*flat, "name", "seed", "backend"})
 
 
-def test_a_setting_is_said_by_the_text_below_it() -> None:
+def test_a_setting_is_explained_by_the_text_below_it() -> None:
     fields = ("x: int = 1", "y: int = 2", '"""Two\n    lines."""', "z = 3", '"""Not a field."""')
     source = "\n    ".join(("class A:", '"""Of all."""', *fields))
     (found,) = ast.parse(source).body

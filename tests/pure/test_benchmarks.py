@@ -2,7 +2,7 @@
 
 import importlib
 import json
-import subprocess
+import runpy
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmark_results import BENCHMARKS, laid_out, results
 from sigmasplat import cli
 from sigmasplat.config import Config, RenderConfig
 from sigmasplat.config.text import override
@@ -29,8 +30,6 @@ from sigmasplat.render.reference import operators as reference
 from sigmasplat.slam.tracker import Tracker
 from sigmasplat.sources import open_source
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-sys.path.append(str(BENCHMARKS))  # they are programs: they find each other beside themselves
 accuracy, accuracy_tables, cpu, cpu_scene, cpu_tables, record, scenes, tables, works = map(
     importlib.import_module,
     ("accuracy", "accuracy_tables", "cpu", "cpu_scene", "cpu_tables", "record", "scenes", "tables", "works"),
@@ -49,27 +48,25 @@ def kernel_settings() -> Iterator[None]:
     torch.set_num_threads(torch_threads)
 
 
-def results(benchmark: str, figures: dict[str, Any], **changes: Any) -> dict[str, Any]:
-    circumstances = {"machine": {"cpu": "Test CPU", "cores": 2}, "commit": "0123456789ab", "dirty": True}
-    rest = {"name": benchmark, "date": "2025-01-02T03:04:05+00:00", "config": {}, "command": "python x.py"}
-    return {"benchmark": benchmark, **circumstances, **rest, "figures": figures, **changes}
-
-
 def job_result(source: str, seed: int, problem: str | None = None, **figures: float | None) -> dict[str, Any]:
     job = {"source": source, "preset": accuracy_tables.GOAL_PRESET, "seed": seed}
     return {"job": job, "problem": problem, "peak_mib": 512.0, "figures": figures}
 
 
-def test_every_program_explains_itself() -> None:
-    programs = {"cpu": "--quick", "accuracy": "--seeds", "tracking": "--experiments", "tables": "--check"}
-    running = {
-        name: subprocess.Popen([sys.executable, BENCHMARKS / f"{name}.py", "--help"], stdout=-1, stderr=-1, text=True)
-        for name in programs
-    }
-    for name, process in running.items():
-        out, err = process.communicate(timeout=60)
-        assert process.returncode == 0, err
-        assert programs[name] in out
+def test_every_program_explains_itself(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    words = {"cpu": "--quick", "accuracy": "--seeds", "tracking": "--experiments", "tables": "--check",
+             "loops": "--experiments", "long_run": "--scratch", "pose_gradient": "--refinement",
+             "systems": "--presets", "consistency": "--variants"}  # fmt: skip
+    programs = [path for path in BENCHMARKS.glob("*.py") if "tyro.cli(" in path.read_text(encoding="utf-8")]
+    assert words.keys() <= {path.stem for path in programs}
+    for path in programs:
+        monkeypatch.setattr(sys, "argv", [str(path), "--help"])
+        with pytest.raises(SystemExit) as left:
+            runpy.run_path(str(path), run_name="__main__")
+        said = capsys.readouterr()
+        assert left.value.code == 0, f"{path.name}: {said.err}"
+        assert said.out.startswith("usage: ") and words.get(path.stem, "--help") in said.out, path.name
+        assert "example: " in said.out or path.stem not in ("systems", "consistency")
 
 
 def test_machines_have_file_names() -> None:
@@ -100,13 +97,10 @@ def test_latest_is_the_newest_of_the_very_name(tmp_path: Path) -> None:
     assert record.latest("gpu", tmp_path) is None
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(6.4312, "6.43"), (12.08, "12.1"), (1189.6, "1190"), (0.0123456, "0.0123"), (0.0, "0.00"), (-2.5, "-2.50"),
-     (999.9, "1000"), (None, "–"), (float("nan"), "–")],
-)  # fmt: skip
-def test_figures_have_three_digits(value: float | None, text: str) -> None:
-    assert tables.significant(value) == text
+def test_figures_have_three_digits() -> None:
+    texts = {6.4312: "6.43", 12.08: "12.1", 1189.6: "1190", 0.0123456: "0.0123", 0.0: "0.00", -2.5: "-2.50",
+             999.9: "1000", None: "–", float("nan"): "–"}  # fmt: skip
+    assert {value: tables.significant(value) for value in texts} == texts
 
 
 def test_blocks_are_rewritten_and_nothing_else(tmp_path: Path) -> None:
@@ -163,7 +157,7 @@ def test_exponents_goals_and_ratios_follow_from_the_times() -> None:
         "scenes": [scene(20_000, 320, 2.0), scene(77_000, 320, 6.0), scene(77_000, 640, 24.0)],
         "reference": {"compared": []},
     }
-    made = {s.title: s for s in tables.sections(results("cpu", figures))}
+    made = laid_out("cpu", figures)
     held = {row[0]: (row[2], row[3]) for row in made["Goals"].rows}
     assert held["forward, all outputs, 77 k, 320×240"] == ("6.00", "yes")
     assert held["colour + depth / all outputs, forward, 77 k, 320×240"] == ("0.600", "yes")
@@ -188,14 +182,14 @@ def test_a_goal_is_held_by_every_seed_of_a_whole_run_or_not_at_all() -> None:
         job_result("livingroom", 1, ate_m=0.02, spearman=0.3),
         job_result("livingroom", 2, problem="sigmasplat: a | b", ate_m=0.9),
     ]
-    made = {s.title: s for s in tables.sections(results("accuracy", {"jobs": jobs}))}
+    made = laid_out("accuracy", {"jobs": jobs})
     held = {row[0]: row[1:] for row in made["Goals"].rows}
     assert held["livingroom: ATE ≤ 1 cm"] == ["0.500, 2.00", "**no**"]
     assert held["livingroom: Spearman > 0"] == ["0.400, 0.300", "yes"]
     assert made["Path and speed"].rows[0][2:4] == ["2", "1.25 ± 1.1"]
     assert list(made["Failed"].rows) == [["livingroom, sigma, seed 2", "sigmasplat: a / b"]]
     for config in ({"limit": 5}, {"settings": ["mapping.iterations=5"]}):
-        assert "Goals" not in {s.title for s in tables.sections(results("accuracy", {"jobs": jobs}, config=config))}
+        assert "Goals" not in laid_out("accuracy", {"jobs": jobs}, config=config)
 
 
 def test_figures_are_picked_from_metrics_where_there_are_any() -> None:
@@ -231,7 +225,7 @@ def test_a_job_is_taken_from_before_only_if_nothing_changed(tmp_path: Path) -> N
         accuracy.jobs_of(accuracy.Options(presets=("varsplat-nothing",)))
 
 
-def test_a_run_that_fails_is_told_and_leaves_no_result_to_reuse(
+def test_a_failed_run_is_reported_and_leaves_no_result_to_reuse(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = accuracy.Job("nothere", "p", "varsplat-fast", 0, (), 2, "abc")
@@ -263,11 +257,11 @@ def stack(opacities: list[float]) -> GaussianField:
     return GaussianField.from_values(means, scales, colors, opacities=torch.tensor(opacities))
 
 
-@pytest.mark.parametrize(("opacities", "pairs"), [([0.5] * 3, 3), ([0.95] * 6, 4), ([0.003, 0.5], 1), ([], 0)])
-def test_pairs_obey_the_threshold_and_the_stop(opacities: list[float], pairs: int) -> None:
-    camera = Camera(9, 7, 8.0, 8.0, 4.0, 3.0)
-    options = RenderConfig(low_pass_px2=0.01)  # one pixel each
-    assert scenes.count_pairs(stack(opacities), camera, options, 63, np.random.default_rng(0)) == (pairs, 0.0)
+def test_pairs_obey_the_threshold_and_the_stop() -> None:
+    for opacities, pairs in [([0.5] * 3, 3), ([0.95] * 6, 4), ([0.003, 0.5], 1), ([], 0)]:
+        camera = Camera(9, 7, 8.0, 8.0, 4.0, 3.0)
+        options = RenderConfig(low_pass_px2=0.01)  # one pixel each
+        assert scenes.count_pairs(stack(opacities), camera, options, 63, np.random.default_rng(0)) == (pairs, 0.0)
 
 
 def test_pairs_are_those_that_the_definition_blends() -> None:
@@ -321,7 +315,7 @@ def test_a_scene_is_measured_whole_and_laid_out(kernel_settings: None, monkeypat
     measured = cpu_scene.measure(request)
     compared = cpu_scene.compare_reference(request, 100)["compared"]
     figures = {"source": "room", "scenes": [measured], "reference": {"compared": compared}}
-    made = {s.title: s for s in tables.sections(results("cpu", json.loads(json.dumps(figures))))}
+    made = laid_out("cpu", figures)
     assert [t["isa"] for t in measured["timings"]] == _core.supported_isas()
     assert set(measured["stages_ms"]) == set(works.STAGES) and min(measured["stages_ms"].values()) > 0
     assert len(made["Times, ms"].rows[0]) == len(made["Times, ms"].columns) == 1 + len(cpu_tables.COLUMNS)
@@ -401,7 +395,7 @@ def test_pairs_are_fitted_on_a_fresh_keyframe_and_held_against_the_truth(monkeyp
     np.testing.assert_allclose(guesses, moved, atol=1e-4)
     aligned = [pair["translation_cm"] for pair in found["pairs"] if pair["method"] == "keyframe"]
     assert max(np.divide(aligned, guesses)) < 0.5
-    made = {s.title: s for s in tables.sections(results("tracking", {"pairs": json.loads(json.dumps(found))}))}
+    made = laid_out("tracking", {"pairs": found})
     assert len(made["Pairs"].rows) == 2 * 5 and len(made["Ratios"].rows) == 2 * 2
     assert all(len(row) == len(section.columns) for section in made.values() for row in section.rows)
 
@@ -438,7 +432,7 @@ def test_a_room_is_followed_with_covariances_and_laid_out(monkeypatch: pytest.Mo
     found = tracking.measure_consistency(ROOM, tracking.Options(source=ROOM, limit=8, seeds=(0, 1)))
     assert found["lost"] == 0 and found["all"]["frames"] == 14
     assert sum(part["frames"] for part in found["by_age"].values()) == 14
-    made = {s.title: s for s in tables.sections(results("tracking", {"consistency": json.loads(json.dumps([found]))}))}
+    made = laid_out("tracking", {"consistency": [found]})
     assert len(made["Consistency"].rows) == 1 + len(found["by_age"]) and len(made["Components"].rows) == 6
     with pytest.raises(SourceError, match="with a covariance"):
         descent = override(small_config(None, 0), {"tracking.method": "adam", "tracking.iterations": "1"})
@@ -459,7 +453,7 @@ def test_alignment_is_held_to_the_better_rates_of_each_column() -> None:
         pair(2, "map", 1.2, 0.1, 30.0),
     ]
     figures = {"pairs": {"source": "x", "starts": [3], "lost": 0, "pairs": found}}
-    made = {s.title: s for s in tables.sections(results("tracking", figures))}
+    made = laid_out("tracking", figures)
     assert [row[2:] for row in made["Ratios"].rows] == [["1.05", "1.05", "40.0"], ["1.20", "0.500", "13.3"]]
     names = [
         row[0].removeprefix("Gauss–Newton, ").replace(", 2 frames after the keyframe:", "")
@@ -490,7 +484,7 @@ def test_whole_runs_are_held_to_adam_by_the_better_rates(tmp_path: Path, monkeyp
     assert [(job["method"], job["seed"]) for job in jobs] == [(method, seed) for method in ate_m for seed in (0, 1)]
     assert {job.limit for job in asked} == {20}
     assert [job.key()["config"]["tracking"]["iterations"] for job in asked[2:]] == [7] * 4
-    made = {s.title: s for s in tables.sections(results("tracking", {"sequence": jobs}))}
+    made = laid_out("tracking", {"sequence": jobs})
     assert [row[:4] for row in made["Sequence"].rows] == [
         ["s", "Gauss–Newton", "2", "2.50 ± 0.0"],
         ["s", "Adam, TUM's rates", "2", "3"],
@@ -498,7 +492,7 @@ def test_whole_runs_are_held_to_adam_by_the_better_rates(tmp_path: Path, monkeyp
     ]
     assert list(made["Goals"].rows) == [["s: ATE, cm; goal: that of the better Adam", "2.50", "≤ 1.00", "**no**"]]
     failed = [{**job, "problem": "a | b"} for job in jobs[:2]] + jobs[2:]
-    made = {s.title: s for s in tables.sections(results("tracking", {"sequence": failed}))}
+    made = laid_out("tracking", {"sequence": failed})
     assert "Goals" not in made and len(made["Failed"].rows) == 2
 
 

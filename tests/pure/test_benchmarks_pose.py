@@ -1,9 +1,6 @@
 """The benchmark of the pose's gradient: it starts, its arithmetic is right, its tables say what was measured."""
 
 import importlib
-import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmark_results import laid_out
 from sigmasplat.errors import ConfigError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
@@ -20,28 +18,11 @@ from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.frame import Frame
 from sigmasplat.render import render
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-sys.path.append(str(BENCHMARKS))  # they are programs: they find each other beside themselves
 accuracy, localise, pose_gradient, tables = map(
     importlib.import_module, ("accuracy", "localise", "pose_gradient", "tables")
 )
 CAMERA = Camera(32, 24, 28.0, 28.0, 15.5, 11.5)
 SEARCH = localise.Search(off_m=0.05, off_deg=2.0, steps=60, weight_color=0.6)
-
-
-def laid_out(figures: dict[str, Any]) -> dict[str, Any]:
-    circumstances = {"machine": {"cpu": "Test CPU", "cores": 2}, "commit": "0123456789ab", "dirty": True}
-    rest = {"name": "pose-gradient", "date": "2025-01-02T03:04:05+00:00", "config": {}, "command": "python x.py"}
-    measured = {"benchmark": "pose_gradient", **circumstances, **rest, "figures": json.loads(json.dumps(figures))}
-    made = {section.title: section for section in tables.sections(measured)}
-    assert all(len(row) == len(section.columns) for section in made.values() for row in section.rows)
-    return made
-
-
-def test_the_program_explains_itself() -> None:
-    program = [sys.executable, BENCHMARKS / "pose_gradient.py", "--help"]
-    done = subprocess.run(program, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0 and "--refinement" in done.stdout, done.stderr
 
 
 def shiny_corner(n: int = 900) -> GaussianField:
@@ -149,7 +130,7 @@ def test_runs_differ_by_the_switch_alone(tmp_path: Path, monkeypatch: pytest.Mon
     assert configs[0]["tracking"]["method"] == "adam" and configs[0]["tracking"]["iterations"] == 30
     rules = [value for name, value in configs[0]["submaps"].items() if name != "inherit"]
     assert configs[0]["final"]["iterations"] == 0 and not any(rules)
-    made = laid_out({"sequence": jobs})
+    made = laid_out("pose_gradient", {"sequence": jobs})
     rows = [["s", "mean + depth", "1", "2"], ["s", "+ covariance", "1", "2"], ["t", "mean + depth", "1", "2"]]
     assert [row[:4] for row in made["Sequences"].rows[:3]] == rows
     assert made["Sequences"].rows[0][-1] == "10" and len(made["Failed"].rows) == 4
@@ -176,7 +157,7 @@ def test_frames_are_found_and_held_against_the_truth(monkeypatch: pytest.MonkeyP
         off_cm = {"as tracked": 0.0, "start": 50.0}.get(f["way"])
         assert off_cm is None or f["translation_cm"] == pytest.approx(off_cm, abs=3.0)
         assert (f["ms"] > 0) == (f["way"] in localise.WAYS)
-    made = laid_out({"localise": [{"source": "room", "maps": [found]}]})
+    made = laid_out("pose_gradient", {"localise": [{"source": "room", "maps": [found]}]})
     assert [row[1] for row in made["Localisation"].rows] == ways
     assert [row[1] for row in made["Paths"].rows] == list(localise.PATHS) and len(found["shares"]) == 2
 
@@ -190,7 +171,7 @@ def test_medians_and_how_many_are_nearer() -> None:
     ]
     parts = [{"mean": [0.5, share], "depth": [0.9, 0.8]} for share in (0.1, 0.2, 0.4)]
     maps = [{"seed": 0, "splats": 9, "view_dependence": 0.01, "shares": parts, "found": found}]
-    made = laid_out({"localise": [{"source": "room", "maps": maps}]})
+    made = laid_out("pose_gradient", {"localise": [{"source": "room", "maps": maps}]})
     assert made["Paths"].rows == [["room", "mean", "50.0", "20.0"], ["room", "depth", "90.0", "80.0"]]
     section = made["Localisation"]
     assert section.rows == [

@@ -3,19 +3,17 @@
 import importlib
 import json
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from benchmark_results import laid_out
 from sigmasplat.config import Config
 from sigmasplat.errors import ConfigError
 from sigmasplat.io.runs import RunFolder
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-sys.path.append(str(BENCHMARKS))  # they are programs: they find each other beside themselves
 accuracy, consistency, systems, tables = map(
     importlib.import_module,
     ("accuracy", "consistency", "systems", "tables"),
@@ -26,30 +24,9 @@ TINY = ("input.width=64", "mapping.first_iterations=30", "mapping.iterations=8",
 NOTHING: dict[str, Any] = systems.figures_of({})
 
 
-def laid_out(benchmark: str, jobs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the tables of made-up results by title, every row as wide as its head."""
-    circumstances = {"machine": {"cpu": "Test CPU", "cores": 2}, "commit": "0123456789ab", "dirty": True}
-    rest = {"name": benchmark, "date": "2025-01-02T03:04:05+00:00", "config": {}, "command": "python x.py"}
-    measured = {"benchmark": benchmark, **circumstances, **rest, "figures": {"jobs": jobs}}
-    made = {section.title: section for section in tables.sections(measured)}
-    assert all(len(row) == len(section.columns) for section in made.values() for row in section.rows)
-    return made
-
-
 def result(source: str, preset: str, seed: int, problem: str | None = None, **figures: float) -> dict[str, Any]:
     job = {"source": source, "preset": preset, "seed": seed}
     return {"job": job, "problem": problem, "peak_mib": 512.0, "figures": NOTHING | figures}
-
-
-def test_both_programs_explain_themselves() -> None:
-    programs = {"systems": ("--presets", "example: "), "consistency": ("--variants", "--jobs", "example: ")}
-    running = [
-        subprocess.Popen([sys.executable, BENCHMARKS / f"{name}.py", "--help"], stdout=-1, stderr=-1, text=True)
-        for name in programs
-    ]
-    for process, words in zip(running, programs.values(), strict=True):
-        out, err = process.communicate(timeout=120)
-        assert process.returncode == 0 and all(word in out for word in words), err
 
 
 def test_systems_are_compared_on_the_same_input_only() -> None:
@@ -62,13 +39,13 @@ def test_systems_are_compared_on_the_same_input_only() -> None:
 
 
 def test_each_sequence_has_a_table_with_a_column_for_each_system() -> None:
-    made = laid_out("systems", [
+    made = laid_out("systems", {"jobs": [
         result("synthetic", "a", 0, ate_m=0.01, accuracy_m=0.02, map_bytes=2_500_000, worst_frame_s=0.25, lost=0),
         result("synthetic", "a", 1, ate_m=0.03, accuracy_m=0.02, map_bytes=2_500_000, worst_frame_s=0.75, lost=0),
         result("synthetic", "b", 0, ate_m=0.05, completion_ratio=0.875, spearman=0.5, lost=2),
         result("synthetic", "b", 1, problem="lost | its way"),
         result("redkitchen", "a", 0, ate_m=0.07),
-    ])  # fmt: skip
+    ]})  # fmt: skip
     assert list(made) == ["synthetic", "redkitchen", "Failed"]
     assert list(made["synthetic"].columns) == ["figure", "a", "b"]
     rows = {row[0]: row[1:] for row in made["synthetic"].rows}
@@ -179,13 +156,13 @@ def test_an_ablation_is_judged_at_equal_scene_and_seed() -> None:
         for variant, ate_m in (("full", full_m), ("without both", without_m))
     ]
     jobs.append({"variant": "without both", **result("hall", "p", 1, problem="lost")})
-    made = laid_out("consistency", jobs)
+    made = laid_out("consistency", {"jobs": jobs})
     assert list(made) == ["Mean of scenes", "Effects", "room", "hall", "Failed"]
     assert [row[1] for row in made["Mean of scenes"].rows] == ["**3.25**", "5.00"], "of the scenes' means"
     assert [row[:2] for row in made["Effects"].rows] == [["without both", "**+2.00 ± 1.00 cm**, 3/3"]]
     assert made["Effects"].rows[0][5] == "0, 0/3" and made["Effects"].rows[0][2] == "–"
     assert made["room"].rows[0][:2] == ["full", "**1.50 ± 0.71**"]
-    assert not {"Effects", "Mean of scenes"} & set(laid_out("consistency", jobs[-1:]))
+    assert not {"Effects", "Mean of scenes"} & set(laid_out("consistency", {"jobs": jobs[-1:]}))
 
 
 @pytest.mark.skipif(shutil.which("taskset") is None, reason="runs are kept on their cores by taskset")

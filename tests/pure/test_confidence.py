@@ -72,7 +72,7 @@ def test_outliers_are_beyond_the_factor_times_the_median_of_valid_errors() -> No
     assert outlier_mask(error, valid, 0.0).tolist() == valid.tolist()
 
 
-def test_outlier_mask_bears_perfect_depth_nan_and_nothing_valid() -> None:
+def test_outlier_mask_accepts_perfect_depth_nan_and_zero_valid_pixels() -> None:
     valid = torch.ones(1, 4, dtype=torch.bool)
     assert outlier_mask(torch.tensor([[0.0, 0.0, 0.0, 0.1]]), valid, 50.0).tolist() == [[True, True, True, False]]
     nan = torch.tensor([[0.1, 0.2, float("nan"), 0.1]])

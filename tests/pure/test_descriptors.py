@@ -131,7 +131,7 @@ def test_the_gradient_points_where_it_points() -> None:
     )
 
 
-def test_it_knows_the_kitchen_again(data_folder: Callable[[str], Path]) -> None:
+def test_the_kitchen_is_recognised(data_folder: Callable[[str], Path]) -> None:
     """Every tenth frame: of the pairs far apart in time, the most alike show one place. Truth judges, here only."""
     source = open_source(data_folder("redkitchen"), stride=10)
     frames = [source.frame(i).prepared(160, 0.1, 8.0) for i in range(len(source))]

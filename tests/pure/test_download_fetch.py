@@ -1,5 +1,6 @@
 """For every behaviour of the server, the file is complete or absent, and no byte is requested twice."""
 
+import resource
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -205,14 +206,16 @@ def test_two_processes_cannot_write_one_file(server: FileServer, tmp_path: Path)
     assert (tmp_path / "a.tgz.part").read_bytes() == b"mine"
 
 
-def test_a_full_disk_is_reported(server: FileServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(file: object, chunk: memoryview) -> int:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("sigmasplat.download.partial._write_some", full)
-    with pytest.raises(DownloadError, match="No space left on device"):
-        fetched(server, tmp_path / "a.tgz")
-    assert not (tmp_path / "a.tgz").exists()
+def test_a_full_disk_is_reported(server: FileServer, tmp_path: Path) -> None:
+    """The system's limit on the size of a file stands for the disk: what fits is written, then writing fails."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (5000, limits[1]))
+    try:
+        with pytest.raises(DownloadError, match="File too large"):
+            fetched(server, tmp_path / "a.tgz")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not (tmp_path / "a.tgz").exists() and (tmp_path / "a.tgz.part").stat().st_size == 5000
 
 
 def test_an_unreachable_server_is_reported(tmp_path: Path, server: FileServer) -> None:

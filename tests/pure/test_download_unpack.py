@@ -133,12 +133,12 @@ def test_a_zip_with_wrong_sizes_is_damaged(tmp_path: Path) -> None:
         unpacked(lying, "a.zip", tmp_path)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.9, 0.999])
 @pytest.mark.parametrize(("pack", "name"), [(tar_gz, "a.tgz"), (zipped, "a.zip")])
-def test_a_truncated_archive_is_damaged(pack: Callable[..., bytes], name: str, share: float, tmp_path: Path) -> None:
-    whole = pack(FILES | {"noise": bytes(i * i % 251 for i in range(9000))})
-    with pytest.raises(ArchiveError, match="is damaged"):
-        unpacked(whole[: int(share * len(whole))], name, tmp_path)
+def test_a_truncated_archive_is_damaged(pack: Callable[..., bytes], name: str, tmp_path: Path) -> None:
+    for share in [0.0, 0.01, 0.5, 0.9, 0.999]:
+        whole = pack(FILES | {"noise": bytes(i * i % 251 for i in range(9000))})
+        with pytest.raises(ArchiveError, match="is damaged"):
+            unpacked(whole[: int(share * len(whole))], name, tmp_path / str(share))
 
 
 @pytest.mark.parametrize(("pack", "name"), [(tar_gz, "a.tgz"), (zipped, "a.zip")])

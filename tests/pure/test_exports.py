@@ -121,35 +121,34 @@ def test_the_orbit_view_removes_the_ceiling_and_shows_the_whole_room() -> None:
         assert (np.abs(CAMERA.fx * x / z) < 80).all() and (np.abs(CAMERA.fy * y / z) < 75).all()
 
 
-@pytest.mark.parametrize("width", [32, 48, 64, 96, 128, 160, 200, 320, 640])
-def test_the_texts_of_a_films_legend_do_not_overlap(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    boxes: list[tuple[float, float, float, float]] = []
-    words: list[str] = []
+def test_the_texts_of_a_films_legend_do_not_overlap(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[tuple[str, tuple[float, float, float, float]]] = []
     plain = ImageDraw.ImageDraw.text
 
     def text(
         draw: ImageDraw.ImageDraw, at: tuple[float, float], said: str, fill: str, font: object, anchor: str
     ) -> None:
         if said:
-            boxes.append(draw.textbbox(at, said, font=font, anchor=anchor))
-            words.append(said)
+            drawn.append((said, draw.textbbox(at, said, font=font, anchor=anchor)))
         plain(draw, at, said, fill, font, anchor=anchor)
 
     monkeypatch.setattr(ImageDraw.ImageDraw, "text", text)
-    strip = legend_strip(FilmScale((0.8, 12.4), (0.0, 0.23)), width)
-    assert strip.shape == (40, 3 * width, 3)
-    for i, (left, top, right, bottom) in enumerate(boxes):
-        assert left // width == (right - 1) // width and 0 < top < bottom < 40, f"{words[i]} leaves its panel"
-        for other in boxes[:i]:
-            apart = right + 2 < other[0] or other[2] + 2 < left or bottom <= other[1] or other[3] <= top
-            assert apart, f"{words[i]} overlaps {words[boxes.index(other)]}"
-    if width >= 128:
-        assert " ".join(words).split() == ["colour", "depth", "0.8", "12.4", "m", "uncertainty", "0", "0.23"]
-    for panel in (1, 2):
-        bar = strip[:, panel * width : (panel + 1) * width].max(0) - strip[:, panel * width : (panel + 1) * width].min(
-            0
-        )
-        assert (bar.max(1) > 60).sum() >= 20, "a colour bar"
+    for width in (32, 48, 64, 96, 128, 160, 200, 320, 640):
+        drawn.clear()
+        strip = legend_strip(FilmScale((0.8, 12.4), (0.0, 0.23)), width)
+        assert strip.shape == (40, 3 * width, 3)
+        for i, (word, (left, top, right, bottom)) in enumerate(drawn):
+            inside = left // width == (right - 1) // width and 0 < top < bottom < 40
+            assert inside, f"{word} leaves its panel at {width} px"
+            for above, other in drawn[:i]:
+                clear = right + 2 < other[0] or other[2] + 2 < left or bottom <= other[1] or other[3] <= top
+                assert clear, f"{word} overlaps {above} at {width} px"
+        if width >= 128:
+            words = " ".join(word for word, _ in drawn).split()
+            assert words == ["colour", "depth", "0.8", "12.4", "m", "uncertainty", "0", "0.23"]
+        for panel in (1, 2):
+            colors = strip[:, panel * width : (panel + 1) * width]
+            assert ((colors.max(0) - colors.min(0)).max(1) > 60).sum() >= 20, "a colour bar"
 
 
 def test_film_options_out_of_range_are_refused() -> None:

@@ -54,10 +54,10 @@ def test_new_rows_start_without_moments() -> None:
     assert len(GaussianField.empty()) == 0
 
 
-@pytest.mark.parametrize("shape", [(3, 16), (17,), (2, 3, 17)])
-def test_another_shape_is_refused(shape: tuple[int, ...]) -> None:
-    with pytest.raises(SigmaSplatError, match=r"params \[N, 17\]"):
-        GaussianField(torch.zeros(shape))
+def test_another_shape_is_refused() -> None:
+    for shape in [(3, 16), (17,), (2, 3, 17)]:
+        with pytest.raises(SigmaSplatError, match=r"params \[N, 17\]"):
+            GaussianField(torch.zeros(shape))
 
 
 def random_field(n: int = 40, seed: int = 0) -> GaussianField:
@@ -88,18 +88,18 @@ def picture(field: GaussianField, T_camera_world: Tensor) -> list[Tensor]:
     return [r.color, r.depth, r.alpha, r.variance]
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_moved_carries_what_is_seen(seed: int) -> None:
+def test_moved_carries_what_is_seen() -> None:
     """A camera that moves along sees the same: the render at T·M⁻¹ of the field moved by M."""
-    field = random_field(seed=seed)
-    M = se3.exp(np.random.default_rng(seed).normal(size=6))
-    moved = field.moved(torch.as_tensor(M))
-    before, after = picture(field, torch.eye(4)), picture(moved, torch.as_tensor(se3.inverse(M)).float())
-    for a, b in zip(before, after, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-3, atol=2e-4)
-        assert float((a - b).norm()) < 1e-4 * float(a.norm())
-    stayed = picture(moved, torch.eye(4))
-    assert float((before[0] - stayed[0]).norm()) > 0.1 * float(before[0].norm())
+    for seed in range(4):
+        field = random_field(seed=seed)
+        M = se3.exp(np.random.default_rng(seed).normal(size=6))
+        moved = field.moved(torch.as_tensor(M))
+        before, after = picture(field, torch.eye(4)), picture(moved, torch.as_tensor(se3.inverse(M)).float())
+        for a, b in zip(before, after, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-3, atol=2e-4)
+            assert float((a - b).norm()) < 1e-4 * float(a.norm())
+        stayed = picture(moved, torch.eye(4))
+        assert float((before[0] - stayed[0]).norm()) > 0.1 * float(before[0].norm())
 
 
 def test_moved_leaves_looks_shapes_and_the_original_alone() -> None:

@@ -103,7 +103,7 @@ def test_where_submaps_overlap_one_of_them_stays(uncertainty: bool) -> None:
     assert away.max() < SPACING_M * np.sqrt(3), "no hole"
 
 
-def test_no_voxel_keeps_two_submaps_and_none_is_emptied() -> None:
+def test_every_voxel_keeps_exactly_one_submap() -> None:
     rng = np.random.default_rng(1)
     means, owner, unsteady = rng.uniform(-1, 1, (3000, 3)), rng.integers(0, 4, 3000), rng.normal(size=3000)
     for given in (unsteady, None):
@@ -167,7 +167,7 @@ def test_standpoints_are_the_keyframes_in_field_and_world() -> None:
     assert found[4].field is store.submaps[1].field
 
 
-def test_weighing_by_variance_lets_the_steadier_map_say_where_the_wall_is() -> None:
+def test_weighing_by_variance_prefers_the_map_of_lower_variance() -> None:
     """Two maps of a wall 4 cm apart, one very unsure on a third of it: there the weighted surface is the other's."""
     near, far = wall(-1.4, 1.6), wall(-1.4, 1.6)
     far.params[:, 2] += 0.04
@@ -189,7 +189,7 @@ def test_weighing_by_variance_lets_the_steadier_map_say_where_the_wall_is() -> N
 
 
 @pytest.mark.parametrize("uncertainty", [True, False])
-def test_refinement_mends_held_views(uncertainty: bool) -> None:
+def test_refinement_improves_views_of_keyframes(uncertainty: bool) -> None:
     store, true, told = make_store(spoil=0.15), wall(-1.4, 1.6), list[tuple[int, int]]()
     start = refined(store, config(uncertainty=uncertainty))
     settings, view = config(uncertainty=uncertainty, iterations=30), ReferenceView(CAMERA, CONFIG.render)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sigmasplat import cli
+from command_line import exit_code
 from sigmasplat.checks.recording import inspect_source
 from sigmasplat.checks.registration import edge_agreement, outlines
 from sigmasplat.config import InputConfig
@@ -117,21 +117,15 @@ def test_an_unreadable_frame_is_skipped_and_counted(tiny_tum):
     assert "1 files" in dict(inspect_source(tiny_tum, InputConfig()).rows)["skipped"]
 
 
-def run(*arguments) -> int:
-    with pytest.raises(SystemExit) as ended:
-        cli.main(list(arguments))
-    return ended.value.code
-
-
 def test_the_command_prints_rows_and_draws_a_contact_sheet(tiny_tum, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert run("inspect", str(tiny_tum)) == 0
+    assert exit_code("inspect", str(tiny_tum)) == 0
     assert "2.00 to 2.00 m" in capsys.readouterr().out
     assert Image.open(tmp_path / "runs/inspect/tiny.png").width > 500
     damage(tiny_tum, 20, 0)
-    assert run("inspect", str(tiny_tum), "--out", str(tmp_path / "sheet.png")) == 1
+    assert exit_code("inspect", str(tiny_tum), "--out", str(tmp_path / "sheet.png")) == 1
     assert "scale looks wrong" in capsys.readouterr().err
-    assert run("inspect", str(tiny_tum), "--depth-scale", "10", "--out", str(tmp_path / "sheet.png")) == 0
+    assert exit_code("inspect", str(tiny_tum), "--depth-scale", "10", "--out", str(tmp_path / "sheet.png")) == 0
 
 
 class Unregistered:

@@ -1,6 +1,7 @@
 """Compressed maps: image quality for their size, and every byte as the formats' layouts define it."""
 
 import gzip
+import itertools
 import math
 import struct
 from collections.abc import Callable
@@ -92,13 +93,12 @@ def test_values_that_a_format_cannot_hold_are_as_in_a_new_map(tmp_path: Path, en
     assert (back.params[:, 14:17] == -7.0).all() and not back.attributes
 
 
-@pytest.mark.parametrize("degree", [1, 2, 3])
-@pytest.mark.parametrize(("ending", "step"), [(".compressed.ply", 8 / 256), (".spz", 1 / 128)])
-def test_harmonics_are_kept_to_half_a_quantisation_step(tmp_path: Path, ending: str, step: float, degree: int) -> None:
-    field = some(40, degree)
-    back, was = SplatValues.of(again(tmp_path / f"a{ending}", field)), SplatValues.of(field)
-    assert back.degree == degree == was.degree
-    assert np.abs(nearest(back, was).harmonics - was.harmonics).max() <= step / 2 + 1e-6
+def test_harmonics_are_kept_to_half_a_quantisation_step(tmp_path: Path) -> None:
+    for (ending, step), degree in itertools.product([(".compressed.ply", 8 / 256), (".spz", 1 / 128)], [1, 2, 3]):
+        field = some(40, degree)
+        back, was = SplatValues.of(again(tmp_path / f"a{ending}", field)), SplatValues.of(field)
+        assert back.degree == degree == was.degree
+        assert np.abs(nearest(back, was).harmonics - was.harmonics).max() <= step / 2 + 1e-6
 
 
 @pytest.mark.parametrize("ending", list(WRITERS))
@@ -111,10 +111,9 @@ def test_the_same_map_gives_the_same_bytes_and_no_other_files(tmp_path: Path, en
         WRITERS[ending](tmp_path / "none" / "a", some())
 
 
-@pytest.mark.parametrize("ending", [".ply", ".compressed.ply", ".spz"])
-@pytest.mark.parametrize("n", [0, 1, 256, 257])
-def test_maps_of_any_number_of_splats(tmp_path: Path, ending: str, n: int) -> None:
-    assert len(again(tmp_path / f"a{ending}", some(n))) == n
+def test_maps_of_any_number_of_splats(tmp_path: Path) -> None:
+    for n, ending in itertools.product([0, 1, 256, 257], [".ply", ".compressed.ply", ".spz"]):
+        assert len(again(tmp_path / f"a{ending}", some(n))) == n
 
 
 def test_extremes_stay_finite(tmp_path: Path) -> None:
@@ -204,41 +203,41 @@ def test_splat_has_the_documented_layout(tmp_path: Path) -> None:
     assert first[6:] == (255, 128, 255, 204, 192, 192, 64, 192)
 
 
-@pytest.mark.parametrize("start", [b"<", b"{", b" \n<", b"\x1f\x8b"])
-def test_splat_files_may_begin_with_any_bytes(tmp_path: Path, start: bytes) -> None:
-    splat.write_field(tmp_path / "a.splat", some(3))
-    (tmp_path / "b").write_bytes(start + (tmp_path / "a.splat").read_bytes()[len(start) :])
-    assert len(any_format.read_any(tmp_path / "b")) == 3
+def test_splat_files_may_begin_with_any_bytes(tmp_path: Path) -> None:
+    for start in [b"<", b"{", b" \n<", b"\x1f\x8b"]:
+        splat.write_field(tmp_path / "a.splat", some(3))
+        (tmp_path / "b").write_bytes(start + (tmp_path / "a.splat").read_bytes()[len(start) :])
+        assert len(any_format.read_any(tmp_path / "b")) == 3
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_spz_has_the_documented_layout(tmp_path: Path, degree: int) -> None:
+def test_spz_has_the_documented_layout(tmp_path: Path) -> None:
     """Decode a file splat by splat; its map is rotated by 180° about x, as by `GaussianField.moved`."""
-    field = some(50, degree)
-    spz.write_field(tmp_path / "a.spz", field)
-    data = gzip.decompress((tmp_path / "a.spz").read_bytes())
-    each = 3 * count(degree)
-    assert struct.unpack_from("<IIIBBBB", data) == (0x5053474E, 3, 50, degree, 12, 0, 0)
-    assert len(data) == 16 + 50 * (20 + each)
-    was = SplatValues.of(field.moved(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))))
-    at = [16 + 50 * offset for offset in (0, 9, 10, 13, 16, 20)]
-    for i in range(50):
-        mean = [int.from_bytes(data[at[0] + 9 * i + 3 * k :][:3], "little", signed=True) / 4096 for k in range(3)]
-        row = int(np.linalg.norm(was.means - mean, axis=1).argmin())
-        assert np.abs(was.means[row] - mean).max() <= 0.5 / 4096 + 1e-6
-        assert abs(data[at[1] + i] / 255 - was.opacities[row]) < 0.5 / 255 + 1e-6
-        colors = [(b / 255 - 0.5) / 0.15 * 0.28209479 + 0.5 for b in data[at[2] + 3 * i :][:3]]
-        assert np.abs(was.colors[row] - colors).max() < 0.5 / 255 / 0.15 * 0.2821 + 1e-6
-        assert np.abs(was.log_scales[row] - [b / 16 - 10 for b in data[at[3] + 3 * i :][:3]]).max() <= 1 / 32 + 1e-6
-        (word,) = struct.unpack_from("<I", data, at[4] + 4 * i)
-        xyzw = [(-1) ** (word >> s + 9 & 1) * (word >> s & 511) / 511 * math.sqrt(0.5) for s in (20, 10, 0)]
-        xyzw.insert(word >> 30, math.sqrt(1 - sum(q * q for q in xyzw)))
-        w, x, y, z = was.quats[row]
-        assert abs(np.dot(xyzw, (w, z, -y, -x))) > 1 - 1e-5, (
-            "turned axes, not a turned splat: half a turn about its x less"
-        )
-        k = [(b - 128) / 128 for b in data[at[5] + each * i :][:each]]
-        assert np.abs(np.array(k) - was.harmonics[row]).max(initial=0) <= 0.5 / 128 + 1e-5
+    for degree in [0, 1, 2, 3]:
+        field = some(50, degree)
+        spz.write_field(tmp_path / "a.spz", field)
+        data = gzip.decompress((tmp_path / "a.spz").read_bytes())
+        each = 3 * count(degree)
+        assert struct.unpack_from("<IIIBBBB", data) == (0x5053474E, 3, 50, degree, 12, 0, 0)
+        assert len(data) == 16 + 50 * (20 + each)
+        was = SplatValues.of(field.moved(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))))
+        at = [16 + 50 * offset for offset in (0, 9, 10, 13, 16, 20)]
+        for i in range(50):
+            mean = [int.from_bytes(data[at[0] + 9 * i + 3 * k :][:3], "little", signed=True) / 4096 for k in range(3)]
+            row = int(np.linalg.norm(was.means - mean, axis=1).argmin())
+            assert np.abs(was.means[row] - mean).max() <= 0.5 / 4096 + 1e-6
+            assert abs(data[at[1] + i] / 255 - was.opacities[row]) < 0.5 / 255 + 1e-6
+            colors = [(b / 255 - 0.5) / 0.15 * 0.28209479 + 0.5 for b in data[at[2] + 3 * i :][:3]]
+            assert np.abs(was.colors[row] - colors).max() < 0.5 / 255 / 0.15 * 0.2821 + 1e-6
+            assert np.abs(was.log_scales[row] - [b / 16 - 10 for b in data[at[3] + 3 * i :][:3]]).max() <= 1 / 32 + 1e-6
+            (word,) = struct.unpack_from("<I", data, at[4] + 4 * i)
+            xyzw = [(-1) ** (word >> s + 9 & 1) * (word >> s & 511) / 511 * math.sqrt(0.5) for s in (20, 10, 0)]
+            xyzw.insert(word >> 30, math.sqrt(1 - sum(q * q for q in xyzw)))
+            w, x, y, z = was.quats[row]
+            assert abs(np.dot(xyzw, (w, z, -y, -x))) > 1 - 1e-5, (
+                "turned axes, not a turned splat: half a turn about its x less"
+            )
+            k = [(b - 128) / 128 for b in data[at[5] + each * i :][:each]]
+            assert np.abs(np.array(k) - was.harmonics[row]).max(initial=0) <= 0.5 / 128 + 1e-5
 
 
 def test_spz_of_version_2_is_read(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """NetVLAD on tiny random networks: against loops in numpy written from the paper, from every format and bad files."""
 
+import itertools
 import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -131,14 +132,12 @@ def imagenet(color: np.ndarray) -> np.ndarray:
     return ((color - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]).transpose(2, 0, 1)
 
 
-@pytest.mark.parametrize("module", ["", ".module"])
-@pytest.mark.parametrize("bias", [False, True])
-@pytest.mark.parametrize("whiten", [False, True])
-def test_a_checkpoint_gives_the_papers_descriptor(tmp_path: Path, module: str, bias: bool, whiten: bool) -> None:
-    n = net()
-    found = described(save_checkpoint(tmp_path / "c.pth.tar", state_dict(n, module, bias, whiten)))
-    assert found.dtype == np.float32 and np.linalg.norm(found) == pytest.approx(1.0, abs=1e-6)
-    np.testing.assert_allclose(found, expected(n, imagenet(picture()), bias, whiten), atol=2e-6)
+def test_a_checkpoint_gives_the_papers_descriptor(tmp_path: Path) -> None:
+    for whiten, bias, module in itertools.product([False, True], [False, True], ["", ".module"]):
+        n = net()
+        found = described(save_checkpoint(tmp_path / "c.pth.tar", state_dict(n, module, bias, whiten)))
+        assert found.dtype == np.float32 and np.linalg.norm(found) == pytest.approx(1.0, abs=1e-6)
+        np.testing.assert_allclose(found, expected(n, imagenet(picture()), bias, whiten), atol=2e-6)
 
 
 @pytest.mark.parametrize("mean_size", [1, 4])
@@ -167,7 +166,7 @@ def test_saving_and_loading_changes_no_bit(tmp_path: Path, kind: str) -> None:
     assert np.array_equal(described(tmp_path / "ours.safetensors"), described(path))
 
 
-def test_the_format_is_told_by_content_not_by_name(tmp_path: Path) -> None:
+def test_the_format_follows_from_the_content_not_the_name(tmp_path: Path) -> None:
     n = net()
     wrong = save_matlab(tmp_path / "net.mat", n).rename(tmp_path / "net.pth")
     assert described(wrong).shape == (P,)
@@ -214,9 +213,8 @@ def put(name: str, *shape: int) -> Damage:
     return lambda tensors: tensors.__setitem__(name, torch.zeros(shape))
 
 
-@pytest.mark.parametrize(
-    ("damage", "wanted"),
-    [
+def test_a_checkpoint_that_does_not_fit_is_named_with_found_and_expected(tmp_path: Path) -> None:
+    for damage, wanted in [
         (lambda t: t.pop("encoder.17.weight"), "encoder.17.weight is missing (expected any × 6 × 3 × 3)"),
         (lambda t: t.pop("encoder.28.bias"), "encoder.28.bias is missing (expected 4)"),
         (lambda t: t.pop("pool.centroids"), "pool.centroids is missing (expected any × 4)"),
@@ -229,15 +227,11 @@ def put(name: str, *shape: int) -> Damage:
         (put("WPCA.0.weight", 7, 99, 1, 1), "WPCA.0.weight is 7 × 99 × 1 × 1, expected any × 12"),
         (put("pool.centroids"), "pool.centroids is a single number, expected any × 4"),
         (lambda t: t["encoder.7.bias"].fill_(np.nan), "encoder.7.bias holds NaN or inf"),
-    ],
-)
-def test_a_checkpoint_that_does_not_fit_is_named_with_found_and_expected(
-    tmp_path: Path, damage: Damage, wanted: str
-) -> None:
-    tensors = state_dict(net(), whiten=True)
-    damage(tensors)
-    text = one_line(save_checkpoint(tmp_path / "c.pth", tensors))
-    assert wanted in text and ("give a pytorch-NetVlad checkpoint" in text or "download" in text)
+    ]:
+        tensors = state_dict(net(), whiten=True)
+        damage(tensors)
+        text = one_line(save_checkpoint(tmp_path / "c.pth", tensors))
+        assert wanted in text and ("give a pytorch-NetVlad checkpoint" in text or "download" in text)
 
 
 def test_other_formats_name_their_own_keys(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """The distribution: metadata, extras, Dockerfile, command line, completion, and the compiled module."""
 
-import importlib.util
 import os
 import re
 import shutil
@@ -13,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import sigmasplat
+from module_files import module_from
 from sigmasplat.checks import installation
 from sigmasplat.cli import COMMANDS
 from sigmasplat.io.machine import package_version
@@ -129,10 +129,7 @@ def checkout(tmp_path: Path) -> Path:
 
 def code_of(package: Path) -> str:
     """Return the version of the code of a copy of the package."""
-    spec = importlib.util.spec_from_file_location("machine_there", package / "io/machine.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return str(module.code_version())
+    return str(module_from(package / "io/machine.py").code_version())
 
 
 def test_the_code_version_is_the_commit_of_the_checkout_else_of_the_build_else_the_release(checkout: Path) -> None:

@@ -1,5 +1,6 @@
 """The pose graph: false loops that must not bend the map, its minimum against scipy's, its derivatives and laws."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -81,25 +82,25 @@ def small(seed: int) -> tuple[Array, list[Edge]]:
 # The false loop must not bend the map: issue 4.
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_two_false_loops_of_six_harm_no_more_than_none(seed: int) -> None:
-    truth, drifted, edges = scene(seed)
-    found = optimise(drifted, edges)
-    with_true_loops = node_error(truth, optimise(drifted, edges[:-2], confidence=1.0).T_world_node)
-    believing_all = node_error(truth, optimise(drifted, edges, confidence=1.0).T_world_node)
-    assert [v.accepted for v in found.verdicts] == [True] * 4 + [False] * 2
-    assert node_error(truth, found.T_world_node) == pytest.approx(with_true_loops, rel=0.01)
-    assert with_true_loops < node_error(truth, drifted)
-    assert believing_all > 3 * with_true_loops, "the false loops are false enough to show"
+def test_two_false_loops_of_six_do_no_harm() -> None:
+    for seed in range(8):
+        truth, drifted, edges = scene(seed)
+        found = optimise(drifted, edges)
+        with_true_loops = node_error(truth, optimise(drifted, edges[:-2], confidence=1.0).T_world_node)
+        believing_all = node_error(truth, optimise(drifted, edges, confidence=1.0).T_world_node)
+        assert [v.accepted for v in found.verdicts] == [True] * 4 + [False] * 2
+        assert node_error(truth, found.T_world_node) == pytest.approx(with_true_loops, rel=0.01)
+        assert with_true_loops < node_error(truth, drifted)
+        assert believing_all > 3 * with_true_loops, "the false loops are false enough to show"
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_false_loops_alone_leave_the_odometry(seed: int) -> None:
-    _, drifted, edges = scene(seed, true_loops=0, false_loops=6)
-    found = optimise(drifted, edges)
-    assert not any(v.accepted for v in found.verdicts)
-    assert all(v.weight < 0.01 and v.chi2 > 1000 for v in found.verdicts)
-    np.testing.assert_allclose(found.T_world_node, drifted, atol=1e-9)
+def test_false_loops_alone_leave_the_odometry() -> None:
+    for seed in range(4):
+        _, drifted, edges = scene(seed, true_loops=0, false_loops=6)
+        found = optimise(drifted, edges)
+        assert not any(v.accepted for v in found.verdicts)
+        assert all(v.weight < 0.01 and v.chi2 > 1000 for v in found.verdicts)
+        np.testing.assert_allclose(found.T_world_node, drifted, atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -111,49 +112,50 @@ def test_true_loops_are_believed_and_help_long_chains(seed: int) -> None:
     assert found.cost_after < found.cost_before
 
 
-@pytest.mark.parametrize("confidence", [0.95, 0.99])
-@pytest.mark.parametrize("inside", [True, False])
-def test_a_loop_is_believed_up_to_the_quantile_of_chi_squared(confidence: float, inside: bool) -> None:
+def test_a_loop_is_believed_up_to_the_quantile_of_chi_squared() -> None:
     """Odometry as stiff as a beam: the loop's χ² is what it was made with, and its weight at the limit is ¼."""
-    limit = chi2.ppf(confidence, 6)
-    r2 = limit * (0.98 if inside else 1.02)
-    rng = np.random.default_rng(5)
-    information = random_information(rng)
-    direction = rng.normal(size=6)
-    error = direction * np.sqrt(r2 / (direction @ information @ direction))
-    truth = rounds(2, rng)
-    edges = [
-        measured(truth, 0, 1, np.zeros(6), 1e12 * np.eye(6), False),
-        measured(truth, 0, 1, error, information, True),
-    ]
-    (verdict,) = optimise(truth, edges, confidence).verdicts
-    assert verdict.accepted is inside
-    assert verdict.chi2 == pytest.approx(r2, rel=1e-5)
-    assert verdict.weight == pytest.approx((limit / (r2 + limit)) ** 2, rel=1e-5)
-    assert (verdict.weight > 0.25) is inside
+    for inside, confidence in itertools.product([True, False], [0.95, 0.99]):
+        limit = chi2.ppf(confidence, 6)
+        r2 = limit * (0.98 if inside else 1.02)
+        rng = np.random.default_rng(5)
+        information = random_information(rng)
+        direction = rng.normal(size=6)
+        error = direction * np.sqrt(r2 / (direction @ information @ direction))
+        truth = rounds(2, rng)
+        edges = [
+            measured(truth, 0, 1, np.zeros(6), 1e12 * np.eye(6), False),
+            measured(truth, 0, 1, error, information, True),
+        ]
+        (verdict,) = optimise(truth, edges, confidence).verdicts
+        assert verdict.accepted is inside
+        assert verdict.chi2 == pytest.approx(r2, rel=1e-5)
+        assert verdict.weight == pytest.approx((limit / (r2 + limit)) ** 2, rel=1e-5)
+        assert (verdict.weight > 0.25) is inside
 
 
 # The minimum is the minimum.
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_jacobians_are_the_derivatives(seed: int) -> None:
+def test_jacobians_are_the_derivatives() -> None:
     """Far from agreement too: residuals of metres and radians, where J⁻¹ is nowhere near 1."""
-    rng = np.random.default_rng(seed)
-    truth = rounds(5, rng)
-    pairs = [(0, 1), (1, 2), (3, 2), (3, 4), (0, 4), (4, 1)]
-    graph = PoseGraph(5, [measured(truth, a, b, rng.normal(size=6), random_information(rng), True) for a, b in pairs])
-    J = graph.jacobians(truth, graph.residuals(truth))
-    for node in range(5):
-        for k in range(6):
-            h = 1e-6 * np.eye(6)[k]
-            ends = []
-            for delta in (h, -h):
-                moved = truth.copy()
-                moved[node] = se3.exp(delta) @ truth[node]
-                ends.append(graph.residuals(moved))
-            sign = np.array([(node == b) - (node == a) for a, b in pairs])[:, None]
-            np.testing.assert_allclose((ends[0] - ends[1]) / 2e-6, sign * J[:, :, k], atol=1e-7)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        truth = rounds(5, rng)
+        pairs = [(0, 1), (1, 2), (3, 2), (3, 4), (0, 4), (4, 1)]
+        graph = PoseGraph(
+            5, [measured(truth, a, b, rng.normal(size=6), random_information(rng), True) for a, b in pairs]
+        )
+        J = graph.jacobians(truth, graph.residuals(truth))
+        for node in range(5):
+            for k in range(6):
+                h = 1e-6 * np.eye(6)[k]
+                ends = []
+                for delta in (h, -h):
+                    moved = truth.copy()
+                    moved[node] = se3.exp(delta) @ truth[node]
+                    ends.append(graph.residuals(moved))
+                sign = np.array([(node == b) - (node == a) for a, b in pairs])[:, None]
+                np.testing.assert_allclose((ends[0] - ends[1]) / 2e-6, sign * J[:, :, k], atol=1e-7)
 
 
 def test_normal_equations_are_the_gradient_and_its_gauss_newton_matrix() -> None:
@@ -194,17 +196,17 @@ def test_plain_least_squares_finds_what_scipy_finds(seed: int) -> None:
     np.testing.assert_allclose(found.T_world_node, poses(oracle.x), atol=1e-5)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_without_noise_the_truth_comes_back_from_a_disturbed_start(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    truth = rounds(30, rng)
-    pairs = [(i, i + 1) for i in range(29)] + [(0, 29), (3, 20), (25, 8)]
-    edges = [measured(truth, a, b, np.zeros(6), random_information(rng), abs(a - b) > 1) for a, b in pairs]
-    disturbed = truth.copy()
-    disturbed[1:] = se3.exp_stack(0.2 * rng.normal(size=(29, 6))) @ truth[1:]
-    found = optimise(disturbed, edges)
-    np.testing.assert_allclose(found.T_world_node, truth, atol=1e-8)
-    assert all(v.accepted and v.weight == pytest.approx(1.0) for v in found.verdicts)
+def test_without_noise_the_truth_comes_back_from_a_disturbed_start() -> None:
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        truth = rounds(30, rng)
+        pairs = [(i, i + 1) for i in range(29)] + [(0, 29), (3, 20), (25, 8)]
+        edges = [measured(truth, a, b, np.zeros(6), random_information(rng), abs(a - b) > 1) for a, b in pairs]
+        disturbed = truth.copy()
+        disturbed[1:] = se3.exp_stack(0.2 * rng.normal(size=(29, 6))) @ truth[1:]
+        found = optimise(disturbed, edges)
+        np.testing.assert_allclose(found.T_world_node, truth, atol=1e-8)
+        assert all(v.accepted and v.weight == pytest.approx(1.0) for v in found.verdicts)
 
 
 def test_the_better_informed_edge_wins_by_its_share() -> None:
@@ -287,9 +289,8 @@ def test_a_node_that_hangs_on_a_loop_only_is_named() -> None:
         optimise(drifted, [])
 
 
-@pytest.mark.parametrize(
-    "information",
-    [
+def test_information_must_be_symmetric_positive_definite() -> None:
+    for information in [
         np.zeros((6, 6)),
         np.diag([1.0, 1, 1, 1, 1, -1e-3]),
         np.diag([1.0, 1, 1, 1, 1, 0]),
@@ -297,20 +298,18 @@ def test_a_node_that_hangs_on_a_loop_only_is_named() -> None:
         np.diag([1.0, 1, 1, 1, 1, np.nan]),
         np.diag([1.0, 1, 1, 1, 1, np.inf]),
         np.eye(3),
-    ],
-)
-def test_information_must_be_symmetric_positive_definite(information: Array) -> None:
-    _, drifted, edges = scene(0, nodes=12, true_loops=1, false_loops=0)
-    edges[4] = replace(edges[4], information=information)
-    with pytest.raises(SigmaSplatError, match=r"edge 4 → 5 .* symmetric positive definite"):
-        optimise(drifted, edges)
+    ]:
+        _, drifted, edges = scene(0, nodes=12, true_loops=1, false_loops=0)
+        edges[4] = replace(edges[4], information=information)
+        with pytest.raises(SigmaSplatError, match=r"edge 4 → 5 .* symmetric positive definite"):
+            optimise(drifted, edges)
 
 
-@pytest.mark.parametrize(("a", "b"), [(3, 3), (0, 12), (-1, 4)])
-def test_edges_must_join_two_nodes(a: int, b: int) -> None:
-    _, drifted, edges = scene(0, nodes=12, true_loops=1, false_loops=0)
-    with pytest.raises(SigmaSplatError, match=f"edge {a} → {b} does not join two of the 12 nodes"):
-        optimise(drifted, [*edges, replace(edges[-1], a=a, b=b)])
+def test_edges_must_join_two_nodes() -> None:
+    for a, b in [(3, 3), (0, 12), (-1, 4)]:
+        _, drifted, edges = scene(0, nodes=12, true_loops=1, false_loops=0)
+        with pytest.raises(SigmaSplatError, match=f"edge {a} → {b} does not join two of the 12 nodes"):
+            optimise(drifted, [*edges, replace(edges[-1], a=a, b=b)])
 
 
 def test_poses_measurements_and_confidence_must_make_sense() -> None:

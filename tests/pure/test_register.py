@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from sigmasplat.slam.loop_closure import registration
 from sigmasplat.slam.loop_closure.candidates import Candidate, SubmapPair
 from sigmasplat.slam.loop_closure.registration import Localisation, Registrar, Registration
 from sigmasplat.slam.seeding import make_splats
-from sigmasplat.sources import SyntheticRoom
+from small_room import frame_at, walk
 
 Matrix = NDArray[np.float64]
 
@@ -31,20 +30,15 @@ CONFIG = Config(
 )
 
 
-@cache
-def walk() -> SyntheticRoom:
-    return SyntheticRoom(frames=200, width=160, height=120)
-
-
 def piece(store: MemoryStore, frames: Sequence[int], brighter: float = 1.0) -> Submap:
     """Add a submap of some frames, every pixel a splat at its true place, and what those frames saw."""
     truth = walk().truth().T_world_camera
     T_submap_camera = np.stack([se3.inverse(truth[frames[0]]) @ truth[i] for i in frames])
     field, pictures = GaussianField.empty(), []
     for i, T in zip(frames, T_submap_camera, strict=True):
-        frame = walk().frame(i)
-        target = Target.of(replace(frame, color=np.clip(frame.color * brighter, 0, 1)), (120, 160))
-        field.append(make_splats(target, T, frame.depth_m > 0, 1.0, field, SEEDS))
+        seen = frame_at(i)
+        target = Target.of(replace(seen, color=np.clip(seen.color * brighter, 0, 1)), (120, 160))
+        field.append(make_splats(target, T, seen.depth_m > 0, 1.0, field, SEEDS))
         pictures.append(target.picture())
     submap = Submap(len(store), field, tuple(frames), T_submap_camera, walk().camera)
     store.save(submap, pictures)

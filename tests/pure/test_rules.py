@@ -15,14 +15,9 @@ def fit(agreement: float, overlap: float) -> PoseFit:
     return PoseFit(np.eye(4), agreement, overlap, NAN, 0.0, 1)
 
 
-@pytest.mark.parametrize(
-    ("frames_since", "overlap", "yes"),
-    [(4, 1.0, False), (5, 1.0, True), (6, 1.0, True), (1, 0.71, False), (1, 0.69, True), (1, 0.0, True)],
-)
-def test_a_keyframe_is_due_after_so_many_frames_or_when_too_little_is_shared(
-    frames_since: int, overlap: float, yes: bool
-) -> None:
-    assert is_keyframe(frames_since, 5, overlap, 0.7) is yes
+def test_a_keyframe_is_due_after_a_number_of_frames_or_at_low_overlap() -> None:
+    due = {(4, 1.0): False, (5, 1.0): True, (6, 1.0): True, (1, 0.71): False, (1, 0.69): True, (1, 0.0): True}
+    assert {(frames, overlap): is_keyframe(frames, 5, overlap, 0.7) for frames, overlap in due} == due
 
 
 def test_overlap_zero_switches_that_rule_off() -> None:
@@ -30,22 +25,17 @@ def test_overlap_zero_switches_that_rule_off() -> None:
     assert is_keyframe(1, 1, 1.0, 0.0), "every frame, as TUM's preset has it"
 
 
-@pytest.mark.parametrize(
-    ("agreement", "overlap", "lost"),
-    [
-        (0.95, 0.90, False),
-        (0.59, 1.00, True),  # the surfaces in common disagree
-        (0.61, 1.00, False),
-        (0.99, 0.15, True),  # too few are in common
-        (0.99, 0.25, False),
-        (0.61, 0.30, True),  # both middling: their product counts
-        (0.00, 0.00, True),
-    ],
-)
-def test_a_pose_is_lost_by_disagreement_or_by_too_little_in_common(
-    agreement: float, overlap: float, lost: bool
-) -> None:
-    assert is_lost(fit(agreement, overlap), 0.6, 0.2) is lost
+def test_a_pose_is_lost_by_disagreement_or_by_too_little_in_common() -> None:
+    lost = {  # by (agreement, overlap)
+        (0.95, 0.90): False,
+        (0.59, 1.00): True,  # the surfaces in common disagree
+        (0.61, 1.00): False,
+        (0.99, 0.15): True,  # too few are in common
+        (0.99, 0.25): False,
+        (0.61, 0.30): True,  # both middling: their product counts
+        (0.00, 0.00): True,
+    }
+    assert {case: is_lost(fit(*case), 0.6, 0.2) for case in lost} == lost
 
 
 def test_a_loss_jumps_against_the_median_of_its_recent_past() -> None:
@@ -77,9 +67,9 @@ def test_history_leaves_out_what_is_older() -> None:
     assert shares(9, 0.4, history=3)[8] == pytest.approx(0.4, abs=0.02)
 
 
-@pytest.mark.parametrize(("keyframes", "probability"), [(1, 0.0), (1, 0.4), (6, 1.0)])
-def test_the_newest_alone_where_there_is_no_other_or_none_is_wanted(keyframes: int, probability: float) -> None:
-    assert shares(keyframes, probability, draws=200) == {keyframes - 1: 1.0}
+def test_only_the_newest_is_drawn_if_it_is_alone_or_certain() -> None:
+    for keyframes, probability in [(1, 0.0), (1, 0.4), (6, 1.0)]:
+        assert shares(keyframes, probability, draws=200) == {keyframes - 1: 1.0}
 
 
 def test_never_the_newest_at_probability_zero() -> None:

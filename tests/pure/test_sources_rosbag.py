@@ -21,8 +21,10 @@ from recordings import (
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.frame import resized_color
 from sigmasplat.sources import open_source
-from sigmasplat.sources.camera.distortion import distort
+from sigmasplat.sources.camera.depth_registration import DepthRegistration
+from sigmasplat.sources.camera.distortion import Undistortion, distort
 from sigmasplat.sources.ros.bag import Bag
 
 pytest.importorskip("rosbags", reason="bags need the extra ros")
@@ -121,13 +123,13 @@ def raw_depth(recorder: Recorder, seen: Scene, linked: str = "/tf_static") -> No
 
 @pytest.mark.parametrize(("kind", "linked"), [("ros1", "/tf_static"), ("ros1", "/tf"), ("mcap", "/tf_static")])
 def test_raw_depth_is_registered_by_the_transforms(tmp_path: Path, kind: str, linked: str) -> None:
-    path, _ = written(tmp_path, kind, lambda recorder, seen: raw_depth(recorder, seen, linked))
+    path, seen = written(tmp_path, kind, lambda recorder, seen: raw_depth(recorder, seen, linked))
     source = open_source(path)
     assert source.depth_registered and source.camera == Camera(*SIZE, *FOCAL).resized(16, 12)
-    calibration = source._rectified.calibration  # type: ignore[attr-defined]
-    np.testing.assert_allclose(calibration.T_color_depth, LINK, atol=1e-12)
     rectified = Camera(16, 12, DEPTH_FOCAL[0] + 1, DEPTH_FOCAL[1] + 1, *DEPTH_FOCAL[2:])  # P, not K
-    assert calibration.depth_camera == rectified and calibration.depth_distortion is None
+    move = DepthRegistration(rectified, source.camera, LINK)
+    for frame, depth_mm in zip(source, seen.depths_mm[:, ::2, ::2], strict=True):
+        np.testing.assert_allclose(frame.depth_m, move(metres(depth_mm)), atol=1e-6)
 
 
 def test_one_optical_frame_means_registered(tmp_path: Path) -> None:
@@ -177,7 +179,7 @@ def test_the_best_topic_is_used_or_the_requested_one(tmp_path: Path) -> None:
     ],
 )
 def test_lenses(tmp_path: Path, model: str, lens: tuple[float, ...]) -> None:
-    """The recorded distortion is OpenCV's: its function distorts points as ours does."""
+    """The recorded distortion is OpenCV's: its function distorts points as ours does, and is removed from images."""
     cv2 = pytest.importorskip("cv2")
 
     def fill(recorder: Recorder, seen: Scene) -> None:
@@ -185,12 +187,12 @@ def test_lenses(tmp_path: Path, model: str, lens: tuple[float, ...]) -> None:
         recorder.messages = [m for m in recorder.messages if "info" not in m[0]]
         recorder.info("/camera/color/camera_info", seen.times_s[0], SIZE, FOCAL, COLOR_FRAME, lens, model)
 
-    path, _ = written(tmp_path, "ros1", fill)
-    found = open_source(path)._rectified.calibration.distortion  # type: ignore[attr-defined]
-    assert found == lens
+    path, seen = written(tmp_path, "ros1", fill)
+    straight = Undistortion(Camera(*SIZE, *FOCAL), lens).color((seen.colors[1] / 255).astype(np.float32))
+    np.testing.assert_allclose(open_source(path).frame(1).color, straight, atol=1e-6)
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 2))
     theirs, _ = cv2.projectPoints(np.c_[points, np.ones(20)], np.zeros(3), np.zeros(3), np.eye(3), np.array(lens))
-    np.testing.assert_allclose(distort(points, np.array(found)), theirs[:, 0], atol=1e-12)
+    np.testing.assert_allclose(distort(points, np.array(lens)), theirs[:, 0], atol=1e-12)
 
 
 def test_without_header_times_the_recording_times_are_used(tmp_path: Path) -> None:
@@ -279,14 +281,17 @@ def sdk_bag(path: Path, seen: Scene) -> Path:
 
 def test_a_realsense_sdks_bag(tmp_path: Path) -> None:
     seen = scene(SIZE)
-    source = open_source(sdk_bag(tmp_path / "d435.bag", seen), undistort=False)
-    calibration = source._rectified.calibration  # type: ignore[attr-defined]
-    assert source.depth_units_per_metre == 2000.0 and source.depth_registered
-    np.testing.assert_allclose(calibration.T_color_depth, LINK, atol=1e-12)
-    assert calibration.distortion == (0.1, -0.05, 0.001, -0.002, 0.01) and calibration.depth_distortion is None
-    images = source._images[2]  # type: ignore[attr-defined]
-    assert np.array_equal(images.read_color(), seen.colors[2])
-    assert np.array_equal(images.read_depth(2000.0), (seen.depths_mm[2, ::2, ::2] / 2000.0).astype(np.float32))
+    path = sdk_bag(tmp_path / "d435.bag", seen)
+    straight, bent = open_source(path), open_source(path, undistort=False)
+    color = (seen.colors[2] / 255).astype(np.float32)
+    lens = Undistortion(Camera(*SIZE, *FOCAL), (0.1, -0.05, 0.001, -0.002, 0.01))
+    np.testing.assert_allclose(bent.frame(2).color, resized_color(color, 16, 12), atol=1e-6)
+    np.testing.assert_allclose(straight.frame(2).color, resized_color(lens.color(color), 16, 12), atol=1e-6)
+    depth_m = (seen.depths_mm[2, ::2, ::2] / 2000.0).astype(np.float32)
+    moved = DepthRegistration(Camera(16, 12, *DEPTH_FOCAL), bent.camera, LINK)(depth_m)
+    for source in (straight, bent):
+        assert source.depth_units_per_metre == 2000.0 and source.depth_registered
+        np.testing.assert_allclose(source.frame(2).depth_m, moved, atol=1e-6)
 
 
 def test_a_time_span_of_a_bag_can_be_selected(tmp_path: Path) -> None:

@@ -74,9 +74,8 @@ def test_depth_is_along_the_axis_not_along_the_ray():
     assert (hit == 0).all() and np.abs(t - 2.0).max() < 1e-5
 
 
-@pytest.mark.parametrize(
-    ("kind", "half", "yaw_rad", "direction", "entry", "normal"),
-    [
+def test_entry_points_and_normals_computed_by_hand():
+    for kind, half, yaw_rad, direction, entry, normal in [
         ("ball", (1, 1, 1), 0.0, (1, 0, 0), 4.0, (-1, 0, 0)),
         ("ball", (2, 1, 1), 0.0, (1, 0, 0), 3.0, (-1, 0, 0)),
         ("ball", (2, 1, 1), np.pi / 2, (1, 0, 0), 4.0, (-1, 0, 0)),
@@ -85,17 +84,15 @@ def test_depth_is_along_the_axis_not_along_the_ray():
         ("box", (1, 1, 1), np.pi / 4, (1, 0.001, 0), 5.0 - np.sqrt(2), (-np.sqrt(0.5), np.sqrt(0.5), 0)),
         ("drum", (1, 1, 2), 0.0, (1, 0, 0), 4.0, (-1, 0, 0)),
         ("drum", (1, 1, 0.5), 0.0, (1, 0, 0.12), 0.5 / 0.12, (0, 0, 1)),
-    ],
-)
-def test_entry_points_and_normals_computed_by_hand(kind, half, yaw_rad, direction, entry, normal):
-    start_z = 1.0 if normal == (0, 0, 1) else 0.0  # the last ray comes from above the cap
-    slope = np.array(direction, np.float32) * [1, 1, -1 if start_z else 1]
-    solid = shape(kind, (5, 0, 0), half, yaw_rad)
-    origin, ray = np.array([[0], [0], [start_z]], np.float32), slope.astype(np.float32)[:, None]
-    t = solid.first_hit(origin, ray)
-    assert t[0] == pytest.approx(entry, rel=2e-3)
-    normals, _, _ = surface_at(solid, origin + ray * t)
-    assert normals[:, 0] == pytest.approx(np.array(normal), abs=2e-3)
+    ]:
+        start_z = 1.0 if normal == (0, 0, 1) else 0.0  # the last ray comes from above the cap
+        slope = np.array(direction, np.float32) * [1, 1, -1 if start_z else 1]
+        solid = shape(kind, (5, 0, 0), half, yaw_rad)
+        origin, ray = np.array([[0], [0], [start_z]], np.float32), slope.astype(np.float32)[:, None]
+        t = solid.first_hit(origin, ray)
+        assert t[0] == pytest.approx(entry, rel=2e-3)
+        normals, _, _ = surface_at(solid, origin + ray * t)
+        assert normals[:, 0] == pytest.approx(np.array(normal), abs=2e-3)
 
 
 def test_rays_beside_or_away_from_a_shape_miss():
@@ -136,18 +133,18 @@ def test_same_seed_same_bytes_in_any_order():
     assert other.frame(2).color.tobytes() != forwards[0].color.tobytes()
 
 
-@pytest.mark.parametrize(("frames", "loops", "rooms"), [(200, 1, 1), (400, 2, 1), (600, 1, 2), (900, 1, 3)])
-def test_the_camera_path_is_smooth_closed_and_rigid(frames, loops, rooms):
-    T = camera_path(frames, loops, rooms, seed=1)
-    assert all(se3.is_rigid(pose, 1e-9) for pose in T)
-    assert np.abs(T[0] - T[-1]).max() < 1e-6
-    steps_m = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
-    turns_deg = [np.degrees(se3.rotation_angle(a[:3, :3].T @ b[:3, :3])) for a, b in pairwise(T)]
-    assert steps_m.min() > 0.01 and steps_m.max() < 0.032
-    assert max(turns_deg) < 2.2
-    if loops > 1:
-        half = frames // 2
-        assert np.abs(T[:half, 2, 3] - T[half:, 2, 3]).max() > 0.2, "loops run at different heights"
+def test_the_camera_path_is_smooth_closed_and_rigid():
+    for frames, loops, rooms in [(200, 1, 1), (400, 2, 1), (600, 1, 2), (900, 1, 3)]:
+        T = camera_path(frames, loops, rooms, seed=1)
+        assert all(se3.is_rigid(pose, 1e-9) for pose in T)
+        assert np.abs(T[0] - T[-1]).max() < 1e-6
+        steps_m = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
+        turns_deg = [np.degrees(se3.rotation_angle(a[:3, :3].T @ b[:3, :3])) for a, b in pairwise(T)]
+        assert steps_m.min() > 0.01 and steps_m.max() < 0.032
+        assert max(turns_deg) < 2.2
+        if loops > 1:
+            half = frames // 2
+            assert np.abs(T[:half, 2, 3] - T[half:, 2, 3]).max() > 0.2, "loops run at different heights"
 
 
 def test_exposure_varies_by_eight_percent():
@@ -255,11 +252,11 @@ def test_depths_of_a_revisit_agree_well_enough_for_a_loop():
         assert (np.abs(first - last) < 0.05).mean() > 0.98
 
 
-@pytest.mark.parametrize(("rooms", "pace"), [(1, 200), (2, 600), (3, 900)])
-def test_an_overrun_repeats_the_start_of_the_path(rooms, pace):
-    turn, walk = camera_path(pace + 1, 1, rooms, 1), camera_path(round(1.25 * pace) + 1, 1, rooms, 1, overrun=0.25)
-    np.testing.assert_allclose(walk[: pace + 1], turn, atol=1e-9)
-    np.testing.assert_allclose(walk[pace:], turn[: pace // 4 + 1], atol=1e-9)
+def test_an_overrun_repeats_the_start_of_the_path():
+    for rooms, pace in [(1, 200), (2, 600), (3, 900)]:
+        turn, walk = camera_path(pace + 1, 1, rooms, 1), camera_path(round(1.25 * pace) + 1, 1, rooms, 1, overrun=0.25)
+        np.testing.assert_allclose(walk[: pace + 1], turn, atol=1e-9)
+        np.testing.assert_allclose(walk[pace:], turn[: pace // 4 + 1], atol=1e-9)
 
 
 @pytest.mark.parametrize(("options", "frame", "position_m", "depth_m", "color"), GOLDEN)
@@ -279,10 +276,10 @@ def test_texture_noise_is_smooth_and_fades_under_large_pixels():
     assert np.abs(noise(u, u, np.full_like(u, 0.1), 0.1, seed=1)).max() == 0
 
 
-@pytest.mark.parametrize("option", ["drift", "overrun", "seed"])
-def test_negative_options_are_refused(option):
-    with pytest.raises(SourceError, match=f"{option} must be at least 0, found -1"):
-        open_source(f"synthetic:frames=7,{option}=-1")
+def test_negative_options_are_refused():
+    for option in ["drift", "overrun", "seed"]:
+        with pytest.raises(SourceError, match=f"{option} must be at least 0, found -1"):
+            open_source(f"synthetic:frames=7,{option}=-1")
 
 
 def test_options_in_the_path():

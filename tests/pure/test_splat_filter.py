@@ -26,22 +26,17 @@ def test_sigma_is_the_root_of_the_mean_variance() -> None:
     assert splat_filter.sigmas(field).tolist() == pytest.approx([math.sqrt(0.1), 0.2, 0.3])
 
 
-@pytest.mark.parametrize(
-    ("bounds", "kept", "by_sigma", "by_opacity"),
-    [
+def test_bounds_select_splats_and_count_the_others() -> None:
+    for bounds, kept, by_sigma, by_opacity in [
         ({}, [True, True, True], 0, 0),
         ({"sigma_below": 0.25}, [True, True, False], 1, 0),
         ({"opacity_above": 0.3}, [True, True, False], 0, 1),
         ({"sigma_below": 0.25, "opacity_above": 0.7}, [True, False, False], 1, 1),
         ({"sigma_below": 0.0}, [False, False, False], 3, 0),
-    ],
-)
-def test_bounds_select_splats_and_count_the_others(
-    bounds: dict[str, float], kept: list[bool], by_sigma: int, by_opacity: int
-) -> None:
-    found = splat_filter.filter_splats(three(), **bounds)
-    assert (found.kept.tolist(), found.by_sigma, found.by_opacity) == (kept, by_sigma, by_opacity)
-    assert found.dropped == kept.count(False)
+    ]:
+        found = splat_filter.filter_splats(three(), **bounds)
+        assert (found.kept.tolist(), found.by_sigma, found.by_opacity) == (kept, by_sigma, by_opacity)
+        assert found.dropped == kept.count(False)
 
 
 def test_a_new_map_has_no_learned_variance() -> None:

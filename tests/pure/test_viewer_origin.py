@@ -13,9 +13,8 @@ from sigmasplat.viewer.server import HOST, close, open_server
 HERE = "127.0.0.1:8080"
 
 
-@pytest.mark.parametrize(
-    ("origin", "reached", "own"),
-    [
+def test_only_pages_of_the_same_address_belong_to_the_viewer() -> None:
+    for origin, reached, own in [
         (None, HERE, True),  # not a browser
         ("http://127.0.0.1:8080", HERE, True),
         ("http://localhost:9000", "localhost:9000", True),  # ssh -L 9000:127.0.0.1:8080
@@ -33,12 +32,8 @@ HERE = "127.0.0.1:8080"
         ("http://[::1", "[::1", False),
         ("file://127.0.0.1:8080", HERE, False),
         ("http://127.0.0.1:8080", None, False),
-    ],
-)
-def test_only_pages_of_the_same_address_belong_to_the_viewer(
-    origin: str | None, reached: str | None, own: bool
-) -> None:
-    assert is_own_page(origin, reached, "box.lan") is own
+    ]:
+        assert is_own_page(origin, reached, "box.lan") is own
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat import cli
+from command_line import exit_code
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError, RunError, SigmaSplatError
@@ -221,10 +221,9 @@ def test_without_viser_the_error_names_the_package_to_install(
     with pytest.raises(SigmaSplatError, match=r"pip install 'sigmasplat\[viewer\]'"):
         open_server("127.0.0.1", 0, "x")
     for command in (["view", str(finished.path)], ["run", ROOM, "--out", str(tmp_path / "run"), "--view"]):
-        with pytest.raises(SystemExit) as left:
-            cli.main(command)
+        assert exit_code(*command) == 2
         said = capsys.readouterr()
-        assert left.value.code == 2 and said.err.count("\n") == 1 and "sigmasplat[viewer]" in said.err
+        assert said.err.count("\n") == 1 and "sigmasplat[viewer]" in said.err
     assert not (tmp_path / "run").exists()
 
 
@@ -232,7 +231,6 @@ def test_a_run_without_a_map_cannot_be_viewed(tmp_path: Path, capsys: pytest.Cap
     run = RunFolder.create(tmp_path / "run", settings(), "room")
     run.note(status="failed")
     for folder, says in ((run.path, "has no map to show"), (tmp_path / "none", "no run folder")):
-        with pytest.raises(SystemExit) as left:
-            cli.main(["view", str(folder)])
+        assert exit_code("view", str(folder)) == 2
         said = capsys.readouterr().err
-        assert left.value.code == 2 and said.count("\n") == 1 and says in said
+        assert said.count("\n") == 1 and says in said

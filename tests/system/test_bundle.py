@@ -140,7 +140,7 @@ def test_frames_follow_their_keyframe_where_mapping_moves_it() -> None:
             np.testing.assert_allclose(now, relative, atol=1e-9)
 
 
-def test_with_poses_fixed_the_path_is_what_each_step_said() -> None:
+def test_with_fixed_poses_the_path_is_that_of_the_steps() -> None:
     slam, steps = followed(**STILL)
     for step, T_world_camera in zip(steps, slam.trajectory().T_world_camera, strict=True):
         np.testing.assert_allclose(T_world_camera, step.T_world_camera, atol=1e-12)

@@ -7,48 +7,37 @@ import numpy as np
 import pytest
 import torch
 
-from sigmasplat.config import Config
 from sigmasplat.config.text import override
 from sigmasplat.metrics.image import psnr
 from sigmasplat.metrics.trajectory import ate
-from sigmasplat.model.frame import Frame
 from sigmasplat.presets import preset
 from sigmasplat.render import render
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import SyntheticRoom
+from small_room import SMALL, frames, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 FRAMES = 16
-SMALL = {"input.width": "160", "mapping.first_iterations": "60", "mapping.iterations": "20"}
 PAPER = SMALL | {"mapping.every": "5", "tracking.iterations": "40", "mapping.first_iterations": "100"}
 
 
-@cache
-def walk() -> SyntheticRoom:
-    return SyntheticRoom(frames=200, width=160, height=120)
-
-
-@cache
-def frames() -> list[Frame]:
-    return [walk().frame(i) for i in range(FRAMES)]
-
-
 def followed(name: str, changes: dict[str, str]) -> Slam:
-    slam = Slam(settings(name, changes))
-    for frame in frames():
+    slam = Slam(override(preset(name), changes))
+    for frame in frames(FRAMES):
         slam.step(frame)
     return slam
 
 
-def settings(name: str, changes: dict[str, str]) -> Config:
-    return override(preset(name), changes)
+@cache
+def followed_once(name: str, changes: tuple[tuple[str, str], ...]) -> Slam:
+    """Return a run that several tests look at."""
+    return followed(name, dict(changes))
 
 
 def shown_db(slam: Slam) -> float:
     """Compare a frame that was not mapped with the map seen from where it was tracked."""
     step = next(s for s in reversed(slam.steps) if not s.is_keyframe)
-    frame = frames()[step.index]
+    frame = frames(FRAMES)[step.index]
     T_camera_world = np.linalg.inv(slam.trajectory().T_world_camera[step.index])
     seen = render(slam.field, frame.camera, T_camera_world, options=slam.config.render).color.detach().numpy()
     return float(psnr(seen, frame.color, frame.depth_m > 0))
@@ -68,7 +57,7 @@ RUNS: list[Any] = [
 def test_the_path_is_followed_and_the_room_shown(
     name: str, changes: dict[str, str], ate_m: float, least_db: float
 ) -> None:
-    slam = followed(name, changes)
+    slam = followed_once(name, tuple(changes.items()))
     assert not any(step.lost for step in slam.steps)
     assert ate(slam.trajectory(), walk().truth()).rmse_m < ate_m
     assert shown_db(slam) > least_db
@@ -77,7 +66,7 @@ def test_the_path_is_followed_and_the_room_shown(
 
 @pytest.mark.parametrize(("name", "changes"), [("cgslam-replica", PAPER), ("sigma", SMALL)])
 def test_same_input_same_bytes(name: str, changes: dict[str, str]) -> None:
-    first, second = (followed(name, changes).checkpoint() for _ in range(2))
+    first, second = followed_once(name, tuple(changes.items())).checkpoint(), followed(name, changes).checkpoint()
     assert all(first[key].numpy().tobytes() == second[key].numpy().tobytes() for key in first)
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from sigmasplat import cli
+from command_line import exit_code
 from sigmasplat.errors import RunError
 from sigmasplat.evaluation.evaluate import evaluate
 from sigmasplat.io.runs import RunFolder
@@ -72,9 +72,8 @@ def test_ctrl_c_leaves_a_usable_run(tmp_path: Path, capsys: pytest.CaptureFixtur
     torch.testing.assert_close(tensors["params"], field.params, rtol=0, atol=1e-5)
     assert run.config().input.width == 80
 
-    with pytest.raises(SystemExit) as left:
-        cli.main(["export", str(out), "--out", str(tmp_path / "map.ply")])
-    assert left.value.code == 0 and (tmp_path / "map.ply").stat().st_size > 1000
+    assert exit_code("export", str(out), "--out", str(tmp_path / "map.ply")) == 0
+    assert (tmp_path / "map.ply").stat().st_size > 1000
     capsys.readouterr()
 
 
@@ -145,10 +144,9 @@ def test_a_killed_run_is_read_or_refused_in_one_line(
             assert "not a run folder" in str(problem)
 
     for command in (["eval", str(out)], ["export", str(out), "--out", str(tmp_path / "map.ply")]):
-        with pytest.raises(SystemExit) as left:
-            cli.main(command)
+        assert exit_code(*command) == 2
         refusal = capsys.readouterr().err
-        assert left.value.code == 2 and refusal.startswith("sigmasplat: ") and refusal.count("\n") == 1, refusal
+        assert refusal.startswith("sigmasplat: ") and refusal.count("\n") == 1, refusal
 
 
 @pytest.mark.parametrize("moment", ["folder", "log"])
@@ -158,8 +156,7 @@ def test_a_killed_run_can_be_repeated_with_overwrite(tmp_path: Path, moment: str
         wait_for(process, out.exists if moment == "folder" else lambda: lines(out) >= 1)
         process.kill()
         process.wait(timeout=PATIENCE_S)
-    with pytest.raises(SystemExit) as left:
-        cli.main(["run", "synthetic:frames=2,width=80,height=60", "--limit", "1", "--out", str(out), "--overwrite",
-                  "--set", "input.width=80", "--set", "mapping.first_iterations=2", "--no-eval"])  # fmt: skip
-    assert left.value.code == 0
+    short = ("--set", "input.width=80", "--set", "mapping.first_iterations=2", "--limit", "1", "--no-eval")
+    room = "synthetic:frames=2,width=80,height=60"
+    assert exit_code("run", room, "--out", str(out), "--overwrite", *short) == 0
     assert RunFolder.open(out).facts()["status"] == "complete" and len(RunFolder.open(out).read_log()) == 1

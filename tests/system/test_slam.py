@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -21,24 +20,13 @@ from sigmasplat.presets import default_preset, preset
 from sigmasplat.render import render
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import SyntheticRoom
+from small_room import SMALL, frames, walk
 
 _core = pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 FRAMES = 20
 HELD_OUT_DB = 28.0
 """Measured: 29.4 dB aligning to the map, 30.0 dB to keyframes."""
-SMALL = {"input.width": "160", "mapping.first_iterations": "60", "mapping.iterations": "20"}
-
-
-@cache
-def walk() -> SyntheticRoom:
-    """Two hundred frames once round the room; the tests take its beginning."""
-    return SyntheticRoom(frames=200, width=160, height=120)
-
-
-@cache
-def frames() -> list[Frame]:
-    return [walk().frame(i) for i in range(FRAMES)]
 
 
 def settings(**changes: str) -> Config:
@@ -69,7 +57,7 @@ def contents(slam: Slam) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def run() -> Slam:
-    return follow(frames(), settings())
+    return follow(frames(FRAMES), settings())
 
 
 @pytest.fixture
@@ -109,7 +97,7 @@ def test_keyframes_are_mapped_and_the_map_is_finite(run: Slam) -> None:
 
 def test_views_never_mapped_look_right(run: Slam) -> None:
     scores = []
-    for step, frame, T_world_camera in zip(run.steps, frames(), run.trajectory().T_world_camera, strict=True):
+    for step, frame, T_world_camera in zip(run.steps, frames(FRAMES), run.trajectory().T_world_camera, strict=True):
         if step.is_keyframe:
             continue
         with torch.no_grad():
@@ -122,7 +110,7 @@ def test_two_runs_and_two_threads_give_the_same_bytes(threads: Callable[[int], N
     config, found = settings(mapping__first_iterations="30", mapping__iterations="10"), []
     for n in (1, 1, 2):
         threads(n)
-        found.append(contents(follow(frames()[:8], config)))
+        found.append(contents(follow(frames(8), config)))
     assert found[0] == found[1], "the same run twice"
     assert found[0] == found[2], "one thread against two"
 
@@ -141,18 +129,18 @@ def test_threads_share_large_images_without_a_trace(threads: Callable[[int], Non
 
 def test_another_seed_gives_another_map() -> None:
     few = {"seeding__first_uniform": "500", "seeding__first_gradient": "500", "mapping__first_iterations": "2"}
-    one, two, three = (follow(frames()[:1], settings(seed=seed, **few)).field.params for seed in ("0", "1", "0"))
+    one, two, three = (follow(frames(1), settings(seed=seed, **few)).field.params for seed in ("0", "1", "0"))
     assert not torch.equal(one[:100], two[:100]) and torch.equal(one, three)
 
 
 def test_frames_of_another_camera_are_refused() -> None:
-    slam = follow(frames()[:1], settings(mapping__first_iterations="2"))
-    c = frames()[1].camera
-    stranger = replace(frames()[1], camera=Camera(c.width, c.height, c.fx + 1, c.fy, c.cx, c.cy))
+    slam = follow(frames(1), settings(mapping__first_iterations="2"))
+    c = frames(2)[1].camera
+    stranger = replace(frames(2)[1], camera=Camera(c.width, c.height, c.fx + 1, c.fy, c.cx, c.cy))
     with pytest.raises(SourceError, match="frame 1 comes from another camera"):
         slam.step(stranger)
     assert len(slam.steps) == 1, "the refused frame leaves no trace"
-    assert not slam.step(frames()[1]).lost
+    assert not slam.step(frames(2)[1]).lost
 
 
 def without_depth(frame: Frame) -> Frame:
@@ -161,7 +149,7 @@ def without_depth(frame: Frame) -> Frame:
 
 @pytest.mark.parametrize("depth_m", [0.0, 50.0], ids=["none", "too far"])
 def test_a_first_frame_without_usable_depth_is_refused(depth_m: float) -> None:
-    empty = replace(frames()[0], depth_m=np.full_like(frames()[0].depth_m, depth_m))
+    empty = replace(frames(2)[0], depth_m=np.full_like(frames(2)[0].depth_m, depth_m))
     slam = Slam(settings())
     with pytest.raises(SourceError, match=r"frame 0 has no depth reading in \[0.1, 8.0\] m to start a map from"):
         slam.step(empty)
@@ -171,7 +159,7 @@ def test_a_first_frame_without_usable_depth_is_refused(depth_m: float) -> None:
 @pytest.mark.parametrize("dark", [False, True], ids=["no depth", "nothing at all"])
 def test_a_blackout_is_reported_and_survived(dark: bool) -> None:
     gone = range(8, 11)
-    some = [without_depth(f) if f.index in gone else f for f in frames()]
+    some = [without_depth(f) if f.index in gone else f for f in frames(FRAMES)]
     if dark:
         some = [replace(f, color=np.zeros_like(f.color)) if f.index in gone else f for f in some]
     slam = follow(some, settings())
@@ -183,14 +171,14 @@ def test_a_blackout_is_reported_and_survived(dark: bool) -> None:
 
 
 def test_gradient_descent_tracks_too() -> None:
-    slam = follow(frames()[:6], settings(tracking__method="adam", tracking__iterations="20"))
+    slam = follow(frames(6), settings(tracking__method="adam", tracking__iterations="20"))
     assert lost(slam) == [] and error_m(slam) < 0.02
     assert {step.tracking["iterations"] for step in slam.steps[1:]} == {20.0}
 
 
 @pytest.mark.parametrize("to", ["keyframe", "map"])
 def test_aligning_tracks_to_the_keyframe_and_to_the_map(to: str) -> None:
-    slam = follow(frames()[:12], settings(tracking__method="align", tracking__align_to=to))
+    slam = follow(frames(12), settings(tracking__method="align", tracking__align_to=to))
     assert lost(slam) == [] and error_m(slam) < 0.01
 
 

@@ -1,5 +1,6 @@
 """Submaps as part of SLAM, on the beginning of a walk through the built-in room, small."""
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -18,27 +19,21 @@ from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.presets import default_preset, preset
 from sigmasplat.slam.slam import Slam
-from sigmasplat.sources import SyntheticRoom
+from small_room import frame_at, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
-SMALL = {"input.width": "160", "mapping.first_iterations": "40", "mapping.iterations": "10"}
+SMALL = {"input.width": "160", "mapping.first_iterations": "40", "mapping.iterations": "10", "final.iterations": "20"}
 ONE = {"submaps.distance_m": "0", "submaps.angle_deg": "0", "submaps.uncertainty_m": "0"}
 CUT = ONE | {"submaps.frames": "10", "loops.min_interval": "1", "loops.min_similarity": "0.3"}
 FRAMES = 26
 
 
 @cache
-def walk() -> SyntheticRoom:
-    return SyntheticRoom(frames=200, width=160, height=120)
-
-
-@cache
 def there_and_back() -> list[Frame]:
     """Walk thirteen frames ahead and the same way back, so that the end sees the beginning's place."""
     order = [*range(FRAMES // 2), *reversed(range(FRAMES // 2))]
-    frames = [walk().frame(i) for i in order]
-    return [Frame(n, n / 30.0, f.color, f.depth_m, f.camera) for n, f in enumerate(frames)]
+    return [replace(frame_at(i), index=n, timestamp_s=n / 30.0) for n, i in enumerate(order)]
 
 
 def settings(**changes: str) -> Config:
@@ -80,7 +75,7 @@ def test_the_map_is_cut_and_the_path_goes_on(run: Slam) -> None:
     assert error_m(run) < 0.01
 
 
-def test_each_submap_begins_at_its_own_origin_with_the_keyframe_that_ended_the_one_before(run: Slam) -> None:
+def test_each_submap_starts_with_the_last_keyframe_of_the_previous_one_at_its_origin(run: Slam) -> None:
     pieces = [run.store.load(i) for i in range(len(run.store))]
     assert len(pieces) == 3
     for before, after in pairwise(pieces):
@@ -153,7 +148,7 @@ def test_one_submap_is_refined_too() -> None:
     assert slam.field is not slam.mapper.field
 
 
-def test_an_heir_knows_what_is_in_view_and_an_empty_one_nothing() -> None:
+def test_a_successor_inherits_the_splats_in_view_unless_inherit_is_off() -> None:
     """Inherited splats are where they were in the world, and only those that the new submap's first view can feel."""
     slam = followed(settings(loops__close="false", submaps__frames="0"), finish=False)
     T_submap_camera, whole = slam.mapper.keyframes[-1].T_world_camera, slam.mapper.field
@@ -172,7 +167,7 @@ def test_an_heir_knows_what_is_in_view_and_an_empty_one_nothing() -> None:
 @pytest.mark.parametrize(
     ("steps", "expected"), [("0", [(0, 1), (1, 1)]), ("2", [(0, 2), (0, 2), (1, 2), (2, 2), (2, 2)])]
 )
-def test_finishing_is_told_from_its_beginning_to_its_end(steps: str, expected: list[tuple[int, int]]) -> None:
+def test_finishing_reports_progress_from_start_to_end(steps: str, expected: list[tuple[int, int]]) -> None:
     slam, told, stored = Slam(settings(final__iterations=steps)), list[tuple[int, int]](), list[int]()
     for frame in there_and_back()[:3]:
         slam.step(frame)

@@ -208,7 +208,8 @@ def test_a_cropped_run_has_the_cropped_camera(run: RunFolder) -> None:
 def test_the_command_makes_a_mesh_of_a_real_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
     room, out = "synthetic:frames=120,width=64,height=48", str(tmp_path / "run")
-    small = ["--set", "mapping.first_iterations=30", "--set", "mapping.iterations=8", "--set", "input.width=64"]
+    small = ["--set", "mapping.first_iterations=30", "--set", "mapping.iterations=8", "--set", "input.width=64",
+             "--set", "final.iterations=40"]  # fmt: skip
     assert exit_code("run", room, "--limit", "6", "--no-eval", "--out", out, *small) == 0
     capsys.readouterr()
     assert exit_code("mesh", out, "--voxel-m", "0.05") == 0

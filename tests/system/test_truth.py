@@ -23,7 +23,7 @@ from sigmasplat.sources.tum import write_tum
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
-SETTINGS = {"input.width": "64", "mapping.first_iterations": "10", "mapping.iterations": "4"}
+SETTINGS = {"input.width": "64", "mapping.first_iterations": "10", "mapping.iterations": "4", "final.iterations": "10"}
 FRAMES = 7
 OPTIONS = [word for pair in SETTINGS.items() for word in ("--set", "=".join(pair))]
 LEFT = ("trajectory.txt", "map.ply", "checkpoint.safetensors")
