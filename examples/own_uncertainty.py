@@ -18,8 +18,9 @@ from sigmasplat import GaussianField, Slam, open_source, preset
 from sigmasplat.config import TrackingConfig
 from sigmasplat.config.text import override
 from sigmasplat.fit.confidence import uncertainty_weights
+from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pose import fit_pose_align
-from sigmasplat.fit.pyramid import Pyramid, gray_of
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.metrics import uncertainty
 from sigmasplat.model import se3
