@@ -1,5 +1,6 @@
 """Show one view as a strip: input, rendered colour, depth, uncertainty V and error, side by side with their ranges."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -73,8 +74,12 @@ class Panel:
 
 def side_by_side(view: View) -> Image.Image:
     """Draw the strip of one view, an RGB picture about 1650 pixels wide."""
-    panels = panels_of(view)
-    height = round(PANEL_WIDTH * view.recorded.shape[0] / view.recorded.shape[1])
+    return strip_of(panels_of(view), view.recorded.shape[0] / view.recorded.shape[1])
+
+
+def strip_of(panels: Sequence[Panel], height_over_width: float) -> Image.Image:
+    """Draw panels of one shape side by side, 330 pixels each."""
+    height = round(PANEL_WIDTH * height_over_width)
     size = (len(panels) * (PANEL_WIDTH + GAP) + GAP, height + HEAD + FOOT)
     strip = Image.new("RGB", size, BACKGROUND)
     for i, panel in enumerate(panels):
