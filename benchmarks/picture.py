@@ -16,12 +16,12 @@ import record
 import torch
 import tyro
 
+from sigmasplat.drawing.view_panels import BACKGROUND, ViewPanel, draw_view_strip, view_panels
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.exports.recorded import Recorded
-from sigmasplat.exports.video import from_above
+from sigmasplat.exports.run_reader import RunReader
+from sigmasplat.exports.video import orbit_view
 from sigmasplat.io.runs import RunFolder
-from sigmasplat.metrics.panels import BACKGROUND, Panel, panels_of, strip_of
-from sigmasplat.metrics.views import view_of
+from sigmasplat.metrics.views import scored_view
 from sigmasplat.model import se3
 from sigmasplat.render import FieldRenderer
 from sigmasplat.sources import open_source
@@ -30,34 +30,34 @@ arg = tyro.conf.arg
 DIRECTIONS = 36
 """Steps of a full turn around the map, from which the last panel's view is chosen."""
 ZOOM = 1.2
-"""Of the last panel: `from_above` leaves a wide margin."""
+"""Of the last panel: `orbit_view` leaves a wide margin."""
 Run = Annotated[Path, tyro.conf.Positional, arg(help="folder of a finished run")]
 Index = Annotated[int, arg(help="frame of the first three panels")]
 Direction = Annotated[int, arg(help=f"direction of the last panel, 0 to {DIRECTIONS - 1}")]
 Out = Annotated[Path, arg(help="picture to write")]
 
 
-def panels(run: RunFolder, index: int, direction: int) -> list[Panel]:
+def panels(run: RunFolder, index: int, direction: int) -> list[ViewPanel]:
     """Render the four panels. Raises RunError or SourceError where run or sequence cannot be read."""
-    recorded = Recorded(run, lambda: open_source(run.facts()["source_path"]))
-    config, field = recorded.config, run.read_map()
+    reader = RunReader(run, lambda: open_source(run.facts()["source_path"]))
+    config, field = reader.config, run.read_map()
     renderer = FieldRenderer(config.render, config.backend)
-    frame = recorded.source.frame(index).prepared(0, config.input.min_depth_m, config.input.max_depth_m)
-    T_camera_world = se3.inverse(recorded.path.T_world_camera[index])
+    frame = reader.source.frame(index).prepared(0, config.input.min_depth_m, config.input.max_depth_m)
+    T_camera_world = se3.inverse(reader.path.T_world_camera[index])
     with torch.inference_mode():
-        view = view_of(frame, renderer(field, frame.camera, T_camera_world), "")
-        below, poses = from_above(field, recorded.trusted_path(), frame.camera, DIRECTIONS, renderer)
+        view = scored_view(frame, renderer(field, frame.camera, T_camera_world), "")
+        below, poses = orbit_view(field, reader.tracked_path(), frame.camera, DIRECTIONS, renderer)
         near = replace(frame.camera, fx=ZOOM * frame.camera.fx, fy=ZOOM * frame.camera.fy)
         above = renderer(below, near, se3.inverse(poses[direction % DIRECTIONS]))
     backdrop = np.array(BACKGROUND, np.float32) / 255.0
     seen = above.color.numpy() + (1.0 - above.alpha.numpy()[..., None]) * backdrop
     pixels = (np.clip(seen, 0.0, 1.0) * 255.0).round().astype(np.uint8)
-    sensor, rendered, _, uncertainty, _ = panels_of(view)
+    sensor, rendered, _, uncertainty, _ = view_panels(view)
     return [
         replace(sensor, title="sensor", caption=f"{run.facts()['source']}, frame {index}"),
         replace(rendered, title="map, same view", caption=f"{len(field):,} splats"),
         replace(uncertainty, title="uncertainty of the colour"),
-        Panel("map, from above", pixels, "without the ceiling"),
+        ViewPanel("map, from above", pixels, "without the ceiling"),
     ]
 
 
@@ -70,8 +70,7 @@ def main(
     except SigmaSplatError as problem:
         print(f"picture.py: {problem}", file=sys.stderr)
         return 2
-    height, width = drawn[0].pixels.shape[:2]
-    strip_of(drawn, height / width).save(out, quality=88)
+    draw_view_strip(drawn).save(out, quality=88)
     print(f"{out}: {out.stat().st_size / 1000:.0f} kB")
     return 0
 
