@@ -236,18 +236,23 @@ def _colmap(source: ExportSource, target: Path, *, pictures: bool) -> str:
 def _export_views(
     export: "Callable[[RunReader, Path, bool, Progress], int]", source: ExportSource, target: Path, pictures: bool
 ) -> str:
+    from sigmasplat.types import no_progress
+
     reader = source.reader()
     if not pictures:
-        return f"{export(reader, target, False, lambda done, total: None):,} views, no pictures (--pictures)"
+        return f"{export(reader, target, False, no_progress):,} views, no pictures (--pictures)"
     with _counting("pictures") as progress:
         return f"{export(reader, target, True, progress):,} views with their pictures"
 
 
 def _points(source: ExportSource, target: Path, *, voxel_m: float) -> str:
+    from sigmasplat.evaluation.reconstruct import FusionInput
     from sigmasplat.exports.points import export_points
 
+    reader = source.reader()
     with _counting("surface") as progress:
-        return f"{export_points(source.reader(), target, voxel_m=voxel_m, progress=progress):,} points"
+        surface = FusionInput.at(reader.run, reader.camera).surface(voxel_m, progress=progress)
+        return f"{export_points(surface, target):,} points"
 
 
 def _video(source: ExportSource, target: Path, *, size: int, fps: float, seconds: float | None, path: str) -> str:

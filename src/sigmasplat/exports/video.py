@@ -27,7 +27,7 @@ from sigmasplat.model.camera_path import orbit, smooth_path
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import FieldRenderer
-from sigmasplat.types import Matrix, Progress
+from sigmasplat.types import Matrix, Progress, no_progress
 
 SHORTEST_S, LONGEST_S, ORBIT_S = 4.0, 60.0, 12.0
 SAMPLES = 12
@@ -74,7 +74,7 @@ def export_video(
     options: VideoOptions | None = None,
     *,
     renderer: SurfaceRenderer | None = None,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = no_progress,
 ) -> int:
     """Write a film and return its number of images. Calls `progress(done, total)` after each image.
 

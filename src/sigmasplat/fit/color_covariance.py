@@ -71,10 +71,7 @@ class FullCovarianceStep:
     def splats(
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Matrix, float]:
-        """Carry the planes to the splats in view, add the gradient of the shape terms, and step, correlations too.
-
-        Returns the pose twist [6] and the cost of the shape terms. grad2d [N] is filled as by `View.backward`.
-        """
+        """Step the splats in view and their correlations, as `MappingStep.splats`."""
         grad, cost = torch.zeros_like(field.params), 0.0
         twist = self._wide.backward(field.params, grad, grad2d)
         correlations, correlation_rates = self._wide.correlations, rates.of_attribute("correlations")

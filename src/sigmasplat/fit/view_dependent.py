@@ -61,10 +61,7 @@ class ViewDependentStep:
     def splats(
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Matrix, float]:
-        """Carry the planes to the splats in view and their harmonics, add the gradient of the shape terms, and step.
-
-        Returns the pose twist [6] and the cost of the shape terms. grad2d [N] is filled as by `View.backward`.
-        """
+        """Step the splats in view and their harmonics, as `MappingStep.splats`."""
         grad, cost = torch.zeros_like(field.params), 0.0
         twist = self.view.backward(self.rows, grad, grad2d)
         harmonics = self._begin(field.get_or_create("harmonics"))

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from sigmasplat.errors import ConfigError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.types import Matrix
 
 Floats = NDArray[np.float32]
 Image = NDArray[np.floating]
-Doubles = NDArray[np.float64]
 Keys = NDArray[np.int64]
 
 BLOCK = 8
@@ -87,7 +87,7 @@ class Tsdf:
         depth_m: Image,
         color: Image,
         camera: Camera,
-        T_world_camera: Doubles,
+        T_world_camera: Matrix,
         weight: Image | None = None,
     ) -> None:
         """Add an image: depth [H, W] m, 0 = no reading; color [H, W, 3]; weight [H, W] ≥ 0 per pixel (default 1).
@@ -104,7 +104,7 @@ class Tsdf:
                 a, b, z = (corners[k, at, None] + steps[k] for k in range(3))
                 self._update(self._pages[page], numbers[at] % BLOCKS_PER_PAGE, image, a, b, z)
 
-    def _allocate(self, image: "_Image", T_world_camera: Doubles) -> None:
+    def _allocate(self, image: "_Image", T_world_camera: Matrix) -> None:
         """Allocate the blocks near the surface: within the truncation along z, or one voxel in any direction."""
         R, t = T_world_camera[:3, :3].astype(np.float32), T_world_camera[:3, 3].astype(np.float32)
         rays = image.rays @ R.T
@@ -121,7 +121,7 @@ class Tsdf:
         while len(self._pages) * BLOCKS_PER_PAGE < len(self):
             self._pages.append(np.zeros((BLOCKS_PER_PAGE, 6, BLOCK**3), np.float32))
 
-    def _in_view(self, image: "_Image", T_world_camera: Doubles) -> tuple[NDArray[np.intp], Floats]:
+    def _in_view(self, image: "_Image", T_world_camera: Matrix) -> tuple[NDArray[np.intp], Floats]:
         """Return numbers [N] and projected first corners [3, N] of the blocks that may be visible, by number."""
         T, edge_m = se3.inverse(T_world_camera), BLOCK * self.voxel_m
         corners = self.blocks * edge_m @ T[:3, :3].T + T[:3, 3]
@@ -190,7 +190,7 @@ class _Image:
         w = self.inverse[pixel] + self.slope_u[pixel] * (u - column) + self.slope_v[pixel] * (v - row)
         return np.float32(1.0) / np.maximum(w, np.float32(1e-6)) - z, self.weight[pixel], pixel
 
-    def may_see(self, centers: Doubles, radius_m: float, reach_m: float) -> NDArray[np.bool_]:
+    def may_see(self, centers: Matrix, radius_m: float, reach_m: float) -> NDArray[np.bool_]:
         """Return which spheres (centers [N, 3], camera frame) may be in view and not behind all surfaces."""
         c, z = self.camera, centers[:, 2]
         least = self.inverse - 0.5 * (np.abs(self.slope_u) + np.abs(self.slope_v))
@@ -215,7 +215,7 @@ def _slope(w: Floats, axis: int) -> Floats:
     return np.moveaxis(np.where(ahead * behind > 0, smaller, np.float32(0.0)), 0, axis)
 
 
-def _projected(points: NDArray[np.floating], camera: Camera, R: Doubles | None = None) -> Floats:
+def _projected(points: NDArray[np.floating], camera: Camera, R: Matrix | None = None) -> Floats:
     """Return (fx x + cx z, fy y + cy z, z) [3, N] of points [N, 3], turned by R first."""
     x, y, z = (points if R is None else points @ R.T).T
     return np.stack([camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z, z]).astype(np.float32)

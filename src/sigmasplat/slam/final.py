@@ -23,7 +23,7 @@ from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.tsdf import packed
 from sigmasplat.render.view import View
 from sigmasplat.slam.fusion import count_keyframes, fuse, fusion_views
-from sigmasplat.types import Matrix, Progress
+from sigmasplat.types import Matrix, Progress, no_progress
 
 CACHE_BYTES = 64 << 20
 """Memory for prepared pictures; other pictures are read again when they are drawn."""
@@ -35,7 +35,7 @@ def final_map(
     config: Config,
     view: View,
     random: np.random.Generator,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = no_progress,
 ) -> GaussianField:
     """Return the map in the world, made of submaps at `anchors` (T_world_submap [4, 4] each) and refined with `view`.
 

@@ -30,7 +30,7 @@ from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.rules import ends_submap, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer, metrics_of
 from sigmasplat.slam.tracker import Tracker
-from sigmasplat.types import Matrix
+from sigmasplat.types import Matrix, no_progress
 
 HOST = torch.device("cpu")
 
@@ -91,7 +91,7 @@ class Slam:
         self.steps.append(self._step_result(seen.frame, T_submap_camera, mapped, tracking, loops))
         return self.steps[-1]
 
-    def finish(self, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
+    def finish(self, progress: Callable[[int, int], None] = no_progress) -> None:
         """Finish the last submap, look for its loops, and make the final map (VarSplat §7); call it once, at the end.
 
         Calls `progress(done, total)` with the steps of refinement, from 0 to the last one; without refinement the total

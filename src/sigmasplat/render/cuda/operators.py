@@ -4,8 +4,6 @@ NVRTC compiles them at first use for the device in use (native/cuda/cubins.py); 
 stream.
 """
 
-from typing import Any
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,9 +16,10 @@ from sigmasplat.native.cuda.cubins import FEATURE_COUNTS
 from sigmasplat.render.cuda import launch as cuda_launch
 from sigmasplat.render.cuda.launch import blocks_for
 from sigmasplat.render.cuda.raster import Planes, Raster
+from sigmasplat.render.kernel_operators import blend_with, project_with
 from sigmasplat.render.kernel_params import view_params
 from sigmasplat.render.pose_gradient import pose_gradient
-from sigmasplat.render.reference.operators import Blended, Projection
+from sigmasplat.render.reference import operators as reference
 
 FEATURES_AT_ONCE = FEATURE_COUNTS[-1]
 
@@ -31,10 +30,6 @@ def _float32(name: str, value: Tensor, device: torch.device) -> Tensor:
             f"the cuda backend takes float32 tensors on one device; {name} is {value.dtype} on {value.device}"
         )
     return value.detach().contiguous()
-
-
-def _apply(function: type[torch.autograd.Function], *inputs: Any) -> Any:
-    return function.apply(*inputs)  # type: ignore[no-untyped-call] # torch leaves apply untyped
 
 
 def _view(T: Tensor, camera: Camera, options: RenderConfig) -> tuple[NDArray[np.floating], Tensor | None]:
@@ -69,13 +64,6 @@ class _Project(torch.autograd.Function):
             g_m, g_q, g_s, twists,
         )  # fmt: skip
         return g_m, g_q, g_s, pose_gradient(T, twists.sum(0)) if ctx.needs_input_grad[3] else None, None, None
-
-
-def project(
-    means: Tensor, quats: Tensor, scales: Tensor, T_camera_world: Tensor, camera: Camera, options: RenderConfig
-) -> Projection:
-    """Project splats to the image; arguments and result as `reference.project`, float32 (the pose may be float64)."""
-    return Projection(*_apply(_Project, means, quats, scales, T_camera_world, camera, options))
 
 
 class _Blend(torch.autograd.Function):
@@ -118,19 +106,5 @@ class _Blend(torch.autograd.Function):
         return on_means2d, on_conics, on_z, None, on_opacities, on_features, None, None, None
 
 
-def blend(
-    means2d: Tensor,
-    conics: Tensor,
-    z: Tensor,
-    radii: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    ref_depth: Tensor | None,
-    camera: Camera,
-    options: RenderConfig,
-) -> Blended:
-    """Composite splats front to back; arguments and result as `reference.blend`, float32, any number of features."""
-    groups = torch.split(features, FEATURES_AT_ONCE, dim=1)
-    first = _apply(_Blend, means2d, conics, z, radii, opacities, groups[0], ref_depth, camera, options)
-    more = [_apply(_Blend, means2d, conics, z, radii, opacities, g, None, camera, options)[0] for g in groups[1:]]
-    return Blended(torch.cat([first[0], *more], -1) if more else first[0], *first[1:])
+project = project_with(_Project, reference.project)
+blend = blend_with(_Blend, FEATURES_AT_ONCE, reference.blend)
