@@ -1,4 +1,4 @@
-"""Run the compiled kernels: `project` and `blend` as autograd operators, float32, to the definition in `reference`."""
+"""Call the compiled kernels: `project` and `blend` as autograd operators in float32, as defined in `reference`."""
 
 from typing import Any
 
@@ -86,7 +86,8 @@ class _Project(torch.autograd.Function):
 def project(
     means: Tensor, quats: Tensor, scales: Tensor, T_camera_world: Tensor, camera: Camera, options: RenderConfig
 ) -> Projection:
-    """Project splats to the image; arguments and result as `reference.project`, float32 (the pose may be float64)."""
+    """Project splats to the image; arguments and result as in `reference.project`, float32 (the pose may be
+    float64)."""
     return Projection(*_apply(_Project, means, quats, scales, T_camera_world, camera, options))
 
 
@@ -143,7 +144,7 @@ def blend(
     camera: Camera,
     options: RenderConfig,
 ) -> Blended:
-    """Composite splats front to back; arguments and result as `reference.blend`, float32, any number of features."""
+    """Composite splats front to back; arguments and result as in `reference.blend`, float32, any number of features."""
     groups = torch.split(features, FEATURES_AT_ONCE, dim=1)
     first = _apply(_Blend, means2d, conics, z, radii, opacities, groups[0], ref_depth, camera, options)
     more = [_apply(_Blend, means2d, conics, z, radii, opacities, g, None, camera, options)[0] for g in groups[1:]]
