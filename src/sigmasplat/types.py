@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Matrix = NDArray[np.float64]
-"""A float64 array of any shape; its docstring says which, as in T_world_camera [4, 4]."""
+"""A float64 array of any shape; the docstring of its function gives the shape, as in T_world_camera [4, 4]."""
 Progress = Callable[[int, int], None]
 """Called with (done, total) while a long task runs; a total of 0 is not known yet."""
 

@@ -44,7 +44,8 @@ class RetryPolicy:
 
 
 class _TransferError(Exception):
-    """A failed attempt that can be retried; hopeless: not before any byte has arrived (no network, no such host)."""
+    """A failed attempt that can be retried. hopeless: do not retry before any byte has arrived (no network, no such
+    host)."""
 
     def __init__(self, why: str, wait_s: float = 0.0, hopeless: bool = False) -> None:
         super().__init__(why)
@@ -159,7 +160,7 @@ def _prepare(
         raise _TransferError(f"{_host(url)} sent another part of the file than requested")
     part.restart()
     length = headers.get("Content-Length", "")
-    if not length.isdigit() and not response.chunked:  # the end would look like a broken connection
+    if not length.isdigit() and not response.chunked:  # otherwise the end would look like a broken connection
         raise DownloadError(f"{_host(url)} does not say how long the file is, so it could not be known to be whole")
     size_bytes = int(length) if length.isdigit() else None
     part.begin(RemoteVersion(url, _version(headers), size_bytes))

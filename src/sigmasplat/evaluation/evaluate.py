@@ -185,7 +185,7 @@ def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField, loops
 
 
 def _frames_per_s(run: RunFolder, log: Log) -> float | None:
-    """Return the end-to-end speed, by wall_s of run.json if it is there, else by the sum of the frames' times."""
+    """Return the end-to-end speed: from wall_s of run.json if it exists, else from the sum of the frames' times."""
     seconds = run.facts().get("wall_s") or sum(charts.frame_seconds(record) for record in log)
     return len(log) / seconds if seconds else None
 

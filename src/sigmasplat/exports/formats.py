@@ -67,10 +67,10 @@ class ExportSource:
 class ExportFormat:
     """A row of the table: the name for --format, the endings that select it, a line of help, and its writer.
 
-    The first row with an ending owns it. An export without --out gets the first ending. `write(source, target, …)`
-    writes the target, a file or folder that does not exist or may be replaced, and returns a short description of its
-    content. Its keyword-only parameters are the options of the command line that the format accepts. reads_sequence:
-    the format also accepts --source.
+    An ending selects the first row that has it. Without --out, an export gets the row's first ending. `write(source,
+    target, …)` writes the target, a file or folder that does not exist or may be replaced, and returns a short
+    description of its content. Its keyword-only parameters are the options of the command line that the format accepts.
+    reads_sequence: the format also accepts --source.
     """
 
     name: str

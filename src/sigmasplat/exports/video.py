@@ -115,7 +115,7 @@ def orbit_view(
     radius_m = 0.85 * float(np.linalg.norm((high - low)[:2]) / 2.0 / np.sin(half_view))
     T_world_floor = se3.inverse(T)
     center = T_world_floor[:3, :3] @ middle + T_world_floor[:3, 3]
-    kept = field.moved(torch.eye(4))  # a copy
+    kept = field.moved(torch.eye(4))  # makes a copy
     kept.keep(torch.from_numpy(field.means.numpy().astype(np.float64) @ T[2, :3] + T[2, 3] < ceiling_m))
     return kept, orbit(center, T[2, :3], T[1, :3], radius_m, images)
 

@@ -1,6 +1,7 @@
 """Fit the full colour covariance of splats: one mapping step.
 
-This goes beyond the paper, which has one variance per channel. Tracking and everything else read the diagonal of V.
+This is an extension of the paper, which has one variance per channel. Tracking and all other code read only the
+diagonal of V.
 """
 
 from typing import Protocol
@@ -22,7 +23,7 @@ COLORS, SCALES = COLUMNS["colors"], COLUMNS["log_scales"]
 
 
 class ImageTerms(Protocol):
-    """The part of another step that this one uses: the gradient of the image terms."""
+    """The part of the inner step that this step uses: the gradient of the image terms."""
 
     def images(self, target: Target, weights: Weights) -> float | Tensor:
         """Write the gradient of the image terms to the first seven gradient planes; return the loss."""
@@ -30,11 +31,11 @@ class ImageTerms(Protocol):
 
 
 class FullCovarianceStep:
-    """One mapping step with `nll_color_full` in place of `nll_color`; `others` computes the other terms on the same
+    """One mapping step with `nll_color_full` instead of `nll_color`; `others` computes the other terms on the same
     view.
 
-    The gradient of V reaches everything that V depends on: variances, correlations, colours, and the weights of splats
-    in a pixel.
+    The gradient of V is propagated to everything that V depends on: variances, correlations, colours, and the weights
+    of splats in a pixel.
     """
 
     def __init__(self, view: CorrelationView, others: ImageTerms) -> None:
@@ -42,11 +43,11 @@ class FullCovarianceStep:
 
     @property
     def view(self) -> View:
-        """Return the view it renders to."""
+        """Return the view that the step renders to."""
         return self._wide
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
-        """Render the field to the view's planes."""
+        """Render the field into the view's planes."""
         self._wide.forward(field.params, T_camera_world)
 
     def images(self, target: Target, weights: Weights) -> float:
@@ -89,5 +90,5 @@ class FullCovarianceStep:
         return twist, cost
 
     def accumulator(self, field: GaussianField) -> Accumulator:
-        """Refuse with a ConfigError: the step takes one image only."""
+        """Raise ConfigError: this step takes one image only."""
         raise one_image_only()

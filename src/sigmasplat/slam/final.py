@@ -37,10 +37,12 @@ def final_map(
     random: np.random.Generator,
     progress: Progress = no_progress,
 ) -> GaussianField:
-    """Return the map in the world, made of submaps at `anchors` (T_world_submap [4, 4] each) and refined with `view`.
+    """Return the map in the world: made from submaps at `anchors` (T_world_submap [4, 4] each), then refined with
+    `view`.
 
-    Calls `progress(steps done, total)`. Memory holds this map, one submap and some pictures. Raises SigmaSplatError if
-    there is no submap, a submap has no anchor, or its camera is not the view's; ConfigError on settings out of range.
+    Calls `progress(steps done, total)`. Memory contains this map, one submap and some pictures. Raises SigmaSplatError
+    if there is no submap, a submap has no anchor, or its camera is not the view's; ConfigError on settings out of
+    range.
     """
     _refuse_misfits(store, anchors, config.final)
     seed = seeded_on_surface if config.final.seed_from == "mesh" else merged

@@ -1,4 +1,4 @@
-"""Run the compiled kernels: `project` and `blend` as autograd operators, float32, to the definition in `reference`."""
+"""Call the compiled kernels: `project` and `blend` as autograd operators in float32, as defined in `reference`."""
 
 import numpy as np
 import torch

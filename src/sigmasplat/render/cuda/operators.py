@@ -1,7 +1,7 @@
-"""Run the CUDA kernels: `project` and `blend` as autograd operators, float32, to the definition in `reference`.
+"""Call the CUDA kernels: `project` and `blend` as autograd operators in float32, as defined in `reference`.
 
-NVRTC compiles them at first use for the device in use (native/cuda/cubins.py); torch supplies memory, sorting and the
-stream.
+NVRTC compiles the kernels at first use for the current device (native/cuda/cubins.py). torch provides memory, sorting
+and the stream.
 """
 
 import numpy as np
@@ -33,7 +33,8 @@ def _float32(name: str, value: Tensor, device: torch.device) -> Tensor:
 
 
 def _view(T: Tensor, camera: Camera, options: RenderConfig) -> tuple[NDArray[np.floating], Tensor | None]:
-    """Return the kernels' `View` by value, and the pose if it is on a device: then the host does not wait for it."""
+    """Return the kernels' `View` by value. If the pose is on a device, return it too, so that the host does not wait
+    for it."""
     if T.device.type == "cpu":
         return view_params(camera, T.detach().double().numpy(), options), None
     return view_params(camera, np.eye(4), options), T.detach().float().contiguous()
@@ -87,7 +88,7 @@ class _Blend(torch.autograd.Function):
         ctx.given, ctx.planes, ctx.ref = (c, depth, o), planes, ref
         detached = [ids[0], weights[0], ids[1], weights[1]]
         ctx.mark_non_differentiable(*detached)
-        # What backward reads is kept from a caller who writes to the maps.
+        # The caller gets copies, because the backward pass reads the originals.
         maps = (sums.movedim(0, -1), moment, alpha)
         return (*(x.clone() if x is not None else None for x in maps), *detached)
 
