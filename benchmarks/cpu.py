@@ -1,7 +1,7 @@
 """Time the CPU kernels on maps back-projected from real depth: every operation, instruction set, number of threads.
 
 Writes benchmarks/results/cpu-<machine>.json and prints its tables; benchmarks/README.md says what each figure means.
-Do not use the machine for anything else meanwhile.
+Do not use the machine for anything else during the measurement.
 
 example: python benchmarks/cpu.py --quick
 """

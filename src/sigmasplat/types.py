@@ -1,4 +1,4 @@
-"""Name the types that many modules share, and the default for an optional callback."""
+"""Define the types that many modules share, and the default for an optional callback."""
 
 from collections.abc import Callable
 

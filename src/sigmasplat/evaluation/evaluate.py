@@ -105,7 +105,7 @@ def _submaps(log: Log) -> int:
 def _posed(log: Log, path: Trajectory, run: RunFolder) -> Log:
     """Return the log's records that have a pose, each with its `T_world_camera` [4, 4] and its `row` in the log.
 
-    Raises RunError if none has.
+    Raises RunError if no record has a pose.
     """
     times = np.array([record["timestamp_s"] for record in log], np.float64)
     rows, poses = associate(times, path.timestamps_s, SAME_TIME_S)

@@ -22,9 +22,9 @@ def image_name(frame: int) -> str:
 
 
 def export_images(reader: RunReader, folder: Path, depth: bool, progress: Progress) -> Sequence[int]:
-    """Write the keyframes' colour to images/, and their depth to depths/ if asked for; lost keyframes are left out.
+    """Write the keyframes' colour to images/, and their depth to depths/ if requested; lost keyframes are left out.
 
-    Returns their frame numbers. Raises RunError if there is none.
+    Returns their frame numbers. Raises RunError if no keyframe is left.
     """
     tracked, written = set(reader.tracked_frames()), []
     total = reader.count_keyframes()

@@ -56,7 +56,7 @@ def up_direction(normals: Matrix, area: Matrix, poses: Matrix) -> Matrix:
 
     Candidates are normals within 40° of the mean up direction of the cameras. The best one has the most area whose
     normals are parallel (weight 1) or perpendicular (weight ½) to it. With too few level surfaces the result is
-    perpendicular to the walls; without walls, it is the mean up direction of the cameras.
+    perpendicular to the walls. Without walls it is the mean up direction of the cameras.
     """
     camera_up = _unit(-poses[:, :3, 1].sum(0), -poses[0, :3, 1])
     level = np.abs(normals @ camera_up) > MAX_TILT_COS

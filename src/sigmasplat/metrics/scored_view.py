@@ -1,4 +1,4 @@
-"""Hold one recorded image with its rendering, and score the pair."""
+"""Store one recorded image with its rendering, and score the pair."""
 
 from dataclasses import dataclass, field
 

@@ -5,10 +5,10 @@ triangular, have length 1:
 
     (1, 0, 0)    (t₁, √(1−t₁²), 0)    (t₂, t₃ √(1−t₂²), √(1−t₂²) √(1−t₃²))        t = 0.999 tanh(a)
 
-so that L = D A is the Cholesky factor of Σ, and Σ is positive definite whatever a [3] is, the field's `correlations`.
-t₁ and t₂ are the correlations red–green and red–blue, t₃ that of green–blue once red is known. a = 0: no correlation,
-the paper's diagonal. For every a, the variances of the channels stay exp(s) (VarSplat §1). Code that reads only the
-variances, such as V for tracking and loops, does not depend on a. a has no unit.
+a [3] are the field's `correlations`. L = D A is the Cholesky factor of Σ, and Σ is positive definite for every a. t₁
+and t₂ are the correlations red–green and red–blue; t₃ is the correlation green–blue for known red. a = 0 means no
+correlation: the paper's diagonal. For every a, the variances of the channels stay exp(s) (VarSplat §1). Code that reads
+only the variances, such as V for tracking and loops, does not depend on a. a has no unit.
 """
 
 import torch

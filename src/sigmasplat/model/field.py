@@ -1,4 +1,4 @@
-"""Hold the Gaussians: one row per splat. Parameters and optimiser state are always edited together."""
+"""Store the Gaussians: one row per splat. Parameters and optimiser state are always edited together."""
 
 from dataclasses import dataclass, field as dataclass_field
 

@@ -124,7 +124,7 @@ LIGHT_WIDTHS = {"replica": 600, "tum": 320, "scannet": 320}
 
 
 def _with_loops(config: Config, like: Config) -> Config:
-    """Take submaps, loops, registration and final map from a VarSplat preset, without the weights of V."""
+    """Return settings with submaps, loops, registration and final map of a VarSplat preset, without weights of V."""
     plain = varsplat.without_variance(like)
     return dataclasses.replace(
         config, submaps=like.submaps, loops=plain.loops, registration=plain.registration, final=plain.final

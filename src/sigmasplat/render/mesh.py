@@ -48,7 +48,7 @@ def _boxes(
     faces = np.flatnonzero((z > near_m)[corners].all(0))
     boxes: list[Rows] = []
     for values, pixels in ((u, camera.width), (v, camera.height)):
-        # A box without a pixel centre ends before it begins.
+        # The box of a face that covers no pixel centre has a negative size.
         at = values[np.take(corners, faces, 1)]
         first, last = np.clip(np.ceil(at.min(0)), 0, pixels), np.clip(np.floor(at.max(0)), -1, pixels - 1)
         some = last >= first

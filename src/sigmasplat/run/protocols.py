@@ -95,17 +95,17 @@ class CallbackList:
         self.callbacks = callbacks
 
     def __call__(self, step: StepResult) -> None:
-        """Pass on a step."""
+        """Call every callback with a step."""
         for callback in self.callbacks:
             callback(step)
 
     def finishing(self, done: int, total: int) -> None:
-        """Pass on the progress of the final map."""
+        """Call every callback with the progress of the final map."""
         for callback in self.callbacks:
             callback.finishing(done, total)
 
     def last_loops(self, loops: Sequence[LoopResult]) -> None:
-        """Pass on the loops tried after the last step."""
+        """Call every callback with the loops tried after the last step."""
         for callback in self.callbacks:
             callback.last_loops(loops)
 

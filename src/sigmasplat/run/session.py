@@ -139,7 +139,7 @@ class Session:
         return self._outcome(status)
 
     def _count_earlier_frames(self) -> None:
-        """Take the counts of a resumed run from its log."""
+        """Restore the counts of a resumed run from its log."""
         log = self.run.read_log()
         self.frames, self.lost = len(log), sum(line["lost"] for line in log)
         self.submaps = 1 + (log[-1]["submap"] if log else 0)
@@ -223,7 +223,7 @@ def log_line(step: StepResult) -> dict[str, Any]:
 
 @contextmanager
 def interrupt_event() -> Iterator[threading.Event]:
-    """Turn the first Ctrl-C into an event, so that no step is cut in half; the next one raises KeyboardInterrupt.
+    """Convert the first Ctrl-C to an event, so that no step is interrupted; the next one raises KeyboardInterrupt.
 
     Outside the main thread signals cannot be handled, and the event is never set.
     """

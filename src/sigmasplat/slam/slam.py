@@ -166,7 +166,7 @@ class Slam:
         return self._view
 
     def _observe(self, frame: Frame) -> Observation:
-        """Bring a frame to working size and lay it out for the fits."""
+        """Resize a frame to working size and prepare it for the fits."""
         with self._timer.stage("prepare"):
             i = self.config.input
             frame = frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px)

@@ -50,8 +50,8 @@ def formats() -> tuple[Format, ...]:
 def open_source(path: str | Path, settings: InputConfig | None = None, **changes: Any) -> Source:
     """Open a recorded or synthetic sequence; the format is recognised from the content of `path`.
 
-    `path` is a folder or file, or "synthetic" with options as in "synthetic:frames=200,seed=1,noise=1". `settings` say
-    which frames are read and how they are processed; each can also be given by name: stride=2, limit=100.
+    `path` is a folder or file, or "synthetic" with options as in "synthetic:frames=200,seed=1,noise=1". `settings`
+    choose which frames are read and how they are processed; each can also be given by name: stride=2, limit=100.
     Raises SourceError if the path does not exist, no format recognises it, or its content cannot be used;
     ConfigError on an unknown setting.
     """

@@ -1,4 +1,4 @@
-"""Draw the newest snapshot of a run as the controls ask, in one thread and at a bounded rate."""
+"""Draw the newest snapshot of a run according to the controls, in one thread and at a bounded rate."""
 
 import contextlib
 import ctypes

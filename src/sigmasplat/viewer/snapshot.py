@@ -1,4 +1,4 @@
-"""Hold the state of a run that the viewer shows at one time: path, keyframes, map. Needs no browser and no file."""
+"""Store the state of a run that the viewer shows at one time: path, keyframes, map. Needs no browser and no file."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field as dataclass_field, replace
@@ -77,7 +77,7 @@ class Snapshot:
     status: str = ""
 
     def visible_pieces(self, final_map: bool, row: int) -> tuple[Piece, ...]:
-        """Return the final map if it exists and is asked for, else the submaps started up to frame `row`."""
+        """Return the final map if it exists and is requested, else the submaps started up to frame `row`."""
         if self.final is not None and (final_map or not self.pieces):
             return (self.final,)
         if not len(self.path):

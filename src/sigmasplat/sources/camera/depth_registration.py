@@ -69,6 +69,6 @@ def draw_footprints(nearest: Floats, width: int, columns: Floats, rows: Floats, 
 
 
 def _span(centre: Floats, half: Floats, count: int) -> Floats:
-    """Return first and last pixel of `count` whose centre is within centre ± half, [2, N]; last < first if none is."""
+    """Return first and last pixel of `count` whose centre is within centre ± half, [2, N]; last < first if none."""
     bounded = np.clip(half, 0.0, MAX_HALF_FOOTPRINT_PX)
     return np.stack([np.maximum(np.ceil(centre - bounded), 0.0), np.minimum(np.floor(centre + bounded), count - 1.0)])

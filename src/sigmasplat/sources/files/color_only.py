@@ -33,7 +33,7 @@ def without_depth(path: Path) -> SourceError | None:
 
 
 def _describe(path: Path) -> str | None:
-    """Name the images at the path in a few words, None if it may hold depth or holds no image."""
+    """Describe the images at the path in a few words; None if it may hold depth or holds no image."""
     if not path.is_dir():
         ending = path.suffix.lower()
         return "a video" if ending in VIDEO_ENDINGS else "a single image" if _is_color_image(path) else None
@@ -75,7 +75,7 @@ def _is_color_image(path: Path) -> bool:
 
 
 def _stereo_folders(folders: dict[Path, list[Path]]) -> list[str]:
-    """Return the names of the folders of a stereo rig's cameras, none if there are not at least two."""
+    """Return the folder names of a stereo rig's cameras; empty if there are fewer than two."""
     cameras = [folder.parent if folder.name == "data" else folder for folder in folders]
     names = sorted({camera.name for camera in cameras if STEREO_FOLDER.fullmatch(camera.name.lower())})
     return names if len(names) > 1 else []
