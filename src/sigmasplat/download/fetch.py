@@ -160,7 +160,9 @@ def _prepare(
     part.restart()
     length = headers.get("Content-Length", "")
     if not length.isdigit() and not response.chunked:  # the end would look like a broken connection
-        raise DownloadError(f"{_host(url)} does not say how long the file is, so it could not be known to be whole")
+        raise DownloadError(
+            f"{_host(url)} does not send the length of the file, so a complete download could not be recognised"
+        )
     size_bytes = int(length) if length.isdigit() else None
     part.begin(RemoteVersion(url, _version(headers), size_bytes))
     return size_bytes

@@ -131,16 +131,16 @@ def _checked(found: tuple[Any, ...], failure: str) -> Any:
     """Return what the driver found. Raises BackendError with its reason where it did not succeed."""
     result, *values = found
     if result.value != 0:
-        raise BackendError(f"{failure}: {result.name}; `sigmasplat doctor` tells more")
+        raise BackendError(f"{failure}: {result.name}; run `sigmasplat doctor` for details")
     return values[0] if values else None
 
 
 def missing() -> str | None:
     """Return in one line why the CUDA backend cannot run here and what to do about it; None if it can run."""
     if torch.version.cuda is None:
-        return f"torch {torch.__version__} is built without CUDA; install one that is (https://pytorch.org)"
+        return f"torch {torch.__version__} is built without CUDA; install a torch with CUDA (https://pytorch.org)"
     if not torch.cuda.is_available():
-        return "torch finds no CUDA device; is there one, and its driver?"
+        return "torch finds no CUDA device; check that a GPU and its driver are installed"
     try:
         cubins.compiler_version()
     except BackendError as problem:
