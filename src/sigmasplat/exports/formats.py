@@ -273,7 +273,7 @@ FORMATS = (
     ExportFormat(
         "compressed-ply", (".compressed.ply",), "SuperSplat's compressed PLY, a fifth of the size", _compressed_ply
     ),
-    ExportFormat("splat", (".splat",), ".splat with 32 bytes per splat, for web viewers", _splat),
+    ExportFormat("splat", (".splat",), "32 bytes per splat, for web viewers", _splat),
     ExportFormat("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", _spz),
     ExportFormat("trajectory", (".txt",), "the path as TUM text", _trajectory),
     ExportFormat("kitti", (".kitti.txt",), "the path as KITTI text, one line per frame", _kitti, True),
