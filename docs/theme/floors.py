@@ -1,4 +1,4 @@
-"""Draw docs/images/floors.svg, the layers of the package and who imports whom: python docs/theme/floors.py.
+"""Draw docs/images/floors.svg, the layers of the package and their imports: python docs/theme/floors.py.
 
 The imports are read from the sources. `FLOORS` is the one list of the layers; tests/pure/test_layers.py enforces it and
 checks that the committed picture shows the current imports.
@@ -18,7 +18,7 @@ PICTURE = ROOT / "docs" / "images" / "floors.svg"
 
 @dataclass(frozen=True)
 class Floor:
-    """One layer: the folders or top files in it, the group it belongs to, and what it holds."""
+    """One layer: the folders or top files in it, the group it belongs to, and its contents."""
 
     names: tuple[str, ...]
     group: str
@@ -35,18 +35,18 @@ FLOORS = (
     Floor(("config",), "base", "every setting, with units"),
     Floor(("presets",), "base", "values of the published systems"),
     Floor(("native",), "base", "C++ and CUDA kernels"),
-    Floor(("model",), "core", "what exists: camera, splats, submap"),
-    Floor(("render",), "core", "how it is seen: colour, depth, variance"),
-    Floor(("fit",), "core", "how it is adjusted: poses and splats"),
-    Floor(("slam",), "core", "how it decides: track, map, close loops"),
-    Floor(("sources",), "data", "data sets and recordings in"),
-    Floor(("io",), "data", "run folders, splats, meshes out"),
+    Floor(("model",), "core", "data: camera, splats, submap"),
+    Floor(("render",), "core", "images: colour, depth, variance"),
+    Floor(("fit",), "core", "optimise poses and splats"),
+    Floor(("slam",), "core", "track, map, close loops"),
+    Floor(("sources",), "data", "read data sets and recordings"),
+    Floor(("io",), "data", "run folders, splats, meshes"),
     Floor(("metrics",), "results", "scores"),
     Floor(("drawing",), "results", "images, charts, contact sheets"),
     Floor(("floorplan",), "results", "floor plan, regions to rescan"),
     Floor(("report",), "results", "the HTML report"),
     Floor(("checks",), "results", "check an installation, a recording"),
-    Floor(("run",), "programs", "a sequence through SLAM to a folder"),
+    Floor(("run",), "programs", "run SLAM on a sequence"),
     Floor(("evaluation",), "programs", "score runs, compare them"),
     Floor(("exports",), "programs", "formats of other programs"),
     Floor(("viewer",), "programs", "a run in the browser"),
@@ -58,7 +58,7 @@ FLOORS = (
 
 ROW, COLUMN, LEFT, TOP = 25, 22, 578, 34
 NAME, WHAT = 100, 200
-"""Where the name of a layer begins, and what it holds."""
+"""Where the name and the contents of a layer begin."""
 WIDTH = LEFT + COLUMN * len(FLOORS) + 62
 STYLE = """
 text { font: 13px system-ui, sans-serif; fill: #1f2328 }

@@ -56,7 +56,7 @@ def test_where_there_are_no_graphs_one_warning_says_so(recorder: Recorder) -> No
     Graph.fails = "begin"
     done: list[int] = []
     with pytest.warns(
-        UserWarning, match=r"no CUDA graphs here \(CUDA error: operation not permitted\): kernels"
+        UserWarning, match=r"CUDA graphs cannot be used \(CUDA error: operation not permitted\); kernels"
     ) as seen:
         again = recorder.record(lambda: done.append(1))
     assert done == [] and len(seen) == 1
@@ -74,7 +74,7 @@ def test_work_that_cannot_be_recorded_is_done_as_it_is(recorder: Recorder, probl
         if len(calls) == 1:
             raise problem
 
-    with pytest.warns(UserWarning, match="no CUDA graphs here"):
+    with pytest.warns(UserWarning, match="CUDA graphs cannot be used"):
         again = recorder.record(work)
     assert Graph.asked == [("begin", None), ("end", None)], "the stream is left as it was"
     again()

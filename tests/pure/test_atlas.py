@@ -76,7 +76,7 @@ def test_the_memory_store_gives_back_what_it_took() -> None:
 
 def test_submaps_are_kept_in_order_and_with_all_their_pictures() -> None:
     store = MemoryStore()
-    with pytest.raises(SigmaSplatError, match="submap 1 cannot be kept: the next one is 0"):
+    with pytest.raises(SigmaSplatError, match="submap 1 cannot be saved: the next index is 0"):
         store.save(piece(1), [picture()])
     with pytest.raises(SigmaSplatError, match="2 frames, 2 poses, 1 pictures"):
         store.save(piece(0, 2), [picture()])

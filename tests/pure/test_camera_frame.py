@@ -75,7 +75,7 @@ def test_sizes_that_differ_are_refused() -> None:
         ((6, 8, 4), (6, 8)),
         ((3, 4, 3), (3, 4)),
     ]:
-        with pytest.raises(SourceError, match="the camera says 8×6"):
+        with pytest.raises(SourceError, match="the camera is 8×6"):
             Frame(0, 0.0, np.zeros(color, np.float32), np.ones(depth, np.float32), CAMERA)
 
 
@@ -145,7 +145,7 @@ def test_half_size_is_cropped_after_resizing() -> None:
 def test_a_crop_of_the_whole_image_is_refused() -> None:
     for width, crop_px in [(0, 3), (4, 2), (16, 6), (0, 100)]:
         with pytest.raises(
-            ConfigError, match=rf"input\.crop_px is {crop_px}, which leaves nothing of \d+×\d+"
+            ConfigError, match=rf"input\.crop_px is {crop_px}, which removes the whole image of \d+×\d+"
         ) as refused:
             frame().prepared(width, 0.1, 8.0, crop_px)
         assert "\n" not in str(refused.value)

@@ -214,7 +214,7 @@ def test_lost_frames_are_printed(corridor: Corridor, capsys: pytest.CaptureFixtu
     assert exit_code("run", "corridor") == 0
     said = capsys.readouterr().out
     assert "frame 2 (t = 2.000 s): tracking lost" in said
-    assert "frame 4 (t = 4.000 s): tracking found again, lost since frame 2" in said
+    assert "frame 4 (t = 4.000 s): tracking recovered; it was lost since frame 2" in said
     assert "tracking was LOST on 3 of 6 frames: 2–3, 5" in said
     assert said.count("tracking lost") == 2
 

@@ -175,7 +175,7 @@ def test_a_slow_server_is_an_error(act: Act, says: str, server: FileServer, tmp_
         (acts.status(404), r"/a.tgz is not available \(HTTP 404 Not Found\)"),
         (acts.status(403), r"HTTP 403 Forbidden"),
         (acts.web_page, r"answers with a web page"),
-        (acts.endless, r"does not say how long the file is"),
+        (acts.endless, r"does not send the length of the file"),
         (acts.sends_on("ftp://127.0.0.1/a.tgz"), r"redirects to ftp://127.0.0.1/a.tgz, which is not https"),
     ],
     ids=["404", "403", "html", "no length", "ftp"],

@@ -161,10 +161,10 @@ def test_images_are_read_one_by_one(store: DiskStore, monkeypatch: pytest.Monkey
 
 
 def test_submaps_are_saved_in_order_and_complete(store: DiskStore) -> None:
-    with pytest.raises(SigmaSplatError, match="submap 1 cannot be kept: the next one is 0"):
+    with pytest.raises(SigmaSplatError, match="submap 1 cannot be saved: the next index is 0"):
         store.save(*some_submap(1))
     store.save(*some_submap(0))
-    with pytest.raises(SigmaSplatError, match="submap 0 cannot be kept: the next one is 1"):
+    with pytest.raises(SigmaSplatError, match="submap 0 cannot be saved: the next index is 1"):
         store.save(*some_submap(0))
     submap, pictures = some_submap(1)
     with pytest.raises(SigmaSplatError, match="3 frames, 3 poses, 2 pictures"):

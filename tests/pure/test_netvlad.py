@@ -194,7 +194,7 @@ def test_depth_is_not_looked_at_and_the_working_width_is_kept(tmp_path: Path) ->
     small = described(tmp_path / "c", large, width=50)
     assert small @ described(tmp_path / "c", color) > 0.99 > small @ described(tmp_path / "c", large)
     assert np.array_equal(described(tmp_path / "c", color, width=50), described(tmp_path / "c", color))
-    with pytest.raises(ConfigError, match=r"at least 16 pixels each way, found 20×15; raise input\.width"):
+    with pytest.raises(ConfigError, match=r"at least 16 pixels in each direction, found 20×15; raise input\.width"):
         described(tmp_path / "c", color, width=20)
 
 
@@ -291,7 +291,7 @@ class Payload:
 def test_loading_runs_no_code(tmp_path: Path, zipped: bool) -> None:
     evil = {"state_dict": state_dict(net()), "optimizer": Payload(tmp_path / "ran")}
     torch.save(evil, tmp_path / "evil.pth", _use_new_zipfile_serialization=zipped)
-    assert "holds more than tensors and numbers" in one_line(tmp_path / "evil.pth")
+    assert "contains more than tensors and numbers" in one_line(tmp_path / "evil.pth")
     (tmp_path / "plain.pkl").write_bytes(pickle.dumps(evil["optimizer"]))
     one_line(tmp_path / "plain.pkl")
     assert not (tmp_path / "ran").exists()

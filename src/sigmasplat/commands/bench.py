@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 DEFAULT_PRESET = default_preset()
 WIDTH = 132
 """Width of a table in characters if the output is not a terminal."""
-BEST = "best of its column"
+BEST = "best value of its column"
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,9 @@ class Ablation:
                 run_jobs(study.jobs(source), results, runner, self.keep, partial(_announce, screen, jobs, results))
                 show(screen, study, source, results.of(source))
         except BaseException:
-            screen.say(f"{len(results.runs)} of {len(jobs)} runs are in {self.out}; the same command makes the others")
+            screen.say(
+                f"{len(results.runs)} of {len(jobs)} runs are in {self.out}; repeat the command to make the others"
+            )
             raise
         screen.say(f"{len(jobs)} runs: {self.out}")
         return 0

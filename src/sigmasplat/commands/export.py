@@ -43,7 +43,7 @@ def export(
     overwrite: options.Overwrite = False,
     asked: ExportOptionsFlat = DEFAULT_EXPORT_OPTIONS,
 ) -> int:
-    """Write a run's map, or a map from a file, for viewers and other programs; or a run's path.
+    """Write the map or the path of a run, or a map from a file, in a format of other programs.
 
     {formats}
 

@@ -88,7 +88,7 @@ def resume(
 ) -> int:
     """Resume a run that was stopped or killed, from its last saved state.
 
-    The result is byte for byte that of an uninterrupted run. example: sigmasplat resume runs/kitchen-sigma
+    The result has the same bytes as an uninterrupted run. example: sigmasplat resume runs/kitchen-sigma
     """
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.run.resume import resume as resumed

@@ -6,13 +6,13 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class DensifyConfig:
-    """How splats are pruned, split and cloned, halfway through the steps of a keyframe and after them (CG-SLAM §4,
+    """Pruning, splitting and cloning of splats, halfway through the steps of a keyframe and after them (CG-SLAM §4,
     5)."""
 
     uncertain_m2: float = 0.0
-    """A splat is uncertain if the depth readings at its pixels over the window deviate from its own depth by a mean
-    square above this (ν > τ, CG-SLAM eq. 13). It fades halfway through the steps of a keyframe, and is removed at the
-    end unless it has recovered; 0 = off."""
+    """A splat is uncertain if the mean squared difference between its depth and the depth readings at its pixels, over
+    the window, is above this (ν > τ, CG-SLAM eq. 13). It fades halfway through the steps of a keyframe, and is removed
+    at the end unless it has recovered; 0 = off."""
     owner: Literal["dominant", "median"] = "dominant"
     """Which splat of a pixel is compared with its depth reading: the one with the largest weight (paper), or the one at
     the median depth (CG-SLAM's code)."""

@@ -6,7 +6,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class RenderConfig:
-    """How splats become pixels; the thresholds are those of 3DGS."""
+    """Rendering of splats; the thresholds are those of 3DGS."""
 
     alpha_min: float = 1.0 / 255.0
     """A splat is ignored at pixels where its alpha is below this."""
@@ -30,7 +30,7 @@ class RenderConfig:
 
 @dataclass(frozen=True)
 class SeedConfig:
-    """Where new splats are created (VarSplat §2, seeding)."""
+    """Creation of new splats (VarSplat §2, seeding)."""
 
     first_uniform: int = 100_000
     """Number of pixels of the first keyframe, drawn uniformly, that become splats. Use more for large images, fewer for
@@ -53,16 +53,16 @@ class SeedConfig:
     min_distance_m: float = 0.01
     """No seed is placed closer than this to an existing splat in view."""
     opacity: float = 0.5
-    """Initial opacity of seeds, 0 to 1. With a high one the map can be tracked sooner; a low one is fitted more
-    freely."""
+    """Initial opacity of seeds, 0 to 1. With a higher value the map can be used for tracking sooner; a lower value
+    leaves more freedom to the fit."""
     scale_from: Literal["neighbours", "pixel"] = "neighbours"
     """Initial size of seeds: neighbours = root mean squared distance to the 3 nearest splats (papers); pixel = size of
     a pixel at that depth × spacing of the seeds."""
     scale_factor: float = 1.0
     """Factor on the size from `scale_from`. A larger one closes gaps, a smaller one keeps edges."""
     push_back: float = 1.005
-    """Factor on the depth of seeds. Blending with closer splats first moves the rendered depth forward (VarSplat's
-    code)."""
+    """Factor on the depth of seeds. Blending with closer splats makes the rendered depth too small at first; a factor
+    above 1 compensates for this (VarSplat's code)."""
     density: float = 1.0
     """Share of the chosen pixels of a later keyframe that become splats."""
     outlier_neighbours: int = 0
@@ -73,7 +73,7 @@ class SeedConfig:
 
 @dataclass(frozen=True)
 class MappingConfig:
-    """How the map is fitted to keyframes: iterations, loss weights, learning rates (VarSplat §2; CG-SLAM §3, 5, 7)."""
+    """Fit of the map to keyframes: iterations, loss weights, learning rates (VarSplat §2; CG-SLAM §3, 5, 7)."""
 
     every: int = 1
     """A frame becomes a keyframe this many frames after the last keyframe."""
@@ -136,8 +136,8 @@ class MappingConfig:
     freeze_old_colors: bool = False
     """Whether splats older than the keyframe keep their colours."""
     prune_opacity: float = 0.5
-    """Splats with at most this opacity are removed after the steps of a keyframe. A lower value keeps haze, a higher
-    one makes holes."""
+    """Splats with at most this opacity are removed after the steps of a keyframe. A lower value keeps faint splats, a
+    higher one makes holes."""
     keyframe_history: int = 0
     """Older keyframes are drawn only from this many of the latest ones; 0 = from all."""
     window: int = 0
@@ -152,7 +152,7 @@ class MappingConfig:
 
 @dataclass(frozen=True)
 class TrackingConfig:
-    """How camera poses are fitted: method, iterations, masks, weights (VarSplat §3; CG-SLAM §6)."""
+    """Fit of camera poses: method, iterations, masks, weights (VarSplat §3; CG-SLAM §6)."""
 
     method: Literal["adam", "align"] = "adam"
     """adam: gradient descent through the renderer, as in the papers; align: one render, then Gauss–Newton on that
@@ -179,8 +179,8 @@ class TrackingConfig:
     first_lr_rotation: float = 0.0
     """Learning rate of rotation for the second frame; 0 = as for other frames."""
     lr_rotation: float = 2e-3
-    """Learning rate of rotation, radians per step; a quaternion's components rotate twice as far. Use a higher one for
-    fast motion."""
+    """Learning rate of rotation, radians per step; with quaternions the angle per step is twice as large. Use a higher
+    one for fast motion."""
     lr_translation: float = 1e-2
     """Learning rate of translation, metres per step."""
     weight_color: float = 0.6

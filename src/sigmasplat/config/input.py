@@ -8,7 +8,7 @@ from sigmasplat.errors import ConfigError
 
 @dataclass(frozen=True)
 class InputConfig:
-    """Which frames of the source are used, and how. Raises ConfigError on invalid values."""
+    """Selection and processing of the frames of a source. Raises ConfigError on invalid values."""
 
     stride: int = 1
     """Use every N-th frame."""

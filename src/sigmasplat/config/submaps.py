@@ -6,7 +6,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class SubmapConfig:
-    """When the active submap ends and the next one starts; checked at each keyframe (VarSplat §2)."""
+    """Rules that end the active submap and start the next one; checked at each keyframe (VarSplat §2)."""
 
     distance_m: float = 0.0
     """A new submap starts if the camera is farther than this from the submap's first pose; 0 = off. If all four rules
@@ -25,7 +25,7 @@ class SubmapConfig:
 
 @dataclass(frozen=True)
 class LoopConfig:
-    """Which submaps may show the same place (VarSplat §4)."""
+    """Selection of submaps that may show the same place (VarSplat §4)."""
 
     close: bool = True
     """Whether loops are searched and closed."""
@@ -35,10 +35,10 @@ class LoopConfig:
     weights: str = ""
     """File of NetVLAD weights, needed by descriptor=netvlad; read at the start."""
     min_similarity: float = 0.5
-    """Sets the similarity that a loop must exceed: the k-th highest one of a keyframe within its own submap, with k =
-    this share of the submap's keyframes."""
+    """Sets the similarity that a loop must exceed: the k-th highest similarity of a keyframe to the keyframes of its
+    own submap, where k is this share of their number."""
     min_interval: int = 2
-    """Submaps that are fewer than this many submaps apart are neighbours, and not tested as loops."""
+    """Two submaps are tested as a loop only if their numbers differ by at least this."""
     similarity_floor: float = 0.0
     """Pairs of keyframes with a similarity of at most this are never tested."""
     near_m: float = 0.0
@@ -58,7 +58,7 @@ class LoopConfig:
 
 @dataclass(frozen=True)
 class RegistrationConfig:
-    """How two submaps are registered, and when the result is accepted (VarSplat §5)."""
+    """Registration of two submaps, and acceptance of the result (VarSplat §5)."""
 
     keyframes: int = 2
     """Number of keyframes of each submap that are localised in the other one."""
@@ -85,15 +85,18 @@ class RegistrationConfig:
     """A loop is rejected if less than this share of the splats has a neighbour within `overlap_m` in the other
     submap."""
     overlap_m: float = 0.1
-    """Maximum distance of such a neighbour in metres: about the distance between two maps of the same wall."""
+    """Maximum distance in metres between a splat and its neighbour in the other submap, for `overlap_least`: about the
+    distance between two maps of the same wall."""
     agreement_least: float = 0.8
     """A localisation is valid only if at least this share of the common surface agrees in depth."""
     share_least: float = 0.3
     """A localisation is valid only if the other submap explains at least this share of its depth readings."""
     spread_m: float = 0.1
-    """A loop is rejected unless at least two valid localisations are within this distance of one of them, in metres."""
+    """Localisations agree if they are within this distance of one of them, in metres. A loop is rejected if fewer than
+    two agree."""
     spread_deg: float = 5.0
-    """A loop is rejected unless at least two valid localisations differ from one of them by at most this rotation."""
+    """Localisations agree if their rotations differ from one of them by at most this. A loop is rejected if fewer than
+    two agree."""
 
 
 @dataclass(frozen=True)

@@ -160,8 +160,10 @@ def _prepare(
         raise _TransferError(f"{_host(url)} sent another part of the file than requested")
     part.restart()
     length = headers.get("Content-Length", "")
-    if not length.isdigit() and not response.chunked:  # otherwise the end would look like a broken connection
-        raise DownloadError(f"{_host(url)} does not say how long the file is, so it could not be known to be whole")
+    if not length.isdigit() and not response.chunked:  # the end would look like a broken connection
+        raise DownloadError(
+            f"{_host(url)} does not send the length of the file, so a complete download could not be recognised"
+        )
     size_bytes = int(length) if length.isdigit() else None
     part.begin(RemoteVersion(url, _version(headers), size_bytes))
     return size_bytes

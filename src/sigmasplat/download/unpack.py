@@ -145,7 +145,7 @@ def _check_entry(entry: zipfile.ZipInfo) -> None:
         raise ArchiveError(f"holds {entry.filename!r}, which is not a plain file or folder")
     if entry.file_size > RATIO_CHECKED_ABOVE_BYTES and entry.file_size > MAX_RATIO * entry.compress_size:
         raise ArchiveError(
-            f"holds {entry.filename!r}, which grows {entry.file_size // max(entry.compress_size, 1)}-fold"
+            f"holds {entry.filename!r}, which expands {entry.file_size // max(entry.compress_size, 1)}-fold"
         )
 
 

@@ -269,21 +269,23 @@ def _plan(source: ExportSource, target: Path, *, cell_m: float) -> str:
 
     with _counting("floor plan") as progress:
         plan = export_plan(source.reader(), target, cell_m=cell_m, progress=progress)
-    regions = "nowhere to scan again" if not plan.regions else f"{len(plan.regions)} places to scan again"
+    regions = "no places to scan again" if not plan.regions else f"{len(plan.regions)} places to scan again"
     return f"{regions}, also in {target.with_suffix('.json').name}"
 
 
 FORMATS = (
     ExportFormat("ply", (".ply",), "3DGS PLY with σ², for every viewer", _ply),
-    ExportFormat("compressed-ply", (".compressed.ply",), "SuperSplat's, a fifth of the size", _compressed_ply),
+    ExportFormat(
+        "compressed-ply", (".compressed.ply",), "SuperSplat's compressed PLY, a fifth of the size", _compressed_ply
+    ),
     ExportFormat("splat", (".splat",), "32 bytes per splat, for web viewers", _splat),
-    ExportFormat("spz", (".spz",), "Niantic's, less than a fifth of the size", _spz),
+    ExportFormat("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", _spz),
     ExportFormat("trajectory", (".txt",), "the path as TUM text", _trajectory),
     ExportFormat("kitti", (".kitti.txt",), "the path as KITTI text, one line per frame", _kitti, True),
     ExportFormat("nerfstudio", (".json",), "views as nerfstudio's transforms.json", _nerfstudio, True),
     ExportFormat("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap, True),
     ExportFormat("points", (".points.ply",), "the surface as points with normals", _points, True),
-    ExportFormat("video", (".webm", ".mp4", ".gif", ".webp"), "a film of colour, depth and uncertainty", _video, True),
+    ExportFormat("video", (".webm", ".mp4", ".gif", ".webp"), "a video of colour, depth and uncertainty", _video, True),
     ExportFormat("plan", (".plan.png", ".png"), "a floor plan with regions to scan again", _plan, True),
 )
 """All formats. The first one is the default."""

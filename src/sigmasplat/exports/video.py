@@ -1,4 +1,4 @@
-"""Render a run as a film: colour, depth and uncertainty side by side, along its path or on an orbit above the room."""
+"""Render a run as a video: colour, depth and uncertainty side by side, along its path or on an orbit above the room."""
 
 import os
 import sys
@@ -39,7 +39,7 @@ CEILING_M = 0.1
 
 @dataclass(frozen=True)
 class VideoOptions:
-    """The options of a film.
+    """The options of a video.
 
     width_px: width of each of the three panels (0: that of the run's images); fps: images per second; seconds: length
     (None: that of the path, within 4 to 60 s; 12 s for an orbit); path: along the run's path or on an orbit.
@@ -54,13 +54,13 @@ class VideoOptions:
 
     def __post_init__(self) -> None:
         if not (self.width_px == 0 or 32 <= self.width_px <= 4096):
-            raise ConfigError(f"a film's panels must be 32 to 4096 pixels wide, found {self.width_px}")
+            raise ConfigError(f"a video's panels must be 32 to 4096 pixels wide, found {self.width_px}")
         if not 1.0 <= self.fps <= 120.0 or not (self.seconds is None or 0.04 <= self.seconds <= 3600.0):
             raise ConfigError(
-                f"a film must have 1 to 120 images/s and last 0.04 s to 1 h, found {self.fps} and {self.seconds} s"
+                f"a video must have 1 to 120 images/s and last 0.04 s to 1 h, found {self.fps} and {self.seconds} s"
             )
         if self.path not in ("run", "orbit"):
-            raise ConfigError(f"a film's path must be 'run' or 'orbit', found {self.path!r}")
+            raise ConfigError(f"a video's path must be 'run' or 'orbit', found {self.path!r}")
 
     def images(self, path_s: float) -> int:
         """Return the number of images of the film, for a path that lasts `path_s` seconds."""
@@ -76,7 +76,7 @@ def export_video(
     renderer: SurfaceRenderer | None = None,
     progress: Progress = no_progress,
 ) -> int:
-    """Write a film and return its number of images. Calls `progress(done, total)` after each image.
+    """Write a video and return its number of images. Calls `progress(done, total)` after each image.
 
     Raises RunError on an unknown ending, or without a map or path; BackendError without OpenCV for .webm and .mp4.
     """
@@ -126,7 +126,7 @@ def _show(renderer: SurfaceRenderer, field: GaussianField, camera: Camera, T_wor
 
 
 def _images(show: Callable[[Matrix], FilmMaps], poses: Matrix, width: int, progress: Progress) -> Iterator[Rgb]:
-    """Yield a film's images; a few of them determine the colour scale."""
+    """Yield the images of a video; a few of them determine the colour scale."""
     rows = np.unique(np.linspace(0, len(poses) - 1, min(SAMPLES, len(poses))).round().astype(int))
     scale = FilmScale.of([show(poses[row]) for row in rows])
     strip = legend_strip(scale, width)
@@ -138,11 +138,11 @@ def _images(show: Callable[[Matrix], FilmMaps], poses: Matrix, width: int, progr
 CODECS = {".webm": "VP90", ".mp4": "vp09"}
 ANIMATIONS = {".gif": "GIF", ".webp": "WEBP"}
 ENDINGS = (*CODECS, *ANIMATIONS)
-NO_IMAGES = "a film needs at least one image, found none"
+NO_IMAGES = "a video needs at least one image, found none"
 
 
 def write_video(path: Path, images: Iterable[Rgb], fps: float) -> None:
-    """Write images uint8 RGB [H, W, 3] of equal size as a film in the format of the path's ending, atomically.
+    """Write images uint8 RGB [H, W, 3] of equal size as a video in the format of the path's ending, atomically.
 
     Raises RunError on an unknown ending, an unwritable file or a missing codec; BackendError without OpenCV.
     """
@@ -161,9 +161,9 @@ def write_video(path: Path, images: Iterable[Rgb], fps: float) -> None:
 
 
 def check_ending(path: Path) -> None:
-    """Raise RunError unless the path's ending is a film's, BackendError if it needs OpenCV, which is missing."""
+    """Raise RunError unless the path's ending is that of a video, BackendError if it needs OpenCV, which is missing."""
     if path.suffix.lower() not in ENDINGS:
-        raise RunError(f"cannot write a film as {path.name}; give a name that ends in {', '.join(ENDINGS)}")
+        raise RunError(f"cannot write a video as {path.name}; give a name that ends in {', '.join(ENDINGS)}")
     if path.suffix.lower() in CODECS:
         _opencv()
 
@@ -173,7 +173,7 @@ def _opencv() -> Any:
         import cv2
     except ImportError as problem:
         raise BackendError(
-            f"films as .webm and .mp4 need OpenCV: {install_extra('video')}; or write .gif or .webp"
+            f"videos as .webm and .mp4 need OpenCV: {install_extra('video')}; or write .gif or .webp"
         ) from problem
     return cv2
 

@@ -136,7 +136,7 @@ def align(
     kernels, or if only one image is on a device.
     """
     if reference.kernels is not live.kernels:
-        raise BackendError("one image to align lies on a device, the other does not; make both for the same view")
+        raise BackendError("the two images to align are on different devices; make both for the same view")
     rules = AlignRules(iterations, update_stop, plateau_stop, DEGENERATE, MIN_PIXELS)
     pair = Pair(reference, live, weight_color)
     levels = [pair.level(k) for k in range(len(reference.cameras))]

@@ -100,7 +100,7 @@ def step_for(field: GaussianField, view: View, weights: Weights, degree: int) ->
     full = bool(weights["nll_color_full"])
     if full and (weights["median_depth"] or weights["moment"]):
         raise ConfigError(
-            "mapping.color_covariance full goes without weight_alignment and weight_moment; set both to 0"
+            "mapping.color_covariance=full does not support weight_alignment or weight_moment; set both to 0"
         )
     fits = fits_of(view)
     if full:

@@ -256,7 +256,7 @@ class _Sheet:
         y = self.below + (len(self.legend_rows) + 1.0) * LINE
         self.text(self.gap, y, "Where to scan again", 17)
         if not self.plan.regions:
-            self.text(self.gap, y + LINE, "Nowhere: everything was observed, and the map is certain.", 14)
+            self.text(self.gap, y + LINE, "No regions: everything was observed, and the map is certain.", 14)
         for number, region in enumerate(self.plan.regions, 1):
             y += LINE
             self.numbered_dot(self.gap + DOT, y, number, self.theme.curves[REASON_COLOURS[region.why]])

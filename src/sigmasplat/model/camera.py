@@ -37,7 +37,8 @@ class Camera:
         c = self.resized(width, round(self.height * width / self.width)) if width else self
         if 2 * crop_px >= min(c.width, c.height):
             raise ConfigError(
-                f"input.crop_px is {crop_px}, which leaves nothing of {c.width}×{c.height}; give a smaller one"
+                f"input.crop_px is {crop_px}, which removes the whole image of {c.width}×{c.height}; "
+                "give a smaller value"
             )
         return Camera(c.width - 2 * crop_px, c.height - 2 * crop_px, c.fx, c.fy, c.cx - crop_px, c.cy - crop_px)
 

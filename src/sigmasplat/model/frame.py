@@ -29,7 +29,7 @@ class Frame:
         size = (self.camera.height, self.camera.width)
         if self.color.shape != (*size, 3) or self.depth_m.shape != size:
             raise SourceError(
-                f"frame {self.index}: colour is {self.color.shape}, depth is {self.depth_m.shape}, the camera says "
+                f"frame {self.index}: colour is {self.color.shape}, depth is {self.depth_m.shape}, the camera is "
                 f"{size[1]}×{size[0]}; register depth to colour and give both one size"
             )
         for name, array in (("colour", self.color), ("depth", self.depth_m)):

@@ -85,7 +85,7 @@ class MemoryStore:
 def refuse_misfit(submap: Submap, pictures: list[Picture], next_index: int) -> None:
     """Raise SigmaSplatError if a submap is not the next one to save, or its keyframes and images do not match."""
     if submap.index != next_index:
-        raise SigmaSplatError(f"submap {submap.index} cannot be kept: the next one is {next_index}")
+        raise SigmaSplatError(f"submap {submap.index} cannot be saved: the next index is {next_index}")
     if not len(submap.frames) == len(submap.T_submap_camera) == len(pictures):
         counts = f"{len(submap.frames)} frames, {len(submap.T_submap_camera)} poses, {len(pictures)} pictures"
-        raise SigmaSplatError(f"submap {submap.index} cannot be kept: {counts}")
+        raise SigmaSplatError(f"submap {submap.index} cannot be saved: {counts}")

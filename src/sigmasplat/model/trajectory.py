@@ -27,7 +27,7 @@ class Trajectory:
         for t, T in zip(self.timestamps_s, self.T_world_camera, strict=True):
             if not (np.isfinite(t) and se3.is_rigid(T)):
                 raise SourceError(
-                    f"pose at t={t} s is not a finite rigid transform; drop it or mend its rotation "
+                    f"pose at t={t} s is not a finite rigid transform; remove it or correct its rotation "
                     f"(found {T.tolist()})"
                 )
 

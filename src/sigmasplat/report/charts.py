@@ -13,7 +13,7 @@ SUBMAP_COLOURS = (BLUE, GREEN, PURPLE)
 """Neighbouring submaps get different colours; the accent colour is for loops."""
 MAX_LABELS = 24
 SUBMAPS_CAPTION = (
-    "The final path. Each submap has another colour than the one before, and its number is where it starts. "
+    "The final path. The colour changes from submap to submap, and each number marks the start of a submap. "
     "A line connects two frames that were compared as a loop."
 )
 

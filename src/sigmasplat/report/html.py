@@ -179,8 +179,8 @@ def _strips(contents: Contents) -> str:
     if not any(contents.strips.values()):
         return ""
     explanation = (
-        "<p class=soft>Images are rendered at the estimated poses. V is the variance of colour along each ray that the "
-        "map predicts. The root of V and the RMS error have separate colour scales. Where both look alike, V predicts "
+        "<p class=soft>Images are rendered at the estimated poses. The map predicts V, the variance of colour along "
+        "each ray. The root of V and the RMS error have separate colour scales. Where both look alike, V predicts "
         "the error well. Slate pixels: no depth reading, or no surface in the map.</p>"
     )
     parts = ["<h2>Views</h2>", explanation]

@@ -170,7 +170,7 @@ class _StepShow:
             self.lost_since = step.index
             self.say(f"{where}: tracking lost")
         elif not step.lost and self.lost_since is not None:
-            self.say(f"{where}: tracking found again, lost since frame {self.lost_since}")
+            self.say(f"{where}: tracking recovered; it was lost since frame {self.lost_since}")
             self.lost_since = None
 
 

@@ -57,7 +57,9 @@ def final_map(
 def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix], final: FinalConfig) -> None:
     """Raise SigmaSplatError or ConfigError if no final map can be made."""
     if not 0 < len(store) <= len(anchors):
-        raise SigmaSplatError(f"no final map without submaps and their anchors: {len(store)} and {len(anchors)} given")
+        raise SigmaSplatError(
+            f"the final map needs submaps and one anchor for each, found {len(store)} and {len(anchors)}"
+        )
     count(final.sh_degree)
     for name in ("spacing_m", "sh_every", "prune_every"):
         if not getattr(final, name) > 0:
@@ -128,7 +130,7 @@ def seeded_on_surface(store: SubmapStore, anchors: Sequence[Matrix], config: Con
     final = config.final
     mesh = fuse(fusion_views(store, anchors), count_keyframes(store), config, weigh=final.uncertainty)
     if not len(mesh.vertices):
-        raise SigmaSplatError("the submaps show no surface to seed the final map on; take final.seed_from=submaps")
+        raise SigmaSplatError("the submaps have no surface for the seeds of the final map; use final.seed_from=submaps")
     points, colors = thinned_vertices(mesh, final.spacing_m)
     log_variances = torch.full((len(points), 3), INITIAL_LOG_VARIANCE)
     if final.uncertainty:
@@ -182,13 +184,13 @@ class KeyframeReader:
         for index in range(len(store)):
             self._add(index, anchors[index])
         if not self.places:
-            raise SigmaSplatError("the submaps have no keyframes to refine the final map over")
+            raise SigmaSplatError("the submaps have no keyframes, so the final map cannot be refined")
         self._target = lru_cache(max(1, CACHE_BYTES // (16 * view.alpha.numel())))(self._read)
 
     def _add(self, index: int, T_world_submap: Matrix) -> None:
         submap = self.store.load(index)
         if submap.camera != self.camera:
-            raise SigmaSplatError(f"submap {index} was seen by {submap.camera}, the view is of {self.camera}")
+            raise SigmaSplatError(f"the camera of submap {index} is {submap.camera}, but the view has {self.camera}")
         self.places += [(index, k) for k in range(len(submap.frames))]
         self.poses += [T_world_submap @ T for T in submap.T_submap_camera]
 

@@ -109,18 +109,18 @@ def _share_seen(points: NDArray[np.float64], keyframe: Keyframe) -> float:
 
 def _seen(keyframe: Keyframe) -> Ids:
     if keyframe.visible_ids is None:
-        raise _nothing(keyframe, "a list of the splats it sees", "splats")
+        raise _nothing(keyframe, "list of visible splats", "splats")
     return keyframe.visible_ids
 
 
 def _descriptor(keyframe: Keyframe) -> NDArray[np.float32]:
     if keyframe.descriptor is None:
-        raise _nothing(keyframe, "a descriptor", "descriptor")
+        raise _nothing(keyframe, "descriptor", "descriptor")
     return keyframe.descriptor
 
 
 def _nothing(keyframe: Keyframe, missing: str, by: str) -> SigmaSplatError:
     return SigmaSplatError(
-        f"keyframe {keyframe.index} has not been given {missing}, which mapping.covisibility={by} compares; "
-        "choose mapping.covisibility=frustum, which needs depth only"
+        f"keyframe {keyframe.index} has no {missing}, which mapping.covisibility={by} needs; "
+        "use mapping.covisibility=frustum, which needs depth only"
     )

@@ -95,7 +95,9 @@ def _unknown_format(path: Path) -> SourceError:
     if inner:
         names = ", ".join(f"{name} ({known.name}: {known.looked_for})" for name, known in inner[:4])
         names += ", …" * (len(inner) > 4)
-        return SourceError(f"{path} holds sequences: {names}; give the path of one of them, as {path / inner[0][0]}")
+        return SourceError(
+            f"{path} holds sequences: {names}; give the path of one of them, for example {path / inner[0][0]}"
+        )
     if problem := without_depth(path):
         return problem
     known_names = ", ".join(known.name for known in formats())

@@ -61,7 +61,7 @@ def _only_sequence(scene: Path) -> Path:
         raise SourceError(f"{scene}: the sequences are not unpacked ({', '.join(packed[:3])}); unzip them first")
     if len(sequences) != 1:
         names = ", ".join(path.name for path in sequences)
-        raise SourceError(f"{scene} holds {len(sequences)} sequences ({names}); give one, as {sequences[0]}")
+        raise SourceError(f"{scene} holds {len(sequences)} sequences ({names}); give one, for example {sequences[0]}")
     return sequences[0]
 
 

@@ -85,9 +85,7 @@ class ControlPanel:
 
     def _add_path_controls(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("Path"):  # Any: mypy takes `value` for read-only
-            self.row: Any = gui.add_slider(
-                "frame", 0, 1, 1, 1, hint="show the path up to this frame and the submaps started by then"
-            )
+            self.row: Any = gui.add_slider("frame", 0, 1, 1, 1, hint="show the path and the submaps up to this frame")
             self.frame = gui.add_markdown("")
             self.look = gui.add_button("look from here")
             self.follow = gui.add_checkbox("follow the camera", False, visible=False)

@@ -43,7 +43,7 @@ class Recorder:
         except (RuntimeError, BackendError) as problem:
             self._refused = True
             reason = str(problem).partition("\n")[0]
-            warnings.warn(f"no CUDA graphs here ({reason}): kernels are launched one by one", stacklevel=3)
+            warnings.warn(f"CUDA graphs cannot be used ({reason}); kernels are launched one by one", stacklevel=3)
             return work
 
     def _recorded(self, work: Work) -> torch.cuda.CUDAGraph:

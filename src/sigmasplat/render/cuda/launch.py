@@ -133,7 +133,7 @@ def _checked(found: tuple[Any, ...], failure: str) -> Any:
     """Return the result of a driver call. Raises BackendError with its reason if it failed."""
     result, *values = found
     if result.value != 0:
-        raise BackendError(f"{failure}: {result.name}; `sigmasplat doctor` tells more")
+        raise BackendError(f"{failure}: {result.name}; run `sigmasplat doctor` for details")
     return values[0] if values else None
 
 
@@ -141,9 +141,9 @@ def missing() -> str | None:
     """Return one line that says why the CUDA backend cannot run on this machine and how to fix it; None if it can
     run."""
     if torch.version.cuda is None:
-        return f"torch {torch.__version__} is built without CUDA; install one that is (https://pytorch.org)"
+        return f"torch {torch.__version__} is built without CUDA; install a torch with CUDA (https://pytorch.org)"
     if not torch.cuda.is_available():
-        return "torch finds no CUDA device; is there one, and its driver?"
+        return "torch finds no CUDA device; check that a GPU and its driver are installed"
     try:
         cubins.compiler_version()
     except BackendError as problem:

@@ -58,8 +58,8 @@ class NetVladWeights:
             file = read(path)
         except UnpicklingError as problem:
             raise ConfigError(
-                f"{path}: holds more than tensors and numbers, or is damaged, and loading that could run anything; "
-                "if it comes from someone you trust, save its state_dict alone"
+                f"{path}: contains more than tensors and numbers, or is damaged; loading it could run any code. "
+                "If you trust its source, save only its state_dict"
             ) from problem
         except Exception as problem:  # damaged bytes cause many kinds of exceptions
             reason = " ".join(f"{type(problem).__name__}: {problem}".split())[:200]
@@ -99,7 +99,7 @@ class NetVlad:
             image = F.interpolate(image, size, mode="bilinear", antialias=True)
         if min(image.shape[2:]) < SMALLEST_PX:
             raise ConfigError(
-                f"NetVLAD needs images of at least {SMALLEST_PX} pixels each way, found {image.shape[3]}×"
+                f"NetVLAD needs images of at least {SMALLEST_PX} pixels in each direction, found {image.shape[3]}×"
                 f"{image.shape[2]}; raise input.width, or use the built-in descriptor"
             )
         return self._vlad(_vgg(w, (image * w.scale - w.mean[:, None, None]) / w.std[:, None, None])).numpy()

@@ -207,9 +207,9 @@ def _refuse_bad_input(poses: Matrix, edges: Sequence[Edge]) -> None:
     for edge in edges:
         name = f"pose graph: edge {edge.a} → {edge.b}"
         if edge.a == edge.b or not (0 <= edge.a < len(poses) and 0 <= edge.b < len(poses)):
-            raise SigmaSplatError(f"{name} does not join two of the {len(poses)} nodes; they are numbered from 0")
+            raise SigmaSplatError(f"{name} does not connect two of the {len(poses)} nodes; they are numbered from 0")
         if not se3.is_rigid(edge.T_a_b):
-            raise SigmaSplatError(f"{name} measures no rigid motion; orthonormalise it first")
+            raise SigmaSplatError(f"{name} does not have a rigid motion; orthonormalise it first")
         if not _is_positive_definite(edge.information):
             raise SigmaSplatError(f"{name} has an information matrix that is not 6×6 symmetric positive definite")
     trusted = [(edge.a, edge.b) for edge in edges if not edge.loop]
@@ -217,7 +217,9 @@ def _refuse_bad_input(poses: Matrix, edges: Sequence[Edge]) -> None:
     _, part = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(len(poses),) * 2), directed=False)
     loose = np.flatnonzero(part != part[0])
     if len(loose):
-        raise SigmaSplatError(f"pose graph: no chain of odometry edges ties node {loose[0]} to node 0; add its edge")
+        raise SigmaSplatError(
+            f"pose graph: no chain of odometry edges connects node {loose[0]} to node 0; add its edge"
+        )
 
 
 def _is_positive_definite(information: Matrix) -> bool:
