@@ -98,7 +98,7 @@ class GpuWorks:
         self.all.backward(self.params, self.grad)
 
     def both_color_depth(self) -> None:
-        """Do the same for colour, depth and alpha only."""
+        """Render colour, depth and alpha only, and propagate their gradients to every parameter and the pose."""
         self.forward_color_depth()
         self.color_depth.backward(self.params, self.grad)
 
@@ -116,7 +116,7 @@ class GpuWorks:
         fit_pose_adam(self.params, self.all, self.later, np.eye(4), self.tracking, TRACKING_ITERATIONS)
 
     def launched_tracking_iterations(self) -> None:
-        """Do the same kernel by kernel."""
+        """Descend the tracking loss for `TRACKING_ITERATIONS`, without a CUDA graph."""
         launched = dataclasses.replace(self.tracking, cuda_graphs=False)
         fit_pose_adam(self.params, self.all, self.later, np.eye(4), launched, TRACKING_ITERATIONS)
 
@@ -155,7 +155,7 @@ def time_gsplat(scene: Scene, runs: int, device: torch.device) -> dict[str, Any]
         return None
     try:
         return _time_gsplat(scene, runs, device)
-    except Exception as problem:  # it is compiled at first use, which can fail in many ways
+    except Exception as problem:  # the kernels are compiled at first use, which can fail in many ways
         print(f"gsplat is left out: {problem!r}"[:500], file=sys.stderr, flush=True)
         return None
 

@@ -35,7 +35,7 @@ class Options:
 
 
 class Multiprocessor(NamedTuple):
-    """What a multiprocessor has for blocks (CUDA C++ programming guide, compute capabilities)."""
+    """Resources of a multiprocessor for blocks (CUDA C++ programming guide, compute capabilities)."""
 
     shared_kib: int
     threads: int
@@ -62,7 +62,7 @@ USED = re.compile(
 
 
 class Usage(NamedTuple):
-    """What one kernel uses; shared memory per block and spills per thread, in bytes."""
+    """Resources of one kernel; shared memory per block and spills per thread, in bytes."""
 
     kernel: str
     registers: int

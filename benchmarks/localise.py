@@ -85,7 +85,8 @@ def gradient(
 
 
 def shares(field: GaussianField, frame: Frame, T_camera_world: Matrix, search: Search) -> dict[str, list[float]]:
-    """Return the size of each path's gradient relative to the whole, by ρ and by φ: |∂L| of the path over |∂L|."""
+    """Return the magnitude of each path's gradient relative to the whole gradient, for ρ and for φ: |∂L| of the path
+    over |∂L|."""
     whole = gradient(field, frame, T_camera_world, RenderConfig(), search)
     found = {}
     for path in PATHS:

@@ -34,7 +34,7 @@ Matrix = NDArray[np.float64]
 Records = list[dict[str, Any]]
 Experiment = Literal["drift", "real"]
 DRIFTING = "synthetic:frames=720,rooms=2,overrun=20,noise=1,drift=6"
-"""See `sigmasplat.sources.synthetic.SyntheticRoom` for the reason for this one."""
+"""`sigmasplat.sources.synthetic.SyntheticRoom` gives the reason for this path."""
 ONE_SUBMAP = tuple(f"submaps.{field.name}=0" for field in fields(SubmapConfig))
 WAYS: dict[Experiment, dict[str, tuple[str, ...]]] = {
     "drift": {"loops": ("loops.close=true",)},

@@ -1,4 +1,4 @@
-"""Time a mapping iteration with and without a loss term of one's own, which autograd computes beside the CPU's kernels.
+"""Time a mapping iteration with and without an additional loss term, which autograd computes beside the CPU kernels.
 
 Both are timed in turns. Prints milliseconds and their ratio.
 
@@ -25,13 +25,13 @@ arg = tyro.conf.arg
 
 @term
 def charbonnier(color: Tensor, color_target: Tensor, valid: Tensor) -> Tensor:
-    """Take mean √(r² + 10⁻⁶) of the colour residual over valid pixels (the term of docs/recipes.md)."""
+    """Return the mean of √(r² + 10⁻⁶) of the colour residual over valid pixels (the term of docs/recipes.md)."""
     return mean_over(((color - color_target) ** 2 + 1e-6).sqrt(), valid)
 
 
 @dataclass(frozen=True)
 class OwnMapping(MappingConfig):
-    """Mapping's settings with the weight of one more term."""
+    """The settings of mapping with the weight of one more term."""
 
     weight_charbonnier: float = 0.0
 

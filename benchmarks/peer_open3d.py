@@ -17,9 +17,10 @@ DEVICE = o3d.core.Device("CPU:0")
 DEPTH_MIN_M, VOXEL_SIZE_M, BLOCKS, DISTANCE_M, TRUNCATION_VOXELS = 0.1, 0.0058, 40000, 0.07, 8.0
 """Values of default_config.yml of Open3D's reconstruction system."""
 MODEL_DEPTH_MAX_M, ODOMETRY_DEPTH_MAX_M = 3.0, 8.0
-"""The first is Open3D's default. Odometry is better with the range that SigmaSplat uses."""
+"""The first value is Open3D's default. Odometry is better with the range that SigmaSplat uses."""
 ITERATIONS = {"PointToPlane": (10, 5, 3), "Hybrid": (60, 30, 15, 5)}
-"""On each level, coarse to fine. The first are Open3D's default; at full size hybrid does not converge with them."""
+"""Iterations per level, coarse to fine. The first are Open3D's default, with which hybrid does not converge at full
+size."""
 Frames = tuple[Any, Any, Any]
 
 

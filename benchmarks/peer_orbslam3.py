@@ -18,9 +18,9 @@ import numpy as np
 import pyorbslam3
 
 BRANCHES, LEVELS, ROUNDS = 10, 6, 8
-"""The published vocabulary's own numbers of branches and levels; rounds of k-majority clustering."""
+"""Numbers of branches and levels, as in the published vocabulary, and rounds of k-majority clustering."""
 SECONDS_PER_FRAME = 0.5
-"""ORB-SLAM3 maps in threads of its own: frames that come too fast leave them behind."""
+"""Delay between frames. ORB-SLAM3 maps in its own threads, which cannot keep up if frames come too fast."""
 SETTINGS = """%YAML:1.0
 File.version: "1.0"
 Camera.type: "PinHole"
@@ -55,7 +55,7 @@ Viewer.ViewpointY: -0.7
 Viewer.ViewpointZ: -1.8
 Viewer.ViewpointF: 500.0
 """
-"""ORB-SLAM3's own settings for TUM RGB-D, with the camera of the frames."""
+"""ORB-SLAM3's settings for TUM RGB-D, with the camera of the frames."""
 
 
 def descriptors_of(color: Any, every: int = 3) -> Any:
@@ -69,7 +69,7 @@ def clusters(bits: Any, random: np.random.Generator) -> tuple[Any, Any]:
     """Cluster binary descriptors [M, 256] by k-majority; return centres [≤ 10, 256] and the cluster of each [M]."""
     centres = np.unique(bits[random.permutation(len(bits))[:BRANCHES]], axis=0)
     for _ in range(ROUNDS):
-        nearest = (bits @ (1 - 2 * centres.T) + centres.sum(1)).argmin(1)  # Hamming distance less a constant
+        nearest = (bits @ (1 - 2 * centres.T) + centres.sum(1)).argmin(1)  # Hamming distance minus a constant
         kept = np.unique(nearest)
         centres = np.array([bits[nearest == k].mean(0) >= 0.5 for k in kept], np.float32)
     return centres, (bits @ (1 - 2 * centres.T) + centres.sum(1)).argmin(1)

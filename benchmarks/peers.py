@@ -61,7 +61,7 @@ QUOTED: tuple[Result, ...] = (
     {"system": "RTAB-Map 0.23 †", "source": "hololens", "ate_m": 0.102, "with_pose": 0.37},
     {"system": "RTAB-Map 0.23, odometry †", "source": "hololens", "ate_m": 0.164},
 )
-"""Figures that this program did not measure."""
+"""Figures that are not measured by this program."""
 PROPERTIES = {
     OURS: ("splats", "yes"),
     OURS_BEFORE_LOOPS: ("splats", "no"),
@@ -126,7 +126,7 @@ def frames_in(source: Source, limit: int | None) -> int:
 
 
 def path_of(times_s: NDArray[np.float64], poses: NDArray[np.float64]) -> Trajectory:
-    """Return the poses [N, 4, 4] that are there (the others are NaN), their rotations made exact by SVD."""
+    """Return the known poses [N, 4, 4] (the others are NaN), with rotations made exact by SVD."""
     there = np.isfinite(poses).all((1, 2))
     u, _, vt = np.linalg.svd(poses[there, :3, :3])
     exact = poses[there].copy()
@@ -147,20 +147,20 @@ def score(path: Trajectory, source: Source, limit: int | None) -> dict[str, Any]
 
 
 def run_ours(options: Options) -> list[Result]:
-    """Run SigmaSplat as `accuracy.py` does; return two results a run: with loops, and the path before them."""
+    """Run SigmaSplat as `accuracy.py` does; return two results per run: with loops, and the path without loops."""
     wanted = accuracy.Options(options.sources, seeds=options.seeds, limit=options.limit)
     made = []
     for result in accuracy.run_all(accuracy.jobs_of(wanted), options):  # type: ignore[arg-type]
         figures = result["figures"]
         for system, name in ((OURS, "ate_m"), (OURS_BEFORE_LOOPS, "ate_odometry_m")):
-            error_m = figures.get(name) or figures.get("ate_m")  # without loops both paths are one
+            error_m = figures.get(name) or figures.get("ate_m")  # without loops both paths are the same
             kept = {"frames": figures.get("frames"), "without_pose": figures.get("lost"), "ate_m": error_m}
             made.append({"system": system, "source": result["job"]["source"], "problem": result["problem"], **kept})
     return made
 
 
 def run_peer(peer: Peer, name: str, path: str, frames: Path, options: Options, python: Path) -> Result:
-    """Run one system on the frames in a folder and score its path; what fails is the result's `problem`."""
+    """Run one system on the frames in a folder and score its path; if it fails, the result has a `problem`."""
     words = [peer.method or str(options.vocabulary or frames / "vocabulary.txt")]
     for old in ("poses.npy", "version.txt"):
         (frames / old).unlink(missing_ok=True)
@@ -178,7 +178,7 @@ def run_peer(peer: Peer, name: str, path: str, frames: Path, options: Options, p
 
 
 def finished(peer: Peer, path: str, options: Options) -> tuple[Path, Result, Result | None]:
-    """Return where the result of a peer is kept, its key, and the result of an earlier run with an equal key."""
+    """Return the file of a peer's result, its key, and the result of an earlier run with an equal key."""
     program = (FOLDER / f"peer_{peer.package}.py").read_bytes()
     given = {"path": path, "limit": options.limit, "method": peer.method, "vocabulary": str(options.vocabulary)}
     key = given | {"program": sha256(program).hexdigest()}
@@ -188,7 +188,7 @@ def finished(peer: Peer, path: str, options: Options) -> tuple[Path, Result, Res
 
 
 def run_peers(options: Options) -> list[Result]:
-    """Run the other systems whose Python is given, sequence by sequence."""
+    """Run the other systems for which a Python is given, sequence by sequence."""
     pythons = {"open3d": options.open3d, "orbslam3": options.orbslam3}
     wanted = [peer for peer in PEERS if (peer.method or peer.package) in options.systems]
     chosen = [(peer, python) for peer in wanted if (python := pythons[peer.package])]
@@ -210,7 +210,7 @@ def run_peers(options: Options) -> list[Result]:
 
 
 def read_paths(options: Options) -> list[Result]:
-    """Score the paths that other systems have written. Raises ConfigError or SourceError for one that is no path."""
+    """Score the paths written by other systems. Raises ConfigError or SourceError if a file is not a valid path."""
     made = []
     for text in options.paths:
         system, _, rest = text.partition("=")
@@ -243,7 +243,7 @@ NOTE = (
 
 
 def _row(system: str, runs: list[Result], sources: list[str]) -> list[str]:
-    """Lay out one system: its error in each sequence, then the frames without a pose."""
+    """Return the row of one system: its error in each sequence, then the number of frames without a pose."""
     cells, without = [], []
     for source in sources:
         found = [r for r in runs if (r["system"], r["source"]) == (system, source) and r.get("ate_m") is not None]
@@ -258,7 +258,7 @@ def _row(system: str, runs: list[Result], sources: list[str]) -> list[str]:
 
 
 def main(options: Options) -> int:
-    """Run, score, write, print; exit code 1 if a run failed, 2 if the options mean nothing."""
+    """Run, score, write, print; return exit code 1 if a run failed, 2 if the options are invalid."""
     try:
         extra = read_paths(options)
         runs = [*run_ours(options), *run_peers(options), *extra]

@@ -13,7 +13,7 @@ from sigmasplat.errors import SigmaSplatError
 
 Options = TypeVar("Options")
 NOT_RECORDED = ("runs", "out", "fresh", "quick", "scratch", "other")
-"""Options that do not change what is measured."""
+"""Options that do not affect the measurements."""
 
 
 def start(main: Callable[[Options], int], options: type[Options], description: str | None = None) -> NoReturn:
@@ -30,7 +30,7 @@ def refuse(benchmark: str, problem: Exception) -> int:
 def keep(
     benchmark: str, figures: dict[str, Any], options: Any, seeds: Sequence[int] = (), write: bool = True, **config: Any
 ) -> dict[str, Any]:
-    """Return results with the options they were measured with; write them too unless told not to.
+    """Return results with the options they were measured with; write them too, unless an option disables it.
 
     `options` have a `name` and the folder `out`; `config` replaces values of them in the results.
     """

@@ -24,7 +24,7 @@ class Results:
     folder: Path
 
     def measured(self, name: str) -> dict[str, Any]:
-        """Return the newest results of a name. Raises KeyError without results."""
+        """Return the newest results of a name. Raises KeyError if there are none."""
         found = record.latest(name, self.folder)
         if found is None:
             raise KeyError(f"the summary needs the results {name!r}")
@@ -43,14 +43,14 @@ class Results:
         return " · ".join(self.cell("accuracy", title, (name, "sigma"), column) for name in SEQUENCES)
 
     def goals(self) -> tuple[int, int]:
-        """Return how many goals all results hold, and how many goals there are."""
+        """Return how many goals are met in all results, and the number of goals."""
         measured = [record.read(path) for path in sorted(self.folder.glob("*.json"))]
         rows = [row for m in measured for s in tables.sections(m) if s.title == "Goals" for row in s.rows]
         return sum(row[-1] == "yes" for row in rows), len(rows)
 
 
 def weights_of_variance(results: Results) -> str:
-    """Count which figures the weights of σ² improve."""
+    """Count the figures that the weights of σ² improve."""
     measured = results.measured("ablation")
     earlier = verdict_counts(measured, "+registration", "none")
     final = verdict_counts(measured, "+final", "+registration")
@@ -82,14 +82,14 @@ def alignment(results: Results) -> str:
 
 
 def coverage(results: Results) -> str:
-    """Give the share of poses whose error the covariance covers."""
+    """Return the share of poses whose error is covered by the covariance."""
     rooms = ("synthetic:frames=200,noise=1", "synthetic:frames=200")
     noisy, exact = (results.cell("tracking", "Consistency", (room, "all"), "in the band, %") for room in rooms)
     return f"not fully: {noisy} % of the errors lie in the 95 % band with a sensor's noise, {exact} % with exact depth"
 
 
 def loops(results: Results) -> str:
-    """Give what closing loops does to the path under drift."""
+    """Return the effect of loop closure on the path under drift."""
     ratio = results.cell("loops", "Goals", ("drift: ATE with loops / without, of means",), "measured")
     wrong = results.cell("loops", "Goals", ("drift: false loops closed, all seeds",), "measured")
     seeds = len(results.measured("loops")["seeds"])
@@ -97,7 +97,7 @@ def loops(results: Results) -> str:
 
 
 def kernels(results: Results) -> str:
-    """Give the times of the main pieces of work."""
+    """Return the times of the main operations."""
     columns = {
         "render all outputs": "forward, all outputs",
         "track a frame": "track, Gauss–Newton",
@@ -108,7 +108,7 @@ def kernels(results: Results) -> str:
 
 
 def growth(results: Results) -> str:
-    """Give how time and memory grow over a long run."""
+    """Return how time and memory grow over a long run."""
     column = "measured"
     frames, time, memory = (
         results.cell("long-run", "Goals", (row,), column) for row in ("frames", "… mean", "resident memory, median")
@@ -117,7 +117,7 @@ def growth(results: Results) -> str:
 
 
 def hard_sequence(results: Results) -> str:
-    """Give the error on the hardest sequence."""
+    """Return the error on the hardest sequence."""
     ate, fast = (
         results.cell("hololens", "Path and speed", ("hololens", p), "ATE, cm") for p in ("sigma", "varsplat-fast")
     )
@@ -126,19 +126,19 @@ def hard_sequence(results: Results) -> str:
 
 
 def speed(results: Results) -> str:
-    """Give frames per second, and the time of the final map beside it."""
+    """Return the frames per second, and the time of the final map."""
     finish = (results.cell("systems", name, ("finish, s",), "sigma") for name in SEQUENCES)
     return f"{results.each('Path and speed', 'frames/s')}; then the final map, s: {' · '.join(finish)}"
 
 
 def goals(results: Results) -> str:
-    """Count the goals that are held."""
+    """Count the goals that are met."""
     held, total = results.goals()
     return f"{held} of {total}; the others are marked **no**"
 
 
 def each(title: str, column: str) -> Callable[[Results], str]:
-    """Give a figure of the preset sigma on each sequence."""
+    """Return a figure of the preset sigma on each sequence."""
     return lambda results: results.each(title, column)
 
 
@@ -160,7 +160,7 @@ ROWS: tuple[tuple[str, Callable[[Results], str], tuple[str, ...]], ...] = (
     ("A sequence it finds hard (hololens, ATE)", hard_sequence, ("hololens",)),
     ("Goals held, all results", goals, ()),
 )  # fmt: skip
-"""Question, answer, results it is taken from."""
+"""Question, answer, and the results that the answer is taken from."""
 
 
 def table(folder: Path = record.RESULTS) -> str:

@@ -15,7 +15,7 @@ from sigmasplat.render import render
 
 @term
 def charbonnier(color: Tensor, color_target: Tensor, valid: Tensor) -> Tensor:
-    """Take mean √(r² + 10⁻⁶) of the colour residual over valid pixels: a smooth L1."""
+    """Return the mean of √(r² + 10⁻⁶) of the colour residual over valid pixels: a smooth L1."""
     return mean_over(((color - color_target) ** 2 + 1e-6).sqrt(), valid)
 
 

@@ -11,7 +11,7 @@ slam.finish()
 from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
-from sigmasplat import env as env  # must precede torch: it sets how idle OpenMP threads wait
+from sigmasplat import env as env  # must come before torch: it sets how idle OpenMP threads wait
 
 if TYPE_CHECKING:
     from sigmasplat.config import Config as Config

@@ -1,4 +1,4 @@
-"""Name the types that many modules share."""
+"""Name the types that many modules share, and the default for an optional callback."""
 
 from collections.abc import Callable
 
@@ -6,6 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 Matrix = NDArray[np.float64]
-"""A float64 array of any shape; its docstring says which, as in T_world_camera [4, 4]."""
+"""A float64 array of any shape; the docstring of its function gives the shape, as in T_world_camera [4, 4]."""
 Progress = Callable[[int, int], None]
 """Called with (done, total) while a long task runs; a total of 0 is not known yet."""
+
+
+def no_progress(done: int, total: int) -> None:
+    """Ignore the progress of a task: the default where a `Progress` is optional."""

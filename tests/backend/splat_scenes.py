@@ -1,5 +1,6 @@
 """Make scenes that stress a splat rasteriser, and compare gradients as vectors."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -121,6 +122,15 @@ def twist_gradient(matrix_gradient: Tensor, T: Tensor) -> Tensor:
     G, T = matrix_gradient.double().numpy(), T.double().numpy()
     torque = np.cross(T[:3].T, G[:3].T).sum(0)
     return torch.as_tensor(np.concatenate([G[:3, 3], torque]))
+
+
+def twist_differences(loss: Callable[[Tensor], Any], T: Tensor, step: float) -> Tensor:
+    """Differentiate a loss of a pose by the twist [6] of exp(ξ)·T, central differences, float64."""
+    out = []
+    for e in np.eye(6):
+        ahead, behind = (float(loss(torch.as_tensor(se3.exp(sign * step * e)) @ T)) for sign in (1, -1))
+        out.append((ahead - behind) / (2 * step))
+    return torch.tensor(out, dtype=torch.float64)
 
 
 def assert_same_vector(got: Tensor, want: Tensor, relative: float = 1e-4, what: str = "") -> None:

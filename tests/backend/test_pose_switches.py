@@ -20,7 +20,7 @@ from sigmasplat.render import Render, render
 from sigmasplat.render.channels import features_of
 from sigmasplat.render.reference import operators as reference
 from splat_fields import exact_view, params_of, plane_gradients
-from splat_scenes import SMALL, Scene, assert_same_vector, probe, scene, twist_gradient
+from splat_scenes import SMALL, Scene, assert_same_vector, probe, scene, twist_differences, twist_gradient
 
 PATHS = ("mean", "covariance", "depth", "color")
 Moves = tuple[bool, ...]
@@ -86,23 +86,18 @@ def composed(s: Scene, T_mean: Tensor, T_covariance: Tensor, T_depth: Tensor, T_
 
 def differences(s: Scene, moves: Moves) -> Tensor:
     """Differentiate by the twist of exp(ξ)·T, moving the chosen paths only."""
-    out = []
-    for e in np.eye(6):
-        ahead, behind = (torch.as_tensor(se3.exp(sign * STEP * e)) @ s.T_camera_world for sign in (1, -1))
-        ends = [composed(s, *(T if on else s.T_camera_world for on in moves)) for T in (ahead, behind)]
-        out.append((ends[0] - ends[1]) / (2 * STEP))
-    return torch.tensor(out, dtype=torch.float64)
+    T_now = s.T_camera_world
+    return twist_differences(lambda T: composed(s, *(T if on else T_now for on in moves)), T_now, STEP)
 
 
 @pytest.mark.parametrize("kind", ["random", "off_screen"])
 def test_the_whole_gradient_equals_differences_of_the_render(kind: str) -> None:
     """Nothing is composed here: the render itself is asked at poses ahead and behind."""
-    s, out = scene(kind, 7, SMALL, 1e-3), []
-    for e in np.eye(6):
-        poses = (torch.as_tensor(se3.exp(sign * STEP * e)) @ s.T_camera_world for sign in (1, -1))
-        ends = [loss_of(render(shiny(s), s.camera, T, s.ref_depth, backend="reference")) for T in poses]
-        out.append(float(ends[0] - ends[1]) / (2 * STEP))
-    assert_same_vector(gradient(s, ALL), torch.tensor(out).double(), 1e-6, kind)
+    s = scene(kind, 7, SMALL, 1e-3)
+    found = twist_differences(
+        lambda T: loss_of(render(shiny(s), s.camera, T, s.ref_depth, backend="reference")), s.T_camera_world, STEP
+    )
+    assert_same_vector(gradient(s, ALL), found, 1e-6, kind)
 
 
 @pytest.mark.parametrize("moves", CHOICES, ids=named)

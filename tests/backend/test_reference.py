@@ -5,10 +5,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.model import se3
 from sigmasplat.render.reference import operators as reference
 from splat_oracle import flat, look
-from splat_scenes import FIELD, KINDS, SMALL, Scene, assert_same_vector, gradients, probe, render, scene
+from splat_scenes import (
+    FIELD,
+    KINDS,
+    SMALL,
+    Scene,
+    assert_same_vector,
+    gradients,
+    probe,
+    render,
+    scene,
+    twist_differences,
+)
 
 PATHS = ("mean_pose_gradient", "covariance_pose_gradient", "depth_pose_gradient")
 STEP = 3e-7
@@ -40,12 +50,8 @@ def difference_field(s: Scene, name: str) -> Tensor:
 
 def difference_pose(s: Scene, moves: tuple[bool, bool, bool]) -> Tensor:
     """Differentiate by the twist of exp(ξ)·T, moving only the chosen paths."""
-    out = []
-    for e in np.eye(6):
-        ahead, behind = (torch.as_tensor(se3.exp(sign * STEP * e)) @ s.T_camera_world for sign in (1, -1))
-        sides = [loss(s, *(T if move else s.T_camera_world for move in moves)) for T in (ahead, behind)]
-        out.append((sides[0] - sides[1]) / (2 * STEP))
-    return torch.tensor(out, dtype=torch.float64)
+    T_now = s.T_camera_world
+    return twist_differences(lambda T: loss(s, *(T if move else T_now for move in moves)), T_now, STEP)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -9,21 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bag_recordings import CAMERA_TOPICS, FOCAL, Recorder, aligned
 from fake_realsense import Device
-from recordings import (
-    CAMERA_TOPICS,
-    FOCAL,
-    FRAMES,
-    Recorder,
-    Scene,
-    aligned,
-    encoded,
-    r3d_members,
-    scene,
-    write_exr_export,
-    write_stray,
-    write_zip,
-)
+from recordings import FRAMES, Scene, encoded, r3d_members, scene, write_exr_export, write_stray, write_zip
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.sources import open_source
 

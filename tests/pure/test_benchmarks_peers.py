@@ -25,7 +25,7 @@ def run(system: str, source: str, ate_m: float | None, **rest: Any) -> dict[str,
     return {"system": system, "source": source, "problem": None, "frames": 6, "ate_m": ate_m, **rest}
 
 
-@pytest.mark.parametrize("program", ["peers"])
+@pytest.mark.parametrize("program", ["peers", "picture"])
 def test_the_program_explains_itself(program: str) -> None:
     command = [sys.executable, BENCHMARKS / f"{program}.py", "--help"]
     answer = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)

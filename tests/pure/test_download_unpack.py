@@ -12,6 +12,7 @@ from hypothesis import given, settings, strategies as st
 
 from archives import entry, folder_content, tar_gz, zipped
 from sigmasplat.download.unpack import ArchiveError, Budget, unpack
+from sigmasplat.types import no_progress
 
 FILES = {"rgb.txt": b"# colour\n", "rgb/1.png": bytes(range(256)) * 999, "rgb/2.png": b"", "a b/ö.txt": b"x"}
 PLENTY = 2**24
@@ -22,7 +23,7 @@ def unpacked(content: bytes, name: str, folder: Path, bytes_: int = PLENTY, file
     folder.mkdir(exist_ok=True)
     archive = folder / name
     archive.write_bytes(content)
-    unpack(archive, folder / "inside", Budget(bytes_, files), lambda done, total: None)
+    unpack(archive, folder / "inside", Budget(bytes_, files), no_progress)
     return folder_content(folder / "inside")
 
 

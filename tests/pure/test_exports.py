@@ -12,12 +12,14 @@ from box_room import CAMERA, HIGH, LOW, seer, splats
 from room_run import FRAMES, LOST, PATH, T_ROOM, WORLD, Walls, made_run, picture
 from sigmasplat.drawing.film import FilmScale, legend_strip
 from sigmasplat.errors import ConfigError, RunError
+from sigmasplat.evaluation.reconstruct import FusionInput
 from sigmasplat.exports.colmap import export_colmap
 from sigmasplat.exports.nerfstudio import export_nerfstudio
-from sigmasplat.exports.plan import export_plan
+from sigmasplat.exports.plan import export_plan, write_plan
 from sigmasplat.exports.points import export_points, splat_points
 from sigmasplat.exports.run_reader import RunReader
 from sigmasplat.exports.video import VideoOptions, export_video, film_camera, orbit_view
+from sigmasplat.floorplan.floor_plan import floor_plan
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
@@ -72,7 +74,8 @@ def test_splat_centres_are_thinned_evenly(reader: RunReader) -> None:
 def test_surface_normals_point_into_the_room(reader: RunReader, tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh", reason="the [dev] extra is not installed")
     renderer = _from_any_submap(reader)
-    count = export_points(reader, tmp_path / "cloud.ply", voxel_m=0.05, renderer=renderer)
+    surface = FusionInput.at(reader.run, reader.camera).surface(voxel_m=0.05, renderer=renderer)
+    count = export_points(surface, tmp_path / "cloud.ply")
     cloud = trimesh.load(tmp_path / "cloud.ply")
     assert len(cloud.vertices) == count > 500
     rows = cloud.metadata["_ply_raw"]["vertex"]["data"]
@@ -167,7 +170,8 @@ def test_film_options_out_of_range_are_refused() -> None:
 
 
 def test_the_plan_is_an_image_and_a_json_file(reader: RunReader, tmp_path: Path) -> None:
-    plan = export_plan(reader, tmp_path / "plan.png", renderer=seer(WORLD))
+    plan = floor_plan(reader.run.read_map(), reader.tracked_path(), reader.camera, renderer=seer(WORLD))
+    write_plan(plan, tmp_path / "plan.png")
     with Image.open(tmp_path / "plan.png") as drawn:
         assert drawn.format == "PNG" and drawn.size[0] > 700
     record = json.loads((tmp_path / "plan.json").read_text())

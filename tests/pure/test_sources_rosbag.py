@@ -6,18 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recordings import (
-    CAMERA_TOPICS,
-    FOCAL,
-    FRAMES,
-    Recorder,
-    Scene,
-    aligned,
-    compressed_depth,
-    encoded,
-    quantised_depth,
-    scene,
-)
+from bag_recordings import CAMERA_TOPICS, FOCAL, Recorder, aligned, compressed_depth, quantised_depth
+from recordings import FRAMES, Scene, encoded, scene
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera

@@ -13,7 +13,7 @@ from command_line import exit_code
 from sigmasplat.config import Config, InputConfig
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.evaluation.evaluate import evaluate
-from sigmasplat.evaluation.reconstruct import FusionInput, reconstruct
+from sigmasplat.evaluation.reconstruct import FusionInput
 from sigmasplat.io.mesh import read_mesh
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.metrics.reconstruction import distances
@@ -106,7 +106,7 @@ def write_checkpoint(run: RunFolder, keyframes: list[int], **more: torch.Tensor)
 
 def test_the_surface_is_where_keyframes_render_it(run: RunFolder) -> None:
     renderer, told = KnownView(), list[tuple[int, int]]()
-    mesh = reconstruct(run, CAMERA, voxel_m=VOXEL_M, renderer=renderer, progress=lambda *at: told.append(at))
+    mesh = FusionInput.of(run, CAMERA).surface(voxel_m=VOXEL_M, renderer=renderer, progress=lambda *at: told.append(at))
     np.testing.assert_allclose(renderer.seen, poses()[KEYFRAMES], atol=1e-12)
     assert told == [(1, 3), (2, 3), (3, 3)]
     assert len(mesh.vertices) > 200 and np.abs(mesh.vertices[:, 2] - WALL_M).max() < 0.1 * VOXEL_M, "depth is D / A"
@@ -127,7 +127,7 @@ def submap_of(index: int, T_world_submap: np.ndarray, frames: tuple[int, ...]) -
 
 def test_each_keyframe_renders_its_own_submap(run: RunFolder) -> None:
     """Rendered in the submap's frame and placed by its anchor, the surface is that of the run without submaps."""
-    whole = reconstruct(run, CAMERA, voxel_m=VOXEL_M, renderer=KnownView())
+    whole = FusionInput.of(run, CAMERA).surface(voxel_m=VOXEL_M, renderer=KnownView())
     anchors = [np.eye(4), se3.exp(np.array([0.3, -0.1, 0.2, 0.1, 0.4, 0.0]))]
     for index, frames in enumerate(((0, 2), (4,))):
         run.submaps.save(*submap_of(index, anchors[index], frames))
@@ -138,10 +138,10 @@ def test_each_keyframe_renders_its_own_submap(run: RunFolder) -> None:
         return show(field, camera, T_camera_submap @ se3.inverse(anchors[len(field) - 1]))
 
     with pytest.raises(RunError, match="has 2 submaps, but its checkpoint has poses of 0; run it again"):
-        reconstruct(run, CAMERA, renderer=renderer)
+        FusionInput.of(run, CAMERA).surface(renderer=renderer)
     write_checkpoint(run, KEYFRAMES, T_world_submap=torch.from_numpy(np.stack(anchors)))
     (run.path / "map.ply").unlink()  # it must not be needed
-    mesh = reconstruct(run, CAMERA, voxel_m=VOXEL_M, renderer=renderer, progress=lambda *at: told.append(at))
+    mesh = FusionInput.of(run, CAMERA).surface(voxel_m=VOXEL_M, renderer=renderer, progress=lambda *at: told.append(at))
     assert [splats for splats, _ in seen] == [1, 1, 2] and told == [(1, 3), (2, 3), (3, 3)]
     np.testing.assert_allclose(seen[2][1], se3.inverse(poses()[4]) @ anchors[1], atol=1e-9)
     np.testing.assert_allclose(mesh.vertices, whole.vertices, atol=1e-4)
@@ -185,13 +185,13 @@ def test_without_a_true_surface_the_mesh_has_no_score(run: RunFolder) -> None:
 
 def test_no_keyframes_and_zero_voxels_are_refused(run: RunFolder) -> None:
     with pytest.raises(ConfigError, match="a voxel must be above 0"):
-        reconstruct(run, CAMERA, voxel_m=0.0, renderer=KnownView())
+        FusionInput.of(run, CAMERA).surface(voxel_m=0.0, renderer=KnownView())
     write_checkpoint(run, [])
     with pytest.raises(RunError, match="no keyframes in its checkpoint"):
-        reconstruct(run, CAMERA, renderer=KnownView())
+        FusionInput.of(run, CAMERA).surface(renderer=KnownView())
     (run.path / "checkpoint.safetensors").unlink()
     with pytest.raises(RunError, match=r"no checkpoint\.safetensors"):
-        reconstruct(run, CAMERA, renderer=KnownView())
+        FusionInput.of(run, CAMERA).surface(renderer=KnownView())
 
 
 def test_the_working_camera_is_that_of_prepared_frames(run: RunFolder) -> None:

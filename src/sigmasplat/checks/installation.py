@@ -12,7 +12,7 @@ from sigmasplat import env
 from sigmasplat.io import machine
 
 MAX_DIFFERENCE = 1e-2
-"""If rounding moves a splat across the threshold alpha_min, a pixel changes by up to 1/255."""
+"""If rounding moves a splat across the threshold alpha_min, a pixel can change by up to 1/255."""
 MEAN_DIFFERENCE = 1e-4
 
 

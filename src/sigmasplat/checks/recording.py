@@ -121,7 +121,7 @@ def _depth_camera(source: Source, settings: InputConfig) -> str:
 
 
 def _scale_question(middle_m: float, settings: InputConfig) -> list[tuple[str, str]]:
-    """Ask whether the median depth is plausible if the user gave a depth scale; else nothing."""
+    """Return a question about the median depth if the user gave a depth scale, else no row."""
     if not settings.depth_scale:
         return []
     return [("your depth scale", f"it gives a median depth of {middle_m:.2f} m: is this plausible?")]

@@ -92,8 +92,8 @@ def edge_agreement(frames: Iterable[Frame]) -> EdgeAgreement | None:
 def outlines(depth_m: Plane) -> NDArray[np.bool_]:
     """Return the pixels [H, W] next to a pixel at least 8 % farther away. A hole gets the farthest depth around it.
 
-    The shadow of a structured-light sensor such as Kinect is a hole on the side of the background. Its far border is
-    therefore not an outline.
+    The shadow of a structured-light sensor such as Kinect is a hole on the background side of an edge. The far side of
+    the hole is therefore not an outline.
     """
     filled = np.where(depth_m > 0, depth_m, ndimage.maximum_filter(depth_m, size=9))
     return np.asarray((depth_m > 0) & (ndimage.maximum_filter(filled, size=3) > 1.08 * filled + 0.03))

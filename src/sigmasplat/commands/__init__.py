@@ -1,1 +1,1 @@
-"""Carry out what the command line asks: one module a command; torch loads where it is needed."""
+"""Implement the commands of the command line, one module per command. torch is loaded only when it is needed."""

@@ -159,7 +159,7 @@ def verdict_lines(variants: Sequence[str], runs: Sequence[dict[str, Any]], seeds
 
 
 def _announce(screen: "Screen", jobs: Sequence[Job], results: Results, job: Job) -> None:
-    """Print which run starts, and the time left as estimated from the runs so far."""
+    """Print which run starts, and the remaining time, estimated from the runs so far."""
     durations_s = [run["wall_s"] for run in results.runs]
     left_min = sum(durations_s) / len(durations_s) * (len(jobs) - len(durations_s)) / 60 if durations_s else None
     rest = "" if left_min is None else f" (about {max(left_min, 1):.0f} min left)"

@@ -6,8 +6,8 @@ import sys
 from sigmasplat.commands import options
 from sigmasplat.presets import list_presets
 
-# tyro's script offers commands and options. Elsewhere it offers one empty word, which is removed here, so that bash
-# completes file names.
+# tyro's script suggests commands and options. In other places it suggests one empty word, which is removed here, so
+# that bash completes file names.
 BASH = """
 _sigmasplat() {{
   _tyro_sigmasplat

@@ -15,7 +15,7 @@ def make_mesh(
 
     example: sigmasplat mesh runs/kitchen-sigma --out kitchen.glb
     """
-    from sigmasplat.evaluation.reconstruct import reconstruct
+    from sigmasplat.evaluation.reconstruct import FusionInput
     from sigmasplat.io.mesh import check_ending, write_mesh
     from sigmasplat.io.runs import MESH, RunFolder
     from sigmasplat.run.terminal import Screen
@@ -26,7 +26,7 @@ def make_mesh(
     source = source_of(folder, moved_to)
     prepare_torch()
     with screen.counting("surface") as progress:
-        surface = reconstruct(folder, source.camera, voxel_m=voxel_m, progress=progress)
+        surface = FusionInput.of(folder, source.camera).surface(voxel_m, progress=progress)
     write_mesh(target, surface)
     screen.say(f"{len(surface.vertices):,} vertices, {len(surface.faces):,} triangles: {target}")
     return 0

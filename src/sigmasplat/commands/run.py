@@ -45,7 +45,7 @@ def demo(
     """
     if frames < 1:
         raise ConfigError(f"--frames must be at least 1, found {frames}")
-    whole_walk = max(frames, DEMO_FRAMES)  # fewer frames are a part of this walk: squeezed into a few, it is too fast
+    whole_walk = max(frames, DEMO_FRAMES)  # a short demo is the start of this walk, at the same pace
     limit = options.InputOptions(limit=frames)
     return run(f"synthetic:frames={whole_walk}", preset, settings, out, overwrite=True, input_options=limit, seed=seed)
 
@@ -173,7 +173,7 @@ def _run_and_score(
     with _progress(screen, start, source, viewer) as callback:
         outcome = Session(start.slam, source, folder, callback, state, start.next_index, start.wall_s).execute()
     if outcome.status == "interrupted" and not outcome.frames:
-        raise KeyboardInterrupt  # the folder holds no results, and nothing to resume from
+        raise KeyboardInterrupt  # the folder has no results, and no state to resume from
     if run_options.profile:
         screen.profile(folder.read_profile())
     _warn_of_skipped_frames(screen, source)
@@ -181,7 +181,7 @@ def _run_and_score(
         _say_interrupted(screen, outcome, folder)
         return INTERRUPTED
     if isinstance(source, LiveSource):
-        source = source_of(folder, None)  # what follows reads the recording
+        source = source_of(folder, None)  # the steps below read the recording
     if run_options.evaluate:
         score(screen, folder, source)
     else:

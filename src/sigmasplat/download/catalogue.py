@@ -1,8 +1,8 @@
 """List the public data sets: addresses, sizes, licences.
 
-Addresses are those that the download scripts of public SLAM repositories use (MASt3R-SLAM's and monodepth2's for TUM,
+The addresses are those in the download scripts of public SLAM repositories (MASt3R-SLAM's and monodepth2's for TUM,
 NICE-SLAM's and pySLAM's download_replica.sh, cuVSLAM's download_icl_nuim.sh, hloc's README for 7-Scenes, WildGS-SLAM's
-download_bonn.sh, Open3D's RedwoodIndoor*.cpp). Only Open3D publishes checksums: those of TUM and 7-Scenes here were
+download_bonn.sh, Open3D's RedwoodIndoor*.cpp). Only Open3D publishes checksums. The checksums of TUM and 7-Scenes were
 recorded by two independent projects with equal results. Other sizes are approximate.
 """
 
@@ -72,7 +72,7 @@ REDWOOD_MD5 = {
         "698f2f09da7d2ed3fcb604889e6f8479",
     ),
 }
-"""Of colour, depth with Kinect noise, and the path."""
+"""Contains colour, depth with Kinect noise, and the path."""
 REDWOOD_URL = "https://github.com/isl-org/open3d_downloads/releases/download/augmented-icl-nuim"
 
 

@@ -44,7 +44,8 @@ class RetryPolicy:
 
 
 class _TransferError(Exception):
-    """A failed attempt that can be retried; hopeless: not before any byte has arrived (no network, no such host)."""
+    """A failed attempt that can be retried. hopeless: do not retry before any byte has arrived (no network, no such
+    host)."""
 
     def __init__(self, why: str, wait_s: float = 0.0, hopeless: bool = False) -> None:
         super().__init__(why)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 CHUNK_BYTES = 2**20
 MAX_RATIO, RATIO_CHECKED_ABOVE_BYTES = 200, 2**20
-"""Largest compression ratio of a file above a MiB in a zip; images hardly compress, text to a fifth."""
+"""Maximum compression ratio of a file above 1 MiB in a zip; images hardly compress, text to a fifth."""
 DESKTOP_FILES = {"__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini"}
 
 
@@ -100,7 +100,7 @@ def _unpack_tar(archive: Path, folder: Path, budget: Budget, progress: "Progress
                 else:
                     raise ArchiveError(f"holds {member.name!r}, which is not a plain file or folder")
                 progress(min(packed.tell(), size_bytes - 1), size_bytes)
-        while stream.read(CHUNK_BYTES):  # read to the end: the checksum of the stream is there
+        while stream.read(CHUNK_BYTES):  # read to the end, where the checksum of the stream is
             pass
     progress(size_bytes, size_bytes)
 

@@ -22,7 +22,7 @@ from sigmasplat.report import charts
 from sigmasplat.report.page import report_plan, write_charts, write_page
 from sigmasplat.report.view_strips import ViewStrips
 from sigmasplat.sources.base import Source
-from sigmasplat.types import Progress
+from sigmasplat.types import Progress, no_progress
 
 SAME_TIME_S = 1e-4
 """Log and trajectory hold the same timestamps up to rounding."""
@@ -38,7 +38,7 @@ def evaluate(
     views_per_kind: int = 40,
     strips_per_kind: int = 3,
     mesh: bool = False,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = no_progress,
 ) -> dict[str, Any]:
     """Score trajectory, map and uncertainty of a run against its source, and return the metrics written.
 
@@ -185,7 +185,7 @@ def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField, loops
 
 
 def _frames_per_s(run: RunFolder, log: Log) -> float | None:
-    """Return the end-to-end speed, by wall_s of run.json if it is there, else by the sum of the frames' times."""
+    """Return the end-to-end speed: from wall_s of run.json if it exists, else from the sum of the frames' times."""
     seconds = run.facts().get("wall_s") or sum(charts.frame_seconds(record) for record in log)
     return len(log) / seconds if seconds else None
 

@@ -46,8 +46,8 @@ FIGURES = (
     Figure("lost", "lost", "", -1, digits=1, judged=False),
     Figure("frames_per_s", "frames/s", "", +1, digits=1, judged=False),
 )
-"""PSNR and depth L1 are of held-out views; PSNR before and after the refinement of the final map. Figures of quality
-are judged, counts and speed are not."""
+"""PSNR and depth L1 are of held-out views. PSNR is given before and after the refinement of the final map. Figures of
+quality are judged; counts and speed are not."""
 
 
 def figures_of(metrics: Mapping[str, Any]) -> dict[str, float | None]:
@@ -104,7 +104,8 @@ def best(means: Mapping[str, float], figure: Figure) -> set[str]:
 def rows(
     runs: Sequence[Run], variants: Sequence[str], mark: Callable[[str], str], figures: Sequence[Figure]
 ) -> list[list[str]]:
-    """Return a row per variant: its name and each figure's mean ± standard deviation; `mark` marks the best."""
+    """Return a row per variant: its name and each figure's mean ± standard deviation; `mark` is put at the best
+    value."""
     laid_out = [[variant] for variant in variants]
     for figure in figures:
         values = {variant: list(by_seed(runs, variant, figure).values()) for variant in variants}

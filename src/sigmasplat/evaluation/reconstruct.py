@@ -22,7 +22,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.slam.fusion import VOXEL_M, FusionView, Renderer, count_keyframes, fuse, fusion_views
-from sigmasplat.types import Progress
+from sigmasplat.types import Progress, no_progress
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,26 +65,15 @@ class FusionInput:
             )
         return fusion_views(submaps, list(anchors)), count_keyframes(submaps)
 
-    def surface(self, voxel_m: float, renderer: Renderer | None, progress: Progress) -> Mesh:
-        """Fuse the keyframes. Raises RunError as `views` does, ConfigError unless voxel_m > 0."""
+    def surface(
+        self, voxel_m: float = VOXEL_M, renderer: Renderer | None = None, progress: Progress = no_progress
+    ) -> Mesh:
+        """Fuse renders of the map at the keyframes into a mesh in the run's world.
+
+        Calls `progress(done, total)` with keyframes. Raises RunError as `views` does; ConfigError unless voxel_m > 0.
+        """
         views, total = self.views()
         return fuse(views, total, self.config, voxel_m=voxel_m, renderer=renderer, progress=progress)
-
-
-def reconstruct(
-    run: RunFolder,
-    camera: Camera,
-    *,
-    voxel_m: float = VOXEL_M,
-    renderer: Renderer | None = None,
-    progress: Progress = lambda done, total: None,
-) -> Mesh:
-    """Fuse renders of the run's map at its keyframes into a mesh in the run's world; `camera` is the source's.
-
-    Calls `progress(done, total)` with keyframes. Raises RunError if the run has no map, no checkpoint or no
-    keyframe; ConfigError unless voxel_m > 0.
-    """
-    return FusionInput.of(run, camera).surface(voxel_m, renderer, progress)
 
 
 def fuse_and_score(
@@ -93,7 +82,7 @@ def fuse_and_score(
     true_surface: Mesh | None,
     true_path: Trajectory | None,
     renderer: Renderer | None = None,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = no_progress,
 ) -> dict[str, Any] | None:
     """Write the run's mesh.ply and return its scores, or None if the true surface or the true path is unknown."""
     fusion_input = FusionInput.of(run, camera)
@@ -105,11 +94,7 @@ def fuse_and_score(
 
 
 def score(
-    fusion_input: FusionInput,
-    mesh: Mesh,
-    true_surface: Mesh,
-    true_path: Trajectory,
-    progress: Progress = lambda done, total: None,
+    fusion_input: FusionInput, mesh: Mesh, true_surface: Mesh, true_path: Trajectory, progress: Progress = no_progress
 ) -> dict[str, float]:
     """Score a run's mesh and its splats against the true surface, after the same alignment as for the ATE.
 

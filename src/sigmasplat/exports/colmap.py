@@ -18,16 +18,14 @@ from sigmasplat.io.atomic import make_folder, write_text
 from sigmasplat.io.mesh import color_bytes
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.types import Matrix, Progress
+from sigmasplat.types import Matrix, Progress, no_progress
 
 SPARSE = Path("sparse") / "0"
 """The folder in which trainers that start from COLMAP look for a model."""
 Points = NDArray[np.floating]
 
 
-def export_colmap(
-    reader: RunReader, target: Path, images: bool = False, progress: Progress = lambda done, total: None
-) -> int:
+def export_colmap(reader: RunReader, target: Path, images: bool = False, progress: Progress = no_progress) -> int:
     """Write a sparse model to sparse/0 in a folder; return the number of views.
 
     Views are all frames that were not lost; with `images` only the keyframes, whose images are written to images/.

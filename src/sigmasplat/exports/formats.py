@@ -67,10 +67,10 @@ class ExportSource:
 class ExportFormat:
     """A row of the table: the name for --format, the endings that select it, a line of help, and its writer.
 
-    The first row with an ending owns it. An export without --out gets the first ending. `write(source, target, …)`
-    writes the target, a file or folder that does not exist or may be replaced, and returns a short description of its
-    content. Its keyword-only parameters are the options of the command line that the format accepts. reads_sequence:
-    the format also accepts --source.
+    An ending selects the first row that has it. Without --out, an export gets the row's first ending. `write(source,
+    target, …)` writes the target, a file or folder that does not exist or may be replaced, and returns a short
+    description of its content. Its keyword-only parameters are the options of the command line that the format accepts.
+    reads_sequence: the format also accepts --source.
     """
 
     name: str
@@ -234,18 +234,23 @@ def _colmap(source: ExportSource, target: Path, *, pictures: bool) -> str:
 def _export_views(
     export: "Callable[[RunReader, Path, bool, Progress], int]", source: ExportSource, target: Path, pictures: bool
 ) -> str:
+    from sigmasplat.types import no_progress
+
     reader = source.reader()
     if not pictures:
-        return f"{export(reader, target, False, lambda done, total: None):,} views, no pictures (--pictures)"
+        return f"{export(reader, target, False, no_progress):,} views, no pictures (--pictures)"
     with _counting("pictures") as progress:
         return f"{export(reader, target, True, progress):,} views with their pictures"
 
 
 def _points(source: ExportSource, target: Path, *, voxel_m: float) -> str:
+    from sigmasplat.evaluation.reconstruct import FusionInput
     from sigmasplat.exports.points import export_points
 
+    reader = source.reader()
     with _counting("surface") as progress:
-        return f"{export_points(source.reader(), target, voxel_m=voxel_m, progress=progress):,} points"
+        surface = FusionInput.at(reader.run, reader.camera).surface(voxel_m, progress=progress)
+        return f"{export_points(surface, target):,} points"
 
 
 def _video(source: ExportSource, target: Path, *, size: int, fps: float, seconds: float | None, path: str) -> str:

@@ -16,7 +16,7 @@ from sigmasplat.exports.points import splat_points, write_points
 from sigmasplat.exports.run_reader import RunReader
 from sigmasplat.io.json_files import write_json
 from sigmasplat.model.camera import Camera
-from sigmasplat.types import Matrix, Progress
+from sigmasplat.types import Matrix, Progress, no_progress
 
 POINTS = "points.ply"
 T_GL_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -24,9 +24,7 @@ T_GL_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])
 MILLIMETRES = 0.001
 
 
-def export_nerfstudio(
-    reader: RunReader, target: Path, images: bool = False, progress: Progress = lambda done, total: None
-) -> int:
+def export_nerfstudio(reader: RunReader, target: Path, images: bool = False, progress: Progress = no_progress) -> int:
     """Write transforms.json; return the number of views.
 
     Views are all frames that were not lost; with `images` only the keyframes, whose images are written to images/ and

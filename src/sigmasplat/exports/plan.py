@@ -6,20 +6,14 @@ from sigmasplat.errors import RunError
 from sigmasplat.exports.run_reader import RunReader
 from sigmasplat.floorplan.floor_plan import CELL_M, FloorPlan
 from sigmasplat.floorplan.picture import draw_floor_plan
-from sigmasplat.floorplan.surface_samples import SurfaceRenderer
 from sigmasplat.io.atomic import replacing
 from sigmasplat.io.json_files import write_json
 from sigmasplat.report.plan import run_floor_plan
-from sigmasplat.types import Progress
+from sigmasplat.types import Progress, no_progress
 
 
 def export_plan(
-    reader: RunReader,
-    target: Path,
-    *,
-    cell_m: float = CELL_M,
-    renderer: SurfaceRenderer | None = None,
-    progress: Progress = lambda done, total: None,
+    reader: RunReader, target: Path, *, cell_m: float = CELL_M, progress: Progress = no_progress
 ) -> FloorPlan:
     """Write the image (.png) and the data of the plan beside it (.json); return the plan.
 
@@ -28,11 +22,17 @@ def export_plan(
     """
     if target.suffix.lower() != ".png":
         raise RunError(f"cannot write a floor plan as {target.name}; give a name that ends in .png")
-    plan = run_floor_plan(
-        reader.run, reader.tracked_path(), reader.camera, cell_m=cell_m, renderer=renderer, progress=progress
-    )
+    plan = run_floor_plan(reader.run, reader.tracked_path(), reader.camera, cell_m=cell_m, progress=progress)
+    write_plan(plan, target)
+    return plan
+
+
+def write_plan(plan: FloorPlan, target: Path) -> None:
+    """Write the image to `target` (.png) and the data beside it (.json).
+
+    Raises RunError if a file cannot be written.
+    """
     picture = draw_floor_plan(plan)
     with replacing(target) as temporary:
         picture.save(temporary, "PNG")
     write_json(target.with_suffix(".json"), plan.record())
-    return plan

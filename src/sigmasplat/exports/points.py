@@ -5,13 +5,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.evaluation.reconstruct import FusionInput
-from sigmasplat.exports.run_reader import RunReader
 from sigmasplat.io.atomic import replacing
 from sigmasplat.io.mesh import color_bytes
 from sigmasplat.model.field import GaussianField
-from sigmasplat.slam.fusion import VOXEL_M, Renderer
-from sigmasplat.types import Matrix, Progress
+from sigmasplat.model.mesh import Mesh
+from sigmasplat.types import Matrix
 
 Points = NDArray[np.floating]
 
@@ -19,20 +17,11 @@ MAX_POINTS = 100_000
 MIN_OPACITY = 0.5
 
 
-def export_points(
-    reader: RunReader,
-    target: Path,
-    *,
-    voxel_m: float = VOXEL_M,
-    renderer: Renderer | None = None,
-    progress: Progress = lambda done, total: None,
-) -> int:
-    """Fuse the map's renders at its keyframes to a surface and write its vertices; return their number.
+def export_points(surface: Mesh, target: Path) -> int:
+    """Write the vertices of a run's surface (`FusionInput.surface`), about one per voxel; return their number.
 
-    They are the vertices of `evaluation.reconstruct`'s mesh, about one per voxel on the surface. Raises RunError if the
-    run has no map, checkpoint or keyframe, ConfigError unless voxel_m > 0.
+    Raises RunError if the file cannot be written.
     """
-    surface = FusionInput.at(reader.run, reader.camera).surface(voxel_m, renderer, progress)
     colors = surface.vertices * 0.0 + 0.7 if surface.colors is None else surface.colors
     write_points(target, surface.vertices, colors, surface.normals())
     return len(surface.vertices)

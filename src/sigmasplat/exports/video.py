@@ -27,7 +27,7 @@ from sigmasplat.model.camera_path import orbit, smooth_path
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import FieldRenderer
-from sigmasplat.types import Matrix, Progress
+from sigmasplat.types import Matrix, Progress, no_progress
 
 SHORTEST_S, LONGEST_S, ORBIT_S = 4.0, 60.0, 12.0
 SAMPLES = 12
@@ -74,7 +74,7 @@ def export_video(
     options: VideoOptions | None = None,
     *,
     renderer: SurfaceRenderer | None = None,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = no_progress,
 ) -> int:
     """Write a video and return its number of images. Calls `progress(done, total)` after each image.
 
@@ -115,7 +115,7 @@ def orbit_view(
     radius_m = 0.85 * float(np.linalg.norm((high - low)[:2]) / 2.0 / np.sin(half_view))
     T_world_floor = se3.inverse(T)
     center = T_world_floor[:3, :3] @ middle + T_world_floor[:3, 3]
-    kept = field.moved(torch.eye(4))  # a copy
+    kept = field.moved(torch.eye(4))  # makes a copy
     kept.keep(torch.from_numpy(field.means.numpy().astype(np.float64) @ T[2, :3] + T[2, 3] < ceiling_m))
     return kept, orbit(center, T[2, :3], T[1, :3], radius_m, images)
 

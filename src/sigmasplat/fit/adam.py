@@ -1,4 +1,4 @@
-"""Step every splat by Adam (Kingma & Ba 2015), a learning rate per column of the field."""
+"""Update splats with Adam (Kingma & Ba 2015), with a learning rate per column of the field."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ from sigmasplat.model.field import ATTRIBUTES, COLUMNS, WIDTH, Rows
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 ATTRIBUTE_RATES = {"correlations": ("log_variances", 0.03), "harmonics": ("colors", 1.0 / 20.0)}
-"""The rate of an attribute, as a share of the rate of some columns (harmonics: 3DGS's; correlations: ours, from 0.1 on
-they fit the errors of single pixels, and likelihood on held-out frames falls)."""
+"""Learning rate of an attribute, relative to the rate of the named columns. Harmonics: the value of 3DGS. Correlations:
+our value; from 0.1 on they fit the errors of single pixels, and the likelihood on held-out frames falls."""
 ROWS_AT_ONCE = 8192
-"""This many rows and their intermediate results fit the processor's cache."""
+"""This many rows and their intermediate results fit in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class Rates:
 
     @staticmethod
     def of(config: MappingConfig) -> "Rates":
-        """Read them from the mapping settings (VarSplat §2)."""
+        """Make the rates from the mapping settings (VarSplat §2)."""
         rates = torch.zeros(WIDTH)
         for name, columns in COLUMNS.items():
             rates[columns] = getattr(config, f"lr_{name}")
@@ -35,7 +35,8 @@ class Rates:
 
     @staticmethod
     def falling(config: MappingConfig, steps: int) -> "Iterator[Rates]":
-        """Yield the rates of a first keyframe's steps: of means from `lr_means_first` down to `lr_means`, by log."""
+        """Yield the rates of the first keyframe's steps. The rate of the means decays exponentially from
+        `lr_means_first` to `lr_means`."""
         for step in range(steps):
             rates = Rates.of(config)
             if config.lr_means_first and config.lr_means:
@@ -44,23 +45,25 @@ class Rates:
             yield rates
 
     def of_attribute(self, name: str) -> "Rates":
-        """Return the rates of an attribute of a field that has these ones."""
+        """Return the rates of an attribute, for a field that has these rates."""
         columns, share = ATTRIBUTE_RATES[name]
         return Rates(self.per_column.new_full((ATTRIBUTES[name],), share * float(self.per_column[COLUMNS[columns]][0])))
 
 
 def adam_step(field: Rows, grad: Tensor, rates: Rates, visible: Tensor) -> None:
-    """Move the rows of `field.params` in view (bool [N]) against grad [N, m], in place; `field.steps` is this step.
+    """Step the visible rows (bool [N]) of `field.params` with the gradient grad [N, m], in place. `field.steps` is the
+    number of this step.
 
-    Rows out of view wait. What dense Adam would have done to one meanwhile, coast on its decaying moments, is made up
-    for when it is seen again (`_catch_up`) or by `settle`. The native kernels do the same, fused (native/adam.h).
+    Invisible rows are not changed now. Dense Adam would still move them, because its moments decay slowly. This missed
+    motion is added when the row is visible again (`_catch_up`), or by `settle`. The native kernels do the same in one
+    fused pass (native/adam.h).
     """
     for rows in torch.split(visible.nonzero().squeeze(1), ROWS_AT_ONCE):
         adam_rows(field, rows, grad[rows], rates)
 
 
 def adam_rows(field: Rows, rows: Tensor, g: Tensor, rates: Rates) -> None:
-    """Move some rows (indices [n]) against their gradients g [n, m], as `adam_step` does."""
+    """Step the rows with indices [n] with their gradients g [n, m], as `adam_step` does."""
     params, moment1, moment2 = _catch_up(field, rows, rates, field.steps - 1)
     moment1.lerp_(g, 1 - BETA1)
     moment2.mul_(BETA2).addcmul_(g, g, value=1 - BETA2)
@@ -71,17 +74,17 @@ def adam_rows(field: Rows, rows: Tensor, g: Tensor, rates: Rates) -> None:
 
 
 def settle(field: Rows, rates: Rates) -> None:
-    """Bring every row to the present step, as dense Adam would have it: to be called when a fit ends."""
+    """Apply the missed motion to every row, as in dense Adam. Call this when a fit ends."""
     rows = (field.last_step != field.steps).nonzero().squeeze(1)
     field.params[rows], field.moment1[rows], field.moment2[rows] = _catch_up(field, rows, rates, field.steps)
     field.last_step[rows] = field.steps
 
 
 def _catch_up(field: Rows, rows: Tensor, rates: Rates, to: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return params and moments of rows as dense Adam without a gradient would have left them after step `to`.
+    """Return params and moments of rows as dense Adam with zero gradient would leave them after step `to`.
 
-    A step without gradient is β₁/√β₂ times the one before it, so that the missed ones add up to a geometric series.
-    Left out is only how the bias correction changes meanwhile.
+    Each step with zero gradient is β₁/√β₂ times the step before, so the missed steps are a geometric series. The change
+    of the bias correction during these steps is neglected.
     """
     last = field.last_step[rows][:, None].to(field.params)
     missed, ratio, moved = to - last, BETA1 / BETA2**0.5, last > 0
@@ -98,14 +101,16 @@ def _catch_up(field: Rows, rows: Tensor, rates: Rates, to: int) -> tuple[Tensor,
 def _move(
     params: Tensor, moment1: Tensor, moment2: Tensor, rates: Rates, unbias1: Tensor | float, unbias2: Tensor | float
 ) -> None:
-    """Take Adam's step on rows in place; unbias1, unbias2: what corrects moment1 and the root of moment2."""
+    """Apply Adam's step to rows in place. unbias1 and unbias2 correct the bias of moment1 and of the root of
+    moment2."""
     spread = moment2.sqrt().mul_(unbias2).add_(EPSILON)
     params.addcmul_((moment1 * unbias1).div_(spread), rates.per_column.to(params.device), value=-1.0)
 
 
 @dataclass(eq=False)
 class VectorAdam:
-    """Adam on a few numbers: a pose's twist, where each step starts from the pose of the last, or its coordinates."""
+    """Adam for a small vector: the parameters of a pose, or its twist. With a twist, each step starts from the pose of
+    the step before."""
 
     moment1: NDArray[np.float64]
     moment2: NDArray[np.float64]
@@ -113,11 +118,11 @@ class VectorAdam:
 
     @staticmethod
     def of(size: int) -> "VectorAdam":
-        """Start at rest on `size` numbers."""
+        """Return a new state for a vector of `size` numbers, with zero moments."""
         return VectorAdam(np.zeros(size), np.zeros(size))
 
     def step(self, gradient: NDArray[np.float64], rates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the update for a gradient, a rate for each number."""
+        """Return the update for a gradient, with one learning rate per number."""
         self.steps += 1
         self.moment1 += (1 - BETA1) * (gradient - self.moment1)
         self.moment2 += (1 - BETA2) * (gradient**2 - self.moment2)

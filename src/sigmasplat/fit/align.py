@@ -1,7 +1,7 @@
-"""Align two RGB-D images directly: Gauss–Newton on SE(3), coarse to fine, gray and depth residuals together.
+"""Align two RGB-D images directly: Gauss–Newton on SE(3), coarse to fine, with gray and depth residuals together.
 
-The reference may be a rendered map (tracking) or the previous frame (odometry). One render and a dozen steps of 0.1 ms
-replace dozens of renders. It runs where the images are: on the CPU, or on a CUDA device.
+The reference is a rendered map (tracking) or the previous frame (odometry). One render and a dozen steps of 0.1 ms
+replace dozens of renders. Alignment runs on the device that holds the images: the CPU or a CUDA device.
 """
 
 from collections.abc import Sequence
@@ -18,24 +18,28 @@ from sigmasplat.model import se3
 from sigmasplat.types import Matrix
 
 HUBER_GRAY = (0.02, 0.05, 0.1, 0.2)
-"""Width of the gray residual's quadratic part, from the finest level up: far from the solution all residuals are
-large."""
+"""Huber width of the gray residual per pyramid level, finest level first. It is wider on coarse levels because
+residuals are large far from the solution."""
 HUBER_DEPTH_RELATIVE = (0.003, 0.006, 0.012, 0.05)
-"""The same for depth, times z² (m); the finest is a structured-light sensor's noise (Khoshelham & Elberink 2012)."""
+"""Huber width of the depth residual per level, times z² (m). The finest value is the noise of a structured-light sensor
+(Khoshelham & Elberink 2012)."""
 DEPTH_GATES_M = (0.1, 0.3, 0.8, 2.0)
-"""Larger depth residuals belong to other surfaces; from the finest level up."""
+"""Depth residuals above this limit are assumed to belong to other surfaces; finest level first."""
 MIN_PIXELS = 60
 DEGENERATE = 1e-5
-"""A direction with less than this share of the best one's information is undetermined."""
+"""A direction is undetermined if its information is below this share of the largest one."""
 UNKNOWN_M = 1.0
-"""Standard deviation given to such a direction, metres (of shift at the usual depth)."""
+"""Standard deviation assumed for an undetermined direction, metres (for rotations: shift at the mean depth)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """T_live_reference; agreement: share of overlapping pixels whose depths agree; overlap: share of reference pixels
-    that land on a live reading; degenerate: number of undetermined directions of motion; cost per pixel;
-    steps taken; depth_m: mean depth of the reference."""
+    """The result of an alignment: the motion T_live_reference and its quality.
+
+    agreement: share of overlapping pixels whose depths agree; overlap: share of reference pixels that fall on a live
+    depth reading; degenerate: number of undetermined directions of motion; cost: per pixel; steps: number of steps
+    taken; depth_m: mean depth of the reference.
+    """
 
     T_live_reference: Matrix
     agreement: float
@@ -48,13 +52,14 @@ class Alignment:
 
     @cached_property
     def covariance(self) -> Matrix:
-        """Estimate the covariance [6, 6] of the left twist (ρ, φ), m and rad, on first access; costs as much as 13
+        """Estimate the covariance [6, 6] of the left twist (ρ, φ), m and rad, on first access. It costs as much as 13
         steps.
 
-        D⁻¹ S D⁻ᵀ: S sums outer products of the gradient cell by cell, as residuals of neighbouring pixels are
-        correlated (cluster-robust sandwich estimator, Liang & Zeger 1986); D is the measured change of the gradient
-        within half a pixel, as H, built of noisy image gradients, is several times too steep. A degenerate direction
-        has `UNKNOWN_M` of deviation. Infinite without common pixels.
+        The result is D⁻¹ S D⁻ᵀ. S sums outer products of the gradient per cell of the image, because residuals of
+        neighbouring pixels are correlated (cluster-robust sandwich estimator, Liang & Zeger 1986). D is the measured
+        change of the gradient within half a pixel. H is not used for D: it is computed from noisy image gradients, so
+        it is several times too steep. An undetermined direction has the standard deviation `UNKNOWN_M`. Without common
+        pixels the covariance is infinite.
         """
         half_rad = 0.5 / self.pair.reference.cameras[0].fx
         steps = np.repeat([half_rad * self.depth_m, half_rad], 3)
@@ -71,7 +76,7 @@ class Alignment:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two images to align, and how much gray counts against depth."""
+    """Two images to align, and the weight of gray relative to depth."""
 
     reference: Pyramid
     live: Pyramid
@@ -79,11 +84,11 @@ class Pair:
 
     @property
     def kernels(self) -> ImageKernels:
-        """Return what aligns the two."""
+        """Return the kernels that align both images."""
         return self.reference.kernels
 
     def level(self, k: int) -> LevelPlanes:
-        """Lay one level of the pyramids out for the kernels."""
+        """Return one pyramid level of both images in the layout of the kernels."""
         r, live, width = self.reference, self.live, min(k, LEVELS - 1)
         c = r.cameras[k]
         options = [self.weight_color, 1.0 - self.weight_color]
@@ -96,18 +101,19 @@ class Pair:
 
 @dataclass(eq=False)
 class Normal:
-    """The normal equations of one step, as `_core.align_step` writes them: information H and gradient b by a left
-    twist, S = Σ b_c b_cᵀ over cells c of the image."""
+    """The normal equations of one step, as returned by `_core.align_step`: information H and gradient b with respect to
+    a left twist, and S = Σ b_c b_cᵀ over the cells c of the image."""
 
     H: Matrix
     b: Matrix
     S: Matrix
     sums: Matrix
-    """Weighted cost, pixels used, pixels in view with depth, pixels agreeing in depth."""
+    """Weighted cost, number of pixels used, number of pixels in view with depth, number of pixels whose depths
+    agree."""
 
 
 def normal_equations(kernels: ImageKernels, level: LevelPlanes, motions: Sequence[Matrix]) -> list[Normal]:
-    """Linearise the residuals of a level at some motions T_live_reference, at most 13."""
+    """Linearise the residuals of a level at up to 13 motions T_live_reference."""
     rows = kernels.normal_equations(level, motions)
     return [Normal(_symmetric(row[:21]), row[21:27], _symmetric(row[31:]), row[27:31]) for row in rows]
 
@@ -121,13 +127,13 @@ def align(
     update_stop: float = 1e-4,
     plateau_stop: float = 0.0,
 ) -> Alignment:
-    """Find the motion from the reference to the live image, from a first guess.
+    """Find the motion from the reference to the live image, starting at an initial guess.
 
-    Each level takes up to `iterations` Gauss–Newton steps with Huber weights and ends below `update_stop` (m, rad), or
-    when the cost has changed by less than `plateau_stop` of it (0 = off). If the finest level does neither, its best
-    iterate is returned. Undetermined directions keep the guess. weight_color in [0, 1] balances gray against depth,
-    each in units of its Huber width. Raises BackendError without the compiled kernels, or where only one image is on a
-    device.
+    Each level takes at most `iterations` Gauss–Newton steps with Huber weights. A level ends when a step is below
+    `update_stop` (m, rad), or when the relative change of the cost is below `plateau_stop` (0 = off). If the finest
+    level meets neither condition, its best iterate is returned. Undetermined directions keep the guess. weight_color in
+    [0, 1] balances gray against depth, each in units of its Huber width. Raises BackendError without the compiled
+    kernels, or if only one image is on a device.
     """
     if reference.kernels is not live.kernels:
         raise BackendError("the two images to align are on different devices; make both for the same view")
@@ -148,9 +154,10 @@ def align(
 
 
 def _axes(n: Normal, depth_m: float) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Split the information into principal directions, rotations measured by the shift they cause at the mean depth.
+    """Split the information into principal directions; rotations are measured by the shift they cause at the mean
+    depth.
 
-    Returns (directions as columns [6, 6], which ones the images decide [6]) (Zhang et al. 2016).
+    Returns the directions as columns [6, 6], and which of them the images determine [6] (Zhang et al. 2016).
     """
     unit = np.repeat([1.0, 1.0 / depth_m], 3)
     eigenvalues, directions = np.linalg.eigh(n.H * np.outer(unit, unit))
@@ -158,7 +165,8 @@ def _axes(n: Normal, depth_m: float) -> tuple[Matrix, NDArray[np.bool_]]:
 
 
 def _slope(around: Sequence[Normal], steps: Matrix) -> Matrix:
-    """Differentiate the gradient by the twist, by central differences: steps [6] ahead and behind; symmetric."""
+    """Return the derivative of the gradient with respect to the twist, made symmetric. Uses central differences with
+    steps [6]."""
     pulls = np.stack([n.b for n in around])
     D = ((pulls[::2] - pulls[1::2]) / (2.0 * steps[:, None])).T
     return np.asarray(0.5 * (D + D.T))

@@ -1,4 +1,4 @@
-"""The table of devices: what each backend does for the fits. Nothing else in `fit` or above chooses by device."""
+"""List what each backend offers to the fits. In `fit` and the layers above, only this module chooses by device."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -80,22 +80,22 @@ DEVICES = {"reference": TORCH, "cpu": CPU, "cuda": CUDA}
 
 
 class OnBackend(Protocol):
-    """Anything that names its backend: a view, a pyramid."""
+    """An object that names its backend: a view or a pyramid."""
 
     @property
     def backend(self) -> str: ...
 
 
 def fits_of(on: OnBackend) -> DeviceFits:
-    """Return what the backend of a view or a pyramid does for the fits."""
+    """Return the functions that the backend of a view or a pyramid offers to the fits."""
     return DEVICES[on.backend]
 
 
 def step_for(field: GaussianField, view: View, weights: Weights, degree: int) -> MappingStep:
     """Make the step that fits a field on a view; degree: of view-dependent colour.
 
-    The device's kernels compute the terms that they have; autograd computes the others beside them.
-    Raises ConfigError where full colour covariance meets terms that its view has no maps for.
+    The device's kernels compute the loss terms that they support; autograd computes the others.
+    Raises ConfigError if full colour covariance is combined with terms that its view has no maps for.
     """
     full = bool(weights["nll_color_full"])
     if full and (weights["median_depth"] or weights["moment"]):

@@ -1,6 +1,7 @@
 """Fit the full colour covariance of splats: one mapping step.
 
-This goes beyond the paper, which has one variance per channel. Tracking and everything else read the diagonal of V.
+This is an extension of the paper, which has one variance per channel. Tracking and all other code read only the
+diagonal of V.
 """
 
 from typing import Protocol
@@ -22,7 +23,7 @@ COLORS, SCALES = COLUMNS["colors"], COLUMNS["log_scales"]
 
 
 class ImageTerms(Protocol):
-    """The part of another step that this one uses: the gradient of the image terms."""
+    """The part of the inner step that this step uses: the gradient of the image terms."""
 
     def images(self, target: Target, weights: Weights) -> float | Tensor:
         """Write the gradient of the image terms to the first seven gradient planes; return the loss."""
@@ -30,11 +31,11 @@ class ImageTerms(Protocol):
 
 
 class FullCovarianceStep:
-    """One mapping step with `nll_color_full` in place of `nll_color`; `others` computes the other terms on the same
+    """One mapping step with `nll_color_full` instead of `nll_color`; `others` computes the other terms on the same
     view.
 
-    The gradient of V reaches everything that V depends on: variances, correlations, colours, and the weights of splats
-    in a pixel.
+    The gradient of V is propagated to everything that V depends on: variances, correlations, colours, and the weights
+    of splats in a pixel.
     """
 
     def __init__(self, view: CorrelationView, others: ImageTerms) -> None:
@@ -42,11 +43,11 @@ class FullCovarianceStep:
 
     @property
     def view(self) -> View:
-        """Return the view it renders to."""
+        """Return the view that the step renders to."""
         return self._wide
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
-        """Render the field to the view's planes."""
+        """Render the field into the view's planes."""
         self._wide.forward(field.params, T_camera_world)
 
     def images(self, target: Target, weights: Weights) -> float:
@@ -71,10 +72,7 @@ class FullCovarianceStep:
     def splats(
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Matrix, float]:
-        """Carry the planes to the splats in view, add the gradient of the shape terms, and step, correlations too.
-
-        Returns the pose twist [6] and the cost of the shape terms. grad2d [N] is filled as by `View.backward`.
-        """
+        """Step the splats in view and their correlations, as `MappingStep.splats`."""
         grad, cost = torch.zeros_like(field.params), 0.0
         twist = self._wide.backward(field.params, grad, grad2d)
         correlations, correlation_rates = self._wide.correlations, rates.of_attribute("correlations")
@@ -92,5 +90,5 @@ class FullCovarianceStep:
         return twist, cost
 
     def accumulator(self, field: GaussianField) -> Accumulator:
-        """Refuse with a ConfigError: the step takes one image only."""
+        """Raise ConfigError: this step takes one image only."""
         raise one_image_only()

@@ -1,4 +1,4 @@
-"""Statistics of a fit that densification reads."""
+"""Collect statistics of a fit for densification."""
 
 from dataclasses import dataclass
 
@@ -10,8 +10,8 @@ from sigmasplat.fit.target import Keyframe
 
 @dataclass(eq=False)
 class DensifyStats:
-    """How strongly one keyframe's loss pulls at the image means of N splats (3DGS): the sum over steps [N], and the
-    number of steps that saw each splat [N]. Rows that are dropped or added make it invalid."""
+    """Gradient of one keyframe's loss with respect to the image means of N splats (3DGS): the sum of its norms over
+    steps [N], and the number of steps in which each splat was visible [N]. Invalid after rows are removed or added."""
 
     keyframe: Keyframe
     grad2d: Tensor
@@ -19,11 +19,11 @@ class DensifyStats:
 
     @staticmethod
     def of(keyframe: Keyframe, n: int, device: torch.device | None = None) -> "DensifyStats":
-        """Start at 0 for n splats, on a device; by default in the host's memory."""
+        """Make statistics of n splats, all 0, on a device (default: host memory)."""
         return DensifyStats(keyframe, torch.zeros(n, device=device), torch.zeros(n, device=device))
 
     def on_gradient(self, keyframe: Keyframe, grad2d: Tensor) -> None:
-        """Add one step's norms [N] ≥ 0, 0 for a splat that was not seen. Other keyframes than its own are ignored."""
+        """Add the norms [N] of one step, 0 for an invisible splat. Norms of other keyframes are ignored."""
         if keyframe is self.keyframe:
             self.grad2d += grad2d
             self.times += grad2d > 0

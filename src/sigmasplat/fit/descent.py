@@ -1,4 +1,5 @@
-"""Descend the tracking loss by Adam, one camera's pose and exposure, the field fixed (VarSplat §3; CG-SLAM §6)."""
+"""Minimise the tracking loss by Adam over one camera's pose and exposure, with a fixed field (VarSplat §3; CG-SLAM
+§6)."""
 
 from collections.abc import Callable
 from typing import Any
@@ -28,11 +29,11 @@ def descend(
     iterations: int,
     tracking_loss: TrackingLoss = tracking_gradient,
 ) -> Descent:
-    """Descend L_track over the numbers that `parametrisation` makes of the pose; the best iterate wins.
+    """Minimise L_track over the parameters that `parametrisation` makes of the pose; return the best iterate.
 
-    params [N, 17] and target are on the view's device; tracking_loss is what that device computes it by. Ends early
-    when a step is below `update_stop`, or when it changed the loss by less than `plateau_stop` of it. Without common
-    pixels the guess is returned.
+    params [N, 17] and target are on the view's device; `tracking_loss` computes the loss on that device. The descent
+    stops early when a step is below `update_stop`, or when the relative change of the loss is below `plateau_stop`.
+    Without common pixels the guess is returned.
     """
     way = parametrisation(config, T_camera_world)
     numbers, exposure = way.start, np.zeros(2)
@@ -46,7 +47,7 @@ def descend(
         view.forward(params, T)
         loss, g_exposure = tracking_loss(view, target, config, torch.as_tensor(exposure).float())
         first = loss if steps == 1 else first
-        blind = loss == 0.0  # where no pixel counts: that may not win over one where some do
+        blind = loss == 0.0  # no common pixels: must not replace a pose that has some
         if loss < best and not (blind and steps > 1):
             best, best_T, best_exposure = loss, T, exposure.copy()
         moved = adam.step(way.gradient(numbers, view.backward_pose(params)), rates)
@@ -60,5 +61,5 @@ def descend(
 
 
 def exposure_rate(config: TrackingConfig) -> float:
-    """Return Adam's rate of the exposure: 0 where it is not fitted."""
+    """Return Adam's learning rate of the exposure; 0 if exposure is not fitted."""
     return config.lr_exposure if config.exposure else 0.0

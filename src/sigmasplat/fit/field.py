@@ -1,4 +1,4 @@
-"""fit_field: adjust the splats to keyframes, and the keyframes' poses too if asked. Mapping is this one function."""
+"""Fit splats to keyframes, and optionally the keyframes' poses: `fit_field` is all of mapping's optimisation."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field as dataclass_field
@@ -23,7 +23,7 @@ from sigmasplat.types import Matrix
 
 @dataclass
 class FieldFit:
-    """Result of a fit: the loss of each iteration, and the seconds of each stage."""
+    """The result of a fit: the loss of each iteration, and the seconds of each stage."""
 
     losses: list[float] = dataclass_field(default_factory=list)
     stopwatch: Stopwatch = dataclass_field(default_factory=Stopwatch)
@@ -40,10 +40,10 @@ class FieldFit:
 
 
 def loss_weights(config: MappingConfig) -> dict[str, float]:
-    """List the mapping loss as (term, weight): VarSplat §2, 0.8 L1 + 0.2 (1 − SSIM) + depth + L_reg + NLL; CG-SLAM
-    eq. 18, with the median depth, isotropy as a ratio, and U.
+    """Return the terms of the mapping loss with their weights.
 
-    Any other term of `fit.losses` has the weight `weight_<term>` of the settings, where there is such a field.
+    VarSplat §2: 0.8 L1 + 0.2 (1 − SSIM) + depth + L_reg + NLL. CG-SLAM eq. 18: with median depth, isotropy as a ratio,
+    and U. Any other term of `fit.losses` has the weight `weight_<term>` if the settings have such a field.
     """
     full = config.color_covariance == "full"
     weights = {
@@ -72,16 +72,19 @@ def fit_field(
     degree: int = 0,
     stats: FitStats | None = None,
 ) -> FieldFit:
-    """Take one Adam step on the field per batch of keyframes, against their mean loss, in the order given.
+    """Take one Adam step on the field for each batch of keyframes, in the given order, with the mean loss of the batch.
 
-    schedule: the rates of each step; by default those of the settings. The first `frozen_colors` splats keep their
-    colours. degree: of view-dependent colour, fitted too if above 0. Poses of keyframes that are `movable` and not
-    `fixed` are fitted too, at the settings' rates. stats: receives the gradient by each splat's image mean, keyframe
-    by keyframe.
-    Adam's moments continue from fit to fit. A new splat's moments start from zero after the bias correction has run
-    out, so its first steps are a few times longer, which suits the longer way it has to go.
-    Raises BackendError where the field is not on the view's device; ConfigError where colour covariances or
-    view-dependent colours are to be fitted to several keyframes at once.
+    schedule: the learning rates of each step, by default those of the settings. frozen_colors: the first splats that
+    keep their colours. degree: degree of view-dependent colour; 0 = none. stats: receives the gradient with respect to
+    each splat's image mean, per keyframe. Poses of keyframes that are `movable` and not `fixed` are fitted too, with
+    the rates of the settings.
+
+    Adam's moments continue from fit to fit. The moments of a new splat start at zero, but the bias correction has
+    already faded. Its first steps are therefore a few times longer, which is useful because a new splat is far from its
+    optimum.
+
+    Raises BackendError if the field is not on the view's device; ConfigError if colour covariances or view-dependent
+    colours are to be fitted to several keyframes at once.
     """
     if field.params.device != view.sums.device:
         where = f"the field is on {field.params.device}, the view on {view.sums.device}"
@@ -114,12 +117,12 @@ class _Steps:
         stats: FitStats | None,
     ) -> None:
         self.field, self.weights, self.frozen_colors, self.stats = field, weights, frozen_colors, stats
-        field.moment1[:frozen_colors, COLUMNS["colors"]] = 0.0  # or they would coast on
+        field.moment1[:frozen_colors, COLUMNS["colors"]] = 0.0  # otherwise Adam would keep moving them
         self.step, self.to_host = step_for(field, view, weights, degree), fits_of(view).to_host
         self.grad2d = None if stats is None else field.params.new_zeros(len(field))
 
     def take(self, batch: Sequence[Keyframe], rates: Rates, stopwatch: Stopwatch) -> tuple[float, list[Matrix]]:
-        """Step against the mean loss of a batch; return that loss, and of each image its own pose twist [6]."""
+        """Step with the mean loss of a batch. Return that loss, and the pose twist [6] of each image."""
         self.field.steps += 1
         accumulator = self.step.accumulator(self.field) if len(batch) > 1 else None
         costs, shape, twists = list[float | Tensor](), list[float | Tensor](), list[Twist]()

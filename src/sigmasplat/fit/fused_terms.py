@@ -1,4 +1,4 @@
-"""Which loss terms the compiled kernels compute, by backend. A term that a backend does not have here runs in torch."""
+"""List the loss terms that the compiled kernels compute, by backend. All other terms are computed in torch."""
 
 from dataclasses import dataclass
 
@@ -10,8 +10,8 @@ from sigmasplat.fit.interface import Weights
 
 @dataclass(frozen=True)
 class FusedTerm:
-    """A term's index in an array of weights that the kernels take (None: it has a kernel of its own), and the backends
-    whose kernels compute it."""
+    """A term's index in the weights array of the kernels (None: it has its own kernel), and the backends whose kernels
+    compute it."""
 
     index: int | None
     backends: frozenset[str]
@@ -26,10 +26,10 @@ PIXEL_TERMS = {
     "median_depth": FusedTerm(4, COMPILED),
     "moment": FusedTerm(5, COMPILED),
 }
-"""Terms of single pixels, in the order of `LossWeights` (native/kernels.h, native/cuda/fit.cu)."""
+"""Terms per pixel, in the order of `LossWeights` (native/kernels.h, native/cuda/fit.cu)."""
 WINDOW_TERMS = {"ssim": FusedTerm(None, COMPILED)}
 SHAPE_TERMS = {"isotropy": FusedTerm(0, COMPILED), "isotropy_ratio": FusedTerm(1, COMPILED)}
-"""Terms of the splats, not of an image, in the order of `StepOptions` (native/kernels.h)."""
+"""Terms of the splats instead of an image, in the order of `StepOptions` (native/kernels.h)."""
 VARIANCE_TERMS = ("nll_color", "nll_depth")
 """Terms that need the variance planes."""
 
@@ -41,7 +41,7 @@ def fused_terms(backend: str) -> frozenset[str]:
 
 
 def kernel_weights(table: dict[str, FusedTerm], weights: Weights, backend: str) -> NDArray[np.float64]:
-    """Lay the weights of a table's terms out as a backend's kernels take them."""
+    """Return the weights of a table's terms as the array that a backend's kernels take."""
     own = {name: fused.index for name, fused in table.items() if backend in fused.backends and fused.index is not None}
     laid_out = np.zeros(1 + max(own.values()))
     for name, index in own.items():
@@ -50,6 +50,6 @@ def kernel_weights(table: dict[str, FusedTerm], weights: Weights, backend: str) 
 
 
 def pixel_weights(weights: Weights, backend: str, variance: bool) -> NDArray[np.float64]:
-    """Lay out the weights of the pixel terms; without variance planes those that need them are 0."""
+    """Return the weights of the pixel terms as an array; without variance planes, terms that need them get weight 0."""
     known = weights if variance else {n: w for n, w in weights.items() if n not in VARIANCE_TERMS}
     return kernel_weights(PIXEL_TERMS, known, backend)

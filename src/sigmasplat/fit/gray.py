@@ -1,4 +1,4 @@
-"""Reduce colour to gray."""
+"""Convert colour to gray, and compute its gradient."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,12 +10,12 @@ LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
 
 def gray_of(color: Image) -> Image:
-    """Reduce colour [H, W, 3] to luma [H, W]."""
+    """Return the luma [H, W] of colour [H, W, 3]."""
     return np.asarray(color @ LUMA)
 
 
 def luma(color: Tensor) -> Tensor:
-    """Reduce colour planes [3, H, W] to luma [H, W], on their device."""
+    """Return the luma [H, W] of colour planes [3, H, W], on their device."""
     red, green, blue = map(float, LUMA)
     gray: Tensor = red * color[0] + green * color[1] + blue * color[2]
     return gray

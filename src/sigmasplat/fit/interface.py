@@ -1,4 +1,5 @@
-"""What the fits ask of a device: one record, `DeviceFits`, with a row for each backend in fit/backends.py."""
+"""Define what the fits need from a device: one record, `DeviceFits`, with an instance per backend in
+fit/backends.py."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,25 +16,27 @@ from sigmasplat.render.view import CorrelationView, View
 from sigmasplat.types import Matrix
 
 Weights = Mapping[str, float]
-"""Loss terms (`fit.losses`) by name, and how much each counts."""
+"""Weights of the loss terms (`fit.losses`) by name."""
 Twist = Matrix | Tensor
-"""Gradient by a pose's left twist (ρ, φ) [6]; a tensor may still be computed on a device, as may a cost."""
+"""Gradient with respect to a pose's left twist (ρ, φ) [6]. A tensor, like a cost, may still be in computation on a
+device."""
 Plane = Any
-"""An image [H, W], float32: an array in the host's memory, or a tensor on the device that aligns it."""
+"""An image [H, W], float32: an array in host memory, or a tensor on the device that aligns it."""
 
 
 # ---- mapping ----
 
 
 class Accumulator(Protocol):
-    """Adds up the gradient of several images' mean loss, then steps every splat that any of them shows."""
+    """Sums the gradient of the mean loss of several images, then steps every splat that is visible in any of them."""
 
     def add(self, field: GaussianField, share: float, grad2d: Tensor | None = None) -> Twist:
-        """Add the view's gradient planes at their share of the mean; return the image's own pose twist [6]."""
+        """Add the view's gradient planes, weighted by their share of the mean. Return the image's own pose twist
+        [6]."""
         ...
 
     def step(self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int) -> float | Tensor:
-        """Add the gradient of the shape terms, take Adam's step; return the cost of those terms."""
+        """Add the gradient of the shape terms and take Adam's step. Return the cost of the shape terms."""
         ...
 
 
@@ -41,22 +44,22 @@ class FitStats(Protocol):
     """Statistics of a fit, such as `DensifyStats`."""
 
     def on_gradient(self, keyframe: Keyframe, grad2d: Tensor) -> None:
-        """Receive the norm of each splat's gradient by its image mean [N], of one keyframe in one step. The tensor is
-        reused by the next step."""
+        """Receive the norm of the gradient with respect to each splat's image mean [N], of one keyframe in one step.
+        The tensor is reused in the next step."""
 
 
 class MappingStep(Protocol):
-    """One mapping step on a view: render, the gradient of the image terms, and from there to splats and Adam's step.
+    """One mapping step on a view: render, compute the gradient of the image terms, propagate it to the splats, step.
 
     Twists and costs may still be on a device; `DeviceFits.to_host` reads them.
     """
 
     @property
     def view(self) -> View:
-        """Return the view it renders to."""
+        """Return the view that the step renders to."""
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
-        """Render the field to the view's planes."""
+        """Render the field into the view's planes."""
 
     def images(self, target: Target, weights: Weights) -> float | Tensor:
         """Write the gradient of every image term to the view's gradient planes; return the loss."""
@@ -72,12 +75,12 @@ class MappingStep(Protocol):
         ...
 
     def accumulator(self, field: GaussianField) -> Accumulator:
-        """Make room for the gradient of several images. Raises ConfigError where a step takes one image only."""
+        """Allocate the gradient sum of several images. Raises ConfigError if the step takes one image only."""
         ...
 
 
 def one_image_only() -> ConfigError:
-    """Return what steps raise that cannot add up several images."""
+    """Return the error of steps that cannot sum several images."""
     return ConfigError("mapping.frames_per_step must be 1 with full colour covariance or view-dependent colour")
 
 
@@ -85,8 +88,8 @@ def one_image_only() -> ConfigError:
 
 
 class Descent(NamedTuple):
-    """Result of a descent: T_camera_world [4, 4], exposure (a, b) of exp(a)·Ĉ + b, the first and the least loss, and
-    how many steps were taken."""
+    """The result of a descent: T_camera_world [4, 4]; exposure (a, b) of exp(a)·Ĉ + b; the first and the smallest loss;
+    the number of steps."""
 
     T_camera_world: Matrix
     exposure: tuple[float, float]
@@ -96,7 +99,7 @@ class Descent(NamedTuple):
 
 
 class ReferenceMaps(NamedTuple):
-    """Gray in [0, 1], surface in m (0 where the map is thin), weights of gray and depth or None, each [H, W]."""
+    """Gray in [0, 1], surface in m (0 where the map is thin), and weights of gray and depth or None, each [H, W]."""
 
     gray: Plane
     depth: Plane
@@ -107,9 +110,11 @@ class ReferenceMaps(NamedTuple):
 
 
 class AlignRules(NamedTuple):
-    """When alignment stops and which directions it leaves alone (native/align_level.h, `AlignLoop`): steps a level; the
-    update, m and rad, and the change of cost that end one; the share of the best direction's information below which
-    one is not decided; the least number of pixels."""
+    """When alignment stops, and which directions it does not change (native/align_level.h, `AlignLoop`).
+
+    Maximum number of steps per level; the update (m and rad) and the change of cost that end a level; the share of the
+    largest information below which a direction is undetermined; the minimum number of pixels.
+    """
 
     iterations: int
     update_stop: float
@@ -119,8 +124,8 @@ class AlignRules(NamedTuple):
 
 
 class AlignedPose(NamedTuple):
-    """T_live_reference [4, 4]; sums [4] of the final iterate; steps of all levels; how many directions were left alone;
-    mean depth of the reference, metres, and how many of its pixels have one."""
+    """The result of an alignment: T_live_reference [4, 4]; sums [4] of the final iterate; steps on all levels; number
+    of undetermined directions; mean depth of the reference in metres, and how many of its pixels have depth."""
 
     T: Matrix
     sums: Matrix
@@ -131,7 +136,7 @@ class AlignedPose(NamedTuple):
 
 
 class LevelPlanes(NamedTuple):
-    """One level of two images to align, and how their residuals are weighed, as the kernels' `Level` takes it."""
+    """One level of two images to align, and the weights of its residuals, in the layout of the kernels' `Level`."""
 
     reference_gray: Plane
     reference_depth: Plane
@@ -144,27 +149,27 @@ class LevelPlanes(NamedTuple):
 
 
 NORMAL_TERMS = 52
-"""Numbers of one linearisation: H 21, b 6, sums 4, S 21 (native/align_pixel.h)."""
+"""Number of values in one linearisation: H 21, b 6, sums 4, S 21 (native/align_pixel.h)."""
 
 
 @dataclass(frozen=True)
 class ImageKernels:
-    """What halves and aligns images where their planes are: in the host's memory or on a device."""
+    """Functions that halve and align images in host memory or on a device."""
 
     contiguous: Callable[[Plane], Plane]
-    """Return a plane whose rows follow each other without gaps."""
+    """Return a contiguous copy of a plane, or the plane itself if it is contiguous."""
     as_tensor: Callable[[Plane], Tensor]
-    """Return a plane as a tensor that a view takes as reference depth."""
+    """Return a plane as a tensor that a view accepts as reference depth."""
     halve: Callable[[tuple[Plane | None, Plane | None], Plane | None], tuple[Plane | None, Plane | None, Plane | None]]
-    """Halve up to three planes of one size: two averaged over 2×2 cells, and a depth where it is one surface.
-    What is None stays None. Odd sizes drop their last row or column."""
+    """Halve up to three planes of equal size: two are averaged over 2×2 cells; depth only where a cell shows one
+    surface. None stays None. With odd sizes the last row or column is dropped."""
     readings_of: Callable[[Plane, Plane], Any]
-    """Return of a finest and a coarsest depth: the coarsest one's mean, metres (1 where nothing is read), and how many
-    pixels of the finest have a reading, float64 [2]."""
+    """Return the mean depth of the coarsest level in metres (1 without readings), and how many pixels of the finest
+    level have a reading, float64 [2]."""
     align: Callable[[Sequence[LevelPlanes], Any, Matrix, AlignRules], AlignedPose]
-    """Align levels, finest first, by their readings, from a guess T_live_reference [4, 4]."""
+    """Align levels, finest first, starting at T_live_reference [4, 4]; `readings` is the result of `readings_of`."""
     normal_equations: Callable[[LevelPlanes, Sequence[Matrix]], Matrix]
-    """Linearise at some motions T_live_reference, at most 13: rows [n, `NORMAL_TERMS`]."""
+    """Linearise at up to 13 motions T_live_reference; returns rows [n, `NORMAL_TERMS`]."""
 
 
 # ---- the record ----
@@ -172,27 +177,30 @@ class ImageKernels:
 
 @dataclass(frozen=True)
 class DeviceFits:
-    """What a backend offers to `fit` and `slam`. The row of plain torch (fit/backends.py) works for every view; the
-    other rows replace what their device does itself. Functions of a row take views of its own backend."""
+    """What a backend offers to `fit` and `slam`. The instance of plain torch (fit/backends.py) works for every view.
+    The other instances replace the parts that their device computes itself; their functions take views of their own
+    backend."""
 
     mapping_step: Callable[[Any], MappingStep]
-    """Make the step of a view; it knows the terms that fit/fused_terms.py gives its backend."""
+    """Make the mapping step of a view; it computes the terms that fit/fused_terms.py lists for its backend."""
     covariance_step: Callable[[CorrelationView], MappingStep]
     """Make the step that also fits the full colour covariance."""
     view_dependent_step: Callable[[Any, int], MappingStep]
-    """Make the step of view-dependent colour up to a degree from one of the two others."""
+    """Make the step of view-dependent colour up to a degree, from one of the two other steps."""
     settle: Callable[[Rows, Rates], None]
-    """Bring every row of a field to the present step of Adam when a fit ends."""
+    """Apply Adam's missed motion to every row of a field when a fit ends."""
     to_host: Callable[[Sequence[Twist], Sequence[float | Tensor]], tuple[list[Matrix], list[float]]]
-    """Return twists and costs in the host's memory; it waits for the device once."""
+    """Return twists and costs in host memory; waits for the device once."""
     tracking_loss: Callable[[Any, Target, TrackingConfig, Tensor], tuple[float, Tensor]]
     """Write the gradient of the tracking loss to a view's planes (`fit.tracking_loss.tracking_gradient`)."""
     descend: Callable[[Tensor, Any, Target, Matrix, TrackingConfig, int], Descent]
-    """Descend the tracking loss (`fit.descent.descend`)."""
+    """Minimise the tracking loss (`fit.descent.descend`)."""
     reference_maps: Callable[[Any, TrackingConfig, Tensor | None], ReferenceMaps]
-    """Read a reference for alignment off a view (`fit.reference_maps.reference_maps`)."""
+    """Make the reference maps of alignment from a view (`fit.reference_maps.reference_maps`)."""
     live_planes: Callable[[View, Plane, Plane, Target], tuple[Plane, Plane]]
-    """Return gray and depth of a frame (colour [H, W, 3], depth [H, W] m, its target) where they are aligned."""
+    """Return gray and depth of a frame (colour [H, W, 3], depth [H, W] m, its target) on the device that aligns
+    them."""
     images: ImageKernels
     aligns: bool
-    """Whether images may be aligned where the settings do not ask for it: plain torch runs without compiled kernels."""
+    """Whether images may be aligned even if the settings do not ask for it. Plain torch also runs without compiled
+    kernels, which alignment needs."""

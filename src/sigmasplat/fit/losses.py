@@ -1,14 +1,15 @@
-"""The loss terms: each is a function of the maps that it names.
+"""Define the loss terms: each is a function of the maps that its parameters name.
 
-A term is a function registered by `@term`; its name is what a weight is given to, its parameters are the maps it takes.
-`total` hands each term its maps by those names, so a new term is one function (and a weight).
+`@term` registers a function as a term. The function's name is the term's name, to which a weight is given; its
+parameters are the maps it takes. `total` passes each term its maps by name, so a new term needs one function and one
+weight.
 
 Maps: color, color_target [H, W, 3] in [0, 1]; depth, depth_target [H, W] m; variance [H, W, 3] (V, VarSplat §1);
-covariance [H, W, 6] (V with its off-diagonal: rr, gg, bb, rg, rb, gb); moment [H, W] m² (U, CG-SLAM
-eq. 10); median_depth [H, W] m, 0 = none (CG-SLAM eq. 8); valid [H, W] bool, pixels with a depth reading; scales
-[N, 3] m.
-Every image term is a mean over valid pixels (and channels), SSIM over all pixels of the masked images; without valid
-pixels it is 0 with zero gradient, never NaN.
+covariance [H, W, 6] (V with its off-diagonal: rr, gg, bb, rg, rb, gb); moment [H, W] m² (U, CG-SLAM eq. 10);
+median_depth [H, W] m, 0 = none (CG-SLAM eq. 8); valid [H, W] bool, pixels with a depth reading; scales [N, 3] m.
+
+Every image term is a mean over valid pixels (and channels), except SSIM, which is a mean over all pixels of the masked
+images. Without valid pixels a term is 0 with zero gradient, never NaN.
 """
 
 import inspect
@@ -32,7 +33,7 @@ def term(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
 
 
 def total(weights: Mapping[str, float], maps: Mapping[str, Tensor]) -> Tensor:
-    """Add up weight × term to a scalar []; a term of weight 0 is not computed and its maps may be absent.
+    """Return the sum of weight × term, a scalar []. A term of weight 0 is not computed, and its maps may be missing.
 
     Raises ConfigError if a weight names no term, KeyError if a term's map is missing.
     """
@@ -47,33 +48,36 @@ def total(weights: Mapping[str, float], maps: Mapping[str, Tensor]) -> Tensor:
 
 
 def masked(values: Tensor, valid: Tensor, fill: float = 0.0) -> Tensor:
-    """Put `fill` where valid [H, W] is false in values [H, W] or [H, W, C]; NaN there neither passes nor returns."""
+    """Replace values [H, W] or [H, W, C] by `fill` where valid [H, W] is false. NaN at these pixels affects neither the
+    result nor the gradient."""
     return torch.where(valid if values.ndim == valid.ndim else valid[..., None], values, fill)
 
 
 def mean_over(values: Tensor, valid: Tensor) -> Tensor:
-    """Average values [H, W] or [H, W, C] over valid [H, W] and channels, in their unit []; 0 if none is valid."""
+    """Return the mean of values [H, W] or [H, W, C] over valid [H, W] and channels, in their unit []; 0 if none is
+    valid."""
     channels = values.numel() // max(valid.numel(), 1)
     return masked(values, valid).sum() / (valid.sum() * channels).clamp(min=1)
 
 
 @term
 def l1(color: Tensor, color_target: Tensor, valid: Tensor) -> Tensor:
-    """Take mean |Ĉ − C| of colours [H, W, 3] in [0, 1] over valid [H, W] × 3 (VarSplat §2, L_color)."""
+    """Return the mean of |Ĉ − C| of colours [H, W, 3] in [0, 1] over valid [H, W] × 3 (VarSplat §2, L_color)."""
     return mean_over(masked(color - color_target, valid).abs(), valid)
 
 
 @term
 def ssim(color: Tensor, color_target: Tensor, valid: Tensor) -> Tensor:
-    """Take 1 − mean SSIM of colours [H, W, 3], both 0 where not valid [H, W] and beyond the border (VarSplat §2).
+    """Return 1 − mean SSIM of colours [H, W, 3]. Both are 0 outside valid [H, W] and outside the image (VarSplat §2).
 
-    Windows without valid pixels are equal in both (SSIM 1): they dilute the mean, as in the released code.
+    Windows without valid pixels are equal in both images (SSIM 1) and count in the mean, as in the released code.
     """
     return 1.0 - ssim_map(masked(color, valid), masked(color_target, valid)).mean()
 
 
 def ssim_map(a: Tensor, b: Tensor) -> Tensor:
-    """Compare two images [H, W, C] window by window, [H, W, C] in [−1, 1] (11×11 Gaussian, σ 1.5, zero padding)."""
+    """Return the SSIM of two images [H, W, C] at every window, [H, W, C] in [−1, 1] (11×11 Gaussian, σ 1.5, zero
+    padding)."""
     x, y = a.movedim(-1, 0), b.movedim(-1, 0)
     mx, my, xx, yy, xy = _blur(torch.cat([x, y, x * x, y * y, x * y])).chunk(5)
     var_x, var_y, cov = xx - mx * mx, yy - my * my, xy - mx * my
@@ -83,7 +87,7 @@ def ssim_map(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _blur(planes: Tensor) -> Tensor:
-    """Convolve planes [C, H, W] with a normalised 11×11 Gaussian of σ 1.5 px, zero beyond the border."""
+    """Convolve planes [C, H, W] with a normalised 11×11 Gaussian of σ 1.5 px, with zero padding."""
     taps = torch.arange(-5, 6, dtype=planes.dtype, device=planes.device)
     kernel = torch.exp(-(taps**2) / (2 * 1.5**2))
     kernel = kernel / kernel.sum()
@@ -93,41 +97,44 @@ def _blur(planes: Tensor) -> Tensor:
 
 @term
 def depth(depth: Tensor, depth_target: Tensor, valid: Tensor) -> Tensor:
-    """Take mean |D̂ − D| of depths [H, W] m over valid [H, W] with a reading, m (VarSplat §2, L_depth)."""
+    """Return the mean of |D̂ − D| of depths [H, W] m over valid [H, W] with a reading, m (VarSplat §2, L_depth)."""
     valid = valid & (depth_target > 0)
     return mean_over(masked(depth - depth_target, valid).abs(), valid)
 
 
 @term
 def isotropy(scales: Tensor) -> Tensor:
-    """Take mean |s_i − mean(s_i)| of scales [N, 3] m over splats × 3, m (VarSplat §2, L_reg); 0 without splats."""
+    """Return the mean of |s_i − mean(s_i)| of scales [N, 3] m over splats × 3, m (VarSplat §2, L_reg); 0 without
+    splats."""
     off = scales - scales.mean(1, keepdim=True)
     return off.abs().sum() / max(off.numel(), 1)
 
 
 @term
 def isotropy_ratio(scales: Tensor) -> Tensor:
-    """Take mean max(s_i) / min(s_i) − 1 of scales [N, 3] m in view (CG-SLAM eq. 17, ε = 1); 0 without splats."""
+    """Return the mean of max(s_i) / min(s_i) − 1 of scales [N, 3] m in view (CG-SLAM eq. 17, ε = 1); 0 without
+    splats."""
     return (scales.amax(1) / scales.amin(1) - 1.0).sum() / max(len(scales), 1)
 
 
 @term
 def nll_color(color: Tensor, color_target: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
-    """Take the Gaussian NLL of colours [H, W, 3] under V [H, W, 3] (VarSplat §2, L_var); trains variance only."""
+    """Return the Gaussian NLL of colours [H, W, 3] under V [H, W, 3] (VarSplat §2, L_var); trains variance only."""
     return gaussian_nll(color - color_target, variance, valid)
 
 
 @term
 def nll_depth(depth: Tensor, depth_target: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
-    """Take the Gaussian NLL of depths [H, W] m, the same for each channel of V [H, W, 3] (VarSplat §2, L_var)."""
+    """Return the Gaussian NLL of depths [H, W] m, the same for each channel of V [H, W, 3] (VarSplat §2, L_var)."""
     residual = (depth - depth_target)[..., None].expand_as(variance)
     return gaussian_nll(residual, variance, valid & (depth_target > 0))
 
 
 def gaussian_nll(residual: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
-    """Take mean ½ r²/(V+ε) + ½ log(V+ε) over valid [H, W] × C, ε = 1e-6, of residuals r, detached, and V [H, W, C].
+    """Return the mean of ½ r²/(V+ε) + ½ log(V+ε) over valid [H, W] × C, ε = 1e-6, of detached residuals r and V [H, W,
+    C].
 
-    V is clamped at 0 here only, never the map itself.
+    V is clamped at 0 only here; the map itself is not changed.
     """
     r = masked(residual.detach(), valid)
     v = masked(variance, valid, fill=1.0).clamp(min=0.0) + NLL_EPS
@@ -136,11 +143,11 @@ def gaussian_nll(residual: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
 
 @term
 def nll_color_full(color: Tensor, color_target: Tensor, covariance: Tensor, valid: Tensor) -> Tensor:
-    """Take the Gaussian NLL of colours [H, W, 3] under the full V [H, W, 6]; trains V only, as `nll_color` does.
+    """Return the Gaussian NLL of colours [H, W, 3] under the full V [H, W, 6]; trains V only, as `nll_color` does.
 
-    Mean over valid pixels × 3 of ½ rᵀ (V+εI)⁻¹ r + ½ log det (V+εI), so that it equals `nll_color` for a diagonal V.
-    V+εI = L diag(d) Lᵀ, L with ones on its diagonal: then it is ½ y²/d + ½ log d with L y = r. No d of a true
-    covariance is below ε: one that is by rounding is put there.
+    The mean over valid pixels × 3 of ½ rᵀ (V+εI)⁻¹ r + ½ log det (V+εI). For a diagonal V it equals `nll_color`. With
+    V+εI = L diag(d) Lᵀ, where L has a unit diagonal, it is ½ y²/d + ½ log d with L y = r. For a true covariance no d is
+    below ε; if rounding makes one smaller, it is clamped to ε.
     """
     r1, r2, r3 = masked((color - color_target).detach(), valid).unbind(-1)
     d1, v2, v3 = (masked(covariance[..., :3], valid, fill=1.0).clamp(min=0.0) + NLL_EPS).unbind(-1)
@@ -157,14 +164,14 @@ def nll_color_full(color: Tensor, color_target: Tensor, covariance: Tensor, vali
 
 @term
 def moment(moment: Tensor, valid: Tensor) -> Tensor:
-    """Take mean |U| of the moment [H, W] m² over valid [H, W], m² (CG-SLAM, L_var)."""
+    """Return the mean of |U| of the moment [H, W] m² over valid [H, W], m² (CG-SLAM, L_var)."""
     return mean_over(masked(moment, valid).abs(), valid)
 
 
 @term
 def median_depth(depth: Tensor, median_depth: Tensor, valid: Tensor) -> Tensor:
-    """Take mean |D̂ − D̂m| of depths [H, W] m over valid [H, W], m; 0 without a median (CG-SLAM eq. 16).
+    """Return the mean of |D̂ − D̂m| of depths [H, W] m over valid [H, W], m; 0 without a median (CG-SLAM eq. 16).
 
-    The median is the depth of the splat that takes half the light. Both depths get a gradient.
+    The median is the depth of the splat at which half of the light is absorbed. Both depths get a gradient.
     """
     return masked((depth - median_depth).abs(), valid & (median_depth > 0)).sum() / valid.sum().clamp(min=1)

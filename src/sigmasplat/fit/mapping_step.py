@@ -1,4 +1,4 @@
-"""One mapping step on a view: the image terms' gradient on its planes, from there to the splats, and Adam's step."""
+"""One mapping step on a view: compute the gradient of the image terms, propagate it to the splats, take Adam's step."""
 
 import torch
 from torch import Tensor
@@ -15,15 +15,17 @@ from sigmasplat.types import Matrix
 
 
 def render_for(view: View, params: Tensor, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
-    """Render rows to the view's planes, with what the terms that have weight need."""
+    """Render rows into the view's planes, with the outputs that terms with a nonzero weight need."""
     reference = target.depth_image if weights.get("moment") else None
     view.forward(params, T_camera_world, reference, layers=bool(weights.get("median_depth")))
 
 
 def shape_gradient(log_scales: Tensor, weights: Weights, of_all: float, of_visible: float) -> tuple[Tensor, float]:
-    """Return the gradient of the weighted shape terms by some splats' log scales [n, 3], and the cost of those terms.
+    """Return the gradient of the weighted shape terms with respect to the log scales [n, 3] of some splats, and the
+    cost.
 
-    of_all, of_visible: share of these splats among all and among those in view, which each term is a mean over.
+    of_all, of_visible: the number of these splats relative to all splats and to those in view; each term is a mean over
+    one of the two.
     """
     leaf, shares = log_scales.clone().requires_grad_(), dict(zip(SHAPE_TERMS, (of_all, of_visible), strict=True))
     cost = losses.total(
@@ -35,9 +37,9 @@ def shape_gradient(log_scales: Tensor, weights: Weights, of_all: float, of_visib
 
 
 def image_gradients(view: View, target: Target, weights: Weights) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
-    """Return the loss of the image terms, and each of the view's gradient planes with its gradient, by autograd.
+    """Return the loss of the image terms, and a list of the view's gradient planes with their gradients, by autograd.
 
-    Terms of the splats are left out, and terms of the variance on a view without it.
+    Terms of the splats are skipped, and so are terms of the variance if the view has none.
     """
     v, (h, w) = view, target.depth_image.shape
     used = {n: x for n, x in weights.items() if n not in SHAPE_TERMS and (len(v.sums) >= 7 or "nll" not in n)}
@@ -63,7 +65,7 @@ def image_gradients(view: View, target: Target, weights: Weights) -> tuple[Tenso
 
 
 class GradientAccumulator:
-    """The gradient of several images' mean loss by the splats that any of them shows."""
+    """Sum of the gradient of several images' mean loss with respect to the splats visible in any of them."""
 
     def __init__(self, view: View, field: GaussianField) -> None:
         self._view = view
@@ -71,14 +73,15 @@ class GradientAccumulator:
         self.visible = torch.zeros(len(field), dtype=torch.bool, device=field.params.device)
 
     def add(self, field: GaussianField, share: float, grad2d: Tensor | None = None) -> Matrix:
-        """Add the view's gradient planes at their share of the mean; return the image's own pose twist [6]."""
+        """Add the view's gradient planes, weighted by their share of the mean. Return the image's own pose twist
+        [6]."""
         twist = self._view.backward(field.params, self._rows, grad2d)
         self.visible |= self._view.visible(len(field))
         self.grad += share * self._rows
         return twist
 
     def step(self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int) -> float:
-        """Add the gradient of the shape terms, take Adam's step; return the cost of those terms."""
+        """Add the gradient of the shape terms and take Adam's step. Return the cost of the shape terms."""
         scales = COLUMNS["log_scales"]
         of_all = float(self.visible.sum()) / max(len(field), 1)
         on_scales, cost = shape_gradient(field.params[self.visible][:, scales], weights, of_all, 1.0)
@@ -91,13 +94,13 @@ class GradientAccumulator:
 
 
 class TorchStep:
-    """One mapping step by its definition: terms of `losses`, gradients by autograd, `adam_step`."""
+    """One mapping step in its defining form: terms of `losses`, gradients by autograd, `adam_step`."""
 
     def __init__(self, view: View) -> None:
         self.view = view
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
-        """Render the field to the view's planes."""
+        """Render the field into the view's planes."""
         render_for(self.view, field.params, T_camera_world, target, weights)
 
     def images(self, target: Target, weights: Weights) -> float:
@@ -110,7 +113,7 @@ class TorchStep:
     def splats(
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Matrix, float]:
-        """Carry the planes to the splats in view, add the gradient of the shape terms, and step.
+        """Propagate the gradient planes to the splats in view, add the gradient of the shape terms, and step.
 
         Returns the pose twist [6] and the cost of the shape terms. grad2d [N] is filled as by `View.backward`.
         """
@@ -119,12 +122,12 @@ class TorchStep:
         return twist, accumulator.step(field, rates, weights, frozen_colors)
 
     def accumulator(self, field: GaussianField) -> GradientAccumulator:
-        """Make room for the gradient of several images."""
+        """Allocate the gradient sum of several images."""
         return GradientAccumulator(self.view, field)
 
 
 class OwnTermsStep:
-    """A device's fused step, and beside it the image terms that its kernels do not have, by autograd."""
+    """A device's fused step, together with the image terms that its kernels do not support, which autograd computes."""
 
     def __init__(self, fused: MappingStep, own: frozenset[str]) -> None:
         self._fused, self._own = fused, own

@@ -1,5 +1,4 @@
-"""The parameters of a pose that descent changes additively: from parameters to pose, from a twist's gradient to
-theirs."""
+"""Define pose parameters that can be changed by addition, and convert the gradient of a twist to their gradient."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -15,24 +14,27 @@ Vector = NDArray[np.float64]
 
 
 class Parametrisation(Protocol):
-    """T_camera_world [4, 4] as a vector whose first `rotations` numbers turn it and whose last three move it."""
+    """A parametrisation of T_camera_world [4, 4] by a vector: first `rotations` numbers for the rotation, last three
+    for the translation."""
 
     rotations: int
 
     @property
     def start(self) -> Vector:
-        """Return the first guess's numbers."""
+        """Return the parameters of the initial guess."""
 
     def pose(self, numbers: Vector) -> Matrix:
-        """Return their T_camera_world."""
+        """Return T_camera_world of some parameters."""
 
     def gradient(self, numbers: Vector, twist: Vector) -> Vector:
-        """Turn the gradient [6] by the left twist (ρ, φ) of T_camera_world into that by the numbers."""
+        """Convert the gradient [6] with respect to the left twist (ρ, φ) of T_camera_world to the gradient with respect
+        to the parameters."""
 
 
 @dataclass(frozen=True, eq=False)
 class QuaternionMotion:
-    """(w, x, y, z, tx, ty, tz) of the motion after a first guess, the quaternion of any norm (VarSplat's code)."""
+    """(w, x, y, z, tx, ty, tz) of the motion relative to an initial guess; the quaternion may have any norm (VarSplat's
+    code)."""
 
     guess: Matrix
     rotations = 4
@@ -48,9 +50,10 @@ class QuaternionMotion:
         return motion @ self.guess
 
     def gradient(self, numbers: Vector, twist: Vector) -> Vector:
-        """The motion's rotation turns the pose about the motion's translation t, so its gradient is g = g_φ − t × g_ρ.
+        """Return the gradient with respect to the parameters.
 
-        By a quaternion q that is 2 (0, g) ⊗ q / |q|².
+        The motion's rotation turns the pose about the motion's translation t, so its gradient is g = g_φ − t × g_ρ.
+        With respect to a quaternion q the gradient is 2 (0, g) ⊗ q / |q|².
         """
         q, t = numbers[:4], numbers[4:]
         g = twist[3:] - np.cross(t, twist[:3])
@@ -63,7 +66,7 @@ class QuaternionMotion:
 class AxisAngle:
     """(ω, t_wc): axis times angle of the camera-to-world rotation, radians, and the camera's position, m (CG-SLAM §6).
 
-    Adding δ to ω turns the camera by less than |δ|: by 2 sin(|ω|/2)/|ω| of it where δ is across ω.
+    Adding δ to ω rotates the camera by less than |δ|: if δ is perpendicular to ω, by 2 sin(|ω|/2)/|ω| times |δ|.
     """
 
     guess: Matrix
@@ -80,15 +83,16 @@ class AxisAngle:
         return se3.inverse(T_world_camera)
 
     def gradient(self, numbers: Vector, twist: Vector) -> Vector:
-        """ω + δ turns T_camera_world by φ = −Jr(ω) δ, and t_wc + δ moves it by ρ = −R_camera_world δ.
+        """Return the gradient with respect to the parameters.
 
-        So ∂L/∂ω = −Jr(ω)ᵀ g_φ and ∂L/∂t_wc = −R_world_camera g_ρ. Jr(ω)ᵀ is the left Jacobian Jl(ω), which `exp`
-        applies to the ρ of its twist.
+        ω + δ rotates T_camera_world by φ = −Jr(ω) δ, and t_wc + δ moves it by ρ = −R_camera_world δ. So ∂L/∂ω = −Jr(ω)ᵀ
+        g_φ and ∂L/∂t_wc = −R_world_camera g_ρ. Jr(ω)ᵀ is the left Jacobian Jl(ω), which `exp` applies to the ρ of its
+        twist.
         """
         turned = se3.exp(np.concatenate([twist[3:], numbers[:3]]))
         return -np.concatenate([turned[:3, 3], turned[:3, :3] @ twist[:3]])
 
 
 def parametrisation(config: TrackingConfig, guess: Matrix) -> Parametrisation:
-    """Choose the numbers to descend on from a first guess of T_camera_world."""
+    """Return the parametrisation that the settings choose, for an initial guess of T_camera_world."""
     return AxisAngle(guess) if config.parametrisation == "axis-angle" else QuaternionMotion(guess)

@@ -1,4 +1,4 @@
-"""fit_pose: move one camera, the field fixed. By the papers' Adam through the renderer, or by aligning images."""
+"""Fit the pose of one camera to a fixed field: by the papers' Adam through the renderer, or by image alignment."""
 
 from dataclasses import dataclass
 
@@ -18,10 +18,12 @@ from sigmasplat.types import Matrix
 
 @dataclass(eq=False)
 class PoseFit:
-    """T_camera_world; agreement: share of pixels seen by both map and sensor whose depths agree; overlap: share of
-    sensor readings where the map has a surface; first and last loss; iterations; alignment: what found it, or None;
-    degenerate: number of undetermined directions of motion (those keep the guess); exposure
-    (a, b) of exp(a)·Ĉ + b."""
+    """The result of a pose fit: T_camera_world and its quality.
+
+    agreement: share of the pixels visible to both map and sensor whose depths agree; overlap: share of sensor readings
+    where the map has a surface; first and last loss; iterations; alignment: the alignment that found the pose, or None;
+    degenerate: number of undetermined directions of motion, which keep the guess; exposure (a, b) of exp(a)·Ĉ + b.
+    """
 
     T_camera_world: Matrix
     agreement: float
@@ -35,18 +37,20 @@ class PoseFit:
 
     @property
     def covariance(self) -> Matrix | None:
-        """Return the covariance [6, 6] of the left twist (ρ, φ), m and rad, to the reference; None from descent."""
+        """Return the covariance [6, 6] of the left twist (ρ, φ), m and rad, relative to the reference; None after
+        descent."""
         return None if self.alignment is None else self.alignment.covariance
 
 
 def fit_pose_adam(
     params: Tensor, view: View, target: Target, T_camera_world: Matrix, config: TrackingConfig, iterations: int
 ) -> PoseFit:
-    """Descend L_track by Adam (`fit.descent`), on a CUDA device without the host; the best iterate wins.
+    """Minimise L_track by Adam (`fit.descent`) and return the best iterate. On a CUDA device the loop runs without the
+    host.
 
-    params [N, 17] and σ² are frozen (VarSplat §3). Ends early when a step is below `update_stop`, or when it changed
-    the loss by less than `plateau_stop` of it. Without common pixels the guess is returned. Raises BackendError where a
-    CUDA device has too many pairs of splats and tiles.
+    params [N, 17] and σ² are fixed (VarSplat §3). The descent stops early when a step is below `update_stop`, or when
+    the relative change of the loss is below `plateau_stop`. Without common pixels the guess is returned. Raises
+    BackendError if a CUDA device has too many pairs of splats and tiles.
     """
     params, target = params.to(view.sums.device), target.to(view.sums.device)
     found = fits_of(view).descend(params, view, target, T_camera_world, config, iterations)
@@ -59,7 +63,8 @@ def fit_pose_adam(
 def fit_pose_align(reference: Reference, live: Pyramid, T_camera_world: Matrix, config: TrackingConfig) -> PoseFit:
     """Align the live image, a gray and depth (m) pyramid, to a reference by Gauss–Newton (`fit.align`), from a guess.
 
-    T_camera_world [4, 4]: the guess for the live camera. The fit's `loss` is the cost it ended with, `first_loss` NaN.
+    T_camera_world [4, 4]: the guess for the live camera. In the result, `loss` is the final cost and `first_loss` is
+    NaN.
     """
     guess = T_camera_world @ se3.inverse(reference.T_camera_world)
     found = align(

@@ -1,4 +1,4 @@
-"""Halve images again and again: what alignment works on, coarse to fine."""
+"""Make image pyramids for coarse-to-fine alignment."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +15,7 @@ LEVELS = 4
 class Pyramid:
     """Gray in [0, 1] and depth in metres (0 = none) at halving sizes, finest first; weights of both; cameras.
 
-    backend: whose image kernels halve and align the planes; only CUDA's are not in the host's memory.
+    backend: its image kernels halve and align the planes. Only the planes of CUDA are not in host memory.
     """
 
     gray: list[Plane]
@@ -27,17 +27,18 @@ class Pyramid:
 
     @property
     def kernels(self) -> ImageKernels:
-        """Return what halves and aligns the planes."""
+        """Return the kernels that halve and align the planes."""
         return fits_of(self).images
 
     @cached_property
     def readings(self) -> Any:
-        """Return the mean depth of the coarsest level, metres (1 where nothing is read), and how many pixels of the
-        finest have a reading, float64 [2], where the planes are."""
+        """Return the mean depth of the coarsest level in metres (1 without readings), and how many pixels of the finest
+        level have a reading, float64 [2], on the planes' device."""
         return self.kernels.readings_of(self.depth[0], self.depth[-1])
 
     def weighed(self, weight: Plane | None, weight_depth: Plane | None = None) -> "Pyramid":
-        """Return the same images with other weights [H, W] of gray and depth; depth's is gray's where none is given."""
+        """Return the same images with other weights [H, W] of gray and depth; without a depth weight, gray's weight is
+        used."""
         given = (None if w is None else self.kernels.contiguous(w) for w in (weight, weight_depth))
         gray_weights, depth_weights = ([w] for w in given)
         for _ in self.cameras[1:]:
@@ -56,7 +57,7 @@ class Pyramid:
         levels: int = LEVELS,
         backend: str = "cpu",
     ) -> "Pyramid":
-        """Halve gray [H, W], depth [H, W] and an optional weight [H, W] until `levels` sizes exist."""
+        """Build a pyramid of at most `levels` sizes from gray [H, W], depth [H, W] and an optional weight [H, W]."""
         p = Pyramid([], [], [None], [None], [camera], backend)
         p.gray.append(p.kernels.contiguous(gray))
         p.depth.append(p.kernels.contiguous(depth_m))
@@ -67,7 +68,7 @@ class Pyramid:
             half_gray, _, half_depth = p.kernels.halve((p.gray[-1], None), p.depth[-1])
             p.gray.append(half_gray)
             p.depth.append(half_depth)
-            # Odd sizes drop their last row or column, so the scale is exactly ½.
+            # With odd sizes the last row or column is dropped, so the scale is exactly ½.
             p.cameras.append(
                 Camera(c.width // 2, c.height // 2, c.fx / 2, c.fy / 2, (c.cx - 0.5) / 2, (c.cy - 0.5) / 2)
             )

@@ -1,4 +1,4 @@
-"""What alignment reads off a view: gray, surface, and how much each pixel counts."""
+"""Compute the reference maps of alignment from a view: gray, surface, and pixel weights."""
 
 import torch
 from torch import Tensor
@@ -11,15 +11,15 @@ from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.render.view import View
 
 ALIGN_ALPHA = 0.95
-"""Align only where the map is this opaque, so that C/A and D/A are those of the surface."""
+"""Minimum alpha of the map for alignment; above it, C/A and D/A are those of the surface."""
 
 
 def reference_maps(view: View, config: TrackingConfig, moment: Tensor | None) -> ReferenceMaps:
-    """Read a reference off a view's last forward pass: w̃ averaged over the channels, and the same form of U where its
-    moment is given. The maps are tensors where the view's planes are.
+    """Make a reference from a view's last forward pass. Weights: w̃ averaged over the channels; for depth the same
+    formula with U, if the view has a moment. The maps are tensors on the device of the view's planes.
 
-    Where the map is thin V has no meaning and the weight is 1, as for depth where there is no U. A view without
-    variance gives no w̃: then gray has no weight.
+    Where the map is thin, V has no meaning and the weight is 1; so is the depth weight without U. Without variance
+    there is no w̃, and gray has no weight.
     """
     maps = PoseMaps.of(view)
     opaque, divisor = maps.alpha > ALIGN_ALPHA, maps.alpha.clamp(min=0.5)
@@ -33,7 +33,7 @@ def reference_maps(view: View, config: TrackingConfig, moment: Tensor | None) ->
 
 
 def reference_arrays(view: View, config: TrackingConfig, moment: Tensor | None) -> ReferenceMaps:
-    """Return the same as arrays, for a view whose planes are in the host's memory."""
+    """Return the same maps as arrays, for a view whose planes are in host memory."""
     gray, surface, weights = reference_maps(view, config, moment)
     on_gray, on_depth = (None if weight is None else weight.numpy() for weight in weights)
     return ReferenceMaps(gray.numpy(), surface.numpy(), (on_gray, on_depth))

@@ -1,4 +1,4 @@
-"""References for alignment: the rendered map, or a keyframe's own image weighed by the map's V."""
+"""Make references for alignment: the rendered map, or a keyframe's own image weighted by the map's V."""
 
 from dataclasses import dataclass
 
@@ -15,23 +15,23 @@ from sigmasplat.types import Matrix
 
 @dataclass(eq=False)
 class Reference:
-    """An image with depth and pixel weights to align others to, and its pose T_camera_world [4, 4]."""
+    """An image with depth and pixel weights that other images are aligned to, and its pose T_camera_world [4, 4]."""
 
     pyramid: Pyramid
     T_camera_world: Matrix
 
 
 def live_image(view: View, color: Image, depth_m: Image, target: Target) -> Pyramid:
-    """Halve what a camera sees, colour [H, W, 3] and depth [H, W] m, where the view's device aligns it."""
+    """Make the pyramid of a camera image, colour [H, W, 3] and depth [H, W] m, on the device that aligns it."""
     gray, depth = fits_of(view).live_planes(view, color, depth_m, target)
     return Pyramid.of(gray, depth, target.camera, backend=view.backend)
 
 
 def map_reference(params: Tensor, view: View, T_camera_world: Matrix, config: TrackingConfig) -> Reference:
-    """Render the map as a reference: gray C/A and depth D/A m where it is opaque, weighed by w̃ (VarSplat §3).
+    """Render the map as a reference: gray C/A and depth D/A in m where it is opaque, weighted by w̃ (VarSplat §3).
 
-    params: rows [N, 17]; T_camera_world [4, 4]: the pose to render from. With depth weighed by U it is rendered
-    twice, as U is about the surface that the first render finds.
+    params: rows [N, 17]; T_camera_world [4, 4]: the pose to render from. To weight depth by U the map is rendered
+    twice, because U refers to the surface that the first render finds.
     """
     fits = fits_of(view)
     view.forward(params, T_camera_world)
@@ -46,11 +46,11 @@ def map_reference(params: Tensor, view: View, T_camera_world: Matrix, config: Tr
 def keyframe_reference(
     params: Tensor, view: View, image: Pyramid, T_camera_world: Matrix, config: TrackingConfig
 ) -> Reference:
-    """Take a keyframe's own image as a reference, each pixel weighed by w̃ of the map seen from there (VarSplat §3).
+    """Make a reference from a keyframe's own image; each pixel is weighted by w̃ of the map at its pose (VarSplat §3).
 
     params: rows [N, 17]; image: its gray and depth (m) pyramid; T_camera_world [4, 4]: its pose. The sensor's surface
-    is unbiased where a young map still renders too near; the map says which pixels to trust. Depth may be weighed by U
-    about the sensor's depth instead (CG-SLAM eq. 10).
+    is unbiased, while a young map still renders surfaces too close; the map only supplies the pixel weights. Depth can
+    be weighted by U about the sensor's depth instead (CG-SLAM eq. 10).
     """
     if not config.uncertainty:
         return Reference(image, T_camera_world)

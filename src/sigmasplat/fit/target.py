@@ -1,4 +1,4 @@
-"""Lay a frame out for a fit: image planes padded like the view's."""
+"""Prepare a frame for a fit: image planes with the same padding as the view's."""
 
 from dataclasses import dataclass, field as dataclass_field
 
@@ -26,7 +26,7 @@ class Target:
     _on_device: "Target | None" = dataclass_field(default=None, init=False, repr=False)
 
     def to(self, device: torch.device) -> "Target":
-        """Return the target on a device; the last copy is kept."""
+        """Return the target on a device; the latest copy is cached."""
         if self.depth.device == device:
             return self
         if self._on_device is None or self._on_device.depth.device != device:
@@ -35,7 +35,7 @@ class Target:
 
     @staticmethod
     def of(frame: Frame, size: tuple[int, int]) -> "Target":
-        """Lay out a frame on planes of `size` = (rows, columns) ≥ its own."""
+        """Make the target of a frame on planes of `size` = (rows, columns), at least the frame's size."""
         h, w = frame.depth_m.shape
         color, depth = torch.zeros(3, *size), torch.zeros(size)
         color[:, :h, :w] = torch.tensor(frame.color).movedim(-1, 0)
@@ -53,21 +53,21 @@ class Target:
         return self.depth[: self.camera.height, : self.camera.width]
 
     def picture(self) -> Picture:
-        """Return the image, colour in 256 steps as a camera delivers it."""
+        """Return the image; colour is rounded to 256 steps, as a camera delivers it."""
         color = (self.image.numpy() * 255.0).round().clip(0, 255).astype(np.uint8)
         return Picture(np.ascontiguousarray(color), self.depth_image.numpy().copy())
 
     @staticmethod
     def of_picture(picture: Picture, camera: Camera, size: tuple[int, int]) -> "Target":
-        """Lay out an earlier keyframe's picture."""
+        """Make the target of an earlier keyframe's picture."""
         return Target.of(Frame(0, 0.0, picture.unit_color, picture.depth_m, camera), size)
 
 
 @dataclass(eq=False)
 class Keyframe:
-    """A target with the pose it was seen from, T_world_camera float64 [4, 4].
+    """A target with its camera pose T_world_camera, float64 [4, 4].
 
-    A `fixed` pose never moves; of the others a fit moves those that are `movable`, which is set before it.
+    A `fixed` pose never moves. A fit moves the other poses if they are `movable`, which is set before the fit.
     """
 
     index: int
@@ -77,10 +77,11 @@ class Keyframe:
     movable: bool = True
     motion: VectorAdam = dataclass_field(default_factory=lambda: VectorAdam.of(6))
     visible_ids: NDArray[np.int64] | None = None
-    """Sorted ids of the splats that dominate a pixel of it; None where they were not computed."""
+    """Sorted ids of the splats that dominate at least one of its pixels; None if not computed."""
     descriptor: NDArray[np.float32] | None = None
 
     def move(self, gradient: NDArray[np.float64], rates: NDArray[np.float64]) -> None:
-        """Take an Adam step on the pose; gradient [6] by the left twist of T_camera_world, rates [6] in m and rad."""
+        """Take an Adam step on the pose; gradient [6] with respect to the left twist of T_camera_world, rates [6] in m
+        and rad."""
         update = self.motion.step(gradient, rates)
         self.T_world_camera = se3.orthonormalise(self.T_world_camera @ se3.exp(-update))

@@ -1,4 +1,4 @@
-"""The papers' tracking loss: the weights of pixels, the loss and its gradient on a view's planes."""
+"""The papers' tracking loss: pixel weights, the loss, and its gradient on a view's planes."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -24,7 +24,7 @@ class PoseMaps:
 
     @staticmethod
     def of(view: View) -> "PoseMaps":
-        """Take the maps of a view's last forward pass, without padding."""
+        """Return the maps of a view's last forward pass, without padding."""
         h, w = view.camera.height, view.camera.width
         sums = view.sums[:, :h, :w].movedim(0, -1)
         variance = variance_of(sums) if sums.shape[-1] == 7 else None
@@ -32,7 +32,8 @@ class PoseMaps:
 
 
 def agreement(maps: PoseMaps, target: Target) -> tuple[float, float]:
-    """Return how well a render explains a depth image: (share of common pixels within 5 % or 5 cm, common share)."""
+    """Return how well a render explains a depth image: the share of common pixels within 5 % or 5 cm, and the share of
+    common pixels."""
     common = (maps.alpha > 0.5) & (target.depth_image > 0)
     surface = maps.depth / maps.alpha.clamp(min=0.5)
     close = (surface - target.depth_image).abs() < (0.05 * target.depth_image).clamp(min=0.05)
@@ -41,7 +42,8 @@ def agreement(maps: PoseMaps, target: Target) -> tuple[float, float]:
 
 
 class PixelWeights(NamedTuple):
-    """Which pixels count in colour and in depth, bool [H, W]; how much, A^p [H, W] and w̃ of colour [H, W, 3]."""
+    """Which pixels are used for colour and for depth, bool [H, W], and their weights: A^p [H, W], and w̃ of colour [H,
+    W, 3]."""
 
     in_color: Tensor
     in_depth: Tensor
@@ -51,7 +53,7 @@ class PixelWeights(NamedTuple):
 
 @torch.no_grad()
 def pixel_weights(maps: PoseMaps, target: Target, color_error: Tensor, config: TrackingConfig) -> PixelWeights:
-    """Choose and weigh pixels (VarSplat §3; CG-SLAM §6), stop-gradient; color_error [H, W, 3] of any sign."""
+    """Choose and weight pixels (VarSplat §3; CG-SLAM §6), without gradient; color_error [H, W, 3] may have any sign."""
     valid = target.depth_image > 0
     if config.alpha_above > 0:
         valid = valid & (maps.alpha > config.alpha_above)
@@ -66,19 +68,20 @@ def pixel_weights(maps: PoseMaps, target: Target, color_error: Tensor, config: T
 
 
 def per_value(weight: float, mask: Tensor, channels: int, average: str) -> float:
-    """Return the weight of one error in the mean: over an image's pixels, or over the kept pixels and channels.
+    """Return the weight of one error in the mean: over the pixels of the image, or over the used pixels and channels.
 
-    Without a kept pixel it is 0.
+    Without a used pixel it is 0.
     """
     n = mask.numel() if average == "image" else channels * int(mask.sum())
     return weight / n if n else 0.0
 
 
 def tracking_gradient(view: View, target: Target, config: TrackingConfig, exposure: Tensor) -> tuple[float, Tensor]:
-    """Write ∂L_track/∂(color, depth) to the view's planes; return the loss and its gradient by exposure (a, b).
+    """Write ∂L_track/∂(color, depth) to the view's planes; return the loss and its gradient with respect to exposure
+    (a, b).
 
-    L_track = Σ A³ M (λ_c w̃ |exp(a) Ĉ + b − C| + (1 − λ_c) |D̂ − D|), here a mean over pixels (VarSplat §3), or over
-    those that colour and depth each keep (CG-SLAM §6).
+    L_track = Σ A³ M (λ_c w̃ |exp(a) Ĉ + b − C| + (1 − λ_c) |D̂ − D|). Here it is a mean over all pixels (VarSplat §3),
+    or over the pixels used for colour and for depth (CG-SLAM §6).
     """
     maps, c = PoseMaps.of(view), config
     gain, offset = exposure[0].exp(), exposure[1]
@@ -99,7 +102,7 @@ def tracking_gradient(view: View, target: Target, config: TrackingConfig, exposu
 
 
 def tracking_params(config: TrackingConfig, alpha_above: float) -> list[float]:
-    """Lay settings out as `TrackOptions` of the kernels (native/track.h)."""
+    """Return the settings as `TrackOptions` of the kernels (native/track.h)."""
     c = config
     return [
         alpha_above, c.alpha_power, c.outlier_factor, c.outlier_factor_color, c.weight_color, c.tau, c.weight_max,

@@ -19,7 +19,7 @@ COLORS, MEANS, SCALES = (COLUMNS[name] for name in ("colors", "means", "log_scal
 
 
 class ImageStep(Protocol):
-    """The part of another step that this one uses: its view, and the gradient of the image terms."""
+    """The part of the inner step that this step uses: its view, and the gradient of the image terms."""
 
     @property
     def view(self) -> View: ...
@@ -32,7 +32,7 @@ class ImageStep(Protocol):
 class ViewDependentStep:
     """One mapping step of a field with view-dependent colours of degree 1 to 3.
 
-    The view renders rows that hold the colours as this camera sees them, and returns the gradient of those rows.
+    The view renders rows with the colours that this camera sees, and returns the gradient of these rows.
     """
 
     def __init__(self, base: ImageStep, degree: int) -> None:
@@ -41,7 +41,7 @@ class ViewDependentStep:
         self.rows, self._R, self._position = torch.empty(0), torch.empty(0), torch.empty(0)
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
-        """Render the field, with the colours seen from that pose, to the view's planes."""
+        """Render the field into the view's planes, with the colours seen from that pose."""
         self._R, t = (
             torch.as_tensor(part).to(field.params) for part in (T_camera_world[:3, :3], T_camera_world[:3, 3])
         )
@@ -61,10 +61,7 @@ class ViewDependentStep:
     def splats(
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Matrix, float]:
-        """Carry the planes to the splats in view and their harmonics, add the gradient of the shape terms, and step.
-
-        Returns the pose twist [6] and the cost of the shape terms. grad2d [N] is filled as by `View.backward`.
-        """
+        """Step the splats in view and their harmonics, as `MappingStep.splats`."""
         grad, cost = torch.zeros_like(field.params), 0.0
         twist = self.view.backward(self.rows, grad, grad2d)
         harmonics = self._begin(field.get_or_create("harmonics"))
@@ -79,7 +76,7 @@ class ViewDependentStep:
             )
             g[:, MEANS] += g_means
             g[:, SCALES] += g_scales
-            if self.view.options.color_pose_gradient:  # a camera that moves by ρ leaves the directions to −ρ
+            if self.view.options.color_pose_gradient:  # a camera motion ρ acts like a splat motion −ρ
                 twist[:3] += (self._R @ g_means.sum(0)).cpu().numpy()
             cost += term
             adam_rows(field, rows, g, rates)
@@ -87,11 +84,12 @@ class ViewDependentStep:
         return twist, cost
 
     def accumulator(self, field: GaussianField) -> Accumulator:
-        """Refuse with a ConfigError: the step takes one image only."""
+        """Raise ConfigError: this step takes one image only."""
         raise one_image_only()
 
     def _begin(self, harmonics: Rows) -> Rows:
-        """Begin a step of the harmonics; return those of the degrees in use, in the memory of all."""
+        """Start a step of the harmonics; return the harmonics of the degrees in use, which share memory with the
+        field's."""
         harmonics.steps += 1
         params, moment1, moment2 = (
             x[:, : self.width] for x in (harmonics.params, harmonics.moment1, harmonics.moment2)
@@ -99,7 +97,8 @@ class ViewDependentStep:
         return Rows(params, moment1, moment2, harmonics.last_step, harmonics.steps)
 
     def _through_colors(self, own: Tensor, harmonics: Tensor, g_shown: Tensor) -> tuple[Tensor, Tensor]:
-        """Carry the gradient of shown colours [n, 3] to harmonics [n, width] and, by the direction, to means [n, 3]."""
+        """Propagate the gradient of view-dependent colours [n, 3] to harmonics [n, width] and, by the direction, to
+        means [n, 3]."""
         means = own[:, MEANS].clone().requires_grad_()
         values = basis(normalize(means - self._position, dim=1), self.degree)
         g_harmonics = values.detach()[:, :, None] * g_shown[:, None, :]

@@ -17,7 +17,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import render
-from sigmasplat.types import Matrix, Progress
+from sigmasplat.types import Matrix, Progress, no_progress
 
 CELL_M = 0.05
 UNOBSERVED, FLOOR_UNOBSERVED, FREE, OBJECT, WALL = range(5)
@@ -89,7 +89,7 @@ def floor_plan(
     *,
     cell_m: float = CELL_M,
     renderer: SurfaceRenderer = render,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = no_progress,
 ) -> FloorPlan:
     """Make the floor plan of a map from poses along its path; `camera` gives the field of view.
 

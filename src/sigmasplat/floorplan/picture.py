@@ -18,7 +18,7 @@ GAP, NARROW_GAP, HEAD, FOOT, LINE = 24, 12, 40, 44, 24
 MIN_WIDTH, DOT = 760, 9
 REASON_COLOURS = {"unseen": BLUE, "thin": PURPLE, "unsure": ACCENT}
 UNOBSERVED_SHADE, OBJECT_SHADE, FLOOR_UNOBSERVED_SHADE = 0.14, 0.45, 0.2
-"""Share of the text colour in the background, for the first two; the last is the share of blue."""
+"""Share of the text colour that is mixed into the background, for the first two; the last is the share of blue."""
 
 Corner = tuple[int, int]
 Floats = NDArray[np.float32]

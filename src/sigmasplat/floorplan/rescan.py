@@ -112,8 +112,8 @@ def _open(mask: Mask) -> Mask:
 def _widest_place(mask: Mask) -> tuple[tuple[float, float], float]:
     """Return row and column of the centre of the largest circle inside the mask, and its radius in cells.
 
-    Of all centres whose radius is within half a cell of the largest, this is their mean if it is one of them, else the
-    centre nearest to the mean.
+    The candidates are all centres whose radius is within half a cell of the largest. The result is their mean if the
+    mean is a candidate, else the candidate nearest to the mean.
     """
     inside = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
     places = np.argwhere(inside >= inside.max() - 0.5)

@@ -15,7 +15,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import Render
-from sigmasplat.types import Matrix, Progress
+from sigmasplat.types import Matrix, Progress, no_progress
 
 WIDTH_PX = 160
 """Width of the rendered images: at 5 m a pixel is about 4 cm wide."""
@@ -56,7 +56,7 @@ def sample_surfaces(
     camera: Camera,
     renderer: SurfaceRenderer,
     max_poses: int = MAX_POSES,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = no_progress,
 ) -> Iterator[SurfaceSample]:
     """Sample from at most `max_poses` poses, evenly spaced over the path, including the first and the last."""
     small = camera.resized(WIDTH_PX, max(1, round(camera.height * WIDTH_PX / camera.width)))

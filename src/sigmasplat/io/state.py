@@ -46,8 +46,8 @@ def read_state(path: Path, classes: Iterable[type], fixed: Mapping[str, Any]) ->
 
 
 class _Encoder:
-    """Converts objects to JSON values. Large arrays are collected as tensors, each once, so that shared arrays stay
-    shared."""
+    """Converts objects to JSON values. Large arrays are collected as tensors. An array that is used twice is stored
+    once, so that it is still shared after reading."""
 
     def __init__(self, classes: Mapping[str, type], fixed: Mapping[int, str]) -> None:
         self.classes, self.fixed = classes, fixed

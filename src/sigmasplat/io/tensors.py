@@ -19,16 +19,16 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: dict[str, str
     with replacing(path) as temporary:
         try:
             save_file(_without_shared_memory(tensors), temporary, text)
-        except SafetensorError as problem:  # also if the disk is full
+        except SafetensorError as problem:  # also raised if the disk is full
             raise RunError(f"cannot write {path}: {problem}; choose a writable place") from problem
-        temporary.chmod(0o666 & ~_umask())  # safetensors lets only the owner read it
+        temporary.chmod(0o666 & ~_umask())  # safetensors makes the file readable only for its owner
 
 
 @contextmanager
 def open_tensors(path: Path, what: str) -> Iterator[Any]:
-    """Open a file to read tensors or parts of them (`safe_open`); errors call it `what`.
+    """Open a file to read tensors or parts of them (`safe_open`); error messages call it `what`.
 
-    Raises RunError if it is damaged, also if the block does not find a tensor or cannot use it.
+    Raises RunError if it is damaged, or if the block does not find a tensor or cannot use it.
     """
     try:
         with safe_open(path, "pt") as file:

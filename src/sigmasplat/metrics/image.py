@@ -18,7 +18,7 @@ WINDOW_SIGMA = 1.5
 def psnr(rendered: Pixels, recorded: Pixels, valid: Mask | None = None) -> float:
     """Return the peak signal-to-noise ratio, dB, of colours [H, W, 3] in [0, 1] on the pixels of `valid` [H, W].
 
-    inf where both are equal, nan where no pixel is valid.
+    inf if both images are equal, nan if no pixel is valid.
     """
     squared = (rendered.astype(np.float64) - recorded) ** 2
     if valid is not None:

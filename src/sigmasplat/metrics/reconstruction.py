@@ -14,9 +14,8 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.render.mesh import mesh_depth
-from sigmasplat.types import Progress
+from sigmasplat.types import Matrix, Progress, no_progress
 
-Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 POINTS = 200_000
@@ -64,12 +63,12 @@ def score(
     found: Mesh,
     truth: Mesh,
     camera: Camera,
-    T_world_camera: Doubles,
+    T_world_camera: Matrix,
     *,
     points: int = POINTS,
     novel_views: int = NOVEL_VIEWS,
     seed: int = 0,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = no_progress,
 ) -> MeshScores:
     """Score mesh `found` against mesh `truth`, both in the frame of the truth, as seen from true poses [K, 4, 4].
 
@@ -100,11 +99,7 @@ def score(
 
 
 def visible_parts(
-    truth: Mesh,
-    points: Doubles,
-    camera: Camera,
-    T_world_camera: Doubles,
-    progress: Progress = lambda done, total: None,
+    truth: Mesh, points: Matrix, camera: Camera, T_world_camera: Matrix, progress: Progress = no_progress
 ) -> tuple[Mask, Mask]:
     """Return which faces [F] of the truth and which points [N] of the map are visible from poses [K, 4, 4].
 
@@ -130,7 +125,7 @@ def f1(precision: float, recall: float) -> float:
 
 
 def visible_points(
-    points: Doubles, depth_m: NDArray[np.float32], camera: Camera, T_world_camera: Doubles, slack_m: float
+    points: Matrix, depth_m: NDArray[np.float32], camera: Camera, T_world_camera: Matrix, slack_m: float
 ) -> Mask:
     """Return which points [N, 3] a camera sees: inside its image and at most `slack_m` behind the depth [H, W].
 
@@ -147,7 +142,7 @@ def visible_points(
     return seen
 
 
-def distances(points: Doubles, mesh: Mesh) -> Doubles:
+def distances(points: Matrix, mesh: Mesh) -> Matrix:
     """Return the distance [N] of each point to the nearest face of the mesh; inf if the mesh has no face."""
     if not len(mesh.faces) or not len(points):
         return np.full(len(points), np.inf)
@@ -162,7 +157,7 @@ def distances(points: Doubles, mesh: Mesh) -> Doubles:
     return out
 
 
-def _squared_distance(p: Doubles, a: Doubles, b: Doubles, c: Doubles) -> Doubles:
+def _squared_distance(p: Matrix, a: Matrix, b: Matrix, c: Matrix) -> Matrix:
     """Return squared distances [...] of points to triangles [..., 3].
 
     This is the distance to the plane if the point projects into the triangle, else to the nearest edge.
@@ -180,13 +175,13 @@ def _squared_distance(p: Doubles, a: Doubles, b: Doubles, c: Doubles) -> Doubles
     return np.where(above, np.minimum(to_plane, to_edges), to_edges)
 
 
-def _dot(a: Doubles, b: Doubles) -> Doubles:
+def _dot(a: Matrix, b: Matrix) -> Matrix:
     return np.asarray(np.einsum("...k,...k->...", a, b))
 
 
 def sample_novel_views(
-    truth: Mesh, camera: Camera, T_world_camera: Doubles, views: int, seed: int
-) -> list[tuple[Doubles, NDArray[np.float32], NDArray[np.intp]]]:
+    truth: Mesh, camera: Camera, T_world_camera: Matrix, views: int, seed: int
+) -> list[tuple[Matrix, NDArray[np.float32], NDArray[np.intp]]]:
     """Sample at most `views` novel views. Return their poses, true depth and true faces (see `NOVEL_SHIFT_M`)."""
     rng, found = np.random.default_rng(seed), []
     for _ in range(4 * views if len(T_world_camera) else 0):
@@ -201,17 +196,17 @@ def sample_novel_views(
 
 
 def _depth_pairs(
-    found: Mesh, seen_true: Mask, camera: Camera, T: Doubles, depth_m: NDArray[np.float32], face: NDArray[np.intp]
-) -> Doubles:
+    found: Mesh, seen_true: Mask, camera: Camera, T: Matrix, depth_m: NDArray[np.float32], face: NDArray[np.intp]
+) -> Matrix:
     """Return reconstructed and true depth [2, P] where a training view saw the true face; 0 = no reconstruction."""
     ours, _ = mesh_depth(found, camera, se3.inverse(T))
     counted = (face >= 0) & seen_true[face]
     return np.stack([ours[counted], depth_m[counted]]).astype(np.float64)
 
 
-def _mean(values: Doubles) -> float:
+def _mean(values: Matrix) -> float:
     return float(values.mean()) if values.size else float("nan")
 
 
-def _share(distance_m: Doubles, limit_m: float) -> float:
+def _share(distance_m: Matrix, limit_m: float) -> float:
     return float((distance_m < limit_m).mean()) if distance_m.size else float("nan")

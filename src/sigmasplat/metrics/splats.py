@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sigmasplat.metrics.reconstruction import POINTS, Doubles, distances, visible_parts
+from sigmasplat.metrics.reconstruction import POINTS, distances, visible_parts
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.mesh import Mesh
+from sigmasplat.types import Matrix
 
 OPAQUE = 0.1
 """Only a splat above this opacity can be a floater."""
@@ -31,11 +32,11 @@ class SplatScores:
 
 
 def score_splats(
-    centers: Doubles,
-    opacities: Doubles,
+    centers: Matrix,
+    opacities: Matrix,
     truth: Mesh,
     camera: Camera,
-    T_world_camera: Doubles,
+    T_world_camera: Matrix,
     *,
     points: int = POINTS,
     seed: int = 0,
@@ -53,12 +54,12 @@ def score_splats(
     return SplatScores(accuracy, completion, (accuracy + completion) / 2, _mean(floating.astype(np.float64)))
 
 
-def _to_nearest(points: Doubles, centers: Doubles) -> Doubles:
+def _to_nearest(points: Matrix, centers: Matrix) -> Matrix:
     """Return the distance [P] of each point to the nearest centre; inf if there is no centre."""
     if not len(centers):
         return np.full(len(points), np.inf)
     return np.asarray(cKDTree(centers).query(points)[0])
 
 
-def _mean(values: Doubles) -> float:
+def _mean(values: Matrix) -> float:
     return float(values.mean()) if values.size else float("nan")

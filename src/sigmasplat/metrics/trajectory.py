@@ -158,7 +158,7 @@ def score_path(
 ) -> tuple[dict[str, Any], SourceError | None]:
     """Return ATE and RPE over all frames, and the ATE of the path without loop closures (`odometry`) if given.
 
-    All scores are None without a truth. If the truth shares no timestamps with the path, they are None and the
+    All scores are None without a truth. If the truth shares no timestamps with the path, the scores are None and the
     error is returned too.
     """
     unknown: dict[str, Any] = {"ate": None, "rpe": None, "ate_odometry": None}

@@ -25,7 +25,7 @@ class Camera:
             raise ConfigError(f"not a camera: {self} (sizes and focal lengths must be positive and finite)")
 
     def resized(self, width: int, height: int) -> "Camera":
-        """Return the camera of the same view sampled at another size (centres of corner pixels map half a pixel in)."""
+        """Return the camera of the same view sampled at another size. The corner (−½, −½) stays fixed."""
         if (width, height) == (self.width, self.height):
             return self
         sx, sy = width / self.width, height / self.height

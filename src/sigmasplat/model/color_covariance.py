@@ -19,10 +19,11 @@ MOST_CORRELATED = 0.999
 
 
 def correlations_of(parameters: Tensor) -> Tensor:
-    """Turn a splat's three numbers a [N, 3] into the correlations red–green, red–blue, green–blue [N, 3] in (−1, 1)."""
+    """Convert a splat's three numbers a [N, 3] to the correlations red–green, red–blue, green–blue [N, 3] in (−1,
+    1)."""
     t = MOST_CORRELATED * torch.tanh(parameters)
     first, second, third = t.unbind(-1)
-    left = ((1.0 - first * first) * (1.0 - second * second)).sqrt()  # of green and blue once red is known
+    left = ((1.0 - first * first) * (1.0 - second * second)).sqrt()  # of green and blue for known red
     return torch.stack([first, second, first * second + third * left], -1)
 
 
@@ -34,6 +35,6 @@ def covariances_of(variances: Tensor, parameters: Tensor) -> Tensor:
 
 
 def outer(x: Tensor) -> Tensor:
-    """Return x xᵀ of x [..., 3] as (rr, gg, bb, rg, rb, gb) [..., 6], each of them a plane in memory."""
+    """Return x xᵀ of x [..., 3] as (rr, gg, bb, rg, rb, gb) [..., 6], each of them contiguous in memory."""
     r, g, b = x.unbind(-1)
     return torch.stack([r * r, g * g, b * b, r * g, r * b, g * b]).movedim(0, -1)

@@ -1,4 +1,4 @@
-"""Hold the Gaussians: one row per splat, parameters and optimiser state edited together."""
+"""Hold the Gaussians: one row per splat. Parameters and optimiser state are always edited together."""
 
 from dataclasses import dataclass, field as dataclass_field
 
@@ -20,16 +20,18 @@ WIDTH = 17
 INITIAL_LOG_VARIANCE = -7.0
 """s₀ (VarSplat §1)."""
 ATTRIBUTES = {"correlations": 3, "harmonics": 45}
-"""Optional attributes of splats, and how many columns each has. correlations: unbounded, 0 = none, their tanh are the
-partial correlations of the colour channels red–green, red–blue, green–blue (`model.color_covariance`). harmonics:
-spherical ones of degrees 1 to 3, one by one in the order of `model.harmonics.basis`, red, green and blue of each:
-columns 3·i + channel."""
+"""Optional attributes of splats, with their number of columns.
+
+correlations: unbounded, 0 = none; their tanh are the partial correlations of the colour channels red–green, red–blue,
+green–blue (`model.color_covariance`). harmonics: spherical harmonics of degrees 1 to 3, in the order of
+`model.harmonics.basis`, with red, green and blue of each: columns 3·i + channel.
+"""
 
 
 @dataclass(eq=False)
 class Rows:
-    """Parameters [N, m] of N splats with Adam's state: moments of the same shape; `last_step` [N] int32 says which step
-    last moved each row; `steps` counts Adam's steps."""
+    """Parameters [N, m] of N splats with Adam's state: moments of the same shape; `last_step` [N] int32, the step that
+    last moved each row; `steps`, the number of Adam steps."""
 
     params: Tensor
     moment1: Tensor = dataclass_field(default_factory=lambda: torch.empty(0))
@@ -58,7 +60,7 @@ class Rows:
         return Rows(params, moment1, moment2, last_step, self.steps)
 
     def take(self, other: "Rows") -> None:
-        """Copy the state of the same rows from another, from any device."""
+        """Copy the state of the same rows from another object, from any device."""
         for mine, theirs in zip(self._tensors, other._tensors, strict=True):
             mine.copy_(theirs)
         self.steps = other.steps
@@ -68,14 +70,14 @@ class Rows:
         return self.params, self.moment1, self.moment2, self.last_step
 
     def join(self, other: "Rows") -> None:
-        """Append another's rows, from any device, with their optimiser state."""
+        """Append the rows of another object, from any device, with their optimiser state."""
         more = zip(self._tensors, other._tensors, strict=True)
         self.params, self.moment1, self.moment2, self.last_step = (
             torch.cat([mine, theirs.to(mine.device)]) for mine, theirs in more
         )
 
     def choose(self, rows: Tensor) -> None:
-        """Keep the rows chosen by a bool mask [N] or an index tensor."""
+        """Keep the rows selected by a bool mask [N] or an index tensor."""
         self.params, self.last_step = self.params[rows], self.last_step[rows]
         self.moment1, self.moment2 = self.moment1[rows], self.moment2[rows]
 
@@ -85,9 +87,9 @@ class GaussianField(Rows):
     """N splats as one float32 tensor `params` [N, 17], columns named in `COLUMNS`.
 
     means: metres, world (or submap) frame; quats: wxyz, any positive norm; log_scales: log metres; opacity_logits:
-    logit of opacity; colors: RGB in [0, 1]; log_variances: log σ² of observed colour about `colors` (VarSplat §3,
-    s_i). `attributes` holds what only some maps need, by its name in `ATTRIBUTES`, rows of the same splats. `ids` [N]
-    int64 identify splats whatever row they move to; `next_id` is the id of the next new splat.
+    logit of opacity; colors: RGB in [0, 1]; log_variances: log σ² of observed colour about `colors` (VarSplat §3, s_i).
+    `attributes` contains rows that only some maps need, by name (`ATTRIBUTES`). `ids` [N] int64 identify splats,
+    whatever row they are in; `next_id` is the id of the next new splat.
     """
 
     attributes: dict[str, Rows] = dataclass_field(default_factory=dict)
@@ -164,14 +166,14 @@ class GaussianField(Rows):
         return self.params[:, COLUMNS["log_variances"]].exp()
 
     def get_or_create(self, name: str) -> Rows:
-        """Return an attribute by its name; one that the field does not have yet is created as zeros."""
+        """Return an attribute by its name; if the field does not have it yet, it is created as zeros."""
         if name not in self.attributes:
             self.attributes[name] = Rows(self.params.new_zeros(len(self), ATTRIBUTES[name]))
         return self.attributes[name]
 
     def append(self, other: "GaussianField") -> None:
-        """Append another field's splats, from any device, with new ids; an attribute that only one field has is 0 for
-        the other's splats."""
+        """Append another field's splats, from any device, with new ids. An attribute that only one of the fields has is
+        0 for the splats of the other."""
         for name in {**self.attributes, **other.attributes}:
             self.get_or_create(name).join(other.get_or_create(name))
         self.ids = torch.cat([self.ids, torch.arange(self.next_id, self.next_id + len(other), device=self.ids.device)])
@@ -179,7 +181,7 @@ class GaussianField(Rows):
         self.join(other)
 
     def copy_to(self, device: torch.device) -> "GaussianField":
-        """Return a copy of the field on a device, its attributes and ids with it."""
+        """Return a copy of the field on a device, including attributes and ids."""
         attributes = {name: attribute.copy_to(device) for name, attribute in self.attributes.items()}
         params, moment1, moment2, last_step = (x.to(device, copy=True) for x in self._tensors)
         return GaussianField(
@@ -187,11 +189,11 @@ class GaussianField(Rows):
         )  # fmt: skip
 
     def to(self, device: torch.device) -> "GaussianField":
-        """Return the field itself if it is on a device already, else a copy on it."""
+        """Return the field itself if it is already on a device, else a copy on it."""
         return self if self.params.device == device else self.copy_to(device)
 
     def keep(self, rows: Tensor) -> None:
-        """Keep the splats chosen by a bool mask [N] or an index tensor, drop the others."""
+        """Keep the splats selected by a bool mask [N] or an index tensor."""
         if rows.dtype == torch.bool:
             rows = rows.nonzero().squeeze(1)  # once for all parts: on a device the host waits for the number of rows
         for part in (self, *self.attributes.values()):
@@ -201,8 +203,8 @@ class GaussianField(Rows):
     def moved(self, T_new_old: Tensor) -> "GaussianField":
         """Return the field moved by a rigid 4×4 transform: positions and rotations change, shapes and colours do not.
 
-        View-dependent colours rotate with it, and so do Adam's moments (the second ones as if the components of a
-        gradient were independent).
+        View-dependent colours rotate with the field, and so do Adam's moments. The second moments rotate as if the
+        components of a gradient were independent.
         """
         T = T_new_old.to(self.params)
         params, moment1, moment2, last_step = self.state()
@@ -220,17 +222,18 @@ class GaussianField(Rows):
 
 
 def quaternion_of(R: Tensor) -> Tensor:
-    """Turn a 3×3 rotation tensor into a unit quaternion wxyz."""
+    """Convert a 3×3 rotation tensor to a unit quaternion wxyz."""
     return torch.as_tensor(se3.quaternion_from_rotation(R.detach().cpu().double().numpy())).to(R)
 
 
 def left_factor(quaternion: Tensor) -> Tensor:
-    """Write multiplication by a quaternion wxyz from the left as a matrix [4, 4]."""
+    """Return the matrix [4, 4] of multiplication by a quaternion wxyz from the left."""
     w, x, y, z = quaternion
     rows = [(w, -x, -y, -z), (x, w, -z, y), (y, z, w, -x), (z, -y, x, w)]
     return torch.stack([torch.stack(row) for row in rows])
 
 
 def transformed(rows: Tensor, matrix: Tensor) -> Tensor:
-    """Return rows [N, m] times matrixᵀ [m, m], column by column: a library product rounds as memory happens to lie."""
+    """Return rows [N, m] times matrixᵀ [m, m], column by column. The rounding of a library's matrix product depends on
+    memory alignment."""
     return sum((rows[:, k, None] * matrix[:, k] for k in range(len(matrix))), torch.zeros_like(rows))

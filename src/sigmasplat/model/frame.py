@@ -1,4 +1,4 @@
-"""One RGB-D image: immutable, checked when it is made, without ground truth."""
+"""One RGB-D image: immutable, checked on construction, without ground truth."""
 
 from dataclasses import dataclass
 
@@ -12,11 +12,11 @@ from sigmasplat.model.camera import Camera
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One colour + depth image.
+    """One image of colour and depth.
 
     color: float32 [H, W, 3] in [0, 1]; depth_m: float32 [H, W] along the optical axis in metres, 0 = no reading;
-    camera: the pinhole of both; timestamp_s: seconds; index: position in the source.
-    Raises SourceError on shapes that disagree, values that are not finite, negative depth.
+    camera: the pinhole of both; timestamp_s: seconds; index: position in the source. Raises SourceError on inconsistent
+    shapes, values that are not finite, or negative depth.
     """
 
     index: int
@@ -43,7 +43,7 @@ class Frame:
     def resized(self, width: int, height: int) -> "Frame":
         """Return the frame at another size: colour averaged over the pixel's area, depth of the nearest pixel.
 
-        Depth is never averaged: the mean of a near and a far surface lies on neither.
+        Depth is never averaged: the mean of a near and a far surface is on neither of them.
         """
         if (width, height) == (self.camera.width, self.camera.height):
             return self

@@ -51,10 +51,10 @@ def basis(directions: Tensor, degree: int = DEGREES) -> Tensor:
 def view_colors(
     colors: Tensor, harmonics: Tensor, means: Tensor, camera_position: Tensor, degree: int = DEGREES
 ) -> Tensor:
-    """Return the colours [N, 3] that splats show a camera: `colors` + Σ Y(direction from camera to splat) · k.
+    """Return the colours [N, 3] of splats as a camera sees them: `colors` + Σ Y(direction from camera to splat) · k.
 
-    harmonics [N, 45], columns: `model.field.ATTRIBUTES`; means [N, 3] and camera_position [3] in one frame, metres.
-    Not clamped: a colour may leave [0, 1].
+    harmonics [N, 45], columns: `model.field.ATTRIBUTES`; means [N, 3] and camera_position [3] in the same frame,
+    metres. Not clamped: a colour may be outside [0, 1].
     """
     n = count(degree)
     if n == 0:
@@ -64,10 +64,10 @@ def view_colors(
 
 
 def turned(harmonics: Tensor, R_new_old: Tensor) -> Tensor:
-    """Return harmonics [N, 45] as they are in axes turned by a rotation [3, 3]: Y(R d) · k_new = Y(d) · k_old.
+    """Return harmonics [N, 45] for axes rotated by [3, 3]: Y(R d) · k_new = Y(d) · k_old.
 
-    The rotation matrix of the harmonics is ∫ Y(R d) Y(d)ᵀ dΩ. Sums are written out: the rounding of a library's matrix
-    product depends on memory alignment.
+    The rotation matrix of the harmonics is ∫ Y(R d) Y(d)ᵀ dΩ. Sums are written out because the rounding of a library's
+    matrix product depends on memory alignment.
     """
     directions, weights = sphere_rule()
     new = basis((directions[:, None, :] * R_new_old.cpu().double()).sum(-1))
@@ -78,7 +78,8 @@ def turned(harmonics: Tensor, R_new_old: Tensor) -> Tensor:
 
 
 def sphere_rule() -> tuple[Tensor, Tensor]:
-    """Return directions [D, 3] and weights [D], float64: their sum is the integral of polynomials up to degree 7."""
+    """Return directions [D, 3] and weights [D], float64, for which the weighted sum is the integral of polynomials up
+    to degree 7."""
     nodes, weights = np.polynomial.legendre.leggauss(4)
     z, turn = np.repeat(nodes, 8), np.tile(np.arange(8) * pi / 4, 4)
     r = np.sqrt(1 - z**2)

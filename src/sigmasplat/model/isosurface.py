@@ -12,12 +12,12 @@ from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.tsdf import BLOCK, BLUE, COLOR_WEIGHT, DISTANCE, GREEN, RED, WEIGHT, Tsdf, packed, unpacked
 
 BRICK = 8
-"""Blocks along the edge of a brick, the volume that one call of marching cubes processes."""
+"""Blocks along the edge of a brick, which is the volume that one call of marching cubes processes."""
 EDGE = BRICK * BLOCK + 1
-"""Voxels along it: the last layer is the next brick's first."""
+"""Voxels along the edge of a brick; its last layer is the first layer of the next brick."""
 LEAST_DISTANCE = 1e-3
-"""Distances closer to 0 (in units of the truncation) are moved away from 0. Then no vertex falls on a voxel, and each
-vertex lies on its own edge of the lattice."""
+"""Distances closer to 0 than this (in units of the truncation) are moved away from 0. Then no vertex is exactly on a
+voxel, and each vertex is on its own edge of the lattice."""
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -26,7 +26,7 @@ Ints = NDArray[np.int64]
 def surface(volume: Tsdf) -> Mesh:
     """Return the zero level set as a connected mesh with colours.
 
-    Only cubes whose eight voxels were all observed make faces. The same field makes the same bytes.
+    Only cubes with eight observed voxels produce faces. The same field gives the same bytes.
     """
     bricks = unpacked(np.unique(packed(volume.blocks // BRICK)))
     parts = [part for brick in bricks if (part := _brick(volume, brick * BRICK))]
@@ -42,7 +42,8 @@ def surface(volume: Tsdf) -> Mesh:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """A brick's surface: vertices [V, 3] m, the lattice edge each lies on [V] as a key, colors [V, 3], faces [F, 3]."""
+    """A brick's surface: vertices [V, 3] m, the lattice edge of each vertex [V] as a key, colors [V, 3], faces [F,
+    3]."""
 
     vertices: Floats
     edges: Ints
@@ -63,11 +64,11 @@ def _brick(volume: Tsdf, first_block: Ints) -> _Part | None:
     if not cubes.any():
         return None
     mask = np.zeros(distance.shape, bool)
-    mask[1:, 1:, 1:] = cubes  # scikit-image knows a cube by its last corner
+    mask[1:, 1:, 1:] = cubes  # scikit-image indexes a cube by its last corner
     cut: Callable[..., Any] = marching_cubes
     points, faces, _, _ = cut(distance, 0.0, mask=mask, gradient_direction="descent")
-    # A vertex lies between two voxels: it has one broken coordinate, or, inside a cube, three. Twice the whole part,
-    # plus 1 where it is broken, names the edge (or the cube), in the same way from both sides of a seam.
+    # A vertex is between two voxels: one of its coordinates has a fraction, or, inside a cube, three. Twice the integer
+    # part, plus 1 if there is a fraction, identifies the edge (or the cube). It is the same on both sides of a seam.
     whole = np.rint(points)
     broken = np.abs(points - whole) > 0.1 * LEAST_DISTANCE
     low = np.where(broken, np.floor(points), whole).astype(np.int64)
@@ -80,7 +81,7 @@ def _brick(volume: Tsdf, first_block: Ints) -> _Part | None:
 
 
 def _dense(blocks: Floats, places: NDArray[np.intp], empty: np.float32) -> Floats:
-    """Set blocks [N, 512] at their places in a cube of blocks; return its first EDGE³ voxels."""
+    """Copy blocks [N, 512] to their places in a cube of blocks; return its first EDGE³ voxels."""
     side = BRICK + 1
     cube = np.full((side, BLOCK, side, BLOCK, side, BLOCK), empty, np.float32)
     x, y, z = np.unravel_index(places, (side, side, side))
@@ -89,7 +90,7 @@ def _dense(blocks: Floats, places: NDArray[np.intp], empty: np.float32) -> Float
 
 
 def _of_corners(corner: NDArray[np.bool_], join: Callable[..., NDArray[np.bool_]]) -> NDArray[np.bool_]:
-    """Join the eight corners of each cube, all axes one shorter."""
+    """Combine the eight corners of each cube; the result is shorter by one along each axis."""
     for axis in range(3):
         corner = np.moveaxis(corner, axis, 0)
         corner = np.moveaxis(join(corner[1:], corner[:-1]), 0, axis)

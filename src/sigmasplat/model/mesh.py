@@ -1,4 +1,4 @@
-"""Represent a triangle mesh: sample it, move it, select parts of it."""
+"""A triangle mesh, and functions to sample it, move it, and select parts of it."""
 
 from dataclasses import dataclass, replace
 
@@ -54,7 +54,8 @@ class Mesh:
         return 0.5 * np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
     def normals(self) -> NDArray[np.float64]:
-        """Return outward unit normals of the vertices [V, 3], area-weighted means of their faces'; 0 without a face."""
+        """Return outward unit normals of the vertices [V, 3]: area-weighted means of the normals of their faces, 0
+        without a face."""
         a, b, c = np.moveaxis(self.corners, 1, 0)
         across = np.cross(b - a, c - a)
         sums = np.stack(
@@ -71,7 +72,7 @@ class Mesh:
         chosen = rng.choice(len(areas), points, p=areas / areas.sum())
         a, b, c = np.moveaxis(self.vertices[self.faces[chosen]].astype(np.float64), 1, 0)
         s, t = rng.uniform(size=(2, points, 1))
-        s, t = np.where(s + t > 1.0, 1.0 - s, s), np.where(s + t > 1.0, 1.0 - t, t)  # mirrored back into the triangle
+        s, t = np.where(s + t > 1.0, 1.0 - s, s), np.where(s + t > 1.0, 1.0 - t, t)  # mirrored into the triangle
         return np.asarray(a + s * (b - a) + t * (c - a))
 
     def moved(self, T_new_old: NDArray[np.float64]) -> "Mesh":

@@ -1,4 +1,4 @@
-"""Rigid motions: SE(3) in double precision with numpy. `T_a_b` takes coordinates in b to coordinates in a.
+"""Compute rigid motions: SE(3) in double precision with numpy. `T_a_b` converts coordinates in b to coordinates in a.
 
 A twist is ξ = (ρ, φ): translation first, then rotation vector (radians).
 """
@@ -11,7 +11,7 @@ from sigmasplat.types import Matrix
 
 
 def hat(w: Matrix) -> Matrix:
-    """Build the cross-product matrix [w]× of a 3-vector (or of a stack [..., 3])."""
+    """Return the cross-product matrix [w]× of a 3-vector (or of a stack [..., 3])."""
     out = np.zeros((*w.shape, 3))
     out[..., 2, 1], out[..., 0, 2], out[..., 1, 0] = w[..., 0], w[..., 1], w[..., 2]
     out[..., 1, 2], out[..., 2, 0], out[..., 0, 1] = -w[..., 0], -w[..., 1], -w[..., 2]
@@ -19,7 +19,7 @@ def hat(w: Matrix) -> Matrix:
 
 
 def _series(theta2: float) -> tuple[float, float, float]:
-    """Return sinθ/θ, (1−cosθ)/θ², (θ−sinθ)/θ³, by Taylor series where θ is small."""
+    """Return sinθ/θ, (1−cosθ)/θ², (θ−sinθ)/θ³; for small θ by Taylor series."""
     if theta2 < 1e-8:
         return 1.0 - theta2 / 6.0, 0.5 - theta2 / 24.0, 1.0 / 6.0 - theta2 / 120.0
     theta = float(np.sqrt(theta2))
@@ -31,7 +31,7 @@ def _series(theta2: float) -> tuple[float, float, float]:
 
 
 def exp(xi: NDArray[np.floating]) -> Matrix:
-    """Map a twist ξ=(ρ, φ), shape [6], to a 4×4 rigid transform."""
+    """Convert a twist ξ=(ρ, φ), shape [6], to a 4×4 rigid transform."""
     rho, phi = np.asarray(xi[:3], float), np.asarray(xi[3:], float)
     k = hat(phi)
     a, b, c = _series(float(phi @ phi))
@@ -43,7 +43,7 @@ def exp(xi: NDArray[np.floating]) -> Matrix:
 
 
 def log(T: Matrix) -> Matrix:
-    """Map a 4×4 rigid transform to its twist ξ=(ρ, φ), shape [6], |φ| ≤ π."""
+    """Convert a 4×4 rigid transform to its twist ξ=(ρ, φ), shape [6], |φ| ≤ π."""
     phi = log_rotation(T[:3, :3])
     k = hat(phi)
     _, b, c = _series(float(phi @ phi))
@@ -52,7 +52,7 @@ def log(T: Matrix) -> Matrix:
 
 
 def log_rotation(R: Matrix) -> Matrix:
-    """Map a 3×3 rotation to its rotation vector, radians, stable near 0 and near π."""
+    """Convert a 3×3 rotation to its rotation vector, radians; stable near 0 and near π."""
     w, x, y, z = quaternion_from_rotation(R)
     vector = np.array([x, y, z])
     norm = float(np.linalg.norm(vector))
@@ -72,7 +72,7 @@ def inverse(T: Matrix) -> Matrix:
 
 
 def adjoint(T: Matrix) -> Matrix:
-    """Build Ad(T) [..., 6, 6], which transforms twists between frames: T exp(ξ) T⁻¹ = exp(Ad(T) ξ)."""
+    """Return Ad(T) [..., 6, 6], which transforms twists between frames: T exp(ξ) T⁻¹ = exp(Ad(T) ξ)."""
     R = T[..., :3, :3]
     out = np.zeros((*T.shape[:-2], 6, 6))
     out[..., :3, :3] = out[..., 3:, 3:] = R
@@ -81,12 +81,12 @@ def adjoint(T: Matrix) -> Matrix:
 
 
 def exp_stack(xi: Matrix) -> Matrix:
-    """Map twists [N, 6] to transforms [N, 4, 4]: `exp` for many at once."""
+    """Convert twists [N, 6] to transforms [N, 4, 4]: `exp` for many twists."""
     k = hat(xi[:, 3:])
     kk = k @ k
     theta = np.linalg.norm(xi[:, 3:], axis=1)[:, None, None]
     a, b = np.sinc(theta / np.pi), 0.5 * np.sinc(theta / (2 * np.pi)) ** 2
-    # (1 − a)/θ² loses its digits where θ vanishes, but there it multiplies k² = O(θ²).
+    # (1 − a)/θ² is inaccurate for very small θ, but there it is multiplied by k² = O(θ²).
     c = (1.0 - a) / np.maximum(theta, 1e-100) ** 2
     T = np.tile(np.eye(4), (len(xi), 1, 1))
     T[:, :3, :3] += a * k + b * kk
@@ -95,7 +95,7 @@ def exp_stack(xi: Matrix) -> Matrix:
 
 
 def log_stack(T: Matrix) -> Matrix:
-    """Map transforms [N, 4, 4] to twists [N, 6], |φ| ≤ π: `log` for many at once."""
+    """Convert transforms [N, 4, 4] to twists [N, 6], |φ| ≤ π: `log` for many transforms."""
     phi = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
     k, theta2 = hat(phi), (phi * phi).sum(1)[:, None, None]
     h, _ = _half_cotangent(theta2)
@@ -104,10 +104,10 @@ def log_stack(T: Matrix) -> Matrix:
 
 
 def left_jacobian_inverse(xi: Matrix) -> Matrix:
-    """Build J⁻¹(ξ) [N, 6, 6] for twists [N, 6], |φ| < 2π: log(exp(δ) exp(ξ)) = ξ + J⁻¹(ξ) δ + O(δ²).
+    """Return J⁻¹(ξ) [N, 6, 6] for twists [N, 6], |φ| < 2π: log(exp(δ) exp(ξ)) = ξ + J⁻¹(ξ) δ + O(δ²).
 
-    J⁻¹ = ad / (exp(ad) − 1), ad = ad(ξ). As ad (ad² + θ²)² = 0, the power series closes as 1 − ad/2 + p ad² + q ad⁴;
-    p and q follow from the value and slope of x/2·coth(x/2) at x = iθ.
+    J⁻¹ = ad / (exp(ad) − 1), ad = ad(ξ). Because ad (ad² + θ²)² = 0, the power series is finite: 1 − ad/2 + p ad² + q
+    ad⁴. p and q follow from the value and slope of x/2·coth(x/2) at x = iθ.
     """
     k = hat(xi[:, 3:])
     ad = np.zeros((len(xi), 6, 6))
@@ -123,14 +123,14 @@ def left_jacobian_inverse(xi: Matrix) -> Matrix:
 
 
 def _half_cotangent(theta2: Matrix) -> tuple[Matrix, Matrix]:
-    """Return h = θ/2·cot(θ/2) and its slope dh/dθ², 0 ≤ θ < 2π."""
+    """Return h = θ/2·cot(θ/2) and its derivative dh/dθ², 0 ≤ θ < 2π."""
     half = 0.5 * np.sqrt(np.maximum(theta2, 1e-16))
     h = half / np.tan(half)
     return h, (h - (half / np.sin(half)) ** 2) / (8.0 * half**2)
 
 
 def rotation_from_quaternion(q_wxyz: Matrix) -> Matrix:
-    """Turn quaternions [..., 4] (w first, any norm > 0) into rotations [..., 3, 3]."""
+    """Convert quaternions [..., 4] (w first, any norm > 0) to rotations [..., 3, 3]."""
     q = np.asarray(q_wxyz, float)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     w, x, y, z = np.moveaxis(q, -1, 0)
@@ -143,7 +143,7 @@ def rotation_from_quaternion(q_wxyz: Matrix) -> Matrix:
 
 
 def quaternion_from_rotation(R: Matrix) -> Matrix:
-    """Turn one 3×3 rotation into a unit quaternion wxyz with w ≥ 0 (largest-pivot form, stable everywhere)."""
+    """Convert one 3×3 rotation to a unit quaternion wxyz with w ≥ 0 (largest-pivot form, stable everywhere)."""
     trace = float(np.trace(R))
     pivots = np.array([trace, R[0, 0], R[1, 1], R[2, 2]])
     i = int(np.argmax(pivots))
@@ -166,7 +166,7 @@ def rotation_angle(R: Matrix) -> float:
 
 
 def orthonormalise(T: Matrix) -> Matrix:
-    """Project the rotation part onto SO(3), so that thousands of products do not drift off the group."""
+    """Project the rotation part onto SO(3), so that errors do not accumulate over thousands of products."""
     u, _, vt = np.linalg.svd(T[:3, :3])
     out = T.copy()
     out[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt

@@ -10,7 +10,8 @@ from sigmasplat.model.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField
 
 @dataclass(frozen=True)
 class FilterResult:
-    """The mask of the kept splats, bool [N], and the numbers dropped for their σ, and for their opacity only."""
+    """The mask of the kept splats, bool [N]; the number of splats dropped for their σ; the number dropped only for
+    their opacity."""
 
     kept: Tensor
     by_sigma: int
@@ -28,7 +29,7 @@ def sigmas(field: GaussianField) -> Tensor:
 
 
 def has_learned_variance(field: GaussianField) -> bool:
-    """Return whether any σ² differs from its initial value, which readers also use for maps without σ²."""
+    """Return whether any σ² differs from its initial value. Maps read from files without σ² have this value too."""
     return bool((field.params[:, COLUMNS["log_variances"]] != INITIAL_LOG_VARIANCE).any())
 
 

@@ -30,7 +30,7 @@ class Submap:
     """A finished part of the map in its own frame, which is the camera of its first keyframe.
 
     field: its splats; frames [K]: the frame numbers of its keyframes; T_submap_camera [K, 4, 4]: their poses; camera:
-    of all keyframes. The `SubmapStore` keeps the keyframes' pictures, the `Atlas` the submap's pose in the world.
+    shared by all keyframes. The `SubmapStore` keeps the keyframes' images, the `Atlas` the submap's pose in the world.
     """
 
     index: int
@@ -41,19 +41,19 @@ class Submap:
 
 
 class SubmapStore(Protocol):
-    """Keeps finished submaps; numbers count from 0 in the order of saving."""
+    """Keeps finished submaps. They are numbered from 0 in the order of saving."""
 
     def __len__(self) -> int: ...
 
     def save(self, submap: Submap, pictures: list[Picture]) -> None:
-        """Save a submap and the pictures of its keyframes. A finished submap never changes."""
+        """Save a submap and the images of its keyframes. A finished submap never changes."""
 
     def load(self, index: int) -> Submap:
-        """Return a submap, in memory of its own."""
+        """Return a submap; the caller may change it."""
         ...
 
     def picture(self, index: int, keyframe: int) -> Picture:
-        """Return what one keyframe of a submap saw."""
+        """Return the images of one keyframe of a submap."""
         ...
 
 
@@ -68,7 +68,7 @@ class MemoryStore:
         return len(self.submaps)
 
     def save(self, submap: Submap, pictures: list[Picture]) -> None:
-        """Save a submap. Raises SigmaSplatError unless it is the next one and has a picture per keyframe."""
+        """Save a submap. Raises SigmaSplatError unless it is the next one and has images for each keyframe."""
         refuse_misfit(submap, pictures, len(self))
         self.submaps.append(submap)
         self.pictures.append(pictures)
@@ -78,12 +78,12 @@ class MemoryStore:
         return self.submaps[index]
 
     def picture(self, index: int, keyframe: int) -> Picture:
-        """Return what one keyframe of a submap saw."""
+        """Return the images of one keyframe of a submap."""
         return self.pictures[index][keyframe]
 
 
 def refuse_misfit(submap: Submap, pictures: list[Picture], next_index: int) -> None:
-    """Raise SigmaSplatError if a submap is not the next one to save, or its keyframes and pictures do not match."""
+    """Raise SigmaSplatError if a submap is not the next one to save, or its keyframes and images do not match."""
     if submap.index != next_index:
         raise SigmaSplatError(f"submap {submap.index} cannot be saved: the next index is {next_index}")
     if not len(submap.frames) == len(submap.T_submap_camera) == len(pictures):

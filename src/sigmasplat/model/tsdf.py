@@ -1,8 +1,9 @@
 """Fuse depth images into a truncated signed distance field on sparse blocks of voxels (VarSplat §7).
 
-A voxel holds the weighted mean of D − z over the images that see it: z is its depth, D that of the surface in its
-pixel, + in front, − behind. D is taken at the very point of the image where the voxel projects, not at the pixel's
-centre: the inverse depth of a plane is affine in (u, v), so a slope in the image carries it there exactly.
+A voxel contains the weighted mean of D − z over the images that see it. z is its depth; D is the depth of the surface
+in its pixel. The value is positive in front of the surface and negative behind it. D is taken at the exact point where
+the voxel projects, not at the centre of the pixel. The inverse depth of a plane is affine in (u, v), so its slope in
+the image gives D at that point exactly.
 """
 
 from dataclasses import dataclass
@@ -13,10 +14,10 @@ from numpy.typing import NDArray
 from sigmasplat.errors import ConfigError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.types import Matrix
 
 Floats = NDArray[np.float32]
 Image = NDArray[np.floating]
-Doubles = NDArray[np.float64]
 Keys = NDArray[np.int64]
 
 BLOCK = 8
@@ -32,13 +33,13 @@ LOCAL = np.stack(np.meshgrid(*[np.arange(BLOCK)] * 3, indexing="ij"), -1).reshap
 
 
 class Tsdf:
-    """Blocks of 8³ voxels, allocated where surfaces are; voxel (i, j, k) lies at (i, j, k) · voxel_m in the world.
+    """Blocks of 8³ voxels, allocated near surfaces; voxel (i, j, k) is at (i, j, k) · voxel_m in the world.
 
-    Memory: 24 bytes a voxel: distance in units of the truncation, weight, colour, weight of the colour.
+    Memory: 24 bytes per voxel: distance in units of the truncation, weight, colour, weight of the colour.
     """
 
     def __init__(self, voxel_m: float = 0.01, truncation_m: float = 0.04) -> None:
-        """Start empty. Raises ConfigError unless 0 < 2 · voxel_m ≤ truncation_m."""
+        """Make an empty field. Raises ConfigError unless 0 < 2 · voxel_m ≤ truncation_m."""
         if not (0.0 < 2.0 * voxel_m <= truncation_m < np.inf):
             raise ConfigError(
                 f"a voxel must be above 0 and at most half the truncation, found {voxel_m} m and {truncation_m} m"
@@ -48,7 +49,7 @@ class Tsdf:
         self._pages: list[Floats] = []
 
     def __len__(self) -> int:
-        """Count the blocks."""
+        """Return the number of blocks."""
         return len(self._keys)
 
     @property
@@ -57,7 +58,7 @@ class Tsdf:
         return unpacked(self._keys)
 
     def find(self, blocks: Keys) -> NDArray[np.intp]:
-        """Return each block's number [N] by its coordinates [N, 3], −1 where it was never allocated."""
+        """Return the number [N] of each block from its coordinates [N, 3], −1 if it was never allocated."""
         if not len(self._keys):
             return np.full(len(blocks), -1, np.intp)
         wanted = packed(blocks)
@@ -65,7 +66,7 @@ class Tsdf:
         return np.where(self._keys[place] == wanted, self._numbers[place], -1)
 
     def voxels(self, numbers: NDArray[np.intp], plane: int) -> Floats:
-        """Return one plane of blocks by number: [N, 512]."""
+        """Return one plane of the blocks with these numbers: [N, 512]."""
         out = np.empty((len(numbers), BLOCK**3), np.float32)
         pages, rows = np.divmod(numbers, BLOCKS_PER_PAGE)
         for page in np.unique(pages):
@@ -74,7 +75,7 @@ class Tsdf:
         return out
 
     def at(self, numbers: NDArray[np.intp], local: NDArray[np.intp]) -> Floats:
-        """Return all planes of single voxels [N, 6] by their block's number and their place in it."""
+        """Return all planes of single voxels [N, 6], given by block number and index in the block."""
         out = np.empty((len(numbers), 6), np.float32)
         pages, rows = np.divmod(numbers, BLOCKS_PER_PAGE)
         for page in np.unique(pages):
@@ -87,7 +88,7 @@ class Tsdf:
         depth_m: Image,
         color: Image,
         camera: Camera,
-        T_world_camera: Doubles,
+        T_world_camera: Matrix,
         weight: Image | None = None,
     ) -> None:
         """Add an image: depth [H, W] m, 0 = no reading; color [H, W, 3]; weight [H, W] ≥ 0 per pixel (default 1).
@@ -104,7 +105,7 @@ class Tsdf:
                 a, b, z = (corners[k, at, None] + steps[k] for k in range(3))
                 self._update(self._pages[page], numbers[at] % BLOCKS_PER_PAGE, image, a, b, z)
 
-    def _allocate(self, image: "_Image", T_world_camera: Doubles) -> None:
+    def _allocate(self, image: "_Image", T_world_camera: Matrix) -> None:
         """Allocate the blocks near the surface: within the truncation along z, or one voxel in any direction."""
         R, t = T_world_camera[:3, :3].astype(np.float32), T_world_camera[:3, 3].astype(np.float32)
         rays = image.rays @ R.T
@@ -121,8 +122,8 @@ class Tsdf:
         while len(self._pages) * BLOCKS_PER_PAGE < len(self):
             self._pages.append(np.zeros((BLOCKS_PER_PAGE, 6, BLOCK**3), np.float32))
 
-    def _in_view(self, image: "_Image", T_world_camera: Doubles) -> tuple[NDArray[np.intp], Floats]:
-        """Return numbers [N] and projected first corners [3, N] of the blocks that may be visible, by number."""
+    def _in_view(self, image: "_Image", T_world_camera: Matrix) -> tuple[NDArray[np.intp], Floats]:
+        """Return numbers [N] and projected first corners [3, N] of the blocks that may be visible, sorted by number."""
         T, edge_m = se3.inverse(T_world_camera), BLOCK * self.voxel_m
         corners = self.blocks * edge_m @ T[:3, :3].T + T[:3, 3]
         seen = image.may_see(corners + T[:3, :3].sum(1) * edge_m / 2, np.sqrt(0.75) * edge_m, self.truncation_m)
@@ -131,7 +132,7 @@ class Tsdf:
         return self._numbers[seen][order], np.stack([a, b, z])
 
     def _update(self, page: Floats, rows: NDArray[np.intp], image: "_Image", a: Floats, b: Floats, z: Floats) -> None:
-        """Average the image into a page's rows [N]; voxels at pixel (a/z, b/z) and depth z, [N, 512] each."""
+        """Average the image into the rows [N] of a page; voxels are at pixel (a/z, b/z) and depth z, [N, 512] each."""
         distance, weight, pixel = image.distances(a, b, z)
         weight *= distance > -self.truncation_m
         touched = np.flatnonzero(weight.any(1))
@@ -147,7 +148,7 @@ class Tsdf:
 
 
 def _average(voxels: Floats, planes: tuple[int, ...], total: int, values: list[Floats], weight: Floats) -> None:
-    """Move the planes' weighted means, whose weight so far is plane `total`, towards new values of given weight."""
+    """Update weighted means with new values of given weight; plane `total` contains the weight so far."""
     voxels[:, total] += weight
     gain = weight / np.maximum(voxels[:, total], np.float32(1e-12))
     for plane, value in zip(planes, values, strict=True):
@@ -156,9 +157,8 @@ def _average(voxels: Floats, planes: tuple[int, ...], total: int, values: list[F
 
 @dataclass(frozen=True, eq=False)
 class _Image:
-    """A prepared image: depth_m [P] and rays [P, 3] of the pixels with weight, and flat planes [(H+2)·(W+2)] with a
-    border of one pixel of weight 0: inverse depth w, its slopes per pixel, weight, red, green, blue.
-    """
+    """A prepared image: depth_m [P] and rays [P, 3] of the pixels with weight, and flat planes [(H+2)·(W+2)]: inverse
+    depth w, its slopes per pixel, weight, red, green, blue. The border of one pixel has weight 0."""
 
     camera: Camera
     depth_m: Floats
@@ -171,7 +171,7 @@ class _Image:
 
     @staticmethod
     def of(depth_m: Image, color: Image, camera: Camera, weight: Image | None) -> "_Image":
-        """Prepare an image; a pixel counts where it has depth and weight."""
+        """Prepare an image; a pixel counts if it has depth and weight."""
         depth_m = depth_m.astype(np.float32)
         weight = (depth_m > 0) * (np.float32(1.0) if weight is None else weight)
         use = weight > 0
@@ -181,7 +181,7 @@ class _Image:
         return _Image(camera, depth_m[use], camera.rays()[use], w, u, v, weight, rgb)
 
     def distances(self, a: Floats, b: Floats, z: Floats) -> tuple[Floats, Floats, NDArray[np.intp]]:
-        """Return D − z, weight and flat pixel of voxels that project to (a/z, b/z) at depth z."""
+        """Return D − z, weight and flat pixel index of voxels that project to (a/z, b/z) at depth z."""
         per_z = np.float32(1.0) / np.maximum(z, np.float32(NEAR_M))
         u, v = a * per_z, b * per_z
         column, row = np.clip(np.rint(u), -1, self.camera.width), np.clip(np.rint(v), -1, self.camera.height)
@@ -190,7 +190,7 @@ class _Image:
         w = self.inverse[pixel] + self.slope_u[pixel] * (u - column) + self.slope_v[pixel] * (v - row)
         return np.float32(1.0) / np.maximum(w, np.float32(1e-6)) - z, self.weight[pixel], pixel
 
-    def may_see(self, centers: Doubles, radius_m: float, reach_m: float) -> NDArray[np.bool_]:
+    def may_see(self, centers: Matrix, radius_m: float, reach_m: float) -> NDArray[np.bool_]:
         """Return which spheres (centers [N, 3], camera frame) may be in view and not behind all surfaces."""
         c, z = self.camera, centers[:, 2]
         least = self.inverse - 0.5 * (np.abs(self.slope_u) + np.abs(self.slope_v))
@@ -203,9 +203,10 @@ class _Image:
 
 
 def _slope(w: Floats, axis: int) -> Floats:
-    """Return the smaller of the differences to both neighbours along an axis, 0 where they disagree in sign (minmod).
+    """Return the smaller of the differences to both neighbours along an axis, 0 if their signs differ (minmod).
 
-    A surface's last pixel before an edge then takes no slope from the other side, and w stays above 0 in the pixel.
+    At an edge, the last pixel of a surface thus gets no slope from the other surface, and w stays positive in the
+    pixel.
     """
     w = np.moveaxis(w, axis, 0)
     step = np.where((w[1:] > 0) & (w[:-1] > 0), w[1:] - w[:-1], np.float32(0.0))
@@ -215,24 +216,24 @@ def _slope(w: Floats, axis: int) -> Floats:
     return np.moveaxis(np.where(ahead * behind > 0, smaller, np.float32(0.0)), 0, axis)
 
 
-def _projected(points: NDArray[np.floating], camera: Camera, R: Doubles | None = None) -> Floats:
-    """Return (fx x + cx z, fy y + cy z, z) [3, N] of points [N, 3], turned by R first."""
+def _projected(points: NDArray[np.floating], camera: Camera, R: Matrix | None = None) -> Floats:
+    """Return (fx x + cx z, fy y + cy z, z) [3, N] of points [N, 3], rotated by R first."""
     x, y, z = (points if R is None else points @ R.T).T
     return np.stack([camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z, z]).astype(np.float32)
 
 
 def packed(blocks: Keys) -> Keys:
-    """Write block coordinates [N, 3], each within ±2²⁰, as one ordered number [N]."""
+    """Return block coordinates [N, 3], each within ±2²⁰, as one number [N] that keeps their order."""
     x, y, z = (blocks + (1 << 20)).T
     return np.asarray((x << 42) | (y << 21) | z)
 
 
 def unpacked(keys: Keys) -> Keys:
-    """Return the coordinates [N, 3] of `packed` numbers."""
+    """Return the coordinates [N, 3] of packed numbers."""
     mask = (1 << 21) - 1
     return np.stack([keys >> 42, (keys >> 21) & mask, keys & mask], -1) - (1 << 20)
 
 
 def _runs(keys: Keys) -> Keys:
-    """Drop adjacent repetitions: most neighbours share a block, and sorting all of them would be slow."""
+    """Drop adjacent duplicates. Most neighbours share a block, so this makes the sorting much faster."""
     return keys[np.concatenate([[True], keys[1:] != keys[:-1]])] if len(keys) else keys

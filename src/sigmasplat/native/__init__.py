@@ -1,1 +1,1 @@
-"""Hold the compiled kernels: `_core`, built from the sources beside this file; it takes arrays and links no torch."""
+"""The compiled kernels: `_core`, built from the sources in this folder. It takes arrays and does not link torch."""

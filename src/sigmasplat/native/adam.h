@@ -1,9 +1,9 @@
-// Adam (Kingma & Ba 2015) on parameter rows [n, 17], a learning rate per column (0 freezes it). Only rows in view are
-// stepped. What dense Adam would have done to a row meanwhile - coast on its moments, which decay - is made up for when it is
-// seen again, or by `adam_settle`; fit/adam.py is the definition.
+// Adam (Kingma & Ba 2015) on parameter rows [n, 17], with a learning rate per column (0 freezes it). Only rows in view
+// are stepped. Dense Adam would also move the other rows, because their moments decay slowly. This missed motion is
+// added when a row is visible again, or by `adam_settle`. fit/adam.py is the definition.
 
 struct AdamRates {
-    alignas(64) float rate[ROW * W];                  // rates of W rows on end: 17 whole vectors
+    alignas(64) float rate[ROW * W];                  // rates of W consecutive rows: 17 whole vectors
     float beta1, beta2, epsilon, unbias1, unbias2;
     int step;
     explicit AdamRates(const AdamOptions& o)
@@ -13,10 +13,10 @@ struct AdamRates {
     }
 };
 
-// What a row that last moved at step `last` has to make up for before step `to`.
+// The motion and decay that a row missed between step `last`, when it last moved, and step `to`.
 struct Absence {
-    float decay1, decay2;                             // of the moments, by step `to`
-    float coasted, unbias1, unbias2;                  // steps' worth of its last one: Σ (β1/√β2)^j, j = 1 … to − last (− 1)
+    float decay1, decay2;                             // decay of both moments up to step `to`
+    float coasted, unbias1, unbias2;                  // missed motion in steps like the last: Σ (β1/√β2)^j, j = 1 … to − last (− 1)
     Absence(const AdamRates& a, int last, bool stepped) {
         const int age = a.step - last, missed = stepped ? age - 1 : age;
         decay1 = __builtin_powf(a.beta1, float(age));
@@ -48,7 +48,7 @@ SIGMA_INLINE void adam_row(const AdamRates& a, const Absence& away, const float*
     for (int k = 0; k < 3; k++) memcpy(from[k], t[k], ROW * sizeof(float));
 }
 
-// Step the seen among rows i … i+W−1; gradient in lanes.
+// Step the visible rows (`seen`) among rows i … i+W−1; the gradient is in lanes.
 SIGMA_INLINE void adam_rows(const AdamRates& a, float* params, const AdamState& state, int64_t i, int64_t n, unsigned seen,
                             const float (*gradient)[W]) {
     alignas(64) float g[ROW * W + W];
@@ -72,7 +72,7 @@ SIGMA_INLINE void adam_rows(const AdamRates& a, float* params, const AdamState& 
     }
 }
 
-// Bring every row to the present step: what was not seen lately has coasted, its moments have decayed.
+// Apply the missed motion and decay to every row.
 static void adam_settle(float* params, int64_t n, AdamState state, AdamOptions options) {
     const AdamRates a(options);
 #pragma omp parallel for schedule(static)

@@ -1,10 +1,11 @@
-// Direct alignment on a CPU: the normal equations of one step, and the loop, whose steps of a tenth of a millisecond do not wait for
-// Python. H [21] upper triangle, b [6], sums [4], S [21], upper triangle of Σ b_c b_cᵀ over cells c of CELL×CELL pixels.
+// Direct alignment on a CPU: the normal equations of one step, and the loop. The loop is in C++ because a step takes
+// only a tenth of a millisecond. H [21] upper triangle, b [6], sums [4], S [21], upper triangle of Σ b_c b_cᵀ over
+// cells c of CELL×CELL pixels.
 #include "align_loop.h"
 #include "align_pixel.h"
 static_assert(CELL % W == 0, "a cell is whole vectors wide");
 
-// Residuals and derivatives of W reference pixels from (x, y): add to H and sums (acc) and to b (pull).
+// Residuals and derivatives of W reference pixels from (x, y) on. Adds to H and sums (acc) and to b (pull).
 SIGMA_INLINE void add_pixels(const AlignLevel& L, const AlignOptions& o, const Motion& T, int x, int y, vf* acc, vf* pull) {
     const size_t at = size_t(y) * L.width + x;
     const int lanes = L.width - x < W ? L.width - x : W;
@@ -27,7 +28,7 @@ static void align_step(const AlignLevel* level, const AlignOptions* o, const dou
     band_sums.reserve(size_t(bands) * NORMAL_TERMS);
 #pragma omp parallel for schedule(dynamic, 1)
     for (int band = 0; band < bands; band++) {
-        vf acc[MATRIX_TERMS + SUMS];                  // H and sums; b is taken cell by cell
+        vf acc[MATRIX_TERMS + SUMS];                  // H and sums; b is summed per cell
         for (auto& a : acc) a = splat(0.f);
         double* total = &band_sums[size_t(band) * NORMAL_TERMS];
         for (int cell = 0; cell < cells; cell++) {
@@ -53,8 +54,8 @@ static void align_step(const AlignLevel* level, const AlignOptions* o, const dou
     memcpy(S, total + 31, 21 * sizeof(double));
 }
 
-// Align from the coarsest level, `levels[count - 1]`, to the finest. T goes in as the guess and comes out as the motion; found: sums
-// of the last or best iterate of the finest level. Returns the steps taken.
+// Align from the coarsest level, `levels[count - 1]`, to the finest. T is the guess on input and the motion on output.
+// found: sums of the last or best iterate of the finest level. Returns the number of steps.
 static int align_images(const AlignLevel* levels, const AlignOptions* options, int count, AlignLoop o, double* T, double* found, int* degenerate) {
     double normal[NORMAL_TERMS];
     Descent d = begin_descent(T, count);

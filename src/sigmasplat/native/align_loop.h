@@ -1,7 +1,8 @@
-// Steps of an alignment from their normal equations: solve, move, judge, go on to the next level. In double, for one thread.
-// fit/align.py `align` says how. Includes nothing and opens no namespace; ::sqrt, ::fabs, ::sin and ::cos are known.
+// The steps of an alignment from their normal equations: solve, move, test, start the next level. In double precision,
+// for one thread. fit/align.py `align` is the description. Has no includes and no namespace; the caller provides
+// ::sqrt, ::fabs, ::sin and ::cos.
 
-// Eigenvalues and, as columns of V, eigenvectors of a symmetric 6×6 matrix, by cyclic Jacobi rotations.
+// Compute the eigenvalues of a symmetric 6×6 matrix, and its eigenvectors as columns of V, by cyclic Jacobi rotations.
 inline void eigen6(double (*A)[6], double* values, double (*V)[6]) {
     for (int i = 0; i < 6; i++)
         for (int j = 0; j < 6; j++) V[i][j] = i == j;
@@ -24,8 +25,9 @@ inline void eigen6(double (*A)[6], double* values, double (*V)[6]) {
     for (int i = 0; i < 6; i++) values[i] = A[i][i];
 }
 
-// Gauss–Newton update −H⁻¹ b within the directions whose information is more than `share` of the best one's, rotations
-// measured by the shift they make at depth_m; returns how many directions are left out (fit/align.py `_axes`).
+// Compute the Gauss–Newton update −H⁻¹ b in the directions whose information is above `share` of the largest one.
+// Rotations are measured by the shift that they cause at depth_m. Returns the number of other directions (fit/align.py
+// `_axes`).
 inline int solve_decided(const double* H, const double* b, double depth_m, double share, double* update) {
     double A[6][6], V[6][6], values[6], best = 1e-300;
     for (int i = 0, q = 0; i < 6; i++)
@@ -45,7 +47,7 @@ inline int solve_decided(const double* H, const double* b, double depth_m, doubl
 
 inline void copy(const double* from, int count, double* to) { for (int k = 0; k < count; k++) to[k] = from[k]; }
 
-// T ← exp(twist) · T, T the first three rows of a rigid motion.
+// T ← exp(twist) · T, where T is the first three rows of a rigid motion.
 inline void move_left(const double* twist, double* T) {
     const double *r = twist, *w = twist + 3, theta2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2], theta = ::sqrt(theta2);
     const bool small = theta2 < 1e-12;
@@ -68,8 +70,9 @@ inline void move_left(const double* twist, double* T) {
 
 constexpr double UNKNOWN_COST = 1.7976931348623157e308;
 
-// How far an alignment has come: T_live_reference; sums of the last step, or of the best where a level ended with that; what is
-// remembered within a level; `degenerate`: directions that its last step left out; steps of all levels.
+// The progress of an alignment. T: T_live_reference; sums: those of the last step, or of the best one if a level ended
+// with it; best… and previous: values within a level; degenerate: number of directions that the last step did not
+// change; steps: on all levels.
 struct Descent {
     double T[12], sums[4], best_T[12], best_sums[4], best, previous;
     int level, taken, steps, degenerate;
@@ -90,7 +93,8 @@ inline Descent begin_descent(const double* T, int levels) {
     return d;
 }
 
-// Take the step that the normal equations at d.T call for, in the order of NORMAL_TERMS; a level's last one goes on to the next.
+// Take the step of the normal equations at d.T, in the order of NORMAL_TERMS. The last step of a level starts the next
+// level.
 inline void take_step(Descent& d, const AlignLoop& o, const double* normal) {
     copy(normal + 27, 4, d.sums);
     d.steps++;

@@ -1,10 +1,10 @@
-// What one reference pixel says of a motion, or as many as a vector has lanes: a reference image with depth, warped into the live
-// image by T_live_reference. Residuals: gray difference and depth difference, Huber weighted; left twist increment (ρ, φ) on T.
-// Written against vf, vi, Mask and the functions of lanes.h; on a GPU a thread is a vector of one lane (align.cu says how).
-// Includes nothing and opens no namespace.
+// Residuals and derivatives of one reference pixel, or of one pixel per vector lane. A reference image with depth is
+// warped into the live image by T_live_reference. Residuals: gray difference and depth difference, with Huber weights;
+// the increment is a left twist (ρ, φ) on T. Written with vf, vi, Mask and the functions of lanes.h; on a GPU a thread
+// is a vector of one lane (see align.cu). Has no includes and no namespace.
 
-constexpr int CELL = 16;                   // pixels each way: neighbours err together, cells hardly do
-constexpr int MATRIX_TERMS = 21, SUMS = 4; // upper triangle of a symmetric 6×6; weighed cost, pixels used, in view with depth, agreeing
+constexpr int CELL = 16;                   // size in pixels: errors are correlated within a cell, hardly between cells
+constexpr int MATRIX_TERMS = 21, SUMS = 4; // upper triangle of a 6×6; cost, pixels used, in view with depth, agreeing
 constexpr int NORMAL_TERMS = MATRIX_TERMS + 6 + SUMS + MATRIX_TERMS;   // H, b, sums, and S = Σ b_c b_cᵀ over cells c
 
 struct Bilinear { vf value, dx, dy; };
@@ -14,7 +14,7 @@ SIGMA_INLINE Bilinear interpolate(vf v00, vf v10, vf v01, vf v11, vf a, vf b) {
 }
 SIGMA_INLINE vf huber_weight(vf r, vf width) { return min(splat(1.f), width / max(abs(r), splat(1e-12f))); }
 
-// The rotation and translation of T, rows of a 4×4, in the pixels' precision.
+// The rotation and translation of T (rows of a 4×4), in the precision of the pixels.
 struct Motion { float R[9], t[3]; };
 SIGMA_INLINE Motion motion_of(const double* T) {
     Motion m;
@@ -25,10 +25,10 @@ SIGMA_INLINE Motion motion_of(const double* T) {
     return m;
 }
 
-struct ReferencePixels { const float *depth, *gray, *weight_gray, *weight_depth; };   // where they lie; weights may be null
+struct ReferencePixels { const float *depth, *gray, *weight_gray, *weight_depth; };   // weights may be null
 
-// Add residuals and derivatives of reference pixels, `off_x` and `off_y` from the principal point, to H (acc, 21), sums (acc + 21, 4)
-// and b (pull, 6). inside: lanes that are pixels.
+// Add residuals and derivatives of reference pixels to H (acc, 21), sums (acc + 21, 4) and b (pull, 6). off_x, off_y:
+// position relative to the principal point. inside: lanes that are pixels of the image.
 SIGMA_INLINE void add_residuals(const AlignLevel& L, const AlignOptions& o, const Motion& T, vf off_x, float off_y, Mask inside,
                                 const ReferencePixels& pixels, vf* acc, vf* pull) {
     const float *R = T.R, *t = T.t;
@@ -54,7 +54,7 @@ SIGMA_INLINE void add_residuals(const AlignLevel& L, const AlignOptions& o, cons
     const Mask read = both(ok, gt(nearest, splat(0.f)));       // all four neighbours have a reading
     const vf r_depth = D.value - pz, r_gray = I.value - load(pixels.gray);
     const Mask agrees = both(read, gt(splat(o.depth_gate), abs(r_depth)));
-    // A depth step inside the 2×2 cell has no derivative; where the live depth is missing colour alone decides.
+    // No derivative is used where the 2×2 cell contains a depth step. Without live depth only colour is used.
     const Mask smooth = both(agrees, gt(0.03f * pz, farthest - nearest));
     const Mask color_ok = both(ok, mask_or(agrees, mask_not(read)));
     const vf weight_gray = pixels.weight_gray ? load(pixels.weight_gray) : splat(1.f), weight_depth = pixels.weight_depth ? load(pixels.weight_depth) : splat(1.f);

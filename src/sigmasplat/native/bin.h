@@ -1,7 +1,8 @@
 // Stage 2: footprints → for every tile, the splats that reach it, near to far.
 
-// Gradients sum g·x² about the tile's centre and subtract; on needles that costs digits with the square of the tile's size.
-// 32×16 is 5 % faster and misses 1e-4 on them, 16×16 does not.
+// The tile size limits the precision of gradients. They are sums of g·x² about the tile's centre, and moving them to
+// the splat's mean subtracts large numbers: on needles this costs digits in proportion to the square of the tile's
+// size. 32×16 is 5 % faster, but its error on needles is above 1e-4; with 16×16 it is below.
 // Another size is a build option: pip install . -C cmake.define.SIGMASPLAT_TILE_WIDTH=32
 constexpr int TILE_WIDTH = SIGMASPLAT_TILE_WIDTH, TILE_HEIGHT = SIGMASPLAT_TILE_HEIGHT;
 static_assert(TILE_WIDTH % 4 == 0 && TILE_HEIGHT % 4 == 0, "a tile is whole blocks");
@@ -10,23 +11,24 @@ static_assert(BLOCKS <= 64, "a tile's blocks must fit one mask");
 using BlockMask = std::conditional_t<BLOCKS <= 32, uint32_t, uint64_t>;
 
 constexpr float LOG2_E = 1.4426950408889634f;
-// Exponents are of two: alpha = 2^t, t = log2(o) − p² − q², p = L1·dx + L2·dy, q = L3·dy, L = CONIC_SCALE·l.
+// Exponents have base 2: alpha = 2^t, t = log2(o) − p² − q², p = L1·dx + L2·dy, q = L3·dy, L = CONIC_SCALE·l.
 constexpr float CONIC_SCALE = 0.8493218002880191f;    // sqrt(log2(e)/2)
 constexpr float ALPHA_MAX = 0.99f;
 
-// A splat as the pixels read it: one row of 8 floats of geometry, then its features. `tag`: where its gradients begin among
-// its chunk's slots; in a tile's own copy the splat's number (forward) or the slot of this tile (backward).
+// A splat as used per pixel: one row of 8 floats of geometry, then its features. `tag`: the first slot of its gradients
+// among the slots of its chunk. In a tile's own copy, `tag` is the splat's number (forward) or the slot of this tile
+// (backward).
 struct Geometry { float l1, l2, l3, u, v, log_opacity, z; int tag; };
 constexpr int GEOMETRY = sizeof(Geometry) / sizeof(float);
 struct Box { uint16_t x0, y0, x1, y1; };              // in blocks, inclusive
 
-constexpr int ALPHA_CHUNK = 32;                       // entries of a block's list dealt with together
-typedef float Pixels[W];                              // a number of each of a block's pixels
-struct AlphaBuffer {                                  // one chunk of a block's splats that survive the alpha test
+constexpr int ALPHA_CHUNK = 32;                       // entries of a block's list processed together
+typedef float Pixels[W];                              // one number per pixel of a block
+struct AlphaBuffer {                                  // one chunk of a block's splats that pass the alpha test
     alignas(64) Pixels alpha[ALPHA_CHUNK + 4];
     int entry[ALPHA_CHUNK + 4];
 };
-struct Walk {                                         // all of a block's splats that survive it, near to far: for the way back
+struct Walk {                                         // all splats of a block that pass it, near to far: for the backward pass
     Buffer<Pixels> alpha, weight, gain;
     Buffer<int> entry;
     alignas(64) float pairs[ALPHA_CHUNK][2 * W];
@@ -34,9 +36,9 @@ struct Walk {                                         // all of a block's splats
     size_t bytes() const { return alpha.bytes() + weight.bytes() + gain.bytes() + entry.bytes(); }
 };
 struct Center { float u, v; };
-struct Scratch {                                      // one thread's tile
+struct Scratch {                                      // buffers of one thread for its tile
     Buffer<float> rows, records;
-    Buffer<Center> centers;                           // from the tile's centre
+    Buffer<Center> centers;                           // relative to the tile's centre
     Buffer<BlockMask> masks;
     Buffer<int> lists;
     Buffer<uint64_t> sorted;
@@ -51,12 +53,12 @@ struct Scratch {                                      // one thread's tile
 };
 
 
-// The feature counts compiled in; a count between them is padded with zeros.
+// The compiled feature counts; other counts are padded with zeros.
 constexpr int feature_slots(int k) { return k <= 4 ? 4 : k <= 7 ? 7 : k <= 11 ? 11 : 16; }
-// Floats of a row; the shortest fill a cache line, so that no row crosses two lines.
+// Number of floats in a row. The shortest rows fill a cache line, so that no row crosses two lines.
 constexpr int floats_of_row(int k) { return k <= 8 ? 16 : GEOMETRY + (k + 3) / 4 * 4; }
 template <int K> constexpr int row_floats = floats_of_row(K);
-template <class F> SIGMA_INLINE void with_features(int k, F f) {   // K is compiled in: colour + depth pays for no variance
+template <class F> SIGMA_INLINE void with_features(int k, F f) {   // K is compiled in: colour + depth has no cost for variance
     switch (k) {
         case 4: f(std_int<4>{}); break;
         case 7: f(std_int<7>{}); break;
@@ -65,14 +67,14 @@ template <class F> SIGMA_INLINE void with_features(int k, F f) {   // K is compi
     }
 }
 
-struct Render {                                       // what one forward pass leaves for its backward pass
+struct Render {                                       // what a forward pass stores for its backward pass
     int64_t n = 0;
     int k = 0, used = 0, row = 0, width = 0, height = 0, tiles_x = 0, tiles_y = 0;
     View<float> view;
     BlendOptions options;
     const float* reference = nullptr;
     int64_t intersections = 0;
-    Buffer<float> rows, depths, partials;             // depths are in the rows too, but those are sixteen times as long
+    Buffer<float> rows, depths, partials;             // depths are also in the rows, which are sixteen times as long
     Buffer<Box> boxes;
     Buffer<int> tiles_of, tile_begin, histogram, chunk_begin;   // chunk_begin: first slot of each chunk
     Buffer<uint64_t> items;
@@ -103,7 +105,7 @@ struct Render {                                       // what one forward pass l
     }
 };
 
-// Turn W columns at a time, of geometry and then of features, into the next W floats of the rows of the splats that are live.
+// Transpose W columns at a time, first geometry and then features, into the next W floats of the rows of live splats.
 template <int ROW_FLOATS, int C = 0>
 SIGMA_INLINE void store_columns(float* rows, unsigned live, const vf* geometry, const float (*features)[W]) {
     if constexpr (C < ROW_FLOATS) {
@@ -120,9 +122,9 @@ SIGMA_INLINE void store_columns(float* rows, unsigned live, const vf* geometry, 
     }
 }
 
-// Store W footprints and their features (lanes, padded to ROW_FLOATS - GEOMETRY of them); return how many tiles they reach, `before` being
-// the slots of the chunk in use already. Bounds are those of alpha ≥ alpha_min, not three sigma, so the image does not
-// depend on the tiling.
+// Store W footprints and their features (lanes, padded to ROW_FLOATS - GEOMETRY features). Returns how many tiles they
+// reach; `before` is the number of slots of the chunk already in use. The bounds are those of alpha ≥ alpha_min, not
+// three sigma, so the image does not depend on the tiling.
 template <int ROW_FLOATS>
 SIGMA_INLINE int pack(Render& r, const Footprint<vf>& f, vf opacity, Mask seen, int64_t i, int before, const float (*features)[W]) {
     const vf log_opacity = log2(max(opacity, splat(1e-30f)));
@@ -137,7 +139,7 @@ SIGMA_INLINE int pack(Render& r, const Footprint<vf>& f, vf opacity, Mask seen, 
     const vf y0 = clamp(-floor((float(BLOCK_HEIGHT - 1) - f.v + dv) * (1.f / BLOCK_HEIGHT)), 0.f, float(blocks_y));
     const vf y1 = clamp(floor((f.v + dv) * (1.f / BLOCK_HEIGHT)), -1.f, float(blocks_y - 1));
     seen = both(seen, both(ge(x1, x0), ge(y1, y0)));
-    seen = both(seen, both(ge(splat(r.width - 1.f), f.u - du), ge(splat(r.height - 1.f), f.v - dv)));   // not in padding only
+    seen = both(seen, both(ge(splat(r.width - 1.f), f.u - du), ge(splat(r.height - 1.f), f.v - dv)));   // not only in padding
     const unsigned live = bits(seen) & (r.n - i < W ? (1u << (r.n - i)) - 1u : ~0u);
     memset(&r.tiles_of[i], 0, W * sizeof(int));
     store(&r.depths[i], f.z);
@@ -161,8 +163,8 @@ SIGMA_INLINE int pack(Render& r, const Footprint<vf>& f, vf opacity, Mask seen, 
 
 constexpr int LINE = 8;                               // items in a cache line
 
-// Visit the tiles of a splat. Most have one or two each way: those are visited without a branch, `spare` and the two after it
-// standing for tiles that it does not have.
+// Visit the tiles of a splat. Most splats have one or two tiles in each direction. These are visited without a branch;
+// `spare` and the next two numbers replace tiles that the splat does not reach.
 template <class Visit> SIGMA_INLINE void for_tiles(const Render& r, int64_t i, int spare, Visit visit) {
     const Box b = r.boxes[i];
     const int x = b.x0 / BLOCKS_X, y = b.y0 / BLOCKS_Y, right = b.x1 / BLOCKS_X - x, down = b.y1 / BLOCKS_Y - y;
@@ -178,7 +180,7 @@ template <class Visit> SIGMA_INLINE void for_tiles(const Render& r, int64_t i, i
         for (int dx = 0; dx <= right; dx++) visit(first + dy * r.tiles_x + dx);
 }
 
-static void number_slots(Render& r) {                 // where each splat's per-tile gradients will lie
+static void number_slots(Render& r) {                 // first slot of each chunk's per-tile gradients
     const int64_t chunks = (r.n + CHUNK - 1) / CHUNK;
     int sum = 0;
     for (int64_t c = 0; c < chunks; c++) { const int t = r.chunk_begin[c]; r.chunk_begin[c] = sum; sum += t; }
@@ -188,10 +190,10 @@ static void number_slots(Render& r) {                 // where each splat's per-
 static void bin(Render& r) {
     number_slots(r);
     const int tiles = r.tiles_x * r.tiles_y, threads = omp_get_max_threads();
-    const int stride = (tiles + 3 + 2 * LINE - 1) / (2 * LINE) * (2 * LINE);   // counters of two threads never share a cache line
+    const int stride = (tiles + 3 + 2 * LINE - 1) / (2 * LINE) * (2 * LINE);   // no cache line has counters of two threads
     r.tile_begin.reserve(tiles + 1);
     r.histogram.reserve(size_t(threads) * stride);
-    r.items.reserve(r.intersections + LINE * (threads + 1));   // each thread's spare tiles lie in a cache line of its own
+    r.items.reserve(r.intersections + LINE * (threads + 1));   // each thread's spare tiles have their own cache line
 #pragma omp parallel num_threads(threads)
     {
         const int t = omp_get_thread_num(), team = omp_get_num_threads();
@@ -218,7 +220,7 @@ static void bin(Render& r) {
         for (int q = tiles; q < tiles + 3; q++) mine[q] = int(r.intersections) + LINE * (t + 1);
         for (int64_t i = begin; i < end; i++)
             if (r.tiles_of[i]) {
-                uint32_t depth_bits;                  // positive floats order as their bits
+                uint32_t depth_bits;                  // positive floats have the same order as their bits
                 memcpy(&depth_bits, &r.depths[i], 4);
                 const uint64_t item = uint64_t(depth_bits) << 32 | uint32_t(i);
                 for_tiles(r, i, tiles, [&](int tile) {

@@ -1,4 +1,5 @@
-// Offer the kernels to Python: arrays in, arrays out, no copies, the GIL released; the instruction set chosen at run time.
+// Python bindings of the kernels: arrays in, arrays out, no copies, the GIL released; the instruction set is chosen at
+// run time.
 #include <cmath>
 #include <cstring>
 #include <memory>
@@ -66,7 +67,7 @@ static Outputs outputs(Floats& sums, Maybe<Floats>& moment, Floats& alpha, Maybe
     return {sums.data(), pointer(moment), alpha.data(), pointer(median_id), pointer(median_weight), pointer(dominant_id), pointer(dominant_weight)};
 }
 
-// One level of two images to align, and how their residuals are weighed; holds on to the arrays.
+// One level of two images to align, and the weights of its residuals. Keeps references to the arrays.
 struct Level {
     ConstFloats reference_gray, reference_depth;
     Maybe<ConstFloats> weight_gray, weight_depth;
@@ -93,7 +94,7 @@ static TrackOptions track_options(const std::vector<float>& v, bool uncertainty,
     return {v[0], v[1], v[2], v[3], v[4], v[5], v[6], uncertainty, kept};
 }
 
-// The buffers of one render, bound to the instruction set that was active when it was made.
+// The buffers of one render, for the instruction set that was active when it was made.
 class Rasteriser {
 public:
     Rasteriser() : kernels(active), context(kernels->create()) {}
@@ -187,7 +188,7 @@ static void project_double(Doubles view, Doubles means, Doubles quats, Doubles s
 }
 
 NB_MODULE(_core, m) {
-    nb::set_leak_warnings(false);         // autograd graphs may outlive the interpreter's orderly end
+    nb::set_leak_warnings(false);         // autograd graphs can outlive the interpreter's orderly shutdown
     m.doc() = "SigmaSplat's CPU kernels. Arrays are float32, C-contiguous, on the CPU; see sigmasplat.render.cpu for the shapes.";
     m.def("isa_name", [] { return std::string(active->name); });
     m.def("supported_isas", [] { std::vector<std::string> names; for (auto* k : supported()) names.push_back(k->name); return names; });

@@ -1,7 +1,8 @@
-// Stage 3: tiles → pixels. A tile is cut into blocks of W pixels; lanes are pixels; a block walks its own list of
-// splats near to far. Alphas come first, a chunk at a time, so that the transmittance chain stays one multiply-add long.
+// Stage 3: tiles → pixels. A tile is divided into blocks of W pixels, one pixel per lane. Each block processes its own
+// list of splats, near to far. Alphas are computed first, one chunk at a time, so that the dependency chain of the
+// transmittance is one multiply-add per splat.
 
-constexpr int AHEAD = 24;                             // splats fetched before they are needed
+constexpr int AHEAD = 24;                             // number of splats to prefetch
 struct Tile { int index, x, y, count; };              // x, y: pixel of its corner
 
 SIGMA_INLINE BlockMask block_mask(Box b, int tile_bx, int tile_by) {
@@ -15,7 +16,8 @@ SIGMA_INLINE BlockMask block_mask(Box b, int tile_bx, int tile_by) {
     return BlockMask((columns * every_row) & span);
 }
 
-// List, block by block, which of a tile's n splats reach it, in order; each list ends in four entries that are never alive.
+// For each block, list in order which of a tile's n splats reach it. Each list ends with four entries that are never
+// alive.
 SIGMA_INLINE void list_blocks(Scratch& s, int n) {
     s.list_capacity = size_t(n) + W + 4;
     s.lists.reserve(s.list_capacity * BLOCKS);
@@ -46,7 +48,7 @@ SIGMA_INLINE void list_blocks(Scratch& s, int n) {
         for (int q = 0; q < 4; q++) s.lists[b * s.list_capacity + s.counts[b] + q] = n;
 }
 
-// Bring a tile's splats together, near to far, coordinates about the tile's centre, and list them per block.
+// Copy a tile's splats, near to far, with coordinates relative to the tile's centre, and list them per block.
 template <int ROW_FLOATS, bool BACKWARD> static Tile gather_tile(const Render& r, Scratch& s, int index) {
     const int begin = r.tile_begin[index], n = r.tile_begin[index + 1] - begin;
     const int tx = index % r.tiles_x, ty = index / r.tiles_x;
@@ -82,7 +84,7 @@ template <int ROW_FLOATS, bool BACKWARD> static Tile gather_tile(const Render& r
         s.masks[k] = block_mask(box, tx * BLOCKS_X, ty * BLOCKS_Y);
     }
     memset(&s.masks[n], 0, W * sizeof(BlockMask));
-    memset(&s.rows[n * row], 0, row_bytes);           // what the lists end in: never alive
+    memset(&s.rows[n * row], 0, row_bytes);           // the entry at the end of each list: never alive
     reinterpret_cast<Geometry*>(&s.rows[n * row])->log_opacity = -1e30f;
     list_blocks(s, n);
     return tile;
@@ -99,7 +101,7 @@ SIGMA_INLINE vf block_y(int b) {
     return y;
 }
 
-// Where the planes hold block b of a tile.
+// Return the position of a tile's block b in the planes.
 SIGMA_INLINE size_t block_at(const Tile& tile, int b, size_t stride) {
     return (tile.y + size_t(b / BLOCKS_X) * BLOCK_HEIGHT) * stride + tile.x + b % BLOCKS_X * BLOCK_WIDTH;
 }
@@ -108,7 +110,8 @@ template <int ROW_FLOATS> SIGMA_INLINE const Geometry& geometry_of(const float* 
     return *reinterpret_cast<const Geometry*>(rows + size_t(entry) * ROW_FLOATS);
 }
 
-// Alphas of up to ALPHA_CHUNK entries of a block's list; entries that reach no live pixel are dropped, without a branch.
+// Compute alphas of up to ALPHA_CHUNK entries of a block's list. Entries that reach no live pixel are dropped, without
+// a branch.
 template <int ROW_FLOATS> SIGMA_INLINE int live_alphas(const float* rows, const int* list, int begin, int end, vf x, vf y, Mask alive,
                              float log_alpha_min, Pixels* alpha, int* entry) {
     const vf floor_ = splat(log_alpha_min), top = splat(ALPHA_MAX);

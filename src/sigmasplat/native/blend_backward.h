@@ -1,7 +1,8 @@
-// Stage 3 backwards: gradients on pixels → a record for each splat of each tile → sums for each splat. docs/kernels.md derives it.
+// Stage 3 backwards: gradients on pixels → a record per tile and splat → sums per splat. Derivation: docs/kernels.md.
 
-// A splat's gradient in one tile: 8 interleaved pairs (even: sums of g·{1, x, y, xx, xy, yy}; odd: sums of w·∂L/∂feature),
-// then the features that did not fit. With a moment, two further w-sums: 2·∂L/∂moment and its product with −ref.
+// The record of a splat's gradient in one tile. First 8 interleaved pairs (even: sums of g·{1, x, y, xx, xy, yy}; odd:
+// sums of w·∂L/∂feature), then the remaining features. With a moment there are two more w-sums: 2·∂L/∂moment and its
+// product with −ref.
 template <int K, bool MOMENT> constexpr int weight_columns = K + (MOMENT ? 2 : 0);
 template <int K, bool MOMENT> constexpr int extra_floats =
     weight_columns<K, MOMENT> <= 8 ? 0 : (weight_columns<K, MOMENT> - 8 + W - 1) / W * W;
@@ -41,8 +42,8 @@ template <int K, bool MOMENT> SIGMA_INLINE PixelGradients<K> gradients_at(const 
     return on_pixels;
 }
 
-// What each pixel's pair (g, w) is multiplied with: a row for every pixel, in the order of `store_pairs`, a column for every sum
-// of the record.
+// The factors of each pixel's pair (g, w): one row per pixel, in the order of `store_pairs`, and one column per sum of
+// the record.
 template <int K, bool MOMENT> using Basis = float[W][record_floats<K, MOMENT>];
 template <int K, bool MOMENT> SIGMA_INLINE void store_basis(const PixelGradients<K>& on_pixels, vf x, vf y, Basis<K, MOMENT>& basis) {
     constexpr int COLUMNS = record_floats<K, MOMENT>;
@@ -62,7 +63,8 @@ template <int K, bool MOMENT> SIGMA_INLINE void store_basis(const PixelGradients
     }
 }
 
-// Near to far: note of each splat that reaches a live pixel its alpha, its weight w and its gain G = ∂L/∂w. Returns how many there are.
+// Near to far: store alpha, weight w and gain G = ∂L/∂w of each splat that reaches a live pixel. Returns the number of
+// these splats.
 template <int ROW_FLOATS, int K, bool MOMENT>
 SIGMA_INLINE int walk_out(const float* rows, const int* list, int count, vf x, vf y, const PixelGradients<K>& on_pixels,
                           float log_alpha_min, vf stop, Walk& walk) {
@@ -94,7 +96,7 @@ SIGMA_INLINE int walk_out(const float* rows, const int* list, int count, vf x, v
 // Add one splat's sums over a block's pixels to its record: pairs times basis.
 template <int K, bool MOMENT> SIGMA_INLINE void add_to_record(const float* pairs, const Basis<K, MOMENT>& basis, float* record) {
     constexpr int EXTRA = extra_floats<K, MOMENT>;
-    vf acc[16 / W][2], rest[EXTRA ? EXTRA / W : 1];       // two chains: the sum waits half as long
+    vf acc[16 / W][2], rest[EXTRA ? EXTRA / W : 1];       // two chains of additions, so that each waits half as long
     for (int h = 0; h < 16 / W; h++) { acc[h][0] = load(record + h * W); acc[h][1] = splat(0.f); }
     for (int h = 0; h < EXTRA / W; h++) rest[h] = load(record + 16 + h * W);
 #pragma GCC unroll 16
@@ -110,8 +112,9 @@ template <int K, bool MOMENT> SIGMA_INLINE void add_to_record(const float* pairs
     for (int h = 0; h < EXTRA / W; h++) store(record + 16 + h * W, rest[h]);
 }
 
-// Far to near: with C the gain of a unit of light that comes from behind a splat, ∂L/∂α = T·(G − C), and C ← (1 − α)·C + α·G.
-// Walls in front do not enter; were C a difference of sums over all splats, rounding would leave nothing of it where T is small.
+// Far to near. C is the gain of one unit of light from behind a splat: ∂L/∂α = T·(G − C), then C ← (1 − α)·C + α·G. C
+// is not computed as a difference of sums over all splats: where T is small, opaque splats in front would leave only
+// rounding errors in it.
 template <int K, bool MOMENT>
 SIGMA_INLINE void walk_back(int n, const Basis<K, MOMENT>& basis, Walk& walk, float* records) {
     const Pixels *const alphas = walk.alpha.data, *const weights = walk.weight.data, *const gains = walk.gain.data;
@@ -130,8 +133,8 @@ SIGMA_INLINE void walk_back(int n, const Basis<K, MOMENT>& basis, Walk& walk, fl
     }
 }
 
-// Walk every tile's pixels once more and hand its records to `finish(scratch, tile)`. The first K of a row's ROW_K features
-// have gradients; the others have none and are passed over.
+// Process every tile's pixels again and pass its records to `finish(scratch, tile)`. The first K of a row's ROW_K
+// features have gradients; the others are skipped.
 template <int ROW_K, int K, bool MOMENT, class Finish>
 static void blend_tiles_backward(Render& r, OutputGradients g, Finish finish) {
     constexpr int RECORD = record_floats<K, MOMENT>;
@@ -157,11 +160,11 @@ static void blend_tiles_backward(Render& r, OutputGradients g, Finish finish) {
             }
             finish(s, tile);
         }
-        fence();                                      // records may have been streamed
+        fence();                                      // records may have been written past the caches
     }
 }
 
-// Move a record's moments from the tile's centre to the splat's mean at (u, v) from there.
+// Move the centre of a record's moments from the tile's centre to the splat's mean, at (u, v) relative to it.
 template <class T> SIGMA_INLINE void shift_moments(T m0, T& mx, T& my, T& mxx, T& mxy, T& myy, T u, T v) {
     mxx += u * (u * m0 - 2.f * mx);
     mxy += u * (v * m0 - my) - v * mx;
@@ -170,7 +173,7 @@ template <class T> SIGMA_INLINE void shift_moments(T m0, T& mx, T& my, T& mxx, T
     my -= v * m0;
 }
 
-// Move a tile's records to each splat's own slots, moments now about the splat's mean.
+// Copy a tile's records to each splat's own slots; the moments are now about the splat's mean.
 template <int RECORD> static void flush_records(Render& r, Scratch& s, const Tile& tile) {
     for (int k = 0; k < tile.count; k++) {
         float* m = &s.records[size_t(k) * RECORD];
@@ -183,7 +186,7 @@ template <int RECORD> static void flush_records(Render& r, Scratch& s, const Til
     }
 }
 
-// Sum W splats' per-tile records in slot order and turn them to lanes, sums[column][lane]; `slot` walks on.
+// Sum the per-tile records of W splats in slot order and transpose them to lanes, sums[column][lane]; advances `slot`.
 template <int RECORD> SIGMA_INLINE void reduce_records(const Render& r, int64_t i, int& slot, float (*sums)[W]) {
     constexpr int PARTS = RECORD / W;
     vf turn[PARTS][W];
@@ -199,10 +202,10 @@ template <int RECORD> SIGMA_INLINE void reduce_records(const Render& r, int64_t 
     }
 }
 
-// ∂L/∂feature c of W splats, from their reduced records.
+// ∂L/∂feature c of W splats, from their summed records.
 SIGMA_INLINE vf weight_sum(const float (*sums)[W], int c) { return load(sums[c < 8 ? 2 * c + 1 : 8 + c]); }
 
-// ∂L/∂(mean, conic) of W splats: power = −½(p² + q²), so every derivative is a moment of g about the splat's mean.
+// ∂L/∂(mean, conic) of W splats. power = −½(p² + q²), so every derivative is a moment of g about the splat's mean.
 struct Moments { vf m[6]; };                           // Σ g·{1, x, y, xx, xy, yy} about the splat's mean
 SIGMA_INLINE Moments moments_of(const float (*sums)[W]) {
     Moments a;

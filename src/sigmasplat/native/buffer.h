@@ -1,5 +1,5 @@
-// Keep memory between iterations: a growing, 64-byte aligned array of plain values.
-// Lives in the ISA's namespace so that no inline function compiled for AVX-512 can be picked by the linker for another ISA.
+// Memory that is kept between iterations: a growing, 64-byte aligned array of plain values. It is in the namespace of
+// the instruction set, so that the linker cannot use an inline function compiled for AVX-512 in code for another one.
 template <class T> struct Buffer {
     T* data = nullptr;
     size_t capacity = 0;
@@ -7,7 +7,7 @@ template <class T> struct Buffer {
     Buffer(const Buffer&) = delete;
     Buffer& operator=(const Buffer&) = delete;
     ~Buffer() { __builtin_free(data); }
-    // Make room for n values; what was there is lost when it grows, new memory is zero.
+    // Make room for n values. If the buffer grows, the old values are lost and the new memory is zero.
     T* reserve(size_t n) {
         if (n > capacity) {
             __builtin_free(data);

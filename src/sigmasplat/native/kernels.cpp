@@ -1,5 +1,5 @@
-// Compile every kernel for one instruction set. CMake builds this file once per ISA with its own flags and
-// SIGMASPLAT_ISA; nothing with external linkage but the table leaves it, so no AVX-512 code can leak into the rest.
+// Compile every kernel for one instruction set. CMake builds this file once per instruction set, with its own flags and
+// SIGMASPLAT_ISA. Only the table has external linkage, so no AVX-512 code can be linked into other code.
 #include <cmath>
 #include <cstdint>
 #include <cstdlib>

@@ -1,4 +1,5 @@
-// What the kernels offer: one table of functions per instruction set, filled by kernels.cpp, chosen at run time by bind.cpp.
+// The interface of the kernels: one table of functions per instruction set. kernels.cpp fills it; bind.cpp chooses at
+// run time.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -20,7 +21,7 @@ struct Outputs {                           // planes of Hp × Wp, padded to whol
     float* median_depth = nullptr;         // with the ids, or null
 };
 
-struct OutputGradients {                   // planes like Outputs; all but sums may be null, median_id where median_depth is
+struct OutputGradients {                   // planes like Outputs; all but sums may be null; median_id goes with median_depth
     const float *sums, *moment, *alpha;
     const int* median_id = nullptr;
     const float* median_depth = nullptr;
@@ -34,14 +35,14 @@ struct DepthGradients { float *median_depth, *moment; };
 
 struct AdamOptions { const float* rates; float beta1, beta2, epsilon; int step; };   // rates: one per column
 struct StepOptions { float isotropy, isotropy_ratio; int64_t frozen_colors; };
-struct AdamState { float *moment1, *moment2; int* last_step; };                       // last_step: when a row last moved
+struct AdamState { float *moment1, *moment2; int* last_step; };                       // last_step: when a row was last stepped
 
-struct Plane { int width, height; size_t stride, plane; };   // image planes of rows `stride` floats long, `plane` floats apart
+struct Plane { int width, height; size_t stride, plane; };   // distance in floats of rows, and of image planes
 
 struct TrackOptions {                      // settings of TrackingConfig
     float alpha_above, alpha_power, outlier_factor, outlier_factor_color, weight_color, tau, weight_max;
     bool uncertainty;
-    bool kept = false;                     // errors are averaged over the pixels they keep, not over the image
+    bool kept = false;                     // errors are averaged over the used pixels, not over the image
 };
 
 #include "align_level.h"
@@ -61,7 +62,7 @@ struct Kernels {
                           const float* opacities, const float* features, int64_t n, int k, int width, int height,
                           const float* reference, BlendOptions, Outputs);
     void (*blend_backward)(Context*, OutputGradients, SplatGradients);
-    // Fused: rows of raw parameters [n, 17] straight to images of (r, g, b, z[, q, q, q]) with q = σ² + c².
+    // Fused: from rows of raw parameters [n, 17] to images of (r, g, b, z[, q, q, q]) with q = σ² + c².
     void (*view_forward)(Context*, const float* view, const float* params, int64_t n, int k, const float* reference,
                          BlendOptions, Outputs, double* seconds);
     // pull [n], or null: |∂L/∂mean| in the image, per half image size.

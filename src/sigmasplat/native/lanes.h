@@ -1,5 +1,5 @@
-// Compute on many floats at once: one vector of W lanes per instruction set, on GCC vector extensions.
-// Every kernel is written once against this page; only masks and a few moves know their instruction set.
+// Vectors of W lanes, one definition per instruction set, based on GCC vector extensions. Kernels are written once with
+// these functions; only masks and a few data movements depend on the instruction set.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -41,7 +41,7 @@ template <int COUNT> SIGMA_INLINE void store_first(float* p, vf a) {
     else memcpy(p, &a, COUNT * sizeof(float));
 #endif
 }
-SIGMA_INLINE vf fma(vf a, vf b, vf c) { return a * b + c; }   // contracted by -ffp-contract=fast where the ISA has it
+SIGMA_INLINE vf fma(vf a, vf b, vf c) { return a * b + c; }   // contracted by -ffp-contract=fast if the instruction set has FMA
 SIGMA_INLINE vf fnma(vf a, vf b, vf c) { return c - a * b; }
 SIGMA_INLINE vf to_float(vi a) { return __builtin_convertvector(a, vf); }
 SIGMA_INLINE vi to_int(vf a) { return __builtin_convertvector(a, vi); }  // towards zero
@@ -114,7 +114,7 @@ SIGMA_INLINE vf clamp(vf a, float lo, float hi) { return min(max(a, splat(lo)), 
 SIGMA_INLINE Mask first_lanes(int n) { return mask_of_bits(n <= 0 ? 0u : n >= 32 ? ~0u : (1u << n) - 1u); }
 SIGMA_INLINE vf lane_index() { vf r; for (int i = 0; i < W; i++) r[i] = (float)i; return r; }
 
-// 2^x for any x in float range (relative error 2e-9 before rounding; flushes below 2^-126).
+// 2^x for any x in float range (relative error 2e-9 before rounding; results below 2^-126 become 0).
 SIGMA_INLINE vf exp2(vf x) {
     x = clamp(x, -126.f, 127.f);
     vf whole = floor(x + 0.5f), f = x - whole;
@@ -128,8 +128,9 @@ SIGMA_INLINE vf exp2(vf x) {
 }
 SIGMA_INLINE vf exp(vf x) { return exp2(x * 1.4426950408889634f); }
 
-// 2^x for x in [-100, 0], without `exp2`'s clamps, as a live alpha is in [1/255, 1] (relative error 8e-8 before rounding).
-// What rounds x adds, and adders wait while the multipliers are what an alpha waits for; outside the range it is any number.
+// 2^x for x in [-100, 0], without the clamps of `exp2`; outside this range the result is undefined. A live alpha is in
+// [1/255, 1] (relative error 8e-8 before rounding). x is rounded with an addition, because the multipliers are the
+// bottleneck of an alpha and the adders are idle.
 SIGMA_INLINE vf exp2_alpha(vf x) {
     const vf shifted = x + 12582912.f, f = x - (shifted - 12582912.f);      // 1.5·2²³: its last bits hold round(x)
     vf p = fma(splat(1.327647217e-3f), f, splat(9.675541331e-3f));
@@ -149,7 +150,7 @@ SIGMA_INLINE vf log2(vf a) {
     return fma(p, s, to_float(e));
 }
 
-// Turn W rows of W lanes into W columns, in place: log2(W) rounds of exchanges between rows `S` apart.
+// Transpose W rows of W lanes in place: log2(W) rounds of exchanges between rows `S` apart.
 template <int S, int... L> SIGMA_INLINE void exchange(vf& a, vf& b, std::integer_sequence<int, L...>) {
     const vf low = __builtin_shufflevector(a, b, (L & S ? L - S + W : L)...);
     b = __builtin_shufflevector(a, b, (L & S ? L + W : L + S)...);
@@ -164,7 +165,7 @@ template <int S = 1> SIGMA_INLINE void transpose(vf* rows) {
     }
 }
 
-// Store past the caches what is not read again soon; `fence` before another thread reads it.
+// Store past the caches, for values that are not read again soon. Call `fence` before another thread reads them.
 #if defined(__AVX512F__)
 SIGMA_INLINE void stream(float* p, vf a) { _mm512_stream_ps(p, (__m512)a); }
 #elif defined(__AVX2__)
@@ -180,14 +181,14 @@ SIGMA_INLINE void fence() { _mm_sfence(); }
 SIGMA_INLINE void fence() {}
 #endif
 
-// A (BLOCK_WIDTH × BLOCK_HEIGHT) block of an image plane whose rows are `stride` floats apart.
+// A (BLOCK_WIDTH × BLOCK_HEIGHT) block of an image plane; rows are `stride` floats apart.
 typedef float row_of_block __attribute__((vector_size(BLOCK_WIDTH * 4)));
 SIGMA_INLINE row_of_block load_row(const float* p) { row_of_block r; memcpy(&r, p, sizeof r); return r; }
 template <int... L, class V> SIGMA_INLINE auto joined(V a, V b, std::integer_sequence<int, L...>) { return __builtin_shufflevector(a, b, L...); }
-SIGMA_INLINE vf load_block(const float* p, size_t stride) {   // joined in registers: a load of fresh stores would stall
+SIGMA_INLINE vf load_block(const float* p, size_t stride) {   // joined in registers: loading data just stored would stall
     constexpr auto two_rows = std::make_integer_sequence<int, 2 * BLOCK_WIDTH>{};
     const auto top = joined(load_row(p), load_row(p + stride), two_rows);
-#if defined(__AVX512F__)                              // four rows, elsewhere two
+#if defined(__AVX512F__)                              // four rows here, two on other instruction sets
     return joined(top, joined(load_row(p + 2 * stride), load_row(p + 3 * stride), two_rows), std::make_integer_sequence<int, W>{});
 #else
     return top;

@@ -1,6 +1,6 @@
-// The mapping loss on image planes and its gradient, in one pass; fit/losses.py is the definition of every term.
-// `sums` are planes (r, g, b, z[, q, q, q]); a pixel counts where the target depth is above 0. The gradient planes are
-// written whole (0 where nothing counts), those of the median depth and of U only where these are given.
+// The mapping loss on image planes and its gradient, in one pass; fit/losses.py defines every term. `sums` are planes
+// (r, g, b, z[, q, q, q]). A pixel counts if its target depth is above 0. All values of the gradient planes are written
+// (0 at pixels that do not count); those of the median depth and of U only if given.
 constexpr float NLL_EPSILON = 1e-6f;
 
 SIGMA_INLINE vf signed_weight(vf error, float weight) {
@@ -24,7 +24,7 @@ static void mapping_losses(const float* sums, const float* target_color, const f
             const vf depth_error = only(valid, load(sums + 3 * plane + at) - depth);
             total[1] += abs(depth_error);
             vf g_depth = signed_weight(depth_error, weights.depth * per_pixel);
-            if (maps.median_depth) {                  // both sides are pulled; where no splat takes half the light there is none
+            if (maps.median_depth) {                  // both depths get a gradient; median depth 0 = none
                 const vf median = load(maps.median_depth + at);
                 const vf apart = only(both(valid, gt(median, zero)), load(sums + 3 * plane + at) - median);
                 const vf g = signed_weight(apart, weights.median_depth * per_pixel);
@@ -73,8 +73,8 @@ static void mapping_losses(const float* sums, const float* target_color, const f
     if (maps.moment) clear_padding(gradients.moment);
 }
 
-// |s − mean(s)| summed over W splats' axes (losses.isotropy, to be divided by 3n): return it over those seen, add
-// `scale` × its gradient by log-scale to three gradient lanes.
+// |s − mean(s)| summed over the axes of W splats (losses.isotropy; the caller divides by 3n). Returns the sum over
+// visible splats, and adds `scale` × its gradient with respect to log scale to three gradient lanes.
 SIGMA_INLINE double add_isotropy(const vf* s, Mask seen, float scale, float (*gradient)[W]) {
     const vf mean = (s[0] + s[1] + s[2]) * (1.f / 3.f);
     vf sign[3], total = splat(0.f);
@@ -87,11 +87,12 @@ SIGMA_INLINE double add_isotropy(const vf* s, Mask seen, float scale, float (*gr
     return lane_sum(total);
 }
 
-// max(s)/min(s) − 1 summed over W splats (losses.isotropy_ratio, to be divided by the number seen): as `add_isotropy`.
+// max(s)/min(s) − 1 summed over W splats (losses.isotropy_ratio; the caller divides by the number of visible splats).
+// Like `add_isotropy`.
 SIGMA_INLINE double add_isotropy_ratio(const vf* s, Mask seen, float scale, float (*gradient)[W]) {
     const vf most = max(max(s[0], s[1]), s[2]), least = min(min(s[0], s[1]), s[2]), ratio = most / least, one = splat(1.f);
     vf is_most[3], is_least[3], mosts = splat(0.f), leasts = splat(0.f);
-    for (int k = 0; k < 3; k++) {                     // equals share the pull
+    for (int k = 0; k < 3; k++) {                     // equal scales share the gradient
         is_most[k] = only(ge(s[k], most), one);
         is_least[k] = only(ge(least, s[k]), one);
         mosts += is_most[k];

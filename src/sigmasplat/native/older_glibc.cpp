@@ -1,6 +1,7 @@
-// Keep the module loadable with a C library older than the one it was built with, as far as one name decides that.
-// A C++ library built against glibc 2.32 or newer asks this flag whether it may count references without atomics; linked in
-// statically, it finds the answer here ("there are several threads", always right) instead of in a glibc that must have it.
+// Make the module loadable with a C library older than the one it was built with, as far as one symbol is concerned. A
+// C++ library built with glibc 2.32 or newer reads this flag to decide whether to count references without atomics. It
+// is linked in statically and finds the flag here, so the system's glibc need not have it. The value "there are several
+// threads" is always safe.
 extern "C" {
 [[gnu::visibility("hidden")]] extern char __libc_single_threaded;
 char __libc_single_threaded = 0;

@@ -5,7 +5,8 @@ constexpr int CHUNK = 512;                 // splats per unit of work: fixed, so
 
 SIGMA_INLINE View<float> read_view(const float* numbers) { View<float> v; memcpy(&v, numbers, sizeof v); return v; }
 
-// W rows as lanes, lanes[column][row]. Whole groups of W columns are turned in registers, the rest goes one by one.
+// Load W rows as lanes, lanes[column][row]. Complete groups of W columns are transposed in registers, the others one by
+// one.
 template <int COLUMNS> SIGMA_INLINE void turn_rows(const float* const* rows, float (*lanes)[W]) {
     constexpr int TURNED = COLUMNS / W * W;
     for (int g = 0; g < TURNED; g += W) {
@@ -17,7 +18,7 @@ template <int COLUMNS> SIGMA_INLINE void turn_rows(const float* const* rows, flo
     for (int k = TURNED; k < COLUMNS; k++)
         for (int l = 0; l < W; l++) lanes[k][l] = rows[l][k];
 }
-// W rows of a row-major [n, columns] array as lanes; rows past the end repeat the last one.
+// Load W rows of a row-major [n, columns] array as lanes; rows past the end repeat the last one.
 template <int COLUMNS> SIGMA_INLINE void load_rows(const float* rows, int64_t first, int64_t n, float (*lanes)[W]) {
     const float* row[W];
     if (first + W <= n)

@@ -1,8 +1,9 @@
-// Sort a tile's splats by depth. An item is (depth's bits << 32 | splat): positive floats order as their bits.
+// Sort a tile's splats by depth. An item is (depth's bits << 32 | splat). Positive floats have the same order as their
+// bits.
 
-constexpr int DIGIT = 8;                              // bits that a pass sorts by
+constexpr int DIGIT = 8;                              // bits sorted by one pass
 
-// Sort n ≤ `limit` moves away from order; say whether that was enough.
+// Try an insertion sort of n items with at most `limit` moves. Returns whether that was enough.
 SIGMA_INLINE bool insertion_sort(uint64_t* a, int n, int limit) {
     for (int i = 1; i < n; i++) {
         const uint64_t x = a[i];
@@ -14,7 +15,8 @@ SIGMA_INLINE bool insertion_sort(uint64_t* a, int n, int limit) {
     }
     return true;
 }
-// Sort by `bits` bits of the depth above `low`, from bit `shift` on, stable: PASSES digits, the least first.
+// Sort by `bits` bits of the depth above `low`, from bit `shift` on, stable: PASSES digits, the least significant
+// first.
 template <int PASSES> static void radix_sort(uint64_t* a, uint64_t* spare, int n, uint32_t low, int shift, int bits) {
     const int digit = (bits + PASSES - 1) / PASSES;
     const uint32_t mask = (1u << digit) - 1;
@@ -47,6 +49,6 @@ static void sort_tile(uint64_t* a, uint64_t* spare, int n) {
     }
     const int bits = high > low ? 32 - __builtin_clz(high - low) : 1, below = bits > 2 * DIGIT ? bits - 2 * DIGIT : 0;
     radix_sort<2>(a, spare, n, low, below, bits - below);
-    // By its upper two digits a tile is nearly sorted, unless most of its depths are alike.
+    // After sorting by the upper two digits, a tile is nearly sorted, unless most depths are almost equal.
     if (below && !insertion_sort(a, n, 4 * n)) radix_sort<4>(a, spare, n, low, 0, bits);
 }

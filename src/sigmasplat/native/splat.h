@@ -1,14 +1,14 @@
 // The maths of one splat: EWA projection and its derivative, templated on the number type (float, double, SIMD lanes).
-// Includes nothing and opens no namespace: include it where T's functions sqrt, max, clamp, ge, both, select, only are known.
-// Notation: cg-slam.md §2.1. S is the scalar type of the camera's numbers.
+// Has no includes and no namespace: include it where the functions sqrt, max, clamp, ge, both, select and only of T are
+// declared. Notation: cg-slam.md §2.1. S is the scalar type of the camera's numbers.
 
 template <class S> struct View {          // pinhole + pose: p_camera = R · p_world + t
     S fx, fy, cx, cy;
     S R[9], t[3];
     S near_m, low_pass;
-    S lim_x_low, lim_x_high, lim_y_low, lim_y_high;   // x/z is clamped to these in the Jacobian, as in 3DGS
+    S lim_x_low, lim_x_high, lim_y_low, lim_y_high;   // limits of x/z in the Jacobian, as in 3DGS
     S width, height;
-    S pose_mean, pose_covariance, pose_depth;         // 1 or 0: which paths reach the pose gradient
+    S pose_mean, pose_covariance, pose_depth;         // 1 or 0: paths included in the pose gradient
 };
 
 template <class T> struct Shape {         // one splat, activated values
@@ -76,7 +76,7 @@ inline __attribute__((always_inline)) void intermediate(const View<S>& view, con
     m.cc = bb + view.low_pass;
     m.cb = dot3(m.a, m.b);
     cross(m.a, m.b, m.n);
-    // ca·cc − cb² cancels on thin splats; |a×b|² + lp(|a|²+|b|²) + lp² is the same number, all terms positive.
+    // ca·cc − cb² cancels on thin splats. |a×b|² + lp(|a|²+|b|²) + lp² is the same number with positive terms only.
     m.det = dot3(m.n, m.n) + view.low_pass * (aa + bb) + view.low_pass * view.low_pass;
 }
 
@@ -97,7 +97,7 @@ inline __attribute__((always_inline)) Footprint<T> project(const View<S>& view, 
     return f;
 }
 
-// Chain a gradient on the footprint back to the splat and, as a left twist (ρ, φ), to the pose (cg-slam.md §2.1).
+// Propagate a gradient on the footprint to the splat and, as a left twist (ρ, φ), to the pose (cg-slam.md §2.1).
 template <class T, class S>
 inline __attribute__((always_inline)) void project_backward(
     const View<S>& view, const Shape<T>& s, T safe_z_floor, const FootprintGradient<T>& g, ShapeGradient<T>& out) {
@@ -116,7 +116,7 @@ inline __attribute__((always_inline)) void project_backward(
         ga[j] = S(2) * g_det * (bn[j] + view.low_pass * m.a[j]) + g_cb * m.b[j];
         gb[j] = S(2) * g_det * (na[j] + view.low_pass * m.b[j]) + g_cb * m.a[j] + S(2) * g_cc * m.b[j];
     }
-    // A = J·V: to V and to the entries of J
+    // A = J·V: gradients of V and of the entries of J
     T gV[9];
     for (int j = 0; j < 3; j++) {
         gV[j] = m.fxz * ga[j];

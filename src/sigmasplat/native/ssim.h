@@ -1,5 +1,5 @@
-// SSIM (Wang et al. 2004): 11×11 Gaussian window, σ 1.5, zero padding, separable; forward and gradient in one go.
-// Three channels of `height` rows, `stride` floats apart; `plane` floats between channels.
+// SSIM (Wang et al. 2004): 11×11 Gaussian window, σ 1.5, zero padding, separable; value and gradient in one call. Three
+// channels of `height` rows; rows are `stride` floats apart, channels `plane` floats.
 constexpr int SSIM_RADIUS = 5, SSIM_PAD = 16;
 constexpr float SSIM_C1 = 1e-4f, SSIM_C2 = 9e-4f;
 
@@ -20,7 +20,8 @@ SIGMA_INLINE vf blur_row(const Window& k, const float* p) {
     return r;
 }
 
-// Blur F fields at once: make(field, x) gives W source values of a row; results land in out[field], rows of `wide` floats.
+// Blur F fields at once: make(field, x) returns W source values of a row; results are written to out[field], in rows of
+// `wide` floats.
 template <int F, class Make> SIGMA_INLINE void blur_rows(const Window& k, int width, float* padded, size_t pad_stride, float* const* out, Make make) {
     for (int x = 0; x < width; x += W)
         for (int f = 0; f < F; f++) {
@@ -45,8 +46,8 @@ SIGMA_INLINE vf masked(const float* p, const float* mask, ptrdiff_t at) {
     return mask ? only(gt(load(mask + at), splat(0.f)), load(p + at)) : load(p + at);
 }
 
-// What depends on the target alone: its blurred mean and mean square, 6 planes of height × wide_of(width). Where a mask is
-// given, both images are 0 where it is not above 0.
+// The part that depends only on the target: its blurred mean and mean square, 6 planes of height × wide_of(width). With
+// a mask, both images are 0 where the mask is not above 0.
 static void ssim_target(const float* target, const float* mask, int width, int height, size_t stride, size_t plane, float* cache) {
     static const Window window;
     const size_t wide = wide_of(width), field = wide * height;
@@ -78,11 +79,12 @@ static void ssim_target(const float* target, const float* mask, int width, int h
     }
 }
 
-// Return the mean SSIM of image and target; add weight · ∂(mean SSIM)/∂image to gradient, where mask (if any) is above 0.
+// Return the mean SSIM of image and target. Adds weight · ∂(mean SSIM)/∂image to the gradient where mask (if any) is
+// above 0.
 static double ssim(const float* image, const float* target, const float* cache, int width, int height, size_t stride,
                    size_t plane, const float* mask, float weight, float* gradient) {
     static const Window window;
-    static SsimScratch scratch;                       // one caller at a time, as for every kernel here
+    static SsimScratch scratch;                       // not thread-safe: one call at a time, like every kernel here
     const size_t wide = wide_of(width), field = wide * height;
     float* f[6];
     for (int i = 0; i < 6; i++) f[i] = scratch.fields[i].reserve(3 * field + W);
@@ -118,7 +120,7 @@ static double ssim(const float* image, const float* target, const float* cache, 
                 const vf inv = 1.f / (b1 * b2), s = a1 * a2 * inv;
                 const Mask inside = first_lanes(width - int(x) < W ? width - int(x) : W);
                 total += only(inside, s);
-                const vf d11 = -s * b1 * inv, d12 = 2.f * a1 * inv;   // by E[x²] and E[xy]
+                const vf d11 = -s * b1 * inv, d12 = 2.f * a1 * inv;   // derivatives with respect to E[x²] and E[xy]
                 const vf d1 = 2.f * (m2 * a2 - m1 * s * b2) * inv - 2.f * m1 * d11 - m2 * d12;
                 store(f[3] + q * wide + x, only(inside, d1));
                 store(f[4] + q * wide + x, only(inside, d11));
@@ -127,7 +129,7 @@ static double ssim(const float* image, const float* target, const float* cache, 
             row_sum[q] = lane_sum(total);
         }
 #pragma omp for schedule(static)
-        for (int q = 0; q < 3 * height; q++) {        // the window is symmetric: its transpose is itself
+        for (int q = 0; q < 3 * height; q++) {        // the window is symmetric, so it is its own transpose
             float* out[3] = {f[0] + q * wide, f[1] + q * wide, f[2] + q * wide};
             blur_rows<3>(window, width, padded.data, pad, out, [&](int k, int x) { return load(f[3 + k] + q * wide + x); });
         }

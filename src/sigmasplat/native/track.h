@@ -1,14 +1,14 @@
-// What tracking reads off a render: how far each pixel is to be trusted, the papers' loss with its gradient, and the
-// reference that images are aligned to. fit/confidence.py, tracking_loss.py and references.py are the definitions.
+// What tracking computes from a render: pixel weights, the papers' loss with its gradient, and the reference of
+// alignment. fit/confidence.py, tracking_loss.py and reference_maps.py are the definitions.
 
 constexpr float WEIGHT_EPSILON = 1e-6f;
 
-// Selection among the floats ≥ 0 of an image, as their bits (whose order is theirs): 11 bits first, in parallel over rows;
-// then those that share them.
+// Select the median of an image's floats ≥ 0 by their bits, which have the same order. First by the upper 11 bits, in
+// parallel over rows; then among the floats that share these bits.
 constexpr int DIGITS = 2048;
 struct Selection { Buffer<int> keys, counts; };
 
-// The lower middle one of n ≥ 1 numbers of 31 bits that share their upper 11.
+// The lower of the two middle values of n ≥ 1 numbers of 31 bits that share their upper 11 bits.
 static uint32_t select_low_bits(int* keys, int64_t n, int64_t rank) {
     uint32_t found = 0;
     for (int shift : {10, 0}) {
@@ -24,7 +24,8 @@ static uint32_t select_low_bits(int* keys, int64_t n, int64_t rank) {
     return found;
 }
 
-// The lower middle one of value(at) [lanes] over the pixels where chosen(at, value) holds; false where none does.
+// The median (lower middle value) of value(at) [lanes] over the pixels where chosen(at, value) is true. Returns false
+// if there are none.
 template <class Value, class Chosen>
 static bool lower_median(const Plane& p, Selection& s, Value value, Chosen chosen, float* median) {
     const int threads = omp_get_max_threads();
@@ -33,7 +34,7 @@ static bool lower_median(const Plane& p, Selection& s, Value value, Chosen chose
     memset(counts, 0, size_t(threads) * 2 * DIGITS * sizeof(int));
 #pragma omp parallel num_threads(threads)
     {
-        int* mine = counts + size_t(omp_get_thread_num()) * 2 * DIGITS;   // the upper half counts what is not chosen
+        int* mine = counts + size_t(omp_get_thread_num()) * 2 * DIGITS;   // the upper half counts pixels that are not chosen
 #pragma omp for schedule(static)
         for (int y = 0; y < p.height; y++) {
             int* row = keys + size_t(y) * p.stride;
@@ -56,7 +57,7 @@ static bool lower_median(const Plane& p, Selection& s, Value value, Chosen chose
         if (rank < before + here) break;
         before += here;
     }
-    int64_t kept = 0;                                 // over the keys read already: kept never overtakes the reading
+    int64_t kept = 0;                                 // overwrites only keys that were already read
     for (int y = 0; y < p.height; y++)
         for (int x = 0; x < p.width; x++) {
             const int key = keys[size_t(y) * p.stride + x];
@@ -68,12 +69,12 @@ static bool lower_median(const Plane& p, Selection& s, Value value, Chosen chose
     return true;
 }
 
-SIGMA_INLINE vf variance_of(const float* sums, const Plane& p, size_t at, int c) {   // V + ε, V held at 0 from below
+SIGMA_INLINE vf variance_of(const float* sums, const Plane& p, size_t at, int c) {   // V + ε, with V clamped at 0 from below
     const vf color = load(sums + c * p.plane + at);
     return max(fnma(color, color, load(sums + (4 + c) * p.plane + at)), splat(0.f)) + WEIGHT_EPSILON;
 }
 
-// log2 of the median of V + ε over the pixels chosen, per channel; false where none is.
+// log2 of the median of V + ε over the chosen pixels, per channel. Returns false if there are none.
 template <class Chosen>
 static bool median_log_variance(const float* sums, const Plane& p, Selection& s, Chosen chosen, float* log_median) {
     for (int c = 0; c < 3; c++) {
@@ -85,7 +86,7 @@ static bool median_log_variance(const float* sums, const Plane& p, Selection& s,
     return true;
 }
 
-// exp(−(log(V+ε) − median)/τ), clamped (VarSplat §3); of V + ε itself.
+// exp(−(log(V+ε) − median)/τ), clamped (VarSplat §3), as a function of V + ε.
 SIGMA_INLINE vf confidence(vf variance, float log_median, const TrackOptions& o) {
     return clamp(exp2((log_median - log2(variance)) * (1.f / o.tau)), 1.f / o.weight_max, o.weight_max);
 }
@@ -94,7 +95,7 @@ SIGMA_INLINE vf uncertainty_weight(const float* sums, const Plane& p, size_t at,
     return confidence(variance_of(sums, p, at, c), log_median, o);
 }
 
-// factor × the median of an error over the pixels chosen; infinite where the factor is 0 or none is chosen.
+// factor × the median of an error over the chosen pixels; infinite if the factor is 0 or there are none.
 template <class Error, class Chosen>
 static float outlier_limit(const Plane& p, Selection& s, float factor, Error error, Chosen chosen) {
     float median;
@@ -102,7 +103,8 @@ static float outlier_limit(const Plane& p, Selection& s, float factor, Error err
     return found ? factor * median : __builtin_inff();
 }
 
-// What an error counts in a mean: over the image's pixels (all channels together), or over each channel of those kept.
+// The weight of one error in a mean: over the image's pixels (all channels together), or over each channel of the used
+// pixels.
 template <class Chosen>
 static float per_value(const Plane& p, bool kept, float weight, int channels, Chosen chosen) {
     if (!kept) return weight / (float(p.width) * float(p.height));
@@ -114,12 +116,13 @@ static float per_value(const Plane& p, bool kept, float weight, int channels, Ch
     return n ? weight / float(channels * n) : 0.f;
 }
 
-// L_track (VarSplat §3; CG-SLAM §6) as a mean over pixels: write its gradient by colour and depth to planes, return the
-// loss; g_exposure [2] is its gradient by (a, b) of exp(a)·Ĉ + b. The masks need the errors' medians, the weights that of V.
+// L_track (VarSplat §3; CG-SLAM §6) as a mean over pixels. Writes its gradient with respect to colour and depth to
+// planes and returns the loss. g_exposure [2] is the gradient with respect to (a, b) of exp(a)·Ĉ + b. The masks need
+// the medians of the errors, the weights those of V.
 static double tracking_loss(const float* sums, const float* alpha, bool variance, const float* target_color,
                             const float* target_depth, Plane p, TrackOptions o, float gain, float offset, float* g_sums,
                             double* g_exposure) {
-    static Selection scratch;                         // one caller at a time, as for every kernel here
+    static Selection scratch;                         // not thread-safe: one call at a time, like every kernel here
     const float* depth = sums + 3 * p.plane;
     const auto error_at = [&](size_t at) { return abs(load(depth + at) - load(target_depth + at)); };
     const auto counts = [&](size_t at) {
@@ -134,7 +137,7 @@ static double tracking_loss(const float* sums, const float* alpha, bool variance
     };
     const float limit = outlier_limit(p, scratch, o.outlier_factor, error_at, counts);
     const float limit_color = outlier_limit(p, scratch, o.outlier_factor_color, color_error_at, counts);
-    const bool own = o.outlier_factor_color > 0.f;    // colour has a mask of its own, else depth's
+    const bool own = o.outlier_factor_color > 0.f;    // colour has its own mask, otherwise that of depth
     const auto in_depth = [&](size_t at) { return both(counts(at), ge(splat(limit), error_at(at))); };
     const auto in_color = [&](size_t at) { return own ? both(counts(at), ge(splat(limit_color), color_error_at(at))) : in_depth(at); };
     float log_median[3];
@@ -169,7 +172,7 @@ static double tracking_loss(const float* sums, const float* alpha, bool variance
     double sum[3] = {};
     for (int y = 0; y < p.height; y++)
         for (int k = 0; k < 3; k++) sum[k] += rows[size_t(y) * 3 + k];
-    for (int c = 0; c < (variance ? 7 : 4); c++)      // padding below the image, and the planes without a gradient
+    for (int c = 0; c < (variance ? 7 : 4); c++)      // padding below the image, and planes without a gradient
         if (c < 4) memset(g_sums + c * p.plane + size_t(p.height) * p.stride, 0, (p.plane - size_t(p.height) * p.stride) * sizeof(float));
         else memset(g_sums + c * p.plane, 0, p.plane * sizeof(float));
     g_exposure[0] = sum[1];
@@ -177,9 +180,9 @@ static double tracking_loss(const float* sums, const float* alpha, bool variance
     return sum[0];
 }
 
-// A render as a reference image [height, width]: gray C/A, depth D/A where A > alpha_above (else 0), and weights there
-// (else 1: where the map is thin it says nothing): of gray w̃ averaged over channels, of depth the same form of U, the moment
-// about a reference depth, where there is one.
+// A render as a reference image [height, width]: gray C/A, and depth D/A where A > alpha_above (0 elsewhere). Weights
+// at these pixels: of gray, w̃ averaged over the channels; of depth, the same formula with U, the moment about a
+// reference depth, if given. Elsewhere the weight is 1, because V has no meaning where the map is thin.
 static void reference_maps(const float* sums, const float* alpha, const float* moment, bool variance, Plane p, TrackOptions o,
                            float* gray, float* depth, float* weight_gray, float* weight_depth) {
     static Selection scratch;

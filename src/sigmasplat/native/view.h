@@ -1,4 +1,5 @@
-// Stages 1–3 joined: the two operators of the kernel seam, and the fused way from raw parameter rows to images and back.
+// Stages 1–3 together: the two operators `project` and `blend`, and the fused path from raw parameter rows to images
+// and back.
 
 static void blend(Render& r, Outputs o) {
     with_features(r.k, [&](auto k) {
@@ -19,7 +20,7 @@ static void blend_gradients(Render& r, OutputGradients g) {   // to each splat's
     });
 }
 
-// ---- the seam: blend on its own -------------------------------------------------------------------------------------
+// ---- the operators: blend on its own -------------------------------------------------------------------------------
 
 template <int K> static void pack_given(Render& r, const float* means2d, const float* conics, const float* z, const float* radii,
                                         const float* opacities, const float* features, int k) {
@@ -75,7 +76,7 @@ static void blend_backward(Context* context, OutputGradients g, SplatGradients o
               for (int64_t i = chunk * CHUNK; i < r.n && i < (chunk + 1) * CHUNK; i += W) {
                 alignas(64) float sums[decltype(record)::value][W], t[3][W], l[8][W];
                 reduce_records<decltype(record)::value>(r, i, slot, sums);
-                for (int q = 0; q < W; q++) {         // unseen splats left no geometry: any finite conic will do
+                for (int q = 0; q < W; q++) {         // unseen splats have no geometry: any finite conic is correct
                     const bool seen = i + q < r.n && r.tiles_of[i + q];
                     const Geometry g0 = seen ? r.geometry(i + q) : Geometry{1, 0, 1, 0, 0, 0, 1, 0};
                     l[0][q] = g0.l1 / CONIC_SCALE; l[1][q] = g0.l2 / CONIC_SCALE; l[2][q] = g0.l3 / CONIC_SCALE;
@@ -154,7 +155,8 @@ static void view_forward(Context* context, const float* view_numbers, const floa
     if (seconds) { seconds[0] += t1 - t0; seconds[1] += t2 - t1; seconds[2] += omp_get_wtime() - t2; }
 }
 
-// ∂L/∂(median depth) goes to the depth of one splat per pixel; in the pixels' order, so that sums do not depend on threads.
+// Add ∂L/∂(median depth) of each pixel to the depth of one splat, in the order of the pixels, so that sums do not
+// depend on threads.
 static const float* gather_median(Render& r, OutputGradients g) {
     if (!g.median_depth) return nullptr;
     float* sums = r.median_gradient.reserve(r.n + W);
@@ -168,9 +170,9 @@ static const float* gather_median(Render& r, OutputGradients g) {
     return sums;
 }
 
-// Chain the reduced records of all splats to the pose twist, and to rows of parameters: where any of W splats is seen,
-// `sink(i, seen, splats, gradient lanes)` takes what ∂L/∂params is; `unseen(i)` hears of the others.
-// g_median: of `gather_median`; pull [n], or null: |∂L/∂mean| in the image, per half image size, 0 where unseen.
+// Propagate the summed records of all splats to the pose twist and to parameter rows. If any of W splats is seen,
+// `sink(i, seen, splats, gradient lanes)` receives ∂L/∂params; otherwise `unseen(i)` is called. g_median: result of
+// `gather_median`. pull [n], or null: |∂L/∂mean| in the image, per half image size, 0 for unseen splats.
 template <int K, bool MOMENT, class Sink, class Unseen>
 static void chain_to_params(const Render& r, const float* params, const float* g_median, float* pull, double* g_twist, Sink sink,
                             Unseen unseen) {
@@ -250,8 +252,9 @@ static void view_backward(Context* context, const float* params, OutputGradients
     if (seconds) { seconds[0] += t1 - t0; seconds[1] += omp_get_wtime() - t1; }
 }
 
-// Backward and one Adam step in one go: no gradient row reaches memory. Splats out of view wait (adam.h), and get no isotropy
-// term: |s − mean(s)| is a mean over all splats, max(s)/min(s) − 1 over those in view. Returns what both cost, weighted.
+// Backward pass and one Adam step together, so that no gradient row is written to memory. Splats out of view are not
+// stepped now (adam.h), and have no isotropy term: |s − mean(s)| is a mean over all splats, max(s)/min(s) − 1 over
+// those in view. Returns the weighted cost of both.
 static double view_step(Context* context, float* params, OutputGradients g, AdamState state, AdamOptions options,
                         StepOptions terms, float* pull, double* g_twist, double* seconds) {
     Render& r = *reinterpret_cast<Render*>(context);
@@ -281,7 +284,7 @@ static double view_step(Context* context, float* params, OutputGradients g, Adam
     return sum;
 }
 
-// ∂L/∂pose alone, from gradients on colour and depth: chained tile by tile, no splat's gradient is ever formed.
+// Only ∂L/∂pose, from gradients on colour and depth. It is accumulated per tile; no gradient of a splat is stored.
 static void view_backward_pose(Context* context, const float* params, OutputGradients g, double* g_twist, double* seconds) {
     Render& r = *reinterpret_cast<Render*>(context);
     const double t0 = omp_get_wtime();

@@ -28,7 +28,7 @@ from sigmasplat.presets import varsplat
 PAPER = Config(
     render=RenderConfig(alpha_min=15.0 / 255.0, near_m=0.2),
     seeding=SeedConfig(
-        first_uniform=10_000_000,  # more pixels than any image has: every pixel with a reading
+        first_uniform=10_000_000,  # more than the number of pixels of any image: selects every pixel with a reading
         first_gradient=0,
         first_edges=False,
         later_max=0,
@@ -54,7 +54,7 @@ PAPER = Config(
         poses_from="half",
         prune_opacity=0.005,
         window=4,
-        covisibility="splats",  # paper and code use NetVLAD, the paper only for its speed; its weights are a download
+        covisibility="splats",  # paper (for its speed) and code use NetVLAD, whose weights are a download
         frames_per_step=0,
     ),
     primitives=DensifyConfig(
@@ -76,7 +76,7 @@ PAPER = Config(
     registration=RegistrationConfig(uncertainty=False),
     final=FinalConfig(uncertainty=False),
 )
-"""What the data sets share."""
+"""The settings that all data sets share."""
 
 
 def sized(config: Config, extent: float, first: float = 3e-4, last: float = 2.5e-4, log_scales: float = 1e-4) -> Config:

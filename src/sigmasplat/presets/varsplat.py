@@ -20,13 +20,13 @@ from sigmasplat.config import (
 UNCERTAIN_M = 0.02
 """The rule of accumulated uncertainty is the paper's, the limit is ours; docs/varsplat.md shows its effect."""
 
-# What the data sets share.
+# The settings that all data sets share.
 PAPER = Config(
     seeding=SeedConfig(first_gradient=50_000, alpha_below=0.6, depth_error_factor=40.0, opacity=0.5),
     mapping=MappingConfig(iterations=100, weight_nll_color=1e-4, freeze_old_colors=True),
     tracking=TrackingConfig(weight_max=3.0),
     submaps=SubmapConfig(distance_m=0.5, angle_deg=50.0, uncertainty_m=UNCERTAIN_M),
-    final=FinalConfig(seed_from="mesh", iterations=30_000, sh_degree=3, uncertainty=False),  # §7 makes no use of V
+    final=FinalConfig(seed_from="mesh", iterations=30_000, sh_degree=3, uncertainty=False),  # §7 does not use V
 )
 
 # Synthetic data with exact depth. Ours: max_depth_m (the PNGs end at 10 m) and no masks; the paper specifies neither.

@@ -1,4 +1,4 @@
-"""See: project splats, blend them, and read maps off what was gathered."""
+"""Render splats: project them, blend them, and compute maps from the blended sums."""
 
 from sigmasplat.render.render import FieldRenderer, Render, render
 

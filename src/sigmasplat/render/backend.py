@@ -1,5 +1,8 @@
-"""Choose what renders: the kernels of a device, or their definition in plain torch. Nothing else chooses by device,
-but the fits' table (fit/backends.py), which goes by the name that a view has from here."""
+"""Choose the renderer: the kernels of a device, or their definition in plain torch.
+
+Only this module and the table of the fits (fit/backends.py) choose by device. The table uses the backend name that a
+view gets here.
+"""
 
 from types import ModuleType
 
@@ -16,8 +19,11 @@ BACKENDS = ("auto", "cpu", "cuda", "reference")
 
 
 def backend_name(asked: str, device: torch.device | None = None) -> str:
-    """Return "cpu", "cuda" or "reference" for what is asked for; "auto" is SIGMASPLAT_BACKEND's, else the kernels of
-    the device that the tensors lie on, without one the CPU's. Raises BackendError if the name is unknown."""
+    """Return "cpu", "cuda" or "reference" for a requested backend.
+
+    "auto" means the value of SIGMASPLAT_BACKEND if it is set, else the kernels of the device that holds the tensors,
+    else those of the CPU. Raises BackendError if the name is unknown.
+    """
     name = env.switches().backend if asked == "auto" else asked
     if name not in BACKENDS:
         raise BackendError(f"unknown backend {name!r} (known: {', '.join(BACKENDS)})")
@@ -27,7 +33,7 @@ def backend_name(asked: str, device: torch.device | None = None) -> str:
 
 
 def backend_module(asked: str, device: torch.device | None = None) -> ModuleType:
-    """Return the module whose `project` and `blend` do the work, by `backend_name`.
+    """Return the module with `project` and `blend` of the backend that `backend_name` returns.
 
     Raises BackendError if it is unknown or not built.
     """
@@ -52,7 +58,7 @@ def backend_module(asked: str, device: torch.device | None = None) -> ModuleType
 
 def make_view(backend: str, camera: Camera, options: RenderConfig, variance: bool = True) -> View:
     """Make a view on a backend by name (one of `BACKENDS`). Raises BackendError as `backend_module` does."""
-    backend_module(backend)  # refuses in one line where the kernels are missing
+    backend_module(backend)  # raises BackendError if the kernels are missing
     name = backend_name(backend)
     if name == "reference":
         from sigmasplat.render.reference.view import ReferenceView
@@ -68,7 +74,7 @@ def make_view(backend: str, camera: Camera, options: RenderConfig, variance: boo
 
 
 def make_covariance_view(view: View, correlations: Rows) -> CorrelationView:
-    """Make the view of ten planes that goes with a view of seven, on its backend."""
+    """Make the view of ten planes that belongs to a view of seven planes, on the same backend."""
     if view.backend == "reference":
         from sigmasplat.render.reference.covariance_view import CovarianceView
 

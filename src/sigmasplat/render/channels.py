@@ -1,4 +1,4 @@
-"""The channels that pixels sum over splats, and the variances computed from the sums."""
+"""Define the channels that are summed over splats per pixel, and compute variances from the sums."""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""Lay out camera, pose and switches as all kernels read them."""
+"""Convert camera, pose and switches to the struct that all kernels read."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from sigmasplat.render.reference.operators import FRUSTUM_MARGIN
 def view_params(
     camera: Camera, T_camera_world: NDArray[np.floating], options: RenderConfig, dtype: type = np.float32
 ) -> NDArray[np.floating]:
-    """Lay out camera, pose and switches as the kernels' `View` (native/splat.h)."""
+    """Return camera, pose and switches as the kernels' `View` (native/splat.h)."""
     T = np.asarray(T_camera_world, np.float64)
     margin_u, margin_v = FRUSTUM_MARGIN * camera.width, FRUSTUM_MARGIN * camera.height
     limits = [

@@ -1,4 +1,4 @@
-"""Render a mesh from a camera: depth and the face at each pixel."""
+"""Render a mesh from a camera: the depth and the face at each pixel."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,17 +15,17 @@ NOTHING = np.uint64(0xFFFFFFFFFFFFFFFF)
 def mesh_depth(
     mesh: Mesh, camera: Camera, T_camera_world: Doubles, near_m: float = 0.02
 ) -> tuple[NDArray[np.float32], Rows]:
-    """Return depth [H, W] along the optical axis, m, 0 where no face is, and the nearest face [H, W], −1 for none.
+    """Return depth [H, W] along the optical axis, m, 0 without a face, and the nearest face [H, W], −1 = none.
 
-    Both sides of a face are seen; a face that reaches nearer than `near_m` is left out. Its cost is the pixels inside
-    the faces' bounding boxes, so faces should be small in the image.
+    Both sides of a face are visible; a face with a point closer than `near_m` is ignored. The cost is the number of
+    pixels inside the faces' bounding boxes, so faces should be small in the image.
     """
     x, y, z = T_camera_world[:3, :3] @ mesh.vertices.T + T_camera_world[:3, 3:]
     ahead = np.maximum(z, near_m)
     u, v = camera.fx * x / ahead + camera.cx, camera.fy * y / ahead + camera.cy
     faces, first, size = _boxes(np.ascontiguousarray(mesh.faces.T), u, v, z, camera, near_m)
     corners, pixels = mesh.faces[faces].T, size[0] * size[1]
-    # One row for each pixel of each face's box.
+    # One row per pixel of each face's box.
     row = np.repeat(np.arange(len(faces)), pixels)
     within = np.arange(len(row)) - np.repeat(np.cumsum(pixels) - pixels, pixels)
     column, line = first[0, row] + within % size[0, row], first[1, row] + within // size[0, row]
@@ -33,7 +33,7 @@ def mesh_depth(
     nearest = np.full(camera.height * camera.width, NOTHING)
     depth = (np.float32(1.0) / per_z[inside]).astype(np.float32)
     key = (depth.view(np.uint32).astype(np.uint64) << np.uint64(32)) | faces[row[inside]].astype(np.uint64)
-    np.minimum.at(nearest, (line * camera.width + column)[inside], key)  # positive floats are ordered as their bits are
+    np.minimum.at(nearest, (line * camera.width + column)[inside], key)  # positive floats: same order as their bits
     shape, hit = (camera.height, camera.width), nearest != NOTHING
     depth_m = np.where(hit, (nearest >> np.uint64(32)).astype(np.uint32).view(np.float32), np.float32(0.0))
     face = np.where(hit, (nearest & np.uint64(0xFFFFFFFF)).astype(np.int64), -1)
@@ -43,7 +43,8 @@ def mesh_depth(
 def _boxes(
     corners: NDArray[np.int32], u: Doubles, v: Doubles, z: Doubles, camera: Camera, near_m: float
 ) -> tuple[Rows, Rows, Rows]:
-    """Return the faces [F'] that may show, each one's first pixel (column, line) [2, F'] and its box's size [2, F']."""
+    """Return the faces [F'] that may be visible, the first pixel (column, line) of each box [2, F'] and its size [2,
+    F']."""
     faces = np.flatnonzero((z > near_m)[corners].all(0))
     boxes: list[Rows] = []
     for values, pixels in ((u, camera.width), (v, camera.height)):
@@ -59,7 +60,8 @@ def _boxes(
 def _inverse_depth(
     u: Doubles, v: Doubles, per_z: Doubles, row: Rows, column: Rows, line: Rows
 ) -> tuple[Doubles, NDArray[np.bool_]]:
-    """Return 1/z of faces (corners [3, F]) at pixels, of face `row` each, and whether the pixel is inside the face.
+    """Return 1/z at pixels, for faces (corners [3, F]), and whether each pixel is inside its face; row: the face of a
+    pixel.
 
     1/z is affine over the image of a plane.
     """

@@ -1,4 +1,4 @@
-"""Turn the gradient on a pose's tangent space into one autograd can carry."""
+"""Convert the gradient on a pose's tangent space to a matrix gradient for autograd."""
 
 import numpy as np
 import torch
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def pose_gradient(T_camera_world: Tensor, twist: NDArray[np.float64] | Tensor) -> Tensor:
-    """Express a left-twist gradient (ρ, φ) as a [4, 4] matrix gradient with the same value along every rigid motion.
+    """Return a left-twist gradient (ρ, φ) as a [4, 4] matrix gradient with the same value along every rigid motion.
 
     <G, [φ]× R | φ×t + ρ> = ρ·g_ρ + φ·g_φ for G = (½ [g_φ − t × g_ρ]× R | g_ρ). It is on the device of T_camera_world.
     """
@@ -21,7 +21,7 @@ def pose_gradient(T_camera_world: Tensor, twist: NDArray[np.float64] | Tensor) -
 
 
 def twist_matrix(xi: Tensor) -> Tensor:
-    """Write a twist (ρ, φ) [6], m and rad, as the matrix [4, 4] whose exponential is the motion."""
+    """Return a twist (ρ, φ) [6], m and rad, as the matrix [4, 4] whose exponential is the motion."""
     zero = torch.zeros((), dtype=xi.dtype)
     x, y, z, a, b, c = xi
     rows = [[zero, -c, b, x], [c, zero, -a, y], [-b, a, zero, z], [zero, zero, zero, zero]]

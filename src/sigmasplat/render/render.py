@@ -1,4 +1,4 @@
-"""Render a field from a camera: two kernels, and algebra on their sums (DESIGN §3)."""
+"""Render a field from a camera: two kernels, then formulas on their sums (DESIGN §3)."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -23,9 +23,9 @@ class Render:
 
     color Ĉ = Σ w c; depth D̂ = Σ w z (m, not divided by alpha); alpha A = Σ w; variance V = Σ w (σ² + c²) − Ĉ², the law
     of total variance (VarSplat §1); uncertainty U = Σ w (z − D)² about a reference depth D (m², CG-SLAM eq. 10), None
-    without one; median_depth: z where half the light is gone, 0 where it never is (CG-SLAM eq. 8); median_id,
-    dominant_id: the splat of that depth, the splat of largest weight, −1 = none; covariance: V with its
-    off-diagonal, in the order rr, gg, bb, rg, rb, gb, None where the field has no `correlations`.
+    without a reference; median_depth: z where half of the light is absorbed, 0 if it never is (CG-SLAM eq. 8);
+    median_id, dominant_id: the splat at that depth, and the splat of largest weight, −1 = none; covariance: V with its
+    off-diagonal, in the order rr, gg, bb, rg, rb, gb, None if the field has no `correlations`.
     """
 
     color: Tensor
@@ -50,7 +50,7 @@ def _colors_from(field: GaussianField, T_camera_world: Tensor) -> Tensor:
 
 
 def _features_from(field: GaussianField, z: Tensor, T_camera_world: Tensor) -> Tensor:
-    """Return what a pixel gathers of each splat, [N, 7], or [N, 10] where colours vary together."""
+    """Return the values of each splat that are summed per pixel, [N, 7], or [N, 10] with full colour covariance."""
     colors = _colors_from(field, T_camera_world)
     if "correlations" not in field.attributes:
         return features_of(colors, z, field.variances)
@@ -58,7 +58,7 @@ def _features_from(field: GaussianField, z: Tensor, T_camera_world: Tensor) -> T
 
 
 def _on_device(field: GaussianField, backend: str) -> GaussianField:
-    """Return what a render needs of a field in the memory that the backend reads, without optimiser state."""
+    """Return the parts of a field that a render needs, in memory that the backend can read, without optimiser state."""
     if backend_name(backend, field.params.device) != "cuda" or field.params.device.type != "cpu":
         return field
     device = cuda_launch.this_device()
@@ -76,8 +76,8 @@ def render(
 ) -> Render:
     """Render a field at a pose (4×4, world to camera); differentiable in `field.params` and in a tensor pose.
 
-    The pose's gradient is the sum of the paths that `options` has on: through 2D means, 2D covariances, depths, and the
-    directions from which `harmonics` are seen. Raises BackendError if the backend is not available.
+    The pose gradient is the sum of the paths that `options` enables: through 2D means, 2D covariances, depths, and the
+    viewing directions of `harmonics`. Raises BackendError if the backend is not available.
     """
     kernels, options = backend_module(backend, field.params.device), options or RenderConfig()
     field = _on_device(field, backend)
@@ -102,8 +102,8 @@ def render(
 
 
 class FieldRenderer:
-    """Renders with the same settings repeatedly. The two fields rendered last must not change meanwhile; each is copied
-    to a device once."""
+    """Renders repeatedly with the same settings. Each field is copied to a device once, so the last two fields rendered
+    must not change in between."""
 
     def __init__(self, options: RenderConfig, backend: str) -> None:
         self.options, self.backend = options, backend

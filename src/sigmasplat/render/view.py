@@ -20,7 +20,7 @@ from sigmasplat.types import Matrix
 
 class Layers(NamedTuple):
     """The splats that determine a pixel, planes [rows, columns]: int32 rows of the splat at median depth (CG-SLAM eq.
-    8) and of the one of largest weight, −1 = none; their weights; median_depth in m, 0 = none."""
+    8) and of the splat of largest weight, −1 = none; their weights; median_depth in m, 0 = none."""
 
     median_id: Tensor
     median_weight: Tensor
@@ -30,19 +30,19 @@ class Layers(NamedTuple):
 
     @staticmethod
     def of(rows: int, columns: int, device: torch.device | None = None) -> "Layers":
-        """Make empty planes, by default in the host's memory."""
+        """Make empty planes, by default in host memory."""
         ids = [torch.zeros(rows, columns, dtype=torch.int32, device=device) for _ in range(2)]
         floats = [torch.zeros(rows, columns, device=device) for _ in range(3)]
         return Layers(ids[0], floats[0], ids[1], floats[1], floats[2])
 
     def fill(self, b: reference.Blended, z: Tensor) -> None:
-        """Copy what was blended of splats at depths z [N] m."""
+        """Copy the result of a blend of splats at depths z [N] m."""
         for plane, image in zip(self[:4], b[3:], strict=True):
             plane.copy_(image)
         self.fill_depth(z)
 
     def fill_depth(self, z: Tensor) -> None:
-        """Read the median depth off depths z [N] m."""
+        """Set the median depth from the splats' depths z [N] m."""
         nearest = z[self.median_id.clamp(min=0).long()] if len(z) else self.median_depth
         self.median_depth.copy_(torch.where(self.median_id >= 0, nearest, 0.0))
 
@@ -55,7 +55,7 @@ class View(Protocol):
     """One camera with its planes: sums [K, rows, columns] of (r, g, b, z[, σ²+c² ×3]), alpha, and their gradients."""
 
     backend: str
-    """What renders: "cpu", "cuda" or "reference"."""
+    """Name of the renderer: "cpu", "cuda" or "reference"."""
     camera: Camera
     options: RenderConfig
     sums: Tensor
@@ -63,7 +63,7 @@ class View(Protocol):
     g_sums: Tensor
     g_alpha: Tensor
     moment: Tensor
-    """U about the reference depth of the last forward pass that was given one, [rows, columns] m² (CG-SLAM eq. 10)."""
+    """U about the reference depth of the last forward pass with a reference, [rows, columns] m² (CG-SLAM eq. 10)."""
     layers: "Layers"
     g_moment: Tensor
     g_median_depth: Tensor
@@ -76,15 +76,16 @@ class View(Protocol):
     def forward(
         self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
     ) -> None:
-        """Render parameter rows [N, 17] at a pose into `sums` and `alpha`; with a depth [H, W] m into `moment` too,
-        with layers=True into `layers` too."""
+        """Render parameter rows [N, 17] at a pose into `sums` and `alpha`. With a depth reference [H, W] m, also render
+        `moment`; with layers=True, also `layers`."""
 
     def backward(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Matrix:
-        """Carry the gradient planes to parameter rows, written to g_params [N, 17]; return the pose twist [6] (ρ, φ; m,
-        rad). grad2d [N], if given, receives the norm of the gradient by each image mean, per half image size (3DGS)."""
+        """Propagate the gradient planes to parameter rows, written to g_params [N, 17]. Return the pose twist [6] (ρ,
+        φ; m, rad). grad2d [N], if given, receives the norm of the gradient with respect to each image mean, per half
+        image size (3DGS)."""
 
     def backward_pose(self, params: Tensor) -> Matrix:
-        """Carry the gradient planes of colour and depth to the pose alone; return the twist (ρ, φ) [6]."""
+        """Propagate the gradient planes of colour and depth to the pose only; return the twist (ρ, φ) [6]."""
 
     def visible(self, n: int) -> Tensor:
         """Return which of the n splats of the last forward pass reach the image, bool [n]."""

@@ -1,29 +1,22 @@
 """Make the floor plan of a run: the report and the exported plan use this one function, so that both agree."""
 
 from sigmasplat.floorplan.floor_plan import CELL_M, FloorPlan, floor_plan
-from sigmasplat.floorplan.surface_samples import SurfaceRenderer
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import FieldRenderer
-from sigmasplat.types import Progress
+from sigmasplat.types import Progress, no_progress
 
 
 def run_floor_plan(
-    run: RunFolder,
-    path: Trajectory,
-    camera: Camera,
-    *,
-    cell_m: float = CELL_M,
-    renderer: SurfaceRenderer | None = None,
-    progress: Progress = lambda done, total: None,
+    run: RunFolder, path: Trajectory, camera: Camera, *, cell_m: float = CELL_M, progress: Progress = no_progress
 ) -> FloorPlan:
     """Make the floor plan of a run's map.
 
-    path: poses of the frames that were not lost; camera: that of the images the run worked on. Without a `renderer`,
-    the run's render settings are used. Calls `progress(poses done, total)`. Raises RunError without a map; ConfigError
+    path: poses of the frames that were not lost; camera: that of the images the run worked on. It is
+    rendered with the run's settings. Calls `progress(poses done, total)`. Raises RunError without a map; ConfigError
     unless 1 mm ≤ cell_m ≤ 1 m; SigmaSplatError if no surface is visible.
     """
     config, field = run.config(), run.read_map()
-    renderer = renderer or FieldRenderer(config.render, config.backend)
+    renderer = FieldRenderer(config.render, config.backend)
     return floor_plan(field, path, camera, cell_m=cell_m, renderer=renderer, progress=progress)

@@ -14,7 +14,7 @@ from sigmasplat.types import Progress
 
 
 class LoopResult(Protocol):
-    """What a session reads of a tested pair of submaps (slam.loop_closure.closer.Loop)."""
+    """The values that a session reads from a tested pair of submaps (slam.loop_closure.closer.Loop)."""
 
     @property
     def query(self) -> int: ...
@@ -30,7 +30,7 @@ class LoopResult(Protocol):
 
 
 class StepResult(Protocol):
-    """What a session reads of a step (slam.step_result.Step)."""
+    """The values that a session reads from a step (slam.step_result.Step)."""
 
     @property
     def index(self) -> int: ...
@@ -55,7 +55,7 @@ class StepResult(Protocol):
 
 
 class SlamSystem(Protocol):
-    """What a session needs from the system that it runs (slam.slam.Slam)."""
+    """The interface that a session needs from its SLAM system (slam.slam.Slam)."""
 
     @property
     def field(self) -> GaussianField: ...
@@ -68,7 +68,7 @@ class SlamSystem(Protocol):
 
 
 class Callback(Protocol):
-    """Is called while a session runs."""
+    """Receives the progress of a session."""
 
     def __call__(self, step: StepResult) -> None:
         """Handle a step."""
@@ -114,7 +114,7 @@ class Checkpointer(Protocol):
     """Saves the state that a stopped run resumes from (resume.StateFile)."""
 
     def after_frame(self, index: int, wall_s: float) -> None:
-        """Save the state after source frame `index` if it is time to."""
+        """Save the state after source frame `index` if a save is due."""
 
     def save(self, index: int, wall_s: float) -> None:
         """Save the state after source frame `index`, `wall_s` seconds into the run."""

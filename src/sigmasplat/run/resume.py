@@ -27,7 +27,7 @@ class StateFile:
     last_s: float = field(default_factory=time.perf_counter)
 
     def after_frame(self, index: int, wall_s: float) -> None:
-        """Save the state after source frame `index`, `wall_s` seconds into the run, if it is time to."""
+        """Save the state after source frame `index`, `wall_s` seconds into the run, if a save is due."""
         if self.every_s and time.perf_counter() - self.last_s >= self.every_s:
             self.save(index, wall_s)
 

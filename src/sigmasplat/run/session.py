@@ -1,7 +1,8 @@
 """Run SLAM on a sequence and keep the results in a run folder that stays readable however the run ends.
 
-In order: a new folder; for each frame a step, a line of the log, the callback and now and then a checkpoint; the final
-map; the results. The command (`commands/run.py`) opens the source before that and scores the run afterwards.
+The order: create the run folder; for each frame take a step, append a line to the log, call the callback, and sometimes
+write a checkpoint; make the final map; write the results. The command (`commands/run.py`) opens the source before that
+and scores the run afterwards.
 """
 
 import signal
@@ -109,9 +110,9 @@ class Session:
     def execute(self) -> Outcome:
         """Process all frames, make the final map, and write trajectory, map, loops and checkpoint.
 
-        The results are written also if the session is cut short. The first Ctrl-C stops after the current frame, or at
-        the next progress report of the final map; a second one stops at once. Both end as "interrupted", and a session
-        interrupted between frames makes no final map. A live source has no other end than Ctrl-C: the first one ends
+        The results are also written if the session is interrupted. The first Ctrl-C stops after the current frame, or
+        at the next progress report of the final map; a second one stops immediately. Both end as "interrupted", and a
+        session interrupted between frames makes no final map. A live source ends only with Ctrl-C: the first one ends
         its frames, and the final map is made. Any other exception marks the run as "failed" and gets a note with the
         path of the run folder.
         """

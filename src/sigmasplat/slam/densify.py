@@ -1,4 +1,5 @@
-"""Multiply splats where the loss pulls hardest, and find those that have grown too large (3DGS; CG-SLAM §5)."""
+"""Split and clone splats where the loss has the largest gradient, and find splats that have grown too large (3DGS;
+CG-SLAM §5)."""
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 
 MEANS, SCALES = COLUMNS["means"], COLUMNS["log_scales"]
 CHILD_SCALE = 1.6
-"""A half is smaller than the whole by this (3DGS)."""
+"""Scale of each half of a split splat: the scale of the splat divided by this (3DGS)."""
 RADIUS_SIGMAS = 3.0
 
 
@@ -21,7 +22,7 @@ def densify_mask(stats: DensifyStats, split_gradient: float, most: int | None = 
     """Return which splats to densify, bool [N]: those whose mean gradient over the steps that saw them is at least
     `split_gradient` (0 = none).
 
-    most: at most this many, those of the largest gradient, the first of equal ones.
+    most: maximum number, the splats with the largest gradients first; equal ones in the order of their rows.
     """
     mean = stats.grad2d / stats.times.clamp(min=1)
     chosen = (stats.times > 0) & (mean >= split_gradient) & (split_gradient > 0)
@@ -32,10 +33,10 @@ def densify_mask(stats: DensifyStats, split_gradient: float, most: int | None = 
 
 
 def multiply(field: GaussianField, chosen: Tensor, config: DensifyConfig, random: np.random.Generator) -> Tensor:
-    """Split the chosen splats [N] that are large, clone the others if asked; return which were split [N].
+    """Split the chosen splats [N] that are large; clone the others if the settings say so. Return which were split [N].
 
-    Split splats are removed and the rows after them move up; new splats are appended. A chosen splat makes the field
-    larger by one at most.
+    Split splats are removed and the rows after them move up; new splats are appended. Each chosen splat enlarges the
+    field by at most one.
     """
     large = chosen & (field.scales.amax(1) > config.split_scale_m)
     twins = _copies(field, chosen & ~large & config.clone)
@@ -47,7 +48,7 @@ def multiply(field: GaussianField, chosen: Tensor, config: DensifyConfig, random
 def split(field: GaussianField, chosen: Tensor, random: np.random.Generator) -> None:
     """Replace each chosen splat (bool [N]) by two smaller ones drawn from its Gaussian, appended in pairs.
 
-    All but place and size is the parent's; ids are new and Adam's state is at rest.
+    Everything except position and size is copied from the splat. Ids are new, and Adam's moments start at 0.
     """
     halves = _copies(field, chosen.nonzero().squeeze(1).repeat_interleave(2))
     _scatter(halves, random)
@@ -56,7 +57,7 @@ def split(field: GaussianField, chosen: Tensor, random: np.random.Generator) -> 
 
 
 def clone(field: GaussianField, rows: Tensor) -> None:
-    """Add copies of some splats (bool [N] or indices) at the end, with new ids and Adam's state at rest."""
+    """Append copies of some splats (bool [N] or indices), with new ids; Adam's moments start at 0."""
     field.append(_copies(field, rows))
 
 
@@ -84,7 +85,7 @@ def too_large(
 
 
 def _copies(field: GaussianField, rows: Tensor) -> GaussianField:
-    """Copy rows with what they carry besides, Adam's state at rest."""
+    """Return copies of rows with their attributes; Adam's moments start at 0."""
     attributes = {name: Rows(attribute.params[rows]) for name, attribute in field.attributes.items()}
     return GaussianField(field.params[rows], attributes=attributes)
 

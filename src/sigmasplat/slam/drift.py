@@ -1,4 +1,5 @@
-"""Accumulate the covariance of tracking within a submap: it cuts submaps and weighs odometry edges."""
+"""Accumulate the covariance of tracking within a submap. It decides when to cut a submap, and weights odometry
+edges."""
 
 from dataclasses import dataclass, field
 
@@ -12,8 +13,8 @@ HOP_M, HOP_RAD = 0.002, 0.002
 UNKNOWN = np.diag([1.0] * 6)
 """Covariance of a hop between images without overlap, m² and rad²."""
 BIAS = 0.02
-"""Relative systematic error of the distance travelled and the angle turned: calibration errors do not average out from
-hop to hop. On redkitchen the estimated rotations are 3 to 11 % smaller than the true ones."""
+"""Relative systematic error of the distance travelled and the angle turned: calibration errors do not average out over
+hops. On redkitchen the estimated rotations are 3 to 11 % smaller than the true ones."""
 
 
 @dataclass(eq=False)

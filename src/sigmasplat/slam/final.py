@@ -23,7 +23,7 @@ from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.tsdf import packed
 from sigmasplat.render.view import View
 from sigmasplat.slam.fusion import count_keyframes, fuse, fusion_views
-from sigmasplat.types import Matrix, Progress
+from sigmasplat.types import Matrix, Progress, no_progress
 
 CACHE_BYTES = 64 << 20
 """Memory for prepared pictures; other pictures are read again when they are drawn."""
@@ -35,12 +35,14 @@ def final_map(
     config: Config,
     view: View,
     random: np.random.Generator,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = no_progress,
 ) -> GaussianField:
-    """Return the map in the world, made of submaps at `anchors` (T_world_submap [4, 4] each) and refined with `view`.
+    """Return the map in the world: made from submaps at `anchors` (T_world_submap [4, 4] each), then refined with
+    `view`.
 
-    Calls `progress(steps done, total)`. Memory holds this map, one submap and some pictures. Raises SigmaSplatError if
-    there is no submap, a submap has no anchor, or its camera is not the view's; ConfigError on settings out of range.
+    Calls `progress(steps done, total)`. Memory contains this map, one submap and some pictures. Raises SigmaSplatError
+    if there is no submap, a submap has no anchor, or its camera is not the view's; ConfigError on settings out of
+    range.
     """
     _refuse_misfits(store, anchors, config.final)
     seed = seeded_on_surface if config.final.seed_from == "mesh" else merged

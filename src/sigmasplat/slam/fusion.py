@@ -20,7 +20,7 @@ from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.tsdf import Tsdf
 from sigmasplat.render import FieldRenderer, Render
-from sigmasplat.types import Matrix, Progress
+from sigmasplat.types import Matrix, Progress, no_progress
 
 VOXEL_M = 0.01
 TRUNCATION_VOXELS = 4
@@ -69,7 +69,7 @@ def fuse(
     voxel_m: float = VOXEL_M,
     weigh: bool = False,
     renderer: Renderer | None = None,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = no_progress,
 ) -> Mesh:
     """Fuse depth and colour, rendered at `total` views, into a mesh in the world.
 

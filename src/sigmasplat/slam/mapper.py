@@ -124,7 +124,7 @@ class Mapper:
         return Mapper(self.config, self.random, field)
 
     def _seed(self, view: View, target: Target, T_world_camera: NDArray[np.float64]) -> None:
-        """Add splats where the map does not explain the keyframe, within the budget."""
+        """Add splats where the map does not explain the keyframe, up to the maximum number of splats."""
         c = self.config.seeding
         if len(self.field) == 0:
             wanted = target.depth_image.numpy() > 0
@@ -141,8 +141,8 @@ class Mapper:
         self.field.append(new)
 
     def _densify(self, view: View, stats: DensifyStats) -> None:
-        """Split and clone the splats with the largest gradient in the newest keyframe, and split those too large in it,
-        within the budget."""
+        """Split and clone the splats with the largest gradient in the newest keyframe, and split those that are too
+        large in it, up to the maximum number of splats."""
         p, most = self.config.primitives, self.config.seeding.max_splats
         room = max(most - len(self.field), 0) if most else len(self.field)
         multiply(self.field, densify_mask(stats, p.split_gradient, room), p, self.random)
@@ -153,7 +153,8 @@ class Mapper:
             split(self.field, coarse, self.random)
 
     def _judging_keyframes(self, window: list[Keyframe]) -> list[Keyframe]:
-        """Return the keyframes that splats are judged by: those of the window, or the newest if there is no window."""
+        """Return the keyframes that pruning uses to judge splats: those of the window, or the newest if there is no
+        window."""
         return window if self.config.mapping.window else window[:1]
 
     def _fade_uncertain(self, view: View, window: list[Keyframe]) -> Tensor:

@@ -30,7 +30,7 @@ def splat_uncertainty(
         view.forward(field.params, T_camera_world, layers=True)
         rows, weights, readings = (x.to(field.params.device) for x in _owned(view, keyframe, owner))
         off = readings - depths(field.means[rows].double(), T_camera_world)
-        # Sorted by torch where that runs in parallel, so that the sums are the same every time.
+        # On a device that sums in parallel, torch sorts the indices first, so that the sums are the same every time.
         spread += torch.zeros_like(spread).index_put_((rows,), weights * (off * off), accumulate=True)
         count.index_put_((rows,), torch.ones_like(rows), accumulate=True)
     return spread / count.clamp(min=1), count
@@ -58,7 +58,7 @@ def _owned(view: View, keyframe: Keyframe, owner: str) -> tuple[Tensor, Tensor, 
 def fade(field: GaussianField, rows: Tensor, opacity: float) -> Tensor:
     """Limit the opacity of some splats (bool [N] or indices) and clear Adam's moments of it; return their ids.
 
-    Call it between fits. Moments that are kept would move the opacity back or further down, whatever the images show.
+    Call it between fits. Without clearing, the moments would move the opacity up or down regardless of the images.
     """
     column = COLUMNS["opacity_logits"].start
     limit = float(np.log(opacity / (1.0 - opacity)))
@@ -74,8 +74,9 @@ def still_uncertain(
 ) -> Tensor:
     """Return which faded splats [N] did not recover: still too uncertain, or opacity below `least_opacity`.
 
-    faded: their ids; ids that no longer exist are ignored. uncertainty [N] m²: `splat_uncertainty` of now. A faded
-    splat seldom owns a pixel, so opacity decides; in a few dozen steps it does not fall from 0.07 to 1/255.
+    faded: their ids; ids that no longer exist are ignored. uncertainty [N] m²: the current `splat_uncertainty`. A faded
+    splat rarely owns a pixel, so its opacity decides. Within a few dozen steps the opacity cannot fall from 0.07 to
+    1/255.
     """
     named = torch.zeros(field.next_id, dtype=torch.bool, device=field.ids.device)
     named[faded] = True

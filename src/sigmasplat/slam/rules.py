@@ -1,4 +1,4 @@
-"""The rules: small functions that answer yes or no, or choose from a list."""
+"""Decide by rules: small functions that answer yes or no, or choose from a list."""
 
 from collections.abc import Iterator, Sequence
 from typing import TypeVar

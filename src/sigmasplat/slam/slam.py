@@ -1,4 +1,4 @@
-"""SLAM: track every frame, map keyframes, cut submaps, close loops. `Slam.step` reads like the papers' overviews."""
+"""SLAM: track every frame, map keyframes, cut submaps, close loops. `Slam.step` follows the papers' overviews."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -30,13 +30,13 @@ from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.rules import ends_submap, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer, metrics_of
 from sigmasplat.slam.tracker import Tracker
-from sigmasplat.types import Matrix
+from sigmasplat.types import Matrix, no_progress
 
 HOST = torch.device("cpu")
 
 
 class Observation(NamedTuple):
-    """One frame as each part of the system reads it: images, what the fits compare renders with, and a pyramid."""
+    """One frame in the forms that the parts of the system need: images, the target of the fits, and a pyramid."""
 
     frame: Frame
     target: Target
@@ -91,7 +91,7 @@ class Slam:
         self.steps.append(self._step_result(seen.frame, T_submap_camera, mapped, tracking, loops))
         return self.steps[-1]
 
-    def finish(self, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
+    def finish(self, progress: Callable[[int, int], None] = no_progress) -> None:
         """Finish the last submap, look for its loops, and make the final map (VarSplat §7); call it once, at the end.
 
         Calls `progress(done, total)` with the steps of refinement, from 0 to the last one; without refinement the total
@@ -127,10 +127,10 @@ class Slam:
         return list(self.closer.loops)
 
     def trajectory(self) -> Trajectory:
-        """Return the poses of all frames so far, lost ones included (their log lines say so).
+        """Return the poses of all frames so far, including lost ones (the log marks them).
 
-        A frame is stored relative to the newest keyframe of its time, a keyframe relative to its submap. So a frame
-        follows when mapping moves its keyframe or a loop moves its submap.
+        A frame is stored relative to the newest keyframe at its time, and a keyframe relative to its submap. A frame
+        therefore moves when mapping moves its keyframe, or a loop moves its submap.
         """
         return Trajectory(np.array([s.timestamp_s for s in self.steps]), self.atlas.T_world_camera())
 
@@ -157,7 +157,8 @@ class Slam:
         return self._view
 
     def prepare(self, camera: Camera) -> View:
-        """Make the view for the images of a camera, as `Frame.prepared` leaves them; the first frame does it too."""
+        """Make the view for the images of a camera with the size of `Frame.prepared`. The first frame calls this
+        too."""
         c = self.config
         learned = bool(c.mapping.weight_nll_color or c.mapping.weight_nll_depth)
         read = c.tracking.uncertainty and c.tracking.align_depth_by == "V"
@@ -177,7 +178,7 @@ class Slam:
             return Observation(frame, target, live_image(view, frame.color, frame.depth_m, target))
 
     def _begin(self, seen: Observation) -> Matrix:
-        """Begin the first submap at the first frame, whose camera is the world; return its pose."""
+        """Start the first submap at the first frame, whose camera is the world; return its pose."""
         if not (seen.frame.depth_m > 0).any():
             raise SourceError(
                 f"frame {seen.frame.index} has no depth reading in [{self.config.input.min_depth_m}, "
@@ -210,7 +211,7 @@ class Slam:
         with self._timer.stage("map"):
             fit = self.mapper.map(self.view, index, seen.target, T_submap_camera, descriptor)
         self._timer.add(fit.seconds, prefix="map_")
-        if self.keyframe_indices[-1:] != [index]:  # a keyframe that two submaps share counts once
+        if self.keyframe_indices[-1:] != [index]:  # a keyframe that two submaps share is counted once
             self.keyframe_indices.append(index)
         self.atlas.keyframe_poses[-1] = [keyframe.T_world_camera for keyframe in self.mapper.keyframes]
         self.tracker.keep_keyframe(self.mapper.field, self.view, seen.live, self.atlas.keyframe_poses[-1][-1])
@@ -221,7 +222,7 @@ class Slam:
         return bool(ends_submap(T_submap_camera, since, moved_m, self.config.submaps))
 
     def _cut(self, T_submap_camera: Matrix) -> list[Loop]:
-        """Finish the active submap and begin the next one at its newest keyframe; return the loops tried."""
+        """Finish the active submap and start the next one at its newest keyframe; return the loops tried."""
         with self._timer.stage("cut"):
             loops = self._finish_submap()
             self.closer.submap_begun(len(self.store), T_submap_camera, self.drift.information)

@@ -19,9 +19,9 @@ KERNELS = ("project", "sort", "blend", "blend_backward", "project_backward")
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """The result of one frame: pose T_world_camera [4, 4], whether it was mapped, whether tracking was lost, numbers
-    of tracking, the number of splats, the submap, the loops that were tried when the submap before ended, and seconds
-    by stage."""
+    """The result of one frame: pose T_world_camera [4, 4], whether it was mapped, whether tracking was lost, results of
+    tracking, the number of splats, the submap, the loops that were tried when the submap before ended, and seconds by
+    stage."""
 
     index: int
     timestamp_s: float
@@ -36,7 +36,7 @@ class Step:
 
 
 def metrics_of(fit: PoseFit) -> dict[str, float]:
-    """Return the tracking numbers that a step reports."""
+    """Return the tracking values that a step reports."""
     return {
         "agreement": fit.agreement, "overlap": fit.overlap, "first_loss": fit.first_loss,
         "loss": fit.loss, "iterations": float(fit.iterations),
@@ -44,19 +44,19 @@ def metrics_of(fit: PoseFit) -> dict[str, float]:
 
 
 class StepTimer(Stopwatch):
-    """Wall-clock seconds of one step by stage, with what the view's kernels took of them."""
+    """Wall-clock seconds of one step by stage, including the seconds of the view's kernels."""
 
     def start(self) -> None:
-        """Begin a step: forget the one before."""
+        """Start the times of a new step."""
         self.seconds, self._begin_s = {}, time.perf_counter()
 
     def watch_kernels(self, view: View) -> None:
-        """Count the kernels of this view from now on."""
+        """Measure the kernels of this view from now on."""
         self._view, self._kernels_before = view, view.seconds.copy()
 
     @contextmanager
     def kernels_of(self, name: str) -> Iterator[None]:
-        """Add the kernels' part of a block of code to a stage."""
+        """Add the time of the kernels in a block of code to a stage."""
         before_s = self._view.seconds.sum()
         yield
         self.add({name: float(self._view.seconds.sum() - before_s)})

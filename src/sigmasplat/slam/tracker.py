@@ -1,4 +1,4 @@
-"""Tracking: predict the pose, fit it to the fixed map, judge the fit, and retry from other poses if it is doubtful."""
+"""Tracking: predict the pose, fit it to the fixed map, check the fit, and retry from other poses if it is doubtful."""
 
 import dataclasses
 from dataclasses import dataclass, field as dataclass_field
@@ -130,7 +130,7 @@ class Tracker:
 
 
 def _without_motion(config: TrackingConfig) -> TrackingConfig:
-    """Return the settings for a sequence's second frame: there is no motion to guess it by (CG-SLAM's code)."""
+    """Return the settings for the second frame of a sequence, which has no motion model yet (CG-SLAM's code)."""
     return dataclasses.replace(
         config,
         iterations=config.first_iterations or config.iterations,

@@ -64,7 +64,7 @@ class R3dImagePair(ImagePair):
         where, data = self.archive.path / name, self.archive.read(name)
         try:
             return np.frombuffer(self.lzfse.decompress(data), kind).reshape(height, width)
-        except (self.lzfse.error, ValueError, MemoryError) as error:  # truncated data asks for endless memory
+        except (self.lzfse.error, ValueError, MemoryError) as error:  # truncated data can request very much memory
             raise SourceError(
                 f"{where}: not {width}×{height} LZFSE-compressed values ({error}); export it again"
             ) from error
@@ -91,7 +91,7 @@ class ExrImagePair(ImagePair):
     def _opened(self) -> Any:
         try:
             return self.openexr.File(str(self.depth), separate_channels=True)
-        except Exception as error:  # the library passes on any C++ exception
+        except Exception as error:  # the library can raise any C++ exception
             raise SourceError(f"{self.depth}: unreadable EXR file ({error}); export it again") from error
 
 

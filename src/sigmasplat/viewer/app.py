@@ -195,7 +195,7 @@ class ViewerApp:
                 self._merged[1], camera, pose, controls.layer, snapshot.options, snapshot.backend
             )
             if client.client_id not in self.server.get_clients():
-                return None  # the client has disconnected meanwhile
+                return None  # the client has disconnected in the meantime
             client.scene.set_background_image(made.pixels, "jpeg", jpeg_quality=85)
             drawn = self._drawn[key] = (state, made.legend)
         legend: Legend | None = drawn[1]

@@ -39,7 +39,7 @@ def open_server(host: str, port: int, title: str) -> "ViserServer":
 
     found = free_port(host, port)
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # do not log clients that disconnect
-    with own_pages_only(host) as restricted, contextlib.redirect_stdout(io.StringIO()):  # no banner of viser
+    with own_pages_only(host) as restricted, contextlib.redirect_stdout(io.StringIO()):  # no banner from viser
         server = LocalServer(host=host, port=found, label=title, verbose=False)
     if not restricted:
         close(server)

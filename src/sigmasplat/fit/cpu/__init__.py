@@ -1,1 +1,1 @@
-"""What the compiled CPU kernels do for the fits."""
+"""Run the fits on the compiled CPU kernels."""

@@ -1,11 +1,11 @@
-"""Adam's settling of a field in the compiled CPU kernels (native/adam.h)."""
+"""Settle a field's Adam state with the compiled CPU kernels (native/adam.h)."""
 
 from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates
 from sigmasplat.model.field import Rows
 
 
 def settle(field: Rows, rates: Rates) -> None:
-    """Settle rows of a field's 17 columns as `fit.adam.settle` does."""
+    """Settle the rows of a field's 17 columns, as `fit.adam.settle` does."""
     from sigmasplat.native import _core
 
     _core.adam_settle(

@@ -1,4 +1,4 @@
-"""Halve and align images in the host's memory: numpy, and the compiled CPU kernels (native/align.h)."""
+"""Halve and align images in host memory with numpy and the compiled CPU kernels (native/align.h)."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -26,13 +26,13 @@ def halve(averaged: tuple[Half, Half], depth: Half) -> tuple[Half, Half, Half]:
 
 
 def _quarter(image: Image) -> Image:
-    """Stack the four pixels of each 2×2 cell, [4, H/2, W/2]."""
+    """Return the four pixels of each 2×2 cell, stacked as [4, H/2, W/2]."""
     h, w = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
     return np.stack([image[0:h:2, 0:w:2], image[0:h:2, 1:w:2], image[1:h:2, 0:w:2], image[1:h:2, 1:w:2]])
 
 
 def _half_depth(depth: Image) -> Image:
-    """Average 2×2 cells of one surface; a cell with a hole or a depth step gets no reading."""
+    """Average depth over 2×2 cells. A cell gets no reading if it contains a hole or a depth step."""
     cells = _quarter(depth)
     near, far = cells.min(0), cells.max(0)
     return np.where((near > 0) & (far - near < 0.05), cells.mean(0), np.float32(0.0))
@@ -45,11 +45,11 @@ def readings_of(finest: Image, coarsest: Image) -> Matrix:
 
 
 def align(levels: Sequence[LevelPlanes], readings: Matrix, T_live_reference: Matrix, rules: AlignRules) -> AlignedPose:
-    """Align from the coarsest level, the last, to the finest, in one call of the kernels.
+    """Align from the coarsest level (the last one) to the finest, in one call of the kernels.
 
-    Raises BackendError where they are not built.
+    Raises BackendError if the kernels are not built.
     """
-    backend_module("cpu")  # refuses in one line where the kernels are not built
+    backend_module("cpu")  # raises BackendError if the kernels are not built
     from sigmasplat.native import _core
 
     (depth_m, n), T, sums = readings.tolist(), np.array(T_live_reference, np.float64), np.zeros(4)

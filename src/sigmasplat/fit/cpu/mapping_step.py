@@ -1,4 +1,4 @@
-"""One mapping step fused in the compiled CPU kernels; tests hold it to `TorchStep`."""
+"""One mapping step, fused in the compiled CPU kernels. Tests compare it with `TorchStep`."""
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from sigmasplat.types import Matrix
 
 
 class CompiledImages:
-    """The image terms fused in the native kernels, on a view's planes (r, g, b, z[, σ²+c² ×3])."""
+    """The image terms, fused in the native kernels, on a view's planes (r, g, b, z[, σ²+c² ×3])."""
 
     def __init__(self, planes: View) -> None:
         from sigmasplat.native import _core
@@ -46,20 +46,20 @@ class CompiledImages:
 
 
 class CompiledStep(CompiledImages):
-    """The same step fused in the native kernels (tests hold it to `TorchStep`)."""
+    """The mapping step, fused in the native kernels. Tests compare it with `TorchStep`."""
 
     def __init__(self, view: CpuView) -> None:
         super().__init__(view)
         self.view = view
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
-        """Render the field to the view's planes."""
+        """Render the field into the view's planes."""
         render_for(self.view, field.params, T_camera_world, target, weights)
 
     def splats(
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Matrix, float]:
-        """Step as `TorchStep.splats` does, in one pass without gradient rows in memory."""
+        """Step the splats as `TorchStep.splats` does, in one pass that stores no gradient rows in memory."""
         twist, v = np.zeros(6), self.view
         cost = v.raster.step(
             field.params, field.moment1, field.moment2, field.last_step, v.g_sums, *v.depth_gradients(),
@@ -69,5 +69,5 @@ class CompiledStep(CompiledImages):
         return twist, cost
 
     def accumulator(self, field: GaussianField) -> GradientAccumulator:
-        """Make room for the gradient of several images."""
+        """Allocate the gradient sum of several images."""
         return GradientAccumulator(self.view, field)

@@ -1,4 +1,4 @@
-"""What alignment reads off a view, in the compiled CPU kernels (native/track.h)."""
+"""Compute the reference maps of alignment from a view, with the compiled CPU kernels (native/track.h)."""
 
 import numpy as np
 from torch import Tensor
@@ -11,7 +11,7 @@ from sigmasplat.render.cpu.view import CpuView
 
 
 def reference_maps(view: CpuView, config: TrackingConfig, moment: Tensor | None) -> ReferenceMaps:
-    """Compute `fit.reference_maps.reference_maps` in the kernels; the maps are arrays."""
+    """Compute `fit.reference_maps.reference_maps` with the kernels; the maps are arrays."""
     from sigmasplat.native import _core
 
     weighed, by_U = config.uncertainty and len(view.sums) == 7, config.uncertainty and moment is not None

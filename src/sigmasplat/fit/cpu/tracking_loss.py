@@ -1,4 +1,5 @@
-"""The tracking loss in the compiled CPU kernels (native/track.h): medians, weights and gradient in one call."""
+"""Compute the tracking loss with the compiled CPU kernels (native/track.h): medians, weights and gradient in one
+call."""
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from sigmasplat.render.cpu.view import CpuView
 
 
 def tracking_gradient(view: CpuView, target: Target, config: TrackingConfig, exposure: Tensor) -> tuple[float, Tensor]:
-    """Compute `fit.tracking_loss.tracking_gradient` in the kernels."""
+    """Compute `fit.tracking_loss.tracking_gradient` with the kernels."""
     from sigmasplat.native import _core
 
     g_exposure, camera = np.zeros(2), view.camera

@@ -1,1 +1,1 @@
-"""What the CUDA kernels do for the fits. Experimental: this code has never run on a GPU."""
+"""Run the fits on the CUDA kernels. Experimental: this code has never run on a GPU."""

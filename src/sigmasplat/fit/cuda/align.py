@@ -1,5 +1,8 @@
-"""Align images that lie on a CUDA device (native/cuda/align.cu). All steps are launched at once; the host waits at the
-end only. The arithmetic is the text that the CPU's kernels use too (native/align_pixel.h, align_loop.h)."""
+"""Align images on a CUDA device (native/cuda/align.cu).
+
+All steps are launched at once, and the host waits only at the end. CPU and CUDA share the source code of the arithmetic
+(native/align_pixel.h, align_loop.h).
+"""
 
 from collections.abc import Sequence
 
@@ -13,9 +16,9 @@ from sigmasplat.render.cuda import launch as cuda_launch
 from sigmasplat.types import Matrix
 
 CELL = 16
-"""Pixels of a cell each way, a block of threads (native/align_pixel.h)."""
+"""Width and height of a cell in pixels; one block of threads processes one cell (native/align_pixel.h)."""
 MOTIONS = 13
-"""The most motions that one launch linearises."""
+"""Maximum number of motions that one launch linearises."""
 PINHOLE = np.dtype([("size", "i4", 2), ("intrinsics", "f4", 4)])
 LOOP = np.dtype(
     [
@@ -36,9 +39,9 @@ STATE = np.dtype([("loop", LOOP), ("descent", DESCENT), ("readings", "f8")], ali
 
 
 class CudaLevel:
-    """One level of two images to align and how their residuals are weighed, as `_core.Level` of the CPU.
+    """One level of two images to align, and the weights of its residuals, like `_core.Level` on the CPU.
 
-    Planes [H, W], float32, on one device; weights may be None. Raises ValueError where they are not alike.
+    Planes [H, W], float32, on one device; weights may be None. Raises ValueError if shapes, types or devices differ.
     """
 
     def __init__(
@@ -56,7 +59,8 @@ class CudaLevel:
         self.device = reference_gray.device
 
     def normal_equations(self, motions: Matrix) -> Matrix:
-        """Linearise at T_live_reference [n, 4, 4], n ≤ `MOTIONS`: rows of H, b, sums, S [n, 52]. The host waits."""
+        """Linearise at T_live_reference [n, 4, 4], n ≤ `MOTIONS`. Returns rows of H, b, sums and S, [n, 52]. The host
+        waits."""
         n, given = len(motions), np.zeros((MOTIONS, 12))
         given[:n] = motions[:, :3].reshape(n, 12)
         of_cells, arrived = _workspace(n, self.cells, self.device)
@@ -69,7 +73,7 @@ class CudaLevel:
 
 
 def _workspace(motions: int, cells: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Allocate the sums of every cell, and the counter of blocks that have stored theirs."""
+    """Allocate the sums of all cells, and the counter of blocks that have stored their sums."""
     of_cells = torch.empty(motions * cells, NORMAL_TERMS, dtype=torch.float64, device=device)
     return of_cells, torch.zeros(motions, dtype=torch.int32, device=device)
 
@@ -80,9 +84,9 @@ def normal_equations(level: LevelPlanes, motions: Sequence[Matrix]) -> Matrix:
 
 
 def align(planes: Sequence[LevelPlanes], readings: Tensor, T_live_reference: Matrix, rules: AlignRules) -> AlignedPose:
-    """Align from the coarsest level, the last, to the finest. The host waits once.
+    """Align from the coarsest level (the last one) to the finest. The host waits once.
 
-    All steps are launched; those of a level that has converged do nothing.
+    All steps are launched; the steps of a level that has converged do nothing.
     """
     device, r, levels = readings.device, rules, [CudaLevel(*level) for level in planes]
     loop = (r.iterations, r.update_stop, r.plateau_stop, 0.0, r.degenerate_share, r.min_pixels)

@@ -1,8 +1,9 @@
-"""Descend the tracking loss as `fit.descent` does, on a CUDA device alone (native/cuda/track.cuh, descend.cuh).
+"""Minimise the tracking loss as `fit.descent` does, on a CUDA device without the host (native/cuda/track.cuh,
+descend.cuh).
 
-An iteration is launched without waiting: loss, gradient, pose, stop rules and the best iterate stay on the device. The
-host reads the state of some iterations ago now and then. Iterations launched after the descent has stopped change
-nothing.
+An iteration is launched without waiting. Loss, gradient, pose, stop rules and the best iterate stay on the device. From
+time to time the host reads the state of some iterations ago. Iterations that are launched after the descent has stopped
+change nothing.
 """
 
 import numpy as np
@@ -23,13 +24,14 @@ from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.types import Matrix
 
 MEDIANS, PASSES, DIGITS = 5, 3, 2048
-"""Of errors of depth and colour and of three channels of V; counts by 11, 10 and 10 bits (native/cuda/track.cuh)."""
+"""Medians of the errors of depth and colour, and of the three channels of V. Each is found by three passes that count
+11, 10 and 10 bits (native/cuda/track.cuh)."""
 MOST_BLOCKS = 512
-"""Blocks that share an image's pixels."""
+"""Maximum number of blocks for the pixels of an image."""
 LOOK = 8
-"""Iterations launched at once; meanwhile the host reads the result of those before."""
+"""Number of iterations launched together; while they run, the host reads the result of those before."""
 GRAPH_FROM = 12
-"""With fewer remaining iterations a graph does not pay off."""
+"""Minimum number of remaining iterations for a CUDA graph; with fewer, recording costs more than it saves."""
 STATE = np.dtype(
     [
         ("numbers", "f8", 7), ("moment1", "f8", 9), ("moment2", "f8", 9), ("exposure", "f8", 2),
@@ -37,20 +39,21 @@ STATE = np.dtype(
         ("previous", "f8"), ("steps", "i8"), ("stopped", "i8"), ("missing", "i8"),
     ]
 )  # fmt: skip
-"""The kernels' `Descending` (native/cuda/descend.cuh)."""
+"""The layout of the kernels' `Descending` (native/cuda/descend.cuh)."""
 
 
 def descend_on_device(
     params: Tensor, view: CudaView, target: Target, T_camera_world: Matrix, config: TrackingConfig, iterations: int
 ) -> Descent:
-    """Descend as `descend` does. Raises BackendError where there are too many pairs of splats and tiles."""
+    """Minimise the tracking loss as `descend` does. Raises BackendError if there are too many pairs of splats and
+    tiles."""
     if view.raster.capacity is None:
         view.forward(params, T_camera_world)  # measures how many pairs to expect
     return CudaDescent(params, view, target, T_camera_world, config).run(iterations)
 
 
 class CudaTrackingLoss:
-    """L_track of a view's planes against a target, under an exposure (exp(a), b) float32 [2] on the device."""
+    """L_track of a view's planes against a target, with an exposure (exp(a), b), float32 [2] on the device."""
 
     def __init__(self, view: CudaView, target: Target, config: TrackingConfig, exposure: Tensor) -> None:
         c, empty, pixels = config, view.raster.empty, view.alpha.numel()
@@ -63,7 +66,8 @@ class CudaTrackingLoss:
         self._given = (images, np.array(tracking_params(c, c.alpha_above), np.float32), exposure, self.selection)
 
     def launch(self) -> Tensor:
-        """Write the gradient to the view's planes; return loss and gradient by (a, b), to be added up [blocks, 3]."""
+        """Write the gradient to the view's planes. Return loss and gradient with respect to (a, b) per block [blocks,
+        3]."""
         self._tally.zero_()
         for kernel in ["count_errors"] * self._errors + ["count_variances"] * self._weigh:
             for digit in range(PASSES):
@@ -96,8 +100,8 @@ class CudaDescent:
         self.loss = CudaTrackingLoss(view, target, config, self._shown[16:])
 
     def run(self, iterations: int) -> Descent:
-        """Take at most this many steps. Where there was not room for all pairs, make room and continue from the step
-        that was not taken."""
+        """Take at most this many steps. If there is not enough memory for all pairs, allocate more and continue from
+        the step that was not taken."""
         work, left, at_once, look = self.iterate, iterations, 1, _Look(self._state)
         while left:
             for _ in range(min(at_once, left)):
@@ -128,7 +132,7 @@ class CudaDescent:
         return repeatable(self.iterate, self.view.alpha.device)
 
     def _make_room(self, iterations: int) -> "tuple[int, _Look]":
-        """Make room for the missing pairs; return how many steps remain."""
+        """Allocate memory for the missing pairs; return the number of remaining steps."""
         now = _Look(self._state).read()
         self.view.raster.expect(int(now["missing"]))
         self._state[-1] = 0
@@ -136,7 +140,7 @@ class CudaDescent:
 
 
 class _Look:
-    """A copy to the host of a descent's state at this point of the device's queue; the host does not wait."""
+    """A copy of the descent's state to the host, made at this point of the device's queue; the host does not wait."""
 
     def __init__(self, state: Tensor) -> None:
         self._on_host = torch.empty(state.shape, dtype=state.dtype, pin_memory=state.is_cuda)
@@ -147,7 +151,7 @@ class _Look:
             self._copied.record(torch.cuda.current_stream(state.device))
 
     def read(self) -> np.void:
-        """Return the state as a `STATE`. Waits until it has arrived."""
+        """Return the state as a `STATE`. Waits until the copy has finished."""
         if self._copied is not None:
             self._copied.synchronize()
         state: np.void = np.frombuffer(self._on_host.numpy().tobytes(), STATE)[0]
@@ -163,12 +167,12 @@ def _at_rest(T_camera_world: Matrix, config: TrackingConfig) -> NDArray[np.void]
 
 
 def _shown(T: Matrix) -> NDArray[np.float32]:
-    """Lay out the kernels' `Shown`: T_camera_world [4, 4] of a pose [3, 4], no exposure."""
+    """Return the kernels' `Shown` for a pose [3, 4]: T_camera_world [4, 4], without exposure."""
     return np.concatenate([T.ravel(), [0, 0, 0, 1], [1, 0]]).astype(np.float32)
 
 
 def _settings(T_camera_world: Matrix, config: TrackingConfig) -> Matrix:
-    """Lay out the kernels' `DescentNumbers`."""
+    """Return the kernels' `DescentNumbers`."""
     c = config
     rates = [c.lr_rotation, c.lr_translation, exposure_rate(c)]
     return np.array([*T_camera_world[:3].ravel(), BETA1, BETA2, EPSILON, *rates, c.update_stop, c.plateau_stop])

@@ -1,4 +1,4 @@
-"""Halve images on a CUDA device (native/cuda/align.cu), to the same values as on the CPU; the host does not wait."""
+"""Halve images on a CUDA device (native/cuda/align.cu), with the same values as on the CPU; the host does not wait."""
 
 import torch
 from torch import Tensor
@@ -40,7 +40,7 @@ def readings_of(finest: Tensor, coarsest: Tensor) -> Tensor:
 
 
 def live_planes(view: View, color: Plane, depth_m: Plane, target: Target) -> tuple[Tensor, Tensor]:
-    """Return gray and depth [H, W] of a frame on the view's device, from the target's copy there."""
+    """Return gray and depth [H, W] of a frame on the view's device, from the copy of the target on that device."""
     on_device, (h, w) = target.to(view.sums.device), depth_m.shape
     return luma(on_device.color[:, :h, :w]), on_device.depth_image
 

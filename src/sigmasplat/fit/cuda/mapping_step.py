@@ -1,4 +1,4 @@
-"""One mapping step fused in the CUDA kernels (native/cuda/fit.cu); tests hold it to `TorchStep`."""
+"""One mapping step, fused in the CUDA kernels (native/cuda/fit.cu). Tests compare it with `TorchStep`."""
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ CHANNELS = 3
 class CudaStep:
     """The image terms, the backward pass and Adam's step on a device. The host does not wait until `to_host`.
 
-    On a view of ten planes it fits the full colour covariance, as `FullCovarianceStep` does.
+    On a view of ten planes the step fits the full colour covariance, as `FullCovarianceStep` does.
     """
 
     def __init__(self, view: CudaView) -> None:
@@ -36,7 +36,7 @@ class CudaStep:
         self._taps = _gaussian_taps()
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
-        """Render the field to the view's planes."""
+        """Render the field into the view's planes."""
         render_for(self.view, field.params, T_camera_world, target, weights)
 
     def images(self, target: Target, weights: Weights) -> Tensor:
@@ -76,7 +76,8 @@ class CudaStep:
     def splats(
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Step as `TorchStep.splats` or `FullCovarianceStep.splats` does; twist and cost stay on the device."""
+        """Step the splats as `TorchStep.splats` or `FullCovarianceStep.splats` does; twist and cost stay on the
+        device."""
         view, gradient = self.view, torch.empty_like(field.params)
         twist, visible = view.backward_on_device(field.params, gradient, grad2d), view.raster.visible
         cost = add_shape_gradient(view, visible, field, gradient, weights, frozen_colors)
@@ -87,7 +88,7 @@ class CudaStep:
         return twist, cost
 
     def accumulator(self, field: GaussianField) -> Accumulator:
-        """Make room for the gradient of several images. Raises ConfigError with full colour covariance."""
+        """Allocate the gradient sum of several images. Raises ConfigError with full colour covariance."""
         if isinstance(self.view, CudaCovarianceView):
             raise one_image_only()
         return CudaAccumulator(self.view, field)
@@ -100,6 +101,6 @@ def covariance_step(view: CorrelationView) -> CudaStep:
 
 
 def _gaussian_taps() -> NDArray[np.float32]:
-    """Return the Gaussian of SSIM's window (σ 1.5 px, 11 wide, normalised) from its middle out, [6]."""
+    """Return half of SSIM's Gaussian window (σ 1.5 px, 11 wide, normalised), from the centre to the edge, [6]."""
     whole = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
     return np.asarray((whole / whole.sum())[5:], np.float32)

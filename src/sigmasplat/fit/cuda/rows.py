@@ -1,4 +1,4 @@
-"""From gradient rows to splats on a CUDA device (native/cuda/fit.cu): shape terms, Adam, sums over several images."""
+"""Step splats from gradient rows on a CUDA device (native/cuda/fit.cu): shape terms, Adam, sums over several images."""
 
 from collections.abc import Sequence
 
@@ -15,14 +15,14 @@ from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.types import Matrix
 
 MOST_COLUMNS = max(ATTRIBUTES.values())
-"""The most columns of a row that the Adam kernel steps."""
+"""Maximum number of columns that the Adam kernel steps."""
 
 
 def add_shape_gradient(
     view: CudaView, visible: Tensor, field: GaussianField, gradient: Tensor, weights: Weights, frozen_colors: int
 ) -> Tensor:
-    """Add the gradient of the shape terms to the rows [N, 17] of splats in view (uint8 [N]), in place, and zero that of
-    the first colours, which are frozen; return the cost of those terms, on the device."""
+    """Add the gradient of the shape terms to the rows [N, 17] of splats in view (uint8 [N]), in place. Set the colour
+    gradient of the first `frozen_colors` splats to 0. Return the cost of the shape terms, on the device."""
     n, (isotropy, ratio) = len(field), kernel_weights(SHAPE_TERMS, weights, "cuda").tolist()
     costs = view.raster.empty(blocks_for(n), 1, dtype=torch.float64)
     with view.stages.of("project_backward"):
@@ -34,7 +34,7 @@ def add_shape_gradient(
 
 
 def step_rows(view: CudaView, visible: Tensor, rows: Rows, gradient: Tensor, rates: Rates) -> None:
-    """Step rows in view (uint8 [N]) as `adam_step` does; gradient [N, m] and rates are those of the first m columns."""
+    """Step the visible rows (uint8 [N]) as `adam_step` does; gradient [N, m] and rates are for the first m columns."""
     used, step = gradient.shape[1], rows.steps
     per_column = np.zeros(MOST_COLUMNS, np.float32)
     per_column[:used] = rates.per_column.numpy()
@@ -48,7 +48,7 @@ def step_rows(view: CudaView, visible: Tensor, rows: Rows, gradient: Tensor, rat
 
 
 def to_host(twists: Sequence[Twist], costs: Sequence[float | Tensor]) -> tuple[list[Matrix], list[float]]:
-    """Return twists and costs in the host's memory; it waits once for all that are on a device."""
+    """Return twists and costs in host memory; waits once for all values that are on a device."""
     on_device = [x.double().reshape(-1) for x in (*twists, *costs) if isinstance(x, Tensor)]
     found = torch.cat(on_device).cpu().numpy() if on_device else np.empty(0)
     parts = iter(np.split(found, np.cumsum([len(x) for x in on_device])))
@@ -65,14 +65,15 @@ class CudaAccumulator:
         self.visible = torch.zeros(len(field), dtype=torch.uint8, device=field.params.device)
 
     def add(self, field: GaussianField, share: float, grad2d: Tensor | None = None) -> Tensor:
-        """Add the view's gradient planes at their share of the mean; return the image's own pose twist [6]."""
+        """Add the view's gradient planes, weighted by their share of the mean. Return the image's own pose twist
+        [6]."""
         twist = self._view.backward_on_device(field.params, self._rows, grad2d)
         self.visible |= self._view.raster.visible
         self.grad.add_(self._rows, alpha=share)
         return twist
 
     def step(self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int) -> Tensor:
-        """Add the gradient of the shape terms, take Adam's step; return the cost of those terms."""
+        """Add the gradient of the shape terms and take Adam's step. Return the cost of the shape terms."""
         cost = add_shape_gradient(self._view, self.visible, field, self.grad, weights, frozen_colors)
         step_rows(self._view, self.visible, field, self.grad, rates)
         return cost

@@ -26,7 +26,7 @@ class CudaViewDependentStep:
         self.rows, self._eye = torch.empty(0), np.zeros(15, np.float32)
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
-        """Render the field, with the colours seen from that pose, to the view's planes."""
+        """Render the field into the view's planes, with the colours seen from that pose."""
         harmonics, n = field.get_or_create("harmonics").params, len(field)
         self.rows, self._eye = field.params.clone(), _eye(T_camera_world)
         with self.view.stages.of("project"):
@@ -56,12 +56,15 @@ class CudaViewDependentStep:
         return twist, cost
 
     def accumulator(self, field: GaussianField) -> Accumulator:
-        """Refuse with a ConfigError: the step takes one image only."""
+        """Raise ConfigError: this step takes one image only."""
         raise one_image_only()
 
     def _through_colors(self, field: GaussianField, visible: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        """Carry the gradient of shown colours, in rows [N, 17], to the harmonics [N, width], returned, and by the
-        directions to the means, in the same rows, and to the camera's translation, returned [3]."""
+        """Propagate the gradient of the colours, in rows [N, 17], to the harmonics and through the viewing direction.
+
+        Returns the gradient of the harmonics [N, width] and of the camera's translation [3]. The gradient of the means
+        is added to the same rows.
+        """
         raster, n, harmonics = self.view.raster, len(field), field.get_or_create("harmonics").params
         found, partial = raster.empty(n, self.width), raster.empty(blocks_for(n), 3, dtype=torch.float64)
         with self.view.stages.of("project_backward"):
@@ -73,6 +76,6 @@ class CudaViewDependentStep:
 
 
 def _eye(T_camera_world: Matrix) -> NDArray[np.float32]:
-    """Lay out the kernels' `Eye`: the camera's position, and its pose's R and t, [15]."""
+    """Return the kernels' `Eye` [15]: the camera's position, and R and t of its pose."""
     R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
     return np.concatenate([-R.T @ t, R.ravel(), t]).astype(np.float32)

@@ -15,7 +15,7 @@ def unit(quats: Doubles) -> Doubles:
 def smallest_three(quats: Doubles) -> tuple[NDArray[np.intp], Doubles]:
     """Split unit quaternions [N, 4] into the index of the largest component [N] and the other three [N, 3], in order.
 
-    Signs are chosen so that the largest component is positive: it then follows from the others, which lie in ±1/√2.
+    Signs are chosen so that the largest component is positive. It then follows from the others, which are within ±1/√2.
     """
     which = np.abs(quats).argmax(1)
     rows = np.arange(len(quats))

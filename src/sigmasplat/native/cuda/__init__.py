@@ -1,1 +1,1 @@
-"""The CUDA kernels and what compiles them. Experimental: they have never run on a GPU."""
+"""The CUDA kernels, and their compilation. Experimental: they have never run on a GPU."""

@@ -1,10 +1,11 @@
-// Aligning two images on a GPU: pyramids, normal equations, and steps that no host waits for. fit/align.py is the definition;
-// residuals and steps are the CPU's own text (align_pixel.h, align_loop.h). A block is a cell of CELL×CELL pixels, a thread a pixel.
+// Image alignment on a GPU: pyramids, normal equations, and steps for which the host does not wait. fit/align.py is the
+// definition. Residuals and steps are the source code of the CPU kernels (align_pixel.h, align_loop.h). A block of
+// threads processes a cell of CELL×CELL pixels, one pixel per thread.
 #include "sums.cuh"
 
 namespace sigmasplat {
 
-// What lanes.h is on a CPU: a vector of one lane.
+// Replaces lanes.h: a vector of one lane.
 typedef float vf;
 typedef int vi;
 typedef bool Mask;
@@ -33,15 +34,15 @@ inline vf only(Mask mask, vf a) { return mask ? a : 0.f; }
 
 static_assert(CELL * CELL == THREADS, "a thread for each pixel of a cell");
 constexpr int WARPS = THREADS / 32;
-constexpr int PULL = MATRIX_TERMS + SUMS, FLOATS = 32;   // of a pixel: H, sums, b, and one to spare
+constexpr int PULL = MATRIX_TERMS + SUMS, FLOATS = 32;   // per pixel: H, sums, b, and one unused
 
 // ---- pyramids -------------------------------------------------------------------------------------------------------
 
 struct Averaged { const float *a, *b; };   // planes; both may be null
 struct Halved { float *a, *b; };
 
-// Halve images [height, width]: two that are averaged over 2×2 cells, and a depth, which has a reading where all four pixels of
-// a cell have one, of one surface.
+// Halve images [height, width]: two are averaged over 2×2 cells. Depth gets a reading only if all four pixels of a cell
+// have one and belong to one surface.
 KERNEL halve_images(Averaged from, Halved to, const float* depth, float* half_depth, int width, int height) {
     const int w = width / 2, h = height / 2, i = thread_number();
     if (i >= w * h) return;
@@ -56,7 +57,8 @@ KERNEL halve_images(Averaged from, Halved to, const float* depth, float* half_de
 
 // ---- normal equations -----------------------------------------------------------------------------------------------
 
-// Add 32 numbers over a warp's lanes, in 31 shuffles: half of them change hands at each round; lane k returns the sum of the k-th.
+// Sum 32 numbers over a warp's lanes in 31 shuffles: in each round, lanes exchange half of their numbers. Lane k
+// returns the sum of number k.
 template <int HALF> inline float sum_of_lanes(float* values) {
     const bool upper = int(threadIdx.x) & HALF;
     for (int k = 0; k < HALF; k++) {
@@ -69,7 +71,8 @@ template <int HALF> inline float sum_of_lanes(float* values) {
 
 inline int cells_of(const AlignLevel& L) { return (L.width + CELL - 1) / CELL * ((L.height + CELL - 1) / CELL); }
 
-// Store the sums of one cell's pixels, float within a warp and double beyond, in the order of NORMAL_TERMS. Every thread must come.
+// Store the sums of one cell's pixels in the order of NORMAL_TERMS: float within a warp, double across warps. All
+// threads must call this.
 inline void store_cell(const AlignLevel& L, const AlignOptions& o, const double* T, int cell, double* stored) {
     __shared__ float of_warps[WARPS][FLOATS];
     __shared__ double of_cell[FLOATS];
@@ -104,8 +107,8 @@ inline void store_cell(const AlignLevel& L, const AlignOptions& o, const double*
     stored[thread] = value;
 }
 
-// Store a cell's share; the block that comes last adds up all cells, in their order, to `total`, and learns that it was the last.
-// arrived: 0, and left at 0. Every thread must come.
+// Store a cell's sums. The last block to arrive adds all cells in order to `total` and returns true. arrived: 0 before
+// and after. All threads must call this.
 inline bool add_cells(const AlignLevel& L, const AlignOptions& o, const double* T, int cell, double* of_cells, unsigned* arrived,
                       double* total) {
     constexpr int GROUPS = THREADS / NORMAL_TERMS;
@@ -113,7 +116,7 @@ inline bool add_cells(const AlignLevel& L, const AlignOptions& o, const double* 
     __shared__ double of_groups[GROUPS * NORMAL_TERMS];
     const int thread = int(threadIdx.x), cells = cells_of(L);
     store_cell(L, o, T, cell, of_cells + size_t(cell) * NORMAL_TERMS);
-    __threadfence();                       // what this thread stored is seen before the block is counted
+    __threadfence();                       // make this thread's data visible before the block is counted
     __syncthreads();
     if (thread == 0) last = atomicAdd(arrived, 1u) == unsigned(cells) - 1u;
     __syncthreads();
@@ -135,11 +138,11 @@ inline bool add_cells(const AlignLevel& L, const AlignOptions& o, const double* 
     return true;
 }
 
-constexpr int MOTIONS = 13;                // at most, of one launch: a motion and six steps to either side
+constexpr int MOTIONS = 13;                // maximum of one launch: one motion, and six steps in both directions
 struct Motions { double T[MOTIONS][12]; };
 
-// Linearise a level at several motions, as many blocks for each as there are cells: found [motions, NORMAL_TERMS],
-// of_cells [motions, cells, NORMAL_TERMS], arrived [motions].
+// Linearise a level at several motions, with one block per cell and motion: found [motions, NORMAL_TERMS], of_cells
+// [motions, cells, NORMAL_TERMS], arrived [motions].
 KERNEL normal_equations(AlignPlanes planes, AlignPinhole pinhole, AlignOptions options, Motions motions, double* of_cells,
                         unsigned* arrived, double* found) {
     __shared__ double total[NORMAL_TERMS];
@@ -150,23 +153,23 @@ KERNEL normal_equations(AlignPlanes planes, AlignPinhole pinhole, AlignOptions o
         found[motion * NORMAL_TERMS + int(threadIdx.x)] = total[threadIdx.x];
 }
 
-// ---- the loop: launched as often as steps may be taken; what is settled goes by ------------------------------------------
+// ---- the loop: launched once per possible step; steps of a finished level do nothing -------------------------------
 
 struct AlignState {                        // of one alignment, in device memory; the host reads it at the end (fit/cuda/align.py)
     AlignLoop loop;
     Descent descent;
-    double readings;                       // pixels of the reference that have depth
+    double readings;                       // number of reference pixels with depth
 };
 struct Guess { double T[12]; };
 
-// reference [2]: its usual depth, metres, and how many pixels have one.
+// reference [2]: its mean depth in metres, and the number of pixels with depth.
 KERNEL begin_alignment(AlignState* state, AlignLoop loop, Guess guess, int levels, const double* reference) {
     if (threadIdx.x) return;
     loop.depth_m = reference[0];
     *state = {loop, begin_descent(guess.T, levels), reference[1]};
 }
 
-// Take a step on a level, unless it is settled. of_cells [cells, NORMAL_TERMS], arrived [1].
+// Take a step on a level, unless the level is finished. of_cells [cells, NORMAL_TERMS], arrived [1].
 KERNEL take_align_step(AlignPlanes planes, AlignPinhole pinhole, AlignOptions options, int number, AlignState* state,
                        double* of_cells, unsigned* arrived) {
     __shared__ double total[NORMAL_TERMS];

@@ -1,4 +1,5 @@
-"""Compile the CUDA kernels' text for a GPU architecture by NVRTC, which needs no driver, and keep the result."""
+"""Compile the source of the CUDA kernels for a GPU architecture with NVRTC, which needs no driver, and cache the
+result."""
 
 import hashlib
 import os
@@ -12,7 +13,7 @@ from sigmasplat.env import install_extra
 from sigmasplat.errors import BackendError
 
 FOLDER = Path(__file__).parents[1]
-"""Of the texts: headers that the CPU's kernels share, and `cuda/` below it."""
+"""Folder of the sources: headers shared with the CPU kernels, and the CUDA kernels in its subfolder `cuda`."""
 RASTER, FIT, ALIGN = "cuda/raster.cu", "cuda/fit.cu", "cuda/align.cu"
 TEXTS = {
     RASTER: (RASTER, "cuda/gradients.cuh", "cuda/tiles.cuh", "cuda/device.cuh", "cuda/sums.cuh", "splat.h"),
@@ -20,28 +21,28 @@ TEXTS = {
     ALIGN: (ALIGN, "align_pixel.h", "align_loop.h", "align_level.h", "cuda/sums.cuh"),
 }
 FEATURE_COUNTS = (4, 7, 11, 16)
-"""The feature counts compiled, a program each; a count between them is padded with zeros."""
+"""The compiled feature counts, one program each; other counts are padded with zeros."""
 FITTING = 0
-"""In a feature count's place: the program of the fits' loops, which does without one."""
+"""Used instead of a feature count for the program of the fits' loops, which has no feature count."""
 ALIGNING = -1
 """The same for the program that aligns images."""
 PROGRAMS = (ALIGNING, FITTING, *FEATURE_COUNTS)
 ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
-"""What the tests compile for; any other that NVRTC knows is compiled when a device asks for it."""
+"""Architectures compiled in the tests; any other that NVRTC supports is compiled when a device needs it."""
 INSTALL = install_extra("gpu")
 INSTALL_OLDER = "pip install 'cuda-bindings<13' nvidia-cuda-nvrtc-cu12"
-"""For drivers that support CUDA 12 only."""
+"""For drivers that support only CUDA 12."""
 
 
 class Compiled(NamedTuple):
-    """Machine code of one program, or PTX, and what the compiler had to say about it."""
+    """Machine code of one program, or PTX, and the compiler's log."""
 
     code: bytes
     log: str
 
 
 def cache_folder() -> Path:
-    """Return where compiled kernels are kept: the user's cache folder, as the XDG base directories have it."""
+    """Return the folder of compiled kernels: the user's cache folder of the XDG standard."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sigmasplat" / "kernels"
 
 
@@ -57,15 +58,15 @@ def compiler_version() -> str:
 
 
 def text_of(features: int) -> str:
-    """Name the text that a program is made of."""
+    """Return the name of the source file of a program."""
     return {FITTING: FIT, ALIGNING: ALIGN}.get(features, RASTER)
 
 
 def cubin(features: int, architecture: str, folder: Path | None = None) -> bytes:
-    """Return the program of one feature count as machine code, from the cache where it is there, else compiled.
+    """Return the machine code of the program of one feature count, from the cache if it is there, else compiled.
 
-    folder: instead of the user's cache. A cache that cannot be written is done without. Raises BackendError as
-    `compiled` does.
+    folder: replaces the user's cache. If a cache cannot be written, it is not used. Raises BackendError as `compiled`
+    does.
     """
     kept = (folder or cache_folder()) / f"{architecture}-{features}-{key_of(features, architecture)}.cubin"
     try:
@@ -77,7 +78,8 @@ def cubin(features: int, architecture: str, folder: Path | None = None) -> bytes
 
 
 def key_of(features: int, architecture: str) -> str:
-    """Hash all that decides on the machine code: texts, options, architecture, the compiler's version."""
+    """Return a hash of everything that determines the machine code: sources, options, architecture, compiler
+    version."""
     said = [compiler_version(), *_options(features, architecture)]
     texts = [(FOLDER / name).read_text(encoding="utf-8") for name in TEXTS[text_of(features)]]
     return hashlib.sha256("\0".join(said + texts).encode()).hexdigest()[:32]
@@ -86,7 +88,7 @@ def key_of(features: int, architecture: str) -> str:
 def compiled(features: int, architecture: str, more: Sequence[str] = ()) -> Compiled:
     """Compile the program: machine code for sm_90, PTX for compute_90.
 
-    more: further options of NVRTC's. Raises BackendError with the compiler's log, or where NVRTC is missing.
+    more: further options of NVRTC. Raises BackendError with the compiler's log, or if NVRTC is missing.
     """
     version = compiler_version()
     from cuda.bindings import nvrtc
@@ -110,7 +112,7 @@ def compiled(features: int, architecture: str, more: Sequence[str] = ()) -> Comp
 
 
 def _read(size_of: Callable[..., Any], fill: Callable[..., Any], program: Any) -> bytes:
-    """Copy out one of a program's results."""
+    """Copy one result of a program from NVRTC."""
     memory = bytearray(size_of(program)[1])
     fill(program, memory)
     return bytes(memory)
@@ -121,7 +123,7 @@ def _said(log: str) -> str:
 
 
 def _options(features: int, architecture: str) -> list[str]:
-    """Return the compiler's options. Without contraction the rounding is the same on every device."""
+    """Return the compiler's options. Contraction is off, so that the rounding is the same on every device."""
     return [
         f"--gpu-architecture={architecture}",
         "--std=c++17",
@@ -132,14 +134,15 @@ def _options(features: int, architecture: str) -> list[str]:
 
 
 def architecture_of(capability: tuple[int, int]) -> str:
-    """Name the architecture of a compute capability: (9, 0) is sm_90."""
+    """Return the name of the architecture of a compute capability: (9, 0) is sm_90."""
     return f"sm_{capability[0]}{capability[1]}"
 
 
 def target_of(capability: tuple[int, int]) -> str:
-    """Return what to compile for a device: its architecture or, where the compiler is older than that, compute_120.
+    """Return the architecture to compile for on a device, or compute_120 if the compiler is older than the device.
 
-    That is PTX for the newest it knows, of which the driver makes machine code. Raises BackendError without NVRTC.
+    compute_120 means PTX of the newest architecture that the compiler knows; the driver converts it to machine code.
+    Raises BackendError without NVRTC.
     """
     compiler_version()
     from cuda.bindings import nvrtc
@@ -150,18 +153,18 @@ def target_of(capability: tuple[int, int]) -> str:
 
 
 def include_folders() -> tuple[Path, ...]:
-    """Return where the texts' headers are."""
+    """Return the folder of the sources' headers."""
     return FOLDER / "cuda", FOLDER
 
 
 def kernel_names(features: int) -> list[str]:
-    """List the kernels that a program's texts define, whatever the feature count."""
+    """List the kernels that a program defines, whatever its feature count."""
     texts = ((FOLDER / name).read_text(encoding="utf-8") for name in TEXTS[text_of(features)])
     return [name for text in texts for name in re.findall(r"^KERNEL (\w+)\(", text, re.MULTILINE)]
 
 
 def _keep(path: Path, code: bytes) -> None:
-    """Write machine code to the cache in one step; several processes may do so at once."""
+    """Write machine code to the cache atomically, because several processes may do so at once."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as part:

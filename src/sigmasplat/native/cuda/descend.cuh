@@ -1,29 +1,31 @@
-// A pose's descent by Adam, on the device: what fit/descent.py does between a gradient and the next render. Included by track.cuh.
+// Minimise the tracking loss by Adam on the device: the work of fit/descent.py between a gradient and the next render.
+// Included by track.cuh.
 #pragma once
 
 namespace sigmasplat {
 
-struct Pairs { const long long* total; long long room; };   // of tiles and splats: how many there were, how many were listed
+struct Pairs { const long long* total; long long room; };   // pairs of tiles and splats: number needed, number that fits
 
-// Where there were more pairs than room, set every splat's count to 0: the backward pass then reads no unwritten record.
+// If there are more pairs than fit, set every splat's count to 0, so that the backward pass reads no unwritten record.
 KERNEL drop_pairs(Pairs pairs, int n, int* counts) {
     const int i = thread_number();
     if (i < n && *pairs.total > pairs.room) counts[i] = 0;
 }
 
-struct Descending {                        // fit/cuda/descent.py lays it out
-    double numbers[7], moment1[9], moment2[9];        // of the pose, quaternion or axis times angle first; Adam's, exposure's last
+struct Descending {                        // layout: fit/cuda/descent.py
+    double numbers[7], moment1[9], moment2[9];        // pose parameters, rotation first; Adam's moments, exposure's last
     double exposure[2], best_exposure[2];             // (a, b)
-    double T[12], best_T[12];                         // T_camera_world, rows of [R | t]: now, and where the loss was least
+    double T[12], best_T[12];                         // T_camera_world, rows of [R | t]: now, and at the smallest loss
     double first, best, previous;                     // losses
-    long long steps, stopped, missing;                // missing: how many pairs there were when there was not room for all
+    long long steps, stopped, missing;                // missing: number of pairs needed if not all fit
 };
 struct DescentNumbers {                    // guess: rows of T_camera_world
     double guess[12], beta1, beta2, epsilon, lr_rotation, lr_translation, lr_exposure, update_stop, plateau_stop;
 };
-struct Shown { float pose[16], gain, offset; };       // as the render and the loss read them
+struct Shown { float pose[16], gain, offset; };       // the pose and exposure that render and loss use
 
-// Add up what the blocks of a kernel stored, COUNT numbers each, in a fixed order. Every thread must come; thread 0 has the sums.
+// Sum what the blocks of a kernel stored, COUNT numbers each, in a fixed order. All threads must call this; thread 0
+// gets the sums.
 template <int COUNT> inline void sum_blocks(const double* partial, int blocks, double* total) {
     __shared__ double of_warps[COUNT * THREADS / 32];
     const int t = int(threadIdx.x);
@@ -49,7 +51,7 @@ inline void times(const double* R, const double* v, double* out) {
     for (int i = 0; i < 3; i++) out[i] = R[3 * i] * v[0] + R[3 * i + 1] * v[1] + R[3 * i + 2] * v[2];
 }
 
-// The rotation exp([w]×) and its left Jacobian, row by row (model/se3.py: exp).
+// Compute the rotation exp([w]×) and its left Jacobian, by rows (model/se3.py: exp).
 inline void rotation_of_axis(const double* w, double* R, double* jacobian) {
     const double theta2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2], theta = sqrt(theta2);
     const bool small = theta2 < 1e-8;
@@ -72,7 +74,8 @@ inline void rotation_of_quaternion(const double* q, double* R) {
     R[6] = 2.0 * (x * z - w * y); R[7] = 2.0 * (y * z + w * x); R[8] = 1.0 - 2.0 * (x * x + y * y);
 }
 
-// The gradient by the numbers of that by the left twist (ρ, φ) (fit/motion.py: AxisAngle, QuaternionMotion).
+// Compute the gradient with respect to the parameters from that of the left twist (ρ, φ) (fit/motion.py: AxisAngle,
+// QuaternionMotion).
 inline void by_axis(const double* numbers, const double* twist, double* gradient) {
     double R[9], jacobian[9];
     rotation_of_axis(numbers, R, jacobian);
@@ -93,7 +96,7 @@ inline void by_quaternion(const double* q, const double* twist, double* gradient
     }
 }
 
-// The numbers' pose, rows of [R | t].
+// Compute the pose of the parameters, rows of [R | t].
 inline void pose_of_axis(const double* numbers, double* T) {
     double R[9], jacobian[9];
     rotation_of_axis(numbers, R, jacobian);
@@ -111,7 +114,7 @@ inline void pose_of_quaternion(const double* numbers, const double* guess, doubl
     }
 }
 
-// What Adam moves number k by at a rate (fit/adam.py: VectorAdam).
+// Return Adam's update of number k at a rate (fit/adam.py: VectorAdam).
 inline double adam_update(Descending& d, const DescentNumbers& n, int k, double gradient, double rate) {
     d.moment1[k] += (1.0 - n.beta1) * (gradient - d.moment1[k]);
     d.moment2[k] += (1.0 - n.beta2) * (gradient * gradient - d.moment2[k]);
@@ -122,13 +125,14 @@ inline double adam_update(Descending& d, const DescentNumbers& n, int k, double 
 
 inline void keep_best(Descending& d, double loss) {
     if (d.steps == 1) d.first = loss;
-    if (!(loss < d.best) || (loss == 0.0 && d.steps > 1)) return;   // no pixel that counts may not win over one that does
+    if (!(loss < d.best) || (loss == 0.0 && d.steps > 1)) return;   // no common pixels: must not replace a pose that has some
     d.best = loss;
     for (int k = 0; k < 12; k++) d.best_T[k] = d.T[k];
     for (int k = 0; k < 2; k++) d.best_exposure[k] = d.exposure[k];
 }
 
-// Take a step from the loss and its gradients, in one block; nothing where the descent has stopped, or where pairs were missing.
+// Take a step from the loss and its gradients, in one block. Does nothing if the descent has stopped, or if pairs were
+// missing.
 KERNEL descend(Descending* descending, Shown* shown, DescentNumbers n, int axis, const double* losses, int loss_blocks,
                const double* twists, int twist_blocks, Pairs pairs) {
     double loss[3], twist[6], gradient[7];

@@ -1,5 +1,6 @@
-// What splat.h asks of its number type, for one float of a GPU thread, and the layouts that the CUDA kernels share.
-// One program per feature count: FEATURES is defined when the text is compiled (render/cuda/raster.py lists the counts).
+// The functions that splat.h needs from its number type, for one float of a GPU thread, and the layouts shared by the
+// CUDA kernels. There is one program per feature count: FEATURES is defined on compilation (native/cuda/cubins.py lists
+// the counts).
 #pragma once
 #include "sums.cuh"
 
@@ -15,7 +16,7 @@ inline float only(bool condition, float a) { return condition ? a : 0.f; }
 
 #include "splat.h"
 
-constexpr int TILE = 16;                   // pixels each way, one thread a pixel: a warp is a patch of 8×4 of them
+constexpr int TILE = 16;                   // size in pixels, one thread per pixel: a warp is a patch of 8×4 pixels
 constexpr int PATCH_WIDTH = 8, PATCH_HEIGHT = 4, PATCHES = 8;
 
 constexpr float ALPHA_MAX = 0.99f;
@@ -23,7 +24,7 @@ constexpr float LOG2_E = 1.4426950408889634f;
 // alpha = 2^(log2(o) − p² − q²), p = L1·dx + L2·dy, q = L3·dy, L = CONIC_SCALE·l.
 constexpr float CONIC_SCALE = 0.8493218002880191f;    // sqrt(log2(e)/2)
 
-// A splat as the pixels read it: 8 floats of geometry, then its features, padded to whole float4s.
+// A splat as used per pixel: 8 floats of geometry, then its features, padded to whole float4s.
 struct Geometry { float l1, l2, l3, u, v, log_opacity, z, spare; };
 constexpr int GEOMETRY = 8;
 constexpr int SLOTS = (FEATURES + 3) / 4 * 4;         // floats of features in a row
@@ -32,12 +33,13 @@ constexpr int PARAMS = 17;                            // columns of GaussianFiel
 
 struct Box { short x0, y0, x1, y1; };                 // tiles, inclusive
 
-struct Frame {                             // the image, as every kernel takes it, by value
+struct Frame {                             // the image; every kernel takes it by value
     int width, height, tiles_x, tiles_y;
     float log_alpha_min, stop;             // log2 of alpha_min; transmittance_stop
 };
 
-// The camera is passed by value; its pose may lie in device memory instead, so that no host waits for it: `pose` holds T [4, 4].
+// The camera is passed by value. Its pose can be in device memory instead, so that the host does not wait for it:
+// `pose` is T [4, 4].
 inline View<float> posed(View<float> view, const float* pose) {
     if (pose)
         for (int i = 0; i < 3; i++) {

@@ -1,5 +1,6 @@
-// The loops of the fits on a GPU: the mapping loss with its gradient, SSIM, the shape terms, Adam. fit/losses.py and fit/adam.py are
-// their definitions, native/losses.h and native/adam.h the same on a CPU. Planes are [K, H, W], exactly the image's size.
+// The loops of the fits on a GPU: the mapping loss with its gradient, SSIM, the shape terms, Adam. fit/losses.py and
+// fit/adam.py are the definitions; native/losses.h and native/adam.h are the CPU versions. Planes are [K, H, W],
+// exactly of the image's size.
 #include "harmonics.cuh"
 
 namespace sigmasplat {
@@ -10,13 +11,13 @@ inline float signed_weight(float error, float weight) { return error > 0.f ? wei
 
 // ---- the mapping loss -----------------------------------------------------------------------------------------------
 
-struct LossPlanes {                        // median_depth and moment, and their gradients, are null where they have no weight
+struct LossPlanes {                        // median_depth, moment and their gradients are null if their weight is 0
     const float *sums, *color, *depth, *median_depth, *moment;
     float *on_sums, *on_median_depth, *on_moment;
 };
 struct LossWeights { float l1, depth, nll_color, nll_depth, median_depth, moment; };
 
-// Store, block by block, what the weighted terms sum up to over valid pixels; write every gradient plane whole.
+// Store, per block, the sums of the weighted terms over valid pixels. All values of every gradient plane are written.
 KERNEL mapping_losses(LossPlanes p, int pixels, int variance, float per_pixel, LossWeights weights, double* sums) {
     const int at = thread_number();
     float cost = 0.f;
@@ -26,7 +27,7 @@ KERNEL mapping_losses(LossPlanes p, int pixels, int variance, float per_pixel, L
         const float depth = p.sums[3 * size_t(pixels) + at], depth_error = valid ? depth - reading : 0.f;
         cost = weights.depth * per_pixel * fabsf(depth_error);
         float on_depth = signed_weight(depth_error, weights.depth * per_pixel);
-        if (p.median_depth) {              // both sides are pulled; where no splat takes half the light there is none
+        if (p.median_depth) {              // both depths get a gradient; median depth 0 = none
             const float median = p.median_depth[at], apart = valid && median > 0.f ? depth - median : 0.f;
             const float pull = signed_weight(apart, weights.median_depth * per_pixel);
             cost += weights.median_depth * per_pixel * fabsf(apart);
@@ -62,9 +63,10 @@ KERNEL mapping_losses(LossPlanes p, int pixels, int variance, float per_pixel, L
     store_sums<1>(&cost, sums);
 }
 
-// Store, block by block, what `nll_color_full` sums up to over valid pixels; add its gradient to the colours' planes and those of the
-// variances' second moments, and write it to the three off-diagonal planes: sums [10, H, W], `weight` over values.
-// V + εI = L diag(d) Lᵀ as in fit/losses.py, and back through it line by line; r is detached.
+// Store, per block, the sum of `nll_color_full` over valid pixels. Its gradient is added to the planes of the colours
+// and of the variances' second moments, and written to the three off-diagonal planes. sums [10, H, W]; `weight` is
+// divided by the number of values. V + εI = L diag(d) Lᵀ as in fit/losses.py, then backwards line by line; r is
+// detached.
 KERNEL nll_color_full(const float* sums, const float* target, const float* depth, int pixels, float weight, float* on_sums, double* costs) {
     const int at = thread_number();
     const size_t plane = size_t(pixels);
@@ -105,19 +107,19 @@ KERNEL nll_color_full(const float* sums, const float* target, const float* depth
     store_sums<1>(&cost, costs);
 }
 
-// ---- SSIM: 11×11 Gaussian, zero beyond the border and where there is no reading ---------------------------------------
+// ---- SSIM: 11×11 Gaussian; images are 0 outside the border and without a reading ----------------------------------
 
 constexpr int TILE = 16, RADIUS = 5, HALO = TILE + 2 * RADIUS;
 constexpr float C1 = 0.01f * 0.01f, C2 = 0.03f * 0.03f;
-struct Taps { float at[RADIUS + 1]; };     // of the Gaussian, from its middle out; they sum to 1
+struct Taps { float at[RADIUS + 1]; };     // Gaussian weights from the centre to the edge; the whole window sums to 1
 
-struct Patch { int x, y, channel; };       // a block's first pixel; blocks go through tiles, then channels
+struct Patch { int x, y, channel; };       // a block's first pixel; blocks are numbered by tile, then by channel
 inline Patch patch_of_block(int width, int height) {
     const int tiles_x = (width + TILE - 1) / TILE, tiles_y = (height + TILE - 1) / TILE, tile = int(blockIdx.x) % (tiles_x * tiles_y);
     return {tile % tiles_x * TILE, tile / tiles_x * TILE, int(blockIdx.x) / (tiles_x * tiles_y)};
 }
 
-// Blur COUNT planes of a patch with its halo along the rows, planes[q][row][column] to rows[q][row][column of the tile].
+// Blur COUNT planes of a patch and its halo along the rows: planes[q][row][column] to rows[q][row][column of the tile].
 template <int COUNT> inline void blur_rows(const float* planes, const Taps& taps, float* rows) {
     for (int k = int(threadIdx.x); k < COUNT * HALO * TILE; k += THREADS) {
         const float* from = planes + k / TILE * HALO + k % TILE + RADIUS;
@@ -126,14 +128,15 @@ template <int COUNT> inline void blur_rows(const float* planes, const Taps& taps
         rows[k] = sum;
     }
 }
-inline float blur_column(const float* rows, const Taps& taps, int x, int y) {   // of one plane, at a pixel of the tile
+inline float blur_column(const float* rows, const Taps& taps, int x, int y) {   // value of one plane at a pixel of the tile
     const float* from = rows + (y + RADIUS) * TILE + x;
     float sum = taps.at[0] * from[0];
     for (int d = 1; d <= RADIUS; d++) sum = fmaf(taps.at[d], from[-d * TILE] + from[d * TILE], sum);
     return sum;
 }
 
-// Store the sum of SSIM over each block's pixels, and its derivatives by the blurred x, x² and x·y: 3 planes for each channel.
+// Store the sum of SSIM over each block's pixels, and its derivatives with respect to the blurred x, x² and x·y: 3
+// planes per channel.
 KERNEL ssim(const float* image, const float* target, const float* depth, int width, int height, Taps taps, float* derivatives,
             double* sums) {
     __shared__ float planes[5 * HALO * HALO];
@@ -173,7 +176,7 @@ KERNEL ssim(const float* image, const float* target, const float* depth, int wid
     store_sums<1>(&similarity, sums);
 }
 
-// Add `scale` times the gradient of the summed SSIM to the image's.
+// Add `scale` times the gradient of the summed SSIM to the image's gradient.
 KERNEL ssim_backward(const float* image, const float* target, const float* depth, int width, int height, Taps taps,
                      const float* derivatives, float scale, float* on_image) {
     __shared__ float planes[3 * HALO * HALO];
@@ -200,8 +203,9 @@ KERNEL ssim_backward(const float* image, const float* target, const float* depth
 
 // ---- the splats -----------------------------------------------------------------------------------------------------
 
-// Add the pull of |s − mean(s)| and of max(s)/min(s) − 1 on the log scales of splats in view to their gradient rows, and store what
-// they cost; still the colours of the first `frozen`. isotropy: weight over 3n; ratio: weight, a mean over `seen` splats.
+// Add the gradient of |s − mean(s)| and of max(s)/min(s) − 1 with respect to log scales to the gradient rows of splats
+// in view, and store the cost. Set the colour gradient of the first `frozen` splats to 0. isotropy: weight over 3n;
+// ratio: weight, for a mean over `seen` splats.
 KERNEL shape_terms(const float* params, const unsigned char* visible, const long long* seen, int n, int frozen, float isotropy, float ratio,
                    float* on_params, double* costs) {
     const int i = thread_number();
@@ -219,7 +223,7 @@ KERNEL shape_terms(const float* params, const unsigned char* visible, const long
             leasts += s[k] == least;
         }
         cost += ratios * (most / least - 1.f);
-        for (int k = 0; k < 3; k++) {      // equals share the pull
+        for (int k = 0; k < 3; k++) {      // equal scales share the gradient
             const float apart = (s[k] == most ? 1.f / mosts : 0.f) - (s[k] == least ? 1.f / leasts : 0.f);
             on_row[7 + k] += isotropy * (signed_weight(s[k] - mean, 1.f) - shared) * s[k] + ratios * (most / least) * apart;
         }
@@ -229,12 +233,12 @@ KERNEL shape_terms(const float* params, const unsigned char* visible, const long
     store_sums<1>(&cost, costs);
 }
 
-constexpr int MOST_COLUMNS = 45;           // of rows that Adam steps
+constexpr int MOST_COLUMNS = 45;           // maximum number of columns that Adam steps
 struct Rates { float of[MOST_COLUMNS]; };
 struct AdamNumbers { float beta1, beta2, epsilon, unbias1, unbias2; };   // unbias: 1 / (1 − βᵗ) at this step
 
-// Step the rows in view by Adam, one thread for each of the first `used` numbers of `columns`; what a row missed meanwhile is made up
-// for, as adam_step does. Gradient rows hold the used columns only.
+// Step the rows in view by Adam, one thread per number in the first `used` of `columns` columns. The missed motion of a
+// row is added, as in adam_step. Gradient rows contain only the used columns.
 KERNEL adam(float* params, float* moment1, float* moment2, const int* last_step, const unsigned char* visible, const float* gradient,
             int numbers, int columns, int used, Rates rates, AdamNumbers a, int step) {
     const int k = thread_number();
@@ -243,7 +247,7 @@ KERNEL adam(float* params, float* moment1, float* moment2, const int* last_step,
     const size_t at = size_t(row) * columns + column;
     const float rate = rates.of[column], g = gradient[k], m0 = moment1[at], v0 = moment2[at];
     float value = params[at];
-    if (missed > 0 && last > 0) {          // coasting on its moments, each step r times the one before
+    if (missed > 0 && last > 0) {          // missed motion: each step is r times the one before
         const float r = a.beta1 / sqrtf(a.beta2), steps = r * (1.f - powf(r, float(missed))) / (1.f - r);
         const float m = m0 / (1.f - powf(a.beta1, float(last))), v = v0 / (1.f - powf(a.beta2, float(last)));
         value -= rate * steps * m / (sqrtf(v) + a.epsilon);

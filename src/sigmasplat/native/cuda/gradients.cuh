@@ -1,5 +1,6 @@
-// Pixels' gradients to splats: for every (tile, splat) pair a record of sums over the tile's pixels, then the records of each
-// splat added in a fixed order, then the chain to its shape and to the pose. Included by raster.cu. docs/kernels.md derives it.
+// Gradients from pixels to splats. For every (tile, splat) pair, a record of sums over the tile's pixels; then the sum
+// of each splat's records in a fixed order; then the chain rule to its shape and to the pose. Included by raster.cu.
+// Derivation: docs/kernels.md.
 #pragma once
 
 namespace sigmasplat {
@@ -11,12 +12,12 @@ template <int COLORS, bool MOMENT> constexpr int record_floats = (sums_in<COLORS
 
 struct PlaneGradients { const float *sums, *moment, *alpha; };   // alpha may be null
 
-constexpr int AT_ONCE = 8;                 // splats whose pairs (g, w) lie in shared memory together: one for each warp
-constexpr int PIXELS = THREADS + 4;        // floats from a row of pixels to the next: eight threads read eight banks
-constexpr int WEIGHTS = AT_ONCE * PIXELS + 16;   // where w lies behind g: in other banks
-constexpr int LOADED = 64;                 // splats brought to shared memory together
+constexpr int AT_ONCE = 8;                 // splats whose pairs (g, w) are in shared memory together, one per warp
+constexpr int PIXELS = THREADS + 4;        // floats between rows of pixels: eight threads read eight banks
+constexpr int WEIGHTS = AT_ONCE * PIXELS + 16;   // offset of w relative to g: other banks
+constexpr int LOADED = 64;                 // splats copied to shared memory together
 
-// What one pixel carries through the backward walk, near to far: `behind` is Σ w·G over the splats still to come.
+// The state of one pixel in the backward pass, near to far: `behind` is Σ w·G over the splats not yet processed.
 template <int COLORS, bool MOMENT> struct Walk {
     float on_sums[COLORS], on_alpha, on_moment, ref, light, behind;
 };
@@ -42,7 +43,7 @@ inline Walk<COLORS, MOMENT> walk_at(const Pixel& pixel, const Frame& frame, cons
     return walk;
 }
 
-// What a splat's pair (g, w) is multiplied with at this thread's pixel, a column for each sum of the record.
+// The factors of a splat's pair (g, w) at this thread's pixel, one column per sum of the record.
 template <int COLORS, bool MOMENT> inline void store_basis(const Walk<COLORS, MOMENT>& walk, float x, float y, float* basis) {
     float* at = basis + threadIdx.x;
     const float moments[MOMENTS] = {1.f, x, y, x * x, x * y, y * y};
@@ -54,7 +55,7 @@ template <int COLORS, bool MOMENT> inline void store_basis(const Walk<COLORS, MO
     }
 }
 
-// Pass one splat: set ∂L/∂power and w, tell whether the splat counts here.
+// Process one splat: set ∂L/∂power and w; return whether the splat contributes to this pixel.
 template <int COLORS, bool MOMENT>
 inline bool pass(Walk<COLORS, MOMENT>& walk, const float* row, float x, float y, const Frame& frame, float& on_power, float& w) {
     const float4 a = reinterpret_cast<const float4*>(row)[0], b = reinterpret_cast<const float4*>(row)[1];
@@ -76,7 +77,8 @@ inline bool pass(Walk<COLORS, MOMENT>& walk, const float* row, float x, float y,
     return true;
 }
 
-// Lane c of a warp holds sum c of one record; move its moments from the tile's centre to the splat's mean, (u, v) from there.
+// Lane c of a warp holds sum c of one record. Move the centre of its moments from the tile's centre to the splat's
+// mean, at (u, v) relative to it.
 inline float about_mean(float sum, int c, float u, float v) {
     const float m0 = __shfl_sync(ALL_LANES, sum, 0), mx = __shfl_sync(ALL_LANES, sum, 1), my = __shfl_sync(ALL_LANES, sum, 2);
     switch (c) {
@@ -89,7 +91,8 @@ inline float about_mean(float sum, int c, float u, float v) {
     }
 }
 
-// One warp makes one splat's record: lanes 0–15 and 16–31 add the same sums over each half of every patch's pixels.
+// One warp computes one splat's record: lanes 0–15 and 16–31 compute the same sums over one half of every patch's
+// pixels each.
 template <int COLORS, bool MOMENT>
 inline void write_record(const float* pairs, const float* basis, const bool* live, int s, float u, float v, float* record) {
     constexpr int SUMS = sums_in<COLORS, MOMENT>, RECORD = record_floats<COLORS, MOMENT>;
@@ -114,8 +117,8 @@ inline void write_record(const float* pairs, const float* basis, const bool* liv
     }
 }
 
-// Walk a tile's pixels once more. `slots` [pairs]: where the record of each listed pair belongs. The first COLORS of a row's
-// features have gradients; the others have none and are passed over.
+// Process a tile's pixels again. `slots` [pairs]: where to store the record of each listed pair. The first COLORS of a
+// row's features have gradients; the others are skipped.
 template <int COLORS, bool MOMENT>
 inline void blend_tile_backward(const Frame& frame, const float* rows, const Lists& lists, const long long* slots,
                                 const float* reference, int used, const Planes& o, const PlaneGradients& g, float* records) {
@@ -123,7 +126,7 @@ inline void blend_tile_backward(const Frame& frame, const float* rows, const Lis
     __shared__ __align__(16) float batch[LOADED * STEP];
     __shared__ __align__(16) float basis[sums_in<COLORS, MOMENT> * PIXELS];
     __shared__ __align__(16) float pairs[WEIGHTS + AT_ONCE * PIXELS];
-    __shared__ float2 means[LOADED];       // from the tile's centre
+    __shared__ float2 means[LOADED];       // relative to the tile's centre
     __shared__ unsigned patches[LOADED];
     __shared__ bool live[AT_ONCE * PATCHES];
     const int tile = int(blockIdx.x), t = int(threadIdx.x), patch = t / 32;
@@ -164,7 +167,7 @@ inline void blend_tile_backward(const Frame& frame, const float* rows, const Lis
                 if (t % 32 == 0) live[s * PATCHES + patch] = anywhere;
             }
             __syncthreads();
-            if (patch < together)          // here a warp is not a patch but the one that makes record number `patch`
+            if (patch < together)          // here `patch` is a warp's number: it computes that record
                 write_record<COLORS, MOMENT>(pairs, basis, live, patch, means[some + patch].x, means[some + patch].y,
                                              records + size_t(slots[begin + first + some + patch]) * RECORD);
             __syncthreads();
@@ -183,8 +186,8 @@ KERNEL blend_backward_moment(Frame frame, const float* rows, Lists lists, const 
     blend_tile_backward<FEATURES, true>(frame, rows, lists, slots, reference, used, o, g, records);
 }
 
-// Add each splat's records, which lie side by side, in their order: a thread for every sum of every splat, of which there must be
-// fewer than 2³², for 64-bit divisions take several times as long.
+// Sum each splat's records, which are contiguous, in order, with one thread per sum and splat. There must be fewer than
+// 2³² such sums, because 64-bit divisions take several times as long.
 KERNEL sum_records(const float* records, const int* first_slots, const int* counts, int n, int record, float* sums) {
     const unsigned k = unsigned(blockIdx.x) * THREADS + unsigned(threadIdx.x), width = unsigned(record);
     const unsigned i = k / width, c = k - i * width;
@@ -210,7 +213,7 @@ inline FootprintGradient<float> footprint_gradient(const float* m, float l1, flo
     return g;
 }
 
-// moment: where in a record the two sums about the reference depth lie, 0 = nowhere.
+// moment: position in a record of the two sums about the reference depth, 0 = none.
 KERNEL chain_given(const float* conics, const float* z, const float* opacities, const int* counts, const float* sums, int n, int used,
                    int record, int moment, float* on_means2d, float* on_conics, float* on_z, float* on_opacities, float* on_features) {
     const int i = thread_number();
@@ -251,7 +254,7 @@ KERNEL blend_backward_pose(Frame frame, const float* rows, Lists lists, const lo
     blend_tile_backward<4, false>(frame, rows, lists, slots, nullptr, used, o, g, records);
 }
 
-// Chain a splat's summed record to its shape, and to the pose.
+// Propagate a splat's summed record to its shape and to the pose.
 inline void chain(const View<float>& view, const Splat& s, const float* m, int moment, float on_median, FootprintGradient<float>& g,
                   ShapeGradient<float>& out) {
     const Footprint<float> f = project(view, s.shape, view.near_m);

@@ -1,5 +1,5 @@
-// Colours that depend on where they are seen from, on a GPU: from splats to the colours that a camera is shown, and back.
-// model/harmonics.py defines the functions, fit/view_dependent.py the step that lives on this.
+// View-dependent colours on a GPU: from splats to the colours that a camera sees, and back. model/harmonics.py defines
+// the functions, fit/view_dependent.py the mapping step that uses them.
 #pragma once
 #include "sums.cuh"
 
@@ -7,7 +7,7 @@ namespace sigmasplat {
 
 constexpr int PARAMS = 17;                 // columns of GaussianField.params
 
-struct Dual { float value, by[3]; };       // a number and its derivatives by x, y, z
+struct Dual { float value, by[3]; };       // a number and its derivatives with respect to x, y, z
 inline Dual operator+(Dual a, Dual b) { return {a.value + b.value, {a.by[0] + b.by[0], a.by[1] + b.by[1], a.by[2] + b.by[2]}}; }
 inline Dual operator-(Dual a, Dual b) { return {a.value - b.value, {a.by[0] - b.by[0], a.by[1] - b.by[1], a.by[2] - b.by[2]}}; }
 inline Dual operator*(float a, Dual b) { return {a * b.value, {a * b.by[0], a * b.by[1], a * b.by[2]}}; }
@@ -16,7 +16,7 @@ inline Dual operator*(Dual a, Dual b) {
                                 a.by[2] * b.value + a.value * b.by[2]}};
 }
 
-// Hand the harmonics of degrees 1 to `degree` in the direction (x, y, z) to take(number, value), one after another.
+// Call take(number, value) for each harmonic of degrees 1 to `degree` in the direction (x, y, z), in order.
 template <class Number, class Take> inline void each_harmonic(Number x, Number y, Number z, int degree, Take take) {
     const float a1 = 0.4886025119029199f;                                  // √(3/4π)
     take(0, -a1 * y); take(1, a1 * z); take(2, -a1 * x);
@@ -36,9 +36,9 @@ template <class Number, class Take> inline void each_harmonic(Number x, Number y
     take(14, -a3 * (x * (xx - 3.f * yy)));
 }
 
-struct Eye { float position[3], R[9], t[3]; };   // a camera: where it is, and T_camera_world
+struct Eye { float position[3], R[9], t[3]; };   // a camera: its position, and T_camera_world
 
-// The unit direction from the camera to a splat, and how far it is.
+// Compute the unit direction from the camera to a splat; return the distance.
 inline float direction_to(const float* mean, const Eye& eye, float* unit) {
     for (int k = 0; k < 3; k++) unit[k] = mean[k] - eye.position[k];
     const float length = sqrtf(unit[0] * unit[0] + unit[1] * unit[1] + unit[2] * unit[2]);
@@ -46,7 +46,8 @@ inline float direction_to(const float* mean, const Eye& eye, float* unit) {
     return length;
 }
 
-// Put the colours that the camera is shown in the place of those of the splats before it; `rows` begin as copies of theirs.
+// Replace the colours of the splats in front of the camera by those that it sees; `rows` are initially copies of the
+// splats.
 KERNEL show_colors(float* rows, const float* harmonics, int n, int degree, int columns, Eye eye) {
     const int i = thread_number();
     if (i >= n) return;
@@ -61,8 +62,9 @@ KERNEL show_colors(float* rows, const float* harmonics, int n, int degree, int c
     for (int c = 0; c < 3; c++) row[11 + c] = color[c];
 }
 
-// Carry the gradient of shown colours, in `on_params`, to the harmonics of splats in view [n, used], written, and by the direction
-// to their means, added. A camera that moves by ρ leaves the directions to −ρ: R times the means' share is its own, summed by block.
+// Propagate the gradient of the colours, in `on_params`, to the harmonics of splats in view [n, used] (written), and by
+// the viewing direction to their means (added). A camera motion ρ acts like a splat motion −ρ: the camera's gradient is
+// R times the sum over the means, stored per block.
 KERNEL carry_colors(const float* params, const float* harmonics, const unsigned char* visible, int n, int degree, int columns, int used,
                     Eye eye, float* on_params, float* on_harmonics, double* on_position) {
     const int i = thread_number();

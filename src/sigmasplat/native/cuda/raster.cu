@@ -1,4 +1,5 @@
-// Splats to pixels on a GPU: project, list for every tile the splats that reach it, blend. docs/kernels.md says how.
+// Render splats on a GPU: project them, list for every tile the splats that reach it, blend. Description:
+// docs/kernels.md.
 #include "tiles.cuh"
 
 namespace sigmasplat {
@@ -71,8 +72,9 @@ KERNEL pack_view(View<float> view, const float* pose, const float* params, int n
 
 // ---- rows to lists --------------------------------------------------------------------------------------------------
 
-// Write the (tile, splat) pairs of the splat that is r-th in depth behind those of all nearer ones. Sorted by tile, stably,
-// each tile's lie near to far. `first_slots`: where a splat's pairs begin; its gradients will lie there too.
+// Write the (tile, splat) pairs of the splat at rank r in depth, after those of all nearer splats. A stable sort by
+// tile then leaves each tile's pairs in order near to far. `first_slots`: where a splat's pairs begin, and later its
+// gradients.
 template <class Key>
 inline void list_pairs(const long long* order, const long long* ends, const int* counts, const Box* boxes, const float* rows, int n,
                        int capacity, const Frame& frame, int* first_slots, Key* tiles, int* owners) {
@@ -102,8 +104,9 @@ KERNEL list_pairs_int(const long long* order, const long long* ends, const int* 
 
 // ---- lists to pixels ------------------------------------------------------------------------------------------------
 
-// A tile's splats are items[tile_begin[t]] … items[tile_begin[t + 1] − 1], near to far. Where there were more pairs than
-// `capacity` the lists are cut short, and the tiles go through all splats in order of depth instead: slow, but the same image.
+// A tile's splats are items[tile_begin[t]] … items[tile_begin[t + 1] − 1], near to far. If there are more pairs than
+// `capacity`, the lists are incomplete, and the tiles process all splats in order of depth instead: slow, but the same
+// image.
 struct Lists {
     const int *items, *tile_begin;
     const long long *order, *total;
@@ -118,7 +121,7 @@ struct Planes {                            // [K, H, W] and [H, W]; those not re
     float* median_depth;
 };
 
-struct Pixel { int x, y; bool inside; size_t at; float dx, dy; };   // dx, dy from the tile's centre
+struct Pixel { int x, y; bool inside; size_t at; float dx, dy; };   // dx, dy: relative to the tile's centre
 inline Pixel pixel_of_thread(const Frame& frame) {
     const int patch = int(threadIdx.x) / 32, lane = int(threadIdx.x) % 32;
     const int x = patch % 2 * PATCH_WIDTH + lane % PATCH_WIDTH, y = patch / 2 * PATCH_HEIGHT + lane / PATCH_WIDTH;
@@ -132,17 +135,19 @@ inline Pixel pixel_of_thread(const Frame& frame) {
     return p;
 }
 
-// Rows in shared memory are an odd number of float4s, so that eight threads that write one each meet eight different banks.
+// Rows in shared memory have an odd number of float4s, so that eight threads that write one each use eight different
+// banks.
 constexpr int SHARED_ROW = ROW / 4 % 2 ? ROW : ROW + 4;
 constexpr int BATCH = THREADS;
 
-// log2 of what a splat's alpha would be at a pixel; a: l1, l2, l3, U, b: V, log2(o) with p = l1·x + l2·y + U, q = l3·y + V.
+// log2 of a splat's alpha at a pixel before its limits. a: l1, l2, l3, U; b: V, log2(o), with p = l1·x + l2·y + U, q =
+// l3·y + V.
 inline float log_alpha(const float4& a, const float4& b, float dx, float dy) {
     const float q = fmaf(a.z, dy, b.x), p = fmaf(a.x, dx, fmaf(a.y, dy, a.w));
     return fmaf(-p, p, fmaf(-q, q, b.y));
 }
 
-// Geometry about the centre of the tile whose corner is (x, y), as `log_alpha` reads it.
+// Store geometry relative to the centre of the tile whose corner is (x, y), in the layout of `log_alpha`.
 inline void store_about_center(const Geometry& g, float x, float y, float* to) {
     const float u = g.u - (x + (TILE - 1) * 0.5f), v = g.v - (y + (TILE - 1) * 0.5f);
     float4* row = reinterpret_cast<float4*>(to);

@@ -1,16 +1,16 @@
-// Sums over the threads of a block, in a fixed order: the same bytes every time, without atomics.
+// Sums over the threads of a block in a fixed order, without atomics, so that every run gives the same bytes.
 #pragma once
 
 #define KERNEL extern "C" __global__ void __launch_bounds__(256)
 
 namespace sigmasplat {
 
-constexpr int THREADS = 256;               // of every block
+constexpr int THREADS = 256;               // threads per block
 constexpr unsigned ALL_LANES = 0xffffffffu;
 
 inline int thread_number() { return int(blockIdx.x) * THREADS + int(threadIdx.x); }
 
-// Add COUNT numbers of all threads of a block, and store them as the block's. Every thread must come.
+// Sum COUNT numbers over all threads of a block, and store them as the block's sums. All threads must call this.
 template <int COUNT> inline void store_sums(const float* values, double* partial) {
     __shared__ double of_warps[COUNT * THREADS / 32];
     const int lane = int(threadIdx.x) % 32, warp = int(threadIdx.x) / 32;

@@ -1,18 +1,19 @@
-// Which splats reach which pixels: bounds of alpha ≥ alpha_min, not of three sigma, so that the image does not depend on tiles.
+// Which splats reach which pixels. The bounds are those of alpha ≥ alpha_min, not of three sigma, so that the image
+// does not depend on tiles.
 #pragma once
 #include "device.cuh"
 
 namespace sigmasplat {
 
-// p² + q² at (x, y) from the splat's mean, less what rounding may have added to it: p's terms cancel on needles.
+// p² + q² at (x, y) from the splat's mean, minus the largest rounding error: on needles the terms of p cancel.
 inline float fall(const Geometry& g, float x, float y) {
     const float a = g.l1 * x, b = g.l2 * y, q = g.l3 * y;
     const float p = fmaxf(fabsf(a + b) - 1e-6f * (fabsf(a) + fabsf(b)), 0.f);
     return fmaf(p, p, q * q);
 }
 
-// Tell whether alpha may reach alpha_min anywhere in the rectangle of pixels from (x0, y0) to (x1, y1), inclusive.
-// Outside of the rectangle that holds the mean, the least p² + q² lies on an edge, where it is a parabola.
+// Return whether alpha can reach alpha_min in the rectangle of pixels from (x0, y0) to (x1, y1), inclusive. If the mean
+// is outside the rectangle, the minimum of p² + q² is on an edge, where it is a parabola.
 inline bool reaches(const Geometry& g, const Frame& frame, float x0, float y0, float x1, float y1) {
     const float left = x0 - g.u, right = x1 - g.u, top = y0 - g.v, bottom = y1 - g.v;
     if (left <= 0.f && right >= 0.f && top <= 0.f && bottom >= 0.f) return true;
@@ -27,7 +28,7 @@ inline bool reaches_tile(const Geometry& g, const Frame& frame, int x, int y) {
     return reaches(g, frame, x0, y0, fminf(x0 + (TILE - 1), float(frame.width - 1)), fminf(y0 + (TILE - 1), float(frame.height - 1)));
 }
 
-// Bit w is set where the splat may reach the patch of warp w in the tile whose corner is (x, y).
+// Return a mask: bit w is set if the splat can reach the patch of warp w in the tile whose corner is (x, y).
 inline unsigned patches_reached(const Geometry& g, const Frame& frame, float x, float y) {
     unsigned mask = 0;
     for (int w = 0; w < PATCHES; w++) {
@@ -39,8 +40,8 @@ inline unsigned patches_reached(const Geometry& g, const Frame& frame, float x, 
 
 struct Packed { float* rows; Box* boxes; int* counts; float* depths; unsigned char* visible; };
 
-// Store a splat's geometry, the box of tiles that its bounds meet, how many of them it truly reaches, and the depth it is
-// sorted by: infinite where it reaches none.
+// Store a splat's geometry, the box of tiles that its bounds meet, how many of them it really reaches, and the depth
+// for sorting: infinite if it reaches none.
 inline void pack(const Packed& to, int i, const Footprint<float>& f, float opacity, bool seen, const Frame& frame) {
     Geometry g = {f.l1 * CONIC_SCALE, f.l2 * CONIC_SCALE, f.l3 * CONIC_SCALE, f.u, f.v, log2f(fmaxf(opacity, 1e-30f)), f.z, 0.f};
     const float reach = g.log_opacity - frame.log_alpha_min, radius2 = fmaxf(reach, 0.f) * (2.f / LOG2_E) * 1.0002f;
@@ -64,7 +65,7 @@ inline void pack(const Packed& to, int i, const Footprint<float>& f, float opaci
     row[0] = make_float4(g.l1, g.l2, g.l3, g.u);
     row[1] = make_float4(g.v, g.log_opacity, g.z, 0.f);
 }
-inline void pack_features(const Packed& to, int i, const float* features) {   // SLOTS of them
+inline void pack_features(const Packed& to, int i, const float* features) {   // SLOTS features
     float4* row = reinterpret_cast<float4*>(to.rows + size_t(i) * ROW + GEOMETRY);
     for (int c = 0; c < SLOTS / 4; c++) row[c] = make_float4(features[4 * c], features[4 * c + 1], features[4 * c + 2], features[4 * c + 3]);
 }

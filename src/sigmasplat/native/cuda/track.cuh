@@ -1,23 +1,25 @@
-// Tracking by Adam without the host: the papers' loss on a render with its gradient, and the step of the pose. Included by fit.cu.
-// fit/tracking_loss.py, fit/confidence.py, fit/motion.py and fit/descent.py are the definitions, native/track.h the same on a CPU.
+// Tracking by Adam without the host: the papers' loss on a render with its gradient, and the step of the pose. Included
+// by fit.cu. fit/tracking_loss.py, fit/confidence.py, fit/motion.py and fit/descent.py are the definitions;
+// native/track.h is the CPU version.
 #pragma once
 
 namespace sigmasplat {
 
 // ---- medians --------------------------------------------------------------------------------------------------------
 
-// Floats ≥ 0 are in the order of their bits. Counting those of an image by the first 11 of 31 bits says which 11 the lower middle
-// one has; counting those that share them by the next 10, and by the last 10, says the rest. Counts are whole numbers: whoever
-// adds first, the sum is the same.
+// Floats ≥ 0 have the same order as their bits. The median (lower middle value) of an image is found in three passes.
+// The first pass counts floats by their upper 11 of 31 bits, which gives these bits of the median. The other passes
+// count the floats that share them by the next 10 and the last 10 bits. Counts are whole numbers, so the sum does not
+// depend on the order of additions.
 constexpr int PASSES = 3, DIGITS = 2048, EACH = DIGITS / THREADS;
 inline float infinite() { return __int_as_float(0x7f800000); }
 
-struct Digits { unsigned bits; int rank; };           // those known so far; which of the floats that share them it is, −1 = none
-struct Selection { int* counts; Digits* known; };     // [medians, PASSES, DIGITS], all 0 at first; [medians, PASSES]
+struct Digits { unsigned bits; int rank; };           // bits known so far; rank among the floats that share them, −1 = none
+struct Selection { int* counts; Digits* known; };     // [medians, PASSES, DIGITS], initially 0; [medians, PASSES]
 enum Median { OF_DEPTH, OF_COLOR, OF_VARIANCE };      // errors of depth and of colour; V + ε of each channel
 
-// Find the digit of a median that a pass has counted. Every block does, to spare a launch; the first one writes it down for the
-// kernels after the next. Every thread must come.
+// Find the digit of a median that a pass has counted. Every block does this, which saves a launch; the first block
+// stores the result for the kernels after the next one. All threads must call this.
 inline Digits next_digits(const Selection& s, int median, int pass) {
     __shared__ int of_warps[THREADS / 32];
     __shared__ Digits found;
@@ -47,17 +49,17 @@ inline Digits next_digits(const Selection& s, int median, int pass) {
     if (known.rank < 0 && t == 0) found = known;
     __syncthreads();
     const Digits result = found;
-    __syncthreads();                                  // before another call writes over it
+    __syncthreads();                                  // before another call overwrites it
     if (blockIdx.x == 0 && t == 0) s.known[at] = result;
     return result;
 }
 
-struct Images {                            // planes [K, H, W] of a render; what was read; how many threads go through the pixels
+struct Images {                            // planes [K, H, W] of a render; target; number of threads for all pixels
     const float *sums, *alpha, *color, *depth;
     long long pixels, threads;
 };
 
-// Count by their digit number `pass` the floats that value(at, median) gives, −1 where a pixel has none that counts.
+// Count floats by their digit number `pass`. value(at, median) returns the float, or −1 for a pixel without one.
 template <int FIRST, int COUNT, class Value>
 inline void count_digits(const Images& im, const Selection& s, int pass, Value value) {
     __shared__ int bins[COUNT * DIGITS];
@@ -95,7 +97,7 @@ inline float color_error(const Images& im, const Exposure& e, size_t at, int c) 
 inline float color_distance(const Images& im, const Exposure& e, size_t at) {
     return fabsf(color_error(im, e, at, 0)) + fabsf(color_error(im, e, at, 1)) + fabsf(color_error(im, e, at, 2));
 }
-inline float variance_at(const Images& im, size_t at, int c) {   // V + ε, V held at 0 from below
+inline float variance_at(const Images& im, size_t at, int c) {   // V + ε, with V clamped at 0 from below
     const float color = im.sums[c * im.pixels + at];
     return fmaxf(fmaf(-color, color, im.sums[(4 + c) * im.pixels + at]), 0.f) + NLL_EPSILON;
 }
@@ -109,14 +111,14 @@ KERNEL count_errors(Images im, TrackNumbers o, const Exposure* exposure, Selecti
     });
 }
 
-// factor × a median; infinite where the factor is 0 or no pixel counts. Every thread must come.
+// factor × a median; infinite if the factor is 0 or no pixel counts. All threads must call this.
 inline float outlier_limit(const Selection& s, int median, float factor) {
     if (factor <= 0.f) return infinite();
     const Digits found = next_digits(s, median, PASSES - 1);
     return found.rank < 0 ? infinite() : factor * __int_as_float(int(found.bits));
 }
 
-struct Limits { float depth, color; bool own; };      // own: colour has a mask of its own, else depth's
+struct Limits { float depth, color; bool own; };      // own: colour has its own mask, otherwise that of depth
 inline Limits limits_of(const Selection& s, const TrackNumbers& o) {
     return {outlier_limit(s, OF_DEPTH, o.outlier_factor), outlier_limit(s, OF_COLOR, o.outlier_factor_color), o.outlier_factor_color > 0.f};
 }
@@ -135,7 +137,7 @@ KERNEL count_variances(Images im, TrackNumbers o, const Exposure* exposure, Sele
     });
 }
 
-// Add up how many pixels colour keeps and depth keeps: kept [2], 0 at first.
+// Count the pixels used for colour and for depth: kept [2], initially 0.
 KERNEL count_kept(Images im, TrackNumbers o, const Exposure* exposure, Selection s, int* kept) {
     const Exposure e = *exposure;
     const Limits limits = limits_of(s, o);
@@ -152,8 +154,9 @@ KERNEL count_kept(Images im, TrackNumbers o, const Exposure* exposure, Selection
 
 inline float weight_each(float weight, int channels, int kept) { return kept ? weight / float(channels * kept) : 0.f; }
 
-// Write the gradient of L_track by the rendered planes, all of them; store, block by block, what the loss and its gradient by (a, b) of
-// the exposure sum up to. kept: null where the mean is over the image. weigh: whether by w̃ (VarSplat §3), whose medians are counted.
+// Write the gradient of L_track with respect to all rendered planes. Store, per block, the sums of the loss and of its
+// gradient with respect to (a, b) of the exposure. kept: null if the mean is over the image. weigh: whether to use w̃
+// (VarSplat §3), whose medians must have been counted.
 KERNEL tracking_loss(Images im, TrackNumbers o, const Exposure* exposure, Selection s, const int* kept, int weigh, int planes,
                      float* on_sums, double* sums) {
     const Exposure e = *exposure;

@@ -1,1 +1,1 @@
-"""Rendering by the compiled CPU kernels."""
+"""Render with the compiled CPU kernels."""

@@ -10,7 +10,7 @@ from sigmasplat.render.reference.covariance_view import CovarianceView
 from sigmasplat.render.view import NO_LAYERS, View
 
 SLOTS = cpu.feature_slots(COVARIANCE_PLANES)
-"""The kernels are compiled for this many planes, the next count after ten."""
+"""Number of planes that the kernels are compiled for: the next count after ten."""
 
 
 class CpuCovarianceView(CovarianceView):

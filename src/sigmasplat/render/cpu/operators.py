@@ -1,19 +1,17 @@
-"""Run the compiled kernels: `project` and `blend` as autograd operators, float32, to the definition in `reference`."""
-
-from typing import Any
+"""Call the compiled kernels: `project` and `blend` as autograd operators in float32, as defined in `reference`."""
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from sigmasplat import env
-from sigmasplat.config import RenderConfig
 from sigmasplat.errors import BackendError
 from sigmasplat.model.camera import Camera
 from sigmasplat.native import _core
+from sigmasplat.render.kernel_operators import blend_with, project_with
 from sigmasplat.render.kernel_params import view_params
 from sigmasplat.render.pose_gradient import pose_gradient
-from sigmasplat.render.reference.operators import Blended, Projection
+from sigmasplat.render.reference import operators as reference
 
 FEATURES_AT_ONCE = 16
 
@@ -55,10 +53,6 @@ def _float32(name: str, value: Tensor) -> Tensor:
     return value.detach().contiguous()
 
 
-def _apply(function: type[torch.autograd.Function], *inputs: Any) -> Any:
-    return function.apply(*inputs)  # type: ignore[no-untyped-call] # torch leaves apply untyped
-
-
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, quats, scales, T, camera, options):  # type: ignore[no-untyped-def]
@@ -81,13 +75,6 @@ class _Project(torch.autograd.Function):
         given = [g.contiguous() for g in (g_means2d, g_conics, g_z)]
         _core.project_backward(ctx.view, m, q, s, radii, given[0], given[1], given[2], g_m, g_q, g_s, twist)
         return g_m, g_q, g_s, pose_gradient(T, twist), None, None
-
-
-def project(
-    means: Tensor, quats: Tensor, scales: Tensor, T_camera_world: Tensor, camera: Camera, options: RenderConfig
-) -> Projection:
-    """Project splats to the image; arguments and result as `reference.project`, float32 (the pose may be float64)."""
-    return Projection(*_apply(_Project, means, quats, scales, T_camera_world, camera, options))
 
 
 class _Blend(torch.autograd.Function):
@@ -132,19 +119,5 @@ class _Blend(torch.autograd.Function):
         return m, c, z, None, o, f, None, None, None
 
 
-def blend(
-    means2d: Tensor,
-    conics: Tensor,
-    z: Tensor,
-    radii: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    ref_depth: Tensor | None,
-    camera: Camera,
-    options: RenderConfig,
-) -> Blended:
-    """Composite splats front to back; arguments and result as `reference.blend`, float32, any number of features."""
-    groups = torch.split(features, FEATURES_AT_ONCE, dim=1)
-    first = _apply(_Blend, means2d, conics, z, radii, opacities, groups[0], ref_depth, camera, options)
-    more = [_apply(_Blend, means2d, conics, z, radii, opacities, g, None, camera, options)[0] for g in groups[1:]]
-    return Blended(torch.cat([first[0], *more], -1) if more else first[0], *first[1:])
+project = project_with(_Project, reference.project)
+blend = blend_with(_Blend, FEATURES_AT_ONCE, reference.blend)

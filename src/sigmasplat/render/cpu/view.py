@@ -22,7 +22,7 @@ class CpuView:
 
         self.camera, self.options = camera, options
         self.raster = _core.Rasteriser()
-        """The kernels' own buffers of this view; `fit` steps a field through it (`Rasteriser.step`)."""
+        """The kernels' buffers of this view. `fit` steps a field with them (`Rasteriser.step`)."""
         self._k = 7 if variance else 4
         size = cpu.padded_size(camera)
         self.sums, self.g_sums = torch.zeros(self._k, *size), torch.zeros(self._k, *size)
@@ -53,7 +53,8 @@ class CpuView:
         return self.g_moment if moment else None, ids if layers else None, self.g_median_depth if layers else None
 
     def backward(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Matrix:
-        """Write gradients by rows, g_params [N, 17], and grad2d [N] if given; return the pose twist (ρ, φ) [6]."""
+        """Write the gradient of the rows to g_params [N, 17], and grad2d [N] if given. Return the pose twist (ρ, φ)
+        [6]."""
         twist, (g_moment, median_id, g_median_depth) = np.zeros(6), self.depth_gradients()
         self.raster.view_backward(
             params, self.g_sums, g_moment, self.g_alpha, median_id, g_median_depth, g_params, grad2d, twist,
@@ -62,13 +63,13 @@ class CpuView:
         return twist
 
     def backward_pose(self, params: Tensor) -> Matrix:
-        """Return the pose twist (ρ, φ) [6] of the gradient planes of colour and depth; params are rows [N, 17]."""
+        """Return the pose twist (ρ, φ) [6] from the gradient planes of colour and depth; params are rows [N, 17]."""
         twist = np.zeros(6)
         self.raster.backward_pose(params, self.g_sums, twist, self.seconds[3:])
         return twist
 
     def visible(self, n: int) -> Tensor:
-        """Return which of the n splats last rendered reach the image, bool [n]."""
+        """Return which of the n splats of the last render reach the image, bool [n]."""
         seen = torch.empty(n, dtype=torch.uint8)
         self.raster.visible(seen)
         return seen.bool()

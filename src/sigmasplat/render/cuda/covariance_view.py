@@ -11,7 +11,8 @@ from sigmasplat.types import Matrix
 
 
 class CudaCovarianceView(CudaView):
-    """The same on a CUDA device, for a view that is on one; the host waits where `CudaView` has it wait."""
+    """`CovarianceView` on a CUDA device, for a view that is on the device. The host waits where it waits with
+    `CudaView`."""
 
     def __init__(self, view: CudaView, correlations: Rows) -> None:
         super().__init__(view.camera, view.options, device=view.raster.device)
@@ -36,7 +37,7 @@ class CudaCovarianceView(CudaView):
             r.blend(self._planes, self._reference if depth_reference is not None else None)
 
     def _project(self, parts: list[Tensor]) -> None:
-        """Pack splats, given by the columns of their rows, as the image shows them."""
+        """Pack splats, given by the columns of their rows, with the features that are rendered."""
         r, (means, quats, log_scales, *looks) = self.raster, parts
         self._shapes = means, quats, log_scales.exp()
         means2d, conics, z, radii = r.empty(r.n, 2), r.empty(r.n, 3), r.empty(r.n), r.empty(r.n, 2)
@@ -64,7 +65,8 @@ class CudaCovarianceView(CudaView):
         return self._carry_on_device(g_sums, torch.zeros_like(self.alpha), False, False)[-2].cpu().numpy()
 
     def _carry_on_device(self, g_sums: Tensor, g_alpha: Tensor, moment: bool, layers: bool) -> tuple[Tensor, ...]:
-        """Carry gradient planes to the columns of the rows, the correlations, the twist, and the means on the image."""
+        """Propagate gradient planes to the columns of the rows, the correlations, the twist, and the means on the
+        image."""
         r, (_, conics, z, radii) = self.raster, self._seen
         on_moment, reference_depth = (self.g_moment, self._reference) if moment else (None, None)
         with self.stages.of("blend_backward"):

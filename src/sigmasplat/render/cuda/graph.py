@@ -1,7 +1,7 @@
-"""Record what is launched on a CUDA device once, and launch it again as a whole: CUDA graphs, through torch.
+"""Record kernel launches on a CUDA device once, and replay them together: CUDA graphs, through torch.
 
-What is recorded may not wait for the device or read from it, and must find its inputs where they were: it sees the same
-addresses each time.
+Recorded work must not wait for the device or read from it. Its inputs must stay at the same addresses, because each
+replay uses the addresses of the recording.
 """
 
 import warnings
@@ -17,16 +17,17 @@ Work = Callable[[], None]
 
 
 def repeatable(work: Work, device: torch.device) -> Work:
-    """Return a function that repeats some work: a graph of it that has not run yet, or the work itself where graphs are
-    not available or stages are measured, whose events a graph would not contain.
+    """Return a function that repeats some work: a graph of it, which has not run yet, or the work itself.
 
-    If recording fails, one warning says why, and no more graphs are recorded on that device.
+    The work itself is returned if graphs are not available, or if stages are measured, because a graph would not
+    contain the events of the measurement. If recording fails, one warning gives the reason, and no more graphs are
+    recorded on that device.
     """
     return work if device.type != "cuda" or measured() else _recorder(device).record(work)
 
 
 class Recorder:
-    """Records on one device, on a stream of its own. All graphs share their memory: only the last one may be run."""
+    """Records on one device, on its own stream. All graphs share their memory, so only the latest one may run."""
 
     def __init__(self, device: torch.device) -> None:
         self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
@@ -34,7 +35,7 @@ class Recorder:
         self._refused = False
 
     def record(self, work: Work) -> Work:
-        """Return what runs a graph of some work on the current stream, or the work itself."""
+        """Return a function that runs a graph of some work on the current stream, or the work itself."""
         if self._refused:
             return work
         try:
@@ -47,15 +48,16 @@ class Recorder:
 
     def _recorded(self, work: Work) -> torch.cuda.CUDAGraph:
         graph, pool = torch.cuda.CUDAGraph(), None if self._last is None else self._last.pool()
-        # torch.cuda.graph would wait for the device and give all cached memory back first, for every fit. Another
-        # thread, a viewer's, may meanwhile do what a recording thread may not.
+        # torch.cuda.graph is not used: for every fit it would first wait for the device and release all cached memory.
+        # "thread_local": another thread, such as the viewer's, may meanwhile call functions that are forbidden while
+        # recording.
         with torch.cuda.stream(self._stream):
             graph.capture_begin(pool=pool, capture_error_mode="thread_local")
             try:
                 work()
             finally:
                 graph.capture_end()
-        self._last = graph  # its predecessor had to live until here: a pool without a graph is no more
+        self._last = graph  # the graph before must exist until here, because the pool is freed with its last graph
         return graph
 
 

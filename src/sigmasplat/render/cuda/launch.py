@@ -1,4 +1,4 @@
-"""Launch the CUDA kernels: arguments laid out as their parameters, machine code loaded once for each device."""
+"""Launch the CUDA kernels: convert the arguments to the kernels' parameters, and load machine code once per device."""
 
 import struct
 from array import array
@@ -16,27 +16,28 @@ from sigmasplat.errors import BackendError
 from sigmasplat.native.cuda import cubins
 
 THREADS = 256
-"""Of every block (native/cuda/device.cuh)."""
+"""Number of threads per block (native/cuda/device.cuh)."""
 Struct = tuple["Tensor | int | None", ...]
 Argument = Tensor | NDArray[Any] | Struct | int | float | None
-"""A tensor is a pointer, None a null one; an array is a struct passed by value, a tuple one of pointers and 64-bit
-numbers; int is 32 bits, float single precision."""
+"""A tensor is a pointer, None a null pointer. An array is a struct passed by value; a tuple is a struct of pointers and
+64-bit numbers. int has 32 bits, float is single precision."""
 
 
 class Launcher(Protocol):
-    """What runs a kernel: a device, or in tests its emulation."""
+    """Something that runs a kernel: a device, or its emulation in tests."""
 
     def __call__(self, features: int, kernel: str, blocks: int, *arguments: Argument) -> None:
-        """Run blocks of `THREADS` threads of a kernel of the program of that many features, on torch's stream."""
+        """Run blocks of `THREADS` threads of a kernel on torch's stream; features: the feature count of the kernel's
+        program."""
 
 
 def blocks_for(threads: int) -> int:
-    """Return how many blocks hold this many threads."""
+    """Return the number of blocks for this many threads."""
     return -(-threads // THREADS)
 
 
 def laid_out(arguments: tuple[Argument, ...]) -> "array[int]":
-    """Lay arguments out in memory, 64 bits at a time: the address of each argument, then the arguments."""
+    """Return the arguments in memory, in units of 64 bits: first the address of each argument, then the arguments."""
     begins, words = list[int](), list[int]()
     for argument in arguments:
         begins.append(len(words))
@@ -67,10 +68,10 @@ def _address(tensor: Tensor | None) -> int:
 
 
 class Device:
-    """The kernels on one CUDA device, compiled at first use, a program at a time."""
+    """The kernels on one CUDA device; each program is compiled at its first use."""
 
     def __init__(self, device: torch.device) -> None:
-        """Raises BackendError, which says why, where the CUDA backend cannot run."""
+        """Raises BackendError with the reason if the CUDA backend cannot run."""
         refuse_where_missing()
         self._device = device
         self._kernels: dict[tuple[int, str], Any] = {}
@@ -91,7 +92,8 @@ class Device:
 
     @contextmanager
     def _current(self) -> Iterator[Any]:
-        """Make torch's context of the device the thread's own for a while: threads of autograd begin without one."""
+        """Make torch's context of the device current in this thread, because threads of autograd start without a
+        context."""
         from cuda.bindings import driver
 
         _checked(driver.cuCtxPushCurrent(self._context), f"{self._device} cannot be used")
@@ -128,7 +130,7 @@ def _primary_context(device: torch.device) -> Any:
 
 
 def _checked(found: tuple[Any, ...], failure: str) -> Any:
-    """Return what the driver found. Raises BackendError with its reason where it did not succeed."""
+    """Return the result of a driver call. Raises BackendError with its reason if it failed."""
     result, *values = found
     if result.value != 0:
         raise BackendError(f"{failure}: {result.name}; run `sigmasplat doctor` for details")
@@ -136,7 +138,8 @@ def _checked(found: tuple[Any, ...], failure: str) -> Any:
 
 
 def missing() -> str | None:
-    """Return in one line why the CUDA backend cannot run here and what to do about it; None if it can run."""
+    """Return one line that says why the CUDA backend cannot run on this machine and how to fix it; None if it can
+    run."""
     if torch.version.cuda is None:
         return f"torch {torch.__version__} is built without CUDA; install a torch with CUDA (https://pytorch.org)"
     if not torch.cuda.is_available():
@@ -149,7 +152,7 @@ def missing() -> str | None:
 
 
 def refuse_where_missing() -> None:
-    """Raise BackendError, which says why, where the CUDA backend cannot run."""
+    """Raise BackendError with the reason if the CUDA backend cannot run."""
     reason = missing()
     if reason:
         raise BackendError(f"the CUDA backend cannot run: {reason}")
@@ -159,13 +162,13 @@ _device = cache(Device)
 
 
 def this_device() -> torch.device:
-    """Return torch's current CUDA device. Raises BackendError, which says why, where the CUDA backend cannot run."""
+    """Return torch's current CUDA device. Raises BackendError with the reason if the CUDA backend cannot run."""
     refuse_where_missing()
     return torch.device("cuda", torch.cuda.current_device())
 
 
 def launcher_for(device: torch.device) -> Launcher:
-    """Return what runs kernels on tensors of a device. Raises BackendError where nothing can."""
+    """Return the launcher for tensors of a device. Raises BackendError if there is none."""
     if device.type != "cuda":
         raise BackendError(f"the cuda backend takes tensors on a CUDA device; these are on {device}")
     return _device(this_device() if device.index is None else device)

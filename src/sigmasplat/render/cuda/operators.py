@@ -1,10 +1,8 @@
-"""Run the CUDA kernels: `project` and `blend` as autograd operators, float32, to the definition in `reference`.
+"""Call the CUDA kernels: `project` and `blend` as autograd operators in float32, as defined in `reference`.
 
-NVRTC compiles them at first use for the device in use (native/cuda/cubins.py); torch supplies memory, sorting and the
-stream.
+NVRTC compiles the kernels at first use for the current device (native/cuda/cubins.py). torch provides memory, sorting
+and the stream.
 """
-
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,9 +16,10 @@ from sigmasplat.native.cuda.cubins import FEATURE_COUNTS
 from sigmasplat.render.cuda import launch as cuda_launch
 from sigmasplat.render.cuda.launch import blocks_for
 from sigmasplat.render.cuda.raster import Planes, Raster
+from sigmasplat.render.kernel_operators import blend_with, project_with
 from sigmasplat.render.kernel_params import view_params
 from sigmasplat.render.pose_gradient import pose_gradient
-from sigmasplat.render.reference.operators import Blended, Projection
+from sigmasplat.render.reference import operators as reference
 
 FEATURES_AT_ONCE = FEATURE_COUNTS[-1]
 
@@ -33,12 +32,9 @@ def _float32(name: str, value: Tensor, device: torch.device) -> Tensor:
     return value.detach().contiguous()
 
 
-def _apply(function: type[torch.autograd.Function], *inputs: Any) -> Any:
-    return function.apply(*inputs)  # type: ignore[no-untyped-call] # torch leaves apply untyped
-
-
 def _view(T: Tensor, camera: Camera, options: RenderConfig) -> tuple[NDArray[np.floating], Tensor | None]:
-    """Return the kernels' `View` by value, and the pose if it is on a device: then the host does not wait for it."""
+    """Return the kernels' `View` by value. If the pose is on a device, return it too, so that the host does not wait
+    for it."""
     if T.device.type == "cpu":
         return view_params(camera, T.detach().double().numpy(), options), None
     return view_params(camera, np.eye(4), options), T.detach().float().contiguous()
@@ -71,13 +67,6 @@ class _Project(torch.autograd.Function):
         return g_m, g_q, g_s, pose_gradient(T, twists.sum(0)) if ctx.needs_input_grad[3] else None, None, None
 
 
-def project(
-    means: Tensor, quats: Tensor, scales: Tensor, T_camera_world: Tensor, camera: Camera, options: RenderConfig
-) -> Projection:
-    """Project splats to the image; arguments and result as `reference.project`, float32 (the pose may be float64)."""
-    return Projection(*_apply(_Project, means, quats, scales, T_camera_world, camera, options))
-
-
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means2d, conics, z, radii, opacities, features, ref_depth, camera, options):  # type: ignore[no-untyped-def]
@@ -99,7 +88,7 @@ class _Blend(torch.autograd.Function):
         ctx.given, ctx.planes, ctx.ref = (c, depth, o), planes, ref
         detached = [ids[0], weights[0], ids[1], weights[1]]
         ctx.mark_non_differentiable(*detached)
-        # What backward reads is kept from a caller who writes to the maps.
+        # The caller gets copies, because the backward pass reads the originals.
         maps = (sums.movedim(0, -1), moment, alpha)
         return (*(x.clone() if x is not None else None for x in maps), *detached)
 
@@ -118,19 +107,5 @@ class _Blend(torch.autograd.Function):
         return on_means2d, on_conics, on_z, None, on_opacities, on_features, None, None, None
 
 
-def blend(
-    means2d: Tensor,
-    conics: Tensor,
-    z: Tensor,
-    radii: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    ref_depth: Tensor | None,
-    camera: Camera,
-    options: RenderConfig,
-) -> Blended:
-    """Composite splats front to back; arguments and result as `reference.blend`, float32, any number of features."""
-    groups = torch.split(features, FEATURES_AT_ONCE, dim=1)
-    first = _apply(_Blend, means2d, conics, z, radii, opacities, groups[0], ref_depth, camera, options)
-    more = [_apply(_Blend, means2d, conics, z, radii, opacities, g, None, camera, options)[0] for g in groups[1:]]
-    return Blended(torch.cat([first[0], *more], -1) if more else first[0], *first[1:])
+project = project_with(_Project, reference.project)
+blend = blend_with(_Blend, FEATURES_AT_ONCE, reference.blend)

@@ -1,9 +1,10 @@
-"""Bin and blend on CUDA: what one render leaves for its backward pass. torch supplies memory, sorts and sums.
+"""Bin and blend on CUDA, and keep the buffers for the backward pass. torch provides memory, sorting and sums.
 
-No host waits for the device between a forward and its backward pass once a first image has said how many pairs of tile
-and splat to expect. Where there are more than expected, `blend` goes through all splats instead of lists: slowly,
-to the same image; the backward pass, which learns of it by then, lists them anew. A loop that is to run without the
-host altogether bins and goes back `within` the room there is: `pairs` say, on the device, whether it sufficed.
+The number of (tile, splat) pairs is known only on the device. After the first image, memory for the expected number is
+allocated, so the host does not wait during a forward pass. If an image has more pairs than expected, `blend` processes
+all splats instead of lists: the result is the same, but slower. The backward pass then knows the number and lists the
+pairs again. Loops that must run without the host use the methods that end in `_within`. They never allocate more
+memory; `pairs` says on the device whether all pairs fitted.
 """
 
 import math
@@ -22,16 +23,16 @@ from sigmasplat.render.cuda.launch import Argument, Launcher, Struct, blocks_for
 
 TILE = 16
 GEOMETRY = 8
-"""Floats of a splat's row before its features (native/cuda/device.cuh)."""
+"""Number of floats in a splat's row before its features (native/cuda/device.cuh)."""
 MOMENTS = 6
-"""Sums of a record before those of the features (native/cuda/gradients.cuh)."""
+"""Number of sums in a record before those of the features (native/cuda/gradients.cuh)."""
 SPARE = 1.25
-"""Room is made for this many times the pairs of the last image."""
+"""Memory is allocated for this multiple of the number of pairs in the last image."""
 MOST_PAIRS = 2**31 - 1
 
 
 class Planes(NamedTuple):
-    """What is blended to, as the kernels' `Planes`: sums [K, H, W], the others [H, W], None where not asked for."""
+    """The output planes, as the kernels' `Planes`: sums [K, H, W], the others [H, W], None if not requested."""
 
     sums: Tensor
     moment: Tensor | None
@@ -44,15 +45,15 @@ class Planes(NamedTuple):
 
 
 def program_for(features: int) -> int:
-    """Return the feature count of the program that blends this many."""
+    """Return the feature count of the program that blends this many features."""
     return next(count for count in FEATURE_COUNTS if count >= features)
 
 
 class Raster:
-    """The buffers of one render of n splats on a device, kept from its forward to its backward pass."""
+    """The buffers of one render of n splats on a device, kept from the forward to the backward pass."""
 
     def __init__(self, launch: Launcher, device: torch.device, capacity: int | None = None) -> None:
-        """capacity: pairs to make room for at first; by default the first image is waited for."""
+        """capacity: initial number of pairs to allocate memory for; by default the host waits for the first image."""
         self._launch, self.device, self.capacity = launch, device, capacity
         self._arrived: torch.cuda.Event | None = None
         self.n = 0
@@ -68,11 +69,11 @@ class Raster:
 
     @property
     def packed(self) -> Struct:
-        """Return where splats are packed to, as the kernels' `Packed`."""
+        """Return the buffers of packed splats, as the kernels' `Packed`."""
         return self.rows, self.boxes, self.counts, self.depths, self.visible
 
     def empty(self, *size: int, dtype: torch.dtype = torch.float32) -> Tensor:
-        """Make room on the device."""
+        """Allocate memory on the device."""
         return torch.empty(size, dtype=dtype, device=self.device)
 
     def launch(self, kernel: str, blocks: int, *arguments: Argument) -> None:
@@ -88,7 +89,7 @@ class Raster:
         self.launch(kernel, blocks_for(self.n), *arguments)
 
     def bin(self) -> None:
-        """List, tile by tile, the packed splats that reach it, near to far."""
+        """For each tile, list the packed splats that reach it, near to far."""
         self._order_splats()
         self._send_total()
         if self.capacity is None:
@@ -97,7 +98,7 @@ class Raster:
             self._list()
 
     def bin_within(self) -> None:
-        """Do the same within the room there is; the host learns nothing of it."""
+        """List the pairs that fit into the allocated memory, without informing the host of their number."""
         self._order_splats()
         self._list()
 
@@ -107,7 +108,7 @@ class Raster:
         self._total = self._ends[-1:] if self.n else torch.zeros(1, dtype=torch.int64, device=self.device)
 
     def _send_total(self) -> None:
-        """Let the number of pairs travel to the host, without waiting for it."""
+        """Start copying the number of pairs to the host, without waiting for it."""
         on_cuda = self.device.type == "cuda"
         self._host_total = torch.empty(1, dtype=torch.int64, pin_memory=on_cuda)
         self._host_total.copy_(self._total, non_blocking=on_cuda)
@@ -116,7 +117,7 @@ class Raster:
             self._arrived.record(torch.cuda.current_stream(self.device))
 
     def make_room(self) -> None:
-        """List the pairs anew if there was not room for all. Waits for their number alone, known before the image.
+        """List the pairs again if they did not all fit. Waits only for their number, which is known before the image.
 
         Raises BackendError as `expect` does.
         """
@@ -128,9 +129,9 @@ class Raster:
             self._list()
 
     def expect(self, pairs: int) -> None:
-        """Make room for so many pairs, and some more, from the next list on.
+        """Allocate memory for this number of pairs and a margin, from the next listing on.
 
-        Raises BackendError where there are more than can be numbered.
+        Raises BackendError if there are more pairs than can be numbered.
         """
         if pairs > MOST_PAIRS // SPARE:
             raise BackendError(f"{pairs} pairs of splats and tiles are too many; use fewer or smaller splats")
@@ -138,7 +139,7 @@ class Raster:
 
     @property
     def pairs(self) -> Struct:
-        """Return how many pairs there were, on the device, and for how many there was room, as the kernels' `Pairs`."""
+        """Return the number of pairs, on the device, and the number that fits, as the kernels' `Pairs`."""
         return self._total, self._room
 
     def _list(self) -> None:
@@ -163,7 +164,7 @@ class Raster:
         return self._items, self._tile_begin, self._order, self._total, self.counts, self.n, self._room
 
     def blend(self, planes: Planes, reference: Tensor | None) -> None:
-        """Blend the listed splats to planes; the depth reference [H, W] goes with a moment plane."""
+        """Blend the listed splats into planes; `reference` [H, W] is the depth reference of the moment plane."""
         kernel = "blend" + "_moment" * (planes.moment is not None) + "_ids" * (planes.median_id is not None)
         self.launch(
             kernel, self.tiles_x * self.tiles_y, self.frame, self.rows, self._lists, reference, self.used, planes
@@ -177,8 +178,8 @@ class Raster:
         on_moment: Tensor | None,
         on_alpha: Tensor | None,
     ) -> tuple[Tensor, int]:
-        """Sum the planes' gradients over pixels, splat by splat: records [n, R], and where the moment's two sums lie in
-        one (0 = nowhere)."""
+        """Sum the planes' gradients over pixels, per splat. Return the records [n, R], and the position in a record of
+        the moment's two sums (0 = none)."""
         self.make_room()
         moment = MOMENTS + self.features if on_moment is not None else 0
         floats = _rounded(moment + 2 if moment else MOMENTS + self.features)
@@ -192,12 +193,13 @@ class Raster:
         return self._summed(records), moment
 
     def pose_gradients(self, planes: Planes, on_sums: Tensor) -> Tensor:
-        """Do the same for colour and depth alone, the first four planes."""
+        """Sum the gradients of colour and depth only, which are the first four planes."""
         self.make_room()
         return self._summed(self._pose_records(planes, on_sums))
 
     def pose_gradients_within(self, planes: Planes, on_sums: Tensor) -> Tensor:
-        """Do the same with what room there was; where it did not suffice no splat counts."""
+        """Sum the gradients of colour and depth without allocating more memory; if not all pairs fit, all sums are
+        0."""
         records = self._pose_records(planes, on_sums)
         self.launch_fit("drop_pairs", blocks_for(self.n), self.pairs, self.n, self.counts)
         return self._summed(records)
@@ -219,7 +221,7 @@ class Raster:
         return sums
 
     def twists(self) -> Tensor:
-        """Make room for the pose twist [blocks, 6] that each block of a chain adds up."""
+        """Allocate the pose twists [blocks, 6], one per block of a kernel."""
         return self.empty(blocks_for(self.n), 6, dtype=torch.float64)
 
 
@@ -228,7 +230,7 @@ def _rounded(floats: int) -> int:
 
 
 def _frame(camera: Camera, options: RenderConfig, tiles_x: int, tiles_y: int) -> NDArray[np.void]:
-    """Lay out the kernels' `Frame` (native/cuda/device.cuh)."""
+    """Return the kernels' `Frame` (native/cuda/device.cuh)."""
     numbers = (
         camera.width, camera.height, tiles_x, tiles_y, math.log2(options.alpha_min), options.transmittance_stop,
     )  # fmt: skip

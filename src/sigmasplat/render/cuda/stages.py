@@ -1,4 +1,4 @@
-"""Measure the stages of renders on a CUDA device by events on its stream; the host waits only when times are read."""
+"""Measure the stages of renders on a CUDA device with events on its stream; the host waits only when times are read."""
 
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -10,13 +10,13 @@ import torch
 from numpy.typing import NDArray
 
 STAGES = ("project", "sort", "blend", "blend_backward", "project_backward")
-"""What `View.seconds` counts, in its order."""
+"""The stages of `View.seconds`, in its order."""
 
 _asked = False
 
 
 def measure(asked: bool = True) -> None:
-    """Have CUDA views count their `seconds` from now on, or no longer; `run --profile` asks for it."""
+    """Start or stop counting `seconds` in CUDA views; `run --profile` starts it."""
     global _asked
     _asked = asked
 
@@ -36,7 +36,8 @@ class Event(Protocol):
 
 
 class Stages:
-    """Times between pairs of events on the current stream, by stage. Pairs that have passed are added up on the way.
+    """Times between pairs of events on the current stream, by stage. Pairs that have passed are summed from time to
+    time.
 
     Unless `measure` was called there are no events, and all stages take 0 s.
     """
@@ -65,7 +66,7 @@ class Stages:
 
     @property
     def seconds(self) -> NDArray[np.float64]:
-        """Return the time spent so far by stage [5]. Waits for what has not passed yet."""
+        """Return the time spent so far by stage [5]. Waits for events that have not passed yet."""
         if self._pending:
             self._pending[-1][2].synchronize()
         while self._pending:

@@ -1,4 +1,4 @@
-"""A view on the CUDA kernels: raw parameter rows to image planes and back, without autograd."""
+"""A view on the CUDA kernels: from raw parameter rows to image planes, and gradients back, without autograd."""
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from sigmasplat.types import Matrix
 class CudaView:
     """A view on the CUDA kernels: `View` with planes of exactly the image's size, on a device.
 
-    A backward pass ends by reading the twist, the only time the host waits for the device. Its `seconds` stay 0 unless
+    The host waits for the device only at the end of a backward pass, when it reads the twist. `seconds` stay 0 unless
     `measure` (render/cuda/stages.py) was called; reading them waits for the device.
     """
 
@@ -62,7 +62,7 @@ class CudaView:
             r.blend(self._planes, self._reference if depth_reference is not None else None)
 
     def _on_device(self, params: Tensor) -> Tensor:
-        """Return rows on this device, contiguous, as the kernels read them."""
+        """Return rows on this device, contiguous, as the kernels need them."""
         return params.detach().to(self.raster.device).contiguous()
 
     @property
@@ -75,7 +75,7 @@ class CudaView:
         return self.backward_on_device(params, g_params, grad2d).cpu().numpy()
 
     def backward_on_device(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Tensor:
-        """Do what `backward` does and leave the twist on the device; the host does not wait."""
+        """Do the same as `backward`, but leave the twist on the device; the host does not wait."""
         (moment, layers), r = self._made, self.raster
         on_moment, reference = (self.g_moment, self._reference) if moment else (None, None)
         with self.stages.of("blend_backward"):
@@ -89,10 +89,10 @@ class CudaView:
             return twists.sum(0)
 
     def _on_median(self) -> Tensor:
-        """Gather ∂L/∂(median depth) of all pixels by the splats whose depths they are, [n]."""
+        """Sum ∂L/∂(median depth) over the pixels whose median depth is that of each splat, [n]."""
         ids, found = self.layers.median_id.flatten().long(), torch.zeros(self.raster.n + 1, device=self.raster.device)
-        # Pixels without one (−1) add to the last row. Sorted by torch, so that the sums are the same every time; told
-        # that the rows exist (the last argument), it does not make the host wait to look.
+        # Pixels without a median splat (−1) are added to the last row. torch sorts the indices, so that the sums are
+        # the same every time. The last argument promises that the rows exist, so that the host does not wait to check.
         torch.ops.aten._index_put_impl_(found, [ids], self.g_median_depth.flatten(), True, True)
         return found[:-1]
 
@@ -108,7 +108,8 @@ class CudaView:
         return twists.sum(0).cpu().numpy()
 
     def follow(self, params: Tensor, pose: Tensor) -> None:
-        """Render rows [N, 17] to `sums` and `alpha` from T_camera_world float32 [4, 4] on the device; no host waits."""
+        """Render rows [N, 17] to `sums` and `alpha`; T_camera_world, float32 [4, 4], is on the device. The host does
+        not wait."""
         params = self._on_device(params)
         r, n, self._made = self.raster, len(params), (False, False)
         with self.stages.of("project"):
@@ -120,9 +121,10 @@ class CudaView:
             r.blend(self._planes, None)
 
     def follow_back(self, params: Tensor, pose: Tensor) -> Tensor:
-        """Carry the gradient planes of colour and depth to that pose: twists [blocks, 6], to be added up on the device.
+        """Propagate the gradient planes of colour and depth to that pose. Return twists [blocks, 6] on the device, to
+        be summed.
 
-        They are 0 where `raster.pairs` were more than there was room for.
+        They are 0 if there were more `raster.pairs` than fit into memory.
         """
         r = self.raster
         with self.stages.of("blend_backward"):

@@ -1,1 +1,1 @@
-"""The definition of both kernels in plain torch."""
+"""The definition of the kernels in plain torch."""

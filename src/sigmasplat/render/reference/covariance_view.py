@@ -1,4 +1,4 @@
-"""A view of ten planes instead of seven, for the full colour covariance, on the definition in plain torch."""
+"""A view of ten planes instead of seven, for the full colour covariance, with the definition in plain torch."""
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from sigmasplat.types import Matrix
 class CovarianceView:
     """A view of ten planes (r, g, b, z, Σ + c cᵀ ×6), which also reads a field's `correlations`.
 
-    It stands for a plain view of the same backend. `g_correlations` [N, 3] is the gradient of the last backward pass.
+    It wraps a plain view of the same backend. `g_correlations` [N, 3] is the gradient of the last backward pass.
     """
 
     backend = "reference"
@@ -33,7 +33,7 @@ class CovarianceView:
 
     @property
     def seconds(self) -> Matrix:
-        """Return the seconds of the view that this one stands for."""
+        """Return the seconds of the wrapped view."""
         return self._plain.seconds
 
     def forward(
@@ -68,7 +68,7 @@ class CovarianceView:
             self.layers.fill(b, z.detach())
 
     def _blend_backward(self, g_sums: Tensor, g_alpha: Tensor) -> tuple[Tensor, ...]:
-        """Return the gradient of what was blended, in the order of `_splats`."""
+        """Return the gradient of the blended splat values, in the order of `_splats`."""
         return torch.autograd.grad(self._maps, self._blended, (g_sums, g_alpha), materialize_grads=True)
 
     def backward(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Matrix:
@@ -85,7 +85,7 @@ class CovarianceView:
         return np.asarray(self._carry(g_sums, torch.zeros_like(self.alpha))[-1].numpy(), np.float64)
 
     def _carry(self, g_sums: Tensor, g_alpha: Tensor) -> tuple[Tensor, ...]:
-        """Carry gradient planes to the columns of the rows, the correlations and the twist."""
+        """Propagate gradient planes to the columns of the rows, the correlations and the twist."""
         g_blended = self._blend_backward(g_sums, g_alpha)
         self._g_means2d = g_blended[0]
         return torch.autograd.grad(self._splats, (*self._leaves, self._twist), g_blended, materialize_grads=True)

@@ -1,6 +1,6 @@
 """Define both kernels in plain torch: slow, exact, readable, any float type. Compiled backends are tested against this.
 
-Pixel centres lie at integer coordinates, (u, v) = (column, row). Depth is z along the optical axis in metres.
+Pixel centres have integer coordinates, (u, v) = (column, row). Depth is z along the optical axis in metres.
 """
 
 from typing import NamedTuple
@@ -13,14 +13,14 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
 
 ALPHA_MAX = 0.99
-"""No splat is more opaque than this, so that the backward pass may divide by 1 − α (3DGS)."""
+"""Maximum alpha of a splat at a pixel, so that the backward pass can divide by 1 − α (3DGS)."""
 FRUSTUM_MARGIN = 0.15
-"""The projection is linearised no further outside the image than this share of its size (3DGS's factor 1.3)."""
+"""The projection is linearised at most this share of the image size outside the image (3DGS's factor 1.3)."""
 PAIRS_AT_ONCE = 1 << 22
 
 
 class Projection(NamedTuple):
-    """Splats on the image plane; a culled one (z ≤ near_m) has radii 0, means2d 0, conics 0 and takes no gradient."""
+    """Splats on the image plane. A culled splat (z ≤ near_m) has radii, means2d and conics 0, and gets no gradient."""
 
     means2d: Tensor
     """[N, 2] px."""
@@ -33,20 +33,20 @@ class Projection(NamedTuple):
 
 
 class Blended(NamedTuple):
-    """Sums over splats at each pixel, with w = α·T the weight of a splat at a pixel."""
+    """Sums over splats at each pixel; w = α·T is the weight of a splat at a pixel."""
 
     sums: Tensor
     """[H, W, K] Σ w f."""
     moment: Tensor | None
     """[H, W] Σ w (z − ref)² in m², 0 where ref ≤ 0; None without ref."""
     alpha: Tensor
-    """[H, W] Σ w, one minus the light that passes."""
+    """[H, W] Σ w, one minus the light that passes all splats."""
     median_id: Tensor
-    """[H, W] int32, the splat that takes the light from ≥ ½ to < ½; −1 = none."""
+    """[H, W] int32, the splat at which the light falls from ≥ ½ to < ½; −1 = none."""
     median_weight: Tensor
     """[H, W] its w, detached; 0 = none."""
     dominant_id: Tensor
-    """[H, W] int32, the splat of largest w, the nearest if several; −1 = none."""
+    """[H, W] int32, the splat of largest w, the nearest one if several are equal; −1 = none."""
     dominant_weight: Tensor
     """[H, W] its w, detached; 0 = none."""
 
@@ -56,8 +56,8 @@ def project(
 ) -> Projection:
     """Project splats to the image (EWA splatting, 3DGS eq. 5; CG-SLAM eq. 2).
 
-    means [N, 3] m, world; quats [N, 4] wxyz, any norm; scales [N, 3] m, activated; T_camera_world [4, 4].
-    The pose gradient is the sum of three paths (CG-SLAM spec §2.1), each switched off by a constant pose in its place.
+    means [N, 3] m, world; quats [N, 4] wxyz, any norm; scales [N, 3] m, activated; T_camera_world [4, 4]. The pose
+    gradient is the sum of three paths (CG-SLAM spec §2.1). A path is switched off by using a constant pose in it.
     """
     T = T_camera_world.to(means)
     in_view = (means @ T[:3, :3].T + T[:3, 3])[:, 2].detach() > options.near_m
@@ -79,7 +79,7 @@ def project(
 
 
 def _to_camera(means: Tensor, T: Tensor, in_view: Tensor) -> Tensor:
-    """Bring positions [N, 3] to the camera frame; culled ones to (0, 0, 1), where every gradient is finite."""
+    """Transform positions [N, 3] to the camera frame; culled ones become (0, 0, 1), where every gradient is finite."""
     p = means @ T[:3, :3].T + T[:3, 3]
     return torch.where(in_view[:, None], p, p.new_tensor([0.0, 0.0, 1.0]))
 
@@ -90,13 +90,13 @@ def _pinhole(p: Tensor, camera: Camera) -> Tensor:
 
 
 def _footprints(means: Tensor, quats: Tensor, scales: Tensor, T: Tensor, in_view: Tensor, camera: Camera) -> Tensor:
-    """Build A = J R_cw R_q diag(s), [N, 2, 3] px: the splat's own axes seen in the image, Σ2D = A Aᵀ + low-pass."""
+    """Build A = J R_cw R_q diag(s), [N, 2, 3] px: the splat's axes in the image, Σ2D = A Aᵀ + low-pass."""
     J = _projection_jacobian(_to_camera(means, T, in_view), camera)
     return J @ T[:3, :3] @ (rotations(quats) * scales[:, None, :])
 
 
 def _projection_jacobian(p: Tensor, camera: Camera) -> Tensor:
-    """Linearise the pinhole at p [N, 3] → [N, 2, 3], with x/z and y/z held inside the widened image (3DGS)."""
+    """Linearise the pinhole at p [N, 3] → [N, 2, 3], with x/z and y/z clamped to the enlarged image (3DGS)."""
     x, y, z = p.unbind(1)
     margin_u, margin_v = FRUSTUM_MARGIN * camera.width, FRUSTUM_MARGIN * camera.height
     tx = (x / z).clamp(-(camera.cx + margin_u) / camera.fx, (camera.width - camera.cx + margin_u) / camera.fx)
@@ -108,7 +108,7 @@ def _projection_jacobian(p: Tensor, camera: Camera) -> Tensor:
 
 
 def rotations(quats: Tensor) -> Tensor:
-    """Turn quaternions [N, 4] wxyz of any norm into rotations [N, 3, 3]."""
+    """Convert quaternions [N, 4] wxyz of any norm to rotations [N, 3, 3]."""
     w, x, y, z = normalize(quats, dim=1).unbind(1)
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
@@ -121,7 +121,7 @@ def rotations(quats: Tensor) -> Tensor:
 def _whiten(A: Tensor, low_pass_px2: float) -> tuple[Tensor, Tensor]:
     """Factor (A Aᵀ + low_pass·I)⁻¹: conics [N, 3], and standard deviations [N, 2] px, detached.
 
-    The determinant is a sum of positive terms (Lagrange's identity); ca·cc − cb² would cancel on needles.
+    The determinant is computed as a sum of positive terms (Lagrange's identity); ca·cc − cb² would cancel on needles.
     """
     a, b = A.unbind(1)
     aa, bb, cb = (a * a).sum(1), (b * b).sum(1), (a * b).sum(1)
@@ -146,8 +146,9 @@ def blend(
     """Composite splats front to back at every pixel (3DGS eq. 3; VarSplat §1; CG-SLAM eq. 3, 6, 8-10).
 
     means2d, conics, z, radii as `project` returns them; opacities [N]; features [N, K]; ref_depth [H, W] m or None.
-    Order is z, ties by index. A pair counts where o·exp(power) ≥ alpha_min and the light before it is at least
-    transmittance_stop; no other cut, so the result does not depend on tiles. Ids and their weights carry no gradient.
+    Splats are sorted by z, equal ones by index. A pair of splat and pixel counts if o·exp(power) ≥ alpha_min and the
+    light before the splat is at least transmittance_stop. There is no other limit, so the result does not depend on
+    tiles. Ids and their weights have no gradient.
     """
     order = torch.sort(z.detach(), stable=True).indices
     order = order[radii[order, 0] > 0]
@@ -173,7 +174,7 @@ def blend(
 
 
 def _alphas(pixels: Tensor, means2d: Tensor, conics: Tensor, opacities: Tensor, options: RenderConfig) -> Tensor:
-    """Evaluate α [N, P] = min(0.99, o·exp(power)), 0 where below alpha_min; the clamp passes no gradient."""
+    """Evaluate α [N, P] = min(0.99, o·exp(power)), 0 if below alpha_min; no gradient where α is clamped."""
     dx, dy = (pixels[None] - means2d[:, None]).unbind(-1)
     l1, l2, l3 = conics[:, :, None].unbind(1)
     power = -0.5 * ((l1 * dx + l2 * dy) ** 2 + (l3 * dy) ** 2)
@@ -186,8 +187,8 @@ def _blend_pixels(
 ) -> tuple[Tensor, ...]:
     """Composite sorted splats at P pixels; returns `Blended`'s maps flat.
 
-    A row of clear air (id −1, α = 0) stands in front: it makes the light before each splat a plain shift of the light
-    after, and is what `argmax` finds where no splat qualifies.
+    A row with id −1 and α = 0 is added in front. With it, the light before each splat is the light after the previous
+    row, and `argmax` finds this row if no splat qualifies.
     """
     air = alphas.new_zeros(1, alphas.shape[1])
     alphas = torch.cat([air, alphas])

@@ -1,4 +1,4 @@
-"""A view on the definition in plain torch."""
+"""A view with the definition in plain torch."""
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from sigmasplat.types import Matrix
 
 
 class ReferenceView:
-    """The same view on the plain-torch definition: slow, for tests and for machines without the compiled kernels."""
+    """A view with the definition in plain torch: slow, for tests and for machines without the compiled kernels."""
 
     backend = "reference"
 
@@ -52,7 +52,8 @@ class ReferenceView:
             self._maps.append((torch.where(b.median_id >= 0, nearest, 0.0), self.g_median_depth))
 
     def backward(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Matrix:
-        """Write gradients by rows, g_params [N, 17], and grad2d [N] if given; return the pose twist (ρ, φ) [6]."""
+        """Write the gradient of the rows to g_params [N, 17], and grad2d [N] if given. Return the pose twist (ρ, φ)
+        [6]."""
         maps, gradients = zip(*self._maps, strict=True)
         leaves = (self._leaf, self._twist, self._means2d)
         g_leaf, g_twist, g_means2d = torch.autograd.grad(maps, leaves, gradients, materialize_grads=True)
@@ -62,17 +63,17 @@ class ReferenceView:
         return np.asarray(g_twist.numpy(), np.float64)
 
     def backward_pose(self, params: Tensor) -> Matrix:
-        """Return the pose twist (ρ, φ) [6] of the gradient planes of colour and depth."""
+        """Return the pose twist (ρ, φ) [6] from the gradient planes of colour and depth."""
         (g_twist,) = torch.autograd.grad(self._maps[0][0][:4], self._twist, self.g_sums[:4], materialize_grads=True)
         return np.asarray(g_twist.numpy(), np.float64)
 
     def visible(self, n: int) -> Tensor:
-        """Return which splats last rendered reach the image, bool [n]."""
+        """Return which splats of the last render reach the image, bool [n]."""
         return self._visible
 
 
 def grad2d_of(g_means2d: Tensor, camera: Camera) -> Tensor:
-    """Return the norm of image-mean gradients [N, 2] per px, per half image size [N] (3DGS)."""
+    """Return the norm of image-mean gradients [N, 2] per px, converted to gradients per half image size, [N] (3DGS)."""
     half_image = g_means2d.new_tensor([camera.width / 2, camera.height / 2])
     return (g_means2d * half_image).square().sum(1).sqrt()
 

@@ -13,7 +13,7 @@ from sigmasplat.types import Matrix
 Descriptors = NDArray[np.float32]
 
 GATE_LEAST, GATE_MOST = 0.85, 1.20
-"""How far the variance of two submaps may lower or raise the similarity of their keyframes."""
+"""Limits of the factor by which the variance of two submaps changes the similarity of their keyframes."""
 
 
 @dataclass(frozen=True, eq=False)

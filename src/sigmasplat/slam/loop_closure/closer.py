@@ -76,7 +76,7 @@ def make_descriptor(config: LoopConfig) -> Descriptor:
 
 @dataclass(eq=False)
 class LoopCloser:
-    """Keeps the descriptors of finished submaps and all edges between them; nothing else moves anchors."""
+    """Keeps the descriptors of finished submaps and all edges between them. Only this class moves anchors."""
 
     config: Config
     store: SubmapStore

@@ -1,4 +1,4 @@
-"""Describe places by NetVLAD (Arandjelović et al. 2016), with weights from a file that the user brings."""
+"""Describe places by NetVLAD (Arandjelović et al. 2016), with weights from a file of the user."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ from torch import Tensor
 from sigmasplat.errors import ConfigError
 
 CONVOLUTIONS = tuple(f"conv{block}_{i + 1}" for block, count in enumerate((2, 2, 3, 3, 3), 1) for i in range(count))
-"""VGG16's up to conv5_3, after which NetVLAD leaves out ReLU and pooling."""
+"""The layers of VGG16 up to conv5_3; NetVLAD omits the ReLU and the pooling after it."""
 POOLED_BEFORE = ("conv2_1", "conv3_1", "conv4_1", "conv5_1")
 SMALLEST_PX = 2 ** len(POOLED_BEFORE)
 LAYER_NUMBERS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
-"""Numbers of the convolutions if ReLUs and poolings are counted too, as both common formats do."""
+"""Numbers of the convolutions if ReLUs and poolings are counted too, as in both common formats."""
 VLAD_LAYER, WHITEN_LAYER = 30, 33
 """Numbers of the NetVLAD layer and the whitening layer in the Matlab network."""
 IMAGENET_MEAN, IMAGENET_STD = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
@@ -33,8 +33,8 @@ class NetVladWeights:
     """VGG16 and the NetVLAD layer in float32, from any file format; the shapes give the width of the network.
 
     convolutions: 13 of weight [out, in, 3, 3] and bias [out], the last out = D; assign [K, D] and assign_bias [K]: the
-    soft assignment to K clusters; centroids [K, D]; whitening: weight [P, K · D] and bias [P] of the PCA over the
-    clusters one after another, if any; the network sees (RGB in [0, 1] · scale − mean [3]) / std [3].
+    soft assignment to K clusters; centroids [K, D]; whitening: weight [P, K · D] and bias [P] of the PCA over all
+    clusters, if any. The input of the network is (RGB in [0, 1] · scale − mean [3]) / std [3].
     """
 
     convolutions: list[tuple[Tensor, Tensor]]
@@ -48,9 +48,9 @@ class NetVladWeights:
 
     @staticmethod
     def load(path: Path | str) -> "NetVladWeights":
-        """Read a weights file of any of the three formats, told apart by content.
+        """Read a weights file of any of the three formats, which are recognised by content.
 
-        Raises ConfigError naming the file, and the tensor with its found and expected shape, if that does not fit.
+        Raises ConfigError naming the file, and the tensor with its actual and expected shape, if a tensor does not fit.
         """
         path = Path(path)
         read = _reader(path)
@@ -61,13 +61,13 @@ class NetVladWeights:
                 f"{path}: contains more than tensors and numbers, or is damaged; loading it could run any code. "
                 "If you trust its source, save only its state_dict"
             ) from problem
-        except Exception as problem:  # decoders fail in many ways on damaged bytes, and all of them mean: not usable
+        except Exception as problem:  # damaged bytes cause many kinds of exceptions
             reason = " ".join(f"{type(problem).__name__}: {problem}".split())[:200]
             raise ConfigError(f"{path}: unreadable as NetVLAD weights ({reason}); give {FORMATS}") from problem
         return file.weights()
 
     def save(self, path: Path | str) -> None:
-        """Write as safetensors: loads faster than the other formats, and runs no code."""
+        """Write as safetensors, which loads faster than the other formats and runs no code."""
         tensors = {"vlad.assign.weight": self.assign, "vlad.assign.bias": self.assign_bias}
         tensors |= {"vlad.centroids": self.centroids, "input.mean": self.mean, "input.std": self.std}
         tensors["input.scale"] = torch.tensor([self.scale])
@@ -89,7 +89,8 @@ class NetVlad:
     def describe(self, color: NDArray[np.float32], depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return float32 [P], or [K · D] without whitening, of unit norm (`Descriptor.describe`).
 
-        Raises ConfigError if the image is below 16 pixels at the working width: nothing would be left of it.
+        Raises ConfigError if the image is smaller than 16 pixels at the working width, because its feature map would be
+        empty.
         """
         w = self.weights
         image = torch.tensor(color, dtype=torch.float32).permute(2, 0, 1)[None]
@@ -104,7 +105,8 @@ class NetVlad:
         return self._vlad(_vgg(w, (image * w.scale - w.mean[:, None, None]) / w.std[:, None, None])).numpy()
 
     def _vlad(self, features: Tensor) -> Tensor:
-        """Sum residuals to the clusters, features [D, pixels]: V_k = Σ a_k (x − c_k), normalised per k, then as one."""
+        """Sum residuals to the clusters, features [D, pixels]: V_k = Σ a_k (x − c_k). Normalise per k, then the whole
+        vector."""
         w = self.weights
         x = F.normalize(features, dim=0)
         a = torch.softmax(w.assign @ x + w.assign_bias[:, None], dim=0)
@@ -129,14 +131,14 @@ def _vgg(weights: NetVladWeights, image: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class _TensorFile:
-    """The tensors of a file by our names, in PyTorch's order of axes; alias: their names in the file."""
+    """The tensors of a file by the names used here, in PyTorch's order of axes; alias: their names in the file."""
 
     path: Path
     tensors: dict[str, Tensor]
     alias: dict[str, str]
 
     def take(self, name: str, *shape: int | None) -> Tensor:
-        """Return a tensor as float32 of the given shape, None = any; dimensions of 1 at either end do not count.
+        """Return a tensor as float32 of the given shape, None = any; dimensions of 1 at either end are ignored.
 
         Raises ConfigError if it is missing, of another shape, or not finite.
         """
@@ -153,11 +155,11 @@ class _TensorFile:
             raise ConfigError(f"{where} is {sizes}, expected {expected}; give {FORMATS}")
         if not torch.isfinite(tensor).all():
             raise ConfigError(f"{where} holds NaN or inf, expected finite weights; download the file again")
-        # A copy: the last bits of a product depend on memory alignment, which differs from file to file.
+        # A copy, because the last bits of a product depend on memory alignment, which differs from file to file.
         return torch.empty(found).copy_(tensor.reshape(found))
 
     def weights(self) -> NetVladWeights:
-        """Check all tensors against each other and gather them."""
+        """Check that all tensors fit together, and return the weights."""
         chain, width = [], 3
         for name in CONVOLUTIONS:
             kernel = self.take(f"vgg.{name}.weight", None, width, 3, 3)
@@ -180,9 +182,10 @@ def _read_safetensors(path: Path) -> _TensorFile:
 
 
 def _read_checkpoint(path: Path) -> _TensorFile:
-    """Read pytorch-NetVlad's state_dict, wrapped or bare; Patch-NetVLAD adds the whitening.
+    """Read pytorch-NetVlad's state_dict, either wrapped or not; Patch-NetVLAD adds the whitening.
 
-    Trained on torchvision's normalisation. Besides tensors only numpy's numbers (its scores) may be in the file.
+    It was trained with torchvision's normalisation. Apart from tensors, the file may contain only numpy numbers (its
+    scores).
     """
     numbers: list[Any] = [np.dtype, type(np.dtype(np.float64)), type(np.dtype(np.int64))]
     scalar = np.float64(0.0).__reduce__()[0]
@@ -201,12 +204,12 @@ def _read_checkpoint(path: Path) -> _TensorFile:
 
 
 def _read_matlab(path: Path) -> _TensorFile:
-    """Read the layers where hloc does; they take RGB in 0…255 less the mean image's first pixel."""
+    """Read the layers that hloc reads; their input is RGB in 0…255 minus the first pixel of the mean image."""
     net = loadmat(path, struct_as_record=False, squeeze_me=True, variable_names=["net"])["net"]
     tensors: dict[str, Tensor] = {}
     for i, layer in enumerate(np.ravel(net.layers)):
         for j, weights in enumerate(np.ravel(getattr(layer, "weights", ()))):
-            # Matlab's order of axes is reversed: [height, width, in, out], [D, K].
+            # loadmat reverses the order of axes: [height, width, in, out], [D, K].
             array = np.asarray(weights, np.float32).T
             array = array.swapaxes(2, 3) if array.ndim == 4 else array
             tensors[f"net.layers[{i}].weights[{j}]"] = torch.tensor(array.copy())
@@ -216,10 +219,10 @@ def _read_matlab(path: Path) -> _TensorFile:
     alias |= {"whiten.weight": f"{white}[0]", "whiten.bias": f"{white}[1]"}
     named = {ours: tensors[theirs] for ours, theirs in alias.items() if theirs in tensors}
     if "vlad.centroids" in named:
-        named["vlad.centroids"] = -named["vlad.centroids"]  # −c_k is what the file holds
+        named["vlad.centroids"] = -named["vlad.centroids"]  # the file contains −c_k
         shape = named["vlad.centroids"].T.shape
         if "whiten.weight" in named and named["whiten.weight"][0].numel() == shape.numel():
-            # From the clusters of one feature side by side to the features of one cluster.
+            # Reorder from "clusters of one feature" to "features of one cluster".
             named["whiten.weight"] = named["whiten.weight"].reshape(-1, *shape).transpose(1, 2).flatten(1)
     image = np.asarray(net.meta.normalization.averageImage, np.float32)
     named["input.mean"] = torch.tensor(image.reshape(-1, image.shape[-1])[0])
@@ -228,14 +231,14 @@ def _read_matlab(path: Path) -> _TensorFile:
 
 
 def _alias(weight: str, bias: str) -> dict[str, str]:
-    """Map our names of the convolutions to a file's, given as patterns of the layer's number."""
+    """Map the names of the convolutions used here to the names in a file, given as patterns of the layer's number."""
     patterns = {"weight": weight, "bias": bias}.items()
     layers = list(zip(CONVOLUTIONS, LAYER_NUMBERS, strict=True))
     return {f"vgg.{name}.{part}": pattern.format(number) for part, pattern in patterns for name, number in layers}
 
 
 def _reader(path: Path) -> Callable[[Path], _TensorFile]:
-    """Choose the reader by how the file begins."""
+    """Choose the reader by the first bytes of the file."""
     try:
         with path.open("rb") as stream:
             head = stream.read(16)
@@ -243,7 +246,7 @@ def _reader(path: Path) -> Callable[[Path], _TensorFile]:
         raise ConfigError(f"cannot read NetVLAD weights {path}: {problem.strerror}; give {FORMATS}") from problem
     if head.startswith(b"MATLAB"):
         return _read_matlab
-    if head[5:9] == b"\0\0\0{":  # JSON after its length, which may begin with any byte: a pickle's, too
+    if head[5:9] == b"\0\0\0{":  # JSON follows its length, which may start with any byte, even that of a pickle
         return _read_safetensors
     if head.startswith((b"PK", b"\x80")):
         return _read_checkpoint

@@ -1,8 +1,8 @@
-"""Robust pose graph: Levenberg–Marquardt on SE(3) that rejects false loops.
+"""Solve a robust pose graph: Levenberg–Marquardt on SE(3) that rejects false loops.
 
 Odometry edges are trusted. Loop edges are judged while the graph is solved, by graduated non-convexity with the
-Geman–McClure loss (Yang et al., RA-L 2020): at first every loop has nearly full weight, at the end only loops that
-agree with the rest of the graph. Then accepted loops get weight 1 and the others weight 0.
+Geman–McClure loss (Yang et al., RA-L 2020). At first every loop has nearly full weight; at the end only loops that
+agree with the rest of the graph have. Then accepted loops get weight 1 and the others weight 0.
 """
 
 from collections.abc import Sequence
@@ -19,12 +19,13 @@ from sigmasplat.model import se3
 from sigmasplat.types import Matrix
 
 PRUNE_WEIGHT = 0.25
-"""A loop with a lower weight is rejected (VarSplat §6). At μ = 1 the weight is ¼ exactly if r² = c²: the χ² test."""
+"""A loop with a lower weight is rejected (VarSplat §6). At μ = 1 the weight is exactly ¼ if r² = c², so this is the χ²
+test."""
 GRADUATION = 1.4
 """Factor from one μ to the next (Yang et al. 2020, remark 5)."""
 STEPS_PER_MU = 10
-"""Enough steps to converge. With two steps, one loop that was wrong by half a turn distorted the first solutions so
-much that thirteen true loops were rejected with it (half a metre of drift, 36 submaps)."""
+"""Enough steps to converge. With only two steps, one loop that was wrong by half a turn distorted the first solutions
+so much that thirteen true loops were rejected too (half a metre of drift, 36 submaps)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +54,8 @@ class LoopVerdict:
 
 @dataclass(frozen=True, eq=False)
 class PoseGraphSolution:
-    """T_world_node [N, 4, 4]; one verdict per loop edge in the order of the edges; steps of Levenberg–Marquardt; cost
-    Σ χ² of odometry and accepted loops, at the given poses and at the solution."""
+    """T_world_node [N, 4, 4]; one verdict per loop edge in the order of the edges; number of steps of
+    Levenberg–Marquardt; cost Σ χ² of odometry and accepted loops, at the given poses and at the solution."""
 
     T_world_node: Matrix
     verdicts: tuple[LoopVerdict, ...]
@@ -68,12 +69,13 @@ def optimise(
 ) -> PoseGraphSolution:
     """Find the poses [N, 4, 4] that agree best with the edges; node 0 is fixed.
 
-    A loop is rejected where its χ² exceeds the `confidence` quantile of 6 degrees of freedom; confidence = 1 believes
-    every loop (plain least squares). Without loops the poses come back as they are. Up to `max_iterations` steps follow
-    once the verdicts stand.
+    A loop is rejected if its χ² exceeds the `confidence` quantile of 6 degrees of freedom; with confidence = 1 every
+    loop is accepted (plain least squares). Without loops the poses are returned unchanged. After the verdicts, up to
+    `max_iterations` more steps are taken.
+
     Raises SigmaSplatError on poses or edges that are not rigid, edges to nodes that do not exist, information that is
-    not symmetric positive definite, and nodes that no chain of odometry edges ties to node 0: with their loops rejected
-    they would hang on nothing.
+    not symmetric positive definite, and nodes without a chain of odometry edges to node 0: if their loops are rejected,
+    their poses are undetermined.
     """
     if not 0.0 < confidence <= 1.0:
         raise SigmaSplatError(f"pose graph: confidence is {confidence}; give a probability above 0 and at most 1")
@@ -82,7 +84,7 @@ def optimise(
     if not edges:
         return PoseGraphSolution(poses, (), 0, 0.0, 0.0)
     graph = PoseGraph(len(poses), edges)
-    # Relative to node 0: neither rounding nor the optimiser's path depends on where the world has its origin.
+    # Relative to node 0, so that rounding and the steps do not depend on the origin of the world.
     start = se3.inverse(poses[:1]) @ poses
     if not graph.loop.any():
         cost = float(graph.chi2(start).sum())
@@ -150,10 +152,12 @@ class PoseGraph:
 
 
 def _graduate(graph: PoseGraph, T: Matrix, chi2_limit: float) -> tuple[Matrix, Matrix, int]:
-    """Solve while μ falls: return poses, weights [E] of the Geman–McClure loss with c² = chi2_limit, and steps taken.
+    """Solve for decreasing μ: return poses, weights [E] of the Geman–McClure loss with c² = chi2_limit, and steps
+    taken.
 
     w = (μc² / (r² + μc²))², μ from 2 max r² / c² down to 1 (Yang et al. 2020, eq. 12 and remark 5). The first r² is
-    that of the given poses; where all loops weigh alike, false ones have bent the graph most.
+    that of the given poses. It is not that of a solution with equal weights, because false loops distort such a
+    solution most.
     """
     chi2, steps = graph.chi2(T), 0
     mu = max(2.0 * float(chi2[graph.loop].max()) / chi2_limit, 1.0)
@@ -169,7 +173,8 @@ def _graduate(graph: PoseGraph, T: Matrix, chi2_limit: float) -> tuple[Matrix, M
 def _minimise(graph: PoseGraph, T: Matrix, weights: Matrix, max_iterations: int) -> tuple[Matrix, int]:
     """Minimise Σ w eᵀΩe by Levenberg–Marquardt from poses T; return the poses and the number of steps tried.
 
-    Damping scales with H's diagonal and starts tiny: the soft modes of a chain are N² times smaller than that.
+    Damping is proportional to H's diagonal and starts very small, because the smallest eigenvalues of a chain are about
+    N² times smaller than the diagonal.
     """
     cost, damping = float(weights @ graph.chi2(T)), 1e-9
     for step in range(1, max_iterations + 1):
@@ -191,7 +196,7 @@ def _minimise(graph: PoseGraph, T: Matrix, weights: Matrix, max_iterations: int)
 
 
 def _refuse_bad_input(poses: Matrix, edges: Sequence[Edge]) -> None:
-    """Raise SigmaSplatError with one line that names the node or the edge."""
+    """Raise SigmaSplatError if the input is invalid; its message names the node or the edge."""
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
         raise SigmaSplatError(
             f"pose graph: poses have shape {list(poses.shape)}; give [N, 4, 4] with at least one node"

@@ -23,7 +23,7 @@ from sigmasplat.slam.loop_closure.candidates import SubmapPair
 from sigmasplat.types import Matrix
 
 FLOOR_M, FLOOR_RAD = 0.005, 0.003
-"""Least standard deviation of a registration: two maps of the same wall differ by about this much."""
+"""Minimum standard deviation of a registration: two maps of the same wall differ by about this much."""
 HOPELESS = 0.5
 """If alignment explains less than this share of `share_least`, the keyframe is not refined further."""
 OVERLAP_SAMPLE = 5000

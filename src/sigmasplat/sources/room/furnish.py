@@ -39,7 +39,7 @@ SOFAS: tuple[Color, ...] = ((0.20, 0.40, 0.46), (0.56, 0.26, 0.22), (0.30, 0.36,
 
 @dataclass
 class Room:
-    """The shapes of one room; `place` takes room coordinates and mirrors every second room in x."""
+    """The shapes of one room. `place` uses room coordinates and mirrors every second room in x."""
 
     number: int
     seed: int
@@ -53,7 +53,7 @@ class Room:
         material: Material | Texture,
         yaw_rad: float = 0.0,
     ) -> None:
-        """Add a shape: centre and half extents in metres; a texture alone means a matt material."""
+        """Add a shape: centre and half extents in metres; if `material` is only a texture, the material is matt."""
         side = -1.0 if self.number % 2 else 1.0
         x, y, z = center
         made = material if isinstance(material, Material) else Material(material)

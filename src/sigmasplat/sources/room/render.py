@@ -121,7 +121,7 @@ def _pixel_m(directions: Floats, normals: Floats, t: Floats, focal_px: float) ->
 
 
 def _face_number(shape: Shape, normals: Floats) -> Indices:
-    """Tell the smooth parts of one shape apart [N]: six faces of a box, caps and side of a drum, one part of a ball."""
+    """Number the smooth parts of one shape [N]: six faces of a box, caps and side of a drum, one part of a ball."""
     if shape.kind == "ball":
         return np.zeros(normals.shape[1], np.intp)
     n = np.rint(shape.to_local_axes(normals)).astype(np.intp) + 1

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.floating[Any]]  # float32 throughout; numpy's types lose that at every factor
+Floats = NDArray[np.floating[Any]]  # values are float32, but the type of their products is wider
 Texture = Callable[[Floats, Floats, Floats], Floats]
 Color = tuple[float, float, float]
 

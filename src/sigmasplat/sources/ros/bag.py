@@ -110,10 +110,10 @@ class Bag:
         msgtype = self.topics[name].msgtype
         if not self.ros1:
             return self._guarded(lambda: self._types.deserialize_cdr(raw, msgtype))
-        msgtype = TRANSFORMS if msgtype == "tf/msg/tfMessage" else msgtype  # its name before ROS Hydro
+        msgtype = TRANSFORMS if msgtype == "tf/msg/tfMessage" else msgtype  # the name of the type before ROS Hydro
         try:
             return self._types.deserialize_ros1(raw, msgtype)
-        except Exception:  # RealSense's SDK appends the depth unit to images, four bytes that are not in the type
+        except Exception:  # RealSense's SDK appends the depth unit to images: four bytes
             return self._guarded(lambda: self._types.deserialize_ros1(raw[:-4], msgtype))
 
     def _guarded(self, call: Callable[[], Value]) -> Value:

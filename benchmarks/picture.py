@@ -1,0 +1,79 @@
+"""Draw the picture of a real scan that README.md shows: sensor, map, uncertainty, and the map seen from above.
+
+Reads a finished run of an RGB-D sequence and measures nothing. The last panel leaves out what is higher than the
+camera: mostly the ceiling.
+
+example: sigmasplat run DATA/redkitchen --out runs/kitchen && python benchmarks/picture.py runs/kitchen
+"""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import record
+import torch
+import tyro
+
+from sigmasplat.drawing.view_panels import BACKGROUND, ViewPanel, draw_view_strip, view_panels
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.exports.run_reader import RunReader
+from sigmasplat.exports.video import orbit_view
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.metrics.views import scored_view
+from sigmasplat.model import se3
+from sigmasplat.render import FieldRenderer
+from sigmasplat.sources import open_source
+
+arg = tyro.conf.arg
+DIRECTIONS = 36
+"""Steps of a full turn around the map, from which the last panel's view is chosen."""
+ZOOM = 1.2
+"""Of the last panel: `orbit_view` leaves a wide margin."""
+Run = Annotated[Path, tyro.conf.Positional, arg(help="folder of a finished run")]
+Index = Annotated[int, arg(help="frame of the first three panels")]
+Direction = Annotated[int, arg(help=f"direction of the last panel, 0 to {DIRECTIONS - 1}")]
+Out = Annotated[Path, arg(help="picture to write")]
+
+
+def panels(run: RunFolder, index: int, direction: int) -> list[ViewPanel]:
+    """Render the four panels. Raises RunError or SourceError where run or sequence cannot be read."""
+    reader = RunReader(run, lambda: open_source(run.facts()["source_path"]))
+    config, field = reader.config, run.read_map()
+    renderer = FieldRenderer(config.render, config.backend)
+    frame = reader.source.frame(index).prepared(0, config.input.min_depth_m, config.input.max_depth_m)
+    T_camera_world = se3.inverse(reader.path.T_world_camera[index])
+    with torch.inference_mode():
+        view = scored_view(frame, renderer(field, frame.camera, T_camera_world), "")
+        below, poses = orbit_view(field, reader.tracked_path(), frame.camera, DIRECTIONS, renderer)
+        near = replace(frame.camera, fx=ZOOM * frame.camera.fx, fy=ZOOM * frame.camera.fy)
+        above = renderer(below, near, se3.inverse(poses[direction % DIRECTIONS]))
+    backdrop = np.array(BACKGROUND, np.float32) / 255.0
+    seen = above.color.numpy() + (1.0 - above.alpha.numpy()[..., None]) * backdrop
+    pixels = (np.clip(seen, 0.0, 1.0) * 255.0).round().astype(np.uint8)
+    sensor, rendered, _, uncertainty, _ = view_panels(view)
+    return [
+        replace(sensor, title="sensor", caption=f"{run.facts()['source']}, frame {index}"),
+        replace(rendered, title="map, same view", caption=f"{len(field):,} splats"),
+        replace(uncertainty, title="uncertainty of the colour"),
+        ViewPanel("map, from above", pixels, "without the ceiling"),
+    ]
+
+
+def main(
+    run: Run, frame: Index = 257, direction: Direction = 33, out: Out = record.ROOT / "docs" / "images" / "scan.jpg"
+) -> int:
+    """Draw the picture of a real scan; exit code 2 if the run or its sequence cannot be read."""
+    try:
+        drawn = panels(RunFolder.open(run), frame, direction)
+    except SigmaSplatError as problem:
+        print(f"picture.py: {problem}", file=sys.stderr)
+        return 2
+    draw_view_strip(drawn).save(out, quality=88)
+    print(f"{out}: {out.stat().st_size / 1000:.0f} kB")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(main, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,)))
