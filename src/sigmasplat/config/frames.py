@@ -139,7 +139,7 @@ class MappingConfig:
     """Splats with at most this opacity are removed after the steps of a keyframe. A lower value keeps faint splats, a
     higher one makes holes."""
     keyframe_history: int = 0
-    """Older keyframes are drawn only from this many of the latest ones; 0 = from all."""
+    """Steps on older keyframes use only this many of the latest keyframes; 0 = all keyframes."""
     window: int = 0
     """Use only this many keyframes: the newest two, and those that overlap most with the newest (CG-SLAM's
     sliding-window bundle adjustment). 0 = all, drawn at random (VarSplat)."""

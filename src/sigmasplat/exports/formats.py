@@ -188,9 +188,7 @@ def _write_splats(
             raise ConfigError(f"{option} must be finite and not negative, found {bound}")
     field = source.field()
     if sigma_below is not None and len(field) and not has_learned_variance(field):
-        raise ConfigError(
-            f"{source.path} has no learned σ, so --sigma-below cannot be used; runs and their PLY have it"
-        )
+        raise ConfigError(f"{source.path} has no learned σ, so --sigma-below cannot be used; give a run or its PLY")
     result, total = filter_splats(field, sigma_below=sigma_below, opacity_above=opacity_above), len(field)
     if total and result.dropped == total:
         medians = f"{sigmas(field).median():.3g} and {field.opacities.median():.3g}"
