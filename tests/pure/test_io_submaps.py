@@ -11,6 +11,7 @@ import torch
 from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.io import tensors
 from sigmasplat.io.submaps import DiskStore
+from sigmasplat.io.tensors import open_tensors, write_tensors
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import ATTRIBUTES, GaussianField, Rows
@@ -252,3 +253,22 @@ def test_clearing_removes_only_submaps(store: DiskStore) -> None:
     (store.folder / "submap-best.safetensors").unlink()
     store.clear()
     assert not store.folder.exists()
+
+
+def test_the_same_submap_makes_the_same_bytes(tmp_path: Path) -> None:
+    submap, pictures = some_submap()
+    for name in "abcdefgh":
+        DiskStore(tmp_path / name).save(submap, pictures)
+    files = [next((tmp_path / name).iterdir()).read_bytes() for name in "abcdefgh"]
+    assert len(set(files)) == 1
+
+
+def test_tensors_and_text_are_read_back_whatever_the_text(tmp_path: Path) -> None:
+    text = {f"key {i}": f'"ü" \\ line\n{i}' for i in range(9)}
+    made = set[bytes]()
+    for name in "abcd":
+        write_tensors(tmp_path / name, {"x": torch.arange(3.0)}, text)
+        made.add((tmp_path / name).read_bytes())
+    assert len(made) == 1
+    with open_tensors(tmp_path / "a", "file") as file:
+        assert file.metadata() == text and file.get_tensor("x").tolist() == [0.0, 1.0, 2.0]

@@ -1,5 +1,6 @@
 """Write and read named tensors with text metadata (safetensors), completely or not at all."""
 
+import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: dict[str, str
     with replacing(path) as temporary:
         try:
             save_file(_without_shared_memory(tensors), temporary, text)
+            _sort_metadata(temporary)
         except SafetensorError as problem:  # also raised if the disk is full
             raise RunError(f"cannot write {path}: {problem}; choose a writable place") from problem
         temporary.chmod(0o666 & ~_umask())  # safetensors makes the file readable only for its owner
@@ -35,6 +37,18 @@ def open_tensors(path: Path, what: str) -> Iterator[Any]:
             yield file
     except (SafetensorError, OSError, KeyError, IndexError, TypeError, ValueError) as problem:
         raise RunError(f"{what} {path} is damaged: {problem}") from problem
+
+
+def _sort_metadata(path: Path) -> None:
+    """Sort the text metadata in a file's header: safetensors writes it in a random order, so bytes would differ."""
+    with path.open("r+b") as file:
+        size = int.from_bytes(file.read(8), "little")
+        header = json.loads(file.read(size))
+        header["__metadata__"] = dict(sorted(header.get("__metadata__", {}).items()))
+        text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+        if len(text) <= size:  # the header is padded with spaces
+            file.seek(8)
+            file.write(text.ljust(size))
 
 
 def _without_shared_memory(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
