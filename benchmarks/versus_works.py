@@ -14,6 +14,8 @@ WORKS = {
     "forward_color_depth": "colour + depth",
     "pose_only": "forward + loss + pose gradient",
     "backward": "full backward",
+    "keyframe_reference": "reference of a keyframe",
+    "track_align": "track a frame",
 }
 MAPPING = "mapping iteration"
 NAMES = (*WORKS.values(), MAPPING)

@@ -24,8 +24,11 @@ def replace(path: Path, old: str, new: str) -> None:
 
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
-    """Return a copy of the package's sources and kernels."""
-    return shutil.copytree(PACKAGE, tmp_path / "sigmasplat", ignore=shutil.ignore_patterns("__pycache__"))
+    """Return a copy of the package's sources, with the compiled kernels that are installed."""
+    core = pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+    copy = shutil.copytree(PACKAGE, tmp_path / "sigmasplat", ignore=shutil.ignore_patterns("__pycache__", "*.so"))
+    shutil.copy(core.__file__, copy / "native")
+    return copy
 
 
 @pytest.fixture

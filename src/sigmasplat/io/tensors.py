@@ -20,7 +20,8 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: dict[str, str
     with replacing(path) as temporary:
         try:
             save_file(_without_shared_memory(tensors), temporary, text)
-            _sort_metadata(temporary)
+            if tensors and len(text) > 1:
+                _sort_metadata(temporary)
         except SafetensorError as problem:  # also raised if the disk is full
             raise RunError(f"cannot write {path}: {problem}; choose a writable place") from problem
         temporary.chmod(0o666 & ~_umask())  # safetensors makes the file readable only for its owner
@@ -44,7 +45,7 @@ def _sort_metadata(path: Path) -> None:
     with path.open("r+b") as file:
         size = int.from_bytes(file.read(8), "little")
         header = json.loads(file.read(size))
-        header["__metadata__"] = dict(sorted(header.get("__metadata__", {}).items()))
+        header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
         text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
         if len(text) <= size:  # the header is padded with spaces
             file.seek(8)
