@@ -92,6 +92,7 @@ def sections(measured: dict[str, Any]) -> list[Section]:
         _row(threads, name, [t for t in turns if t["threads"] == threads])
         for threads in sorted({t["threads"] for t in turns})
         for name in NAMES
+        if name in turns[0]["this"]  # older results have fewer operations
     ]
     note = (
         f"Before: commit {str(figures['other'])[:9]}. Shortest of {config['runs']} runs in each of {len(turns)} turns; "
@@ -114,7 +115,8 @@ def _row(threads: int, name: str, turns: list[dict[str, Any]]) -> list[str]:
 
 def main(options: Options) -> int:
     """Measure, write the results, print them; return the exit code."""
-    return program.run("versus", options, measure_all, [0], refused=(ValueError,), source=Path(options.source).name)
+    config = {"source": Path(options.source).name, "runs": options.runs}
+    return program.run("versus", options, measure_all, [0], refused=(ValueError,), **config)
 
 
 if __name__ == "__main__":
