@@ -72,7 +72,7 @@ class Slam:
 
         Raises SourceError if the first frame has no depth or a later one comes from another camera.
         """
-        self._timer.start()
+        self._timer = StepTimer()
         seen, tracking, loops = self._observe(frame), dict[str, float](), list[Loop]()
         if not self.steps:
             T_submap_camera, mapped = self._begin(seen), True
@@ -173,7 +173,7 @@ class Slam:
             view = self._view or self.prepare(frame.camera)
             if frame.camera != view.camera:
                 raise SourceError(f"frame {frame.index} comes from another camera ({frame.camera}) than the first")
-            self._timer.watch_kernels(view)
+            self._timer.start_kernels(view)
             target = Target.of(frame, (view.sums.shape[1], view.sums.shape[2]))
             return Observation(frame, target, live_image(view, frame.color, frame.depth_m, target))
 
@@ -190,7 +190,7 @@ class Slam:
 
     def _track(self, seen: Observation) -> PoseFit:
         """Fit the frame's pose to the active submap."""
-        with self._timer.stage("track"), self._timer.kernels_of("track_kernels"):
+        with self._timer.stage("track"), self._timer.kernels_of(self.view, "track_kernels"):
             return self.tracker.track(self.mapper.field, self.view, seen.target, seen.live)
 
     def _is_keyframe(self, overlap: float) -> bool:
@@ -245,7 +245,7 @@ class Slam:
     ) -> Step:
         return Step(
             frame.index, frame.timestamp_s, self.atlas.anchors[-1] @ T_submap_camera, mapped, self.tracker.lost,
-            tracking, len(self.mapper.field), len(self.atlas.anchors) - 1, tuple(loops), self._timer.stop(),
+            tracking, len(self.mapper.field), len(self.atlas.anchors) - 1, tuple(loops), self._timer.stop(self.view),
         )  # fmt: skip
 
     @property

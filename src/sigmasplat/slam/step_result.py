@@ -43,26 +43,26 @@ def metrics_of(fit: PoseFit) -> dict[str, float]:
     }  # fmt: skip
 
 
+@dataclass(eq=False)
 class StepTimer(Stopwatch):
-    """Wall-clock seconds of one step by stage, including the seconds of the view's kernels."""
+    """Wall-clock seconds of one step by stage, including the seconds of the view's kernels. The step begins with it."""
 
-    def start(self) -> None:
-        """Start the times of a new step."""
-        self.seconds, self._begin_s = {}, time.perf_counter()
+    begin_s: float = field(default_factory=time.perf_counter)
+    kernels_before: NDArray[np.float64] = field(default_factory=lambda: np.zeros(len(KERNELS)))
 
-    def watch_kernels(self, view: View) -> None:
-        """Measure the kernels of this view from now on."""
-        self._view, self._kernels_before = view, view.seconds.copy()
+    def start_kernels(self, view: View) -> None:
+        """Measure the kernels of the view from now on."""
+        self.kernels_before = view.seconds.copy()
 
     @contextmanager
-    def kernels_of(self, name: str) -> Iterator[None]:
-        """Add the time of the kernels in a block of code to a stage."""
-        before_s = self._view.seconds.sum()
+    def kernels_of(self, view: View, name: str) -> Iterator[None]:
+        """Add the time of the view's kernels in a block of code to a stage."""
+        before_s = view.seconds.sum()
         yield
-        self.add({name: float(self._view.seconds.sum() - before_s)})
+        self.add({name: float(view.seconds.sum() - before_s)})
 
-    def stop(self) -> dict[str, float]:
-        """Return the seconds of all stages, of the kernels, and in total."""
-        kernels_s = (self._view.seconds - self._kernels_before).tolist()
-        self.add(dict(zip(KERNELS, kernels_s, strict=True)) | {"total": time.perf_counter() - self._begin_s})
+    def stop(self, view: View) -> dict[str, float]:
+        """Return the seconds of all stages, of the view's kernels, and in total."""
+        kernels_s = (view.seconds - self.kernels_before).tolist()
+        self.add(dict(zip(KERNELS, kernels_s, strict=True)) | {"total": time.perf_counter() - self.begin_s})
         return self.seconds
