@@ -5,6 +5,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
@@ -158,6 +160,8 @@ class ImageKernels:
 
     contiguous: Callable[[Plane], Plane]
     """Return a contiguous copy of a plane, or the plane itself if it is contiguous."""
+    to_host: Callable[[Plane], NDArray[np.float32]]
+    """Return a plane as an array in host memory."""
     as_tensor: Callable[[Plane], Tensor]
     """Return a plane as a tensor that a view accepts as reference depth."""
     halve: Callable[[tuple[Plane | None, Plane | None], Plane | None], tuple[Plane | None, Plane | None, Plane | None]]

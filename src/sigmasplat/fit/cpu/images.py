@@ -83,4 +83,4 @@ def live_planes(view: View, color: Image, depth_m: Image, target: Target) -> tup
     return gray_of(color), depth_m
 
 
-CPU_IMAGES = ImageKernels(np.ascontiguousarray, torch.tensor, halve, readings_of, align, normal_equations)
+CPU_IMAGES = ImageKernels(np.ascontiguousarray, np.asarray, torch.tensor, halve, readings_of, align, normal_equations)

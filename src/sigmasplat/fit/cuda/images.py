@@ -1,6 +1,8 @@
 """Halve images on a CUDA device (native/cuda/align.cu), with the same values as on the CPU; the host does not wait."""
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.fit.cuda.align import align, normal_equations
@@ -49,8 +51,13 @@ def _contiguous(plane: Tensor) -> Tensor:
     return plane.contiguous()
 
 
+def _to_host(plane: Tensor) -> NDArray[np.float32]:
+    array: NDArray[np.float32] = plane.cpu().numpy()
+    return array
+
+
 def _as_tensor(plane: Tensor) -> Tensor:
     return plane
 
 
-CUDA_IMAGES = ImageKernels(_contiguous, _as_tensor, halve, readings_of, align, normal_equations)
+CUDA_IMAGES = ImageKernels(_contiguous, _to_host, _as_tensor, halve, readings_of, align, normal_equations)

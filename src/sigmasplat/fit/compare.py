@@ -1,0 +1,93 @@
+"""Compare two RGB-D images at a given motion: does the depth of one lie on the surface of the other?
+
+Alignment minimises residuals, so its own cost cannot tell a wrong minimum from a right one. This comparison is made
+afterwards, with the noise of the sensor as its unit. It also separates the two signs of a depth difference: an object
+in front may be new, but seeing through a known surface contradicts the pose.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.types import Matrix
+
+LEVEL = 1
+"""Pyramid level that is compared: a quarter of the pixels, with less noise."""
+STEP = 2
+"""Every second row and column of that level is compared."""
+NOISE_RELATIVE, NOISE_M = 0.003, 0.002
+"""Standard deviation of a depth reading: a share of z² (Khoshelham & Elberink 2012) plus a constant."""
+CLOSE_SIGMA, CLOSE_M = 3.0, 0.02
+"""Two surfaces are the same if they are closer than this many standard deviations plus a tolerance for the pose."""
+LEAST_PIXELS = 50
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How well two images agree at a motion.
+
+    common: share of the reference's readings that fall on a live reading; close, front, behind: shares of these whose
+    live surface is the same, nearer, or farther; residual: median |depth difference| in standard deviations of a
+    reading; correlation: of the gray values, −1 to 1, whatever the exposure.
+    """
+
+    common: float
+    close: float
+    front: float
+    behind: float
+    residual: float
+    correlation: float
+
+
+NOTHING = Comparison(0.0, 0.0, 0.0, 0.0, float("inf"), 0.0)
+
+
+def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comparison:
+    """Compare two images at T_live_reference [4, 4]; `NOTHING` if they have less than 50 compared pixels in common."""
+    level = min(LEVEL, len(reference.cameras) - 1)
+    host, camera = reference.kernels.to_host, reference.cameras[level]
+    depth, gray = (host(plane)[::STEP, ::STEP] for plane in (reference.depth[level], reference.gray[level]))
+    v, u = np.nonzero(depth > 0)
+    if len(u) < LEAST_PIXELS:
+        return NOTHING
+    z = depth[v, u].astype(np.float64)
+    rays = np.stack([(STEP * u - camera.cx) / camera.fx, (STEP * v - camera.cy) / camera.fy, np.ones(len(u))])
+    x, y, seen = T_live_reference[:3, :3] @ (rays * z) + T_live_reference[:3, 3:]
+    ahead = np.maximum(seen, 1e-3)
+    column, row = camera.fx * x / ahead + camera.cx, camera.fy * y / ahead + camera.cy
+    inside = (seen > 0.05) & (column >= 0) & (row >= 0) & (column < camera.width - 1) & (row < camera.height - 1)
+    if inside.sum() < LEAST_PIXELS:
+        return NOTHING
+    left, top, seen = column[inside].astype(np.intp), row[inside].astype(np.intp), seen[inside]
+    other, difference = _nearest_surface(host(live.depth[level]), left, top, seen)
+    count = int(other.sum())
+    if count < LEAST_PIXELS:
+        return NOTHING
+    difference, noise = difference[other], NOISE_RELATIVE * seen[other] ** 2 + NOISE_M
+    limit = CLOSE_SIGMA * noise + CLOSE_M
+    shares = [float(np.mean(found)) for found in (np.abs(difference) < limit, difference <= -limit, difference >= limit)]
+    right, below = (column[inside] - left > 0.5), (row[inside] - top > 0.5)
+    live_gray = host(live.gray[level])[top + below, left + right]
+    residual = float(np.median(np.abs(difference) / noise))
+    return Comparison(count / len(u), *shares, residual, _correlation(gray[v, u][inside], live_gray))
+
+
+def _nearest_surface(
+    depth: NDArray[np.float32], left: NDArray[np.intp], top: NDArray[np.intp], expected_m: Matrix
+) -> tuple[NDArray[np.bool_], Matrix]:
+    """Return which points fall on a reading, and the difference to the one of the four neighbours that is closest to
+    the expected depth: at a depth step either side may be meant."""
+    best = np.full(len(left), np.inf)
+    for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        reading = depth[top + down, left + across]
+        difference = np.where(reading > 0, reading - expected_m, np.inf)
+        best = np.where(np.abs(difference) < np.abs(best), difference, best)
+    return np.isfinite(best), best
+
+
+def _correlation(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
+    a, b = one - one.mean(dtype=np.float64), other - other.mean(dtype=np.float64)
+    norm = float(np.sqrt((a @ a) * (b @ b)))
+    return float(a @ b) / norm if norm > 0.0 else 0.0
