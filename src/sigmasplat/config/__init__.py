@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sigmasplat.config.densify import DensifyConfig
+from sigmasplat.config.features import FeatureConfig
 from sigmasplat.config.frames import MappingConfig, RenderConfig, SeedConfig, TrackingConfig
 from sigmasplat.config.input import InputConfig
 from sigmasplat.config.submaps import FinalConfig, LoopConfig, RegistrationConfig, SubmapConfig
 from sigmasplat.errors import ConfigError
 
 __all__ = [
-    "Config", "DensifyConfig", "FinalConfig", "InputConfig", "LoopConfig", "MappingConfig", "RegistrationConfig",
-    "RenderConfig", "SeedConfig", "SubmapConfig", "TrackingConfig",
+    "Config", "DensifyConfig", "FeatureConfig", "FinalConfig", "InputConfig", "LoopConfig", "MappingConfig",
+    "RegistrationConfig", "RenderConfig", "SeedConfig", "SubmapConfig", "TrackingConfig",
 ]  # fmt: skip
 
 
@@ -38,6 +39,7 @@ class Config:
     mapping: MappingConfig = field(default_factory=MappingConfig)
     primitives: DensifyConfig = field(default_factory=DensifyConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    features: FeatureConfig = field(default_factory=FeatureConfig)
     submaps: SubmapConfig = field(default_factory=SubmapConfig)
     loops: LoopConfig = field(default_factory=LoopConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)

@@ -1,0 +1,22 @@
+"""Import OpenCV when it is first needed."""
+
+import functools
+import importlib
+from typing import Any
+
+from sigmasplat.env import switches
+from sigmasplat.errors import ConfigError
+
+
+@functools.cache
+def opencv() -> Any:
+    """Return the module cv2; it uses SIGMASPLAT_THREADS threads. Raises ConfigError if it cannot be imported."""
+    try:
+        cv2 = importlib.import_module("cv2")
+    except ImportError as problem:
+        raise ConfigError(
+            f"sparse features need OpenCV, which does not load ({problem}): pip install opencv-python-headless"
+        ) from problem
+    if switches().threads:
+        cv2.setNumThreads(switches().threads)
+    return cv2
