@@ -213,6 +213,11 @@ class TrackingConfig:
     """Whether a factor and an offset of the colour are fitted with the pose, for cameras that change their exposure."""
     lr_exposure: float = 0.01
     """Learning rate of the exposure: change per step of the factor's logarithm and of the offset (colours 0 to 1)."""
+    features: bool = False
+    """Whether sparse features give a second guess of the pose where motion is wide or the first fit is doubtful (ours).
+    The same fit starts from each guess, and the result that explains more is used."""
+    verify: bool = False
+    """Whether a pose is judged by comparing surfaces at it (ours); off = by the agreement of alignment only."""
     lost_agreement: float = 0.6
     """Tracking is lost if map and sensor agree in depth on less than this share of the pixels where both have a
     surface."""

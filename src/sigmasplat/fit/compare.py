@@ -22,6 +22,8 @@ NOISE_RELATIVE, NOISE_M = 0.003, 0.002
 CLOSE_SIGMA, CLOSE_M = 3.0, 0.02
 """Two surfaces are the same if they are closer than this many standard deviations plus a tolerance for the pose."""
 LEAST_PIXELS = 50
+FLAT = 0.01
+"""A gray image with a smaller standard deviation (0 to 1) has no texture to compare."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +31,8 @@ class Comparison:
     """How well two images agree at a motion.
 
     common: share of the reference's readings that fall on a live reading; close, front, behind: shares of these whose
-    live surface is the same, nearer, or farther; residual: median |depth difference| in standard deviations of a
-    reading; correlation: of the gray values, −1 to 1, whatever the exposure.
+    live surface is the same, nearer, or farther. Of those that are not in front: residual, the median |depth
+    difference| in standard deviations of a reading; correlation of the gray values, −1 to 1, NaN if one image is flat.
     """
 
     common: float
@@ -41,7 +43,7 @@ class Comparison:
     correlation: float
 
 
-NOTHING = Comparison(0.0, 0.0, 0.0, 0.0, float("inf"), 0.0)
+NOTHING = Comparison(0.0, 0.0, 0.0, 0.0, float("inf"), float("nan"))
 
 
 def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comparison:
@@ -61,17 +63,37 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
     if inside.sum() < LEAST_PIXELS:
         return NOTHING
     left, top, seen = column[inside].astype(np.intp), row[inside].astype(np.intp), seen[inside]
-    other, difference = _nearest_surface(host(live.depth[level]), left, top, seen)
+    live_depth = host(live.depth[level])
+    other, difference = _nearest_surface(live_depth, left, top, seen)
     count = int(other.sum())
     if count < LEAST_PIXELS:
         return NOTHING
-    difference, noise = difference[other], NOISE_RELATIVE * seen[other] ** 2 + NOISE_M
+    difference, noise = difference[other], (NOISE_RELATIVE * seen[other] ** 2 + NOISE_M) * noise_scale(live_depth)
     limit = CLOSE_SIGMA * noise + CLOSE_M
-    shares = [float(np.mean(found)) for found in (np.abs(difference) < limit, difference <= -limit, difference >= limit)]
-    right, below = (column[inside] - left > 0.5), (row[inside] - top > 0.5)
+    front = difference <= -limit
+    shares = [float(np.mean(found)) for found in (np.abs(difference) < limit, front, difference >= limit)]
+    if count - front.sum() < LEAST_PIXELS:
+        return Comparison(count / len(u), *shares, float("inf"), float("nan"))
+    residual = float(np.median(np.abs(difference)[~front] / noise[~front]))
+    right, below = column[inside] - left > 0.5, row[inside] - top > 0.5
     live_gray = host(live.gray[level])[top + below, left + right]
-    residual = float(np.median(np.abs(difference) / noise))
-    return Comparison(count / len(u), *shares, residual, _correlation(gray[v, u][inside], live_gray))
+    grays = (gray[v, u][inside][other][~front], live_gray[other][~front])
+    return Comparison(count / len(u), *shares, residual, _correlation(*grays))
+
+
+def noise_scale(depth: NDArray[np.float32]) -> float:
+    """Return how much noisier a depth image [h, w] is than assumed, at least 1: by the difference of each reading to
+    the mean of its two neighbours in the row, which is 0 on every plane."""
+    rows = depth[::STEP]
+    width = (rows.shape[1] - 2) // STEP * STEP
+    left, middle, right = (rows[:, i : i + width : STEP] for i in range(3))
+    read = (left > 0) & (middle > 0) & (right > 0)
+    if read.sum() < LEAST_PIXELS:
+        return 1.0
+    noise = NOISE_RELATIVE * middle[read].astype(np.float64) ** 2 + NOISE_M
+    bend = np.abs(middle[read] - 0.5 * (left[read] + right[read])) / noise
+    # For normal noise the bend has 1.22 standard deviations, and the median of its absolute value is 0.67 of these.
+    return max(1.0, float(np.median(bend)) / (1.2247 * 0.6745))
 
 
 def _nearest_surface(
@@ -89,5 +111,5 @@ def _nearest_surface(
 
 def _correlation(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
     a, b = one - one.mean(dtype=np.float64), other - other.mean(dtype=np.float64)
-    norm = float(np.sqrt((a @ a) * (b @ b)))
-    return float(a @ b) / norm if norm > 0.0 else 0.0
+    norms = float(np.sqrt(np.mean(a * a))), float(np.sqrt(np.mean(b * b)))
+    return float(np.mean(a * b)) / (norms[0] * norms[1]) if min(norms) > FLAT else float("nan")

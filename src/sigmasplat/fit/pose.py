@@ -7,6 +7,7 @@ from torch import Tensor
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.align import Alignment, align
 from sigmasplat.fit.backends import fits_of
+from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
@@ -22,7 +23,8 @@ class PoseFit:
 
     agreement: share of the pixels visible to both map and sensor whose depths agree; overlap: share of sensor readings
     where the map has a surface; first and last loss; iterations; alignment: the alignment that found the pose, or None;
-    degenerate: number of undetermined directions of motion, which keep the guess; exposure (a, b) of exp(a)·Ĉ + b.
+    degenerate: number of undetermined directions of motion, which keep the guess; exposure (a, b) of exp(a)·Ĉ + b;
+    comparison: of the two images at the pose, if it was made.
     """
 
     T_camera_world: Matrix
@@ -34,6 +36,7 @@ class PoseFit:
     alignment: Alignment | None = None
     degenerate: int = 0
     exposure: tuple[float, float] = (0.0, 0.0)
+    comparison: Comparison | None = None
 
     @property
     def covariance(self) -> Matrix | None:

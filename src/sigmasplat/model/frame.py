@@ -11,6 +11,17 @@ from sigmasplat.model.camera import Camera
 
 
 @dataclass(frozen=True, eq=False)
+class Detail:
+    """The gray image of a frame, uint8 [H, W], at its own size (or reduced to a maximum width), and its pinhole.
+
+    Features are found in it: the working image is too small for them.
+    """
+
+    gray: NDArray[np.uint8]
+    camera: Camera
+
+
+@dataclass(frozen=True, eq=False)
 class Frame:
     """One image of colour and depth.
 

@@ -9,6 +9,7 @@ from sigmasplat.presets import varsplat
 # U, and costs an eighth of the speed. There are fewer iterations, to compensate for the cost of U.
 SIGMA = varsplat.FAST.changed(
     mapping={"iterations": 15, "weight_moment": 0.1},
+    tracking={"features": True, "verify": True},
     primitives={"uncertain_m2": 0.025, "faded_opacity": 0.07},
 )
 

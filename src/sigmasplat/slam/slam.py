@@ -1,7 +1,7 @@
 """SLAM: track every frame, map keyframes, cut submaps, close loops. `Slam.step` follows the papers' overviews."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -10,7 +10,6 @@ from torch import Tensor
 from sigmasplat.config import Config
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import live_image
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
@@ -24,23 +23,24 @@ from sigmasplat.presets import default_preset, preset
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
 from sigmasplat.slam.drift import Drift
+from sigmasplat.slam.features import make_extractor
 from sigmasplat.slam.final import final_map
+from sigmasplat.slam.localisation.feature_image import FeatureImage, detail_of
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.rules import ends_submap, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer, metrics_of
-from sigmasplat.slam.tracker import Tracker
+from sigmasplat.slam.tracker import Sight, Tracker
 from sigmasplat.types import Matrix, no_progress
 
 HOST = torch.device("cpu")
 
 
-class Observation(NamedTuple):
-    """One frame in the forms that the parts of the system need: images, the target of the fits, and a pyramid."""
+@dataclass(eq=False)
+class Observation(Sight):
+    """A frame as the system sees it: the working images, and the forms that tracking needs."""
 
-    frame: Frame
-    target: Target
-    live: Pyramid
+    frame: Frame = field(kw_only=True)
 
 
 class Slam:
@@ -56,7 +56,9 @@ class Slam:
         self.random = np.random.default_rng(self.config.seed)
         self.store = MemoryStore() if store is None else store
         self.atlas = Atlas()
-        self.tracker = Tracker(self.config.tracking)
+        wanted = self.config.tracking.features
+        self.extractor = make_extractor(self.config.features) if wanted else None
+        self.tracker = Tracker(self.config.tracking, self.extractor)
         self.mapper = Mapper(self.config, self.random)
         self.drift = Drift()
         self.descriptor = make_descriptor(self.config.loops)
@@ -79,7 +81,7 @@ class Slam:
         else:
             fit = self._track(seen)
             T_submap_camera, tracking = se3.inverse(fit.T_camera_world), metrics_of(fit)
-            mapped = not self.tracker.lost and self._is_keyframe(fit.overlap)
+            mapped = not self.tracker.lost and not self.tracker.doubtful and self._is_keyframe(fit.overlap)
             if mapped and self._cuts:
                 tracking["drift_m"] = self._add_drift(fit, seen)
         if mapped:
@@ -168,14 +170,18 @@ class Slam:
     def _observe(self, frame: Frame) -> Observation:
         """Resize a frame to working size and prepare it for the fits."""
         with self._timer.stage("prepare"):
-            i = self.config.input
+            i, whole = self.config.input, frame
             frame = frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px)
             view = self._view or self.prepare(frame.camera)
             if frame.camera != view.camera:
                 raise SourceError(f"frame {frame.index} comes from another camera ({frame.camera}) than the first")
             self._timer.start_kernels(view)
             target = Target.of(frame, (view.sums.shape[1], view.sums.shape[2]))
-            return Observation(frame, target, live_image(view, frame.color, frame.depth_m, target))
+            live, image = live_image(view, frame.color, frame.depth_m, target), None
+            if self.extractor is not None:
+                detail = detail_of(whole, self.config.features.width)
+                image = FeatureImage(detail, frame.depth_m, frame.camera)
+            return Observation(target, live, image, frame=frame)
 
     def _begin(self, seen: Observation) -> Matrix:
         """Start the first submap at the first frame, whose camera is the world; return its pose."""
@@ -184,14 +190,14 @@ class Slam:
                 f"frame {seen.frame.index} has no depth reading in [{self.config.input.min_depth_m}, "
                 f"{self.config.input.max_depth_m}] m to start a map from; check the depth scale or start at a later one"
             )
-        self.tracker.start(seen.live)
+        self.tracker.start(seen)
         self.atlas.begin_submap()
         return np.eye(4)
 
     def _track(self, seen: Observation) -> PoseFit:
         """Fit the frame's pose to the active submap."""
         with self._timer.stage("track"), self._timer.kernels_of(self.view, "track_kernels"):
-            return self.tracker.track(self.mapper.field, self.view, seen.target, seen.live)
+            return self.tracker.track(self.mapper.field, self.view, seen)
 
     def _is_keyframe(self, overlap: float) -> bool:
         c = self.config.mapping
@@ -214,7 +220,7 @@ class Slam:
         if self.keyframe_indices[-1:] != [index]:  # a keyframe that two submaps share is counted once
             self.keyframe_indices.append(index)
         self.atlas.keyframe_poses[-1] = [keyframe.T_world_camera for keyframe in self.mapper.keyframes]
-        self.tracker.keep_keyframe(self.mapper.field, self.view, seen.live, self.atlas.keyframe_poses[-1][-1])
+        self.tracker.keep_keyframe(self.mapper.field, self.view, seen, self.atlas.keyframe_poses[-1][-1])
         return self.atlas.keyframe_poses[-1][-1]
 
     def _submap_ends(self, T_submap_camera: Matrix) -> bool:

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,10 +37,11 @@ class Step:
 
 def metrics_of(fit: PoseFit) -> dict[str, float]:
     """Return the tracking values that a step reports."""
+    compared = {} if fit.comparison is None else asdict(fit.comparison)
     return {
         "agreement": fit.agreement, "overlap": fit.overlap, "first_loss": fit.first_loss,
         "loss": fit.loss, "iterations": float(fit.iterations),
-    }  # fmt: skip
+    } | compared  # fmt: skip
 
 
 @dataclass(eq=False)

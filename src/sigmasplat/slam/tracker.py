@@ -1,6 +1,7 @@
-"""Tracking: predict the pose, fit it to the fixed map, check the fit, and retry from other poses if it is doubtful."""
+"""Tracking: predict the pose, fit it to the fixed map, judge the fit, and try other guesses if it is doubtful."""
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass, field as dataclass_field
 
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.align import align
 from sigmasplat.fit.backends import fits_of
+from sigmasplat.fit.compare import compare
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, map_reference
@@ -15,43 +17,74 @@ from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render.view import View
+from sigmasplat.slam.features import Extractor
+from sigmasplat.slam.localisation.feature_image import FeatureImage, pose_by_features
+from sigmasplat.slam.localisation.verdict import Usual, score
 from sigmasplat.slam.rules import is_lost, jumped
 from sigmasplat.types import Matrix
 
 DOUBT = 0.7
 """A pose is doubtful if its agreement × overlap falls below this share of the usual value."""
+WIDE = 0.05
+"""A motion between two frames is wide if it moves the image by more than this share of its width: the basin of
+convergence of alignment ends near there."""
+
+
+@dataclass(eq=False)
+class Sight:
+    """A frame in the forms that tracking needs: the target of the fits, its pyramid, and the image for features."""
+
+    target: Target
+    live: Pyramid
+    image: FeatureImage | None = None
 
 
 @dataclass(eq=False)
 class Tracker:
-    """Keeps the last pose, the velocity, the last image, the reference keyframe, and statistics of recent fits."""
+    """Keeps the last pose, the velocity, the last image, the reference keyframe, and statistics of recent fits.
+
+    lost: tracking of the last frame failed; doubtful: no guess explains it as well as usual.
+    """
 
     config: TrackingConfig
+    extractor: Extractor | None = None
     previous: Matrix = dataclass_field(default_factory=lambda: np.eye(4))
     velocity: Matrix = dataclass_field(default_factory=lambda: np.eye(4))
     last_image: Pyramid | None = None
+    last_features: FeatureImage | None = None
     keyframe: Reference | None = None
+    keyframe_features: FeatureImage | None = None
     agreements: list[float] = dataclass_field(default_factory=list)
     first_losses: list[float] = dataclass_field(default_factory=list)
+    usual: Usual = dataclass_field(default_factory=Usual)
     lost: bool = False
+    doubtful: bool = False
     started: bool = False
     """Whether a frame has been tracked yet."""
 
-    def start(self, live: Pyramid) -> None:
+    def start(self, seen: Sight) -> None:
         """Fix the gauge: the first camera is the world."""
-        self.last_image = live
+        self.last_image, self.last_features = seen.live, seen.image
 
-    def track(self, field: GaussianField, view: View, target: Target, live: Pyramid) -> PoseFit:
+    def track(self, field: GaussianField, view: View, seen: Sight) -> PoseFit:
         """Estimate T_camera_world of a frame; `self.lost` then says whether tracking failed.
 
         A lost frame gets the best available guess (odometry, else the last pose), and the velocity is reset.
         """
         predicted = self.previous @ self.velocity if self.config.motion_model else self.previous
-        fit = self._fit(field, view, target, live, predicted)
-        if self._doubtful(fit):
-            fit = self._retry(field, view, target, live, fit)
-        self.lost = is_lost(fit, self.config.lost_agreement, self.config.lost_share)
-        fit.T_camera_world = se3.orthonormalise(fit.T_camera_world)
+        best = self._fit(field, view, seen, predicted)
+        if self._is_wide(best, view) or self._doubts(best):
+            guesses = [self._fit(field, view, seen, guess) for guess in self._guesses_by_features(seen)]
+            best = max([best, *guesses], key=self._score)
+        if self._doubts(best):
+            best = self._retry(field, view, seen, best)
+        self.lost, self.doubtful = self._is_lost(best), self._doubts(best)
+        best.T_camera_world = se3.orthonormalise(best.T_camera_world)
+        self._remember(best, seen)
+        return best
+
+    def _remember(self, fit: PoseFit, seen: Sight) -> None:
+        """Keep what the next frame needs."""
         T_world_camera = se3.inverse(fit.T_camera_world)
         if self.lost:
             self.velocity = np.eye(4)
@@ -59,42 +92,58 @@ class Tracker:
             self.velocity = se3.inverse(self.previous) @ T_world_camera
             self.agreements.append(fit.agreement * fit.overlap)
             self.first_losses.append(fit.first_loss)
+            if fit.comparison is not None:
+                self.usual.add(fit.comparison)
         self.previous = T_world_camera
-        self.last_image, self.started = live, True
-        return fit
+        self.last_image, self.last_features, self.started = seen.live, seen.image, True
 
-    def _fit(
-        self, field: GaussianField, view: View, target: Target, live: Pyramid, guess: Matrix, patience: int = 1
-    ) -> PoseFit:
+    # ---- guesses ----
+
+    def _fit(self, field: GaussianField, view: View, seen: Sight, guess: Matrix, patience: int = 1) -> PoseFit:
         """Fit from an initial T_world_camera; patience: factor on the number of iterations of gradient descent."""
         T_camera_world = se3.inverse(guess)
         if self.config.method == "adam":
             config = self.config if self.started else _without_motion(self.config)
-            return fit_pose_adam(field.params, view, target, T_camera_world, config, patience * config.iterations)
+            steps = patience * config.iterations
+            return fit_pose_adam(field.params, view, seen.target, T_camera_world, config, steps)
         if self.config.align_to == "keyframe" and self.keyframe is not None:
-            return fit_pose_align(self.keyframe, live, T_camera_world, self.config)
-        reference = map_reference(field.params, view, T_camera_world, self.config)
-        return fit_pose_align(reference, live, T_camera_world, self.config)
+            return self._aligned(self.keyframe, seen.live, T_camera_world)
+        return self._aligned(map_reference(field.params, view, T_camera_world, self.config), seen.live, T_camera_world)
 
-    def _doubtful(self, fit: PoseFit) -> bool:
-        usual = float(np.median(self.agreements[-50:])) if self.agreements else 1.0
-        worse = fit.agreement * fit.overlap < DOUBT * usual
-        return worse or jumped(fit.first_loss, self.first_losses, self.config.reinit_factor)
+    def _aligned(self, reference: Reference, live: Pyramid, T_camera_world: Matrix) -> PoseFit:
+        fit = fit_pose_align(reference, live, T_camera_world, self.config)
+        if self.config.verify:
+            fit.comparison = compare(reference.pyramid, live, fit.T_camera_world @ se3.inverse(reference.T_camera_world))
+        return fit
 
-    def _retry(self, field: GaussianField, view: View, target: Target, live: Pyramid, fit: PoseFit) -> PoseFit:
+    def _guesses_by_features(self, seen: Sight) -> Iterator[Matrix]:
+        """Yield T_world_camera by features of the newest keyframe and of the last image, where they give a pose."""
+        if self.extractor is None or seen.image is None:
+            return
+        if self.keyframe is not None and self.keyframe_features is not None:
+            landmarks = self.keyframe_features.landmarks(self.extractor)
+            found = pose_by_features(landmarks, seen.image, self.extractor, seed=0)
+            if found is not None:
+                yield se3.inverse(found.T_live_reference @ self.keyframe.T_camera_world)
+        if self.last_features is not None:
+            found = pose_by_features(self.last_features.landmarks(self.extractor), seen.image, self.extractor, seed=0)
+            if found is not None:
+                yield self.previous @ se3.inverse(found.T_live_reference)
+
+    def _retry(self, field: GaussianField, view: View, seen: Sight, fit: PoseFit) -> PoseFit:
         """Retry from odometry with twice the iterations (VarSplat §3), and from the last pose; return the best fit.
 
         With alignment, also try the map rendered at these poses: it contains more than the newest keyframe.
         """
-        odometry = self._odometry(view, live)
+        odometry = self._odometry(view, seen.live)
         starts = [self.previous] if odometry is None else [odometry, self.previous]
-        fits = [fit] + [self._fit(field, view, target, live, s, 2) for s in starts]
+        fits = [fit] + [self._fit(field, view, seen, s, 2) for s in starts]
         if self.config.method == "align" and self.config.align_to == "keyframe":  # with "map", `_fit` has tried it
             for start in starts:
                 reference = map_reference(field.params, view, se3.inverse(start), self.config)
-                fits.append(fit_pose_align(reference, live, se3.inverse(start), self.config))
-        best = max(fits, key=lambda f: f.agreement * f.overlap)
-        if is_lost(best, self.config.lost_agreement, self.config.lost_share):
+                fits.append(self._aligned(reference, seen.live, se3.inverse(start)))
+        best = max(fits, key=self._score)
+        if self._is_lost(best):
             best.T_camera_world = se3.inverse(starts[0])
         return best
 
@@ -112,11 +161,42 @@ class Tracker:
             return None
         return np.asarray(self.previous @ se3.inverse(best.T_live_reference))
 
-    def keep_keyframe(self, field: GaussianField, view: View, live: Pyramid, T_world_camera: Matrix) -> None:
+    # ---- verdicts ----
+
+    def _is_wide(self, fit: PoseFit, view: View) -> bool:
+        """Return whether the frame is so far from the last one that a second guess is worth its time."""
+        if self.extractor is None:
+            return False
+        motion = se3.inverse(self.previous) @ se3.inverse(fit.T_camera_world)
+        depth_m = fit.alignment.depth_m if fit.alignment is not None else 1.0
+        moved = se3.rotation_angle(motion[:3, :3]) + float(np.linalg.norm(motion[:3, 3])) / depth_m
+        return moved * view.camera.fx > WIDE * view.camera.width
+
+    def _score(self, fit: PoseFit) -> float:
+        return fit.agreement * fit.overlap if fit.comparison is None else score(fit.comparison)
+
+    def _is_lost(self, fit: PoseFit) -> bool:
+        c = self.config
+        if fit.comparison is None:
+            return is_lost(fit, c.lost_agreement, c.lost_share)
+        return self.usual.is_lost(fit.comparison, c.lost_share)
+
+    def _doubts(self, fit: PoseFit) -> bool:
+        if fit.comparison is not None:
+            return self.usual.doubts(fit.comparison)
+        usual = float(np.median(self.agreements[-50:])) if self.agreements else 1.0
+        worse = fit.agreement * fit.overlap < DOUBT * usual
+        return worse or jumped(fit.first_loss, self.first_losses, self.config.reinit_factor)
+
+    # ---- keyframes ----
+
+    def keep_keyframe(self, field: GaussianField, view: View, seen: Sight, T_world_camera: Matrix) -> None:
         """Use a keyframe that was just mapped: its refined pose, and its image as the reference of the next frames."""
         self.previous = T_world_camera
+        self.keyframe_features = seen.image
         if self.config.method == "align" or fits_of(view).aligns:  # otherwise nothing aligns to it
-            self.keyframe = keyframe_reference(field.params, view, live, se3.inverse(T_world_camera), self.config)
+            T_camera_world = se3.inverse(T_world_camera)
+            self.keyframe = keyframe_reference(field.params, view, seen.live, T_camera_world, self.config)
 
     def hop_covariance(self, fit: PoseFit, live: Pyramid) -> Matrix | None:
         """Estimate the covariance [6, 6] of a fit's left twist to the newest keyframe; None without the kernels.

@@ -1,0 +1,56 @@
+"""An image in which features can be found again: gray at its own size, depth at working size."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.frame import Detail, Frame
+from sigmasplat.slam.features import Extractor, Features, Landmarks, PnP, depth_readings, landmarks_of, pose_from_landmarks
+from sigmasplat.slam.features.opencv import opencv
+
+
+def detail_of(frame: Frame, width: int) -> Detail:
+    """Return the gray image of a frame at its own size, or `width` pixels wide if it is wider; 0 = no limit."""
+    cv2 = opencv()
+    gray, camera = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), frame.camera
+    if width and camera.width > width:
+        camera = camera.prepared(width)
+        gray = cv2.resize(gray, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return Detail(cv2.convertScaleAbs(gray, alpha=255.0), camera)
+
+
+@dataclass(eq=False)
+class FeatureImage:
+    """The gray image of a frame at its own size, and its depth [h, w] (m, 0 = no reading) in the working camera.
+
+    weights [h, w]: factor on the information of a landmark, such as w̃ of the map's V; None = 1. Features are found when
+    they are first needed, and kept.
+    """
+
+    detail: Detail
+    depth_m: NDArray[np.float32]
+    camera: Camera
+    weights: NDArray[np.float32] | None = None
+    _features: Features | None = field(default=None, init=False, repr=False)
+    _landmarks: Landmarks | None = field(default=None, init=False, repr=False)
+
+    def features(self, extractor: Extractor) -> Features:
+        """Return the features of the image."""
+        if self._features is None:
+            self._features = extractor.find(self.detail.gray, self.detail.camera)
+        return self._features
+
+    def landmarks(self, extractor: Extractor) -> Landmarks:
+        """Return the features that have depth."""
+        if self._landmarks is None:
+            self._landmarks = landmarks_of(self.features(extractor), self.depth_m, self.camera, self.weights)
+        return self._landmarks
+
+
+def pose_by_features(reference: Landmarks, live: FeatureImage, extractor: Extractor, seed: int) -> PnP | None:
+    """Match landmarks with the features of a live image; return the motion T_live_reference, or None without one."""
+    seen = live.features(extractor)
+    pairs = extractor.match(reference.features, seen)
+    return pose_from_landmarks(reference, seen, pairs, seed, depth_readings(seen, live.depth_m, live.camera))

@@ -1,0 +1,81 @@
+"""Judge a pose by comparing surfaces: believe it, doubt it, or call the camera lost."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sigmasplat.fit.compare import Comparison
+
+RECENT = 50
+"""Values of this many believed frames define what is usual."""
+FEW = 5
+"""With fewer values nothing is usual yet."""
+LOST_CLOSE, LOST_EXPLAINED = 0.3, 0.8
+"""Lost: less than this share of the common surface is where it should be; of the part that nothing new covers, less
+than this share is. Something large in front of the camera lowers the first, only a wrong pose lowers the second."""
+DOUBT_CLOSE, DOUBT_EXPLAINED = 0.9, 0.95
+"""Doubtful: the same, less than these shares of their usual values."""
+DOUBT_RESIDUAL = 2.5
+"""Doubtful: the median depth difference is this many times the usual one."""
+DOUBT_CORRELATION, LOST_CORRELATION = 0.85, 0.4
+"""Doubtful or lost: the gray values correlate less than this share of what is usual. A flat surface fits itself at many
+poses, its texture at one."""
+LOST_RESIDUAL = 6.0
+"""Lost: the median depth difference, in standard deviations of a reading. Clean recordings stay below 1."""
+DOUBT_SCORE = 0.7
+"""Doubtful: the score falls below this share of the usual one."""
+
+
+def explained(c: Comparison) -> float:
+    """Return the share of close points among those that nothing in front covers, in [0, 1]."""
+    return c.close / max(c.close + c.behind, 1e-9)
+
+
+def score(c: Comparison) -> float:
+    """Return the share of the reference that a pose explains, less if it sees through known surfaces; in [0, 1]."""
+    return c.common * c.close * explained(c)
+
+
+@dataclass(eq=False)
+class Usual:
+    """What comparisons of recent believed frames have found: scores, residuals, correlations."""
+
+    scores: list[float] = field(default_factory=list)
+    closes: list[float] = field(default_factory=list)
+    residuals: list[float] = field(default_factory=list)
+    correlations: list[float] = field(default_factory=list)
+
+    def add(self, c: Comparison) -> None:
+        """Take a believed frame into account."""
+        for values, value in (
+            (self.scores, score(c)), (self.closes, c.close), (self.residuals, c.residual),
+            (self.correlations, c.correlation),
+        ):  # fmt: skip
+            if np.isfinite(value):
+                values.append(value)
+                del values[:-RECENT]
+
+    def is_lost(self, c: Comparison, least_share: float) -> bool:
+        """Return whether a pose is refuted, or explains less than `least_share` of the reference."""
+        return (
+            c.close < LOST_CLOSE
+            or explained(c) < LOST_EXPLAINED
+            or c.residual > LOST_RESIDUAL * max(1.0, _median(self.residuals, 0.0))
+            or c.correlation < LOST_CORRELATION * _median(self.correlations, 0.8)
+            or score(c) < least_share
+        )
+
+    def doubts(self, c: Comparison) -> bool:
+        """Return whether a pose is clearly worse than usual."""
+        return (
+            c.close < DOUBT_CLOSE * _median(self.closes, 1.0)
+            or explained(c) < DOUBT_EXPLAINED
+            or c.residual > DOUBT_RESIDUAL * max(0.2, _median(self.residuals, 1.0))
+            or c.correlation < DOUBT_CORRELATION * _median(self.correlations, 0.9)
+            or score(c) < DOUBT_SCORE * _median(self.scores, 1.0)
+        )
+
+
+def _median(values: Sequence[float], otherwise: float) -> float:
+    return float(np.median(values)) if len(values) >= FEW else otherwise
