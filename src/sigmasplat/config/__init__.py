@@ -12,12 +12,13 @@ from sigmasplat.config.densify import DensifyConfig
 from sigmasplat.config.features import FeatureConfig
 from sigmasplat.config.frames import MappingConfig, RenderConfig, SeedConfig, TrackingConfig
 from sigmasplat.config.input import InputConfig
+from sigmasplat.config.recovery import RecoveryConfig
 from sigmasplat.config.submaps import FinalConfig, LoopConfig, RegistrationConfig, SubmapConfig
 from sigmasplat.errors import ConfigError
 
 __all__ = [
     "Config", "DensifyConfig", "FeatureConfig", "FinalConfig", "InputConfig", "LoopConfig", "MappingConfig",
-    "RegistrationConfig", "RenderConfig", "SeedConfig", "SubmapConfig", "TrackingConfig",
+    "RecoveryConfig", "RegistrationConfig", "RenderConfig", "SeedConfig", "SubmapConfig", "TrackingConfig",
 ]  # fmt: skip
 
 
@@ -40,6 +41,7 @@ class Config:
     primitives: DensifyConfig = field(default_factory=DensifyConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     features: FeatureConfig = field(default_factory=FeatureConfig)
+    recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     submaps: SubmapConfig = field(default_factory=SubmapConfig)
     loops: LoopConfig = field(default_factory=LoopConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)

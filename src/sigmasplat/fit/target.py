@@ -1,6 +1,6 @@
 """Prepare a frame for a fit: image planes with the same padding as the view's."""
 
-from dataclasses import dataclass, field as dataclass_field
+from dataclasses import dataclass, field as dataclass_field, replace
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ from torch import Tensor
 from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame
+from sigmasplat.model.frame import Detail, Frame
 from sigmasplat.model.submap import Picture
 
 
@@ -79,6 +79,12 @@ class Keyframe:
     visible_ids: NDArray[np.int64] | None = None
     """Sorted ids of the splats that dominate at least one of its pixels; None if not computed."""
     descriptor: NDArray[np.float32] | None = None
+    detail: Detail | None = None
+    """The gray image in which features are found."""
+
+    def picture(self) -> Picture:
+        """Return the images that a finished submap keeps of it."""
+        return replace(self.target.picture(), detail=self.detail)
 
     def move(self, gradient: NDArray[np.float64], rates: NDArray[np.float64]) -> None:
         """Take an Adam step on the pose; gradient [6] with respect to the left twist of T_camera_world, rates [6] in m

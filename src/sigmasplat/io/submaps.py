@@ -16,6 +16,7 @@ from sigmasplat.io.atomic import make_folder
 from sigmasplat.io.tensors import open_tensors, write_tensors
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import ATTRIBUTES, GaussianField, Rows
+from sigmasplat.model.frame import Detail
 from sigmasplat.model.submap import Picture, Submap, refuse_misfit
 
 OURS = re.compile(r"submap-\d{5,}\.safetensors")
@@ -53,6 +54,10 @@ class DiskStore:
         }
         make_folder(self.folder)
         text = {"index": str(submap.index), "camera": json.dumps(asdict(submap.camera))}
+        details = [picture.detail for picture in pictures if picture.detail is not None]
+        if details and len(details) == len(pictures):
+            tensors["details"] = torch.from_numpy(np.stack([detail.gray for detail in details]))
+            text["detail_camera"] = json.dumps(asdict(details[0].camera))
         write_tensors(self.path(submap.index), tensors, text)
 
     def load(self, index: int) -> Submap:
@@ -70,8 +75,11 @@ class DiskStore:
     def picture(self, index: int, keyframe: int) -> Picture:
         """Read the images of one keyframe. Raises RunError if the submap is missing or damaged."""
         with self._opened(index) as file:
-            color, depth_m = (file.get_slice(name)[keyframe] for name in ("colors", "depths_m"))
-            return Picture(color.numpy(), depth_m.numpy())
+            color, depth_m = (file.get_slice(name)[keyframe].numpy() for name in ("colors", "depths_m"))
+            if "details" not in file.keys():  # noqa: SIM118
+                return Picture(color, depth_m)
+            camera = Camera(**json.loads(file.metadata()["detail_camera"]))
+            return Picture(color, depth_m, Detail(file.get_slice("details")[keyframe].numpy(), camera))
 
     def truncate(self, count: int) -> None:
         """Remove all submaps except the first `count`, and incomplete files."""

@@ -25,18 +25,46 @@ class Atlas:
     odometry: the same poses from tracking alone; no loop changes them.
     keyframe_poses: T_submap_camera of each submap's keyframes; those of the last submap change while it is mapped.
     places: one per frame.
+    components: one number per submap. Submaps of a component are connected, and their anchors are in one frame: the
+    world for component 0, else the first camera of the component. A component joins another when a place is recognised.
     """
 
     anchors: list[Matrix] = field(default_factory=list)
     odometry: list[Matrix] = field(default_factory=list)
     keyframe_poses: list[list[Matrix]] = field(default_factory=list)
     places: list[Place] = field(default_factory=list)
+    components: list[int] = field(default_factory=list)
 
-    def begin_submap(self, T_before_submap: Matrix | None = None) -> None:
-        """Append a submap at its pose in the submap before; the first submap's frame is the world."""
+    def begin_submap(self, T_parent_submap: Matrix | None = None, parent: int = -1) -> None:
+        """Append a submap at its pose in a parent submap, the last one by default; without a pose, a new component
+        begins with it."""
         for chain in (self.anchors, self.odometry):
-            chain.append(np.eye(4) if T_before_submap is None else se3.orthonormalise(chain[-1] @ T_before_submap))
+            new = np.eye(4) if T_parent_submap is None else se3.orthonormalise(chain[parent] @ T_parent_submap)
+            chain.append(new)
+        begun = max(self.components, default=-1) + 1
+        self.components.append(begun if T_parent_submap is None else self.components[parent])
         self.keyframe_poses.append([])
+
+    def join(self, a: int, b: int, T_a_b: Matrix) -> None:
+        """Join the components of two submaps, given T_a_b [4, 4]: the one with the higher number moves to the other."""
+        if self.components[a] > self.components[b]:
+            a, b, T_a_b = b, a, se3.inverse(T_a_b)
+        kept, moved = self.components[a], self.components[b]
+        for chain in (self.anchors, self.odometry):
+            motion = chain[a] @ T_a_b @ se3.inverse(chain[b])
+            for s, component in enumerate(self.components):
+                if component == moved:
+                    chain[s] = se3.orthonormalise(motion @ chain[s])
+        self.components = [kept if component == moved else component for component in self.components]
+
+    def members(self, component: int) -> list[int]:
+        """Return the submaps of a component."""
+        return [s for s, number in enumerate(self.components) if number == component]
+
+    @property
+    def believed(self) -> Matrix:
+        """Return which frames are in a submap that is connected to the world, bool [F]."""
+        return np.array([self.components[place.submap] == 0 for place in self.places], bool)
 
     def place_frame(self, T_submap_camera: Matrix) -> None:
         """Append a frame, relative to the newest keyframe of the last submap."""

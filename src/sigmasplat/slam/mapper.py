@@ -17,6 +17,7 @@ from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField, Rows
+from sigmasplat.model.frame import Detail
 from sigmasplat.model.submap import Picture, Submap
 from sigmasplat.render.view import View
 from sigmasplat.slam.densify import densify_mask, multiply, split, too_large
@@ -42,6 +43,7 @@ class Mapper:
         target: Target,
         T_world_camera: NDArray[np.float64],
         descriptor: NDArray[np.float32] | None = None,
+        detail: Detail | None = None,
     ) -> FieldFit:
         """Map one keyframe: seed, choose the window of keyframes, fit, densify and prune, fit again, prune again.
 
@@ -49,7 +51,8 @@ class Mapper:
         """
         self.field = self.field.to(view.sums.device)  # the active field stays on the view's device
         c, first_new, begun = self.config.mapping, self.field.next_id, len(self.field) > 0
-        self.keyframes.append(Keyframe(index, target, T_world_camera, not self.keyframes, descriptor=descriptor))
+        fixed = not self.keyframes
+        self.keyframes.append(Keyframe(index, target, T_world_camera, fixed, descriptor=descriptor, detail=detail))
         if begun and len(self.keyframes) == 1:
             return FieldFit()
         self._seed(view, target, T_world_camera)
@@ -104,7 +107,7 @@ class Mapper:
         """Return the finished submap in host memory, and the pictures of its keyframes."""
         poses = np.stack([keyframe.T_world_camera for keyframe in self.keyframes])
         frames = tuple(keyframe.index for keyframe in self.keyframes)
-        pictures = [keyframe.target.picture() for keyframe in self.keyframes]
+        pictures = [keyframe.picture() for keyframe in self.keyframes]
         here = torch.device("cpu")
         params, *attributes = (
             rows.params.to(here, copy=True) for rows in (self.field, *self.field.attributes.values())

@@ -13,12 +13,12 @@ from sigmasplat.fit.compare import compare
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, map_reference
-from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.feature_image import FeatureImage, pose_by_features
+from sigmasplat.slam.localisation.sight import Sight
 from sigmasplat.slam.localisation.verdict import Usual, score
 from sigmasplat.slam.rules import is_lost, jumped
 from sigmasplat.types import Matrix
@@ -28,15 +28,6 @@ DOUBT = 0.7
 WIDE = 0.05
 """A motion between two frames is wide if it moves the image by more than this share of its width: the basin of
 convergence of alignment ends near there."""
-
-
-@dataclass(eq=False)
-class Sight:
-    """A frame in the forms that tracking needs: the target of the fits, its pyramid, and the image for features."""
-
-    target: Target
-    live: Pyramid
-    image: FeatureImage | None = None
 
 
 @dataclass(eq=False)

@@ -2,8 +2,10 @@
 
 from collections.abc import Callable
 
+import numpy as np
+
 from sigmasplat.config.features import FeatureConfig
-from sigmasplat.slam.features.base import Extractor, Features
+from sigmasplat.slam.features.base import Extractor, Features, Pairs, matched_by_distance
 from sigmasplat.slam.features.landmarks import Landmarks, depth_readings, landmarks_of
 from sigmasplat.slam.features.pose import PnP, pose_from_landmarks
 from sigmasplat.slam.features.sift_orb import Orb, Sift
@@ -11,8 +13,18 @@ from sigmasplat.slam.features.xfeat import XFeat
 
 __all__ = [
     "Extractor", "Features", "Landmarks", "PnP", "depth_readings", "landmarks_of", "make_extractor",
-    "pose_from_landmarks",
+    "matches_by_descriptor", "pose_from_landmarks",
 ]  # fmt: skip
+
+RATIO = 0.85
+"""A match counts if its descriptor distance is below this multiple of the distance to the second-best candidate."""
+
+
+def matches_by_descriptor(a: Features, b: Features, extractor: Extractor) -> Pairs:
+    """Return matches [M, 2] by descriptors alone, also for kinds whose own matcher is slow: enough to compare images."""
+    if a.descriptors.dtype == np.uint8:
+        return extractor.match(a, b)
+    return matched_by_distance(a.descriptors.astype(np.float32), b.descriptors.astype(np.float32), RATIO)
 
 
 def make_extractor(config: FeatureConfig) -> Extractor:

@@ -13,12 +13,19 @@ from sigmasplat.slam.features.opencv import opencv
 
 def detail_of(frame: Frame, width: int) -> Detail:
     """Return the gray image of a frame at its own size, or `width` pixels wide if it is wider; 0 = no limit."""
-    cv2 = opencv()
-    gray, camera = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), frame.camera
+    gray, camera = gray_levels(frame.color), frame.camera
     if width and camera.width > width:
         camera = camera.prepared(width)
+        cv2 = opencv()
         gray = cv2.resize(gray, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    return Detail(cv2.convertScaleAbs(gray, alpha=255.0), camera)
+    return Detail(gray, camera)
+
+
+def gray_levels(color: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return the gray values [H, W], 0 to 255, of colour [H, W, 3] in [0, 1]."""
+    cv2 = opencv()
+    gray: NDArray[np.uint8] = cv2.convertScaleAbs(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), alpha=255.0)
+    return gray
 
 
 @dataclass(eq=False)

@@ -85,10 +85,10 @@ class LoopCloser:
     closed: list[Edge] = field(default_factory=list)
     loops: list[Loop] = field(default_factory=list)
 
-    def submap_begun(self, index: int, T_before_new: Matrix, information: Matrix) -> None:
-        """Add the odometry edge from the previous submap to a new one: T_before_new [4, 4], and the information [6, 6]
-        of its left twist (m, rad)."""
-        self.odometry.append(Edge(index - 1, index, T_before_new, information, loop=False))
+    def connect(self, a: int, b: int, T_a_b: Matrix, information: Matrix) -> None:
+        """Add a trusted edge between two submaps, such as odometry to the next one or a relocalisation: T_a_b [4, 4],
+        and the information [6, 6] of its left twist (m, rad)."""
+        self.odometry.append(Edge(a, b, T_a_b, information, loop=False))
 
     def submap_finished(
         self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], atlas: Atlas, view: View
@@ -108,21 +108,22 @@ class LoopCloser:
         self.descriptors.append(query)
         tried = [self._try(pair, submap, atlas, view) for pair in pairs]
         if any(loop.accepted for loop in tried):
-            self._correct(atlas)
+            self._correct(atlas, atlas.components[submap.index])
         return self.loops[len(self.loops) - len(tried) :]
 
     def _pairs(self, query: SubmapDescriptor, atlas: Atlas) -> list[SubmapPair]:
         """Choose the earlier submaps to register with: first similar ones, then those near by the current poses."""
         c = self.config.loops
+        database = [d for d in self.descriptors if atlas.components[d.index] == atlas.components[query.index]]
         candidates = find_candidates(
-            query, self.descriptors, c.min_similarity, c.min_interval, c.similarity_floor, c.uncertainty
+            query, database, c.min_similarity, c.min_interval, c.similarity_floor, c.uncertainty
         )
         keyframes = self.config.registration.keyframes
-        pairs = pairs_to_register(candidates, query, self.descriptors, keyframes)
+        pairs = pairs_to_register(candidates, query, database, keyframes)
         if c.near_m:
             poses = [atlas.T_world_keyframe(index) for index in range(query.index + 1)]
             near_rad, known = np.deg2rad(c.near_deg), {pair.best.database_submap for pair in pairs}
-            near = find_nearby(query, self.descriptors, poses, c.near_m, near_rad, c.min_interval, keyframes)
+            near = find_nearby(query, database, poses, c.near_m, near_rad, c.min_interval, keyframes)
             pairs += [pair for pair in near if pair.best.database_submap not in known]
         return pairs[: c.most] if c.most else pairs
 
@@ -137,14 +138,18 @@ class LoopCloser:
             self.closed.append(Edge(a.index, b.index, found.T_a_b, found.information, loop=True))
         return loop
 
-    def _correct(self, atlas: Atlas) -> None:
-        """Solve the pose graph, move the anchors, and update the verdict on every registered loop."""
-        solution = optimise(np.stack(atlas.anchors), [*self.odometry, *self.closed])
-        atlas.anchors[:] = list(solution.T_world_node)
+    def _correct(self, atlas: Atlas, component: int) -> None:
+        """Solve the pose graph of a component, move its anchors, and update the verdict on its registered loops."""
+        members = atlas.members(component)
+        number = {submap: i for i, submap in enumerate(members)}
+        edges = [replace(e, a=number[e.a], b=number[e.b]) for e in (*self.odometry, *self.closed) if e.a in number]
+        solution = optimise(np.stack([atlas.anchors[submap] for submap in members]), edges)
+        for submap, T_world_submap in zip(members, solution.T_world_node, strict=True):
+            atlas.anchors[submap] = T_world_submap
         verdicts = iter(solution.verdicts)
-        registered = [i for i, loop in enumerate(self.loops) if np.isfinite(loop.chi2) or loop.accepted]
-        for i in registered:
-            self.loops[i] = judged(self.loops[i], next(verdicts))
+        for i, loop in enumerate(self.loops):
+            if loop.query in number and (np.isfinite(loop.chi2) or loop.accepted):
+                self.loops[i] = judged(loop, next(verdicts))
 
 
 def described(best: Candidate, a: Submap, b: Submap, found: Registration, known: Matrix) -> Loop:

@@ -1,0 +1,69 @@
+"""Count lost and steady frames, and decide what follows: map again, or begin a new map."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sigmasplat.config import RecoveryConfig
+from sigmasplat.model import se3
+from sigmasplat.slam.localisation.sight import Sight
+from sigmasplat.types import Matrix
+
+LEAST_READINGS = 0.05
+"""An image with depth on less than this share of its pixels, or with flat gray, cannot begin a map."""
+LEAST_CONTRAST = 5.0
+"""Least standard deviation of gray values, 0 to 255."""
+SAME_M, SAME_RAD = 0.1, np.deg2rad(5.0)
+"""Two observations of where a component lies agree within these limits."""
+
+
+def usable(seen: Sight) -> bool:
+    """Return whether a frame shows enough to be recognised or to begin a map."""
+    readings = seen.target.valid_pixels / (seen.target.camera.width * seen.target.camera.height)
+    return readings >= LEAST_READINGS and (seen.image is None or float(seen.image.detail.gray.std()) >= LEAST_CONTRAST)
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """An observation that connects two submaps of different components: T_a_b [4, 4] and its information [6, 6]."""
+
+    a: int
+    b: int
+    T_a_b: Matrix
+    information: Matrix
+
+
+@dataclass(eq=False)
+class Recovery:
+    """lost: usable frames in a row in which the camera was not found; steady: frames in a row tracked without doubt
+    since the camera was last lost; link: one observation of a place of another component that waits for a second."""
+
+    config: RecoveryConfig
+    lost: int = 0
+    steady: int = 1_000_000
+    link: Link | None = None
+
+    def count(self, lost: bool, doubtful: bool, seen: Sight) -> None:
+        """Take a frame into account."""
+        if lost:
+            self.lost += usable(seen)
+            self.steady = 0
+        else:
+            self.lost = 0
+            self.steady = 0 if doubtful and self.steady < self.config.steady_frames else self.steady + 1
+
+    @property
+    def is_steady(self) -> bool:
+        """Return whether the pose may be used for mapping."""
+        return self.steady >= self.config.steady_frames
+
+    @property
+    def gives_up(self) -> bool:
+        """Return whether a new map begins."""
+        return bool(self.config.new_map_after) and self.lost >= self.config.new_map_after
+
+    def confirmed(self, link: Link, T_before: Matrix) -> bool:
+        """Return whether an earlier observation agrees with a new one; T_before [4, 4]: what the earlier one predicts
+        for T_a_b of the new one."""
+        apart = se3.inverse(T_before) @ link.T_a_b
+        return float(np.linalg.norm(apart[:3, 3])) < SAME_M and se3.rotation_angle(apart[:3, :3]) < SAME_RAD

@@ -1,0 +1,171 @@
+"""Find a lost camera in the whole map: retrieve keyframes by features, compute a pose, align, verify the surface.
+
+The order is that of systems that people trust: many cheap candidates, a minimal solver, dense alignment, and acceptance
+by depth and overlap. The number of inliers alone accepts nothing, because a repeated pattern has many.
+"""
+
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sigmasplat.config import Config, TrackingConfig
+from sigmasplat.fit.compare import Comparison, compare
+from sigmasplat.fit.pose import PoseFit, fit_pose_align
+from sigmasplat.fit.references import Reference, live_image, map_reference
+from sigmasplat.fit.target import Target
+from sigmasplat.model import se3
+from sigmasplat.render.view import View
+from sigmasplat.slam.features import Extractor, Features, Landmarks, matches_by_descriptor
+from sigmasplat.slam.localisation.feature_image import pose_by_features
+from sigmasplat.slam.localisation.known_map import KnownKeyframe, KnownMap, Where
+from sigmasplat.slam.localisation.sight import Sight
+from sigmasplat.slam.localisation.verdict import explained, score
+from sigmasplat.types import Matrix
+
+STRONGEST = 400
+"""Number of features of each image that are compared to choose candidates."""
+LEAST_MATCHES = 8
+INDEX_AT_MOST = 25
+"""Number of keyframes whose features are found per call: 25 take about a second."""
+KEPT_LANDMARKS = 64
+"""Number of keyframes whose complete landmarks stay in memory, half a megabyte each."""
+LEAST_COMMON, LEAST_CLOSE, LEAST_EXPLAINED, LEAST_CORRELATION, MOST_RESIDUAL = 0.25, 0.7, 0.9, 0.5, 2.0
+"""A pose is accepted if the images have this share of the reference in common, if this share of it is the same surface,
+if nothing known is seen through, if the gray values correlate, and if the median depth difference is below this many
+standard deviations of a reading."""
+ENOUGH = 0.5
+"""A pose with a higher score ends the search."""
+
+
+@dataclass(frozen=True, eq=False)
+class Relocation:
+    """Where the camera was found: submap, keyframe, the fit whose T_camera_world is T_camera_submap [4, 4], its
+    comparison with the map, and the number of matches that support it."""
+
+    where: Where
+    fit: PoseFit
+    comparison: Comparison
+    inliers: int
+
+    @property
+    def T_submap_camera(self) -> Matrix:
+        """Return the pose [4, 4] of the camera in the submap."""
+        return se3.inverse(self.fit.T_camera_world)
+
+    @property
+    def score(self) -> float:
+        """Return the share of the reference that the pose explains, 0 to 1."""
+        return score(self.comparison)
+
+
+@dataclass(eq=False)
+class Relocaliser:
+    """Searches a map for the camera. The features of keyframes are found when they are first needed.
+
+    indexed: the keyframes that are searched, in the order in which they were added.
+    """
+
+    config: Config
+    extractor: Extractor
+    indexed: list[Where] = field(default_factory=list)
+    _strongest: dict[Where, Features] = field(default_factory=dict, init=False)
+    _landmarks: "OrderedDict[Where, Landmarks]" = field(default_factory=OrderedDict, init=False)
+
+    def find(
+        self, known: KnownMap, view: View, seen: Sight, index_at_most: int | None = INDEX_AT_MOST
+    ) -> Relocation | None:
+        """Return where the camera is, or None if no keyframe leads to a pose that the map confirms.
+
+        index_at_most: number of keyframes that may be added to the search; None = all.
+        """
+        wanted = known.keyframes()
+        self._index(known, view, wanted, index_at_most)
+        best: Relocation | None = None
+        for where in self._candidates(wanted, seen):
+            for found in self._poses(known, view, seen, where):
+                if accepted(found.comparison) and (best is None or found.score > best.score):
+                    best = found
+            if best is not None and best.score > ENOUGH:
+                break
+        return best
+
+    def _index(self, known: KnownMap, view: View, wanted: Sequence[Where], at_most: int | None) -> None:
+        """Add keyframes to the search; also find again the features that a resumed run no longer has."""
+        have = set(self.indexed)
+        self.indexed += [where for where in wanted if where not in have][:at_most]
+        for where in self.indexed:
+            if where not in self._strongest:
+                self._landmarks_of(known, view, where)
+
+    def _landmarks_of(self, known: KnownMap, view: View, where: Where) -> Landmarks:
+        """Return the landmarks of a keyframe; those used last stay in memory."""
+        if where not in self._landmarks:
+            landmarks = known.keyframe(where).image(view.camera).landmarks(self.extractor)
+            self._landmarks[where] = landmarks
+            some = landmarks.features.take(np.arange(min(STRONGEST, len(landmarks))))
+            self._strongest[where] = replace(some, descriptors=_compact(some.descriptors))
+            if len(self._landmarks) > KEPT_LANDMARKS:
+                self._landmarks.popitem(last=False)
+        self._landmarks.move_to_end(where)
+        return self._landmarks[where]
+
+    def _candidates(self, wanted: Sequence[Where], seen: Sight) -> list[Where]:
+        """Return the keyframes with the most matches, best first."""
+        assert seen.image is not None
+        live = seen.image.features(self.extractor)
+        live, searched = live.take(np.arange(min(STRONGEST, len(live)))), set(self.indexed)
+        votes = [
+            (len(matches_by_descriptor(self._strongest[where], live, self.extractor)), where)
+            for where in wanted
+            if where in searched
+        ]
+        best = sorted((vote for vote in votes if vote[0] >= LEAST_MATCHES), key=lambda vote: -vote[0])
+        return [where for _, where in best[: self.config.recovery.candidates]]
+
+    def _poses(self, known: KnownMap, view: View, seen: Sight, where: Where) -> Iterator[Relocation]:
+        """Yield the pose of a candidate, aligned to the keyframe's own image, then to the map rendered there."""
+        assert seen.image is not None
+        keyframe, landmarks = known.keyframe(where), self._landmarks_of(known, view, where)
+        found = pose_by_features(landmarks, seen.image, self.extractor, seed=self.config.seed)
+        if found is None:
+            return
+        guess = found.T_live_reference @ se3.inverse(keyframe.T_submap_camera)
+        own = aligned(keyframe_image(keyframe, view), seen, guess, self.config.tracking)
+        yield Relocation(where, *own, found.inliers)
+        field = known.splats(where[0])
+        reference = map_reference(field.params.to(view.sums.device), view, guess, self.config.tracking)
+        yield Relocation(where, *aligned(reference, seen, guess, self.config.tracking), found.inliers)
+
+
+def aligned(reference: Reference, seen: Sight, T_camera_world: Matrix, config: TrackingConfig) -> tuple[PoseFit, Comparison]:
+    """Align a frame to a reference from a guess; return the fit, and the comparison of both images at it."""
+    fit = fit_pose_align(reference, seen.live, T_camera_world, config)
+    motion = fit.T_camera_world @ se3.inverse(reference.T_camera_world)
+    fit.comparison = compare(reference.pyramid, seen.live, motion)
+    return fit, fit.comparison
+
+
+def keyframe_image(keyframe: KnownKeyframe, view: View) -> Reference:
+    """Return a keyframe's own image as a reference of alignment."""
+    picture = keyframe.picture
+    target = Target.of_picture(picture, view.camera, (view.sums.shape[1], view.sums.shape[2]))
+    pyramid = live_image(view, picture.unit_color, picture.depth_m, target)
+    return Reference(pyramid, se3.inverse(keyframe.T_submap_camera))
+
+
+def accepted(c: Comparison) -> bool:
+    """Return whether the map confirms a pose."""
+    return (
+        c.common >= LEAST_COMMON
+        and c.close >= LEAST_CLOSE
+        and explained(c) >= LEAST_EXPLAINED
+        and c.residual <= MOST_RESIDUAL
+        and not c.correlation < LEAST_CORRELATION
+    )
+
+
+def _compact(descriptors: Matrix) -> Matrix:
+    """Return float descriptors in half precision, which holds them exactly."""
+    return descriptors.astype(np.float16) if descriptors.dtype == np.float32 else descriptors
