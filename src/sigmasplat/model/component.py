@@ -1,0 +1,22 @@
+"""States of frames, and the parts of an atlas that are not connected to its first frame."""
+
+from dataclasses import dataclass
+
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.trajectory import Trajectory
+
+TRACKED, RELOCALISED, LOST, APART = STATES = ("tracked", "relocalised", "lost", "apart")
+"""The states of a frame. Apart: tracked in a component that is not connected to the world."""
+
+
+@dataclass(frozen=True, eq=False)
+class Component:
+    """A component of the atlas that is not connected to the world, so its pose in the world is unknown.
+
+    number: 1 or more; the world is component 0. Its own frame is its first camera: there are its splats (`field`) and
+    the poses of its tracked frames (`trajectory`).
+    """
+
+    number: int
+    field: GaussianField
+    trajectory: Trajectory
