@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
+from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED, outside_world, submaps_outside
 from sigmasplat.model.trajectory import Trajectory
 
 Log = list[dict[str, Any]]
@@ -81,17 +81,6 @@ class RunFrames:
     def submaps_outside(self) -> frozenset[int]:
         """Return the submaps that are not connected to the world."""
         return submaps_outside(np.array(self.states), np.array([r.get("submap", 0) for r in self.log], np.int64))
-
-
-def outside_world(states: NDArray[np.str_]) -> NDArray[np.bool_]:
-    """Return whether each frame [F] is apart, or lost after a frame that is apart."""
-    last_found = np.maximum.accumulate(np.where(states == LOST, 0, np.arange(len(states))))
-    return np.asarray(states[last_found] == APART)
-
-
-def submaps_outside(states: NDArray[np.str_], submaps: NDArray[np.int64]) -> frozenset[int]:
-    """Return the submaps that have a frame that is apart; states [F], submaps [F]: of all frames."""
-    return frozenset(submaps[states == APART].tolist())
 
 
 def _is_lost(record: dict[str, Any]) -> bool:

@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 
@@ -20,3 +23,14 @@ class Component:
     number: int
     field: GaussianField
     trajectory: Trajectory
+
+
+def outside_world(states: NDArray[np.str_]) -> NDArray[np.bool_]:
+    """Return whether each frame [F] is apart, or lost after a frame that is apart."""
+    last_found = np.maximum.accumulate(np.where(states == LOST, 0, np.arange(len(states))))
+    return np.asarray(states[last_found] == APART)
+
+
+def submaps_outside(states: NDArray[np.str_], submaps: NDArray[np.int64]) -> frozenset[int]:
+    """Return the submaps that have a frame that is apart; states [F], submaps [F]: of all frames."""
+    return frozenset(submaps[states == APART].tolist())

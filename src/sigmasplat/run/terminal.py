@@ -19,8 +19,7 @@ from rich.progress import (
 from rich.table import Table
 
 from sigmasplat.model.component import APART, RELOCALISED
-from sigmasplat.report.summary import format_ranges
-from sigmasplat.report.tables import headline, number
+from sigmasplat.report.tables import format_ranges, headline, number
 from sigmasplat.run.profile import shares
 from sigmasplat.run.protocols import LoopResult, StepResult
 from sigmasplat.types import Progress
