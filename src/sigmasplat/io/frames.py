@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED, outside_world, submaps_outside
+from sigmasplat.model.component import LOST, TRACKED, outside_world, states_at_end, submaps_outside
 from sigmasplat.model.trajectory import Trajectory
 
 Log = list[dict[str, Any]]
@@ -42,12 +42,15 @@ class RunFrames:
         rows, poses = _common(log, trajectory.timestamps_s)
         if not any("state" in record for record in log):
             log = log[: rows[-1] + 1] if len(rows) else []
-        believed = np.array([not _is_lost(log[row]) for row in rows], np.bool_)
-        rows, poses = rows[believed], poses[believed]
-        states = [LOST if _is_lost(record) or "state" not in record else APART for record in log]
-        for row in rows:
-            states[row] = RELOCALISED if log[row].get("state") == RELOCALISED else TRACKED
-        return RunFrames(log, tuple(states), rows, trajectory.at(poses))
+        kept = np.array([not _is_lost(log[row]) for row in rows], np.bool_)
+        rows, poses = rows[kept], poses[kept]
+        believed = np.isin(np.arange(len(log)), rows)
+        logged = [
+            LOST if _is_lost(record) or ("state" not in record and not posed) else record.get("state", TRACKED)
+            for record, posed in zip(log, believed, strict=True)
+        ]
+        states = states_at_end(logged, believed)
+        return RunFrames(log, tuple(states.tolist()), rows, trajectory.at(poses))
 
     def __len__(self) -> int:
         return len(self.log)

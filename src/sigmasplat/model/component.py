@@ -1,5 +1,6 @@
 """States of frames, and the parts of an atlas that are not connected to its first frame."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,16 @@ class Component:
     number: int
     field: GaussianField
     trajectory: Trajectory
+
+
+def states_at_end(states: Sequence[str], believed: NDArray[np.bool_]) -> NDArray[np.str_]:
+    """Return the states [F] at the end: a frame that is not lost is apart exactly if its pose is not believed.
+
+    states [F]: as of each step, when a component may not have joined the world yet; believed [F]: at the end.
+    """
+    at_step = np.array(states, dtype="<U11")
+    found = np.where(believed, np.where(at_step == RELOCALISED, RELOCALISED, TRACKED), APART)
+    return np.where(at_step == LOST, LOST, found)
 
 
 def outside_world(states: NDArray[np.str_]) -> NDArray[np.bool_]:
