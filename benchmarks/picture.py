@@ -43,10 +43,10 @@ def panels(run: RunFolder, index: int, direction: int) -> list[ViewPanel]:
     config, field = reader.config, run.read_map()
     renderer = FieldRenderer(config.render, config.backend)
     frame = reader.source.frame(index).prepared(0, config.input.min_depth_m, config.input.max_depth_m)
-    T_camera_world = se3.inverse(reader.path.T_world_camera[index])
+    T_camera_world = se3.inverse(reader.poses_of([index]).T_world_camera[0])
     with torch.inference_mode():
         view = scored_view(frame, renderer(field, frame.camera, T_camera_world), "")
-        below, poses = orbit_view(field, reader.tracked_path(), frame.camera, DIRECTIONS, renderer)
+        below, poses = orbit_view(field, reader.believed_path(), frame.camera, DIRECTIONS, renderer)
         near = replace(frame.camera, fx=ZOOM * frame.camera.fx, fy=ZOOM * frame.camera.fy)
         above = renderer(below, near, se3.inverse(poses[direction % DIRECTIONS]))
     backdrop = np.array(BACKGROUND, np.float32) / 255.0

@@ -26,6 +26,7 @@ from sigmasplat.io.splats.ply import read_field
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.trajectory import read_trajectory
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.component import Component
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import SubmapStore
@@ -90,16 +91,23 @@ class MadeUpStep:
     loops: tuple["MadeUpLoop", ...] = ()
     tracking: dict[str, float] = field(default_factory=lambda: {"loss": float("nan")})
     seconds: dict[str, float] = field(default_factory=lambda: {"total": 0.1})
+    state: str = "tracked"
+    component: int = 0
+    p_off: float = 0.25
 
 
 class MadeUpSlam:
     """Moves 10 cm per frame. `at`: functions to call at a frame or at a step of the final map; `lost`: frames without
-    tracking; `tried`: loops tested at a frame or at the end; a new submap starts after `every` frames."""
+    tracking; `tried`: loops tested at a frame or at the end; a new submap starts after `every` frames. `relocalised`:
+    frames found again; `apart`: the component of each frame that is in another one, until `joined`."""
 
     at: dict[int | str, Callable[[], None]]
     lost: set[int]
     tried: dict[int | str, list[MadeUpLoop]]
     every: int
+    relocalised: set[int]
+    apart: dict[int, int]
+    joined: set[int]
     latest: "MadeUpSlam"
 
     def __init__(self, config: Config, store: SubmapStore | None = None) -> None:
@@ -116,7 +124,12 @@ class MadeUpSlam:
         T[0, 3] = 0.1 * frame.index
         i, tried = frame.index, tuple(self.tried.get(frame.index, ()))
         self.loops += tried
-        step = MadeUpStep(i, frame.timestamp_s, T, i % 5 == 0, i in self.lost, submap=i // self.every, loops=tried)
+        component = self.apart.get(i, 0)
+        state = "lost" if i in self.lost else "relocalised" if i in self.relocalised else "tracked"
+        step = MadeUpStep(
+            i, frame.timestamp_s, T, i % 5 == 0, i in self.lost, submap=i // self.every, loops=tried,
+            state="apart" if component and state != "lost" else state, component=component,
+        )  # fmt: skip
         self.steps.append(step)
         return step
 
@@ -133,6 +146,15 @@ class MadeUpSlam:
     def trajectory(self) -> Trajectory:
         poses = np.array([step.T_world_camera for step in self.steps]).reshape(-1, 4, 4)
         return Trajectory(np.array([step.timestamp_s for step in self.steps]), poses)
+
+    def believed(self) -> np.ndarray:
+        worlds = {0, *self.joined}
+        return np.array([not step.lost and step.component in worlds for step in self.steps])
+
+    def components(self) -> list[Component]:
+        numbers = np.array([-1 if step.lost else step.component for step in self.steps])
+        outside = sorted({*numbers.tolist()} - {-1, 0, *self.joined})
+        return [Component(number, self.field, self.trajectory().at(numbers == number)) for number in outside]
 
     def checkpoint(self) -> dict[str, torch.Tensor]:
         return {"field.params": self.field.params}
@@ -155,6 +177,9 @@ def corridor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Corridor:
     monkeypatch.setattr(MadeUpSlam, "lost", set(), raising=False)
     monkeypatch.setattr(MadeUpSlam, "tried", {}, raising=False)
     monkeypatch.setattr(MadeUpSlam, "every", 100, raising=False)
+    monkeypatch.setattr(MadeUpSlam, "relocalised", set(), raising=False)
+    monkeypatch.setattr(MadeUpSlam, "apart", {}, raising=False)
+    monkeypatch.setattr(MadeUpSlam, "joined", set(), raising=False)
     monkeypatch.chdir(tmp_path)
     return source
 
@@ -193,6 +218,58 @@ def test_a_run_writes_all_files(corridor: Corridor, capsys: pytest.CaptureFixtur
     for figure in ("1.23", "27.31", "31.25", str(Path("runs/my-corridor-sigma/report.html").resolve())):
         assert figure in said
     assert "LOST" not in said
+
+
+def test_only_believed_poses_are_in_the_trajectory(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
+    MadeUpSlam.lost, MadeUpSlam.relocalised, MadeUpSlam.apart = {1, 3}, {2}, {3: 1, 4: 1, 5: 2}
+    assert exit_code("run", "corridor", "--no-eval", "--out", "mine", "--all-poses") == 0
+    run = RunFolder.open(Path("mine"))
+    log = run.read_log()
+    assert [record["state"] for record in log] == ["tracked", "lost", "relocalised", "lost", "apart", "apart"]
+    assert [record["component"] for record in log] == [0, 0, 0, 1, 1, 2]
+    assert [record["lost"] for record in log] == [False, True, False, True, False, False]
+    assert {record["p_off"] for record in log} == {0.25}
+    assert run.read_trajectory().timestamps_s.tolist() == [0.0, 2.0]
+    assert len(read_trajectory(run.path / "trajectory_all.txt")) == 6
+    assert run.component_numbers() == [1, 2] and run.read_component(1).trajectory.timestamps_s.tolist() == [4.0]
+    assert torch.allclose(run.read_component(2).field.means, MadeUpSlam.latest.field.means)
+    assert "6 frames, 2 lost, 1 relocalised, 2 components apart (2 frames)" in capsys.readouterr().out
+    frames = run.read_frames()
+    assert frames.states == ("tracked", "lost", "relocalised", "lost", "apart", "apart")
+    assert frames.outside().tolist() == [False] * 4 + [True] * 2
+
+
+def test_changes_of_state_are_printed(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
+    MadeUpSlam.lost, MadeUpSlam.relocalised, MadeUpSlam.apart = {1, 3}, {2}, {4: 1}
+    assert exit_code("run", "corridor", "--no-eval") == 0
+    said = capsys.readouterr().out
+    assert "frame 2 (t = 2.000 s): relocalised; it was lost since frame 1" in said
+    assert "frame 4: component 1 begins" in said and "frame 5: connected" in said
+
+
+def test_the_progress_bar_shows_that_tracking_is_lost(corridor: Corridor) -> None:
+    MadeUpSlam.lost = {3, 4, 5}
+    out = io.StringIO()
+    folder = RunFolder.create(Path("direct"), Config(), "corridor")
+    with Screen(Console(file=out, force_terminal=True, width=120)).steps(6) as callback:
+        Session(MadeUpSlam(Config()), corridor, folder, callback).execute()
+    assert "LOST since frame 3" in out.getvalue()
+
+
+def test_a_component_that_joins_later_is_in_the_trajectory(corridor: Corridor) -> None:
+    MadeUpSlam.lost, MadeUpSlam.apart, MadeUpSlam.joined = {2}, {3: 1, 4: 1}, {1}
+    assert exit_code("run", "corridor", "--no-eval", "--out", "mine") == 0
+    run = RunFolder.open(Path("mine"))
+    assert run.read_log()[3]["state"] == "apart", "the state of that time"
+    assert run.read_frames().states == ("tracked", "tracked", "lost", "tracked", "tracked", "tracked")
+    assert run.component_numbers() == [] and not (run.path / "trajectory_all.txt").exists()
+    MadeUpSlam.joined = set()
+    assert exit_code("run", "corridor", "--no-eval", "--out", "mine", "--overwrite") == 0
+    assert run.component_numbers() == [1]
+    (run.path / "components" / "1" / "notes.txt").write_text("the user's")
+    MadeUpSlam.apart = {}
+    assert exit_code("run", "corridor", "--no-eval", "--out", "mine", "--overwrite") == 0
+    assert sorted(p.name for p in (run.path / "components").rglob("*")) == ["1", "notes.txt"]
 
 
 def test_a_second_run_gets_a_numbered_folder(corridor: Corridor) -> None:

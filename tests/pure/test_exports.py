@@ -170,7 +170,7 @@ def test_film_options_out_of_range_are_refused() -> None:
 
 
 def test_the_plan_is_an_image_and_a_json_file(reader: RunReader, tmp_path: Path) -> None:
-    plan = floor_plan(reader.run.read_map(), reader.tracked_path(), reader.camera, renderer=seer(WORLD))
+    plan = floor_plan(reader.run.read_map(), reader.believed_path(), reader.camera, renderer=seer(WORLD))
     write_plan(plan, tmp_path / "plan.png")
     with Image.open(tmp_path / "plan.png") as drawn:
         assert drawn.format == "PNG" and drawn.size[0] > 700

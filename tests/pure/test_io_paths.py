@@ -45,12 +45,12 @@ def ahead(T_world_camera: np.ndarray) -> np.ndarray:
 
 def test_kitti_rows_are_the_matrices(tmp_path: Path) -> None:
     path = some_path()
-    write_kitti_poses(tmp_path / "poses.txt", path)
+    write_kitti_poses(tmp_path / "poses.txt", path.T_world_camera)
     rows = np.loadtxt(tmp_path / "poses.txt")
     assert rows.shape == (7, 12)
     np.testing.assert_allclose(rows.reshape(-1, 3, 4), path.T_world_camera[:, :3], atol=1e-11)
     with pytest.raises(RunError, match="cannot write"):
-        write_kitti_poses(tmp_path / "no" / "poses.txt", path)
+        write_kitti_poses(tmp_path / "no" / "poses.txt", path.T_world_camera)
 
 
 def test_transforms_are_opengl_cameras(tmp_path: Path) -> None:

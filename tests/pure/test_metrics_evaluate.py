@@ -20,6 +20,7 @@ from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.component import Component
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import Picture, Submap
@@ -91,7 +92,7 @@ class KnownErrors:
 def run(tmp_path: Path) -> RunFolder:
     run = RunFolder.create(tmp_path / "run", CONFIG, "hand-made")
     for i in range(FRAMES):
-        record = {"index": i, "timestamp_s": TIMES[i], "is_keyframe": i % 4 == 0, "lost": i in (6, 7)}
+        record = {"index": i, "timestamp_s": TIMES[i], "is_keyframe": i % 4 == 0, "lost": False}
         run.log(record | {"seconds": {"tracking": 0.1, "mapping": 0.15}})
     run.write_trajectory(Trajectory(TIMES, poses()))
     run.write_map(GaussianField(torch.ones(3, 17)))
@@ -134,13 +135,75 @@ def test_path_and_facts(run: RunFolder) -> None:
     metrics = score(run, HandMade(truth_of(half_of_them_off)))
     assert metrics["ate"]["pairs"] == FRAMES and metrics["ate"]["rmse_m"] == pytest.approx(0.05, rel=0.05)
     assert metrics["rpe"]["translation_rmse_m"] == pytest.approx(0.1, rel=1e-6)
-    assert metrics["lost_frames"] == [6, 7] and metrics["lost"] == 2 and metrics["splats"] == 3
+    assert metrics["lost_frames"] == [] and metrics["lost"] == 0 and metrics["splats"] == 3
+    assert metrics["believed"] == FRAMES and metrics["failures"]["silent"] == 0
     assert metrics["frames"] == 20 and metrics["keyframes"] == 5 and metrics["frames_per_s"] == pytest.approx(4.0)
     run.note(wall_s=10.0)
     metrics = score(run, HandMade(None))
     assert metrics["frames_per_s"] == 2.0 and metrics["total_s"] is None
     run.note(finish_s=2.5)
     assert score(run, HandMade(None))["total_s"] == 12.5
+
+
+def rewritten_log(run: RunFolder, change: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
+    lines = [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
+    (run.path / "log.jsonl").write_text("".join(json.dumps(line | change(line)) + "\n" for line in lines))
+
+
+def test_lost_frames_of_an_old_run_are_not_scored(run: RunFolder) -> None:
+    """Old releases wrote the poses of lost frames to trajectory.txt, and no states to the log."""
+    rewritten_log(run, lambda line: {"lost": line["index"] in (6, 7)})
+    renderer = KnownErrors()
+    metrics = score(run, HandMade(truth_of()), renderer=renderer)
+    assert metrics["lost_frames"] == [6, 7] and metrics["lost"] == 2 and metrics["frames"] == FRAMES
+    assert metrics["believed"] == metrics["ate"]["pairs"] == FRAMES - 2 and not {6, 7} & set(renderer.seen)
+    assert metrics["apart"] == 0 and metrics["components"] == []
+
+
+STATES = {6: "lost", 7: "relocalised", 12: "lost", 13: "apart", 14: "apart", 15: "lost", 16: "tracked"}
+
+
+def test_states_and_silent_failures_are_scored(run: RunFolder) -> None:
+    """Frame 10 is off by 30 cm and believed; lost frame 6 is off by 20 cm in the checkpoint, frame 12 is not off."""
+    p_off = {6: 0.9, 10: 0.75, 12: 0.3, 16: 0.8}
+    rewritten_log(
+        run,
+        lambda line: {
+            "state": (state := STATES.get(line["index"], "tracked")), "lost": state == "lost",
+            "p_off": p_off.get(line["index"], 0.1),
+        },
+    )  # fmt: skip
+    estimate = poses()
+    estimate[10, 1, 3] += 0.3
+    estimate[6, 1, 3] += 0.2
+    believed = [i for i in range(FRAMES) if STATES.get(i) not in ("lost", "apart")]
+    run.write_trajectory(Trajectory(TIMES[believed], estimate[believed]))
+    run.write_checkpoint({"T_world_camera": torch.from_numpy(estimate)}, {})
+    run.write_components([Component(1, GaussianField(torch.ones(2, 17)), Trajectory(TIMES[13:15], poses()[:2]))])
+    metrics = score(
+        run, HandMade(truth_of()), renderer=lambda field, camera, T: KnownErrors()(field, camera, nearest(T))
+    )
+    assert (metrics["believed"], metrics["lost"], metrics["relocalised"], metrics["apart"]) == (15, 3, 1, 2)
+    assert metrics["believed_share"] == 0.75 and metrics["lost_frames"] == [6, 12, 15]
+    assert metrics["relocalised_frames"] == [7] and metrics["apart_frames"] == [13, 14]
+    (component,) = metrics["components"]
+    assert (component["number"], component["frames"]) == (1, 2)
+    assert component["start_s"] == pytest.approx(TIMES[13]) and component["end_s"] == pytest.approx(TIMES[14])
+    failures = metrics["failures"]
+    assert failures["silent_frames"] == [10] and failures["silent"] == 1 and failures["off"] == 2
+    assert failures["frames"] == 17, "believed ones, and lost ones in the world"
+    assert failures["auroc"] == pytest.approx((15 + 14) / 30), "one frame that is not off has p = 0.8, above 0.75"
+    wrong = [(1 - 0.9) ** 2, (1 - 0.75) ** 2, 0.3**2, 0.8**2, *[0.01] * 13]
+    assert failures["brier"] == pytest.approx(sum(wrong) / 17)
+    page = (run.path / "report.html").read_text()
+    assert "States of the frames" in page and (run.images / "states-light.png").is_file()
+    assert "13–14" in page and "silent failures" in page
+
+
+def nearest(T_camera_world: np.ndarray) -> np.ndarray:
+    """Return the pose of the hand-made path that is nearest to a pose."""
+    known = se3.inverse(poses())
+    return known[np.abs(known - T_camera_world).max((1, 2)).argmin()]
 
 
 def test_the_longest_frame_excludes_the_first_and_the_map_has_a_size(run: RunFolder) -> None:

@@ -11,7 +11,9 @@ from PIL import Image, ImageFont
 from sigmasplat.drawing import colormap, plot
 from sigmasplat.drawing.view_panels import GAP, HEAD, PANEL_WIDTH, draw_view_strip, view_panels
 from sigmasplat.floorplan.rescan import RescanMaps, RescanRegion, find_rescan_regions
+from sigmasplat.io.frames import RunFrames
 from sigmasplat.metrics.scored_view import ScoredView
+from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.report import charts
 from sigmasplat.report.html import Contents, build_report
 from sigmasplat.report.tables import headline, number
@@ -188,14 +190,44 @@ def test_a_long_run_has_few_labels() -> None:
 
 def test_a_loop_line_joins_the_positions_of_its_frames() -> None:
     """Frames of loops are rows of the whole log. Some frames have no pose, so row and position differ."""
-    log = [{"row": row, "index": 10 * row, "submap": row // 4} for row in (0, 1, 3, 4, 5, 7, 8)]
-    estimate = np.stack([[record["row"], 0.0, 0.0] for record in log])
+    rows = np.array([0, 1, 3, 4, 5, 7, 8])
+    log = [
+        {"index": 10 * row, "submap": row // 4, "timestamp_s": float(row), "lost": row in (2, 6)} for row in range(9)
+    ]
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, 0, 3] = rows
+    path = Trajectory(rows.astype(np.float64), poses)
     loops = [{"query_frame": 8, "database_frame": 1, "accepted": True},
              {"query_frame": 5, "database_frame": 2, "accepted": False}]  # fmt: skip
-    (chart,), caption = charts.run_charts(log, estimate, None, loops)["submaps"]
+    new = [record | {"state": "lost" if record["lost"] else "tracked"} for record in log]
+    drawn = charts.run_charts(RunFrames.of(new, path), None, loops)
+    (chart,), caption = drawn["submaps"]
     lines = {curve.name: curve.points[:, 0].tolist() for curve in chart.curves if curve.name}
     assert lines == {"loop accepted": [8, 1]} and "submap" in caption
-    assert set(charts.run_charts([record | {"submap": 0} for record in log], estimate, None)) == {"trajectory"}
+    lost = next(curve for curve in drawn["trajectory"][0][0].curves if curve.name == "lost")
+    assert lost.points[:, 0].tolist() == [1, 5], "the last poses before"
+    calm = [record | {"submap": 0, "lost": False} for record in log[:2]]
+    assert set(charts.run_charts(RunFrames.of(calm, path.at(np.arange(2))), None)) == {"trajectory"}
+
+
+def test_the_strip_shows_each_range_of_frames_in_one_state() -> None:
+    states = ["tracked", "tracked", "lost", "relocalised", "tracked", "lost", "lost", "apart"]
+    log = [{"index": 2 * i, "timestamp_s": float(i), "lost": s == "lost", "state": s, "p_off": 0.1 * i}
+           for i, s in enumerate(states)]  # fmt: skip
+    believed = [0, 1, 3, 4]
+    path = Trajectory(np.array(believed, np.float64), np.tile(np.eye(4), (4, 1, 1)))
+    found = charts.run_charts(RunFrames.of(log, path), None)
+    strip, along = found["states"][0]
+    ranges = [(c.colour, *c.points[:, 0]) for c in strip.curves[1:]]
+    colours = charts.STATE_COLOURS
+    assert sorted(ranges, key=lambda r: r[1]) == [
+        (colours["tracked"], -0.5, 2.5), (colours["lost"], 3.5, 4.5), (colours["relocalised"], 5.5, 6.5),
+        (colours["tracked"], 7.5, 8.5), (colours["lost"], 9.5, 12.5), (colours["apart"], 13.5, 14.5),
+    ]  # fmt: skip
+    assert {c.name for c in strip.curves if c.name} == {"tracked", "relocalised", "lost", "apart"}
+    assert sum(len(c.points) for c in along.curves if c.dots) == 4, "only believed frames have a place"
+    for theme in (plot.LIGHT, plot.DARK):
+        plot.draw_charts([strip, along], theme)
 
 
 class Balance(HTMLParser):

@@ -1,5 +1,7 @@
 """The viewer's data, without a browser: splats within a budget, filtering by σ, paths, rendered layers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -154,6 +156,15 @@ def test_the_path_is_drawn_up_to_a_frame_in_submap_colours_with_lost_frames_in_r
     np.testing.assert_array_equal(lines.lost_points(path, 5)[:, 0], [5])
     assert len(lines.lost_points(path, 29)) == 2 and len(lines.lost_points(path, -1)) == 0
     assert len(lines.path_segments(path_of(0), 0).points) == 0 == len(lines.path_segments(path_of(1), 0).points)
+
+
+def test_frames_that_are_not_connected_to_the_world_are_not_drawn() -> None:
+    whole = path_of(30, lost=(5, 14))
+    path = replace(whole, outside=(np.arange(30) >= 12) & (np.arange(30) < 20))
+    drawn = lines.path_segments(path, 29)
+    np.testing.assert_array_equal(drawn.points[:, 0, 0], [*range(11), *range(20, 29)])
+    np.testing.assert_array_equal(lines.lost_points(path, 29)[:, 0], [5])
+    assert lines.keyframes_to_show(path, 29) == (0, 5, 10, 20, 25)
 
 
 def test_long_paths_and_many_keyframes_are_reduced_without_large_changes_between_frames() -> None:

@@ -1,9 +1,12 @@
 """Snapshots of run folders and of a running system: the same map, path and images; a bounded rate."""
 
+import json
 import shutil
 import socket
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,10 +17,13 @@ from sigmasplat.config import Config
 from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError, RunError, SigmaSplatError
 from sigmasplat.evaluation.evaluate import evaluate
+from sigmasplat.evaluation.reconstruct import FusionInput
+from sigmasplat.exports.formats import FORMATS, ExportSource, choose
 from sigmasplat.io.runs import TRUTH, RunFolder
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.trajectory import read_trajectory
 from sigmasplat.model import se3
+from sigmasplat.model.component import Component
 from sigmasplat.presets import default_preset, preset
 from sigmasplat.run.protocols import CallbackList, NullCallback
 from sigmasplat.run.session import Session
@@ -133,6 +139,58 @@ def test_an_evaluation_without_truth_removes_the_stored_true_path(finished: RunF
     assert (copied.path / TRUTH).is_file()
     evaluate(copied, RoomWithoutTruth(frames=120, width=64, height=48), views_per_kind=1, strips_per_kind=0)
     assert not (copied.path / TRUTH).exists() and finished_snapshot(copied).true_positions is None
+
+
+def rewritten(finished: RunFolder, folder: Path, change: Callable[[dict[str, Any]], dict[str, Any]]) -> RunFolder:
+    """Return a copy of the run with other lines in its log."""
+    shutil.copytree(finished.path, folder)
+    lines = [json.dumps(change(record)) + "\n" for record in finished.read_log()]
+    (folder / "log.jsonl").write_text("".join(lines))
+    return RunFolder(folder)
+
+
+def with_states(record: dict[str, Any]) -> dict[str, Any]:
+    """Frame 2 is lost; the frames of submap 2 are apart, the second of them is lost."""
+    component = int(record["submap"] == 2)
+    lost = record["index"] in (2, FRAMES - 1)
+    return record | {"lost": lost, "state": "lost" if lost else "apart" if component else "tracked",
+                     "component": component}  # fmt: skip
+
+
+def test_lost_frames_and_submaps_apart_of_a_finished_run(finished: RunFolder, tmp_path: Path) -> None:
+    run, path = rewritten(finished, tmp_path / "run", with_states), finished.read_trajectory()
+    in_world = [record["submap"] < 2 for record in finished.read_log()]
+    run.write_trajectory(path.at(np.array(in_world) & (np.arange(FRAMES) != 2)))
+    run.write_components([Component(1, run.read_map(), path.at(~np.array(in_world)))])
+    for shown in (finished_snapshot(run), running_snapshot(run, SubmapCache(run))):
+        assert [piece.submap for piece in shown.pieces] == [0, 1]
+        assert shown.path.inside.tolist() == in_world and np.flatnonzero(shown.path.lost).tolist() == [2, FRAMES - 1]
+    shown = finished_snapshot(run)
+    np.testing.assert_allclose(shown.path.T_world_camera[2], path.T_world_camera[2], atol=1e-9)
+    _, total = FusionInput.of(run, open_source(ROOM).camera).views()
+    assert total == sum(len(run.submaps.load(i).frames) for i in (0, 1))
+    assert running_snapshot(finished, SubmapCache(finished)).path.inside.all()
+
+
+def test_a_run_of_an_old_release_is_shown_evaluated_and_exported(finished: RunFolder, tmp_path: Path) -> None:
+    """Its log has no states, and its trajectory contains the pose of a lost frame."""
+    new = ("state", "component", "p_off")
+    run = rewritten(
+        finished,
+        tmp_path / "run",
+        lambda record: {k: v for k, v in record.items() if k not in new} | {"lost": record["index"] == 2},
+    )
+    shown = finished_snapshot(run)
+    assert shown.path.inside.all() and len(shown.path) == FRAMES and np.flatnonzero(shown.path.lost).tolist() == [2]
+    metrics = evaluate(run, open_source(ROOM), views_per_kind=1, strips_per_kind=0)
+    assert (metrics["frames"], metrics["believed"], metrics["lost"], metrics["apart"]) == (FRAMES, FRAMES - 1, 1, 0)
+    assert metrics["failures"]["auroc"] is None or np.isnan(metrics["failures"]["auroc"])
+    for name, said in (("path.txt", "13 poses; left out: 1 lost"), ("path.kitti.txt", "13 poses; left out: 1 lost")):
+        chosen = choose(FORMATS, None, tmp_path / name)
+        assert chosen.write(ExportSource(run.path), tmp_path / name).startswith(said)
+    assert len(read_trajectory(tmp_path / "path.txt")) == FRAMES - 1
+    rows = np.loadtxt(tmp_path / "path.kitti.txt")
+    assert len(rows) == FRAMES and np.flatnonzero(np.isnan(rows).any(1)).tolist() == [2]
 
 
 class Clock:

@@ -83,6 +83,10 @@ Overwrite = Annotated[bool, arg(help="replace an earlier result", help_behavior_
 Limit = Annotated[Whole, arg(metavar="N", help="use at most N frames", help_behavior_hint="(default: all)")]
 Profile = Annotated[bool, arg(help="print the time spent in each stage", help_behavior_hint="")]
 SaveEvery = Annotated[float, arg(metavar="S", help="save the state for `resume` every S seconds; 0 = at the end only")]
+AllPoses = Annotated[
+    bool,
+    arg(help="also write trajectory_all.txt with the poses of all frames, including lost ones", help_behavior_hint=""),
+]
 View = Annotated[
     bool, arg(help="show the run in the browser while it runs, and afterwards until Ctrl-C", help_behavior_hint="")
 ]
@@ -231,11 +235,12 @@ InputOptionsFlat = Annotated[InputOptions, arg(name=""), tyro.conf.OmitArgPrefix
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of run and resume: scoring, profile, saving, viewer."""
+    """Options of run and resume: scoring, profile, saving, all poses, viewer."""
 
     evaluate: Evaluate = True
     profile: Profile = False
     save_every: SaveEvery = 60.0
+    all_poses: AllPoses = False
     view: View = False
     host: Host = HOST
     port: Port = PORT

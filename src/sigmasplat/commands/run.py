@@ -171,7 +171,9 @@ def _run_and_score(
     cuda_stages.measure(run_options.profile)
     state = StateFile(start.slam, folder, run_options.save_every)
     with _progress(screen, start, source, viewer) as callback:
-        outcome = Session(start.slam, source, folder, callback, state, start.next_index, start.wall_s).execute()
+        outcome = Session(
+            start.slam, source, folder, callback, state, start.next_index, start.wall_s, run_options.all_poses
+        ).execute()
     if outcome.status == "interrupted" and not outcome.frames:
         raise KeyboardInterrupt  # the folder has no results, and no state to resume from
     if run_options.profile:

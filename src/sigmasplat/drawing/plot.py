@@ -55,7 +55,8 @@ class Curve:
 class Chart:
     """Curves on one pair of axes.
 
-    `square`: both axes have the same scale; `from_zero`: the y axis starts at 0; labels: texts beside points.
+    `square`: both axes have the same scale; `from_zero`: the y axis starts at 0; labels: texts beside points;
+    y_limits: ends of the y axis (default: from the curves).
     """
 
     title: str
@@ -65,6 +66,7 @@ class Chart:
     square: bool = False
     from_zero: bool = False
     labels: dict[str, tuple[float, float]] = field(default_factory=dict)
+    y_limits: tuple[float, float] | None = None
 
 
 def draw_charts(charts: list[Chart], theme: Theme, size: tuple[int, int] = SIZE) -> Image.Image:
@@ -105,6 +107,8 @@ def _limits(chart: Chart, box: Box) -> tuple[Matrix, Matrix]:
         low[1] = min(low[1], 0.0)
     margin = np.maximum(0.06 * (high - low), [1e-3, 1e-3])
     low, high = low - margin * (0.0 if chart.from_zero else 1.0), high + margin
+    if chart.y_limits is not None:
+        low[1], high[1] = chart.y_limits
     if chart.square:
         pixels = np.array([box[2] - box[0], box[3] - box[1]])
         half = 0.5 * pixels * ((high - low) / pixels).max()

@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 from sigmasplat.config import Config, FinalConfig
 from sigmasplat.errors import RunError
 from sigmasplat.evaluation import reconstruct
+from sigmasplat.evaluation.frame_states import score_states
 from sigmasplat.evaluation.novel_views import score_novel_views
 from sigmasplat.evaluation.view_selection import evenly_spread, working_frame
+from sigmasplat.io.frames import RunFrames
 from sigmasplat.io.runs import TRUTH, RunFolder
 from sigmasplat.io.trajectory import write_trajectory
 from sigmasplat.metrics import views
-from sigmasplat.metrics.trajectory import aligned_truth, associate, score_path, truth_in_estimate
+from sigmasplat.metrics.trajectory import aligned_truth, score_path, truth_in_estimate
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import FieldRenderer
@@ -23,9 +25,6 @@ from sigmasplat.report.page import report_plan, write_charts, write_page
 from sigmasplat.report.view_strips import ViewStrips
 from sigmasplat.sources.base import Source
 from sigmasplat.types import Progress, no_progress
-
-SAME_TIME_S = 1e-4
-"""Log and trajectory hold the same timestamps up to rounding."""
 
 Log = list[dict[str, Any]]
 
@@ -42,6 +41,7 @@ def evaluate(
 ) -> dict[str, Any]:
     """Score trajectory, map and uncertainty of a run against its source, and return the metrics written.
 
+    Path and views are scored on the frames whose pose is believed: those of trajectory.txt, without lost frames.
     Training views are the run's keyframes; held-out views are the frames that no map was fitted to. At most
     `views_per_kind` of each are scored, evenly spread. They are rendered from the final map at the estimated poses and
     the run's working resolution, with the run's render settings unless a `renderer` is given. If the run kept its
@@ -55,17 +55,20 @@ def evaluate(
     records = run.read_log()
     if not records:
         raise RunError(f"run {run.path} stopped before its first frame: its log.jsonl is empty; run it again")
-    path, field = run.read_trajectory(), run.read_map()
-    log = _posed(records, path, run)
+    frames, field = RunFrames.of(records, run.read_trajectory()), run.read_map()
+    records, log = frames.log, frames.posed_log()
+    if not log:
+        raise RunError(f"run {run.path}: trajectory.txt and log.jsonl share no timestamps; do they belong to one run?")
     truth = source.truth()
-    path_scores, problem = score_path(path, run.read_odometry(), truth)
-    chosen = {kind: evenly_spread(records, views_per_kind) for kind, records in _kinds(log).items()}
+    path_scores, problem = score_path(frames.path, _believed_odometry(run, frames), truth)
+    chosen = {kind: evenly_spread(views, views_per_kind) for kind, views in _kinds(log).items()}
     strips, config, loops = ViewStrips(run, strips_per_kind), run.config(), run.read_loops()
     standard = renderer is None
     renderer = renderer or FieldRenderer(config.render, config.backend)
     maps = views.MapSources(field, run.submaps, _anchors(run, records, config.final))
     scores = _score_views(config, source, maps, chosen, strips, renderer, progress)
-    metrics = _facts(run, source, log, field, loops) | path_scores | scores | {"reconstruction": None}
+    facts = _facts(run, source, records, field, loops) | score_states(run, frames, None if problem else truth)
+    metrics = facts | path_scores | scores | {"reconstruction": None}
     if mesh:
         known = None if problem else truth
         found = reconstruct.fuse_and_score(run, source.camera, source.true_surface(), known, renderer, progress)
@@ -73,12 +76,13 @@ def evaluate(
     metrics["test_views"] = None
     novel = source.test_views()
     if novel is not None and truth is not None and problem is None:
-        poses = novel.truth(), truth_in_estimate(*_positions(log), truth)
+        path = frames.path
+        poses = novel.truth(), truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], truth)
         metrics["test_views"] = score_novel_views(novel, *poses, field, config.input, renderer, strips, views_per_kind)
     run.write_metrics(metrics)
-    plots = _draw_plots(run, log, None if problem else truth, loops)
+    plots = _draw_plots(run, frames, None if problem else truth, loops)
     warnings = [str(problem)] if problem else []
-    plan = report_plan(run, log, source.camera) if standard else None
+    plan = report_plan(run, frames.path, source.camera) if standard else None
     write_page(run, metrics, strips.figures, plots, warnings, plan)
     if problem:
         raise problem
@@ -102,19 +106,10 @@ def _submaps(log: Log) -> int:
     return 1 + max(int(record.get("submap", 0)) for record in log)
 
 
-def _posed(log: Log, path: Trajectory, run: RunFolder) -> Log:
-    """Return the log's records that have a pose, each with its `T_world_camera` [4, 4] and its `row` in the log.
-
-    Raises RunError if no record has a pose.
-    """
-    times = np.array([record["timestamp_s"] for record in log], np.float64)
-    rows, poses = associate(times, path.timestamps_s, SAME_TIME_S)
-    if not len(rows):
-        raise RunError(f"run {run.path}: trajectory.txt and log.jsonl share no timestamps; do they belong to one run?")
-    return [
-        log[row] | {"T_world_camera": path.T_world_camera[pose], "row": int(row)}
-        for row, pose in zip(rows, poses, strict=True)
-    ]
+def _believed_odometry(run: RunFolder, frames: RunFrames) -> Trajectory | None:
+    """Return the path of tracking alone at the believed frames; None if the run has no such path or no loop."""
+    odometry = run.read_odometry()
+    return None if odometry is None else odometry.at(frames.rows[frames.rows < len(odometry)])
 
 
 def _kinds(log: Log) -> dict[str, Log]:
@@ -164,14 +159,11 @@ def _keeps_variance(final: FinalConfig) -> bool:
 
 def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField, loops: Log) -> dict[str, Any]:
     """Return counts, size and speed of the run."""
-    lost = [record["index"] for record in log if record.get("lost")]
     return {
         "source": source.name,
         "status": run.facts().get("status"),
         "frames": len(log),
         "keyframes": sum(bool(record["is_keyframe"]) for record in log),
-        "lost": len(lost),
-        "lost_frames": lost,
         "skipped": run.facts().get("skipped", list(source.skipped)),
         "splats": len(field),
         "map_bytes": run.map_bytes(),
@@ -198,18 +190,12 @@ def _total_s(run: RunFolder) -> float | None:
 
 def _worst_frame_s(log: Log) -> float | None:
     """Return the longest time of a frame except the first, which creates the map; None if no frame was timed."""
-    return max((charts.frame_seconds(record) for record in log if record["row"]), default=0.0) or None
+    return max(map(charts.frame_seconds, log[1:]), default=0.0) or None
 
 
-def _positions(log: Log) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the times [N], s, and the estimated positions [N, 3], m, of the logged frames."""
-    times_s = np.array([record["timestamp_s"] for record in log])
-    return times_s, np.array([record["T_world_camera"][:3, 3] for record in log])
-
-
-def _draw_plots(run: RunFolder, log: Log, truth: Trajectory | None, loops: Log) -> dict[str, str]:
-    """Draw the charts of path, submaps and times, and write truth.txt; return the captions by name."""
-    times, estimate = _positions(log)
+def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None, loops: Log) -> dict[str, str]:
+    """Draw the charts of path, states, submaps and times, and write truth.txt; return the captions by name."""
+    times, estimate = frames.path.timestamps_s, frames.path.T_world_camera[:, :3, 3]
     known: NDArray[np.float64] | None = None
     aligned: Trajectory | None = None
     if truth is not None:
@@ -217,7 +203,7 @@ def _draw_plots(run: RunFolder, log: Log, truth: Trajectory | None, loops: Log) 
         known = np.full_like(estimate, np.nan)
         known[rows] = aligned.T_world_camera[:, :3, 3]
     _write_truth(run, aligned)
-    return write_charts(run, charts.run_charts(log, estimate, known, loops))
+    return write_charts(run, charts.run_charts(frames, known, loops))
 
 
 def _write_truth(run: RunFolder, aligned: Trajectory | None) -> None:

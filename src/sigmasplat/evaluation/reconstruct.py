@@ -51,6 +51,7 @@ class FusionInput:
     def views(self) -> tuple[Iterable[FusionView], int]:
         """Return a view of each keyframe's own submap, or of the one map of a run without submaps, and their number.
 
+        Submaps that are not connected to the world are left out.
         Raises RunError if there is no map, or if the checkpoint lacks the pose of a submap.
         """
         submaps, tensors = self.run.submaps, self.checkpoint
@@ -63,7 +64,8 @@ class FusionInput:
                 f"run {self.run.path} has {len(submaps)} submaps, but its checkpoint has poses of {len(anchors)}; "
                 "run it again"
             )
-        return fusion_views(submaps, list(anchors)), count_keyframes(submaps)
+        outside = self.run.read_frames().submaps_outside() if self.run.component_numbers() else frozenset[int]()
+        return fusion_views(submaps, list(anchors), outside), count_keyframes(submaps, outside)
 
     def surface(
         self, voxel_m: float = VOXEL_M, renderer: Renderer | None = None, progress: Progress = no_progress
@@ -100,10 +102,12 @@ def score(
 
     The training views are the true poses of the keyframes. Raises SourceError if path and truth share no timestamps.
     """
-    path, tensors = fusion_input.run.read_trajectory(), fusion_input.checkpoint
-    ours, theirs = pair_poses(path, true_path)
+    frames, tensors = fusion_input.run.read_frames(), fusion_input.checkpoint
+    ours, theirs = pair_poses(frames.path, true_path)
     T_truth_world = align_rigid(ours[:, :3, 3], theirs[:, :3, 3])
-    _, rows = associate(tensors["timestamps_s"][tensors["keyframes"]].numpy(), true_path.timestamps_s)
+    keyframes = tensors["keyframes"].numpy()
+    keyframes = keyframes[frames.believed[keyframes]]
+    _, rows = associate(tensors["timestamps_s"].numpy()[keyframes], true_path.timestamps_s)
     views = true_path.T_world_camera[rows]
     reference = (true_surface, fusion_input.camera, views)
     of_mesh = reconstruction.score(mesh.moved(T_truth_world), *reference, progress=progress)

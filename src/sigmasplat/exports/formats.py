@@ -205,18 +205,25 @@ def _write_splats(
 def _trajectory(source: ExportSource, target: Path) -> str:
     from sigmasplat.io.trajectory import write_trajectory
 
-    path = source.run().read_trajectory()
+    reader = source.reader()
+    has_log = (reader.run.path / "log.jsonl").is_file()
+    path = reader.believed_path() if has_log else reader.run.read_trajectory()
     write_trajectory(target, path)
-    return f"{len(path):,} poses"
+    return f"{len(path):,} poses{reader.left_out() if has_log else ''}"
 
 
 def _kitti(source: ExportSource, target: Path) -> str:
-    """Write the poses of all frames, including lost ones, since the line number is the frame number."""
+    """Write one line per frame, since the line number is the frame number; nan for frames without a believed pose."""
+    import numpy as np
+
     from sigmasplat.io.trajectory import write_kitti_poses
 
-    path = source.run().read_trajectory()
-    write_kitti_poses(target, path)
-    return f"{len(path):,} poses"
+    reader = source.reader()
+    poses = np.full((len(reader.frames), 4, 4), np.nan)
+    poses[reader.believed_frames()] = reader.believed_path().T_world_camera
+    write_kitti_poses(target, poses)
+    left_out = reader.left_out()
+    return f"{len(reader.frames.rows):,} poses{left_out}{' (written as nan)' if left_out else ''}"
 
 
 def _nerfstudio(source: ExportSource, target: Path, *, pictures: bool) -> str:
@@ -238,9 +245,11 @@ def _export_views(
 
     reader = source.reader()
     if not pictures:
-        return f"{export(reader, target, False, no_progress):,} views, no pictures (--pictures)"
+        count = export(reader, target, False, no_progress)
+        return f"{count:,} views, no pictures (--pictures){reader.left_out()}"
     with _counting("pictures") as progress:
-        return f"{export(reader, target, True, progress):,} views with their pictures"
+        count = export(reader, target, True, progress)
+        return f"{count:,} views with their pictures{reader.left_out(keyframes=True)}"
 
 
 def _points(source: ExportSource, target: Path, *, voxel_m: float) -> str:

@@ -22,14 +22,14 @@ def image_name(frame: int) -> str:
 
 
 def export_images(reader: RunReader, folder: Path, depth: bool, progress: Progress) -> Sequence[int]:
-    """Write the keyframes' colour to images/, and their depth to depths/ if requested; lost keyframes are left out.
+    """Write the colour of the keyframes to images/, and their depth to depths/ if requested.
 
-    Returns their frame numbers. Raises RunError if no keyframe is left.
+    Keyframes without a believed pose are left out. Returns their frame numbers. Raises RunError if no keyframe is left.
     """
-    tracked, written = set(reader.tracked_frames()), []
+    believed, written = set(reader.believed_frames()), []
     total = reader.count_keyframes()
     for done, (frame, picture) in enumerate(reader.keyframes(), 1):
-        if frame in tracked:
+        if frame in believed:
             write_color(folder / IMAGES / image_name(frame), picture)
             if depth:
                 write_depth(folder / DEPTHS / image_name(frame), picture)

@@ -27,18 +27,19 @@ MILLIMETRES = 0.001
 def export_nerfstudio(reader: RunReader, target: Path, images: bool = False, progress: Progress = no_progress) -> int:
     """Write transforms.json; return the number of views.
 
-    Views are all frames that were not lost; with `images` only the keyframes, whose images are written to images/ and
-    depths/ beside the file, with points.ply. The images' names are the same in both cases. Raises RunError.
+    Views are all frames whose pose is believed; with `images` only the keyframes, whose images are written to images/
+    and depths/ beside the file, with points.ply. The images' names are the same in both cases. Raises RunError.
     """
-    frames = export_images(reader, target.parent, True, progress) if images else reader.tracked_frames()
+    frames = export_images(reader, target.parent, True, progress) if images else reader.believed_frames()
+    path = reader.poses_of(frames)
     if images:
         write_points(target.parent / POINTS, *splat_points(reader.run.read_map()))
     write_transforms(
         target,
         reader.camera,
         [f"{IMAGES}/{image_name(frame)}" for frame in frames],
-        reader.path.T_world_camera[frames],
-        reader.path.timestamps_s[frames].tolist(),
+        path.T_world_camera,
+        path.timestamps_s.tolist(),
         depth_names=[f"{DEPTHS}/{image_name(frame)}" for frame in frames] if images else None,
         points_name=POINTS if images else None,
     )

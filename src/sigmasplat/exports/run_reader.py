@@ -1,6 +1,6 @@
 """Read the parts of a run that exports need: its camera, its path, and the images of its keyframes."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -8,8 +8,10 @@ import numpy as np
 
 from sigmasplat.config import Config
 from sigmasplat.errors import RunError
+from sigmasplat.io.frames import RunFrames
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.component import APART, LOST
 from sigmasplat.model.submap import Picture
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
@@ -40,31 +42,41 @@ class RunReader:
         return self.source.camera.prepared(self.config.input.width, self.config.input.crop_px)
 
     @cached_property
-    def path(self) -> Trajectory:
-        """Return the poses of all frames. Raises RunError if the run has none."""
-        return self.run.read_trajectory()
-
-    def tracked_frames(self) -> list[int]:
-        """Return the frames that were not lost, counted from the run's start.
-
-        Raises RunError if there is none, or if log and path have different lengths.
-        """
+    def frames(self) -> RunFrames:
+        """Return the frames of the run. Raises RunError if it has no path, or if its log is shorter than its path."""
+        path = self.run.read_trajectory()
         log = self.run.read_log()
-        if len(log) < len(self.path):
-            raise RunError(f"run {self.run.path}: its log has {len(log)} frames, its path {len(self.path)} poses")
-        found = [i for i, record in enumerate(log[: len(self.path)]) if not record.get("lost")]
-        if not found:
-            raise RunError(f"run {self.run.path} was lost on every frame, so it has no pose to export; run it again")
-        return found
+        if len(log) < len(path):
+            raise RunError(f"run {self.run.path}: its log has {len(log)} frames, its path {len(path)} poses")
+        return RunFrames.of(log, path)
 
-    def tracked_path(self) -> Trajectory:
-        """Return the poses of the frames that were not lost."""
-        frames = self.tracked_frames()
-        return Trajectory(self.path.timestamps_s[frames], self.path.T_world_camera[frames])
+    def believed_frames(self) -> list[int]:
+        """Return the frames whose pose is believed, counted from the run's start. Raises RunError if there is none."""
+        if not len(self.frames.rows):
+            raise RunError(f"run {self.run.path} was lost on every frame, so it has no pose to export; run it again")
+        return [int(row) for row in self.frames.rows]
+
+    def believed_path(self) -> Trajectory:
+        """Return the poses of `believed_frames`. Raises RunError if there is none."""
+        self.believed_frames()
+        return self.frames.path
+
+    def poses_of(self, frames: Sequence[int]) -> Trajectory:
+        """Return the poses of some frames. Raises RunError if the pose of one is not believed."""
+        if unknown := sorted(set(frames) - set(self.believed_frames())):
+            raise RunError(f"run {self.run.path} has no believed pose of frame {unknown[0]}; choose another frame")
+        return self.frames.path.at(np.searchsorted(self.frames.rows, frames))
+
+    def left_out(self, keyframes: bool = False) -> str:
+        """Describe how many frames have no believed pose, of all or of the keyframes; empty if there are none."""
+        log, states = self.frames.log, self.frames.states
+        counted = [s for s, record in zip(states, log, strict=True) if not keyframes or record["is_keyframe"]]
+        found = [f"{counted.count(state):,} {state}" for state in (LOST, APART) if state in counted]
+        return f"; left out: {', '.join(found)}" if found else ""
 
     def count_keyframes(self) -> int:
         """Return the number of keyframes that `keyframes` yields."""
-        return sum(bool(record["is_keyframe"]) for record in self.run.read_log()[: len(self.path)])
+        return sum(bool(record["is_keyframe"]) for record in self.frames.log)
 
     def keyframes(self) -> Iterator[tuple[int, Picture]]:
         """Yield each keyframe once, in order of time: its frame number, and its images, one at a time in memory."""
@@ -74,14 +86,14 @@ class RunReader:
         seen = set[int]()
         for index in range(len(self.run.submaps)):
             for k, frame in enumerate(self.run.submaps.load(index).frames):
-                if frame < len(self.path) and frame not in seen:  # submaps share the keyframe between them
+                if frame < len(self.frames) and frame not in seen:  # submaps share the keyframe between them
                     seen.add(frame)
                     yield frame, self.run.submaps.picture(index, k)
 
     def _keyframes_of_sequence(self) -> Iterator[tuple[int, Picture]]:
         """Read the keyframes from the sequence again."""
         s = self.config.input
-        for i, record in enumerate(self.run.read_log()[: len(self.path)]):
+        for i, record in enumerate(self.frames.log):
             if record["is_keyframe"]:
                 read = self.source.frame(record["index"])
                 frame = read.prepared(s.width, s.min_depth_m, s.max_depth_m, s.crop_px)

@@ -1,5 +1,7 @@
 """Write and read the folder of a run, which is valid at any time."""
 
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,10 +13,12 @@ from sigmasplat.config import Config
 from sigmasplat.errors import RunError
 from sigmasplat.io import machine, trajectory as tum
 from sigmasplat.io.atomic import replacing, write_text
+from sigmasplat.io.frames import RunFrames
 from sigmasplat.io.json_files import append_line, read_json, read_lines, write_json
 from sigmasplat.io.splats import ply
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.tensors import open_tensors, write_tensors
+from sigmasplat.model.component import Component
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 
@@ -25,11 +29,15 @@ MESH = "mesh.ply"
 """The surface, written by `sigmasplat mesh`."""
 STATE = "state.safetensors"
 """The state from which an unfinished run resumes."""
+ALL_POSES = "trajectory_all.txt"
+"""The poses of all frames, written if requested."""
 FILES = (
-    "config.json", "trajectory.txt", "map.ply", "checkpoint.safetensors", "log.jsonl", "loops.json", "metrics.json",
-    "profile.json", "report.html", TRUTH,
+    "config.json", "trajectory.txt", ALL_POSES, "map.ply", "checkpoint.safetensors", "log.jsonl", "loops.json",
+    "metrics.json", "profile.json", "report.html", TRUTH,
 )  # fmt: skip
 """Files that a run may have in addition to run.json, which always exists and identifies the folder as ours."""
+COMPONENTS, COMPONENT_FILES = "components", ("trajectory.txt", "map.ply")
+"""The folder of components that are not connected to the world, and the files of each."""
 PARTIAL_RUN_JSON = ".run.json.part"
 """The only file of a run that was killed before its run.json was complete."""
 
@@ -38,7 +46,7 @@ PARTIAL_RUN_JSON = ".run.json.part"
 class RunFolder:
     """One run on disk: config.json, run.json (source, version, machine, status), log.jsonl (one line per frame),
     trajectory.txt, map.ply, checkpoint.safetensors, loops.json, profile.json, metrics.json, report.html, images/,
-    submaps/.
+    submaps/, components/.
 
     Files are replaced atomically, and the log grows by complete lines, so an interrupted run can still be read.
     """
@@ -118,6 +126,7 @@ class RunFolder:
         for picture in self.images.glob("*.png"):
             picture.unlink()
         self.submaps.clear()
+        self.write_components(())
 
     @property
     def images(self) -> Path:
@@ -170,12 +179,51 @@ class RunFolder:
         return loops
 
     def write_trajectory(self, trajectory: Trajectory) -> None:
-        """Write trajectory.txt (TUM text, T_world_camera)."""
+        """Write trajectory.txt: the believed poses (TUM text, T_world_camera)."""
         tum.write_trajectory(self.path / "trajectory.txt", trajectory)
 
     def read_trajectory(self) -> Trajectory:
         """Read trajectory.txt. Raises RunError if it is missing, SourceError if it is damaged."""
         return tum.read_trajectory(self._existing("trajectory.txt"))
+
+    def read_frames(self) -> RunFrames:
+        """Read log.jsonl and trajectory.txt together: the state of each frame at the end of the run, and its pose.
+
+        Raises RunError or SourceError as `read_log` and `read_trajectory` do.
+        """
+        return RunFrames.of(self.read_log(), self.read_trajectory())
+
+    def write_all_poses(self, trajectory: Trajectory) -> None:
+        """Write trajectory_all.txt: the poses of all frames, including lost ones and those of other components."""
+        tum.write_trajectory(self.path / ALL_POSES, trajectory)
+
+    def write_components(self, components: Sequence[Component]) -> None:
+        """Write components/N/trajectory.txt and map.ply of each component N that is not connected to the world.
+
+        Both are in the component's own frame. Files of components that are not given are removed.
+        """
+        for component in components:
+            folder = self._component(component.number)
+            folder.mkdir(parents=True, exist_ok=True)
+            tum.write_trajectory(folder / "trajectory.txt", component.trajectory)
+            ply.write_field(folder / "map.ply", component.field)
+        for number in set(self.component_numbers()) - {component.number for component in components}:
+            for name in COMPONENT_FILES:
+                (self._component(number) / name).unlink(missing_ok=True)
+            _remove_if_empty(self._component(number))
+        _remove_if_empty(self.path / COMPONENTS)
+
+    def component_numbers(self) -> list[int]:
+        """Return the numbers of the components that are not connected to the world, in ascending order."""
+        return sorted(int(folder.name) for folder in (self.path / COMPONENTS).glob("*") if folder.name.isdecimal())
+
+    def read_component(self, number: int) -> Component:
+        """Read a component from components/. Raises RunError if a file is missing, SourceError if it is damaged."""
+        trajectory, field = (self._existing(f"{COMPONENTS}/{number}/{name}") for name in COMPONENT_FILES)
+        return Component(number, ply.read_field(field), tum.read_trajectory(trajectory))
+
+    def _component(self, number: int) -> Path:
+        return self.path / COMPONENTS / str(number)
 
     def write_map(self, field: GaussianField) -> None:
         """Write map.ply (3DGS PLY, world frame)."""
@@ -244,3 +292,8 @@ class RunFolder:
         if not isinstance(values, dict):
             raise RunError(f"{self.path / name} is not a JSON object")
         return values
+
+
+def _remove_if_empty(folder: Path) -> None:
+    with suppress(OSError):
+        folder.rmdir()

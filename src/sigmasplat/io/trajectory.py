@@ -8,6 +8,7 @@ from sigmasplat.errors import SourceError
 from sigmasplat.io.atomic import write_text
 from sigmasplat.model import se3
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.types import Matrix
 
 COLUMNS = "t tx ty tz qx qy qz qw"
 
@@ -60,10 +61,10 @@ def _parse(line: str, where: str) -> list[float]:
     return values
 
 
-def write_kitti_poses(path: Path, trajectory: Trajectory) -> None:
-    """Write T_world_camera as KITTI text, 3×4 matrices with 12 significant digits.
+def write_kitti_poses(path: Path, T_world_camera: Matrix) -> None:
+    """Write poses [F, 4, 4] as KITTI text, 3×4 matrices with 12 significant digits; nan for a frame without a pose.
 
     Raises RunError if the file cannot be written.
     """
-    rows = (T[:3].ravel().tolist() for T in trajectory.T_world_camera)
+    rows = (T[:3].ravel().tolist() for T in T_world_camera)
     write_text(path, "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows))

@@ -156,7 +156,7 @@ def _root_mean_square(values: Matrix) -> float:
 def score_path(
     path: Trajectory, odometry: Trajectory | None, truth: Trajectory | None
 ) -> tuple[dict[str, Any], SourceError | None]:
-    """Return ATE and RPE over all frames, and the ATE of the path without loop closures (`odometry`) if given.
+    """Return ATE and RPE over all poses, and the ATE of the path without loop closures (`odometry`) if given.
 
     All scores are None without a truth. If the truth shares no timestamps with the path, the scores are None and the
     error is returned too.

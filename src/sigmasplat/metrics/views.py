@@ -65,12 +65,11 @@ def render_views(
         submap = maps.submap(index)
         for _, kind, record in group:
             frame, T_camera_world = frame_of(record["index"]), se3.inverse(record["T_world_camera"])
-            notes = ("lost",) if record.get("lost") else ()
-            final = scored_view(frame, renderer(maps.final, frame.camera, T_camera_world), kind, notes)
+            final = scored_view(frame, renderer(maps.final, frame.camera, T_camera_world), kind)
             before = None
             if submap is not None and maps.T_world_submap is not None:
                 rendered = renderer(submap, frame.camera, T_camera_world @ maps.T_world_submap[index])
-                before = scored_view(frame, rendered, kind, (*notes, f"in submap {index}"))
+                before = scored_view(frame, rendered, kind, (f"in submap {index}",))
             yield final, before
 
 

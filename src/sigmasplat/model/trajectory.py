@@ -33,3 +33,7 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.timestamps_s)
+
+    def at(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> "Trajectory":
+        """Return the poses at some rows, given by their numbers or as a mask [N]."""
+        return Trajectory(self.timestamps_s[rows], self.T_world_camera[rows])

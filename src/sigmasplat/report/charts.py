@@ -7,11 +7,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.drawing.plot import ACCENT, BLUE, FAINT, GREEN, PURPLE, Chart, Curve
+from sigmasplat.io.frames import RunFrames
+from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.types import Matrix
 
 SUBMAP_COLOURS = (BLUE, GREEN, PURPLE)
 """Neighbouring submaps get different colours; the accent colour is for loops."""
+STATE_COLOURS = {TRACKED: GREEN, APART: PURPLE, LOST: ACCENT, RELOCALISED: BLUE}
+"""In the order of drawing."""
+STRIP_Y, STRIP_WIDTH = -0.07, 9.0
+STRIP_SHORTEST = 0.003
+"""Half of the shortest visible range on the strip, as a share of its length; otherwise single frames are too thin."""
+P_LEVELS = (("below 10 %", 0.0, 0.1, GREEN), ("10 to 50 %", 0.1, 0.5, BLUE), ("above 50 %", 0.5, np.inf, ACCENT))
+"""Levels of p_off on the chart of the path: name, lowest value, end, colour."""
 MAX_LABELS = 24
+STATES_CAPTION = (
+    "The strip shows the state of each frame. The line and the colours along the path show the probability that a pose "
+    "is off by more than 5 cm. Lost frames and frames apart have no place on the path."
+)
 SUBMAPS_CAPTION = (
     "The final path. The colour changes from submap to submap, and each number marks the start of a submap. "
     "A line connects two frames that were compared as a loop."
@@ -30,19 +43,24 @@ Log = list[dict[str, Any]]
 
 
 def run_charts(
-    log: Log, estimate: Matrix, truth: Matrix | None, loops: Sequence[dict[str, Any]] = ()
+    frames: RunFrames, truth: Matrix | None, loops: Sequence[dict[str, Any]] = ()
 ) -> dict[str, tuple[list[Chart], str]]:
-    """Return the charts of a run with captions, by name: trajectory; submaps if there are several; seconds if known.
+    """Return the charts of a run with captions, by name: trajectory; states if known; submaps if there are several;
+    seconds if known.
 
-    log: records with `row`, their row in the whole log, to which the frames of loops refer; estimate, truth: [N, 3] of
-    these records, as in `trajectory_charts`.
+    truth: [B, 3] of the believed frames, as in `trajectory_charts`.
     """
-    lost = np.array([bool(record.get("lost")) for record in log])
+    estimate, log = frames.path.T_world_camera[:, :3, 3], frames.log
+    before_lost = np.array([row + 1 < len(frames) and frames.states[row + 1] == LOST for row in frames.rows], np.bool_)
     caption = "In the frame of the first camera." + ("" if truth is None else " The true path is rigidly aligned.")
-    found = {"trajectory": (trajectory_charts(estimate, truth, lost), caption)}
-    submaps = np.array([record.get("submap", 0) for record in log])
+    if before_lost.any():
+        caption += " A dot marks the last pose before tracking was lost."
+    found = {"trajectory": (trajectory_charts(estimate, truth, before_lost), caption)}
+    if len(set(frames.states)) > 1 or np.isfinite(frames.p_off).any():
+        found["states"] = state_charts(frames), STATES_CAPTION
+    submaps = np.array([log[row].get("submap", 0) for row in frames.rows])
     if submaps.max() > 0:
-        found["submaps"] = [submap_chart(estimate, submaps, _known_links(log, loops))], SUBMAPS_CAPTION
+        found["submaps"] = [submap_chart(estimate, submaps, _known_links(frames, loops))], SUBMAPS_CAPTION
     if any(frame_seconds(record) for record in log):
         stages = {name: np.array([(r.get("seconds") or {}).get(name, 0.0) for r in log]) for name in _stages(log)}
         stages["total"] = np.array([frame_seconds(record) for record in log])
@@ -62,9 +80,9 @@ def _stages(log: Log) -> list[str]:
     return [name for name in (log[0].get("seconds") or {}) if name != "total"][:3]
 
 
-def _known_links(log: Log, loops: Sequence[dict[str, Any]]) -> list[LoopLink]:
+def _known_links(frames: RunFrames, loops: Sequence[dict[str, Any]]) -> list[LoopLink]:
     """Return the loops of which both frames have a pose."""
-    place = {record["row"]: i for i, record in enumerate(log)}
+    place = {row: i for i, row in enumerate(frames.rows.tolist())}
     ends = [(place.get(loop["query_frame"]), place.get(loop["database_frame"]), loop["accepted"]) for loop in loops]
     return [LoopLink(a, b, bool(accepted)) for a, b, accepted in ends if a is not None and b is not None]
 
@@ -73,7 +91,7 @@ def trajectory_charts(estimate: Matrix, truth: Matrix | None, lost: NDArray[np.b
     """Return the charts of a path from above (x right, z forward) and of its height (−y) over frames.
 
     estimate: positions [N, 3], metres, in the frame of the first camera; truth: positions [N, 3] of the same frames,
-    aligned to the estimate, nan if unknown; lost: frames [N] to mark.
+    aligned to the estimate, nan if unknown; lost: frames [N] to mark as the place where tracking was lost.
     """
     top, height = [], []
     frames = np.arange(len(estimate))
@@ -90,6 +108,43 @@ def trajectory_charts(estimate: Matrix, truth: Matrix | None, lost: NDArray[np.b
         Chart("Path from above", "right, m", "forward, m", top, square=True),
         Chart("Height", "frame", "up, m", height),
     ]
+
+
+def state_charts(frames: RunFrames) -> list[Chart]:
+    """Return the charts of the states: as a coloured strip over the frames with p_off, and p_off along the path."""
+    numbers = np.array([record["index"] for record in frames.log], np.float64)
+    curves = [Curve("", np.stack([numbers, frames.p_off], 1), FAINT, width=1.5)]
+    for state in STATE_COLOURS:
+        curves += _strip(state, numbers, np.array(frames.states) == state)
+    over_frames = Chart("State of each frame", "frame", "", curves, y_limits=(-0.12, 1.04))
+    return [over_frames, _p_off_chart(frames)]
+
+
+def _strip(state: str, numbers: Matrix, at: NDArray[np.bool_]) -> list[Curve]:
+    """Return one thick line per uninterrupted range of frames in a state; only the first one is named."""
+    edges = np.diff(np.r_[False, at, False].astype(int))
+    half = 0.5 if state == TRACKED else max(0.5, STRIP_SHORTEST * np.ptp(numbers))
+    ranges = zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1, strict=True)
+    return [
+        Curve(
+            "" if i else state,
+            np.array([[numbers[a] - half, STRIP_Y], [numbers[b] + half, STRIP_Y]]),
+            STATE_COLOURS[state],
+            width=STRIP_WIDTH,
+        )
+        for i, (a, b) in enumerate(ranges)
+    ]
+
+
+def _p_off_chart(frames: RunFrames) -> Chart:
+    """Return the chart of the believed path from above, in one colour per level of p_off."""
+    top, p = frames.path.T_world_camera[:, [0, 2], 3], frames.p_off[frames.rows]
+    curves = [Curve("", top, FAINT, width=1.5)]
+    for name, low, high, colour in P_LEVELS:
+        at = (p >= low) & (p < high)
+        if at.any():
+            curves.append(Curve(name, top[at], colour, dots=True))
+    return Chart("Probability along the path", "right, m", "forward, m", curves, square=True)
 
 
 def seconds_chart(frames: NDArray[np.int_], stages: dict[str, Matrix]) -> Chart:

@@ -106,6 +106,7 @@ def build_report(contents: Contents) -> str:
         _tiles(contents.metrics),
         _rescan(contents),
         _plot(contents, "trajectory", "Trajectory"),
+        _states(contents),
         _strips(contents),
         _submaps(contents),
         _tables(contents.metrics),
@@ -201,6 +202,14 @@ def _panel(panel: PanelFigure) -> str:
     )
     title = html.escape(panel.title)
     return f"<div>{title}<img src='{html.escape(panel.address)}' alt='{title}'>{below}</div>"
+
+
+def _states(contents: Contents) -> str:
+    """Show the states of the frames: the chart and the table."""
+    if "states" not in contents.plots:
+        return ""
+    table = f"<div class=card>{_table(tables.state_rows(contents.metrics))}</div>"
+    return f"<h2>States of the frames</h2>{_figure(contents, 'states', 'States of the frames')}{table}"
 
 
 def _plot(contents: Contents, name: str, title: str) -> str:

@@ -5,8 +5,6 @@ import shlex
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from sigmasplat.config import Config
 from sigmasplat.config.text import differences
 from sigmasplat.drawing import plot
@@ -77,16 +75,12 @@ def _write_plan(run: RunFolder, plan: FloorPlan) -> None:
         run.write_image(f"plan-narrow-{theme.name}.png", draw_narrow_floor_plan(plan, theme))
 
 
-def report_plan(run: RunFolder, log: list[dict[str, Any]], camera: Camera) -> FloorPlan | None:
-    """Return the floor plan of a run, seen from the frames that were not lost; None if no surface is visible.
+def report_plan(run: RunFolder, path: Trajectory, camera: Camera) -> FloorPlan | None:
+    """Return the floor plan of a run, seen from its believed poses; None if no surface is visible.
 
-    log: records with their `T_world_camera`; camera: that of the source.
+    path: the believed poses; camera: that of the source.
     """
-    tracked, settings = [record for record in log if not record["lost"]], run.config().input
-    path = Trajectory(
-        np.array([record["timestamp_s"] for record in tracked]),
-        np.array([record["T_world_camera"] for record in tracked]).reshape(-1, 4, 4),
-    )
+    settings = run.config().input
     try:
         return run_floor_plan(run, path, camera.prepared(settings.width, settings.crop_px))
     except SigmaSplatError:

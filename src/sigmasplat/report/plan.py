@@ -13,7 +13,7 @@ def run_floor_plan(
 ) -> FloorPlan:
     """Make the floor plan of a run's map.
 
-    path: poses of the frames that were not lost; camera: that of the images the run worked on. It is
+    path: the believed poses; camera: that of the images the run worked on. It is
     rendered with the run's settings. Calls `progress(poses done, total)`. Raises RunError without a map; ConfigError
     unless 1 mm ≤ cell_m ≤ 1 m; SigmaSplatError if no surface is visible.
     """

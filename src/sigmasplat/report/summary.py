@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from sigmasplat.report.tables import number
+from sigmasplat.report.tables import format_ranges, number
 
 if TYPE_CHECKING:
     from sigmasplat.floorplan.floor_plan import FloorPlan
@@ -48,10 +48,11 @@ def _overview(metrics: Metrics, machine: str) -> str:
 def _path(metrics: Metrics) -> str:
     lost, ate = metrics.get("lost") or 0, metrics.get("ate") or {}
     tracked = (
-        f"Tracking was lost on {lost} of {metrics.get('frames')} images; do not trust their poses."
+        f"Tracking was lost on {lost} of {metrics.get('frames')} images, which have no pose."
         if lost
         else "Tracking was never lost."
     )
+    tracked += _apart_sentence(metrics)
     if ate.get("rmse_m") is None:
         return f"{tracked} The error of the path is unknown, because the recording has no ground truth."
     before = (metrics.get("ate_odometry") or {}).get("rmse_m")
@@ -59,6 +60,14 @@ def _path(metrics: Metrics) -> str:
     loops = f" Without loop closure the RMS error is {number(before, 1, 100.0)} cm." if differs else ""
     error, largest = number(ate["rmse_m"], 1, 100.0), number(ate.get("max_m"), 1, 100.0)
     return f"{tracked} The RMS error of the path is {error} cm; the largest error is {largest} cm.{loops}"
+
+
+def _apart_sentence(metrics: Metrics) -> str:
+    apart, components = metrics.get("apart") or 0, len(metrics.get("components") or [])
+    if not apart:
+        return ""
+    maps = "a map of their own" if components == 1 else f"{components} maps of their own"
+    return f" {apart} images are in {maps}, which could not be connected to the first one (components/)."
 
 
 def _images(metrics: Metrics) -> list[str]:
@@ -94,11 +103,13 @@ def _uncertainty(metrics: Metrics) -> list[str]:
 
 
 def rescan_sentences(metrics: Metrics, plan: "FloorPlan | None") -> list[str]:
-    """Return sentences about where not to trust the map: frames where tracking was lost, and regions of the plan."""
+    """Return sentences about what the map lacks: lost frames, frames apart, and regions of the plan."""
     sentences = []
     lost = metrics.get("lost_frames") or []
     if lost:
-        sentences.append(f"Tracking was lost at images {format_ranges(lost)}: do not trust the map there.")
+        sentences.append(f"Tracking was lost at images {format_ranges(lost)}: they are not in the map.")
+    if apart := metrics.get("apart_frames"):
+        sentences.append(f"Images {format_ranges(apart)} are not connected to the map, so they are not in the plan.")
     if plan is None:
         return sentences
     reasons = {"unseen": "not observed", "thin": "mapped too thinly", "unsure": "mapped with high uncertainty"}
@@ -109,24 +120,14 @@ def rescan_sentences(metrics: Metrics, plan: "FloorPlan | None") -> list[str]:
     return sentences
 
 
-def format_ranges(indices: list[int], most: int = 4) -> str:
-    """Write increasing indices as at most `most` ranges: 3–5, 9."""
-    runs: list[list[int]] = []
-    for i in indices:
-        if runs and i == runs[-1][-1] + 1:
-            runs[-1].append(i)
-        else:
-            runs.append([i])
-    words = [str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs[:most]]
-    return ", ".join(words) + (", …" if len(runs) > most else "")
-
-
 def advice(metrics: Metrics, run: str, again: str, settings: dict[str, Any]) -> list[Advice]:
     """Return what to try next.
 
     run: the run folder; again: the command that makes the run again; settings: the values of its config.json.
     """
-    found = [rule(metrics, again, settings) for rule in (_lost, _few_keyframes, _blurred, _holes, _slow, _no_loop)]
+    found = [
+        rule(metrics, again, settings) for rule in (_lost, _apart, _few_keyframes, _blurred, _holes, _slow, _no_loop)
+    ]
     view = ("View the map in 3D, and hide uncertain splats:", f"sigmasplat view {run}")
     mesh = ("Export a mesh for other programs:", f"sigmasplat mesh {run} --out room.glb")
     return [*filter(None, found), view, mesh]
@@ -144,6 +145,17 @@ def _lost(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | No
         "Tracking was lost: the camera moved too fast, or saw only a bare wall. Map more often; if this does not help, "
         "record that part again and move more slowly.",
         f"{again} --set mapping.every={every}",
+    )
+
+
+def _apart(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
+    if not metrics.get("apart"):
+        return None
+    where = format_ranges(metrics.get("apart_frames") or [])
+    return (
+        f"Images {where} are in separate maps, in components/. To connect them, record again, and after each "
+        "interruption return to a place that was recorded before.",
+        "",
     )
 
 

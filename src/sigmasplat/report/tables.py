@@ -3,12 +3,26 @@
 import math
 from typing import Any
 
+from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
+
 
 def number(value: float | None, digits: int, scale: float = 1.0) -> str:
     """Format a figure with fixed digits and thin spaces between thousands; a dash if it is None, nan or inf."""
     if value is None or not math.isfinite(value):
         return "–"
     return f"{value * scale:,.{digits}f}".replace(",", "\u202f").replace("-", "−")
+
+
+def format_ranges(indices: list[int], most: int = 4) -> str:
+    """Write increasing indices as at most `most` ranges: 3–5, 9."""
+    runs: list[list[int]] = []
+    for i in indices:
+        if runs and i == runs[-1][-1] + 1:
+            runs[-1].append(i)
+        else:
+            runs.append([i])
+    words = [str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs[:most]]
+    return ", ".join(words) + (", …" if len(runs) > most else "")
 
 
 def headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
@@ -35,6 +49,7 @@ def headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
         ("Splats", number(metrics.get("splats"), 0), ""),
         ("Map file", number(metrics.get("map_bytes"), 1, 1e-6), "MB"),
         ("Lost frames", number(metrics.get("lost"), 0), f"of {metrics.get('frames', 0)}"),
+        *_state_figures(metrics),
         *_submap_figures(metrics),
     ]
 
@@ -45,6 +60,17 @@ def _total_times(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     return [(name, number(seconds, 1), "s") for name, seconds in known.items() if seconds is not None]
 
 
+def _state_figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Return the numbers of frames that were relocalised, are apart, or are silently wrong, if there are any."""
+    silent = (metrics.get("failures") or {}).get("silent")
+    known = {
+        "Relocalised frames": metrics.get("relocalised"),
+        "Frames apart": metrics.get("apart"),
+        "Silent failures": silent,
+    }
+    return [(name, number(count, 0), f"of {metrics.get('frames', 0)}") for name, count in known.items() if count]
+
+
 def _submap_figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     """Return the numbers of submaps and loops; nothing for a single submap."""
     if (metrics.get("submaps") or 1) < 2:
@@ -52,6 +78,17 @@ def _submap_figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     loops = metrics.get("loops") or {}
     closed = ("Loops closed", number(loops.get("accepted"), 0), f"of {loops.get('tried', 0)} tried")
     return [("Submaps", number(metrics["submaps"], 0), ""), closed]
+
+
+def state_rows(metrics: dict[str, Any]) -> list[list[str]]:
+    """Return one row per state that occurs: number of frames, share, and which frames."""
+    frames = metrics.get("frames") or 0
+    listed = {state: metrics.get(f"{state}_frames") or [] for state in (RELOCALISED, LOST, APART)}
+    counts = [(TRACKED, frames - sum(map(len, listed.values())), "")]
+    counts += [(state, len(found), format_ranges(found)) for state, found in listed.items() if found]
+    return [["state", "frames", "%", "which"]] + [
+        [state, number(count, 0), number(count / max(frames, 1), 1, 100.0), where] for state, count, where in counts
+    ]
 
 
 def score_tables(metrics: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
@@ -129,10 +166,24 @@ def _path_rows(metrics: dict[str, Any]) -> list[list[str]]:
     if without:
         rows.append(["ATE rmse without loop closure, cm", number(without["rmse_m"], 3, 100.0)])
     return [
-        ["all frames, rigid alignment", f"{ate['pairs']} poses"],
+        ["believed frames, rigid alignment", f"{ate['pairs']} poses"],
         *rows,
         ["RPE translation, cm per frame", number(rpe["translation_rmse_m"], 3, 100.0)],
         ["RPE rotation, ° per frame", number(rpe["rotation_rmse_deg"], 3)],
+        *_failure_rows(metrics),
+    ]
+
+
+def _failure_rows(metrics: dict[str, Any]) -> list[list[str]]:
+    """Return how honest the run is about its path: silent failures, and scores of the predicted probability."""
+    found = metrics.get("failures")
+    if not found:
+        return []
+    return [
+        ["silent failures: believed, but off by > 10 cm", number(found["silent"], 0)],
+        ["frames off by > 5 cm, with lost ones", f"{number(found['off'], 0)} of {number(found['frames'], 0)}"],
+        ["AUROC of the probability of > 5 cm", number(found["auroc"], 3)],
+        ["Brier score of it", number(found["brier"], 4)],
     ]
 
 

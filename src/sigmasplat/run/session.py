@@ -16,7 +16,8 @@ from types import FrameType
 from typing import Any
 
 from sigmasplat.config import Config
-from sigmasplat.io.runs import RunFolder
+from sigmasplat.io.runs import ALL_POSES, RunFolder
+from sigmasplat.model.component import RELOCALISED
 from sigmasplat.run.profile import profile
 from sigmasplat.run.protocols import (
     Callback,
@@ -74,7 +75,10 @@ def removed_on_early_failure(run: RunFolder) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a session ended: "complete" or "interrupted", and its counts. wall_s covers the frames, not the final map."""
+    """How a session ended: "complete" or "interrupted", and its counts. wall_s covers the frames, not the final map.
+
+    apart: the number of frames of each component that is not connected to the world.
+    """
 
     status: str
     frames: int
@@ -83,10 +87,17 @@ class Outcome:
     submaps: int = 1
     loops_closed: int = 0
     loops_refused: int = 0
+    relocalised: int = 0
+    apart: tuple[int, ...] = ()
 
     def summary(self) -> str:
         """Return the counts as text."""
-        line = f"{self.frames} frames, {self.lost} lost, {self.frames / self.wall_s:.1f} frames/s"
+        line = f"{self.frames} frames, {self.lost} lost"
+        if self.relocalised:
+            line += f", {self.relocalised} relocalised"
+        if self.apart:
+            line += f", {len(self.apart)} component{'s' * (len(self.apart) != 1)} apart ({sum(self.apart)} frames)"
+        line += f", {self.frames / self.wall_s:.1f} frames/s"
         if self.submaps > 1:
             line += f", {self.submaps} submaps, loops: {self.loops_closed} closed, {self.loops_refused} refused"
         return line
@@ -94,7 +105,10 @@ class Outcome:
 
 @dataclass(eq=False)
 class Session:
-    """A run of SLAM on a source, from its frame `first_index` on; a resumed run has already taken `wall_s` seconds."""
+    """A run of SLAM on a source, from its frame `first_index` on; a resumed run has already taken `wall_s` seconds.
+
+    all_poses: also write trajectory_all.txt, which has the poses of all frames.
+    """
 
     slam: SlamSystem
     source: Source
@@ -103,8 +117,11 @@ class Session:
     checkpointer: Checkpointer = field(default_factory=NullCheckpointer)
     first_index: int = 0
     wall_s: float = 0.0
+    all_poses: bool = False
     frames: int = field(default=0, init=False)
     lost: int = field(default=0, init=False)
+    relocalised: int = field(default=0, init=False)
+    apart: tuple[int, ...] = field(default=(), init=False)
     submaps: int = field(default=1, init=False)
 
     def execute(self) -> Outcome:
@@ -142,6 +159,7 @@ class Session:
         """Restore the counts of a resumed run from its log."""
         log = self.run.read_log()
         self.frames, self.lost = len(log), sum(line["lost"] for line in log)
+        self.relocalised = sum(line.get("state") == RELOCALISED for line in log)
         self.submaps = 1 + (log[-1]["submap"] if log else 0)
 
     def _process_frames(self, interrupt: threading.Event) -> bool:
@@ -171,6 +189,7 @@ class Session:
             self._write_loops()
         self.frames += 1
         self.lost += step.lost
+        self.relocalised += step.state == RELOCALISED
         self.submaps = step.submap + 1
 
     def _finish(self, interrupt: threading.Event) -> None:
@@ -187,13 +206,18 @@ class Session:
         self.callback.last_loops(self.slam.loops[before:])
 
     def _write_results(self) -> None:
-        """Write the results of the frames so far. The map is the last file because it takes longest."""
+        """Write the results of the frames so far. The maps are the last files because they take longest."""
         if self.frames == 0:
             return
-        self.run.write_trajectory(self.slam.trajectory())
+        path, components = self.slam.trajectory(), self.slam.components()
+        self.apart = tuple(len(component.trajectory) for component in components)
+        self.run.write_trajectory(path.at(self.slam.believed()))
+        if self.all_poses or (self.run.path / ALL_POSES).exists():
+            self.run.write_all_poses(path)
         self._write_loops()
         self.run.write_checkpoint(self.slam.checkpoint(), {"frames": str(self.frames)})
         self.run.write_profile(profile(self.run.read_log(), self.wall_s))
+        self.run.write_components(components)
         self.run.write_map(self.slam.field)
 
     def _write_loops(self) -> None:
@@ -202,7 +226,8 @@ class Session:
     def _outcome(self, status: str) -> Outcome:
         closed = sum(loop.accepted for loop in self.slam.loops)
         refused = len(self.slam.loops) - closed
-        return Outcome(status, self.frames, self.lost, self.wall_s, self.submaps, closed, refused)
+        counts = self.submaps, closed, refused, self.relocalised, self.apart
+        return Outcome(status, self.frames, self.lost, self.wall_s, *counts)
 
 
 def log_line(step: StepResult) -> dict[str, Any]:
@@ -212,6 +237,9 @@ def log_line(step: StepResult) -> dict[str, Any]:
         "timestamp_s": step.timestamp_s,
         "is_keyframe": step.is_keyframe,
         "lost": step.lost,
+        "state": step.state,
+        "component": step.component,
+        "p_off": step.p_off,
         "splats": step.splats,
         "submap": step.submap,
         "tracking": dict(step.tracking),

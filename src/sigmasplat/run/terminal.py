@@ -18,8 +18,8 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from sigmasplat.report.summary import format_ranges
-from sigmasplat.report.tables import headline, number
+from sigmasplat.model.component import APART, RELOCALISED
+from sigmasplat.report.tables import format_ranges, headline, number
 from sigmasplat.run.profile import shares
 from sigmasplat.run.protocols import LoopResult, StepResult
 from sigmasplat.types import Progress
@@ -50,8 +50,8 @@ class Screen:
     def steps(self, total: int | None, done: int = 0) -> Iterator["_StepShow"]:
         """Show a session of `total` frames, None if unknown.
 
-        One bar shows frames/s, splats and lost frames, another one the final map. Lost tracking and closed loops are
-        printed as lines.
+        One bar shows frames/s, splats and lost frames, another one the final map. Lost tracking, relocalisation,
+        components and closed loops are printed as lines.
         """
         with self._counters() as begin:
             yield _StepShow(self.say, begin, total, done)
@@ -88,17 +88,19 @@ class Screen:
             yield partial(_bar, bars)
 
     def results(self, metrics: dict[str, Any]) -> None:
-        """Print the main figures as a table, and the frames on which tracking was lost."""
+        """Print the main figures as a table, and the frames that have no pose in the world."""
         table = Table("", "value", "")
         table.columns[1].justify = "right"
         for name, value, unit in _figures(metrics):
             table.add_row(name, value, unit)
         self.out.print(table)
-        lost = metrics.get("lost_frames") or []
+        lost, apart = metrics.get("lost_frames") or [], metrics.get("apart_frames") or []
+        frames = metrics.get("frames")
         if lost:
-            frames = metrics.get("frames")
-            where = format_ranges(lost)
-            self.say(f"tracking was LOST on {len(lost)} of {frames} frames: {where}; their poses are unreliable")
+            self.say(f"tracking was LOST on {len(lost)} of {frames} frames: {format_ranges(lost)}; they have no pose")
+        if apart:
+            where = format_ranges(apart)
+            self.say(f"{len(apart)} of {frames} frames are APART: {where}; their maps are in components/")
 
     def profile(self, seconds: Mapping[str, float]) -> None:
         """Print the time of each stage."""
@@ -140,14 +142,17 @@ class _StepShow:
         self.started_s = time.perf_counter()
         self.done, self.lost, self.earlier = done, 0, done
         self.lost_since: int | None = None
+        self.component = 0
 
     def __call__(self, step: StepResult) -> None:
         self.done += 1
         self.lost += step.lost
         self._print_lost(step)
+        self._print_component(step)
         self._print_loops(f"frame {step.index}", step.loops)
         speed = (self.done - self.earlier) / max(time.perf_counter() - self.started_s, 1e-9)
-        self.show(self.done, None, f"{speed:.1f} frames/s  {step.splats:,} splats  {self.lost} lost")
+        warning = "" if self.lost_since is None else f"LOST since frame {self.lost_since}  "
+        self.show(self.done, None, f"{warning}{speed:.1f} frames/s  {step.splats:,} splats  {self.lost} lost")
 
     def finishing(self, done: int, total: int) -> None:
         """Show the progress of the final map."""
@@ -170,8 +175,19 @@ class _StepShow:
             self.lost_since = step.index
             self.say(f"{where}: tracking lost")
         elif not step.lost and self.lost_since is not None:
-            self.say(f"{where}: tracking recovered; it was lost since frame {self.lost_since}")
+            how = "relocalised" if step.state == RELOCALISED else "tracking recovered"
+            self.say(f"{where}: {how}; it was lost since frame {self.lost_since}")
             self.lost_since = None
+
+    def _print_component(self, step: StepResult) -> None:
+        component = step.component if step.state == APART else 0
+        if step.lost or component == self.component:
+            return
+        if component:
+            self.say(f"frame {step.index}: component {component} begins, a map that is not connected to the first one")
+        else:
+            self.say(f"frame {step.index}: connected to the first map again")
+        self.component = component
 
 
 class _PlainShow:

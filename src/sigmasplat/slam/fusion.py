@@ -3,7 +3,7 @@
 Only renders of the map are fused, never recorded images.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,21 +44,25 @@ class FusionView:
     T_world_camera: Matrix
 
 
-def fusion_views(store: SubmapStore, anchors: Sequence[Matrix]) -> Iterator[FusionView]:
+def fusion_views(store: SubmapStore, anchors: Sequence[Matrix], outside: Collection[int] = ()) -> Iterator[FusionView]:
     """Yield a view of each submap at each of its keyframes; one submap is in memory at a time.
 
-    anchors: T_world_submap of each submap.
+    anchors: T_world_submap of each submap; outside: the submaps that are not connected to the world, which are skipped.
     """
-    for index in range(len(store)):
+    for index in _inside(store, outside):
         submap = store.load(index)
         for T_submap_camera in submap.T_submap_camera:
             T_world_camera = anchors[index] @ T_submap_camera
             yield FusionView(submap.field, submap.camera, se3.inverse(T_submap_camera), T_world_camera)
 
 
-def count_keyframes(store: SubmapStore) -> int:
-    """Return the number of keyframes in all submaps."""
-    return sum(len(store.load(index).frames) for index in range(len(store)))
+def count_keyframes(store: SubmapStore, outside: Collection[int] = ()) -> int:
+    """Return the number of keyframes in all submaps except those in `outside`."""
+    return sum(len(store.load(index).frames) for index in _inside(store, outside))
+
+
+def _inside(store: SubmapStore, outside: Collection[int]) -> list[int]:
+    return [index for index in range(len(store)) if index not in outside]
 
 
 def fuse(

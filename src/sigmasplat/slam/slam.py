@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import Config
@@ -15,6 +16,7 @@ from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.component import LOST, TRACKED, Component
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import MemoryStore, SubmapStore
@@ -136,6 +138,14 @@ class Slam:
         """
         return Trajectory(np.array([s.timestamp_s for s in self.steps]), self.atlas.T_world_camera())
 
+    def believed(self) -> NDArray[np.bool_]:
+        """Return whether the pose of each frame so far is believed [F]: not lost, and connected to the world."""
+        return np.array([not step.lost for step in self.steps], np.bool_)
+
+    def components(self) -> list[Component]:
+        """Return the components of the atlas that are not connected to the world."""
+        return []
+
     def checkpoint(self) -> dict[str, Tensor]:
         """Return what is needed to read a run back, in host memory: the active submap's field with its optimiser state,
         poses, times, keyframes, anchors, and the submap of each frame."""
@@ -252,6 +262,7 @@ class Slam:
         return Step(
             frame.index, frame.timestamp_s, self.atlas.anchors[-1] @ T_submap_camera, mapped, self.tracker.lost,
             tracking, len(self.mapper.field), len(self.atlas.anchors) - 1, tuple(loops), self._timer.stop(self.view),
+            LOST if self.tracker.lost else TRACKED,
         )  # fmt: skip
 
     @property

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.fit.pose import PoseFit
+from sigmasplat.model.component import TRACKED
 from sigmasplat.model.stopwatch import Stopwatch
 from sigmasplat.render.view import View
 from sigmasplat.slam.loop_closure.closer import Loop
@@ -21,7 +22,11 @@ KERNELS = ("project", "sort", "blend", "blend_backward", "project_backward")
 class Step:
     """The result of one frame: pose T_world_camera [4, 4], whether it was mapped, whether tracking was lost, results of
     tracking, the number of splats, the submap, the loops that were tried when the submap before ended, and seconds by
-    stage."""
+    stage.
+
+    state: tracked, relocalised, lost or apart; component: that of the atlas, 0 is the world; p_off: the probability
+    that the pose is off by more than 5 cm.
+    """
 
     index: int
     timestamp_s: float
@@ -33,6 +38,9 @@ class Step:
     submap: int = 0
     loops: tuple[Loop, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
+    state: str = TRACKED
+    component: int = 0
+    p_off: float = 0.0
 
 
 def metrics_of(fit: PoseFit) -> dict[str, float]:

@@ -146,8 +146,9 @@ class ViewerApp:
         if self._is_new("path", (IdentityKey(path), row, controls.path)):
             self.scene.show_lines("path", lines.path_segments(path, row) if controls.path else None)
             self.scene.show_lost(lines.lost_points(path, row if controls.path else -1))
-            current = path.T_world_camera[min(row, len(path) - 1)] if len(path) else None
-            self.scene.show_current_camera(snapshot.camera, current)
+            at = min(row, len(path) - 1)
+            current = path.T_world_camera[at] if len(path) and path.inside[at] else None
+            self.scene.show_current_camera(snapshot.camera, current, bool(len(path) and path.lost[at]))
         truth = snapshot.true_positions
         if self._is_new("true path", (IdentityKey(truth), controls.true_path)):
             shown = truth is not None and controls.true_path
@@ -207,9 +208,11 @@ class ViewerApp:
         path = snapshot.path
         splats, kept = sum(len(p.field) for p in pieces), sum(int(visible.mask(p.field).sum()) for p in pieces)
         submaps = int(path.submaps[-1]) + 1 if len(path) else 0
+        outside = int((~path.inside & ~path.lost).sum())
+        apart = f", {outside} apart (not shown)" if outside else ""
         facts = (
             f"**{snapshot.title}** ({snapshot.status})  \n{len(path)} frames, {len(path.keyframes)} keyframes, "
-            f"{int(path.lost.sum())} lost, {submaps} submap{'s' * (submaps != 1)}  \n"
+            f"{int(path.lost.sum())} lost{apart}, {submaps} submap{'s' * (submaps != 1)}  \n"
             f"{kept:,} of {splats:,} splats shown"
         )
         hidden = "" if visible.max_sigma == float("inf") else f"hidden: σ above {visible.max_sigma:.3g}"
@@ -256,5 +259,6 @@ def _frame_text(snapshot: Snapshot, row: int) -> str:
     if not len(path):
         return "no frame yet"
     row = min(row, len(path) - 1)
+    apart = "" if path.inside[row] else ", not connected to the world"
     kind = "lost" if path.lost[row] else "keyframe" if row in set(path.keyframes) else "tracked"
-    return f"frame {row}: {kind}, submap {path.submaps[row]}"
+    return f"frame {row}: {kind}, submap {path.submaps[row]}{apart}"

@@ -1,18 +1,21 @@
 """Read snapshots from a run folder, either finished or still written by another process."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from sigmasplat.drawing.colormap import Rgb
 from sigmasplat.errors import RunError, SigmaSplatError
+from sigmasplat.io.frames import RunFrames
 from sigmasplat.io.runs import TRUTH, RunFolder
 from sigmasplat.io.trajectory import read_trajectory
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.component import outside_world, submaps_outside
 from sigmasplat.model.field import GaussianField
 from sigmasplat.sources.base import Source
 from sigmasplat.types import Matrix
@@ -37,24 +40,24 @@ def finished_snapshot(run: RunFolder, source: Source | None = None, budget: int 
 
     Raises RunError if the run stopped before it had a map.
     """
-    path, final, tensors = run.read_trajectory(), run.read_map(), run.read_checkpoint()[0]
-    log, config, true_file = run.read_log(), run.config(), run.path / TRUTH
-    frames = min(len(path), len(log))
-    keyframes = tuple(row for row in tensors["keyframes"].tolist() if row < frames)
+    frames, final, tensors = run.read_frames(), run.read_map(), run.read_checkpoint()[0]
+    config, true_file = run.config(), run.path / TRUTH
+    outside = frames.submaps_outside()
     cache = SubmapCache(run, budget)
     cache.load_all(np.asarray(tensors["T_world_submap"], np.float64))
     pieces = list(cache.pieces.values())
     if pieces and len(pieces) < len(tensors["T_world_submap"]):
         active = GaussianField(tensors["params"])
         pieces.append(Piece(len(pieces), thin(active, budget), np.asarray(tensors["T_world_submap"][-1])))
+    pieces = [piece for piece in pieces if piece.submap not in outside]
     return Snapshot(
         run.path.resolve().name,
-        CameraPath(path.T_world_camera[:frames], *_lost_and_submaps(log[:frames]), keyframes),
+        _final_path(frames, tensors),
         Piece(None, without_moments(final)),
         within_budget(pieces, budget),
         read_trajectory(true_file).T_world_camera[:, :3, 3] if true_file.is_file() else None,
         _camera(run, cache, source),
-        partial(_image, cache, log, run, source),
+        partial(_image, cache, frames.log, run, source),
         config.render,
         config.backend,
         status=str(run.facts().get("status")),
@@ -64,15 +67,20 @@ def finished_snapshot(run: RunFolder, source: Source | None = None, budget: int 
 def running_snapshot(run: RunFolder, cache: "SubmapCache") -> Snapshot:
     """Read the snapshot of an unfinished run: the path of its log, and its finished submaps.
 
-    A submap has the logged pose of its first keyframe. `cache` holds the submaps that were read before.
+    A submap has the logged pose of its first keyframe; submaps that are not connected to the world are left out.
+    `cache` holds the submaps that were read before.
     """
     log = run.read_log() if (run.path / "log.jsonl").is_file() else []
     config, poses = run.config(), [np.array(record["T_world_camera"], np.float64) for record in log]
     cache.load_new(poses)
     keyframes = tuple(row for row, record in enumerate(log) if record["is_keyframe"])
-    path = CameraPath(np.array(poses).reshape(-1, 4, 4), *_lost_and_submaps(log), keyframes)
+    lost, submaps = _lost_and_submaps(log)
+    states = np.array([record.get("state", "") for record in log], str)
+    outside = submaps_outside(states, submaps)
+    path = CameraPath(np.array(poses).reshape(-1, 4, 4), lost, submaps, keyframes, outside_world(states))
+    pieces = tuple(piece for piece in cache.pieces.values() if piece.submap not in outside)
     return Snapshot(
-        run.path.resolve().name, path, None, tuple(cache.pieces.values()), None, cache.camera or DEFAULT_CAMERA,
+        run.path.resolve().name, path, None, pieces, None, cache.camera or DEFAULT_CAMERA,
         cache.image, config.render, config.backend, live=True, status="running",
     )  # fmt: skip
 
@@ -126,6 +134,16 @@ class SubmapCache:
         self.pieces = dict(zip(self.pieces, fitting, strict=True))
         for k, row in enumerate(submap.frames):
             self._keyframes.setdefault(row, (index, k))
+
+
+def _final_path(frames: RunFrames, tensors: Mapping[str, Tensor]) -> CameraPath:
+    """Return the path of a finished run: believed poses from trajectory.txt, the others from the checkpoint."""
+    poses = np.tile(np.eye(4), (len(frames), 1, 1))
+    kept = np.asarray(tensors["T_world_camera"], np.float64)[: len(frames)]
+    poses[: len(kept)] = kept
+    poses[frames.rows] = frames.path.T_world_camera
+    keyframes = tuple(row for row in tensors["keyframes"].tolist() if row < len(frames))
+    return CameraPath(poses, *_lost_and_submaps(frames.log), keyframes, frames.outside())
 
 
 def _lost_and_submaps(log: Log) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:

@@ -30,13 +30,15 @@ class Segments(NamedTuple):
 def path_segments(path: CameraPath, row: int, most: int = MAX_SEGMENTS) -> Segments:
     """Return the path up to frame `row`, in alternating colours per submap, red at lost frames.
 
-    A long path is reduced to about `most` evenly spaced segments.
+    A long path is reduced to about `most` evenly spaced segments. Frames outside the world are left out.
     """
     count = min(row + 1, len(path))
     rows = evenly_spaced(count, most + 1)
     colors = np.array(SUBMAP_COLOURS, np.uint8)[path.submaps[rows] % len(SUBMAP_COLOURS)]
     colors[path.lost[rows]] = LOST_COLOUR
-    return _segments(path.T_world_camera[rows, :3, 3], colors)
+    segments, inside = _segments(path.T_world_camera[rows, :3, 3], colors), path.inside[rows]
+    drawn = inside[:-1] & inside[1:]
+    return Segments(segments.points[drawn], segments.colors[drawn])
 
 
 def truth_segments(positions: Matrix, most: int = MAX_SEGMENTS) -> Segments:
@@ -47,7 +49,7 @@ def truth_segments(positions: Matrix, most: int = MAX_SEGMENTS) -> Segments:
 
 def lost_points(path: CameraPath, row: int, most: int = MAX_SEGMENTS) -> Floats:
     """Return the estimated positions [L, 3] m of the lost frames up to `row`, at most `most`."""
-    rows = np.flatnonzero(path.lost[: row + 1])
+    rows = np.flatnonzero((path.lost & path.inside)[: row + 1])
     return np.asarray(path.T_world_camera[rows[evenly_spaced(len(rows), most)], :3, 3], np.float32)
 
 
@@ -56,7 +58,8 @@ def keyframes_to_show(path: CameraPath, row: int, most: int = MAX_KEYFRAMES) -> 
 
     With a power of two most of the keyframes shown stay the same while new ones are added.
     """
-    rows = [keyframe for keyframe in path.keyframes if keyframe <= row]
+    inside = path.inside
+    rows = [keyframe for keyframe in path.keyframes if keyframe <= row and inside[keyframe]]
     stride = 1
     while len(rows) / stride > most - 1:
         stride *= 2

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from sigmasplat.drawing.colormap import Rgb
+from sigmasplat.model.component import LOST, outside_world, states_at_end, submaps_outside
 from sigmasplat.run.protocols import LoopResult, StepResult
 from sigmasplat.slam.slam import Slam
 from sigmasplat.viewer.finished import ShowSnapshot
@@ -55,13 +56,17 @@ class LiveView:
         slam = self.slam
         lost = np.array([step.lost for step in slam.steps], np.bool_)
         submaps = np.array([step.submap for step in slam.steps], np.int64)
-        path = CameraPath(slam.atlas.T_world_camera(), lost, submaps, tuple(slam.keyframe_indices))
+        states = states_at_end([LOST if step.lost else step.state for step in slam.steps], slam.believed())
+        outside = submaps_outside(states, submaps)
+        poses, keyframes = slam.atlas.T_world_camera(), tuple(slam.keyframe_indices)
+        path = CameraPath(poses, lost, submaps, keyframes, outside_world(states))
         self._add_finished()
         final = Piece(None, thin(slam.field, self.budget)) if finished else None
-        keyframes = slam.mapper.keyframes
+        pieces = tuple(piece for piece in (*self._finished, *self._active()) if piece.submap not in outside)
+        mapped = slam.mapper.keyframes
         return Snapshot(
-            self.title, path, final, (*self._finished, *self._active()), None,
-            keyframes[0].target.camera if keyframes else DEFAULT_CAMERA, self.image, slam.config.render,
+            self.title, path, final, pieces, None,
+            mapped[0].target.camera if mapped else DEFAULT_CAMERA, self.image, slam.config.render,
             slam.config.backend, live=True, status="running",
         )  # fmt: skip
 

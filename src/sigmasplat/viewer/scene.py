@@ -77,14 +77,17 @@ class ViserScene:
             "/lost", points, LOST_COLOUR, point_size=DOT_M, point_shape="circle"
         )
 
-    def show_current_camera(self, camera: Camera, T_world_camera: Matrix | None) -> None:
-        """Show the camera of the frame selected on the timeline."""
+    def show_current_camera(self, camera: Camera, T_world_camera: Matrix | None, lost: bool = False) -> None:
+        """Show the camera of the frame selected on the timeline; a lost one has another colour."""
+        shown, hidden = ("lost camera", "current") if lost else ("current", "lost camera")
+        self._drop(hidden)
         if T_world_camera is None:
-            self._drop("current")
+            self._drop(shown)
             return
-        if "current" not in self._marks:
-            self._marks["current"] = self._frustum("/current", camera, 1.5 * FRUSTUM_M, CURRENT_COLOUR, None)
-        _place(self._marks["current"], T_world_camera)
+        if shown not in self._marks:
+            colour = LOST_COLOUR if lost else CURRENT_COLOUR
+            self._marks[shown] = self._frustum(f"/{shown.replace(' ', '-')}", camera, 1.5 * FRUSTUM_M, colour, None)
+        _place(self._marks[shown], T_world_camera)
 
     def show_keyframes(
         self, camera: Camera, T_world_camera: Mapping[int, Matrix], image: Callable[[int], Rgb | None] | None

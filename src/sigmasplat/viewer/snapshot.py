@@ -41,12 +41,22 @@ class Piece:
 @dataclass(frozen=True, eq=False)
 class CameraPath:
     """The frames so far: poses T_world_camera [F, 4, 4], whether each is lost bool [F], its submap [F], and the rows of
-    the keyframes in ascending order."""
+    the keyframes in ascending order.
+
+    outside: whether each frame is not connected to the world (`outside_world`) [F]; such frames are not drawn, because
+    their poses are in the frame of another component. None: all are connected.
+    """
 
     T_world_camera: Matrix
     lost: NDArray[np.bool_]
     submaps: NDArray[np.int64]
     keyframes: tuple[int, ...]
+    outside: NDArray[np.bool_] | None = None
+
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """Return whether each frame is connected to the world [F]."""
+        return np.ones(len(self), np.bool_) if self.outside is None else ~self.outside
 
     def __len__(self) -> int:
         return len(self.T_world_camera)
