@@ -13,7 +13,7 @@ RUN PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt \
     pip wheel --no-cache-dir --no-deps --wheel-dir wheels .
 
 FROM python:${PYTHON}-slim
-# EXTRAS=viewer,video adds extras. TORCH_INDEX is the index for torch; the default has no CUDA libraries.
+# EXTRAS=viewer,ros adds extras. TORCH_INDEX is the index for torch; the default has no CUDA libraries.
 ARG EXTRAS=""
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 COPY constraints.txt /tmp/sigmasplat/

@@ -62,6 +62,11 @@ def _choice(environment: Mapping[str, str], name: str, allowed: tuple[str, ...])
     return text
 
 
+def install_package(requirement: str) -> str:
+    """Return the command that installs a package into the running Python."""
+    return f"{sys.executable} -m pip install {requirement}"
+
+
 def install_extra(extra: str) -> str:
     """Return the command that installs an optional dependency into the running Python."""
-    return f"{sys.executable} -m pip install 'sigmasplat[{extra}]'"
+    return install_package(f"'sigmasplat[{extra}]'")

@@ -10,7 +10,6 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.sources import open_source
 from sigmasplat.sources.files.video import Video
 
-pytest.importorskip("cv2", reason="videos need the extra iphone")
 pytest.importorskip("lzfse", reason="Record3D needs the extra iphone")
 
 LARGE, SMALL = (64, 48), (32, 24)

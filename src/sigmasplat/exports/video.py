@@ -15,7 +15,7 @@ from PIL import Image
 
 from sigmasplat.drawing.colormap import Rgb
 from sigmasplat.drawing.film import FilmMaps, FilmScale, film_image, legend_strip
-from sigmasplat.env import install_extra
+from sigmasplat.env import install_package
 from sigmasplat.errors import BackendError, ConfigError, RunError
 from sigmasplat.exports.run_reader import RunReader
 from sigmasplat.floorplan.ground import floor_frame
@@ -173,7 +173,7 @@ def _opencv() -> Any:
         import cv2
     except ImportError as problem:
         raise BackendError(
-            f"videos as .webm and .mp4 need OpenCV: {install_extra('video')}; or write .gif or .webp"
+            f"videos as .webm and .mp4 need OpenCV: {install_package('opencv-python-headless')}; or write .gif or .webp"
         ) from problem
     return cv2
 

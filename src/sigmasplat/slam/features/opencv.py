@@ -4,7 +4,7 @@ import functools
 import importlib
 from typing import Any
 
-from sigmasplat.env import switches
+from sigmasplat.env import install_package, switches
 from sigmasplat.errors import ConfigError
 
 
@@ -15,7 +15,7 @@ def opencv() -> Any:
         cv2 = importlib.import_module("cv2")
     except ImportError as problem:
         raise ConfigError(
-            f"sparse features need OpenCV, which does not load ({problem}): pip install opencv-python-headless"
+            f"sparse features need OpenCV, which does not load ({problem}): {install_package('opencv-python-headless')}"
         ) from problem
     if switches().threads:
         cv2.setNumThreads(switches().threads)
