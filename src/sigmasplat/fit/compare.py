@@ -71,14 +71,15 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
     difference, noise = difference[other], (NOISE_RELATIVE * seen[other] ** 2 + NOISE_M) * noise_scale(live_depth)
     limit = CLOSE_SIGMA * noise + CLOSE_M
     front = difference <= -limit
-    shares = [float(np.mean(found)) for found in (np.abs(difference) < limit, front, difference >= limit)]
+    close, behind = (float(np.mean(found)) for found in (np.abs(difference) < limit, difference >= limit))
+    common, before = count / len(u), float(np.mean(front))
     if count - front.sum() < LEAST_PIXELS:
-        return Comparison(count / len(u), *shares, float("inf"), float("nan"))
+        return Comparison(common, close, before, behind, float("inf"), float("nan"))
     residual = float(np.median(np.abs(difference)[~front] / noise[~front]))
     right, below = column[inside] - left > 0.5, row[inside] - top > 0.5
     live_gray = host(live.gray[level])[top + below, left + right]
-    grays = (gray[v, u][inside][other][~front], live_gray[other][~front])
-    return Comparison(count / len(u), *shares, residual, _correlation(*grays))
+    correlation = _correlation(gray[v, u][inside][other][~front], live_gray[other][~front])
+    return Comparison(common, close, before, behind, residual, correlation)
 
 
 def noise_scale(depth: NDArray[np.float32]) -> float:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sigmasplat.model import se3
 from sigmasplat.types import Matrix
@@ -62,7 +63,7 @@ class Atlas:
         return [s for s, number in enumerate(self.components) if number == component]
 
     @property
-    def believed(self) -> Matrix:
+    def in_world(self) -> NDArray[np.bool_]:
         """Return which frames are in a submap that is connected to the world, bool [F]."""
         return np.array([self.components[place.submap] == 0 for place in self.places], bool)
 

@@ -1,5 +1,6 @@
 """Submaps, and the stores that keep finished ones."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -83,6 +84,29 @@ class MemoryStore:
     def picture(self, index: int, keyframe: int) -> Picture:
         """Return the images of one keyframe of a submap."""
         return self.pictures[index][keyframe]
+
+
+@dataclass(frozen=True, eq=False)
+class StorePart:
+    """Some submaps of a store, numbered from 0 in the order of `members`. It can only be read."""
+
+    store: SubmapStore
+    members: Sequence[int]
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+    def save(self, submap: Submap, pictures: list[Picture]) -> None:
+        """Raise SigmaSplatError: a part cannot grow."""
+        raise SigmaSplatError(f"submap {submap.index} cannot be saved in a part of a store; save it in the whole store")
+
+    def load(self, index: int) -> Submap:
+        """Return a submap."""
+        return self.store.load(self.members[index])
+
+    def picture(self, index: int, keyframe: int) -> Picture:
+        """Return the images of one keyframe of a submap."""
+        return self.store.picture(self.members[index], keyframe)
 
 
 def refuse_misfit(submap: Submap, pictures: list[Picture], next_index: int) -> None:

@@ -1,7 +1,7 @@
 """SLAM: track every frame, map keyframes, cut submaps, close loops. `Slam.step` follows the papers' overviews."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 import torch
@@ -16,10 +16,10 @@ from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.component import LOST, TRACKED, Component
+from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED, Component
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
-from sigmasplat.model.submap import MemoryStore, SubmapStore
+from sigmasplat.model.submap import MemoryStore, StorePart, SubmapStore
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, preset
 from sigmasplat.render.backend import make_view
@@ -27,12 +27,18 @@ from sigmasplat.render.view import View
 from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.features import make_extractor
 from sigmasplat.slam.final import final_map
+from sigmasplat.slam.found import Found
 from sigmasplat.slam.localisation.feature_image import FeatureImage, detail_of
+from sigmasplat.slam.localisation.known_map import KnownMap
+from sigmasplat.slam.localisation.recovery import Link, Recovery, usable
+from sigmasplat.slam.localisation.relocaliser import Relocaliser, Relocation
+from sigmasplat.slam.localisation.sight import Sight
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
 from sigmasplat.slam.mapper import Mapper
+from sigmasplat.slam.merged import merged_field
 from sigmasplat.slam.rules import ends_submap, is_keyframe
-from sigmasplat.slam.step_result import Step, StepTimer, metrics_of
-from sigmasplat.slam.tracker import Sight, Tracker
+from sigmasplat.slam.step_result import Step, StepTimer
+from sigmasplat.slam.tracker import Tracker
 from sigmasplat.types import Matrix, no_progress
 
 HOST = torch.device("cpu")
@@ -58,13 +64,15 @@ class Slam:
         self.random = np.random.default_rng(self.config.seed)
         self.store = MemoryStore() if store is None else store
         self.atlas = Atlas()
-        wanted = self.config.tracking.features
+        wanted = self.config.tracking.features or self.config.recovery.relocalise
         self.extractor = make_extractor(self.config.features) if wanted else None
-        self.tracker = Tracker(self.config.tracking, self.extractor)
+        self.tracker = Tracker(self.config.tracking, self.extractor if self.config.tracking.features else None)
         self.mapper = Mapper(self.config, self.random)
         self.drift = Drift()
         self.descriptor = make_descriptor(self.config.loops)
         self.closer = LoopCloser(self.config, self.store)
+        self.recovery = Recovery(self.config.recovery)
+        self.relocaliser = Relocaliser(self.config, self.extractor)
         self.steps: list[Step] = []
         self.keyframe_indices: list[int] = []
         self._view: View | None = None
@@ -72,41 +80,39 @@ class Slam:
         self._timer = StepTimer()
 
     def step(self, frame: Frame) -> Step:
-        """Process one frame: track it, map it if it is a keyframe, and cut the submap if a rule ends it here.
+        """Process one frame: track it, find it in the whole map if it is lost, map it if it is a keyframe, and cut the
+        submap if a rule ends it here.
 
         Raises SourceError if the first frame has no depth or a later one comes from another camera.
         """
         self._timer = StepTimer()
-        seen, tracking, loops = self._observe(frame), dict[str, float](), list[Loop]()
-        if not self.steps:
-            T_submap_camera, mapped = self._begin(seen), True
-        else:
-            fit = self._track(seen)
-            T_submap_camera, tracking = se3.inverse(fit.T_camera_world), metrics_of(fit)
-            mapped = not self.tracker.lost and not self.tracker.doubtful and self._is_keyframe(fit.overlap)
-            if mapped and self._cuts:
-                tracking["drift_m"] = self._add_drift(fit, seen)
-        if mapped:
-            T_submap_camera = self._map(seen, T_submap_camera)
-            if self._submap_ends(T_submap_camera):
-                loops = self._cut(T_submap_camera)
-                T_submap_camera = self._map(seen, np.eye(4))  # the next submap begins with the same keyframe
-        self.atlas.place_frame(T_submap_camera)
-        self.steps.append(self._step_result(seen.frame, T_submap_camera, mapped, tracking, loops))
+        seen = self._observe(frame)
+        found = self._localise(seen) if self.steps else self._begin(seen)
+        if found.mapped:
+            found.T_submap_camera = self._map(seen, found.T_submap_camera)
+            if self._submap_ends(found.T_submap_camera):
+                found.loops += self._cut(found.T_submap_camera)
+                found.T_submap_camera = self._map(seen, np.eye(4))  # the next submap begins with the same keyframe
+            self._seek_component(seen, found)
+        self.atlas.place_frame(found.T_submap_camera)
+        self.steps.append(self._step_result(seen.frame, found))
         return self.steps[-1]
 
     def finish(self, progress: Callable[[int, int], None] = no_progress) -> None:
         """Finish the last submap, look for its loops, and make the final map (VarSplat §7); call it once, at the end.
 
         Calls `progress(done, total)` with the steps of refinement, from 0 to the last one; without refinement the total
-        is 1. Does nothing when no rule cuts submaps and `final.iterations` is 0.
+        is 1. Does nothing when no rule cuts submaps and `final.iterations` is 0. Components that are not connected to
+        the world are left out of the final map.
         """
         if not self.steps or not (len(self.store) or self._cuts or self.config.final.iterations):
             return
         total = self.config.final.iterations or 1
         progress(0, total)
         self._finish_submap()
-        self._final = final_map(self.store, self.atlas.anchors, self.config, self.view, self.random, progress)
+        members = self.atlas.members(0)
+        store, anchors = StorePart(self.store, members), [self.atlas.anchors[s] for s in members]
+        self._final = final_map(store, anchors, self.config, self.view, self.random, progress)
         progress(total, total)
 
     @property
@@ -115,15 +121,20 @@ class Slam:
         side."""
         if self._final is not None:
             return self._final
-        active = self.mapper.field
         if not len(self.store):
-            return active.to(HOST)
-        merged = GaussianField.empty()
-        for index in range(len(self.store)):
-            merged.append(self.store.load(index).field.moved(torch.from_numpy(self.atlas.anchors[index])))
-        if len(self.store) < len(self.atlas.anchors):
-            merged.append(active.moved(torch.from_numpy(self.atlas.anchors[-1])))
-        return merged
+            return self.mapper.field.to(HOST)
+        return merged_field(self.store, self.atlas, 0, self.mapper.field)
+
+    def components(self) -> list[Component]:
+        """Return the components of the atlas that are not connected to the world."""
+        numbers = sorted(set(self.atlas.components) - {0})
+        return [self._component(number) for number in numbers]
+
+    def _component(self, number: int) -> Component:
+        place_of = [self.atlas.components[place.submap] == number for place in self.atlas.places]
+        tracked = np.array(place_of) & np.array([not step.lost for step in self.steps])
+        field = merged_field(self.store, self.atlas, number, self.mapper.field)
+        return Component(number, field, self.trajectory().at(tracked))
 
     @property
     def loops(self) -> list[Loop]:
@@ -140,11 +151,7 @@ class Slam:
 
     def believed(self) -> NDArray[np.bool_]:
         """Return whether the pose of each frame so far is believed [F]: not lost, and connected to the world."""
-        return np.array([not step.lost for step in self.steps], np.bool_)
-
-    def components(self) -> list[Component]:
-        """Return the components of the atlas that are not connected to the world."""
-        return []
+        return self.atlas.in_world & np.array([not step.lost for step in self.steps], np.bool_)
 
     def checkpoint(self) -> dict[str, Tensor]:
         """Return what is needed to read a run back, in host memory: the active submap's field with its optimiser state,
@@ -158,6 +165,7 @@ class Slam:
             "T_world_camera_odometry": torch.from_numpy(self.atlas.T_world_camera(loops=False)),
             "keyframes": torch.tensor(self.keyframe_indices, dtype=torch.int64),
             "T_world_submap": torch.from_numpy(np.array(self.atlas.anchors).reshape(-1, 4, 4)),
+            "submap_component": torch.tensor(self.atlas.components, dtype=torch.int64),
             "frame_submap": torch.tensor([place.submap for place in self.atlas.places], dtype=torch.int64),
         }
 
@@ -193,8 +201,8 @@ class Slam:
                 image = FeatureImage(detail, frame.depth_m, frame.camera)
             return Observation(target, live, image, frame=frame)
 
-    def _begin(self, seen: Observation) -> Matrix:
-        """Start the first submap at the first frame, whose camera is the world; return its pose."""
+    def _begin(self, seen: Observation) -> Found:
+        """Start the first submap at the first frame, whose camera is the world."""
         if not (seen.frame.depth_m > 0).any():
             raise SourceError(
                 f"frame {seen.frame.index} has no depth reading in [{self.config.input.min_depth_m}, "
@@ -202,7 +210,24 @@ class Slam:
             )
         self.tracker.start(seen)
         self.atlas.begin_submap()
-        return np.eye(4)
+        return Found(np.eye(4), TRACKED, mapped=True)
+
+    def _localise(self, seen: Observation) -> Found:
+        """Track a frame; if it is lost, search the whole map for it; if that fails too often, begin a new map."""
+        fit = self._track(seen)
+        lost = self.tracker.lost
+        self.recovery.count(lost, self.tracker.doubtful, seen)
+        found = Found.of(fit, se3.inverse(fit.T_camera_world), lost)
+        if not lost:
+            certain = self.recovery.is_steady and not (self.config.tracking.verify and self.tracker.doubtful)
+            found.mapped = certain and self._is_keyframe(fit.overlap)
+            if found.mapped and self._cuts:
+                found.tracking["drift_m"] = self._add_drift(fit, seen)
+        elif (place := self._relocalise(seen)) is not None:
+            self._go_to(place, seen, found)
+        elif self.recovery.gives_up and usable(seen):
+            self._begin_apart(seen, found)
+        return found
 
     def _track(self, seen: Observation) -> PoseFit:
         """Fit the frame's pose to the active submap."""
@@ -225,7 +250,8 @@ class Slam:
         with self._timer.stage("describe"):
             descriptor = self.descriptor.describe(frame.color, frame.depth_m) if self._describes else None
         with self._timer.stage("map"):
-            fit = self.mapper.map(self.view, index, seen.target, T_submap_camera, descriptor)
+            detail = None if seen.image is None else seen.image.detail
+            fit = self.mapper.map(self.view, index, seen.target, T_submap_camera, descriptor, detail)
         self._timer.add(fit.seconds, prefix="map_")
         if self.keyframe_indices[-1:] != [index]:  # a keyframe that two submaps share is counted once
             self.keyframe_indices.append(index)
@@ -239,11 +265,21 @@ class Slam:
 
     def _cut(self, T_submap_camera: Matrix) -> list[Loop]:
         """Finish the active submap and start the next one at its newest keyframe; return the loops tried."""
+        field, drift = self.mapper.field, self.drift.information
+        return self._branch(len(self.store), T_submap_camera, drift, field)
+
+    def _branch(self, parent: int, T_parent_camera: Matrix, information: Matrix, field: GaussianField) -> list[Loop]:
+        """Finish the active submap and start the next one at the camera, connected to a parent submap; return the loops
+        tried.
+
+        information [6, 6]: of T_parent_camera's left twist; field: the parent's splats, which the new submap may
+        inherit.
+        """
         with self._timer.stage("cut"):
             loops = self._finish_submap()
-            self.closer.submap_begun(len(self.store), T_submap_camera, self.drift.information)
-            self.atlas.begin_submap(T_submap_camera)
-            self.mapper = self.mapper.successor(self.view, T_submap_camera)
+            self.closer.connect(parent, len(self.store), T_parent_camera, information)
+            self.atlas.begin_submap(T_parent_camera, parent)
+            self.mapper = Mapper(self.config, self.random, field).successor(self.view, T_parent_camera)
             self.drift = Drift()
             return loops
 
@@ -256,13 +292,62 @@ class Slam:
             submap, [d for d in descriptors if d is not None], self.atlas, self.view
         )  # fmt: skip
 
-    def _step_result(
-        self, frame: Frame, T_submap_camera: Matrix, mapped: bool, tracking: dict[str, float], loops: list[Loop]
-    ) -> Step:
+    # ---- lost and found ----
+
+    def _relocalise(self, seen: Observation, elsewhere: bool = False) -> Relocation | None:
+        """Search the map for the camera; elsewhere: only in components that are not connected to the active submap."""
+        if not self.config.recovery.relocalise or not usable(seen):
+            return None
+        components = self.atlas.components
+        known = KnownMap(
+            self.store, self.atlas.keyframe_poses, self.mapper.keyframes, self.mapper.field,
+            lambda s: not elsewhere or components[s] != components[-1],
+        )  # fmt: skip
+        with self._timer.stage("relocalise"):
+            return self.relocaliser.find(known, self.view, seen)
+
+    def _go_to(self, place: Relocation, seen: Observation, found: Found) -> None:
+        """Continue where the camera was found: in the active submap, or in a new one that is connected to the place."""
+        found.state, submap = RELOCALISED, place.where[0]
+        found.tracking |= asdict(place.comparison) | {"inliers": float(place.inliers)}
+        if submap == len(self.store):
+            found.T_submap_camera = place.T_submap_camera
+            self.tracker.move_to(self.mapper.field, self.view, place.keyframe, place.T_submap_camera)
+        else:
+            field = self.store.load(submap).field.to(self.view.sums.device)
+            found.loops += self._branch(submap, place.T_submap_camera, place.information, field)
+            found.T_submap_camera, found.mapped = np.eye(4), True
+        self.recovery.found()
+
+    def _begin_apart(self, seen: Observation, found: Found) -> None:
+        """Begin a new map at the camera, whose place in the world is not known yet."""
+        found.loops += self._finish_submap()
+        self.atlas.begin_submap()
+        self.mapper, self.drift = Mapper(self.config, self.random), Drift()
+        self.tracker.forget()
+        self.recovery.found()
+        found.T_submap_camera, found.state, found.mapped = np.eye(4), APART, True
+
+    def _seek_component(self, seen: Observation, found: Found) -> None:
+        """Look for a place of another component; two observations that agree join the components."""
+        if len(set(self.atlas.components)) < 2:
+            return
+        place = self._relocalise(seen, elsewhere=True)
+        if place is None:
+            return
+        a, b = place.where[0], len(self.store)
+        link = Link(a, b, place.T_submap_camera @ se3.inverse(found.T_submap_camera), place.information)
+        if self.recovery.confirms(link, self.atlas):
+            self.atlas.join(a, b, link.T_a_b)
+            self.closer.connect(a, b, link.T_a_b, link.information)
+
+    def _step_result(self, frame: Frame, found: Found) -> Step:
+        component = self.atlas.components[-1]
+        state = APART if component and found.state != LOST else found.state
         return Step(
-            frame.index, frame.timestamp_s, self.atlas.anchors[-1] @ T_submap_camera, mapped, self.tracker.lost,
-            tracking, len(self.mapper.field), len(self.atlas.anchors) - 1, tuple(loops), self._timer.stop(self.view),
-            LOST if self.tracker.lost else TRACKED,
+            frame.index, frame.timestamp_s, self.atlas.anchors[-1] @ found.T_submap_camera, found.mapped,
+            state == LOST, found.tracking, len(self.mapper.field), len(self.atlas.anchors) - 1,
+            tuple(found.loops), self._timer.stop(self.view), state, component,
         )  # fmt: skip
 
     @property

@@ -18,7 +18,7 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.feature_image import FeatureImage, pose_by_features
-from sigmasplat.slam.localisation.sight import Sight
+from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.verdict import Usual, score
 from sigmasplat.slam.rules import is_lost, jumped
 from sigmasplat.types import Matrix
@@ -104,7 +104,9 @@ class Tracker:
     def _aligned(self, reference: Reference, live: Pyramid, T_camera_world: Matrix) -> PoseFit:
         fit = fit_pose_align(reference, live, T_camera_world, self.config)
         if self.config.verify:
-            fit.comparison = compare(reference.pyramid, live, fit.T_camera_world @ se3.inverse(reference.T_camera_world))
+            fit.comparison = compare(
+                reference.pyramid, live, fit.T_camera_world @ se3.inverse(reference.T_camera_world)
+            )
         return fit
 
     def _guesses_by_features(self, seen: Sight) -> Iterator[Matrix]:
@@ -188,6 +190,18 @@ class Tracker:
         if self.config.method == "align" or fits_of(view).aligns:  # otherwise nothing aligns to it
             T_camera_world = se3.inverse(T_world_camera)
             self.keyframe = keyframe_reference(field.params, view, seen.live, T_camera_world, self.config)
+
+    def move_to(self, field: GaussianField, view: View, keyframe: FoundKeyframe, T_world_camera: Matrix) -> None:
+        """Continue at another pose, with a keyframe as the reference of the next frames."""
+        self.previous, self.velocity = T_world_camera, np.eye(4)
+        self.keyframe = keyframe_reference(
+            field.params, view, keyframe.pyramid, keyframe.T_camera_world, self.config
+        )  # fmt: skip
+        self.keyframe_features = keyframe.image
+
+    def forget(self) -> None:
+        """Start anew at the identity, as for the first frame."""
+        self.previous, self.velocity, self.keyframe, self.keyframe_features = np.eye(4), np.eye(4), None, None
 
     def hop_covariance(self, fit: PoseFit, live: Pyramid) -> Matrix | None:
         """Estimate the covariance [6, 6] of a fit's left twist to the newest keyframe; None without the kernels.

@@ -21,7 +21,7 @@ RATIO = 0.85
 
 
 def matches_by_descriptor(a: Features, b: Features, extractor: Extractor) -> Pairs:
-    """Return matches [M, 2] by descriptors alone, also for kinds whose own matcher is slow: enough to compare images."""
+    """Return matches [M, 2] by descriptors alone, also for kinds whose own matcher is slow."""
     if a.descriptors.dtype == np.uint8:
         return extractor.match(a, b)
     return matched_by_distance(a.descriptors.astype(np.float32), b.descriptors.astype(np.float32), RATIO)

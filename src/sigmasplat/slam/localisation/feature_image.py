@@ -7,7 +7,15 @@ from numpy.typing import NDArray
 
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Detail, Frame
-from sigmasplat.slam.features import Extractor, Features, Landmarks, PnP, depth_readings, landmarks_of, pose_from_landmarks
+from sigmasplat.slam.features import (
+    Extractor,
+    Features,
+    Landmarks,
+    PnP,
+    depth_readings,
+    landmarks_of,
+    pose_from_landmarks,
+)
 from sigmasplat.slam.features.opencv import opencv
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from sigmasplat.config import RecoveryConfig
 from sigmasplat.model import se3
+from sigmasplat.model.atlas import Atlas
 from sigmasplat.slam.localisation.sight import Sight
 from sigmasplat.types import Matrix
 
@@ -62,8 +63,20 @@ class Recovery:
         """Return whether a new map begins."""
         return bool(self.config.new_map_after) and self.lost >= self.config.new_map_after
 
-    def confirmed(self, link: Link, T_before: Matrix) -> bool:
-        """Return whether an earlier observation agrees with a new one; T_before [4, 4]: what the earlier one predicts
-        for T_a_b of the new one."""
-        apart = se3.inverse(T_before) @ link.T_a_b
+    def found(self) -> None:
+        """Restart the counts: the camera has been found, or a new map has begun."""
+        self.lost = self.steady = 0
+
+    def confirms(self, link: Link, atlas: Atlas) -> bool:
+        """Return whether the observation before agrees with a new one, which is kept for the next one."""
+        before, self.link = self.link, link
+        if before is None or {atlas.components[s] for s in (before.a, before.b)} != {
+            atlas.components[s] for s in (link.a, link.b)
+        }:
+            return False
+        if atlas.components[before.a] != atlas.components[link.a]:
+            before = Link(before.b, before.a, se3.inverse(before.T_a_b), before.information)
+        between = atlas.anchors[before.a] @ before.T_a_b @ se3.inverse(atlas.anchors[before.b])
+        expected = se3.inverse(atlas.anchors[link.a]) @ between @ atlas.anchors[link.b]
+        apart = se3.inverse(expected) @ link.T_a_b
         return float(np.linalg.norm(apart[:3, 3])) < SAME_M and se3.rotation_angle(apart[:3, :3]) < SAME_RAD

@@ -17,10 +17,11 @@ from sigmasplat.fit.references import Reference, live_image, map_reference
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.render.view import View
+from sigmasplat.slam.drift import symmetric
 from sigmasplat.slam.features import Extractor, Features, Landmarks, matches_by_descriptor
 from sigmasplat.slam.localisation.feature_image import pose_by_features
 from sigmasplat.slam.localisation.known_map import KnownKeyframe, KnownMap, Where
-from sigmasplat.slam.localisation.sight import Sight
+from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.verdict import explained, score
 from sigmasplat.types import Matrix
 
@@ -35,24 +36,39 @@ LEAST_COMMON, LEAST_CLOSE, LEAST_EXPLAINED, LEAST_CORRELATION, MOST_RESIDUAL = 0
 """A pose is accepted if the images have this share of the reference in common, if this share of it is the same surface,
 if nothing known is seen through, if the gray values correlate, and if the median depth difference is below this many
 standard deviations of a reading."""
+FLOOR_M, FLOOR_RAD = 0.005, 0.003
+"""Minimum standard deviation of a pose that was found."""
+UNKNOWN = np.eye(6)
+"""Covariance of a pose without an estimate, m² and rad²."""
 ENOUGH = 0.5
 """A pose with a higher score ends the search."""
 
 
 @dataclass(frozen=True, eq=False)
 class Relocation:
-    """Where the camera was found: submap, keyframe, the fit whose T_camera_world is T_camera_submap [4, 4], its
-    comparison with the map, and the number of matches that support it."""
+    """Where the camera was found: submap and keyframe by number, the keyframe, the number of matches that support the
+    pose, the fit whose T_camera_world is T_camera_submap [4, 4], and its comparison with the map."""
 
     where: Where
+    keyframe: FoundKeyframe
+    inliers: int
     fit: PoseFit
     comparison: Comparison
-    inliers: int
 
     @property
     def T_submap_camera(self) -> Matrix:
         """Return the pose [4, 4] of the camera in the submap."""
         return se3.inverse(self.fit.T_camera_world)
+
+    @property
+    def information(self) -> Matrix:
+        """Return the information [6, 6] of T_submap_camera's left twist, m and rad."""
+        estimated = self.fit.covariance
+        if estimated is None or not np.isfinite(estimated).all():
+            estimated = UNKNOWN
+        A = se3.adjoint(self.T_submap_camera)
+        covariance = A @ estimated @ A.T + np.diag(np.repeat([FLOOR_M**2, FLOOR_RAD**2], 3))
+        return symmetric(np.asarray(np.linalg.inv(symmetric(covariance)), np.float64))
 
     @property
     def score(self) -> float:
@@ -68,7 +84,7 @@ class Relocaliser:
     """
 
     config: Config
-    extractor: Extractor
+    extractor: Extractor | None
     indexed: list[Where] = field(default_factory=list)
     _strongest: dict[Where, Features] = field(default_factory=dict, init=False)
     _landmarks: "OrderedDict[Where, Landmarks]" = field(default_factory=OrderedDict, init=False)
@@ -102,6 +118,7 @@ class Relocaliser:
     def _landmarks_of(self, known: KnownMap, view: View, where: Where) -> Landmarks:
         """Return the landmarks of a keyframe; those used last stay in memory."""
         if where not in self._landmarks:
+            assert self.extractor is not None
             landmarks = known.keyframe(where).image(view.camera).landmarks(self.extractor)
             self._landmarks[where] = landmarks
             some = landmarks.features.take(np.arange(min(STRONGEST, len(landmarks))))
@@ -113,7 +130,7 @@ class Relocaliser:
 
     def _candidates(self, wanted: Sequence[Where], seen: Sight) -> list[Where]:
         """Return the keyframes with the most matches, best first."""
-        assert seen.image is not None
+        assert seen.image is not None and self.extractor is not None
         live = seen.image.features(self.extractor)
         live, searched = live.take(np.arange(min(STRONGEST, len(live)))), set(self.indexed)
         votes = [
@@ -126,20 +143,23 @@ class Relocaliser:
 
     def _poses(self, known: KnownMap, view: View, seen: Sight, where: Where) -> Iterator[Relocation]:
         """Yield the pose of a candidate, aligned to the keyframe's own image, then to the map rendered there."""
-        assert seen.image is not None
+        assert seen.image is not None and self.extractor is not None
         keyframe, landmarks = known.keyframe(where), self._landmarks_of(known, view, where)
         found = pose_by_features(landmarks, seen.image, self.extractor, seed=self.config.seed)
         if found is None:
             return
         guess = found.T_live_reference @ se3.inverse(keyframe.T_submap_camera)
-        own = aligned(keyframe_image(keyframe, view), seen, guess, self.config.tracking)
-        yield Relocation(where, *own, found.inliers)
-        field = known.splats(where[0])
-        reference = map_reference(field.params.to(view.sums.device), view, guess, self.config.tracking)
-        yield Relocation(where, *aligned(reference, seen, guess, self.config.tracking), found.inliers)
+        image = keyframe_image(keyframe, view)
+        shown = FoundKeyframe(image.pyramid, image.T_camera_world, keyframe.image(view.camera))
+        yield Relocation(where, shown, found.inliers, *aligned(image, seen, guess, self.config.tracking))
+        params = known.splats(where[0]).params.to(view.sums.device)
+        rendered = map_reference(params, view, guess, self.config.tracking)
+        yield Relocation(where, shown, found.inliers, *aligned(rendered, seen, guess, self.config.tracking))
 
 
-def aligned(reference: Reference, seen: Sight, T_camera_world: Matrix, config: TrackingConfig) -> tuple[PoseFit, Comparison]:
+def aligned(
+    reference: Reference, seen: Sight, T_camera_world: Matrix, config: TrackingConfig
+) -> tuple[PoseFit, Comparison]:
     """Align a frame to a reference from a guess; return the fit, and the comparison of both images at it."""
     fit = fit_pose_align(reference, seen.live, T_camera_world, config)
     motion = fit.T_camera_world @ se3.inverse(reference.T_camera_world)

@@ -1,0 +1,26 @@
+"""The result of localising one frame, before it is mapped and recorded."""
+
+from dataclasses import dataclass, field
+
+from sigmasplat.fit.pose import PoseFit
+from sigmasplat.model.component import LOST, TRACKED
+from sigmasplat.slam.loop_closure.closer import Loop
+from sigmasplat.slam.step_result import metrics_of
+from sigmasplat.types import Matrix
+
+
+@dataclass(eq=False)
+class Found:
+    """Where a frame is: T_submap_camera [4, 4] in the active submap, its state, values of tracking, whether it is to be
+    mapped, and the loops that were tried on the way."""
+
+    T_submap_camera: Matrix
+    state: str = TRACKED
+    tracking: dict[str, float] = field(default_factory=dict)
+    mapped: bool = False
+    loops: list[Loop] = field(default_factory=list)
+
+    @staticmethod
+    def of(fit: PoseFit, T_submap_camera: Matrix, lost: bool) -> "Found":
+        """Return the result of tracking."""
+        return Found(T_submap_camera, LOST if lost else TRACKED, metrics_of(fit))
