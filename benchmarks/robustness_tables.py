@@ -1,0 +1,5 @@
+"""Tabulate nothing yet."""
+
+
+def sections(measured):
+    return []
