@@ -173,6 +173,7 @@ def arrays(run: RunPath, truth: NDArray[np.float64], planned: Plan) -> dict[str,
         "p_off": run.p_off,
         "is_keyframe": np.array([bool(line and line["is_keyframe"]) for line in run.log]),
         "T_tracked": run.tracked,
+        "T_final": run.final,
         "T_true": truth,
         "event": np.array([planned.begin, planned.end]),
     }
