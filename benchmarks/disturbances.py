@@ -87,7 +87,7 @@ def blur(color: Color, depth: Depth, level: float, at: Moment) -> tuple[Color, D
     middle, angle = (length - 1) / 2, at.random.uniform(0, np.pi)
     kernel = np.zeros((length, length), np.float32)
     ends = [np.rint(middle + sign * middle * np.array([np.cos(angle), np.sin(angle)])).astype(int) for sign in (-1, 1)]
-    cv2.line(kernel, *[(int(x), int(y)) for x, y in ends], 1.0)
+    cv2.line(kernel, ends[0].tolist(), ends[1].tolist(), (1.0,))
     blurred: Any = cv2.filter2D(color, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
     return blurred, depth
 

@@ -41,7 +41,7 @@ class Original:
 
     def depth_m(self, index: int) -> NDArray[np.float32]:
         """Return the depth of a frame, m, 0 = no reading."""
-        return (self.depth[index] / np.float32(UNITS_PER_METRE)).astype(np.float32)
+        return np.asarray(self.depth[index] / np.float32(UNITS_PER_METRE), np.float32)
 
     @cached_property
     def _readings_m(self) -> NDArray[np.float32]:

@@ -203,7 +203,7 @@ def figures_of(results: list[dict[str, Any]]) -> dict[str, Any]:
     ]
     every_pair = [tuple(pair) for result in results for pair in result["pairs"]]
     codes = sorted({result["code"] for result in results if result.get("code")})
-    return {"measured": codes, "runs": runs, "p_off": scores.probability_scores(every_pair)}
+    return {"measured": ", ".join(codes), "runs": runs, "p_off": scores.probability_scores(every_pair)}
 
 
 def main(options: Options) -> int:
