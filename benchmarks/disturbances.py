@@ -131,9 +131,9 @@ class Disturbance:
     """What changes in a recording, by severity from 1.
 
     labels: the severities in words; levels: the values for `change`; event_frames: how long the event lasts, empty if
-    the disturbance lasts for the whole recording; order: how a level changes the order of the frames, "" for not at
-    all, "every" (every N-th frame), "late" (depth N frames late), "back" (after the event the camera is N frames ahead,
-    and goes back the way that it would have come).
+    the disturbance lasts for the whole recording; order: how a level N changes the order of the frames: "" not at all,
+    "every": every N-th frame, "late": depth stands still for N frames and is late from then on, "back": after the event
+    the camera is N frames ahead, and goes back the way that it would have come.
     """
 
     title: str
@@ -165,7 +165,9 @@ DISTURBANCES = {
     "kidnapped": Disturbance(
         "kidnapped: black + skipped", ("5 + 20", "15 + 60", "20 + 100"), (20, 60, 100), black, (5, 15, 20), "back"
     ),
-    "desync": Disturbance("depth late", ("2 frames", "5 frames", "10 frames"), (2, 5, 10), order="late"),
+    "desync": Disturbance(
+        "depth late", ("2 frames", "5 frames", "10 frames"), (2, 5, 10), unchanged, (2, 5, 10), "late"
+    ),
     "moving-object": Disturbance(
         "object in front", ("10 %, 20 frames", "30 %, 40 frames", "50 %, 80 frames"), (0.1, 0.3, 0.5), moving_object,
         (20, 40, 80),
@@ -203,14 +205,15 @@ def plan(name: str, severity: int, seed: int, frames: int, available: int) -> Pl
     if disturbance.event_frames:
         begin = int(frames * np.random.default_rng((seed, 41)).uniform(*BEGIN))
         end = begin + disturbance.event_frames[severity - 1]
-    step, late = (level if disturbance.order == order else 0 for order in ("every", "late"))
-    chosen = np.arange(max(frames, end + AFTER if end else 0)) * max(step, 1)
+    step = level if disturbance.order == "every" else 1
+    color = np.arange(max(frames, end + AFTER if end else 0)) * step
     if disturbance.order == "back":
-        chosen = np.concatenate([np.arange(end), np.arange(min(end + level, available - 1), begin // 2, -1)])
-    depth = chosen[chosen + late < available]
-    if len(depth) <= end:
+        color = np.concatenate([np.arange(end), np.arange(min(end + level, available - 1), begin // 2, -1)])
+    color = color[color < available]
+    if len(color) <= end:
         raise ValueError(f"{available} frames are too few for {name}, severity {severity}, with {frames} frames")
-    return Plan(depth + late, depth, begin, end)
+    late = disturbance.order == "late"
+    return Plan(color, np.maximum(color - level, np.minimum(color, begin)) if late else color, begin, end)
 
 
 def disturbed(

@@ -119,14 +119,13 @@ def jobs_of(options: Options) -> list[Job]:
     ]  # fmt: skip
 
 
-def finished(job: Job, folder: Path) -> dict[str, Any] | None:
-    """Return the result of an earlier run of the same job with the same code; None without one or if it failed."""
+def earlier(job: Job, folder: Path) -> dict[str, Any] | None:
+    """Return the result of an earlier run of the same job with the same code; None without one."""
     try:
         result = record.read(folder / f"{job.stem}.json")
     except (OSError, ValueError):
         return None
-    same = result["job"] == json.loads(json.dumps(asdict(job)))
-    return result if same and result["problem"] is None else None
+    return result if result["job"] == json.loads(json.dumps(asdict(job))) else None
 
 
 def perform(job: Job, from_: Original, folder: Path, keep: Path | None = None) -> dict[str, Any]:
@@ -142,7 +141,8 @@ def perform(job: Job, from_: Original, folder: Path, keep: Path | None = None) -
         result["wall_s"] = round(time.perf_counter() - start, 2)
         if result["problem"] is None:
             run = scores.read_run(scratch / "run", len(planned))
-            truth = from_.T_world_camera[planned.color]
+            shown = [planned.color] + [planned.depth] * bool((planned.depth != planned.color).any())
+            truth = from_.T_world_camera[np.stack(shown)]
             result["code"] = json.loads((scratch / "run" / "run.json").read_text())["code"]
             result |= {"figures": scores.score(run, truth, planned), "pairs": scores.pairs(run, truth, planned)}
             if keep:
@@ -176,9 +176,9 @@ def measure(options: Options) -> dict[str, Any]:
 
     def work(numbered: tuple[int, Job]) -> dict[str, Any] | None:
         number, job = numbered
-        earlier = None if options.fresh else finished(job, folder)
-        if earlier or options.collect:
-            return earlier
+        found = None if options.fresh else earlier(job, folder)
+        if options.collect or (found and found["problem"] is None):
+            return found
         result = perform(job, originals[job.path], folder, options.keep)
         how = result["problem"] or f"{result['wall_s']:.0f} s, {said(result['figures'])}"
         print(f"[{number}/{len(listed)}] {job.stem}: {how}", file=sys.stderr, flush=True)

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ ANCHOR_FRAMES, ANCHOR_M = 20, 0.05
 """Without an event, this number of first frames fixes the world; frames further off than this do not count."""
 KNOWN_M, KNOWN_DEG = 0.5, 25.0
 """A view is known if a frame from before the event is this near and looks in this direction."""
+Truth = NDArray[np.float64]
+"""T_world_camera [1 or 2, N, 4, 4]: the true poses of the colour, and of the depth if it shows other frames."""
 BELIEVED_STATES = ("tracked", "relocalised")
 BINS = 10
 
@@ -81,66 +84,66 @@ def world_of_truth(estimate: NDArray[np.float64], truth: NDArray[np.float64]) ->
     return T
 
 
-def errors_m(poses: NDArray[np.float64], run: RunPath, truth: NDArray[np.float64], event: int) -> NDArray[np.float64]:
+def errors_m(poses: NDArray[np.float64], run: RunPath, truth: Truth, event: int) -> NDArray[np.float64]:
     """Return how far the positions of poses [N, 4, 4] are from the truth, m [N]; nan without a pose.
 
-    The world is fixed by the believed frames before frame `event`, the first 20 if that is 0.
+    The nearer one counts where colour and depth have different true poses. The world is fixed by the believed frames
+    before frame `event`, the first 20 if that is 0.
     """
     early = np.flatnonzero(run.believed[: event or ANCHOR_FRAMES])
     if not len(early):
         return np.full(len(poses), np.nan)
-    T = world_of_truth(poses[early], truth[early])
-    off: NDArray[np.float64] = np.linalg.norm((T @ poses)[:, :3, 3] - truth[:, :3, 3], axis=1)
+    T = world_of_truth(poses[early], truth[0, early])
+    off: NDArray[np.float64] = np.linalg.norm((T @ poses)[:, :3, 3] - truth[:, :, :3, 3], axis=2).min(0)
     return off
 
 
-def ate_m(run: RunPath, truth: NDArray[np.float64]) -> float | None:
+def ate_m(run: RunPath, truth: Truth) -> float | None:
     """Return the RMSE of the believed positions after the usual rigid alignment, m; None with fewer than 3."""
     positions = run.final[run.believed, :3, 3]
     if len(positions) < 3:
         return None
-    true = truth[run.believed, :3, 3]
+    true = truth[0, run.believed, :3, 3]
     T = align_rigid(positions, true)
     return float(np.sqrt(((positions @ T[:3, :3].T + T[:3, 3] - true) ** 2).sum(1).mean()))
 
 
-def known_views(truth: NDArray[np.float64], begin: int, end: int) -> NDArray[np.bool_]:
+def known_views(truth: Truth, begin: int, end: int) -> NDArray[np.bool_]:
     """Return for each frame [N] whether it is after the event and sees what a frame before the event has seen."""
-    near = np.linalg.norm(truth[:, None, :3, 3] - truth[None, :begin, :3, 3], axis=2) < KNOWN_M
-    along = np.einsum("ia,ja->ij", truth[:, :3, 2], truth[:begin, :3, 2]) > np.cos(np.radians(KNOWN_DEG))
-    known: NDArray[np.bool_] = (near & along).any(1) & (np.arange(len(truth)) >= end)
+    centre, axis = truth[0, :, :3, 3], truth[0, :, :3, 2]
+    near = np.linalg.norm(centre[:, None] - centre[None, :begin], axis=2) < KNOWN_M
+    along = axis @ axis[:begin].T > np.cos(np.radians(KNOWN_DEG))
+    known: NDArray[np.bool_] = (near & along).any(1) & (np.arange(len(centre)) >= end)
     return known
 
 
-def score(run: RunPath, truth: NDArray[np.float64], planned: Plan) -> dict[str, Any]:
-    """Return the figures of a run; truth: T_world_camera [N, 4, 4] of its frames.
+def score(run: RunPath, truth: Truth, planned: Plan) -> dict[str, Any]:
+    """Return the figures of a run.
 
-    Frames off by more than 10 cm are wrong; those that are believed are silent failures. `declared` is the number of
-    frames from the beginning of the event to the first one that is not believed, `recovery` that from its end to the
-    first right one, `recovery_known` that from the first known view after it; None if there is none.
+    Frames off by more than 10 cm are wrong; those that are believed are silent failures, and `silent_in_a_row` is the
+    longest time, in frames, until one is declared. `recovery` is the number of frames from the end of the event to the
+    first right one, `recovery_known` from the first known view, which comes `known` frames after the end; None if
+    there is none.
     """
     off = errors_m(run.final, run, truth, planned.begin)
     wrong = run.believed & ~(off <= WRONG_M)
     right = run.believed & ~wrong
-    outside = np.ones(len(truth), bool)
+    outside = np.ones(len(off), bool)
     outside[planned.begin : planned.end] = False
-    found = {
-        "frames": len(truth),
+    known = _first(known_views(truth, planned.begin, planned.end), planned.end) if planned.end else None
+    return {
+        "frames": len(off),
         "lost": int(run.lost.sum()),
         "believed": int(run.believed.sum()),
         "silent": int(wrong.sum()),
+        "silent_in_a_row": max((len([*row]) for is_wrong, row in groupby(wrong) if is_wrong), default=0),
         "ate_m": ate_m(run, truth),
         "outside": int(outside.sum()),
         "missed_outside": int((outside & ~run.believed).sum()),
         "event": [planned.begin, planned.end] if planned.end else None,
-    }
-    if not planned.end:
-        return found | dict.fromkeys(("declared", "recovery", "recovery_known"))
-    known = np.flatnonzero(known_views(truth, planned.begin, planned.end))
-    return found | {
-        "declared": _first(~run.believed, planned.begin),
-        "recovery": _first(right, planned.end),
-        "recovery_known": _first(right, int(known[0])) if len(known) else None,
+        "recovery": _first(right, planned.end) if planned.end else None,
+        "known": known,
+        "recovery_known": None if known is None else _first(right, planned.end + known),
     }
 
 
@@ -150,7 +153,7 @@ def _first(chosen: NDArray[np.bool_], begin: int) -> int | None:
     return int(rows[0]) if len(rows) else None
 
 
-def pairs(run: RunPath, truth: NDArray[np.float64], planned: Plan) -> list[tuple[float, bool]]:
+def pairs(run: RunPath, truth: Truth, planned: Plan) -> list[tuple[float, bool]]:
     """Return (p_off, whether the pose is off by more than 5 cm) of every frame with a pose, lost ones included.
 
     The pose is the one at the time of tracking, as in log.jsonl. The list is empty if the log has no p_off.
@@ -160,7 +163,7 @@ def pairs(run: RunPath, truth: NDArray[np.float64], planned: Plan) -> list[tuple
     return [(float(run.p_off[i]), bool(off[i] > OFF_M)) for i in known]
 
 
-def arrays(run: RunPath, truth: NDArray[np.float64], planned: Plan) -> dict[str, NDArray[Any]]:
+def arrays(run: RunPath, truth: Truth, planned: Plan) -> dict[str, NDArray[Any]]:
     """Return all tracking values of the log by name, with the true errors, an array [N] each; nan for missing ones."""
     names = sorted({name for line in run.log if line for name in line["tracking"]})
     values = {name: [_number(line["tracking"].get(name) if line else None) for line in run.log] for name in names}
@@ -174,7 +177,7 @@ def arrays(run: RunPath, truth: NDArray[np.float64], planned: Plan) -> dict[str,
         "is_keyframe": np.array([bool(line and line["is_keyframe"]) for line in run.log]),
         "T_tracked": run.tracked,
         "T_final": run.final,
-        "T_true": truth,
+        "T_true": truth[0],
         "event": np.array([planned.begin, planned.end]),
     }
 
