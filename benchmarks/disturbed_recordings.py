@@ -12,6 +12,7 @@ import record
 from disturbances import Color, Plan, disturbed
 from numpy.typing import NDArray
 
+from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.metrics.trajectory import associate
 from sigmasplat.model.camera import Camera
@@ -55,16 +56,16 @@ class Original:
         return float(np.quantile(self._readings_m, share))
 
 
-def original(path: str, folder: Path) -> Original:
-    """Open a recording or a synthetic room; its decoded frames are kept in `folder` and read from there the next time.
+def original(path: str, start_s: float, folder: Path) -> Original:
+    """Open a recording or a synthetic room from `start_s` seconds on.
 
-    Raises SourceError if it cannot be read or a frame has no true pose.
+    Its decoded frames are kept in `folder`, and read from there the next time. Raises SourceError if it cannot be read or a frame has no true pose.
     """
-    source = open_source(path)
+    source = open_source(path, InputConfig(start_s=start_s))
     truth = source.truth()
     if truth is None:
         raise SourceError(f"{path}: the true path is unknown, so nothing can be scored")
-    stem = folder / record.slug(path)
+    stem = folder / record.slug(f"{path} {start_s:g}")
     color_path, depth_path, times_path = (stem.with_suffix(f".{part}.npy") for part in ("color", "depth", "times"))
     if not times_path.is_file():
         folder.mkdir(parents=True, exist_ok=True)

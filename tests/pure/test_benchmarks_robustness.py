@@ -149,8 +149,8 @@ def test_events_begin_where_the_seed_says_and_leave_frames_to_recover() -> None:
 
 def test_a_recording_is_written_without_truth_and_read_back(tmp_path: Path) -> None:
     path = "synthetic:frames=8,width=64,height=48"
-    original = recordings.original(path, tmp_path / "frames")
-    again = recordings.original(path, tmp_path / "frames")
+    original = recordings.original(path, 0.0, tmp_path / "frames")
+    again = recordings.original(path, 0.0, tmp_path / "frames")
     planned = disturbances.plan("speed", 1, 0, 3, len(original))
     recordings.write(again, planned, "speed", 1, 0, tmp_path / "recording")
     read = open_source(str(tmp_path / "recording"))
@@ -328,7 +328,7 @@ def test_a_finished_run_is_scored_once_and_its_recording_removed(
         assert not other and {file.name for file in recording.iterdir()} == {
             "rgb", "depth", "rgb.txt", "depth.txt", "calibration.json",
         }  # fmt: skip
-        run_folder(out, MOVED @ recordings.original(path, tmp_path / "frames").T_world_camera[:5], {2})
+        run_folder(out, MOVED @ recordings.original(path, 0.0, tmp_path / "frames").T_world_camera[:5], {2})
         (out / "run.json").write_text(json.dumps({"code": "abc"}))
 
     monkeypatch.setattr(robustness, "call", call)
