@@ -59,7 +59,8 @@ class Original:
 def original(path: str, start_s: float, folder: Path) -> Original:
     """Open a recording or a synthetic room from `start_s` seconds on.
 
-    Its decoded frames are kept in `folder`, and read from there the next time. Raises SourceError if it cannot be read or a frame has no true pose.
+    Its decoded frames are kept in `folder`, and read from there the next time. Raises SourceError if it cannot be read
+    or a frame has no true pose.
     """
     source = open_source(path, InputConfig(start_s=start_s))
     truth = source.truth()
