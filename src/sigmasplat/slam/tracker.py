@@ -172,7 +172,9 @@ class Tracker:
         c = self.config
         if fit.comparison is None:
             return is_lost(fit, c.lost_agreement, c.lost_share)
-        return self.usual.is_lost(fit.comparison, c.lost_share)
+        # A lost camera often meets a surface that fits in part: only a pose without doubt ends the loss.
+        doubted = self.lost and self.usual.doubts(fit.comparison)
+        return doubted or self.usual.is_lost(fit.comparison, c.lost_share)
 
     def _doubts(self, fit: PoseFit) -> bool:
         if fit.comparison is not None:
@@ -193,7 +195,7 @@ class Tracker:
 
     def move_to(self, field: GaussianField, view: View, keyframe: FoundKeyframe, T_world_camera: Matrix) -> None:
         """Continue at another pose, with a keyframe as the reference of the next frames."""
-        self.previous, self.velocity = T_world_camera, np.eye(4)
+        self.previous, self.velocity, self.lost = T_world_camera, np.eye(4), False
         self.keyframe = keyframe_reference(
             field.params, view, keyframe.pyramid, keyframe.T_camera_world, self.config
         )  # fmt: skip
@@ -201,7 +203,8 @@ class Tracker:
 
     def forget(self) -> None:
         """Start anew at the identity, as for the first frame."""
-        self.previous, self.velocity, self.keyframe, self.keyframe_features = np.eye(4), np.eye(4), None, None
+        self.previous, self.velocity, self.lost = np.eye(4), np.eye(4), False
+        self.keyframe = self.keyframe_features = None
 
     def hop_covariance(self, fit: PoseFit, live: Pyramid) -> Matrix | None:
         """Estimate the covariance [6, 6] of a fit's left twist to the newest keyframe; None without the kernels.
