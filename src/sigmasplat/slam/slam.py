@@ -33,6 +33,7 @@ from sigmasplat.slam.localisation.known_map import KnownMap
 from sigmasplat.slam.localisation.recovery import Link, Recovery, usable
 from sigmasplat.slam.localisation.relocaliser import Relocaliser, Relocation
 from sigmasplat.slam.localisation.sight import Sight
+from sigmasplat.slam.localisation.verdict import score
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.merged import merged_field
@@ -42,6 +43,10 @@ from sigmasplat.slam.tracker import Tracker
 from sigmasplat.types import Matrix, no_progress
 
 HOST = torch.device("cpu")
+PATIENCE = 3
+"""Number of doubtful frames in a row after which the whole map is searched."""
+BETTER = 0.1
+"""A pose from the whole map replaces a doubtful one if its score is higher by this."""
 
 
 @dataclass(eq=False)
@@ -216,13 +221,14 @@ class Slam:
         """Track a frame; if it is lost, search the whole map for it; if that fails too often, begin a new map."""
         fit = self._track(seen)
         lost = self.tracker.lost
-        self.recovery.count(lost, self.tracker.doubtful, seen)
+        self.recovery.count(lost, self.tracker.doubtful > 0, seen)
         found = Found.of(fit, se3.inverse(fit.T_camera_world), lost)
         if not lost:
-            certain = self.recovery.is_steady and not (self.config.tracking.verify and self.tracker.doubtful)
+            certain = self.recovery.is_steady and not (self.config.tracking.verify and self.tracker.doubtful > 0)
             found.mapped = certain and self._is_keyframe(fit.overlap)
             if found.mapped and self._cuts:
                 found.tracking["drift_m"] = self._add_drift(fit, seen)
+            self._question(fit, seen, found)
         elif (place := self._relocalise(seen)) is not None:
             self._go_to(place, seen, found)
         elif self.recovery.gives_up and usable(seen):
@@ -305,6 +311,14 @@ class Slam:
         )  # fmt: skip
         with self._timer.stage("relocalise"):
             return self.relocaliser.find(known, self.view, seen)
+
+    def _question(self, fit: PoseFit, seen: Observation, found: Found) -> None:
+        """After some doubtful frames, ask the whole map whether another pose explains the frame much better."""
+        if fit.comparison is None or not self.tracker.doubtful or self.tracker.doubtful % PATIENCE:
+            return
+        place = self._relocalise(seen)
+        if place is not None and place.score > score(fit.comparison) + BETTER:
+            self._go_to(place, seen, found)
 
     def _go_to(self, place: Relocation, seen: Observation, found: Found) -> None:
         """Continue where the camera was found: in the active submap, or in a new one that is connected to the place."""
