@@ -24,6 +24,7 @@ from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, preset
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
+from sigmasplat.slam.checkpoint import checkpoint_of
 from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.features import make_extractor
 from sigmasplat.slam.final import final_map
@@ -33,6 +34,7 @@ from sigmasplat.slam.localisation.known_map import KnownMap
 from sigmasplat.slam.localisation.recovery import Link, Recovery, usable
 from sigmasplat.slam.localisation.relocaliser import Relocaliser, Relocation
 from sigmasplat.slam.localisation.sight import Observation
+from sigmasplat.slam.localisation.verdict import is_better, is_questionable
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.merged import components_apart, merged_field
@@ -143,18 +145,7 @@ class Slam:
     def checkpoint(self) -> dict[str, Tensor]:
         """Return what is needed to read a run back, in host memory: the active submap's field with its optimiser state,
         poses, times, keyframes, anchors, and the submap of each frame."""
-        path, active = self.trajectory(), self.mapper.field
-        return {
-            **{name: getattr(active, name).cpu() for name in ("params", "moment1", "moment2", "last_step")},
-            "adam_steps": torch.tensor(active.steps),
-            "timestamps_s": torch.from_numpy(path.timestamps_s),
-            "T_world_camera": torch.from_numpy(path.T_world_camera),
-            "T_world_camera_odometry": torch.from_numpy(self.atlas.T_world_camera(loops=False)),
-            "keyframes": torch.tensor(self.keyframe_indices, dtype=torch.int64),
-            "T_world_submap": torch.from_numpy(np.array(self.atlas.anchors).reshape(-1, 4, 4)),
-            "submap_component": torch.tensor(self.atlas.components, dtype=torch.int64),
-            "frame_submap": torch.tensor([place.submap for place in self.atlas.places], dtype=torch.int64),
-        }
+        return checkpoint_of(self.mapper.field, self.trajectory(), self.atlas, self.keyframe_indices)
 
     @property
     def view(self) -> View:
@@ -203,13 +194,14 @@ class Slam:
         """Track a frame; if it is lost, search the whole map for it; if that fails too often, begin a new map."""
         fit = self._track(seen)
         lost = self.tracker.lost
-        self.recovery.count(lost, self.tracker.doubtful, seen)
+        self.recovery.count(lost, self.tracker.doubtful > 0, seen)
         found = Found.of(fit, se3.inverse(fit.T_camera_world), lost)
         if not lost:
-            certain = self.recovery.is_steady and not (self.config.tracking.verify and self.tracker.doubtful)
+            certain = self.recovery.is_steady and not (self.config.tracking.verify and self.tracker.doubtful > 0)
             found.mapped = certain and self._is_keyframe(fit.overlap)
             if found.mapped and self._cuts:
                 found.tracking["drift_m"] = self._add_drift(fit, seen)
+            self._question(fit, seen, found)
         elif (place := self._relocalise(seen)) is not None:
             self._go_to(place, seen, found)
         elif self.recovery.gives_up and usable(seen):
@@ -252,8 +244,7 @@ class Slam:
 
     def _cut(self, T_submap_camera: Matrix) -> list[Loop]:
         """Finish the active submap and start the next one at its newest keyframe; return the loops tried."""
-        field, drift = self.mapper.field, self.drift.information
-        return self._branch(len(self.store), T_submap_camera, drift, field)
+        return self._branch(len(self.store), T_submap_camera, self.drift.information, self.mapper.field)
 
     def _branch(self, parent: int, T_parent_camera: Matrix, information: Matrix, field: GaussianField) -> list[Loop]:
         """Finish the active submap and start the next one at the camera, connected to a parent submap; return the loops
@@ -274,10 +265,8 @@ class Slam:
         """Move the active submap to the store and look for its loops, which may move anchors."""
         submap, pictures = self.mapper.finished(len(self.store))
         self.store.save(submap, pictures)
-        descriptors = [keyframe.descriptor for keyframe in self.mapper.keyframes]
-        return self.closer.submap_finished(
-            submap, [d for d in descriptors if d is not None], self.atlas, self.view
-        )  # fmt: skip
+        descriptors = [k.descriptor for k in self.mapper.keyframes if k.descriptor is not None]
+        return self.closer.submap_finished(submap, descriptors, self.atlas, self.view)
 
     # ---- lost and found ----
 
@@ -292,6 +281,14 @@ class Slam:
         )  # fmt: skip
         with self._timer.stage("relocalise"):
             return self.relocaliser.find(known, self.view, seen)
+
+    def _question(self, fit: PoseFit, seen: Observation, found: Found) -> None:
+        """After some doubtful frames, ask the whole map whether another pose explains the frame much better."""
+        if fit.comparison is None or not is_questionable(self.tracker.doubtful):
+            return
+        place = self._relocalise(seen)
+        if place is not None and is_better(place.comparison, fit.comparison):
+            self._go_to(place, seen, found)
 
     def _go_to(self, place: Relocation, seen: Observation, found: Found) -> None:
         """Continue where the camera was found: in the active submap, or in a new one that is connected to the place."""

@@ -19,7 +19,7 @@ from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.feature_image import FeatureImage, pose_by_features
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
-from sigmasplat.slam.localisation.verdict import Usual, score
+from sigmasplat.slam.localisation.verdict import Usual, confirmed, score
 from sigmasplat.slam.rules import is_lost, jumped
 from sigmasplat.types import Matrix
 
@@ -34,7 +34,8 @@ convergence of alignment ends near there."""
 class Tracker:
     """Keeps the last pose, the velocity, the last image, the reference keyframe, and statistics of recent fits.
 
-    lost: tracking of the last frame failed; doubtful: no guess explains it as well as usual.
+    lost: tracking of the last frame failed; doubtful: how many frames in a row no guess has explained as well as
+    usual.
     """
 
     config: TrackingConfig
@@ -49,7 +50,7 @@ class Tracker:
     first_losses: list[float] = dataclass_field(default_factory=list)
     usual: Usual = dataclass_field(default_factory=Usual)
     lost: bool = False
-    doubtful: bool = False
+    doubtful: int = 0
     started: bool = False
     """Whether a frame has been tracked yet."""
 
@@ -69,7 +70,8 @@ class Tracker:
             best = max([best, *guesses], key=self._score)
         if self._doubts(best):
             best = self._retry(field, view, seen, best)
-        self.lost, self.doubtful = self._is_lost(best), self._doubts(best)
+        self.lost = self._is_lost(best)
+        self.doubtful = self.doubtful + 1 if self._doubts(best) else 0
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
         self._remember(best, seen)
         return best
@@ -172,9 +174,9 @@ class Tracker:
         c = self.config
         if fit.comparison is None:
             return is_lost(fit, c.lost_agreement, c.lost_share)
-        # A lost camera often meets a surface that fits in part: only a pose without doubt ends the loss.
-        doubted = self.lost and self.usual.doubts(fit.comparison)
-        return doubted or self.usual.is_lost(fit.comparison, c.lost_share)
+        if self.lost:  # after a lost frame no prediction speaks for a pose
+            return not confirmed(fit.comparison)
+        return self.usual.is_lost(fit.comparison, c.lost_share)
 
     def _doubts(self, fit: PoseFit) -> bool:
         if fit.comparison is not None:
@@ -195,7 +197,7 @@ class Tracker:
 
     def move_to(self, field: GaussianField, view: View, keyframe: FoundKeyframe, T_world_camera: Matrix) -> None:
         """Continue at another pose, with a keyframe as the reference of the next frames."""
-        self.previous, self.velocity, self.lost = T_world_camera, np.eye(4), False
+        self.previous, self.velocity = T_world_camera, np.eye(4)
         self.keyframe = keyframe_reference(
             field.params, view, keyframe.pyramid, keyframe.T_camera_world, self.config
         )  # fmt: skip
@@ -203,8 +205,7 @@ class Tracker:
 
     def forget(self) -> None:
         """Start anew at the identity, as for the first frame."""
-        self.previous, self.velocity, self.lost = np.eye(4), np.eye(4), False
-        self.keyframe = self.keyframe_features = None
+        self.previous, self.velocity, self.keyframe, self.keyframe_features = np.eye(4), np.eye(4), None, None
 
     def hop_covariance(self, fit: PoseFit, live: Pyramid) -> Matrix | None:
         """Estimate the covariance [6, 6] of a fit's left twist to the newest keyframe; None without the kernels.
