@@ -1,7 +1,7 @@
 """SLAM: track every frame, map keyframes, cut submaps, close loops. `Slam.step` follows the papers' overviews."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 
 import numpy as np
 import torch
@@ -32,11 +32,11 @@ from sigmasplat.slam.localisation.feature_image import FeatureImage, detail_of
 from sigmasplat.slam.localisation.known_map import KnownMap
 from sigmasplat.slam.localisation.recovery import Link, Recovery, usable
 from sigmasplat.slam.localisation.relocaliser import Relocaliser, Relocation
-from sigmasplat.slam.localisation.sight import Sight
+from sigmasplat.slam.localisation.sight import Observation
 from sigmasplat.slam.localisation.verdict import score
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
 from sigmasplat.slam.mapper import Mapper
-from sigmasplat.slam.merged import merged_field
+from sigmasplat.slam.merged import components_apart, merged_field
 from sigmasplat.slam.rules import ends_submap, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.slam.tracker import Tracker
@@ -47,13 +47,6 @@ PATIENCE = 3
 """Number of doubtful frames in a row after which the whole map is searched."""
 BETTER = 0.1
 """A pose from the whole map replaces a doubtful one if its score is higher by this."""
-
-
-@dataclass(eq=False)
-class Observation(Sight):
-    """A frame as the system sees it: the working images, and the forms that tracking needs."""
-
-    frame: Frame = field(kw_only=True)
 
 
 class Slam:
@@ -132,14 +125,8 @@ class Slam:
 
     def components(self) -> list[Component]:
         """Return the components of the atlas that are not connected to the world."""
-        numbers = sorted(set(self.atlas.components) - {0})
-        return [self._component(number) for number in numbers]
-
-    def _component(self, number: int) -> Component:
-        place_of = [self.atlas.components[place.submap] == number for place in self.atlas.places]
-        tracked = np.array(place_of) & np.array([not step.lost for step in self.steps])
-        field = merged_field(self.store, self.atlas, number, self.mapper.field)
-        return Component(number, field, self.trajectory().at(tracked))
+        found = np.array([not step.lost for step in self.steps], np.bool_)
+        return components_apart(self.store, self.atlas, self.mapper.field, self.trajectory(), found)
 
     @property
     def loops(self) -> list[Loop]:

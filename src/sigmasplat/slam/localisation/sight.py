@@ -1,9 +1,10 @@
 """One frame, or one keyframe of the map, in the forms that tracking needs."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.target import Target
+from sigmasplat.model.frame import Frame
 from sigmasplat.slam.localisation.feature_image import FeatureImage
 from sigmasplat.types import Matrix
 
@@ -15,6 +16,13 @@ class Sight:
     target: Target
     live: Pyramid
     image: FeatureImage | None = None
+
+
+@dataclass(eq=False)
+class Observation(Sight):
+    """A frame in the forms that tracking and mapping need."""
+
+    frame: Frame = field(kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)

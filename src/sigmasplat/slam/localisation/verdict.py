@@ -24,9 +24,9 @@ poses, its texture at one."""
 LOST_RESIDUAL = 6.0
 """Lost: the median depth difference, in standard deviations of a reading. Clean recordings stay below 1."""
 LEAST_COMMON, LEAST_CLOSE, LEAST_EXPLAINED, LEAST_CORRELATION, MOST_RESIDUAL = 0.25, 0.75, 0.9, 0.8, 1.5
-"""The pose of a lost camera is confirmed if the images have this share of the reference in common, if this share of it is the same surface,
-if nothing known is seen through, if the gray values correlate, and if the median depth difference is below this many
-standard deviations of a reading."""
+"""The pose of a lost camera is confirmed if the images have this share of the reference in common, if this share of it
+is the same surface, if nothing known is seen through, if the gray values correlate, and if the median depth difference
+is below this many standard deviations of a reading."""
 DOUBT_SCORE = 0.7
 """Doubtful: the score falls below this share of the usual one."""
 
