@@ -17,7 +17,7 @@ from sigmasplat.model.submap import StorePart
 from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.final import final_map
 from sigmasplat.slam.found import Found
-from sigmasplat.slam.localisation.confidence import position_std_m
+from sigmasplat.slam.localisation.confidence import std_of
 from sigmasplat.slam.localisation.feature_image import FeatureImage, detail_of
 from sigmasplat.slam.localisation.known_map import KnownMap
 from sigmasplat.slam.localisation.recovery import Link, usable
@@ -181,7 +181,7 @@ class Slam(World):
             loops = self._finish_submap()
             self.closer.connect(parent, len(self.store), T_parent_camera, information)
             self.atlas.begin_submap(T_parent_camera, parent)
-            self.confidence.begun(parent, position_std_m(information))
+            self.confidence.begun(parent, std_of(information))
             self.mapper = Mapper(self.config, self.random, field).successor(self.view, T_parent_camera)
             self.drift = Drift()
             return loops
@@ -256,7 +256,10 @@ class Slam(World):
     def _step_result(self, frame: Frame, found: Found) -> Step:
         component, in_submap_m = self.atlas.components[-1], self.drift.position_m(found.T_submap_camera)
         state = APART if component and found.state != LOST else found.state
-        p_off = self.confidence.probability(found.state, found.tracking, in_submap_m, self.tracker.doubtful)
+        found.tracking |= {
+            "position_std_m": self.confidence.position_std_m(in_submap_m), "doubtful": float(self.tracker.doubtful),
+        }  # fmt: skip
+        p_off = self.confidence.probability(found.state, found.tracking)
         return Step(
             frame.index, frame.timestamp_s, self.atlas.anchors[-1] @ found.T_submap_camera, found.mapped,
             state == LOST, found.tracking, len(self.mapper.field), len(self.atlas.anchors) - 1,

@@ -25,8 +25,8 @@ from sigmasplat.slam.step_result import Step
 from sigmasplat.slam.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
-    Atlas, Camera, Confidence, Detail, Drift, Edge, FeatureImage, GaussianField, Keyframe, Link, Loop, LoopCloser, Mapper, Place,
-    Pyramid, Recovery, Reference, Relocaliser, Rows, SubmapDescriptor, Step, Target, Tracker, Usual, VectorAdam,
+    Atlas, Camera, Confidence, Detail, Drift, Edge, FeatureImage, GaussianField, Keyframe, Link, Loop, LoopCloser,
+    Mapper, Place, Pyramid, Recovery, Reference, Relocaliser, Rows, SubmapDescriptor, Step, Target, Tracker, Usual, VectorAdam,
 )  # fmt: skip
 """The classes that a state may contain."""
 

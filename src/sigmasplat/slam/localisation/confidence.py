@@ -53,34 +53,37 @@ class Confidence:
                 ours, theirs = loop.query, math.hypot(self.spread_m[loop.database], LOOP_STD_M)
                 self.spread_m[ours] = min(self.spread_m[ours], theirs)
 
-    def probability(self, state: str, tracking: Mapping[str, float], in_submap_m: float, doubtful: int) -> float:
+    def position_std_m(self, in_submap_m: float) -> float:
+        """Return the standard deviation of the camera's position in its component, given that in its submap, metres."""
+        return math.hypot(self.spread_m[-1], in_submap_m)
+
+    def probability(self, state: str, tracking: Mapping[str, float]) -> float:
         """Return the probability that the pose of the newest frame is off by more than 5 cm.
 
-        tracking: values of its fit (`metrics_of`); in_submap_m: standard deviation of its position in its submap.
+        tracking: values of its fit (`metrics_of`), with position_std_m and the number of doubtful frames in a row.
         """
         self.since_lost = 0 if state in (LOST, RELOCALISED) else self.since_lost + 1
         if state == LOST:
             return PROBABILITY_LOST
-        position_m = math.hypot(self.spread_m[-1], in_submap_m)
-        values = evidence(tracking, position_m, self.since_lost, doubtful)
+        values = evidence(tracking, self.since_lost)
         return 1.0 / (1.0 + math.exp(-BIAS - sum(WEIGHTS[name] * value for name, value in values.items())))
 
 
-def evidence(tracking: Mapping[str, float], position_m: float, since_lost: int, doubtful: int) -> dict[str, float]:
+def evidence(tracking: Mapping[str, float], since_lost: int) -> dict[str, float]:
     """Return the inputs of the logistic model by name; without a comparison of surfaces, agreement stands for it."""
     close, behind = tracking.get("close", tracking.get("agreement", 1.0)), tracking.get("behind", 0.0)
     residual, correlation = tracking.get("residual", 0.3), tracking.get("correlation", 0.95)
     return {
-        "log_position_std": math.log(position_m + 1e-3),
+        "log_position_std": math.log(tracking.get("position_std_m", 0.0) + 1e-3),
         "log_residual": math.log(min(residual, 10.0) + 0.05),
         "unexplained": behind / max(close + behind, 1e-9),
         "not_close": 1.0 - close,
         "uncorrelated": 0.1 if math.isnan(correlation) else 1.0 - max(correlation, 0.0),
-        "log_doubtful": math.log1p(doubtful),
+        "log_doubtful": math.log1p(tracking.get("doubtful", 0.0)),
         "lately_lost": math.exp(-since_lost / MEMORY),
     }
 
 
-def position_std_m(information: Matrix) -> float:
+def std_of(information: Matrix) -> float:
     """Return the standard deviation of the position, m, from the information [6, 6] of a twist."""
     return float(np.sqrt(np.trace(np.linalg.inv(information)[:3, :3])))
