@@ -56,7 +56,8 @@ class TrueMap:
             wanted=lambda submap: abs(self.keyframes[submap] - i) > APART,
         )
         seen = self._sight(self.source.frame(i))
-        self.relocaliser.find(known, self.view, seen, index_at_most=None)  # finds the features of keyframes, not timed
+        assert seen.image is not None
+        seen.image.features(self.extractor)
         clock = time.process_time()
         found = self.relocaliser.find(known, self.view, seen, index_at_most=None)
         searched: dict[str, Any] = {"frame": i, "cpu_ms": round(1e3 * (time.process_time() - clock), 1)}
