@@ -26,7 +26,8 @@ from sigmasplat.slam.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
     Atlas, Camera, Confidence, Detail, Drift, Edge, FeatureImage, GaussianField, Keyframe, Link, Loop, LoopCloser,
-    Mapper, Place, Pyramid, Recovery, Reference, Relocaliser, Rows, SubmapDescriptor, Step, Target, Tracker, Usual, VectorAdam,
+    Mapper, Place, Pyramid, Recovery, Reference, Relocaliser, Rows, SubmapDescriptor, Step, Target, Tracker, Usual,
+    VectorAdam,
 )  # fmt: skip
 """The classes that a state may contain."""
 
