@@ -23,18 +23,13 @@ from sigmasplat.slam.localisation.known_map import KnownMap
 from sigmasplat.slam.localisation.recovery import Link, usable
 from sigmasplat.slam.localisation.relocaliser import Relocation
 from sigmasplat.slam.localisation.sight import Observation
-from sigmasplat.slam.localisation.verdict import score
+from sigmasplat.slam.localisation.verdict import is_better, is_questionable
 from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.rules import ends_submap, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.slam.world import World
 from sigmasplat.types import Matrix, no_progress
-
-PATIENCE = 3
-"""Number of doubtful frames in a row after which the whole map is searched."""
-BETTER = 0.1
-"""A pose from the whole map replaces a doubtful one if its score is higher by this."""
 
 
 class Slam(World):
@@ -167,8 +162,7 @@ class Slam(World):
 
     def _cut(self, T_submap_camera: Matrix) -> list[Loop]:
         """Finish the active submap and start the next one at its newest keyframe; return the loops tried."""
-        field, drift = self.mapper.field, self.drift.information
-        return self._branch(len(self.store), T_submap_camera, drift, field)
+        return self._branch(len(self.store), T_submap_camera, self.drift.information, self.mapper.field)
 
     def _branch(self, parent: int, T_parent_camera: Matrix, information: Matrix, field: GaussianField) -> list[Loop]:
         """Finish the active submap and start the next one at the camera, connected to a parent submap; return the loops
@@ -212,10 +206,10 @@ class Slam(World):
 
     def _question(self, fit: PoseFit, seen: Observation, found: Found) -> None:
         """After some doubtful frames, ask the whole map whether another pose explains the frame much better."""
-        if fit.comparison is None or not self.tracker.doubtful or self.tracker.doubtful % PATIENCE:
+        if fit.comparison is None or not is_questionable(self.tracker.doubtful):
             return
         place = self._relocalise(seen)
-        if place is not None and place.score > score(fit.comparison) + BETTER:
+        if place is not None and is_better(place.comparison, fit.comparison):
             self._go_to(place, seen, found)
 
     def _go_to(self, place: Relocation, seen: Observation, found: Found) -> None:

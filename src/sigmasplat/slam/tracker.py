@@ -197,7 +197,7 @@ class Tracker:
 
     def move_to(self, field: GaussianField, view: View, keyframe: FoundKeyframe, T_world_camera: Matrix) -> None:
         """Continue at another pose, with a keyframe as the reference of the next frames."""
-        self.previous, self.velocity, self.lost = T_world_camera, np.eye(4), False
+        self.previous, self.velocity = T_world_camera, np.eye(4)
         self.keyframe = keyframe_reference(
             field.params, view, keyframe.pyramid, keyframe.T_camera_world, self.config
         )  # fmt: skip
@@ -205,8 +205,7 @@ class Tracker:
 
     def forget(self) -> None:
         """Start anew at the identity, as for the first frame."""
-        self.previous, self.velocity, self.lost = np.eye(4), np.eye(4), False
-        self.keyframe = self.keyframe_features = None
+        self.previous, self.velocity, self.keyframe, self.keyframe_features = np.eye(4), np.eye(4), None, None
 
     def hop_covariance(self, fit: PoseFit, live: Pyramid) -> Matrix | None:
         """Estimate the covariance [6, 6] of a fit's left twist to the newest keyframe; None without the kernels.

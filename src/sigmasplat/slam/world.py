@@ -16,6 +16,7 @@ from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, preset
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
+from sigmasplat.slam.checkpoint import checkpoint_of
 from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.features import make_extractor
 from sigmasplat.slam.localisation.confidence import Confidence
@@ -92,18 +93,7 @@ class World:
     def checkpoint(self) -> dict[str, Tensor]:
         """Return what is needed to read a run back, in host memory: the active submap's field with its optimiser state,
         poses, times, keyframes, anchors, and the submap of each frame."""
-        path, active = self.trajectory(), self.mapper.field
-        return {
-            **{name: getattr(active, name).cpu() for name in ("params", "moment1", "moment2", "last_step")},
-            "adam_steps": torch.tensor(active.steps),
-            "timestamps_s": torch.from_numpy(path.timestamps_s),
-            "T_world_camera": torch.from_numpy(path.T_world_camera),
-            "T_world_camera_odometry": torch.from_numpy(self.atlas.T_world_camera(loops=False)),
-            "keyframes": torch.tensor(self.keyframe_indices, dtype=torch.int64),
-            "T_world_submap": torch.from_numpy(np.array(self.atlas.anchors).reshape(-1, 4, 4)),
-            "submap_component": torch.tensor(self.atlas.components, dtype=torch.int64),
-            "frame_submap": torch.tensor([place.submap for place in self.atlas.places], dtype=torch.int64),
-        }
+        return checkpoint_of(self.mapper.field, self.trajectory(), self.atlas, self.keyframe_indices)
 
     @property
     def view(self) -> View:

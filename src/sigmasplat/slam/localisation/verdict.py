@@ -29,6 +29,10 @@ is the same surface, if nothing known is seen through, if the gray values correl
 is below this many standard deviations of a reading."""
 DOUBT_SCORE = 0.7
 """Doubtful: the score falls below this share of the usual one."""
+PATIENCE = 3
+"""Number of doubtful frames in a row after which the whole map is searched."""
+BETTER = 0.1
+"""A pose from the whole map replaces a doubtful one if its score is higher by this."""
 
 
 def explained(c: Comparison) -> float:
@@ -50,6 +54,16 @@ def confirmed(c: Comparison) -> bool:
         and c.residual <= MOST_RESIDUAL
         and not c.correlation < LEAST_CORRELATION
     )
+
+
+def is_questionable(doubtful: int) -> bool:
+    """Return whether the whole map is searched after this number of doubtful frames in a row."""
+    return doubtful > 0 and doubtful % PATIENCE == 0
+
+
+def is_better(c: Comparison, doubtful: Comparison) -> bool:
+    """Return whether a pose from the whole map replaces a doubtful one."""
+    return score(c) > score(doubtful) + BETTER
 
 
 @dataclass(eq=False)
