@@ -4,75 +4,41 @@ from collections.abc import Callable
 from dataclasses import asdict
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
-from sigmasplat.config import Config
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.references import live_image
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
-from sigmasplat.model.atlas import Atlas
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED, Component
+from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
-from sigmasplat.model.submap import MemoryStore, StorePart, SubmapStore
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.presets import default_preset, preset
-from sigmasplat.render.backend import make_view
-from sigmasplat.render.view import View
-from sigmasplat.slam.checkpoint import checkpoint_of
+from sigmasplat.model.submap import StorePart
 from sigmasplat.slam.drift import Drift
-from sigmasplat.slam.features import make_extractor
 from sigmasplat.slam.final import final_map
 from sigmasplat.slam.found import Found
+from sigmasplat.slam.localisation.confidence import std_of
 from sigmasplat.slam.localisation.feature_image import FeatureImage, detail_of
 from sigmasplat.slam.localisation.known_map import KnownMap
-from sigmasplat.slam.localisation.recovery import Link, Recovery, usable
-from sigmasplat.slam.localisation.relocaliser import Relocaliser, Relocation
+from sigmasplat.slam.localisation.recovery import Link, usable
+from sigmasplat.slam.localisation.relocaliser import Relocation
 from sigmasplat.slam.localisation.sight import Observation
 from sigmasplat.slam.localisation.verdict import is_better, is_questionable
-from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
+from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.slam.mapper import Mapper
-from sigmasplat.slam.merged import components_apart, merged_field
 from sigmasplat.slam.rules import ends_submap, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer
-from sigmasplat.slam.tracker import Tracker
+from sigmasplat.slam.world import World
 from sigmasplat.types import Matrix, no_progress
 
-HOST = torch.device("cpu")
 
-
-class Slam:
+class Slam(World):
     """Simultaneous localisation and mapping: give frames to `step`, then call `finish`; read `field` and `trajectory()`
     at any time.
 
     Frame 0 fixes the gauge: the world is the first camera. No part of this class reads ground truth. Finished submaps
     go to `store`, by default in memory.
     """
-
-    def __init__(self, config: Config | None = None, store: SubmapStore | None = None) -> None:
-        self.config = config or preset(default_preset())
-        self.random = np.random.default_rng(self.config.seed)
-        self.store = MemoryStore() if store is None else store
-        self.atlas = Atlas()
-        wanted = self.config.tracking.features or self.config.recovery.relocalise
-        self.extractor = make_extractor(self.config.features) if wanted else None
-        self.tracker = Tracker(self.config.tracking, self.extractor if self.config.tracking.features else None)
-        self.mapper = Mapper(self.config, self.random)
-        self.drift = Drift()
-        self.descriptor = make_descriptor(self.config.loops)
-        self.closer = LoopCloser(self.config, self.store)
-        self.recovery = Recovery(self.config.recovery)
-        self.relocaliser = Relocaliser(self.config, self.extractor)
-        self.steps: list[Step] = []
-        self.keyframe_indices: list[int] = []
-        self._view: View | None = None
-        self._final: GaussianField | None = None
-        self._timer = StepTimer()
 
     def step(self, frame: Frame) -> Step:
         """Process one frame: track it, find it in the whole map if it is lost, map it if it is a keyframe, and cut the
@@ -110,59 +76,6 @@ class Slam:
         self._final = final_map(store, anchors, self.config, self.view, self.random, progress)
         progress(total, total)
 
-    @property
-    def field(self) -> GaussianField:
-        """Return the map in the world, in host memory: the final map after `finish`, before that all submaps side by
-        side."""
-        if self._final is not None:
-            return self._final
-        if not len(self.store):
-            return self.mapper.field.to(HOST)
-        return merged_field(self.store, self.atlas, 0, self.mapper.field)
-
-    def components(self) -> list[Component]:
-        """Return the components of the atlas that are not connected to the world."""
-        found = np.array([not step.lost for step in self.steps], np.bool_)
-        return components_apart(self.store, self.atlas, self.mapper.field, self.trajectory(), found)
-
-    @property
-    def loops(self) -> list[Loop]:
-        """Return every pair of submaps that was tried as a loop, with the latest verdict."""
-        return list(self.closer.loops)
-
-    def trajectory(self) -> Trajectory:
-        """Return the poses of all frames so far, including lost ones (the log marks them).
-
-        A frame is stored relative to the newest keyframe at its time, and a keyframe relative to its submap. A frame
-        therefore moves when mapping moves its keyframe, or a loop moves its submap.
-        """
-        return Trajectory(np.array([s.timestamp_s for s in self.steps]), self.atlas.T_world_camera())
-
-    def believed(self) -> NDArray[np.bool_]:
-        """Return whether the pose of each frame so far is believed [F]: not lost, and connected to the world."""
-        return self.atlas.in_world & np.array([not step.lost for step in self.steps], np.bool_)
-
-    def checkpoint(self) -> dict[str, Tensor]:
-        """Return what is needed to read a run back, in host memory: the active submap's field with its optimiser state,
-        poses, times, keyframes, anchors, and the submap of each frame."""
-        return checkpoint_of(self.mapper.field, self.trajectory(), self.atlas, self.keyframe_indices)
-
-    @property
-    def view(self) -> View:
-        """Return the view that renders for this run's camera. Raises SourceError before the first frame."""
-        if self._view is None:
-            raise SourceError("no camera yet: give a frame to `step` first")
-        return self._view
-
-    def prepare(self, camera: Camera) -> View:
-        """Make the view for the images of a camera with the size of `Frame.prepared`. The first frame calls this
-        too."""
-        c = self.config
-        learned = bool(c.mapping.weight_nll_color or c.mapping.weight_nll_depth)
-        read = c.tracking.uncertainty and c.tracking.align_depth_by == "V"
-        self._view = make_view(c.backend, camera, c.render, variance=learned or read)
-        return self._view
-
     def _observe(self, frame: Frame) -> Observation:
         """Resize a frame to working size and prepare it for the fits."""
         with self._timer.stage("prepare"):
@@ -187,8 +100,13 @@ class Slam:
                 f"{self.config.input.max_depth_m}] m to start a map from; check the depth scale or start at a later one"
             )
         self.tracker.start(seen)
-        self.atlas.begin_submap()
+        self._begin_component()
         return Found(np.eye(4), TRACKED, mapped=True)
+
+    def _begin_component(self) -> None:
+        """Begin a map at the camera, which is its origin."""
+        self.atlas.begin_submap()
+        self.confidence.begun(None, 0.0)
 
     def _localise(self, seen: Observation) -> Found:
         """Track a frame; if it is lost, search the whole map for it; if that fails too often, begin a new map."""
@@ -257,6 +175,7 @@ class Slam:
             loops = self._finish_submap()
             self.closer.connect(parent, len(self.store), T_parent_camera, information)
             self.atlas.begin_submap(T_parent_camera, parent)
+            self.confidence.begun(parent, std_of(information))
             self.mapper = Mapper(self.config, self.random, field).successor(self.view, T_parent_camera)
             self.drift = Drift()
             return loops
@@ -265,8 +184,11 @@ class Slam:
         """Move the active submap to the store and look for its loops, which may move anchors."""
         submap, pictures = self.mapper.finished(len(self.store))
         self.store.save(submap, pictures)
-        descriptors = [k.descriptor for k in self.mapper.keyframes if k.descriptor is not None]
-        return self.closer.submap_finished(submap, descriptors, self.atlas, self.view)
+        descriptors = [keyframe.descriptor for keyframe in self.mapper.keyframes]
+        known = [descriptor for descriptor in descriptors if descriptor is not None]
+        loops = self.closer.submap_finished(submap, known, self.atlas, self.view)
+        self.confidence.closed(loops)
+        return loops
 
     # ---- lost and found ----
 
@@ -306,7 +228,7 @@ class Slam:
     def _begin_apart(self, seen: Observation, found: Found) -> None:
         """Begin a new map at the camera, whose place in the world is not known yet."""
         found.loops += self._finish_submap()
-        self.atlas.begin_submap()
+        self._begin_component()
         self.mapper, self.drift = Mapper(self.config, self.random), Drift()
         self.tracker.forget()
         self.recovery.found()
@@ -326,22 +248,14 @@ class Slam:
             self.closer.connect(a, b, link.T_a_b, link.information)
 
     def _step_result(self, frame: Frame, found: Found) -> Step:
-        component = self.atlas.components[-1]
+        component, in_submap_m = self.atlas.components[-1], self.drift.position_m(found.T_submap_camera)
         state = APART if component and found.state != LOST else found.state
+        found.tracking |= {
+            "position_std_m": self.confidence.position_std_m(in_submap_m), "doubtful": float(self.tracker.doubtful),
+        }  # fmt: skip
+        p_off = self.confidence.probability(found.state, found.tracking)
         return Step(
             frame.index, frame.timestamp_s, self.atlas.anchors[-1] @ found.T_submap_camera, found.mapped,
             state == LOST, found.tracking, len(self.mapper.field), len(self.atlas.anchors) - 1,
-            tuple(found.loops), self._timer.stop(self.view), state, component,
+            tuple(found.loops), self._timer.stop(self.view), state, component, p_off,
         )  # fmt: skip
-
-    @property
-    def _cuts(self) -> bool:
-        """Return whether any rule may end a submap."""
-        s = self.config.submaps
-        return bool(s.distance_m or s.angle_deg or s.frames or s.uncertainty_m)
-
-    @property
-    def _describes(self) -> bool:
-        """Return whether any part compares keyframes by their descriptors."""
-        m = self.config.mapping
-        return (self._cuts and self.config.loops.close) or (m.window > 2 and m.covisibility == "descriptor")

@@ -189,7 +189,7 @@ class Tracker:
 
     def keep_keyframe(self, field: GaussianField, view: View, seen: Sight, T_world_camera: Matrix) -> None:
         """Use a keyframe that was just mapped: its refined pose, and its image as the reference of the next frames."""
-        self.previous = T_world_camera
+        self.previous, self.lost = T_world_camera, False
         self.keyframe_features = seen.image
         if self.config.method == "align" or fits_of(view).aligns:  # otherwise nothing aligns to it
             T_camera_world = se3.inverse(T_world_camera)
