@@ -1,29 +1,23 @@
 """A camera that is covered and uncovered elsewhere: lost at once, found again, and never placed wrongly in silence."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config
 from sigmasplat.config.text import override
-from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.state import read_state, write_state
 from sigmasplat.model import se3
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import MemoryStore
-from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import preset
-from sigmasplat.run.session import Session, new_folder
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
-from sigmasplat.sources import SyntheticRoom
-from sigmasplat.sources.base import Source
 from small_room import frame_at, walk
 
 _core = pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
