@@ -125,6 +125,15 @@ WithMesh = Annotated[
     bool,
     arg(name="mesh", help="also write mesh.ply, and score it if the true surface is known", help_behavior_hint=""),
 ]
+InRun = Annotated[Path, arg(name="in", metavar="RUN", help="folder of a finished run, in whose map to search")]
+PosesFile = Annotated[
+    Path | None,
+    arg(
+        metavar="FILE",
+        help="file to write: .jsonl (all results) or .txt (poses as TUM text)",
+        help_behavior_hint="(default: none)",
+    ),
+]
 RunOrMap = Annotated[Path, tyro.conf.Positional, arg(metavar="RUN", help="run folder or map file")]
 FormatName = Annotated[
     str | None,
