@@ -95,11 +95,15 @@ def _table(found: Sequence["Localisation"]) -> "Table":
     """Return the results as a table, of all images or of some that are evenly spread."""
     from rich.table import Table
 
-    table = Table("image", "verdict", "x y z, m", "± cm", "submap", "keyframe", "why not")
-    shown = found[:: -(-len(found) // MOST_ROWS) or 1]
-    for r in shown:
-        posed = r.T_world_camera is not None
-        xyz = "  ".join(f"{v:.3f}" for v in r.T_world_camera[:3, 3]) if posed else ""
-        where = (str(r.submap), str(r.keyframe)) if posed else ("", "")
-        table.add_row(str(r.index), r.verdict, xyz, f"{100 * r.position_m:.1f}" if posed else "", *where, r.reason)
+    table = Table("image", "verdict", "camera in the world, or why not")
+    for r in found[:: -(-len(found) // MOST_ROWS) or 1]:
+        table.add_row(str(r.index), r.verdict, _place(r))
     return table
+
+
+def _place(r: "Localisation") -> str:
+    """Return the position with its standard deviation, and where it was found; else the reason."""
+    if r.T_world_camera is None or r.component:
+        return r.reason
+    xyz = " ".join(f"{v:.3f}" for v in r.T_world_camera[:3, 3])
+    return f"{xyz} m ± {100 * r.position_m:.1f} cm, submap {r.submap}, keyframe {r.keyframe}"

@@ -50,8 +50,8 @@ class Camera:
     def pixels_in(self, other: "Camera") -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the columns [width] and rows [height] of this camera's pixels in the image of another camera at the
         same pose. The depth of a point is the same in both."""
-        columns = (np.arange(self.width) - self.cx) * (other.fx / self.fx) + other.cx
-        rows = (np.arange(self.height) - self.cy) * (other.fy / self.fy) + other.cy
+        columns = (np.arange(self.width, dtype=np.float64) - self.cx) * (other.fx / self.fx) + other.cx
+        rows = (np.arange(self.height, dtype=np.float64) - self.cy) * (other.fy / self.fy) + other.cy
         return columns, rows
 
     def rays(self) -> NDArray[np.float32]:

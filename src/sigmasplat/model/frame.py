@@ -105,7 +105,8 @@ def _interpolated(color: NDArray[np.float32], rows: NDArray[np.float64]) -> NDAr
     at = np.clip(rows, 0, len(color) - 1)
     above = np.minimum(at.astype(np.intp), max(len(color) - 2, 0))
     share = (at - above).astype(np.float32)[:, None, None]
-    return (1 - share) * color[above] + share * color[np.minimum(above + 1, len(color) - 1)]
+    below = np.minimum(above + 1, len(color) - 1)
+    return np.asarray((1 - share) * color[above] + share * color[below], np.float32)
 
 
 def resized_color(color: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:

@@ -9,7 +9,12 @@ from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model.atlas import Atlas, Place
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField, Rows
+from sigmasplat.model.frame import Detail
 from sigmasplat.slam.drift import Drift
+from sigmasplat.slam.localisation.feature_image import FeatureImage
+from sigmasplat.slam.localisation.recovery import Link, Recovery
+from sigmasplat.slam.localisation.relocaliser import Relocaliser
+from sigmasplat.slam.localisation.verdict import Usual
 from sigmasplat.slam.loop_closure.candidates import SubmapDescriptor
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser
 from sigmasplat.slam.loop_closure.pose_graph import Edge
@@ -19,20 +24,21 @@ from sigmasplat.slam.step_result import Step
 from sigmasplat.slam.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
-    Atlas, Camera, Drift, Edge, GaussianField, Keyframe, Loop, LoopCloser, Mapper, Place, Pyramid, Reference, Rows,
-    SubmapDescriptor, Step, Target, Tracker, VectorAdam,
+    Atlas, Camera, Detail, Drift, Edge, FeatureImage, GaussianField, Keyframe, Link, Loop, LoopCloser, Mapper, Place,
+    Pyramid, Recovery, Reference, Relocaliser, Rows, SubmapDescriptor, Step, Target, Tracker, Usual, VectorAdam,
 )  # fmt: skip
 """The classes that a state may contain."""
 
 
-REMEMBERED = ("atlas", "mapper", "tracker", "drift", "steps", "keyframe_indices", "closer")
+REMEMBERED = ("atlas", "mapper", "tracker", "drift", "steps", "keyframe_indices", "closer", "recovery", "relocaliser")
 """The attributes of `Slam` that change from frame to frame, except its random numbers."""
 
 
 def fixed(slam: Slam) -> dict[str, Any]:
     """Return the objects that a state refers to but does not contain: settings, store, view, random numbers."""
     c = slam.config
-    return {"config": c, "tracking": c.tracking, "store": slam.store, "view": slam.view, "random": slam.random}
+    known = {"config": c, "tracking": c.tracking, "recovery": c.recovery, "store": slam.store, "random": slam.random}
+    return known | {"view": slam.view} | ({"extractor": slam.extractor} if slam.extractor else {})
 
 
 def state_of(slam: Slam) -> dict[str, Any]:
