@@ -32,7 +32,7 @@ INDEX_AT_MOST = 25
 """Number of keyframes whose features are found per call: 25 take about a second."""
 KEPT_LANDMARKS = 64
 """Number of keyframes whose complete landmarks stay in memory, half a megabyte each."""
-LEAST_COMMON, LEAST_CLOSE, LEAST_EXPLAINED, LEAST_CORRELATION, MOST_RESIDUAL = 0.25, 0.7, 0.9, 0.5, 2.0
+LEAST_COMMON, LEAST_CLOSE, LEAST_EXPLAINED, LEAST_CORRELATION, MOST_RESIDUAL = 0.25, 0.75, 0.9, 0.8, 1.5
 """A pose is accepted if the images have this share of the reference in common, if this share of it is the same surface,
 if nothing known is seen through, if the gray values correlate, and if the median depth difference is below this many
 standard deviations of a reading."""
