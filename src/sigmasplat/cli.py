@@ -62,7 +62,6 @@ def _run_command(arguments: Sequence[str]) -> int:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command and exit: 0 done, 1 problems found (doctor, inspect) or no image found (localise), 2 refused with
     one line, 130 interrupted."""
-    line, 130 interrupted."""
     given = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if given == ["--version"]:
         print(f"sigmasplat {sigmasplat.__version__}")
