@@ -104,7 +104,7 @@ def test_a_frame_seen_by_another_camera_has_the_same_surface() -> None:
     moved, expected = plane(large).seen_by(small), plane(small)
     read = moved.depth_m > 0
     assert 0.8 < read.mean() <= 1.0 and small.share_seen_by(large) == pytest.approx(read.mean(), abs=0.1)
-    assert np.abs(moved.depth_m - expected.depth_m)[read].max() < 0.01
+    assert np.abs(moved.depth_m - expected.depth_m)[read].max() < 0.02  # the nearest pixel is up to half a pixel off
     assert np.abs(moved.color - expected.color)[read].max() < 0.01
     assert moved.index == 3 and moved.camera == small
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sigmasplat.commands import options
-from sigmasplat.commands.options import prepare_torch, refuse_existing
+from sigmasplat.commands.options import prepare_torch, refuse_existing, working_images
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError, RunError
 
@@ -67,16 +67,6 @@ def localise(
 def search_settings(config: "Config", settings: Sequence[str], input_options: options.InputOptions) -> "Config":
     """Return a run's settings for another recording: frames and calibration are not those of the run."""
     return override(config, working_images(config) | input_options.settings() | split_settings(settings))
-
-
-def working_images(config: "Config") -> dict[str, str]:
-    """Return the default settings of the input, except that working images are made as in a run."""
-    from dataclasses import asdict
-
-    from sigmasplat.config import InputConfig
-
-    kept = {name: getattr(config.input, name) for name in ("width", "crop_px", "min_depth_m", "max_depth_m")}
-    return {f"input.{name}": str(value) for name, value in (asdict(InputConfig()) | kept).items()}
 
 
 def _refuse_ending(out: Path | None) -> None:

@@ -86,7 +86,8 @@ class RunReader:
         seen = set[int]()
         for index in range(len(self.run.submaps)):
             for k, frame in enumerate(self.run.submaps.load(index).frames):
-                if frame < len(self.frames) and frame not in seen:  # submaps share the keyframe between them
+                # Submaps share the keyframe between them. Frame numbers below 0 belong to an earlier session.
+                if 0 <= frame < len(self.frames) and frame not in seen:
                     seen.add(frame)
                     yield frame, self.run.submaps.picture(index, k)
 

@@ -9,6 +9,9 @@ from sigmasplat.errors import RunError
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.model.camera import Camera
+from sigmasplat.slam.continuation import continued, refuse_without_relocalisation, take_over
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources.base import Source
 from sigmasplat.types import Matrix
 
 LEAST_SHARE = 0.5
@@ -60,6 +63,21 @@ class FinishedMap:
         frames = len(tensors["timestamps_s"])
         return FinishedMap(run, run.config(), store, list(anchors), components, poses, frames, submaps[0].camera)
 
+    @property
+    def members(self) -> list[int]:
+        """Return the submaps that are connected to the world."""
+        return [index for index, component in enumerate(self.components) if component == 0]
+
+    def refuse_other_size(self, config: Config) -> None:
+        """Raise RunError if settings make working images of another size than those of the map."""
+        for name in ("width", "crop_px"):
+            ours, theirs = getattr(config.input, name), getattr(self.config.input, name)
+            if ours != theirs:
+                raise RunError(
+                    f"input.{name} is {ours}, but run {self.run.path} was made with {theirs}, and all submaps of a map "
+                    f"have images of one size; leave out --set input.{name}"
+                )
+
     def refuse_other_view(self, camera: Camera) -> None:
         """Raise RunError if a camera (of working size) sees too little of what the map's camera sees."""
         if self.camera.share_seen_by(camera) < LEAST_SHARE:
@@ -67,3 +85,18 @@ class FinishedMap:
                 f"the recording's camera ({camera}) sees less than half of the images of run {self.run.path} "
                 f"({self.camera}); record with a similar lens, or check --fx and --calibration"
             )
+
+
+def continue_map(earlier: FinishedMap, config: Config, source: Source, run: RunFolder) -> Slam:
+    """Copy the world of an earlier run to a new run's folder, and return a system that continues it.
+
+    run.json of the new run names the earlier one under `onto`. Raises RunError if the camera of the source sees too
+    little of what the map's camera sees, ConfigError if relocalisation is off.
+    """
+    camera = source.camera.prepared(config.input.width, config.input.crop_px)
+    earlier.refuse_other_view(camera)
+    refuse_without_relocalisation(config)
+    take_over(earlier.store, earlier.members, earlier.frames, run.submaps)
+    anchors = [earlier.anchors[index] for index in earlier.members]
+    run.note(onto={"run": str(earlier.run.path.resolve()), "submaps": len(anchors), "T_world_submap": anchors})
+    return continued(config, run.submaps, anchors)

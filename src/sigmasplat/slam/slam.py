@@ -1,7 +1,7 @@
 """SLAM: track every frame, map keyframes, cut submaps, close loops. `Slam.step` follows the papers' overviews."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -11,8 +11,6 @@ from torch import Tensor
 from sigmasplat.config import Config
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.fit.references import live_image
-from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.camera import Camera
@@ -28,11 +26,10 @@ from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.features import make_extractor
 from sigmasplat.slam.final import final_map
 from sigmasplat.slam.found import Found
-from sigmasplat.slam.localisation.feature_image import FeatureImage, detail_of
 from sigmasplat.slam.localisation.known_map import KnownMap
 from sigmasplat.slam.localisation.recovery import Link, Recovery, usable
-from sigmasplat.slam.localisation.relocaliser import Relocaliser, Relocation
-from sigmasplat.slam.localisation.sight import Sight
+from sigmasplat.slam.localisation.relocaliser import INDEX_AT_MOST, Relocaliser, Relocation
+from sigmasplat.slam.localisation.sight import Sight, sight_of, working_frame
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.merged import merged_field
@@ -76,6 +73,7 @@ class Slam:
         self.steps: list[Step] = []
         self.keyframe_indices: list[int] = []
         self._view: View | None = None
+        self._resample = False
         self._final: GaussianField | None = None
         self._timer = StepTimer()
 
@@ -176,10 +174,10 @@ class Slam:
             raise SourceError("no camera yet: give a frame to `step` first")
         return self._view
 
-    def prepare(self, camera: Camera) -> View:
+    def prepare(self, camera: Camera, resample: bool = False) -> View:
         """Make the view for the images of a camera with the size of `Frame.prepared`. The first frame calls this
-        too."""
-        c = self.config
+        too. With `resample`, frames of another camera are accepted and resampled to this one."""
+        self._resample, c = resample, self.config
         learned = bool(c.mapping.weight_nll_color or c.mapping.weight_nll_depth)
         read = c.tracking.uncertainty and c.tracking.align_depth_by == "V"
         self._view = make_view(c.backend, camera, c.render, variance=learned or read)
@@ -188,29 +186,29 @@ class Slam:
     def _observe(self, frame: Frame) -> Observation:
         """Resize a frame to working size and prepare it for the fits."""
         with self._timer.stage("prepare"):
-            i, whole = self.config.input, frame
-            frame = frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px)
-            view = self._view or self.prepare(frame.camera)
-            if frame.camera != view.camera:
-                raise SourceError(f"frame {frame.index} comes from another camera ({frame.camera}) than the first")
+            view = self._view or self.prepare(working_frame(frame, self.config).camera)
+            working = working_frame(frame, self.config, view.camera if self._resample else None)
+            if working.camera != view.camera:
+                raise SourceError(f"frame {frame.index} comes from another camera ({working.camera}) than the first")
             self._timer.start_kernels(view)
-            target = Target.of(frame, (view.sums.shape[1], view.sums.shape[2]))
-            live, image = live_image(view, frame.color, frame.depth_m, target), None
-            if self.extractor is not None:
-                detail = detail_of(whole, self.config.features.width)
-                image = FeatureImage(detail, frame.depth_m, frame.camera)
-            return Observation(target, live, image, frame=frame)
+            seen = sight_of(frame, working, view, self.config, self.extractor)
+            return Observation(seen.target, seen.live, seen.image, frame=working)
 
     def _begin(self, seen: Observation) -> Found:
-        """Start the first submap at the first frame, whose camera is the world."""
+        """Start the first submap at the first frame. Its camera is the world, unless there are earlier submaps: then
+        it is connected to the place where it is found, or begins a new component."""
         if not (seen.frame.depth_m > 0).any():
             raise SourceError(
                 f"frame {seen.frame.index} has no depth reading in [{self.config.input.min_depth_m}, "
                 f"{self.config.input.max_depth_m}] m to start a map from; check the depth scale or start at a later one"
             )
         self.tracker.start(seen)
-        self.atlas.begin_submap()
-        return Found(np.eye(4), TRACKED, mapped=True)
+        place = self._relocalise(seen, index_at_most=None) if self.atlas.anchors else None
+        if place is None:
+            self.atlas.begin_submap()
+            return Found(np.eye(4), TRACKED, mapped=True)
+        self._begin_at(place.where[0], place.T_submap_camera, place.information, self._splats_of(place))
+        return Found(np.eye(4), RELOCALISED, place.values(), mapped=True)
 
     def _localise(self, seen: Observation) -> Found:
         """Track a frame; if it is lost, search the whole map for it; if that fails too often, begin a new map."""
@@ -277,11 +275,15 @@ class Slam:
         """
         with self._timer.stage("cut"):
             loops = self._finish_submap()
-            self.closer.connect(parent, len(self.store), T_parent_camera, information)
-            self.atlas.begin_submap(T_parent_camera, parent)
-            self.mapper = Mapper(self.config, self.random, field).successor(self.view, T_parent_camera)
-            self.drift = Drift()
+            self._begin_at(parent, T_parent_camera, information, field)
             return loops
+
+    def _begin_at(self, parent: int, T_parent_camera: Matrix, information: Matrix, field: GaussianField) -> None:
+        """Start a submap at the camera, connected to a parent submap, as `_branch` does."""
+        self.closer.connect(parent, len(self.store), T_parent_camera, information)
+        self.atlas.begin_submap(T_parent_camera, parent)
+        self.mapper = Mapper(self.config, self.random, field).successor(self.view, T_parent_camera)
+        self.drift = Drift()
 
     def _finish_submap(self) -> list[Loop]:
         """Move the active submap to the store and look for its loops, which may move anchors."""
@@ -294,7 +296,9 @@ class Slam:
 
     # ---- lost and found ----
 
-    def _relocalise(self, seen: Observation, elsewhere: bool = False) -> Relocation | None:
+    def _relocalise(
+        self, seen: Observation, elsewhere: bool = False, index_at_most: int | None = INDEX_AT_MOST
+    ) -> Relocation | None:
         """Search the map for the camera; elsewhere: only in components that are not connected to the active submap."""
         if not self.config.recovery.relocalise or not usable(seen):
             return None
@@ -304,20 +308,23 @@ class Slam:
             lambda s: not elsewhere or components[s] != components[-1],
         )  # fmt: skip
         with self._timer.stage("relocalise"):
-            return self.relocaliser.find(known, self.view, seen)
+            return self.relocaliser.find(known, self.view, seen, index_at_most)
 
     def _go_to(self, place: Relocation, seen: Observation, found: Found) -> None:
         """Continue where the camera was found: in the active submap, or in a new one that is connected to the place."""
         found.state, submap = RELOCALISED, place.where[0]
-        found.tracking |= asdict(place.comparison) | {"inliers": float(place.inliers)}
+        found.tracking |= place.values()
         if submap == len(self.store):
             found.T_submap_camera = place.T_submap_camera
             self.tracker.move_to(self.mapper.field, self.view, place.keyframe, place.T_submap_camera)
         else:
-            field = self.store.load(submap).field.to(self.view.sums.device)
+            field = self._splats_of(place)
             found.loops += self._branch(submap, place.T_submap_camera, place.information, field)
             found.T_submap_camera, found.mapped = np.eye(4), True
         self.recovery.found()
+
+    def _splats_of(self, place: Relocation) -> GaussianField:
+        return self.store.load(place.where[0]).field.to(self.view.sums.device)
 
     def _begin_apart(self, seen: Observation, found: Found) -> None:
         """Begin a new map at the camera, whose place in the world is not known yet."""

@@ -6,7 +6,7 @@ by depth and overlap. The number of inliers alone accepts nothing, because a rep
 
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
@@ -77,6 +77,10 @@ class Relocation:
         A = se3.adjoint(self.T_submap_camera)
         covariance = A @ self._estimated @ A.T + FLOOR
         return symmetric(np.asarray(np.linalg.inv(symmetric(covariance)), np.float64))
+
+    def values(self) -> dict[str, float]:
+        """Return the comparison with the map and the number of matches, as a step reports them."""
+        return asdict(self.comparison) | {"inliers": float(self.inliers)}
 
     @property
     def score(self) -> float:
