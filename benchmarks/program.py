@@ -12,7 +12,7 @@ import tyro
 from sigmasplat.errors import SigmaSplatError
 
 Options = TypeVar("Options")
-NOT_RECORDED = ("runs", "out", "fresh", "quick", "scratch", "other")
+NOT_RECORDED = ("runs", "out", "fresh", "quick", "scratch", "other", "collect", "keep")
 """Options that do not affect the measurements."""
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from align_oracle import CAMERA, HUGE, Pair, oracle, pair
+from align_oracle import CAMERA, HUGE, MISSING, Pair, missing, oracle, pair
 from emulated_cuda import Emulator
 from sigmasplat.errors import BackendError
 from sigmasplat.fit import align as aligning
@@ -71,6 +71,7 @@ def test_pyramids_are_the_cpus_to_the_bit(size: tuple[int, int], weighed: bool) 
     want = seen(10, *size, weighed)
     depth = np.array(want.depth[0])
     depth[5:20, 7:30:3] = 0.0
+    depth[np.random.default_rng(0).random(depth.shape) < 0.3] = 0.0
     want = Pyramid.of(want.gray[0], depth, want.cameras[0]).weighed(want.weight[0], want.weight_depth[0])
     got = there(want)
     assert got.cameras == want.cameras and len(want.cameras) > 1
@@ -118,6 +119,20 @@ def test_normal_equations_are_the_cpus_and_those_of_the_residuals(huber: Any, ho
     assert np.linalg.eigvalsh(got.S).min() > -1e-9 * np.linalg.eigvalsh(got.S).max()
 
 
+@pytest.mark.parametrize("share", MISSING)
+def test_missing_readings_leave_the_normal_equations_those_of_the_cpu_and_of_the_residuals(share: float) -> None:
+    p = missing(pair(0.05, 0.004), share)
+    (got,) = aligning.normal_equations(CUDA_IMAGES, level_of(p, device="cpu"), [p.T])
+    (want,) = aligning.normal_equations(CPU_IMAGES, level_of(p), [p.T])
+    H, b, sums = oracle(p)
+    np.testing.assert_array_equal(got.sums[1:], want.sums[1:])
+    np.testing.assert_array_equal(got.sums[1:], sums[1:])
+    for ours, theirs, exact in ((got.H, want.H, H), (got.b, want.b, b), (got.sums[:1], want.sums[:1], sums[:1])):
+        assert np.linalg.norm(ours - theirs) < 1e-5 * np.linalg.norm(theirs)
+        assert np.linalg.norm(ours - exact) < 1e-3 * np.linalg.norm(exact)
+    assert np.linalg.norm(got.S - want.S) < 1e-5 * np.linalg.norm(want.S)
+
+
 def test_several_motions_at_once_are_each_alone() -> None:
     p = pair(0.05, 0.004, True)
     motions = [se3.exp(0.002 * k * np.ones(6)) @ p.T for k in range(MOTIONS)]
@@ -156,8 +171,9 @@ def assert_same(ours: Alignment, theirs: Alignment, atol: float = 1e-6) -> None:
 @pytest.mark.parametrize(("size", "weighed"), [((80, 60), True), ((81, 59), False)], ids=str)
 def test_two_images_are_aligned_as_on_the_cpu(size: tuple[int, int], weighed: bool) -> None:
     reference, live = seen(10, *size, weighed), seen(12, *size)
-    theirs = align(reference, live, np.eye(4), 8)
-    ours = align(there(reference), there(live), np.eye(4), 8)
+    guess = se3.exp(np.array([0.003, -0.002, 0.001, 0.002, 0.001, -0.003]))  # no point falls on the middle of a pixel
+    theirs = align(reference, live, guess, 8)
+    ours = align(there(reference), there(live), guess, 8)
     assert theirs.steps > 4 and np.abs(theirs.T_live_reference - np.eye(4)).max() > 0.02
     assert_same(ours, theirs, 1e-5)
     np.testing.assert_allclose(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from align_oracle import CAMERA, HUGE, Pair, oracle, pair
+from align_oracle import CAMERA, HUGE, MISSING, Pair, missing, oracle, pair
 from sigmasplat.fit.align import align
 from sigmasplat.fit.gray import gray_of
 from sigmasplat.fit.pyramid import Pyramid
@@ -114,20 +114,21 @@ def test_a_pyramids_camera_looks_through_the_middle_of_each_cell() -> None:
 
 def test_half_depth_never_averages_two_surfaces() -> None:
     depth = np.full((64, 64), 2.0, np.float32)
-    depth[10, 10], depth[20:, 31:] = 0.0, 3.0
+    depth[10, 10], depth[20:, 31:], depth[11, 12:14], depth[10, 14:16], depth[11, 14] = 0.0, 3.0, 0.0, 0.0, 0.0
     p = Pyramid.of(depth, depth, Camera(64, 64, 50.0, 50.0, 31.5, 31.5), levels=2)
     assert set(np.unique(p.depth[1])) == {0.0, 2.0, 3.0}
-    assert p.depth[1][5, 5] == 0.0 and p.depth[1][5, 6] == 2.0 and p.depth[1][12, 15] == 0.0
+    assert p.depth[1][5, 5:8].tolist() == [2.0, 2.0, 0.0], "three readings, two, one"
+    assert p.depth[1][5, 8] == 2.0 and p.depth[1][12, 15] == 0.0
 
 
 # ---- one step against an oracle that differentiates its residuals numerically
 
 
 def step(p: Pair, T: Array | None = None) -> tuple[Array, Array, Array]:
-    """Run the kernel: H [6, 6], b [6], sums [4]."""
+    """Run the kernel: H [6, 6], b [6], sums [5]."""
     planes = (p.gray, p.depth, p.weight, p.weight_depth, p.live_gray, p.live_depth)
     images = [np.ascontiguousarray(x, np.float32) for x in planes]
-    H, b, S, sums = np.zeros(21), np.zeros(6), np.zeros(21), np.zeros(4)
+    H, b, S, sums = np.zeros(21), np.zeros(6), np.zeros(21), np.zeros(5)
     intrinsics = [CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy]
     level = _core.Level(*images, intrinsics, [p.colors, p.depths, p.huber_gray, p.huber_depth, p.gate])
     _core.align_step(level, p.T if T is None else T, H, b, S, sums)
@@ -149,6 +150,47 @@ def test_normal_equations_are_those_of_the_residuals() -> None:
         assert np.linalg.norm(b - want_b) < 1e-3 * np.linalg.norm(want_b)
         assert np.linalg.norm(H - want_H) < 1e-3 * np.linalg.norm(want_H)
         assert np.linalg.eigvalsh(H).min() > 0
+
+
+@pytest.mark.parametrize("share", MISSING)
+def test_missing_readings_leave_the_normal_equations_those_of_the_residuals(share: float) -> None:
+    for kinds, huber in itertools.product([(1.0, 0.0), (0.0, 1.0), (0.4, 0.6)], [(HUGE, HUGE), (0.05, 0.004)]):
+        p = missing(pair(*huber), share)
+        p.colors, p.depths = kinds
+        (H, b, sums), (want_H, want_b, want_sums) = step(p), oracle(p)
+        np.testing.assert_array_equal(sums[1:], want_sums[1:])
+        assert sums[0] == pytest.approx(want_sums[0], rel=1e-4)
+        assert np.linalg.norm(b - want_b) < 1e-3 * np.linalg.norm(want_b)
+        assert np.linalg.norm(H - want_H) < 1e-3 * np.linalg.norm(want_H)
+
+
+def test_scattered_holes_keep_the_overlap_and_large_ones_reduce_it() -> None:
+    def overlap(live_depth: Array) -> float:
+        gray = gray_of(room().frame(10).color)
+        live = Pyramid.of(gray, live_depth.astype(np.float32), seen(10).cameras[0])
+        found = align(seen(10), live, np.eye(4), 1)
+        assert found.agreement > 0.95
+        return found.overlap
+
+    depth, drawn = room().frame(10).depth_m, np.random.default_rng(0).random((120, 160))
+    whole = overlap(depth)
+    assert whole > 0.97
+    for share in (0.5, 0.75):
+        assert overlap(np.where(drawn < share, 0.0, depth)) == pytest.approx(whole, abs=0.01)
+    assert overlap(np.where(np.arange(160) < 64, 0.0, depth)) == pytest.approx(0.6 * whole, abs=0.03)
+    assert overlap(np.where(drawn < 0.99, 0.0, depth)) < 0.4
+
+
+@pytest.mark.parametrize("share", [0.5, 0.75])
+def test_a_known_motion_is_found_with_missing_readings(share: float) -> None:
+    images = []
+    for i in (10, 12):
+        frame = room().frame(i)
+        drawn = np.random.default_rng(i).random(frame.depth_m.shape)
+        images.append(Pyramid.of(gray_of(frame.color), np.where(drawn < share, 0.0, frame.depth_m), frame.camera))
+    found = align(images[0], images[1], np.eye(4), 20)
+    assert_same_pose(found.T_live_reference, motion(10, 12), 3e-3, 0.15)
+    assert found.agreement > 0.9 and found.overlap > 0.7
 
 
 def test_gray_gradient_is_half_the_derivative_of_the_cost_itself() -> None:

@@ -97,6 +97,26 @@ def test_resizing_averages_colour_over_the_area_and_picks_depth() -> None:
     assert f.resized(8, 6) is f
 
 
+@pytest.mark.parametrize("size", [(320, 240), (240, 180), (150, 113)], ids=str)
+def test_resizing_finds_a_reading_anywhere_in_the_pixels_area(size: tuple[int, int]) -> None:
+    camera, drawn = Camera(640, 480, 500.0, 500.0, 319.5, 239.5), np.random.default_rng(0).random((480, 640))
+    number = np.arange(480 * 640).reshape(480, 640)
+    depth = (1.0 + number / 2**20).astype(np.float32)  # exact, so a reading tells which pixel it comes from
+    sparse = np.where(drawn < 0.5, np.float32(0.0), depth)
+    nearest, found = (
+        Frame(0, 0.0, np.zeros((480, 640, 3), np.float32), d, camera).resized(*size).depth_m for d in (depth, sparse)
+    )
+    read = found > 0
+    assert read.mean() > 0.9, "half of the readings, but four or more in each pixel's area"
+    rows, columns = np.divmod(np.rint((found[read].astype(float) - 1.0) * 2**20).astype(int), 640)
+    assert (sparse[rows, columns] == found[read]).all(), "no reading is averaged"
+    for at, pixels, scale in zip((rows, columns), np.nonzero(read), (480 / size[1], 640 / size[0]), strict=True):
+        assert np.abs(at + 0.5 - (pixels + 0.5) * scale).max() <= 0.5 * scale + 1e-9
+    kept = np.isin(nearest, sparse)
+    assert 0.4 < kept.mean() < 0.6
+    np.testing.assert_array_equal(found[kept], nearest[kept])
+
+
 def test_prepared_takes_out_of_range_readings_away() -> None:
     f = frame()
     out = f.prepared(0, 1.0, 4.0)

@@ -22,6 +22,7 @@ from sigmasplat.exports.video import VideoOptions, export_video, film_camera, or
 from sigmasplat.floorplan.floor_plan import floor_plan
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.component import Component
 from sigmasplat.model.field import GaussianField
 
 
@@ -178,6 +179,32 @@ def test_the_plan_is_an_image_and_a_json_file(reader: RunReader, tmp_path: Path)
     assert len(record["cells"]) == plan.kind.shape[0] and len(plan.path_m) == FRAMES - 1, "without the lost frame"
     with pytest.raises(RunError, match=r"give a name that ends in \.png"):
         export_plan(reader, tmp_path / "plan.pdf")
+
+
+@pytest.fixture
+def reader_apart(tmp_path: Path) -> RunReader:
+    """A run whose second submap, with its keyframe 4 and the frames after it, is not connected to the world."""
+    run = made_run(tmp_path / "run", submaps=True)
+    log, apart = run.read_log(), (4, 5)
+    for i, record in enumerate(log):
+        record |= {"submap": int(i in apart), "state": "lost" if i == LOST else "apart" if i in apart else "tracked"}
+    (run.path / "log.jsonl").write_text("".join(json.dumps(record) + "\n" for record in log))
+    run.write_trajectory(PATH.at(np.array([0, 1, 2])))
+    run.write_components([Component(1, splats(WORLD), PATH.at(np.array([4, 5])))])
+    return RunReader(run, Walls)
+
+
+def test_frames_apart_are_not_exported(reader_apart: RunReader, tmp_path: Path) -> None:
+    reader, out = reader_apart, tmp_path / "out"
+    out.mkdir()
+    assert export_nerfstudio(reader, out / "t.json") == 3 and reader.left_out() == "; left out: 1 lost, 2 apart"
+    assert export_colmap(reader, out, images=True) == 2 and reader.left_out(keyframes=True) == "; left out: 1 apart"
+    assert sorted(p.name for p in (out / "images").iterdir()) == ["frame-000000.png", "frame-000002.png"]
+    _, keyframes = FusionInput.at(reader.run, reader.camera).views()
+    assert keyframes == 2, "those of the first submap"
+    assert len(reader.believed_path()) == 3
+    with pytest.raises(RunError, match="no believed pose of frame 4"):
+        reader.poses_of([0, 4])
 
 
 def test_runs_without_a_pose_are_refused(reader: RunReader, tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from sigmasplat.io.runs import RunFolder
 from sigmasplat.presets import preset
 from sigmasplat.report.page import rerun_command, write_page
 from sigmasplat.report.summary import advice, rescan_sentences, summary_sentences
+from sigmasplat.report.tables import headline, state_rows
 from sigmasplat.report.view_strips import PanelFigure, data_uri, file_data_uri
 
 GOOD = {
@@ -47,6 +48,9 @@ def test_a_good_run_in_words() -> None:
     "changes, words",
     [
         ({"lost": 52}, "lost on 52 of 500 images"),
+        ({"apart": 41, "components": [{}]}, "41 images are in a map of their own"),
+        ({"apart": 41, "components": [{}, {}]}, "41 images are in 2 maps of their own"),
+        ({"failures": {"silent": 7}}, "7 poses are off by more than 10 cm"),
         ({"ate": None}, "no ground truth"),
         ({"status": "interrupted"}, "The run is interrupted"),
         ({"held_out": {"psnr_db": 17.0}}, "17.0 dB PSNR: poor"),
@@ -79,6 +83,7 @@ def test_unknown_figures_are_left_out() -> None:
     [
         ({"lost": 3}, {"input.stride": "3"}, "one image in 3", "--stride 1"),
         ({"lost": 3}, {}, "record that part again", "mapping.every=2"),
+        ({"apart": 2, "apart_frames": [7, 8]}, {}, "Images 7–8 are in separate maps", ""),
         ({"training": {"psnr_db": 36.0}}, {}, "5.0 dB better", "mapping.every=2"),
         ({"held_out": {"psnr_db": 22.0}}, {}, "320 pixels wide", "input.width=640"),
         ({"held_out": {"psnr_db": 31.0, "depth_coverage": 0.6}}, {}, "40 % of the depth readings", ""),
@@ -132,6 +137,17 @@ def test_regions_to_scan_again_are_summed_up() -> None:
     assert "2 not observed (3.5 m²), 1 mapped with high uncertainty (0.4 m²)" in sentence
     lost = rescan_sentences(GOOD | {"lost_frames": [3, 4, 5, 9]}, SimpleNamespace(regions=[]))
     assert len(lost) == 1 and "3–5, 9" in lost[0]
+    both = rescan_sentences(GOOD | {"lost_frames": [3], "apart_frames": [4, 5]}, None)
+    assert len(both) == 2 and "4–5" in both[1]
+
+
+def test_tables_count_the_states() -> None:
+    found = GOOD | {"lost": 2, "lost_frames": [3, 4], "relocalised_frames": [5], "apart": 1, "apart_frames": [9]}
+    rows = {row[0]: row[1:] for row in state_rows(found)}
+    assert [rows[state][0] for state in ("tracked", "relocalised", "lost", "apart")] == ["496", "1", "2", "1"]
+    assert rows["lost"][2] == "3–4"
+    assert {"Frames apart", "Silent failures"} <= {row[0] for row in headline(found | {"failures": {"silent": 3}})}
+    assert len(state_rows(GOOD)) == 2
 
 
 def test_the_page_is_one_file(tmp_path) -> None:

@@ -36,9 +36,9 @@ UNKNOWN_M = 1.0
 class Alignment:
     """The result of an alignment: the motion T_live_reference and its quality.
 
-    agreement: share of overlapping pixels whose depths agree; overlap: share of reference pixels that fall on a live
-    depth reading; degenerate: number of undetermined directions of motion; cost: per pixel; steps: number of steps
-    taken; depth_m: mean depth of the reference.
+    agreement: share of overlapping pixels whose depths agree; overlap: share of reference pixels that both cameras see,
+    where live depth has no large hole (scattered holes do not reduce it); degenerate: number of undetermined directions
+    of motion; cost: per pixel; steps: number of steps taken; depth_m: mean depth of the reference.
     """
 
     T_live_reference: Matrix
@@ -108,14 +108,14 @@ class Normal:
     b: Matrix
     S: Matrix
     sums: Matrix
-    """Weighted cost, number of pixels used, number of pixels in view with depth, number of pixels whose depths
-    agree."""
+    """Weighted cost; number of pixels used; of pixels in view that fall on a live depth reading; of those whose depths
+    agree; of pixels that both cameras see (`common_pixels` in native/align_pixel.h)."""
 
 
 def normal_equations(kernels: ImageKernels, level: LevelPlanes, motions: Sequence[Matrix]) -> list[Normal]:
     """Linearise the residuals of a level at up to 13 motions T_live_reference."""
     rows = kernels.normal_equations(level, motions)
-    return [Normal(_symmetric(row[:21]), row[21:27], _symmetric(row[31:]), row[27:31]) for row in rows]
+    return [Normal(_symmetric(row[:21]), row[21:27], _symmetric(row[32:]), row[27:32]) for row in rows]
 
 
 def align(
@@ -144,7 +144,7 @@ def align(
     return Alignment(
         se3.orthonormalise(found.T),
         agreement=float(found.sums[3] / max(found.sums[2], 1.0)),
-        overlap=float(found.sums[2] / max(found.readings, 1.0)),
+        overlap=float(found.sums[4] / max(found.readings, 1.0)),
         degenerate=found.degenerate,
         cost=float(found.sums[0] / max(found.sums[1], 1.0)),
         steps=found.steps,

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.types import Matrix
 
-LEVEL = 1
-"""Pyramid level that is compared: a quarter of the pixels, with less noise."""
-STEP = 2
-"""Every second row and column of that level is compared."""
+LEVEL = 0
+"""Pyramid level that is compared: coarser ones have no depth where the sensor is noisy."""
+STEP = 4
+"""Every fourth row and column of that level is compared."""
 NOISE_RELATIVE, NOISE_M = 0.003, 0.002
 """Standard deviation of a depth reading: a share of z² (Khoshelham & Elberink 2012) plus a constant."""
 CLOSE_SIGMA, CLOSE_M = 3.0, 0.02

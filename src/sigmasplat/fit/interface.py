@@ -126,7 +126,7 @@ class AlignRules(NamedTuple):
 
 
 class AlignedPose(NamedTuple):
-    """The result of an alignment: T_live_reference [4, 4]; sums [4] of the final iterate; steps on all levels; number
+    """The result of an alignment: T_live_reference [4, 4]; sums [5] of the final iterate; steps on all levels; number
     of undetermined directions; mean depth of the reference in metres, and how many of its pixels have depth."""
 
     T: Matrix
@@ -150,8 +150,8 @@ class LevelPlanes(NamedTuple):
     options: Sequence[float]
 
 
-NORMAL_TERMS = 52
-"""Number of values in one linearisation: H 21, b 6, sums 4, S 21 (native/align_pixel.h)."""
+NORMAL_TERMS = 53
+"""Number of values in one linearisation: H 21, b 6, sums 5, S 21 (native/align_pixel.h)."""
 
 
 @dataclass(frozen=True)
@@ -165,8 +165,9 @@ class ImageKernels:
     as_tensor: Callable[[Plane], Tensor]
     """Return a plane as a tensor that a view accepts as reference depth."""
     halve: Callable[[tuple[Plane | None, Plane | None], Plane | None], tuple[Plane | None, Plane | None, Plane | None]]
-    """Halve up to three planes of equal size: two are averaged over 2×2 cells; depth only where a cell shows one
-    surface. None stays None. With odd sizes the last row or column is dropped."""
+    """Halve up to three planes of equal size: two are averaged over 2×2 cells; depth over the readings of a cell, if
+    there are two or more and they show one surface. None stays None. With odd sizes the last row or column is
+    dropped."""
     readings_of: Callable[[Plane, Plane], Any]
     """Return the mean depth of the coarsest level in metres (1 without readings), and how many pixels of the finest
     level have a reading, float64 [2]."""

@@ -32,7 +32,7 @@ STATE = "state.safetensors"
 ALL_POSES = "trajectory_all.txt"
 """The poses of all frames, written if requested."""
 FILES = (
-    "config.json", "trajectory.txt", ALL_POSES, "map.ply", "checkpoint.safetensors", "log.jsonl", "loops.json",
+    "config.json", "trajectory.txt", "map.ply", "checkpoint.safetensors", "log.jsonl", "loops.json",
     "metrics.json", "profile.json", "report.html", TRUTH,
 )  # fmt: skip
 """Files that a run may have in addition to run.json, which always exists and identifies the folder as ours."""
@@ -121,7 +121,7 @@ class RunFolder:
 
     def _clear(self) -> None:
         """Remove the files of an earlier run, and keep files that the user added."""
-        for name in (*FILES, MESH, STATE):
+        for name in (*FILES, ALL_POSES, MESH, STATE):
             (self.path / name).unlink(missing_ok=True)
         for picture in self.images.glob("*.png"):
             picture.unlink()

@@ -52,18 +52,14 @@ class Frame:
         self.depth_m.setflags(write=False)
 
     def resized(self, width: int, height: int) -> "Frame":
-        """Return the frame at another size: colour averaged over the pixel's area, depth of the nearest pixel.
-
-        Depth is never averaged: the mean of a near and a far surface is on neither of them.
-        """
+        """Return the frame at another size: colour averaged over the pixel's area, depth by `resized_depth`."""
         if (width, height) == (self.camera.width, self.camera.height):
             return self
-        depth = Image.fromarray(self.depth_m).resize((width, height), Image.Resampling.NEAREST)
         return Frame(
             self.index,
             self.timestamp_s,
             resized_color(self.color, width, height),
-            np.array(depth, np.float32),
+            resized_depth(self.depth_m, width, height),
             self.camera.resized(width, height),
         )
 
@@ -116,3 +112,36 @@ def resized_color(color: NDArray[np.float32], width: int, height: int) -> NDArra
     planes = [np.ascontiguousarray(color[..., c]) for c in range(3)]
     small = [np.asarray(Image.fromarray(plane).resize((width, height), Image.Resampling.BOX)) for plane in planes]
     return np.asarray(np.clip(np.stack(small, -1), 0.0, 1.0), np.float32)
+
+
+def resized_depth(depth_m: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
+    """Return depth [height, width], m: in each pixel's area the reading nearest to its centre, 0 without a reading.
+
+    Depth is never averaged: the mean of a near and a far surface is on neither of them.
+    """
+    small = np.array(Image.fromarray(depth_m).resize((width, height), Image.Resampling.NEAREST), np.float32)
+    holes = np.flatnonzero(small == 0.0)
+    if not len(holes):
+        return small
+    readings, filled = depth_m.ravel(), small.ravel()
+    at_rows, at_columns = (_area(*sizes) for sizes in zip(depth_m.shape, small.shape, strict=True))
+    around = [(dy, dx) for dy in at_rows for dx in at_columns if dy or dx]
+    for dy, dx in sorted(around, key=lambda d: d[0] ** 2 + d[1] ** 2):
+        source = (at_rows[dy] * depth_m.shape[1])[:, None] + at_columns[dx]
+        found = readings.take(source.ravel().take(holes))
+        filled[holes] = found
+        holes = holes[found == 0.0]
+    return small
+
+
+def _area(size: int, resized: int) -> dict[int, NDArray[np.intp]]:
+    """Return the source pixels whose centres a resized row of pixels covers, by their offset from the nearest one.
+
+    Where a pixel does not reach as far as the offset, its outermost source pixel is repeated.
+    """
+    edges = np.arange(resized + 1) * (size / resized)
+    nearest = (edges[:-1] + 0.5 * size / resized).astype(np.intp)
+    inside = np.ceil(edges - 0.5).astype(np.intp)
+    first, last = np.minimum(inside[:-1], nearest), np.maximum(inside[1:] - 1, nearest)
+    offsets = range(int((first - nearest).min()), int((last - nearest).max()) + 1)
+    return {offset: np.clip(nearest + offset, first, last) for offset in offsets}

@@ -1,5 +1,5 @@
 // Direct alignment on a CPU: the normal equations of one step, and the loop. The loop is in C++ because a step takes
-// only a tenth of a millisecond. H [21] upper triangle, b [6], sums [4], S [21], upper triangle of Σ b_c b_cᵀ over
+// only a tenth of a millisecond. H [21] upper triangle, b [6], sums [5], S [21], upper triangle of Σ b_c b_cᵀ over
 // cells c of CELL×CELL pixels.
 #include "align_loop.h"
 #include "align_pixel.h"
@@ -34,12 +34,15 @@ static void align_step(const AlignLevel* level, const AlignOptions* o, const dou
         for (int cell = 0; cell < cells; cell++) {
             vf pull[6];
             for (auto& a : pull) a = splat(0.f);
+            const vf used = acc[22], read = acc[23], agreeing = acc[24];
             const int bottom = (band + 1) * CELL < L.height ? (band + 1) * CELL : L.height, right = (cell + 1) * CELL < L.width ? (cell + 1) * CELL : L.width;
             for (int y = band * CELL; y < bottom; y++)
                 for (int x = cell * CELL; x < right; x += W) add_pixels(L, *o, motion, x, y, acc, pull);
             double g[6];
             for (int k = 0; k < 6; k++) { g[k] = lane_sum(pull[k]); total[21 + k] += g[k]; }
-            for (int i = 0, q = 31; i < 6; i++)
+            const double read_here = lane_sum(acc[23] - read);
+            total[COMMON] += common_pixels(lane_sum((acc[22] - used) - (acc[24] - agreeing)) + read_here, read_here);
+            for (int i = 0, q = COMMON + 1; i < 6; i++)
                 for (int j = i; j < 6; j++, q++) total[q] += g[i] * g[j];
         }
         for (int k = 0; k < 21; k++) total[k] = lane_sum(acc[k]);
@@ -50,8 +53,8 @@ static void align_step(const AlignLevel* level, const AlignOptions* o, const dou
         for (int k = 0; k < NORMAL_TERMS; k++) total[k] += band_sums[size_t(band) * NORMAL_TERMS + k];
     memcpy(H, total, 21 * sizeof(double));
     memcpy(b, total + 21, 6 * sizeof(double));
-    memcpy(sums, total + 27, 4 * sizeof(double));
-    memcpy(S, total + 31, 21 * sizeof(double));
+    memcpy(sums, total + 27, (SUMS + 1) * sizeof(double));
+    memcpy(S, total + COMMON + 1, 21 * sizeof(double));
 }
 
 // Align from the coarsest level, `levels[count - 1]`, to the finest. T is the guess on input and the motion on output.
@@ -61,11 +64,11 @@ static int align_images(const AlignLevel* levels, const AlignOptions* options, i
     Descent d = begin_descent(T, count);
     while (d.level >= 0 && o.iterations > 0) {
         const int k = d.level;
-        align_step(&levels[k], &options[k], d.T, normal, normal + 21, normal + 31, normal + 27);
+        align_step(&levels[k], &options[k], d.T, normal, normal + 21, normal + COMMON + 1, normal + 27);
         take_step(d, o, normal);
     }
     copy(d.T, 12, T);
-    copy(d.sums, 4, found);
+    copy(d.sums, SUMS + 1, found);
     *degenerate = d.degenerate;
     return d.steps;
 }

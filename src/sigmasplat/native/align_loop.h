@@ -74,7 +74,7 @@ constexpr double UNKNOWN_COST = 1.7976931348623157e308;
 // with it; best… and previous: values within a level; degenerate: number of directions that the last step did not
 // change; steps: on all levels.
 struct Descent {
-    double T[12], sums[4], best_T[12], best_sums[4], best, previous;
+    double T[12], sums[5], best_T[12], best_sums[5], best, previous;
     int level, taken, steps, degenerate;
 };
 
@@ -96,7 +96,7 @@ inline Descent begin_descent(const double* T, int levels) {
 // Take the step of the normal equations at d.T, in the order of NORMAL_TERMS. The last step of a level starts the next
 // level.
 inline void take_step(Descent& d, const AlignLoop& o, const double* normal) {
-    copy(normal + 27, 4, d.sums);
+    copy(normal + 27, 5, d.sums);
     d.steps++;
     d.taken++;
     const bool blind = d.sums[1] < o.min_pixels;
@@ -104,7 +104,7 @@ inline void take_step(Descent& d, const AlignLoop& o, const double* normal) {
     if (!blind) {
         double update[6];
         const double cost = d.sums[0] / d.sums[1];
-        if (cost < d.best) { d.best = cost; copy(d.T, 12, d.best_T); copy(d.sums, 4, d.best_sums); }
+        if (cost < d.best) { d.best = cost; copy(d.T, 12, d.best_T); copy(d.sums, 5, d.best_sums); }
         d.degenerate = solve_decided(normal, normal + 21, o.depth_m, o.degenerate_share, update);
         move_left(update, d.T);
         settled = true;
@@ -113,6 +113,6 @@ inline void take_step(Descent& d, const AlignLoop& o, const double* normal) {
         d.previous = cost;
     }
     if (!blind && !settled && d.taken < o.iterations) return;
-    if (!settled && d.best < UNKNOWN_COST) { copy(d.best_T, 12, d.T); copy(d.best_sums, 4, d.sums); }
+    if (!settled && d.best < UNKNOWN_COST) { copy(d.best_T, 12, d.T); copy(d.best_sums, 5, d.sums); }
     begin_level(d, d.level - 1);
 }

@@ -5,12 +5,27 @@
 
 constexpr int CELL = 16;                   // size in pixels: errors are correlated within a cell, hardly between cells
 constexpr int MATRIX_TERMS = 21, SUMS = 4; // upper triangle of a 6×6; cost, pixels used, in view with depth, agreeing
-constexpr int NORMAL_TERMS = MATRIX_TERMS + 6 + SUMS + MATRIX_TERMS;   // H, b, sums, and S = Σ b_c b_cᵀ over cells c
+constexpr int COMMON = MATRIX_TERMS + 6 + SUMS;                        // a fifth sum, over cells: `common_pixels`
+constexpr int NORMAL_TERMS = COMMON + 1 + MATRIX_TERMS;                // H, b, sums, and S = Σ b_c b_cᵀ over cells c
 
 struct Bilinear { vf value, dx, dy; };
 SIGMA_INLINE Bilinear interpolate(vf v00, vf v10, vf v01, vf v11, vf a, vf b) {
     const vf top = fma(a, v10 - v00, v00), bottom = fma(a, v11 - v01, v01);
     return {fma(b, bottom - top, top), fma(b, (v11 - v01) - (v10 - v00), v10 - v00), bottom - top};
+}
+// Depth between four neighbours of which some have no reading (0). A plane through the readings: exact for three. A
+// derivative is 0 if no pair of readings determines it. planar: both derivatives are determined.
+struct Sparse { Bilinear at; Mask read, planar; vf nearest; };
+SIGMA_INLINE Sparse interpolate_readings(vf v00, vf v10, vf v01, vf v11, vf a, vf b) {
+    const vf none = splat(0.f), one = splat(1.f), far = splat(1e9f);
+    const Mask m00 = gt(v00, none), m10 = gt(v10, none), m01 = gt(v01, none), m11 = gt(v11, none);
+    const Mask top = both(m00, m10), bottom = both(m01, m11), left = both(m00, m01), right = both(m10, m11);
+    // With a hole among the four, at most one of the two pairs along an axis is complete.
+    const vf dx = only(top, v10 - v00) + only(bottom, v11 - v01), dy = only(left, v01 - v00) + only(right, v11 - v10);
+    const vf n10 = only(m10, one), n01 = only(m01, one), n11 = only(m11, one), n = only(m00, one) + n10 + n01 + n11;
+    const vf sum = v00 + v10 + v01 + v11 - dx * (n10 + n11) - dy * (n01 + n11);
+    const vf nearest = min(min(select(m00, v00, far), select(m10, v10, far)), min(select(m01, v01, far), select(m11, v11, far)));
+    return {{sum / max(n, one) + dx * a + dy * b, dx, dy}, gt(n, none), both(mask_or(top, bottom), mask_or(left, right)), nearest};
 }
 SIGMA_INLINE vf huber_weight(vf r, vf width) { return min(splat(1.f), width / max(abs(r), splat(1e-12f))); }
 
@@ -26,6 +41,10 @@ SIGMA_INLINE Motion motion_of(const double* T) {
 }
 
 struct ReferencePixels { const float *depth, *gray, *weight_gray, *weight_depth; };   // weights may be null
+
+// The number of a cell's pixels that both cameras see: those in view, unless live depth has a large hole there. Holes
+// that are scattered do not matter as long as a quarter of the pixels fall on a reading.
+inline double common_pixels(double in_view, double read) { return in_view < 4.0 * read ? in_view : 4.0 * read; }
 
 // Add residuals and derivatives of reference pixels to H (acc, 21), sums (acc + 21, 4) and b (pull, 6). off_x, off_y:
 // position relative to the principal point. inside: lanes that are pixels of the image.
@@ -49,13 +68,22 @@ SIGMA_INLINE void add_residuals(const AlignLevel& L, const AlignOptions& o, cons
     const vi i00 = to_int(fma(fv, splat(float(L.width)), fu));
     const Bilinear I = interpolate(gather(L.live_gray, i00), gather(L.live_gray + 1, i00), gather(L.live_gray + L.width, i00), gather(L.live_gray + L.width + 1, i00), a, c);
     const vf d00 = gather(L.live_depth, i00), d10 = gather(L.live_depth + 1, i00), d01 = gather(L.live_depth + L.width, i00), d11 = gather(L.live_depth + L.width + 1, i00);
-    const Bilinear D = interpolate(d00, d10, d01, d11, a, c);
-    const vf nearest = min(min(d00, d10), min(d01, d11)), farthest = max(max(d00, d10), max(d01, d11));
-    const Mask read = both(ok, gt(nearest, splat(0.f)));       // all four neighbours have a reading
+    Bilinear D = interpolate(d00, d10, d01, d11, a, c);
+    vf nearest = min(min(d00, d10), min(d01, d11));
+    const vf farthest = max(max(d00, d10), max(d01, d11));
+    Mask read = both(ok, gt(nearest, splat(0.f))), planar = read;
+    if (any(both(ok, mask_not(read)))) {                       // a hole among the neighbours of some pixel
+        const Sparse s = interpolate_readings(d00, d10, d01, d11, a, c);
+        D = {select(read, D.value, s.at.value), select(read, D.dx, s.at.dx), select(read, D.dy, s.at.dy)};
+        nearest = s.nearest;
+        planar = both(ok, s.planar);
+        read = both(ok, s.read);
+    }
     const vf r_depth = D.value - pz, r_gray = I.value - load(pixels.gray);
     const Mask agrees = both(read, gt(splat(o.depth_gate), abs(r_depth)));
-    // No derivative is used where the 2×2 cell contains a depth step. Without live depth only colour is used.
-    const Mask smooth = both(agrees, gt(0.03f * pz, farthest - nearest));
+    // No derivative is used where the neighbours do not determine it or contain a depth step. Without live depth only
+    // colour is used.
+    const Mask smooth = both(both(agrees, planar), gt(0.03f * pz, farthest - nearest));
     const Mask color_ok = both(ok, mask_or(agrees, mask_not(read)));
     const vf weight_gray = pixels.weight_gray ? load(pixels.weight_gray) : splat(1.f), weight_depth = pixels.weight_depth ? load(pixels.weight_depth) : splat(1.f);
     const vf hd = splat(o.huber_depth_relative) * pz * pz;    // sensor noise grows with z²

@@ -259,14 +259,14 @@ NB_MODULE(_core, m) {
              nb::arg("reference_gray"), nb::arg("reference_depth"), nb::arg("weight_gray").none(), nb::arg("weight_depth").none(), nb::arg("live_gray"),
              nb::arg("live_depth"), nb::arg("intrinsics"), nb::arg("options"));
     m.def("align_step", [](const Level& level, Doubles T, Doubles H, Doubles b, Doubles S, Doubles sums) {
-        need(T.size() >= 12 && H.size() == 21 && b.size() == 6 && S.size() == 21 && sums.size() == 4, "align_step: wrong sizes");
+        need(T.size() >= 12 && H.size() == 21 && b.size() == 6 && S.size() == 21 && sums.size() == 5, "align_step: wrong sizes");
         const AlignLevel planes = level.planes();
         nb::gil_scoped_release unlocked;
         active->align_step(&planes, &level.options, T.data(), H.data(), b.data(), S.data(), sums.data());
     });
     m.def("align_images", [](const std::vector<Level*>& levels, int iterations, double update_stop, double plateau_stop, double depth_m, double degenerate_share,
                              double min_pixels, Doubles T, Doubles sums) {
-        need(!levels.empty() && T.size() >= 12 && sums.size() == 4, "align_images: wrong sizes");
+        need(!levels.empty() && T.size() >= 12 && sums.size() == 5, "align_images: wrong sizes");
         std::vector<AlignLevel> planes;
         std::vector<AlignOptions> options;
         for (auto* level : levels) { planes.push_back(level->planes()); options.push_back(level->options); }

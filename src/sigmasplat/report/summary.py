@@ -59,7 +59,9 @@ def _path(metrics: Metrics) -> str:
     differs = before is not None and abs(before - ate["rmse_m"]) > max(0.1 * ate["rmse_m"], 1e-3)
     loops = f" Without loop closure the RMS error is {number(before, 1, 100.0)} cm." if differs else ""
     error, largest = number(ate["rmse_m"], 1, 100.0), number(ate.get("max_m"), 1, 100.0)
-    return f"{tracked} The RMS error of the path is {error} cm; the largest error is {largest} cm.{loops}"
+    silent = (metrics.get("failures") or {}).get("silent") or 0
+    undeclared = f" {silent} poses are off by more than 10 cm, but were not reported as lost." if silent else ""
+    return f"{tracked} The RMS error of the path is {error} cm; the largest error is {largest} cm.{undeclared}{loops}"
 
 
 def _apart_sentence(metrics: Metrics) -> str:

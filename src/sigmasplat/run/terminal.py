@@ -183,10 +183,11 @@ class _StepShow:
         component = step.component if step.state == APART else 0
         if step.lost or component == self.component:
             return
-        if component:
+        if component > self.component:
             self.say(f"frame {step.index}: component {component} begins, a map that is not connected to the first one")
         else:
-            self.say(f"frame {step.index}: connected to the first map again")
+            other = f"component {component}" if component else "the first map"
+            self.say(f"frame {step.index}: connected to {other}")
         self.component = component
 
 

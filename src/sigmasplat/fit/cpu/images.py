@@ -32,10 +32,12 @@ def _quarter(image: Image) -> Image:
 
 
 def _half_depth(depth: Image) -> Image:
-    """Average depth over 2×2 cells. A cell gets no reading if it contains a hole or a depth step."""
+    """Average the readings of 2×2 cells. A cell gets no reading if it has a single one or contains a depth step."""
     cells = _quarter(depth)
-    near, far = cells.min(0), cells.max(0)
-    return np.where((near > 0) & (far - near < 0.05), cells.mean(0), np.float32(0.0))
+    readings = (cells > 0).sum(0, dtype=np.float32)
+    near, far = np.where(cells > 0, cells, np.float32(np.inf)).min(0), cells.max(0)
+    mean = cells.sum(0) / np.maximum(readings, 1)
+    return np.where((readings > 1) & (far - near < 0.05), mean, np.float32(0.0))
 
 
 def readings_of(finest: Image, coarsest: Image) -> Matrix:
@@ -52,7 +54,7 @@ def align(levels: Sequence[LevelPlanes], readings: Matrix, T_live_reference: Mat
     backend_module("cpu")  # raises BackendError if the kernels are not built
     from sigmasplat.native import _core
 
-    (depth_m, n), T, sums = readings.tolist(), np.array(T_live_reference, np.float64), np.zeros(4)
+    (depth_m, n), T, sums = readings.tolist(), np.array(T_live_reference, np.float64), np.zeros(5)
     r = rules
     steps, degenerate = _core.align_images(
         [_laid_out(level) for level in levels], r.iterations, r.update_stop, r.plateau_stop, depth_m,
@@ -67,7 +69,7 @@ def normal_equations(level: LevelPlanes, motions: Sequence[Matrix]) -> Matrix:
 
     rows, laid_out = np.zeros((len(motions), NORMAL_TERMS)), _laid_out(level)
     for row, T in zip(rows, motions, strict=True):
-        _core.align_step(laid_out, T, row[:21], row[21:27], row[31:], row[27:31])
+        _core.align_step(laid_out, T, row[:21], row[21:27], row[32:], row[27:32])
     return rows
 
 

@@ -29,7 +29,7 @@ LOOP = np.dtype(
 )  # fmt: skip
 DESCENT = np.dtype(
     [
-        ("T", "f8", 12), ("sums", "f8", 4), ("best_T", "f8", 12), ("best_sums", "f8", 4), ("best", "f8"),
+        ("T", "f8", 12), ("sums", "f8", 5), ("best_T", "f8", 12), ("best_sums", "f8", 5), ("best", "f8"),
         ("previous", "f8"), ("level", "i4"), ("taken", "i4"), ("steps", "i4"), ("degenerate", "i4"),
     ],
     align=True,
@@ -59,7 +59,7 @@ class CudaLevel:
         self.device = reference_gray.device
 
     def normal_equations(self, motions: Matrix) -> Matrix:
-        """Linearise at T_live_reference [n, 4, 4], n ≤ `MOTIONS`. Returns rows of H, b, sums and S, [n, 52]. The host
+        """Linearise at T_live_reference [n, 4, 4], n ≤ `MOTIONS`. Returns rows of H, b, sums and S, [n, 53]. The host
         waits."""
         n, given = len(motions), np.zeros((MOTIONS, 12))
         given[:n] = motions[:, :3].reshape(n, 12)

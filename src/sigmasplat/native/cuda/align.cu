@@ -27,6 +27,7 @@ inline Mask mask_or(Mask a, Mask b) { return a || b; }
 inline Mask mask_not(Mask a) { return !a; }
 inline Mask any(Mask a) { return a; }
 inline vf only(Mask mask, vf a) { return mask ? a : 0.f; }
+inline vf select(Mask mask, vf a, vf b) { return mask ? a : b; }
 
 #include "align_level.h"
 #include "align_loop.h"
@@ -41,8 +42,8 @@ constexpr int PULL = MATRIX_TERMS + SUMS, FLOATS = 32;   // per pixel: H, sums, 
 struct Averaged { const float *a, *b; };   // planes; both may be null
 struct Halved { float *a, *b; };
 
-// Halve images [height, width]: two are averaged over 2×2 cells. Depth gets a reading only if all four pixels of a cell
-// have one and belong to one surface.
+// Halve images [height, width]: two are averaged over 2×2 cells. Depth is averaged over the readings of a cell; it gets
+// no reading if there is only one, or if they do not belong to one surface.
 KERNEL halve_images(Averaged from, Halved to, const float* depth, float* half_depth, int width, int height) {
     const int w = width / 2, h = height / 2, i = thread_number();
     if (i >= w * h) return;
@@ -51,8 +52,14 @@ KERNEL halve_images(Averaged from, Halved to, const float* depth, float* half_de
     if (from.b) to.b[i] = (from.b[at] + from.b[at + 1] + from.b[below] + from.b[below + 1]) / 4.f;
     if (!depth) return;
     const float z[4] = {depth[at], depth[at + 1], depth[below], depth[below + 1]};
-    const float nearest = fminf(fminf(z[0], z[1]), fminf(z[2], z[3])), farthest = fmaxf(fmaxf(z[0], z[1]), fmaxf(z[2], z[3]));
-    half_depth[i] = nearest > 0.f && farthest - nearest < 0.05f ? (z[0] + z[1] + z[2] + z[3]) / 4.f : 0.f;
+    float nearest = 1e9f, farthest = 0.f, readings = 0.f;
+    for (int k = 0; k < 4; k++) {
+        if (!(z[k] > 0.f)) continue;
+        nearest = fminf(nearest, z[k]);
+        farthest = fmaxf(farthest, z[k]);
+        readings += 1.f;
+    }
+    half_depth[i] = readings > 1.f && farthest - nearest < 0.05f ? (z[0] + z[1] + z[2] + z[3]) / readings : 0.f;
 }
 
 // ---- normal equations -----------------------------------------------------------------------------------------------
@@ -98,9 +105,12 @@ inline void store_cell(const AlignLevel& L, const AlignOptions& o, const double*
     double value;
     if (thread < MATRIX_TERMS) value = of_cell[thread];
     else if (thread < MATRIX_TERMS + 6) value = b[thread - MATRIX_TERMS];
-    else if (thread < MATRIX_TERMS + 6 + SUMS) value = of_cell[thread - 6];
-    else {
-        int row = 0, at = thread - (MATRIX_TERMS + 6 + SUMS);
+    else if (thread < COMMON) value = of_cell[thread - 6];
+    else if (thread == COMMON) {
+        const double *sums = of_cell + MATRIX_TERMS, read = sums[2];
+        value = common_pixels(sums[1] + read - sums[3], read);
+    } else {
+        int row = 0, at = thread - (COMMON + 1);
         for (; at >= 6 - row; row++) at -= 6 - row;
         value = b[row] * b[row + at];
     }

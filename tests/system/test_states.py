@@ -1,0 +1,82 @@
+"""Frames that are lost: what a run with the real SLAM leaves, and what reads it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from command_line import exit_code
+from sigmasplat.config import Config
+from sigmasplat.config.text import override
+from sigmasplat.evaluation.evaluate import evaluate
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.io.trajectory import read_trajectory
+from sigmasplat.model.frame import Frame
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.presets import default_preset, preset
+from sigmasplat.run.session import Outcome, Session
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources import SyntheticRoom
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+
+FRAMES, COVERED = 9, (4, 5)
+
+
+class CoveredCamera(SyntheticRoom):
+    """The first frames of the room; the camera is covered for two frames."""
+
+    def __init__(self) -> None:
+        super().__init__(frames=120, width=64, height=48)
+
+    def __len__(self) -> int:
+        return FRAMES
+
+    def truth(self) -> Trajectory:
+        return SyntheticRoom(frames=120, width=64, height=48).truth()
+
+    def frame(self, i: int) -> Frame:
+        frame = super().frame(i)
+        if i not in COVERED:
+            return frame
+        return replace(frame, color=np.zeros_like(frame.color), depth_m=np.zeros_like(frame.depth_m))
+
+
+def config() -> Config:
+    quick = {"input.width": "64", "mapping.first_iterations": "30", "mapping.iterations": "10", "final.iterations": "2"}
+    return override(preset(default_preset()), quick)
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunFolder, Outcome]:
+    run = RunFolder.create(tmp_path_factory.mktemp("states") / "run", config(), "room")
+    session = Session(Slam(config(), run.submaps), CoveredCamera(), run, all_poses=True)
+    return run, session.execute()
+
+
+def test_lost_frames_have_a_state_but_no_pose(result: tuple[RunFolder, Outcome]) -> None:
+    run, outcome = result
+    frames, log = run.read_frames(), run.read_log()
+    assert outcome.lost == 2 == len(frames.indices("lost")) and outcome.frames == FRAMES == len(log)
+    assert tuple(frames.indices("lost")) == COVERED and outcome.apart == ()
+    assert all(record["lost"] == (record["state"] == "lost") for record in log)
+    assert all(0.0 <= record["p_off"] <= 1.0 for record in log)
+    kept = [i for i in range(FRAMES) if i not in COVERED]
+    assert frames.rows.tolist() == kept
+    whole = read_trajectory(run.path / "trajectory_all.txt")
+    np.testing.assert_array_equal(run.read_trajectory().T_world_camera, whole.T_world_camera[kept])
+
+
+def test_lost_frames_are_not_scored_and_not_exported(
+    result: tuple[RunFolder, Outcome], capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, _ = result
+    metrics = evaluate(run, CoveredCamera(), views_per_kind=20, strips_per_kind=1)
+    assert (metrics["frames"], metrics["believed"], metrics["lost"]) == (FRAMES, FRAMES - 2, 2)
+    assert metrics["ate"]["pairs"] == FRAMES - 2 and metrics["failures"]["silent"] == 0
+    assert metrics["training"]["views"] + metrics["held_out"]["views"] == FRAMES - 2
+    assert "States of the frames" in (run.path / "report.html").read_text()
+    out: Path = run.path.parent / "path.txt"
+    assert exit_code("export", str(run.path), "--out", str(out)) == 0
+    assert len(read_trajectory(out)) == FRAMES - 2 and "left out: 2 lost" in capsys.readouterr().out
