@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from command_line import exit_code
+from recorded_room import OPTIONS, mirrored, write_images
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.trajectory import read_trajectory
 from sigmasplat.model import se3
@@ -68,8 +69,7 @@ def test_images_of_another_room_are_not_found(localiser: Localiser) -> None:
     """No room that was seen looks like its own mirror image."""
     for i in range(0, 40, 8):
         seen = SyntheticRoom(frames=200, width=160, height=120, seed=1).frame(i)
-        mirrored = replace(seen, color=seen.color[:, ::-1].copy(), depth_m=seen.depth_m[:, ::-1].copy())
-        result = localiser.locate(mirrored)
+        result = localiser.locate(mirrored(seen))
         assert result.verdict == NOT_FOUND and result.reason and result.T_world_camera is None
 
 
@@ -120,14 +120,8 @@ def test_a_frame_seen_by_another_camera_has_the_same_surface() -> None:
 def test_a_refusal_is_one_line(
     arguments: list[str], words: str, run: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    folder = tmp_path / "images"
-    from PIL import Image
-
-    for name, values in (("color", np.zeros((12, 16, 3), np.uint8)), ("depth", np.full((12, 16), 1000, np.uint16))):
-        (folder / name).mkdir(parents=True)
-        Image.fromarray(values).save(folder / name / "0.png")
-    calibration = [] if "--fx" in arguments else ["--fx", "13"]
-    assert exit_code("localise", str(folder), "--in", str(run), "--depth-scale", "1000", *calibration, *arguments) == 2
+    recording = write_images(tmp_path / "images", [open_source(WALK).frame(0)])
+    assert exit_code("localise", str(recording), "--in", str(run), *OPTIONS, *arguments) == 2
     told = capsys.readouterr().err
     assert words in told and told.count("\n") == 1
 

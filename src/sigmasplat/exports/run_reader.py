@@ -53,7 +53,10 @@ class RunReader:
     def believed_frames(self) -> list[int]:
         """Return the frames whose pose is believed, counted from the run's start. Raises RunError if there is none."""
         if not len(self.frames.rows):
-            raise RunError(f"run {self.run.path} was lost on every frame, so it has no pose to export; run it again")
+            raise RunError(
+                f"run {self.run.path} has no frame whose pose is known in its world, so it has no pose to export; "
+                "run it again"
+            )
         return [int(row) for row in self.frames.rows]
 
     def believed_path(self) -> Trajectory:
