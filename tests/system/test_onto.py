@@ -31,10 +31,9 @@ SECOND_BEGINS = 21
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run SLAM on two overlapping parts of one walk, the second onto the first."""
     folder = tmp_path_factory.mktemp("onto")
-    assert exit_code("run", WALK, *FIRST, "--out", str(folder / "first"), "--no-eval", *SHORT) == 0
-    assert (
-        exit_code("run", WALK, *SECOND, "--onto", str(folder / "first"), "--out", str(folder / "second"), *SHORT) == 0
-    )
+    first, second = str(folder / "first"), str(folder / "second")
+    assert exit_code("run", WALK, *FIRST, "--out", first, "--no-eval", *SHORT) == 0
+    assert exit_code("run", WALK, *SECOND, "--onto", first, "--out", second, *SHORT) == 0
     return folder
 
 
@@ -76,7 +75,7 @@ def test_readers_use_the_frames_of_the_new_session_only(place: Path) -> None:
     found = [frame for frame, _ in reader.keyframes()]
     assert len(found) == reader.count_keyframes() and min(found) == 0 and max(found) < 28
     snapshot = finished_snapshot(second)
-    assert len(snapshot.path) == 28 and {piece.submap for piece in snapshot.submaps} == set(range(len(second.submaps)))
+    assert len(snapshot.path) == 28 and {piece.submap for piece in snapshot.pieces} == set(range(len(second.submaps)))
     cache = SubmapCache(second)
     cache.load_new([np.array(line["T_world_camera"]) for line in second.read_log()])
     assert len(cache.pieces) == len(second.submaps)
