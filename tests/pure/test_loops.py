@@ -55,7 +55,7 @@ def walked(closer: LoopCloser, alike: bool = True) -> Atlas:
     directions = [0.0, 60.0, 120.0, 0.0 if alike else 180.0]
     for k, degrees in enumerate(directions):
         if k:
-            closer.submap_begun(k, drift, np.diag([1e4] * 6))
+            closer.connect(k - 1, k, drift, np.diag([1e4] * 6))
         atlas.begin_submap(drift if k else None)
         atlas.keyframe_poses[-1] = [np.eye(4), np.eye(4)]
         field = GaussianField.from_values(torch.zeros(3, 3), torch.ones(3), torch.zeros(3, 3))

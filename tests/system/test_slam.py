@@ -60,6 +60,16 @@ def run() -> Slam:
     return follow(frames(FRAMES), settings())
 
 
+@pytest.fixture(scope="module")
+def sparse() -> Slam:
+    """Run on the same frames, of which half of the depth readings are missing at random."""
+    random, given = np.random.default_rng(5), []
+    for frame in frames(FRAMES):
+        drawn = random.random(frame.depth_m.shape)
+        given.append(replace(frame, depth_m=np.where(drawn < 0.5, np.float32(0.0), frame.depth_m)))
+    return follow(given, settings())
+
+
 @pytest.fixture
 def threads() -> Iterator[Callable[[int], None]]:
     """Choose the threads of kernels and torch for one test."""
@@ -72,6 +82,12 @@ def threads() -> Iterator[Callable[[int], None]]:
     yield choose
     _core.set_threads(before[0])
     torch.set_num_threads(before[1])
+
+
+def test_half_of_the_depth_readings_are_enough(run: Slam, sparse: Slam) -> None:
+    assert lost(sparse) == []
+    assert error_m(sparse) < 2 * error_m(run)
+    assert len(sparse.keyframe_indices) <= len(run.keyframe_indices) + 1, "missing readings alone make no keyframe"
 
 
 def test_the_path_is_followed(run: Slam) -> None:

@@ -16,7 +16,7 @@ class FeatureConfig:
     time."""
     width: int = 640
     """Images wider than this are reduced to this width before detection; 0 = never."""
-    ratio: float = 0.8
+    ratio: float = 0.9
     """A match is used if its descriptor distance is below this multiple of the distance to the second-best candidate
     (Lowe 2004). Not used by xfeat."""
     ransac_px: float = 3.0

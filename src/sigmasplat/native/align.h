@@ -40,8 +40,10 @@ static void align_step(const AlignLevel* level, const AlignOptions* o, const dou
                 for (int x = cell * CELL; x < right; x += W) add_pixels(L, *o, motion, x, y, acc, pull);
             double g[6];
             for (int k = 0; k < 6; k++) { g[k] = lane_sum(pull[k]); total[21 + k] += g[k]; }
-            const double read_here = lane_sum(acc[23] - read);
-            total[COMMON] += common_pixels(lane_sum((acc[22] - used) - (acc[24] - agreeing)) + read_here, read_here);
+            // Two counts in one sum, exact below 2²⁴: pixels in view without a reading or agreeing, and readings.
+            const int counts = int(lane_sum(fma(splat(4096.f), (acc[22] - used) - (acc[24] - agreeing), acc[23] - read)));
+            const int read_here = counts % 4096;
+            total[COMMON] += common_pixels(counts / 4096 + read_here, read_here);
             for (int i = 0, q = COMMON + 1; i < 6; i++)
                 for (int j = i; j < 6; j++, q++) total[q] += g[i] * g[j];
         }

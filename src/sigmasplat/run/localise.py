@@ -21,7 +21,7 @@ from sigmasplat.slam.features import make_extractor
 from sigmasplat.slam.localisation.known_map import KnownMap
 from sigmasplat.slam.localisation.recovery import usable
 from sigmasplat.slam.localisation.relocaliser import Relocaliser, Relocation, SearchResult
-from sigmasplat.slam.localisation.sight import sight_of, working_frame
+from sigmasplat.slam.localisation.sight import observe, working_frame
 from sigmasplat.types import Matrix
 
 FOUND, APART, NOT_FOUND = "found", "apart", "not found"
@@ -80,7 +80,7 @@ class Localiser:
     def locate(self, frame: Frame) -> Localisation:
         """Return where an image was taken."""
         working = working_frame(frame, self.config, self.finished.camera)
-        seen = sight_of(frame, working, self.view, self.config, self.extractor)
+        seen = observe(frame, working, self.view, self.config, self.extractor)
         if not usable(seen):
             return Localisation(frame.index, frame.timestamp_s, NOT_FOUND, "too little depth or texture")
         result = self.relocaliser.search(self.known, self.view, seen, index_at_most=None)

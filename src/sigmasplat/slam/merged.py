@@ -1,10 +1,14 @@
 """Read the map while it grows: the splats of one component of the atlas in one frame."""
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from sigmasplat.model.atlas import Atlas
+from sigmasplat.model.component import Component
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.submap import SubmapStore
+from sigmasplat.model.trajectory import Trajectory
 
 
 def merged_field(store: SubmapStore, atlas: Atlas, component: int, active: GaussianField) -> GaussianField:
@@ -15,3 +19,14 @@ def merged_field(store: SubmapStore, atlas: Atlas, component: int, active: Gauss
         field = store.load(s).field if s < len(store) else active.to(torch.device("cpu"))
         merged.append(field.moved(torch.from_numpy(atlas.anchors[s])))
     return merged
+
+
+def components_apart(
+    store: SubmapStore, atlas: Atlas, active: GaussianField, trajectory: Trajectory, found: NDArray[np.bool_]
+) -> list[Component]:
+    """Return the components that are not connected to the world; trajectory: of all frames, found [F]: not lost."""
+    component_of = np.array([atlas.components[place.submap] for place in atlas.places], np.int64)
+    return [
+        Component(n, merged_field(store, atlas, n, active), trajectory.at(found & (component_of == n)))
+        for n in sorted(set(atlas.components) - {0})
+    ]

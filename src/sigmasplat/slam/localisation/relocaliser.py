@@ -22,7 +22,7 @@ from sigmasplat.slam.features import Extractor, Features, Landmarks, matches_by_
 from sigmasplat.slam.localisation.feature_image import pose_by_features
 from sigmasplat.slam.localisation.known_map import KnownKeyframe, KnownMap, Where
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
-from sigmasplat.slam.localisation.verdict import explained, score
+from sigmasplat.slam.localisation.verdict import confirmed, score
 from sigmasplat.types import Matrix
 
 STRONGEST = 400
@@ -32,10 +32,6 @@ INDEX_AT_MOST = 25
 """Number of keyframes whose features are found per call: 25 take about a second."""
 KEPT_LANDMARKS = 64
 """Number of keyframes whose complete landmarks stay in memory, half a megabyte each."""
-LEAST_COMMON, LEAST_CLOSE, LEAST_EXPLAINED, LEAST_CORRELATION, MOST_RESIDUAL = 0.25, 0.75, 0.9, 0.8, 1.5
-"""A pose is accepted if the images have this share of the reference in common, if this share of it is the same surface,
-if nothing known is seen through, if the gray values correlate, and if the median depth difference is below this many
-standard deviations of a reading."""
 FLOOR_M, FLOOR_RAD = 0.005, 0.003
 """Minimum standard deviation of a pose that was found."""
 FLOOR = np.diag(np.repeat([FLOOR_M**2, FLOOR_RAD**2], 3))
@@ -129,7 +125,7 @@ class Relocaliser:
         best: dict[bool, Relocation] = {}
         for where in candidates:
             for tried in self._poses(known, view, seen, where):
-                verdict = accepted(tried.comparison)
+                verdict = confirmed(tried.comparison)
                 if verdict not in best or tried.score > best[verdict].score:
                     best[verdict] = tried
             if True in best and best[True].score > ENOUGH:
@@ -202,17 +198,6 @@ def keyframe_image(keyframe: KnownKeyframe, view: View) -> Reference:
     target = Target.of_picture(picture, view.camera, (view.sums.shape[1], view.sums.shape[2]))
     pyramid = live_image(view, picture.unit_color, picture.depth_m, target)
     return Reference(pyramid, se3.inverse(keyframe.T_submap_camera))
-
-
-def accepted(c: Comparison) -> bool:
-    """Return whether the map confirms a pose."""
-    return (
-        c.common >= LEAST_COMMON
-        and c.close >= LEAST_CLOSE
-        and explained(c) >= LEAST_EXPLAINED
-        and c.residual <= MOST_RESIDUAL
-        and not c.correlation < LEAST_CORRELATION
-    )
 
 
 def _compact(descriptors: Matrix) -> Matrix:

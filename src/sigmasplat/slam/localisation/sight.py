@@ -1,6 +1,6 @@
 """One frame, or one keyframe of the map, in the forms that tracking needs."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from sigmasplat.config import Config
 from sigmasplat.fit.pyramid import Pyramid
@@ -23,6 +23,13 @@ class Sight:
     image: FeatureImage | None = None
 
 
+@dataclass(eq=False)
+class Observation(Sight):
+    """A frame in the forms that tracking and mapping need."""
+
+    frame: Frame = field(kw_only=True)
+
+
 def working_frame(frame: Frame, config: Config, camera: Camera | None = None) -> Frame:
     """Return a frame at working size; if `camera` is given and differs, as that camera at the same pose sees it."""
     i = config.input
@@ -32,14 +39,14 @@ def working_frame(frame: Frame, config: Config, camera: Camera | None = None) ->
     return frame.seen_by(camera).prepared(0, i.min_depth_m, i.max_depth_m)
 
 
-def sight_of(whole: Frame, working: Frame, view: View, config: Config, extractor: Extractor | None) -> Sight:
+def observe(whole: Frame, working: Frame, view: View, config: Config, extractor: Extractor | None) -> Observation:
     """Return a frame in the forms that tracking needs; features are found in the whole frame, the rest is made of the
     working one."""
     target = Target.of(working, (view.sums.shape[1], view.sums.shape[2]))
     live, image = live_image(view, working.color, working.depth_m, target), None
     if extractor is not None:
         image = FeatureImage(detail_of(whole, config.features.width), working.depth_m, working.camera)
-    return Sight(target, live, image)
+    return Observation(target, live, image, frame=working)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ RECENT = 50
 """Values of this many believed frames define what is usual."""
 FEW = 5
 """With fewer values nothing is usual yet."""
-LOST_CLOSE, LOST_EXPLAINED = 0.3, 0.8
+LOST_CLOSE, LOST_EXPLAINED = 0.3, 0.85
 """Lost: less than this share of the common surface is where it should be; of the part that nothing new covers, less
 than this share is. Something large in front of the camera lowers the first, only a wrong pose lowers the second."""
 DOUBT_CLOSE, DOUBT_EXPLAINED = 0.9, 0.95
@@ -23,8 +23,16 @@ DOUBT_CORRELATION, LOST_CORRELATION = 0.85, 0.4
 poses, its texture at one."""
 LOST_RESIDUAL = 6.0
 """Lost: the median depth difference, in standard deviations of a reading. Clean recordings stay below 1."""
+LEAST_COMMON, LEAST_CLOSE, LEAST_EXPLAINED, LEAST_CORRELATION, MOST_RESIDUAL = 0.25, 0.75, 0.9, 0.8, 1.5
+"""The pose of a lost camera is confirmed if the images have this share of the reference in common, if this share of it
+is the same surface, if nothing known is seen through, if the gray values correlate, and if the median depth difference
+is below this many standard deviations of a reading."""
 DOUBT_SCORE = 0.7
 """Doubtful: the score falls below this share of the usual one."""
+PATIENCE = 3
+"""Number of doubtful frames in a row after which the whole map is searched."""
+BETTER = 0.1
+"""A pose from the whole map replaces a doubtful one if its score is higher by this."""
 
 
 def explained(c: Comparison) -> float:
@@ -35,6 +43,27 @@ def explained(c: Comparison) -> float:
 def score(c: Comparison) -> float:
     """Return the share of the reference that a pose explains, less if it sees through known surfaces; in [0, 1]."""
     return c.common * c.close * explained(c)
+
+
+def confirmed(c: Comparison) -> bool:
+    """Return whether the map confirms a pose without any knowledge of the camera's path."""
+    return (
+        c.common >= LEAST_COMMON
+        and c.close >= LEAST_CLOSE
+        and explained(c) >= LEAST_EXPLAINED
+        and c.residual <= MOST_RESIDUAL
+        and not c.correlation < LEAST_CORRELATION
+    )
+
+
+def is_questionable(doubtful: int) -> bool:
+    """Return whether the whole map is searched after this number of doubtful frames in a row."""
+    return doubtful > 0 and doubtful % PATIENCE == 0
+
+
+def is_better(c: Comparison, doubtful: Comparison) -> bool:
+    """Return whether a pose from the whole map replaces a doubtful one."""
+    return score(c) > score(doubtful) + BETTER
 
 
 @dataclass(eq=False)
@@ -57,13 +86,13 @@ class Usual:
                 del values[:-RECENT]
 
     def is_lost(self, c: Comparison, least_share: float) -> bool:
-        """Return whether a pose is refuted, or explains less than `least_share` of the reference."""
+        """Return whether a pose is refuted, or has less than `least_share` of the reference in common."""
         return (
             c.close < LOST_CLOSE
             or explained(c) < LOST_EXPLAINED
             or c.residual > LOST_RESIDUAL * max(1.0, _median(self.residuals, 0.0))
             or c.correlation < LOST_CORRELATION * _median(self.correlations, 0.8)
-            or score(c) < least_share
+            or c.common < least_share
         )
 
     def doubts(self, c: Comparison) -> bool:

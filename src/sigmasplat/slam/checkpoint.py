@@ -1,0 +1,27 @@
+"""What a run keeps in its checkpoint."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sigmasplat.model.atlas import Atlas
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.trajectory import Trajectory
+
+
+def checkpoint_of(active: GaussianField, path: Trajectory, atlas: Atlas, keyframes: Sequence[int]) -> dict[str, Tensor]:
+    """Return the active submap's field with its optimiser state, poses, times, keyframes, anchors, and the submap of
+    each frame, in host memory."""
+    return {
+        **{name: getattr(active, name).cpu() for name in ("params", "moment1", "moment2", "last_step")},
+        "adam_steps": torch.tensor(active.steps),
+        "timestamps_s": torch.from_numpy(path.timestamps_s),
+        "T_world_camera": torch.from_numpy(path.T_world_camera),
+        "T_world_camera_odometry": torch.from_numpy(atlas.T_world_camera(loops=False)),
+        "keyframes": torch.tensor(keyframes, dtype=torch.int64),
+        "T_world_submap": torch.from_numpy(np.array(atlas.anchors).reshape(-1, 4, 4)),
+        "submap_component": torch.tensor(atlas.components, dtype=torch.int64),
+        "frame_submap": torch.tensor([place.submap for place in atlas.places], dtype=torch.int64),
+    }

@@ -1,0 +1,89 @@
+"""Estimate the probability that the pose of a frame is off by more than 5 cm.
+
+Two things make a pose wrong: the fit of this frame, which the comparison of surfaces judges, and the path to its
+submap, whose spread grows with every hop between keyframes and shrinks with every loop. A logistic model joins them;
+`benchmarks/failure_probability.py` fits its weights to disturbed recordings with known truth.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sigmasplat.model.component import LOST, RELOCALISED
+from sigmasplat.slam.loop_closure.closer import Loop
+from sigmasplat.types import Matrix
+
+LOOP_STD_M = 0.01
+"""Standard deviation of the position that a loop gives."""
+MEMORY = 20.0
+"""A lost frame is forgotten after about this many tracked ones."""
+BIAS = -3.0
+WEIGHTS: dict[str, float] = {
+    "log_position_std": 0.8,
+    "log_residual": 0.3,
+    "unexplained": 6.0,
+    "not_close": 3.0,
+    "uncorrelated": 3.0,
+    "log_doubtful": 0.5,
+    "lately_lost": 1.0,
+}
+"""Weights of the logistic model."""
+PROBABILITY_LOST = 0.95
+"""Share of lost frames whose guess of the pose is off by more than 5 cm."""
+
+
+@dataclass(eq=False)
+class Confidence:
+    """spread_m: standard deviation of each submap's position in its component; since_lost: frames since the last lost
+    one; doubtful: doubtful frames in a row."""
+
+    spread_m: list[float] = field(default_factory=list)
+    since_lost: int = 1_000_000
+
+    def begun(self, parent: int | None, position_m: float) -> None:
+        """Add a submap: at position_m (standard deviation, m) from its parent, or the first of a component."""
+        self.spread_m.append(0.0 if parent is None else math.hypot(self.spread_m[parent], position_m))
+
+    def closed(self, loops: Sequence[Loop]) -> None:
+        """Take the loops of a finished submap into account."""
+        for loop in loops:
+            if loop.accepted:
+                ours, theirs = loop.query, math.hypot(self.spread_m[loop.database], LOOP_STD_M)
+                self.spread_m[ours] = min(self.spread_m[ours], theirs)
+
+    def position_std_m(self, in_submap_m: float) -> float:
+        """Return the standard deviation of the camera's position in its component, given that in its submap, metres."""
+        return math.hypot(self.spread_m[-1], in_submap_m)
+
+    def probability(self, state: str, tracking: Mapping[str, float]) -> float:
+        """Return the probability that the pose of the newest frame is off by more than 5 cm.
+
+        tracking: values of its fit (`metrics_of`), with position_std_m and the number of doubtful frames in a row.
+        """
+        self.since_lost = 0 if state in (LOST, RELOCALISED) else self.since_lost + 1
+        if state == LOST:
+            return PROBABILITY_LOST
+        values = evidence(tracking, self.since_lost)
+        return 1.0 / (1.0 + math.exp(-BIAS - sum(WEIGHTS[name] * value for name, value in values.items())))
+
+
+def evidence(tracking: Mapping[str, float], since_lost: int) -> dict[str, float]:
+    """Return the inputs of the logistic model by name; without a comparison of surfaces, agreement stands for it."""
+    close, behind = tracking.get("close", tracking.get("agreement", 1.0)), tracking.get("behind", 0.0)
+    residual, correlation = tracking.get("residual", 0.3), tracking.get("correlation", 0.95)
+    return {
+        "log_position_std": math.log(tracking.get("position_std_m", 0.0) + 1e-3),
+        "log_residual": math.log(min(residual, 10.0) + 0.05),
+        "unexplained": behind / max(close + behind, 1e-9),
+        "not_close": 1.0 - close,
+        "uncorrelated": 0.1 if math.isnan(correlation) else 1.0 - max(correlation, 0.0),
+        "log_doubtful": math.log1p(tracking.get("doubtful", 0.0)),
+        "lately_lost": math.exp(-since_lost / MEMORY),
+    }
+
+
+def std_of(information: Matrix) -> float:
+    """Return the standard deviation of the position, m, from the information [6, 6] of a twist."""
+    return float(np.sqrt(np.trace(np.linalg.inv(information)[:3, :3])))

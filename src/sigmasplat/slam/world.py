@@ -1,0 +1,126 @@
+"""The state of SLAM, and how to read it: map, path, components, checkpoint."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.config import Config
+from sigmasplat.errors import SourceError
+from sigmasplat.model.atlas import Atlas
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.component import Component
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.submap import MemoryStore, SubmapStore
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.presets import default_preset, preset
+from sigmasplat.render.backend import make_view
+from sigmasplat.render.view import View
+from sigmasplat.slam.checkpoint import checkpoint_of
+from sigmasplat.slam.drift import Drift
+from sigmasplat.slam.features import make_extractor
+from sigmasplat.slam.localisation.confidence import Confidence
+from sigmasplat.slam.localisation.recovery import Recovery
+from sigmasplat.slam.localisation.relocaliser import Relocaliser
+from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
+from sigmasplat.slam.mapper import Mapper
+from sigmasplat.slam.merged import components_apart, merged_field
+from sigmasplat.slam.step_result import Step, StepTimer
+from sigmasplat.slam.tracker import Tracker
+
+HOST = torch.device("cpu")
+
+
+class World:
+    """Everything that SLAM knows between two frames; `Slam` changes it.
+
+    Frame 0 fixes the gauge: the world is the first camera, or that of the map that is continued. Finished submaps go to
+    `store`, by default in memory.
+    """
+
+    def __init__(self, config: Config | None = None, store: SubmapStore | None = None) -> None:
+        self.config = config or preset(default_preset())
+        self.random = np.random.default_rng(self.config.seed)
+        self.store = MemoryStore() if store is None else store
+        self.atlas = Atlas()
+        wanted = self.config.tracking.features or self.config.recovery.relocalise
+        self.extractor = make_extractor(self.config.features) if wanted else None
+        self.tracker = Tracker(self.config.tracking, self.extractor if self.config.tracking.features else None)
+        self.mapper = Mapper(self.config, self.random)
+        self.drift = Drift()
+        self.descriptor = make_descriptor(self.config.loops)
+        self.closer = LoopCloser(self.config, self.store)
+        self.recovery = Recovery(self.config.recovery)
+        self.confidence = Confidence()
+        self.relocaliser = Relocaliser(self.config, self.extractor)
+        self.steps: list[Step] = []
+        self.keyframe_indices: list[int] = []
+        self._view: View | None = None
+        self._resample = False
+        self._final: GaussianField | None = None
+        self._timer = StepTimer()
+
+    @property
+    def field(self) -> GaussianField:
+        """Return the map in the world, in host memory: the final map after `finish`, before that all submaps side by
+        side."""
+        if self._final is not None:
+            return self._final
+        if not len(self.store):
+            return self.mapper.field.to(HOST)
+        return merged_field(self.store, self.atlas, 0, self.mapper.field)
+
+    def components(self) -> list[Component]:
+        """Return the components of the atlas that are not connected to the world."""
+        found = np.array([not step.lost for step in self.steps], np.bool_)
+        return components_apart(self.store, self.atlas, self.mapper.field, self.trajectory(), found)
+
+    @property
+    def loops(self) -> list[Loop]:
+        """Return every pair of submaps that was tried as a loop, with the latest verdict."""
+        return list(self.closer.loops)
+
+    def trajectory(self) -> Trajectory:
+        """Return the poses of all frames so far, including lost ones (the log marks them).
+
+        A frame is stored relative to the newest keyframe at its time, and a keyframe relative to its submap. A frame
+        therefore moves when mapping moves its keyframe, or a loop moves its submap.
+        """
+        return Trajectory(np.array([s.timestamp_s for s in self.steps]), self.atlas.T_world_camera())
+
+    def believed(self) -> NDArray[np.bool_]:
+        """Return whether the pose of each frame so far is believed [F]: not lost, and connected to the world."""
+        return self.atlas.in_world & np.array([not step.lost for step in self.steps], np.bool_)
+
+    def checkpoint(self) -> dict[str, Tensor]:
+        """Return what is needed to read a run back, in host memory: the active submap's field with its optimiser state,
+        poses, times, keyframes, anchors, and the submap of each frame."""
+        return checkpoint_of(self.mapper.field, self.trajectory(), self.atlas, self.keyframe_indices)
+
+    @property
+    def view(self) -> View:
+        """Return the view that renders for this run's camera. Raises SourceError before the first frame."""
+        if self._view is None:
+            raise SourceError("no camera yet: give a frame to `step` first")
+        return self._view
+
+    def prepare(self, camera: Camera, resample: bool = False) -> View:
+        """Make the view for the images of a camera with the size of `Frame.prepared`. The first frame calls this
+        too. With `resample`, frames of another camera are accepted and resampled to this one."""
+        self._resample, c = resample, self.config
+        learned = bool(c.mapping.weight_nll_color or c.mapping.weight_nll_depth)
+        read = c.tracking.uncertainty and c.tracking.align_depth_by == "V"
+        self._view = make_view(c.backend, camera, c.render, variance=learned or read)
+        return self._view
+
+    @property
+    def _cuts(self) -> bool:
+        """Return whether any rule may end a submap."""
+        s = self.config.submaps
+        return bool(s.distance_m or s.angle_deg or s.frames or s.uncertainty_m)
+
+    @property
+    def _describes(self) -> bool:
+        """Return whether any part compares keyframes by their descriptors."""
+        m = self.config.mapping
+        return (self._cuts and self.config.loops.close) or (m.window > 2 and m.covisibility == "descriptor")
