@@ -54,8 +54,9 @@ def localise(
     with screen.counting("localise") as progress:
         found = list(_located(localiser, source, progress))
     screen.out.print(_table(found))
-    for file in source.skipped:
-        screen.warn(f"skipped: {file}")
+    if source.skipped:
+        images = "image" if len(source.skipped) == 1 else "images"
+        screen.warn(f"{len(source.skipped)} unreadable {images} skipped (first: {source.skipped[0]})")
     count = sum(result.verdict == FOUND for result in found)
     screen.say(f"{count} of {len(found)} images found in {run}")
     if out:
