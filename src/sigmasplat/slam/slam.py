@@ -1,14 +1,11 @@
 """SLAM: track every frame, map keyframes, cut submaps, close loops. `Slam.step` follows the papers' overviews."""
 
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.fit.references import live_image
-from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.model.field import GaussianField
@@ -18,11 +15,10 @@ from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.final import final_map
 from sigmasplat.slam.found import Found
 from sigmasplat.slam.localisation.confidence import std_of
-from sigmasplat.slam.localisation.feature_image import FeatureImage, detail_of
 from sigmasplat.slam.localisation.known_map import KnownMap
 from sigmasplat.slam.localisation.recovery import Link, usable
-from sigmasplat.slam.localisation.relocaliser import Relocation
-from sigmasplat.slam.localisation.sight import Observation
+from sigmasplat.slam.localisation.relocaliser import INDEX_AT_MOST, Relocation, sight_of
+from sigmasplat.slam.localisation.sight import Observation, Sight, observe, working_frame
 from sigmasplat.slam.localisation.verdict import is_better, is_questionable
 from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.slam.mapper import Mapper
@@ -30,6 +26,9 @@ from sigmasplat.slam.rules import ends_submap, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.slam.world import World
 from sigmasplat.types import Matrix, no_progress
+
+LAST_TRIES = 3
+"""Number of keyframes per submap that is apart with which other components are searched at the end."""
 
 
 class Slam(World):
@@ -71,6 +70,7 @@ class Slam(World):
         total = self.config.final.iterations or 1
         progress(0, total)
         self._finish_submap()
+        self._connect_components()
         members = self.atlas.members(0)
         store, anchors = StorePart(self.store, members), [self.atlas.anchors[s] for s in members]
         self._final = final_map(store, anchors, self.config, self.view, self.random, progress)
@@ -79,29 +79,28 @@ class Slam(World):
     def _observe(self, frame: Frame) -> Observation:
         """Resize a frame to working size and prepare it for the fits."""
         with self._timer.stage("prepare"):
-            i, whole = self.config.input, frame
-            frame = frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px)
-            view = self._view or self.prepare(frame.camera)
-            if frame.camera != view.camera:
-                raise SourceError(f"frame {frame.index} comes from another camera ({frame.camera}) than the first")
+            view = self._view or self.prepare(working_frame(frame, self.config).camera)
+            working = working_frame(frame, self.config, view.camera if self._resample else None)
+            if working.camera != view.camera:
+                raise SourceError(f"frame {frame.index} comes from another camera ({working.camera}) than the first")
             self._timer.start_kernels(view)
-            target = Target.of(frame, (view.sums.shape[1], view.sums.shape[2]))
-            live, image = live_image(view, frame.color, frame.depth_m, target), None
-            if self.extractor is not None:
-                detail = detail_of(whole, self.config.features.width)
-                image = FeatureImage(detail, frame.depth_m, frame.camera)
-            return Observation(target, live, image, frame=frame)
+            return observe(frame, working, view, self.config, self.extractor)
 
     def _begin(self, seen: Observation) -> Found:
-        """Start the first submap at the first frame, whose camera is the world."""
+        """Start the first submap at the first frame. Its camera is the world, unless there are earlier submaps: then
+        it is connected to the place where it is found, or begins a new component."""
         if not (seen.frame.depth_m > 0).any():
             raise SourceError(
                 f"frame {seen.frame.index} has no depth reading in [{self.config.input.min_depth_m}, "
                 f"{self.config.input.max_depth_m}] m to start a map from; check the depth scale or start at a later one"
             )
         self.tracker.start(seen)
-        self._begin_component()
-        return Found(np.eye(4), TRACKED, mapped=True)
+        place = self._relocalise(seen, index_at_most=None) if self.atlas.anchors else None
+        if place is None:
+            self._begin_component()
+            return Found(np.eye(4), TRACKED, mapped=True)
+        self._begin_at(place.where[0], place.T_submap_camera, place.information, self._splats_of(place))
+        return Found(np.eye(4), RELOCALISED, place.values(), mapped=True)
 
     def _begin_component(self) -> None:
         """Begin a map at the camera, which is its origin."""
@@ -173,12 +172,16 @@ class Slam(World):
         """
         with self._timer.stage("cut"):
             loops = self._finish_submap()
-            self.closer.connect(parent, len(self.store), T_parent_camera, information)
-            self.atlas.begin_submap(T_parent_camera, parent)
-            self.confidence.begun(parent, std_of(information))
-            self.mapper = Mapper(self.config, self.random, field).successor(self.view, T_parent_camera)
-            self.drift = Drift()
+            self._begin_at(parent, T_parent_camera, information, field)
             return loops
+
+    def _begin_at(self, parent: int, T_parent_camera: Matrix, information: Matrix, field: GaussianField) -> None:
+        """Start a submap at the camera, connected to a parent submap, as `_branch` does."""
+        self.closer.connect(parent, len(self.store), T_parent_camera, information)
+        self.atlas.begin_submap(T_parent_camera, parent)
+        self.confidence.begun(parent, std_of(information))
+        self.mapper = Mapper(self.config, self.random, field).successor(self.view, T_parent_camera)
+        self.drift = Drift()
 
     def _finish_submap(self) -> list[Loop]:
         """Move the active submap to the store and look for its loops, which may move anchors."""
@@ -192,17 +195,21 @@ class Slam(World):
 
     # ---- lost and found ----
 
-    def _relocalise(self, seen: Observation, elsewhere: bool = False) -> Relocation | None:
-        """Search the map for the camera; elsewhere: only in components that are not connected to the active submap."""
+    def _relocalise(
+        self, seen: Sight, apart_from: int | None = None, index_at_most: int | None = INDEX_AT_MOST
+    ) -> Relocation | None:
+        """Search the map for the camera; apart_from: only in components that are not that of this submap."""
         if not self.config.recovery.relocalise or not usable(seen):
             return None
         components = self.atlas.components
-        known = KnownMap(
-            self.store, self.atlas.keyframe_poses, self.mapper.keyframes, self.mapper.field,
-            lambda s: not elsewhere or components[s] != components[-1],
-        )  # fmt: skip
+        wanted = [apart_from is None or number != components[apart_from] for number in components]
         with self._timer.stage("relocalise"):
-            return self.relocaliser.find(known, self.view, seen)
+            return self.relocaliser.find(self._known(wanted), self.view, seen, index_at_most)
+
+    def _known(self, wanted: Sequence[bool]) -> KnownMap:
+        """Return the map as relocalisation reads it; wanted [S]: which submaps are searched."""
+        active = self.mapper.keyframes, self.mapper.field
+        return KnownMap(self.store, self.atlas.keyframe_poses, *active, wanted.__getitem__)
 
     def _question(self, fit: PoseFit, seen: Observation, found: Found) -> None:
         """After some doubtful frames, ask the whole map whether another pose explains the frame much better."""
@@ -215,15 +222,18 @@ class Slam(World):
     def _go_to(self, place: Relocation, seen: Observation, found: Found) -> None:
         """Continue where the camera was found: in the active submap, or in a new one that is connected to the place."""
         found.state, submap = RELOCALISED, place.where[0]
-        found.tracking |= asdict(place.comparison) | {"inliers": float(place.inliers)}
+        found.tracking |= place.values()
         if submap == len(self.store):
             found.T_submap_camera = place.T_submap_camera
             self.tracker.move_to(self.mapper.field, self.view, place.keyframe, place.T_submap_camera)
         else:
-            field = self.store.load(submap).field.to(self.view.sums.device)
+            field = self._splats_of(place)
             found.loops += self._branch(submap, place.T_submap_camera, place.information, field)
             found.T_submap_camera, found.mapped = np.eye(4), True
         self.recovery.found()
+
+    def _splats_of(self, place: Relocation) -> GaussianField:
+        return self.store.load(place.where[0]).field.to(self.view.sums.device)
 
     def _begin_apart(self, seen: Observation, found: Found) -> None:
         """Begin a new map at the camera, whose place in the world is not known yet."""
@@ -236,16 +246,26 @@ class Slam(World):
 
     def _seek_component(self, seen: Observation, found: Found) -> None:
         """Look for a place of another component; two observations that agree join the components."""
-        if len(set(self.atlas.components)) < 2:
-            return
-        place = self._relocalise(seen, elsewhere=True)
+        if len(set(self.atlas.components)) > 1:
+            self._seek_link(seen, len(self.store), found.T_submap_camera)
+
+    def _connect_components(self) -> None:
+        """When all is mapped, search other components for the keyframes of those that are apart."""
+        for s, poses in enumerate(self.atlas.keyframe_poses):
+            for k in sorted({round(i) for i in np.linspace(0, len(poses) - 1, LAST_TRIES)}):
+                if self.atlas.components[s]:
+                    keyframe = self._known([True] * len(self.atlas.components)).keyframe((s, k))
+                    self._seek_link(sight_of(keyframe, self.view), s, keyframe.T_submap_camera)
+
+    def _seek_link(self, seen: Sight, submap: int, T_submap_camera: Matrix) -> None:
+        """Search other components for a camera of a submap; if a second observation agrees, join them."""
+        place = self._relocalise(seen, apart_from=submap)
         if place is None:
             return
-        a, b = place.where[0], len(self.store)
-        link = Link(a, b, place.T_submap_camera @ se3.inverse(found.T_submap_camera), place.information)
+        link = Link(place.where[0], submap, place.T_submap_camera @ se3.inverse(T_submap_camera), place.information)
         if self.recovery.confirms(link, self.atlas):
-            self.atlas.join(a, b, link.T_a_b)
-            self.closer.connect(a, b, link.T_a_b, link.information)
+            self.atlas.join(link.a, link.b, link.T_a_b)
+            self.closer.connect(link.a, link.b, link.T_a_b, link.information)
 
     def _step_result(self, frame: Frame, found: Found) -> Step:
         component, in_submap_m = self.atlas.components[-1], self.drift.position_m(found.T_submap_camera)
@@ -253,7 +273,7 @@ class Slam(World):
         found.tracking |= {
             "position_std_m": self.confidence.position_std_m(in_submap_m), "doubtful": float(self.tracker.doubtful),
         }  # fmt: skip
-        p_off = self.confidence.probability(found.state, found.tracking)
+        p_off = self.confidence.probability(state, found.tracking)
         return Step(
             frame.index, frame.timestamp_s, self.atlas.anchors[-1] @ found.T_submap_camera, found.mapped,
             state == LOST, found.tracking, len(self.mapper.field), len(self.atlas.anchors) - 1,

@@ -11,14 +11,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sigmasplat.model.component import LOST, RELOCALISED
+from sigmasplat.model.component import APART, LOST, RELOCALISED
 from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.types import Matrix
 
 LOOP_STD_M = 0.01
 """Standard deviation of the position that a loop gives."""
+NEVER_LOST = 1_000_000
+"""Number of frames since the last lost one, before any was lost."""
 MEMORY = 20.0
 """A lost frame is forgotten after about this many tracked ones."""
+MANY = 2000.0
+"""With at least this many compared points, their number is no reason for doubt."""
 BIAS = -3.0
 WEIGHTS: dict[str, float] = {
     "log_position_std": 0.8,
@@ -28,10 +32,12 @@ WEIGHTS: dict[str, float] = {
     "uncorrelated": 3.0,
     "log_doubtful": 0.5,
     "lately_lost": 1.0,
+    "few_points": 1.0,
 }
 """Weights of the logistic model."""
-PROBABILITY_LOST = 0.95
-"""Share of lost frames whose guess of the pose is off by more than 5 cm."""
+CERTAIN = {LOST: 0.95, APART: 0.99}
+"""Probability for a lost frame, by the share of those whose guess is off, and for one whose place in the world is not
+known."""
 
 
 @dataclass(eq=False)
@@ -40,7 +46,7 @@ class Confidence:
     one; doubtful: doubtful frames in a row."""
 
     spread_m: list[float] = field(default_factory=list)
-    since_lost: int = 1_000_000
+    since_lost: int = NEVER_LOST
 
     def begun(self, parent: int | None, position_m: float) -> None:
         """Add a submap: at position_m (standard deviation, m) from its parent, or the first of a component."""
@@ -63,8 +69,8 @@ class Confidence:
         tracking: values of its fit (`metrics_of`), with position_std_m and the number of doubtful frames in a row.
         """
         self.since_lost = 0 if state in (LOST, RELOCALISED) else self.since_lost + 1
-        if state == LOST:
-            return PROBABILITY_LOST
+        if state in CERTAIN:
+            return CERTAIN[state]
         values = evidence(tracking, self.since_lost)
         return 1.0 / (1.0 + math.exp(-BIAS - sum(WEIGHTS[name] * value for name, value in values.items())))
 
@@ -75,12 +81,13 @@ def evidence(tracking: Mapping[str, float], since_lost: int) -> dict[str, float]
     residual, correlation = tracking.get("residual", 0.3), tracking.get("correlation", 0.95)
     return {
         "log_position_std": math.log(tracking.get("position_std_m", 0.0) + 1e-3),
-        "log_residual": math.log(min(residual, 10.0) + 0.05),
+        "log_residual": math.log((min(residual, 10.0) if math.isfinite(residual) else 10.0) + 0.05),
         "unexplained": behind / max(close + behind, 1e-9),
         "not_close": 1.0 - close,
         "uncorrelated": 0.1 if math.isnan(correlation) else 1.0 - max(correlation, 0.0),
         "log_doubtful": math.log1p(tracking.get("doubtful", 0.0)),
         "lately_lost": math.exp(-since_lost / MEMORY),
+        "few_points": max(0.0, math.log(MANY / max(tracking.get("points", MANY), 1.0))),
     }
 
 
