@@ -1,6 +1,5 @@
 """Comparing two RGB-D images at a motion: what a right pose, a wrong one, and something in front look like."""
 
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
