@@ -57,6 +57,12 @@ class FeatureImage:
             self._features = extractor.find(self.detail.gray, self.detail.camera)
         return self._features
 
+    def weighed(self, weights: NDArray[np.float32] | None) -> "FeatureImage":
+        """Return the same image with other weights; features that were found already are kept."""
+        other = FeatureImage(self.detail, self.depth_m, self.camera, weights)
+        other._features = self._features
+        return other
+
     def landmarks(self, extractor: Extractor) -> Landmarks:
         """Return the features that have depth."""
         if self._landmarks is None:
@@ -68,4 +74,5 @@ def pose_by_features(reference: Landmarks, live: FeatureImage, extractor: Extrac
     """Match landmarks with the features of a live image; return the motion T_live_reference, or None without one."""
     seen = live.features(extractor)
     pairs = extractor.match(reference.features, seen)
-    return pose_from_landmarks(reference, seen, pairs, seed, depth_readings(seen, live.depth_m, live.camera))
+    depth_m = depth_readings(seen, live.depth_m, live.camera)
+    return pose_from_landmarks(reference, seen, pairs, seed, depth_m, extractor.config)
