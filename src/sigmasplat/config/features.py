@@ -1,4 +1,4 @@
-"""Settings of sparse features: which kind, how many, and the limits of a pose from them."""
+"""Settings of sparse features: kind, number, and the limits of a pose from them."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -6,7 +6,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class FeatureConfig:
-    """Sparse features for a second guess in tracking, for relocalisation and for loops (ours)."""
+    """Sparse features for a second guess in tracking and for relocalisation (ours)."""
 
     kind: Literal["sift", "orb", "xfeat"] = "sift"
     """Kind of features: sift = RootSIFT, orb = faster and less reliable, xfeat = a neural network with its own matcher,
