@@ -14,6 +14,7 @@ from sigmasplat.commands.download import download
 from sigmasplat.commands.evaluate import evaluate_run
 from sigmasplat.commands.export import export
 from sigmasplat.commands.inspect import inspect
+from sigmasplat.commands.localise import localise
 from sigmasplat.commands.mesh import make_mesh
 from sigmasplat.commands.run import demo, resume, run
 from sigmasplat.commands.view import view
@@ -32,6 +33,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "inspect": inspect,
     "run": run,
     "resume": resume,
+    "localise": localise,
     "view": view,
     "eval": evaluate_run,
     "mesh": make_mesh,
@@ -58,7 +60,8 @@ def _run_command(arguments: Sequence[str]) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run a command and exit: 0 done, 1 problems found (doctor, inspect), 2 refused with one line, 130 interrupted."""
+    """Run a command and exit: 0 done, 1 problems found (doctor, inspect) or no image found (localise), 2 refused with
+    one line, 130 interrupted."""
     given = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if given == ["--version"]:
         print(f"sigmasplat {sigmasplat.__version__}")

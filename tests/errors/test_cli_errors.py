@@ -29,7 +29,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     [
         (["rnu", "data/kitchen"], "no command 'rnu' (did you mean run?); the commands are demo, "),
         (["evaluate", "--help"], "no command 'evaluate' (did you mean eval?)"),
-        (["xyzzy"], "no command 'xyzzy'; the commands are demo, inspect, run, resume, view, eval, mesh, export, down"),
+        (["xyzzy"], "no command 'xyzzy'; the commands are demo, inspect, run, resume, localise, view, eval, me"),
         (["run", "/no/such/place"], "/no/such/place"),
         (["run", "."], "unknown format"),
         (["run", "/no/such/place", "--preset", "quick"], "no preset 'quick'"),
@@ -115,7 +115,7 @@ def test_the_message_for_a_mistyped_number_has_no_parser_types(
         assert internal not in told
 
 
-@pytest.mark.parametrize("command", ["run", "inspect", "export", "bench", "mesh", "eval", "resume", "demo"])
+@pytest.mark.parametrize("command", ["run", "inspect", "localise", "export", "bench", "mesh", "eval", "resume", "demo"])
 def test_help_does_not_show_none(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         cli.main([command, "--help"])

@@ -210,7 +210,7 @@ def test_frames_apart_are_not_exported(reader_apart: RunReader, tmp_path: Path) 
 def test_runs_without_a_pose_are_refused(reader: RunReader, tmp_path: Path) -> None:
     log = reader.run.path / "log.jsonl"
     log.write_text(log.read_text().replace('"lost": false', '"lost": true'))
-    with pytest.raises(RunError, match="was lost on every frame"):
+    with pytest.raises(RunError, match="has no frame whose pose is known"):
         export_nerfstudio(reader, tmp_path / "t.json")
     (reader.run.path / "trajectory.txt").unlink()
     with pytest.raises(RunError, match=r"no trajectory\.txt"):

@@ -1,14 +1,14 @@
 """Define the options of the command line (type, placeholder, one line of help) and convert them to values."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from sigmasplat import env
-from sigmasplat.config import Config
+from sigmasplat.config import Config, InputConfig
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.presets import families, preset as preset_of
@@ -124,6 +124,19 @@ VoxelM = Annotated[float, arg(metavar="M", help="edge of a voxel in metres; the 
 WithMesh = Annotated[
     bool,
     arg(name="mesh", help="also write mesh.ply, and score it if the true surface is known", help_behavior_hint=""),
+]
+InRun = Annotated[Path, arg(name="in", metavar="RUN", help="folder of a finished run, in whose map to search")]
+OntoRun = Annotated[
+    Path | None,
+    arg(metavar="RUN", help="continue the map of a finished run in a new run folder", help_behavior_hint=""),
+]
+PosesFile = Annotated[
+    Path | None,
+    arg(
+        metavar="FILE",
+        help="file to write: .jsonl (all results) or .txt (poses as TUM text)",
+        help_behavior_hint="(default: none)",
+    ),
 ]
 RunOrMap = Annotated[Path, tyro.conf.Positional, arg(metavar="RUN", help="run folder or map file")]
 FormatName = Annotated[
@@ -251,12 +264,20 @@ RunOptionsFlat = Annotated[RunOptions, arg(name=""), tyro.conf.OmitArgPrefixes]
 
 
 def configured(
-    preset: str, settings: Sequence[str], seed: int | None, input_options: InputOptions = DEFAULT_INPUT_OPTIONS
-) -> Config:
-    """Return a preset's settings, changed by --set, the input options and --seed. Raises ConfigError."""
-    given = split_settings(settings) | input_options.settings()
+    preset: str, settings: Sequence[str], seed: int | None, input_options: InputOptions = DEFAULT_INPUT_OPTIONS,
+    like: Config | None = None,
+) -> Config:  # fmt: skip
+    """Return a preset's settings, changed by --set, the input options and --seed; with `like`, working images are made
+    as in these settings unless --set says otherwise. Raises ConfigError."""
+    given = (working_images(like) if like else {}) | split_settings(settings) | input_options.settings()
     config = override(preset_of(preset), given)
     return config if seed is None else override(config, {"seed": str(seed)})
+
+
+def working_images(config: Config) -> dict[str, str]:
+    """Return the default settings of the input, but with the size and depth range of the images of `config`."""
+    kept = {name: getattr(config.input, name) for name in ("width", "crop_px", "min_depth_m", "max_depth_m")}
+    return {f"input.{name}": str(value) for name, value in (asdict(InputConfig()) | kept).items()}
 
 
 def source_of(folder: "RunFolder", moved_to: str | None) -> "Source":

@@ -60,24 +60,31 @@ def run(
     seed: options.Seed = None,
     record: options.Record = None,
     run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
+    onto: options.OntoRun = None,
 ) -> int:
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
     example: sigmasplat run data/kitchen --limit 200 --set input.width=480
     """
+    from sigmasplat.io.runs import RunFolder
+    from sigmasplat.run.finished_map import FinishedMap, continue_map
     from sigmasplat.run.resume import StartPoint
     from sigmasplat.run.session import new_folder, removed_on_early_failure
     from sigmasplat.run.terminal import Screen
     from sigmasplat.slam.slam import Slam
 
-    screen, config = Screen(), configured(preset, settings, seed, input_options)
+    screen, earlier = Screen(), FinishedMap.of(RunFolder.open(onto)) if onto else None
+    config = configured(preset, settings, seed, input_options, earlier.config if earlier else None)
+    if earlier:
+        earlier.refuse_other_size(config)
     source, config = _opened(screen, path, config, record)
     with _viewer(screen, run_options) as viewer:
-        folder = new_folder(out, config, source, overwrite, source_path=full_path(path))
+        folder = new_folder(out, config, source, overwrite, keep=onto, source_path=full_path(path))
         with removed_on_early_failure(folder):
             _announce(screen, config.name, source, folder, record)
             prepare_torch()
-            start = StartPoint(Slam(config, folder.submaps))
+            slam = continue_map(earlier, config, source, folder) if earlier else Slam(config, folder.submaps)
+            start = StartPoint(slam)
             return _run_and_score(screen, start, source, folder, run_options, viewer)
 
 

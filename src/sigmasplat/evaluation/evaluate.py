@@ -55,11 +55,12 @@ def evaluate(
     records = run.read_log()
     if not records:
         raise RunError(f"run {run.path} stopped before its first frame: its log.jsonl is empty; run it again")
-    frames, field = RunFrames.of(records, run.read_trajectory()), run.read_map()
+    path, field = run.read_trajectory(), run.read_map()
+    frames = RunFrames.of(records, path)
     records, log = frames.log, frames.posed_log()
-    if not log:
+    if len(path) and not log:
         raise RunError(f"run {run.path}: trajectory.txt and log.jsonl share no timestamps; do they belong to one run?")
-    truth = source.truth()
+    truth = source.truth() if log else None  # without a believed pose nothing can be aligned
     path_scores, problem = score_path(frames.path, _believed_odometry(run, frames), truth)
     chosen = {kind: evenly_spread(views, views_per_kind) for kind, views in _kinds(log).items()}
     strips, config, loops = ViewStrips(run, strips_per_kind), run.config(), run.read_loops()
@@ -76,8 +77,8 @@ def evaluate(
     metrics["test_views"] = None
     novel = source.test_views()
     if novel is not None and truth is not None and problem is None:
-        path = frames.path
-        poses = novel.truth(), truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], truth)
+        believed = frames.path
+        poses = novel.truth(), truth_in_estimate(believed.timestamps_s, believed.T_world_camera[:, :3, 3], truth)
         metrics["test_views"] = score_novel_views(novel, *poses, field, config.input, renderer, strips, views_per_kind)
     run.write_metrics(metrics)
     plots = _draw_plots(run, frames, None if problem else truth, loops)
@@ -170,6 +171,7 @@ def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField, loops
         "frames_per_s": _frames_per_s(run, log),
         "worst_frame_s": _worst_frame_s(log),
         "submaps": _submaps(log),
+        "onto": (run.facts().get("onto") or {}).get("run"),
         "loops": {"tried": len(loops), "accepted": sum(bool(loop.get("accepted")) for loop in loops)},
         "finish_s": run.facts().get("finish_s"),
         "total_s": _total_s(run),

@@ -53,7 +53,10 @@ class RunReader:
     def believed_frames(self) -> list[int]:
         """Return the frames whose pose is believed, counted from the run's start. Raises RunError if there is none."""
         if not len(self.frames.rows):
-            raise RunError(f"run {self.run.path} was lost on every frame, so it has no pose to export; run it again")
+            raise RunError(
+                f"run {self.run.path} has no frame whose pose is known in its world, so it has no pose to export; "
+                "run it again"
+            )
         return [int(row) for row in self.frames.rows]
 
     def believed_path(self) -> Trajectory:
@@ -86,7 +89,8 @@ class RunReader:
         seen = set[int]()
         for index in range(len(self.run.submaps)):
             for k, frame in enumerate(self.run.submaps.load(index).frames):
-                if frame < len(self.frames) and frame not in seen:  # submaps share the keyframe between them
+                # Submaps share the keyframe between them. Frame numbers below 0 belong to an earlier session.
+                if 0 <= frame < len(self.frames) and frame not in seen:
                     seen.add(frame)
                     yield frame, self.run.submaps.picture(index, k)
 

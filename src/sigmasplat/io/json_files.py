@@ -38,9 +38,14 @@ def read_json(path: Path) -> Any:
         raise RunError(f"{path} is not JSON: {problem}") from problem
 
 
+def json_line(values: Any) -> str:
+    """Return a value as one line of JSON, with the line break."""
+    return json.dumps(to_json(values), allow_nan=False) + "\n"
+
+
 def append_line(path: Path, values: Any) -> None:
     """Append a line and flush it to the operating system. Raises RunError if the file cannot be written."""
-    line = json.dumps(to_json(values), allow_nan=False) + "\n"
+    line = json_line(values)
     try:
         with path.open("a", encoding="utf-8") as file:
             file.write(line)

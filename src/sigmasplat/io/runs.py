@@ -183,8 +183,11 @@ class RunFolder:
         tum.write_trajectory(self.path / "trajectory.txt", trajectory)
 
     def read_trajectory(self) -> Trajectory:
-        """Read trajectory.txt. Raises RunError if it is missing, SourceError if it is damaged."""
-        return tum.read_trajectory(self._existing("trajectory.txt"))
+        """Read trajectory.txt; it is empty if no pose is believed.
+
+        Raises RunError if it is missing, SourceError if it is damaged.
+        """
+        return tum.read_trajectory(self._existing("trajectory.txt"), may_be_empty=True)
 
     def read_frames(self) -> RunFrames:
         """Read log.jsonl and trajectory.txt together: the state of each frame at the end of the run, and its pose.

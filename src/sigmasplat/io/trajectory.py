@@ -25,11 +25,11 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
     write_text(path, "\n".join(lines) + "\n")
 
 
-def read_trajectory(path: Path) -> Trajectory:
+def read_trajectory(path: Path, may_be_empty: bool = False) -> Trajectory:
     """Read TUM text; empty lines and comments after # are skipped.
 
-    Raises SourceError with file and line if it is missing, not text, empty, or if a line does not have eight finite
-    numbers or has a zero quaternion.
+    Raises SourceError with file and line if it is missing, not text, empty (unless `may_be_empty`), or if a line does
+    not have eight finite numbers or has a zero quaternion.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -37,9 +37,9 @@ def read_trajectory(path: Path) -> Trajectory:
         raise SourceError(f"cannot read trajectory {path}: {problem}") from problem
     stripped = ((number, line.split("#")[0].strip()) for number, line in enumerate(lines, 1))
     rows = [_parse(line, f"{path}:{number}") for number, line in stripped if line]
-    if not rows:
+    if not rows and not may_be_empty:
         raise SourceError(f"no poses in {path} (expected lines of '{COLUMNS}')")
-    table = np.array(rows)
+    table = np.array(rows, np.float64).reshape(-1, 8)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = se3.rotation_from_quaternion(table[:, [7, 4, 5, 6]])
     poses[:, :3, 3] = table[:, 1:4]

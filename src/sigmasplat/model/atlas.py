@@ -46,6 +46,13 @@ class Atlas:
         self.components.append(begun if T_parent_submap is None else self.components[parent])
         self.keyframe_poses.append([])
 
+    def add_finished(self, T_world_submap: Matrix, keyframe_poses: list[Matrix]) -> None:
+        """Append a submap of an earlier session to the world, with T_submap_camera [4, 4] of its keyframes."""
+        self.anchors.append(T_world_submap)
+        self.odometry.append(T_world_submap)
+        self.components.append(0)
+        self.keyframe_poses.append(keyframe_poses)
+
     def join(self, a: int, b: int, T_a_b: Matrix) -> None:
         """Join the components of two submaps, given T_a_b [4, 4]: the one with the higher number moves to the other."""
         if self.components[a] > self.components[b]:

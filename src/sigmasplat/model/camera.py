@@ -42,9 +42,26 @@ class Camera:
             )
         return Camera(c.width - 2 * crop_px, c.height - 2 * crop_px, c.fx, c.fy, c.cx - crop_px, c.cy - crop_px)
 
+    def share_seen_by(self, other: "Camera") -> float:
+        """Return the share of this camera's image, in [0, 1], that another camera at the same pose also sees."""
+        columns, rows = self.pixels_in(other)
+        return float(np.mean(_inside(columns, other.width)) * np.mean(_inside(rows, other.height)))
+
+    def pixels_in(self, other: "Camera") -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the columns [width] and rows [height] of this camera's pixels in the image of another camera at the
+        same pose. The depth of a point is the same in both."""
+        columns = (np.arange(self.width, dtype=np.float64) - self.cx) * (other.fx / self.fx) + other.cx
+        rows = (np.arange(self.height, dtype=np.float64) - self.cy) * (other.fy / self.fy) + other.cy
+        return columns, rows
+
     def rays(self) -> NDArray[np.float32]:
         """Return the point at depth 1 m on each pixel's ray [H, W, 3], camera frame; multiply by depth for the
         surface."""
         u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
         x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
         return np.stack([x, y, np.ones_like(x)], -1).astype(np.float32)
+
+
+def _inside(pixels: NDArray[np.float64], count: int) -> NDArray[np.bool_]:
+    """Return which of the coordinates are on an image with `count` pixels."""
+    return (pixels >= -0.5) & (pixels <= count - 0.5)

@@ -78,6 +78,32 @@ class Frame:
         color = np.ascontiguousarray(small.color[inner])
         return Frame(self.index, self.timestamp_s, color, np.where(keep, depth, np.float32(0.0)), camera)
 
+    def seen_by(self, camera: Camera) -> "Frame":
+        """Return the frame as a camera with other intrinsics at the same pose sees it: a homography, exact for depth.
+
+        Colour is averaged if the new pixels are larger, and interpolated; depth is that of the nearest pixel. Pixels
+        outside the frame have depth 0 and the colour of its edge.
+        """
+        size = self.camera.width, self.camera.height
+        scales = (camera.fx / self.camera.fx, camera.fy / self.camera.fy)
+        width, height = (max(1, round(n * min(scale, 1.0))) for n, scale in zip(size, scales, strict=True))
+        columns, rows = camera.pixels_in(self.camera.resized(width, height))
+        color = _interpolated(_interpolated(resized_color(self.color, width, height), rows).swapaxes(0, 1), columns)
+        u, v = (np.rint(pixels).astype(np.intp) for pixels in camera.pixels_in(self.camera))
+        read = ((v >= 0) & (v < size[1]))[:, None] & (u >= 0) & (u < size[0])
+        depth = self.depth_m[np.clip(v, 0, size[1] - 1)][:, np.clip(u, 0, size[0] - 1)]
+        color, depth = np.ascontiguousarray(color.swapaxes(0, 1)), np.where(read, depth, np.float32(0.0))
+        return Frame(self.index, self.timestamp_s, color, depth, camera)
+
+
+def _interpolated(color: NDArray[np.float32], rows: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return colour at rows that are not whole numbers; beyond the first and the last row it is theirs."""
+    at = np.clip(rows, 0, len(color) - 1)
+    above = np.minimum(at.astype(np.intp), max(len(color) - 2, 0))
+    share = (at - above).astype(np.float32)[:, None, None]
+    below = np.minimum(above + 1, len(color) - 1)
+    return np.asarray((1 - share) * color[above] + share * color[below], np.float32)
+
 
 def resized_color(color: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
     """Return colour [height, width, 3], each pixel the mean over its area."""

@@ -33,8 +33,10 @@ class Picture:
 class Submap:
     """A finished part of the map in its own frame, which is the camera of its first keyframe.
 
-    field: its splats; frames [K]: the frame numbers of its keyframes; T_submap_camera [K, 4, 4]: their poses; camera:
-    shared by all keyframes. The `SubmapStore` keeps the keyframes' images, the `Atlas` the submap's pose in the world.
+    field: its splats; frames [K]: the frame numbers of its keyframes, counted from the first frame of the run (those of
+    an earlier session are negative, −1 is its last frame: `run --onto`); T_submap_camera [K, 4, 4]: their poses;
+    camera: shared by all keyframes. The `SubmapStore` keeps the keyframes' images, the `Atlas` the submap's pose in the
+    world.
     """
 
     index: int

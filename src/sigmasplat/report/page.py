@@ -95,6 +95,8 @@ def _machine(run: RunFolder) -> str:
 def rerun_command(config: Config, facts: dict[str, Any]) -> str:
     """Return the command that makes the run again: its preset, and every setting that differs from the preset."""
     words = ["sigmasplat", "run", str(facts.get("source_path") or "PATH")]
+    if onto := facts.get("onto"):
+        words += ["--onto", str(onto["run"])]
     if config.name not in list_presets():
         return shlex.join(words)
     if config.name != default_preset():

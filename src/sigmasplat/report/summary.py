@@ -41,8 +41,17 @@ def _overview(metrics: Metrics, machine: str) -> str:
     return (
         f"SigmaSplat made a camera path and a map of {number(metrics.get('splats'), 0)} splats from "
         f"{number(metrics.get('frames'), 0)} colour and depth images of {metrics.get('source')}{how}"
-        f"{f' on {machine}' if machine else ''}.{unfinished}"
+        f"{f' on {machine}' if machine else ''}.{_continued(metrics)}{unfinished}"
     )
+
+
+def _continued(metrics: Metrics) -> str:
+    """Return whether the run is connected to the map of the earlier run that it continues."""
+    if not metrics.get("onto"):
+        return ""
+    if not metrics.get("believed"):
+        return f" It was never recognised in the map of {metrics['onto']}, so all of it is in components/."
+    return f" It continues the map of {metrics['onto']}: poses are in the world of that run."
 
 
 def _path(metrics: Metrics) -> str:

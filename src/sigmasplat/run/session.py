@@ -16,6 +16,7 @@ from types import FrameType
 from typing import Any
 
 from sigmasplat.config import Config
+from sigmasplat.errors import RunError
 from sigmasplat.io.runs import ALL_POSES, RunFolder
 from sigmasplat.model.component import RELOCALISED
 from sigmasplat.run.profile import profile
@@ -32,14 +33,20 @@ from sigmasplat.sources.base import Source
 RUNS = Path("runs")
 
 
-def new_folder(out: Path | None, config: Config, source: Source, overwrite: bool = False, **facts: Any) -> RunFolder:
+def new_folder(
+    out: Path | None, config: Config, source: Source, overwrite: bool = False, keep: Path | None = None, **facts: Any
+) -> RunFolder:
     """Create a run folder and write facts to its run.json; the default is runs/SOURCE-PRESET, numbered if it exists.
 
-    Raises RunError if it cannot be written, or if it is not empty and may not be overwritten.
+    keep: a run that must not be overwritten. Raises RunError if the folder cannot be written, is `keep`, or is not
+    empty and may not be overwritten.
     """
     plain_name = "".join(c if c.isalnum() or c in "._-" else "-" for c in source.name).strip("-.") or "run"
     default = RUNS / f"{plain_name}-{config.name}"
-    folder = RunFolder.create(out or (default if overwrite else unused_path(default)), config, source.name, overwrite)
+    path = out or (default if overwrite else unused_path(default))
+    if keep and path.resolve() == keep.resolve():
+        raise RunError(f"output {path} is the run that --onto continues, which is never changed; give another --out")
+    folder = RunFolder.create(path, config, source.name, overwrite)
     folder.note(**facts)
     return folder
 
@@ -57,14 +64,17 @@ def unused_path(wanted: Path) -> Path:
 def removed_on_early_failure(run: RunFolder) -> Iterator[None]:
     """Remove a new run folder if the block fails before the run has results.
 
-    The folder stays if it holds a log, a recording or a file of the user's. An empty runs/ is removed too.
+    The folder stays if it holds a log, a recording or a file of the user's. An empty runs/ is removed too. Submaps that
+    were copied from an earlier run are removed.
     """
     try:
         yield
     except BaseException:
         # run.json goes last: it marks the folder as ours, so that after a kill in between --overwrite still accepts it.
         written_first = [run.path / "config.json", run.path / "run.json"]
-        if {*run.path.rglob("*")} <= {run.images, *written_first}:
+        copied = {run.submaps.folder, *run.submaps.folder.glob("*")}
+        if {*run.path.rglob("*")} <= {run.images, *written_first, *copied}:
+            run.submaps.clear()
             for file in written_first:
                 file.unlink(missing_ok=True)
             for folder in (run.images, run.path, RUNS):

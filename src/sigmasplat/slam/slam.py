@@ -1,14 +1,11 @@
 """SLAM: track every frame, map keyframes, cut submaps, close loops. `Slam.step` follows the papers' overviews."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 
 import numpy as np
 
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.fit.references import live_image
-from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.model.field import GaussianField
@@ -18,11 +15,10 @@ from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.final import final_map
 from sigmasplat.slam.found import Found
 from sigmasplat.slam.localisation.confidence import std_of
-from sigmasplat.slam.localisation.feature_image import FeatureImage, detail_of
 from sigmasplat.slam.localisation.known_map import KnownMap
 from sigmasplat.slam.localisation.recovery import Link, usable
-from sigmasplat.slam.localisation.relocaliser import Relocation, sight_of
-from sigmasplat.slam.localisation.sight import Observation, Sight
+from sigmasplat.slam.localisation.relocaliser import INDEX_AT_MOST, Relocation, sight_of
+from sigmasplat.slam.localisation.sight import Observation, Sight, observe, working_frame
 from sigmasplat.slam.localisation.verdict import is_better, is_questionable
 from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.slam.mapper import Mapper
@@ -83,29 +79,28 @@ class Slam(World):
     def _observe(self, frame: Frame) -> Observation:
         """Resize a frame to working size and prepare it for the fits."""
         with self._timer.stage("prepare"):
-            i, whole = self.config.input, frame
-            frame = frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px)
-            view = self._view or self.prepare(frame.camera)
-            if frame.camera != view.camera:
-                raise SourceError(f"frame {frame.index} comes from another camera ({frame.camera}) than the first")
+            view = self._view or self.prepare(working_frame(frame, self.config).camera)
+            working = working_frame(frame, self.config, view.camera if self._resample else None)
+            if working.camera != view.camera:
+                raise SourceError(f"frame {frame.index} comes from another camera ({working.camera}) than the first")
             self._timer.start_kernels(view)
-            target = Target.of(frame, (view.sums.shape[1], view.sums.shape[2]))
-            live, image = live_image(view, frame.color, frame.depth_m, target), None
-            if self.extractor is not None:
-                detail = detail_of(whole, self.config.features.width)
-                image = FeatureImage(detail, frame.depth_m, frame.camera)
-            return Observation(target, live, image, frame=frame)
+            return observe(frame, working, view, self.config, self.extractor)
 
     def _begin(self, seen: Observation) -> Found:
-        """Start the first submap at the first frame, whose camera is the world."""
+        """Start the first submap at the first frame. Its camera is the world, unless there are earlier submaps: then
+        it is connected to the place where it is found, or begins a new component."""
         if not (seen.frame.depth_m > 0).any():
             raise SourceError(
                 f"frame {seen.frame.index} has no depth reading in [{self.config.input.min_depth_m}, "
                 f"{self.config.input.max_depth_m}] m to start a map from; check the depth scale or start at a later one"
             )
         self.tracker.start(seen)
-        self._begin_component()
-        return Found(np.eye(4), TRACKED, mapped=True)
+        place = self._relocalise(seen, index_at_most=None) if self.atlas.anchors else None
+        if place is None:
+            self._begin_component()
+            return Found(np.eye(4), TRACKED, mapped=True)
+        self._begin_at(place.where[0], place.T_submap_camera, place.information, self._splats_of(place))
+        return Found(np.eye(4), RELOCALISED, place.values(), mapped=True)
 
     def _begin_component(self) -> None:
         """Begin a map at the camera, which is its origin."""
@@ -177,12 +172,16 @@ class Slam(World):
         """
         with self._timer.stage("cut"):
             loops = self._finish_submap()
-            self.closer.connect(parent, len(self.store), T_parent_camera, information)
-            self.atlas.begin_submap(T_parent_camera, parent)
-            self.confidence.begun(parent, std_of(information))
-            self.mapper = Mapper(self.config, self.random, field).successor(self.view, T_parent_camera)
-            self.drift = Drift()
+            self._begin_at(parent, T_parent_camera, information, field)
             return loops
+
+    def _begin_at(self, parent: int, T_parent_camera: Matrix, information: Matrix, field: GaussianField) -> None:
+        """Start a submap at the camera, connected to a parent submap, as `_branch` does."""
+        self.closer.connect(parent, len(self.store), T_parent_camera, information)
+        self.atlas.begin_submap(T_parent_camera, parent)
+        self.confidence.begun(parent, std_of(information))
+        self.mapper = Mapper(self.config, self.random, field).successor(self.view, T_parent_camera)
+        self.drift = Drift()
 
     def _finish_submap(self) -> list[Loop]:
         """Move the active submap to the store and look for its loops, which may move anchors."""
@@ -196,14 +195,16 @@ class Slam(World):
 
     # ---- lost and found ----
 
-    def _relocalise(self, seen: Sight, apart_from: int | None = None) -> Relocation | None:
+    def _relocalise(
+        self, seen: Sight, apart_from: int | None = None, index_at_most: int | None = INDEX_AT_MOST
+    ) -> Relocation | None:
         """Search the map for the camera; apart_from: only in components that are not that of this submap."""
         if not self.config.recovery.relocalise or not usable(seen):
             return None
         components = self.atlas.components
         wanted = [apart_from is None or number != components[apart_from] for number in components]
         with self._timer.stage("relocalise"):
-            return self.relocaliser.find(self._known(wanted), self.view, seen)
+            return self.relocaliser.find(self._known(wanted), self.view, seen, index_at_most)
 
     def _known(self, wanted: Sequence[bool]) -> KnownMap:
         """Return the map as relocalisation reads it; wanted [S]: which submaps are searched."""
@@ -221,15 +222,18 @@ class Slam(World):
     def _go_to(self, place: Relocation, seen: Observation, found: Found) -> None:
         """Continue where the camera was found: in the active submap, or in a new one that is connected to the place."""
         found.state, submap = RELOCALISED, place.where[0]
-        found.tracking |= asdict(place.comparison) | {"inliers": float(place.inliers)}
+        found.tracking |= place.values()
         if submap == len(self.store):
             found.T_submap_camera = place.T_submap_camera
             self.tracker.move_to(self.mapper.field, self.view, place.keyframe, place.T_submap_camera)
         else:
-            field = self.store.load(submap).field.to(self.view.sums.device)
+            field = self._splats_of(place)
             found.loops += self._branch(submap, place.T_submap_camera, place.information, field)
             found.T_submap_camera, found.mapped = np.eye(4), True
         self.recovery.found()
+
+    def _splats_of(self, place: Relocation) -> GaussianField:
+        return self.store.load(place.where[0]).field.to(self.view.sums.device)
 
     def _begin_apart(self, seen: Observation, found: Found) -> None:
         """Begin a new map at the camera, whose place in the world is not known yet."""
@@ -269,7 +273,7 @@ class Slam(World):
         found.tracking |= {
             "position_std_m": self.confidence.position_std_m(in_submap_m), "doubtful": float(self.tracker.doubtful),
         }  # fmt: skip
-        p_off = self.confidence.probability(found.state, found.tracking)
+        p_off = self.confidence.probability(state, found.tracking)
         return Step(
             frame.index, frame.timestamp_s, self.atlas.anchors[-1] @ found.T_submap_camera, found.mapped,
             state == LOST, found.tracking, len(self.mapper.field), len(self.atlas.anchors) - 1,

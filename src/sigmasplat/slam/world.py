@@ -34,7 +34,8 @@ HOST = torch.device("cpu")
 class World:
     """Everything that SLAM knows between two frames; `Slam` changes it.
 
-    Frame 0 fixes the gauge: the world is the first camera. Finished submaps go to `store`, by default in memory.
+    Frame 0 fixes the gauge: the world is the first camera, or that of the map that is continued. Finished submaps go to
+    `store`, by default in memory.
     """
 
     def __init__(self, config: Config | None = None, store: SubmapStore | None = None) -> None:
@@ -48,13 +49,14 @@ class World:
         self.mapper = Mapper(self.config, self.random)
         self.drift = Drift()
         self.descriptor = make_descriptor(self.config.loops)
-        self.closer = LoopCloser(self.config, self.store)
+        self.closer = LoopCloser(self.config, self.store, self.extractor if self.config.tracking.features else None)
         self.recovery = Recovery(self.config.recovery)
         self.confidence = Confidence()
         self.relocaliser = Relocaliser(self.config, self.extractor)
         self.steps: list[Step] = []
         self.keyframe_indices: list[int] = []
         self._view: View | None = None
+        self._resample = False
         self._final: GaussianField | None = None
         self._timer = StepTimer()
 
@@ -102,10 +104,10 @@ class World:
             raise SourceError("no camera yet: give a frame to `step` first")
         return self._view
 
-    def prepare(self, camera: Camera) -> View:
+    def prepare(self, camera: Camera, resample: bool = False) -> View:
         """Make the view for the images of a camera with the size of `Frame.prepared`. The first frame calls this
-        too."""
-        c = self.config
+        too. With `resample`, frames of another camera are accepted and resampled to this one."""
+        self._resample, c = resample, self.config
         learned = bool(c.mapping.weight_nll_color or c.mapping.weight_nll_depth)
         read = c.tracking.uncertainty and c.tracking.align_depth_by == "V"
         self._view = make_view(c.backend, camera, c.render, variance=learned or read)

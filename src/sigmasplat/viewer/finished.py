@@ -99,10 +99,14 @@ def follow_run(run: RunFolder, show: ShowSnapshot, stop: threading.Event, source
 
 
 class SubmapCache:
-    """The finished submaps of a run that have been read so far, within a budget of splats, and their images."""
+    """The finished submaps of a run that have been read so far, within a budget of splats, and their images.
+
+    earlier [E, 4, 4]: T_world_submap of the submaps of an earlier session that the run continues.
+    """
 
     def __init__(self, run: RunFolder, budget: int = BUDGET) -> None:
         self.store, self.budget = run.submaps, budget
+        self.earlier = np.array(run.facts().get("onto", {}).get("T_world_submap", [])).reshape(-1, 4, 4)
         self.pieces: dict[int, Piece] = {}
         self.camera: Camera | None = None
         self._keyframes: dict[int, tuple[int, int]] = {}
@@ -110,7 +114,10 @@ class SubmapCache:
     def load_new(self, T_world_camera: list[Matrix]) -> None:
         """Read the submaps that were not read before and whose first keyframe has a pose."""
         for index in range(len(self.pieces), len(self.store)):
-            self._add(index, lambda first: T_world_camera[first] if first < len(T_world_camera) else None)
+            if index < len(self.earlier):
+                self._add(index, lambda first, T=self.earlier[index]: T)  # type: ignore[misc]
+            else:
+                self._add(index, lambda first: T_world_camera[first] if first < len(T_world_camera) else None)
 
     def load_all(self, T_world_submap: NDArray[np.float64]) -> None:
         """Read all submaps that have a pose."""

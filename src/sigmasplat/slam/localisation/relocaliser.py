@@ -6,7 +6,7 @@ by depth and overlap. The number of inliers alone accepts nothing, because a rep
 
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
@@ -34,6 +34,7 @@ KEPT_LANDMARKS = 64
 """Number of keyframes whose complete landmarks stay in memory, half a megabyte each."""
 FLOOR_M, FLOOR_RAD = 0.005, 0.003
 """Minimum standard deviation of a pose that was found."""
+FLOOR = np.diag(np.repeat([FLOOR_M**2, FLOOR_RAD**2], 3))
 UNKNOWN = np.eye(6)
 """Covariance of a pose without an estimate, m² and rad²."""
 ENOUGH = 0.5
@@ -57,19 +58,39 @@ class Relocation:
         return se3.inverse(self.fit.T_camera_world)
 
     @property
+    def _estimated(self) -> Matrix:
+        estimated = self.fit.covariance
+        return UNKNOWN if estimated is None or not np.isfinite(estimated).all() else estimated
+
+    @property
+    def covariance(self) -> Matrix:
+        """Return the covariance [6, 6] of the camera's translation and rotation in its own axes, m and rad."""
+        return self._estimated + FLOOR
+
+    @property
     def information(self) -> Matrix:
         """Return the information [6, 6] of T_submap_camera's left twist, m and rad."""
-        estimated = self.fit.covariance
-        if estimated is None or not np.isfinite(estimated).all():
-            estimated = UNKNOWN
         A = se3.adjoint(self.T_submap_camera)
-        covariance = A @ estimated @ A.T + np.diag(np.repeat([FLOOR_M**2, FLOOR_RAD**2], 3))
+        covariance = A @ self._estimated @ A.T + FLOOR
         return symmetric(np.asarray(np.linalg.inv(symmetric(covariance)), np.float64))
+
+    def values(self) -> dict[str, float]:
+        """Return the comparison with the map and the number of matches, as a step reports them."""
+        return asdict(self.comparison) | {"inliers": float(self.inliers)}
 
     @property
     def score(self) -> float:
         """Return the share of the reference that the pose explains, 0 to 1."""
         return score(self.comparison)
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """Where the camera was found, if the map confirms it; the number of similar keyframes; the best refused pose."""
+
+    found: Relocation | None
+    candidates: int
+    refused: Relocation | None
 
 
 @dataclass(eq=False)
@@ -92,16 +113,24 @@ class Relocaliser:
 
         index_at_most: number of keyframes that may be added to the search; None = all.
         """
+        return self.search(known, view, seen, index_at_most).found
+
+    def search(
+        self, known: KnownMap, view: View, seen: Sight, index_at_most: int | None = INDEX_AT_MOST
+    ) -> "SearchResult":
+        """Search as `find` does, and also return what was refused."""
         wanted = known.keyframes()
         self._index(known, view, wanted, index_at_most)
-        best: Relocation | None = None
-        for where in self._candidates(wanted, seen):
-            for found in self._poses(known, view, seen, where):
-                if confirmed(found.comparison) and (best is None or found.score > best.score):
-                    best = found
-            if best is not None and best.score > ENOUGH:
+        candidates = self._candidates(wanted, seen)
+        best: dict[bool, Relocation] = {}
+        for where in candidates:
+            for tried in self._poses(known, view, seen, where):
+                verdict = confirmed(tried.comparison)
+                if verdict not in best or tried.score > best[verdict].score:
+                    best[verdict] = tried
+            if True in best and best[True].score > ENOUGH:
                 break
-        return best
+        return SearchResult(best.get(True), len(candidates), best.get(False))
 
     def _index(self, known: KnownMap, view: View, wanted: Sequence[Where], at_most: int | None) -> None:
         """Add keyframes to the search; also find again the features that a resumed run no longer has."""

@@ -2,10 +2,15 @@
 
 from dataclasses import dataclass, field
 
+from sigmasplat.config import Config
 from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.references import live_image
 from sigmasplat.fit.target import Target
+from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
-from sigmasplat.slam.localisation.feature_image import FeatureImage
+from sigmasplat.render.view import View
+from sigmasplat.slam.features import Extractor
+from sigmasplat.slam.localisation.feature_image import FeatureImage, detail_of
 from sigmasplat.types import Matrix
 
 
@@ -23,6 +28,25 @@ class Observation(Sight):
     """A frame in the forms that tracking and mapping need."""
 
     frame: Frame = field(kw_only=True)
+
+
+def working_frame(frame: Frame, config: Config, camera: Camera | None = None) -> Frame:
+    """Return a frame at working size; if `camera` is given and differs, as that camera at the same pose sees it."""
+    i = config.input
+    working = frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px)
+    if camera is None or working.camera == camera:
+        return working
+    return frame.seen_by(camera).prepared(0, i.min_depth_m, i.max_depth_m)
+
+
+def observe(whole: Frame, working: Frame, view: View, config: Config, extractor: Extractor | None) -> Observation:
+    """Return a frame in the forms that tracking needs; features are found in the whole frame, the rest is made of the
+    working one."""
+    target = Target.of(working, (view.sums.shape[1], view.sums.shape[2]))
+    live, image = live_image(view, working.color, working.depth_m, target), None
+    if extractor is not None:
+        image = FeatureImage(detail_of(whole, config.features.width), working.depth_m, working.camera)
+    return Observation(target, live, image, frame=working)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.field import COLUMNS
 from sigmasplat.model.submap import Submap, SubmapStore
 from sigmasplat.render.view import View
+from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.loop_closure.candidates import (
     Candidate,
     SubmapDescriptor,
@@ -27,6 +28,10 @@ from sigmasplat.slam.loop_closure.descriptors import Descriptor, OrientationGrid
 from sigmasplat.slam.loop_closure.pose_graph import Edge, LoopVerdict, optimise
 from sigmasplat.slam.loop_closure.registration import Registrar, Registration
 from sigmasplat.types import Matrix
+
+RIGID = np.diag(np.repeat([1e-4, 1e-5], 3) ** -2.0)
+"""Information of the edge to a submap of an earlier session: 0.1 mm and 0.0006°. Its map is finished, and poses in its
+world stay valid: a loop that disagrees moves the submaps of the new session."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +85,7 @@ class LoopCloser:
 
     config: Config
     store: SubmapStore
+    extractor: Extractor | None = None
     descriptors: list[SubmapDescriptor] = field(default_factory=list)
     odometry: list[Edge] = field(default_factory=list)
     closed: list[Edge] = field(default_factory=list)
@@ -90,6 +96,23 @@ class LoopCloser:
         and the information [6, 6] of its left twist (m, rad)."""
         self.odometry.append(Edge(a, b, T_a_b, information, loop=False))
 
+    def add_finished(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], T_first_submap: Matrix) -> None:
+        """Add a submap of an earlier session: loops to it are tried, but it stays where it is relative to the first
+        submap.
+
+        descriptors [D]: one per keyframe, none if loops are not closed. T_first_submap [4, 4]: its pose in submap 0.
+        """
+        if descriptors:
+            self.descriptors.append(self._described(submap, descriptors))
+        if submap.index:
+            self.connect(0, submap.index, T_first_submap, RIGID)
+
+    def _described(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]]) -> SubmapDescriptor:
+        c, field = self.config.loops, submap.field
+        log_variances = field.params[:, COLUMNS["log_variances"]].numpy()
+        ratio = opacity_ratio(field.opacities.numpy(), log_variances, c.tau, c.weight_max)
+        return SubmapDescriptor(submap.index, np.stack(descriptors), ratio)
+
     def submap_finished(
         self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], atlas: Atlas, view: View
     ) -> list[Loop]:
@@ -98,12 +121,9 @@ class LoopCloser:
         descriptors [D]: one per keyframe, in order, of unit norm or zero. Returns the pairs that were tried, each with
         the latest verdict.
         """
-        c, field = self.config.loops, submap.field
-        if not c.close or not descriptors:
+        if not self.config.loops.close or not descriptors:
             return []
-        log_variances = field.params[:, COLUMNS["log_variances"]].numpy()
-        ratio = opacity_ratio(field.opacities.numpy(), log_variances, c.tau, c.weight_max)
-        query = SubmapDescriptor(submap.index, np.stack(descriptors), ratio)
+        query = self._described(submap, descriptors)
         pairs = self._pairs(query, atlas)
         self.descriptors.append(query)
         tried = [self._try(pair, submap, atlas, view) for pair in pairs]
@@ -131,7 +151,7 @@ class LoopCloser:
         """Register a pair, with `a` as the query, and record the result, accepted or not."""
         b = self.store.load(pair.best.database_submap)
         known = se3.inverse(atlas.anchors[a.index]) @ atlas.anchors[b.index]
-        found = Registrar(self.config, self.store, view).register(pair, a, b, known)
+        found = Registrar(self.config, self.store, view, self.extractor).register(pair, a, b, known)
         loop = described(pair.best, a, b, found, known)
         self.loops.append(loop)
         if found.accepted:

@@ -1,0 +1,102 @@
+"""Read the map of a finished run, to find cameras in it or to continue it in another run."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sigmasplat.config import Config
+from sigmasplat.errors import RunError
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.io.submaps import DiskStore
+from sigmasplat.model.camera import Camera
+from sigmasplat.slam.continuation import continued, refuse_without_relocalisation, take_over
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources.base import Source
+from sigmasplat.types import Matrix
+
+LEAST_SHARE = 0.5
+"""Another camera must see at least this share of the map's images."""
+
+
+@dataclass(frozen=True, eq=False)
+class FinishedMap:
+    """The submaps of a finished run, their poses, and the camera of their images.
+
+    anchors: T_world_submap [4, 4] of each submap, or T_component_submap if its component is not connected to the world;
+    components: one number per submap, 0 is the world; keyframe_poses: T_submap_camera [4, 4] of their keyframes;
+    frames: number of frames of the run.
+    """
+
+    run: RunFolder
+    config: Config
+    store: DiskStore
+    anchors: list[Matrix]
+    components: list[int]
+    keyframe_poses: list[list[Matrix]]
+    frames: int
+    camera: Camera
+
+    @staticmethod
+    def of(run: RunFolder) -> "FinishedMap":
+        """Read a run. Raises RunError if it is not complete or kept no submaps."""
+        status = run.facts().get("status")
+        if status != "complete":
+            raise RunError(
+                f"run {run.path} is not complete (status: {status}); finish it first: sigmasplat resume {run.path}"
+            )
+        store = run.submaps
+        if not len(store):
+            raise RunError(
+                f"run {run.path} kept no submaps, so no camera can be found in it; run it again with a preset "
+                "that makes submaps, such as sigma"
+            )
+        tensors, _ = run.read_checkpoint()
+        anchors = np.asarray(tensors.get("T_world_submap", np.empty((0, 4, 4))), np.float64)
+        if len(anchors) < len(store):
+            raise RunError(
+                f"run {run.path} has {len(store)} submaps, but its checkpoint has poses of {len(anchors)}; run it again"
+            )
+        known = tensors.get("submap_component")
+        components = [0] * len(store) if known is None else [int(number) for number in known]
+        submaps = [store.load(index) for index in range(len(store))]
+        poses = [list(np.asarray(submap.T_submap_camera, np.float64)) for submap in submaps]
+        frames = len(tensors["timestamps_s"])
+        return FinishedMap(run, run.config(), store, list(anchors), components, poses, frames, submaps[0].camera)
+
+    @property
+    def members(self) -> list[int]:
+        """Return the submaps that are connected to the world."""
+        return [index for index, component in enumerate(self.components) if component == 0]
+
+    def refuse_other_size(self, config: Config) -> None:
+        """Raise RunError if settings make working images of another size than those of the map."""
+        for name in ("width", "crop_px"):
+            ours, theirs = getattr(config.input, name), getattr(self.config.input, name)
+            if ours != theirs:
+                raise RunError(
+                    f"input.{name} is {ours}, but run {self.run.path} was made with {theirs}, and all submaps of a map "
+                    f"have images of one size; leave out --set input.{name}"
+                )
+
+    def refuse_other_view(self, camera: Camera) -> None:
+        """Raise RunError if a camera (of working size) sees too little of what the map's camera sees."""
+        if self.camera.share_seen_by(camera) < LEAST_SHARE:
+            raise RunError(
+                f"the recording's camera ({camera}) sees less than half of the images of run {self.run.path} "
+                f"({self.camera}); record with a similar lens, or check --fx and --calibration"
+            )
+
+
+def continue_map(earlier: FinishedMap, config: Config, source: Source, run: RunFolder) -> Slam:
+    """Copy the world of an earlier run to a new run's folder, and return a system that continues it.
+
+    run.json of the new run names the earlier one under `onto`. Raises RunError if the camera of the source sees too
+    little of what the map's camera sees, ConfigError if relocalisation is off.
+    """
+    camera = source.camera.prepared(config.input.width, config.input.crop_px)
+    earlier.refuse_other_view(camera)
+    refuse_without_relocalisation(config)
+    take_over(earlier.store, earlier.members, earlier.frames, run.submaps)
+    anchors = [earlier.anchors[index] for index in earlier.members]
+    run.note(onto={"run": str(earlier.run.path.resolve()), "submaps": len(anchors), "T_world_submap": anchors})
+    return continued(config, run.submaps, anchors)
