@@ -6,7 +6,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class FeatureConfig:
-    """Sparse features for a second guess in tracking and for relocalisation (ours)."""
+    """Sparse features for a second guess in tracking, for relocalisation and for loops (ours)."""
 
     kind: Literal["sift", "orb", "xfeat"] = "sift"
     """Kind of features: sift = RootSIFT, orb = faster and less reliable, xfeat = a neural network with its own matcher,
