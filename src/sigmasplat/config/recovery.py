@@ -10,7 +10,7 @@ class RecoveryConfig:
     relocalise: bool = False
     """Whether a lost camera is searched for in the keyframes of all submaps, by features; off = only near the last pose
     (papers)."""
-    candidates: int = 5
+    candidates: int = 8
     """Number of keyframes, those with the most matches, from which the pose of a lost camera is computed and
     verified."""
     steady_frames: int = 2

@@ -74,4 +74,5 @@ def pose_by_features(reference: Landmarks, live: FeatureImage, extractor: Extrac
     """Match landmarks with the features of a live image; return the motion T_live_reference, or None without one."""
     seen = live.features(extractor)
     pairs = extractor.match(reference.features, seen)
-    return pose_from_landmarks(reference, seen, pairs, seed, depth_readings(seen, live.depth_m, live.camera))
+    depth_m = depth_readings(seen, live.depth_m, live.camera)
+    return pose_from_landmarks(reference, seen, pairs, seed, depth_m, extractor.config)
