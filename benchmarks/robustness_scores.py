@@ -26,7 +26,6 @@ KNOWN_M, KNOWN_DEG = 0.5, 25.0
 """A view is known if a frame from before the event is this near and looks in this direction."""
 Truth = NDArray[np.float64]
 """T_world_camera [1 or 2, N, 4, 4]: the true poses of the colour, and of the depth if it shows other frames."""
-BELIEVED_STATES = ("tracked", "relocalised")
 BINS = 10
 
 
@@ -53,18 +52,17 @@ def read_run(folder: Path, frames: int) -> RunPath:
         values = json.loads(line)
         log[values["index"]] = values
     tracked, final = (np.full((frames, 4, 4), np.nan) for _ in range(2))
-    lost, states, p_off = np.ones(frames, bool), [""] * frames, np.full(frames, np.nan)
+    lost, p_off = np.ones(frames, bool), np.full(frames, np.nan)
     for index, values in enumerate(log):
         if values is not None:
             lost[index] = values["lost"]
-            states[index] = values.get("state", "lost" if values["lost"] else "tracked")
             p_off[index] = np.nan if values.get("p_off") is None else values["p_off"]
             if values["T_world_camera"] is not None:
                 tracked[index] = values["T_world_camera"]
     path = read_trajectory(folder / "trajectory.txt")
     rows = np.rint(path.timestamps_s * FRAMES_PER_SECOND).astype(int)
     final[rows] = path.T_world_camera
-    believed = np.isfinite(final[:, 0, 0]) & ~lost & np.isin(states, BELIEVED_STATES)
+    believed = np.isfinite(final[:, 0, 0]) & ~lost  # a component that joined the world later is believed at the end
     return RunPath(tracked, final, lost, believed, p_off, log)
 
 

@@ -1,6 +1,6 @@
 """SLAM: track every frame, map keyframes, cut submaps, close loops. `Slam.step` follows the papers' overviews."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -17,8 +17,8 @@ from sigmasplat.slam.found import Found
 from sigmasplat.slam.localisation.confidence import std_of
 from sigmasplat.slam.localisation.known_map import KnownMap
 from sigmasplat.slam.localisation.recovery import Link, usable
-from sigmasplat.slam.localisation.relocaliser import INDEX_AT_MOST, Relocation
-from sigmasplat.slam.localisation.sight import Observation, observe, working_frame
+from sigmasplat.slam.localisation.relocaliser import INDEX_AT_MOST, Relocation, sight_of
+from sigmasplat.slam.localisation.sight import Observation, Sight, observe, working_frame
 from sigmasplat.slam.localisation.verdict import is_better, is_questionable
 from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.slam.mapper import Mapper
@@ -26,6 +26,9 @@ from sigmasplat.slam.rules import ends_submap, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.slam.world import World
 from sigmasplat.types import Matrix, no_progress
+
+LAST_TRIES = 3
+"""Number of keyframes per submap that is apart with which other components are searched at the end."""
 
 
 class Slam(World):
@@ -67,6 +70,7 @@ class Slam(World):
         total = self.config.final.iterations or 1
         progress(0, total)
         self._finish_submap()
+        self._connect_components()
         members = self.atlas.members(0)
         store, anchors = StorePart(self.store, members), [self.atlas.anchors[s] for s in members]
         self._final = final_map(store, anchors, self.config, self.view, self.random, progress)
@@ -192,18 +196,20 @@ class Slam(World):
     # ---- lost and found ----
 
     def _relocalise(
-        self, seen: Observation, elsewhere: bool = False, index_at_most: int | None = INDEX_AT_MOST
+        self, seen: Sight, apart_from: int | None = None, index_at_most: int | None = INDEX_AT_MOST
     ) -> Relocation | None:
-        """Search the map for the camera; elsewhere: only in components that are not connected to the active submap."""
+        """Search the map for the camera; apart_from: only in components that are not that of this submap."""
         if not self.config.recovery.relocalise or not usable(seen):
             return None
         components = self.atlas.components
-        known = KnownMap(
-            self.store, self.atlas.keyframe_poses, self.mapper.keyframes, self.mapper.field,
-            lambda s: not elsewhere or components[s] != components[-1],
-        )  # fmt: skip
+        wanted = [apart_from is None or number != components[apart_from] for number in components]
         with self._timer.stage("relocalise"):
-            return self.relocaliser.find(known, self.view, seen, index_at_most)
+            return self.relocaliser.find(self._known(wanted), self.view, seen, index_at_most)
+
+    def _known(self, wanted: Sequence[bool]) -> KnownMap:
+        """Return the map as relocalisation reads it; wanted [S]: which submaps are searched."""
+        active = self.mapper.keyframes, self.mapper.field
+        return KnownMap(self.store, self.atlas.keyframe_poses, *active, wanted.__getitem__)
 
     def _question(self, fit: PoseFit, seen: Observation, found: Found) -> None:
         """After some doubtful frames, ask the whole map whether another pose explains the frame much better."""
@@ -240,16 +246,26 @@ class Slam(World):
 
     def _seek_component(self, seen: Observation, found: Found) -> None:
         """Look for a place of another component; two observations that agree join the components."""
-        if len(set(self.atlas.components)) < 2:
-            return
-        place = self._relocalise(seen, elsewhere=True)
+        if len(set(self.atlas.components)) > 1:
+            self._seek_link(seen, len(self.store), found.T_submap_camera)
+
+    def _connect_components(self) -> None:
+        """When all is mapped, search other components for the keyframes of those that are apart."""
+        for s, poses in enumerate(self.atlas.keyframe_poses):
+            for k in sorted({round(i) for i in np.linspace(0, len(poses) - 1, LAST_TRIES)}):
+                if self.atlas.components[s]:
+                    keyframe = self._known([True] * len(self.atlas.components)).keyframe((s, k))
+                    self._seek_link(sight_of(keyframe, self.view), s, keyframe.T_submap_camera)
+
+    def _seek_link(self, seen: Sight, submap: int, T_submap_camera: Matrix) -> None:
+        """Search other components for a camera of a submap; if a second observation agrees, join them."""
+        place = self._relocalise(seen, apart_from=submap)
         if place is None:
             return
-        a, b = place.where[0], len(self.store)
-        link = Link(a, b, place.T_submap_camera @ se3.inverse(found.T_submap_camera), place.information)
+        link = Link(place.where[0], submap, place.T_submap_camera @ se3.inverse(T_submap_camera), place.information)
         if self.recovery.confirms(link, self.atlas):
-            self.atlas.join(a, b, link.T_a_b)
-            self.closer.connect(a, b, link.T_a_b, link.information)
+            self.atlas.join(link.a, link.b, link.T_a_b)
+            self.closer.connect(link.a, link.b, link.T_a_b, link.information)
 
     def _step_result(self, frame: Frame, found: Found) -> Step:
         component, in_submap_m = self.atlas.components[-1], self.drift.position_m(found.T_submap_camera)

@@ -17,6 +17,8 @@ from sigmasplat.types import Matrix
 
 LOOP_STD_M = 0.01
 """Standard deviation of the position that a loop gives."""
+NEVER_LOST = 1_000_000
+"""Number of frames since the last lost one, before any was lost."""
 MEMORY = 20.0
 """A lost frame is forgotten after about this many tracked ones."""
 BIAS = -3.0
@@ -40,7 +42,7 @@ class Confidence:
     one; doubtful: doubtful frames in a row."""
 
     spread_m: list[float] = field(default_factory=list)
-    since_lost: int = 1_000_000
+    since_lost: int = NEVER_LOST
 
     def begun(self, parent: int | None, position_m: float) -> None:
         """Add a submap: at position_m (standard deviation, m) from its parent, or the first of a component."""
@@ -75,7 +77,7 @@ def evidence(tracking: Mapping[str, float], since_lost: int) -> dict[str, float]
     residual, correlation = tracking.get("residual", 0.3), tracking.get("correlation", 0.95)
     return {
         "log_position_std": math.log(tracking.get("position_std_m", 0.0) + 1e-3),
-        "log_residual": math.log(min(residual, 10.0) + 0.05),
+        "log_residual": math.log((min(residual, 10.0) if math.isfinite(residual) else 10.0) + 0.05),
         "unexplained": behind / max(close + behind, 1e-9),
         "not_close": 1.0 - close,
         "uncorrelated": 0.1 if math.isnan(correlation) else 1.0 - max(correlation, 0.0),

@@ -194,12 +194,17 @@ def aligned(
 
 def keyframe_image(keyframe: KnownKeyframe, view: View) -> Reference:
     """Return a keyframe's own image as a reference of alignment."""
-    picture = keyframe.picture
-    target = Target.of_picture(picture, view.camera, (view.sums.shape[1], view.sums.shape[2]))
-    pyramid = live_image(view, picture.unit_color, picture.depth_m, target)
-    return Reference(pyramid, se3.inverse(keyframe.T_submap_camera))
+    return Reference(sight_of(keyframe, view).live, se3.inverse(keyframe.T_submap_camera))
 
 
 def _compact(descriptors: Matrix) -> Matrix:
     """Return float descriptors in half precision, which holds them exactly."""
     return descriptors.astype(np.float16) if descriptors.dtype == np.float32 else descriptors
+
+
+def sight_of(keyframe: KnownKeyframe, view: View) -> Sight:
+    """Return a keyframe of the map in the form of a frame to be found."""
+    picture = keyframe.picture
+    target = Target.of_picture(picture, view.camera, (view.sums.shape[1], view.sums.shape[2]))
+    pyramid = live_image(view, picture.unit_color, picture.depth_m, target)
+    return Sight(target, pyramid, keyframe.image(view.camera))

@@ -1,0 +1,126 @@
+"""Fit the weights of the probability that a pose is off by more than 5 cm (slam/localisation/confidence.py).
+
+The data are disturbed recordings with known truth, kept by benchmarks/robustness.py --keep DIR. A model that is fitted
+to all sequences but one is judged on that one. Writes benchmarks/results/<name>-<machine>.json and prints the weights,
+which belong into confidence.py.
+
+example: python benchmarks/failure_probability.py --data runs/kept
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import program
+import record
+import tyro
+from numpy.typing import NDArray
+from robustness_scores import OFF_M
+from scipy.optimize import minimize
+from scipy.special import expit
+
+from sigmasplat.metrics.failures import auroc
+from sigmasplat.slam.localisation.confidence import NEVER_LOST, WEIGHTS, evidence
+
+arg = tyro.conf.arg
+SHRINK = 1.0
+"""Weight of the squared weights in the loss: correlated inputs share their weight."""
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Fit the weights of the probability that a pose is off by more than 5 cm."""
+
+    data: Annotated[Path, arg(help="folder of robustness.py --keep")]
+    name: Annotated[str, arg(help="name of the results")] = "failure-probability"
+    out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Inputs [N, K] of frames that are not lost, whether each is off [N], its sequence [N], and frames lost [N]."""
+
+    inputs: Values
+    off: NDArray[np.bool_]
+    sequence: NDArray[np.str_]
+    lost_off: NDArray[np.bool_]
+
+
+def samples_of(folder: Path) -> Samples:
+    """Read the kept runs. Raises OSError or ValueError if a file is missing or damaged."""
+    inputs, off, sequence, lost_off = list[list[float]](), list[bool](), list[str](), list[bool]()
+    for path in sorted(folder.glob("*.npz")):
+        error_m = np.load(path)["error_tracked_m"]
+        since_lost = NEVER_LOST
+        for line in path.with_suffix(".jsonl").read_text().splitlines():
+            frame = json.loads(line)
+            since_lost = 0 if frame["state"] in ("lost", "relocalised") else since_lost + 1
+            error = error_m[frame["index"]]
+            if not frame["tracking"] or not np.isfinite(error) or frame["component"]:
+                continue
+            if frame["lost"]:
+                lost_off.append(error > OFF_M)
+                continue
+            values = evidence(_plain(frame["tracking"]), since_lost)
+            inputs.append([values[name] for name in WEIGHTS])
+            off.append(error > OFF_M)
+            sequence.append(path.name.partition("-")[0])
+    return Samples(np.array(inputs), np.array(off), np.array(sequence), np.array(lost_off))
+
+
+def _plain(tracking: Mapping[str, float | None]) -> dict[str, float]:
+    """Return the values of a log, in which null stands for NaN or inf."""
+    return {name: float("nan") if value is None else value for name, value in tracking.items()}
+
+
+def fitted(inputs: Values, off: NDArray[np.bool_]) -> Values:
+    """Return bias and weights [1 + K] of the most likely logistic model; no input may lower the probability."""
+    x = np.column_stack([np.ones(len(inputs)), inputs])
+
+    def loss(weights: Values) -> tuple[float, Values]:
+        z = x @ weights
+        p = expit(z)
+        value = float(np.logaddexp(0.0, z).sum() - z[off].sum() + 0.5 * SHRINK * (weights[1:] ** 2).sum())
+        return value, x.T @ (p - off) + SHRINK * np.concatenate([[0.0], weights[1:]])
+
+    bounds = [(None, None)] + [(0.0, None)] * inputs.shape[1]
+    start = np.zeros(x.shape[1])
+    return np.asarray(minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 2000}).x)
+
+
+def probability(weights: Values, inputs: Values) -> Values:
+    """Return the probability of each frame [N]."""
+    return np.asarray(expit(weights[0] + inputs @ weights[1:]))
+
+
+def judged(p: Values, off: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return AUROC, Brier score, and mean probability against share of frames that are off."""
+    area = auroc(p, off)
+    brier = float(np.mean((p - off) ** 2))
+    return {"frames": len(off), "off": float(off.mean()), "mean": float(p.mean()), "auroc": area, "brier": brier}
+
+
+def main(options: Options) -> int:
+    """Fit, judge each sequence by a model without it, write and print."""
+    s = samples_of(options.data)
+    held_out = {}
+    for name in sorted(set(s.sequence.tolist())):
+        test = s.sequence == name
+        held_out[name] = judged(probability(fitted(s.inputs[~test], s.off[~test]), s.inputs[test]), s.off[test])
+    weights = fitted(s.inputs, s.off)
+    found = {
+        "bias": float(weights[0]), "weights": dict(zip(WEIGHTS, weights[1:].tolist(), strict=True)),
+        "lost": float(s.lost_off.mean()) if len(s.lost_off) else None, "held_out": held_out,
+        "all": judged(probability(weights, s.inputs), s.off),
+    }  # fmt: skip
+    print(json.dumps(found, indent=1))
+    program.keep("failure_probability", found, options, ())
+    return 0
+
+
+if __name__ == "__main__":
+    program.start(main, Options)
