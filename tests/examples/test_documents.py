@@ -49,7 +49,7 @@ def unknown_names(path: Path) -> list[str]:
     files = re.findall(rf"`((?:{'|'.join(FOLDERS)})/[\w/]+\.\w+)`", text)
     settings = re.findall(rf"`({'|'.join(SECTIONS)})\.([a-z]\w+)`", text)
     presets = re.findall(r"`((?:varsplat|loopsplat|cgslam)-[a-z0-9-]*[a-z0-9])`", text)
-    fitted = {"agreement", "overlap", "first_loss", "loss", "iterations"}
+    fitted = {"agreement", "overlap", "first_loss", "loss", "iterations", "inliers", "position_std_m", "doubtful"}
     compared = {field.name for field in dataclasses.fields(Comparison)}
     logged = fitted | compared if path.name == "runs.md" else set()
 

@@ -33,6 +33,7 @@ class Comparison:
     common: share of the reference's readings that fall on a live reading; close, front, behind: shares of these whose
     live surface is the same, nearer, or farther. Of those that are not in front: residual, the median |depth
     difference| in standard deviations of a reading; correlation of the gray values, −1 to 1, NaN if one image is flat.
+    points: the number of compared pixels.
     """
 
     common: float
@@ -41,6 +42,7 @@ class Comparison:
     behind: float
     residual: float
     correlation: float
+    points: int = 0
 
 
 NOTHING = Comparison(0.0, 0.0, 0.0, 0.0, float("inf"), float("nan"))
@@ -74,12 +76,12 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
     close, behind = (float(np.mean(found)) for found in (np.abs(difference) < limit, difference >= limit))
     common, before = count / len(u), float(np.mean(front))
     if count - front.sum() < LEAST_PIXELS:
-        return Comparison(common, close, before, behind, float("inf"), float("nan"))
+        return Comparison(common, close, before, behind, float("inf"), float("nan"), count)
     residual = float(np.median(np.abs(difference)[~front] / noise[~front]))
     right, below = column[inside] - left > 0.5, row[inside] - top > 0.5
     live_gray = host(live.gray[level])[top + below, left + right]
     correlation = _correlation(gray[v, u][inside][other][~front], live_gray[other][~front])
-    return Comparison(common, close, before, behind, residual, correlation)
+    return Comparison(common, close, before, behind, residual, correlation, count)
 
 
 def noise_scale(depth: NDArray[np.float32]) -> float:

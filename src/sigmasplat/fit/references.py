@@ -20,6 +20,12 @@ class Reference:
     pyramid: Pyramid
     T_camera_world: Matrix
 
+    @property
+    def weights(self) -> Image | None:
+        """Return the weight of each pixel [H, W] in host memory; None if all are equal."""
+        weight = self.pyramid.weight[0]
+        return None if weight is None else self.pyramid.kernels.to_host(weight)
+
 
 def live_image(view: View, color: Image, depth_m: Image, target: Target) -> Pyramid:
     """Make the pyramid of a camera image, colour [H, W, 3] and depth [H, W] m, on the device that aligns it."""

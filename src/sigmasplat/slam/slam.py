@@ -273,7 +273,7 @@ class Slam(World):
         found.tracking |= {
             "position_std_m": self.confidence.position_std_m(in_submap_m), "doubtful": float(self.tracker.doubtful),
         }  # fmt: skip
-        p_off = self.confidence.probability(found.state, found.tracking)
+        p_off = self.confidence.probability(state, found.tracking)
         return Step(
             frame.index, frame.timestamp_s, self.atlas.anchors[-1] @ found.T_submap_camera, found.mapped,
             state == LOST, found.tracking, len(self.mapper.field), len(self.atlas.anchors) - 1,

@@ -194,6 +194,8 @@ class Tracker:
         if self.config.method == "align" or fits_of(view).aligns:  # otherwise nothing aligns to it
             T_camera_world = se3.inverse(T_world_camera)
             self.keyframe = keyframe_reference(field.params, view, seen.live, T_camera_world, self.config)
+            if seen.image is not None:
+                self.keyframe_features = seen.image.weighed(self.keyframe.weights)
 
     def move_to(self, field: GaussianField, view: View, keyframe: FoundKeyframe, T_world_camera: Matrix) -> None:
         """Continue at another pose, with a keyframe as the reference of the next frames."""
@@ -201,7 +203,7 @@ class Tracker:
         self.keyframe = keyframe_reference(
             field.params, view, keyframe.pyramid, keyframe.T_camera_world, self.config
         )  # fmt: skip
-        self.keyframe_features = keyframe.image
+        self.keyframe_features = keyframe.image.weighed(self.keyframe.weights)
 
     def forget(self) -> None:
         """Start anew at the identity, as for the first frame."""

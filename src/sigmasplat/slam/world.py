@@ -49,7 +49,7 @@ class World:
         self.mapper = Mapper(self.config, self.random)
         self.drift = Drift()
         self.descriptor = make_descriptor(self.config.loops)
-        self.closer = LoopCloser(self.config, self.store)
+        self.closer = LoopCloser(self.config, self.store, self.extractor if self.config.tracking.features else None)
         self.recovery = Recovery(self.config.recovery)
         self.confidence = Confidence()
         self.relocaliser = Relocaliser(self.config, self.extractor)

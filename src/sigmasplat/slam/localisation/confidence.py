@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sigmasplat.model.component import LOST, RELOCALISED
+from sigmasplat.model.component import APART, LOST, RELOCALISED
 from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.types import Matrix
 
@@ -21,6 +21,8 @@ NEVER_LOST = 1_000_000
 """Number of frames since the last lost one, before any was lost."""
 MEMORY = 20.0
 """A lost frame is forgotten after about this many tracked ones."""
+MANY = 2000.0
+"""With at least this many compared points, their number is no reason for doubt."""
 BIAS = -3.0
 WEIGHTS: dict[str, float] = {
     "log_position_std": 0.8,
@@ -30,10 +32,12 @@ WEIGHTS: dict[str, float] = {
     "uncorrelated": 3.0,
     "log_doubtful": 0.5,
     "lately_lost": 1.0,
+    "few_points": 1.0,
 }
 """Weights of the logistic model."""
-PROBABILITY_LOST = 0.95
-"""Share of lost frames whose guess of the pose is off by more than 5 cm."""
+CERTAIN = {LOST: 0.95, APART: 0.99}
+"""Probability for a lost frame, by the share of those whose guess is off, and for one whose place in the world is not
+known."""
 
 
 @dataclass(eq=False)
@@ -65,8 +69,8 @@ class Confidence:
         tracking: values of its fit (`metrics_of`), with position_std_m and the number of doubtful frames in a row.
         """
         self.since_lost = 0 if state in (LOST, RELOCALISED) else self.since_lost + 1
-        if state == LOST:
-            return PROBABILITY_LOST
+        if state in CERTAIN:
+            return CERTAIN[state]
         values = evidence(tracking, self.since_lost)
         return 1.0 / (1.0 + math.exp(-BIAS - sum(WEIGHTS[name] * value for name, value in values.items())))
 
@@ -83,6 +87,7 @@ def evidence(tracking: Mapping[str, float], since_lost: int) -> dict[str, float]
         "uncorrelated": 0.1 if math.isnan(correlation) else 1.0 - max(correlation, 0.0),
         "log_doubtful": math.log1p(tracking.get("doubtful", 0.0)),
         "lately_lost": math.exp(-since_lost / MEMORY),
+        "few_points": max(0.0, math.log(MANY / max(tracking.get("points", MANY), 1.0))),
     }
 
 

@@ -57,6 +57,12 @@ class FeatureImage:
             self._features = extractor.find(self.detail.gray, self.detail.camera)
         return self._features
 
+    def weighed(self, weights: NDArray[np.float32] | None) -> "FeatureImage":
+        """Return the same image with other weights; features that were found already are kept."""
+        other = FeatureImage(self.detail, self.depth_m, self.camera, weights)
+        other._features = self._features
+        return other
+
     def landmarks(self, extractor: Extractor) -> Landmarks:
         """Return the features that have depth."""
         if self._landmarks is None:

@@ -14,6 +14,7 @@ from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.field import COLUMNS
 from sigmasplat.model.submap import Submap, SubmapStore
 from sigmasplat.render.view import View
+from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.loop_closure.candidates import (
     Candidate,
     SubmapDescriptor,
@@ -84,6 +85,7 @@ class LoopCloser:
 
     config: Config
     store: SubmapStore
+    extractor: Extractor | None = None
     descriptors: list[SubmapDescriptor] = field(default_factory=list)
     odometry: list[Edge] = field(default_factory=list)
     closed: list[Edge] = field(default_factory=list)
@@ -149,7 +151,7 @@ class LoopCloser:
         """Register a pair, with `a` as the query, and record the result, accepted or not."""
         b = self.store.load(pair.best.database_submap)
         known = se3.inverse(atlas.anchors[a.index]) @ atlas.anchors[b.index]
-        found = Registrar(self.config, self.store, view).register(pair, a, b, known)
+        found = Registrar(self.config, self.store, view, self.extractor).register(pair, a, b, known)
         loop = described(pair.best, a, b, found, known)
         self.loops.append(loop)
         if found.accepted:

@@ -1,7 +1,7 @@
 """Register two submaps: keyframes of each are localised in the other, and the results must agree (VarSplat §5)."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from torch import Tensor
 from sigmasplat.config import Config, RegistrationConfig, TrackingConfig
 from sigmasplat.fit.align import align
 from sigmasplat.fit.backends import fits_of
+from sigmasplat.fit.compare import Comparison, compare
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import live_image, map_reference
@@ -19,6 +20,10 @@ from sigmasplat.model import se3
 from sigmasplat.model.submap import Submap, SubmapStore
 from sigmasplat.render.view import View
 from sigmasplat.slam.drift import symmetric
+from sigmasplat.slam.features import Extractor
+from sigmasplat.slam.localisation.feature_image import pose_by_features
+from sigmasplat.slam.localisation.known_map import KnownKeyframe
+from sigmasplat.slam.localisation.verdict import confirmed
 from sigmasplat.slam.loop_closure.candidates import SubmapPair
 from sigmasplat.types import Matrix
 
@@ -26,6 +31,8 @@ FLOOR_M, FLOOR_RAD = 0.005, 0.003
 """Minimum standard deviation of a registration: two maps of the same wall differ by about this much."""
 HOPELESS = 0.5
 """If alignment explains less than this share of `share_least`, the keyframe is not refined further."""
+DOUBTFUL = 0.6
+"""If alignment from the known poses explains less than this share of a keyframe, features give another guess."""
 OVERLAP_SAMPLE = 5000
 OPAQUE = 0.95
 """Pixels count if the other submap's alpha is above this (VarSplat §5 uses it for depth; here for colour too)."""
@@ -34,13 +41,15 @@ OPAQUE = 0.95
 @dataclass(frozen=True, eq=False)
 class Localisation:
     """A keyframe's pose in the other submap, expressed as T_a_b [4, 4] between the submaps; residual: the final loss;
-    covariance [6, 6] of T_a_b's left twist (m, rad); agreement and overlap as in `PoseFit`."""
+    covariance [6, 6] of T_a_b's left twist (m, rad); agreement and overlap as in `PoseFit`; comparison: with the other
+    map rendered at the pose, None if it was not made."""
 
     T_a_b: Matrix
     residual: float
     covariance: Matrix
     agreement: float
     overlap: float
+    comparison: Comparison | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +70,12 @@ class Registration:
 
 
 class Registrar:
-    """Registers submaps of one store; all of them share the camera of the view."""
+    """Registers submaps of one store; all of them share the camera of the view. With an extractor, features give a
+    guess where the known poses lead to none, such as between wide angles."""
 
-    def __init__(self, config: Config, store: SubmapStore, view: View) -> None:
-        self.config, self.store, self.view = config.registration, store, view
+    def __init__(self, config: Config, store: SubmapStore, view: View, extractor: Extractor | None = None) -> None:
+        self.config, self.store, self.view, self.extractor = config.registration, store, view, extractor
+        self.verify, self.seed = config.tracking.verify, config.seed
         self.tracking = tracking_of(config.registration, config.tracking)
 
     def register(self, pair: SubmapPair, a: Submap, b: Submap, T_a_b: Matrix) -> Registration:
@@ -85,11 +96,29 @@ class Registrar:
         expected = se3.inverse(T_own_camera) @ T_own_other
         guesses = [expected, *(se3.inverse(other.T_submap_camera[k]) for k in alike)]
         fit = max((self._aligned(params, live, guess) for guess in guesses), key=score)
+        if score(fit) < DOUBTFUL:
+            found = (self._aligned(params, live, guess) for guess in self._by_features(own, keyframe, other, alike))
+            fit = max((fit, *found), key=score)
         if fit.alignment is None or score(fit) > HOPELESS * self.config.share_least:
             fit = fit_pose_adam(params, self.view, target, fit.T_camera_world, self.tracking, self.config.iterations)
         A = se3.adjoint(T_own_camera)
-        covariance = A @ self._covariance(params, live, fit.T_camera_world) @ A.T
-        return Localisation(T_own_camera @ fit.T_camera_world, fit.loss, covariance, fit.agreement, fit.overlap)
+        covariance, comparison = self._checked(params, live, fit.T_camera_world)
+        T_own_other = T_own_camera @ fit.T_camera_world
+        return Localisation(T_own_other, fit.loss, A @ covariance @ A.T, fit.agreement, fit.overlap, comparison)
+
+    def _by_features(self, own: Submap, keyframe: int, other: Submap, alike: Sequence[int]) -> Iterator[Matrix]:
+        """Yield T_camera_other by features of the similar keyframes of the other submap, where they give a pose."""
+        if self.extractor is None:
+            return
+        image = self._known(own, keyframe).image(own.camera)
+        for k in alike:
+            landmarks = self._known(other, k).image(other.camera).landmarks(self.extractor)
+            found = pose_by_features(landmarks, image, self.extractor, self.seed)
+            if found is not None:
+                yield found.T_live_reference @ se3.inverse(other.T_submap_camera[k])
+
+    def _known(self, submap: Submap, keyframe: int) -> KnownKeyframe:
+        return KnownKeyframe(self.store.picture(submap.index, keyframe), submap.T_submap_camera[keyframe])
 
     def _laid_out(self, submap: Submap, keyframe: int) -> tuple[Target, Pyramid]:
         picture = self.store.picture(submap.index, keyframe)
@@ -105,19 +134,22 @@ class Registrar:
             guess = fit.T_camera_world
         return fit
 
-    def _covariance(self, params: Tensor, live: Pyramid, T_camera_map: Matrix) -> Matrix:
-        """Return the covariance [6, 6] of T_camera_map's left twist, estimated by alignment to the map at that pose."""
+    def _checked(self, params: Tensor, live: Pyramid, T_camera_map: Matrix) -> tuple[Matrix, Comparison | None]:
+        """Return the covariance [6, 6] of T_camera_map's left twist, estimated by alignment to the map at that pose,
+        and, if poses are verified, the comparison with the map there."""
         if not fits_of(self.view).aligns:
-            return np.zeros((6, 6))
+            return np.zeros((6, 6)), None
         reference = map_reference(params, self.view, T_camera_map, self.tracking)
         covariance = align(reference.pyramid, live, np.eye(4), 0, self.tracking.align_weight_color).covariance
-        return covariance if np.isfinite(covariance).all() else np.eye(6)
+        comparison = compare(reference.pyramid, live, np.eye(4)) if self.verify else None
+        return covariance if np.isfinite(covariance).all() else np.eye(6), comparison
 
     def _judge(
         self, a: Submap, b: Submap, found: Sequence[Localisation], centre_b: Matrix, T_a_b: Matrix
     ) -> Registration:
         c = self.config
         good = [f for f in found if f.agreement >= c.agreement_least and f.agreement * f.overlap >= c.share_least]
+        good = [f for f in good if f.comparison is None or confirmed(f.comparison)]
         if len(good) < 2:
             best = max(f.agreement * f.overlap for f in found)
             why = f"{len(good)} of {len(found)} keyframes were localised (the best explains {best:.0%})"
