@@ -113,7 +113,7 @@ def test_a_frame_seen_by_another_camera_has_the_same_surface() -> None:
     "arguments, words",
     [
         (["--out", "found.csv"], "--out must end in .jsonl or .txt"),
-        (["--fx", "20"], "sees less than half"),
+        (["--fx", "400"], "sees less than half"),
         (["--set", "features.kind=surf"], "features.kind must be one of"),
     ],
 )

@@ -186,6 +186,7 @@ def _run_and_score(
     if run_options.profile:
         screen.profile(folder.read_profile())
     _warn_of_skipped_frames(screen, source)
+    _warn_if_never_recognised(screen, folder)
     if outcome.status == "interrupted":
         _say_interrupted(screen, outcome, folder)
         return INTERRUPTED
@@ -227,6 +228,16 @@ def _warn_of_skipped_frames(screen: "Screen", source: "Source") -> None:
         screen.warn(source.ending)
     if isinstance(source, LiveSource) and source.dropped:
         screen.say(f"{source.dropped} frames of the camera were dropped because SLAM was slower")
+
+
+def _warn_if_never_recognised(screen: "Screen", folder: "RunFolder") -> None:
+    """Print a warning if no frame of a run with --onto is connected to the earlier map."""
+    onto = folder.facts().get("onto")
+    if onto and not len(folder.read_trajectory()):
+        screen.warn(
+            f"the recording was never recognised in the map of {onto['run']}; its path and map are in "
+            f"{folder.path / 'components'}"
+        )
 
 
 def _say_interrupted(screen: "Screen", outcome: "Outcome", folder: "RunFolder") -> None:

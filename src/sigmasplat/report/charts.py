@@ -46,10 +46,24 @@ def run_charts(
     frames: RunFrames, truth: Matrix | None, loops: Sequence[dict[str, Any]] = ()
 ) -> dict[str, tuple[list[Chart], str]]:
     """Return the charts of a run with captions, by name: trajectory; states if known; submaps if there are several;
-    seconds if known.
+    seconds if known. Without a believed frame there are only the seconds.
 
     truth: [B, 3] of the believed frames, as in `trajectory_charts`.
     """
+    log = frames.log
+    found = _path_charts(frames, truth, loops) if len(frames.rows) else {}
+    if any(frame_seconds(record) for record in log):
+        stages = {name: np.array([(r.get("seconds") or {}).get(name, 0.0) for r in log]) for name in _stages(log)}
+        stages["total"] = np.array([frame_seconds(record) for record in log])
+        caption = "Seconds per frame, end to end. Keyframes take longer, because mapping runs on them."
+        found["seconds"] = [seconds_chart(np.array([record["index"] for record in log]), stages)], caption
+    return found
+
+
+def _path_charts(
+    frames: RunFrames, truth: Matrix | None, loops: Sequence[dict[str, Any]]
+) -> dict[str, tuple[list[Chart], str]]:
+    """Return the charts of the believed poses."""
     estimate, log = frames.path.T_world_camera[:, :3, 3], frames.log
     before_lost = np.array([row + 1 < len(frames) and frames.states[row + 1] == LOST for row in frames.rows], np.bool_)
     caption = "In the frame of the first camera." + ("" if truth is None else " The true path is rigidly aligned.")
@@ -61,11 +75,6 @@ def run_charts(
     submaps = np.array([log[row].get("submap", 0) for row in frames.rows])
     if submaps.max() > 0:
         found["submaps"] = [submap_chart(estimate, submaps, _known_links(frames, loops))], SUBMAPS_CAPTION
-    if any(frame_seconds(record) for record in log):
-        stages = {name: np.array([(r.get("seconds") or {}).get(name, 0.0) for r in log]) for name in _stages(log)}
-        stages["total"] = np.array([frame_seconds(record) for record in log])
-        caption = "Seconds per frame, end to end. Keyframes take longer, because mapping runs on them."
-        found["seconds"] = [seconds_chart(np.array([record["index"] for record in log]), stages)], caption
     return found
 
 
