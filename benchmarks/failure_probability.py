@@ -16,11 +16,13 @@ from typing import Annotated, Any
 import numpy as np
 import program
 import record
+import tables
 import tyro
 from numpy.typing import NDArray
 from robustness_scores import OFF_M
 from scipy.optimize import minimize
 from scipy.special import expit
+from tables import Section, significant
 
 from sigmasplat.metrics.failures import auroc
 from sigmasplat.slam.localisation.confidence import NEVER_LOST, WEIGHTS, evidence
@@ -101,7 +103,8 @@ def judged(p: Values, off: NDArray[np.bool_]) -> dict[str, Any]:
     """Return AUROC, Brier score, and mean probability against share of frames that are off."""
     area = auroc(p, off)
     brier = float(np.mean((p - off) ** 2))
-    return {"frames": len(off), "off": float(off.mean()), "mean": float(p.mean()), "auroc": area, "brier": brier}
+    known = area if np.isfinite(area) else None
+    return {"frames": len(off), "off": float(off.mean()), "mean": float(p.mean()), "auroc": known, "brier": brier}
 
 
 def main(options: Options) -> int:
@@ -117,9 +120,30 @@ def main(options: Options) -> int:
         "lost": float(s.lost_off.mean()) if len(s.lost_off) else None, "held_out": held_out,
         "all": judged(probability(weights, s.inputs), s.off),
     }  # fmt: skip
-    print(json.dumps(found, indent=1))
-    program.keep("failure_probability", found, options, ())
+    measured = program.keep("failure_probability", found, options, data=options.data.name)
+    print(tables.table(measured))
     return 0
+
+
+def sections(measured: dict[str, Any]) -> list[Section]:
+    """Tabulate the weights, and how well they judge sequences that they were not fitted to."""
+    measured = measured["figures"]
+    weights = [["bias", significant(measured["bias"])]]
+    weights += [[name.replace("_", " "), significant(value)] for name, value in measured["weights"].items()]
+    judgements = {f"{name}, fitted to the others": scores for name, scores in measured["held_out"].items()}
+    rows = [
+        [name, str(s["frames"]), f"{100 * s['off']:.2f} %", f"{100 * s['mean']:.2f} %",
+         significant(s["auroc"]), significant(s["brier"])]
+        for name, s in (judgements | {"all, fitted to all": measured["all"]}).items()
+    ]  # fmt: skip
+    return [
+        Section("Weights of p_off", ("input", "weight"), weights),
+        Section(
+            "Tracked frames, without lost ones",
+            ("sequence", "frames", "off by > 5 cm", "mean p_off", "AUROC", "Brier"),
+            rows,
+        ),
+    ]
 
 
 if __name__ == "__main__":

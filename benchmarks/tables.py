@@ -26,7 +26,7 @@ SUBJECTS = {
     "Other systems": ("peers",),
     "Effect of σ²": ("ablation", "color_covariance"),
     "Camera tracking": ("tracking", "pose_gradient", "relocalisation"),
-    "Robustness": ("robustness",),
+    "Robustness": ("robustness", "failure_probability"),
     "Loops and submaps": ("loops", "drift_rule"),
     "Consistent maps": ("consistency",),
     "Kernels": ("cpu", "versus", "gpu", "kernels"),

@@ -8,7 +8,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
-from sigmasplat.model.submap import MemoryStore, Picture, Submap
+from sigmasplat.model.submap import MemoryStore, Picture, StorePart, Submap
 
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
 
@@ -81,3 +81,88 @@ def test_submaps_are_kept_in_order_and_with_all_their_pictures() -> None:
     with pytest.raises(SigmaSplatError, match="2 frames, 2 poses, 1 pictures"):
         store.save(piece(0, 2), [picture()])
     assert len(store) == 0
+
+
+# ---- components
+
+
+def three_components() -> Atlas:
+    """Return an atlas of submaps 0 and 1 (the world), 2 and 3, 4; two frames per submap, one keyframe each."""
+    atlas = Atlas()
+    for s in range(5):
+        atlas.begin_submap(None if s in (0, 2, 4) else motion(s))
+        atlas.keyframe_poses[-1].append(np.eye(4))
+        for frame in range(2):
+            atlas.place_frame(motion(20 * s + frame))
+    return atlas
+
+
+def test_a_submap_without_a_pose_begins_a_component_at_its_own_origin() -> None:
+    atlas = three_components()
+    assert atlas.components == [0, 0, 1, 1, 2]
+    assert [atlas.members(n) for n in range(3)] == [[0, 1], [2, 3], [4]]
+    for s in (0, 2, 4):
+        assert np.array_equal(atlas.anchors[s], np.eye(4))
+    assert np.allclose(atlas.anchors[3], motion(3)), "relative to its own component"
+    assert atlas.in_world.tolist() == [True] * 4 + [False] * 6
+
+
+def test_a_submap_may_begin_in_any_other_one() -> None:
+    atlas = three_components()
+    atlas.begin_submap(motion(7), 1)
+    assert atlas.components[-1] == 0
+    assert np.allclose(atlas.anchors[-1], atlas.anchors[1] @ motion(7))
+    assert np.allclose(atlas.odometry[-1], atlas.odometry[1] @ motion(7))
+
+
+@pytest.mark.parametrize("reverse", [False, True], ids=["world first", "world second"])
+def test_a_component_that_joins_moves_rigidly_to_the_world(reverse: bool) -> None:
+    atlas, before = three_components(), three_components()
+    T_1_3 = motion(50)
+    if reverse:
+        atlas.join(3, 1, se3.inverse(T_1_3))
+    else:
+        atlas.join(1, 3, T_1_3)
+    assert atlas.components == [0, 0, 0, 0, 2]
+    for chain, old in ((atlas.anchors, before.anchors), (atlas.odometry, before.odometry)):
+        assert np.allclose(se3.inverse(chain[1]) @ chain[3], T_1_3), "the observation holds exactly"
+        assert np.allclose(se3.inverse(chain[2]) @ chain[3], se3.inverse(old[2]) @ old[3]), "its inside is unchanged"
+        assert all(np.array_equal(chain[s], old[s]) for s in (0, 1, 4)), "the others stay"
+        assert all(se3.is_rigid(T, 1e-9) for T in chain)
+    moved = atlas.anchors[2] @ se3.inverse(before.anchors[2])
+    assert np.allclose(atlas.T_world_camera()[4:8], moved @ before.T_world_camera()[4:8])
+    assert atlas.in_world.tolist() == [True] * 8 + [False] * 2
+
+
+def test_components_outside_the_world_join_each_other_under_the_lower_number() -> None:
+    atlas = three_components()
+    atlas.join(4, 2, motion(60))
+    assert atlas.components == [0, 0, 1, 1, 1] and np.array_equal(atlas.anchors[2], np.eye(4))
+    assert np.allclose(se3.inverse(atlas.anchors[4]) @ atlas.anchors[2], motion(60))
+    atlas.join(0, 4, motion(61))
+    assert atlas.components == [0] * 5 and atlas.in_world.all()
+    assert np.allclose(se3.inverse(atlas.anchors[4]) @ atlas.anchors[2], motion(60))
+
+
+def test_a_loop_before_a_join_is_kept_apart_from_the_path_without_loops() -> None:
+    """Anchors and odometry differ after a loop; each chain gets the component at the observed pose."""
+    atlas = three_components()
+    atlas.anchors[1] = motion(70) @ atlas.anchors[1]
+    atlas.join(1, 2, motion(71))
+    assert np.allclose(atlas.anchors[2], atlas.anchors[1] @ motion(71))
+    assert np.allclose(atlas.odometry[2], atlas.odometry[1] @ motion(71))
+    assert not np.allclose(atlas.anchors[2], atlas.odometry[2])
+
+
+def test_a_part_of_a_store_numbers_its_submaps_anew_and_cannot_grow() -> None:
+    store = MemoryStore()
+    for k in range(4):
+        some = Picture(np.full((3, 4, 3), k, np.uint8), np.ones((3, 4), np.float32))
+        store.save(piece(k), [some])
+    part = StorePart(store, [3, 1])
+    assert len(part) == 2
+    assert [part.load(k).index for k in range(2)] == [3, 1]
+    assert [int(part.picture(k, 0).color[0, 0, 0]) for k in range(2)] == [3, 1]
+    with pytest.raises(SigmaSplatError, match="part of a store"):
+        part.save(piece(2), [picture()])
+    assert len(store) == 4

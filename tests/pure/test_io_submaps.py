@@ -1,6 +1,7 @@
 """Submaps on disk: they are read back bit for bit and in parts, and damage is reported in one line."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from sigmasplat.io.tensors import open_tensors, write_tensors
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import ATTRIBUTES, GaussianField, Rows
+from sigmasplat.model.frame import Detail
 from sigmasplat.model.submap import MemoryStore, Picture, Submap, SubmapStore
 
 CAMERA = Camera(8, 6, 7.25, 7.5, 3.5 + 1 / 3, 2.5)
@@ -60,6 +62,37 @@ def test_a_submap_is_read_back_bit_for_bit(store: DiskStore, attributes: tuple[s
         back = store.picture(0, k)
         assert back.color.dtype == np.uint8 and np.array_equal(back.color, picture.color)
         assert back.depth_m.dtype == np.float32 and np.array_equal(back.depth_m, picture.depth_m)
+
+
+def detailed(pictures: list[Picture], camera: Camera) -> list[Picture]:
+    """Return the pictures with gray images of their own size."""
+    rng = np.random.default_rng(7)
+    gray = [rng.integers(0, 256, (camera.height, camera.width), dtype=np.uint8) for _ in pictures]
+    return [replace(picture, detail=Detail(g, camera)) for picture, g in zip(pictures, gray, strict=True)]
+
+
+def test_the_images_for_features_are_read_back_with_their_own_camera(store: DiskStore) -> None:
+    submap, pictures = some_submap()
+    large = Camera(16, 12, 14.5, 15.0, 7.5 + 1 / 3, 5.5)
+    wanted = detailed(pictures, large)
+    store.save(submap, wanted)
+    for k, picture in enumerate(wanted):
+        back = store.picture(0, k)
+        assert back.detail is not None and picture.detail is not None and back.detail.camera == large
+        assert back.detail.gray.dtype == np.uint8 and np.array_equal(back.detail.gray, picture.detail.gray)
+        assert np.array_equal(back.color, picture.color) and np.array_equal(back.depth_m, picture.depth_m)
+
+
+def test_submaps_of_older_releases_have_no_images_for_features(store: DiskStore) -> None:
+    """A file without them, and a submap of which only some keyframes have one, are read without."""
+    submap, pictures = some_submap()
+    store.save(submap, pictures)
+    with open_tensors(store.path(0), "submap") as file:
+        assert not any("detail" in name for name in [*file.keys(), *(file.metadata() or {})])
+    second, others = some_submap(1)
+    store.save(second, [*detailed(others[:1], CAMERA), *others[1:]])
+    assert store.picture(0, 1).detail is None
+    assert store.picture(1, 0).detail is None and np.array_equal(store.picture(1, 0).color, others[0].color)
 
 
 def test_an_empty_submap_and_nan_are_read_back(store: DiskStore) -> None:

@@ -43,28 +43,35 @@ def make_closer(
 ) -> LoopCloser:
     """A closer whose registrations are made up; submaps lie a metre apart, each says odometry 2 cm too far."""
     monkeypatch.setattr(closer, "Registrar", Registered)
-    Registered.truth = [np.linalg.matrix_power(STEP, k) for k in range(4)]
+    Registered.truth = [np.linalg.matrix_power(STEP, k % 4) for k in range(9)]
     Registered.lies = lies
     config = Config(loops=LoopConfig(**{"min_interval": 2, "min_similarity": 1.0, **changes}))
     return LoopCloser(config, MemoryStore())
 
 
-def walked(closer: LoopCloser, alike: bool = True) -> Atlas:
-    """Finish four submaps with two keyframes each; the last looks like the first, and where asked it is tried."""
-    atlas, drift = Atlas(), se3.exp(np.array([1.02, 0, 0, 0, 0, 0.0]))
-    directions = [0.0, 60.0, 120.0, 0.0 if alike else 180.0]
-    for k, degrees in enumerate(directions):
+def walked(closer: LoopCloser, alike: bool = True, atlas: Atlas | None = None) -> Atlas:
+    """Finish four submaps with two keyframes each, in a new component; the last looks like the first, and where asked
+    it is tried."""
+    atlas, drift = atlas or Atlas(), se3.exp(np.array([1.02, 0, 0, 0, 0, 0.0]))
+    first = len(atlas.anchors)
+    for k, degrees in enumerate([0.0, 60.0, 120.0, 0.0 if alike else 180.0]):
         if k:
-            closer.connect(k - 1, k, drift, np.diag([1e4] * 6))
+            closer.connect(first + k - 1, first + k, drift, np.diag([1e4] * 6))
         atlas.begin_submap(drift if k else None)
-        atlas.keyframe_poses[-1] = [np.eye(4), np.eye(4)]
-        field = GaussianField.from_values(torch.zeros(3, 3), torch.ones(3), torch.zeros(3, 3))
-        submap = Submap(k, field, (2 * k, 2 * k + 1), np.stack([np.eye(4)] * 2), CAMERA)
-        picture = Picture(np.zeros((3, 4, 3), np.uint8), np.ones((3, 4), np.float32))
-        closer.store.save(submap, [picture, picture])
-        looks = [np.array([np.cos(a), np.sin(a)], np.float32) for a in np.deg2rad([degrees, degrees + 20.0])]
-        closer.submap_finished(submap, looks, atlas, None)  # type: ignore[arg-type]
+        finished(closer, atlas, degrees)
     return atlas
+
+
+def finished(closer: LoopCloser, atlas: Atlas, degrees: float) -> None:
+    """Finish the last submap, whose two keyframes look into directions of the plane."""
+    s = len(atlas.anchors) - 1
+    atlas.keyframe_poses[-1] = [np.eye(4), np.eye(4)]
+    field = GaussianField.from_values(torch.zeros(3, 3), torch.ones(3), torch.zeros(3, 3))
+    submap = Submap(s, field, (2 * s, 2 * s + 1), np.stack([np.eye(4)] * 2), CAMERA)
+    picture = Picture(np.zeros((3, 4, 3), np.uint8), np.ones((3, 4), np.float32))
+    closer.store.save(submap, [picture, picture])
+    looks = [np.array([np.cos(a), np.sin(a)], np.float32) for a in np.deg2rad([degrees, degrees + 20.0])]
+    closer.submap_finished(submap, looks, atlas, None)  # type: ignore[arg-type]
 
 
 def test_a_true_loop_takes_the_drift_out_and_leaves_the_first_anchor(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,6 +120,39 @@ def test_a_refused_registration_makes_no_edge(monkeypatch: pytest.MonkeyPatch) -
     assert [loop.reason for loop in made.loops] == ["overlap 0.05 is below 0.2"]
     assert np.isnan(made.loops[0].chi2)
     assert atlas.anchors[3][0, 3] == pytest.approx(3.06)
+
+
+def test_each_component_has_its_own_pose_graph(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both look the same, but their poses cannot be compared: loops are tried and anchors move inside one only."""
+    made = make_closer(monkeypatch, {})
+    atlas = walked(made)
+    world = [T.copy() for T in atlas.anchors]
+    walked(made, atlas=atlas)
+    assert [(loop.query, loop.database) for loop in made.loops] == [(3, 0), (7, 4)]
+    assert all(loop.accepted and loop.chi2 < 16.8 for loop in made.loops)
+    assert all(np.array_equal(a, b) for a, b in zip(atlas.anchors, world, strict=False))
+    assert np.array_equal(atlas.anchors[4], np.eye(4)), "the first submap of a component is its frame"
+    for s, x_m in ((5, 1.0), (7, 3.0)):
+        assert atlas.anchors[s][0, 3] == pytest.approx(x_m, abs=2e-3)
+
+
+def test_components_that_have_joined_share_a_pose_graph(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The link is 5 cm off; a later loop from the joined part to the world corrects it, and old loops stay valid."""
+    made = make_closer(monkeypatch, {})
+    atlas = walked(made, alike=False)
+    walked(made, atlas=atlas)
+    link = se3.exp(np.array([0.05, 0, 0, 0, 0, 0.0]))
+    atlas.join(0, 4, link)
+    made.connect(0, 4, link, np.diag([1e3] * 6))
+    drift = se3.exp(np.array([-3.0, 0, 0, 0, 0, 0.0]))
+    made.connect(7, 8, drift, np.diag([1e4] * 6))
+    atlas.begin_submap(drift, 7)
+    finished(made, atlas, 60.0)
+    tried = {(loop.query, loop.database): loop for loop in made.loops}
+    assert (8, 1) in tried and tried[7, 4].accepted
+    assert np.array_equal(atlas.anchors[0], np.eye(4))
+    assert {loop.query for loop in made.loops if np.isfinite(loop.chi2)} == {7, 8}
+    assert abs(atlas.anchors[4][0, 3]) < 0.03
 
 
 def test_the_descriptor_by_its_name() -> None:

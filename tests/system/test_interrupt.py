@@ -105,8 +105,7 @@ def test_ctrl_c_during_refinement_keeps_the_unrefined_map(tmp_path: Path) -> Non
     def all_frozen() -> bool:
         return lines(out) == 20 and len(RunFolder(out).submaps) == RunFolder(out).read_log()[-1]["submap"] + 1
 
-    room = ROOM.replace("200", "20")
-    with running(out, "submaps.frames=8", "final.iterations=1000000", room=room) as process:
+    with running(out, "submaps.frames=8", "final.iterations=1000000", "input.limit=20") as process:
         wait_for(process, all_frozen)
         process.send_signal(signal.SIGINT)
         said, errors = process.communicate(timeout=PATIENCE_S)
@@ -117,7 +116,7 @@ def test_ctrl_c_during_refinement_keeps_the_unrefined_map(tmp_path: Path) -> Non
     assert run.facts()["status"] == "interrupted" and run.facts()["wall_s"] > 0 and "finish_s" not in run.facts()
     splats = sum(len(run.submaps.load(index).field) for index in range(len(run.submaps)))
     assert len(run.read_trajectory()) == 20 and len(run.submaps) >= 2 and len(run.read_map()) == splats
-    metrics = evaluate(run, open_source(room), views_per_kind=4, strips_per_kind=0)
+    metrics = evaluate(run, open_source(ROOM, limit=20), views_per_kind=4, strips_per_kind=0)
     assert metrics["held_out_submaps"]["views"] == metrics["held_out"]["views"] == 4
 
 

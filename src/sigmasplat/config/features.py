@@ -1,4 +1,4 @@
-"""Settings of sparse features: which kind, how many, and the limits of a pose from them."""
+"""Settings of sparse features: kind, number, and the limits of a pose from them."""
 
 from dataclasses import dataclass
 from typing import Literal

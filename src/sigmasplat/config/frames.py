@@ -217,12 +217,14 @@ class TrackingConfig:
     """Whether sparse features give a second guess of the pose where motion is wide or the first fit is doubtful (ours).
     The same fit starts from each guess, and the result that explains more is used."""
     verify: bool = False
-    """Whether a pose is judged by comparing surfaces at it (ours); off = by the agreement of alignment only."""
+    """Whether a pose is judged by comparing surfaces at it (ours); off = by agreement and overlap only. It needs
+    `method` align."""
     lost_agreement: float = 0.6
     """Tracking is lost if map and sensor agree in depth on less than this share of the pixels where both have a
-    surface."""
+    surface; not used with `verify`."""
     lost_share: float = 0.2
-    """Tracking is lost if the map agrees with less than this share of the sensor's readings (agreement × overlap)."""
+    """Tracking is lost if the map agrees with less than this share of the sensor's readings (agreement × overlap); with
+    `verify`, if reference and frame have less than this share of the reference's readings in common."""
     update_stop: float = 0.0
     """Adam stops when a step is smaller than this (metres and radians); 0 = run every iteration."""
     plateau_stop: float = 0.0

@@ -85,8 +85,11 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
 
 
 def noise_scale(depth: NDArray[np.float32]) -> float:
-    """Return how much noisier a depth image [h, w] is than assumed, at least 1: by the difference of each reading to
-    the mean of its two neighbours in the row, which is 0 on every plane."""
+    """Return the factor, at least 1, by which a depth image [h, w] is noisier than assumed.
+
+    It is measured by the difference of each reading from the mean of its two neighbours in the row. Without noise, this
+    difference is nearly 0 on smooth surfaces.
+    """
     rows = depth[::STEP]
     width = (rows.shape[1] - 2) // STEP * STEP
     left, middle, right = (rows[:, i : i + width : STEP] for i in range(3))
@@ -103,7 +106,7 @@ def _nearest_surface(
     depth: NDArray[np.float32], left: NDArray[np.intp], top: NDArray[np.intp], expected_m: Matrix
 ) -> tuple[NDArray[np.bool_], Matrix]:
     """Return which points fall on a reading, and the difference to the one of the four neighbours that is closest to
-    the expected depth: at a depth step either side may be meant."""
+    the expected depth: at a depth step either surface may be the right one."""
     best = np.full(len(left), np.inf)
     for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
         reading = depth[top + down, left + across]

@@ -45,6 +45,6 @@ def continued(config: Config, store: SubmapStore, anchors: Sequence[Matrix]) -> 
 
 
 def refuse_without_relocalisation(config: Config) -> None:
-    """Raise ConfigError if the settings do not allow to find a camera in an earlier map."""
+    """Raise ConfigError if relocalisation, which finds a camera in an earlier map, is off."""
     if not config.recovery.relocalise:
         raise ConfigError("to continue a map, relocalisation must be on: --set recovery.relocalise=on")

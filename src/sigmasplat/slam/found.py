@@ -12,7 +12,7 @@ from sigmasplat.types import Matrix
 @dataclass(eq=False)
 class Found:
     """Where a frame is: T_submap_camera [4, 4] in the active submap, its state, values of tracking, whether it is to be
-    mapped, and the loops that were tried on the way."""
+    mapped, and the loops that were tried meanwhile."""
 
     T_submap_camera: Matrix
     state: str = TRACKED

@@ -212,7 +212,7 @@ class Slam(World):
         return KnownMap(self.store, self.atlas.keyframe_poses, *active, wanted.__getitem__)
 
     def _question(self, fit: PoseFit, seen: Observation, found: Found) -> None:
-        """After some doubtful frames, ask the whole map whether another pose explains the frame much better."""
+        """After some doubtful frames, search the whole map for a pose that explains the frame much better."""
         if fit.comparison is None or not is_questionable(self.tracker.doubtful):
             return
         place = self._relocalise(seen)

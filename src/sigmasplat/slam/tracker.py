@@ -34,7 +34,7 @@ convergence of alignment ends near there."""
 class Tracker:
     """Keeps the last pose, the velocity, the last image, the reference keyframe, and statistics of recent fits.
 
-    lost: tracking of the last frame failed; doubtful: how many frames in a row no guess has explained as well as
+    lost: tracking of the last frame failed; doubtful: number of frames in a row whose best pose is clearly worse than
     usual.
     """
 
@@ -174,7 +174,7 @@ class Tracker:
         c = self.config
         if fit.comparison is None:
             return is_lost(fit, c.lost_agreement, c.lost_share)
-        if self.lost:  # after a lost frame no prediction speaks for a pose
+        if self.lost:  # after a lost frame the path of the camera does not support a pose
             return not confirmed(fit.comparison)
         return self.usual.is_lost(fit.comparison, c.lost_share)
 
@@ -206,7 +206,7 @@ class Tracker:
         self.keyframe_features = keyframe.image.weighed(self.keyframe.weights)
 
     def forget(self) -> None:
-        """Start anew at the identity, as for the first frame."""
+        """Restart at the identity, as for the first frame."""
         self.previous, self.velocity, self.keyframe, self.keyframe_features = np.eye(4), np.eye(4), None, None
 
     def hop_covariance(self, fit: PoseFit, live: Pyramid) -> Matrix | None:

@@ -32,7 +32,7 @@ HOST = torch.device("cpu")
 
 
 class World:
-    """Everything that SLAM knows between two frames; `Slam` changes it.
+    """The state of SLAM between two frames; `Slam` changes it.
 
     Frame 0 fixes the gauge: the world is the first camera, or that of the map that is continued. Finished submaps go to
     `store`, by default in memory.

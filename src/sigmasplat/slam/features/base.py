@@ -6,6 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from sigmasplat.config.features import FeatureConfig
 from sigmasplat.model.camera import Camera
 from sigmasplat.slam.features.opencv import opencv
 
@@ -42,6 +43,8 @@ class Features:
 
 class Extractor(Protocol):
     """One kind of features: finds them in an image and matches those of two images."""
+
+    config: FeatureConfig
 
     def find(self, gray: Gray, camera: Camera) -> Features:
         """Find features in an image [H, W]; camera is its pinhole."""

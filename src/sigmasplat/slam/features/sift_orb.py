@@ -21,7 +21,7 @@ class Sift:
     """RootSIFT (Lowe 2004; Arandjelović & Zisserman 2012), matched by mutual nearest neighbours and ratio."""
 
     def __init__(self, config: FeatureConfig) -> None:
-        self._config = config
+        self.config = config
         # The precise upscale puts pixel centres at integers; without it all points are shifted by ¼ pixel.
         self._sift = opencv().SIFT_create(
             nfeatures=config.count, contrastThreshold=SIFT_CONTRAST, enable_precise_upscale=True
@@ -29,11 +29,11 @@ class Sift:
 
     def find(self, gray: Gray, camera: Camera) -> Features:
         """Find features; sigma_px grows with the scale of the feature."""
-        gray, camera = reduced(gray, camera, self._config.width)
+        gray, camera = reduced(gray, camera, self.config.width)
         keypoints, raw = self._sift.detectAndCompute(gray, None)
         if not keypoints:
             return no_features(camera, np.zeros((0, 128), np.float32))
-        rows, points, diameter, _ = _strongest(keypoints, self._config.count)
+        rows, points, diameter, _ = _strongest(keypoints, self.config.count)
         raw = raw[rows]
         root = np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-9))
         # A keypoint's diameter is twice the standard deviation of its Gaussian.
@@ -41,24 +41,24 @@ class Sift:
 
     def match(self, a: Features, b: Features) -> Pairs:
         """Return mutual nearest neighbours that pass the ratio test."""
-        return matched_by_distance(a.descriptors, b.descriptors, self._config.ratio)
+        return matched_by_distance(a.descriptors, b.descriptors, self.config.ratio)
 
 
 class Orb:
     """ORB (Rublee et al. 2011), matched by mutual nearest neighbours in Hamming distance and ratio."""
 
     def __init__(self, config: FeatureConfig) -> None:
-        self._config = config
+        self.config = config
         self._orb = opencv().ORB_create(nfeatures=config.count, scaleFactor=ORB_SCALE, fastThreshold=10)
         self._matcher = opencv().BFMatcher(opencv().NORM_HAMMING)
 
     def find(self, gray: Gray, camera: Camera) -> Features:
         """Find features; sigma_px is one pixel of the pyramid level."""
-        gray, camera = reduced(gray, camera, self._config.width)
+        gray, camera = reduced(gray, camera, self.config.width)
         keypoints, raw = self._orb.detectAndCompute(gray, None)
         if not keypoints:
             return no_features(camera, np.zeros((0, 32), np.uint8))
-        rows, points, _, octave = _strongest(keypoints, self._config.count)
+        rows, points, _, octave = _strongest(keypoints, self.config.count)
         scale = (ORB_SCALE**octave).astype(np.float32)
         # OpenCV multiplies level coordinates by the scale, which maps pixel corners, not centres.
         return Features(points + (0.5 * scale - 0.5)[:, None], 0.7 * scale, raw[rows], camera)
@@ -72,7 +72,7 @@ class Orb:
         distance = np.array([[hit.distance for hit in row] for row in forward])
         back = np.array([hit.trainIdx for hit in self._matcher.match(b.descriptors, a.descriptors)], np.intp)
         rows = np.arange(len(a))
-        good = (back[best] == rows) & (distance[:, 0] < self._config.ratio * distance[:, 1])
+        good = (back[best] == rows) & (distance[:, 0] < self.config.ratio * distance[:, 1])
         good &= distance[:, 0] <= ORB_BITS_MOST
         return np.asarray(np.stack([rows, best], 1)[good])
 

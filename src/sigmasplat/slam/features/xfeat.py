@@ -27,7 +27,7 @@ class XFeat:
     """XFeat and LighterGlue on the CPU."""
 
     def __init__(self, config: FeatureConfig) -> None:
-        self._config = config
+        self.config = config
         package = _package()
         cpu = torch.device("cpu")
         try:
@@ -44,10 +44,10 @@ class XFeat:
 
     def find(self, gray: Gray, camera: Camera) -> Features:
         """Find features; all have the same sigma_px."""
-        gray, camera = reduced(gray, camera, self._config.width)
+        gray, camera = reduced(gray, camera, self.config.width)
         image = torch.from_numpy(gray)[None, None].float()
         with _one_thread():
-            found = self._net.detectAndCompute(image, top_k=self._config.count)[0]
+            found = self._net.detectAndCompute(image, top_k=self.config.count)[0]
         # XFeat resizes to multiples of 32 pixels and scales points about the corner of the image, not of the pixel.
         scale = np.array([side / (side // 32 * 32) for side in (camera.width, camera.height)])
         points = found["keypoints"].numpy() + 0.5 * scale - 0.5

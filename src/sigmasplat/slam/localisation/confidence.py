@@ -1,7 +1,7 @@
 """Estimate the probability that the pose of a frame is off by more than 5 cm.
 
 Two things make a pose wrong: the fit of this frame, which the comparison of surfaces judges, and the path to its
-submap, whose spread grows with every hop between keyframes and shrinks with every loop. A logistic model joins them;
+submap, whose spread grows with every hop between keyframes and shrinks with every loop. A logistic model combines them;
 `benchmarks/failure_probability.py` fits its weights to disturbed recordings with known truth.
 """
 
@@ -36,14 +36,14 @@ WEIGHTS: dict[str, float] = {
 }
 """Weights of the logistic model."""
 CERTAIN = {LOST: 0.95, APART: 0.99}
-"""Probability for a lost frame, by the share of those whose guess is off, and for one whose place in the world is not
-known."""
+"""Fixed probabilities: of a lost frame (the share of lost frames whose guess is off), and of a frame whose place in the
+world is not known."""
 
 
 @dataclass(eq=False)
 class Confidence:
-    """spread_m: standard deviation of each submap's position in its component; since_lost: frames since the last lost
-    one; doubtful: doubtful frames in a row."""
+    """spread_m: standard deviation of each submap's position in its component; since_lost: number of frames since the
+    last one that was lost or relocalised."""
 
     spread_m: list[float] = field(default_factory=list)
     since_lost: int = NEVER_LOST

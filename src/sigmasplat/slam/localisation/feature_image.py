@@ -1,4 +1,4 @@
-"""An image in which features can be found again: gray at its own size, depth at working size."""
+"""Find features in the image of a frame: gray at its own size, depth at working size."""
 
 from dataclasses import dataclass, field
 
@@ -71,7 +71,8 @@ class FeatureImage:
 
 
 def pose_by_features(reference: Landmarks, live: FeatureImage, extractor: Extractor, seed: int) -> PnP | None:
-    """Match landmarks with the features of a live image; return the motion T_live_reference, or None without one."""
+    """Match landmarks with the features of a live image; return the pose, or None if the matches do not give one."""
     seen = live.features(extractor)
     pairs = extractor.match(reference.features, seen)
-    return pose_from_landmarks(reference, seen, pairs, seed, depth_readings(seen, live.depth_m, live.camera))
+    depth_m = depth_readings(seen, live.depth_m, live.camera)
+    return pose_from_landmarks(reference, seen, pairs, seed, depth_m, extractor.config)

@@ -11,11 +11,11 @@ from sigmasplat.slam.localisation.sight import Sight
 from sigmasplat.types import Matrix
 
 LEAST_READINGS = 0.05
-"""An image with depth on less than this share of its pixels, or with flat gray, cannot begin a map."""
+"""A frame with depth on a smaller share of its pixels is not usable: it cannot be recognised or begin a map."""
 LEAST_CONTRAST = 5.0
-"""Least standard deviation of gray values, 0 to 255."""
+"""A frame whose gray values, 0 to 255, have a smaller standard deviation is not usable either."""
 SAME_M, SAME_RAD = 0.1, np.deg2rad(5.0)
-"""Two observations of where a component lies agree within these limits."""
+"""Two observations of the pose between two components agree if they differ by less than this."""
 
 
 def usable(seen: Sight) -> bool:
@@ -37,7 +37,7 @@ class Link:
 @dataclass(eq=False)
 class Recovery:
     """lost: usable frames in a row in which the camera was not found; steady: frames in a row tracked without doubt
-    since the camera was last lost; link: one observation of a place of another component that waits for a second."""
+    since the camera was last lost; link: the last observation of another component, which waits for a second one."""
 
     config: RecoveryConfig
     lost: int = 0
@@ -45,7 +45,7 @@ class Recovery:
     link: Link | None = None
 
     def count(self, lost: bool, doubtful: bool, seen: Sight) -> None:
-        """Take a frame into account."""
+        """Count a frame."""
         if lost:
             self.lost += usable(seen)
             self.steady = 0
@@ -68,7 +68,7 @@ class Recovery:
         self.lost = self.steady = 0
 
     def confirms(self, link: Link, atlas: Atlas) -> bool:
-        """Return whether the observation before agrees with a new one, which is kept for the next one."""
+        """Return whether a new observation agrees with the last one; keep the new one for the next call."""
         before, self.link = self.link, link
         if before is None or {atlas.components[s] for s in (before.a, before.b)} != {
             atlas.components[s] for s in (link.a, link.b)

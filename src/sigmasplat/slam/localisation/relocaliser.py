@@ -1,7 +1,7 @@
 """Find a lost camera in the whole map: retrieve keyframes by features, compute a pose, align, verify the surface.
 
-The order is that of systems that people trust: many cheap candidates, a minimal solver, dense alignment, and acceptance
-by depth and overlap. The number of inliers alone accepts nothing, because a repeated pattern has many.
+Many cheap candidates come first, then a minimal solver, dense alignment, and acceptance by depth and overlap. A pose is
+never accepted by its number of inliers alone, because a repeated pattern has many.
 """
 
 from collections import OrderedDict
@@ -29,7 +29,7 @@ STRONGEST = 400
 """Number of features of each image that are compared to choose candidates."""
 LEAST_MATCHES = 8
 INDEX_AT_MOST = 25
-"""Number of keyframes whose features are found per call: 25 take about a second."""
+"""Maximum number of keyframes whose features are found per call: 25 take about a second."""
 KEPT_LANDMARKS = 64
 """Number of keyframes whose complete landmarks stay in memory, half a megabyte each."""
 FLOOR_M, FLOOR_RAD = 0.005, 0.003
@@ -133,7 +133,7 @@ class Relocaliser:
         return SearchResult(best.get(True), len(candidates), best.get(False))
 
     def _index(self, known: KnownMap, view: View, wanted: Sequence[Where], at_most: int | None) -> None:
-        """Add keyframes to the search; also find again the features that a resumed run no longer has."""
+        """Add keyframes to the search, and find the features that are missing, also those of a resumed run."""
         have = set(self.indexed)
         self.indexed += [where for where in wanted if where not in have][:at_most]
         for where in self.indexed:

@@ -31,7 +31,7 @@ class Observation(Sight):
 
 
 def working_frame(frame: Frame, config: Config, camera: Camera | None = None) -> Frame:
-    """Return a frame at working size; if `camera` is given and differs, as that camera at the same pose sees it."""
+    """Return a frame at working size; if `camera` is given and differs, the frame is resampled to it."""
     i = config.input
     working = frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px)
     if camera is None or working.camera == camera:
@@ -40,8 +40,8 @@ def working_frame(frame: Frame, config: Config, camera: Camera | None = None) ->
 
 
 def observe(whole: Frame, working: Frame, view: View, config: Config, extractor: Extractor | None) -> Observation:
-    """Return a frame in the forms that tracking needs; features are found in the whole frame, the rest is made of the
-    working one."""
+    """Return a frame in the forms that tracking needs: features are found in the whole frame, everything else is made
+    from the working frame."""
     target = Target.of(working, (view.sums.shape[1], view.sums.shape[2]))
     live, image = live_image(view, working.color, working.depth_m, target), None
     if extractor is not None:

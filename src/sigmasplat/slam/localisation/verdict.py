@@ -8,25 +8,25 @@ import numpy as np
 from sigmasplat.fit.compare import Comparison
 
 RECENT = 50
-"""Values of this many believed frames define what is usual."""
+"""What is usual is the median over this many recent frames that were not lost."""
 FEW = 5
-"""With fewer values nothing is usual yet."""
+"""With fewer values, defaults are used instead of what is usual."""
 LOST_CLOSE, LOST_EXPLAINED = 0.3, 0.85
-"""Lost: less than this share of the common surface is where it should be; of the part that nothing new covers, less
-than this share is. Something large in front of the camera lowers the first, only a wrong pose lowers the second."""
+"""Lost: `close`, or `explained`, is below this. Something large in front of the camera lowers the first; only a wrong
+pose lowers the second."""
 DOUBT_CLOSE, DOUBT_EXPLAINED = 0.9, 0.95
-"""Doubtful: the same, less than these shares of their usual values."""
+"""Doubtful: `close` is below this share of its usual value, or `explained` is below this."""
 DOUBT_RESIDUAL = 2.5
 """Doubtful: the median depth difference is this many times the usual one."""
 DOUBT_CORRELATION, LOST_CORRELATION = 0.85, 0.4
-"""Doubtful or lost: the gray values correlate less than this share of what is usual. A flat surface fits itself at many
-poses, its texture at one."""
+"""Doubtful or lost: the correlation of the gray values is below this share of its usual value. The depth of a flat
+surface fits at many poses, its texture at one."""
 LOST_RESIDUAL = 6.0
-"""Lost: the median depth difference, in standard deviations of a reading. Clean recordings stay below 1."""
+"""Lost: the median depth difference is above this many times the usual one, or above this many standard deviations of
+a reading if the usual one is smaller than one. Clean recordings stay below 1."""
 LEAST_COMMON, LEAST_CLOSE, LEAST_EXPLAINED, LEAST_CORRELATION, MOST_RESIDUAL = 0.25, 0.75, 0.9, 0.8, 1.5
-"""The pose of a lost camera is confirmed if the images have this share of the reference in common, if this share of it
-is the same surface, if nothing known is seen through, if the gray values correlate, and if the median depth difference
-is below this many standard deviations of a reading."""
+"""The pose of a lost camera is confirmed if `common`, `close`, `explained` and `correlation` are at least this, and if
+`residual`, in standard deviations of a reading, is at most this."""
 DOUBT_SCORE = 0.7
 """Doubtful: the score falls below this share of the usual one."""
 PATIENCE = 3
@@ -68,7 +68,7 @@ def is_better(c: Comparison, doubtful: Comparison) -> bool:
 
 @dataclass(eq=False)
 class Usual:
-    """What comparisons of recent believed frames have found: scores, residuals, correlations."""
+    """Values of recent frames that were not lost; their medians are what is usual."""
 
     scores: list[float] = field(default_factory=list)
     closes: list[float] = field(default_factory=list)
@@ -76,7 +76,7 @@ class Usual:
     correlations: list[float] = field(default_factory=list)
 
     def add(self, c: Comparison) -> None:
-        """Take a believed frame into account."""
+        """Add the values of a frame that is not lost."""
         for values, value in (
             (self.scores, score(c)), (self.closes, c.close), (self.residuals, c.residual),
             (self.correlations, c.correlation),

@@ -70,8 +70,8 @@ class Registration:
 
 
 class Registrar:
-    """Registers submaps of one store; all of them share the camera of the view. With an extractor, features give a
-    guess where the known poses lead to none, such as between wide angles."""
+    """Registers submaps of one store; all of them share the camera of the view. With an extractor, features give
+    another guess where alignment from the known poses fits poorly, such as between wide angles."""
 
     def __init__(self, config: Config, store: SubmapStore, view: View, extractor: Extractor | None = None) -> None:
         self.config, self.store, self.view, self.extractor = config.registration, store, view, extractor
