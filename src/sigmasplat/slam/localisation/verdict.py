@@ -99,6 +99,11 @@ class Usual:
             or c.common < least_share
         )
 
+    @property
+    def residual(self) -> float:
+        """Return the usual median depth difference, in standard deviations of a reading; NaN if it is not known."""
+        return _median(self.residuals, float("nan"))
+
     def is_leap(self, apart_m: float) -> bool:
         """Return whether a camera that has moved as usual cannot be this far from where it was expected."""
         return apart_m > LEAP_M + LEAP_HOPS * _median(self.hops_m, 0.0)
