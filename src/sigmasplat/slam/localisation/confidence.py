@@ -52,6 +52,13 @@ class Confidence:
         """Add a submap: at position_m (standard deviation, m) from its parent, or the first of a component."""
         self.spread_m.append(0.0 if parent is None else math.hypot(self.spread_m[parent], position_m))
 
+    def joined(self, members: Sequence[int], submap: int, kept: int, link_m: float) -> None:
+        """Add the path to the component that the submaps `members` join: from `submap`, one of them, by a link of
+        link_m (standard deviation, m) to submap `kept`."""
+        path_m = math.hypot(self.spread_m[kept], link_m, self.spread_m[submap])
+        for s in members:
+            self.spread_m[s] = math.hypot(path_m, self.spread_m[s])
+
     def closed(self, loops: Sequence[Loop]) -> None:
         """Take the loops of a finished submap into account."""
         for loop in loops:
