@@ -9,8 +9,8 @@ class FeatureConfig:
     """Sparse features for a second guess in tracking, for relocalisation and for loops (ours)."""
 
     kind: Literal["sift", "orb", "xfeat"] = "sift"
-    """Kind of features: sift = RootSIFT, orb = faster and less reliable, xfeat = a neural network with its own matcher,
-    most reliable and slowest; it needs the extra `xfeat`."""
+    """Kind of features: sift = RootSIFT; orb = faster, finds fewer poses; xfeat = a neural network with its own
+    matcher, finds the most poses and is the slowest. It needs the extra `xfeat`."""
     count: int = 1200
     """Maximum number of features per image; the strongest are used. More features find more poses and take more
     time."""

@@ -13,8 +13,9 @@ class RecoveryConfig:
     candidates: int = 8
     """Number of keyframes, those with the most matches, from which the pose of a lost camera is computed and
     verified."""
-    steady_frames: int = 2
-    """After the camera was lost, nothing is mapped until this many frames in a row have been tracked without doubt."""
+    steady_frames: int = 0
+    """After the camera was lost, nothing is mapped until this many frames in a row have been tracked without doubt;
+    0 = off (papers)."""
     new_map_after: int = 0
     """A new map begins after this many lost frames in a row; frames without depth or with a flat image do not count. It
     joins the old map when a place is recognised; 0 = never."""

@@ -10,7 +10,7 @@ from sigmasplat.presets import varsplat
 SIGMA = varsplat.FAST.changed(
     mapping={"iterations": 15, "weight_moment": 0.1},
     tracking={"features": True, "verify": True},
-    recovery={"relocalise": True, "new_map_after": 20},
+    recovery={"relocalise": True, "new_map_after": 20, "steady_frames": 2},
     primitives={"uncertain_m2": 0.025, "faded_opacity": 0.07},
 )
 

@@ -70,7 +70,7 @@ class Tracker:
             best = max([best, *guesses], key=self._score)
         if self._doubts(best):
             best = self._retry(field, view, seen, best)
-        self.lost = self._is_lost(best)
+        self.lost = self._is_lost(best) or self._leaps(best, predicted)
         self.doubtful = self.doubtful + 1 if self._doubts(best) else 0
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
         self._remember(best, seen)
@@ -86,7 +86,7 @@ class Tracker:
             self.agreements.append(fit.agreement * fit.overlap)
             self.first_losses.append(fit.first_loss)
             if fit.comparison is not None:
-                self.usual.add(fit.comparison)
+                self.usual.add(fit.comparison, float(np.linalg.norm(self.velocity[:3, 3])))
         self.previous = T_world_camera
         self.last_image, self.last_features, self.started = seen.live, seen.image, True
 
@@ -177,6 +177,13 @@ class Tracker:
         if self.lost:  # after a lost frame the path of the camera does not support a pose
             return not confirmed(fit.comparison)
         return self.usual.is_lost(fit.comparison, c.lost_share)
+
+    def _leaps(self, fit: PoseFit, predicted: Matrix) -> bool:
+        """Return whether a verified pose is so far from the predicted one that the camera cannot have moved there."""
+        if fit.comparison is None or self.lost:
+            return False
+        apart = se3.inverse(fit.T_camera_world)[:3, 3] - predicted[:3, 3]
+        return self.usual.is_leap(float(np.linalg.norm(apart)))
 
     def _doubts(self, fit: PoseFit) -> bool:
         if fit.comparison is not None:

@@ -123,12 +123,11 @@ class Relocaliser:
         self._index(known, view, wanted, index_at_most)
         candidates = self._candidates(wanted, seen)
         best: dict[bool, Relocation] = {}
-        for where in candidates:
-            for tried in self._poses(known, view, seen, where):
-                verdict = confirmed(tried.comparison)
-                if verdict not in best or tried.score > best[verdict].score:
-                    best[verdict] = tried
-            if True in best and best[True].score > ENOUGH:
+        for tried in (pose for where in candidates for pose in self._poses(known, view, seen, where)):
+            verdict = confirmed(tried.comparison)
+            if verdict not in best or tried.score > best[verdict].score:
+                best[verdict] = tried
+            if verdict and tried.score > ENOUGH:
                 break
         return SearchResult(best.get(True), len(candidates), best.get(False))
 

@@ -27,6 +27,9 @@ a reading if the usual one is smaller than one. Clean recordings stay below 1.""
 LEAST_COMMON, LEAST_CLOSE, LEAST_EXPLAINED, LEAST_CORRELATION, MOST_RESIDUAL = 0.25, 0.75, 0.9, 0.8, 1.5
 """The pose of a lost camera is confirmed if `common`, `close`, `explained` and `correlation` are at least this, and if
 `residual`, in standard deviations of a reading, is at most this."""
+LEAP_M, LEAP_HOPS = 0.3, 3.0
+"""Lost: the pose is farther from the predicted one than this distance and this many usual hops between frames. Flat
+walls fit each other across a room."""
 DOUBT_SCORE = 0.7
 """Doubtful: the score falls below this share of the usual one."""
 PATIENCE = 3
@@ -74,12 +77,13 @@ class Usual:
     closes: list[float] = field(default_factory=list)
     residuals: list[float] = field(default_factory=list)
     correlations: list[float] = field(default_factory=list)
+    hops_m: list[float] = field(default_factory=list)
 
-    def add(self, c: Comparison) -> None:
-        """Add the values of a frame that is not lost."""
+    def add(self, c: Comparison, hop_m: float) -> None:
+        """Add the values of a frame that is not lost, and its distance from the frame before."""
         for values, value in (
             (self.scores, score(c)), (self.closes, c.close), (self.residuals, c.residual),
-            (self.correlations, c.correlation),
+            (self.correlations, c.correlation), (self.hops_m, hop_m),
         ):  # fmt: skip
             if np.isfinite(value):
                 values.append(value)
@@ -94,6 +98,10 @@ class Usual:
             or c.correlation < LOST_CORRELATION * _median(self.correlations, 0.8)
             or c.common < least_share
         )
+
+    def is_leap(self, apart_m: float) -> bool:
+        """Return whether a camera that has moved as usual cannot be this far from where it was expected."""
+        return apart_m > LEAP_M + LEAP_HOPS * _median(self.hops_m, 0.0)
 
     def doubts(self, c: Comparison) -> bool:
         """Return whether a pose is clearly worse than usual."""
