@@ -21,7 +21,8 @@ from sigmasplat.sources import SyntheticRoom, open_source
 pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core is not built")
 
 WALK = "synthetic:frames=200,width=160,height=120"
-SHORT = ("--set", "mapping.first_iterations=30", "--set", "mapping.iterations=10", "--set", "final.iterations=5")
+SHORT = ("--set", "mapping.first_iterations=30", "--set", "mapping.iterations=10", "--set", "final.iterations=5",
+         "--set", "registration.iterations=3")  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,9 @@ from recorded_room import OPTIONS, mirrored, write_images
 from sigmasplat.exports.run_reader import RunReader
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.model import se3
+from sigmasplat.model.submap import MemoryStore
+from sigmasplat.run.finished_map import FinishedMap
+from sigmasplat.slam.continuation import continued, take_over
 from sigmasplat.sources import SyntheticRoom, open_source
 from sigmasplat.viewer.finished import SubmapCache, finished_snapshot
 
@@ -21,7 +25,7 @@ pytest.importorskip("sigmasplat.native._core", reason="sigmasplat.native._core i
 
 WALK = "synthetic:frames=200,width=160,height=120"
 SHORT = ("--set", "mapping.first_iterations=30", "--set", "mapping.iterations=8", "--set", "final.iterations=5",
-         "--set", "submaps.frames=12")  # fmt: skip
+         "--set", "submaps.frames=12", "--set", "registration.iterations=3")  # fmt: skip
 FIRST, SECOND = ("--limit", "24"), ("--start", "0.5", "--limit", "20")
 SECOND_BEGINS = 15
 """Number of the first frame of the second part in the walk."""
@@ -104,6 +108,22 @@ def test_another_room_stays_apart(place: Path, tmp_path: Path, capsys: pytest.Ca
     assert len(run.read_component(1).trajectory) == 8
     assert {line["state"] for line in run.read_log()} == {"apart"}
     assert "never recognised" in (out / "report.html").read_text()
+
+
+def test_a_recording_that_is_recognised_later_joins_with_all_its_frames(place: Path) -> None:
+    """The first images have too little contrast to be recognised, so the recording begins apart."""
+    first = FinishedMap.of(RunFolder.open(place / "first"))
+    store, room = MemoryStore(), SyntheticRoom(frames=200, width=160, height=120)
+    take_over(first.store, first.members, first.frames, store)
+    slam = continued(first.config, store, [first.anchors[index] for index in first.members])
+    walked = range(8, 20)
+    for i, frame in enumerate(room.frame(k) for k in walked):
+        faint = np.float32(0.5) + np.float32(0.05) * (frame.color - np.float32(0.5))
+        slam.step(replace(frame, index=i, color=faint if i < 4 else frame.color))
+    assert slam.steps[0].state == slam.steps[5].state == "apart" and slam.steps[-1].state == "tracked"
+    assert slam.believed().all() and set(slam.atlas.components) == {0}
+    expected = se3.inverse(room.truth().T_world_camera[0]) @ room.truth().T_world_camera[list(walked)]
+    assert np.linalg.norm((slam.trajectory().T_world_camera - expected)[:, :3, 3], axis=1).max() < 0.05
 
 
 def test_a_resumed_run_gives_the_same_bytes(place: Path, tmp_path: Path) -> None:

@@ -275,6 +275,7 @@ class Slam(World):
         state = APART if component and found.state != LOST else found.state
         found.tracking |= {
             "position_std_m": self.confidence.position_std_m(in_submap_m), "doubtful": float(self.tracker.doubtful),
+            "usual_residual": self.tracker.usual.residual,
         }  # fmt: skip
         p_off = self.confidence.probability(state, found.tracking)
         return Step(
