@@ -12,7 +12,7 @@ from sigmasplat.slam.loop_closure.closer import Loop
 
 CLEAN: dict[str, float] = {
     "common": 0.9, "close": 0.98, "front": 0.01, "behind": 0.01, "residual": 0.3, "correlation": 0.97, "points": 3000.0,
-    "position_std_m": 0.005, "doubtful": 0.0,
+    "position_std_m": 0.005, "doubtful": 0.0, "usual_residual": 0.3,
 }  # fmt: skip
 
 

@@ -25,10 +25,10 @@ THROUGH = replace(GOOD, close=0.6, front=0.0, behind=0.4)
 """Known surfaces are seen through."""
 
 
-def usual(c: Comparison = GOOD, times: int = 10) -> Usual:
+def usual(c: Comparison = GOOD, times: int = 10, hop_m: float = 0.02) -> Usual:
     history = Usual()
     for _ in range(times):
-        history.add(c)
+        history.add(c, hop_m)
     return history
 
 
@@ -88,7 +88,7 @@ def test_what_is_usual_follows_the_latest_frames() -> None:
     history = usual(GOOD, 3 * RECENT)
     assert history.doubts(worse)
     for _ in range(RECENT):
-        history.add(worse)
+        history.add(worse, 0.02)
     assert not history.doubts(worse) and len(history.scores) == RECENT
 
 
@@ -113,3 +113,14 @@ def test_the_map_is_searched_after_some_doubtful_frames_in_a_row() -> None:
 def test_a_pose_from_the_whole_map_must_be_clearly_better() -> None:
     assert is_better(GOOD, OBJECT) and not is_better(GOOD, GOOD) and not is_better(OBJECT, GOOD)
     assert not is_better(replace(GOOD, common=0.88), GOOD)
+
+
+def test_a_leap_is_far_from_where_a_camera_that_moves_as_usual_can_be() -> None:
+    slow, fast = usual(hop_m=0.01), usual(hop_m=0.3)
+    assert slow.is_leap(1.0) and not fast.is_leap(1.0) and fast.is_leap(5.0)
+    assert not slow.is_leap(0.02) and not Usual().is_leap(0.02)
+
+
+def test_texture_counts_in_the_score_where_there_is_texture() -> None:
+    assert score(replace(GOOD, correlation=0.3)) < 0.5 * score(GOOD) < score(FLAT)
+    assert score(replace(GOOD, correlation=-0.5)) == 0.0
