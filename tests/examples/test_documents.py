@@ -49,7 +49,8 @@ def unknown_names(path: Path) -> list[str]:
     files = re.findall(rf"`((?:{'|'.join(FOLDERS)})/[\w/]+\.\w+)`", text)
     settings = re.findall(rf"`({'|'.join(SECTIONS)})\.([a-z]\w+)`", text)
     presets = re.findall(r"`((?:varsplat|loopsplat|cgslam)-[a-z0-9-]*[a-z0-9])`", text)
-    fitted = {"agreement", "overlap", "first_loss", "loss", "iterations", "inliers", "position_std_m", "doubtful"}
+    fitted = {"agreement", "overlap", "first_loss", "loss", "iterations", "inliers", "doubtful"}
+    fitted |= {"position_std_m", "usual_residual"}
     compared = {field.name for field in dataclasses.fields(Comparison)}
     logged = fitted | compared if path.name == "runs.md" else set()
 
