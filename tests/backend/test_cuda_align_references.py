@@ -21,6 +21,8 @@ from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.render.view import View
+from sigmasplat.slam.localisation.sight import Sight
+from sigmasplat.slam.localisation.verdict import Usual
 from sigmasplat.slam.loop_closure.registration import Registrar
 from sigmasplat.slam.tracker import Tracker
 from splat_fields import CPU, OPTIONS
@@ -128,18 +130,20 @@ def test_a_keyframe_is_aligned_to_a_submap_as_on_the_cpu() -> None:
     for view in views():
         registrar = Registrar(preset(default_preset()), MemoryStore(), view)
         fit = registrar._aligned(thick(), live(view), TRUTH)
-        found.append((fit, registrar._covariance(thick(), live(view), TRUTH)))
-    assert all(fit.alignment is not None for fit, _ in found)
+        found.append((fit, *registrar._checked(thick(), live(view), TRUTH)))
+    assert all(fit.alignment is not None for fit, *_ in found)
     np.testing.assert_allclose(found[0][0].T_camera_world, found[1][0].T_camera_world, atol=5e-4)
-    deviations = [np.sqrt(np.diag(covariance)) for _, covariance in found]
+    deviations = [np.sqrt(np.diag(covariance)) for _, covariance, _ in found]
     np.testing.assert_allclose(*deviations, rtol=0.1)
+    compared = [dataclasses.astuple(comparison) for *_, comparison in found if comparison is not None]
+    np.testing.assert_allclose(*compared, rtol=0.1, atol=0.02)
 
 
 def test_what_a_tracker_remembers_is_kept_and_read_back(tmp_path: Path) -> None:
     view, _ = views()
     kept = reference("keyframe", view, CONFIGS["V"])
-    tracker, classes = Tracker(CONFIGS["V"], keyframe=kept), (Tracker, Reference, Pyramid, Camera)
-    tracker.start(kept.pyramid)
+    tracker, classes = Tracker(CONFIGS["V"], keyframe=kept), (Tracker, Reference, Pyramid, Camera, Usual)
+    tracker.start(Sight(seen_from(view, TRUTH), kept.pyramid))
     write_state(tmp_path / "state", tracker, classes, {"tracking": CONFIGS["V"]})
     again = read_state(tmp_path / "state", classes, {"tracking": CONFIGS["V"]})
     assert again.keyframe.pyramid.backend == "cuda"

@@ -276,7 +276,8 @@ def test_sigma_adds_to_fast_and_removes_nothing() -> None:
     added = changed_settings(sigma, fast)
     uncertainty = {"mapping.iterations", "mapping.weight_moment", "primitives.uncertain_m2"}
     assert added == uncertainty | {
-        "tracking.features", "tracking.verify", "recovery.relocalise", "recovery.new_map_after"
+        "tracking.features", "tracking.verify",
+        "recovery.relocalise", "recovery.new_map_after", "recovery.steady_frames",
     }  # fmt: skip
     assert sigma.mapping.weight_nll_color == fast.mapping.weight_nll_color > 0
     assert sigma.tracking.uncertainty and sigma.loops.uncertainty and sigma.registration.uncertainty

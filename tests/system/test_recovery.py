@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config
@@ -15,9 +16,12 @@ from sigmasplat.io.state import read_state, write_state
 from sigmasplat.model import se3
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import MemoryStore
+from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import preset
+from sigmasplat.run.session import Session, new_folder
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
+from sigmasplat.sources.base import Source
 from small_room import frame_at, walk
 
 _core = pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -66,6 +70,34 @@ def errors_m(slam: Slam, order: Order) -> NDArray[np.float64]:
     return np.where(np.array(order) == BLACK, np.nan, np.linalg.norm(off, axis=1))
 
 
+Recorded = tuple[Slam, Path]
+"""A run, and the folder of its states after each frame."""
+
+
+def recorded(order: Order, folder: Path) -> Recorded:
+    slam = Slam(settings())
+    for frame in shown(order):
+        slam.step(frame)
+        write_state(folder / f"{frame.index}.st", state_of(slam), CLASSES, fixed(slam))
+    return slam, folder
+
+
+def resumed(run: Recorded, after: int, order: Order) -> Slam:
+    """Return a run that was stopped after a frame, resumed from its state and its submaps, and went on to the end."""
+    whole, folder = run
+    assert isinstance(whole.store, MemoryStore)
+    store = MemoryStore()
+    slam = Slam(settings(), store)
+    slam.prepare(whole.view.camera)
+    state = read_state(folder / f"{after}.st", CLASSES, fixed(slam))
+    store.submaps += whole.store.submaps[: state["submaps"]]
+    store.pictures += whole.store.pictures[: state["submaps"]]
+    restore(slam, state)
+    for frame in list(shown(order))[after + 1 :]:
+        slam.step(frame)
+    return slam
+
+
 def states(slam: Slam) -> list[str]:
     return [step.state for step in slam.steps]
 
@@ -84,46 +116,57 @@ KIDNAPPED = [*AHEAD, *[BLACK] * 20, *BACK]
 
 
 @pytest.fixture(scope="module")
-def kidnapped() -> Slam:
-    return followed(KIDNAPPED, settings())
+def kidnapped(tmp_path_factory: pytest.TempPathFactory) -> tuple[Slam, Path]:
+    return recorded(KIDNAPPED, tmp_path_factory.mktemp("kidnapped"))
 
 
-def test_a_covered_camera_is_lost_at_once_and_found_where_it_is_uncovered(kidnapped: Slam) -> None:
-    now = states(kidnapped)
+def test_a_covered_camera_is_lost_at_once_and_found_where_it_is_uncovered(kidnapped: Recorded) -> None:
+    slam, now = kidnapped[0], states(kidnapped[0])
     assert set(now[: len(AHEAD)]) == {"tracked"}
     assert set(now[len(AHEAD) : -len(BACK)]) == {"lost"}
     assert "relocalised" in now[-len(BACK) :][:3] and now[-1] in ("tracked", "relocalised")
-    assert kidnapped.believed()[-1] and kidnapped.atlas.components == [0] * len(kidnapped.atlas.components)
+    assert slam.believed()[-1] and set(slam.atlas.components) == {0}
 
 
-def test_no_believed_pose_is_wrong(kidnapped: Slam) -> None:
-    off, ahead = errors_m(kidnapped, KIDNAPPED), slice(len(AHEAD))
-    assert np.nanmax(off[kidnapped.believed()]) < OFF_M
-    undisturbed, all_of_it = (np.sqrt(np.mean(e**2)) for e in (off[ahead], off[kidnapped.believed()]))
+def test_no_believed_pose_is_wrong(kidnapped: Recorded) -> None:
+    slam = kidnapped[0]
+    off, ahead = errors_m(slam, KIDNAPPED), slice(len(AHEAD))
+    assert np.nanmax(off[slam.believed()]) < OFF_M
+    undisturbed, all_of_it = (np.sqrt(np.mean(e**2)) for e in (off[ahead], off[slam.believed()]))
     assert all_of_it <= 1.5 * undisturbed + 1e-3
 
 
-def test_nothing_is_mapped_where_the_camera_is_lost(kidnapped: Slam) -> None:
-    assert not any(step.is_keyframe for step in kidnapped.steps if step.lost)
+def test_nothing_is_mapped_where_the_camera_is_lost(kidnapped: Recorded) -> None:
+    assert not any(step.is_keyframe for step in kidnapped[0].steps if step.lost)
+
+
+def test_the_same_run_has_the_same_bytes_on_two_threads(kidnapped: Recorded) -> None:
+    before = _core.threads(), torch.get_num_threads()
+    _core.set_threads(2)
+    torch.set_num_threads(2)
+    try:
+        assert contents(followed(KIDNAPPED, settings())) == contents(kidnapped[0])
+    finally:
+        _core.set_threads(before[0])
+        torch.set_num_threads(before[1])
+
+
+def test_a_run_resumes_with_the_same_bytes_after_a_relocalisation(kidnapped: Recorded) -> None:
+    found = states(kidnapped[0]).index("relocalised")
+    assert contents(resumed(kidnapped, found, KIDNAPPED)) == contents(kidnapped[0])
 
 
 # ---- uncovered where no map is: a new map begins, and joins
 
 JOINING = [*range(10), BLACK, BLACK, *range(2, 6), BLACK, *range(48, 6, -2)]
-BEGUN, JOINED = 19, 34
 
 
 @pytest.fixture(scope="module")
 def joined(tmp_path_factory: pytest.TempPathFactory) -> tuple[Slam, Path]:
-    """Return a run, and the folder of its states after each frame."""
-    slam, folder = Slam(settings()), tmp_path_factory.mktemp("states")
-    for frame in shown(JOINING):
-        slam.step(frame)
-        write_state(folder / f"{frame.index}.st", state_of(slam), CLASSES, fixed(slam))
-    return slam, folder
+    return recorded(JOINING, tmp_path_factory.mktemp("joined"))
 
 
-def test_a_new_map_begins_apart_and_joins_where_the_world_is_recognised(joined: tuple[Slam, Path]) -> None:
+def test_a_new_map_begins_apart_and_joins_where_the_world_is_recognised(joined: Recorded) -> None:
     slam = joined[0]
     parts, now = [step.component for step in slam.steps], states(slam)
     begun = parts.index(1)
@@ -135,17 +178,58 @@ def test_a_new_map_begins_apart_and_joins_where_the_world_is_recognised(joined: 
     assert np.nanmax(errors_m(slam, JOINING)[slam.believed()]) < 0.02
 
 
-@pytest.mark.parametrize("after", [11, 17, 18, 21, 31, 34], ids=lambda n: f"frame {n}")
-def test_a_run_resumes_with_the_same_bytes_while_the_camera_is_lost_or_apart(
-    joined: tuple[Slam, Path], after: int
-) -> None:
-    """Lost with a known place ahead, lost before a new map, apart, one observation before the join, after the join."""
-    whole, folder = joined
-    state = read_state(folder / f"{after}.st", CLASSES, fixed(whole))
-    store = MemoryStore(whole.store.submaps[: state["submaps"]], whole.store.pictures[: state["submaps"]])
-    slam = Slam(settings(), store)
-    slam.prepare(whole.view.camera)
-    restore(slam, read_state(folder / f"{after}.st", CLASSES, fixed(slam)))
-    for frame in list(shown(JOINING))[after + 1 :]:
-        slam.step(frame)
-    assert contents(slam) == contents(whole)
+@pytest.mark.parametrize("after", [11, 18, 31], ids=lambda n: f"frame {n}")
+def test_a_run_resumes_with_the_same_bytes_while_the_camera_is_lost_or_apart(joined: Recorded, after: int) -> None:
+    """Lost with a known place ahead; lost before a new map begins; apart, with one observation before the join."""
+    now, parts = states(joined[0]), [step.component for step in joined[0].steps]
+    assert (now[after], parts[after]) == {11: ("lost", 0), 18: ("lost", 0), 31: ("apart", 1)}[after]
+    assert contents(resumed(joined, after, JOINING)) == contents(joined[0])
+
+
+# ---- another room: never joined
+
+
+class TwoRooms(Source):
+    """A few frames of a room, black ones, and frames of the room's mirror image: another place that looks alike."""
+
+    order = (*range(0, 16, 2), BLACK, *range(60, 80, 2))
+
+    def __init__(self) -> None:
+        super().__init__("rooms", walk().camera)
+
+    def __len__(self) -> int:
+        return len(self.order)
+
+    def frame(self, i: int) -> Frame:
+        frame = replace(seen(self.order[i]), index=i, timestamp_s=i / 30.0)
+        if self.order[i] < 60:
+            return frame
+        color, depth_m = (np.ascontiguousarray(image[:, ::-1]) for image in (frame.color, frame.depth_m))
+        return replace(frame, color=color, depth_m=depth_m)
+
+    def truth(self) -> Trajectory | None:
+        return None
+
+
+def test_another_room_is_kept_apart_in_all_files(tmp_path: Path) -> None:
+    source, config = TwoRooms(), settings(final__iterations="3")
+    run = new_folder(tmp_path / "run", config, source)
+    slam = Slam(config, run.submaps)
+    outcome = Session(slam, source, run).execute()
+    log, first = run.read_log(), 8
+    assert {line["component"] for line in log[:first]} == {0} and log[-1]["state"] == "apart"
+    apart = [line["index"] for line in log if line["state"] == "apart"]
+    assert len(apart) >= 5 and min(apart) > first and outcome.apart == (len(apart),)
+    path = run.read_trajectory()
+    assert path.timestamps_s.tolist() == pytest.approx([i / 30.0 for i in range(first)], abs=1e-9)
+    of_world = [s for s, component in enumerate(slam.atlas.components) if component == 0]
+    one_room = followed([source.order[i] for i in range(first)], config)
+    assert len(of_world) < len(slam.atlas.components)
+    points, alone = run.read_map().means, one_room.field.means
+    assert len(points) <= sum(len(run.submaps.load(s).field) for s in of_world)
+    for side in (points.amin(0) - alone.amin(0), points.amax(0) - alone.amax(0)):
+        assert side.abs().max() < 0.3, "the map of the world ends where the first room was seen"
+    (part,) = slam.components()
+    assert len(part.trajectory) == len(apart) and len(part.field) > 0
+    files = run.path / "components" / str(part.number)
+    assert {file.name for file in files.iterdir()} == {"trajectory.txt", "map.ply"}

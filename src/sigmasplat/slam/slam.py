@@ -264,6 +264,9 @@ class Slam(World):
             return
         link = Link(place.where[0], submap, place.T_submap_camera @ se3.inverse(T_submap_camera), place.information)
         if self.recovery.confirms(link, self.atlas):
+            kept, moved = sorted((link.a, link.b), key=self.atlas.components.__getitem__)
+            members = self.atlas.members(self.atlas.components[moved])
+            self.confidence.joined(members, moved, kept, std_of(link.information))
             self.atlas.join(link.a, link.b, link.T_a_b)
             self.closer.connect(link.a, link.b, link.T_a_b, link.information)
 
@@ -272,6 +275,7 @@ class Slam(World):
         state = APART if component and found.state != LOST else found.state
         found.tracking |= {
             "position_std_m": self.confidence.position_std_m(in_submap_m), "doubtful": float(self.tracker.doubtful),
+            "usual_residual": self.tracker.usual.residual,
         }  # fmt: skip
         p_off = self.confidence.probability(state, found.tracking)
         return Step(

@@ -23,16 +23,16 @@ MEMORY = 20.0
 """A lost frame is forgotten after about this many tracked ones."""
 MANY = 2000.0
 """With at least this many compared points, their number is no reason for doubt."""
-BIAS = -3.0
+BIAS = -1.51
 WEIGHTS: dict[str, float] = {
-    "log_position_std": 0.8,
-    "log_residual": 0.3,
-    "unexplained": 6.0,
-    "not_close": 3.0,
-    "uncorrelated": 3.0,
-    "log_doubtful": 0.5,
-    "lately_lost": 1.0,
-    "few_points": 1.0,
+    "log_position_std": 0.63,
+    "log_residual": 0.1,
+    "unexplained": 0.42,
+    "not_close": 3.27,
+    "uncorrelated": 0.76,
+    "log_doubtful": 0.58,
+    "lately_lost": 0.1,
+    "few_points": 0.48,
 }
 """Weights of the logistic model."""
 CERTAIN = {LOST: 0.95, APART: 0.99}
@@ -51,6 +51,13 @@ class Confidence:
     def begun(self, parent: int | None, position_m: float) -> None:
         """Add a submap: at position_m (standard deviation, m) from its parent, or the first of a component."""
         self.spread_m.append(0.0 if parent is None else math.hypot(self.spread_m[parent], position_m))
+
+    def joined(self, members: Sequence[int], submap: int, kept: int, link_m: float) -> None:
+        """Add the path to the component that the submaps `members` join: from `submap`, one of them, by a link of
+        link_m (standard deviation, m) to submap `kept`."""
+        path_m = math.hypot(self.spread_m[kept], link_m, self.spread_m[submap])
+        for s in members:
+            self.spread_m[s] = math.hypot(path_m, self.spread_m[s])
 
     def closed(self, loops: Sequence[Loop]) -> None:
         """Take the loops of a finished submap into account."""
@@ -78,10 +85,12 @@ class Confidence:
 def evidence(tracking: Mapping[str, float], since_lost: int) -> dict[str, float]:
     """Return the inputs of the logistic model by name; without a comparison of surfaces, agreement stands for it."""
     close, behind = tracking.get("close", tracking.get("agreement", 1.0)), tracking.get("behind", 0.0)
-    residual, correlation = tracking.get("residual", 0.3), tracking.get("correlation", 0.95)
+    residual, usual = tracking.get("residual", 0.0), tracking.get("usual_residual", math.nan)
+    excess = _log_residual(residual) - _log_residual(usual) if math.isfinite(usual) else 0.0
+    correlation = tracking.get("correlation", 0.95)
     return {
         "log_position_std": math.log(tracking.get("position_std_m", 0.0) + 1e-3),
-        "log_residual": math.log((min(residual, 10.0) if math.isfinite(residual) else 10.0) + 0.05),
+        "log_residual": max(excess, 0.0),
         "unexplained": behind / max(close + behind, 1e-9),
         "not_close": 1.0 - close,
         "uncorrelated": 0.1 if math.isnan(correlation) else 1.0 - max(correlation, 0.0),
@@ -89,6 +98,10 @@ def evidence(tracking: Mapping[str, float], since_lost: int) -> dict[str, float]
         "lately_lost": math.exp(-since_lost / MEMORY),
         "few_points": max(0.0, math.log(MANY / max(tracking.get("points", MANY), 1.0))),
     }
+
+
+def _log_residual(residual: float) -> float:
+    return math.log((min(residual, 10.0) if math.isfinite(residual) else 10.0) + 0.05)
 
 
 def std_of(information: Matrix) -> float:

@@ -184,11 +184,17 @@ class Relocaliser:
 def aligned(
     reference: Reference, seen: Sight, T_camera_world: Matrix, config: TrackingConfig
 ) -> tuple[PoseFit, Comparison]:
-    """Align a frame to a reference from a guess; return the fit, and the comparison of both images at it."""
-    fit = fit_pose_align(reference, seen.live, T_camera_world, config)
-    motion = fit.T_camera_world @ se3.inverse(reference.T_camera_world)
-    fit.comparison = compare(reference.pyramid, seen.live, motion)
-    return fit, fit.comparison
+    """Align a frame to a reference from a guess; return the fit, and the comparison of both images at it.
+
+    Where only a wall is in view, alignment can slide along it: then the guess explains the image better, and is kept.
+    """
+    found = list[tuple[PoseFit, Comparison]]()
+    for settings in (config, replace(config, align_iterations=0)):
+        fit = fit_pose_align(reference, seen.live, T_camera_world, settings)
+        motion = fit.T_camera_world @ se3.inverse(reference.T_camera_world)
+        fit.comparison = compare(reference.pyramid, seen.live, motion)
+        found.append((fit, fit.comparison))
+    return max(found, key=lambda each: score(each[1]))
 
 
 def keyframe_image(keyframe: KnownKeyframe, view: View) -> Reference:

@@ -44,8 +44,10 @@ def explained(c: Comparison) -> float:
 
 
 def score(c: Comparison) -> float:
-    """Return the share of the reference that a pose explains, less if it sees through known surfaces; in [0, 1]."""
-    return c.common * c.close * explained(c)
+    """Return the share of the reference that a pose explains, in [0, 1]; it is lower if known surfaces are seen through
+    or the gray values do not correlate."""
+    texture = 1.0 if np.isnan(c.correlation) else max(c.correlation, 0.0)
+    return c.common * c.close * explained(c) * texture
 
 
 def confirmed(c: Comparison) -> bool:
@@ -98,6 +100,11 @@ class Usual:
             or c.correlation < LOST_CORRELATION * _median(self.correlations, 0.8)
             or c.common < least_share
         )
+
+    @property
+    def residual(self) -> float:
+        """Return the usual median depth difference, in standard deviations of a reading; NaN if it is not known."""
+        return _median(self.residuals, float("nan"))
 
     def is_leap(self, apart_m: float) -> bool:
         """Return whether a camera that has moved as usual cannot be this far from where it was expected."""
