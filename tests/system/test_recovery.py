@@ -1,5 +1,6 @@
 """A camera that is covered and uncovered elsewhere: lost at once, found again, and never placed wrongly in silence."""
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
@@ -152,8 +153,11 @@ def test_the_same_run_has_the_same_bytes_on_two_threads(kidnapped: Recorded) -> 
 
 
 def test_a_run_resumes_with_the_same_bytes_after_a_relocalisation(kidnapped: Recorded) -> None:
-    found = states(kidnapped[0]).index("relocalised")
-    assert contents(resumed(kidnapped, found, KIDNAPPED)) == contents(kidnapped[0])
+    whole, found = kidnapped[0], states(kidnapped[0]).index("relocalised")
+    slam = resumed(kidnapped, found, KIDNAPPED)
+    assert contents(slam) == contents(whole)
+    assert dataclasses.asdict(slam.tracker.usual) == dataclasses.asdict(whole.tracker.usual)
+    assert slam.relocaliser.indexed == whole.relocaliser.indexed
 
 
 # ---- uncovered where no map is: a new map begins, and joins
