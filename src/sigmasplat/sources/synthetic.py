@@ -81,7 +81,11 @@ class SyntheticRoom(Source):
             rng = np.random.default_rng((self._seed, i, 7))
             color, depth_m = measured_color(color, rng), measured_depth(depth_m, self.camera, rng)
         bytes_ = np.rint(color * 255.0).astype(np.uint8)
-        return Frame(i, i / FRAMES_PER_SECOND, color_from_bytes(bytes_), depth_m, self.camera)
+        return Frame(i, self.timestamp_s(i), color_from_bytes(bytes_), depth_m, self.camera)
+
+    def timestamp_s(self, i: int) -> float:
+        """Return the time of frame i, without rendering it."""
+        return self._checked_index(i) / FRAMES_PER_SECOND
 
     def truth(self) -> Trajectory:
         """Return the exact pose of every frame, in the room's frame (z up)."""
