@@ -33,7 +33,7 @@ class Comparison:
     common: share of the reference's readings that fall on a live reading; close, front, behind: shares of these whose
     live surface is the same, nearer, or farther. Of those that are not in front: residual, the median |depth
     difference| in standard deviations of a reading; correlation of the gray values, −1 to 1, NaN if one image is flat.
-    points: the number of compared pixels.
+    points: the number of compared pixels; covered: their number relative to that of the live readings, at most 1.
     """
 
     common: float
@@ -43,6 +43,7 @@ class Comparison:
     residual: float
     correlation: float
     points: int = 0
+    covered: float = 1.0
 
 
 NOTHING = Comparison(0.0, 0.0, 0.0, 0.0, float("inf"), float("nan"))
@@ -72,16 +73,17 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
         return NOTHING
     difference, noise = difference[other], (NOISE_RELATIVE * seen[other] ** 2 + NOISE_M) * noise_scale(live_depth)
     limit = CLOSE_SIGMA * noise + CLOSE_M
+    covered = min(1.0, count / max(int(np.count_nonzero(live_depth[::STEP, ::STEP])), 1))
     front = difference <= -limit
     close, behind = (float(np.mean(found)) for found in (np.abs(difference) < limit, difference >= limit))
     common, before = count / len(u), float(np.mean(front))
     if count - front.sum() < LEAST_PIXELS:
-        return Comparison(common, close, before, behind, float("inf"), float("nan"), count)
+        return Comparison(common, close, before, behind, float("inf"), float("nan"), count, covered)
     residual = float(np.median(np.abs(difference)[~front] / noise[~front]))
     right, below = column[inside] - left > 0.5, row[inside] - top > 0.5
     live_gray = host(live.gray[level])[top + below, left + right]
     correlation = _correlation(gray[v, u][inside][other][~front], live_gray[other][~front])
-    return Comparison(common, close, before, behind, residual, correlation, count)
+    return Comparison(common, close, before, behind, residual, correlation, count, covered)
 
 
 def noise_scale(depth: NDArray[np.float32]) -> float:

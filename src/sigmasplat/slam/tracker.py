@@ -9,7 +9,7 @@ import numpy as np
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.align import align
 from sigmasplat.fit.backends import fits_of
-from sigmasplat.fit.compare import compare
+from sigmasplat.fit.compare import Comparison, compare
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, map_reference
@@ -19,7 +19,7 @@ from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.feature_image import FeatureImage, pose_by_features
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
-from sigmasplat.slam.localisation.verdict import Usual, confirmed, score
+from sigmasplat.slam.localisation.verdict import LEAST_COMMON, Usual, confirmed, score
 from sigmasplat.slam.rules import is_lost, jumped
 from sigmasplat.types import Matrix
 
@@ -71,7 +71,7 @@ class Tracker:
         if self._doubts(best):
             best = self._retry(field, view, seen, best)
         self.lost = self._is_lost(best) or self._leaps(best, predicted)
-        self.doubtful = self.doubtful + 1 if self._doubts(best) else 0
+        self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
         self._remember(best, seen)
         return best
@@ -106,10 +106,18 @@ class Tracker:
     def _aligned(self, reference: Reference, live: Pyramid, T_camera_world: Matrix) -> PoseFit:
         fit = fit_pose_align(reference, live, T_camera_world, self.config)
         if self.config.verify:
-            fit.comparison = compare(
-                reference.pyramid, live, fit.T_camera_world @ se3.inverse(reference.T_camera_world)
-            )
+            fit.comparison = self._compared(reference, live, fit.T_camera_world)
         return fit
+
+    def _compared(self, reference: Reference, live: Pyramid, T_camera_world: Matrix) -> Comparison:
+        """Compare a frame at a pose with the newest keyframe, so that all guesses and frames are judged alike; where it
+        shows too little of the frame, with the reference of the alignment."""
+        if self.keyframe is not None and self.keyframe is not reference:
+            motion = T_camera_world @ se3.inverse(self.keyframe.T_camera_world)
+            found = compare(self.keyframe.pyramid, live, motion)
+            if found.common >= LEAST_COMMON:
+                return found
+        return compare(reference.pyramid, live, T_camera_world @ se3.inverse(reference.T_camera_world))
 
     def _guesses_by_features(self, seen: Sight) -> Iterator[Matrix]:
         """Yield T_world_camera by features of the newest keyframe and of the last image, where they give a pose."""
@@ -191,6 +199,10 @@ class Tracker:
         usual = float(np.median(self.agreements[-50:])) if self.agreements else 1.0
         worse = fit.agreement * fit.overlap < DOUBT * usual
         return worse or jumped(fit.first_loss, self.first_losses, self.config.reinit_factor)
+
+    def _contradicted(self, fit: PoseFit) -> bool:
+        """Return whether a pose is doubtful for another reason than a small overlap, which a new keyframe mends."""
+        return self._doubts(fit) if fit.comparison is None else self.usual.contradicts(fit.comparison)
 
     # ---- keyframes ----
 

@@ -16,6 +16,9 @@ LOST_CLOSE, LOST_EXPLAINED = 0.3, 0.85
 pose lowers the second."""
 DOUBT_CLOSE, DOUBT_EXPLAINED = 0.9, 0.95
 """Doubtful: `close` is below this share of its usual value, or `explained` is below this."""
+COVERED_CLOSE = 0.7
+"""Something large has moved into the view if less than this share of what is usual is the same surface. A nearer wall
+that comes into view covers less from one keyframe to the next."""
 DOUBT_RESIDUAL = 2.5
 """Doubtful: the median depth difference is this many times the usual one."""
 DOUBT_CORRELATION, LOST_CORRELATION = 0.85, 0.4
@@ -55,6 +58,7 @@ def confirmed(c: Comparison) -> bool:
     return (
         c.common >= LEAST_COMMON
         and c.close >= LEAST_CLOSE
+        and c.covered >= LEAST_COMMON
         and explained(c) >= LEAST_EXPLAINED
         and c.residual <= MOST_RESIDUAL
         and not c.correlation < LEAST_CORRELATION
@@ -112,12 +116,16 @@ class Usual:
 
     def doubts(self, c: Comparison) -> bool:
         """Return whether a pose is clearly worse than usual."""
+        worse = c.close < DOUBT_CLOSE * _median(self.closes, 1.0) or score(c) < DOUBT_SCORE * _median(self.scores, 1.0)
+        return worse or self.contradicts(c)
+
+    def contradicts(self, c: Comparison) -> bool:
+        """Return whether what both images show differs clearly more than usual, however much they share."""
         return (
-            c.close < DOUBT_CLOSE * _median(self.closes, 1.0)
+            c.close < COVERED_CLOSE * _median(self.closes, 1.0)
             or explained(c) < DOUBT_EXPLAINED
             or c.residual > DOUBT_RESIDUAL * max(0.2, _median(self.residuals, 1.0))
             or c.correlation < DOUBT_CORRELATION * _median(self.correlations, 0.9)
-            or score(c) < DOUBT_SCORE * _median(self.scores, 1.0)
         )
 
 
