@@ -1,7 +1,7 @@
 """Run SigmaSplat and other RGB-D systems on the same frames and score every path with the same evaluation.
 
-Open3D and ORB-SLAM3 run in a Python of their own (--open3d, --orbslam3); without it they are left out. A path that any
-other system has written is scored with --paths. Writes benchmarks/results/<name>-<machine>.json, prints tables.
+Open3D and ORB-SLAM3 run in a Python of their own (--open3d, --orbslam3); without it they are left out, or, with --keep,
+their rows are those of the earlier results. A path that any other system has written is scored with --paths. Writes benchmarks/results/<name>-<machine>.json, prints tables.
 
 example: python benchmarks/peers.py --open3d ../peers/bin/python --sources redkitchen cubicles
 """
@@ -25,6 +25,7 @@ from tables import Section
 
 from sigmasplat.errors import ConfigError, SigmaSplatError, SourceError
 from sigmasplat.io.atomic import write_text
+from sigmasplat.io.machine import describe
 from sigmasplat.io.trajectory import read_trajectory
 from sigmasplat.metrics.trajectory import ate, pair_poses
 from sigmasplat.model.trajectory import Trajectory
@@ -94,6 +95,7 @@ class Options:
         tuple[str, ...],
         arg(help="SYSTEM=SEQUENCE=FILE: also score a TUM text file that another system has written", metavar="PATHS"),
     ] = ()
+    keep: Annotated[bool, arg(help="keep the rows of other systems in the earlier results")] = False
     limit: Annotated[int | None, arg(help="frames at most", help_behavior_hint="(default: all)")] = None
     name: Annotated[str, arg(help="name of the results")] = "peers"
     fresh: Annotated[bool, arg(help="run also what has been run before")] = False
@@ -148,7 +150,9 @@ def score(path: Trajectory, source: Source, limit: int | None) -> dict[str, Any]
 
 def run_ours(options: Options) -> list[Result]:
     """Run SigmaSplat as `accuracy.py` does; return two results per run: with loops, and the path without loops."""
-    wanted = accuracy.Options(options.sources, seeds=options.seeds, limit=options.limit)
+    # Poses are final when the refinement of the map begins, so it is left out.
+    settings = ("final.iterations=0",)
+    wanted = accuracy.Options(options.sources, seeds=options.seeds, settings=settings, limit=options.limit)
     made = []
     for result in accuracy.run_all(accuracy.jobs_of(wanted), options):  # type: ignore[arg-type]
         figures = result["figures"]
@@ -257,11 +261,20 @@ def _row(system: str, runs: list[Result], sources: list[str]) -> list[str]:
     return [system, *cells, ", ".join(without) or ("0" if known else "–"), *PROPERTIES.get(system, ("–", "–"))]
 
 
+def kept_rows(options: Options, measured: set[str]) -> list[Result]:
+    """Return the earlier results of systems that were not measured now, with the commit at which they were measured."""
+    path = options.out / f"{record.slug(options.name)}-{record.machine_slug(describe())}.json"
+    earlier = record.read(path)
+    rows = [row for row in earlier["figures"]["runs"] if row["system"] not in measured]
+    return [{"commit": earlier["commit"], **row} for row in rows]
+
+
 def main(options: Options) -> int:
     """Run, score, write, print; return exit code 1 if a run failed, 2 if the options are invalid."""
     try:
         extra = read_paths(options)
         runs = [*run_ours(options), *run_peers(options), *extra]
+        runs += kept_rows(options, {run["system"] for run in runs}) if options.keep else []
     except SigmaSplatError as problem:
         print(f"peers.py: {problem}", file=sys.stderr)
         return 2
