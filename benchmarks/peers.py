@@ -1,7 +1,7 @@
 """Run SigmaSplat and other RGB-D systems on the same frames and score every path with the same evaluation.
 
-Open3D and ORB-SLAM3 run in a Python of their own (--open3d, --orbslam3). Without it they are left out; with --keep their
-rows in the earlier results are kept. A path that any other system has written is scored with --paths.
+Open3D and ORB-SLAM3 run in a Python of their own (--open3d, --orbslam3). Without it they are left out; with --keep the
+rows of earlier results are kept. A path that any other system has written is scored with --paths.
 Writes benchmarks/results/<name>-<machine>.json, prints tables.
 
 example: python benchmarks/peers.py --open3d ../peers/bin/python --sources redkitchen cubicles
