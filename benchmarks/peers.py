@@ -241,8 +241,8 @@ def sections(measured: dict[str, Any]) -> list[Section]:
 NOTE = (
     "ATE: root mean square over the frames that have a pose, after a rigid fit without scale; mean ± deviation over "
     "several seeds. Without a pose: the system declares itself lost or writes no pose. All systems get the same "
-    "frames; SigmaSplat works at 320 pixels width, the others at full size. † Not measured by this command, but earlier "
-    "by the project's founders: same frames, CPU, RTAB-Map's settings for TUM RGB-D."
+    "frames; SigmaSplat works at 320 pixels width, the others at full size. † Not measured by this command, but "
+    "earlier by the project's founders: same frames, CPU, RTAB-Map's settings for TUM RGB-D."
 )
 
 
