@@ -23,19 +23,19 @@ MEMORY = 20.0
 """A lost frame is forgotten after about this many tracked ones."""
 MANY = 2000.0
 """With at least this many compared points, their number is no reason for doubt."""
-BIAS = -1.51
+BIAS = -1.0
 WEIGHTS: dict[str, float] = {
-    "log_position_std": 0.63,
-    "log_residual": 0.1,
-    "unexplained": 0.42,
-    "not_close": 3.27,
-    "uncorrelated": 0.76,
-    "log_doubtful": 0.58,
-    "lately_lost": 0.1,
-    "few_points": 0.48,
+    "log_position_std": 1.07,
+    "log_residual": 2.96,
+    "unexplained": 1.52,
+    "not_close": 3.21,
+    "uncorrelated": 4.0,
+    "log_doubtful": 0.0,
+    "lately_lost": 1.41,
+    "few_points": 0.0,
 }
-"""Weights of the logistic model."""
-CERTAIN = {LOST: 0.95, APART: 0.99}
+"""Weights of the logistic model; the fit gives no weight to two of the inputs."""
+CERTAIN = {LOST: 0.85, APART: 0.99}
 """Fixed probabilities: of a lost frame (the share of lost frames whose guess is off), and of a frame whose place in the
 world is not known."""
 
