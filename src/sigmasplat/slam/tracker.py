@@ -25,7 +25,7 @@ from sigmasplat.types import Matrix
 
 DOUBT = 0.7
 """A pose is doubtful if its agreement × overlap falls below this share of the usual value."""
-WIDE = 0.05
+WIDE = 0.065
 """A motion between two frames is wide if it moves the image by more than this share of its width: the basin of
 convergence of alignment ends near there."""
 
