@@ -21,8 +21,6 @@ NEVER_LOST = 1_000_000
 """Number of frames since the last lost one, before any was lost."""
 MEMORY = 20.0
 """A lost frame is forgotten after about this many tracked ones."""
-MANY = 2000.0
-"""With at least this many compared points, their number is no reason for doubt."""
 BIAS = -1.0
 WEIGHTS: dict[str, float] = {
     "log_position_std": 1.07,
@@ -30,11 +28,9 @@ WEIGHTS: dict[str, float] = {
     "unexplained": 1.52,
     "not_close": 3.21,
     "uncorrelated": 4.0,
-    "log_doubtful": 0.0,
     "lately_lost": 1.41,
-    "few_points": 0.0,
 }
-"""Weights of the logistic model; the fit gives no weight to two of the inputs."""
+"""Weights of the logistic model. Doubtful frames in a row and few compared points added nothing in the fit."""
 CERTAIN = {LOST: 0.85, APART: 0.99}
 """Fixed probabilities: of a lost frame (the share of lost frames whose guess is off), and of a frame whose place in the
 world is not known."""
@@ -73,7 +69,7 @@ class Confidence:
     def probability(self, state: str, tracking: Mapping[str, float]) -> float:
         """Return the probability that the pose of the newest frame is off by more than 5 cm.
 
-        tracking: values of its fit (`metrics_of`), with position_std_m and the number of doubtful frames in a row.
+        tracking: values of its fit (`metrics_of`), with position_std_m and usual_residual.
         """
         self.since_lost = 0 if state in (LOST, RELOCALISED) else self.since_lost + 1
         if state in CERTAIN:
@@ -94,9 +90,7 @@ def evidence(tracking: Mapping[str, float], since_lost: int) -> dict[str, float]
         "unexplained": behind / max(close + behind, 1e-9),
         "not_close": 1.0 - close,
         "uncorrelated": 0.1 if math.isnan(correlation) else 1.0 - max(correlation, 0.0),
-        "log_doubtful": math.log1p(tracking.get("doubtful", 0.0)),
         "lately_lost": math.exp(-since_lost / MEMORY),
-        "few_points": max(0.0, math.log(MANY / max(tracking.get("points", MANY), 1.0))),
     }
 
 
