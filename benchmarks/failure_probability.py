@@ -19,12 +19,12 @@ import record
 import tables
 import tyro
 from numpy.typing import NDArray
-from robustness_scores import OFF_M
+from robustness_scores import auroc
 from scipy.optimize import minimize
 from scipy.special import expit
 from tables import Section, significant
 
-from sigmasplat.metrics.failures import auroc
+from sigmasplat.metrics.failures import OFF_M, brier
 from sigmasplat.slam.localisation.confidence import NEVER_LOST, WEIGHTS, evidence
 
 arg = tyro.conf.arg
@@ -101,10 +101,8 @@ def probability(weights: Values, inputs: Values) -> Values:
 
 def judged(p: Values, off: NDArray[np.bool_]) -> dict[str, Any]:
     """Return AUROC, Brier score, and mean probability against share of frames that are off."""
-    area = auroc(p, off)
-    brier = float(np.mean((p - off) ** 2))
-    known = area if np.isfinite(area) else None
-    return {"frames": len(off), "off": float(off.mean()), "mean": float(p.mean()), "auroc": known, "brier": brier}
+    means = {"off": float(off.mean()), "mean": float(p.mean())}
+    return {"frames": len(off), **means, "auroc": auroc(p, off), "brier": brier(p, off)}
 
 
 def main(options: Options) -> int:

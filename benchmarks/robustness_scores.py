@@ -10,23 +10,19 @@ import numpy as np
 from disturbances import Plan
 from disturbed_recordings import FRAMES_PER_SECOND
 from numpy.typing import NDArray
-from scipy.stats import rankdata
 
 from sigmasplat.io.trajectory import read_trajectory
+from sigmasplat.metrics import failures
+from sigmasplat.metrics.failures import OFF_M, SILENT_M
 from sigmasplat.metrics.trajectory import align_rigid
 from sigmasplat.model import se3
 
-WRONG_M = 0.10
-"""A believed frame whose position is off by more than this is a silent failure."""
-OFF_M = 0.05
-"""`p_off` of log.jsonl is the probability that the position is off by more than this."""
 ANCHOR_FRAMES, ANCHOR_M = 20, 0.05
 """Without an event, this number of first frames fixes the world; frames further off than this do not count."""
 KNOWN_M, KNOWN_DEG = 0.5, 25.0
 """A view is known if a frame from before the event is this near and looks in this direction."""
 Truth = NDArray[np.float64]
 """T_world_camera [1 or 2, N, 4, 4]: the true poses of the colour, and of the depth if it shows other frames."""
-BINS = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +120,7 @@ def score(run: RunPath, truth: Truth, planned: Plan) -> dict[str, Any]:
     there is none.
     """
     off = errors_m(run.final, run, truth, planned.begin)
-    wrong = run.believed & ~(off <= WRONG_M)
+    wrong = run.believed & ~(off <= SILENT_M)
     right = run.believed & ~wrong
     outside = np.ones(len(off), bool)
     outside[planned.begin : planned.end] = False
@@ -189,25 +185,15 @@ def _number(value: Any) -> float:
 
 
 def auroc(p: NDArray[np.float64], off: NDArray[np.bool_]) -> float | None:
-    """Return the chance that a frame that is off has a larger p than one that is not; ties count half.
-
-    None if all frames are off or none is.
-    """
-    positives, negatives = int(off.sum()), int((~off).sum())
-    if not positives or not negatives:
-        return None
-    ranks = rankdata(p)
-    return float((ranks[off].sum() - positives * (positives + 1) / 2) / (positives * negatives))
+    """Return `metrics.failures.auroc`; None, which JSON can hold, if all frames are off or none is."""
+    area = failures.auroc(p, off)
+    return area if np.isfinite(area) else None
 
 
 def calibration(p: NDArray[np.float64], off: NDArray[np.bool_]) -> list[dict[str, float]]:
     """Return for each tenth of the range of p that has frames: their number, mean p, and the share that is off."""
-    bins = np.minimum((p * BINS).astype(int), BINS - 1)
-    return [
-        {"frames": int((bins == b).sum()), "mean_p": float(p[bins == b].mean()), "off": float(off[bins == b].mean())}
-        for b in range(BINS)
-        if (bins == b).any()
-    ]
+    bins = failures.calibration(p, off)
+    return [{"frames": b["frames"], "mean_p": b["predicted"], "off": b["observed"]} for b in bins]
 
 
 def probability_scores(all_pairs: list[tuple[float, bool]]) -> dict[str, Any] | None:
@@ -219,6 +205,6 @@ def probability_scores(all_pairs: list[tuple[float, bool]]) -> dict[str, Any] | 
         "frames": len(p),
         "off": int(off.sum()),
         "auroc": auroc(p, off),
-        "brier": float(((p - off) ** 2).mean()),
+        "brier": failures.brier(p, off),
         "calibration": calibration(p, off),
     }
