@@ -6,9 +6,13 @@ from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.backends import fits_of
+from sigmasplat.fit.compare import Comparison, compare
 from sigmasplat.fit.gray import Image
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.target import Target
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.submap import Picture
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 
@@ -26,11 +30,21 @@ class Reference:
         weight = self.pyramid.weight[0]
         return None if weight is None else self.pyramid.kernels.to_host(weight)
 
+    def compared(self, live: Pyramid, T_camera_world: Matrix) -> Comparison:
+        """Compare a live image at its pose T_camera_world [4, 4] with this reference."""
+        return compare(self.pyramid, live, T_camera_world @ se3.inverse(self.T_camera_world))
+
 
 def live_image(view: View, color: Image, depth_m: Image, target: Target) -> Pyramid:
     """Make the pyramid of a camera image, colour [H, W, 3] and depth [H, W] m, on the device that aligns it."""
     gray, depth = fits_of(view).live_planes(view, color, depth_m, target)
     return Pyramid.of(gray, depth, target.camera, backend=view.backend)
+
+
+def picture_images(view: View, picture: Picture, camera: Camera) -> tuple[Target, Pyramid]:
+    """Return a stored keyframe's images, taken by `camera`, as the target of a fit and as a pyramid."""
+    target = Target.of_picture(picture, camera, (view.sums.shape[1], view.sums.shape[2]))
+    return target, live_image(view, picture.unit_color, picture.depth_m, target)
 
 
 def map_reference(params: Tensor, view: View, T_camera_world: Matrix, config: TrackingConfig) -> Reference:

@@ -9,7 +9,7 @@ import numpy as np
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.align import align
 from sigmasplat.fit.backends import fits_of
-from sigmasplat.fit.compare import Comparison, compare
+from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference, keyframe_reference, map_reference
@@ -34,8 +34,8 @@ convergence of alignment ends near there."""
 class Tracker:
     """Keeps the last pose, the velocity, the last image, the reference keyframe, and statistics of recent fits.
 
-    lost: tracking of the last frame failed; doubtful: number of frames in a row whose best pose is clearly worse than
-    usual.
+    lost: tracking of the last frame failed; doubtful: number of frames in a row whose best pose the images
+    contradict (`_contradicted`).
     """
 
     config: TrackingConfig
@@ -113,11 +113,10 @@ class Tracker:
         """Compare a frame at a pose with the newest keyframe, so that all guesses and frames are judged alike; where it
         shows too little of the frame, with the reference of the alignment."""
         if self.keyframe is not None and self.keyframe is not reference:
-            motion = T_camera_world @ se3.inverse(self.keyframe.T_camera_world)
-            found = compare(self.keyframe.pyramid, live, motion)
+            found = self.keyframe.compared(live, T_camera_world)
             if found.common >= LEAST_COMMON:
                 return found
-        return compare(reference.pyramid, live, T_camera_world @ se3.inverse(reference.T_camera_world))
+        return reference.compared(live, T_camera_world)
 
     def _guesses_by_features(self, seen: Sight) -> Iterator[Matrix]:
         """Yield T_world_camera by features of the newest keyframe and of the last image, where they give a pose."""
@@ -219,9 +218,8 @@ class Tracker:
     def move_to(self, field: GaussianField, view: View, keyframe: FoundKeyframe, T_world_camera: Matrix) -> None:
         """Continue at another pose, with a keyframe as the reference of the next frames."""
         self.previous, self.velocity = T_world_camera, np.eye(4)
-        self.keyframe = keyframe_reference(
-            field.params, view, keyframe.pyramid, keyframe.T_camera_world, self.config
-        )  # fmt: skip
+        shown = keyframe.reference
+        self.keyframe = keyframe_reference(field.params, view, shown.pyramid, shown.T_camera_world, self.config)
         self.keyframe_features = keyframe.image.weighed(self.keyframe.weights)
 
     def forget(self) -> None:

@@ -11,10 +11,9 @@ from dataclasses import asdict, dataclass, field, replace
 import numpy as np
 
 from sigmasplat.config import Config, TrackingConfig
-from sigmasplat.fit.compare import Comparison, compare
+from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit, fit_pose_align
-from sigmasplat.fit.references import Reference, live_image, map_reference
-from sigmasplat.fit.target import Target
+from sigmasplat.fit.references import Reference, map_reference, picture_images
 from sigmasplat.model import se3
 from sigmasplat.render.view import View
 from sigmasplat.slam.drift import symmetric
@@ -117,7 +116,7 @@ class Relocaliser:
 
     def search(
         self, known: KnownMap, view: View, seen: Sight, index_at_most: int | None = INDEX_AT_MOST
-    ) -> "SearchResult":
+    ) -> SearchResult:
         """Search as `find` does, and also return what was refused."""
         wanted = known.keyframes()
         self._index(known, view, wanted, index_at_most)
@@ -173,9 +172,10 @@ class Relocaliser:
         if found is None:
             return
         guess = found.T_live_reference @ se3.inverse(keyframe.T_submap_camera)
-        image = keyframe_image(keyframe, view)
-        shown = FoundKeyframe(image.pyramid, image.T_camera_world, keyframe.image(view.camera))
-        yield Relocation(where, shown, found.inliers, *aligned(image, seen, guess, self.config.tracking))
+        _, pyramid = picture_images(view, keyframe.picture, view.camera)
+        own = Reference(pyramid, se3.inverse(keyframe.T_submap_camera))
+        shown = FoundKeyframe(own, keyframe.image(view.camera))
+        yield Relocation(where, shown, found.inliers, *aligned(own, seen, guess, self.config.tracking))
         params = known.splats(where[0]).params.to(view.sums.device)
         rendered = map_reference(params, view, guess, self.config.tracking)
         yield Relocation(where, shown, found.inliers, *aligned(rendered, seen, guess, self.config.tracking))
@@ -191,15 +191,9 @@ def aligned(
     found = list[tuple[PoseFit, Comparison]]()
     for settings in (config, replace(config, align_iterations=0)):
         fit = fit_pose_align(reference, seen.live, T_camera_world, settings)
-        motion = fit.T_camera_world @ se3.inverse(reference.T_camera_world)
-        fit.comparison = compare(reference.pyramid, seen.live, motion)
+        fit.comparison = reference.compared(seen.live, fit.T_camera_world)
         found.append((fit, fit.comparison))
     return max(found, key=lambda each: score(each[1]))
-
-
-def keyframe_image(keyframe: KnownKeyframe, view: View) -> Reference:
-    """Return a keyframe's own image as a reference of alignment."""
-    return Reference(sight_of(keyframe, view).live, se3.inverse(keyframe.T_submap_camera))
 
 
 def _compact(descriptors: Matrix) -> Matrix:
@@ -209,7 +203,4 @@ def _compact(descriptors: Matrix) -> Matrix:
 
 def sight_of(keyframe: KnownKeyframe, view: View) -> Sight:
     """Return a keyframe of the map in the form of a frame to be found."""
-    picture = keyframe.picture
-    target = Target.of_picture(picture, view.camera, (view.sums.shape[1], view.sums.shape[2]))
-    pyramid = live_image(view, picture.unit_color, picture.depth_m, target)
-    return Sight(target, pyramid, keyframe.image(view.camera))
+    return Sight(*picture_images(view, keyframe.picture, view.camera), keyframe.image(view.camera))

@@ -4,14 +4,13 @@ from dataclasses import dataclass, field
 
 from sigmasplat.config import Config
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.fit.references import live_image
+from sigmasplat.fit.references import Reference, live_image
 from sigmasplat.fit.target import Target
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.feature_image import FeatureImage, detail_of
-from sigmasplat.types import Matrix
 
 
 @dataclass(eq=False)
@@ -51,9 +50,8 @@ def observe(whole: Frame, working: Frame, view: View, config: Config, extractor:
 
 @dataclass(frozen=True, eq=False)
 class FoundKeyframe:
-    """A keyframe of the map that shows what the camera sees: its pyramid, T_camera_world [4, 4] in its submap, and its
-    image for features."""
+    """A keyframe of the map that shows what the camera sees: its own image as a reference, with its pose in its submap,
+    and its image for features."""
 
-    pyramid: Pyramid
-    T_camera_world: Matrix
+    reference: Reference
     image: FeatureImage

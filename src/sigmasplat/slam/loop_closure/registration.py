@@ -14,8 +14,7 @@ from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison, compare
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.fit.references import live_image, map_reference
-from sigmasplat.fit.target import Target
+from sigmasplat.fit.references import map_reference, picture_images
 from sigmasplat.model import se3
 from sigmasplat.model.submap import Submap, SubmapStore
 from sigmasplat.render.view import View
@@ -92,7 +91,7 @@ class Registrar:
         """Localise a keyframe of `own` in `other`: align from the expected pose and from the poses of similar
         keyframes, then refine the best one by gradient descent on the uncertainty-weighted loss with exposure."""
         T_own_camera, params = own.T_submap_camera[keyframe], other.field.params.to(self.view.sums.device)
-        target, live = self._laid_out(own, keyframe)
+        target, live = picture_images(self.view, self.store.picture(own.index, keyframe), own.camera)
         expected = se3.inverse(T_own_camera) @ T_own_other
         guesses = [expected, *(se3.inverse(other.T_submap_camera[k]) for k in alike)]
         fit = max((self._aligned(params, live, guess) for guess in guesses), key=score)
@@ -119,11 +118,6 @@ class Registrar:
 
     def _known(self, submap: Submap, keyframe: int) -> KnownKeyframe:
         return KnownKeyframe(self.store.picture(submap.index, keyframe), submap.T_submap_camera[keyframe])
-
-    def _laid_out(self, submap: Submap, keyframe: int) -> tuple[Target, Pyramid]:
-        picture = self.store.picture(submap.index, keyframe)
-        target = Target.of_picture(picture, submap.camera, (self.view.sums.shape[1], self.view.sums.shape[2]))
-        return target, live_image(self.view, picture.unit_color, picture.depth_m, target)
 
     def _aligned(self, params: Tensor, live: Pyramid, guess: Matrix) -> PoseFit:
         """Align a keyframe to the map rendered at a guess, then again to the map rendered at the result."""
