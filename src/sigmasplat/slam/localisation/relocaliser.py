@@ -173,12 +173,11 @@ class Relocaliser:
             return
         guess = found.T_live_reference @ se3.inverse(keyframe.T_submap_camera)
         _, pyramid = picture_images(view, keyframe.picture, view.camera)
-        own = Reference(pyramid, se3.inverse(keyframe.T_submap_camera))
-        shown = FoundKeyframe(own, keyframe.image(view.camera))
-        yield Relocation(where, shown, found.inliers, *aligned(own, seen, guess, self.config.tracking))
+        own = FoundKeyframe(pyramid, se3.inverse(keyframe.T_submap_camera), keyframe.image(view.camera))
+        yield Relocation(where, own, found.inliers, *aligned(own, seen, guess, self.config.tracking))
         params = known.splats(where[0]).params.to(view.sums.device)
         rendered = map_reference(params, view, guess, self.config.tracking)
-        yield Relocation(where, shown, found.inliers, *aligned(rendered, seen, guess, self.config.tracking))
+        yield Relocation(where, own, found.inliers, *aligned(rendered, seen, guess, self.config.tracking))
 
 
 def aligned(

@@ -48,10 +48,9 @@ def observe(whole: Frame, working: Frame, view: View, config: Config, extractor:
     return Observation(target, live, image, frame=working)
 
 
-@dataclass(frozen=True, eq=False)
-class FoundKeyframe:
-    """A keyframe of the map that shows what the camera sees: its own image as a reference, with its pose in its submap,
-    and its image for features."""
+@dataclass(eq=False)
+class FoundKeyframe(Reference):
+    """A keyframe of the map that shows what the camera sees: a reference with its pose in its submap, and its image for
+    features."""
 
-    reference: Reference
     image: FeatureImage
