@@ -276,7 +276,7 @@ def test_sigma_adds_to_fast_and_removes_nothing() -> None:
     added = changed_settings(sigma, fast)
     uncertainty = {"mapping.iterations", "mapping.weight_moment", "primitives.uncertain_m2"}
     assert added == uncertainty | {
-        "tracking.features", "tracking.verify",
+        "input.denoise_depth", "tracking.features", "tracking.verify",
         "recovery.relocalise", "recovery.new_map_after", "recovery.steady_frames",
     }  # fmt: skip
     assert sigma.mapping.weight_nll_color == fast.mapping.weight_nll_color > 0

@@ -15,6 +15,7 @@ from sigmasplat.slam.localisation.verdict import (
     is_better,
     is_questionable,
     score,
+    stands,
 )
 
 GOOD = Comparison(common=0.85, close=0.98, front=0.01, behind=0.01, residual=0.3, correlation=0.95)
@@ -124,3 +125,11 @@ def test_a_leap_is_far_from_where_a_camera_that_moves_as_usual_can_be() -> None:
 def test_texture_counts_in_the_score_where_there_is_texture() -> None:
     assert score(replace(GOOD, correlation=0.3)) < 0.5 * score(GOOD) < score(FLAT)
     assert score(replace(GOOD, correlation=-0.5)) == 0.0
+
+
+def test_a_doubtful_pose_stands_only_after_a_search_and_if_the_surfaces_confirm_it() -> None:
+    blurred = replace(GOOD, correlation=0.75)
+    assert not confirmed(blurred)
+    assert not stands(blurred, PATIENCE) and stands(blurred, PATIENCE + 1)
+    for wrong in (THROUGH, OBJECT, NOTHING, replace(blurred, residual=5.0), replace(GOOD, correlation=0.5)):
+        assert not stands(wrong, PATIENCE + 1)

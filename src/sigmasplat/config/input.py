@@ -54,6 +54,8 @@ class InputConfig:
     """Smaller depth readings are ignored: below its range a sensor returns noise."""
     max_depth_m: float = 8.0
     """Larger depth readings are ignored: their errors grow with the square of the depth."""
+    denoise_depth: bool = False
+    """Whether depth images that are noisier than those of a structured-light sensor are smoothed."""
 
     def __post_init__(self) -> None:
         if self.stride < 1 or self.limit < 0:

@@ -8,6 +8,7 @@ from sigmasplat.presets import varsplat
 # The window: a map with loops to close must keep older parts. The median-depth loss: it brings nothing in addition to
 # U, and costs an eighth of the speed. There are fewer iterations, to compensate for the cost of U.
 SIGMA = varsplat.FAST.changed(
+    input={"denoise_depth": True},
     mapping={"iterations": 15, "weight_moment": 0.1},
     tracking={"features": True, "verify": True},
     recovery={"relocalise": True, "new_map_after": 20, "steady_frames": 2},

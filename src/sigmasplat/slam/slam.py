@@ -19,7 +19,7 @@ from sigmasplat.slam.localisation.known_map import KnownMap
 from sigmasplat.slam.localisation.recovery import Link, usable
 from sigmasplat.slam.localisation.relocaliser import INDEX_AT_MOST, Relocation, sight_of
 from sigmasplat.slam.localisation.sight import Observation, Sight, observe, working_frame
-from sigmasplat.slam.localisation.verdict import is_better, is_questionable
+from sigmasplat.slam.localisation.verdict import is_better, is_questionable, stands
 from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.rules import ends_submap, is_keyframe
@@ -114,8 +114,7 @@ class Slam(World):
         self.recovery.count(lost, self.tracker.doubtful > 0, seen)
         found = Found.of(fit, se3.inverse(fit.T_camera_world), lost)
         if not lost:
-            certain = self.recovery.is_steady and not (self.config.tracking.verify and self.tracker.doubtful > 0)
-            found.mapped = certain and self._is_keyframe(fit.overlap)
+            found.mapped = self.recovery.is_steady and self._is_certain(fit) and self._is_keyframe(fit.overlap)
             if found.mapped and self._cuts:
                 found.tracking["drift_m"] = self._add_drift(fit, seen)
             self._question(fit, seen, found)
@@ -129,6 +128,11 @@ class Slam(World):
         """Fit the frame's pose to the active submap."""
         with self._timer.stage("track"), self._timer.kernels_of(self.view, "track_kernels"):
             return self.tracker.track(self.mapper.field, self.view, seen)
+
+    def _is_certain(self, fit: PoseFit) -> bool:
+        """Return whether a pose may be used for mapping."""
+        doubtful = self.tracker.doubtful if self.config.tracking.verify else 0
+        return not doubtful or (fit.comparison is not None and stands(fit.comparison, doubtful))
 
     def _is_keyframe(self, overlap: float) -> bool:
         c = self.config.mapping

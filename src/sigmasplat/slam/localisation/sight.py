@@ -1,6 +1,6 @@
 """One frame, or one keyframe of the map, in the forms that tracking needs."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from sigmasplat.config import Config
 from sigmasplat.fit.pyramid import Pyramid
@@ -10,6 +10,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
+from sigmasplat.slam.localisation.denoise import denoised
 from sigmasplat.slam.localisation.feature_image import FeatureImage, detail_of
 
 
@@ -30,12 +31,13 @@ class Observation(Sight):
 
 
 def working_frame(frame: Frame, config: Config, camera: Camera | None = None) -> Frame:
-    """Return a frame at working size; if `camera` is given and differs, the frame is resampled to it."""
+    """Return a frame at working size, with depth denoised if the settings say so; if `camera` is given and differs, the
+    frame is resampled to it."""
     i = config.input
     working = frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px)
-    if camera is None or working.camera == camera:
-        return working
-    return frame.seen_by(camera).prepared(0, i.min_depth_m, i.max_depth_m)
+    if camera is not None and working.camera != camera:
+        working = frame.seen_by(camera).prepared(0, i.min_depth_m, i.max_depth_m)
+    return replace(working, depth_m=denoised(working.depth_m)) if i.denoise_depth else working
 
 
 def observe(whole: Frame, working: Frame, view: View, config: Config, extractor: Extractor | None) -> Observation:

@@ -37,6 +37,9 @@ DOUBT_SCORE = 0.7
 """Doubtful: the score falls below this share of the usual one."""
 PATIENCE = 3
 """Number of doubtful frames in a row after which the whole map is searched."""
+STANDS_CORRELATION = 0.7
+"""A doubtful pose stands if the map has been searched without success, and if the map confirms the pose with this
+correlation: blur and exposure lower the correlation at right poses too."""
 BETTER = 0.1
 """A pose from the whole map replaces a doubtful one if its score is higher by this."""
 
@@ -53,7 +56,7 @@ def score(c: Comparison) -> float:
     return c.common * c.close * explained(c) * texture
 
 
-def confirmed(c: Comparison) -> bool:
+def confirmed(c: Comparison, least_correlation: float = LEAST_CORRELATION) -> bool:
     """Return whether the map confirms a pose without any knowledge of the camera's path."""
     return (
         c.common >= LEAST_COMMON
@@ -61,13 +64,19 @@ def confirmed(c: Comparison) -> bool:
         and c.covered >= LEAST_COMMON
         and explained(c) >= LEAST_EXPLAINED
         and c.residual <= MOST_RESIDUAL
-        and not c.correlation < LEAST_CORRELATION
+        and not c.correlation < least_correlation
     )
 
 
 def is_questionable(doubtful: int) -> bool:
     """Return whether the whole map is searched after this number of doubtful frames in a row."""
     return doubtful > 0 and doubtful % PATIENCE == 0
+
+
+def stands(c: Comparison, doubtful: int) -> bool:
+    """Return whether a pose is used for mapping after this number of doubtful frames in a row: the whole map has been
+    searched and has no better one."""
+    return doubtful > PATIENCE and confirmed(c, STANDS_CORRELATION)
 
 
 def is_better(c: Comparison, doubtful: Comparison) -> bool:
