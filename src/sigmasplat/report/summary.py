@@ -151,6 +151,10 @@ def _lost(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | No
     if stride > 1:
         words = f"Tracking was lost, and the run used one image in {stride}. Use all images:"
         return words, f"{again} --stride 1"
+    tracking = settings.get("tracking") or {}
+    if not tracking.get("features", True):
+        words = "Tracking was lost, and sparse features are off. They help where the camera moves fast:"
+        return words, f"{again} --set tracking.features=true"
     every = max((settings.get("mapping") or {}).get("every", 1) // 2, 1)
     return (
         "Tracking was lost: the camera moved too fast, or saw only a bare wall. Map more often; if this does not help, "

@@ -15,13 +15,12 @@ from sigmasplat.io.trajectory import write_trajectory
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.render.backend import make_view
 from sigmasplat.run.finished_map import FinishedMap
 from sigmasplat.slam.features import make_extractor
 from sigmasplat.slam.localisation.known_map import KnownMap
 from sigmasplat.slam.localisation.recovery import usable
 from sigmasplat.slam.localisation.relocaliser import Relocaliser, Relocation, SearchResult
-from sigmasplat.slam.localisation.sight import observe, working_frame
+from sigmasplat.slam.localisation.sight import observe, view_of, working_frame
 from sigmasplat.types import Matrix
 
 FOUND, APART, NOT_FOUND = "found", "apart", "not found"
@@ -72,8 +71,7 @@ class Localiser:
         """Prepare the search. Raises ConfigError if the packages of the features are not installed."""
         self.finished, self.config = finished, config
         self.extractor = make_extractor(config.features)
-        learned = bool(config.mapping.weight_nll_color or config.mapping.weight_nll_depth)
-        self.view = make_view(config.backend, finished.camera, config.render, variance=learned)
+        self.view = view_of(finished.camera, config)
         self.relocaliser = Relocaliser(config, self.extractor)
         self.known = KnownMap(finished.store, finished.keyframe_poses, (), GaussianField.empty())
 

@@ -10,6 +10,9 @@ from sigmasplat.types import Matrix
 
 HOP_M, HOP_RAD = 0.002, 0.002
 """Standard deviation added per hop: the estimated covariance contains noise but no bias."""
+FLOOR = np.diag(np.repeat([0.005**2, 0.003**2], 3))
+"""Minimum covariance of a pose between two maps, or in another map, m² and rad²: two maps of the same wall differ by
+about this much."""
 UNKNOWN = np.diag([1.0] * 6)
 """Covariance of a hop between images without overlap, m² and rad²."""
 BIAS = 0.02

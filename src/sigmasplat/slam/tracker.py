@@ -217,7 +217,7 @@ class Tracker:
 
     def move_to(self, field: GaussianField, view: View, keyframe: FoundKeyframe, T_world_camera: Matrix) -> None:
         """Continue at another pose, with a keyframe as the reference of the next frames."""
-        self.previous, self.velocity = T_world_camera, np.eye(4)
+        self.previous, self.velocity, self.lost = T_world_camera, np.eye(4), False
         self.keyframe = keyframe_reference(field.params, view, keyframe.pyramid, keyframe.T_camera_world, self.config)
         self.keyframe_features = keyframe.image.weighed(self.keyframe.weights)
 

@@ -14,7 +14,6 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.model.submap import MemoryStore, SubmapStore
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, preset
-from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
 from sigmasplat.slam.checkpoint import checkpoint_of
 from sigmasplat.slam.drift import Drift
@@ -22,6 +21,7 @@ from sigmasplat.slam.features import make_extractor
 from sigmasplat.slam.localisation.confidence import Confidence
 from sigmasplat.slam.localisation.recovery import Recovery
 from sigmasplat.slam.localisation.relocaliser import Relocaliser
+from sigmasplat.slam.localisation.sight import view_of
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.merged import components_apart, merged_field
@@ -107,10 +107,7 @@ class World:
     def prepare(self, camera: Camera, resample: bool = False) -> View:
         """Make the view for the images of a camera with the size of `Frame.prepared`. The first frame calls this
         too. With `resample`, frames of another camera are accepted and resampled to this one."""
-        self._resample, c = resample, self.config
-        learned = bool(c.mapping.weight_nll_color or c.mapping.weight_nll_depth)
-        read = c.tracking.uncertainty and c.tracking.align_depth_by == "V"
-        self._view = make_view(c.backend, camera, c.render, variance=learned or read)
+        self._resample, self._view = resample, view_of(camera, self.config)
         return self._view
 
     @property

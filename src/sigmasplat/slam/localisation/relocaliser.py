@@ -16,7 +16,7 @@ from sigmasplat.fit.pose import PoseFit, fit_pose_align
 from sigmasplat.fit.references import Reference, map_reference, picture_images
 from sigmasplat.model import se3
 from sigmasplat.render.view import View
-from sigmasplat.slam.drift import symmetric
+from sigmasplat.slam.drift import FLOOR, symmetric
 from sigmasplat.slam.features import Extractor, Features, Landmarks, matches_by_descriptor
 from sigmasplat.slam.localisation.feature_image import pose_by_features
 from sigmasplat.slam.localisation.known_map import KnownKeyframe, KnownMap, Where
@@ -31,9 +31,6 @@ INDEX_AT_MOST = 25
 """Maximum number of keyframes whose features are found per call: 25 take about a second."""
 KEPT_LANDMARKS = 64
 """Number of keyframes whose complete landmarks stay in memory, half a megabyte each."""
-FLOOR_M, FLOOR_RAD = 0.005, 0.003
-"""Minimum standard deviation of a pose that was found."""
-FLOOR = np.diag(np.repeat([FLOOR_M**2, FLOOR_RAD**2], 3))
 UNKNOWN = np.eye(6)
 """Covariance of a pose without an estimate, m² and rad²."""
 ENOUGH = 0.5

@@ -8,6 +8,7 @@ from sigmasplat.fit.references import Reference, live_image
 from sigmasplat.fit.target import Target
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
+from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.denoise import denoised
@@ -28,6 +29,14 @@ class Observation(Sight):
     """A frame in the forms that tracking and mapping need."""
 
     frame: Frame = field(kw_only=True)
+
+
+def view_of(camera: Camera, config: Config) -> View:
+    """Make the view for working images of a camera, with planes for σ² if the run learns it or weighs by it."""
+    mapping, tracking = config.mapping, config.tracking
+    learned = bool(mapping.weight_nll_color or mapping.weight_nll_depth)
+    read = tracking.uncertainty and tracking.align_depth_by == "V"
+    return make_view(config.backend, camera, config.render, variance=learned or read)
 
 
 def working_frame(frame: Frame, config: Config, camera: Camera | None = None) -> Frame:

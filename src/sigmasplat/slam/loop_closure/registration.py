@@ -18,7 +18,7 @@ from sigmasplat.fit.references import map_reference, picture_images
 from sigmasplat.model import se3
 from sigmasplat.model.submap import Submap, SubmapStore
 from sigmasplat.render.view import View
-from sigmasplat.slam.drift import symmetric
+from sigmasplat.slam.drift import FLOOR, symmetric
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.feature_image import pose_by_features
 from sigmasplat.slam.localisation.known_map import KnownKeyframe
@@ -26,8 +26,6 @@ from sigmasplat.slam.localisation.verdict import confirmed
 from sigmasplat.slam.loop_closure.candidates import SubmapPair
 from sigmasplat.types import Matrix
 
-FLOOR_M, FLOOR_RAD = 0.005, 0.003
-"""Minimum standard deviation of a registration: two maps of the same wall differ by about this much."""
 HOPELESS = 0.5
 """If alignment explains less than this share of `share_least`, the keyframe is not refined further."""
 DOUBTFUL = 0.6
@@ -219,8 +217,7 @@ def information(found: Sequence[Localisation], mean: Matrix) -> Matrix:
     """
     twists = np.stack([se3.log(f.T_a_b @ se3.inverse(mean)) for f in found])
     covariance = np.mean([f.covariance for f in found], 0) + twists.T @ twists / len(found)
-    floor = np.diag(np.repeat([FLOOR_M**2, FLOOR_RAD**2], 3))
-    return symmetric(np.asarray(np.linalg.inv(symmetric(covariance) + floor), np.float64))
+    return symmetric(np.asarray(np.linalg.inv(symmetric(covariance) + FLOOR), np.float64))
 
 
 def shared(a: Submap, b: Submap, T_a_b: Matrix, distance_m: float) -> float:
