@@ -1,11 +1,14 @@
 """A gyroscope: angular velocities integrate to rotations between any two times, and frames carry the rotation."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sigmasplat.checks.recording import inspect_source
+from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
@@ -112,6 +115,7 @@ def test_gyroscope_txt_gives_each_frame_its_rotation(tiny_tum):
     # The camera turns right (about y, down): what was ahead is then on its left.
     assert (R.T @ [0, 0, 1])[0] < 0
     assert third.R_inertial_camera is not None and fourth.R_inertial_camera is None
+    assert ("gyroscope", "measured 3 of 4 sampled frames") in inspect_source(tiny_tum, InputConfig()).rows
 
 
 def test_the_rotation_spans_the_frames_that_are_left_out(tiny_tum):
@@ -121,7 +125,7 @@ def test_the_rotation_spans_the_frames_that_are_left_out(tiny_tum):
         frames = list(open_source(tiny_tum, **settings))
         assert [f.timestamp_s for f in frames] == pytest.approx(times_s)
         angles = {0.0: 0.0, 0.2: 0.45, 0.3: 0.85}
-        for a, b in zip(frames, frames[1:], strict=False):
+        for a, b in pairwise(frames):
             turned = se3.rotation_angle(a.R_inertial_camera.T @ b.R_inertial_camera)
             assert turned == pytest.approx(angles[b.timestamp_s] - angles[a.timestamp_s])
 

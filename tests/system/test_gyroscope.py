@@ -1,4 +1,4 @@
-"""A gyroscope in the whole system: it holds tracking through quick turns, and it changes nothing where it is missing."""
+"""A gyroscope in the whole system: it holds tracking in quick turns and in the dark, and a wrong one does no harm."""
 
 from dataclasses import replace
 from functools import cache
@@ -40,7 +40,7 @@ def shaken(i: int) -> Frame:
 
 
 def measured(i: int) -> Frame:
-    """Return a frame with the rotation that a gyroscope measures, 1° off."""
+    """Return a frame with the rotation that a gyroscope measures, about 1° off."""
     error = Rotation.from_rotvec(np.deg2rad(np.random.default_rng(i).normal(0, 0.6, 3))).as_matrix()
     return replace(shaken(i), R_inertial_camera=rotation(90.0) @ rotation(YAW_DEG[i]) @ error)
 
