@@ -187,7 +187,7 @@ class Tracker:
         """Align the last image to this one and return T_world_camera; None if this fails too."""
         if self.last_image is None or (self.config.method == "adam" and not fits_of(view).aligns):
             return None  # alignment needs the compiled kernels
-        guesses = (se3.inverse(expected.motion), expected.turn.T)  # without translation, the transpose is the inverse
+        guesses = (se3.inverse(expected.motion), expected.turn.T.copy())  # the inverse, because it has no translation
         found = [
             align(self.last_image, live, g, 2 * self.config.align_iterations, self.config.align_weight_color)
             for g in guesses
