@@ -58,6 +58,7 @@ def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPL
         *_depth_rows(source, frames, settings),
         ("colour–depth alignment", "unknown: no outlines in depth" if agreement is None else agreement.sentence()),
         ("poses", source.described_truth() or "none: the error of the path cannot be measured"),
+        *_gyroscope_rows(frames),
         ("skipped", f"{len(source.skipped)} files (first: {source.skipped[0]})" if source.skipped else "nothing"),
         ("suggested preset", _suggested(format_.name)),
     ]
@@ -109,6 +110,12 @@ def _depth_rows(source: Source, frames: list[Frame], settings: InputConfig) -> l
         ("depth camera", _depth_camera(source, settings)),
         *_scale_question(middle, settings),
     ]
+
+
+def _gyroscope_rows(frames: list[Frame]) -> list[tuple[str, str]]:
+    """Return how many of the sampled frames have a rotation measured by a gyroscope, no row if none has."""
+    measured = sum(frame.R_inertial_camera is not None for frame in frames)
+    return [("gyroscope", f"measured {measured} of {len(frames)} sampled frames")] if measured else []
 
 
 def _depth_camera(source: Source, settings: InputConfig) -> str:

@@ -1,13 +1,15 @@
 """One RGB-D image: immutable, checked on construction, without ground truth."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from sigmasplat.errors import SourceError
+from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.types import Matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +28,10 @@ class Frame:
     """One image of colour and depth.
 
     color: float32 [H, W, 3] in [0, 1]; depth_m: float32 [H, W] along the optical axis in metres, 0 = no reading;
-    camera: the pinhole of both; timestamp_s: seconds; index: position in the source. Raises SourceError on inconsistent
-    shapes, values that are not finite, or negative depth.
+    camera: the pinhole of both; timestamp_s: seconds; index: position in the source; R_inertial_camera [3, 3]: rotation
+    from the camera's axes to fixed axes, the same for all frames, measured by a gyroscope; None = not measured. Only
+    the rotation between two frames is used, so any fixed axes will do. Raises SourceError on inconsistent shapes,
+    values that are not finite, negative depth, or a matrix that is not a rotation.
     """
 
     index: int
@@ -35,6 +39,7 @@ class Frame:
     color: NDArray[np.float32]
     depth_m: NDArray[np.float32]
     camera: Camera
+    R_inertial_camera: Matrix | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)
@@ -48,6 +53,10 @@ class Frame:
                 raise SourceError(f"frame {self.index}: {name} holds NaN or inf; write 0 where there is no reading")
         if float(self.depth_m.min(initial=0.0)) < 0.0:
             raise SourceError(f"frame {self.index}: depth is negative ({self.depth_m.min():.3f} m); 0 means no reading")
+        if self.R_inertial_camera is not None and not se3.is_rotation(self.R_inertial_camera):
+            raise SourceError(
+                f"frame {self.index}: R_inertial_camera is not a rotation [3, 3]; give None if it is not measured"
+            )
         self.color.setflags(write=False)
         self.depth_m.setflags(write=False)
 
@@ -55,13 +64,8 @@ class Frame:
         """Return the frame at another size: colour averaged over the pixel's area, depth by `resized_depth`."""
         if (width, height) == (self.camera.width, self.camera.height):
             return self
-        return Frame(
-            self.index,
-            self.timestamp_s,
-            resized_color(self.color, width, height),
-            resized_depth(self.depth_m, width, height),
-            self.camera.resized(width, height),
-        )
+        color, depth_m = resized_color(self.color, width, height), resized_depth(self.depth_m, width, height)
+        return replace(self, color=color, depth_m=depth_m, camera=self.camera.resized(width, height))
 
     def prepared(self, width: int, min_depth_m: float, max_depth_m: float, crop_px: int = 0) -> "Frame":
         """Return the working frame: the size of `Camera.prepared`, and depth 0 outside the range.
@@ -76,7 +80,7 @@ class Frame:
         if keep.all() and not crop_px:
             return small
         color = np.ascontiguousarray(small.color[inner])
-        return Frame(self.index, self.timestamp_s, color, np.where(keep, depth, np.float32(0.0)), camera)
+        return replace(self, color=color, depth_m=np.where(keep, depth, np.float32(0.0)), camera=camera)
 
     def seen_by(self, camera: Camera) -> "Frame":
         """Return the frame as a camera with other intrinsics at the same pose sees it: a homography, exact for depth.
@@ -93,7 +97,7 @@ class Frame:
         read = ((v >= 0) & (v < size[1]))[:, None] & (u >= 0) & (u < size[0])
         depth = self.depth_m[np.clip(v, 0, size[1] - 1)][:, np.clip(u, 0, size[0] - 1)]
         color, depth = np.ascontiguousarray(color.swapaxes(0, 1)), np.where(read, depth, np.float32(0.0))
-        return Frame(self.index, self.timestamp_s, color, depth, camera)
+        return replace(self, color=color, depth_m=depth, camera=camera)
 
 
 def _interpolated(color: NDArray[np.float32], rows: NDArray[np.float64]) -> NDArray[np.float32]:

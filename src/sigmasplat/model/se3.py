@@ -178,7 +178,16 @@ def is_rigid(T: Matrix, tolerance: float = 1e-3) -> bool:
     return bool(
         T.shape == (4, 4)
         and np.isfinite(T).all()
-        and np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < tolerance
-        and np.linalg.det(T[:3, :3]) > 0
+        and is_rotation(T[:3, :3], tolerance)
         and np.abs(T[3] - [0, 0, 0, 1]).max() < tolerance
+    )
+
+
+def is_rotation(R: Matrix, tolerance: float = 1e-3) -> bool:
+    """Return whether a 3×3 matrix is a rotation: finite, orthonormal with determinant +1."""
+    return bool(
+        R.shape == (3, 3)
+        and np.isfinite(R).all()
+        and np.abs(R @ R.T - np.eye(3)).max() < tolerance
+        and np.linalg.det(R) > 0
     )

@@ -94,7 +94,7 @@ class Slam(World):
                 f"frame {seen.frame.index} has no depth reading in [{self.config.input.min_depth_m}, "
                 f"{self.config.input.max_depth_m}] m to start a map from; check the depth scale or start at a later one"
             )
-        self.tracker.start(seen)
+        self.tracker.start(seen, seen.frame.R_inertial_camera)
         place = self._relocalise(seen, index_at_most=None) if self.atlas.anchors else None
         if place is None:
             self._begin_component()
@@ -127,7 +127,7 @@ class Slam(World):
     def _track(self, seen: Observation) -> PoseFit:
         """Fit the frame's pose to the active submap."""
         with self._timer.stage("track"), self._timer.kernels_of(self.view, "track_kernels"):
-            return self.tracker.track(self.mapper.field, self.view, seen)
+            return self.tracker.track(self.mapper.field, self.view, seen, seen.frame.R_inertial_camera)
 
     def _is_certain(self, fit: PoseFit) -> bool:
         """Return whether a pose may be used for mapping."""

@@ -30,12 +30,28 @@ WIDE = 0.065
 convergence of alignment ends near there."""
 
 
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """Expected motion and pose of the camera, known before its image is used.
+
+    motion: T_previous_camera with constant velocity; turn: T_previous_camera without translation; predicted:
+    T_world_camera, the first guess; last: T_world_camera, the last pose. If a gyroscope measured the rotation since the
+    last frame (`measured`), this rotation is part of all four.
+    """
+
+    motion: Matrix
+    turn: Matrix
+    predicted: Matrix
+    last: Matrix
+    measured: bool
+
+
 @dataclass(eq=False)
 class Tracker:
     """Keeps the last pose, the velocity, the last image, the reference keyframe, and statistics of recent fits.
 
-    lost: tracking of the last frame failed; doubtful: number of frames in a row whose best pose the images
-    contradict (`_contradicted`).
+    R_inertial_camera: that of the last frame; lost: tracking of the last frame failed; doubtful: number of frames in a
+    row whose best pose the images contradict (`_contradicted`).
     """
 
     config: TrackingConfig
@@ -49,28 +65,31 @@ class Tracker:
     agreements: list[float] = dataclass_field(default_factory=list)
     first_losses: list[float] = dataclass_field(default_factory=list)
     usual: Usual = dataclass_field(default_factory=Usual)
+    R_inertial_camera: Matrix | None = None
     lost: bool = False
     doubtful: int = 0
     started: bool = False
     """Whether a frame has been tracked yet."""
 
-    def start(self, seen: Sight) -> None:
-        """Fix the gauge: the first camera is the world."""
-        self.last_image, self.last_features = seen.live, seen.image
+    def start(self, seen: Sight, R_inertial_camera: Matrix | None = None) -> None:
+        """Fix the gauge: the first camera is the world. R_inertial_camera: as in `Frame`."""
+        self.last_image, self.last_features, self.R_inertial_camera = seen.live, seen.image, R_inertial_camera
 
-    def track(self, field: GaussianField, view: View, seen: Sight) -> PoseFit:
+    def track(self, field: GaussianField, view: View, seen: Sight, R_inertial_camera: Matrix | None = None) -> PoseFit:
         """Estimate T_camera_world of a frame; `self.lost` then says whether tracking failed.
 
-        A lost frame gets the best available guess (odometry, else the last pose), and the velocity is reset.
+        R_inertial_camera: as in `Frame`. A lost frame gets the best available guess (odometry, else the last pose), and
+        the velocity is reset.
         """
-        predicted = self.previous @ self.velocity if self.config.motion_model else self.previous
-        best = self._fit(field, view, seen, predicted)
+        expected = self._expected(R_inertial_camera)
+        best = self._fit(field, view, seen, expected.predicted)
         if self._is_wide(best, view) or self._doubts(best):
-            guesses = [self._fit(field, view, seen, guess) for guess in self._guesses_by_features(seen)]
+            guesses = [self._fit(field, view, seen, guess) for guess in self._other_guesses(seen, expected)]
             best = max([best, *guesses], key=self._score)
         if self._doubts(best):
-            best = self._retry(field, view, seen, best)
-        self.lost = self._is_lost(best) or self._leaps(best, predicted)
+            best = self._retry(field, view, seen, best, expected)
+        self.R_inertial_camera = R_inertial_camera
+        self.lost = self._is_lost(best) or self._leaps(best, expected.predicted)
         self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
         self._remember(best, seen)
@@ -91,6 +110,15 @@ class Tracker:
         self.last_image, self.last_features, self.started = seen.live, seen.image, True
 
     # ---- guesses ----
+
+    def _expected(self, R_inertial_camera: Matrix | None) -> Expected:
+        """Predict the pose by constant velocity; with a gyroscope, its rotation replaces that of the velocity."""
+        motion, turn, last, measured = self.velocity, np.eye(4), self.previous, False
+        if self.R_inertial_camera is not None and R_inertial_camera is not None:
+            motion, measured = motion.copy(), True
+            motion[:3, :3] = turn[:3, :3] = self.R_inertial_camera.T @ R_inertial_camera
+            last = last @ turn
+        return Expected(motion, turn, self.previous @ motion if self.config.motion_model else last, last, measured)
 
     def _fit(self, field: GaussianField, view: View, seen: Sight, guess: Matrix, patience: int = 1) -> PoseFit:
         """Fit from an initial T_world_camera; patience: factor on the number of iterations of gradient descent."""
@@ -118,6 +146,12 @@ class Tracker:
                 return found
         return reference.compared(live, T_camera_world)
 
+    def _other_guesses(self, seen: Sight, expected: Expected) -> Iterator[Matrix]:
+        """Yield T_world_camera by features, and by constant velocity alone if a gyroscope changed the first guess."""
+        yield from self._guesses_by_features(seen)
+        if expected.measured:
+            yield self.previous @ self.velocity if self.config.motion_model else self.previous
+
     def _guesses_by_features(self, seen: Sight) -> Iterator[Matrix]:
         """Yield T_world_camera by features of the newest keyframe and of the last image, where they give a pose."""
         if self.extractor is None or seen.image is None:
@@ -132,13 +166,13 @@ class Tracker:
             if found is not None:
                 yield self.previous @ se3.inverse(found.T_live_reference)
 
-    def _retry(self, field: GaussianField, view: View, seen: Sight, fit: PoseFit) -> PoseFit:
+    def _retry(self, field: GaussianField, view: View, seen: Sight, fit: PoseFit, expected: Expected) -> PoseFit:
         """Retry from odometry with twice the iterations (VarSplat §3), and from the last pose; return the best fit.
 
         With alignment, also try the map rendered at these poses: it contains more than the newest keyframe.
         """
-        odometry = self._odometry(view, seen.live)
-        starts = [self.previous] if odometry is None else [odometry, self.previous]
+        odometry = self._odometry(view, seen.live, expected)
+        starts = [expected.last] if odometry is None else [odometry, expected.last]
         fits = [fit] + [self._fit(field, view, seen, s, 2) for s in starts]
         if self.config.method == "align" and self.config.align_to == "keyframe":  # with "map", `_fit` has tried it
             for start in starts:
@@ -149,11 +183,11 @@ class Tracker:
             best.T_camera_world = se3.inverse(starts[0])
         return best
 
-    def _odometry(self, view: View, live: Pyramid) -> Matrix | None:
+    def _odometry(self, view: View, live: Pyramid, expected: Expected) -> Matrix | None:
         """Align the last image to this one and return T_world_camera; None if this fails too."""
         if self.last_image is None or (self.config.method == "adam" and not fits_of(view).aligns):
             return None  # alignment needs the compiled kernels
-        guesses = (se3.inverse(self.velocity), np.eye(4))
+        guesses = (se3.inverse(expected.motion), expected.turn.T.copy())  # the inverse, because it has no translation
         found = [
             align(self.last_image, live, g, 2 * self.config.align_iterations, self.config.align_weight_color)
             for g in guesses

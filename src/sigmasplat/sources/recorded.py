@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.frame import Frame, resized_color
+from sigmasplat.model.gyroscope import Gyroscope
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
 from sigmasplat.sources.camera.calibration import Calibration
@@ -60,11 +61,13 @@ class RecordedSource(Source):
         truth: Trajectory | None = None,
         skipped: Sequence[str] = (),
         test: Source | None = None,
+        gyroscope: Gyroscope | None = None,
     ) -> None:
         """Store image pairs in order of time; `truth` is the path of the colour camera; `skipped` lists files left out.
 
-        test: separate test views.
-        Raises SourceError if the first images do not match the calibration, or no image has a depth reading.
+        test: separate test views; gyroscope: in the axes of the colour camera.
+        Raises SourceError if the first images do not match the calibration, no image has a depth reading, or no image
+        was taken while the gyroscope measured.
         """
         self._rectified = Rectification(name, calibration, settings)
         super().__init__(name, self._rectified.camera, settings.strict)
@@ -72,8 +75,9 @@ class RecordedSource(Source):
         self.depth_registered = self._rectified.moves_depth
         self.registrable = calibration.depth_camera is not None
         self.skipped = list(skipped)
-        self._images, self._truth, self._test = images, truth, test
+        self._images, self._truth, self._test, self._gyroscope = images, truth, test, gyroscope
         self._refuse_sizes_of_first()
+        self._refuse_other_clock()
         refuse_without_depth(self)
 
     def __len__(self) -> int:
@@ -91,7 +95,8 @@ class RecordedSource(Source):
         check_image_sizes(self._rectified, files.color, color.shape[1::-1], files.depth, depth_m.shape[::-1])
         color, depth_m = self._rectified(color, depth_m)
         color = resized_color(color, self.camera.width, self.camera.height)
-        return Frame(i, files.timestamp_s, color, depth_m, self.camera)
+        R_inertial_camera = None if self._gyroscope is None else self._gyroscope.R_inertial_camera(files.timestamp_s)
+        return Frame(i, files.timestamp_s, color, depth_m, self.camera, R_inertial_camera)
 
     def depth_of(self, i: int) -> NDArray[np.float32]:
         """Read the depth of frame i as `frame` does, without reading colour."""
@@ -112,6 +117,17 @@ class RecordedSource(Source):
         """Raise SourceError before a run if the image sizes do not match the calibration."""
         files, (size, depth_size) = first_readable(self._images, lambda pair: (pair, pair.sizes()))
         check_image_sizes(self._rectified, files.color, size, files.depth, depth_size)
+
+    def _refuse_other_clock(self) -> None:
+        """Raise SourceError before a run if the gyroscope measured at another time than the images were taken."""
+        if self._gyroscope is None:
+            return
+        first_s, last_s = self._gyroscope.timestamps_s[[0, -1]]
+        if not any(first_s <= pair.timestamp_s <= last_s for pair in self._images):
+            raise SourceError(
+                f"{self.name}: the gyroscope measured from {first_s:.3f} to {last_s:.3f} s, but the images were taken "
+                f"from {self._images[0].timestamp_s:.3f} to {self._images[-1].timestamp_s:.3f} s; use the same clock"
+            )
 
 
 def first_size(paths: Sequence[Path]) -> tuple[int, int]:

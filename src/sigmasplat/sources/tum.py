@@ -2,6 +2,7 @@
 
 rgb.txt  depth.txt  groundtruth.txt     lines of "t path" or "t tx ty tz qx qy qz qw", comments after #
 calibration.json                        optional: fx fy cx cy width height depth_scale [distortion]
+gyroscope.txt                           optional: "t wx wy wz", rad/s about the camera's x, y, z (right, down, forward)
 """
 
 import json
@@ -18,6 +19,7 @@ from sigmasplat.errors import RunError, SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.gyroscope import Gyroscope
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
 from sigmasplat.sources.camera.calibration import (
@@ -39,7 +41,8 @@ def open_tum(
     camera: Calibration | None = None,
     camera_path: Callable[[Trajectory], Trajectory] | None = None,
 ) -> RecordedSource:
-    """Open a folder. Raises SourceError if its lists, images, calibration or ground-truth poses cannot be used.
+    """Open a folder. Raises SourceError if its lists, images, calibration, ground-truth poses or gyroscope cannot be
+    used.
 
     camera: the calibration, if it does not follow from the folder's name;
     camera_path: converts the recorded path to the camera's path, if another body was recorded.
@@ -61,7 +64,8 @@ def open_tum(
     calibration = resolve_calibration(
         folder, camera or freiburg_calibration(folder), size, settings, TUM_UNITS_PER_METRE
     )
-    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
+    gyroscope = read_gyroscope(folder / "gyroscope.txt") if (folder / "gyroscope.txt").is_file() else None
+    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped, gyroscope=gyroscope)
 
 
 def write_tum(source: Source, folder: str | Path) -> None:
@@ -143,6 +147,25 @@ def read_poses(path: Path) -> Trajectory:
     if not poses:
         raise SourceError(f"{path}: holds no poses; delete it or add poses")
     return Trajectory(np.array(times), np.stack(poses))
+
+
+def read_gyroscope(path: Path) -> Gyroscope:
+    """Read "t wx wy wz" lines, seconds and rad/s in camera axes. Raises SourceError naming the file, and the line if
+    it has other values or no later time than the line before."""
+    rows: list[list[float]] = []
+    for line, words in read_lines(path):
+        if len(words) != 4:
+            raise SourceError(f"{path}:{line}: expected 't wx wy wz', found {len(words)} values")
+        rows.append(parse_numbers(path, line, words))
+        if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
+            raise SourceError(f"{path}:{line}: time {words[0]} is not after that of the line before; sort the lines")
+    if len(rows) < 2:
+        raise SourceError(f"{path}: holds {len(rows)} measurements; delete it or add measurements")
+    values = np.array(rows)
+    try:
+        return Gyroscope(values[:, 0], values[:, 1:])
+    except SourceError as error:
+        raise SourceError(f"{path}: {error}") from error
 
 
 def read_lines(path: Path) -> Iterator[tuple[int, list[str]]]:

@@ -1,0 +1,58 @@
+"""Measurements of a gyroscope that moves with the camera, integrated to rotations."""
+
+from dataclasses import dataclass, field
+from itertools import accumulate
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from sigmasplat.errors import SourceError
+from sigmasplat.types import Matrix
+
+MAX_RAD_S = 40.0
+"""Gyroscopes of phones and cameras measure up to 2000 °/s = 35 rad/s. Larger values are probably in degrees."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gyroscope:
+    """Angular velocities over time: timestamps_s [M], increasing, from the clock of the frames;
+    angular_velocity_rad_s [M, 3] about the axes of the camera (x right, y down, z forward), by the right-hand rule.
+
+    Raises SourceError on shapes that do not match, fewer than two samples, values that are not finite or above
+    `MAX_RAD_S`, or timestamps that do not increase.
+    """
+
+    timestamps_s: NDArray[np.float64]
+    angular_velocity_rad_s: NDArray[np.float64]
+    _R_inertial_camera: NDArray[np.float64] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        times_s, rates = self.timestamps_s, self.angular_velocity_rad_s
+        if len(times_s) < 2 or rates.shape != (len(times_s), 3):
+            raise SourceError(f"gyroscope has {len(times_s)} timestamps but angular velocities of shape {rates.shape}")
+        if not (np.isfinite(times_s).all() and np.isfinite(rates).all()):
+            raise SourceError("gyroscope: timestamps or angular velocities hold NaN or inf; delete these samples")
+        if not (np.diff(times_s) > 0).all():
+            k = int(np.argmin(np.diff(times_s) > 0))
+            raise SourceError(f"gyroscope: time {times_s[k + 1]} s follows {times_s[k]} s; sort the samples by time")
+        if (largest := float(np.abs(rates).max())) > MAX_RAD_S:
+            raise SourceError(f"gyroscope: {largest:.1f} rad/s is too fast; convert degrees per second to radians")
+        means = 0.5 * (rates[1:] + rates[:-1])
+        steps = Rotation.from_rotvec(means * np.diff(times_s)[:, None]).as_matrix()
+        object.__setattr__(self, "_R_inertial_camera", np.stack(list(accumulate([np.eye(3), *steps], np.matmul))))
+
+    def R_inertial_camera(self, time_s: float) -> Matrix | None:
+        """Return the rotation [3, 3] from the camera's axes at a time to its axes at the first sample; None outside the
+        samples.
+
+        Between two samples the velocity is interpolated linearly, and its mean is the rotation vector of the step.
+        The rotation between two times a and b is R_inertial_camera(a)ᵀ R_inertial_camera(b).
+        """
+        times_s, rates = self.timestamps_s, self.angular_velocity_rad_s
+        if not times_s[0] <= time_s <= times_s[-1]:
+            return None
+        k = min(int(np.searchsorted(times_s, time_s, "right")), len(times_s) - 1) - 1
+        since_s = time_s - times_s[k]
+        mean = rates[k] + 0.5 * (rates[k + 1] - rates[k]) * since_s / (times_s[k + 1] - times_s[k])
+        return np.asarray(self._R_inertial_camera[k] @ Rotation.from_rotvec(mean * since_s).as_matrix())
