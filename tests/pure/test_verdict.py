@@ -14,6 +14,7 @@ from sigmasplat.slam.localisation.verdict import (
     explained,
     is_better,
     is_questionable,
+    recognised,
     score,
     stands,
 )
@@ -133,3 +134,12 @@ def test_a_doubtful_pose_stands_only_after_a_search_and_if_the_surfaces_confirm_
     assert not stands(blurred, PATIENCE) and stands(blurred, PATIENCE + 1)
     for wrong in (THROUGH, OBJECT, NOTHING, replace(blurred, residual=5.0), replace(GOOD, correlation=0.5)):
         assert not stands(wrong, PATIENCE + 1)
+
+
+def test_few_matches_need_surfaces_that_agree_better() -> None:
+    likely = replace(GOOD, close=0.92, behind=0.07, correlation=0.94)
+    assert recognised(GOOD, 9) and recognised(likely, 40)
+    assert confirmed(likely) and not recognised(likely, 12)
+    assert not recognised(replace(GOOD, correlation=0.84), 12)
+    for wrong in (THROUGH, OBJECT, NOTHING):
+        assert not recognised(wrong, 500)

@@ -21,7 +21,7 @@ from sigmasplat.slam.features import Extractor, Features, Landmarks, matches_by_
 from sigmasplat.slam.localisation.feature_image import pose_by_features
 from sigmasplat.slam.localisation.known_map import KnownKeyframe, KnownMap, Where
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
-from sigmasplat.slam.localisation.verdict import confirmed, score
+from sigmasplat.slam.localisation.verdict import recognised, score
 from sigmasplat.types import Matrix
 
 STRONGEST = 400
@@ -120,7 +120,7 @@ class Relocaliser:
         candidates = self._candidates(wanted, seen)
         best: dict[bool, Relocation] = {}
         for tried in (pose for where in candidates for pose in self._poses(known, view, seen, where)):
-            verdict = confirmed(tried.comparison)
+            verdict = recognised(tried.comparison, tried.inliers)
             if verdict not in best or tried.score > best[verdict].score:
                 best[verdict] = tried
             if verdict and tried.score > ENOUGH:

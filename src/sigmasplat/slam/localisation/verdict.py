@@ -30,6 +30,9 @@ a reading if the usual one is smaller than one. Clean recordings stay below 1.""
 LEAST_COMMON, LEAST_CLOSE, LEAST_EXPLAINED, LEAST_CORRELATION, MOST_RESIDUAL = 0.25, 0.75, 0.9, 0.8, 1.5
 """The pose of a lost camera is confirmed if `common`, `close`, `explained` and `correlation` are at least this, and if
 `residual`, in standard deviations of a reading, is at most this."""
+FEW_MATCHES, SURE_EXPLAINED, SURE_CORRELATION = 15, 0.97, 0.9
+"""With fewer matches, a pose without a known path needs at least these values: a dozen features of one wall also match
+another wall, and walls are alike."""
 LEAP_M, LEAP_HOPS = 0.3, 3.0
 """Lost: the pose is farther from the predicted one than this distance and this many usual hops between frames. Flat
 walls fit each other across a room."""
@@ -66,6 +69,12 @@ def confirmed(c: Comparison, least_correlation: float = LEAST_CORRELATION) -> bo
         and c.residual <= MOST_RESIDUAL
         and not c.correlation < least_correlation
     )
+
+
+def recognised(c: Comparison, matches: int) -> bool:
+    """Return whether the map confirms a pose that this number of features has led to."""
+    sure = explained(c) >= SURE_EXPLAINED and not c.correlation < SURE_CORRELATION
+    return confirmed(c) and (sure or matches >= FEW_MATCHES)
 
 
 def is_questionable(doubtful: int) -> bool:
