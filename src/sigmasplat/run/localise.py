@@ -106,7 +106,7 @@ def why_not(result: SearchResult) -> str:
     c = result.refused.comparison
     return (
         f"not confirmed by the map: {c.common:.0%} in common, {c.close:.0%} of it close, {c.behind:.0%} behind, "
-        f"correlation {c.correlation:.2f}, {result.refused.inliers} matches"
+        f"correlation {c.correlation:.2f}, {result.refused.inliers} matches, ± {100 * result.refused.position_m:.0f} cm"
     )
 
 

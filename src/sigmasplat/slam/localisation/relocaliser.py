@@ -21,7 +21,7 @@ from sigmasplat.slam.features import Extractor, Features, Landmarks, matches_by_
 from sigmasplat.slam.localisation.feature_image import pose_by_features
 from sigmasplat.slam.localisation.known_map import KnownKeyframe, KnownMap, Where
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
-from sigmasplat.slam.localisation.verdict import recognised, score
+from sigmasplat.slam.localisation.verdict import MOST_SPREAD_M, recognised, score
 from sigmasplat.types import Matrix
 
 STRONGEST = 400
@@ -62,6 +62,11 @@ class Relocation:
     def covariance(self) -> Matrix:
         """Return the covariance [6, 6] of the camera's translation and rotation in its own axes, m and rad."""
         return self._estimated + FLOOR
+
+    @property
+    def position_m(self) -> float:
+        """Return the standard deviation of the position, metres."""
+        return float(np.sqrt(np.trace(self.covariance[:3, :3])))
 
     @property
     def information(self) -> Matrix:
@@ -120,7 +125,7 @@ class Relocaliser:
         candidates = self._candidates(wanted, seen)
         best: dict[bool, Relocation] = {}
         for tried in (pose for where in candidates for pose in self._poses(known, view, seen, where)):
-            verdict = recognised(tried.comparison, tried.inliers)
+            verdict = recognised(tried.comparison, tried.inliers) and tried.position_m <= MOST_SPREAD_M
             if verdict not in best or tried.score > best[verdict].score:
                 best[verdict] = tried
             if verdict and tried.score > ENOUGH:

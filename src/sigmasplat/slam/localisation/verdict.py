@@ -33,6 +33,9 @@ LEAST_COMMON, LEAST_CLOSE, LEAST_EXPLAINED, LEAST_CORRELATION, MOST_RESIDUAL = 0
 FEW_MATCHES, SURE_EXPLAINED, SURE_CORRELATION = 15, 0.97, 0.9
 """With fewer matches, a pose without a known path needs at least these values: a dozen features of one wall also match
 another wall, and walls are alike."""
+MOST_SPREAD_M = 0.05
+"""A pose without a known path is refused if the standard deviation of its position is larger: where only a wall is in
+view, the images agree as well at every pose along it."""
 LEAP_M, LEAP_HOPS = 0.3, 3.0
 """Lost: the pose is farther from the predicted one than this distance and this many usual hops between frames. Flat
 walls fit each other across a room."""
