@@ -18,6 +18,7 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.feature_image import FeatureImage, pose_by_features
+from sigmasplat.slam.localisation.foreground import Foreground, foreground
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.verdict import LEAST_COMMON, Usual, confirmed, score
 from sigmasplat.slam.rules import is_lost, jumped
@@ -29,13 +30,17 @@ WIDE = 0.065
 """A motion between two frames is wide if it moves the image by more than this share of its width: the basin of
 convergence of alignment ends near there."""
 
+FRONT = 0.01
+"""What is in front is looked for if at least this share of the compared points is nearer than the reference."""
+
 
 @dataclass(eq=False)
 class Tracker:
     """Keeps the last pose, the velocity, the last image, the reference keyframe, and statistics of recent fits.
 
     lost: tracking of the last frame failed; doubtful: number of frames in a row whose best pose the images
-    contradict (`_contradicted`).
+    contradict (`_contradicted`); front: what is in front of the scene in the last frame, if a pose without it is believed;
+    keyframe_front: the same in the reference keyframe.
     """
 
     config: TrackingConfig
@@ -46,6 +51,8 @@ class Tracker:
     last_features: FeatureImage | None = None
     keyframe: Reference | None = None
     keyframe_features: FeatureImage | None = None
+    keyframe_front: Foreground | None = None
+    front: Foreground | None = None
     agreements: list[float] = dataclass_field(default_factory=list)
     first_losses: list[float] = dataclass_field(default_factory=list)
     usual: Usual = dataclass_field(default_factory=Usual)
@@ -65,6 +72,9 @@ class Tracker:
         """
         predicted = self.previous @ self.velocity if self.config.motion_model else self.previous
         best = self._fit(field, view, seen, predicted)
+        uncovered = self._uncovered(field, view, seen, predicted, best)
+        if uncovered is not None:
+            best, seen = uncovered
         if self._is_wide(best, view) or self._doubts(best):
             guesses = [self._fit(field, view, seen, guess) for guess in self._guesses_by_features(seen)]
             best = max([best, *guesses], key=self._score)
@@ -75,6 +85,40 @@ class Tracker:
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
         self._remember(best, seen)
         return best
+
+    def _uncovered(
+        self, field: GaussianField, view: View, seen: Sight, predicted: Matrix, fit: PoseFit
+    ) -> tuple[PoseFit, Sight] | None:
+        """Find what is in front and fit the pose without it; return the fit and the frame without it, None if there is
+        nothing in front or the images contradict the pose."""
+        before, self.front = self.front, None
+        if fit.comparison is None or self.keyframe is None or self.lost:
+            return None
+        if fit.comparison.front < FRONT and before is None and self.keyframe_front is None:
+            return None
+        for guess in (predicted, se3.inverse(fit.T_camera_world)):
+            front = self._front(seen, guess)
+            if front is None:
+                continue
+            found = self._fit(field, view, seen.aside(front, view), guess)
+            front = self._front(seen, se3.inverse(found.T_camera_world))
+            if front is None:
+                continue
+            apart = seen.aside(front, view)
+            found = self._fit(field, view, apart, se3.inverse(found.T_camera_world))
+            if found.comparison and not self._is_lost(found) and not self._contradicted(found):
+                self.front = front
+                return found, apart
+        return None
+
+    def _front(self, seen: Sight, T_world_camera: Matrix) -> Foreground | None:
+        """Find what is in front at a pose, compared with the reference keyframe."""
+        if self.keyframe is None:
+            return None
+        reference_m = self.keyframe.pyramid.kernels.to_host(self.keyframe.pyramid.depth[0])
+        T_reference_live = self.keyframe.T_camera_world @ T_world_camera
+        live_m = seen.target.depth_image.numpy()
+        return foreground(reference_m, self.keyframe_front, live_m, seen.target.camera, T_reference_live)
 
     def _remember(self, fit: PoseFit, seen: Sight) -> None:
         """Keep what the next frame needs."""
@@ -208,7 +252,7 @@ class Tracker:
     def keep_keyframe(self, field: GaussianField, view: View, seen: Sight, T_world_camera: Matrix) -> None:
         """Use a keyframe that was just mapped: its refined pose, and its image as the reference of the next frames."""
         self.previous, self.lost = T_world_camera, False
-        self.keyframe_features = seen.image
+        self.keyframe_features, self.keyframe_front = seen.image, self.front
         if self.config.method == "align" or fits_of(view).aligns:  # otherwise nothing aligns to it
             T_camera_world = se3.inverse(T_world_camera)
             self.keyframe = keyframe_reference(field.params, view, seen.live, T_camera_world, self.config)
@@ -219,11 +263,12 @@ class Tracker:
         """Continue at another pose, with a keyframe as the reference of the next frames."""
         self.previous, self.velocity = T_world_camera, np.eye(4)
         self.keyframe = keyframe_reference(field.params, view, keyframe.pyramid, keyframe.T_camera_world, self.config)
-        self.keyframe_features = keyframe.image.weighed(self.keyframe.weights)
+        self.keyframe_features, self.keyframe_front = keyframe.image.weighed(self.keyframe.weights), None
 
     def forget(self) -> None:
         """Restart at the identity, as for the first frame."""
         self.previous, self.velocity, self.keyframe, self.keyframe_features = np.eye(4), np.eye(4), None, None
+        self.front = self.keyframe_front = None
 
     def hop_covariance(self, fit: PoseFit, live: Pyramid) -> Matrix | None:
         """Estimate the covariance [6, 6] of a fit's left twist to the newest keyframe; None without the kernels.
