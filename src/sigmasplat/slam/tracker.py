@@ -18,7 +18,7 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.feature_image import FeatureImage, pose_by_features
-from sigmasplat.slam.localisation.foreground import Foreground, foreground
+from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.verdict import LEAST_COMMON, Usual, confirmed, score
 from sigmasplat.slam.rules import is_lost, jumped
@@ -83,7 +83,7 @@ class Tracker:
         self.lost = self._is_lost(best) or self._leaps(best, predicted)
         self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
-        self._remember(best, seen)
+        self._remember(best, seen.without(self.front, view))
         return best
 
     def _uncovered(
@@ -97,11 +97,11 @@ class Tracker:
         if fit.comparison.front < FRONT and before is None and self.keyframe_front is None:
             return None
         for guess in (predicted, se3.inverse(fit.T_camera_world)):
-            front = self._front(seen, guess)
+            front = self._front(seen, before, guess)
             if front is None:
                 continue
             found = self._fit(field, view, seen.aside(front, view), guess)
-            front = self._front(seen, se3.inverse(found.T_camera_world))
+            front = self._front(seen, before, se3.inverse(found.T_camera_world))
             if front is None:
                 continue
             apart = seen.aside(front, view)
@@ -111,14 +111,17 @@ class Tracker:
                 return found, apart
         return None
 
-    def _front(self, seen: Sight, T_world_camera: Matrix) -> Foreground | None:
+    def _front(self, seen: Sight, before: Foreground | None, T_world_camera: Matrix) -> Foreground | None:
         """Find what is in front at a pose, compared with the reference keyframe."""
         if self.keyframe is None:
             return None
-        reference_m = self.keyframe.pyramid.kernels.to_host(self.keyframe.pyramid.depth[0])
-        T_reference_live = self.keyframe.T_camera_world @ T_world_camera
-        live_m = seen.target.depth_image.numpy()
-        return foreground(reference_m, self.keyframe_front, live_m, seen.target.camera, T_reference_live)
+        if self.keyframe_front is not None:
+            scene_m = self.keyframe_front.scene_m
+        else:
+            scene_m = self.keyframe.pyramid.kernels.to_host(self.keyframe.pyramid.depth[0])
+        scene = Earlier(scene_m, self.keyframe.T_camera_world @ T_world_camera)
+        last = None if before is None else Earlier(before.depth_m, se3.inverse(self.previous) @ T_world_camera)
+        return foreground(scene, last, seen.target.depth_image.numpy(), seen.target.camera)
 
     def _remember(self, fit: PoseFit, seen: Sight) -> None:
         """Keep what the next frame needs."""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label, maximum_filter, minimum_filter
 
+from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.types import Matrix
 
@@ -33,58 +34,87 @@ MARGIN_PX = 3
 
 @dataclass(frozen=True, eq=False)
 class Foreground:
-    """What is in front in an image: the pixels to ignore [H, W], with a margin, and its depth [H, W] m, 0 elsewhere."""
+    """What is in front in an image.
+
+    hidden [H, W]: the pixels that show it, with a margin; depth_m [H, W]: its depth, 0 elsewhere; scene_m [H, W]: depth
+    of everything else, behind it as far as it is known from earlier images, else 0.
+    """
 
     hidden: Mask
     depth_m: Depth
+    scene_m: Depth
 
 
-def foreground(
-    reference_m: Depth, before: Foreground | None, live_m: Depth, camera: Camera, T_reference_live: Matrix
-) -> Foreground | None:
-    """Find what has moved in front of the camera since a reference; None without.
+@dataclass(frozen=True, eq=False)
+class Earlier:
+    """Depth of an earlier image [H, W] m, 0 where it is not known, and its pose relative to a live camera, [4, 4]."""
 
-    reference_m [H, W]: depth of the reference, 0 where it is not known; before: what was in front in the reference
-    already; live_m [H, W]: live depth, both in metres, 0 = no reading; T_reference_live [4, 4]. A whole region between
-    depth steps is in front, also its part whose place the reference did not see, but not pixels that fit to the
+    depth_m: Depth
+    T_earlier_live: Matrix
+
+
+def foreground(scene: Earlier, before: Earlier | None, live_m: Depth, camera: Camera) -> Foreground | None:
+    """Find what has moved in front of the camera; None without.
+
+    scene: the reference; before: what was in front in the last image; live_m [H, W]: live depth, m. A whole region
+    between depth steps is in front, also its part whose place the reference did not see, but not pixels that fit to the
     reference.
     """
     depth = live_m[::STEP, ::STEP]
     depth = np.where(depth > 0, depth, maximum_filter(depth, 3))  # fill scattered holes
-    free, same = _places(reference_m, before, depth, camera, T_reference_live)
+    free, again, same = _places(scene, before, depth, camera)
     nearest = minimum_filter(np.where(depth > 0, depth, np.float32(np.inf)), 3)
     regions, count = label((depth > 0) & ~same & (depth <= (1 + EDGE_RELATIVE) * nearest), np.ones((3, 3)))
-    sizes, in_free = (np.bincount(regions[chosen], minlength=count + 1) for chosen in (regions > 0, free))
-    chosen = (in_free >= LEAST_REGION * depth.size) & (in_free >= LEAST_SHARE * sizes)
+    sizes, in_free, old = (np.bincount(regions[chosen], minlength=count + 1) for chosen in (regions > 0, free, again))
+    chosen = (in_free >= LEAST_REGION * depth.size) & (in_free + old >= LEAST_SHARE * sizes)
     chosen[0] = False
     if not chosen.any():
         return None
     whole = np.repeat(np.repeat(chosen[regions], STEP, 0), STEP, 1)[: live_m.shape[0], : live_m.shape[1]]
-    return Foreground(maximum_filter(whole, 2 * MARGIN_PX + 1), np.where(whole, live_m, np.float32(0.0)))
+    front_m = np.where(whole, live_m, np.float32(0.0))
+    return Foreground(
+        maximum_filter(whole, 2 * MARGIN_PX + 1), front_m, np.where(whole, _behind(scene, camera), live_m)
+    )
 
 
-def _places(
-    reference_m: Depth, before: Foreground | None, depth: Depth, camera: Camera, T_reference_live: Matrix
-) -> tuple[Mask, Mask]:
-    """Return which pixels of every STEP-th row and column are in places that the reference saw to be free, and which
-    are on its surfaces."""
+def _behind(scene: Earlier, camera: Camera) -> Depth:
+    """Return the scene as the live camera would see it, m, 0 where it is not known."""
+    v, u = np.nonzero(scene.depth_m > 0)
+    points = camera.rays()[v, u].T * scene.depth_m[v, u].astype(np.float64)
+    inside, row, column, z = _projected(points, camera, se3.inverse(scene.T_earlier_live))
+    found = np.flatnonzero(inside)
+    found = found[np.argsort(-z[found], kind="stable")]  # the nearest surface is written last
+    seen = np.zeros(scene.depth_m.shape, np.float32)
+    seen[row[found], column[found]] = z[found]
+    return np.where(seen > 0, seen, maximum_filter(seen, 3))
+
+
+def _places(scene: Earlier, before: Earlier | None, depth: Depth, camera: Camera) -> tuple[Mask, Mask, Mask]:
+    """Return which pixels of every STEP-th row and column are in places that were free, which are where something was
+    in front already, and which are on surfaces of the scene."""
     v, u = np.nonzero(depth > 0)
-    z = depth[v, u].astype(np.float64)
-    rays = np.stack([(STEP * u - camera.cx) / camera.fx, (STEP * v - camera.cy) / camera.fy, np.ones(len(u))])
-    x, y, z = T_reference_live[:3, :3] @ (rays * z) + T_reference_live[:3, 3:]
+    points = camera.rays()[STEP * v, STEP * u].T * depth[v, u].astype(np.float64)
+    near = minimum_filter(np.where(scene.depth_m > 0, scene.depth_m, np.float32(np.inf)), AROUND_PX)
+    far = maximum_filter(scene.depth_m, AROUND_PX)
+    inside, row, column, z = _projected(points, camera, scene.T_earlier_live)
+    known, limit = inside & (far[row, column] > 0), CLEAR_M + CLEAR_RELATIVE * z
+    places = np.zeros((3, *depth.shape), bool)
+    free, again, same = places
+    free[v, u] = known & (z < near[row, column] - limit)
+    if before is not None:
+        in_last, at_row, at_column, z_last = _projected(points, camera, before.T_earlier_live)
+        front = before.depth_m[at_row, at_column]
+        again[v, u] = in_last & (front > 0) & (z_last < front + CLEAR_M + CLEAR_RELATIVE * z_last)
+    same[v, u] = known & (z < far[row, column] + limit)
+    return free, again & ~free, same & ~free & ~again
+
+
+def _projected(
+    points: Matrix, camera: Camera, T_earlier_live: Matrix
+) -> tuple[Mask, NDArray[np.intp], NDArray[np.intp], Matrix]:
+    """Project live points [3, n] into an earlier image: whether they are inside, row, column (0 outside), depth."""
+    x, y, z = T_earlier_live[:3, :3] @ points + T_earlier_live[:3, 3:]
     ahead = np.maximum(z, 1e-3)
     column, row = np.rint(camera.fx * x / ahead + camera.cx), np.rint(camera.fy * y / ahead + camera.cy)
     inside = (z > 0.05) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    v, u, z, row, column = v[inside], u[inside], z[inside], row[inside].astype(np.intp), column[inside].astype(np.intp)
-    limit = CLEAR_M + CLEAR_RELATIVE * z
-    farthest = maximum_filter(reference_m, AROUND_PX)[row, column]
-    nearest = minimum_filter(np.where(reference_m > 0, reference_m, np.float32(np.inf)), AROUND_PX)[row, column]
-    is_free = (farthest > 0) & (z < nearest - limit)
-    is_same = (farthest > 0) & ~is_free & (z < farthest + limit)
-    if before is not None:
-        front = before.depth_m[row, column]
-        again = (front > 0) & (z < front + limit)
-        is_free, is_same = is_free | again, is_same & ~again
-    free, same = np.zeros((2, *depth.shape), bool)
-    free[v, u], same[v, u] = is_free, is_same
-    return free, same
+    return inside, *(np.where(inside, pixel, 0).astype(np.intp) for pixel in (row, column)), z
