@@ -71,9 +71,9 @@ def foreground(scene: Earlier, before: Earlier | None, live_m: Depth, camera: Ca
     if not chosen.any():
         return None
     whole = np.repeat(np.repeat(chosen[regions], STEP, 0), STEP, 1)[: live_m.shape[0], : live_m.shape[1]]
-    front_m = np.where(whole, live_m, np.float32(0.0))
+    hidden = maximum_filter(whole, 2 * MARGIN_PX + 1)
     return Foreground(
-        maximum_filter(whole, 2 * MARGIN_PX + 1), front_m, np.where(whole, _behind(scene, camera), live_m)
+        hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, _behind(scene, camera), live_m)
     )
 
 
