@@ -39,8 +39,8 @@ class Tracker:
     """Keeps the last pose, the velocity, the last image, the reference keyframe, and statistics of recent fits.
 
     lost: tracking of the last frame failed; doubtful: number of frames in a row whose best pose the images
-    contradict (`_contradicted`); front: what is in front of the scene in the last frame, if a pose without it is believed;
-    keyframe_front: the same in the reference keyframe.
+    contradict (`_contradicted`); front: what was in front of the scene in the last frame, None if nothing was or the
+    frame was lost; keyframe_front: the same for the newest keyframe.
     """
 
     config: TrackingConfig
@@ -72,15 +72,15 @@ class Tracker:
         """
         predicted = self.previous @ self.velocity if self.config.motion_model else self.previous
         best = self._fit(field, view, seen, predicted)
-        uncovered = self._uncovered(field, view, seen, predicted, best)
-        if uncovered is not None:
-            best, seen = uncovered
+        best, shown = self._uncovered(field, view, seen, predicted, best)
         if self._is_wide(best, view) or self._doubts(best):
-            guesses = [self._fit(field, view, seen, guess) for guess in self._guesses_by_features(seen)]
+            guesses = [self._fit(field, view, shown, guess) for guess in self._guesses_by_features(shown)]
             best = max([best, *guesses], key=self._score)
         if self._doubts(best):
-            best = self._retry(field, view, seen, best)
+            best = self._retry(field, view, shown, best)
         self.lost = self._is_lost(best) or self._leaps(best, predicted)
+        if self.lost:
+            self.front = None
         self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
         self._remember(best, seen.without(self.front, view))
@@ -88,37 +88,35 @@ class Tracker:
 
     def _uncovered(
         self, field: GaussianField, view: View, seen: Sight, predicted: Matrix, fit: PoseFit
-    ) -> tuple[PoseFit, Sight] | None:
-        """Find what is in front and fit the pose without it; return the fit and the frame without it, None if there is
-        nothing in front or the images contradict the pose."""
+    ) -> tuple[PoseFit, Sight]:
+        """Find what is in front of the scene, and fit the pose without it; return the fit and the frame without it.
+
+        Returns the same fit and frame if nothing is in front, or if the images contradict the pose without it.
+        """
         before, self.front = self.front, None
-        if fit.comparison is None or self.keyframe is None or self.lost:
-            return None
-        if fit.comparison.front < FRONT and before is None and self.keyframe_front is None:
-            return None
+        nothing_before = before is None and self.keyframe_front is None
+        if fit.comparison is None or self.lost or (fit.comparison.front < FRONT and nothing_before):
+            return fit, seen
         for guess in (predicted, se3.inverse(fit.T_camera_world)):
-            front = self._front(seen, before, guess)
-            if front is None:
-                continue
-            found = self._fit(field, view, seen.aside(front, view), guess)
-            front = self._front(seen, before, se3.inverse(found.T_camera_world))
-            if front is None:
-                continue
-            apart = seen.aside(front, view)
-            found = self._fit(field, view, apart, se3.inverse(found.T_camera_world))
-            if found.comparison and not self._is_lost(found) and not self._contradicted(found):
-                self.front = front
-                return found, apart
-        return None
+            for _ in range(2):  # a better pose shows better what is in front
+                front = self._front(seen, before, guess)
+                if front is None:
+                    break
+                shown = seen.aside(front, view)
+                found = self._fit(field, view, shown, guess)
+                guess = se3.inverse(found.T_camera_world)
+            else:
+                if not (self._is_lost(found) or self._contradicted(found) or self._leaps(found, predicted)):
+                    self.front = front
+                    return found, shown
+        return fit, seen
 
     def _front(self, seen: Sight, before: Foreground | None, T_world_camera: Matrix) -> Foreground | None:
-        """Find what is in front at a pose, compared with the reference keyframe."""
+        """Find what is in front at a pose: in places that the newest keyframe saw to be free."""
         if self.keyframe is None:
             return None
-        if self.keyframe_front is not None:
-            scene_m = self.keyframe_front.scene_m
-        else:
-            scene_m = self.keyframe.pyramid.kernels.to_host(self.keyframe.pyramid.depth[0])
+        depth, front = self.keyframe.pyramid.depth[0], self.keyframe_front
+        scene_m = self.keyframe.pyramid.kernels.to_host(depth) if front is None else front.scene_m
         scene = Earlier(scene_m, self.keyframe.T_camera_world @ T_world_camera)
         last = None if before is None else Earlier(before.depth_m, se3.inverse(self.previous) @ T_world_camera)
         return foreground(scene, last, seen.target.depth_image.numpy(), seen.target.camera)

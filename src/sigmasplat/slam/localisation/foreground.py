@@ -26,7 +26,7 @@ AROUND_PX = 5
 """Size of the window around a pixel of the reference in which all readings must be farther: the pose is not exact."""
 EDGE_RELATIVE = 0.05
 """A depth step, where a region ends: neighbouring pixels differ by more than this share of the nearer depth."""
-LEAST_REGION, LEAST_SHARE = 0.005, 0.3
+LEAST_REGION, LEAST_SHARE = 0.01, 0.15
 """A region is in front if at least this share of the image's pixels, and of its own, are in places that were free."""
 MARGIN_PX = 3
 """The mask is wider than the regions by this much: sensors mix depth and colour at an edge."""
@@ -80,7 +80,7 @@ def foreground(scene: Earlier, before: Earlier | None, live_m: Depth, camera: Ca
 def _behind(scene: Earlier, camera: Camera) -> Depth:
     """Return the scene as the live camera would see it, m, 0 where it is not known."""
     v, u = np.nonzero(scene.depth_m > 0)
-    points = camera.rays()[v, u].T * scene.depth_m[v, u].astype(np.float64)
+    points = camera.rays()[v, u].T.astype(np.float64) * scene.depth_m[v, u]
     inside, row, column, z = _projected(points, camera, se3.inverse(scene.T_earlier_live))
     found = np.flatnonzero(inside)
     found = found[np.argsort(-z[found], kind="stable")]  # the nearest surface is written last
@@ -93,7 +93,7 @@ def _places(scene: Earlier, before: Earlier | None, depth: Depth, camera: Camera
     """Return which pixels of every STEP-th row and column are in places that were free, which are where something was
     in front already, and which are on surfaces of the scene."""
     v, u = np.nonzero(depth > 0)
-    points = camera.rays()[STEP * v, STEP * u].T * depth[v, u].astype(np.float64)
+    points = camera.rays()[STEP * v, STEP * u].T.astype(np.float64) * depth[v, u]
     near = minimum_filter(np.where(scene.depth_m > 0, scene.depth_m, np.float32(np.inf)), AROUND_PX)
     far = maximum_filter(scene.depth_m, AROUND_PX)
     inside, row, column, z = _projected(points, camera, scene.T_earlier_live)
