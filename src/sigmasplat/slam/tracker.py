@@ -39,8 +39,8 @@ class Tracker:
     """Keeps the last pose, the velocity, the last image, the reference keyframe, and statistics of recent fits.
 
     lost: tracking of the last frame failed; doubtful: number of frames in a row whose best pose the images
-    contradict (`_contradicted`); front: what was in front of the scene in the last frame, None if nothing was or the
-    frame was lost; keyframe_front: the same for the newest keyframe.
+    contradict (`_contradicted`); front: what was in front of the scene in the last frame, None if there was
+    nothing or the frame was lost; keyframe_front: the same for the newest keyframe.
     """
 
     config: TrackingConfig
