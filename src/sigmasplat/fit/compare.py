@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
 from sigmasplat.types import Matrix
 
 LEVEL = 0
@@ -50,7 +50,10 @@ NOTHING = Comparison(0.0, 0.0, 0.0, 0.0, float("inf"), float("nan"))
 
 
 def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comparison:
-    """Compare two images at T_live_reference [4, 4]; `NOTHING` if they have less than 50 compared pixels in common."""
+    """Compare two images at T_live_reference [4, 4]; `NOTHING` if they have less than 50 compared pixels in common.
+
+    Points of the reference that fall on live pixels of depth `HIDDEN_M` are left out.
+    """
     level = min(LEVEL, len(reference.cameras) - 1)
     host, camera = reference.kernels.to_host, reference.cameras[level]
     depth, gray = (host(plane)[::STEP, ::STEP] for plane in (reference.depth[level], reference.gray[level]))
@@ -67,8 +70,10 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
         return NOTHING
     left, top, seen = column[inside].astype(np.intp), row[inside].astype(np.intp), seen[inside]
     live_depth = host(live.depth[level])
+    hidden = live_depth >= HIDDEN_M
+    live_depth = np.where(hidden, np.float32(0.0), live_depth)
     other, difference = _nearest_surface(live_depth, left, top, seen)
-    count = int(other.sum())
+    count, comparable = int(other.sum()), len(u) - int((hidden[top, left] & ~other).sum())
     if count < LEAST_PIXELS:
         return NOTHING
     difference, noise = difference[other], (NOISE_RELATIVE * seen[other] ** 2 + NOISE_M) * noise_scale(live_depth)
@@ -76,7 +81,7 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
     covered = min(1.0, count / max(int(np.count_nonzero(live_depth[::STEP, ::STEP])), 1))
     front = difference <= -limit
     close, behind = (float(np.mean(found)) for found in (np.abs(difference) < limit, difference >= limit))
-    common, before = count / len(u), float(np.mean(front))
+    common, before = count / comparable, float(np.mean(front))
     if count - front.sum() < LEAST_PIXELS:
         return Comparison(common, close, before, behind, float("inf"), float("nan"), count, covered)
     residual = float(np.median(np.abs(difference)[~front] / noise[~front]))

@@ -9,6 +9,9 @@ from sigmasplat.fit.interface import ImageKernels, Plane
 from sigmasplat.model.camera import Camera
 
 LEVELS = 4
+HIDDEN_M = 1000.0
+"""Depth of live pixels where something in front hides the scene. Alignment takes them for another surface at every
+level, and uses neither their depth nor their colour."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,6 +52,12 @@ class Target:
         """Return the depth as [H, W], metres."""
         return self.depth[: self.camera.height, : self.camera.width]
 
+    def with_depth(self, depth_m: NDArray[np.float32]) -> "Target":
+        """Return the same colour with other depth [H, W], m."""
+        depth = torch.zeros_like(self.depth)
+        depth[: self.camera.height, : self.camera.width] = torch.from_numpy(depth_m)
+        return Target(self.camera, self.color, depth, int((depth_m > 0).sum()))
+
     def picture(self) -> Picture:
         """Return the image; colour is rounded to 256 steps, as a camera delivers it."""
         color = (self.image.numpy() * 255.0).round().clip(0, 255).astype(np.uint8)

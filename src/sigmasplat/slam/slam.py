@@ -49,6 +49,7 @@ class Slam(World):
         seen = self._observe(frame)
         found = self._localise(seen) if self.steps else self._begin(seen)
         if found.mapped:
+            seen = seen.without(self.tracker.front, self.view)
             found.T_submap_camera = self._map(seen, found.T_submap_camera)
             if self._submap_ends(found.T_submap_camera):
                 found.loops += self._cut(found.T_submap_camera)

@@ -13,6 +13,7 @@ from sigmasplat.model.frame import Detail
 from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.localisation.confidence import Confidence
 from sigmasplat.slam.localisation.feature_image import FeatureImage
+from sigmasplat.slam.localisation.foreground import Foreground
 from sigmasplat.slam.localisation.recovery import Link, Recovery
 from sigmasplat.slam.localisation.relocaliser import Relocaliser
 from sigmasplat.slam.localisation.verdict import Usual
@@ -25,9 +26,9 @@ from sigmasplat.slam.step_result import Step
 from sigmasplat.slam.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
-    Atlas, Camera, Confidence, Detail, Drift, Edge, FeatureImage, GaussianField, Keyframe, Link, Loop, LoopCloser,
-    Mapper, Place, Pyramid, Recovery, Reference, Relocaliser, Rows, SubmapDescriptor, Step, Target, Tracker, Usual,
-    VectorAdam,
+    Atlas, Camera, Confidence, Detail, Drift, Edge, FeatureImage, Foreground, GaussianField, Keyframe, Link, Loop,
+    LoopCloser, Mapper, Place, Pyramid, Recovery, Reference, Relocaliser, Rows, SubmapDescriptor, Step, Target, Tracker,
+    Usual, VectorAdam,
 )  # fmt: skip
 """The classes that a state may contain."""
 

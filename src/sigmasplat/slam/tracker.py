@@ -18,6 +18,7 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.feature_image import FeatureImage, pose_by_features
+from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.verdict import LEAST_COMMON, Usual, confirmed, score
 from sigmasplat.slam.rules import is_lost, jumped
@@ -28,6 +29,9 @@ DOUBT = 0.7
 WIDE = 0.065
 """A motion between two frames is wide if it moves the image by more than this share of its width: the basin of
 convergence of alignment ends near there."""
+
+FRONT = 0.01
+"""What is in front is looked for if at least this share of the compared points is nearer than the reference."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +55,8 @@ class Tracker:
     """Keeps the last pose, the velocity, the last image, the reference keyframe, and statistics of recent fits.
 
     R_inertial_camera: that of the last frame; lost: tracking of the last frame failed; doubtful: number of frames in a
-    row whose best pose the images contradict (`_contradicted`).
+    row whose best pose the images contradict (`_contradicted`); front: what was in front of the scene in the last
+    frame, None if there was nothing or the frame was lost; keyframe_front: the same for the newest keyframe.
     """
 
     config: TrackingConfig
@@ -62,6 +67,8 @@ class Tracker:
     last_features: FeatureImage | None = None
     keyframe: Reference | None = None
     keyframe_features: FeatureImage | None = None
+    keyframe_front: Foreground | None = None
+    front: Foreground | None = None
     agreements: list[float] = dataclass_field(default_factory=list)
     first_losses: list[float] = dataclass_field(default_factory=list)
     usual: Usual = dataclass_field(default_factory=Usual)
@@ -83,17 +90,55 @@ class Tracker:
         """
         expected = self._expected(R_inertial_camera)
         best = self._fit(field, view, seen, expected.predicted)
+        best, shown = self._uncovered(field, view, seen, expected.predicted, best)
         if self._is_wide(best, view) or self._doubts(best):
-            guesses = [self._fit(field, view, seen, guess) for guess in self._other_guesses(seen, expected)]
+            guesses = [self._fit(field, view, shown, guess) for guess in self._other_guesses(shown, expected)]
             best = max([best, *guesses], key=self._score)
         if self._doubts(best):
-            best = self._retry(field, view, seen, best, expected)
+            best = self._retry(field, view, shown, best, expected)
         self.R_inertial_camera = R_inertial_camera
         self.lost = self._is_lost(best) or self._leaps(best, expected.predicted)
+        if self.lost:
+            self.front = None
         self.doubtful = self.doubtful + 1 if self._contradicted(best) else 0
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
-        self._remember(best, seen)
+        self._remember(best, seen.without(self.front, view))
         return best
+
+    def _uncovered(
+        self, field: GaussianField, view: View, seen: Sight, predicted: Matrix, fit: PoseFit
+    ) -> tuple[PoseFit, Sight]:
+        """Find what is in front of the scene, and fit the pose without it; return the fit and the frame without it.
+
+        Returns the same fit and frame if nothing is in front, or if the images contradict the pose without it.
+        """
+        before, self.front = self.front, None
+        nothing_before = before is None and self.keyframe_front is None
+        if fit.comparison is None or self.lost or (fit.comparison.front < FRONT and nothing_before):
+            return fit, seen
+        for guess in (predicted, se3.inverse(fit.T_camera_world)):
+            for _ in range(2):  # a better pose shows better what is in front
+                front = self._front(seen, before, guess)
+                if front is None:
+                    break
+                shown = seen.aside(front, view)
+                found = self._fit(field, view, shown, guess)
+                guess = se3.inverse(found.T_camera_world)
+            else:
+                if not (self._is_lost(found) or self._contradicted(found) or self._leaps(found, predicted)):
+                    self.front = front
+                    return found, shown
+        return fit, seen
+
+    def _front(self, seen: Sight, before: Foreground | None, T_world_camera: Matrix) -> Foreground | None:
+        """Find what is in front at a pose: in places that the newest keyframe saw to be free."""
+        if self.keyframe is None:
+            return None
+        depth, front = self.keyframe.pyramid.depth[0], self.keyframe_front
+        scene_m = self.keyframe.pyramid.kernels.to_host(depth) if front is None else front.scene_m
+        scene = Earlier(scene_m, self.keyframe.T_camera_world @ T_world_camera)
+        last = None if before is None else Earlier(before.depth_m, se3.inverse(self.previous) @ T_world_camera)
+        return foreground(scene, last, seen.target.depth_image.numpy(), seen.target.camera)
 
     def _remember(self, fit: PoseFit, seen: Sight) -> None:
         """Keep what the next frame needs."""
@@ -242,7 +287,7 @@ class Tracker:
     def keep_keyframe(self, field: GaussianField, view: View, seen: Sight, T_world_camera: Matrix) -> None:
         """Use a keyframe that was just mapped: its refined pose, and its image as the reference of the next frames."""
         self.previous, self.lost = T_world_camera, False
-        self.keyframe_features = seen.image
+        self.keyframe_features, self.keyframe_front = seen.image, self.front
         if self.config.method == "align" or fits_of(view).aligns:  # otherwise nothing aligns to it
             T_camera_world = se3.inverse(T_world_camera)
             self.keyframe = keyframe_reference(field.params, view, seen.live, T_camera_world, self.config)
@@ -253,11 +298,12 @@ class Tracker:
         """Continue at another pose, with a keyframe as the reference of the next frames."""
         self.previous, self.velocity, self.lost = T_world_camera, np.eye(4), False
         self.keyframe = keyframe_reference(field.params, view, keyframe.pyramid, keyframe.T_camera_world, self.config)
-        self.keyframe_features = keyframe.image.weighed(self.keyframe.weights)
+        self.keyframe_features, self.keyframe_front = keyframe.image.weighed(self.keyframe.weights), None
 
     def forget(self) -> None:
         """Restart at the identity, as for the first frame."""
         self.previous, self.velocity, self.keyframe, self.keyframe_features = np.eye(4), np.eye(4), None, None
+        self.front = self.keyframe_front = None
 
     def hop_covariance(self, fit: PoseFit, live: Pyramid) -> Matrix | None:
         """Estimate the covariance [6, 6] of a fit's left twist to the newest keyframe; None without the kernels.

@@ -57,6 +57,12 @@ class FeatureImage:
             self._features = extractor.find(self.detail.gray, self.detail.camera)
         return self._features
 
+    def with_depth(self, depth_m: NDArray[np.float32]) -> "FeatureImage":
+        """Return the same image with other depth [h, w], m; features that were found already are kept."""
+        other = FeatureImage(self.detail, depth_m, self.camera, self.weights)
+        other._features = self._features
+        return other
+
     def weighed(self, weights: NDArray[np.float32] | None) -> "FeatureImage":
         """Return the same image with other weights; features that were found already are kept."""
         other = FeatureImage(self.detail, self.depth_m, self.camera, weights)

@@ -1,9 +1,13 @@
 """One frame, or one keyframe of the map, in the forms that tracking needs."""
 
 from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
 
 from sigmasplat.config import Config
-from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
 from sigmasplat.fit.references import Reference, live_image
 from sigmasplat.fit.target import Target
 from sigmasplat.model.camera import Camera
@@ -13,6 +17,7 @@ from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.denoise import denoised
 from sigmasplat.slam.localisation.feature_image import FeatureImage, detail_of
+from sigmasplat.slam.localisation.foreground import Foreground
 
 
 @dataclass(eq=False)
@@ -22,6 +27,23 @@ class Sight:
     target: Target
     live: Pyramid
     image: FeatureImage | None = None
+
+    def without(self, front: Foreground | None, view: View) -> Self:
+        """Return the frame without depth where something is in front: it is neither mapped nor a reference there."""
+        if front is None:
+            return self
+        target, live = self._with_depth(np.where(front.hidden, np.float32(0.0), self.target.depth_image.numpy()), view)
+        image = None if self.image is None else self.image.with_depth(target.depth_image.numpy())
+        return replace(self, target=target, live=live, image=image)
+
+    def aside(self, front: Foreground, view: View) -> Self:
+        """Return the frame for fits of its pose, which are to use neither depth nor colour of what is in front."""
+        depth_m = np.where(front.hidden, np.float32(HIDDEN_M), self.target.depth_image.numpy())
+        return replace(self.without(front, view), live=self._with_depth(depth_m, view)[1])
+
+    def _with_depth(self, depth_m: NDArray[np.float32], view: View) -> tuple[Target, Pyramid]:
+        target = self.target.with_depth(depth_m)
+        return target, live_image(view, target.image.numpy(), depth_m, target)
 
 
 @dataclass(eq=False)

@@ -1,0 +1,120 @@
+"""Find what has moved in front of the camera: surfaces in space that the reference saw to be free.
+
+A surface that is nearer than the known one is not enough: a still one comes into view beside a farther one whenever the
+camera moves. But then its place was hidden or outside the earlier view. Something that moved in is where the earlier
+view saw through.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label, maximum_filter, minimum_filter
+
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.types import Matrix
+
+Depth = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+STEP = 2
+"""Every second row and column of the live image is tested."""
+CLEAR_M, CLEAR_RELATIVE = 0.05, 0.05
+"""A place was free if the reference saw a surface farther than it by this distance plus this share of its depth."""
+AROUND_PX = 5
+"""Size of the window around a pixel of the reference in which all readings must be farther: the pose is not exact."""
+EDGE_RELATIVE = 0.05
+"""A depth step, where a region ends: neighbouring pixels differ by more than this share of the nearer depth."""
+LEAST_REGION, LEAST_SHARE = 0.01, 0.15
+"""A region is in front if at least this share of the image's pixels, and of its own, are in places that were free."""
+MARGIN_PX = 3
+"""The mask is wider than the regions by this much: sensors mix depth and colour at an edge."""
+
+
+@dataclass(frozen=True, eq=False)
+class Foreground:
+    """What is in front in an image.
+
+    hidden [H, W]: the pixels that show it, with a margin; depth_m [H, W]: its depth, 0 elsewhere; scene_m [H, W]: depth
+    of everything else, behind it as far as it is known from earlier images, else 0.
+    """
+
+    hidden: Mask
+    depth_m: Depth
+    scene_m: Depth
+
+
+@dataclass(frozen=True, eq=False)
+class Earlier:
+    """Depth of an earlier image [H, W] m, 0 where it is not known, and its pose relative to a live camera, [4, 4]."""
+
+    depth_m: Depth
+    T_earlier_live: Matrix
+
+
+def foreground(scene: Earlier, before: Earlier | None, live_m: Depth, camera: Camera) -> Foreground | None:
+    """Find what has moved in front of the camera; None without.
+
+    scene: the reference; before: what was in front in the last image; live_m [H, W]: live depth, m. A whole region
+    between depth steps is in front, also its part whose place the reference did not see, but not pixels that fit to the
+    reference.
+    """
+    depth = live_m[::STEP, ::STEP]
+    depth = np.where(depth > 0, depth, maximum_filter(depth, 3))  # fill scattered holes
+    free, again, same = _places(scene, before, depth, camera)
+    nearest = minimum_filter(np.where(depth > 0, depth, np.float32(np.inf)), 3)
+    regions, count = label((depth > 0) & ~same & (depth <= (1 + EDGE_RELATIVE) * nearest), np.ones((3, 3)))
+    sizes, in_free, old = (np.bincount(regions[chosen], minlength=count + 1) for chosen in (regions > 0, free, again))
+    chosen = (in_free >= LEAST_REGION * depth.size) & (in_free + old >= LEAST_SHARE * sizes)
+    chosen[0] = False
+    if not chosen.any():
+        return None
+    whole = np.repeat(np.repeat(chosen[regions], STEP, 0), STEP, 1)[: live_m.shape[0], : live_m.shape[1]]
+    hidden = maximum_filter(whole, 2 * MARGIN_PX + 1)
+    return Foreground(
+        hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, _behind(scene, camera), live_m)
+    )
+
+
+def _behind(scene: Earlier, camera: Camera) -> Depth:
+    """Return the scene as the live camera would see it, m, 0 where it is not known."""
+    v, u = np.nonzero(scene.depth_m > 0)
+    points = camera.rays()[v, u].T.astype(np.float64) * scene.depth_m[v, u]
+    inside, row, column, z = _projected(points, camera, se3.inverse(scene.T_earlier_live))
+    found = np.flatnonzero(inside)
+    found = found[np.argsort(-z[found], kind="stable")]  # the nearest surface is written last
+    seen = np.zeros(scene.depth_m.shape, np.float32)
+    seen[row[found], column[found]] = z[found]
+    return np.where(seen > 0, seen, maximum_filter(seen, 3))
+
+
+def _places(scene: Earlier, before: Earlier | None, depth: Depth, camera: Camera) -> tuple[Mask, Mask, Mask]:
+    """Return which pixels of every STEP-th row and column are in places that were free, which are where something was
+    in front already, and which are on surfaces of the scene."""
+    v, u = np.nonzero(depth > 0)
+    points = camera.rays()[STEP * v, STEP * u].T.astype(np.float64) * depth[v, u]
+    near = minimum_filter(np.where(scene.depth_m > 0, scene.depth_m, np.float32(np.inf)), AROUND_PX)
+    far = maximum_filter(scene.depth_m, AROUND_PX)
+    inside, row, column, z = _projected(points, camera, scene.T_earlier_live)
+    known, limit = inside & (far[row, column] > 0), CLEAR_M + CLEAR_RELATIVE * z
+    places = np.zeros((3, *depth.shape), bool)
+    free, again, same = places
+    free[v, u] = known & (z < near[row, column] - limit)
+    if before is not None:
+        in_last, at_row, at_column, z_last = _projected(points, camera, before.T_earlier_live)
+        front = before.depth_m[at_row, at_column]
+        again[v, u] = in_last & (front > 0) & (z_last < front + CLEAR_M + CLEAR_RELATIVE * z_last)
+    same[v, u] = known & (z < far[row, column] + limit)
+    return free, again & ~free, same & ~free & ~again
+
+
+def _projected(
+    points: Matrix, camera: Camera, T_earlier_live: Matrix
+) -> tuple[Mask, NDArray[np.intp], NDArray[np.intp], Matrix]:
+    """Project live points [3, n] into an earlier image: whether they are inside, row, column (0 outside), depth."""
+    x, y, z = T_earlier_live[:3, :3] @ points + T_earlier_live[:3, 3:]
+    ahead = np.maximum(z, 1e-3)
+    column, row = np.rint(camera.fx * x / ahead + camera.cx), np.rint(camera.fy * y / ahead + camera.cy)
+    inside = (z > 0.05) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    return inside, *(np.where(inside, pixel, 0).astype(np.intp) for pixel in (row, column)), z

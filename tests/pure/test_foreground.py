@@ -1,0 +1,114 @@
+"""What has moved in front of the camera is told apart from what comes into view."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground
+from sigmasplat.sources import SyntheticRoom
+
+Depth = NDArray[np.float32]
+CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
+WALL_M, OBJECT_M = 3.0, 1.0
+BOX = np.s_[40:90, 50:110]
+
+
+def wall() -> Depth:
+    return np.full((CAMERA.height, CAMERA.width), WALL_M, np.float32)
+
+
+def with_box(depth_m: Depth) -> Depth:
+    covered = depth_m.copy()
+    covered[BOX] = OBJECT_M
+    return covered
+
+
+def share(mask: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return the share of the box that a mask covers, and the share of all other pixels."""
+    box = np.zeros(mask.shape, bool)
+    box[BOX] = True
+    return float(mask[box].mean()), float(mask[~box].mean())
+
+
+def found(scene_m: Depth, live_m: Depth, before: Foreground | None = None) -> Foreground | None:
+    last = None if before is None else Earlier(before.depth_m, np.eye(4))
+    return foreground(Earlier(scene_m, np.eye(4)), last, live_m, CAMERA)
+
+
+def test_an_object_in_front_of_a_wall_is_found() -> None:
+    front = found(wall(), with_box(wall()))
+    assert front is not None
+    inside, outside = share(front.hidden)
+    assert inside == 1.0 and outside < 0.06
+    assert (front.depth_m[BOX] == OBJECT_M).mean() > 0.9
+    np.testing.assert_array_equal(front.scene_m, wall())
+
+
+def test_the_part_over_an_unknown_place_is_found_too() -> None:
+    unknown = wall()
+    unknown[:, :80] = 0.0
+    front = found(unknown, with_box(wall()))
+    assert front is not None and share(front.hidden)[0] > 0.95
+    assert (front.hidden[:, :40]).mean() < 0.05  # the wall over the unknown place is not in front
+
+
+@pytest.mark.parametrize("share_missing", [0.1, 0.4])
+def test_scattered_holes_do_not_hide_an_object(share_missing: float) -> None:
+    random = np.random.default_rng(0)
+    scene_m, live_m = (
+        np.where(random.random(wall().shape) < share_missing, np.float32(0), depth)
+        for depth in (wall(), with_box(wall()))
+    )
+    front = found(scene_m, live_m)
+    assert front is not None
+    inside, outside = share(front.hidden)
+    assert inside > 0.95 and outside < 0.1
+
+
+def test_a_large_hole_of_the_reference_shows_nothing_in_front() -> None:
+    assert found(np.where(with_box(wall()) < WALL_M, np.float32(0), wall()), with_box(wall())) is None
+
+
+def test_an_object_that_stops_stays_in_front_and_the_scene_behind_it_is_known() -> None:
+    first = found(wall(), with_box(wall()))
+    assert first is not None
+    second = found(first.scene_m, with_box(wall()), first)
+    assert second is not None and share(second.hidden)[0] == 1.0
+    np.testing.assert_array_equal(second.scene_m, wall())
+
+
+def test_when_the_object_has_gone_nothing_is_in_front() -> None:
+    first = found(wall(), with_box(wall()))
+    assert first is not None
+    assert found(first.scene_m, wall(), first) is None
+
+
+def test_noise_is_not_in_front() -> None:
+    noisy = wall() + np.random.default_rng(0).normal(0, 0.027, wall().shape).astype(np.float32)
+    assert found(wall(), noisy) is None
+
+
+@pytest.mark.parametrize("moved", [(0.4, 0.0, 0.0), (0.0, 0.0, -0.5), (0.3, 0.1, 0.3)])
+def test_a_still_surface_that_comes_into_view_is_not_in_front(moved: tuple[float, float, float]) -> None:
+    """A near screen at the side hides a part of a wall: moving aside, or back, brings more of it in front of wall that
+    was seen before."""
+    live_T = se3.exp(np.array([*moved, 0.0, 0.0, 0.0]))
+    scene_m, live_m = screen_and_wall(np.eye(4)), screen_and_wall(live_T)
+    assert foreground(Earlier(scene_m, live_T), None, live_m, CAMERA) is None
+
+
+def screen_and_wall(T_world_camera: NDArray[np.float64]) -> Depth:
+    """Return the depth of a wall at z = 3 m with a screen at z = 1.2 m and x > 0.65 m in front of it."""
+    rays, (x0, _, z0) = CAMERA.rays(), T_world_camera[:3, 3]
+    screen = x0 + rays[..., 0] * (1.2 - z0) > 0.65
+    return np.where(screen, np.float32(1.2 - z0), np.float32(WALL_M - z0)).astype(np.float32)
+
+
+def test_in_a_walk_through_a_still_room_nothing_is_in_front() -> None:
+    room = SyntheticRoom(frames=120, width=160, height=120, exposure_change=False)
+    T = room.truth().T_world_camera
+    for first in range(0, 110, 10):
+        scene = Earlier(room.frame(first).depth_m, se3.inverse(T[first]) @ T[first + 5])
+        assert foreground(scene, None, room.frame(first + 5).depth_m, room.camera) is None
