@@ -1,6 +1,6 @@
 """Measure whether the covariances of a run's poses cover their true errors (issue 17).
 
-Runs SLAM on sequences with known truth. Scores three kinds of motions as `sigmasplat evaluate` does: from each keyframe
+Runs SLAM on sequences with known truth. Scores three kinds of motions as `sigmasplat eval` does: from each keyframe
 to the next, over 50 frames, and from the first frame.
 Writes benchmarks/results/pose_covariance-<machine>.json and prints a table.
 
