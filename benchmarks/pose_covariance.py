@@ -50,7 +50,7 @@ class Options:
     preset: Annotated[str, arg(help="preset to start from")] = default_preset()
     width: Annotated[int, arg(help="width of the working images, pixels; 0 = as recorded")] = 0
     limit: Annotated[int | None, arg(help="number of frames at most")] = None
-    name: Annotated[str, arg(help="name of the results")] = "pose_covariance"
+    name: Annotated[str, arg(help="name of the results")] = "pose-covariance"
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
 
