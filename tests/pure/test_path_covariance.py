@@ -88,6 +88,7 @@ class Loopy:
 
 def checkpoint(atlas: Atlas, edges: list[Edge]) -> dict[str, torch.Tensor]:
     return recorded(atlas, edges) | {
+        "keyframes": torch.arange(len(atlas.places)),
         "T_world_submap": torch.from_numpy(np.stack(atlas.anchors)),
         "submap_component": torch.tensor(atlas.components),
         "frame_submap": torch.tensor([place.submap for place in atlas.places]),
@@ -204,3 +205,14 @@ def test_each_component_has_its_own_origin() -> None:
     first = 2 * (KEYFRAMES + 1)
     assert not apart.of_frame(first).any() and apart.of_frame(first + 1).any()
     np.testing.assert_allclose(apart.of_frame(first - 1), path.of_frame(first - 1))
+
+
+def test_a_frame_that_is_no_keyframe_adds_the_error_of_its_own_motion() -> None:
+    """Also if it is at the very pose of its keyframe, as in a frozen recording."""
+    path = Loopy().covariance(None)
+    loose = replace(path, is_keyframe=np.arange(len(path)) != 1)
+    own = loose.of_frame(1) - path.of_frame(1)
+    assert (np.linalg.eigvalsh(own) > 0).all()
+    T = loose.T_world_camera[1]
+    hop = se3.adjoint(se3.inverse(T)) @ own @ se3.adjoint(se3.inverse(T)).T
+    np.testing.assert_allclose(hop, Loopy().covariances[0][1], rtol=1e-6, atol=1e-14)

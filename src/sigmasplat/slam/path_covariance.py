@@ -28,9 +28,6 @@ from sigmasplat.types import Matrix
 
 Numbers = NDArray[np.int64]
 
-SAME_POSE = 1e-9
-"""Largest difference between the entries of two poses that are the same up to rounding."""
-
 
 def recorded(atlas: Atlas, edges: Sequence[Edge]) -> dict[str, Tensor]:
     """Return what a checkpoint keeps of the errors of a path; edges: the trusted ones and the accepted loops."""
@@ -72,8 +69,8 @@ class PathCovariance:
     """The errors of a path of F frames, K keyframes, S submaps, and edges between submaps.
 
     anchors [S, 4, 4]: T_world_submap; components [S]; frame_submap, frame_keyframe [F], the latter counted in its
-    submap, T_keyframe_camera [F, 4, 4]; keyframe_submap [K], T_submap_keyframe [K, 4, 4]; hops to the keyframes; edges:
-    the trusted ones and the accepted loops.
+    submap, T_keyframe_camera [F, 4, 4], is_keyframe [F]; keyframe_submap [K], T_submap_keyframe [K, 4, 4]; hops to the
+    keyframes; edges: the trusted ones and the accepted loops.
     """
 
     anchors: Matrix
@@ -81,6 +78,7 @@ class PathCovariance:
     frame_submap: Numbers
     frame_keyframe: Numbers
     T_keyframe_camera: Matrix
+    is_keyframe: NDArray[np.bool_]
     keyframe_submap: Numbers
     T_submap_keyframe: Matrix
     hops: Hops
@@ -102,6 +100,7 @@ class PathCovariance:
             read["frame_submap"],
             read["frame_keyframe"],
             read["T_keyframe_camera"],
+            np.isin(np.arange(len(read["frame_keyframe"])), read["keyframes"]),
             read["keyframe_submap"],
             read["T_submap_keyframe"],
             Hops(read["hop_T_camera_before"], read["hop_covariance"], read["hop_bias"]),
@@ -158,8 +157,7 @@ class PathCovariance:
         """Return the error of a frame's pose: a matrix [6, 6n] to multiply with n standard normal twists, which other
         frames share, and the covariance [6, 6] of the rest."""
         A = se3.adjoint(self.T_world_camera[frame])
-        is_keyframe = np.allclose(self.T_keyframe_camera[frame], np.eye(4), 0.0, SAME_POSE)
-        own = np.zeros((6, 6)) if is_keyframe else A @ self._hop_of_frame(frame) @ A.T
+        own = np.zeros((6, 6)) if self.is_keyframe[frame] else A @ self._hop_of_frame(frame) @ A.T
         return self._error_of_keyframe(int(self._row[frame])), own
 
     def _hop_of_frame(self, frame: int) -> Matrix:
