@@ -31,7 +31,7 @@ SETTINGS = {
     "input.width": "80", "input.limit": str(FRAMES), "mapping.first_iterations": "8", "mapping.iterations": "4",
     "mapping.every": "3", "submaps.frames": "9", "final.iterations": "6", "registration.iterations": "2",
 }  # fmt: skip
-SAME = ("trajectory.txt", "map.ply", "loops.json")
+SAME = ("trajectory.txt", "map.ply", "loops.json", "checkpoint.safetensors")
 
 
 def arguments(out: Path, name: str) -> list[str]:

@@ -7,6 +7,7 @@ import numpy as np
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.model import se3
+from sigmasplat.model.atlas import UNKNOWN_HOP, Hop
 from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
@@ -50,7 +51,7 @@ class Slam(World):
         found = self._localise(seen) if self.steps else self._begin(seen)
         if found.mapped:
             seen = seen.without(self.tracker.front, self.view)
-            found.T_submap_camera = self._map(seen, found.T_submap_camera)
+            found.T_submap_camera = self._map(seen, found.T_submap_camera, found.hop)
             if self._submap_ends(found.T_submap_camera):
                 found.loops += self._cut(found.T_submap_camera)
                 found.T_submap_camera = self._map(seen, np.eye(4))  # the next submap begins with the same keyframe
@@ -116,8 +117,10 @@ class Slam(World):
         found = Found.of(fit, se3.inverse(fit.T_camera_world), lost)
         if not lost:
             found.mapped = self.recovery.is_steady and self._is_certain(fit) and self._is_keyframe(fit.overlap)
-            if found.mapped and self._cuts:
-                found.tracking["drift_m"] = self._add_drift(fit, seen)
+            if found.mapped:
+                found.hop = self._hop(fit, seen)
+                if self._cuts:
+                    found.tracking["drift_m"] = self._add_drift(fit, found.hop)
             self._question(fit, seen, found)
         elif (place := self._relocalise(seen)) is not None:
             self._go_to(place, seen, found)
@@ -139,14 +142,22 @@ class Slam(World):
         c = self.config.mapping
         return is_keyframe(len(self.steps) - self.mapper.keyframes[-1].index, c.every, overlap, c.overlap_below)
 
-    def _add_drift(self, fit: PoseFit, seen: Observation) -> float:
+    def _hop(self, fit: PoseFit, seen: Observation) -> Hop:
+        """Return the motion to this keyframe from the one before it, with its errors."""
+        T_camera_before = fit.T_camera_world @ self.atlas.keyframe_poses[-1][-1]
+        alignment = self.tracker.hop(fit, seen.live)
+        if alignment is None:
+            return UNKNOWN_HOP._replace(T_camera_before=T_camera_before)
+        return Hop(T_camera_before, alignment.covariance, alignment.bias)
+
+    def _add_drift(self, fit: PoseFit, hop: Hop) -> float:
         """Add the hop to this keyframe to the submap's drift; return the standard deviation of its position, metres."""
         T_submap_camera = se3.inverse(fit.T_camera_world)
-        self.drift.hop(T_submap_camera, self.tracker.hop_covariance(fit, seen.live))
+        self.drift.hop(T_submap_camera, None if np.isnan(hop.covariance).any() else hop.covariance)
         return self.drift.position_m(T_submap_camera)
 
-    def _map(self, seen: Observation, T_submap_camera: Matrix) -> Matrix:
-        """Map a keyframe; return its pose, which mapping may have moved."""
+    def _map(self, seen: Observation, T_submap_camera: Matrix, hop: Hop = UNKNOWN_HOP) -> Matrix:
+        """Map a keyframe, which `hop` leads to; return its pose, which mapping may have moved."""
         index, frame = len(self.steps), seen.frame
         with self._timer.stage("describe"):
             descriptor = self.descriptor.describe(frame.color, frame.depth_m) if self._describes else None
@@ -156,7 +167,7 @@ class Slam(World):
         self._timer.add(fit.seconds, prefix="map_")
         if self.keyframe_indices[-1:] != [index]:  # a keyframe that two submaps share is counted once
             self.keyframe_indices.append(index)
-        self.atlas.keyframe_poses[-1] = [keyframe.T_world_camera for keyframe in self.mapper.keyframes]
+        self.atlas.set_keyframes([keyframe.T_world_camera for keyframe in self.mapper.keyframes], hop)
         self.tracker.keep_keyframe(self.mapper.field, self.view, seen, self.atlas.keyframe_poses[-1][-1])
         return self.atlas.keyframe_poses[-1][-1]
 

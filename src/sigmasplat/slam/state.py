@@ -6,7 +6,7 @@ from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model.atlas import Atlas, Place
+from sigmasplat.model.atlas import Atlas, Hop, Place
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.frame import Detail
@@ -26,7 +26,7 @@ from sigmasplat.slam.step_result import Step
 from sigmasplat.slam.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
-    Atlas, Camera, Confidence, Detail, Drift, Edge, FeatureImage, Foreground, GaussianField, Keyframe, Link, Loop,
+    Atlas, Camera, Confidence, Detail, Drift, Edge, FeatureImage, Foreground, GaussianField, Hop, Keyframe, Link, Loop,
     LoopCloser, Mapper, Place, Pyramid, Recovery, Reference, Relocaliser, Rows, SubmapDescriptor, Step, Target, Tracker,
     Usual, VectorAdam,
 )  # fmt: skip

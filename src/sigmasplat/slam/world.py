@@ -94,8 +94,9 @@ class World:
 
     def checkpoint(self) -> dict[str, Tensor]:
         """Return what is needed to read a run back, in host memory: the active submap's field with its optimiser state,
-        poses, times, keyframes, anchors, and the submap of each frame."""
-        return checkpoint_of(self.mapper.field, self.trajectory(), self.atlas, self.keyframe_indices)
+        poses, times, keyframes, anchors, the submap of each frame, and the errors of the path (`path_covariance`)."""
+        path, edges = self.trajectory(), self.closer.believed
+        return checkpoint_of(self.mapper.field, path, self.atlas, self.keyframe_indices, edges)
 
     @property
     def view(self) -> View:
