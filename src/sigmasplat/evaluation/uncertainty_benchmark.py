@@ -1,0 +1,328 @@
+"""Run SLAM with frames held back, and collect errors and predicted variances at views that the map was not fitted to.
+
+Nothing here depends on a particular predictor: they are rows of `view_predictors.PREDICTORS`. The samples of a run are
+scored together with those of other runs (`uncertainty_scores`), because temperatures come from other sequences.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sigmasplat.config import Config
+from sigmasplat.config.text import full_path, override, split_settings
+from sigmasplat.errors import ConfigError
+from sigmasplat.evaluation.splat_statistics import MapFacts, map_facts, splat_values
+from sigmasplat.evaluation.view_predictors import PREDICTORS, Predictor, SeenView, see
+from sigmasplat.evaluation.view_selection import evenly_spread, working_frame
+from sigmasplat.metrics.failures import score_failures
+from sigmasplat.metrics.scored_view import COVERED_ALPHA
+from sigmasplat.metrics.trajectory import associate, truth_in_estimate
+from sigmasplat.model import se3
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.frame import Frame, resized_depth
+from sigmasplat.model.submap import MemoryStore, StorePart, SubmapStore
+from sigmasplat.presets import preset as preset_of
+from sigmasplat.render import FieldRenderer
+from sigmasplat.render.backend import make_view
+from sigmasplat.run.protocols import Callback
+from sigmasplat.slam.final import KeyframeReader
+from sigmasplat.slam.rules import is_held_back
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources.base import Source
+from sigmasplat.types import Matrix, Progress, no_progress
+
+Floats = NDArray[np.float32]
+
+SEED = "{seed}"
+RESERVED = ("seed", "input.limit", "input.hold_every")
+HELD_BACK, AWAY = "held back", "away from the path"
+FINAL, SUBMAPS = "final", "submaps"
+PIXELS_PER_VIEW = 5_000
+"""At most this many pixels of a view, drawn at random, are scored: sorting stays fast."""
+TRAINING_VIEWS = 40
+"""At most this many keyframes of a map, evenly spread, teach the statistics of its splats."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run: the sequence as given and as opened, the seed, all settings."""
+
+    source: str
+    path: str
+    seed: int
+    config: Config
+
+
+@dataclass(frozen=True)
+class Study:
+    """What to measure: sequences, each with seeds 0, 1, …, and the settings that all runs share."""
+
+    sources: Sequence[str]
+    config: Config
+    seeds: int = 1
+    limit: int | None = None
+    hold_every: int = 8
+    views: int = 24
+
+    def jobs(self) -> list[Job]:
+        """List the runs; {seed} in a sequence is replaced by the number."""
+        numbers = [(source, seed) for source in self.sources for seed in range(self.seeds)]
+        held = {"input.hold_every": str(self.hold_every), "input.limit": str(self.limit or 0)}
+        return [
+            Job(
+                source, full_path(source.replace(SEED, str(seed))), seed,
+                override(self.config, held | {"seed": str(seed)}),
+            )
+            for source, seed in numbers
+        ]  # fmt: skip
+
+
+def study_config(preset: str, settings: Sequence[str]) -> Config:
+    """Return a preset's settings, changed by --set. Raises ConfigError for a setting that the benchmark itself sets."""
+    given = split_settings(settings)
+    for name in sorted(given.keys() & set(RESERVED)):
+        raise ConfigError(f"bench uncertainty itself sets {name}; remove it (use --seeds, --limit or --hold-every)")
+    return override(preset_of(preset), given)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a set of samples is about: the quantity ("color", "depth"), the map, and the kind of views."""
+
+    quantity: str
+    map: str
+    views: str
+
+
+@dataclass(eq=False)
+class Samples:
+    """Pixels of many views: squared error [P], alpha [P], and the variance [P] that each predictor gives, by name."""
+
+    squared_error: list[Floats] = field(default_factory=list)
+    alpha: list[Floats] = field(default_factory=list)
+    variances: dict[str, list[Floats]] = field(default_factory=dict)
+
+    def joined(self) -> dict[str, Floats]:
+        """Return the arrays "squared_error", "alpha" and "variance NAME" of all views."""
+        parts = {"squared_error": self.squared_error, "alpha": self.alpha}
+        parts |= {f"variance {name}": values for name, values in self.variances.items()}
+        return {name: np.concatenate(values) for name, values in parts.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What a run gives: its facts for the file, and its samples by kind (`Samples.joined`)."""
+
+    facts: dict[str, Any]
+    samples: dict[Kind, dict[str, Floats]]
+
+
+def run_slam(config: Config, source: Source, show: Callback | None = None) -> Slam:
+    """Run SLAM in memory, including the final map."""
+    slam = Slam(config)
+    for frame in source:
+        step = slam.step(frame)
+        if show:
+            show(step)
+    slam.finish(show.finishing if show else no_progress)
+    return slam
+
+
+@dataclass(frozen=True, eq=False)
+class UnseenView:
+    """A recorded view to predict, and its pose in the world; exact: whether its depth is the true depth."""
+
+    frame: Frame
+    T_world_camera: Matrix
+    submap: int
+    exact: bool
+
+
+class RunMaps:
+    """The maps of a finished run, and their facts: the final map, and the submaps one after the other."""
+
+    def __init__(self, slam: Slam) -> None:
+        self.slam, config = slam, slam.config
+        self.store, self.anchors = _finished(slam)
+        self.renderer = FieldRenderer(config.render, config.backend)
+        self.view = make_view(config.backend, slam.view.camera, config.render, variance=False)
+
+    def final(self) -> MapFacts:
+        """Return the facts of the map in the world."""
+        members = [s for s in self.slam.atlas.members(0) if s < len(self.store)]
+        part, anchors = StorePart(self.store, members), [self.anchors[s] for s in members]
+        return self._facts(self.slam.field, part, anchors)
+
+    def submap(self, index: int) -> MapFacts:
+        """Return the facts of a submap in its own frame."""
+        return self._facts(self.store.load(index).field, StorePart(self.store, [index]), [np.eye(4)])
+
+    def _facts(self, splats: GaussianField, store: SubmapStore, anchors: Sequence[Matrix]) -> MapFacts:
+        reader = KeyframeReader(store, anchors, self.view)
+        chosen = [reader[i] for i in evenly_spread(range(len(reader)), TRAINING_VIEWS)]
+        return map_facts(splats, chosen, self.view, self.renderer)
+
+
+def _finished(slam: Slam) -> tuple[SubmapStore, list[Matrix]]:
+    """Return the finished submaps and their anchors; the only submap of a run without cuts is finished here."""
+    if len(slam.store):
+        return slam.store, slam.atlas.anchors
+    store = MemoryStore()
+    store.save(*slam.mapper.finished(0))
+    return store, slam.atlas.anchors
+
+
+def measure(
+    slam: Slam,
+    source: Source,
+    most: int,
+    predictors: Sequence[Predictor] = PREDICTORS,
+    progress: Progress = no_progress,
+) -> Measured:
+    """Collect errors and predictions of a finished run at views that its map was not fitted to.
+
+    Views: at most `most` of the frames held back (`input.hold_every`) whose pose is believed, and as many of the
+    source's test views. Calls `progress(views done, total)`.
+    """
+    maps, samples, random = RunMaps(slam), dict[Kind, Samples](), np.random.default_rng(slam.config.seed)
+    views = {HELD_BACK: held_back_views(slam, source, most), AWAY: away_views(slam, source, most)}
+    total = sum(map(len, views.values())) + len(views[HELD_BACK])
+    for done, (kind, map_name, view, seen) in enumerate(_seen_views(maps, views), 1):
+        for quantity, columns in _pixels(view, seen, predictors, random).items():
+            _add(samples.setdefault(Kind(quantity, map_name, kind), Samples()), columns)
+        progress(done, total)
+    facts = run_facts(slam, source) | {"views": {kind: len(some) for kind, some in views.items()}}
+    return Measured(facts, {kind: found.joined() for kind, found in samples.items()})
+
+
+def _seen_views(
+    maps: RunMaps, views: Mapping[str, Sequence[UnseenView]]
+) -> Iterator[tuple[str, str, UnseenView, SeenView]]:
+    """Render all views from the final map, and those that belong to a submap also from it."""
+    final = maps.final()
+    values = splat_values(final)
+    for kind, some in views.items():
+        for view in some:
+            T_camera_world = se3.inverse(view.T_world_camera)
+            yield kind, FINAL, view, see(final, values, view.frame.camera, T_camera_world, maps.renderer)
+    for index in sorted({view.submap for view in views[HELD_BACK]}):
+        facts = maps.submap(index)
+        values = splat_values(facts)
+        for view in views[HELD_BACK]:
+            if view.submap == index:
+                T_camera_submap = se3.inverse(view.T_world_camera) @ maps.anchors[index]
+                yield HELD_BACK, SUBMAPS, view, see(facts, values, view.frame.camera, T_camera_submap, maps.renderer)
+
+
+def held_back_views(slam: Slam, source: Source, most: int) -> list[UnseenView]:
+    """Return the frames that were held back and whose pose is believed, evenly spread, at the estimated poses."""
+    every, believed, poses = slam.config.input.hold_every, slam.believed(), slam.trajectory().T_world_camera
+    rows = [row for row in range(len(slam.steps)) if is_held_back(row, every) and believed[row]]
+    return [
+        _unseen_view(slam, source, slam.steps[row].index, poses[row], slam.atlas.places[row].submap)
+        for row in evenly_spread(rows, most)
+    ]
+
+
+def away_views(slam: Slam, source: Source, most: int) -> list[UnseenView]:
+    """Return the source's test views at their true poses, which the alignment of the ATE moves to the world."""
+    away, truth, believed = source.test_views(), source.truth(), slam.believed()
+    poses = None if away is None else away.truth()
+    if away is None or poses is None or truth is None or not believed.any():
+        return []
+    path = slam.trajectory().at(believed)
+    T_estimate_truth = truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], truth)
+    found = list[UnseenView]()
+    for i in evenly_spread(range(len(away)), most):
+        rows, at = associate(np.array([away.timestamp_s(i)]), poses.timestamps_s)
+        if len(rows):
+            found.append(_unseen_view(slam, away, i, T_estimate_truth @ poses.T_world_camera[at[0]], 0))
+    return found
+
+
+def _unseen_view(slam: Slam, source: Source, index: int, T_world_camera: Matrix, submap: int) -> UnseenView:
+    """Read a view at working size, with exact depth if the source knows it."""
+    settings = slam.config.input
+    frame, exact = working_frame(source, settings, index), source.exact_depth_of(index)
+    if exact is not None:
+        width, height = frame.camera.width + 2 * settings.crop_px, frame.camera.height + 2 * settings.crop_px
+        inner = np.s_[settings.crop_px : height - settings.crop_px, settings.crop_px : width - settings.crop_px]
+        depth = resized_depth(exact, width, height)[inner]
+        keep = (depth >= settings.min_depth_m) & (depth <= settings.max_depth_m)
+        depth = np.ascontiguousarray(np.where(keep, depth, np.float32(0.0)))
+        frame = Frame(frame.index, frame.timestamp_s, frame.color, depth, frame.camera)
+    return UnseenView(frame, T_world_camera, submap, exact is not None)
+
+
+def _pixels(
+    view: UnseenView, seen: SeenView, predictors: Sequence[Predictor], random: np.random.Generator
+) -> dict[str, dict[str, Floats]]:
+    """Return error, alpha and predictions at random pixels, by quantity.
+
+    Colour is scored on all pixels; depth where the view has a reading and the map covers the pixel.
+    """
+    alpha, frame = _array(seen.rendered.alpha), view.frame
+    color_error2 = ((np.clip(_array(seen.rendered.color), 0.0, 1.0) - frame.color) ** 2).mean(-1)
+    known = (frame.depth_m > 0) & (alpha > COVERED_ALPHA)
+    errors = {
+        "color": (color_error2, np.arange(alpha.size)),
+        "depth": ((_array(seen.depth_m) - frame.depth_m) ** 2, np.flatnonzero(known)),
+    }
+    planes = {(p.quantity, p.name): _array(p.plane(seen)).ravel() for p in predictors}
+    found = dict[str, dict[str, Floats]]()
+    for quantity, (error2, rows) in errors.items():
+        chosen = random.permutation(rows)[:PIXELS_PER_VIEW]
+        columns = {"squared_error": error2.ravel()[chosen], "alpha": alpha.ravel()[chosen]}
+        mine = {name: plane[chosen] for (of, name), plane in planes.items() if of == quantity}
+        found[quantity] = columns | {f"variance {name}": values for name, values in mine.items()}
+    return found
+
+
+def _add(samples: Samples, columns: Mapping[str, Floats]) -> None:
+    """Append the pixels of a view."""
+    samples.squared_error.append(columns["squared_error"])
+    samples.alpha.append(columns["alpha"])
+    for name, values in columns.items():
+        if name.startswith("variance "):
+            samples.variances.setdefault(name.removeprefix("variance "), []).append(values)
+
+
+def run_facts(slam: Slam, source: Source) -> dict[str, Any]:
+    """Return counts, and the scores of poses and of `p_off` if the truth is known.
+
+    "poses" is the place for NEES and coverage of pose covariances; it stays None until frames have a covariance.
+    """
+    lost = sum(step.lost for step in slam.steps)
+    counts = {"frames": len(slam.steps), "lost": lost, "keyframes": len(slam.keyframe_indices)}
+    held = [i for i in range(len(slam.steps)) if is_held_back(i, slam.config.input.hold_every)]
+    counts |= {"held_back": len(held), "submaps": len(slam.atlas.anchors), "splats": len(slam.field)}
+    return counts | {"ate_m": None, "failures": None, "poses": None} | _path_scores(slam, source)
+
+
+def _path_scores(slam: Slam, source: Source) -> dict[str, Any]:
+    """Return the ATE and the scores of `p_off`; nothing without a truth that shares timestamps with the path."""
+    truth, believed, path = source.truth(), slam.believed(), slam.trajectory()
+    if truth is None or not believed.any():
+        return {}
+    times, positions = path.timestamps_s, path.T_world_camera[:, :3, 3]
+    rows, matched = associate(times, truth.timestamps_s)
+    if not believed[rows].any():
+        return {}
+    T_estimate_truth = truth_in_estimate(times[believed], positions[believed], truth)
+    true = (T_estimate_truth @ truth.T_world_camera[matched])[:, :3, 3]
+    error_m = np.full(len(times), np.nan)
+    error_m[rows] = np.linalg.norm(positions[rows] - true, axis=1)
+    at = np.isfinite(error_m) & believed
+    p_off = np.array([step.p_off for step in slam.steps])
+    return {
+        "ate_m": float(np.sqrt(np.mean(error_m[at] ** 2))),
+        "failures": score_failures(error_m, p_off, believed),
+    }
+
+
+def _array(plane: torch.Tensor) -> Floats:
+    return np.asarray(plane.detach().cpu(), np.float32)

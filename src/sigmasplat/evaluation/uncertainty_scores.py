@@ -1,0 +1,146 @@
+"""Score predicted variances of several runs, before and after one temperature per predictor from other sequences."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.drawing.plot import ACCENT, BLUE, FAINT, GREEN, PURPLE, Chart, Curve
+from sigmasplat.evaluation.uncertainty_benchmark import HELD_BACK, Kind
+from sigmasplat.evaluation.view_predictors import PREDICTORS, Predictor
+from sigmasplat.metrics.scored_view import COVERED_ALPHA
+from sigmasplat.metrics.uncertainty import (
+    EPSILON,
+    best_scale,
+    calibration_scores,
+    gaussian_nll,
+    ranking_scores,
+    sparsification,
+)
+
+Arrays = Mapping[str, NDArray[np.float32]]
+ALL, COVERED = "all pixels", "covered pixels"
+CURVES = (ACCENT, BLUE, GREEN, PURPLE)
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """The samples of one run by kind, and which sequence it is of."""
+
+    source: str
+    samples: Mapping[Kind, Arrays]
+
+
+def score_runs(runs: Sequence[Run], predictors: Sequence[Predictor] = PREDICTORS) -> list[dict[Kind, dict[str, Any]]]:
+    """Return the scores of each run: by kind, then by "all pixels" or "covered pixels", then by predictor.
+
+    The temperature of a predictor is the mean of its best scales on the held-back views of all other sequences, for
+    each quantity, map and subset of pixels. With a single sequence it is that of the run itself (`in_sample`).
+    """
+    scales = [_best_scales(run, predictors) for run in runs]
+    found = []
+    for run, own in zip(runs, scales, strict=True):
+        others = [scale for other, scale in zip(runs, scales, strict=True) if other.source != run.source]
+        of_kind = dict[Kind, dict[str, Any]]()
+        for kind, arrays in run.samples.items():
+            fitted_on = Kind(kind.quantity, kind.map, HELD_BACK)
+            subset_scores = dict[str, Any]()
+            for subset, pixels in subsets(kind, arrays).items():
+                fitted = [scale.get((fitted_on, subset), {}) for scale in others or [own]]
+                rows = _score(kind, arrays, pixels, predictors, _mean_scales(fitted))
+                subset_scores[subset] = {"pixels": int(pixels.sum()), "in_sample": not others, "predictors": rows}
+            of_kind[kind] = subset_scores
+        found.append(of_kind)
+    return found
+
+
+def subsets(kind: Kind, arrays: Arrays) -> dict[str, NDArray[np.bool_]]:
+    """Return which pixels are scored, by name. Depth is only known where the map covers the pixel."""
+    covered = arrays["alpha"] > COVERED_ALPHA
+    return {COVERED: covered} if kind.quantity == "depth" else {ALL: np.ones_like(covered), COVERED: covered}
+
+
+def predicted(predictor: Predictor, arrays: Arrays, pixels: NDArray[np.bool_]) -> tuple[Any, Any]:
+    """Return the variance (in its unit, or at its best scale if it has none) and the squared error of some pixels."""
+    variance, error2 = arrays[f"variance {predictor.name}"][pixels], arrays["squared_error"][pixels]
+    if predictor.scaled:
+        variance = (variance + np.float32(EPSILON)) * np.float32(best_scale(variance, error2))
+    return variance, error2
+
+
+def _best_scales(run: Run, predictors: Sequence[Predictor]) -> dict[tuple[Kind, str], dict[str, float]]:
+    """Return the best scale of each predictor on the held-back views, by kind and subset of pixels."""
+    return {
+        (kind, subset): {
+            p.name: best_scale(*predicted(p, arrays, pixels), EPSILON)
+            for p in predictors
+            if p.quantity == kind.quantity
+        }
+        for kind, arrays in run.samples.items()
+        if kind.views == HELD_BACK
+        for subset, pixels in subsets(kind, arrays).items()
+    }
+
+
+def _mean_scales(scales: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return the mean of the finite scales of each predictor."""
+    names = dict.fromkeys(name for scale in scales for name in scale)
+    known = {name: [s[name] for s in scales if np.isfinite(s.get(name, np.nan))] for name in names}
+    return {name: float(np.mean(values)) for name, values in known.items() if values}
+
+
+def _score(
+    kind: Kind,
+    arrays: Arrays,
+    pixels: NDArray[np.bool_],
+    predictors: Sequence[Predictor],
+    temperatures: Mapping[str, float],
+) -> dict[str, Any]:
+    """Return the scores of each predictor on some pixels."""
+    rows = dict[str, Any]()
+    for p in predictors:
+        if p.quantity == kind.quantity:
+            # A temperature transfers a scale between sequences. A scaled predictor already has the best one.
+            temperature = 1.0 if p.scaled else temperatures.get(p.name, 1.0)
+            rows[p.name] = _scores_of(*predicted(p, arrays, pixels), temperature, EPSILON)
+    return rows
+
+
+def _scores_of(
+    variance: NDArray[np.float32], error2: NDArray[np.float32], temperature: float, epsilon: float
+) -> dict[str, Any]:
+    """Return the scores of a variance: rank, before and after the temperature, and the NLL at its own best scale."""
+    own = best_scale(variance, error2, epsilon)
+    scaled = variance.astype(np.float64).clip(min=0.0) + epsilon
+    return {
+        **ranking_scores(variance, error2),
+        "before": calibration_scores(variance, error2, epsilon),
+        "temperature": temperature,
+        "after": calibration_scores(temperature * scaled, error2, 0.0),
+        "best_scale": own,
+        "nll_at_best_scale": gaussian_nll(own * scaled, error2, 0.0) if own > 0 else float("nan"),
+        "mean_variance": float(variance.mean()) if len(variance) else float("nan"),
+        "mean_squared_error": float(error2.mean()) if len(error2) else float("nan"),
+    }
+
+
+def sparsification_charts(kind: Kind, arrays: Arrays, predictors: Sequence[Predictor] = PREDICTORS) -> list[Chart]:
+    """Return charts of the RMSE after the pixels of largest variance are removed, a few predictors in each."""
+    wanted = [p for p in predictors if p.quantity == kind.quantity]
+    unit = "colour 0 to 1" if kind.quantity == "color" else "m"
+    error2, steps = arrays["squared_error"], np.arange(100)
+    oracle = Curve("true error", np.stack([steps, sparsification(error2, error2)], 1), FAINT)
+    top = float(oracle.points[0, 1]) * 1.3 or 1.0
+    charts = []
+    for first in range(0, len(wanted), len(CURVES)):
+        some = wanted[first : first + len(CURVES)]
+        curves = [
+            Curve(p.name, np.stack([steps, sparsification(arrays[f"variance {p.name}"], error2)], 1), colour)
+            for p, colour in zip(some, CURVES, strict=False)
+        ]
+        title = f"{kind.quantity}, {kind.map}, {kind.views}"
+        label = "pixels removed, %"
+        charts.append(Chart(title, label, f"RMSE, {unit}", [*curves, oracle], from_zero=True, y_limits=(0.0, top)))
+    return charts
