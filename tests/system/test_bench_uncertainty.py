@@ -114,7 +114,11 @@ def samples(scale: float, seed: int) -> dict[Kind, dict[str, np.ndarray]]:
     random = np.random.default_rng(seed)
     variance = np.exp(random.uniform(-9, -3, 20_000))
     error2 = scale * variance * random.normal(size=20_000) ** 2
-    arrays = {"squared_error": error2, "alpha": np.where(np.arange(20_000) % 5, 1.0, 0.2)}
+    arrays = {
+        "squared_error": error2,
+        "alpha": np.where(np.arange(20_000) % 5, 1.0, 0.2),
+        "reading": np.arange(20_000) % 2,
+    }
     arrays |= {f"variance {p.name}": variance for p in PREDICTORS if p.quantity == "color"}
     return {Kind("color", "final", HELD_BACK): {name: values.astype(np.float32) for name, values in arrays.items()}}
 
@@ -178,7 +182,7 @@ def test_samples_have_every_predictor_and_both_maps(run: FinishedRun) -> None:
     }  # fmt: skip
     for kind, arrays in found.samples.items():
         names = {f"variance {p.name}" for p in PREDICTORS if p.quantity == kind.quantity}
-        assert arrays.keys() == names | {"squared_error", "alpha"}
+        assert arrays.keys() == names | {"squared_error", "alpha", "reading"}
         assert len({len(values) for values in arrays.values()}) == 1
         assert all(np.isfinite(values).all() and values.min() >= 0.0 for values in arrays.values() if len(values))
     assert found.facts["frames"] == 13 and found.facts["held_back"] == 3 and found.facts["ate_m"] < 0.1

@@ -96,15 +96,17 @@ class Kind:
 
 @dataclass(eq=False)
 class Samples:
-    """Pixels of many views: squared error [P], alpha [P], and the variance [P] that each predictor gives, by name."""
+    """Pixels of many views: squared error [P], alpha [P], whether there is a depth reading [P], and the variance [P]
+    that each predictor gives, by name."""
 
     squared_error: list[Floats] = field(default_factory=list)
     alpha: list[Floats] = field(default_factory=list)
+    reading: list[Floats] = field(default_factory=list)
     variances: dict[str, list[Floats]] = field(default_factory=dict)
 
     def joined(self) -> dict[str, Floats]:
-        """Return the arrays "squared_error", "alpha" and "variance NAME" of all views."""
-        parts = {"squared_error": self.squared_error, "alpha": self.alpha}
+        """Return the arrays "squared_error", "alpha", "reading" and "variance NAME" of all views."""
+        parts = {"squared_error": self.squared_error, "alpha": self.alpha, "reading": self.reading}
         parts |= {f"variance {name}": values for name, values in self.variances.items()}
         return {name: np.concatenate(values) for name, values in parts.items()}
 
@@ -200,7 +202,9 @@ def _pixels(
     found = dict[str, dict[str, Floats]]()
     for quantity, (error2, rows) in errors.items():
         chosen = random.permutation(rows)[:PIXELS_PER_VIEW]
-        columns = {"squared_error": error2.ravel()[chosen], "alpha": alpha.ravel()[chosen]}
+        reading = (frame.depth_m > 0).astype(np.float32)
+        values = {"squared_error": error2, "alpha": alpha, "reading": reading}
+        columns = {name: plane.ravel()[chosen] for name, plane in values.items()}
         mine = {name: plane[chosen] for (of, name), plane in planes.items() if of == quantity}
         found[quantity] = columns | {f"variance {name}": values for name, values in mine.items()}
     return found
@@ -210,6 +214,7 @@ def _add(samples: Samples, columns: Mapping[str, Floats]) -> None:
     """Append the pixels of a view."""
     samples.squared_error.append(columns["squared_error"])
     samples.alpha.append(columns["alpha"])
+    samples.reading.append(columns["reading"])
     for name, values in columns.items():
         if name.startswith("variance "):
             samples.variances.setdefault(name.removeprefix("variance "), []).append(values)

@@ -21,7 +21,7 @@ from sigmasplat.metrics.uncertainty import (
 )
 
 Arrays = Mapping[str, NDArray[np.float32]]
-ALL, COVERED = "all pixels", "covered pixels"
+ALL, READ, COVERED = "all pixels", "pixels with a reading", "covered pixels"
 CURVES = (ACCENT, BLUE, GREEN, PURPLE)
 
 
@@ -34,7 +34,7 @@ class Run:
 
 
 def score_runs(runs: Sequence[Run], predictors: Sequence[Predictor] = PREDICTORS) -> list[dict[Kind, dict[str, Any]]]:
-    """Return the scores of each run: by kind, then by "all pixels" or "covered pixels", then by predictor.
+    """Return the scores of each run: by kind, then by subset of pixels, then by predictor.
 
     The temperature of a predictor is the mean of its best scales on the held-back views of all other sequences, for
     each quantity, map and subset of pixels. With a single sequence it is that of the run itself (`in_sample`).
@@ -59,7 +59,9 @@ def score_runs(runs: Sequence[Run], predictors: Sequence[Predictor] = PREDICTORS
 def subsets(kind: Kind, arrays: Arrays) -> dict[str, NDArray[np.bool_]]:
     """Return which pixels are scored, by name. Depth is only known where the map covers the pixel."""
     covered = arrays["alpha"] > COVERED_ALPHA
-    return {COVERED: covered} if kind.quantity == "depth" else {ALL: np.ones_like(covered), COVERED: covered}
+    if kind.quantity == "depth":
+        return {COVERED: covered}
+    return {ALL: np.ones_like(covered), READ: arrays["reading"] > 0, COVERED: covered}
 
 
 def predicted(predictor: Predictor, arrays: Arrays, pixels: NDArray[np.bool_]) -> tuple[Any, Any]:

@@ -18,6 +18,8 @@ from sigmasplat.render import FieldRenderer, Render
 from sigmasplat.types import Matrix
 
 Quantity = Literal["color", "depth"]
+QUANTITIES: tuple[Quantity, ...] = ("color", "depth")
+"""In the order of `MapFacts.noise` and `MapFacts.prior`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +103,12 @@ def depth_moment_with_prior(seen: SeenView) -> Tensor:
     return depth_moment(seen) + seen.transmittance * seen.facts.prior[1]
 
 
+def ridge_with_prior(quantity: Quantity) -> Callable[[SeenView], Tensor]:
+    """Return a predictor: the ridge regression, plus (1 − A) times the variance of colour or depth seen so far."""
+    prior = QUANTITIES.index(quantity)
+    return lambda seen: seen.splats[f"ridge_{quantity}"] + seen.transmittance * seen.facts.prior[prior]
+
+
 def splat_plane(name: str) -> Callable[[SeenView], Tensor]:
     """Return a predictor that reads the rendered values of a statistic."""
     return lambda seen: seen.splats[name].clamp(min=0.0)
@@ -114,11 +122,13 @@ PREDICTORS: tuple[Predictor, ...] = (
     Predictor("ridge", "color", splat_plane("ridge_color")),
     Predictor("Fisher", "color", splat_plane("fisher_color")),
     Predictor("V + T prior", "color", variance_with_prior),
+    Predictor("ridge + T prior", "color", ridge_with_prior("color")),
     Predictor("constant", "depth", constant, scaled=True),
     Predictor("1 - A", "depth", transmittance, scaled=True),
     Predictor("U", "depth", depth_moment),
     Predictor("ridge", "depth", splat_plane("ridge_depth")),
     Predictor("Fisher", "depth", splat_plane("fisher_depth")),
     Predictor("U + T prior", "depth", depth_moment_with_prior),
+    Predictor("ridge + T prior", "depth", ridge_with_prior("depth")),
 )
 """All predictors, in the order of the table."""
