@@ -11,7 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from sigmasplat.evaluation.splat_statistics import MapFacts
+from sigmasplat.evaluation.splat_statistics import MapFacts, on_host
 from sigmasplat.metrics.scored_view import COVERED_ALPHA
 from sigmasplat.model.camera import Camera
 from sigmasplat.render import FieldRenderer, Render
@@ -52,10 +52,10 @@ def see(
 ) -> SeenView:
     """Render a map and the values [N] of its splats at a pose."""
     with torch.inference_mode():
-        rendered = renderer(facts.field, camera, T_camera_map)
+        rendered = on_host(renderer(facts.field, camera, T_camera_map))
         alpha = rendered.alpha
         depth_m = torch.where(alpha > COVERED_ALPHA, rendered.depth / alpha.clamp(min=COVERED_ALPHA), 0.0)
-        moment = renderer(facts.field, camera, T_camera_map, depth_m).uncertainty
+        moment = on_host(renderer(facts.field, camera, T_camera_map, depth_m)).uncertainty
     assert moment is not None, "a render with a depth reference has a moment"
     return SeenView(rendered, depth_m, moment, facts.rendered(T_camera_map, values), facts)
 
