@@ -105,10 +105,12 @@ class Samples:
     variances: dict[str, list[Floats]] = field(default_factory=dict)
 
     def joined(self) -> dict[str, Floats]:
-        """Return the arrays "squared_error", "alpha", "reading" and "variance NAME" of all views."""
+        """Return the arrays "squared_error", "alpha", "reading" and "variance NAME" of all views, pixels in random order:
+        if the sorting of equal variances kept the order of the views, AUSE would depend on it."""
         parts = {"squared_error": self.squared_error, "alpha": self.alpha, "reading": self.reading}
         parts |= {f"variance {name}": values for name, values in self.variances.items()}
-        return {name: np.concatenate(values) for name, values in parts.items()}
+        order = np.random.default_rng(0).permutation(sum(map(len, self.alpha)))
+        return {name: np.concatenate(values)[order] for name, values in parts.items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -134,7 +134,6 @@ def sparsification_charts(kind: Kind, arrays: Arrays, predictors: Sequence[Predi
     unit = "colour 0 to 1" if kind.quantity == "color" else "m"
     error2, steps = arrays["squared_error"], np.arange(100)
     oracle = Curve("true error", np.stack([steps, sparsification(error2, error2)], 1), FAINT)
-    top = float(oracle.points[0, 1]) * 1.3 or 1.0
     charts = []
     for first in range(0, len(wanted), len(CURVES)):
         some = wanted[first : first + len(CURVES)]
@@ -142,7 +141,6 @@ def sparsification_charts(kind: Kind, arrays: Arrays, predictors: Sequence[Predi
             Curve(p.name, np.stack([steps, sparsification(arrays[f"variance {p.name}"], error2)], 1), colour)
             for p, colour in zip(some, CURVES, strict=False)
         ]
-        title = f"{kind.quantity}, {kind.map}, {kind.views}"
-        label = "pixels removed, %"
-        charts.append(Chart(title, label, f"RMSE, {unit}", [*curves, oracle], from_zero=True, y_limits=(0.0, top)))
+        title = f"{kind.quantity}, {kind.map}, {kind.views}: RMSE, {unit}"
+        charts.append(Chart(title, "pixels removed, %", "", [*curves, oracle], from_zero=True))
     return charts
