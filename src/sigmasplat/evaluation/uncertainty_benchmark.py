@@ -105,8 +105,11 @@ class Samples:
     variances: dict[str, list[Floats]] = field(default_factory=dict)
 
     def joined(self) -> dict[str, Floats]:
-        """Return the arrays "squared_error", "alpha", "reading" and "variance NAME" of all views, pixels in random order:
-        if the sorting of equal variances kept the order of the views, AUSE would depend on it."""
+        """Return the arrays "squared_error", "alpha", "reading" and "variance NAME" of all views.
+
+        Pixels are in random order. Sorting keeps the order of equal variances, so otherwise AUSE would depend on the
+        order of the views.
+        """
         parts = {"squared_error": self.squared_error, "alpha": self.alpha, "reading": self.reading}
         parts |= {f"variance {name}": values for name, values in self.variances.items()}
         order = np.random.default_rng(0).permutation(sum(map(len, self.alpha)))
