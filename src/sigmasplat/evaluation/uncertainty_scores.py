@@ -23,6 +23,8 @@ from sigmasplat.metrics.uncertainty import (
 Arrays = Mapping[str, NDArray[np.float32]]
 ALL, READ, COVERED = "all pixels", "pixels with a reading", "covered pixels"
 CURVES = (ACCENT, BLUE, GREEN, PURPLE)
+HEADROOM = 1.15
+"""Largest RMSE in a sparsification chart, as a multiple of the RMSE of all pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,18 +131,23 @@ def _scores_of(
 
 
 def sparsification_charts(kind: Kind, arrays: Arrays, predictors: Sequence[Predictor] = PREDICTORS) -> list[Chart]:
-    """Return charts of the RMSE after the pixels of largest variance are removed, a few predictors in each."""
+    """Return charts of the RMSE after the pixels of largest variance are removed, a few predictors in each.
+
+    A curve ends where it rises more than `HEADROOM` above its start.
+    """
     wanted = [p for p in predictors if p.quantity == kind.quantity]
-    unit = "colour 0 to 1" if kind.quantity == "color" else "m"
-    error2, steps = arrays["squared_error"], np.arange(100)
-    oracle = Curve("true error", np.stack([steps, sparsification(error2, error2)], 1), FAINT)
-    charts = []
+    quantity, unit = ("colour", "0 to 1") if kind.quantity == "color" else ("depth", "m")
+    error2 = arrays["squared_error"]
+    top = HEADROOM * float(np.sqrt(error2.mean()))
+
+    def curve(name: str, order_by: NDArray[np.float32], colour: int) -> Curve:
+        rmse = sparsification(order_by, error2)
+        return Curve(name, np.stack([np.arange(len(rmse)), np.where(rmse <= top, rmse, np.nan)], 1), colour)
+
+    oracle, charts = curve("true error", error2, FAINT), list[Chart]()
     for first in range(0, len(wanted), len(CURVES)):
-        some = wanted[first : first + len(CURVES)]
-        curves = [
-            Curve(p.name, np.stack([steps, sparsification(arrays[f"variance {p.name}"], error2)], 1), colour)
-            for p, colour in zip(some, CURVES, strict=False)
-        ]
-        title = f"{kind.quantity}, {kind.map}, {kind.views}: RMSE, {unit}"
-        charts.append(Chart(title, "pixels removed, %", "", [*curves, oracle], from_zero=True))
+        some = zip(wanted[first : first + len(CURVES)], CURVES, strict=False)
+        curves = [curve(p.name, arrays[f"variance {p.name}"], colour) for p, colour in some]
+        title = f"{quantity}, {kind.map}, {kind.views}: RMSE, {unit}"
+        charts.append(Chart(title, "pixels removed, %", "", [*curves, oracle], from_zero=True, y_limits=(0.0, top)))
     return charts
