@@ -138,11 +138,11 @@ def _table(title: str, of_runs: Sequence[dict[str, Any]]) -> "Table":
         made.add_column(head, justify="right")
     for name in of_runs[0]["predictors"]:
         rows = [run["predictors"][name] for run in of_runs]
-        made.add_row(name, *(_cell([value(row) for row in rows], digits) for _, digits, value in COLUMNS))
+        made.add_row(name, *(written([value(row) for row in rows], digits) for _, digits, value in COLUMNS))
     return made
 
 
-def _cell(values: Sequence[float | None], digits: int) -> str:
+def written(values: Sequence[float | None], digits: int) -> str:
     """Write the mean of the known values, ± their standard deviation if there are several."""
     from sigmasplat.report.tables import number
 
