@@ -62,12 +62,16 @@ class Uncertainty:
 
     def run(self) -> int:
         """Make the missing runs, score all of them, print the tables, and return 0. Raises SigmaSplatError."""
+        from sigmasplat.evaluation.uncertainty_benchmark import HELD_BACK
         from sigmasplat.evaluation.uncertainty_files import SCORES, StudyFolder
         from sigmasplat.run.terminal import Screen
+        from sigmasplat.sources import open_source
 
         screen, study = Screen(), self.study()
         jobs = study.jobs()
         folder = StudyFolder.create(self.out, study, self.overwrite)
+        for job in jobs:
+            open_source(job.path, job.config.input)  # a wrong path fails now and not after hours
         prepare_torch()
         measured = []
         for number, job in enumerate(jobs, 1):
@@ -76,6 +80,8 @@ class Uncertainty:
                 screen.say(f"[{number}/{len(jobs)}] {job.source}, seed {job.seed}")
                 found = run_job(job, study.views, screen)
                 folder.save(job, found)
+            if not found.facts["views"][HELD_BACK]:
+                screen.warn(f"{job.source}, seed {job.seed}: no frame that was held back has a believed pose")
             measured.append(found)
         runs = folder.write(jobs, measured)
         if not screen.out.is_terminal:
