@@ -26,7 +26,17 @@ SYNTHETIC = "synthetic:frames=240,noise=1,test_views=24,seed={seed}"
 """A different room for each seed."""
 SOURCES = ("synthetic", "livingroom", "redkitchen", "cubicles", "hololens")
 RUNS = record.ROOT / "runs" / "bench" / "uncertainty"
-KEPT = ("ause", "spearman", "before", "after", "temperature", "best_scale", "nll_at_best_scale")
+KEPT = (
+    "ause",
+    "spearman",
+    "before",
+    "after",
+    "temperature",
+    "after_68",
+    "temperature_68",
+    "best_scale",
+    "nll_at_best_scale",
+)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,15 @@ uncertainty, tables = map(importlib.import_module, ("uncertainty", "tables"))
 def scores(nll: float) -> dict[str, Any]:
     """Return the scores of two predictors."""
     found = {"nll": nll, "auce": 0.1, "coverage_68": 0.7, "coverage_95": 0.9, "z_rms": 1.0, "z_68": 1.0}
-    row = {"ause": 0.2, "spearman": None, "before": found, "after": found, "temperature": 2.0}
+    row = {
+        "ause": 0.2,
+        "spearman": None,
+        "before": found,
+        "after": found,
+        "temperature": 2.0,
+        "after_68": found,
+        "temperature_68": 1.0,
+    }
     row |= {"best_scale": 1.5, "nll_at_best_scale": nll, "mean_variance": 0.1, "mean_squared_error": 0.1}
     of_pixels = {"pixels": 10, "in_sample": False, "predictors": {"constant": row, "V": row}}
     return {"color": {"final": {"held back": {"all pixels": of_pixels}}}}

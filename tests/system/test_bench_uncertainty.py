@@ -132,6 +132,7 @@ def test_a_temperature_comes_from_the_other_sequences() -> None:
     assert found[0]["best_scale"] == pytest.approx(4.0, rel=0.05)
     assert found[0]["after"]["nll"] < found[0]["before"]["nll"]
     assert found[0]["nll_at_best_scale"] < found[0]["after"]["nll"]
+    assert [row["temperature_68"] for row in found] == pytest.approx([3.0, 3.0, 20 ** (1 / 3), 180 ** (1 / 3)], rel=0.1)
 
 
 def test_one_sequence_is_scored_in_sample() -> None:
@@ -140,6 +141,7 @@ def test_one_sequence_is_scored_in_sample() -> None:
     assert scores[kind][ALL]["in_sample"] and scores[kind][COVERED]["pixels"] == 16_000
     row = scores[kind][ALL]["predictors"]["V"]
     assert row["temperature"] == row["best_scale"] and row["after"]["auce"] < 0.01 < row["before"]["auce"]
+    assert row["after_68"]["coverage_68"] == pytest.approx(0.6827, abs=0.001)
 
 
 def test_a_constant_is_the_best_one() -> None:

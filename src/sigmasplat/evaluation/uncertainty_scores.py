@@ -18,6 +18,7 @@ from sigmasplat.metrics.uncertainty import (
     gaussian_nll,
     ranking_scores,
     sparsification,
+    z_scores,
 )
 
 Arrays = Mapping[str, NDArray[np.float32]]
@@ -38,8 +39,9 @@ class Run:
 def score_runs(runs: Sequence[Run], predictors: Sequence[Predictor] = PREDICTORS) -> list[dict[Kind, dict[str, Any]]]:
     """Return the scores of each run: by kind, then by subset of pixels, then by predictor.
 
-    The temperature of a predictor is the mean of its best scales on the held-back views of all other sequences, for
-    each quantity, map and subset of pixels. With a single sequence it is that of the run itself (`in_sample`).
+    The temperatures of a predictor come from the held-back views of all other sequences, for each quantity, map and
+    subset of pixels: the mean of its best scales, and the geometric mean of its z_68². With a single sequence they are
+    those of the run itself (`in_sample`).
     """
     scales = [_best_scales(run, predictors) for run in runs]
     found = []
@@ -51,7 +53,7 @@ def score_runs(runs: Sequence[Run], predictors: Sequence[Predictor] = PREDICTORS
             subset_scores = dict[str, Any]()
             for subset, pixels in subsets(kind, arrays).items():
                 fitted = [scale.get((fitted_on, subset), {}) for scale in others or [own]]
-                rows = _score(kind, arrays, pixels, predictors, _mean_scales(fitted))
+                rows = _score(kind, arrays, pixels, predictors, _transferred(fitted))
                 subset_scores[subset] = {"pixels": int(pixels.sum()), "in_sample": not others, "predictors": rows}
             of_kind[kind] = subset_scores
         found.append(of_kind)
@@ -74,13 +76,19 @@ def predicted(predictor: Predictor, arrays: Arrays, pixels: NDArray[np.bool_]) -
     return variance, error2
 
 
-def _best_scales(run: Run, predictors: Sequence[Predictor]) -> dict[tuple[Kind, str], dict[str, float]]:
-    """Return the best scale of each predictor on the held-back views, by kind and subset of pixels."""
+@dataclass(frozen=True)
+class Scales:
+    """Two factors that calibrate a variance: by the highest likelihood, and so that 68 % of the errors are covered."""
+
+    likelihood: float
+    coverage_68: float
+
+
+def _best_scales(run: Run, predictors: Sequence[Predictor]) -> dict[tuple[Kind, str], dict[str, Scales]]:
+    """Return the scales of each predictor on the held-back views, by kind and subset of pixels."""
     return {
         (kind, subset): {
-            p.name: best_scale(*predicted(p, arrays, pixels), EPSILON)
-            for p in predictors
-            if p.quantity == kind.quantity
+            p.name: _scales_of(*predicted(p, arrays, pixels)) for p in predictors if p.quantity == kind.quantity
         }
         for kind, arrays in run.samples.items()
         if kind.views == HELD_BACK
@@ -88,11 +96,19 @@ def _best_scales(run: Run, predictors: Sequence[Predictor]) -> dict[tuple[Kind, 
     }
 
 
-def _mean_scales(scales: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Return the mean of the finite scales of each predictor."""
-    names = dict.fromkeys(name for scale in scales for name in scale)
-    known = {name: [s[name] for s in scales if np.isfinite(s.get(name, np.nan))] for name in names}
-    return {name: float(np.mean(values)) for name, values in known.items() if values}
+def _scales_of(variance: NDArray[np.float32], error2: NDArray[np.float32]) -> Scales:
+    return Scales(best_scale(variance, error2, EPSILON), z_scores(variance, error2, EPSILON)["z_68"] ** 2)
+
+
+def _transferred(scales: Sequence[Mapping[str, Scales]]) -> dict[str, Scales]:
+    """Return one pair of temperatures for each predictor; sequences without finite, positive scales do not count."""
+    found = dict[str, Scales]()
+    for name in dict.fromkeys(name for scale in scales for name in scale):
+        some = np.array([(s[name].likelihood, s[name].coverage_68) for s in scales if name in s])
+        some = some[(np.isfinite(some) & (some > 0)).all(1)]
+        if len(some):
+            found[name] = Scales(float(some[:, 0].mean()), float(np.exp(np.log(some[:, 1]).mean())))
+    return found
 
 
 def _score(
@@ -100,20 +116,20 @@ def _score(
     arrays: Arrays,
     pixels: NDArray[np.bool_],
     predictors: Sequence[Predictor],
-    temperatures: Mapping[str, float],
+    temperatures: Mapping[str, Scales],
 ) -> dict[str, Any]:
     """Return the scores of each predictor on some pixels."""
     rows = dict[str, Any]()
     for p in predictors:
         if p.quantity == kind.quantity:
             # A temperature transfers a scale between sequences. A scaled predictor already has the best one.
-            temperature = 1.0 if p.scaled else temperatures.get(p.name, 1.0)
+            temperature = Scales(1.0, 1.0) if p.scaled else temperatures.get(p.name, Scales(1.0, 1.0))
             rows[p.name] = _scores_of(*predicted(p, arrays, pixels), temperature, EPSILON)
     return rows
 
 
 def _scores_of(
-    variance: NDArray[np.float32], error2: NDArray[np.float32], temperature: float, epsilon: float
+    variance: NDArray[np.float32], error2: NDArray[np.float32], temperature: Scales, epsilon: float
 ) -> dict[str, Any]:
     """Return the scores of a variance: rank, before and after the temperature, and the NLL at its own best scale."""
     own = best_scale(variance, error2, epsilon)
@@ -121,8 +137,10 @@ def _scores_of(
     return {
         **ranking_scores(variance, error2),
         "before": calibration_scores(variance, error2, epsilon),
-        "temperature": temperature,
-        "after": calibration_scores(temperature * scaled, error2, 0.0),
+        "temperature": temperature.likelihood,
+        "after": calibration_scores(temperature.likelihood * scaled, error2, 0.0),
+        "temperature_68": temperature.coverage_68,
+        "after_68": calibration_scores(temperature.coverage_68 * scaled, error2, 0.0),
         "best_scale": own,
         "nll_at_best_scale": gaussian_nll(own * scaled, error2, 0.0) if own > 0 else float("nan"),
         "mean_variance": float(variance.mean()) if len(variance) else float("nan"),
