@@ -23,7 +23,7 @@ from sigmasplat.slam.localisation.sight import Observation, Sight, observe, work
 from sigmasplat.slam.localisation.verdict import is_better, is_questionable, stands
 from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.slam.mapper import Mapper
-from sigmasplat.slam.rules import ends_submap, is_keyframe
+from sigmasplat.slam.rules import ends_submap, is_held_back, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.slam.world import World
 from sigmasplat.types import Matrix, no_progress
@@ -112,16 +112,20 @@ class Slam(World):
     def _localise(self, seen: Observation) -> Found:
         """Track a frame; if it is lost, search the whole map for it; if that fails too often, begin a new map."""
         fit = self._track(seen)
-        lost = self.tracker.lost
+        lost, held_back = self.tracker.lost, is_held_back(len(self.steps), self.config.input.hold_every)
         self.recovery.count(lost, self.tracker.doubtful > 0, seen)
         found = Found.of(fit, se3.inverse(fit.T_camera_world), lost)
         if not lost:
-            found.mapped = self.recovery.is_steady and self._is_certain(fit) and self._is_keyframe(fit.overlap)
+            certain = self.recovery.is_steady and self._is_certain(fit)
+            found.mapped = certain and not held_back and self._is_keyframe(fit.overlap)
             if found.mapped:
                 found.hop = self._hop(fit, seen)
                 if self._cuts:
                     found.tracking["drift_m"] = self._add_drift(fit, found.hop)
-            self._question(fit, seen, found)
+            if not held_back:
+                self._question(fit, seen, found)
+        elif held_back:
+            return found  # a search for the camera could make a keyframe of this frame
         elif (place := self._relocalise(seen)) is not None:
             self._go_to(place, seen, found)
         elif self.recovery.gives_up and usable(seen):
