@@ -89,14 +89,15 @@ class Uncertainty:
 
 def run_job(job: "Job", views: int, screen: "Screen") -> "Measured":
     """Run SLAM with a job's settings and collect its samples."""
-    from sigmasplat.evaluation.uncertainty_benchmark import measure, run_slam
+    from sigmasplat.evaluation.finished_run import run_slam
+    from sigmasplat.evaluation.uncertainty_benchmark import measure
     from sigmasplat.sources import open_source
 
     source = open_source(job.path, job.config.input)
     with screen.steps(len(source)) as show:
-        slam = run_slam(job.config, source, show)
+        run = run_slam(job.config, source, show)
     with screen.counting("views") as progress:
-        return measure(slam, source, views, progress=progress)
+        return measure(run, source, views, progress=progress)
 
 
 def tables(source: str, runs: Sequence[dict[str, Any]]) -> Iterator["Table"]:

@@ -15,23 +15,19 @@ from numpy.typing import NDArray
 from sigmasplat.config import Config
 from sigmasplat.config.text import full_path, override, split_settings
 from sigmasplat.errors import ConfigError
+from sigmasplat.evaluation.finished_run import FinishedRun, run_facts
 from sigmasplat.evaluation.splat_statistics import MapFacts, map_facts, splat_values
+from sigmasplat.evaluation.unseen_views import UnseenView, away_views, held_back_views
 from sigmasplat.evaluation.view_predictors import PREDICTORS, Predictor, SeenView, see
-from sigmasplat.evaluation.view_selection import evenly_spread, working_frame
-from sigmasplat.metrics.failures import score_failures
+from sigmasplat.evaluation.view_selection import evenly_spread
 from sigmasplat.metrics.scored_view import COVERED_ALPHA
-from sigmasplat.metrics.trajectory import associate, truth_in_estimate
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
-from sigmasplat.model.frame import Frame, resized_depth
-from sigmasplat.model.submap import MemoryStore, StorePart, SubmapStore
+from sigmasplat.model.submap import StorePart
 from sigmasplat.presets import preset as preset_of
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.backend import make_view
-from sigmasplat.run.protocols import Callback
 from sigmasplat.slam.final import KeyframeReader
-from sigmasplat.slam.rules import is_held_back
-from sigmasplat.slam.slam import Slam
 from sigmasplat.sources.base import Source
 from sigmasplat.types import Matrix, Progress, no_progress
 
@@ -121,63 +117,31 @@ class Measured:
     samples: dict[Kind, dict[str, Floats]]
 
 
-def run_slam(config: Config, source: Source, show: Callback | None = None) -> Slam:
-    """Run SLAM in memory, including the final map."""
-    slam = Slam(config)
-    for frame in source:
-        step = slam.step(frame)
-        if show:
-            show(step)
-    slam.finish(show.finishing if show else no_progress)
-    return slam
-
-
-@dataclass(frozen=True, eq=False)
-class UnseenView:
-    """A recorded view to predict, and its pose in the world; exact: whether its depth is the true depth."""
-
-    frame: Frame
-    T_world_camera: Matrix
-    submap: int
-    exact: bool
-
-
 class RunMaps:
-    """The maps of a finished run, and their facts: the final map, and the submaps one after the other."""
+    """The maps of a finished run with their facts: the final map and the submaps."""
 
-    def __init__(self, slam: Slam) -> None:
-        self.slam, config = slam, slam.config
-        self.store, self.anchors = _finished(slam)
+    def __init__(self, run: FinishedRun) -> None:
+        self.run, config = run, run.config
         self.renderer = FieldRenderer(config.render, config.backend)
-        self.view = make_view(config.backend, slam.view.camera, config.render, variance=False)
+        self.view = make_view(config.backend, run.camera, config.render, variance=False)
 
     def final(self) -> MapFacts:
         """Return the facts of the map in the world."""
-        members = [s for s in self.slam.atlas.members(0) if s < len(self.store)]
-        part, anchors = StorePart(self.store, members), [self.anchors[s] for s in members]
-        return self._facts(self.slam.field, part, anchors)
+        members = self.run.members
+        return self._facts(self.run.field, members, [self.run.anchors[s] for s in members])
 
     def submap(self, index: int) -> MapFacts:
         """Return the facts of a submap in its own frame."""
-        return self._facts(self.store.load(index).field, StorePart(self.store, [index]), [np.eye(4)])
+        return self._facts(self.run.store.load(index).field, [index], [np.eye(4)])
 
-    def _facts(self, splats: GaussianField, store: SubmapStore, anchors: Sequence[Matrix]) -> MapFacts:
-        reader = KeyframeReader(store, anchors, self.view)
+    def _facts(self, splats: GaussianField, members: Sequence[int], anchors: Sequence[Matrix]) -> MapFacts:
+        reader = KeyframeReader(StorePart(self.run.store, members), anchors, self.view)
         chosen = [reader[i] for i in evenly_spread(range(len(reader)), TRAINING_VIEWS)]
         return map_facts(splats, chosen, self.view, self.renderer)
 
 
-def _finished(slam: Slam) -> tuple[SubmapStore, list[Matrix]]:
-    """Return the finished submaps and their anchors; the only submap of a run without cuts is finished here."""
-    if len(slam.store):
-        return slam.store, slam.atlas.anchors
-    store = MemoryStore()
-    store.save(*slam.mapper.finished(0))
-    return store, slam.atlas.anchors
-
-
 def measure(
-    slam: Slam,
+    run: FinishedRun,
     source: Source,
     most: int,
     predictors: Sequence[Predictor] = PREDICTORS,
@@ -188,14 +152,14 @@ def measure(
     Views: at most `most` of the frames held back (`input.hold_every`) whose pose is believed, and as many of the
     source's test views. Calls `progress(views done, total)`.
     """
-    maps, samples, random = RunMaps(slam), dict[Kind, Samples](), np.random.default_rng(slam.config.seed)
-    views = {HELD_BACK: held_back_views(slam, source, most), AWAY: away_views(slam, source, most)}
+    maps, samples, random = RunMaps(run), dict[Kind, Samples](), np.random.default_rng(run.config.seed)
+    views = {HELD_BACK: held_back_views(run, source, most), AWAY: away_views(run, source, most)}
     total = sum(map(len, views.values())) + len(views[HELD_BACK])
     for done, (kind, map_name, view, seen) in enumerate(_seen_views(maps, views), 1):
         for quantity, columns in _pixels(view, seen, predictors, random).items():
             _add(samples.setdefault(Kind(quantity, map_name, kind), Samples()), columns)
         progress(done, total)
-    facts = run_facts(slam, source) | {"views": {kind: len(some) for kind, some in views.items()}}
+    facts = run_facts(run, source) | {"views": {kind: len(some) for kind, some in views.items()}}
     return Measured(facts, {kind: found.joined() for kind, found in samples.items()})
 
 
@@ -214,48 +178,8 @@ def _seen_views(
         values = splat_values(facts)
         for view in views[HELD_BACK]:
             if view.submap == index:
-                T_camera_submap = se3.inverse(view.T_world_camera) @ maps.anchors[index]
+                T_camera_submap = se3.inverse(view.T_world_camera) @ maps.run.anchors[index]
                 yield HELD_BACK, SUBMAPS, view, see(facts, values, view.frame.camera, T_camera_submap, maps.renderer)
-
-
-def held_back_views(slam: Slam, source: Source, most: int) -> list[UnseenView]:
-    """Return the frames that were held back and whose pose is believed, evenly spread, at the estimated poses."""
-    every, believed, poses = slam.config.input.hold_every, slam.believed(), slam.trajectory().T_world_camera
-    rows = [row for row in range(len(slam.steps)) if is_held_back(row, every) and believed[row]]
-    return [
-        _unseen_view(slam, source, slam.steps[row].index, poses[row], slam.atlas.places[row].submap)
-        for row in evenly_spread(rows, most)
-    ]
-
-
-def away_views(slam: Slam, source: Source, most: int) -> list[UnseenView]:
-    """Return the source's test views at their true poses, which the alignment of the ATE moves to the world."""
-    away, truth, believed = source.test_views(), source.truth(), slam.believed()
-    poses = None if away is None else away.truth()
-    if away is None or poses is None or truth is None or not believed.any():
-        return []
-    path = slam.trajectory().at(believed)
-    T_estimate_truth = truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], truth)
-    found = list[UnseenView]()
-    for i in evenly_spread(range(len(away)), most):
-        rows, at = associate(np.array([away.timestamp_s(i)]), poses.timestamps_s)
-        if len(rows):
-            found.append(_unseen_view(slam, away, i, T_estimate_truth @ poses.T_world_camera[at[0]], 0))
-    return found
-
-
-def _unseen_view(slam: Slam, source: Source, index: int, T_world_camera: Matrix, submap: int) -> UnseenView:
-    """Read a view at working size, with exact depth if the source knows it."""
-    settings = slam.config.input
-    frame, exact = working_frame(source, settings, index), source.exact_depth_of(index)
-    if exact is not None:
-        width, height = frame.camera.width + 2 * settings.crop_px, frame.camera.height + 2 * settings.crop_px
-        inner = np.s_[settings.crop_px : height - settings.crop_px, settings.crop_px : width - settings.crop_px]
-        depth = resized_depth(exact, width, height)[inner]
-        keep = (depth >= settings.min_depth_m) & (depth <= settings.max_depth_m)
-        depth = np.ascontiguousarray(np.where(keep, depth, np.float32(0.0)))
-        frame = Frame(frame.index, frame.timestamp_s, frame.color, depth, frame.camera)
-    return UnseenView(frame, T_world_camera, submap, exact is not None)
 
 
 def _pixels(
@@ -289,39 +213,6 @@ def _add(samples: Samples, columns: Mapping[str, Floats]) -> None:
     for name, values in columns.items():
         if name.startswith("variance "):
             samples.variances.setdefault(name.removeprefix("variance "), []).append(values)
-
-
-def run_facts(slam: Slam, source: Source) -> dict[str, Any]:
-    """Return counts, and the scores of poses and of `p_off` if the truth is known.
-
-    "poses" is the place for NEES and coverage of pose covariances; it stays None until frames have a covariance.
-    """
-    lost = sum(step.lost for step in slam.steps)
-    counts = {"frames": len(slam.steps), "lost": lost, "keyframes": len(slam.keyframe_indices)}
-    held = [i for i in range(len(slam.steps)) if is_held_back(i, slam.config.input.hold_every)]
-    counts |= {"held_back": len(held), "submaps": len(slam.atlas.anchors), "splats": len(slam.field)}
-    return counts | {"ate_m": None, "failures": None, "poses": None} | _path_scores(slam, source)
-
-
-def _path_scores(slam: Slam, source: Source) -> dict[str, Any]:
-    """Return the ATE and the scores of `p_off`; nothing without a truth that shares timestamps with the path."""
-    truth, believed, path = source.truth(), slam.believed(), slam.trajectory()
-    if truth is None or not believed.any():
-        return {}
-    times, positions = path.timestamps_s, path.T_world_camera[:, :3, 3]
-    rows, matched = associate(times, truth.timestamps_s)
-    if not believed[rows].any():
-        return {}
-    T_estimate_truth = truth_in_estimate(times[believed], positions[believed], truth)
-    true = (T_estimate_truth @ truth.T_world_camera[matched])[:, :3, 3]
-    error_m = np.full(len(times), np.nan)
-    error_m[rows] = np.linalg.norm(positions[rows] - true, axis=1)
-    at = np.isfinite(error_m) & believed
-    p_off = np.array([step.p_off for step in slam.steps])
-    return {
-        "ate_m": float(np.sqrt(np.mean(error_m[at] ** 2))),
-        "failures": score_failures(error_m, p_off, believed),
-    }
 
 
 def _array(plane: torch.Tensor) -> Floats:

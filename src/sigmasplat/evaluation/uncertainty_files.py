@@ -12,7 +12,7 @@ import torch
 import sigmasplat
 from sigmasplat.drawing.plot import LIGHT, SIZE, draw_charts
 from sigmasplat.errors import RunError
-from sigmasplat.evaluation.uncertainty_benchmark import Job, Kind, Measured, Study
+from sigmasplat.evaluation.uncertainty_benchmark import AWAY, Job, Kind, Measured, Study
 from sigmasplat.evaluation.uncertainty_scores import Run, score_runs, sparsification_charts
 from sigmasplat.io import machine
 from sigmasplat.io.atomic import make_folder, replacing
@@ -110,7 +110,9 @@ class StudyFolder:
 def _nested(of_kind: dict[Kind, dict[str, Any]]) -> dict[str, Any]:
     """Return scores as quantity → map → views → pixels."""
     nested = dict[str, Any]()
-    for kind, scores in of_kind.items():
+    for kind, scores in sorted(
+        of_kind.items(), key=lambda item: (item[0].quantity, item[0].map, item[0].views == AWAY)
+    ):
         nested.setdefault(kind.quantity, {}).setdefault(kind.map, {})[kind.views] = scores
     return nested
 
