@@ -102,8 +102,9 @@ def _score(
     rows = dict[str, Any]()
     for p in predictors:
         if p.quantity == kind.quantity:
-            # A temperature transfers a scale between sequences. A scaled predictor already has the best one.
-            temperature = 1.0 if p.scaled else temperatures.get(p.name, 1.0)
+            # A temperature transfers a scale between sequences. A scaled predictor already has the best one, and a
+            # calibrated one brings its own from the probe views of its run.
+            temperature = 1.0 if p.scaled or p.calibrated else temperatures.get(p.name, 1.0)
             rows[p.name] = _scores_of(*predicted(p, arrays, pixels), temperature, EPSILON)
     return rows
 

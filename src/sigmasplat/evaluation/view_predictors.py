@@ -15,6 +15,7 @@ from sigmasplat.evaluation.splat_statistics import MapFacts
 from sigmasplat.metrics.scored_view import COVERED_ALPHA
 from sigmasplat.model.camera import Camera
 from sigmasplat.render import FieldRenderer, Render
+from sigmasplat.render.predictive import Predicted, predict
 from sigmasplat.types import Matrix
 
 Quantity = Literal["color", "depth"]
@@ -25,7 +26,8 @@ class SeenView:
     """A view of a map, with all that a predictor may read; no recorded image is among it.
 
     rendered: its maps; depth_m [H, W]: Σwz/Σw, 0 where the map does not cover the pixel; moment [H, W]: Σ w (z − D)²
-    about D = depth_m, m²; splats: planes [H, W] of the values of `splat_statistics`, by name.
+    about D = depth_m, m²; splats: planes [H, W] of the values of `splat_statistics`, by name; predicted: what the run
+    itself predicts, None if it does not.
     """
 
     rendered: Render
@@ -33,6 +35,7 @@ class SeenView:
     moment: Tensor
     splats: Mapping[str, Tensor]
     facts: MapFacts
+    predicted: Predicted | None
 
     @property
     def transmittance(self) -> Tensor:
@@ -55,17 +58,22 @@ def see(
         depth_m = torch.where(alpha > COVERED_ALPHA, rendered.depth / alpha.clamp(min=COVERED_ALPHA), 0.0)
         moment = renderer(facts.field, camera, T_camera_map, depth_m).uncertainty
     assert moment is not None, "a render with a depth reference has a moment"
-    return SeenView(rendered, depth_m, moment, facts.rendered(T_camera_map, values), facts)
+    own = None
+    if facts.uncertainty is not None:
+        own = predict(facts.field, facts.uncertainty, camera, T_camera_map, renderer.options, renderer.backend)
+    return SeenView(rendered, depth_m, moment, facts.rendered(T_camera_map, values), facts, own)
 
 
 @dataclass(frozen=True)
 class Predictor:
-    """A row of the table. A `scaled` predictor has no unit: it gets the best scale for the pixels that are scored."""
+    """A row of the table. A `scaled` predictor has no unit: it gets the best scale for the pixels that are scored. A
+    `calibrated` one is calibrated by the run itself, so it gets no temperature."""
 
     name: str
     quantity: Quantity
     plane: Callable[[SeenView], Tensor]
     scaled: bool = False
+    calibrated: bool = False
 
 
 def constant(seen: SeenView) -> Tensor:
@@ -101,6 +109,16 @@ def depth_moment_with_prior(seen: SeenView) -> Tensor:
     return depth_moment(seen) + seen.transmittance * seen.facts.prior[1]
 
 
+def predictive_color(seen: SeenView) -> Tensor:
+    """Return the predictive variance of colour (`render.predictive`); the best constant if the run has none."""
+    return constant(seen) * seen.facts.noise[0] if seen.predicted is None else seen.predicted.color
+
+
+def predictive_depth(seen: SeenView) -> Tensor:
+    """Return the predictive variance of depth, m², as `predictive_color`."""
+    return constant(seen) * seen.facts.noise[1] if seen.predicted is None else seen.predicted.depth_std_m.square()
+
+
 def splat_plane(name: str) -> Callable[[SeenView], Tensor]:
     """Return a predictor that reads the rendered values of a statistic."""
     return lambda seen: seen.splats[name].clamp(min=0.0)
@@ -114,11 +132,13 @@ PREDICTORS: tuple[Predictor, ...] = (
     Predictor("ridge", "color", splat_plane("ridge_color")),
     Predictor("Fisher", "color", splat_plane("fisher_color")),
     Predictor("V + T prior", "color", variance_with_prior),
+    Predictor("predictive", "color", predictive_color, calibrated=True),
     Predictor("constant", "depth", constant, scaled=True),
     Predictor("1 - A", "depth", transmittance, scaled=True),
     Predictor("U", "depth", depth_moment),
     Predictor("ridge", "depth", splat_plane("ridge_depth")),
     Predictor("Fisher", "depth", splat_plane("fisher_depth")),
     Predictor("U + T prior", "depth", depth_moment_with_prior),
+    Predictor("predictive", "depth", predictive_depth, calibrated=True),
 )
 """All predictors, in the order of the table."""
