@@ -13,11 +13,12 @@ from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.evaluation.finished_run import FinishedRun, run_slam
 from sigmasplat.evaluation.splat_statistics import MapFacts, TrainingView, fisher, map_facts, ridge, splat_values
-from sigmasplat.evaluation.uncertainty_benchmark import HELD_BACK, Job, Kind, Study, measure
+from sigmasplat.evaluation.uncertainty_benchmark import HELD_BACK, Job, Kind, Samples, Study, measure
 from sigmasplat.evaluation.uncertainty_scores import ALL, COVERED, Run, score_runs
 from sigmasplat.evaluation.unseen_views import held_back_views
 from sigmasplat.evaluation.view_predictors import PREDICTORS, see
 from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.metrics.uncertainty import sparsification
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.presets import preset
@@ -114,7 +115,11 @@ def samples(scale: float, seed: int) -> dict[Kind, dict[str, np.ndarray]]:
     random = np.random.default_rng(seed)
     variance = np.exp(random.uniform(-9, -3, 20_000))
     error2 = scale * variance * random.normal(size=20_000) ** 2
-    arrays = {"squared_error": error2, "alpha": np.where(np.arange(20_000) % 5, 1.0, 0.2)}
+    arrays = {
+        "squared_error": error2,
+        "alpha": np.where(np.arange(20_000) % 5, 1.0, 0.2),
+        "reading": np.arange(20_000) % 2,
+    }
     arrays |= {f"variance {p.name}": variance for p in PREDICTORS if p.quantity == "color"}
     return {Kind("color", "final", HELD_BACK): {name: values.astype(np.float32) for name, values in arrays.items()}}
 
@@ -178,9 +183,10 @@ def test_samples_have_every_predictor_and_both_maps(run: FinishedRun) -> None:
     }  # fmt: skip
     for kind, arrays in found.samples.items():
         names = {f"variance {p.name}" for p in PREDICTORS if p.quantity == kind.quantity}
-        assert arrays.keys() == names | {"squared_error", "alpha"}
+        assert arrays.keys() == names | {"squared_error", "alpha", "reading"}
         assert len({len(values) for values in arrays.values()}) == 1
         assert all(np.isfinite(values).all() and values.min() >= 0.0 for values in arrays.values() if len(values))
+
     assert found.facts["frames"] == 13 and found.facts["held_back"] == 3 and found.facts["ate_m"] < 0.1
 
 
@@ -210,3 +216,16 @@ def test_mistakes_are_refused(tmp_path: Path) -> None:
     (tmp_path / "letter.txt").write_text("not ours")
     with pytest.raises(RunError, match="not empty"):
         Uncertainty((ROOM,), out=tmp_path).run()
+
+
+def test_pixels_of_all_views_are_mixed() -> None:
+    """A constant removes no error: its sparsification curve is flat, although the views differ in their errors."""
+    drawn = Samples()
+    for error2 in (0.01, 0.04, 0.09):
+        drawn.squared_error.append(np.full(3000, error2, np.float32))
+        drawn.alpha.append(np.ones(3000, np.float32))
+        drawn.reading.append(np.ones(3000, np.float32))
+        drawn.variances.setdefault("constant", []).append(np.ones(3000, np.float32))
+    joined = drawn.joined()
+    curve = sparsification(joined["variance constant"], joined["squared_error"], 20)
+    np.testing.assert_allclose(curve, curve[0], rtol=0.05)

@@ -107,7 +107,7 @@ def tables(source: str, runs: Sequence[dict[str, Any]]) -> Iterator["Table"]:
             for views, subsets in kinds.items():
                 for subset in subsets:
                     found = [run["scores"][quantity].get(map_name, {}).get(views, {}).get(subset) for run in runs]
-                    title = f"{source}: {quantity}, {map_name}, {views}, {subset}"
+                    title = f"{source}: {quantity.replace('color', 'colour')}, {map_name}, {views}, {subset}"
                     yield _table(title, [scores for scores in found if scores])
 
 

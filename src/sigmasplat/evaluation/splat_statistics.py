@@ -4,7 +4,7 @@ Each statistic is one function in `STATISTICS`; it returns named values [N]. All
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from sigmasplat.metrics.scored_view import COVERED_ALPHA
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.map_uncertainty import MapUncertainty
-from sigmasplat.render import FieldRenderer
+from sigmasplat.render import FieldRenderer, Render
 from sigmasplat.render.splat_sums import CHANNELS, accumulate, render_values
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
@@ -72,7 +72,7 @@ def map_facts(field: GaussianField, keyframes: Sequence[Keyframe], view: View, r
     views, colors, depths = list[TrainingView](), list[Tensor](), list[Tensor]()
     for keyframe in keyframes:
         T_camera_map, target = se3.inverse(keyframe.T_world_camera), keyframe.target
-        seen, depth = renderer(field, target.camera, T_camera_map), target.depth_image
+        seen, depth = on_host(renderer(field, target.camera, T_camera_map)), target.depth_image
         covered = seen.alpha > COVERED_ALPHA
         error_m = torch.where(covered, seen.depth / seen.alpha.clamp(min=COVERED_ALPHA) - depth, 0.0)
         known = (covered & (depth > 0)).float()
@@ -91,6 +91,11 @@ def map_facts(field: GaussianField, keyframes: Sequence[Keyframe], view: View, r
         float(all_depths.var(correction=0)) if len(all_depths) else 1.0,
     )
     return MapFacts(field, view, views, noise, prior, all_colors.mean(0))
+
+
+def on_host(seen: Render) -> Render:
+    """Return a render in host memory, where keyframes and statistics are."""
+    return replace(seen, **{name: plane.detach().cpu() for name, plane in vars(seen).items() if plane is not None})
 
 
 def ridge(facts: MapFacts) -> dict[str, Tensor]:
@@ -128,10 +133,10 @@ def fisher(facts: MapFacts) -> dict[str, Tensor]:
     pixel depends on the splats' depths with the same weights.
     """
     numbers = torch.Generator().manual_seed(PROBES_SEED)
-    information = torch.zeros(len(facts.field), device=facts.field.params.device)
+    information = torch.zeros(len(facts.field))
     for v in facts.views:
         signs = 2.0 * torch.randint(0, 2, (CHANNELS, *v.color_error2.shape), generator=numbers).float() - 1.0
-        sums = accumulate(facts.view, facts.field.params, v.T_camera_map, signs.to(information))
+        sums = accumulate(facts.view, facts.field.params, v.T_camera_map, signs)
         information += sums.square().mean(1)
     return {
         f"fisher_{name}": 1.0 / (information / max(noise, 1e-12) + 1.0 / max(prior, 1e-12))
@@ -151,7 +156,7 @@ def splat_values(facts: MapFacts) -> dict[str, Tensor]:
 def _sums(facts: MapFacts, planes: Sequence[Tensor] | Iterator[Tensor]) -> Tensor:
     """Return Σ_p w_ip g_p [N, 3] over all training views; planes: one [3, H, W] for each."""
     params = facts.field.params
-    total = torch.zeros(len(params), CHANNELS, device=params.device)
+    total = torch.zeros(len(params), CHANNELS)
     for v, plane in zip(facts.views, planes, strict=True):
         total += accumulate(facts.view, params, v.T_camera_map, plane)
     return total

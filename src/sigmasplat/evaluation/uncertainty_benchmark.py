@@ -98,17 +98,24 @@ class Kind:
 
 @dataclass(eq=False)
 class Samples:
-    """Pixels of many views: squared error [P], alpha [P], and the variance [P] that each predictor gives, by name."""
+    """Pixels of many views: squared error [P], alpha [P], whether there is a depth reading [P], and the variance [P]
+    that each predictor gives, by name."""
 
     squared_error: list[Floats] = field(default_factory=list)
     alpha: list[Floats] = field(default_factory=list)
+    reading: list[Floats] = field(default_factory=list)
     variances: dict[str, list[Floats]] = field(default_factory=dict)
 
     def joined(self) -> dict[str, Floats]:
-        """Return the arrays "squared_error", "alpha" and "variance NAME" of all views."""
-        parts = {"squared_error": self.squared_error, "alpha": self.alpha}
+        """Return the arrays "squared_error", "alpha", "reading" and "variance NAME" of all views.
+
+        Pixels are in random order. Sorting keeps the order of equal variances, so otherwise AUSE would depend on the
+        order of the views.
+        """
+        parts = {"squared_error": self.squared_error, "alpha": self.alpha, "reading": self.reading}
         parts |= {f"variance {name}": values for name, values in self.variances.items()}
-        return {name: np.concatenate(values) for name, values in parts.items()}
+        order = np.random.default_rng(0).permutation(sum(map(len, self.alpha)))
+        return {name: np.concatenate(values)[order] for name, values in parts.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,7 +219,9 @@ def _pixels(
     found = dict[str, dict[str, Floats]]()
     for quantity, (error2, rows) in errors.items():
         chosen = random.permutation(rows)[:PIXELS_PER_VIEW]
-        columns = {"squared_error": error2.ravel()[chosen], "alpha": alpha.ravel()[chosen]}
+        reading = (frame.depth_m > 0).astype(np.float32)
+        values = {"squared_error": error2, "alpha": alpha, "reading": reading}
+        columns = {name: plane.ravel()[chosen] for name, plane in values.items()}
         mine = {name: plane[chosen] for (of, name), plane in planes.items() if of == quantity}
         found[quantity] = columns | {f"variance {name}": values for name, values in mine.items()}
     return found
@@ -222,6 +231,7 @@ def _add(samples: Samples, columns: Mapping[str, Floats]) -> None:
     """Append the pixels of a view."""
     samples.squared_error.append(columns["squared_error"])
     samples.alpha.append(columns["alpha"])
+    samples.reading.append(columns["reading"])
     for name, values in columns.items():
         if name.startswith("variance "):
             samples.variances.setdefault(name.removeprefix("variance "), []).append(values)

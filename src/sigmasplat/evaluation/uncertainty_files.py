@@ -22,6 +22,8 @@ from sigmasplat.io.tensors import open_tensors, write_tensors
 
 MADE_BY = "sigmasplat bench uncertainty"
 SCORES, SAMPLES = "uncertainty.json", "samples"
+CHART_WIDTH = 600
+"""Width of one chart in a picture, pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +102,7 @@ class StudyFolder:
                 name = f"{_plain(job)}-{kind.quantity}-{kind.map}-{kind.views}".replace(" ", "-")
                 with replacing(self.path / f"{name}.png") as temporary:
                     charts = sparsification_charts(kind, arrays)
-                    draw_charts(charts, LIGHT, (SIZE[0] * len(charts) // 2, SIZE[1])).save(temporary, "PNG")
+                    draw_charts(charts, LIGHT, (CHART_WIDTH * len(charts), SIZE[1])).save(temporary, "PNG")
         return runs
 
     def _samples(self, job: Job) -> Path:

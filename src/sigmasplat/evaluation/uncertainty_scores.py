@@ -21,8 +21,10 @@ from sigmasplat.metrics.uncertainty import (
 )
 
 Arrays = Mapping[str, NDArray[np.float32]]
-ALL, COVERED = "all pixels", "covered pixels"
+ALL, READ, COVERED = "all pixels", "pixels with a reading", "covered pixels"
 CURVES = (ACCENT, BLUE, GREEN, PURPLE)
+HEADROOM = 1.15
+"""Largest RMSE in a sparsification chart, as a multiple of the RMSE of all pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,7 @@ class Run:
 
 
 def score_runs(runs: Sequence[Run], predictors: Sequence[Predictor] = PREDICTORS) -> list[dict[Kind, dict[str, Any]]]:
-    """Return the scores of each run: by kind, then by "all pixels" or "covered pixels", then by predictor.
+    """Return the scores of each run: by kind, then by subset of pixels, then by predictor.
 
     The temperature of a predictor is the mean of its best scales on the held-back views of all other sequences, for
     each quantity, map and subset of pixels. With a single sequence it is that of the run itself (`in_sample`).
@@ -59,7 +61,9 @@ def score_runs(runs: Sequence[Run], predictors: Sequence[Predictor] = PREDICTORS
 def subsets(kind: Kind, arrays: Arrays) -> dict[str, NDArray[np.bool_]]:
     """Return which pixels are scored, by name. Depth is only known where the map covers the pixel."""
     covered = arrays["alpha"] > COVERED_ALPHA
-    return {COVERED: covered} if kind.quantity == "depth" else {ALL: np.ones_like(covered), COVERED: covered}
+    if kind.quantity == "depth":
+        return {COVERED: covered}
+    return {ALL: np.ones_like(covered), READ: arrays["reading"] > 0, COVERED: covered}
 
 
 def predicted(predictor: Predictor, arrays: Arrays, pixels: NDArray[np.bool_]) -> tuple[Any, Any]:
@@ -128,20 +132,23 @@ def _scores_of(
 
 
 def sparsification_charts(kind: Kind, arrays: Arrays, predictors: Sequence[Predictor] = PREDICTORS) -> list[Chart]:
-    """Return charts of the RMSE after the pixels of largest variance are removed, a few predictors in each."""
+    """Return charts of the RMSE after the pixels of largest variance are removed, a few predictors in each.
+
+    A curve ends where it rises more than `HEADROOM` above its start.
+    """
     wanted = [p for p in predictors if p.quantity == kind.quantity]
-    unit = "colour 0 to 1" if kind.quantity == "color" else "m"
-    error2, steps = arrays["squared_error"], np.arange(100)
-    oracle = Curve("true error", np.stack([steps, sparsification(error2, error2)], 1), FAINT)
-    top = float(oracle.points[0, 1]) * 1.3 or 1.0
-    charts = []
+    quantity, unit = ("colour", "0 to 1") if kind.quantity == "color" else ("depth", "m")
+    error2 = arrays["squared_error"]
+    top = HEADROOM * float(np.sqrt(error2.mean()))
+
+    def curve(name: str, order_by: NDArray[np.float32], colour: int) -> Curve:
+        rmse = sparsification(order_by, error2)
+        return Curve(name, np.stack([np.arange(len(rmse)), np.where(rmse <= top, rmse, np.nan)], 1), colour)
+
+    oracle, charts = curve("true error", error2, FAINT), list[Chart]()
     for first in range(0, len(wanted), len(CURVES)):
-        some = wanted[first : first + len(CURVES)]
-        curves = [
-            Curve(p.name, np.stack([steps, sparsification(arrays[f"variance {p.name}"], error2)], 1), colour)
-            for p, colour in zip(some, CURVES, strict=False)
-        ]
-        title = f"{kind.quantity}, {kind.map}, {kind.views}"
-        label = "pixels removed, %"
-        charts.append(Chart(title, label, f"RMSE, {unit}", [*curves, oracle], from_zero=True, y_limits=(0.0, top)))
+        some = zip(wanted[first : first + len(CURVES)], CURVES, strict=False)
+        curves = [curve(p.name, arrays[f"variance {p.name}"], colour) for p, colour in some]
+        title = f"{quantity}, {kind.map}, {kind.views}: RMSE, {unit}"
+        charts.append(Chart(title, "pixels removed, %", "", [*curves, oracle], from_zero=True, y_limits=(0.0, top)))
     return charts

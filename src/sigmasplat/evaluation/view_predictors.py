@@ -11,7 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from sigmasplat.evaluation.splat_statistics import MapFacts
+from sigmasplat.evaluation.splat_statistics import MapFacts, on_host
 from sigmasplat.metrics.scored_view import COVERED_ALPHA
 from sigmasplat.model.camera import Camera
 from sigmasplat.render import FieldRenderer, Render
@@ -19,6 +19,8 @@ from sigmasplat.render.predictive import Predicted, predict
 from sigmasplat.types import Matrix
 
 Quantity = Literal["color", "depth"]
+QUANTITIES: tuple[Quantity, ...] = ("color", "depth")
+"""In the order of `MapFacts.noise` and `MapFacts.prior`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +55,10 @@ def see(
 ) -> SeenView:
     """Render a map and the values [N] of its splats at a pose."""
     with torch.inference_mode():
-        rendered = renderer(facts.field, camera, T_camera_map)
+        rendered = on_host(renderer(facts.field, camera, T_camera_map))
         alpha = rendered.alpha
         depth_m = torch.where(alpha > COVERED_ALPHA, rendered.depth / alpha.clamp(min=COVERED_ALPHA), 0.0)
-        moment = renderer(facts.field, camera, T_camera_map, depth_m).uncertainty
+        moment = on_host(renderer(facts.field, camera, T_camera_map, depth_m)).uncertainty
     assert moment is not None, "a render with a depth reference has a moment"
     own = None
     if facts.uncertainty is not None:
@@ -109,6 +111,12 @@ def depth_moment_with_prior(seen: SeenView) -> Tensor:
     return depth_moment(seen) + seen.transmittance * seen.facts.prior[1]
 
 
+def ridge_with_prior(quantity: Quantity) -> Callable[[SeenView], Tensor]:
+    """Return a predictor: the ridge regression, plus (1 − A) times the variance of colour or depth seen so far."""
+    prior = QUANTITIES.index(quantity)
+    return lambda seen: seen.splats[f"ridge_{quantity}"] + seen.transmittance * seen.facts.prior[prior]
+
+
 def predictive_color(seen: SeenView) -> Tensor:
     """Return the predictive variance of colour (`render.predictive`); the best constant if the run has none."""
     return constant(seen) * seen.facts.noise[0] if seen.predicted is None else seen.predicted.color
@@ -132,6 +140,7 @@ PREDICTORS: tuple[Predictor, ...] = (
     Predictor("ridge", "color", splat_plane("ridge_color")),
     Predictor("Fisher", "color", splat_plane("fisher_color")),
     Predictor("V + T prior", "color", variance_with_prior),
+    Predictor("ridge + T prior", "color", ridge_with_prior("color")),
     Predictor("predictive", "color", predictive_color, calibrated=True),
     Predictor("constant", "depth", constant, scaled=True),
     Predictor("1 - A", "depth", transmittance, scaled=True),
@@ -139,6 +148,7 @@ PREDICTORS: tuple[Predictor, ...] = (
     Predictor("ridge", "depth", splat_plane("ridge_depth")),
     Predictor("Fisher", "depth", splat_plane("fisher_depth")),
     Predictor("U + T prior", "depth", depth_moment_with_prior),
+    Predictor("ridge + T prior", "depth", ridge_with_prior("depth")),
     Predictor("predictive", "depth", predictive_depth, calibrated=True),
 )
 """All predictors, in the order of the table."""

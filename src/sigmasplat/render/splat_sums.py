@@ -20,8 +20,9 @@ def accumulate(view: View, params: Tensor, T_camera_world: Matrix, planes: Tenso
 
     The colour of a pixel is linear in the splats' colours, so this is the gradient of the colours if g is the gradient
     of the image. Planes may be padded like those of the view. The view's planes hold the render of `params` afterwards;
-    its gradient planes are 0.
+    its gradient planes are 0. Rows and planes may be in host memory; the result is on the device of the planes.
     """
+    params = params.to(view.sums.device)
     g_params = torch.empty_like(params)
     view.forward(params, T_camera_world)
     view.g_sums.zero_()
@@ -30,12 +31,15 @@ def accumulate(view: View, params: Tensor, T_camera_world: Matrix, planes: Tenso
     view.g_sums[:CHANNELS, :height, :width] = planes
     view.backward(params, g_params)
     view.g_sums.zero_()
-    return g_params[:, COLUMNS["colors"]].clone()
+    return g_params[:, COLUMNS["colors"]].to(planes.device, copy=True)
 
 
 def render_values(view: View, params: Tensor, T_camera_world: Matrix, values: Tensor) -> Tensor:
-    """Return Σ_i w_ip v_i [3, H, W] of values [N, 3] of the splats of rows [N, 17] at a pose, without padding."""
-    rows = params.clone()
+    """Return Σ_i w_ip v_i [3, H, W] of values [N, 3] of the splats of rows [N, 17] at a pose, without padding.
+
+    Rows and values may be in host memory; the result is on the device of the values.
+    """
+    rows = params.to(view.sums.device, copy=True)
     rows[:, COLUMNS["colors"]] = values.to(rows)
     view.forward(rows, T_camera_world)
-    return view.sums[:CHANNELS, : view.camera.height, : view.camera.width].clone()
+    return view.sums[:CHANNELS, : view.camera.height, : view.camera.width].to(values.device, copy=True)
