@@ -7,7 +7,6 @@ import torch
 from sigmasplat.config import RenderConfig
 from sigmasplat.fit.splat_residuals import splat_residuals
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.map_uncertainty import (
     COLOR_PARTS,
@@ -23,6 +22,7 @@ from sigmasplat.render.predictive import predict, variance_parts
 from splat_scenes import WIDE, Scene, assert_same_vector, scene
 
 BACKGROUND = Background((0.4, 0.5, 0.3), 0.05, 0.8)
+NOTHING = Background((0.5, 0.5, 0.5), 0.0, 0.0)
 OPTIONS = RenderConfig()
 
 
@@ -37,7 +37,7 @@ def field_of(s: Scene) -> GaussianField:
 
 
 def splats(n: int) -> torch.Tensor:
-    return torch.rand(n, 2, generator=torch.Generator().manual_seed(4)) * 0.01
+    return torch.rand(n, 3, generator=torch.Generator().manual_seed(4)) * 0.01
 
 
 def test_mixture_and_unexplained_light_are_the_variance_of_a_drawn_color() -> None:
@@ -60,7 +60,7 @@ def test_mixture_and_unexplained_light_are_the_variance_of_a_drawn_color() -> No
 
 
 def test_where_the_map_is_empty_the_background_alone_is_predicted() -> None:
-    parts = variance_parts(GaussianField.empty(), torch.zeros(0, 2), BACKGROUND, WIDE, np.eye(4), OPTIONS, "reference")
+    parts = variance_parts(GaussianField.empty(), torch.zeros(0, 3), BACKGROUND, WIDE, np.eye(4), OPTIONS, "reference")
     expected = {"unexplained": BACKGROUND.color_variance, "floor": 1.0}
     for name, plane in zip(COLOR_PARTS, parts.color, strict=True):
         assert torch.allclose(plane, torch.full_like(plane, expected.get(name, 0.0))), name
@@ -89,22 +89,28 @@ def test_a_prediction_is_the_weighted_sum_of_its_parts_and_leaves_the_published_
     color, depth = dict.fromkeys(COLOR_PARTS, 2.0), dict.fromkeys(DEPTH_PARTS, 3.0)
     found = predict(field, MapUncertainty(values, BACKGROUND, Calibration(color, depth)), WIDE, T, OPTIONS, kernels)
     assert torch.allclose(found.color, 2.0 * parts.color.sum(0), rtol=1e-5)
-    assert torch.allclose(found.depth_std_m.square(), 3.0 * parts.depth.sum(0), rtol=1e-5)
+    assert torch.allclose(found.reading_m2, 3.0 * parts.depth.sum(0), rtol=1e-5)
+    noise = sum(parts.depth[DEPTH_PARTS.index(name)] for name in ("residual", "sensor"))
+    assert torch.allclose(found.depth_std_m.square(), 3.0 * (parts.depth.sum(0) - noise + parts.systematic), rtol=1e-4)
     assert torch.equal(found.color, found.color_aleatoric + found.color_epistemic)
     shipped = predict(field, MapUncertainty(values, BACKGROUND, SHIPPED), WIDE, T, OPTIONS, kernels)
     assert float(shipped.color.min()) > 0.0 and float(shipped.depth_std_m.min()) > 0.0
     assert torch.equal(render(field, WIDE, T, backend=kernels).variance, before)
 
 
+def wall() -> tuple[GaussianField, torch.Tensor]:
+    """Return a gray wall at 2 m with a splat in each pixel, and the pixels [N, 2]."""
+    rows = torch.arange(WIDE.height * WIDE.width)
+    at = torch.stack([rows % WIDE.width, rows // WIDE.width], 1).float()
+    sides = (at - torch.tensor([WIDE.cx, WIDE.cy])) / torch.tensor([WIDE.fx, WIDE.fy]) * 2.0
+    means = torch.cat([sides, torch.full_like(at[:, :1], 2.0)], 1)
+    return GaussianField.from_values(means, torch.full_like(means, 0.03), torch.full_like(means, 0.5)), at
+
+
 def test_the_residuals_of_splats_are_the_noise_of_the_images() -> None:
     """Noise of two standard deviations in the two halves of the images; no other error."""
-    rng, rows = np.random.default_rng(0), torch.arange(WIDE.height * WIDE.width)
-    at = torch.stack([rows % WIDE.width, rows // WIDE.width], 1).float()
-    means = torch.cat(
-        [(at - torch.tensor([WIDE.cx, WIDE.cy])) / torch.tensor([WIDE.fx, WIDE.fy]) * 2.0, 0 * at[:, :1] + 2.0], 1
-    )
-    field = GaussianField.from_values(means, torch.full_like(means, 0.03), torch.full_like(means, 0.5))
-    seen = render(field, WIDE, np.eye(4))
+    field, at = wall()
+    seen, rng = render(field, WIDE, np.eye(4)), np.random.default_rng(0)
     noise = torch.where(torch.arange(WIDE.width) < 22, 0.02, 0.06)
     keyframes = []
     for i in range(12):
@@ -112,8 +118,23 @@ def test_the_residuals_of_splats_are_the_noise_of_the_images() -> None:
         color, depth = torch.zeros(3, *image.shape[:2]), seen.depth / seen.alpha
         color[:] = image.movedim(-1, 0)
         depth = depth + 0.5 * noise * torch.from_numpy(rng.normal(size=depth.shape)).float()
-        keyframes.append(Keyframe(i, Target(WIDE, color, depth, depth.numel()), se3.exp(np.zeros(6))))
-    found = splat_residuals(field, keyframes, Background((0.5, 0.5, 0.5), 0.0, 0.0), OPTIONS, "cpu")
+        keyframes.append(Keyframe(i, Target(WIDE, color, depth, depth.numel()), np.eye(4)))
+    found = splat_residuals(field, keyframes, NOTHING, OPTIONS, "cpu")
     for inside, std in ((at[:, 0] < 18, 0.02), (at[:, 0] > 26, 0.06)):
         assert float(found[inside, 0].median()) ** 0.5 == pytest.approx(std, rel=0.15)
         assert float(found[inside, 1].median()) ** 0.5 == pytest.approx(0.5 * std, rel=0.15)
+
+
+def test_the_depth_of_a_splat_is_surer_than_a_reading_unless_all_readings_disagree_with_it() -> None:
+    """Readings with noise of 5 cm; in one half of the images all are 10 cm too far."""
+    field, at = wall()
+    seen, rng = render(field, WIDE, np.eye(4)), np.random.default_rng(0)
+    off_m = torch.where(torch.arange(WIDE.width) < 22, 0.0, 0.1)
+    keyframes = []
+    for i in range(12):
+        depth = seen.depth / seen.alpha + off_m + 0.05 * torch.from_numpy(rng.normal(size=seen.depth.shape)).float()
+        target = Target(WIDE, seen.color.movedim(-1, 0).contiguous(), depth, depth.numel())
+        keyframes.append(Keyframe(i, target, np.eye(4)))
+    own = splat_residuals(field, keyframes, NOTHING, OPTIONS, "cpu")[:, 2].sqrt()
+    assert float(own[at[:, 0] < 18].median()) < 0.02
+    assert float(own[at[:, 0] > 26].median()) == pytest.approx(0.1, rel=0.2)

@@ -191,14 +191,19 @@ def _seen_views(
     for kind, some in views.items():
         for view in some:
             T_camera_world = se3.inverse(view.T_world_camera)
-            yield kind, FINAL, view, see(final, values, view.frame.camera, T_camera_world, maps.renderer)
+            yield kind, FINAL, view, see(final, values, view.frame.camera, T_camera_world, maps.renderer, view.exact)
     for index in sorted({view.submap for view in views[HELD_BACK]}):
         facts = maps.submap(index)
         values = splat_values(facts)
         for view in views[HELD_BACK]:
             if view.submap == index:
                 T_camera_submap = se3.inverse(view.T_world_camera) @ maps.run.anchors[index]
-                yield HELD_BACK, SUBMAPS, view, see(facts, values, view.frame.camera, T_camera_submap, maps.renderer)
+                yield (
+                    HELD_BACK,
+                    SUBMAPS,
+                    view,
+                    see(facts, values, view.frame.camera, T_camera_submap, maps.renderer, view.exact),
+                )
 
 
 def _pixels(

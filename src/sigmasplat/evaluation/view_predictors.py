@@ -29,7 +29,7 @@ class SeenView:
 
     rendered: its maps; depth_m [H, W]: Σwz/Σw, 0 where the map does not cover the pixel; moment [H, W]: Σ w (z − D)²
     about D = depth_m, m²; splats: planes [H, W] of the values of `splat_statistics`, by name; predicted: what the run
-    itself predicts, None if it does not.
+    itself predicts, None if it does not; exact_depth: the view is compared with true depth, not with a reading.
     """
 
     rendered: Render
@@ -38,6 +38,7 @@ class SeenView:
     splats: Mapping[str, Tensor]
     facts: MapFacts
     predicted: Predicted | None
+    exact_depth: bool = False
 
     @property
     def transmittance(self) -> Tensor:
@@ -51,9 +52,14 @@ class SeenView:
 
 
 def see(
-    facts: MapFacts, values: Mapping[str, Tensor], camera: Camera, T_camera_map: Matrix, renderer: FieldRenderer
+    facts: MapFacts,
+    values: Mapping[str, Tensor],
+    camera: Camera,
+    T_camera_map: Matrix,
+    renderer: FieldRenderer,
+    exact_depth: bool = False,
 ) -> SeenView:
-    """Render a map and the values [N] of its splats at a pose."""
+    """Render a map and the values [N] of its splats at a pose; exact_depth: as in `SeenView`."""
     with torch.inference_mode():
         rendered = on_host(renderer(facts.field, camera, T_camera_map))
         alpha = rendered.alpha
@@ -63,7 +69,7 @@ def see(
     own = None
     if facts.uncertainty is not None:
         own = predict(facts.field, facts.uncertainty, camera, T_camera_map, renderer.options, renderer.backend)
-    return SeenView(rendered, depth_m, moment, facts.rendered(T_camera_map, values), facts, own)
+    return SeenView(rendered, depth_m, moment, facts.rendered(T_camera_map, values), facts, own, exact_depth)
 
 
 @dataclass(frozen=True)
@@ -123,8 +129,11 @@ def predictive_color(seen: SeenView) -> Tensor:
 
 
 def predictive_depth(seen: SeenView) -> Tensor:
-    """Return the predictive variance of depth, m², as `predictive_color`."""
-    return constant(seen) * seen.facts.noise[1] if seen.predicted is None else seen.predicted.depth_std_m.square()
+    """Return the predictive variance of depth, m², as `predictive_color`: about the true depth if the view has it, else
+    about a reading of the sensor."""
+    if seen.predicted is None:
+        return constant(seen) * seen.facts.noise[1]
+    return seen.predicted.depth_std_m.square() if seen.exact_depth else seen.predicted.reading_m2
 
 
 def splat_plane(name: str) -> Callable[[SeenView], Tensor]:

@@ -8,9 +8,9 @@ from scipy.optimize import minimize
 
 Values = NDArray[np.float64]
 
-PIXELS_PER_VIEW = 100.0
+PIXELS_PER_VIEW = 30.0
 """Number of independent pixels that a view counts as: errors of neighbouring pixels are correlated."""
-PULL = 1.5
+PULL = 1.0
 """Standard deviation of the logarithm of a weight about the weight that it is pulled to."""
 RANGE = 9.0
 """A weight changes at most by the exponential of this."""

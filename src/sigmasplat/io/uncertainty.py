@@ -6,14 +6,21 @@ from pathlib import Path
 from sigmasplat.errors import RunError
 from sigmasplat.io.json_files import read_json, write_json
 from sigmasplat.io.tensors import open_tensors, write_tensors
-from sigmasplat.model.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, Background, Calibration, MapUncertainty
+from sigmasplat.model.map_uncertainty import (
+    COLOR_PARTS,
+    DEPTH_PARTS,
+    SPLAT_COLUMNS,
+    Background,
+    Calibration,
+    MapUncertainty,
+)
 
 JSON, TENSORS = "uncertainty.json", "uncertainty.safetensors"
 
 
 def write_uncertainty(folder: Path, uncertainty: MapUncertainty) -> None:
     """Write both files. Raises RunError if they cannot be written."""
-    write_tensors(folder / TENSORS, {"variances": uncertainty.splats.cpu()}, {"columns": "color,depth_m2"})
+    write_tensors(folder / TENSORS, {"variances": uncertainty.splats.cpu()}, {"columns": ",".join(SPLAT_COLUMNS)})
     calibration, background = uncertainty.calibration, asdict(uncertainty.background)
     values = {"probes": uncertainty.probes, "background": background}
     write_json(folder / JSON, values | {"color": dict(calibration.color), "depth": dict(calibration.depth)})

@@ -11,6 +11,8 @@ DEPTH_PARTS = ("ray", "residual", "unexplained", "edges", "sensor", "floor")
 """Parts of the predicted variance of depth, as `COLOR_PARTS`."""
 EPISTEMIC = frozenset({"unexplained", "edges"})
 """Parts that more or better views can reduce; the others are aleatoric: noise, and detail that the map cannot show."""
+SPLAT_COLUMNS = ("color", "reading_m2", "depth_m2")
+"""Columns of `MapUncertainty.splats`."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +44,10 @@ class Background:
 class MapUncertainty:
     """How sure a map is.
 
-    splats [N, 2]: the variance of each splat's residuals at the keyframes, of colour (mean over channels) and of depth
-    (m²); calibration: weights of the parts; probes: the number of probe views that it was fitted on.
+    splats [N, 3], columns as `SPLAT_COLUMNS`: the variance of each splat's residuals at the keyframes, of colour (mean
+    over channels) and of depth (m²); the variance of its own depth (m²): the squared mean of its residuals, plus their
+    variance about the mean over the number of readings. calibration: weights of the parts; probes: the number of probe
+    views that it was fitted on.
     """
 
     splats: Tensor

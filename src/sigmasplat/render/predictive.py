@@ -34,7 +34,8 @@ COVERED = 0.5
 @dataclass(frozen=True, eq=False)
 class VarianceParts:
     """Unweighted parts of the variance of a view: color [5, H, W] as `COLOR_PARTS`, depth [6, H, W] as `DEPTH_PARTS`,
-    with what was rendered: image Ĉ [H, W, 3], depth_m D̂/A [H, W], alpha [H, W].
+    systematic [H, W]: the part of depth that takes the place of residual for the depth of the map itself; with what was
+    rendered: image Ĉ [H, W, 3], depth_m D̂/A [H, W], alpha [H, W].
 
     Colour: mixture = Σw(σ²+c²) − |Ĉ|²/A, the variance among the splats of a pixel; residual = Σ w r², r² the squared
     residual of a splat at the keyframes; unexplained = T (σ_b² + A |c_b − Ĉ/A|²), T = 1 − A, of a background of mean
@@ -45,6 +46,7 @@ class VarianceParts:
 
     color: Tensor
     depth: Tensor
+    systematic: Tensor
     image: Tensor
     depth_m: Tensor
     alpha: Tensor
@@ -52,8 +54,8 @@ class VarianceParts:
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
-    """Predicted variance [H, W] of a view: of colour (mean over channels, colour²) and of depth (m², where alpha > ½),
-    each in two parts.
+    """Predicted variance [H, W] of a view: of colour (mean over channels, colour²) and of rendered depth (m², where
+    alpha > ½), each in two parts; reading_m2: the variance of rendered depth about a reading of the depth sensor.
 
     aleatoric: noise, and detail that the map cannot show; epistemic: what more or better views would reduce.
     """
@@ -62,6 +64,7 @@ class Predicted:
     color_epistemic: Tensor
     depth_aleatoric_m2: Tensor
     depth_epistemic_m2: Tensor
+    reading_m2: Tensor
 
     @property
     def color(self) -> Tensor:
@@ -70,7 +73,7 @@ class Predicted:
 
     @property
     def depth_std_m(self) -> Tensor:
-        """Return the standard deviation of depth [H, W], m."""
+        """Return the standard deviation of rendered depth about the true depth [H, W], m."""
         return (self.depth_aleatoric_m2 + self.depth_epistemic_m2).sqrt()
 
 
@@ -83,7 +86,7 @@ def variance_parts(
     options: RenderConfig,
     backend: str,
 ) -> VarianceParts:
-    """Render the parts of a map's variance at a pose (4×4); splats [N, 2] as in `MapUncertainty`."""
+    """Render the parts of a map's variance at a pose (4×4); splats [N, 3] as in `MapUncertainty`."""
     field = on_device(field, backend)
     seen = blend_values(field, camera, T_camera_map, splats, options, backend)
     alpha = seen.alpha
@@ -108,7 +111,8 @@ def variance_parts(
         depth_m.square().square(),
         torch.ones_like(alpha),
     ]
-    return VarianceParts(torch.stack(color), torch.stack(depth), seen.color, depth_m, alpha)
+    systematic = seen.values[..., 2] / covered
+    return VarianceParts(torch.stack(color), torch.stack(depth), systematic, seen.color, depth_m, alpha)
 
 
 def slope2(image: Tensor, camera: Camera) -> Tensor:
@@ -121,10 +125,16 @@ def slope2(image: Tensor, camera: Camera) -> Tensor:
 
 
 def predicted(parts: VarianceParts, calibration: Calibration) -> Predicted:
-    """Weigh the parts of a view's variance and sum them."""
-    return Predicted(
-        *_sums(parts.color, COLOR_PARTS, calibration.color), *_sums(parts.depth, DEPTH_PARTS, calibration.depth)
-    )
+    """Weigh the parts of a view's variance and sum them.
+
+    The depth of the map itself has no sensor noise, and its residual part is `systematic`.
+    """
+    color = _sums(parts.color, COLOR_PARTS, calibration.color)
+    reading = sum(_sums(parts.depth, DEPTH_PARTS, calibration.depth))
+    own = parts.depth.clone()
+    own[DEPTH_PARTS.index("residual")] = parts.systematic
+    depth = _sums(own, DEPTH_PARTS, {**calibration.depth, "sensor": 0.0})
+    return Predicted(*color, *depth, torch.as_tensor(reading))
 
 
 def predict(
