@@ -11,6 +11,7 @@ from sigmasplat.metrics.failures import score_failures
 from sigmasplat.metrics.trajectory import associate, truth_in_estimate
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.map_uncertainty import MapUncertainty
 from sigmasplat.model.submap import MemoryStore, SubmapStore
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.run.protocols import Callback
@@ -26,7 +27,7 @@ class FinishedRun:
 
     field: the final map in the world; store: its submaps; anchors: T_world_submap of each; members: the submaps that
     are connected to the world; submap_of [F]: the submap of each frame; believed [F]: whether its pose is believed;
-    indices [F]: its number in the source; p_off [F].
+    indices [F]: its number in the source; p_off [F]; uncertainty: how sure the final map is, if it was measured.
     """
 
     config: Config
@@ -41,6 +42,7 @@ class FinishedRun:
     indices: list[int]
     p_off: NDArray[np.float64]
     counts: dict[str, int]
+    uncertainty: MapUncertainty | None
 
     @staticmethod
     def of(slam: Slam) -> "FinishedRun":
@@ -57,6 +59,7 @@ class FinishedRun:
             slam.config, slam.view.camera, slam.field, store, slam.atlas.anchors, slam.atlas.members(0),
             slam.trajectory(), [place.submap for place in slam.atlas.places], slam.believed(),
             [step.index for step in slam.steps], np.array([step.p_off for step in slam.steps]), counts,
+            slam.uncertainty,
         )  # fmt: skip
 
     @property

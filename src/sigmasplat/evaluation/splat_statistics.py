@@ -13,6 +13,7 @@ from sigmasplat.fit.target import Keyframe
 from sigmasplat.metrics.scored_view import COVERED_ALPHA
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.map_uncertainty import MapUncertainty
 from sigmasplat.render import FieldRenderer, Render
 from sigmasplat.render.splat_sums import CHANNELS, accumulate, render_values
 from sigmasplat.render.view import View
@@ -43,7 +44,8 @@ class MapFacts:
     """A map and its training views.
 
     noise: mean squared residual of colour and depth (m²); prior: variance of the colours (mean over channels) and of
-    the depths (m²) of the training views; mean_color [3] of them.
+    the depths (m²) of the training views; mean_color [3] of them; uncertainty: what the
+    run itself knows of its map, if it does.
     """
 
     field: GaussianField
@@ -52,6 +54,7 @@ class MapFacts:
     noise: tuple[float, float]
     prior: tuple[float, float]
     mean_color: Tensor
+    uncertainty: MapUncertainty | None = None
 
     def rendered(self, T_camera_map: Matrix, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Render values [N] by name to planes [H, W], Σ_i w_ip v_i."""

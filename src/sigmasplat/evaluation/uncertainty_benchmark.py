@@ -5,7 +5,7 @@ scored together with those of other runs (`uncertainty_scores`), because tempera
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,11 +23,13 @@ from sigmasplat.evaluation.view_selection import evenly_spread
 from sigmasplat.metrics.scored_view import COVERED_ALPHA
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.map_uncertainty import MapUncertainty
 from sigmasplat.model.submap import StorePart
 from sigmasplat.presets import preset as preset_of
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.backend import make_view
 from sigmasplat.slam.final import KeyframeReader
+from sigmasplat.slam.uncertainty import map_uncertainty
 from sigmasplat.sources.base import Source
 from sigmasplat.types import Matrix, Progress, no_progress
 
@@ -135,16 +137,26 @@ class RunMaps:
     def final(self) -> MapFacts:
         """Return the facts of the map in the world."""
         members = self.run.members
-        return self._facts(self.run.field, members, [self.run.anchors[s] for s in members])
+        return self._facts(self.run.field, members, [self.run.anchors[s] for s in members], self.run.uncertainty)
 
     def submap(self, index: int) -> MapFacts:
         """Return the facts of a submap in its own frame."""
-        return self._facts(self.run.store.load(index).field, [index], [np.eye(4)])
+        splats, part, whole = self.run.store.load(index).field, StorePart(self.run.store, [index]), self.run.uncertainty
+        known = None
+        if whole is not None:
+            known = map_uncertainty(splats, part, [np.eye(4)], self.run.config, self.view, whole.calibration)
+        return self._facts(splats, [index], [np.eye(4)], known)
 
-    def _facts(self, splats: GaussianField, members: Sequence[int], anchors: Sequence[Matrix]) -> MapFacts:
+    def _facts(
+        self,
+        splats: GaussianField,
+        members: Sequence[int],
+        anchors: Sequence[Matrix],
+        uncertainty: MapUncertainty | None,
+    ) -> MapFacts:
         reader = KeyframeReader(StorePart(self.run.store, members), anchors, self.view)
         chosen = [reader[i] for i in evenly_spread(range(len(reader)), TRAINING_VIEWS)]
-        return map_facts(splats, chosen, self.view, self.renderer)
+        return replace(map_facts(splats, chosen, self.view, self.renderer), uncertainty=uncertainty)
 
 
 def measure(
@@ -179,14 +191,19 @@ def _seen_views(
     for kind, some in views.items():
         for view in some:
             T_camera_world = se3.inverse(view.T_world_camera)
-            yield kind, FINAL, view, see(final, values, view.frame.camera, T_camera_world, maps.renderer)
+            yield kind, FINAL, view, see(final, values, view.frame.camera, T_camera_world, maps.renderer, view.exact)
     for index in sorted({view.submap for view in views[HELD_BACK]}):
         facts = maps.submap(index)
         values = splat_values(facts)
         for view in views[HELD_BACK]:
             if view.submap == index:
                 T_camera_submap = se3.inverse(view.T_world_camera) @ maps.run.anchors[index]
-                yield HELD_BACK, SUBMAPS, view, see(facts, values, view.frame.camera, T_camera_submap, maps.renderer)
+                yield (
+                    HELD_BACK,
+                    SUBMAPS,
+                    view,
+                    see(facts, values, view.frame.camera, T_camera_submap, maps.renderer, view.exact),
+                )
 
 
 def _pixels(

@@ -122,8 +122,10 @@ def _score(
     rows = dict[str, Any]()
     for p in predictors:
         if p.quantity == kind.quantity:
-            # A temperature transfers a scale between sequences. A scaled predictor already has the best one.
-            temperature = Scales(1.0, 1.0) if p.scaled else temperatures.get(p.name, Scales(1.0, 1.0))
+            # A temperature transfers a scale between sequences. A scaled predictor already has the best one, and a
+            # calibrated one brings its own from the probe views of its run.
+            fitted = not (p.scaled or p.calibrated)
+            temperature = temperatures.get(p.name, Scales(1.0, 1.0)) if fitted else Scales(1.0, 1.0)
             rows[p.name] = _scores_of(*predicted(p, arrays, pixels), temperature, EPSILON)
     return rows
 

@@ -15,6 +15,7 @@ from sigmasplat.evaluation.splat_statistics import MapFacts, on_host
 from sigmasplat.metrics.scored_view import COVERED_ALPHA
 from sigmasplat.model.camera import Camera
 from sigmasplat.render import FieldRenderer, Render
+from sigmasplat.render.predictive import Predicted, predict
 from sigmasplat.types import Matrix
 
 Quantity = Literal["color", "depth"]
@@ -27,7 +28,8 @@ class SeenView:
     """A view of a map, with all that a predictor may read; no recorded image is among it.
 
     rendered: its maps; depth_m [H, W]: Σwz/Σw, 0 where the map does not cover the pixel; moment [H, W]: Σ w (z − D)²
-    about D = depth_m, m²; splats: planes [H, W] of the values of `splat_statistics`, by name.
+    about D = depth_m, m²; splats: planes [H, W] of the values of `splat_statistics`, by name; predicted: what the run
+    itself predicts, None if it does not; exact_depth: the view is compared with true depth, not with a reading.
     """
 
     rendered: Render
@@ -35,6 +37,8 @@ class SeenView:
     moment: Tensor
     splats: Mapping[str, Tensor]
     facts: MapFacts
+    predicted: Predicted | None
+    exact_depth: bool = False
 
     @property
     def transmittance(self) -> Tensor:
@@ -48,26 +52,36 @@ class SeenView:
 
 
 def see(
-    facts: MapFacts, values: Mapping[str, Tensor], camera: Camera, T_camera_map: Matrix, renderer: FieldRenderer
+    facts: MapFacts,
+    values: Mapping[str, Tensor],
+    camera: Camera,
+    T_camera_map: Matrix,
+    renderer: FieldRenderer,
+    exact_depth: bool = False,
 ) -> SeenView:
-    """Render a map and the values [N] of its splats at a pose."""
+    """Render a map and the values [N] of its splats at a pose; exact_depth: as in `SeenView`."""
     with torch.inference_mode():
         rendered = on_host(renderer(facts.field, camera, T_camera_map))
         alpha = rendered.alpha
         depth_m = torch.where(alpha > COVERED_ALPHA, rendered.depth / alpha.clamp(min=COVERED_ALPHA), 0.0)
         moment = on_host(renderer(facts.field, camera, T_camera_map, depth_m)).uncertainty
     assert moment is not None, "a render with a depth reference has a moment"
-    return SeenView(rendered, depth_m, moment, facts.rendered(T_camera_map, values), facts)
+    own = None
+    if facts.uncertainty is not None:
+        own = predict(facts.field, facts.uncertainty, camera, T_camera_map, renderer.options, renderer.backend)
+    return SeenView(rendered, depth_m, moment, facts.rendered(T_camera_map, values), facts, own, exact_depth)
 
 
 @dataclass(frozen=True)
 class Predictor:
-    """A row of the table. A `scaled` predictor has no unit: it gets the best scale for the pixels that are scored."""
+    """A row of the table. A `scaled` predictor has no unit: it gets the best scale for the pixels that are scored. A
+    `calibrated` one is calibrated by the run itself, so it gets no temperature."""
 
     name: str
     quantity: Quantity
     plane: Callable[[SeenView], Tensor]
     scaled: bool = False
+    calibrated: bool = False
 
 
 def constant(seen: SeenView) -> Tensor:
@@ -109,6 +123,19 @@ def ridge_with_prior(quantity: Quantity) -> Callable[[SeenView], Tensor]:
     return lambda seen: seen.splats[f"ridge_{quantity}"] + seen.transmittance * seen.facts.prior[prior]
 
 
+def predictive_color(seen: SeenView) -> Tensor:
+    """Return the predictive variance of colour (`render.predictive`); the best constant if the run has none."""
+    return constant(seen) * seen.facts.noise[0] if seen.predicted is None else seen.predicted.color
+
+
+def predictive_depth(seen: SeenView) -> Tensor:
+    """Return the predictive variance of depth, m², as `predictive_color`: about the true depth if the view has it, else
+    about a reading of the sensor."""
+    if seen.predicted is None:
+        return constant(seen) * seen.facts.noise[1]
+    return seen.predicted.depth_std_m.square() if seen.exact_depth else seen.predicted.reading_m2
+
+
 def splat_plane(name: str) -> Callable[[SeenView], Tensor]:
     """Return a predictor that reads the rendered values of a statistic."""
     return lambda seen: seen.splats[name].clamp(min=0.0)
@@ -123,6 +150,7 @@ PREDICTORS: tuple[Predictor, ...] = (
     Predictor("Fisher", "color", splat_plane("fisher_color")),
     Predictor("V + T prior", "color", variance_with_prior),
     Predictor("ridge + T prior", "color", ridge_with_prior("color")),
+    Predictor("predictive", "color", predictive_color, calibrated=True),
     Predictor("constant", "depth", constant, scaled=True),
     Predictor("1 - A", "depth", transmittance, scaled=True),
     Predictor("U", "depth", depth_moment),
@@ -130,5 +158,6 @@ PREDICTORS: tuple[Predictor, ...] = (
     Predictor("Fisher", "depth", splat_plane("fisher_depth")),
     Predictor("U + T prior", "depth", depth_moment_with_prior),
     Predictor("ridge + T prior", "depth", ridge_with_prior("depth")),
+    Predictor("predictive", "depth", predictive_depth, calibrated=True),
 )
 """All predictors, in the order of the table."""

@@ -25,6 +25,7 @@ from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.rules import ends_submap, is_held_back, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer
+from sigmasplat.slam.uncertainty import final_uncertainty
 from sigmasplat.slam.world import World
 from sigmasplat.types import Matrix, no_progress
 
@@ -56,6 +57,8 @@ class Slam(World):
                 found.loops += self._cut(found.T_submap_camera)
                 found.T_submap_camera = self._map(seen, np.eye(4))  # the next submap begins with the same keyframe
             self._seek_component(seen, found)
+        else:
+            self._offer_probe(seen, found)
         self.atlas.place_frame(found.T_submap_camera)
         self.steps.append(self._step_result(seen.frame, found))
         return self.steps[-1]
@@ -76,6 +79,7 @@ class Slam(World):
         members = self.atlas.members(0)
         store, anchors = StorePart(self.store, members), [self.atlas.anchors[s] for s in members]
         self._final = final_map(store, anchors, self.config, self.view, self.random, progress)
+        self.uncertainty = final_uncertainty(self._final, store, anchors, self.config, self.view)
         progress(total, total)
 
     def _observe(self, frame: Frame) -> Observation:
@@ -175,6 +179,15 @@ class Slam(World):
         self.tracker.keep_keyframe(self.mapper.field, self.view, seen, self.atlas.keyframe_poses[-1][-1])
         return self.atlas.keyframe_poses[-1][-1]
 
+    def _offer_probe(self, seen: Observation, found: Found) -> None:
+        """Offer a frame as a probe view if it was tracked without doubt and is not held back."""
+        index, newest = len(self.steps), self.mapper.keyframes[-1]
+        held_back = is_held_back(index, self.config.input.hold_every)
+        if found.state == TRACKED and self.recovery.is_steady and not self.tracker.doubtful and not held_back:
+            T_keyframe_camera = se3.inverse(newest.T_world_camera) @ found.T_submap_camera
+            last = len(self.mapper.keyframes) - 1
+            self.probes.offer(index, last, index - newest.index, T_keyframe_camera, seen.target)
+
     def _submap_ends(self, T_submap_camera: Matrix) -> bool:
         since, moved_m = len(self.steps) - self.mapper.keyframes[0].index, self.drift.position_m(T_submap_camera)
         return bool(ends_submap(T_submap_camera, since, moved_m, self.config.submaps))
@@ -206,7 +219,9 @@ class Slam(World):
     def _finish_submap(self) -> list[Loop]:
         """Move the active submap to the store and look for its loops, which may move anchors."""
         submap, pictures = self.mapper.finished(len(self.store))
-        self.store.save(submap, pictures)
+        submap, probes = self.probes.of(submap)
+        self.store.save(submap, pictures, probes)
+        self.probes.kept = []
         descriptors = [keyframe.descriptor for keyframe in self.mapper.keyframes]
         known = [descriptor for descriptor in descriptors if descriptor is not None]
         loops = self.closer.submap_finished(submap, known, self.atlas, self.view)
