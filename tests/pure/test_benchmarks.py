@@ -412,7 +412,7 @@ def small_config(options: Any, seed: int) -> Config:
 def test_a_followed_pose_has_the_error_of_its_own_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     """Poses that are off by a known twist in the live camera come back as that twist, whatever mapping moves."""
     known, claimed = np.array([1e-3, -2e-3, 3e-3, 1e-3, 2e-3, -1e-3]), np.diag([1e-6] * 6)
-    covering, source = SimpleNamespace(covariance=claimed), open_source(ROOM, limit=8)
+    covering, source = SimpleNamespace(covariance=claimed, bias=np.zeros(6)), open_source(ROOM, limit=8)
     T_world_room = se3.inverse(source.truth().T_world_camera[0])
 
     def off(self: Tracker, field: Any, view: Any, seen_now: Any) -> PoseFit:

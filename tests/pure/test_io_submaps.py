@@ -117,6 +117,22 @@ def test_disk_and_memory_stores_behave_alike(store: DiskStore) -> None:
         assert np.array_equal(kept[0].picture(index, index).color, kept[1].picture(index, index).color)
 
 
+def test_probe_views_are_read_back_from_both_stores(store: DiskStore) -> None:
+    submap, pictures = some_submap(0)
+    _, probes = some_submap(1, keyframes=2)
+    poses = np.stack([se3.exp(np.full(6, 0.1 * k)) for k in range(2)])
+    submap = replace(submap, probe_frames=(4, 7), T_submap_probe=poses)
+    for where in (store, MemoryStore()):
+        where.save(submap, pictures, probes)
+        found = where.load(0)
+        assert found.probe_frames == (4, 7) and np.array_equal(found.T_submap_probe, poses)
+        for k, probe in enumerate(probes):
+            assert np.array_equal(where.probe(0, k).color, probe.color)
+            assert np.array_equal(where.probe(0, k).depth_m, probe.depth_m)
+        with pytest.raises(SigmaSplatError, match="probe views"):
+            where.save(replace(submap, index=1), pictures, probes[:1])
+
+
 def test_another_store_of_the_same_folder_has_the_same_submaps(store: DiskStore) -> None:
     assert len(store) == 0 and not store.folder.exists(), "the folder is created with the first submap"
     store.save(*some_submap(0))

@@ -4,7 +4,19 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sigmasplat.metrics.uncertainty import ause, gaussian_nll, reliability, score, sparsification, spearman
+from sigmasplat.metrics.uncertainty import (
+    LEVELS,
+    auce,
+    ause,
+    best_scale,
+    calibration_scores,
+    coverage,
+    gaussian_nll,
+    reliability,
+    score,
+    sparsification,
+    spearman,
+)
 
 
 def noise(n: int = 40_000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -69,6 +81,40 @@ def test_ause_is_lower_for_a_better_ranking() -> None:
     assert np.isnan(ause(np.empty(0), np.empty(0))) and np.isnan(ause(np.ones(3), np.zeros(3)))
 
 
+def test_intervals_of_a_true_variance_contain_their_share() -> None:
+    v, e = noise()
+    np.testing.assert_allclose(coverage(v, e, LEVELS), LEVELS, atol=0.01)
+    assert auce(v, e, 0.0) < 0.005
+    scores = calibration_scores(v, e, 0.0)
+    assert scores["coverage_68"] == pytest.approx(0.6827, abs=0.01)
+    assert scores["coverage_95"] == pytest.approx(0.95, abs=0.01)
+    assert scores["z_rms"] == pytest.approx(1.0, abs=0.02) and scores["z_68"] == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("factor", [2.0, 0.5])
+def test_auce_of_a_scaled_variance_is_that_of_the_formula(factor: float) -> None:
+    v, e = noise()
+    inside = 2.0 * stats.norm.cdf(np.sqrt(factor) * stats.norm.ppf(0.5 + 0.5 * LEVELS)) - 1.0
+    assert auce(factor * v, e, 0.0) == pytest.approx(np.abs(inside - LEVELS).mean(), abs=0.005)
+    assert auce(factor * v, e, 0.0) > 0.05
+
+
+def test_the_largest_auce_is_one_half() -> None:
+    v, e = noise(100)
+    assert auce(1e9 * v, e) == pytest.approx(0.5) and auce(1e-9 * v, e + 1.0, 0.0) == pytest.approx(0.5)
+
+
+def test_the_best_scale_has_the_highest_likelihood() -> None:
+    v, e = noise()
+    assert best_scale(3.0 * v, e, 0.0) == pytest.approx(1 / 3, rel=0.03)
+    best = best_scale(v, 5.0 * e)
+    for factor in (0.8, 1.25):
+        assert gaussian_nll(best * v, 5.0 * e) < gaussian_nll(factor * best * v, 5.0 * e)
+    assert best_scale(v, 5.0 * e) == pytest.approx(calibration_scores(v, 5.0 * e)["z_rms"] ** 2)
+
+
 def test_scores_without_pixels_are_nan() -> None:
     values = score(np.empty(0), np.empty(0))
     assert values["pixels"] == 0 and np.isnan(values["spearman"]) and values["reliability"] == []
+    assert all(np.isnan(value) for value in calibration_scores(np.empty(0), np.empty(0)).values())
+    assert np.isnan(best_scale(np.empty(0), np.empty(0)))

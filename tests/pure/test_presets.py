@@ -274,7 +274,7 @@ def test_fast_is_one_map_without_variance() -> None:
 def test_sigma_adds_to_fast_and_removes_nothing() -> None:
     sigma, fast = preset("sigma"), preset("varsplat-fast")
     added = changed_settings(sigma, fast)
-    uncertainty = {"mapping.iterations", "mapping.weight_moment", "primitives.uncertain_m2"}
+    uncertainty = {"mapping.iterations", "mapping.weight_moment", "primitives.uncertain_m2", "uncertainty.probes"}
     assert added == uncertainty | {
         "input.denoise_depth", "tracking.features", "tracking.verify",
         "recovery.relocalise", "recovery.new_map_after", "recovery.steady_frames",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.slam.rules import draw_keyframes, is_keyframe, is_lost, jumped
+from sigmasplat.slam.rules import draw_keyframes, is_held_back, is_keyframe, is_lost, jumped
 
 NAN = float("nan")
 
@@ -23,6 +23,11 @@ def test_a_keyframe_is_due_after_a_number_of_frames_or_at_low_overlap() -> None:
 def test_overlap_zero_switches_that_rule_off() -> None:
     assert not is_keyframe(1, 5, 0.0, 0.0)
     assert is_keyframe(1, 1, 1.0, 0.0), "every frame, as TUM's preset has it"
+
+
+def test_the_last_of_each_n_frames_is_held_back() -> None:
+    assert [index for index in range(24) if is_held_back(index, 8)] == [7, 15, 23]
+    assert not any(is_held_back(index, 0) for index in range(24))
 
 
 def test_a_pose_is_lost_by_disagreement_or_by_too_little_in_common() -> None:

@@ -5,6 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
@@ -274,6 +275,35 @@ def test_texture_noise_is_smooth_and_fades_under_large_pixels():
     fine = noise(u, 0.3 * u, np.full_like(u, 1e-4), 0.1, seed=1)
     assert np.abs(np.diff(fine)).max() < 0.05 and fine.std() > 0.2 and np.abs(fine).max() <= 1
     assert np.abs(noise(u, u, np.full_like(u, 0.1), 0.1, seed=1)).max() == 0
+
+
+def test_the_exact_depth_has_neither_noise_nor_drift():
+    noisy = SyntheticRoom(frames=20, width=64, height=48, noise=True, drift=6)
+    plain_room = SyntheticRoom(frames=20, width=64, height=48)
+    np.testing.assert_array_equal(noisy.exact_depth_of(7), plain_room.frame(7).depth_m)
+    assert not np.array_equal(noisy.frame(7).depth_m, noisy.exact_depth_of(7))
+    part = open_source("synthetic:frames=20,width=64,height=48,noise=1", InputConfig(stride=7))
+    np.testing.assert_array_equal(part.exact_depth_of(1), plain_room.exact_depth_of(7))
+
+
+def test_test_views_are_exact_and_away_from_the_path():
+    room = SyntheticRoom(frames=50, width=64, height=48, noise=True, test_views=5)
+    away = room.test_views()
+    assert room.truth().T_world_camera.shape == (50, 4, 4) and len(away) == 5
+    poses, path = away.truth().T_world_camera, room.truth().T_world_camera
+    distance_m = np.linalg.norm(poses[:, None, :3, 3] - path[None, :, :3, 3], axis=2).min(1)
+    assert distance_m.max() > 0.1 and distance_m.max() < 0.7
+    for i in range(5):
+        color, depth_m = render_scene(build_scene(1, 0), room.camera, poses[i])
+        np.testing.assert_array_equal(away.frame(i).depth_m, depth_m)
+        np.testing.assert_allclose(away.frame(i).color, np.clip(color, 0, 1), atol=0.5001 / 255)
+        assert depth_m.min() > 0.3, "nothing is close to the camera"
+    again = SyntheticRoom(frames=50, width=64, height=48, test_views=5).test_views().truth()
+    np.testing.assert_array_equal(again.T_world_camera, poses)
+
+
+def test_without_the_option_there_are_no_test_views():
+    assert SyntheticRoom(frames=2, width=16, height=12).test_views() is None
 
 
 def test_negative_options_are_refused():

@@ -31,7 +31,7 @@ SETTINGS = {
     "input.width": "80", "input.limit": str(FRAMES), "mapping.first_iterations": "8", "mapping.iterations": "4",
     "mapping.every": "3", "submaps.frames": "9", "final.iterations": "6", "registration.iterations": "2",
 }  # fmt: skip
-SAME = ("trajectory.txt", "map.ply", "loops.json")
+SAME = ("trajectory.txt", "map.ply", "loops.json", "checkpoint.safetensors")
 
 
 def arguments(out: Path, name: str) -> list[str]:
@@ -39,10 +39,12 @@ def arguments(out: Path, name: str) -> list[str]:
     return ["run", ROOM, "--preset", name, "--out", str(out), "--no-eval", "--save-every", "0.001", *settings]
 
 
-def killed(out: Path, name: str, after: int) -> int:
+def killed(out: Path, name: str, after: int, *more: str) -> int:
     """Run in a separate process, kill it when `after` frames are logged, and return how many were logged."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "sigmasplat.cli", *arguments(out, name)], env=os.environ, stdout=subprocess.DEVNULL
+        [sys.executable, "-m", "sigmasplat.cli", *arguments(out, name), *more],
+        env=os.environ,
+        stdout=subprocess.DEVNULL,
     )
     log, deadline_s = out / "log.jsonl", time.monotonic() + 90
     while not log.exists() or log.read_text().count("\n") < after:
@@ -55,6 +57,17 @@ def killed(out: Path, name: str, after: int) -> int:
 
 def without_times(run: Path) -> list[dict]:
     return [{key: value for key, value in line.items() if key != "seconds"} for line in RunFolder(run).read_log()]
+
+
+def test_a_resumed_run_with_probe_views_gives_the_same_bytes(tmp_path: Path) -> None:
+    probes = ("--set", "uncertainty.probes=2")
+    assert exit_code(*arguments(tmp_path / "whole", "sigma"), *probes) == 0
+    assert killed(tmp_path / "cut", "sigma", 13, *probes) < FRAMES
+    assert exit_code("resume", str(tmp_path / "cut"), "--no-eval") == 0
+    for file in (*SAME, "uncertainty.json", "uncertainty.safetensors"):
+        assert (tmp_path / "cut" / file).read_bytes() == (tmp_path / "whole" / file).read_bytes(), file
+    found = RunFolder(tmp_path / "cut").read_uncertainty()
+    assert found is not None and found.probes > 0
 
 
 @pytest.mark.parametrize("name, after", [("sigma", 13), ("cgslam-fast", 7)])

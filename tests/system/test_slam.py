@@ -143,6 +143,23 @@ def test_threads_share_large_images_without_a_trace(threads: Callable[[int], Non
     assert found[0] == found[1]
 
 
+def test_frames_that_are_held_back_are_tracked_but_never_mapped() -> None:
+    slam = follow(frames(13), settings(input__hold_every="3", mapping__every="1"))
+    held_back = {2, 5, 8, 11}
+    assert lost(slam) == []
+    assert set(slam.keyframe_indices) == set(range(13)) - held_back
+    assert {step.index for step in slam.steps if not step.is_keyframe} == held_back
+
+
+def test_a_lost_frame_that_is_held_back_begins_no_map() -> None:
+    """The camera jumps to another part of the room while every second frame is held back."""
+    some = [*frames(4), *[walk().frame(100)] * 8]
+    changes = {"recovery__new_map_after": "2", "input__hold_every": "2"}
+    slam = follow((replace(frame, index=i, timestamp_s=i / 30) for i, frame in enumerate(some)), settings(**changes))
+    assert len(slam.atlas.anchors) > 1, "a new map began"
+    assert not any(index % 2 for index in slam.keyframe_indices)
+
+
 def test_another_seed_gives_another_map() -> None:
     few = {"seeding__first_uniform": "500", "seeding__first_gradient": "500", "mapping__first_iterations": "2"}
     one, two, three = (follow(frames(1), settings(seed=seed, **few)).field.params for seed in ("0", "1", "0"))

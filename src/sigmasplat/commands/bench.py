@@ -1,4 +1,4 @@
-"""Measure over many runs: sigmasplat bench ablation. torch is loaded only when a run needs it."""
+"""Measure over many runs: sigmasplat bench. torch is loaded only when a run needs it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from sigmasplat.commands import options
+from sigmasplat.commands.bench_uncertainty import Uncertainty
 from sigmasplat.commands.options import prepare_torch
 from sigmasplat.errors import ConfigError
 from sigmasplat.evaluation.ablation import COMPARED, Job, Results, Runner, Study, common_config, run_job, run_jobs
@@ -85,15 +86,15 @@ class Ablation:
 
 def bench(
     which: Annotated[
-        Annotated[Ablation, tyro.conf.subcommand("ablation")] | Annotated[None, tyro.conf.Suppress],
+        Annotated[Ablation, tyro.conf.subcommand("ablation")]
+        | Annotated[Uncertainty, tyro.conf.subcommand("uncertainty")],
         tyro.conf.arg(name="", prefix_name=False),
     ],
 ) -> int:
-    """Measure over many runs what each use of uncertainty contributes.
+    """Measure over many runs what each use of uncertainty contributes, and how good the uncertainty is.
 
     example: sigmasplat bench ablation data/kitchen --seeds 5
     """
-    assert which is not None, "tyro asks for a subcommand"
     return which.run()
 
 

@@ -66,6 +66,10 @@ SourcePaths = Annotated[
     ),
 ]
 Seeds = Annotated[int, arg(metavar="N", help="number of runs of each variant, with seeds 0 to N − 1")]
+Runs = Annotated[int, arg(metavar="N", help="number of runs of each sequence, with seeds 0 to N − 1")]
+HoldEvery = Annotated[int, arg(metavar="N", help="hold back every N-th frame from the map")]
+MostViews = Annotated[int, arg(metavar="N", help="largest number of views that are scored, of each kind")]
+StudyFolder = Annotated[Path, arg(metavar="DIR", help="folder of the results; finished runs in it are reused")]
 Tau = Annotated[float, arg(metavar="T", help="τ, the same for every weight and sequence")]
 WithoutVariance = Annotated[
     bool, arg(help="also run without learning any variance, as a reference", help_behavior_hint="")

@@ -14,11 +14,13 @@ from sigmasplat.config.frames import MappingConfig, RenderConfig, SeedConfig, Tr
 from sigmasplat.config.input import InputConfig
 from sigmasplat.config.recovery import RecoveryConfig
 from sigmasplat.config.submaps import FinalConfig, LoopConfig, RegistrationConfig, SubmapConfig
+from sigmasplat.config.uncertainty import UncertaintyConfig
 from sigmasplat.errors import ConfigError
 
 __all__ = [
     "Config", "DensifyConfig", "FeatureConfig", "FinalConfig", "InputConfig", "LoopConfig", "MappingConfig",
     "RecoveryConfig", "RegistrationConfig", "RenderConfig", "SeedConfig", "SubmapConfig", "TrackingConfig",
+    "UncertaintyConfig",
 ]  # fmt: skip
 
 
@@ -46,6 +48,7 @@ class Config:
     loops: LoopConfig = field(default_factory=LoopConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     final: FinalConfig = field(default_factory=FinalConfig)
+    uncertainty: UncertaintyConfig = field(default_factory=UncertaintyConfig)
 
     def changed(self, **sections: Mapping[str, Any]) -> "Config":
         """Return the settings with some values replaced, as in config.changed(mapping={"every": 5})."""

@@ -18,6 +18,8 @@ class InputConfig:
     """Start this many seconds after the first frame of the recording."""
     end_s: float = 0.0
     """Stop this many seconds after the first frame of the recording; 0 = at its end."""
+    hold_every: int = 0
+    """Hold back every N-th frame: it is tracked but never becomes a keyframe, so that it can test the map; 0 = none."""
     strict: bool = False
     """Whether an unreadable image stops the run. If off, such images are skipped and counted."""
 
@@ -63,5 +65,7 @@ class InputConfig:
                 "input.stride must be at least 1 and input.limit at least 0, "
                 f"found stride={self.stride}, limit={self.limit}"
             )
+        if self.hold_every < 0 or self.hold_every == 1:
+            raise ConfigError(f"input.hold_every must be 0 or at least 2, found {self.hold_every}")
         if self.start_s < 0 or (self.end_s and self.end_s <= self.start_s):
             raise ConfigError(f"input.end_s must be after input.start_s, found {self.start_s:g} to {self.end_s:g} s")

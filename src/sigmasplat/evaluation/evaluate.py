@@ -11,6 +11,7 @@ from sigmasplat.errors import RunError
 from sigmasplat.evaluation import reconstruct
 from sigmasplat.evaluation.frame_states import score_states
 from sigmasplat.evaluation.novel_views import score_novel_views
+from sigmasplat.evaluation.pose_covariance import score_pose_covariance
 from sigmasplat.evaluation.view_selection import evenly_spread, working_frame
 from sigmasplat.io.frames import RunFrames
 from sigmasplat.io.runs import TRUTH, RunFolder
@@ -74,6 +75,7 @@ def evaluate(
         known = None if problem else truth
         found = reconstruct.fuse_and_score(run, source.camera, source.true_surface(), known, renderer, progress)
         metrics["reconstruction"] = found
+    metrics["pose_covariance"] = score_pose_covariance(run, frames, None if problem else truth)
     metrics["test_views"] = None
     novel = source.test_views()
     if novel is not None and truth is not None and problem is None:

@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from sigmasplat.exports.run_reader import RunReader
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.model.field import GaussianField
+    from sigmasplat.model.trajectory import Trajectory
     from sigmasplat.sources.base import Source
-    from sigmasplat.types import Progress
+    from sigmasplat.types import Matrix, Progress
 
 
 def _no_sequence(run: "RunFolder") -> "Source":
@@ -212,6 +213,25 @@ def _trajectory(source: ExportSource, target: Path) -> str:
     return f"{len(path):,} poses{reader.left_out() if has_log else ''}"
 
 
+def _covariance(source: ExportSource, target: Path) -> str:
+    from sigmasplat.io.pose_covariance import write_square
+
+    return _write_covariances(source, target, write_square)
+
+
+def _ros_covariance(source: ExportSource, target: Path) -> str:
+    from sigmasplat.io.pose_covariance import write_ros
+
+    return _write_covariances(source, target, write_ros)
+
+
+def _write_covariances(source: ExportSource, target: Path, write: "Callable[[Path, Trajectory, Matrix], None]") -> str:
+    reader = source.reader()
+    path = reader.believed_path()
+    write(target, path, reader.covariances())
+    return f"{len(path):,} poses with their covariance{reader.left_out()}"
+
+
 def _kitti(source: ExportSource, target: Path) -> str:
     """Write one line per frame, since the line number is the frame number; nan for frames without a believed pose."""
     import numpy as np
@@ -288,6 +308,8 @@ FORMATS = (
     ExportFormat("splat", (".splat",), "32 bytes per splat, for web viewers", _splat),
     ExportFormat("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", _spz),
     ExportFormat("trajectory", (".txt",), "the path as TUM text", _trajectory),
+    ExportFormat("covariance", (".cov.txt",), "the path as TUM text with the covariance of each pose", _covariance),
+    ExportFormat("ros-covariance", (".ros.txt",), "the same as geometry_msgs/PoseWithCovariance", _ros_covariance),
     ExportFormat("kitti", (".kitti.txt",), "the path as KITTI text, one line per frame", _kitti, True),
     ExportFormat("nerfstudio", (".json",), "views as nerfstudio's transforms.json", _nerfstudio, True),
     ExportFormat("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap, True),

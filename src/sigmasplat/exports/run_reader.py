@@ -14,7 +14,9 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.component import APART, LOST
 from sigmasplat.model.submap import Picture
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.slam.path_covariance import PathCovariance
 from sigmasplat.sources.base import Source
+from sigmasplat.types import Matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +71,20 @@ class RunReader:
         if unknown := sorted(set(frames) - set(self.believed_frames())):
             raise RunError(f"run {self.run.path} has no believed pose of frame {unknown[0]}; choose another frame")
         return self.frames.path.at(np.searchsorted(self.frames.rows, frames))
+
+    def covariances(self) -> Matrix:
+        """Return the covariance of the poses of `believed_path` [B, 6, 6], of left twists in the world, m and rad.
+
+        Raises RunError if the run did not record the errors of its path.
+        """
+        rows = self.believed_frames()
+        errors = PathCovariance.of(self.run.read_checkpoint()[0])
+        if errors is None or len(errors) <= rows[-1]:
+            raise RunError(
+                f"run {self.run.path} did not record the errors of its path, because an older version made it; "
+                "run it again"
+            )
+        return np.stack([errors.of_frame(row) for row in rows])
 
     def left_out(self, keyframes: bool = False) -> str:
         """Describe how many frames have no believed pose, of all or of the keyframes; empty if there are none."""

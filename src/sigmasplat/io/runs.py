@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sigmasplat.config import Config
 from sigmasplat.errors import RunError
-from sigmasplat.io import machine, trajectory as tum
+from sigmasplat.io import machine, trajectory as tum, uncertainty as uncertainty_files
 from sigmasplat.io.atomic import replacing, write_text
 from sigmasplat.io.frames import RunFrames
 from sigmasplat.io.json_files import append_line, read_json, read_lines, write_json
@@ -20,6 +20,7 @@ from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.tensors import open_tensors, write_tensors
 from sigmasplat.model.component import Component
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.map_uncertainty import MapUncertainty
 from sigmasplat.model.trajectory import Trajectory
 
 PROGRAM = "sigmasplat"
@@ -33,7 +34,7 @@ ALL_POSES = "trajectory_all.txt"
 """The poses of all frames, written if requested."""
 FILES = (
     "config.json", "trajectory.txt", "map.ply", "checkpoint.safetensors", "log.jsonl", "loops.json",
-    "metrics.json", "profile.json", "report.html", TRUTH,
+    "metrics.json", "profile.json", "report.html", TRUTH, uncertainty_files.JSON, uncertainty_files.TENSORS,
 )  # fmt: skip
 """Files that a run may have in addition to run.json, which always exists and identifies the folder as ours."""
 COMPONENTS, COMPONENT_FILES = "components", ("trajectory.txt", "map.ply")
@@ -235,6 +236,14 @@ class RunFolder:
     def read_map(self) -> GaussianField:
         """Read map.ply. Raises RunError if it is missing, SourceError if it is damaged."""
         return ply.read_field(self._existing("map.ply"))
+
+    def write_uncertainty(self, uncertainty: MapUncertainty) -> None:
+        """Write uncertainty.json and uncertainty.safetensors: how sure map.ply is."""
+        uncertainty_files.write_uncertainty(self.path, uncertainty)
+
+    def read_uncertainty(self) -> MapUncertainty | None:
+        """Return how sure map.ply is; None if the run has not measured it. Raises RunError if a file is damaged."""
+        return uncertainty_files.read_uncertainty(self.path)
 
     def map_bytes(self) -> int:
         """Return the size of map.ply. Raises RunError if it is missing."""

@@ -19,7 +19,7 @@ from sigmasplat.io.tensors import open_tensors, write_tensors
 INLINE = 64
 """Arrays with at most this many numbers are stored in the text, since there are many poses and each tensor needs a
 header."""
-VERSION = "3"
+VERSION = "4"
 
 
 def write_state(path: Path, tree: Any, classes: Iterable[type], fixed: Mapping[str, Any]) -> None:

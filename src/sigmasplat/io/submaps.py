@@ -2,9 +2,9 @@
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,9 +41,9 @@ class DiskStore:
         """Return the path of a submap's file."""
         return self.folder / f"submap-{index:05d}.safetensors"
 
-    def save(self, submap: Submap, pictures: list[Picture]) -> None:
+    def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
         """Write a submap. Raises SigmaSplatError if it is inconsistent, RunError if it cannot be written."""
-        refuse_misfit(submap, pictures, len(self))
+        refuse_misfit(submap, pictures, len(self), probes)
         tensors = {
             "params": submap.field.params,
             "T_submap_camera": torch.tensor(submap.T_submap_camera, dtype=torch.float64),
@@ -52,6 +52,13 @@ class DiskStore:
             "colors": torch.from_numpy(np.stack([picture.color for picture in pictures])),
             "depths_m": torch.from_numpy(np.stack([picture.depth_m for picture in pictures])),
         }
+        if probes:
+            tensors |= {
+                "T_submap_probe": torch.tensor(submap.T_submap_probe, dtype=torch.float64),
+                "probe_frames": torch.tensor(submap.probe_frames, dtype=torch.int64),
+                "probe_colors": torch.from_numpy(np.stack([picture.color for picture in probes])),
+                "probe_depths_m": torch.from_numpy(np.stack([picture.depth_m for picture in probes])),
+            }
         make_folder(self.folder)
         text = {"index": str(submap.index), "camera": json.dumps(asdict(submap.camera))}
         details = [picture.detail for picture in pictures if picture.detail is not None]
@@ -64,13 +71,17 @@ class DiskStore:
         """Read a submap without its images. Raises RunError if it is missing or damaged."""
         with self._opened(index) as file:
             attributes = {n: Rows(file.get_tensor(f"extra.{n}")) for n in ATTRIBUTES if f"extra.{n}" in file.keys()}  # noqa: SIM118
-            return Submap(
+            submap = Submap(
                 index,
                 GaussianField(file.get_tensor("params"), attributes=attributes),
                 tuple(file.get_tensor("frames").tolist()),
                 file.get_tensor("T_submap_camera").numpy(),
                 Camera(**json.loads(file.metadata()["camera"])),
             )
+            if "probe_frames" not in file.keys():  # noqa: SIM118
+                return submap
+            frames, poses = file.get_tensor("probe_frames").tolist(), file.get_tensor("T_submap_probe").numpy()
+            return replace(submap, probe_frames=tuple(frames), T_submap_probe=poses)
 
     def picture(self, index: int, keyframe: int) -> Picture:
         """Read the images of one keyframe. Raises RunError if the submap is missing or damaged."""
@@ -80,6 +91,12 @@ class DiskStore:
                 return Picture(color, depth_m)
             camera = Camera(**json.loads(file.metadata()["detail_camera"]))
             return Picture(color, depth_m, Detail(file.get_slice("details")[keyframe].numpy(), camera))
+
+    def probe(self, index: int, probe: int) -> Picture:
+        """Read the images of one probe view. Raises RunError if the submap is missing or damaged."""
+        with self._opened(index) as file:
+            color, depth_m = (file.get_slice(name)[probe].numpy() for name in ("probe_colors", "probe_depths_m"))
+            return Picture(color, depth_m)
 
     def truncate(self, count: int) -> None:
         """Remove all submaps except the first `count`, and incomplete files."""

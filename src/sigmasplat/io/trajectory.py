@@ -20,9 +20,14 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
     """
     lines = [f"# {COLUMNS} (seconds, metres, camera to world)"]
     for t, T in zip(trajectory.timestamps_s, trajectory.T_world_camera, strict=True):
-        w, x, y, z = se3.quaternion_from_rotation(T[:3, :3])
-        lines.append(f"{t:.9f} " + " ".join(f"{value:.12g}" for value in (*T[:3, 3], x, y, z, w)))
+        lines.append(pose_line(t, T))
     write_text(path, "\n".join(lines) + "\n")
+
+
+def pose_line(t: float, T: Matrix) -> str:
+    """Return a pose [4, 4] at a time, seconds, as a line of TUM text."""
+    w, x, y, z = se3.quaternion_from_rotation(T[:3, :3])
+    return f"{t:.9f} " + " ".join(f"{value:.12g}" for value in (*T[:3, 3], x, y, z, w))
 
 
 def read_trajectory(path: Path, may_be_empty: bool = False) -> Trajectory:

@@ -1,4 +1,4 @@
-"""Score a predicted variance against the squared error: rank correlation, likelihood, calibration, sparsification.
+"""Score a predicted variance against the squared error: rank correlation, likelihood, coverage, sparsification.
 
 Every function takes two arrays of one shape: predicted variance V and squared error r², both in colour² (or m²). They
 hold valid pixels only.
@@ -9,12 +9,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import spearmanr
+from scipy.stats import norm, spearmanr
 
 Values = NDArray[np.floating[Any]]
 
 EPSILON = 1e-6
 """VarSplat's ε, colour²: keeps the logarithm and the division finite where V is 0."""
+
+LEVELS = np.arange(0.05, 1.0, 0.1)
+"""The ten nominal coverages of AUCE: 5 %, 15 %, … 95 %."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,38 @@ def gaussian_nll(variance: Values, squared_error: Values, epsilon: float = EPSIL
     """
     v = np.maximum(variance.astype(np.float64), 0.0) + epsilon
     return float(np.mean(0.5 * squared_error / v + 0.5 * np.log(v))) if v.size else float("nan")
+
+
+def best_scale(variance: Values, squared_error: Values, epsilon: float = EPSILON) -> float:
+    """Return the factor T with which T (V+ε) has the highest Gaussian likelihood: the mean of r²/(V+ε); nan without
+    pixels.
+
+    It is the temperature of a calibration, and the mean squared z-score: 1 for a V that is right on average.
+    """
+    if not squared_error.size:
+        return float("nan")
+    return float(np.mean(squared_error / (np.maximum(variance.astype(np.float64), 0.0) + epsilon)))
+
+
+def coverage(variance: Values, squared_error: Values, levels: Values, epsilon: float = EPSILON) -> Values:
+    """Return the share of errors inside the central interval of a Gaussian of variance V+ε, for each nominal level.
+
+    levels [L] in (0, 1). The result [L] equals them if V is right and the errors are Gaussian; nan without pixels.
+    """
+    if not squared_error.size:
+        return np.full(len(levels), np.nan)
+    z2 = squared_error.ravel() / (np.maximum(variance.ravel().astype(np.float64), 0.0) + epsilon)
+    limits = norm.ppf(0.5 + 0.5 * levels) ** 2
+    counts = np.bincount(np.searchsorted(limits, z2, side="left"), minlength=len(limits) + 1)
+    return np.asarray(np.cumsum(counts)[: len(limits)] / z2.size)
+
+
+def auce(variance: Values, squared_error: Values, epsilon: float = EPSILON) -> float:
+    """Return the mean of |coverage − nominal| over `LEVELS` (Gustafsson et al. 2020); nan without pixels.
+
+    0: every interval contains its share of the errors. The largest possible value is 0.5.
+    """
+    return float(np.abs(coverage(variance, squared_error, LEVELS, epsilon) - LEVELS).mean())
 
 
 def reliability(variance: Values, squared_error: Values, bins: int = 10) -> list[ReliabilityBin]:
@@ -70,6 +105,34 @@ def ause(variance: Values, squared_error: Values, steps: int = 100) -> float:
     by_variance = sparsification(variance, squared_error, steps)
     by_error = sparsification(squared_error, squared_error, steps)
     return float(np.mean(by_variance - by_error) / by_error[0])
+
+
+def z_scores(variance: Values, squared_error: Values, epsilon: float = EPSILON) -> dict[str, float]:
+    """Return the root mean square of the z-scores r/√(V+ε), and z_68: 68.3 % of |z| are below it.
+
+    Both are 1 for a right V and Gaussian errors. Few large errors raise the first one only. nan without pixels.
+    """
+    if not squared_error.size:
+        return {"z_rms": float("nan"), "z_68": float("nan")}
+    z2 = squared_error / (np.maximum(variance.astype(np.float64), 0.0) + epsilon)
+    return {"z_rms": float(np.sqrt(z2.mean())), "z_68": float(np.sqrt(np.quantile(z2, 0.6827)))}
+
+
+def calibration_scores(variance: Values, squared_error: Values, epsilon: float = EPSILON) -> dict[str, float]:
+    """Return the scores that a scale of V changes: nll, auce, coverage_68, coverage_95, z_rms, z_68."""
+    at_68, at_95 = coverage(variance, squared_error, np.array([0.6827, 0.95]), epsilon)
+    return {
+        "nll": gaussian_nll(variance, squared_error, epsilon),
+        "auce": auce(variance, squared_error, epsilon),
+        "coverage_68": float(at_68),
+        "coverage_95": float(at_95),
+        **z_scores(variance, squared_error, epsilon),
+    }
+
+
+def ranking_scores(variance: Values, squared_error: Values) -> dict[str, float]:
+    """Return the scores that only depend on the order of V: ause, spearman."""
+    return {"ause": ause(variance, squared_error), "spearman": spearman(variance, squared_error)}
 
 
 def score(variance: Values, squared_error: Values) -> dict[str, Any]:

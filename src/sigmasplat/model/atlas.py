@@ -18,6 +18,21 @@ class Place(NamedTuple):
     T_keyframe_camera: Matrix
 
 
+class Hop(NamedTuple):
+    """The motion T_camera_before [4, 4] from the keyframe before to a keyframe, as tracking found it.
+
+    covariance [6, 6]: of its left twist (ρ, φ), m and rad; nan if it is not known, as for the first keyframe of a
+    submap. bias [6]: standard deviation of the error that is the same in all hops.
+    """
+
+    T_camera_before: Matrix
+    covariance: Matrix
+    bias: Matrix
+
+
+UNKNOWN_HOP = Hop(np.eye(4), np.full((6, 6), np.nan), np.zeros(6))
+
+
 @dataclass(eq=False)
 class Atlas:
     """Poses of submaps, keyframes and frames, each relative to the level above; world poses are computed on reading.
@@ -25,6 +40,7 @@ class Atlas:
     anchors: T_world_submap of each submap, the first one the identity; closing a loop changes only these.
     odometry: the same poses from tracking alone; no loop changes them.
     keyframe_poses: T_submap_camera of each submap's keyframes; those of the last submap change while it is mapped.
+    hops: how tracking found each keyframe from the keyframe before it in the submap.
     places: one per frame.
     components: one number per submap. Submaps of a component are connected, and their anchors are in one frame: the
     world for component 0, else the first camera of the component. A component joins another when a place is recognised.
@@ -33,6 +49,7 @@ class Atlas:
     anchors: list[Matrix] = field(default_factory=list)
     odometry: list[Matrix] = field(default_factory=list)
     keyframe_poses: list[list[Matrix]] = field(default_factory=list)
+    hops: list[list[Hop]] = field(default_factory=list)
     places: list[Place] = field(default_factory=list)
     components: list[int] = field(default_factory=list)
 
@@ -45,6 +62,7 @@ class Atlas:
         begun = max(self.components, default=-1) + 1
         self.components.append(begun if T_parent_submap is None else self.components[parent])
         self.keyframe_poses.append([])
+        self.hops.append([])
 
     def add_finished(self, T_world_submap: Matrix, keyframe_poses: list[Matrix]) -> None:
         """Append a submap of an earlier session to the world, with T_submap_camera [4, 4] of its keyframes."""
@@ -52,6 +70,12 @@ class Atlas:
         self.odometry.append(T_world_submap)
         self.components.append(0)
         self.keyframe_poses.append(keyframe_poses)
+        self.hops.append([UNKNOWN_HOP] * len(keyframe_poses))
+
+    def set_keyframes(self, keyframe_poses: list[Matrix], hop: Hop) -> None:
+        """Set T_submap_camera [4, 4] of the last submap's keyframes, with a new one at the end, and the hop to it."""
+        self.keyframe_poses[-1] = keyframe_poses
+        self.hops[-1].append(hop)
 
     def join(self, a: int, b: int, T_a_b: Matrix) -> None:
         """Join the components of two submaps, given T_a_b [4, 4]: the one with the higher number moves to the other."""

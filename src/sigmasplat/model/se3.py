@@ -80,6 +80,14 @@ def adjoint(T: Matrix) -> Matrix:
     return out
 
 
+def displacement(T: Matrix) -> Matrix:
+    """Return the matrix [..., 6, 6] from a left twist of T to the displacement of T's origin and the rotation, both in
+    the axes of the outer frame: a twist (ρ, φ) moves the origin p by ρ + φ × p."""
+    out = np.broadcast_to(np.eye(6), (*T.shape[:-2], 6, 6)).copy()
+    out[..., :3, 3:] = -hat(T[..., :3, 3])
+    return out
+
+
 def exp_stack(xi: Matrix) -> Matrix:
     """Convert twists [N, 6] to transforms [N, 4, 4]: `exp` for many twists."""
     k = hat(xi[:, 3:])

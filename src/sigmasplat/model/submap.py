@@ -1,7 +1,7 @@
 """Submaps, and the stores that keep finished ones."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field as dataclass_field
 from typing import Protocol
 
 import numpy as np
@@ -37,6 +37,7 @@ class Submap:
     an earlier session are negative, −1 is its last frame: `run --onto`); T_submap_camera [K, 4, 4]: their poses;
     camera: shared by all keyframes. The `SubmapStore` keeps the keyframes' images, the `Atlas` the submap's pose in the
     world.
+    probe_frames [P], T_submap_probe [P, 4, 4]: the same of its probe views, to which nothing is fitted.
     """
 
     index: int
@@ -44,6 +45,8 @@ class Submap:
     frames: tuple[int, ...]
     T_submap_camera: Matrix
     camera: Camera
+    probe_frames: tuple[int, ...] = ()
+    T_submap_probe: Matrix = dataclass_field(default_factory=lambda: np.empty((0, 4, 4)))
 
 
 class SubmapStore(Protocol):
@@ -51,8 +54,8 @@ class SubmapStore(Protocol):
 
     def __len__(self) -> int: ...
 
-    def save(self, submap: Submap, pictures: list[Picture]) -> None:
-        """Save a submap and the images of its keyframes. A finished submap never changes."""
+    def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
+        """Save a submap and the images of its keyframes and probe views. A finished submap never changes."""
 
     def load(self, index: int) -> Submap:
         """Return a submap; the caller may change it."""
@@ -62,22 +65,28 @@ class SubmapStore(Protocol):
         """Return the images of one keyframe of a submap."""
         ...
 
+    def probe(self, index: int, probe: int) -> Picture:
+        """Return the images of one probe view of a submap."""
+        ...
+
 
 @dataclass(eq=False)
 class MemoryStore:
     """Keeps submaps in memory: for short runs, and when no files may be written."""
 
-    submaps: list[Submap] = field(default_factory=list)
-    pictures: list[list[Picture]] = field(default_factory=list)
+    submaps: list[Submap] = dataclass_field(default_factory=list)
+    pictures: list[list[Picture]] = dataclass_field(default_factory=list)
+    probes: list[list[Picture]] = dataclass_field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.submaps)
 
-    def save(self, submap: Submap, pictures: list[Picture]) -> None:
-        """Save a submap. Raises SigmaSplatError unless it is the next one and has images for each keyframe."""
-        refuse_misfit(submap, pictures, len(self))
+    def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
+        """Save a submap. Raises SigmaSplatError unless it is the next one and has images for all its views."""
+        refuse_misfit(submap, pictures, len(self), probes)
         self.submaps.append(submap)
         self.pictures.append(pictures)
+        self.probes.append(list(probes))
 
     def load(self, index: int) -> Submap:
         """Return a submap."""
@@ -86,6 +95,10 @@ class MemoryStore:
     def picture(self, index: int, keyframe: int) -> Picture:
         """Return the images of one keyframe of a submap."""
         return self.pictures[index][keyframe]
+
+    def probe(self, index: int, probe: int) -> Picture:
+        """Return the images of one probe view of a submap."""
+        return self.probes[index][probe]
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +111,7 @@ class StorePart:
     def __len__(self) -> int:
         return len(self.members)
 
-    def save(self, submap: Submap, pictures: list[Picture]) -> None:
+    def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
         """Raise SigmaSplatError: a part cannot grow."""
         raise SigmaSplatError(f"submap {submap.index} cannot be saved in a part of a store; save it in the whole store")
 
@@ -110,11 +123,19 @@ class StorePart:
         """Return the images of one keyframe of a submap."""
         return self.store.picture(self.members[index], keyframe)
 
+    def probe(self, index: int, probe: int) -> Picture:
+        """Return the images of one probe view of a submap."""
+        return self.store.probe(self.members[index], probe)
 
-def refuse_misfit(submap: Submap, pictures: list[Picture], next_index: int) -> None:
-    """Raise SigmaSplatError if a submap is not the next one to save, or its keyframes and images do not match."""
+
+def refuse_misfit(submap: Submap, pictures: Sequence[Picture], next_index: int, probes: Sequence[Picture] = ()) -> None:
+    """Raise SigmaSplatError if a submap is not the next one to save, or its keyframes or probe views do not match their
+    images."""
     if submap.index != next_index:
         raise SigmaSplatError(f"submap {submap.index} cannot be saved: the next index is {next_index}")
     if not len(submap.frames) == len(submap.T_submap_camera) == len(pictures):
         counts = f"{len(submap.frames)} frames, {len(submap.T_submap_camera)} poses, {len(pictures)} pictures"
         raise SigmaSplatError(f"submap {submap.index} cannot be saved: {counts}")
+    if not len(submap.probe_frames) == len(submap.T_submap_probe) == len(probes):
+        counts = f"{len(submap.probe_frames)} frames, {len(submap.T_submap_probe)} poses, {len(probes)} pictures"
+        raise SigmaSplatError(f"submap {submap.index} cannot be saved: {counts} of probe views")

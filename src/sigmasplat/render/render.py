@@ -40,7 +40,7 @@ class Render:
     covariance: Tensor | None = None
 
 
-def _colors_from(field: GaussianField, T_camera_world: Tensor) -> Tensor:
+def colors_from(field: GaussianField, T_camera_world: Tensor) -> Tensor:
     """Return the colours [N, 3] that a camera sees."""
     if "harmonics" not in field.attributes:
         return field.colors
@@ -51,13 +51,13 @@ def _colors_from(field: GaussianField, T_camera_world: Tensor) -> Tensor:
 
 def _features_from(field: GaussianField, z: Tensor, T_camera_world: Tensor) -> Tensor:
     """Return the values of each splat that are summed per pixel, [N, 7], or [N, 10] with full colour covariance."""
-    colors = _colors_from(field, T_camera_world)
+    colors = colors_from(field, T_camera_world)
     if "correlations" not in field.attributes:
         return features_of(colors, z, field.variances)
     return covariance_features(colors, z, field.variances, field.attributes["correlations"].params)
 
 
-def _on_device(field: GaussianField, backend: str) -> GaussianField:
+def on_device(field: GaussianField, backend: str) -> GaussianField:
     """Return the parts of a field that a render needs, in memory that the backend can read, without optimiser state."""
     if backend_name(backend, field.params.device) != "cuda" or field.params.device.type != "cpu":
         return field
@@ -80,7 +80,7 @@ def render(
     viewing directions of `harmonics`. Raises BackendError if the backend is not available.
     """
     kernels, options = backend_module(backend, field.params.device), options or RenderConfig()
-    field = _on_device(field, backend)
+    field = on_device(field, backend)
     T = torch.as_tensor(T_camera_world)
     p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
     features = _features_from(field, p.z, T if options.color_pose_gradient else T.detach())
@@ -117,8 +117,8 @@ class FieldRenderer:
         depth_reference: Tensor | None = None,
     ) -> Render:
         """Render a field as `render` does."""
-        on_device = next((copy for one, copy in self._kept if one is field), None)
-        if on_device is None:
-            on_device = _on_device(field, self.backend)
-            self._kept.append((field, on_device))
-        return render(on_device, camera, T_camera_world, depth_reference, self.options, self.backend)
+        copied = next((copy for one, copy in self._kept if one is field), None)
+        if copied is None:
+            copied = on_device(field, self.backend)
+            self._kept.append((field, copied))
+        return render(copied, camera, T_camera_world, depth_reference, self.options, self.backend)

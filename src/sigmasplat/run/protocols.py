@@ -10,6 +10,7 @@ from torch import Tensor
 from sigmasplat.model.component import Component
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.map_uncertainty import MapUncertainty
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.types import Progress
 
@@ -68,6 +69,11 @@ class SlamSystem(Protocol):
     def field(self) -> GaussianField: ...
     @property
     def loops(self) -> Sequence[LoopResult]: ...
+    @property
+    def uncertainty(self) -> MapUncertainty | None:
+        """Return how sure the final map is, if it was measured."""
+        ...
+
     def step(self, frame: Frame) -> StepResult: ...
     def finish(self, progress: Progress) -> None: ...
     def trajectory(self) -> Trajectory:

@@ -229,6 +229,8 @@ class Session:
         self.run.write_profile(profile(self.run.read_log(), self.wall_s))
         self.run.write_components(components)
         self.run.write_map(self.slam.field)
+        if self.slam.uncertainty is not None:
+            self.run.write_uncertainty(self.slam.uncertainty)
 
     def _write_loops(self) -> None:
         self.run.write_loops([loop.record() for loop in self.slam.loops])

@@ -9,11 +9,15 @@ from torch import Tensor
 from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.slam.loop_closure.pose_graph import Edge
+from sigmasplat.slam.path_covariance import recorded
 
 
-def checkpoint_of(active: GaussianField, path: Trajectory, atlas: Atlas, keyframes: Sequence[int]) -> dict[str, Tensor]:
-    """Return the active submap's field with its optimiser state, poses, times, keyframes, anchors, and the submap of
-    each frame, in host memory."""
+def checkpoint_of(
+    active: GaussianField, path: Trajectory, atlas: Atlas, keyframes: Sequence[int], edges: Sequence[Edge]
+) -> dict[str, Tensor]:
+    """Return the active submap's field with its optimiser state, poses, times, keyframes, anchors, the submap of each
+    frame, and the errors of the path, in host memory."""
     return {
         **{name: getattr(active, name).cpu() for name in ("params", "moment1", "moment2", "last_step")},
         "adam_steps": torch.tensor(active.steps),
@@ -24,4 +28,5 @@ def checkpoint_of(active: GaussianField, path: Trajectory, atlas: Atlas, keyfram
         "T_world_submap": torch.from_numpy(np.array(atlas.anchors).reshape(-1, 4, 4)),
         "submap_component": torch.tensor(atlas.components, dtype=torch.int64),
         "frame_submap": torch.tensor([place.submap for place in atlas.places], dtype=torch.int64),
+        **recorded(atlas, edges),
     }

@@ -21,7 +21,9 @@ def take_over(earlier: SubmapStore, members: Sequence[int], frames: int, store: 
         submap = earlier.load(member)
         numbers = tuple(frame - frames for frame in submap.frames)
         pictures = [earlier.picture(member, k) for k in range(len(numbers))]
-        store.save(replace(submap, index=index, frames=numbers), pictures)
+        probe_numbers = tuple(frame - frames for frame in submap.probe_frames)
+        probes = [earlier.probe(member, k) for k in range(len(probe_numbers))]
+        store.save(replace(submap, index=index, frames=numbers, probe_frames=probe_numbers), pictures, probes)
 
 
 def continued(config: Config, store: SubmapStore, anchors: Sequence[Matrix]) -> Slam:

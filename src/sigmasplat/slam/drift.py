@@ -55,9 +55,9 @@ class Drift:
         """Return the accumulated tracking uncertainty: the standard deviation of the camera's position in the submap,
         metres (square root of the sum over the axes), from the estimates of alignment.
 
-        T_submap_camera [4, 4] is the camera's pose. A twist (ρ, φ) moves the position p by ρ + φ × p.
+        T_submap_camera [4, 4] is the camera's pose.
         """
-        moved = np.hstack([np.eye(3), -se3.hat(T_submap_camera[:3, 3])])
+        moved = se3.displacement(T_submap_camera)[:3]
         return float(np.sqrt(np.trace(moved @ self.covariance @ moved.T)))
 
     @property

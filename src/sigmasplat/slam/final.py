@@ -197,6 +197,9 @@ class KeyframeReader:
     def __len__(self) -> int:
         return len(self.places)
 
+    def __iter__(self) -> Iterator[Keyframe]:
+        return (self[i] for i in range(len(self)))
+
     def __getitem__(self, i: int) -> Keyframe:
         return Keyframe(i, self._target(i), self.poses[i], fixed=True)
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 from sigmasplat.fit.pose import PoseFit
+from sigmasplat.model.atlas import UNKNOWN_HOP, Hop
 from sigmasplat.model.component import LOST, TRACKED
 from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.slam.step_result import metrics_of
@@ -12,12 +13,13 @@ from sigmasplat.types import Matrix
 @dataclass(eq=False)
 class Found:
     """Where a frame is: T_submap_camera [4, 4] in the active submap, its state, values of tracking, whether it is to be
-    mapped, and the loops that were tried meanwhile."""
+    mapped, the hop to it from the last keyframe, and the loops that were tried meanwhile."""
 
     T_submap_camera: Matrix
     state: str = TRACKED
     tracking: dict[str, float] = field(default_factory=dict)
     mapped: bool = False
+    hop: Hop = UNKNOWN_HOP
     loops: list[Loop] = field(default_factory=list)
 
     @staticmethod

@@ -19,6 +19,11 @@ def is_keyframe(frames_since: int, every: int, overlap: float, overlap_below: fl
     return frames_since >= every or overlap < overlap_below
 
 
+def is_held_back(index: int, every: int) -> bool:
+    """Return whether a frame is held back from the map: the last one of each `every` frames; 0 = none."""
+    return every > 0 and index % every == every - 1
+
+
 def ends_submap(
     T_submap_camera: NDArray[np.float64], frames_since: int, uncertainty_m: float, config: SubmapConfig
 ) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.model import se3
+from sigmasplat.model.atlas import UNKNOWN_HOP, Hop
 from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
@@ -22,8 +23,9 @@ from sigmasplat.slam.localisation.sight import Observation, Sight, observe, work
 from sigmasplat.slam.localisation.verdict import is_better, is_questionable, stands
 from sigmasplat.slam.loop_closure.closer import Loop
 from sigmasplat.slam.mapper import Mapper
-from sigmasplat.slam.rules import ends_submap, is_keyframe
+from sigmasplat.slam.rules import ends_submap, is_held_back, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer
+from sigmasplat.slam.uncertainty import final_uncertainty
 from sigmasplat.slam.world import World
 from sigmasplat.types import Matrix, no_progress
 
@@ -50,11 +52,13 @@ class Slam(World):
         found = self._localise(seen) if self.steps else self._begin(seen)
         if found.mapped:
             seen = seen.without(self.tracker.front, self.view)
-            found.T_submap_camera = self._map(seen, found.T_submap_camera)
+            found.T_submap_camera = self._map(seen, found.T_submap_camera, found.hop)
             if self._submap_ends(found.T_submap_camera):
                 found.loops += self._cut(found.T_submap_camera)
                 found.T_submap_camera = self._map(seen, np.eye(4))  # the next submap begins with the same keyframe
             self._seek_component(seen, found)
+        else:
+            self._offer_probe(seen, found)
         self.atlas.place_frame(found.T_submap_camera)
         self.steps.append(self._step_result(seen.frame, found))
         return self.steps[-1]
@@ -75,6 +79,7 @@ class Slam(World):
         members = self.atlas.members(0)
         store, anchors = StorePart(self.store, members), [self.atlas.anchors[s] for s in members]
         self._final = final_map(store, anchors, self.config, self.view, self.random, progress)
+        self.uncertainty = final_uncertainty(self._final, store, anchors, self.config, self.view)
         progress(total, total)
 
     def _observe(self, frame: Frame) -> Observation:
@@ -111,14 +116,20 @@ class Slam(World):
     def _localise(self, seen: Observation) -> Found:
         """Track a frame; if it is lost, search the whole map for it; if that fails too often, begin a new map."""
         fit = self._track(seen)
-        lost = self.tracker.lost
+        lost, held_back = self.tracker.lost, is_held_back(len(self.steps), self.config.input.hold_every)
         self.recovery.count(lost, self.tracker.doubtful > 0, seen)
         found = Found.of(fit, se3.inverse(fit.T_camera_world), lost)
         if not lost:
-            found.mapped = self.recovery.is_steady and self._is_certain(fit) and self._is_keyframe(fit.overlap)
-            if found.mapped and self._cuts:
-                found.tracking["drift_m"] = self._add_drift(fit, seen)
-            self._question(fit, seen, found)
+            certain = self.recovery.is_steady and self._is_certain(fit)
+            found.mapped = certain and not held_back and self._is_keyframe(fit.overlap)
+            if found.mapped:
+                found.hop = self._hop(fit, seen)
+                if self._cuts:
+                    found.tracking["drift_m"] = self._add_drift(fit, found.hop)
+            if not held_back:
+                self._question(fit, seen, found)
+        elif held_back:
+            return found  # a search for the camera could make a keyframe of this frame
         elif (place := self._relocalise(seen)) is not None:
             self._go_to(place, seen, found)
         elif self.recovery.gives_up and usable(seen):
@@ -139,14 +150,22 @@ class Slam(World):
         c = self.config.mapping
         return is_keyframe(len(self.steps) - self.mapper.keyframes[-1].index, c.every, overlap, c.overlap_below)
 
-    def _add_drift(self, fit: PoseFit, seen: Observation) -> float:
+    def _hop(self, fit: PoseFit, seen: Observation) -> Hop:
+        """Return the motion to this keyframe from the one before it, with its errors."""
+        T_camera_before = fit.T_camera_world @ self.atlas.keyframe_poses[-1][-1]
+        alignment = self.tracker.hop(fit, seen.live)
+        if alignment is None:
+            return UNKNOWN_HOP._replace(T_camera_before=T_camera_before)
+        return Hop(T_camera_before, alignment.covariance, alignment.bias)
+
+    def _add_drift(self, fit: PoseFit, hop: Hop) -> float:
         """Add the hop to this keyframe to the submap's drift; return the standard deviation of its position, metres."""
         T_submap_camera = se3.inverse(fit.T_camera_world)
-        self.drift.hop(T_submap_camera, self.tracker.hop_covariance(fit, seen.live))
+        self.drift.hop(T_submap_camera, None if np.isnan(hop.covariance).any() else hop.covariance)
         return self.drift.position_m(T_submap_camera)
 
-    def _map(self, seen: Observation, T_submap_camera: Matrix) -> Matrix:
-        """Map a keyframe; return its pose, which mapping may have moved."""
+    def _map(self, seen: Observation, T_submap_camera: Matrix, hop: Hop = UNKNOWN_HOP) -> Matrix:
+        """Map a keyframe, which `hop` leads to; return its pose, which mapping may have moved."""
         index, frame = len(self.steps), seen.frame
         with self._timer.stage("describe"):
             descriptor = self.descriptor.describe(frame.color, frame.depth_m) if self._describes else None
@@ -156,9 +175,18 @@ class Slam(World):
         self._timer.add(fit.seconds, prefix="map_")
         if self.keyframe_indices[-1:] != [index]:  # a keyframe that two submaps share is counted once
             self.keyframe_indices.append(index)
-        self.atlas.keyframe_poses[-1] = [keyframe.T_world_camera for keyframe in self.mapper.keyframes]
+        self.atlas.set_keyframes([keyframe.T_world_camera for keyframe in self.mapper.keyframes], hop)
         self.tracker.keep_keyframe(self.mapper.field, self.view, seen, self.atlas.keyframe_poses[-1][-1])
         return self.atlas.keyframe_poses[-1][-1]
+
+    def _offer_probe(self, seen: Observation, found: Found) -> None:
+        """Offer a frame as a probe view if it was tracked without doubt and is not held back."""
+        index, newest = len(self.steps), self.mapper.keyframes[-1]
+        held_back = is_held_back(index, self.config.input.hold_every)
+        if found.state == TRACKED and self.recovery.is_steady and not self.tracker.doubtful and not held_back:
+            T_keyframe_camera = se3.inverse(newest.T_world_camera) @ found.T_submap_camera
+            last = len(self.mapper.keyframes) - 1
+            self.probes.offer(index, last, index - newest.index, T_keyframe_camera, seen.target)
 
     def _submap_ends(self, T_submap_camera: Matrix) -> bool:
         since, moved_m = len(self.steps) - self.mapper.keyframes[0].index, self.drift.position_m(T_submap_camera)
@@ -191,7 +219,9 @@ class Slam(World):
     def _finish_submap(self) -> list[Loop]:
         """Move the active submap to the store and look for its loops, which may move anchors."""
         submap, pictures = self.mapper.finished(len(self.store))
-        self.store.save(submap, pictures)
+        submap, probes = self.probes.of(submap)
+        self.store.save(submap, pictures, probes)
+        self.probes.kept = []
         descriptors = [keyframe.descriptor for keyframe in self.mapper.keyframes]
         known = [descriptor for descriptor in descriptors if descriptor is not None]
         loops = self.closer.submap_finished(submap, known, self.atlas, self.view)

@@ -6,10 +6,11 @@ from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.model.atlas import Atlas, Place
+from sigmasplat.model.atlas import Atlas, Hop, Place
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.frame import Detail
+from sigmasplat.model.submap import Picture
 from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.localisation.confidence import Confidence
 from sigmasplat.slam.localisation.feature_image import FeatureImage
@@ -21,21 +22,22 @@ from sigmasplat.slam.loop_closure.candidates import SubmapDescriptor
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser
 from sigmasplat.slam.loop_closure.pose_graph import Edge
 from sigmasplat.slam.mapper import Mapper
+from sigmasplat.slam.probes import Probe, Probes
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step_result import Step
 from sigmasplat.slam.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
-    Atlas, Camera, Confidence, Detail, Drift, Edge, FeatureImage, Foreground, GaussianField, Keyframe, Link, Loop,
-    LoopCloser, Mapper, Place, Pyramid, Recovery, Reference, Relocaliser, Rows, SubmapDescriptor, Step, Target, Tracker,
-    Usual, VectorAdam,
+    Atlas, Camera, Confidence, Detail, Drift, Edge, FeatureImage, Foreground, GaussianField, Hop, Keyframe, Link, Loop,
+    LoopCloser, Mapper, Picture, Place, Probe, Probes, Pyramid, Recovery, Reference, Relocaliser, Rows, Step,
+    SubmapDescriptor, Target, Tracker, Usual, VectorAdam,
 )  # fmt: skip
 """The classes that a state may contain."""
 
 
 REMEMBERED = (
     "atlas", "mapper", "tracker", "drift", "steps", "keyframe_indices", "closer", "recovery", "relocaliser",
-    "confidence",
+    "confidence", "probes",
 )  # fmt: skip
 """The attributes of `Slam` that change from frame to frame, except its random numbers."""
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field as dataclass_field
 import numpy as np
 
 from sigmasplat.config import TrackingConfig
-from sigmasplat.fit.align import align
+from sigmasplat.fit.align import Alignment, align
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
@@ -305,15 +305,15 @@ class Tracker:
         self.previous, self.velocity, self.keyframe, self.keyframe_features = np.eye(4), np.eye(4), None, None
         self.front = self.keyframe_front = None
 
-    def hop_covariance(self, fit: PoseFit, live: Pyramid) -> Matrix | None:
-        """Estimate the covariance [6, 6] of a fit's left twist to the newest keyframe; None without the kernels.
+    def hop(self, fit: PoseFit, live: Pyramid) -> Alignment | None:
+        """Return the alignment to the newest keyframe that gives the covariance of a fit; None without the kernels.
 
-        For a pose found by gradient descent, the covariance is that of an alignment to the keyframe's image.
+        For a pose found by gradient descent, it is an alignment to the keyframe's image that takes no step.
         """
         if fit.alignment is not None or self.keyframe is None:
-            return fit.covariance
+            return fit.alignment
         T_live_keyframe = fit.T_camera_world @ se3.inverse(self.keyframe.T_camera_world)
-        return align(self.keyframe.pyramid, live, T_live_keyframe, 0, self.config.align_weight_color).covariance
+        return align(self.keyframe.pyramid, live, T_live_keyframe, 0, self.config.align_weight_color)
 
 
 def _without_motion(config: TrackingConfig) -> TrackingConfig:

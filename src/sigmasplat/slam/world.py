@@ -11,6 +11,7 @@ from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.component import Component
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.map_uncertainty import MapUncertainty
 from sigmasplat.model.submap import MemoryStore, SubmapStore
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, preset
@@ -25,6 +26,7 @@ from sigmasplat.slam.localisation.sight import view_of
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.merged import components_apart, merged_field
+from sigmasplat.slam.probes import Probes
 from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.slam.tracker import Tracker
 
@@ -48,6 +50,7 @@ class World:
         self.tracker = Tracker(self.config.tracking, self.extractor if self.config.tracking.features else None)
         self.mapper = Mapper(self.config, self.random)
         self.drift = Drift()
+        self.probes = Probes(self.config.uncertainty.probes, self.config.mapping.every)
         self.descriptor = make_descriptor(self.config.loops)
         self.closer = LoopCloser(self.config, self.store, self.extractor if self.config.tracking.features else None)
         self.recovery = Recovery(self.config.recovery)
@@ -58,6 +61,8 @@ class World:
         self._view: View | None = None
         self._resample = False
         self._final: GaussianField | None = None
+        self.uncertainty: MapUncertainty | None = None
+        """How sure the final map is; None before `finish`, or without probe views (`uncertainty.probes`)."""
         self._timer = StepTimer()
 
     @property
@@ -94,8 +99,9 @@ class World:
 
     def checkpoint(self) -> dict[str, Tensor]:
         """Return what is needed to read a run back, in host memory: the active submap's field with its optimiser state,
-        poses, times, keyframes, anchors, and the submap of each frame."""
-        return checkpoint_of(self.mapper.field, self.trajectory(), self.atlas, self.keyframe_indices)
+        poses, times, keyframes, anchors, the submap of each frame, and the errors of the path (`path_covariance`)."""
+        path, edges = self.trajectory(), self.closer.believed
+        return checkpoint_of(self.mapper.field, path, self.atlas, self.keyframe_indices, edges)
 
     @property
     def view(self) -> View:

@@ -57,6 +57,10 @@ class Source(ABC):
         """Read the depth of frame i, m [H, W]; formats override this to avoid reading colour. Raises as `frame`."""
         return self.frame(i).depth_m
 
+    def exact_depth_of(self, i: int) -> NDArray[np.float32] | None:
+        """Return the exact depth of frame i, m [H, W], 0 where there is no surface; None if it is unknown."""
+        return None
+
     @abstractmethod
     def truth(self) -> Trajectory | None:
         """Return the ground-truth path as recorded, with its own timestamps and world frame; None if it is unknown."""
@@ -145,6 +149,10 @@ class Subset(Source):
     def depth_of(self, i: int) -> NDArray[np.float32]:
         """Read the depth of the i-th selected frame."""
         return self._whole.depth_of(self._indices[self._checked_index(i)])
+
+    def exact_depth_of(self, i: int) -> NDArray[np.float32] | None:
+        """Return the exact depth of the i-th selected frame, None if it is unknown."""
+        return self._whole.exact_depth_of(self._indices[self._checked_index(i)])
 
     def truth(self) -> Trajectory | None:
         """Return the ground-truth path of the whole source; it has its own timestamps."""

@@ -3,8 +3,10 @@
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sigmasplat.errors import SourceError
+from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.mesh import Mesh
@@ -17,10 +19,16 @@ from sigmasplat.sources.room.render import build_scene, render_scene
 from sigmasplat.sources.room.sensor import drifted_depth, measured_color, measured_depth
 from sigmasplat.sources.room.solid import triangulate
 from sigmasplat.sources.room.walk import camera_path
+from sigmasplat.types import Matrix
 
 FRAMES_PER_SECOND = 30.0
 FOCAL_PER_WIDTH = 0.8
 EXPOSURE_SWING = 0.08
+AWAY_M, AWAY_RAD = np.array([0.45, 0.25, 0.45]), np.deg2rad([12.0, 40.0, 8.0])
+"""Largest motion of a test view from the path, camera x, y, z, and rotation about them."""
+CLEARANCE_M = 0.3
+
+Floats = NDArray[np.float32]
 
 
 class SyntheticRoom(Source):
@@ -30,7 +38,8 @@ class SyntheticRoom(Source):
     noise: whether depth and colour have sensor noise; loops: rounds of the path; exposure_change: whether the image
     gain varies by ±8 % over the sequence; rooms: number of rooms, joined by doorways; overrun: how far the path
     continues past its start, percent of a round; drift: standard deviation of the depth calibration's slow drift
-    (`room.sensor.drifted_depth`), tenths of a percent of the depth.
+    (`room.sensor.drifted_depth`), tenths of a percent of the depth; test_views: number of exact views away from the
+    path (`SyntheticRoom.test_views`).
 
     A path with loops to close: frames=720,rooms=2,overrun=20,noise=1,drift=6. A round of 600 frames is a slow pace. The
     way back looks in other directions than the way out, so drift accumulates over a whole round; the last 120 frames
@@ -51,13 +60,14 @@ class SyntheticRoom(Source):
         rooms: int = 1,
         overrun: int = 0,
         drift: int = 0,
+        test_views: int = 0,
     ) -> None:
         """Compute the camera path, no image yet. Raises SourceError unless counts and sizes are ≥ 1, the rest ≥ 0."""
         counts = {"frames": frames, "width": width, "height": height, "loops": loops, "rooms": rooms}
         for key, value in counts.items():
             if value < 1:
                 raise SourceError(f"synthetic room: {key} must be at least 1, found {value}")
-        for key, value in {"seed": seed, "overrun": overrun, "drift": drift}.items():
+        for key, value in {"seed": seed, "overrun": overrun, "drift": drift, "test_views": test_views}.items():
             if value < 0:
                 raise SourceError(f"synthetic room: {key} must be at least 0, found {value}")
         focal_px = FOCAL_PER_WIDTH * width
@@ -65,6 +75,7 @@ class SyntheticRoom(Source):
         super().__init__("synthetic", camera)
         self._seed, self._noise, self._rooms = seed, noise, rooms
         self._exposure_change, self._drift = exposure_change, drift / 1000
+        self._test_views = test_views
         self._T_world_camera = camera_path(frames, loops, rooms, seed, overrun / 100)
 
     def __len__(self) -> int:
@@ -87,6 +98,17 @@ class SyntheticRoom(Source):
         """Return the time of frame i, without rendering it."""
         return self._checked_index(i) / FRAMES_PER_SECOND
 
+    def exact_depth_of(self, i: int) -> NDArray[np.float32]:
+        """Return the depth of frame i without noise and drift."""
+        T_world_camera = self._T_world_camera[self._checked_index(i)]
+        return render_scene(build_scene(self._rooms, self._seed), self.camera, T_world_camera)[1]
+
+    def test_views(self) -> Source | None:
+        """Return exact views (no noise, gain 1) up to 0.7 m and 40° away from the path; None without `test_views`."""
+        if not self._test_views:
+            return None
+        return _ViewsAway(self.camera, self._rooms, self._seed, self._T_world_camera, self._test_views)
+
     def truth(self) -> Trajectory:
         """Return the exact pose of every frame, in the room's frame (z up)."""
         return Trajectory(np.arange(len(self)) / FRAMES_PER_SECOND, self._T_world_camera.copy())
@@ -100,6 +122,41 @@ class SyntheticRoom(Source):
         if not self._exposure_change:
             return 1.0
         return 1.0 + EXPOSURE_SWING * float(np.sin(2 * np.pi * i / max(len(self) - 1, 1)))
+
+
+class _ViewsAway(Source):
+    """Exact views of the room away from a camera path, in free space: nothing is nearer than `CLEARANCE_M`."""
+
+    def __init__(self, camera: Camera, rooms: int, seed: int, T_world_path: Matrix, count: int) -> None:
+        super().__init__("synthetic test views", camera)
+        self._scene, random = build_scene(rooms, seed), np.random.default_rng((seed, 11))
+        on_path = T_world_path[np.linspace(0, len(T_world_path) - 1, count).round().astype(int)]
+        self._images = [self._image_near(T, random) for T in on_path]
+
+    def _image_near(self, T_world_path: Matrix, random: np.random.Generator) -> tuple[Matrix, Floats, Floats]:
+        """Draw poses near one of the path until one is free; return it with its colour and depth."""
+        while True:
+            T_path_camera = se3.exp(np.concatenate([np.zeros(3), random.uniform(-1, 1, 3) * AWAY_RAD]))
+            T_path_camera[:3, 3] = random.uniform(-1, 1, 3) * AWAY_M
+            T_world_camera = se3.orthonormalise(T_world_path @ T_path_camera)
+            color, depth_m = render_scene(self._scene, self.camera, T_world_camera)
+            if depth_m[depth_m > 0].min(initial=np.inf) > CLEARANCE_M and (depth_m > 0).any():
+                return T_world_camera, color, depth_m
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def frame(self, i: int) -> Frame:
+        _, color, depth_m = self._images[self._checked_index(i)]
+        bytes_ = np.rint(np.clip(color, 0.0, 1.0) * 255.0).astype(np.uint8)
+        return Frame(i, i / FRAMES_PER_SECOND, color_from_bytes(bytes_), depth_m, self.camera)
+
+    def exact_depth_of(self, i: int) -> Floats:
+        return self._images[self._checked_index(i)][2]
+
+    def truth(self) -> Trajectory:
+        poses = np.stack([T_world_camera for T_world_camera, _, _ in self._images])
+        return Trajectory(np.arange(len(self)) / FRAMES_PER_SECOND, poses)
 
 
 def open_synthetic(text: str) -> SyntheticRoom:
@@ -116,7 +173,9 @@ def open_synthetic(text: str) -> SyntheticRoom:
     return SyntheticRoom(**options)
 
 
-_OPTIONS = ("frames", "width", "height", "seed", "noise", "loops", "exposure_change", "rooms", "overrun", "drift")
+_OPTIONS = (
+    "frames", "width", "height", "seed", "noise", "loops", "exposure_change", "rooms", "overrun", "drift", "test_views",
+)  # fmt: skip
 
 FORMAT = Format(
     "synthetic",

@@ -107,6 +107,12 @@ class LoopCloser:
         if submap.index:
             self.connect(0, submap.index, T_first_submap, RIGID)
 
+    @property
+    def believed(self) -> list[Edge]:
+        """Return the trusted edges and the accepted loops."""
+        registered = [loop for loop in self.loops if np.isfinite(loop.chi2) or loop.accepted]
+        return self.odometry + [e for e, loop in zip(self.closed, registered, strict=True) if loop.accepted]
+
     def _described(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]]) -> SubmapDescriptor:
         c, field = self.config.loops, submap.field
         log_variances = field.params[:, COLUMNS["log_variances"]].numpy()

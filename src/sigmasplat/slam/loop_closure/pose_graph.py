@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 from scipy.special import gammaincinv
 
 from sigmasplat.errors import SigmaSplatError
@@ -180,7 +180,7 @@ def _minimise(graph: PoseGraph, T: Matrix, weights: Matrix, max_iterations: int)
     for step in range(1, max_iterations + 1):
         H, g = graph.normal_equations(T, weights)
         H.setdiag(H.diagonal() * (1.0 + damping))
-        delta = splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}).solve(-g)
+        delta = _factorised(H).solve(-g)
         moved = T.copy()
         moved[1:] = se3.exp_stack(delta.reshape(-1, 6)) @ T[1:]
         cost_moved = float(weights @ graph.chi2(moved))
@@ -193,6 +193,40 @@ def _minimise(graph: PoseGraph, T: Matrix, weights: Matrix, max_iterations: int)
         if settled:
             return T, step
     return T, max_iterations
+
+
+def _factorised(H: csc_array) -> SuperLU:
+    return splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+class Sensitivity:
+    """How the errors of the edges move the nodes of a solved graph, to first order; node 0 does not move.
+
+    Each edge has an error ξ: the true motion is exp(ξ) T_a_b. The solution then has the error ε = Σ G ξ: the true pose
+    of a node is exp(ε) T_world_node. The normal equations are factorised once. A node costs one sparse solution with
+    six right-hand sides, and one product per edge.
+    """
+
+    def __init__(self, T_world_node: Matrix, edges: Sequence[Edge]) -> None:
+        self.graph = graph = PoseGraph(len(T_world_node), edges)
+        e = graph.residuals(T_world_node)
+        H, _ = graph.normal_equations(T_world_node, np.ones(len(edges)))
+        self._solver = _factorised(H)
+        self._pull = np.swapaxes(graph.jacobians(T_world_node, e), 1, 2) @ graph.information
+
+    def of(self, node: int) -> Matrix:
+        """Return G [E, 6, 6] of a node, one block per edge."""
+        columns = np.zeros((self.graph.nodes, 6, 6))  # H⁻¹ between every node and this one
+        if node:
+            unit = np.zeros((6 * (self.graph.nodes - 1), 6))
+            unit[6 * (node - 1) : 6 * node] = np.eye(6)
+            columns[1:] = self._solver.solve(unit).reshape(-1, 6, 6)
+        return np.asarray(np.swapaxes(columns[self.graph.b] - columns[self.graph.a], 1, 2) @ self._pull)
+
+    def covariance(self, node: int) -> Matrix:
+        """Return the marginal covariance [6, 6] of a node, if the information of the edges is that of their errors."""
+        G = self.of(node)
+        return np.asarray((G @ np.linalg.inv(self.graph.information) @ np.swapaxes(G, 1, 2)).sum(0))
 
 
 def _refuse_bad_input(poses: Matrix, edges: Sequence[Edge]) -> None:

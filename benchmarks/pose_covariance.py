@@ -1,0 +1,130 @@
+"""Measure whether the covariances of a run's poses cover their true errors (issue 17).
+
+Runs SLAM on sequences with known truth. Scores three kinds of motions as `sigmasplat eval` does: from each keyframe
+to the next, over 50 frames, and from the first frame.
+Writes benchmarks/results/pose_covariance-<machine>.json and prints a table.
+
+example: python benchmarks/pose_covariance.py --sources synthetic:frames=200,noise=1 --width 240
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import accuracy
+import numpy as np
+import program
+import record
+import tyro
+from cpu import alone
+from tables import Section, significant
+
+from sigmasplat.config.text import override
+from sigmasplat.errors import SourceError
+from sigmasplat.evaluation.pose_covariance import score_motions
+from sigmasplat.metrics.trajectory import associate
+from sigmasplat.presets import default_preset, preset as preset_of
+from sigmasplat.slam.path_covariance import PathCovariance
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources import open_source
+
+arg = tyro.conf.arg
+NOISY = f"{accuracy.SYNTHETIC},noise=1"
+NAMES = {"hops": "keyframe to keyframe", "windows": "50 frames", "from_start": "from the start"}
+"""Kinds of motions, and their names in the table."""
+POOLED = "mean of the rooms with noise"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Compare the covariances of poses with their true errors."""
+
+    sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, paths, or rooms")] = (
+        accuracy.SYNTHETIC,
+        NOISY,
+        f"{NOISY},seed=1",
+        f"{NOISY},seed=2",
+        "livingroom",
+        "redkitchen",
+    )
+    preset: Annotated[str, arg(help="preset to start from")] = default_preset()
+    width: Annotated[int, arg(help="width of the working images, pixels; 0 = as recorded")] = 0
+    limit: Annotated[int | None, arg(help="number of frames at most")] = None
+    name: Annotated[str, arg(help="name of the results")] = "pose-covariance"
+    out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
+
+
+def measure(path: str, options: Options) -> dict[str, Any]:
+    """Run one sequence and score its poses. Raises SourceError if it cannot be read or has no truth."""
+    config = override(preset_of(options.preset), {"final.iterations": "0", "input.width": str(options.width)})
+    source, slam = open_source(path, limit=options.limit), Slam(config)
+    truth = source.truth()
+    if truth is None:
+        raise SourceError(f"{path} has no ground truth")
+    for frame in source:
+        slam.step(frame)
+    slam.finish()
+    errors = PathCovariance.of(slam.checkpoint())
+    assert errors is not None
+    believed = np.flatnonzero(slam.believed())
+    rows, true_rows = associate(slam.trajectory().timestamps_s[believed], truth.timestamps_s)
+    true = dict(zip(believed[rows].tolist(), truth.T_world_camera[true_rows], strict=True))
+    found = score_motions(errors, true, [frame for frame in slam.keyframe_indices if frame in true])
+    loops = sum(loop.accepted for loop in slam.loops)
+    return {"frames": len(slam.steps), "submaps": len(slam.atlas.anchors), "loops": loops, **found}
+
+
+def sections(measured: dict[str, Any]) -> list[Section]:
+    """Return one table: rows for each sequence and kind of motion."""
+    found = measured["figures"]["sources"]
+    rows = [cells(NAMES[kind], kind, [run]) for run in found for kind in NAMES]
+    for row, run in zip(rows, [run for run in found for _ in NAMES], strict=True):
+        row.insert(0, run["source"])
+    noisy = [run for run in found if "noise=1" in run["source"]]
+    if len(noisy) > 1:
+        rows += [[POOLED, *cells(NAMES[kind], kind, noisy)] for kind in NAMES]
+    head = ["sequence", "motion", "motions", "NEES, mean", "… median", "in the 90 % ellipsoid, %"]
+    head += ["position: in its 90 % ellipsoid, %", "… k"]
+    note = (
+        "NEES should be 6 on average (median 5.35), k = 1 (the variances of the position are k times too small). "
+        "Motions of 50 frames and from the start overlap: a run has few independent ones."
+    )
+    return [Section("Covariance of poses", head, rows, note)]
+
+
+def cells(name: str, kind: str, runs: list[dict[str, Any]]) -> list[str]:
+    """Return the cells of one kind of motion, as means over runs."""
+    scores = [run[kind] for run in runs if run[kind]]
+    if not scores:
+        return [name, "0", *["–"] * 5]
+
+    def mean(figure: str, factor: float = 1.0) -> str:
+        return significant(factor * float(np.mean([score[figure] for score in scores])))
+
+    return [
+        name,
+        str(sum(score["count"] for score in scores)),
+        mean("nees_mean"),
+        mean("nees_median"),
+        mean("coverage_90", 100.0),
+        mean("position_coverage_90", 100.0),
+        mean("position_k"),
+    ]
+
+
+def measure_all(options: Options) -> dict[str, Any]:
+    """Measure every sequence, each in a fresh process."""
+    found = []
+    for s in options.sources:
+        path = s if s.startswith("synthetic") else accuracy.located(s)
+        found.append({"source": s if s.startswith("synthetic") else Path(s).name, **alone(measure, path, options)})
+    return {"sources": found}
+
+
+def main(options: Options) -> int:
+    """Measure, write the results, print them; return the exit code."""
+    return program.run("pose_covariance", options, measure_all, [0])
+
+
+if __name__ == "__main__":
+    program.start(main, Options)

@@ -1,0 +1,107 @@
+"""Run SLAM in memory and keep what is measured of it afterwards: maps, path, which frames were held back."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.config import Config
+from sigmasplat.metrics.failures import score_failures
+from sigmasplat.metrics.trajectory import associate, truth_in_estimate
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.map_uncertainty import MapUncertainty
+from sigmasplat.model.submap import MemoryStore, SubmapStore
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.run.protocols import Callback
+from sigmasplat.slam.rules import is_held_back
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources.base import Source
+from sigmasplat.types import Matrix, no_progress
+
+
+@dataclass(frozen=True, eq=False)
+class FinishedRun:
+    """What is measured of a run: its settings, maps and path.
+
+    field: the final map in the world; store: its submaps; anchors: T_world_submap of each; members: the submaps that
+    are connected to the world; submap_of [F]: the submap of each frame; believed [F]: whether its pose is believed;
+    indices [F]: its number in the source; p_off [F]; uncertainty: how sure the final map is, if it was measured.
+    """
+
+    config: Config
+    camera: Camera
+    field: GaussianField
+    store: SubmapStore
+    anchors: list[Matrix]
+    members: list[int]
+    path: Trajectory
+    submap_of: list[int]
+    believed: NDArray[np.bool_]
+    indices: list[int]
+    p_off: NDArray[np.float64]
+    counts: dict[str, int]
+    uncertainty: MapUncertainty | None
+
+    @staticmethod
+    def of(slam: Slam) -> "FinishedRun":
+        """Read a system after its last frame and `finish`. The only submap of a run without cuts is finished here."""
+        store = slam.store
+        if not len(store):
+            store = MemoryStore()
+            store.save(*slam.mapper.finished(0))
+        counts = {
+            "frames": len(slam.steps), "lost": sum(step.lost for step in slam.steps),
+            "keyframes": len(slam.keyframe_indices), "submaps": len(store), "splats": len(slam.field),
+        }  # fmt: skip
+        return FinishedRun(
+            slam.config, slam.view.camera, slam.field, store, slam.atlas.anchors, slam.atlas.members(0),
+            slam.trajectory(), [place.submap for place in slam.atlas.places], slam.believed(),
+            [step.index for step in slam.steps], np.array([step.p_off for step in slam.steps]), counts,
+            slam.uncertainty,
+        )  # fmt: skip
+
+    @property
+    def held_back(self) -> list[int]:
+        """List the frames that were held back from the map."""
+        every = self.config.input.hold_every
+        return [row for row in range(len(self.indices)) if is_held_back(row, every)]
+
+
+def run_slam(config: Config, source: Source, show: Callback | None = None) -> FinishedRun:
+    """Run SLAM in memory, including the final map."""
+    slam = Slam(config)
+    for frame in source:
+        step = slam.step(frame)
+        if show:
+            show(step)
+    slam.finish(show.finishing if show else no_progress)
+    return FinishedRun.of(slam)
+
+
+def run_facts(run: FinishedRun, source: Source) -> dict[str, Any]:
+    """Return counts, and the scores of poses and of `p_off` if the truth is known.
+
+    "poses" is the place for NEES and coverage of pose covariances; it stays None until frames have a covariance.
+    """
+    unknown = {"ate_m": None, "failures": None, "poses": None}
+    return run.counts | {"held_back": len(run.held_back)} | unknown | _path_scores(run, source)
+
+
+def _path_scores(run: FinishedRun, source: Source) -> dict[str, Any]:
+    """Return the ATE and the scores of `p_off`; nothing without a truth that shares timestamps with the path."""
+    truth, believed = source.truth(), run.believed
+    if truth is None or not believed.any():
+        return {}
+    times, positions = run.path.timestamps_s, run.path.T_world_camera[:, :3, 3]
+    rows, matched = associate(times, truth.timestamps_s)
+    if not believed[rows].any():
+        return {}
+    T_estimate_truth = truth_in_estimate(times[believed], positions[believed], truth)
+    true = (T_estimate_truth @ truth.T_world_camera[matched])[:, :3, 3]
+    error_m = np.full(len(times), np.nan)
+    error_m[rows] = np.linalg.norm(positions[rows] - true, axis=1)
+    at = np.isfinite(error_m) & believed
+    ate_m = float(np.sqrt(np.mean(error_m[at] ** 2)))
+    return {"ate_m": ate_m, "failures": score_failures(error_m, run.p_off, believed)}

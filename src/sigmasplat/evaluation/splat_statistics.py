@@ -1,0 +1,162 @@
+"""Compute what the training views tell about each splat: values per splat whose rendering predicts squared errors.
+
+Each statistic is one function in `STATISTICS`; it returns named values [N]. All read training views only.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from sigmasplat.fit.target import Keyframe
+from sigmasplat.metrics.scored_view import COVERED_ALPHA
+from sigmasplat.model import se3
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.map_uncertainty import MapUncertainty
+from sigmasplat.render import FieldRenderer, Render
+from sigmasplat.render.splat_sums import CHANNELS, accumulate, render_values
+from sigmasplat.render.view import View
+from sigmasplat.types import Matrix
+
+GRADIENT_STEPS = 6
+"""Steps of conjugate gradients for the ridge regression."""
+RIDGE = 1.0
+"""λ of the ridge regression, in pixels: the squared weights of a splat must sum to more to count."""
+PROBES_SEED = 17
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingView:
+    """A keyframe at its pose in a map: squared residuals of colour (mean over channels) and depth, [H, W].
+
+    depth_known [H, W]: 1 where the keyframe has a reading and the map covers the pixel, else 0.
+    """
+
+    T_camera_map: Matrix
+    color_error2: Tensor
+    depth_error2: Tensor
+    depth_known: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class MapFacts:
+    """A map and its training views.
+
+    noise: mean squared residual of colour and depth (m²); prior: variance of the colours (mean over channels) and of
+    the depths (m²) of the training views; mean_color [3] of them; uncertainty: what the
+    run itself knows of its map, if it does.
+    """
+
+    field: GaussianField
+    view: View
+    views: Sequence[TrainingView]
+    noise: tuple[float, float]
+    prior: tuple[float, float]
+    mean_color: Tensor
+    uncertainty: MapUncertainty | None = None
+
+    def rendered(self, T_camera_map: Matrix, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Render values [N] by name to planes [H, W], Σ_i w_ip v_i."""
+        planes = dict[str, Tensor]()
+        names = list(values)
+        for first in range(0, len(names), CHANNELS):
+            some = names[first : first + CHANNELS]
+            columns = torch.stack([values[some[min(c, len(some) - 1)]] for c in range(CHANNELS)], 1)
+            planes |= zip(some, render_values(self.view, self.field.params, T_camera_map, columns), strict=False)
+        return planes
+
+
+def map_facts(field: GaussianField, keyframes: Sequence[Keyframe], view: View, renderer: FieldRenderer) -> MapFacts:
+    """Render a map at keyframes (poses in the map's frame) and collect their residuals."""
+    views, colors, depths = list[TrainingView](), list[Tensor](), list[Tensor]()
+    for keyframe in keyframes:
+        T_camera_map, target = se3.inverse(keyframe.T_world_camera), keyframe.target
+        seen, depth = on_host(renderer(field, target.camera, T_camera_map)), target.depth_image
+        covered = seen.alpha > COVERED_ALPHA
+        error_m = torch.where(covered, seen.depth / seen.alpha.clamp(min=COVERED_ALPHA) - depth, 0.0)
+        known = (covered & (depth > 0)).float()
+        color_error2 = (seen.color.clamp(0.0, 1.0) - target.image).square().mean(-1)
+        views.append(TrainingView(T_camera_map, color_error2, error_m.square() * known, known))
+        colors.append(target.image.reshape(-1, 3)[::7])
+        depths.append(depth[depth > 0][::7])
+    all_colors, all_depths = torch.cat(colors), torch.cat(depths)
+    known_pixels = sum(float(v.depth_known.sum()) for v in views)
+    noise = (
+        sum(float(v.color_error2.mean()) for v in views) / len(views),
+        sum(float(v.depth_error2.sum()) for v in views) / max(known_pixels, 1.0),
+    )
+    prior = (
+        float(all_colors.var(0, correction=0).mean()),
+        float(all_depths.var(correction=0)) if len(all_depths) else 1.0,
+    )
+    return MapFacts(field, view, views, noise, prior, all_colors.mean(0))
+
+
+def on_host(seen: Render) -> Render:
+    """Return a render in host memory, where keyframes and statistics are."""
+    return replace(seen, **{name: plane.detach().cpu() for name, plane in vars(seen).items() if plane is not None})
+
+
+def ridge(facts: MapFacts) -> dict[str, Tensor]:
+    """Regress squared training residuals onto splats (3DGS-U, arXiv 2603.22786).
+
+    Returns u ≥ 0 [N] for colour and depth that minimise Σ_p (Σ_i w_ip u_i − r_p²)² + λ Σ_i u_i², by a few steps of
+    conjugate gradients from the weighted mean of each splat; negative values become 0 at the end.
+    """
+    known = [torch.stack([torch.ones_like(v.depth_known), v.depth_known, v.depth_known]) for v in facts.views]
+    errors = [torch.stack([v.color_error2, v.depth_error2, v.depth_error2]) for v in facts.views]
+    weights, wanted = _sums(facts, known), _sums(facts, errors)
+
+    def normal(x: Tensor) -> Tensor:
+        seen = (render_values(facts.view, facts.field.params, v.T_camera_map, x) for v in facts.views)
+        return _sums(facts, (k * plane for k, plane in zip(known, seen, strict=True))) + RIDGE * x
+
+    x = wanted / (weights + RIDGE)
+    residual = wanted - normal(x)
+    direction, size = residual.clone(), residual.square().sum(0)
+    for _ in range(GRADIENT_STEPS):
+        applied = normal(direction)
+        step = size / (direction * applied).sum(0).clamp(min=1e-30)
+        x = x + step * direction
+        residual = residual - step * applied
+        before, size = size, residual.square().sum(0)
+        direction = residual + size / before.clamp(min=1e-30) * direction
+    return {"ridge_color": x[:, 0].clamp(min=0.0), "ridge_depth": x[:, 1].clamp(min=0.0)}
+
+
+def fisher(facts: MapFacts) -> dict[str, Tensor]:
+    """Return the variance [N] of each splat's colour and depth from the Laplace approximation (FisherRF, 2311.17874).
+
+    The Hessian's diagonal of colour is H_i = Σ_p w_ip² over the training views, and the variance is
+    1/(H_i/noise + 1/prior). Random signs g estimate it without bias: E (Σ_p w_ip g_p)² = Σ_p w_ip². The depth of a
+    pixel depends on the splats' depths with the same weights.
+    """
+    numbers = torch.Generator().manual_seed(PROBES_SEED)
+    information = torch.zeros(len(facts.field))
+    for v in facts.views:
+        signs = 2.0 * torch.randint(0, 2, (CHANNELS, *v.color_error2.shape), generator=numbers).float() - 1.0
+        sums = accumulate(facts.view, facts.field.params, v.T_camera_map, signs)
+        information += sums.square().mean(1)
+    return {
+        f"fisher_{name}": 1.0 / (information / max(noise, 1e-12) + 1.0 / max(prior, 1e-12))
+        for name, noise, prior in zip(("color", "depth"), facts.noise, facts.prior, strict=True)
+    }
+
+
+STATISTICS: tuple[Callable[[MapFacts], dict[str, Tensor]], ...] = (ridge, fisher)
+"""Functions from the training views of a map to named values of its splats."""
+
+
+def splat_values(facts: MapFacts) -> dict[str, Tensor]:
+    """Return the values [N] of all statistics by name."""
+    return {name: values for statistic in STATISTICS for name, values in statistic(facts).items()}
+
+
+def _sums(facts: MapFacts, planes: Sequence[Tensor] | Iterator[Tensor]) -> Tensor:
+    """Return Σ_p w_ip g_p [N, 3] over all training views; planes: one [3, H, W] for each."""
+    params = facts.field.params
+    total = torch.zeros(len(params), CHANNELS)
+    for v, plane in zip(facts.views, planes, strict=True):
+        total += accumulate(facts.view, params, v.T_camera_map, plane)
+    return total

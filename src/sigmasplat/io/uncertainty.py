@@ -1,0 +1,44 @@
+"""Write how sure a map is, and read it back: uncertainty.json, and the values of splats in uncertainty.safetensors."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+from sigmasplat.errors import RunError
+from sigmasplat.io.json_files import read_json, write_json
+from sigmasplat.io.tensors import open_tensors, write_tensors
+from sigmasplat.model.map_uncertainty import (
+    COLOR_PARTS,
+    DEPTH_PARTS,
+    SPLAT_COLUMNS,
+    Background,
+    Calibration,
+    MapUncertainty,
+)
+
+JSON, TENSORS = "uncertainty.json", "uncertainty.safetensors"
+
+
+def write_uncertainty(folder: Path, uncertainty: MapUncertainty) -> None:
+    """Write both files. Raises RunError if they cannot be written."""
+    write_tensors(folder / TENSORS, {"variances": uncertainty.splats.cpu()}, {"columns": ",".join(SPLAT_COLUMNS)})
+    calibration, background = uncertainty.calibration, asdict(uncertainty.background)
+    values = {"probes": uncertainty.probes, "background": background}
+    write_json(folder / JSON, values | {"color": dict(calibration.color), "depth": dict(calibration.depth)})
+
+
+def read_uncertainty(folder: Path) -> MapUncertainty | None:
+    """Read both files; None if there is no uncertainty.json. Raises RunError if one is damaged."""
+    path = folder / JSON
+    if not path.is_file():
+        return None
+    values = read_json(path)
+    try:
+        background = dict(values["background"])
+        red, green, blue = background.pop("color")
+        color = {name: float(values["color"][name]) for name in COLOR_PARTS}
+        depth = {name: float(values["depth"][name]) for name in DEPTH_PARTS}
+        known, probes = Background((red, green, blue), **background), int(values["probes"])
+    except (KeyError, TypeError, ValueError) as problem:
+        raise RunError(f"{path} is not the uncertainty of a map: {problem!r}; run it again") from problem
+    with open_tensors(folder / TENSORS, "uncertainty") as file:
+        return MapUncertainty(file.get_tensor("variances"), known, Calibration(color, depth), probes)

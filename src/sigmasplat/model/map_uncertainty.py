@@ -1,0 +1,56 @@
+"""What a map predicts its errors with: variances of its splats, the background, and the weights of each part."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from torch import Tensor
+
+COLOR_PARTS = ("mixture", "residual", "unexplained", "edges", "floor")
+"""Parts of the predicted variance of colour, in the order of `render.predictive.variance_parts`."""
+DEPTH_PARTS = ("ray", "residual", "unexplained", "edges", "sensor", "floor")
+"""Parts of the predicted variance of depth, as `COLOR_PARTS`."""
+EPISTEMIC = frozenset({"unexplained", "edges"})
+"""Parts that more or better views can reduce; the others are aleatoric: noise, and detail that the map cannot show."""
+SPLAT_COLUMNS = ("color", "reading_m2", "depth_m2")
+"""Columns of `MapUncertainty.splats`."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Nonnegative weights by part: V = Σ_k a_k V_k for colour (colour²) and for depth (m²)."""
+
+    color: Mapping[str, float]
+    depth: Mapping[str, float]
+
+
+SHIPPED = Calibration(
+    color={"mixture": 0.01, "residual": 0.9, "unexplained": 0.4, "edges": 2e-6, "floor": 1e-6},
+    depth={"ray": 0.1, "residual": 0.3, "unexplained": 0.02, "edges": 5e-6, "sensor": 3e-6, "floor": 1e-7},
+)
+"""Weights of the presets, fitted on probe views of several sequences with `sigma`. The fit of a run starts at them."""
+
+
+@dataclass(frozen=True)
+class Background:
+    """The light that no splat explains: mean colour, its variance (mean over channels) and the variance of depth, m²,
+    over the keyframes of a map."""
+
+    color: tuple[float, float, float]
+    color_variance: float
+    depth_variance_m2: float
+
+
+@dataclass(frozen=True, eq=False)
+class MapUncertainty:
+    """How sure a map is.
+
+    splats [N, 3], columns as `SPLAT_COLUMNS`: the variance of each splat's residuals at the keyframes, of colour (mean
+    over channels) and of depth (m²); the variance of its own depth (m²): the squared mean of its residuals, plus their
+    variance about the mean over the number of readings. calibration: weights of the parts; probes: the number of probe
+    views that it was fitted on.
+    """
+
+    splats: Tensor
+    background: Background
+    calibration: Calibration
+    probes: int = 0

@@ -1,0 +1,76 @@
+"""Blend values of splats beside their colours, and sum values of pixels over each splat, with the same weights.
+
+The weight w_ip of splat i at pixel p is that of the render: Ĉ_p = Σ_i w_ip c_i.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sigmasplat.config import RenderConfig
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import GaussianField
+from sigmasplat.render.backend import backend_module
+from sigmasplat.render.channels import features_of
+from sigmasplat.render.render import colors_from
+
+OWN = 7
+"""Channels of `features_of`: colour, depth, second moment of colour."""
+
+
+@dataclass(frozen=True, eq=False)
+class BlendedValues:
+    """Sums over the splats of each pixel: color Σwc [H, W, 3], depth Σwz [H, W] m, second Σw(σ²+c²) [H, W, 3], values
+    Σwv [H, W, K], alpha Σw [H, W]; moment: U about a reference depth, m², None without one."""
+
+    color: Tensor
+    depth: Tensor
+    second: Tensor
+    values: Tensor
+    alpha: Tensor
+    moment: Tensor | None
+    _sums: Tensor
+    _features: Tensor
+
+    def gather(self, planes: Tensor) -> Tensor:
+        """Return Σ_p w_ip g_p [N, k] of planes g [H, W, k] with k ≤ 7 + K; call it once, on a blend with `gather`.
+
+        A pixel is linear in the values of its splats, so this is the gradient of the values if g is that of the image.
+        """
+        k = planes.shape[-1]
+        gradient = torch.zeros_like(self._sums)
+        gradient[..., :k] = planes
+        (found,) = torch.autograd.grad(self._sums, self._features, gradient)
+        return found[:, :k]
+
+
+def blend_values(
+    field: GaussianField,
+    camera: Camera,
+    T_camera_map: NDArray[np.floating],
+    values: Tensor,
+    options: RenderConfig,
+    backend: str,
+    depth_reference: Tensor | None = None,
+    gather: bool = False,
+) -> BlendedValues:
+    """Blend values [N, K] of a field's splats at a pose (4×4), on the device that holds the field.
+
+    Raises BackendError if the backend is not available.
+    """
+    kernels, T = backend_module(backend, field.params.device), torch.as_tensor(T_camera_map)
+    with torch.no_grad():
+        p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
+        features = torch.cat([features_of(colors_from(field, T), p.z, field.variances), values.to(p.z)], 1)
+        opacities = field.opacities
+    with torch.set_grad_enabled(gather):
+        features.requires_grad_(gather)
+        b = kernels.blend(*p, opacities, features, depth_reference, camera, options)
+    sums = b.sums.detach()
+    return BlendedValues(
+        sums[..., :3], sums[..., 3], sums[..., 4:OWN], sums[..., OWN:], b.alpha.detach(),
+        None if b.moment is None else b.moment.detach(), b.sums, features,
+    )  # fmt: skip

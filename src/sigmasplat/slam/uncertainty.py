@@ -1,0 +1,124 @@
+"""Measure how sure a map is: variances of its splats, and weights calibrated on probe views."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sigmasplat.config import Config
+from sigmasplat.fit.calibration import fit_weights
+from sigmasplat.fit.splat_residuals import background_of, splat_residuals, squared_errors
+from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.model import se3
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.map_uncertainty import (
+    COLOR_PARTS,
+    DEPTH_PARTS,
+    SHIPPED,
+    Background,
+    Calibration,
+    MapUncertainty,
+)
+from sigmasplat.model.submap import SubmapStore
+from sigmasplat.render.predictive import COVERED, variance_parts
+from sigmasplat.render.view import View
+from sigmasplat.slam.final import KeyframeReader
+from sigmasplat.types import Matrix
+
+PIXELS = 4000
+"""About this many pixels of a probe view, every k-th one, calibrate the weights."""
+LIMITS = {"color": np.inf, "depth": 4.0}
+"""Limit of errors in the fit (`fit_weights`). Depth errors at silhouettes are as large as the depth step there, so a
+few pixels would decide."""
+
+
+def probe_views(store: SubmapStore, anchors: Sequence[Matrix], size: tuple[int, int]) -> list[Keyframe]:
+    """Return the probe views of all submaps, with poses in the world; anchors: T_world_submap [4, 4] of each submap,
+    size: (rows, columns) of the planes of a view."""
+    found = list[Keyframe]()
+    for s in range(len(store)):
+        submap = store.load(s)
+        for k, (frame, T_submap_probe) in enumerate(zip(submap.probe_frames, submap.T_submap_probe, strict=True)):
+            target = Target.of_picture(store.probe(s, k), submap.camera, size)
+            found.append(Keyframe(frame, target, anchors[s] @ T_submap_probe, fixed=True))
+    return found
+
+
+def final_uncertainty(
+    field: GaussianField, store: SubmapStore, anchors: Sequence[Matrix], config: Config, view: View
+) -> MapUncertainty | None:
+    """Return how sure a map in the world is, from its submaps' keyframes and probe views; None if `uncertainty.probes`
+    is 0 or there is no splat."""
+    if not config.uncertainty.probes or not len(field):
+        return None
+    return map_uncertainty(field, store, anchors, config, view)
+
+
+def map_uncertainty(
+    field: GaussianField,
+    store: SubmapStore,
+    anchors: Sequence[Matrix],
+    config: Config,
+    view: View,
+    pulled_to: Calibration = SHIPPED,
+) -> MapUncertainty:
+    """Return how sure a map is that was fitted to the keyframes of submaps at `anchors` (T_map_submap [4, 4] each).
+
+    The weights are fitted to the submaps' probe views and pulled to `pulled_to`; without probe views they equal it.
+    """
+    keyframes = KeyframeReader(store, anchors, view)
+    background = background_of(keyframes)
+    splats = splat_residuals(field, keyframes, background, config.render, config.backend)
+    probes = probe_views(store, anchors, (view.alpha.shape[0], view.alpha.shape[1]))
+    calibration = calibrate(field, splats, background, probes, config, pulled_to)
+    return MapUncertainty(splats, background, calibration, len(probes))
+
+
+def calibrate(
+    field: GaussianField,
+    splats: Tensor,
+    background: Background,
+    probes: Sequence[Keyframe],
+    config: Config,
+    pulled_to: Calibration = SHIPPED,
+) -> Calibration:
+    """Fit the weights of the parts of a map's variance to its errors at probe views."""
+    color, depth = Samples(COLOR_PARTS), Samples(DEPTH_PARTS)
+    for probe in probes:
+        target, T_camera_map = probe.target, se3.inverse(probe.T_world_camera)
+        parts = variance_parts(field, splats, background, target.camera, T_camera_map, config.render, config.backend)
+        image, depth_m = target.image.to(parts.alpha), target.depth_image.to(parts.alpha)
+        raw_depth = parts.depth_m * parts.alpha.clamp(min=COVERED)
+        errors, known = squared_errors(parts.image, raw_depth, parts.alpha, image, depth_m)
+        color.add(parts.color, errors[..., 0], known[..., 0] > 0)
+        depth.add(parts.depth, errors[..., 1], known[..., 1] > 0)
+    return Calibration(color.fitted(pulled_to.color, LIMITS["color"]), depth.fitted(pulled_to.depth, LIMITS["depth"]))
+
+
+@dataclass(eq=False)
+class Samples:
+    """Pixels of probe views: parts of the variance by name, and squared errors."""
+
+    names: Sequence[str]
+
+    def __post_init__(self) -> None:
+        self.parts, self.errors, self.views = list[Tensor](), list[Tensor](), 0
+
+    def add(self, parts: Tensor, errors: Tensor, known: Tensor) -> None:
+        """Add every k-th known pixel of a view: parts [K, H, W], errors and known [H, W]."""
+        step = max(1, errors.numel() // PIXELS)
+        rows = torch.arange(0, errors.numel(), step, device=errors.device)
+        rows = rows[known.reshape(-1)[rows]]
+        self.parts.append(parts.reshape(len(self.names), -1)[:, rows].cpu())
+        self.errors.append(errors.reshape(-1)[rows].cpu())
+        self.views += 1
+
+    def fitted(self, pulled_to: Mapping[str, float], limit: float) -> dict[str, float]:
+        """Return the best weights by name."""
+        if not self.errors:
+            return dict(pulled_to)
+        planes = torch.cat(self.parts, 1).double().numpy()
+        errors = torch.cat(self.errors).double().numpy()
+        return fit_weights(dict(zip(self.names, planes, strict=True)), errors, pulled_to, self.views, limit)

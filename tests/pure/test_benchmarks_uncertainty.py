@@ -1,0 +1,51 @@
+"""benchmarks/uncertainty.py: results are kept without paths and laid out with one row per sequence and predictor."""
+
+import importlib
+import sys
+from pathlib import Path
+from typing import Any
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+uncertainty, tables = map(importlib.import_module, ("uncertainty", "tables"))
+
+
+def scores(nll: float) -> dict[str, Any]:
+    """Return the scores of two predictors."""
+    found = {"nll": nll, "auce": 0.1, "coverage_68": 0.7, "coverage_95": 0.9, "z_rms": 1.0, "z_68": 1.0}
+    row = {
+        "ause": 0.2,
+        "spearman": None,
+        "before": found,
+        "after": found,
+        "temperature": 2.0,
+        "after_68": found,
+        "temperature_68": 1.0,
+    }
+    row |= {"best_scale": 1.5, "nll_at_best_scale": nll, "mean_variance": 0.1, "mean_squared_error": 0.1}
+    of_pixels = {"pixels": 10, "in_sample": False, "predictors": {"constant": row, "V": row}}
+    return {"color": {"final": {"held back": {"all pixels": of_pixels}}}}
+
+
+def runs() -> list[dict[str, Any]]:
+    """Return two seeds of one sequence and one seed of another."""
+    made = [("/data/kitchen", 0, -2.0), ("/data/kitchen", 1, -3.0), ("/data/hall", 0, 1500.0)]
+    return [{"source": path, "path": path, "seed": seed, "scores": scores(nll)} for path, seed, nll in made]
+
+
+def test_results_are_kept_by_name_and_laid_out() -> None:
+    kept = uncertainty.kept({"config": {}, "hold_every": 8, "runs": runs()})
+    assert [run["source"] for run in kept["runs"]] == ["kitchen", "kitchen", "hall"]
+    row = kept["runs"][0]["scores"]["color"]["final"]["held back"]["all pixels"]["predictors"]["V"]
+    assert row["temperature"] == 2.0 and "mean_variance" not in row
+    (section,) = uncertainty.sections({"figures": kept})
+    assert section.title == "colour, final, held back, all pixels"
+    assert [row[:2] for row in section.rows] == [[s, p] for s in ("kitchen", "hall") for p in ("constant", "V")]
+    assert section.rows[0][2] == "−2.50 ± 0.71" and section.rows[2][2] == "1\u202f500"
+    assert "other sequences" in section.note and len(section.columns) == len(section.rows[0])
+
+
+def test_options_are_those_of_the_command(tmp_path: Path) -> None:
+    options = uncertainty.Options(sources=("synthetic",), seeds=2, limit=30, runs=tmp_path)
+    command = options.command()
+    assert "{seed}" in command.sources[0] and command.limit == 30 and command.seeds == 2
+    assert command.out == tmp_path / "uncertainty" and command.overwrite

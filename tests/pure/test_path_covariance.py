@@ -1,0 +1,218 @@
+"""Covariance of a path: marginals, loops, and the choice of world, against dense inverses and solved graphs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from sigmasplat.fit.align import BIAS_PX
+from sigmasplat.model import se3
+from sigmasplat.model.atlas import UNKNOWN_HOP, Atlas, Hop
+from sigmasplat.slam.loop_closure.pose_graph import Edge, PoseGraph, Sensitivity, optimise
+from sigmasplat.slam.path_covariance import PathCovariance, recorded
+
+Array = NDArray[np.float64]
+LOOSE, STIFF = np.diag([400.0] * 3 + [900.0] * 3), np.diag([1e4] * 3 + [4e4] * 3)
+KEYFRAMES, SUBMAPS = 3, 4
+NO_BIAS = np.zeros(6)
+
+
+def covariance_of(rng: np.random.Generator, scale: float) -> Array:
+    A = scale * rng.normal(size=(6, 6))
+    return A @ A.T + 0.1 * scale**2 * np.eye(6)
+
+
+def world_of(solution: Array, keyframes: list[list[Array]]) -> Atlas:
+    """Return an atlas of solved submaps; its frames are its keyframes."""
+    atlas = Atlas()
+    for s, T_world_submap in enumerate(solution):
+        atlas.begin_submap()
+        atlas.anchors[-1], atlas.components[-1] = T_world_submap, 0
+        for k in range(len(keyframes[s])):
+            atlas.set_keyframes(keyframes[s][: k + 1], UNKNOWN_HOP)
+            atlas.place_frame(keyframes[s][k])
+    return atlas
+
+
+class Loopy:
+    """Four submaps of three hops each, walked as a square, with a loop from the last to the first one."""
+
+    def __init__(self, bias: Array = NO_BIAS) -> None:
+        rng = np.random.default_rng(1)
+        step = np.array([0.3, 0.02, -0.05, 0.03, np.pi / 2 / KEYFRAMES, 0.02])
+        self.steps = [[se3.exp(-step + 0.05 * rng.normal(size=6)) for _ in range(KEYFRAMES)] for _ in range(SUBMAPS)]
+        self.covariances = [[covariance_of(rng, 1e-3) for _ in range(KEYFRAMES)] for _ in range(SUBMAPS)]
+        self.bias = bias
+        ends = np.eye(4)
+        for steps in self.steps[:-1]:
+            for T_camera_before in steps:
+                ends = ends @ se3.inverse(T_camera_before)
+        self.loop = Edge(SUBMAPS - 1, 0, se3.inverse(ends), STIFF, loop=True)
+
+    def keyframes(self, errors: dict[tuple[int, int], Array]) -> list[list[Array]]:
+        """Return T_submap_keyframe, with errors of some hops."""
+        chains = []
+        for s, steps in enumerate(self.steps):
+            chain = [np.eye(4)]
+            for k, T_camera_before in enumerate(steps):
+                wrong = se3.exp(errors.get((s, k), np.zeros(6))) @ T_camera_before
+                chain.append(chain[-1] @ se3.inverse(wrong))
+            chains.append(chain)
+        return chains
+
+    def edges(self, keyframes: list[list[Array]], loop: Edge | None) -> list[Edge]:
+        chain = [Edge(s, s + 1, keyframes[s][-1], LOOSE, loop=False) for s in range(SUBMAPS - 1)]
+        return chain if loop is None else [*chain, loop]
+
+    def solved(self, errors: dict[tuple[int, int], Array], loop: Edge | None) -> tuple[Atlas, list[Edge]]:
+        keyframes = self.keyframes(errors)
+        edges = self.edges(keyframes, loop)
+        start = [np.eye(4)]
+        for chain in keyframes[:-1]:
+            start.append(start[-1] @ chain[-1])
+        return world_of(optimise(np.stack(start), edges, confidence=1.0).T_world_node, keyframes), edges
+
+    def covariance(self, loop: Edge | None, hops: bool = True) -> PathCovariance:
+        atlas, edges = self.solved({}, loop)
+        for s in range(SUBMAPS):
+            known = [
+                Hop(T, C, self.bias) for T, C in zip(self.steps[s], self.covariances[s], strict=True)
+            ] if hops else [UNKNOWN_HOP] * KEYFRAMES  # fmt: skip
+            atlas.hops[s] = [UNKNOWN_HOP, *known]
+        found = PathCovariance.of(checkpoint(atlas, edges))
+        assert found is not None
+        return found
+
+
+def checkpoint(atlas: Atlas, edges: list[Edge]) -> dict[str, torch.Tensor]:
+    return recorded(atlas, edges) | {
+        "keyframes": torch.arange(len(atlas.places)),
+        "T_world_submap": torch.from_numpy(np.stack(atlas.anchors)),
+        "submap_component": torch.tensor(atlas.components),
+        "frame_submap": torch.tensor([place.submap for place in atlas.places]),
+    }
+
+
+def test_marginals_are_the_blocks_of_the_dense_inverse() -> None:
+    rng = np.random.default_rng(0)
+    T = np.stack([se3.exp(rng.normal(size=6)) for _ in range(30)])
+    chosen = [(i, i + 1) for i in range(29)] + [(0, 12), (3, 29), (20, 5), (17, 8)]
+    edges = []
+    for a, b in chosen:
+        information = np.linalg.inv(covariance_of(rng, 0.02))
+        measured = se3.exp(0.01 * rng.normal(size=6)) @ se3.inverse(T[a]) @ T[b]
+        edges.append(Edge(a, b, measured, 0.5 * (information + information.T), loop=b != a + 1))
+    H, _ = PoseGraph(len(T), edges).normal_equations(T, np.ones(len(edges)))
+    dense = np.linalg.inv(H.toarray())
+    marginals = Sensitivity(T, edges)
+    assert not marginals.covariance(0).any()
+    for node in (1, 7, 15, 29):
+        block = dense[6 * node - 6 : 6 * node, 6 * node - 6 : 6 * node]
+        np.testing.assert_allclose(marginals.covariance(node), block, rtol=1e-9, atol=1e-9 * np.abs(block).max())
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_covariances_follow_from_the_errors_of_hops_and_loops(closed: bool) -> None:
+    """Each error moves the solved path; the covariance is the sum over all errors, for poses and for motions."""
+    room = Loopy()
+    loop = room.loop if closed else None
+    path, h = room.covariance(loop), 1e-5
+    pairs = [(2, 7), (1, len(path) - 1), (3, 4), (6, 6)]
+    poses, motions = np.zeros((len(path), 6, 6)), np.zeros((len(pairs), 6, 6))
+    plain = room.solved({}, loop)[0].T_world_camera()
+    units: list[tuple[tuple[int, int] | None, Array, Array]] = [
+        ((s, k), unit, room.covariances[s][k]) for s in range(SUBMAPS) for k in range(KEYFRAMES) for unit in np.eye(6)
+    ]
+    units += [(None, unit, np.linalg.inv(STIFF)) for unit in np.eye(6)] if closed else []
+    slopes: dict[tuple[int, int] | None, list[tuple[Array, Array]]] = {}
+    for place, unit, _ in units:
+        error = h * unit
+        turned = (
+            None if loop is None else replace(loop, T_a_b=se3.exp(error if place is None else 0 * error) @ loop.T_a_b)
+        )
+        moved = room.solved({} if place is None else {place: error}, turned)[0].T_world_camera()
+        between = [
+            se3.log(se3.inverse(moved[a]) @ moved[b] @ se3.inverse(se3.inverse(plain[a]) @ plain[b])) for a, b in pairs
+        ]
+        slope = se3.log_stack(moved @ se3.inverse(plain)) / h, np.array(between) / h
+        slopes.setdefault(place, []).append(slope)
+    for place, C in {place: C for place, _, C in units}.items():
+        J = np.stack([poses_of for poses_of, _ in slopes[place]], axis=2)
+        K = np.stack([motions_of for _, motions_of in slopes[place]], axis=2)
+        poses += J @ C @ np.swapaxes(J, 1, 2)
+        motions += K @ C @ np.swapaxes(K, 1, 2)
+    for frame in range(len(path)):
+        np.testing.assert_allclose(path.of_frame(frame), poses[frame], atol=2e-3 * np.abs(poses[-1]).max())
+    for (a, b), expected in zip(pairs, motions, strict=True):
+        np.testing.assert_allclose(path.between(a, b), expected, atol=2e-3 * max(np.abs(expected).max(), 1e-12))
+
+
+def test_a_loop_reduces_the_covariance() -> None:
+    room = Loopy()
+    sure = replace(room.loop, information=1e7 * np.eye(6))
+    chain, closed = room.covariance(None), room.covariance(sure)
+    assert not chain.of_frame(0).any() and not closed.of_frame(0).any()
+    for frame in range((SUBMAPS - 1) * (KEYFRAMES + 1), len(chain)):
+        assert np.trace(closed.of_frame(frame)) < 0.9 * np.trace(chain.of_frame(frame))
+
+
+def test_another_world_turns_the_covariance_and_leaves_motions_alone() -> None:
+    path, W = Loopy(np.full(6, 1e-4)).covariance(Loopy().loop), se3.exp(np.array([1.0, -2.0, 0.5, 0.3, 1.0, -0.4]))
+    moved, A = replace(path, anchors=W @ path.anchors), se3.adjoint(W)
+    for frame in (0, 5, len(path) - 1):
+        np.testing.assert_allclose(moved.of_frame(frame), A @ path.of_frame(frame) @ A.T, rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(moved.between(2, frame), path.between(2, frame), rtol=1e-6, atol=1e-12)
+
+
+def test_bias_grows_with_the_number_of_hops_and_noise_with_its_root() -> None:
+    straight = [[se3.exp(np.array([0.0, 0.0, -0.1, 0.0, 0.0, 0.0]))] * KEYFRAMES] * SUBMAPS
+
+    def std_m(covariance: Array, bias: Array, hops: int) -> float:
+        room = Loopy(bias)
+        room.steps, room.covariances = straight, [[covariance] * KEYFRAMES] * SUBMAPS
+        path = room.covariance(None)
+        return float(np.sqrt(path.of_frame(hops + hops // (KEYFRAMES + 1))[2, 2]))
+
+    noise, bias = np.diag([1e-6] * 3 + [1e-14] * 3), np.array([1e-3] * 3 + [1e-7] * 3)
+    assert std_m(noise, NO_BIAS, 3) == pytest.approx(np.sqrt(3) * 1e-3, rel=0.01)
+    assert std_m(1e-12 * np.eye(6), bias, 3) == pytest.approx(3e-3, rel=0.01)
+    assert 0.001 < BIAS_PX < 1 / 40
+
+
+def test_poses_that_mapping_moves_are_less_certain() -> None:
+    """The disagreement between tracking and mapping is an error that alignment does not estimate."""
+    room = Loopy()
+    sure = room.covariance(None)
+    shift = se3.exp(np.array([5e-3, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    tracked = sure.hops.T_camera_before.copy()
+    tracked[1::2] = shift @ tracked[1::2]
+    moved = replace(sure, hops=replace(sure.hops, T_camera_before=tracked))
+    assert moved.between(0, 1)[0, 0] > sure.between(0, 1)[0, 0] + 0.2 * 5e-3**2
+
+
+def test_an_unknown_hop_is_uncertain_by_a_metre_and_old_checkpoints_have_no_errors() -> None:
+    path = Loopy().covariance(None, hops=False)
+    assert path.of_frame(1)[0, 0] > 0.5
+    assert PathCovariance.of({"T_world_submap": torch.eye(4)[None]}) is None
+
+
+def test_each_component_has_its_own_origin() -> None:
+    room = Loopy()
+    path = room.covariance(None)
+    apart = replace(path, components=np.array([0, 0, 2, 2]), edges=(path.edges[0], path.edges[2]))
+    first = 2 * (KEYFRAMES + 1)
+    assert not apart.of_frame(first).any() and apart.of_frame(first + 1).any()
+    np.testing.assert_allclose(apart.of_frame(first - 1), path.of_frame(first - 1))
+
+
+def test_a_frame_that_is_no_keyframe_adds_the_error_of_its_own_motion() -> None:
+    """Also if it is at the very pose of its keyframe, as in a frozen recording."""
+    path = Loopy().covariance(None)
+    loose = replace(path, is_keyframe=np.arange(len(path)) != 1)
+    own = loose.of_frame(1) - path.of_frame(1)
+    assert (np.linalg.eigvalsh(own) > 0).all()
+    T = loose.T_world_camera[1]
+    hop = se3.adjoint(se3.inverse(T)) @ own @ se3.adjoint(se3.inverse(T)).T
+    np.testing.assert_allclose(hop, Loopy().covariances[0][1], rtol=1e-6, atol=1e-14)

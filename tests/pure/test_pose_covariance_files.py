@@ -1,0 +1,146 @@
+"""Paths with covariances: the files that `sigmasplat export` writes, what they mean, and how they are scored."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from command_line import exit_code
+from room_run import LOST, PATH, made_run
+from sigmasplat.io.pose_covariance import write_ros, write_square
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.io.trajectory import write_trajectory
+from sigmasplat.metrics.pose_covariance import score_covariances
+from sigmasplat.model import se3
+from sigmasplat.model.atlas import Atlas, Hop
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.slam.path_covariance import PathCovariance, recorded
+
+Array = NDArray[np.float64]
+CALIBRATED = 2.366
+"""Median of χ² with three degrees of freedom."""
+
+
+def estimated(count: int, scale: float = 1.0) -> tuple[Trajectory, Trajectory, Array]:
+    """Return the true path, an estimate drawn around it, and the covariance that it claims: `scale` times the right
+    one."""
+    rng = np.random.default_rng(0)
+    true = se3.exp_stack(rng.normal(size=(count, 6)) * [2.0, 1.0, 2.0, 0.3, 1.0, 0.3])
+    halves = rng.normal(size=(count, 6, 6)) * np.repeat([0.02, 0.01], 3)[:, None]
+    twists = (halves @ rng.normal(size=(count, 6, 1)))[..., 0]
+    times_s = np.arange(count) / 30.0
+    # The claim is about the true pose, given the estimate: T_true = exp(ξ) T_estimate.
+    estimate = se3.inverse(se3.exp_stack(twists)) @ true
+    covariance = scale * halves @ np.swapaxes(halves, 1, 2)
+    return Trajectory(times_s, true), Trajectory(times_s, estimate), covariance
+
+
+@pytest.mark.parametrize(("scale", "k"), [(1.0, 1.0), (0.25, 4.0)])
+def test_smfeval_reads_the_file_and_agrees_on_k(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], scale: float, k: float
+) -> None:
+    smfeval = pytest.importorskip("smfeval.cli.main", reason="smfeval is not installed (make install-dev)")
+    true, estimate, covariance = estimated(400, scale)
+    write_square(tmp_path / "path.cov.txt", estimate, covariance)
+    write_trajectory(tmp_path / "true.txt", true)
+    files = str(tmp_path / "path.cov.txt"), str(tmp_path / "true.txt")
+    assert smfeval.main(["validate", "--strict", files[0]]) == 0
+    capsys.readouterr()
+    assert smfeval.main(["nees", *files, "--align", "none", "--ref-body-frame", "camera", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    ours = score_covariances(estimate.T_world_camera, true.T_world_camera, covariance)
+    assert ours is not None and found["n"] == ours.count
+    assert ours.position_k == pytest.approx(k, rel=0.25)
+    assert found["k"] == pytest.approx(ours.position_k, rel=0.05)
+    assert found["coverage"] == pytest.approx(ours.position_coverage_90, abs=0.02)
+
+
+def test_coverage_and_nees_of_right_and_of_small_covariances() -> None:
+    true, estimate, covariance = estimated(4000)
+    right = score_covariances(estimate.T_world_camera, true.T_world_camera, covariance)
+    small = score_covariances(estimate.T_world_camera, true.T_world_camera, covariance / 9.0)
+    assert right is not None and small is not None
+    assert right.count == 4000 and right.nees_mean == pytest.approx(6.0, rel=0.05)
+    assert right.coverage_90 == pytest.approx(0.9, abs=0.02)
+    assert right.position_coverage_90 == pytest.approx(0.9, abs=0.02)
+    assert right.position_nees_median == pytest.approx(CALIBRATED, rel=0.1)
+    assert small.nees_mean == pytest.approx(9.0 * right.nees_mean) and small.coverage_90 < 0.4
+    assert score_covariances(np.empty((0, 4, 4)), np.empty((0, 4, 4)), np.empty((0, 6, 6))) is None
+
+
+def test_the_files_hold_the_spread_in_the_camera_and_in_the_world(tmp_path: Path) -> None:
+    """Draw poses around one pose: the first file describes their spread in the camera's axes, the second in the
+    world's."""
+    rng = np.random.default_rng(3)
+    A = 1e-3 * rng.normal(size=(6, 6))
+    T = se3.exp(np.array([2.0, -1.0, 3.0, 0.4, -0.8, 0.2]))
+    drawn = se3.exp_stack(rng.normal(size=(100_000, 6)) @ A.T) @ T
+    path = Trajectory(np.zeros(1), T[None])
+    write_square(tmp_path / "a.cov.txt", path, (A @ A.T)[None])
+    write_ros(tmp_path / "a.ros.txt", path, (A @ A.T)[None])
+
+    lower = np.loadtxt(tmp_path / "a.cov.txt")[8:]
+    assert len(lower) == 21
+    square = np.zeros((6, 6))
+    square[np.tril_indices(6)] = lower
+    in_camera = np.cov(se3.log_stack(se3.inverse(T) @ drawn).T)
+    np.testing.assert_allclose(square, np.tril(in_camera), atol=0.02 * in_camera.max())
+
+    ros = np.loadtxt(tmp_path / "a.ros.txt")[8:].reshape(6, 6)
+    turns = se3.log_stack(drawn @ se3.inverse(T))[:, 3:]
+    in_world = np.cov(np.hstack([drawn[:, :3, 3] - T[:3, 3], turns]).T)
+    np.testing.assert_allclose(ros, in_world, atol=0.02 * in_world.max())
+    assert "frame_id: world" in (tmp_path / "a.ros.txt").read_text()
+
+
+def with_errors(folder: Path) -> tuple[RunFolder, PathCovariance]:
+    """Make a run that recorded the errors of its path: keyframes 0, 2 and 4 in one submap."""
+    run, atlas, poses = made_run(folder, submaps=False), Atlas(), PATH.T_world_camera
+    atlas.begin_submap()
+    keyframes: list[Array] = []
+    for i, T in enumerate(poses):
+        if i in (0, 2, 4):
+            before = keyframes[-1] if keyframes else T
+            keyframes = [*keyframes, T]
+            hop = Hop(se3.inverse(T) @ before, np.diag([1e-6] * 3 + [1e-7] * 3), np.full(6, 1e-4))
+            atlas.set_keyframes(keyframes, hop)
+        atlas.place_frame(T)
+    tensors, _ = run.read_checkpoint()
+    tensors |= recorded(atlas, []) | {
+        "T_world_submap": torch.eye(4, dtype=torch.float64)[None],
+        "submap_component": torch.zeros(1, dtype=torch.int64),
+        "frame_submap": torch.zeros(len(poses), dtype=torch.int64),
+    }
+    run.write_checkpoint(tensors, {})
+    errors = PathCovariance.of(tensors)
+    assert errors is not None
+    return run, errors
+
+
+def test_a_run_is_exported_with_the_covariance_of_its_believed_poses(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, errors = with_errors(tmp_path / "kitchen")
+    for name in ("path.cov.txt", "path.ros.txt"):
+        assert exit_code("export", str(run.path), "--out", str(tmp_path / name)) == 0
+    said = capsys.readouterr().out
+    assert "path.cov.txt: 5 poses with their covariance; left out: 1 lost" in said
+    rows, ros = np.loadtxt(tmp_path / "path.cov.txt"), np.loadtxt(tmp_path / "path.ros.txt")
+    believed = np.delete(np.arange(len(PATH)), LOST)
+    assert rows.shape == (5, 29) and ros.shape == (5, 44)
+    np.testing.assert_allclose(rows[:, 1:4], PATH.T_world_camera[believed, :3, 3], atol=1e-9)
+    assert not rows[0, 8:].any() and not ros[0, 8:].any()
+    for row, frame in zip(ros[1:], believed[1:], strict=True):
+        J = se3.displacement(PATH.T_world_camera[frame])
+        np.testing.assert_allclose(row[8:].reshape(6, 6), J @ errors.of_frame(int(frame)) @ J.T, rtol=1e-6, atol=1e-14)
+
+
+def test_a_run_without_errors_of_its_path_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = made_run(tmp_path / "kitchen", submaps=False)
+    assert exit_code("export", str(run.path), "--out", str(tmp_path / "path.cov.txt")) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1 and "did not record the errors of its path" in said[0]
+    assert not (tmp_path / "path.cov.txt").exists()
