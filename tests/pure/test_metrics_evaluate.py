@@ -226,6 +226,7 @@ def test_everything_is_written(run: RunFolder) -> None:
     names = shown(run, page)
     assert names == {p.name for p in run.images.iterdir()} and len(names) == 12
     assert {"view-training-000000.png", "view-held-out-000019.png"} <= names
+    assert metrics["predictive"] is None, "the run did not measure how sure its map is"
 
 
 def test_a_page_holds_three_views_of_each_kind(run: RunFolder) -> None:

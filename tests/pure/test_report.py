@@ -9,10 +9,10 @@ import pytest
 from PIL import Image, ImageFont
 
 from sigmasplat.drawing import colormap, plot
-from sigmasplat.drawing.view_panels import GAP, HEAD, PANEL_WIDTH, draw_view_strip, view_panels
+from sigmasplat.drawing.view_panels import GAP, HEAD, PANEL_WIDTH, draw_view_strip, predicted_panels, view_panels
 from sigmasplat.floorplan.rescan import RescanMaps, RescanRegion, find_rescan_regions
 from sigmasplat.io.frames import RunFrames
-from sigmasplat.metrics.scored_view import ScoredView
+from sigmasplat.metrics.scored_view import PredictedErrors, ScoredView
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.report import charts
 from sigmasplat.report.html import Contents, build_report
@@ -35,6 +35,11 @@ def some_view(seed: int = 0) -> ScoredView:
     return ScoredView(
         12, "held-out", color, depth, np.clip(color + 0.1, 0, 1), rendered_depth, alpha, variance, ("lost",)
     )
+
+
+def some_prediction() -> PredictedErrors:
+    """Predict a standard deviation of 0.5 for colour, aleatoric 0.3 and epistemic 0.4, and of 0.2 m for depth."""
+    return PredictedErrors(*(np.full((30, 40), value, np.float32) for value in (0.09, 0.16, 0.04)))
 
 
 @pytest.mark.parametrize("colours", [colormap.VIRIDIS, colormap.INFERNO])
@@ -67,7 +72,8 @@ def test_scores_of_a_view_use_pixels_with_a_depth_reading() -> None:
 
 def test_the_font_has_every_character_of_the_panels() -> None:
     font = ImageFont.load_default(20)
-    texts = [word for panel in view_panels(some_view()) for word in (panel.title, panel.caption, *panel.ends)]
+    panels = [*view_panels(some_view()), *predicted_panels(some_view(), some_prediction())]
+    texts = [word for panel in panels for word in (panel.title, panel.caption, *panel.ends)]
     texts += [region.sentence("sq m") for region in regions_of_every_kind()]
     assert {text.split(":")[0] for text in texts} >= {"unseen", "thin", "unsure"}
     missing = bytes(font.getmask("\uffff"))
@@ -104,6 +110,16 @@ def test_a_strip_shows_the_five_panels_of_a_view() -> None:
     assert (panel(4)[:70] == colormap.NO_READING).all(), "no depth reading"
     # V is the same at every mapped pixel: one colour, and the bar ends at its root, 0.2.
     assert len(np.unique(panel(3)[:150].reshape(-1, 3), axis=0)) == 1 and view_panels(view)[3].ends[1] == "0.200"
+
+
+def test_predicted_errors_are_shown_at_the_scale_of_the_errors() -> None:
+    """The largest colour error of the view is about 0.1, the prediction 0.5; depth errors are 0.1 m, predicted 0.2."""
+    panels = predicted_panels(some_view(), some_prediction())
+    assert [panel.ends[1] for panel in panels] == ["0.500"] * 4 + ["0.200 m"] * 2
+    assert all(panel.caption.endswith(".") for panel in panels)
+    color, aleatoric, epistemic = (panels[i].pixels.astype(float).sum(-1) for i in (1, 2, 3))
+    assert (color > epistemic).all() and (epistemic > aleatoric).all(), "brighter is less certain"
+    assert (panels[5].pixels[20:] == colormap.NO_READING).all(), "the map has no depth there"
 
 
 def test_ticks_are_round_and_few() -> None:

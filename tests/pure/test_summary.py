@@ -55,6 +55,15 @@ def test_a_good_run_in_words() -> None:
         ({"status": "interrupted"}, "The run is interrupted"),
         ({"held_out": {"psnr_db": 17.0}}, "17.0 dB PSNR: poor"),
         (
+            {"predictive": {"views": 9, "color": {"coverage_68": 0.713}, "depth": {"coverage_68": 0.64}}},
+            "measured 71 % (colour), 64 % (depth)",
+        ),
+        ({"predictive": {"views": 9, "color": {"coverage_68": 0.713}, "depth": None}}, "measured 71 % (colour)."),
+        (
+            {"pose_covariance": {"window_frames": 50, "windows": {"position_coverage_90": 0.934}}},
+            "90 % of the position errors over 50 frames should be within the covariance of the poses: measured 93 %",
+        ),
+        (
             {"held_out": {"psnr_db": 24.0, "depth_l1_m": 0.01, "depth_coverage": 0.7}},
             "30 % of the depth readings",
         ),

@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 from sigmasplat import cli
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.model.field import GaussianField
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -77,3 +79,50 @@ def test_the_report_and_the_exported_plan_have_the_same_regions(run: Path, tmp_p
     places = [re.findall(r"[\d.]+", place) for *_, place in items]
     assert places == [[f"{abs(value):.1f}" for value in region["center_m"]] for region in exported]
     assert listed
+
+
+def test_predicted_errors_are_scored_and_shown(run: Path) -> None:
+    scores = json.loads((run / "metrics.json").read_text())["predictive"]
+    assert scores["views"] >= 1
+    for quantity in ("color", "depth"):
+        found = scores[quantity]
+        assert 0 < found["coverage_68"] <= found["coverage_95"] <= 1 and found["pixels"] > 100
+        assert 0 <= found["auce"] <= 0.5 and found["ause"] > 0 and found["nll"] < 0
+    page = (run / "report.html").read_text()
+    pictures = list((run / "images").glob("view-held-out-predicted-*.png"))
+    assert pictures and page.count("alt='predicted colour error'") == len(pictures)
+    assert page.count("alt='predicted depth error'") == len(pictures)
+    measured = f"measured {100 * scores['color']['coverage_68']:.0f} % (colour)"
+    assert measured in page and "Predicted errors, held-out, final map" in page
+
+
+def test_views_that_calibrated_the_prediction_are_not_scored(run: Path) -> None:
+    folder = RunFolder.open(run)
+    log, store = folder.read_log(), folder.submaps
+    probes = [frame for i in range(len(store)) for frame in store.load(i).probe_frames]
+    held_out = [record for record in log if not record["is_keyframe"] and not record["lost"]]
+    metrics = folder.read_metrics()
+    assert probes and metrics["held_out"]["views"] == len(held_out)
+    assert metrics["predictive"]["views"] == len(held_out) - len(probes)
+
+
+def test_without_the_uncertainty_of_the_map_nothing_is_predicted(run: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    for name in ("uncertainty.json", "uncertainty.safetensors"):
+        (copy / name).unlink()
+    sigmasplat("eval", str(copy))
+    assert json.loads((copy / "metrics.json").read_text())["predictive"] is None
+    assert not list((copy / "images").glob("*predicted*")) and "predicted" not in (copy / "report.html").read_text()
+
+
+def test_the_uncertainty_of_another_map_is_refused(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    folder = RunFolder.open(copy)
+    folder.write_map(GaussianField(folder.read_map().params[:-1]))
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["eval", str(copy)])
+    assert ended.value.code and "uncertainty.safetensors" in capsys.readouterr().err

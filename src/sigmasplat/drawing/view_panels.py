@@ -1,22 +1,34 @@
 """Draw one view as a strip of panels: input, rendered colour, depth, uncertainty V and error, with their ranges."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from sigmasplat.drawing import colormap
-from sigmasplat.metrics.scored_view import COVERED_ALPHA, ScoredView
+from sigmasplat.metrics.scored_view import COVERED_ALPHA, PredictedErrors, ScoredView
 
 BACKGROUND, TEXT, FAINT = (21, 24, 29), (233, 237, 242), (150, 158, 168)
 PANEL_WIDTH, GAP, HEAD, FOOT = 320, 10, 34, 38
+PREDICTED_CAPTIONS = (
+    "Difference between the image and the rendered colour.",
+    "One standard deviation: 68 % of the errors should be smaller.",
+    "Noise, and detail that the map cannot show; more views do not reduce it.",
+    "The part that more or better views would reduce.",
+    "Difference between the depth reading and the rendered depth.",
+    "One standard deviation, including the noise of the sensor: 68 % of the errors should be smaller.",
+)
+"""What each panel of `predicted_panels` means."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewPanel:
-    """One panel of a strip: title, uint8 pixels, and a colour bar (palette, labels of its ends) or a line of text."""
+    """One panel of a strip: title, uint8 pixels, and a colour bar (palette, labels of its ends) or a line of text.
+
+    If a panel has both, the line of text is shown on the page only.
+    """
 
     title: str
     pixels: colormap.Rgb
@@ -32,7 +44,7 @@ class ViewPanel:
 
 
 def draw_view_strip(panels: Sequence[ViewPanel]) -> Image.Image:
-    """Draw the panels of one view side by side, an RGB picture about 1650 pixels wide."""
+    """Draw panels side by side, an RGB picture `PANEL_WIDTH + GAP` = 330 pixels wide per panel."""
     first = panels[0].pixels
     height = round(PANEL_WIDTH * first.shape[0] / first.shape[1])
     size = (len(panels) * (PANEL_WIDTH + GAP) + GAP, height + HEAD + FOOT)
@@ -59,6 +71,29 @@ def view_panels(view: ScoredView) -> list[ViewPanel]:
     ]
 
 
+def predicted_panels(view: ScoredView, predicted: PredictedErrors) -> list[ViewPanel]:
+    """Return six panels: the errors of colour and depth, and the standard deviations that the map predicts for them.
+
+    All panels of colour have one range, and both panels of depth. Colour is predicted where the map is empty too.
+    """
+    everywhere, mapped = np.ones_like(view.valid), view.alpha > COVERED_ALPHA
+    error, total = np.sqrt(view.squared_error), np.sqrt(predicted.color)
+    error_m, total_m = np.sqrt(view.depth_squared_error), np.sqrt(predicted.reading_m2)
+    aleatoric, epistemic = np.sqrt(predicted.color_aleatoric), np.sqrt(predicted.color_epistemic)
+    color = 0.0, max(_from_zero(error, view.valid)[1], _from_zero(total, everywhere)[1])
+    depth_m = 0.0, max(_from_zero(error_m, view.depth_compared)[1], _from_zero(total_m, mapped)[1])
+    inferno = colormap.INFERNO
+    panels = [
+        _coloured("colour error, RMS", error, view.valid, color, inferno),
+        _coloured("predicted colour error", total, everywhere, color, inferno),
+        _coloured("... aleatoric part", aleatoric, everywhere, color, inferno),
+        _coloured("... epistemic part", epistemic, everywhere, color, inferno),
+        _coloured("depth error", error_m, view.depth_compared, depth_m, inferno, " m"),
+        _coloured("predicted depth error", total_m, mapped, depth_m, inferno, " m"),
+    ]
+    return [replace(panel, caption=caption) for panel, caption in zip(panels, PREDICTED_CAPTIONS, strict=True)]
+
+
 def _from_zero(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> tuple[float, float]:
     """Return 0 and the 99th percentile of the valid values."""
     return 0.0, colormap.value_range(values, valid)[1]
@@ -73,7 +108,7 @@ def _coloured(
     unit: str = "",
 ) -> ViewPanel:
     """Apply a colour map, and label its range."""
-    digits = 2 if unit else 3
+    digits = 2 if unit and limits[1] >= 1.0 else 3
     ends = (f"{limits[0]:.{digits}f}{unit}", f"{limits[1]:.{digits}f}{unit}")
     return ViewPanel(title, colormap.apply_masked(values, valid, *limits, colours), bar=colours, ends=ends)
 

@@ -1,5 +1,6 @@
 """Score a finished run; only this folder reads ground truth. Writes metrics.json, images/ and report.html."""
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -18,9 +19,11 @@ from sigmasplat.io.runs import TRUTH, RunFolder
 from sigmasplat.io.trajectory import write_trajectory
 from sigmasplat.metrics import views
 from sigmasplat.metrics.trajectory import aligned_truth, score_path, truth_in_estimate
+from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import FieldRenderer
+from sigmasplat.render.predictive import Predicted, predict
 from sigmasplat.report import charts
 from sigmasplat.report.page import report_plan, write_charts, write_page
 from sigmasplat.report.view_strips import ViewStrips
@@ -46,7 +49,8 @@ def evaluate(
     Training views are the run's keyframes; held-out views are the frames that no map was fitted to. At most
     `views_per_kind` of each are scored, evenly spread. They are rendered from the final map at the estimated poses and
     the run's working resolution, with the run's render settings unless a `renderer` is given. If the run kept its
-    submaps, each view is also rendered from the submap of its frame, as it was before the final map was made.
+    submaps, each view is also rendered from the submap of its frame, as it was before the final map was made. If the
+    run has uncertainty.json and no `renderer` is given, the predictive variances are scored too.
     Calls `progress(done, total)` with views. With `mesh` the keyframes are fused into mesh.ply, which is scored if the
     source knows its true surface.
 
@@ -68,15 +72,14 @@ def evaluate(
     standard = renderer is None
     renderer = renderer or FieldRenderer(config.render, config.backend)
     maps = views.MapSources(field, run.submaps, _anchors(run, records, config.final))
-    scores = _score_views(config, source, maps, chosen, strips, renderer, progress)
+    maps, predictions = _with_prediction(maps, run, frames, config) if standard else (maps, views.PredictionScores())
+    scores = _score_views(config, source, maps, chosen, predictions, strips, renderer, progress)
     facts = _facts(run, source, records, field, loops) | score_states(run, frames, None if problem else truth)
-    metrics = facts | path_scores | scores | {"reconstruction": None}
+    metrics = facts | path_scores | scores | {"reconstruction": None, "test_views": None}
     if mesh:
-        known = None if problem else truth
-        found = reconstruct.fuse_and_score(run, source.camera, source.true_surface(), known, renderer, progress)
-        metrics["reconstruction"] = found
+        known = source.true_surface(), None if problem else truth
+        metrics["reconstruction"] = reconstruct.fuse_and_score(run, source.camera, *known, renderer, progress)
     metrics["pose_covariance"] = score_pose_covariance(run, frames, None if problem else truth)
-    metrics["test_views"] = None
     novel = source.test_views()
     if novel is not None and truth is not None and problem is None:
         believed = frames.path
@@ -84,9 +87,8 @@ def evaluate(
         metrics["test_views"] = score_novel_views(novel, *poses, field, config.input, renderer, strips, views_per_kind)
     run.write_metrics(metrics)
     plots = _draw_plots(run, frames, None if problem else truth, loops)
-    warnings = [str(problem)] if problem else []
     plan = report_plan(run, frames.path, source.camera) if standard else None
-    write_page(run, metrics, strips.figures, plots, warnings, plan)
+    write_page(run, metrics, strips.figures, plots, [str(problem)] if problem else [], plan)
     if problem:
         raise problem
     return metrics
@@ -102,6 +104,32 @@ def _anchors(run: RunFolder, records: Log, final: FinalConfig) -> NDArray[np.flo
         return None
     anchors = run.read_checkpoint()[0].get("T_world_submap")
     return None if anchors is None or len(anchors) != count else np.asarray(anchors, np.float64)
+
+
+def _with_prediction(
+    maps: views.MapSources, run: RunFolder, frames: RunFrames, config: Config
+) -> tuple[views.MapSources, views.PredictionScores]:
+    """Add the prediction of errors to the maps if the run measured how sure its map is. Raises RunError if that belongs
+    to another map."""
+    known, field = run.read_uncertainty(), maps.final
+    if known is None:
+        return maps, views.PredictionScores()
+    if len(known.splats) != len(field):
+        raise RunError(
+            f"uncertainty.safetensors of run {run.path} has {len(known.splats)} splats, map.ply has {len(field)}; "
+            "delete uncertainty.json to evaluate without it"
+        )
+
+    def predict_view(camera: Camera, T_camera_world: NDArray[np.float64]) -> Predicted:
+        return predict(field, known, camera, T_camera_world, config.render, config.backend)
+
+    return replace(maps, predict=predict_view), views.PredictionScores(_probe_frames(run, frames))
+
+
+def _probe_frames(run: RunFolder, frames: RunFrames) -> frozenset[int]:
+    """Return the numbers, in the source, of the frames that the predictive variances were calibrated on."""
+    rows = [row for index in range(len(run.submaps)) for row in run.submaps.load(index).probe_frames]
+    return frozenset(frames.log[row]["index"] for row in rows if 0 <= row < len(frames))
 
 
 def _submaps(log: Log) -> int:
@@ -124,10 +152,12 @@ def _kinds(log: Log) -> dict[str, Log]:
 
 
 def _score_views(
-    config: Config, source: Source, maps: views.MapSources, chosen: dict[str, Log], strips: ViewStrips,
-    renderer: views.Renderer, progress: Progress,
+    config: Config, source: Source, maps: views.MapSources, chosen: dict[str, Log],
+    predictions: views.PredictionScores, strips: ViewStrips, renderer: views.Renderer, progress: Progress,
 ) -> dict[str, Any]:  # fmt: skip
-    """Render the chosen views from the final map and from their submaps; average scores per kind and map; judge V."""
+    """Render the chosen views from the final map and from their submaps; average scores per kind and map; judge V and
+    the predictive variances.
+    """
     scores = {kind: views.ViewScores(keep_samples=kind == "held-out") for kind in chosen}
     before = {kind: views.ViewScores(keep_samples=kind == "held-out") for kind in chosen}
     shown = {(kind, r["index"]) for kind, records in chosen.items() for r in evenly_spread(records, strips.per_kind)}
@@ -135,6 +165,7 @@ def _score_views(
     frame_of = partial(working_frame, source, config.input)
     for done, (final, in_submap) in enumerate(views.render_views(frame_of, maps, chosen, renderer), 1):
         scores[final.kind].add(final)
+        predictions.add(final)
         if (final.kind, final.index) in shown:
             strips.add(final)
         if in_submap:
@@ -152,6 +183,7 @@ def _score_views(
         },
         "uncertainty": judged_before if kept else judged,
         "uncertainty_final": judged if kept and _keeps_variance(config.final) else None,
+        "predictive": predictions.scores(),
     }
 
 

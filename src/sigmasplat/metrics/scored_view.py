@@ -12,11 +12,27 @@ COVERED_ALPHA = 0.5
 
 
 @dataclass(frozen=True, eq=False)
+class PredictedErrors:
+    """What a map predicts of the errors of a view, variances [H, W]: of colour (mean over channels, colour²) in two
+    parts, and of the difference between rendered depth and a reading of the sensor (m²)."""
+
+    color_aleatoric: NDArray[np.float32]
+    color_epistemic: NDArray[np.float32]
+    reading_m2: NDArray[np.float32]
+
+    @property
+    def color(self) -> NDArray[np.float32]:
+        """Return the variance of colour [H, W]."""
+        return self.color_aleatoric + self.color_epistemic
+
+
+@dataclass(frozen=True, eq=False)
 class ScoredView:
     """A recorded image and its rendering at the estimated pose, float32.
 
     recorded, rendered: [H, W, 3] in [0, 1]; recorded_depth_m [H, W] (0 = no reading); rendered_depth_m [H, W]
-    (0 where alpha ≤ ½); alpha [H, W]; variance: V [H, W, 3], colour² (VarSplat §1); notes: shown below the view strip.
+    (0 where alpha ≤ ½); alpha [H, W]; variance: V [H, W, 3], colour² (VarSplat §1); notes: shown below the view strip;
+    predicted: the predictive variances, None if they are not known.
     """
 
     index: int
@@ -28,6 +44,7 @@ class ScoredView:
     alpha: NDArray[np.float32]
     variance: NDArray[np.float32]
     notes: tuple[str, ...] = field(default=())
+    predicted: PredictedErrors | None = None
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -43,6 +60,16 @@ class ScoredView:
     def squared_error(self) -> NDArray[np.float32]:
         """Return (Ĉ − C)² averaged over the channels [H, W], colour²."""
         return np.asarray(((self.rendered - self.recorded) ** 2).mean(-1), np.float32)
+
+    @property
+    def depth_compared(self) -> NDArray[np.bool_]:
+        """Return which pixels have a depth reading and a rendered depth [H, W]."""
+        return self.valid & (self.rendered_depth_m > 0)
+
+    @property
+    def depth_squared_error(self) -> NDArray[np.float32]:
+        """Return the squared difference of rendered depth and reading [H, W], m²; it counts where `depth_compared`."""
+        return np.asarray((self.rendered_depth_m - self.recorded_depth_m) ** 2, np.float32)
 
     def scores(self) -> dict[str, float]:
         """Return PSNR (dB), SSIM, depth L1 (m) and the share of depth readings that the map covers, on valid pixels."""

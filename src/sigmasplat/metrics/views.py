@@ -1,7 +1,7 @@
 """Render many views and summarise their scores: means per kind of view, and scores of V over all sampled pixels."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Any
 
@@ -10,16 +10,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.metrics import uncertainty
-from sigmasplat.metrics.scored_view import COVERED_ALPHA, ScoredView
+from sigmasplat.metrics.scored_view import COVERED_ALPHA, PredictedErrors, ScoredView
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.render import Render
+from sigmasplat.render.predictive import Predicted
 
 Renderer = Callable[[GaussianField, Camera, NDArray[np.float64]], Render]
 """Renders a field from T_camera_world."""
+Predictor = Callable[[Camera, NDArray[np.float64]], Predicted]
+"""Predicts the variances of a view of the final map from T_camera_world."""
+HELD_OUT = "held-out"
+"""The kind of views that no map was fitted to."""
 PIXELS_PER_VIEW = 20_000
 """At most this many valid pixels per view, every k-th one, go into the uncertainty scores: sorting stays fast."""
 
@@ -41,11 +46,15 @@ class ViewScores:
 
 @dataclass(frozen=True, eq=False)
 class MapSources:
-    """The maps that views are rendered from: the final map, and the submaps if T_world_submap [S, 4, 4] is known."""
+    """The maps that views are rendered from: the final map, and the submaps if T_world_submap [S, 4, 4] is known.
+
+    predict: predicts the variances of views of the final map; None if it was not measured how sure the map is.
+    """
 
     final: GaussianField
     store: SubmapStore
     T_world_submap: NDArray[np.float64] | None
+    predict: Predictor | None = None
 
     def submap(self, index: int) -> GaussianField | None:
         """Return the splats of a submap in its own frame; None if the run kept no submaps."""
@@ -58,7 +67,8 @@ def render_views(
     """Render the chosen records of each kind at their `T_world_camera`, in the final map and, if kept, in their submap.
 
     `submap` of a record names its submap (default 0). Views are ordered by submap: each submap is loaded once, and only
-    one is in memory.
+    one is in memory. Variances are predicted for held-out views only: the map was fitted to training views, so their
+    errors are smaller.
     """
     wanted = [(record.get("submap", 0), kind, record) for kind, records in chosen.items() for record in records]
     for index, group in groupby(sorted(wanted, key=lambda view: view[0]), key=lambda view: view[0]):
@@ -66,6 +76,8 @@ def render_views(
         for _, kind, record in group:
             frame, T_camera_world = frame_of(record["index"]), se3.inverse(record["T_world_camera"])
             final = scored_view(frame, renderer(maps.final, frame.camera, T_camera_world), kind)
+            if maps.predict is not None and kind == HELD_OUT:
+                final = replace(final, predicted=predicted_errors(maps.predict(frame.camera, T_camera_world)))
             before = None
             if submap is not None and maps.T_world_submap is not None:
                 rendered = renderer(submap, frame.camera, T_camera_world @ maps.T_world_submap[index])
@@ -83,10 +95,14 @@ def scored_view(frame: Frame, rendered: Render, kind: str, notes: tuple[str, ...
     )  # fmt: skip
 
 
+def predicted_errors(found: Predicted) -> PredictedErrors:
+    """Return the predictive variances of a view as arrays."""
+    return PredictedErrors(_array(found.color_aleatoric), _array(found.color_epistemic), _array(found.reading_m2))
+
+
 def sample_pixels(view: ScoredView) -> NDArray[np.float32]:
     """Return (V, squared error, alpha) [3, P] of every k-th pixel with a depth reading, at most `PIXELS_PER_VIEW`."""
-    values = np.stack([view.uncertainty[view.valid], view.squared_error[view.valid], view.alpha[view.valid]])
-    return values[:, :: max(1, -(-values.shape[1] // PIXELS_PER_VIEW))]
+    return _every_kth(np.stack([plane[view.valid] for plane in (view.uncertainty, view.squared_error, view.alpha)]))
 
 
 def mean_scores(rows: list[dict[str, float]]) -> dict[str, Any]:
@@ -108,6 +124,46 @@ def score_uncertainty(samples: list[NDArray[np.float32]]) -> dict[str, Any] | No
         "spearman_covered": uncertainty.spearman(variance[covered], squared_error[covered]),
         "spearman_per_view": _mean(np.array([uncertainty.spearman(part[0], part[1]) for part in samples])),
     }
+
+
+@dataclass(eq=False)
+class PredictionScores:
+    """Samples of views with predictive variances, of the pixels that V is scored on: (variance, squared error) [2, P].
+
+    Frames in `calibrated_on` are left out, because the weights of the parts were fitted to them.
+    """
+
+    calibrated_on: frozenset[int] = frozenset()
+    color: list[NDArray[np.float32]] = field(default_factory=list)
+    depth: list[NDArray[np.float32]] = field(default_factory=list)
+
+    def add(self, view: ScoredView) -> None:
+        """Sample a view if it has predictive variances."""
+        found = view.predicted
+        if found is None or view.index in self.calibrated_on:
+            return
+        read, compared = view.valid, view.depth_compared
+        self.color.append(_every_kth(np.stack([found.color[read], view.squared_error[read]])))
+        self.depth.append(_every_kth(np.stack([found.reading_m2[compared], view.depth_squared_error[compared]])))
+
+    def scores(self) -> dict[str, Any] | None:
+        """Return the number of views, and the scores of colour and depth over all their pixels; None without views."""
+        if not self.color:
+            return None
+        return {"views": len(self.color), "color": _calibrated(self.color), "depth": _calibrated(self.depth)}
+
+
+def _calibrated(samples: list[NDArray[np.float32]]) -> dict[str, Any] | None:
+    """Return all scores of a variance with a unit; None without pixels."""
+    variance, squared_error = np.concatenate(samples, axis=1)
+    if not variance.size:
+        return None
+    return uncertainty.score(variance, squared_error) | uncertainty.calibration_scores(variance, squared_error)
+
+
+def _every_kth(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return every k-th column, at most `PIXELS_PER_VIEW`."""
+    return values[:, :: max(1, -(-values.shape[1] // PIXELS_PER_VIEW))]
 
 
 def _mean(values: NDArray[np.float64]) -> float | None:

@@ -193,13 +193,11 @@ def _strips(contents: Contents) -> str:
 
 
 def _panel(panel: PanelFigure) -> str:
-    """Show one panel of a view: title, picture, and its colour bar or caption."""
+    """Show one panel of a view: title, picture, its colour bar and its caption."""
     low, high = (html.escape(end) for end in panel.ends)
-    below = (
-        f"<span class=bar>{low}<i style='background: linear-gradient(90deg, {', '.join(panel.bar)})'></i>{high}</span>"
-        if panel.bar
-        else f"<span>{html.escape(panel.caption)}</span>"
-    )
+    ramp = f"<i style='background: linear-gradient(90deg, {', '.join(panel.bar)})'></i>"
+    below = f"<span class=bar>{low}{ramp}{high}</span>" if panel.bar else ""
+    below += f"<span>{html.escape(panel.caption)}</span>" if panel.caption else ""
     title = html.escape(panel.title)
     return f"<div>{title}<img src='{html.escape(panel.address)}' alt='{title}'>{below}</div>"
 

@@ -28,6 +28,8 @@ def summary_sentences(metrics: Metrics, machine: str = "") -> list[str]:
         *_images(metrics),
         *_depth(metrics),
         *_uncertainty(metrics),
+        *_predicted_errors(metrics),
+        *_pose_covariance(metrics),
     ]
 
 
@@ -111,6 +113,29 @@ def _uncertainty(metrics: Metrics) -> list[str]:
         (f"V predicts {words} where" for least, words in RANK_WORDS if rank >= least), "V does not show where"
     )
     return [f"The uncertainty {rating} the rendered colours are wrong (rank correlation {number(rank, 2)})."]
+
+
+def _predicted_errors(metrics: Metrics) -> list[str]:
+    found = metrics.get("predictive") or {}
+    measured = [
+        f"{number(found[key]['coverage_68'], 0, 100.0)} % ({name})"
+        for key, name in (("color", "colour"), ("depth", "depth"))
+        if found.get(key)
+    ]
+    if not measured:
+        return []
+    return [f"68 % of the errors should be within one predicted standard deviation: measured {', '.join(measured)}."]
+
+
+def _pose_covariance(metrics: Metrics) -> list[str]:
+    covariance = metrics.get("pose_covariance") or {}
+    found = covariance.get("windows")
+    if not found:
+        return []
+    return [
+        f"90 % of the position errors over {covariance['window_frames']} frames should be within the covariance of the "
+        f"poses: measured {number(found['position_coverage_90'], 0, 100.0)} %."
+    ]
 
 
 def rescan_sentences(metrics: Metrics, plan: "FloorPlan | None") -> list[str]:

@@ -101,6 +101,8 @@ def score_tables(metrics: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
         (f"Uncertainty V, {views}", _uncertainty_rows(metrics.get("uncertainty"))),
         ("Uncertainty V, held-out, final map", _uncertainty_rows(metrics.get("uncertainty_final"))),
         (f"Calibration of V, {views}", _calibration_rows(metrics.get("uncertainty"))),
+        ("Predicted errors, held-out, final map", _predictive_rows(metrics.get("predictive"))),
+        ("Covariance of poses", _covariance_rows(metrics.get("pose_covariance"))),
     ]
 
 
@@ -221,4 +223,34 @@ def _calibration_rows(scores: dict[str, Any] | None) -> list[list[str]]:
     rows = (scores or {}).get("reliability") or []
     return [["decile of V", "mean V, 10⁻³", "squared error, 10⁻³"]] + [
         [str(i), number(row["predicted"], 3, 1e3), number(row["empirical"], 3, 1e3)] for i, row in enumerate(rows, 1)
+    ]
+
+
+def _predictive_rows(scores: dict[str, Any] | None) -> list[list[str]]:
+    if not scores:
+        return []
+    lines = [("Pixels", "pixels", 0, 1.0), ("Within 1 standard deviation, % (ideal 68)", "coverage_68", 1, 100.0),
+             ("Within 1.96 standard deviations, % (95)", "coverage_95", 1, 100.0),
+             ("AUCE (0 = right size)", "auce", 3, 1.0), ("AUSE (0 = perfect ranking)", "ause", 3, 1.0),
+             ("Spearman of variance and squared error", "spearman", 3, 1.0),
+             ("Gaussian NLL", "nll", 3, 1.0)]  # fmt: skip
+    kinds = [scores.get(key) or {} for key in ("color", "depth")]
+    return [[f"{scores['views']} views", "colour", "depth"]] + [
+        [label, *(number(kind.get(key), digits, scale) for kind in kinds)] for label, key, digits, scale in lines
+    ]
+
+
+def _covariance_rows(scores: dict[str, Any] | None) -> list[list[str]]:
+    columns = {"hops": "keyframe to keyframe", "windows": "50 frames", "from_start": "from the start"}
+    known = {name: (scores or {}).get(key) for key, name in columns.items()}
+    kinds = {name: found for name, found in known.items() if found}
+    if not kinds:
+        return []
+    lines = [("Motions", "count", 0, 1.0), ("Poses in their 90 % ellipsoid, %", "coverage_90", 1, 100.0),
+             ("Positions in their 90 % ellipsoid, %", "position_coverage_90", 1, 100.0),
+             ("NEES, mean (ideal 6)", "nees_mean", 2, 1.0),
+             ("k of the position (ideal 1)", "position_k", 2, 1.0)]  # fmt: skip
+    return [["", *kinds]] + [
+        [label, *(number(kind.get(key), digits, scale) for kind in kinds.values())]
+        for label, key, digits, scale in lines
     ]

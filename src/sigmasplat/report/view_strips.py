@@ -7,7 +7,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from sigmasplat.drawing.view_panels import PANEL_WIDTH, ViewPanel, draw_view_strip, view_panels
+from sigmasplat.drawing.view_panels import PANEL_WIDTH, ViewPanel, draw_view_strip, predicted_panels, view_panels
 from sigmasplat.errors import RunError
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.metrics.scored_view import ScoredView
@@ -19,7 +19,7 @@ HEADINGS = {"test": "novel views"}
 
 @dataclass(frozen=True)
 class PanelFigure:
-    """One panel of a view on the page: title, address of its picture, and a caption or a colour bar.
+    """One panel of a view on the page: title, address of its picture, and a caption, a colour bar, or both.
 
     bar: CSS colours from low to high; ends: the labels of both ends of the bar.
     """
@@ -42,11 +42,17 @@ class ViewStrips:
             old.unlink()
 
     def add(self, view: ScoredView, place: str = "") -> None:
-        """Draw one view; `place` is added to its heading if it was not rendered from the final map."""
-        name = f"view-{view.kind.replace(' ', '-')}{place and '-submap'}-{view.index:06d}.png"
-        panels = view_panels(view)
+        """Draw one view, and a second strip if its errors were predicted; `place` is added to the heading if the view
+        was not rendered from the final map.
+        """
+        name, heading = f"view-{view.kind.replace(' ', '-')}", HEADINGS.get(view.kind, f"{view.kind} views") + place
+        self._draw(f"{name}{place and '-submap'}-{view.index:06d}.png", heading, view_panels(view))
+        if view.predicted is not None:
+            self._draw(f"{name}-predicted-{view.index:06d}.png", heading, predicted_panels(view, view.predicted))
+
+    def _draw(self, name: str, heading: str, panels: list[ViewPanel]) -> None:
+        """Write a strip, and keep its panels for the page."""
         self.run.write_image(name, draw_view_strip(panels))
-        heading = HEADINGS.get(view.kind, f"{view.kind} views") + place
         self.figures.setdefault(heading, []).append([panel_figure(panel) for panel in panels])
 
 
