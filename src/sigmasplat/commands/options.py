@@ -159,8 +159,8 @@ StdBelowM = Annotated[
     Number,
     arg(
         metavar="M",
-        help="keep only splats whose surface has a standard deviation of depth below M metres, calibrated on probe "
-        "views; needs a run with uncertainty.json",
+        help="keep only splats whose surface has a standard deviation of depth below M metres (depth_std_m, "
+        "docs/exports.md); needs a run with uncertainty.json",
         help_behavior_hint="(default: all)",
     ),
 ]

@@ -75,7 +75,8 @@ class SplatStd:
 def splat_std(field: GaussianField, uncertainty: MapUncertainty) -> SplatStd:
     """Return what a map predicts (`render.predictive.predicted`) for a pixel that one splat covers alone.
 
-    Of the parts of such a pixel, only three are not 0: mixture (the splat's σ²), residual and floor. A splat without a
+    Of the parts of such a pixel, only three are not 0: mixture (the splat's σ²), residual and floor. Pixels with
+    several splats have more parts, so these are lower bounds of the standard deviation of a view. A splat without a
     reading of depth takes the variance of its readings, which starts at the mean of the map.
     """
     color, reading_m2, depth_m2 = uncertainty.splats.cpu().unbind(1)
