@@ -168,6 +168,8 @@ def sigmasplat(
         ("map.ply --out x.spz --sigma-below -1", "--sigma-below must be finite and not negative, found -1"),
         ("map.ply --out x.spz --opacity-above nan", "--opacity-above must be finite and not negative, found nan"),
         ("map.spz --out x.ply --sigma-below 1", "map.spz has no learned σ"),
+        ("map.ply --out x.spz --std-below-m -1", "--std-below-m must be finite and not negative, found -1"),
+        ("map.ply --out x.spz --std-below-m 1", "map.ply has no calibrated uncertainty"),
         ("map.ply --out x.spz --sigma-below 0", "no splat of map.ply is left (median σ and opacity are "),
         ("map.ply --out no/x.spz", "cannot write no/x.spz"),
     ],

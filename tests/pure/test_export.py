@@ -11,11 +11,13 @@ from command_line import exit_code
 from sigmasplat.commands.export import ExportOptions
 from sigmasplat.config import Config
 from sigmasplat.exports.formats import FORMATS, ExportFormat, ExportSource, choose, listed, owners
+from sigmasplat.io.ply_elements import read_header
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.splats import ply
 from sigmasplat.io.splats.any_format import read_any
 from sigmasplat.io.trajectory import read_trajectory
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd, splat_std
 from sigmasplat.model.trajectory import Trajectory
 
 
@@ -73,6 +75,52 @@ def test_splats_outside_the_bounds_are_dropped_and_counted(export: Callable[...,
     kept = ply.read_field(Path("a.ply"))
     assert kept.variances.max() < 0.055**2 and kept.opacities.min() > 0.1
     assert "dropped 0 of 10" in export("walk", "--out", "b.ply", "--opacity-above", "0")
+
+
+@pytest.fixture
+def std(export: Callable[..., str]) -> SplatStd:
+    """Write the uncertainty of the run's map; return the standard deviations of its splats."""
+    values = torch.rand(10, 3, generator=torch.Generator().manual_seed(2)) * 1e-3
+    uncertainty = MapUncertainty(values, Background((0.5, 0.5, 0.5), 0.1, 1.0), SHIPPED)
+    run = RunFolder.open(Path("walk"))
+    run.write_uncertainty(uncertainty)
+    return splat_std(run.read_map(), uncertainty)
+
+
+def test_a_map_has_the_standard_deviations_of_its_run(export: Callable[..., str], std: SplatStd) -> None:
+    export("walk", "--out", "a.ply")
+    rows = vertices(Path("a.ply"))
+    np.testing.assert_array_equal(rows["depth_std_m"], std.depth_std_m)
+    np.testing.assert_array_equal(rows["color_std"], std.color_std)
+    assert torch.equal(ply.read_field(Path("a.ply")).params, RunFolder.open(Path("walk")).read_map().params)
+    export("walk", "--out", "plain.ply", "--plain")
+    assert not {"depth_std_m", "color_std"} & set(vertices(Path("plain.ply")).dtype.names)
+
+
+def test_a_run_that_has_not_measured_them_is_exported_without_them(export: Callable[..., str]) -> None:
+    export("walk", "--out", "a.ply", "--sigma-below", "1")
+    assert vertices(Path("a.ply")).dtype == vertices(Path("walk/map.ply")).dtype
+
+
+@pytest.mark.parametrize("ending", ["ply", "compressed.ply", "splat", "spz"])
+def test_splats_with_a_large_standard_deviation_of_depth_are_dropped(
+    export: Callable[..., str], std: SplatStd, ending: str
+) -> None:
+    bound = float(std.depth_std_m.median())
+    wanted = std.depth_std_m < bound
+    said = export("walk", "--out", f"a.{ending}", "--std-below-m", str(bound))
+    kept, total = int(wanted.sum()), len(wanted)
+    assert 0 < kept < total and f"{kept} splats; dropped {total - kept} of {total}: {total - kept} for " in said
+    found = read_any(Path(f"a.{ending}")).means
+    theirs = RunFolder.open(Path("walk")).read_map().means[wanted]
+    np.testing.assert_allclose(sorted(found[:, 0].tolist()), sorted(theirs[:, 0].tolist()), atol=2e-3)
+    if ending == "ply":
+        np.testing.assert_array_equal(vertices(Path("a.ply"))["depth_std_m"], std.depth_std_m[wanted])
+
+
+def vertices(path: Path) -> np.ndarray:
+    with path.open("rb") as file:
+        return read_header(file, path)[0].read(file, path)
 
 
 def test_plain_writes_only_the_columns_of_3dgs(export: Callable[..., str]) -> None:

@@ -24,6 +24,8 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.component import Component
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.map_uncertainty import SHIPPED, Background, MapUncertainty
+from sigmasplat.model.mesh import Mesh
 
 
 @pytest.fixture(params=["submaps", "in one piece"])
@@ -85,6 +87,30 @@ def test_surface_normals_point_into_the_room(reader: RunReader, tmp_path: Path) 
     floor = (np.abs(at[:, 2]) < 0.02) & (np.abs(at[:, :2] - 0.3).max(1) < 0.8)
     assert floor.sum() > 50 and np.quantile(normals[floor, 2], 0.1) > 0.9, "except at the edges of the surface"
     assert np.abs(cloud.colors[:, :3].astype(int) - 128).max() <= 1
+
+
+def test_a_surface_has_the_standard_deviation_of_the_nearest_opaque_splat(reader: RunReader) -> None:
+    def surface() -> Mesh:
+        renderer = _from_any_submap(reader)
+        return FusionInput.at(reader.run, reader.camera).surface(voxel_m=0.1, renderer=renderer)
+
+    assert surface().depth_std_m is None
+    field = reader.run.read_map()
+    values = torch.rand(len(field), 3, generator=torch.Generator().manual_seed(0)) * 1e-3
+    reader.run.write_uncertainty(MapUncertainty(values, Background((0.5, 0.5, 0.5), 0.1, 1.0), SHIPPED))
+    found, known = surface(), reader.run.read_splat_std()
+    assert known is not None and found.depth_std_m is not None
+    opaque = field.opacities >= 0.5
+    for k in range(0, len(found.vertices), 100):
+        away_m = (field.means[opaque] - torch.from_numpy(found.vertices[k])).norm(dim=1)
+        near = away_m <= away_m.min() + 1e-6
+        assert float(found.depth_std_m[k]) in known[1].depth_std_m[opaque][near].tolist()
+
+
+def test_an_uncertainty_of_another_map_is_refused(reader: RunReader) -> None:
+    reader.run.write_uncertainty(MapUncertainty(torch.ones(7, 3), Background((0.5, 0.5, 0.5), 0.1, 1.0), SHIPPED))
+    with pytest.raises(RunError, match="run it again"):
+        reader.run.read_splat_std()
 
 
 def _from_any_submap(reader: RunReader):

@@ -1,12 +1,13 @@
 """Files of points and meshes, loaded by trimesh."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sigmasplat.exports.points import write_points
-from sigmasplat.io.mesh import write_mesh
+from sigmasplat.io.mesh import read_mesh, write_mesh
 from sigmasplat.model.mesh import Mesh
 
 trimesh = pytest.importorskip("trimesh", reason="the [dev] extra is not installed")
@@ -49,6 +50,25 @@ def test_normals_of_a_ball_point_outwards_and_unused_vertices_have_none() -> Non
     triangle = Mesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [9, 9, 9]], np.float32), np.array([[0, 1, 2]], np.int32))
     np.testing.assert_array_equal(triangle.normals(), [[0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 0]])
     assert (mesh.normals() * theirs.vertex_normals).sum(1).min() > 0.999
+
+
+def test_vertices_are_loaded_with_their_standard_deviation(tmp_path: Path) -> None:
+    mesh = ball()
+    known = replace(mesh, depth_std_m=np.linspace(0.001, 0.1, len(mesh.vertices)).astype(np.float32))
+    for name in ("a.ply", "a.glb", "a.obj"):
+        write_mesh(tmp_path / name, known)
+    write_mesh(tmp_path / "without.obj", mesh)
+    write_points(tmp_path / "points.ply", known.vertices, known.colors, known.normals(), known.depth_std_m)
+    for name in ("a.ply", "points.ply"):
+        loaded = trimesh.load(tmp_path / name, process=False)
+        rows = loaded.metadata["_ply_raw"]["vertex"]["data"]
+        np.testing.assert_array_equal(rows["depth_std_m"].ravel(), known.depth_std_m)
+        np.testing.assert_array_equal(loaded.vertices.astype(np.float32), mesh.vertices)
+    loaded = trimesh.load(tmp_path / "a.glb", process=False, force="mesh")
+    np.testing.assert_array_equal(loaded.vertex_attributes["_DEPTH_STD_M"].ravel(), known.depth_std_m)
+    np.testing.assert_array_equal(loaded.faces, mesh.faces)
+    assert (tmp_path / "a.obj").read_bytes() == (tmp_path / "without.obj").read_bytes()
+    np.testing.assert_array_equal(read_mesh(tmp_path / "a.ply").vertices, mesh.vertices)
 
 
 @pytest.mark.parametrize("ending", ["ply", "obj", "glb"])

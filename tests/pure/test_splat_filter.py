@@ -5,8 +5,10 @@ import math
 import pytest
 import torch
 
+from sigmasplat.errors import SigmaSplatError
 from sigmasplat.model import splat_filter
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.map_uncertainty import SplatStd
 
 
 def three() -> GaussianField:
@@ -37,6 +39,15 @@ def test_bounds_select_splats_and_count_the_others() -> None:
         found = splat_filter.filter_splats(three(), **bounds)
         assert (found.kept.tolist(), found.by_sigma, found.by_opacity) == (kept, by_sigma, by_opacity)
         assert found.dropped == kept.count(False)
+
+
+def test_a_bound_of_the_depth_drops_exactly_the_splats_above_it() -> None:
+    std = SplatStd(torch.tensor([0.03, 0.01, 0.02]), torch.zeros(3))
+    found = splat_filter.filter_splats(three(), sigma_below=0.25, opacity_above=0.3, std_below_m=0.03, std=std)
+    assert (found.kept.tolist(), found.by_sigma, found.by_std, found.by_opacity) == ([False, True, False], 1, 1, 0)
+    assert found.dropped == 2
+    with pytest.raises(SigmaSplatError, match="standard deviations"):
+        splat_filter.filter_splats(three(), std_below_m=0.03)
 
 
 def test_a_new_map_has_no_learned_variance() -> None:

@@ -16,6 +16,7 @@ class ExportOptions:
     """Options that only some formats accept, under their names on the command line (`ExportFormat.options`)."""
 
     sigma_below: options.SigmaBelow = None
+    std_below_m: options.StdBelowM = None
     opacity_above: options.OpacityAbove = None
     plain: options.Plain = False
     pictures: options.Pictures = False

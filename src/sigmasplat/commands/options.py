@@ -149,7 +149,20 @@ FormatName = Annotated[
 ]
 SigmaBelow = Annotated[
     Number,
-    arg(metavar="S", help="keep only splats with σ below S, for colours 0 to 1", help_behavior_hint="(default: all)"),
+    arg(
+        metavar="S",
+        help="keep only splats with σ below S, for colours 0 to 1; σ is learned, not calibrated",
+        help_behavior_hint="(default: all)",
+    ),
+]
+StdBelowM = Annotated[
+    Number,
+    arg(
+        metavar="M",
+        help="keep only splats whose surface has a standard deviation of depth below M metres (depth_std_m, "
+        "docs/exports.md); needs a run with uncertainty.json",
+        help_behavior_hint="(default: all)",
+    ),
 ]
 OpacityAbove = Annotated[
     Number,

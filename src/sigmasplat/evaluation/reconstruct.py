@@ -4,10 +4,11 @@ Only images rendered from the map are fused, never a recorded image or the groun
 """
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from sigmasplat.config import Config
@@ -19,10 +20,14 @@ from sigmasplat.metrics.splats import score_splats
 from sigmasplat.metrics.trajectory import align_rigid, associate, pair_poses
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.map_uncertainty import SplatStd
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.slam.fusion import VOXEL_M, FusionView, Renderer, count_keyframes, fuse, fusion_views
 from sigmasplat.types import Progress, no_progress
+
+OPAQUE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,10 +77,25 @@ class FusionInput:
     ) -> Mesh:
         """Fuse renders of the map at the keyframes into a mesh in the run's world.
 
-        Calls `progress(done, total)` with keyframes. Raises RunError as `views` does; ConfigError unless voxel_m > 0.
+        Its vertices have a standard deviation (`with_std`) if the run has measured it. Calls `progress(done, total)`
+        with keyframes. Raises RunError as `views` does; ConfigError unless voxel_m > 0.
         """
         views, total = self.views()
-        return fuse(views, total, self.config, voxel_m=voxel_m, renderer=renderer, progress=progress)
+        mesh = fuse(views, total, self.config, voxel_m=voxel_m, renderer=renderer, progress=progress)
+        known = self.run.read_splat_std()
+        return mesh if known is None else with_std(mesh, *known)
+
+
+def with_std(mesh: Mesh, field: GaussianField, std: SplatStd) -> Mesh:
+    """Return a mesh in the frame of a map with the depth_std_m of the nearest opaque splat at each vertex.
+
+    Splats with an opacity of at least ½ are opaque; if there are none, the mesh is returned unchanged.
+    """
+    opaque = (field.opacities >= OPAQUE).cpu()
+    if not bool(opaque.any()):
+        return mesh
+    _, nearest = cKDTree(field.means.cpu()[opaque].double().numpy()).query(mesh.vertices)
+    return replace(mesh, depth_std_m=std.depth_std_m[opaque].numpy()[nearest].astype(np.float32))
 
 
 def fuse_and_score(

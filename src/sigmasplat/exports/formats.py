@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from sigmasplat.exports.run_reader import RunReader
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.model.field import GaussianField
+    from sigmasplat.model.map_uncertainty import SplatStd
     from sigmasplat.model.trajectory import Trajectory
     from sigmasplat.sources.base import Source
     from sigmasplat.types import Matrix, Progress
@@ -56,12 +57,17 @@ class ExportSource:
         run = self.run()
         return RunReader(run, lambda: self.open_sequence(run))
 
-    def field(self) -> "GaussianField":
-        """Read the map. Raises RunError if there is no run, SourceError if the map cannot be read."""
+    def splats(self) -> "tuple[GaussianField, SplatStd | None]":
+        """Read the map, and the standard deviations of its splats if a run has measured them.
+
+        Raises RunError if there is no run, SourceError if the map cannot be read.
+        """
         from sigmasplat.io.splats.any_format import read_any
 
-        is_map = self.path.is_file() or (not self.path.exists() and self.path.suffix != "")
-        return read_any(self.path) if is_map else self.run().read_map()
+        if self.path.is_file() or (not self.path.exists() and self.path.suffix != ""):
+            return read_any(self.path), None
+        run = self.run()
+        return run.read_splat_std() or (run.read_map(), None)
 
 
 @dataclass(frozen=True)
@@ -145,62 +151,66 @@ def _counting(title: str) -> "Iterator[Progress]":
 
 
 def _ply(
-    source: ExportSource, target: Path, *, sigma_below: float | None, opacity_above: float | None, plain: bool
+    source: ExportSource,
+    target: Path,
+    *,
+    sigma_below: float | None,
+    std_below_m: float | None,
+    opacity_above: float | None,
+    plain: bool,
 ) -> str:
+    from sigmasplat.exports.splats import Bounds, write_splats
     from sigmasplat.io.splats import ply
 
-    return _write_splats(source, sigma_below, opacity_above, lambda field: ply.write_field(target, field, plain=plain))
+    bounds = Bounds(sigma_below, std_below_m, opacity_above)
+    return write_splats(
+        source.path, source.splats, bounds, lambda field, std: ply.write_field(target, field, plain=plain, std=std)
+    )
 
 
 def _compressed_ply(
-    source: ExportSource, target: Path, *, sigma_below: float | None, opacity_above: float | None
+    source: ExportSource,
+    target: Path,
+    *,
+    sigma_below: float | None,
+    std_below_m: float | None,
+    opacity_above: float | None,
 ) -> str:
+    from sigmasplat.exports.splats import Bounds, write_splats
     from sigmasplat.io.splats import compressed_ply
 
-    return _write_splats(source, sigma_below, opacity_above, lambda field: compressed_ply.write_field(target, field))
+    bounds = Bounds(sigma_below, std_below_m, opacity_above)
+    return write_splats(source.path, source.splats, bounds, lambda field, _: compressed_ply.write_field(target, field))
 
 
-def _splat(source: ExportSource, target: Path, *, sigma_below: float | None, opacity_above: float | None) -> str:
+def _splat(
+    source: ExportSource,
+    target: Path,
+    *,
+    sigma_below: float | None,
+    std_below_m: float | None,
+    opacity_above: float | None,
+) -> str:
+    from sigmasplat.exports.splats import Bounds, write_splats
     from sigmasplat.io.splats import splat
 
-    return _write_splats(source, sigma_below, opacity_above, lambda field: splat.write_field(target, field))
+    bounds = Bounds(sigma_below, std_below_m, opacity_above)
+    return write_splats(source.path, source.splats, bounds, lambda field, _: splat.write_field(target, field))
 
 
-def _spz(source: ExportSource, target: Path, *, sigma_below: float | None, opacity_above: float | None) -> str:
+def _spz(
+    source: ExportSource,
+    target: Path,
+    *,
+    sigma_below: float | None,
+    std_below_m: float | None,
+    opacity_above: float | None,
+) -> str:
+    from sigmasplat.exports.splats import Bounds, write_splats
     from sigmasplat.io.splats import spz
 
-    return _write_splats(source, sigma_below, opacity_above, lambda field: spz.write_field(target, field))
-
-
-def _write_splats(
-    source: ExportSource,
-    sigma_below: float | None,
-    opacity_above: float | None,
-    write: "Callable[[GaussianField], None]",
-) -> str:
-    """Write the splats within the bounds; return how many were written and dropped.
-
-    Raises ConfigError on a meaningless bound, RunError if no splat is left.
-    """
-    from sigmasplat.model.splat_filter import filter_splats, has_learned_variance, sigmas
-
-    for option, bound in (("--sigma-below", sigma_below), ("--opacity-above", opacity_above)):
-        if bound is not None and not 0.0 <= bound < float("inf"):
-            raise ConfigError(f"{option} must be finite and not negative, found {bound}")
-    field = source.field()
-    if sigma_below is not None and len(field) and not has_learned_variance(field):
-        raise ConfigError(f"{source.path} has no learned σ, so --sigma-below cannot be used; give a run or its PLY")
-    result, total = filter_splats(field, sigma_below=sigma_below, opacity_above=opacity_above), len(field)
-    if total and result.dropped == total:
-        medians = f"{sigmas(field).median():.3g} and {field.opacities.median():.3g}"
-        raise RunError(f"no splat of {source.path} is left (median σ and opacity are {medians}); use weaker bounds")
-    field.keep(result.kept)
-    print(f"writing {len(field):,} splats …", flush=True)
-    write(field)
-    if sigma_below is None and opacity_above is None:
-        return f"{len(field):,} splats"
-    reasons = f"{result.by_sigma:,} for σ, {result.by_opacity:,} for opacity"
-    return f"{len(field):,} splats; dropped {result.dropped:,} of {total:,}: {reasons}"
+    bounds = Bounds(sigma_below, std_below_m, opacity_above)
+    return write_splats(source.path, source.splats, bounds, lambda field, _: spz.write_field(target, field))
 
 
 def _trajectory(source: ExportSource, target: Path) -> str:

@@ -23,7 +23,7 @@ def export_points(surface: Mesh, target: Path) -> int:
     Raises RunError if the file cannot be written.
     """
     colors = surface.vertices * 0.0 + 0.7 if surface.colors is None else surface.colors
-    write_points(target, surface.vertices, colors, surface.normals())
+    write_points(target, surface.vertices, colors, surface.normals(), surface.depth_std_m)
     return len(surface.vertices)
 
 
@@ -34,21 +34,25 @@ def splat_points(field: GaussianField, most: int = MAX_POINTS) -> tuple[Matrix, 
     return field.means.numpy()[rows].astype(np.float64), field.colors.numpy()[rows].astype(np.float64)
 
 
-def write_points(path: Path, positions: Points, colors: Points, normals: Points | None = None) -> None:
-    """Write a binary PLY of positions [N, 3], colors [N, 3] in [0, 1] and unit normals [N, 3].
+def write_points(
+    path: Path, positions: Points, colors: Points, normals: Points | None = None, depth_std_m: Points | None = None
+) -> None:
+    """Write a binary PLY of positions [N, 3], colors [N, 3] in [0, 1], unit normals [N, 3] and depth_std_m [N].
 
     Raises RunError if the file cannot be written.
     """
     floats = ["x", "y", "z"] + ([] if normals is None else ["nx", "ny", "nz"])
     values = positions if normals is None else np.concatenate([positions, normals], 1)
-    rows = np.zeros(len(positions), [(name, "<f4") for name in floats] + [(n, "u1") for n in ("red", "green", "blue")])
+    columns = [(name, "<f4") for name in floats] + [(name, "u1") for name in ("red", "green", "blue")]
+    rows = np.zeros(len(positions), columns + ([] if depth_std_m is None else [("depth_std_m", "<f4")]))
     for i, name in enumerate(floats):
         rows[name] = values[:, i]
     for i, name in enumerate(("red", "green", "blue")):
         rows[name] = color_bytes(colors)[:, i]
-    properties = "".join(
-        f"property {'float' if name in floats else 'uchar'} {name}\n" for name in rows.dtype.names or ()
-    )
+    if depth_std_m is not None:
+        rows["depth_std_m"] = depth_std_m
+    kinds = {name: "uchar" if rows.dtype[name].itemsize == 1 else "float" for name in rows.dtype.names or ()}
+    properties = "".join(f"property {kind} {name}\n" for name, kind in kinds.items())
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(header.encode("ascii"))

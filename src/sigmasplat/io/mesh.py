@@ -1,4 +1,4 @@
-"""Write surfaces as PLY, OBJ or GLB with a colour per vertex; read PLY."""
+"""Write surfaces as PLY, OBJ or GLB with a colour per vertex; read PLY. PLY and GLB also hold depth_std_m, if known."""
 
 import json
 import struct
@@ -107,13 +107,17 @@ def _rows(
 
 
 def _ply(mesh: Mesh) -> bytes:
-    """Return the mesh as binary little-endian PLY: float x y z, uchar red green blue, faces as lists of int."""
+    """Return the mesh as binary little-endian PLY: float x y z, uchar red green blue, float depth_std_m if it is known,
+    faces as lists of int."""
     columns = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    columns += [] if mesh.depth_std_m is None else [("depth_std_m", "<f4")]
     vertices = np.zeros(len(mesh.vertices), np.dtype(columns))
     for k, name in enumerate("xyz"):
         vertices[name] = mesh.vertices[:, k]
     for k, name in enumerate(("red", "green", "blue")):
         vertices[name] = _bytes(mesh)[:, k]
+    if mesh.depth_std_m is not None:
+        vertices["depth_std_m"] = mesh.depth_std_m
     faces = np.zeros(len(mesh.faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
     faces["count"], faces["corners"] = 3, mesh.faces
     properties = [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in columns]
@@ -133,20 +137,28 @@ def _obj(mesh: Mesh) -> bytes:
 
 
 def _glb(mesh: Mesh) -> bytes:
-    """Return the mesh as binary glTF 2.0, rotated by 180° about x, since glTF's y axis points up."""
-    arrays = [mesh.vertices.astype("<f4"), (_bytes(mesh) / np.float32(255.0)).astype("<f4"), mesh.faces.astype("<u4")]
+    """Return the mesh as binary glTF 2.0, rotated by 180° about x, since glTF's y axis points up.
+
+    depth_std_m becomes `_DEPTH_STD_M`: glTF requires an underscore before the names of own attributes.
+    """
+    own = [] if mesh.depth_std_m is None else [mesh.depth_std_m.astype("<f4")]
+    colors = (_bytes(mesh) / np.float32(255.0)).astype("<f4")
+    arrays = [mesh.vertices.astype("<f4"), colors, *own, mesh.faces.astype("<u4")]
     starts = np.cumsum([0, *(array.nbytes for array in arrays)]).tolist()
+    targets = [VERTEX_TARGET] * (len(arrays) - 1) + [INDEX_TARGET]
     views = [
         {"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": target}
-        for array, start, target in zip(arrays, starts, (VERTEX_TARGET, VERTEX_TARGET, INDEX_TARGET), strict=False)
+        for array, start, target in zip(arrays, starts, targets, strict=False)
     ]
     bounds = {"min": mesh.vertices.min(0).tolist(), "max": mesh.vertices.max(0).tolist()} if len(mesh.vertices) else {}
     accessors = [
         {"bufferView": 0, "componentType": FLOAT32, "count": len(mesh.vertices), "type": "VEC3"} | bounds,
         {"bufferView": 1, "componentType": FLOAT32, "count": len(mesh.vertices), "type": "VEC3"},
-        {"bufferView": 2, "componentType": UINT32, "count": mesh.faces.size, "type": "SCALAR"},
+        *[{"bufferView": 2, "componentType": FLOAT32, "count": len(mesh.vertices), "type": "SCALAR"} for _ in own],
+        {"bufferView": 2 + len(own), "componentType": UINT32, "count": mesh.faces.size, "type": "SCALAR"},
     ]
-    primitive = {"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2}
+    attributes = {"POSITION": 0, "COLOR_0": 1} | ({"_DEPTH_STD_M": 2} if own else {})
+    primitive = {"attributes": attributes, "indices": 2 + len(own)}
     scene = {
         "asset": {"version": "2.0", "generator": "sigmasplat"}, "scene": 0, "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "rotation": [1.0, 0.0, 0.0, 0.0]}], "meshes": [{"primitives": [primitive]}],

@@ -20,7 +20,7 @@ from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.tensors import open_tensors, write_tensors
 from sigmasplat.model.component import Component
 from sigmasplat.model.field import GaussianField
-from sigmasplat.model.map_uncertainty import MapUncertainty
+from sigmasplat.model.map_uncertainty import SPLAT_COLUMNS, MapUncertainty, SplatStd, splat_std
 from sigmasplat.model.trajectory import Trajectory
 
 PROGRAM = "sigmasplat"
@@ -244,6 +244,20 @@ class RunFolder:
     def read_uncertainty(self) -> MapUncertainty | None:
         """Return how sure map.ply is; None if the run has not measured it. Raises RunError if a file is damaged."""
         return uncertainty_files.read_uncertainty(self.path)
+
+    def read_splat_std(self) -> tuple[GaussianField, SplatStd] | None:
+        """Return map.ply and the standard deviations of its splats; None if the run has not measured them.
+
+        Raises RunError if a file is damaged, or does not have one row for each splat; SourceError as `read_map` does.
+        """
+        uncertainty = self.read_uncertainty()
+        if uncertainty is None:
+            return None
+        field = self.read_map()
+        if uncertainty.splats.shape != (len(field), len(SPLAT_COLUMNS)):
+            rows = len(uncertainty.splats)
+            raise RunError(f"{self.path} has uncertainties of {rows} rows for {len(field)} splats; run it again")
+        return field, splat_std(field, uncertainty)
 
     def map_bytes(self) -> int:
         """Return the size of map.ply. Raises RunError if it is missing."""

@@ -15,7 +15,8 @@ Indices = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles: vertices [V, 3] m, world frame; faces [F, 3], counter-clockwise from outside; colors [V, 3] in [0, 1].
+    """Triangles: vertices [V, 3] m, world frame; faces [F, 3], counter-clockwise from outside; colors [V, 3] in [0, 1];
+    depth_std_m [V]: standard deviation of the depth of the surface at each vertex, m.
 
     Raises SigmaSplatError on inconsistent shapes, values that are not finite, or faces with unknown vertices.
     """
@@ -23,12 +24,17 @@ class Mesh:
     vertices: Floats
     faces: Indices
     colors: Floats | None = None
+    depth_std_m: Floats | None = None
 
     def __post_init__(self) -> None:
         v, f, c = self.vertices, self.faces, self.colors
         if v.ndim != 2 or v.shape[1] != 3 or f.ndim != 2 or f.shape[1] != 3 or (c is not None and c.shape != v.shape):
             shapes = (v.shape, f.shape, None if c is None else c.shape)
             raise SigmaSplatError(f"a mesh needs vertices [V, 3], faces [F, 3], colors [V, 3], found {shapes}")
+        if self.depth_std_m is not None and self.depth_std_m.shape != (len(v),):
+            raise SigmaSplatError(
+                f"a mesh with {len(v)} vertices needs depth_std_m [V], found {self.depth_std_m.shape}"
+            )
         if not np.isfinite(v).all() or not (c is None or np.isfinite(c).all()):
             raise SigmaSplatError("a mesh needs finite vertices and colors, found NaN or inf")
         if f.size and (f.min() < 0 or f.max() >= len(v)):
@@ -86,7 +92,8 @@ class Mesh:
         used = np.zeros(len(self.vertices), bool)
         used[faces] = True
         number = np.cumsum(used, dtype=np.int32) - np.int32(1)
-        return Mesh(self.vertices[used], number[faces], None if self.colors is None else self.colors[used])
+        of_vertices = (None if values is None else values[used] for values in (self.colors, self.depth_std_m))
+        return Mesh(self.vertices[used], number[faces], *of_vertices)
 
     def without_small_parts(self, vertices: int) -> "Mesh":
         """Remove connected parts of fewer than `vertices` vertices (VarSplat §7: 200), and vertices without a face."""

@@ -2,10 +2,11 @@
 
 Columns: x y z, nx ny nz (0), f_dc_0..2 = (colour − ½)/C0, f_rest_0..44 for view-dependent colours (all harmonics of
 red, then green, then blue), opacity (logit), scale_0..2 (log metres), rot_0..3 (wxyz), and our own at the end:
-log_variance_0..2. Readers that find columns by name skip these: SuperSplat and splat-transform (PlayCanvas),
-antimatter15/splat, nianticlabs/spz. Readers that assume the fixed 62-float layout and ignore the names would read
-garbage: the original 3DGS viewer (SIBR), 3DGS.cpp, older Unity importers. `plain` writes exactly these 62 columns, with
-f_rest 0 if a map has no harmonics. The header has no comments, because SIBR expects the number of splats in line 3.
+log_variance_0..2, then depth_std_m and color_std if they are known. Our reader ignores the last two. Readers that find
+columns by name skip ours: SuperSplat and splat-transform (PlayCanvas), antimatter15/splat, nianticlabs/spz. Readers
+that assume the fixed 62-float layout and ignore the names would read garbage: the original 3DGS viewer (SIBR),
+3DGS.cpp, older Unity importers. `plain` writes exactly these 62 columns, with f_rest 0 if a map has no harmonics. The
+header has no comments, because SIBR expects the number of splats in line 3.
 """
 
 from pathlib import Path
@@ -21,6 +22,7 @@ from sigmasplat.io.ply_elements import read_header
 from sigmasplat.io.splats.values import SH_C0, check_finite, check_values
 from sigmasplat.model.field import ATTRIBUTES, COLUMNS, INITIAL_LOG_VARIANCE, GaussianField, Rows
 from sigmasplat.model.harmonics import DEGREES, count
+from sigmasplat.model.map_uncertainty import SplatStd
 
 PLY_COLUMNS: dict[str, list[str]] = {
     "means": ["x", "y", "z"],
@@ -33,18 +35,20 @@ PLY_COLUMNS: dict[str, list[str]] = {
 BEFORE_HARMONICS = [*PLY_COLUMNS["means"], "nx", "ny", "nz", *PLY_COLUMNS["colors"]]
 AFTER_HARMONICS = ["opacity", *PLY_COLUMNS["log_scales"], *PLY_COLUMNS["quats"]]
 REST = "f_rest_"
+STD_COLUMNS = ("depth_std_m", "color_std")
 
 
-def write_field(path: Path, field: GaussianField, *, plain: bool = False) -> None:
-    """Write the splats as binary little-endian 3DGS PLY atomically; `plain`: only 3DGS's 62 columns, without σ².
+def write_field(path: Path, field: GaussianField, *, plain: bool = False, std: SplatStd | None = None) -> None:
+    """Write the splats as binary little-endian 3DGS PLY atomically; `plain`: only 3DGS's 62 columns.
 
-    Raises RunError if the file cannot be written.
+    `std` adds its two columns unless `plain`. Raises RunError if the file cannot be written.
     """
     params = field.params.detach().cpu().numpy().astype(np.float32)
     harmonics = _by_channel(field)
     rest = [f"{REST}{i}" for i in range(ATTRIBUTES["harmonics"] if plain else harmonics.shape[1])]
     ours = [] if plain else PLY_COLUMNS["log_variances"]
-    names_in_file = [*BEFORE_HARMONICS, *rest, *AFTER_HARMONICS, *ours]
+    of_std = {} if plain or std is None else {name: getattr(std, name) for name in STD_COLUMNS}
+    names_in_file = [*BEFORE_HARMONICS, *rest, *AFTER_HARMONICS, *ours, *of_std]
     rows = np.zeros(len(params), np.dtype([(name, "<f4") for name in names_in_file]))
     for group in (group for group, names in PLY_COLUMNS.items() if names[0] in names_in_file):
         names, values = PLY_COLUMNS[group], params[:, COLUMNS[group]]
@@ -54,6 +58,8 @@ def write_field(path: Path, field: GaussianField, *, plain: bool = False) -> Non
             rows[name] = values[:, i]
     for i, name in enumerate(rest[: harmonics.shape[1]]):
         rows[name] = harmonics[:, i]
+    for name, column in of_std.items():
+        rows[name] = column.numpy()
     properties = "".join(f"property float {name}\n" for name in names_in_file)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
     with replacing(path) as temporary, temporary.open("wb") as file:
