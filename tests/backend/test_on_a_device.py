@@ -244,7 +244,8 @@ def test_what_is_written_is_read_as_from_the_host(device: torch.device, tmp_path
     del again.store.submaps[len(slam.store) - 1 :]  # type: ignore[attr-defined]
     restore(again, read_state(tmp_path / "state", CLASSES, fixed(again)))
     again.step(ROOM.frame(FRAMES - 1))
-    assert all(torch.equal(a, b) for a, b in zip(slam.checkpoint().values(), again.checkpoint().values(), strict=True))
+    for name, written in slam.checkpoint().items():  # the covariance of a first keyframe is not known: NaN
+        torch.testing.assert_close(again.checkpoint()[name], written, rtol=0, atol=0, equal_nan=True)
 
 
 def test_a_run_is_written_and_evaluated(device: torch.device, tmp_path: Path) -> None:
