@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.model.camera import Camera
@@ -169,3 +170,10 @@ def test_a_crop_of_the_whole_image_is_refused() -> None:
         ) as refused:
             frame().prepared(width, 0.1, 8.0, crop_px)
         assert "\n" not in str(refused.value)
+
+
+def test_half_the_size_has_the_bytes_of_the_box_filter() -> None:
+    whole = frame(Camera(30, 22, 20.0, 20.0, 14.5, 10.5))
+    planes = [Image.fromarray(np.ascontiguousarray(whole.color[..., c])) for c in range(3)]
+    expected = np.stack([np.asarray(plane.resize((15, 11), Image.Resampling.BOX)) for plane in planes], -1)
+    assert np.array_equal(whole.resized(15, 11).color, expected)

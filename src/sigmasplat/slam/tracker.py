@@ -30,7 +30,7 @@ WIDE = 0.065
 """A motion between two frames is wide if it moves the image by more than this share of its width: the basin of
 convergence of alignment ends near there."""
 
-FRONT = 0.02
+FRONT = 0.03
 """What is in front is looked for if at least this share of the compared points is nearer than the reference."""
 
 
