@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from sigmasplat.fit.splat_residuals import squared_errors
 from sigmasplat.fit.target import Keyframe
-from sigmasplat.metrics.scored_view import COVERED_ALPHA
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.map_uncertainty import MapUncertainty
@@ -73,11 +73,8 @@ def map_facts(field: GaussianField, keyframes: Sequence[Keyframe], view: View, r
     for keyframe in keyframes:
         T_camera_map, target = se3.inverse(keyframe.T_world_camera), keyframe.target
         seen, depth = on_host(renderer(field, target.camera, T_camera_map)), target.depth_image
-        covered = seen.alpha > COVERED_ALPHA
-        error_m = torch.where(covered, seen.depth / seen.alpha.clamp(min=COVERED_ALPHA) - depth, 0.0)
-        known = (covered & (depth > 0)).float()
-        color_error2 = (seen.color.clamp(0.0, 1.0) - target.image).square().mean(-1)
-        views.append(TrainingView(T_camera_map, color_error2, error_m.square() * known, known))
+        errors, known = squared_errors(seen.color, seen.depth, seen.alpha, target.image, depth)
+        views.append(TrainingView(T_camera_map, errors[..., 0], errors[..., 1], known[..., 1]))
         colors.append(target.image.reshape(-1, 3)[::7])
         depths.append(depth[depth > 0][::7])
     all_colors, all_depths = torch.cat(colors), torch.cat(depths)
