@@ -7,6 +7,7 @@ import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -168,49 +169,24 @@ def _ply(
     )
 
 
-def _compressed_ply(
-    source: ExportSource,
-    target: Path,
-    *,
-    sigma_below: float | None,
-    std_below_m: float | None,
-    opacity_above: float | None,
-) -> str:
-    from sigmasplat.exports.splats import Bounds, write_splats
-    from sigmasplat.io.splats import compressed_ply
+def _splats_without_std(module: str) -> Callable[..., str]:
+    """Return the writer of a format without standard deviations, made of `write_field` of a module of io/splats."""
 
-    bounds = Bounds(sigma_below, std_below_m, opacity_above)
-    return write_splats(source.path, source.splats, bounds, lambda field, _: compressed_ply.write_field(target, field))
+    def write(
+        source: ExportSource,
+        target: Path,
+        *,
+        sigma_below: float | None,
+        std_below_m: float | None,
+        opacity_above: float | None,
+    ) -> str:
+        from sigmasplat.exports.splats import Bounds, write_splats
 
+        written = import_module(f"sigmasplat.io.splats.{module}").write_field
+        bounds = Bounds(sigma_below, std_below_m, opacity_above)
+        return write_splats(source.path, source.splats, bounds, lambda field, _: written(target, field))
 
-def _splat(
-    source: ExportSource,
-    target: Path,
-    *,
-    sigma_below: float | None,
-    std_below_m: float | None,
-    opacity_above: float | None,
-) -> str:
-    from sigmasplat.exports.splats import Bounds, write_splats
-    from sigmasplat.io.splats import splat
-
-    bounds = Bounds(sigma_below, std_below_m, opacity_above)
-    return write_splats(source.path, source.splats, bounds, lambda field, _: splat.write_field(target, field))
-
-
-def _spz(
-    source: ExportSource,
-    target: Path,
-    *,
-    sigma_below: float | None,
-    std_below_m: float | None,
-    opacity_above: float | None,
-) -> str:
-    from sigmasplat.exports.splats import Bounds, write_splats
-    from sigmasplat.io.splats import spz
-
-    bounds = Bounds(sigma_below, std_below_m, opacity_above)
-    return write_splats(source.path, source.splats, bounds, lambda field, _: spz.write_field(target, field))
+    return write
 
 
 def _trajectory(source: ExportSource, target: Path) -> str:
@@ -313,10 +289,13 @@ def _plan(source: ExportSource, target: Path, *, cell_m: float) -> str:
 FORMATS = (
     ExportFormat("ply", (".ply",), "3DGS PLY with σ², for every viewer", _ply),
     ExportFormat(
-        "compressed-ply", (".compressed.ply",), "SuperSplat's compressed PLY, a fifth of the size", _compressed_ply
+        "compressed-ply",
+        (".compressed.ply",),
+        "SuperSplat's compressed PLY, a fifth of the size",
+        _splats_without_std("compressed_ply"),
     ),
-    ExportFormat("splat", (".splat",), "32 bytes per splat, for web viewers", _splat),
-    ExportFormat("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", _spz),
+    ExportFormat("splat", (".splat",), "32 bytes per splat, for web viewers", _splats_without_std("splat")),
+    ExportFormat("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", _splats_without_std("spz")),
     ExportFormat("trajectory", (".txt",), "the path as TUM text", _trajectory),
     ExportFormat("covariance", (".cov.txt",), "the path as TUM text with the covariance of each pose", _covariance),
     ExportFormat("ros-covariance", (".ros.txt",), "the same as geometry_msgs/PoseWithCovariance", _ros_covariance),
