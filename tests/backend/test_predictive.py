@@ -120,7 +120,7 @@ def test_the_residuals_of_splats_are_the_noise_of_the_images() -> None:
         color[:] = image.movedim(-1, 0)
         depth = depth + 0.5 * noise * torch.from_numpy(rng.normal(size=depth.shape)).float()
         keyframes.append(Keyframe(i, Target(WIDE, color, depth, depth.numel()), np.eye(4)))
-    found = splat_residuals(field, keyframes, NOTHING, OPTIONS, "cpu")
+    found = splat_residuals(field, keyframes, OPTIONS, "cpu")
     for inside, std in ((at[:, 0] < 18, 0.02), (at[:, 0] > 26, 0.06)):
         assert float(found[inside, 0].median()) ** 0.5 == pytest.approx(std, rel=0.15)
         assert float(found[inside, 1].median()) ** 0.5 == pytest.approx(0.5 * std, rel=0.15)
@@ -136,7 +136,7 @@ def test_the_depth_of_a_splat_is_surer_than_a_reading_unless_all_readings_disagr
         depth = seen.depth / seen.alpha + off_m + 0.05 * torch.from_numpy(rng.normal(size=seen.depth.shape)).float()
         target = Target(WIDE, seen.color.movedim(-1, 0).contiguous(), depth, depth.numel())
         keyframes.append(Keyframe(i, target, np.eye(4)))
-    own = splat_residuals(field, keyframes, NOTHING, OPTIONS, "cpu")[:, 2].sqrt()
+    own = splat_residuals(field, keyframes, OPTIONS, "cpu")[:, 2].sqrt()
     assert float(own[at[:, 0] < 18].median()) < 0.02
     assert float(own[at[:, 0] > 26].median()) == pytest.approx(0.1, rel=0.2)
 

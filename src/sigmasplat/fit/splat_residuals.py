@@ -1,11 +1,11 @@
 """Measure the variance of each splat's residuals at the keyframes, in closed form: no gradient steps, no learning rate.
 
-The variance of a pixel's error is modelled as Σ_i w_ip r_i² plus the background's share. The likelihood of all pixels
-is raised by multiplicative updates (Févotte et al. 2009, Itakura–Saito NMF): r_i² times Σ_p w_ip e_p²/V_p² over
-Σ_p w_ip/V_p. Each update renders every keyframe once, forwards and backwards.
+A residual is shared among the splats of its pixel by their weights: r_i² is (Σ_p w_ip |e_p| / Σ_p w_ip)², times the
+factor of a Gaussian. Each keyframe is rendered once, forwards and backwards.
 """
 
-from collections.abc import Iterable, Iterator
+import math
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
@@ -15,21 +15,16 @@ from sigmasplat.fit.target import Keyframe
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.map_uncertainty import Background
-from sigmasplat.render.blended_values import BlendedValues, blend_values
+from sigmasplat.render.blended_values import blend_values
 from sigmasplat.render.predictive import COVERED
 from sigmasplat.render.render import on_device
 
-UPDATES = 2
+SQUARE_OF_MEAN = (3.0 * math.pi / 8.0, math.pi / 2.0)
+"""Variance over squared mean absolute residual, of colour and of depth: that of independent Gaussian channels."""
 PSEUDO_PIXELS = 1.0
 """Weight of the mean residual of the map in the variance of a splat, in pixels: it decides for splats hardly seen."""
-LIMIT = 3.0
-"""Errors above this multiple of their predicted standard deviation count as this multiple: they are not noise."""
-FLOOR = (1e-5, 1e-6)
-"""Least variance of a pixel, colour² and m²."""
 FARTHEST_M = 0.3
 """Limit of a depth residual in the mean of a splat's residuals, m: beyond it the reading is of another surface."""
-CHANGE = 4.0
-"""An update changes a variance at most by this factor."""
 
 
 def background_of(keyframes: Iterable[Keyframe]) -> Background:
@@ -45,60 +40,31 @@ def background_of(keyframes: Iterable[Keyframe]) -> Background:
     return Background((red, green, blue), float(color.var(0, correction=0).mean()), depth_variance)
 
 
-def splat_residuals(
-    field: GaussianField,
-    keyframes: Iterable[Keyframe],
-    background: Background,
-    options: RenderConfig,
-    backend: str,
-    updates: int = UPDATES,
-) -> Tensor:
+def splat_residuals(field: GaussianField, keyframes: Iterable[Keyframe], options: RenderConfig, backend: str) -> Tensor:
     """Return the variances of each splat [N, 3] (`SPLAT_COLUMNS`) from keyframes with poses in the map's frame.
 
-    The first two start at the squared mean of the absolute residuals, which outliers hardly change. The third is
+    The first two are from mean absolute residuals, which outliers change less than mean squares. The third is
     m² + v/n: m is the mean of the splat's depth residuals, v their variance about it, n the number of readings.
     """
     field = on_device(field, backend)
-    sums = torch.zeros(len(field), 4, dtype=torch.float64)
-    moments = torch.zeros(len(field), 2, dtype=torch.float64)
-    start = torch.zeros(len(field), 2)
-    for seen, errors, known, off_m in _residuals(field, keyframes, start, options, backend):
-        limited = off_m.clamp(-FARTHEST_M, FARTHEST_M)
-        planes = torch.cat([errors.sqrt() * known, known, torch.stack([limited, limited.square()], -1)], -1)
-        found = seen.gather(planes).cpu().double()
-        sums, moments = sums + found[:, :4], moments + found[:, 4:]
-    usual = sums[:, :2].sum(0) / sums[:, 2:].sum(0).clamp(min=1e-12)
-    variances = ((sums[:, :2] + PSEUDO_PIXELS * usual) / (sums[:, 2:] + PSEUDO_PIXELS)).square().clamp(min=1e-12)
-    first, prior = variances, torch.tensor([background.color_variance, background.depth_variance_m2])
-    readings = sums[:, 3]
-    mean, square = (moments / readings.clamp(min=1e-3)[:, None]).T
-    own = mean**2 + (square - mean**2).clamp(min=0.0) / readings.clamp(min=1.0)
-    for _ in range(updates):
-        sums = torch.zeros_like(sums)
-        for seen, errors, known, _ in _residuals(field, keyframes, variances.float(), options, backend):
-            share, missing = _share(seen), (1.0 - seen.alpha).clamp(min=0.0)[..., None]
-            V = seen.values * share + missing * prior.to(missing) + missing.new_tensor(FLOOR)
-            limited = torch.minimum(errors, LIMIT**2 * V)
-            sums += (
-                seen.gather(torch.cat([limited / V**2, 1.0 / V], -1) * (known * share).repeat(1, 1, 2)).cpu().double()
-            )
-        above, below = sums[:, :2] + PSEUDO_PIXELS * first / variances**2, sums[:, 2:] + PSEUDO_PIXELS / variances
-        variances = variances * (above / below).clamp(1.0 / CHANGE, CHANGE)
-    return torch.cat([variances, own[:, None]], 1).float()
-
-
-def _residuals(
-    field: GaussianField, keyframes: Iterable[Keyframe], values: Tensor, options: RenderConfig, backend: str
-) -> Iterator[tuple[BlendedValues, Tensor, Tensor, Tensor]]:
-    """Yield each keyframe rendered with values [N, 2]: squared errors [H, W, 2] of colour and depth, which are known,
-    and the error of depth [H, W] m, 0 if not known."""
+    sums = torch.zeros(len(field), 6, dtype=torch.float64)
+    nothing = torch.zeros(len(field), 0)
     for keyframe in keyframes:
         target, T_camera_map = keyframe.target, se3.inverse(keyframe.T_world_camera)
-        seen = blend_values(field, target.camera, T_camera_map, values, options, backend, gather=True)
+        seen = blend_values(field, target.camera, T_camera_map, nothing, options, backend, gather=True)
         image, depth = (plane.to(seen.alpha) for plane in (target.image, target.depth_image))
         errors, known = squared_errors(seen.color, seen.depth, seen.alpha, image, depth)
         off_m = (seen.depth / seen.alpha.clamp(min=COVERED) - depth) * known[..., 1]
-        yield seen, errors, known, off_m
+        off_m = off_m.clamp(-FARTHEST_M, FARTHEST_M)[..., None]
+        sums += seen.gather(torch.cat([errors.sqrt() * known, known, off_m, off_m.square()], -1)).cpu().double()
+    absolute, weights, moments = sums[:, :2], sums[:, 2:4], sums[:, 4:]
+    usual = absolute.sum(0) / weights.sum(0).clamp(min=1e-12)
+    means = (absolute + PSEUDO_PIXELS * usual) / (weights + PSEUDO_PIXELS)
+    variances = (means.square() * means.new_tensor(SQUARE_OF_MEAN)).clamp(min=1e-12)
+    readings = weights[:, 1]
+    mean, square = (moments / readings.clamp(min=1e-3)[:, None]).T
+    own = mean**2 + (square - mean**2).clamp(min=0.0) / readings.clamp(min=1.0)
+    return torch.cat([variances, own[:, None]], 1).float()
 
 
 def squared_errors(
@@ -110,8 +76,3 @@ def squared_errors(
     error_m = torch.where(known, depth / alpha.clamp(min=COVERED) - depth_m, 0.0)
     errors = torch.stack([(color.clamp(0.0, 1.0) - image).square().mean(-1), error_m.square()], -1)
     return errors, torch.stack([torch.ones_like(alpha), known.to(alpha)], -1)
-
-
-def _share(seen: BlendedValues) -> Tensor:
-    """Return the factor [H, W, 2] between Σ w r² and the variance of a pixel: 1 for colour, 1/A for depth."""
-    return torch.stack([torch.ones_like(seen.alpha), 1.0 / seen.alpha.clamp(min=COVERED)], -1)

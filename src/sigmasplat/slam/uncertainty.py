@@ -70,7 +70,7 @@ def map_uncertainty(
     """
     keyframes = KeyframeReader(store, anchors, view)
     background = background_of(keyframes)
-    splats = splat_residuals(field, keyframes, background, config.render, config.backend)
+    splats = splat_residuals(field, keyframes, config.render, config.backend)
     probes = probe_views(store, anchors, (view.alpha.shape[0], view.alpha.shape[1]))
     calibration = calibrate(field, splats, background, probes, config, pulled_to)
     return MapUncertainty(splats, background, calibration, len(probes))
