@@ -1,6 +1,7 @@
 """bench uncertainty: statistics of splats, predictors, temperatures, and the command on a tiny room."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,6 @@ from sigmasplat.presets import preset
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.reference import operators as reference
-from sigmasplat.render.splat_sums import render_values
 from sigmasplat.sources import open_source
 from small_room import frame_at, walk
 
@@ -58,7 +58,7 @@ def frame_map() -> MapFacts:
     keyframes = [
         Keyframe(i, Target.of(frame_at(i), size), se3.inverse(poses[0]) @ poses[i], fixed=True) for i in (0, 2, 4)
     ]
-    return map_facts(field, keyframes, view, renderer)
+    return map_facts(field, keyframes, renderer)
 
 
 def test_facts_are_those_of_the_keyframes(frame_map: MapFacts) -> None:
@@ -80,18 +80,18 @@ def test_every_predictor_is_finite_and_not_negative(frame_map: MapFacts) -> None
 
 
 def test_ridge_regression_finds_values_that_explain_the_errors(frame_map: MapFacts) -> None:
-    true = torch.rand(len(frame_map.field), 3, generator=torch.Generator().manual_seed(0)) * 0.01
-    params, view = frame_map.field.params, frame_map.view
+    true = torch.rand(len(frame_map.field), 2, generator=torch.Generator().manual_seed(0)) * 0.01
     views = [
-        TrainingView(v.T_camera_map, *render_values(view, params, v.T_camera_map, true)[:2], v.depth_known)
+        TrainingView(
+            v.T_camera_map, *frame_map.blended(v.T_camera_map, true).values.contiguous().unbind(-1), v.depth_known
+        )
         for v in frame_map.views
     ]
-    facts = MapFacts(frame_map.field, view, views, (0.01, 0.01), frame_map.prior, frame_map.mean_color)
+    facts = replace(frame_map, views=views, noise=(0.01, 0.01))
     found = ridge(facts)
     for k, name in enumerate(("ridge_color", "ridge_depth")):
-        values = torch.stack([found[name]] * 3, 1)
         known = views[0].depth_known > 0
-        got = render_values(view, params, views[0].T_camera_map, values)[0][known]
+        got = frame_map.rendered(views[0].T_camera_map, found)[name][known]
         want = (views[0].color_error2, views[0].depth_error2)[k][known]
         assert float((got - want).square().mean()) < 0.2 * float(want.var()), name
 
@@ -100,8 +100,8 @@ def test_information_is_the_sum_of_squared_weights(frame_map: MapFacts) -> None:
     """Against the weights of the definition in torch, for as many splats as it renders quickly."""
     few = GaussianField(frame_map.field.params[::40].clone())
     views = [frame_map.views[0]] * 60
-    facts = MapFacts(few, frame_map.view, views, (0.02, 0.1), (0.05, 1.0), frame_map.mean_color)
-    T, camera, n = torch.as_tensor(views[0].T_camera_map), frame_map.view.camera, len(few)
+    facts = replace(frame_map, field=few, views=views, noise=(0.02, 0.1), prior=(0.05, 1.0))
+    T, camera, n = torch.as_tensor(views[0].T_camera_map), frame_map.camera, len(few)
     p = reference.project(few.means, few.quats, few.scales, T, camera, OPTIONS)
     weights = reference.blend(*p, few.opacities, torch.eye(n), None, camera, OPTIONS).sums.reshape(-1, n)
     want = 1.0 / (len(views) * weights.square().sum(0) / 0.02 + 1.0 / 0.05)

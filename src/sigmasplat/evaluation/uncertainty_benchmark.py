@@ -156,7 +156,7 @@ class RunMaps:
     ) -> MapFacts:
         reader = KeyframeReader(StorePart(self.run.store, members), anchors, self.view)
         chosen = [reader[i] for i in evenly_spread(range(len(reader)), TRAINING_VIEWS)]
-        return replace(map_facts(splats, chosen, self.view, self.renderer), uncertainty=uncertainty)
+        return replace(map_facts(splats, chosen, self.renderer), uncertainty=uncertainty)
 
 
 def measure(
