@@ -110,7 +110,8 @@ def ridge(facts: MapFacts) -> dict[str, Tensor]:
     """Regress squared training residuals onto splats (3DGS-U, arXiv 2603.22786).
 
     Returns u ≥ 0 [N] for colour and depth that minimise Σ_p (Σ_i w_ip u_i − r_p²)² + λ Σ_i u_i², by a few steps of
-    conjugate gradients from the weighted mean of each splat; negative values become 0 at the end.
+    conjugate gradients from the weighted mean of each splat; negative values become 0 at the end. readings [N]: the
+    weight Σ_p w_ip of each splat in pixels with a reading of depth.
     """
     known = [torch.stack([torch.ones_like(v.depth_known), v.depth_known], -1) for v in facts.views]
     errors = [torch.stack([v.color_error2, v.depth_error2], -1) for v in facts.views]
@@ -138,7 +139,7 @@ def ridge(facts: MapFacts) -> dict[str, Tensor]:
         residual = residual - step * applied
         before, size = size, residual.square().sum(0)
         direction = residual + size / before.clamp(min=1e-30) * direction
-    return {"ridge_color": x[:, 0].clamp(min=0.0), "ridge_depth": x[:, 1].clamp(min=0.0)}
+    return {"ridge_color": x[:, 0].clamp(min=0.0), "ridge_depth": x[:, 1].clamp(min=0.0), "readings": weights[:, 1]}
 
 
 def fisher(facts: MapFacts) -> dict[str, Tensor]:
