@@ -15,7 +15,6 @@ from sigmasplat.model.map_uncertainty import (
     Background,
     Calibration,
     MapUncertainty,
-    splat_std,
 )
 from sigmasplat.render import render
 from sigmasplat.render.blended_values import blend_values
@@ -139,30 +138,3 @@ def test_the_depth_of_a_splat_is_surer_than_a_reading_unless_all_readings_disagr
     own = splat_residuals(field, keyframes, OPTIONS, "cpu")[:, 2].sqrt()
     assert float(own[at[:, 0] < 18].median()) < 0.02
     assert float(own[at[:, 0] > 26].median()) == pytest.approx(0.1, rel=0.2)
-
-
-def test_a_pixel_that_one_splat_covers_alone_has_the_standard_deviation_of_the_splat(kernels: str) -> None:
-    field = GaussianField.from_values(
-        torch.tensor([[0.0, 0.0, 2.0]]),
-        torch.tensor([5.0]),
-        torch.tensor([[0.2, 0.5, 0.7]]),
-        opacities=torch.tensor([0.999]),
-        log_variances=torch.tensor([[0.01, 0.02, 0.06]]).log(),
-    )
-    known = torch.tensor([[0.004, 0.0009, 0.0004]])
-    color = dict.fromkeys(COLOR_PARTS, 0.0) | {"mixture": 0.5, "residual": 0.9, "floor": 1e-4}
-    depth = dict.fromkeys(DEPTH_PARTS, 1.0) | {"unexplained": 0.0, "residual": 0.25, "floor": 1e-6}
-    uncertainty = MapUncertainty(known, NOTHING, Calibration(color, depth))
-    std = splat_std(field, uncertainty)
-    seen = predict(field, uncertainty, WIDE, np.eye(4), OPTIONS, kernels)
-    row, column = WIDE.height // 2, WIDE.width // 2
-    assert float(std.depth_std_m[0]) == pytest.approx((0.25 * 0.0004 + 1e-6) ** 0.5)
-    assert float(seen.depth_std_m[row, column]) == pytest.approx(float(std.depth_std_m[0]), rel=0.02)
-    assert float(seen.color[row, column].sqrt()) == pytest.approx(float(std.color_std[0]), rel=0.02)
-
-
-def test_a_splat_without_a_reading_of_depth_is_not_the_surest() -> None:
-    field = GaussianField.from_values(torch.zeros(2, 3), torch.ones(2), torch.zeros(2, 3))
-    uncertainty = MapUncertainty(torch.tensor([[0.01, 0.0004, 0.0], [0.01, 0.0004, 0.0001]]), NOTHING, SHIPPED)
-    unread, read = splat_std(field, uncertainty).depth_std_m.tolist()
-    assert unread > read

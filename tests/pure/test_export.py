@@ -17,7 +17,7 @@ from sigmasplat.io.splats import ply
 from sigmasplat.io.splats.any_format import read_any
 from sigmasplat.io.trajectory import read_trajectory
 from sigmasplat.model.field import GaussianField
-from sigmasplat.model.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd, splat_std
+from sigmasplat.model.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 from sigmasplat.model.trajectory import Trajectory
 
 
@@ -80,11 +80,11 @@ def test_splats_outside_the_bounds_are_dropped_and_counted(export: Callable[...,
 @pytest.fixture
 def std(export: Callable[..., str]) -> SplatStd:
     """Write the uncertainty of the run's map; return the standard deviations of its splats."""
-    values = torch.rand(10, 3, generator=torch.Generator().manual_seed(2)) * 1e-3
-    uncertainty = MapUncertainty(values, Background((0.5, 0.5, 0.5), 0.1, 1.0), SHIPPED)
-    run = RunFolder.open(Path("walk"))
-    run.write_uncertainty(uncertainty)
-    return splat_std(run.read_map(), uncertainty)
+    values = torch.rand(10, 2, generator=torch.Generator().manual_seed(2)) * 1e-1
+    known = SplatStd(values[:, 0].contiguous(), values[:, 1].contiguous())
+    background = Background((0.5, 0.5, 0.5), 0.1, 1.0)
+    RunFolder.open(Path("walk")).write_uncertainty(MapUncertainty(torch.zeros(10, 3), background, SHIPPED, std=known))
+    return known
 
 
 def test_a_map_has_the_standard_deviations_of_its_run(export: Callable[..., str], std: SplatStd) -> None:
@@ -98,6 +98,9 @@ def test_a_map_has_the_standard_deviations_of_its_run(export: Callable[..., str]
 
 
 def test_a_run_that_has_not_measured_them_is_exported_without_them(export: Callable[..., str]) -> None:
+    """Runs of older versions have an uncertainty.json without standard deviations of splats."""
+    background = Background((0.5, 0.5, 0.5), 0.1, 1.0)
+    RunFolder.open(Path("walk")).write_uncertainty(MapUncertainty(torch.zeros(10, 3), background, SHIPPED))
     export("walk", "--out", "a.ply", "--sigma-below", "1")
     assert vertices(Path("a.ply")).dtype == vertices(Path("walk/map.ply")).dtype
 

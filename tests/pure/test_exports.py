@@ -24,7 +24,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.component import Component
 from sigmasplat.model.field import GaussianField
-from sigmasplat.model.map_uncertainty import SHIPPED, Background, MapUncertainty
+from sigmasplat.model.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 from sigmasplat.model.mesh import Mesh
 
 
@@ -96,8 +96,10 @@ def test_a_surface_has_the_standard_deviation_of_the_nearest_opaque_splat(reader
 
     assert surface().depth_std_m is None
     field = reader.run.read_map()
-    values = torch.rand(len(field), 3, generator=torch.Generator().manual_seed(0)) * 1e-3
-    reader.run.write_uncertainty(MapUncertainty(values, Background((0.5, 0.5, 0.5), 0.1, 1.0), SHIPPED))
+    std = SplatStd(torch.rand(len(field), generator=torch.Generator().manual_seed(0)) * 0.1, torch.ones(len(field)))
+    reader.run.write_uncertainty(
+        MapUncertainty(torch.zeros(len(field), 3), Background((0.5, 0.5, 0.5), 0.1, 1.0), SHIPPED, std=std)
+    )
     found, known = surface(), reader.run.read_splat_std()
     assert known is not None and found.depth_std_m is not None
     opaque = field.opacities >= 0.5
@@ -108,7 +110,10 @@ def test_a_surface_has_the_standard_deviation_of_the_nearest_opaque_splat(reader
 
 
 def test_an_uncertainty_of_another_map_is_refused(reader: RunReader) -> None:
-    reader.run.write_uncertainty(MapUncertainty(torch.ones(7, 3), Background((0.5, 0.5, 0.5), 0.1, 1.0), SHIPPED))
+    std = SplatStd(torch.ones(7), torch.ones(7))
+    reader.run.write_uncertainty(
+        MapUncertainty(torch.ones(7, 3), Background((0.5, 0.5, 0.5), 0.1, 1.0), SHIPPED, std=std)
+    )
     with pytest.raises(RunError, match="run it again"):
         reader.run.read_splat_std()
 

@@ -1,6 +1,7 @@
 """bench uncertainty: statistics of splats, predictors, temperatures, and the command on a tiny room."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,20 @@ from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.evaluation.finished_run import FinishedRun, run_slam
 from sigmasplat.evaluation.splat_statistics import MapFacts, TrainingView, fisher, map_facts, ridge, splat_values
-from sigmasplat.evaluation.uncertainty_benchmark import HELD_BACK, Job, Kind, Samples, Study, measure
-from sigmasplat.evaluation.uncertainty_scores import ALL, COVERED, Run, score_runs
+from sigmasplat.evaluation.surface_errors import surface_errors
+from sigmasplat.evaluation.surface_predictors import SURFACE_PREDICTORS
+from sigmasplat.evaluation.uncertainty_benchmark import (
+    EXACT,
+    FUSED,
+    HELD_BACK,
+    MESH,
+    Job,
+    Kind,
+    Samples,
+    Study,
+    measure,
+)
+from sigmasplat.evaluation.uncertainty_scores import ALL, COVERED, VISIBLE, Run, score_runs
 from sigmasplat.evaluation.unseen_views import held_back_views
 from sigmasplat.evaluation.view_predictors import PREDICTORS, see
 from sigmasplat.fit.target import Keyframe, Target
@@ -25,7 +38,6 @@ from sigmasplat.presets import preset
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.reference import operators as reference
-from sigmasplat.render.splat_sums import render_values
 from sigmasplat.sources import open_source
 from small_room import frame_at, walk
 
@@ -58,7 +70,7 @@ def frame_map() -> MapFacts:
     keyframes = [
         Keyframe(i, Target.of(frame_at(i), size), se3.inverse(poses[0]) @ poses[i], fixed=True) for i in (0, 2, 4)
     ]
-    return map_facts(field, keyframes, view, renderer)
+    return map_facts(field, keyframes, renderer)
 
 
 def test_facts_are_those_of_the_keyframes(frame_map: MapFacts) -> None:
@@ -80,18 +92,18 @@ def test_every_predictor_is_finite_and_not_negative(frame_map: MapFacts) -> None
 
 
 def test_ridge_regression_finds_values_that_explain_the_errors(frame_map: MapFacts) -> None:
-    true = torch.rand(len(frame_map.field), 3, generator=torch.Generator().manual_seed(0)) * 0.01
-    params, view = frame_map.field.params, frame_map.view
+    true = torch.rand(len(frame_map.field), 2, generator=torch.Generator().manual_seed(0)) * 0.01
     views = [
-        TrainingView(v.T_camera_map, *render_values(view, params, v.T_camera_map, true)[:2], v.depth_known)
+        TrainingView(
+            v.T_camera_map, *frame_map.blended(v.T_camera_map, true).values.contiguous().unbind(-1), v.depth_known
+        )
         for v in frame_map.views
     ]
-    facts = MapFacts(frame_map.field, view, views, (0.01, 0.01), frame_map.prior, frame_map.mean_color)
+    facts = replace(frame_map, views=views, noise=(0.01, 0.01))
     found = ridge(facts)
     for k, name in enumerate(("ridge_color", "ridge_depth")):
-        values = torch.stack([found[name]] * 3, 1)
         known = views[0].depth_known > 0
-        got = render_values(view, params, views[0].T_camera_map, values)[0][known]
+        got = frame_map.rendered(views[0].T_camera_map, found)[name][known]
         want = (views[0].color_error2, views[0].depth_error2)[k][known]
         assert float((got - want).square().mean()) < 0.2 * float(want.var()), name
 
@@ -100,8 +112,8 @@ def test_information_is_the_sum_of_squared_weights(frame_map: MapFacts) -> None:
     """Against the weights of the definition in torch, for as many splats as it renders quickly."""
     few = GaussianField(frame_map.field.params[::40].clone())
     views = [frame_map.views[0]] * 60
-    facts = MapFacts(few, frame_map.view, views, (0.02, 0.1), (0.05, 1.0), frame_map.mean_color)
-    T, camera, n = torch.as_tensor(views[0].T_camera_map), frame_map.view.camera, len(few)
+    facts = replace(frame_map, field=few, views=views, noise=(0.02, 0.1), prior=(0.05, 1.0))
+    T, camera, n = torch.as_tensor(views[0].T_camera_map), frame_map.camera, len(few)
     p = reference.project(few.means, few.quats, few.scales, T, camera, OPTIONS)
     weights = reference.blend(*p, few.opacities, torch.eye(n), None, camera, OPTIONS).sums.reshape(-1, n)
     want = 1.0 / (len(views) * weights.square().sum(0) / 0.02 + 1.0 / 0.05)
@@ -178,12 +190,13 @@ def test_scored_views_are_not_in_the_map(run: FinishedRun) -> None:
 
 def test_samples_have_every_predictor_and_both_maps(run: FinishedRun) -> None:
     found = measure(run, open_source(quick_job().path, run.config.input), 24)
-    assert {(kind.quantity, kind.map, kind.views) for kind in found.samples} == {
+    views = {kind: arrays for kind, arrays in found.samples.items() if kind.quantity != "surface"}
+    assert {(kind.quantity, kind.map, kind.views) for kind in views} == {
         (quantity, *of) for quantity in ("color", "depth") for of in (
             ("final", HELD_BACK), ("final", "away from the path"), ("submaps", HELD_BACK),
         )
     }  # fmt: skip
-    for kind, arrays in found.samples.items():
+    for kind, arrays in views.items():
         names = {f"variance {p.name}" for p in PREDICTORS if p.quantity == kind.quantity}
         assert arrays.keys() == names | {"squared_error", "alpha", "reading"}
         assert len({len(values) for values in arrays.values()}) == 1
@@ -231,3 +244,48 @@ def test_pixels_of_all_views_are_mixed() -> None:
     joined = drawn.joined()
     curve = sparsification(joined["variance constant"], joined["squared_error"], 20)
     np.testing.assert_allclose(curve, curve[0], rtol=0.05)
+
+
+def test_a_surface_is_compared_with_the_true_one(run: FinishedRun) -> None:
+    found = measure(run, open_source(quick_job().path, run.config.input), 1).samples[Kind("surface", MESH, EXACT)]
+    names = {f"variance {p.name}" for p in SURFACE_PREDICTORS}
+    assert found.keys() == names | {"squared_error", "alpha", "reading"}
+    assert all(np.isfinite(values).all() and values.min() >= 0.0 for values in found.values())
+    off_m = np.sqrt(found["squared_error"])
+    assert len(off_m) > 1000 and np.median(off_m) < 0.02
+    std_m = np.sqrt(found["variance predictive"])
+    assert 0.4 < (off_m < std_m).mean() < 0.95 and (off_m < 2.0 * std_m).mean() > 0.75
+
+
+def test_without_a_true_surface_the_reference_is_fused_from_the_readings(
+    run: FinishedRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, renderer = open_source(quick_job().path, run.config.input), FieldRenderer(OPTIONS, "cpu")
+    exact = surface_errors(run, source, renderer)
+    monkeypatch.setattr(type(source), "true_surface", lambda _: None)
+    fused = surface_errors(run, source, renderer)
+    assert exact is not None and fused is not None and exact.exact and not fused.exact
+    assert np.median(fused.distance_m) == pytest.approx(np.median(exact.distance_m), abs=0.01)
+
+
+def test_without_a_true_path_there_is_no_surface_to_compare_with(
+    run: FinishedRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = open_source(quick_job().path, run.config.input)
+    monkeypatch.setattr(type(source), "truth", lambda _: None)
+    assert surface_errors(run, source, FieldRenderer(OPTIONS, "cpu")) is None
+
+
+def test_the_temperature_of_a_surface_comes_from_surfaces_with_any_reference() -> None:
+    runs = []
+    for source, surface, scale in (("a", EXACT, 4.0), ("b", FUSED, 9.0)):
+        arrays = next(iter(samples(scale, 0).values()))
+        arrays |= {f"variance {p.name}": arrays["variance V"] for p in SURFACE_PREDICTORS}
+        runs.append(Run(source, {Kind("surface", MESH, surface): arrays | {"alpha": np.ones(20_000, np.float32)}}))
+    first, second = score_runs(runs)
+    rows = first[Kind("surface", MESH, EXACT)][VISIBLE]["predictors"]
+    assert rows["ridge"]["temperature"] == pytest.approx(9.0, rel=0.05)
+    assert rows["predictive"]["temperature"] == 1.0
+    assert second[Kind("surface", MESH, FUSED)][VISIBLE]["predictors"]["ridge"]["temperature"] == pytest.approx(
+        4.0, rel=0.05
+    )

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -25,7 +26,7 @@ from sigmasplat.model.map_uncertainty import SplatStd
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.slam.fusion import VOXEL_M, FusionView, Renderer, count_keyframes, fuse, fusion_views
-from sigmasplat.types import Progress, no_progress
+from sigmasplat.types import Matrix, Progress, no_progress
 
 OPAQUE = 0.5
 
@@ -87,15 +88,20 @@ class FusionInput:
 
 
 def with_std(mesh: Mesh, field: GaussianField, std: SplatStd) -> Mesh:
-    """Return a mesh in the frame of a map with the depth_std_m of the nearest opaque splat at each vertex.
+    """Return a mesh in the frame of a map with the depth_std_m of the nearest opaque splat at each vertex; the mesh
+    unchanged if no splat is opaque."""
+    nearest = nearest_opaque(field, mesh.vertices.astype(np.float64))
+    return mesh if nearest is None else replace(mesh, depth_std_m=std.depth_std_m.numpy()[nearest].astype(np.float32))
 
-    Splats with an opacity of at least ½ are opaque; if there are none, the mesh is returned unchanged.
-    """
-    opaque = (field.opacities >= OPAQUE).cpu()
-    if not bool(opaque.any()):
-        return mesh
-    _, nearest = cKDTree(field.means.cpu()[opaque].double().numpy()).query(mesh.vertices)
-    return replace(mesh, depth_std_m=std.depth_std_m[opaque].numpy()[nearest].astype(np.float32))
+
+def nearest_opaque(field: GaussianField, points: Matrix) -> NDArray[np.intp] | None:
+    """Return the nearest splat [V] to each point [V, 3], m, of those with an opacity of at least ½; None if there are
+    none."""
+    opaque = np.flatnonzero((field.opacities >= OPAQUE).cpu().numpy())
+    if not len(opaque):
+        return None
+    _, nearest = cKDTree(field.means.detach().cpu().double().numpy()[opaque]).query(points)
+    return np.asarray(opaque[nearest], np.intp)
 
 
 def fuse_and_score(

@@ -3,8 +3,9 @@
 Each statistic is one function in `STATISTICS`; it returns named values [N]. All read training views only.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -12,11 +13,12 @@ from torch import Tensor
 from sigmasplat.fit.splat_residuals import squared_errors
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.map_uncertainty import MapUncertainty
 from sigmasplat.render import FieldRenderer, Render
-from sigmasplat.render.splat_sums import CHANNELS, accumulate, render_values
-from sigmasplat.render.view import View
+from sigmasplat.render.blended_values import BlendedValues, blend_values
+from sigmasplat.render.render import on_device
 from sigmasplat.types import Matrix
 
 GRADIENT_STEPS = 6
@@ -24,6 +26,8 @@ GRADIENT_STEPS = 6
 RIDGE = 1.0
 """λ of the ridge regression, in pixels: the squared weights of a splat must sum to more to count."""
 PROBES_SEED = 17
+SIGN_PLANES = 3
+"""Planes of random signs for each view."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +45,7 @@ class TrainingView:
 
 @dataclass(frozen=True, eq=False)
 class MapFacts:
-    """A map and its training views.
+    """A map and its training views, all with one camera.
 
     noise: mean squared residual of colour and depth (m²); prior: variance of the colours (mean over channels) and of
     the depths (m²) of the training views; mean_color [3] of them; uncertainty: what the
@@ -49,25 +53,31 @@ class MapFacts:
     """
 
     field: GaussianField
-    view: View
+    camera: Camera
     views: Sequence[TrainingView]
     noise: tuple[float, float]
     prior: tuple[float, float]
     mean_color: Tensor
+    renderer: FieldRenderer
     uncertainty: MapUncertainty | None = None
+
+    @cached_property
+    def on_device(self) -> GaussianField:
+        """Return the map in memory that the backend can read."""
+        return on_device(self.field, self.renderer.backend)
+
+    def blended(self, T_camera_map: Matrix, values: Tensor, gather: bool = False) -> BlendedValues:
+        """Blend values [N, K] of the splats at a pose; gather: as in `blend_values`."""
+        settings = self.renderer.options, self.renderer.backend
+        return blend_values(self.on_device, self.camera, T_camera_map, values, *settings, gather=gather)
 
     def rendered(self, T_camera_map: Matrix, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Render values [N] by name to planes [H, W], Σ_i w_ip v_i."""
-        planes = dict[str, Tensor]()
-        names = list(values)
-        for first in range(0, len(names), CHANNELS):
-            some = names[first : first + CHANNELS]
-            columns = torch.stack([values[some[min(c, len(some) - 1)]] for c in range(CHANNELS)], 1)
-            planes |= zip(some, render_values(self.view, self.field.params, T_camera_map, columns), strict=False)
-        return planes
+        planes = self.blended(T_camera_map, torch.stack(list(values.values()), 1)).values.cpu()
+        return dict(zip(values, planes.unbind(-1), strict=True))
 
 
-def map_facts(field: GaussianField, keyframes: Sequence[Keyframe], view: View, renderer: FieldRenderer) -> MapFacts:
+def map_facts(field: GaussianField, keyframes: Sequence[Keyframe], renderer: FieldRenderer) -> MapFacts:
     """Render a map at keyframes (poses in the map's frame) and collect their residuals."""
     views, colors, depths = list[TrainingView](), list[Tensor](), list[Tensor]()
     for keyframe in keyframes:
@@ -87,7 +97,8 @@ def map_facts(field: GaussianField, keyframes: Sequence[Keyframe], view: View, r
         float(all_colors.var(0, correction=0).mean()),
         float(all_depths.var(correction=0)) if len(all_depths) else 1.0,
     )
-    return MapFacts(field, view, views, noise, prior, all_colors.mean(0))
+    camera = keyframes[0].target.camera
+    return MapFacts(field, camera, views, noise, prior, all_colors.mean(0), renderer)
 
 
 def on_host(seen: Render) -> Render:
@@ -99,15 +110,24 @@ def ridge(facts: MapFacts) -> dict[str, Tensor]:
     """Regress squared training residuals onto splats (3DGS-U, arXiv 2603.22786).
 
     Returns u ≥ 0 [N] for colour and depth that minimise Σ_p (Σ_i w_ip u_i − r_p²)² + λ Σ_i u_i², by a few steps of
-    conjugate gradients from the weighted mean of each splat; negative values become 0 at the end.
+    conjugate gradients from the weighted mean of each splat; negative values become 0 at the end. readings [N]: the
+    weight Σ_p w_ip of each splat in pixels with a reading of depth.
     """
-    known = [torch.stack([torch.ones_like(v.depth_known), v.depth_known, v.depth_known]) for v in facts.views]
-    errors = [torch.stack([v.color_error2, v.depth_error2, v.depth_error2]) for v in facts.views]
-    weights, wanted = _sums(facts, known), _sums(facts, errors)
+    known = [torch.stack([torch.ones_like(v.depth_known), v.depth_known], -1) for v in facts.views]
+    errors = [torch.stack([v.color_error2, v.depth_error2], -1) for v in facts.views]
+    nothing = torch.zeros(len(facts.field), 0)
+    weights, wanted = torch.zeros(2, len(facts.field), 2)
+    for v, k, e in zip(facts.views, known, errors, strict=True):
+        sums = facts.blended(v.T_camera_map, nothing, gather=True).gather(torch.cat([k, e], -1)).cpu()
+        weights += sums[:, :2]
+        wanted += sums[:, 2:]
 
     def normal(x: Tensor) -> Tensor:
-        seen = (render_values(facts.view, facts.field.params, v.T_camera_map, x) for v in facts.views)
-        return _sums(facts, (k * plane for k, plane in zip(known, seen, strict=True))) + RIDGE * x
+        total = RIDGE * x
+        for v, k in zip(facts.views, known, strict=True):
+            seen = facts.blended(v.T_camera_map, x, gather=True)
+            total += seen.gather(k.to(seen.values) * seen.values).cpu()
+        return total
 
     x = wanted / (weights + RIDGE)
     residual = wanted - normal(x)
@@ -119,7 +139,7 @@ def ridge(facts: MapFacts) -> dict[str, Tensor]:
         residual = residual - step * applied
         before, size = size, residual.square().sum(0)
         direction = residual + size / before.clamp(min=1e-30) * direction
-    return {"ridge_color": x[:, 0].clamp(min=0.0), "ridge_depth": x[:, 1].clamp(min=0.0)}
+    return {"ridge_color": x[:, 0].clamp(min=0.0), "ridge_depth": x[:, 1].clamp(min=0.0), "readings": weights[:, 1]}
 
 
 def fisher(facts: MapFacts) -> dict[str, Tensor]:
@@ -132,8 +152,9 @@ def fisher(facts: MapFacts) -> dict[str, Tensor]:
     numbers = torch.Generator().manual_seed(PROBES_SEED)
     information = torch.zeros(len(facts.field))
     for v in facts.views:
-        signs = 2.0 * torch.randint(0, 2, (CHANNELS, *v.color_error2.shape), generator=numbers).float() - 1.0
-        sums = accumulate(facts.view, facts.field.params, v.T_camera_map, signs)
+        signs = 2.0 * torch.randint(0, 2, (SIGN_PLANES, *v.color_error2.shape), generator=numbers).float() - 1.0
+        planes = signs.movedim(0, -1)
+        sums = facts.blended(v.T_camera_map, torch.zeros(len(facts.field), 0), gather=True).gather(planes).cpu()
         information += sums.square().mean(1)
     return {
         f"fisher_{name}": 1.0 / (information / max(noise, 1e-12) + 1.0 / max(prior, 1e-12))
@@ -148,12 +169,3 @@ STATISTICS: tuple[Callable[[MapFacts], dict[str, Tensor]], ...] = (ridge, fisher
 def splat_values(facts: MapFacts) -> dict[str, Tensor]:
     """Return the values [N] of all statistics by name."""
     return {name: values for statistic in STATISTICS for name, values in statistic(facts).items()}
-
-
-def _sums(facts: MapFacts, planes: Sequence[Tensor] | Iterator[Tensor]) -> Tensor:
-    """Return Σ_p w_ip g_p [N, 3] over all training views; planes: one [3, H, W] for each."""
-    params = facts.field.params
-    total = torch.zeros(len(params), CHANNELS)
-    for v, plane in zip(facts.views, planes, strict=True):
-        total += accumulate(facts.view, params, v.T_camera_map, plane)
-    return total

@@ -11,12 +11,15 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from sigmasplat.config import Config
 from sigmasplat.config.text import full_path, override, split_settings
 from sigmasplat.errors import ConfigError
 from sigmasplat.evaluation.finished_run import FinishedRun, run_facts
 from sigmasplat.evaluation.splat_statistics import MapFacts, map_facts, splat_values
+from sigmasplat.evaluation.surface_errors import surface_errors
+from sigmasplat.evaluation.surface_predictors import surface_columns
 from sigmasplat.evaluation.unseen_views import UnseenView, away_views, held_back_views
 from sigmasplat.evaluation.view_predictors import PREDICTORS, Predictor, SeenView, see
 from sigmasplat.evaluation.view_selection import evenly_spread
@@ -38,7 +41,8 @@ Floats = NDArray[np.float32]
 SEED = "{seed}"
 RESERVED = ("seed", "input.limit", "input.hold_every")
 HELD_BACK, AWAY = "held back", "away from the path"
-FINAL, SUBMAPS = "final", "submaps"
+FINAL, SUBMAPS, MESH = "final", "submaps", "mesh"
+EXACT, FUSED = "true surface", "fused readings"
 PIXELS_PER_VIEW = 5_000
 """At most this many pixels of a view, drawn at random, are scored: sorting stays fast."""
 TRAINING_VIEWS = 40
@@ -89,7 +93,8 @@ def study_config(preset: str, settings: Sequence[str]) -> Config:
 
 @dataclass(frozen=True)
 class Kind:
-    """What a set of samples is about: the quantity ("color", "depth"), the map, and the kind of views."""
+    """What a set of samples is about: the quantity ("color", "depth", "surface"), the map, and the kind of views; for
+    surfaces the reference instead of views."""
 
     quantity: str
     map: str
@@ -156,7 +161,7 @@ class RunMaps:
     ) -> MapFacts:
         reader = KeyframeReader(StorePart(self.run.store, members), anchors, self.view)
         chosen = [reader[i] for i in evenly_spread(range(len(reader)), TRAINING_VIEWS)]
-        return replace(map_facts(splats, chosen, self.view, self.renderer), uncertainty=uncertainty)
+        return replace(map_facts(splats, chosen, self.renderer), uncertainty=uncertainty)
 
 
 def measure(
@@ -166,28 +171,33 @@ def measure(
     predictors: Sequence[Predictor] = PREDICTORS,
     progress: Progress = no_progress,
 ) -> Measured:
-    """Collect errors and predictions of a finished run at views that its map was not fitted to.
+    """Collect errors and predictions of a finished run at views that its map was not fitted to, and of its surface.
 
     Views: at most `most` of the frames held back (`input.hold_every`) whose pose is believed, and as many of the
-    source's test views. Calls `progress(views done, total)`.
+    source's test views. Surface: `surface_errors`, if the true path is known. Calls `progress(views done, total)`.
     """
     maps, samples, random = RunMaps(run), dict[Kind, Samples](), np.random.default_rng(run.config.seed)
     views = {HELD_BACK: held_back_views(run, source, most), AWAY: away_views(run, source, most)}
     total = sum(map(len, views.values())) + len(views[HELD_BACK])
-    for done, (kind, map_name, view, seen) in enumerate(_seen_views(maps, views), 1):
+    final = maps.final()
+    values = splat_values(final)
+    for done, (kind, map_name, view, seen) in enumerate(_seen_views(maps, final, values, views), 1):
         for quantity, columns in _pixels(view, seen, predictors, random).items():
             _add(samples.setdefault(Kind(quantity, map_name, kind), Samples()), columns)
         progress(done, total)
     facts = run_facts(run, source) | {"views": {kind: len(some) for kind, some in views.items()}}
-    return Measured(facts, {kind: found.joined() for kind, found in samples.items()})
+    found = {kind: some.joined() for kind, some in samples.items()}
+    errors = surface_errors(run, source, maps.renderer)
+    of_surface = None if errors is None else surface_columns(errors, final, values)
+    if errors is not None and of_surface is not None:
+        found[Kind("surface", MESH, EXACT if errors.exact else FUSED)] = of_surface
+    return Measured(facts, found)
 
 
 def _seen_views(
-    maps: RunMaps, views: Mapping[str, Sequence[UnseenView]]
+    maps: RunMaps, final: MapFacts, values: Mapping[str, Tensor], views: Mapping[str, Sequence[UnseenView]]
 ) -> Iterator[tuple[str, str, UnseenView, SeenView]]:
     """Render all views from the final map, and those that belong to a submap also from it."""
-    final = maps.final()
-    values = splat_values(final)
     for kind, some in views.items():
         for view in some:
             T_camera_world = se3.inverse(view.T_world_camera)

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.drawing.plot import ACCENT, BLUE, FAINT, GREEN, PURPLE, Chart, Curve
-from sigmasplat.evaluation.uncertainty_benchmark import HELD_BACK, Kind
+from sigmasplat.evaluation.surface_predictors import SURFACE_PREDICTORS, SurfacePredictor
+from sigmasplat.evaluation.uncertainty_benchmark import AWAY, HELD_BACK, Kind
 from sigmasplat.evaluation.view_predictors import PREDICTORS, Predictor
 from sigmasplat.metrics.scored_view import COVERED_ALPHA
 from sigmasplat.metrics.uncertainty import (
@@ -22,7 +23,10 @@ from sigmasplat.metrics.uncertainty import (
 )
 
 Arrays = Mapping[str, NDArray[np.float32]]
+AnyPredictor = Predictor | SurfacePredictor
+EVERY: tuple[AnyPredictor, ...] = (*PREDICTORS, *SURFACE_PREDICTORS)
 ALL, READ, COVERED = "all pixels", "pixels with a reading", "covered pixels"
+VISIBLE = "visible vertices"
 CURVES = (ACCENT, BLUE, GREEN, PURPLE)
 HEADROOM = 1.15
 """Largest RMSE in a sparsification chart, as a multiple of the RMSE of all pixels."""
@@ -36,12 +40,12 @@ class Run:
     samples: Mapping[Kind, Arrays]
 
 
-def score_runs(runs: Sequence[Run], predictors: Sequence[Predictor] = PREDICTORS) -> list[dict[Kind, dict[str, Any]]]:
+def score_runs(runs: Sequence[Run], predictors: Sequence[AnyPredictor] = EVERY) -> list[dict[Kind, dict[str, Any]]]:
     """Return the scores of each run: by kind, then by subset of pixels, then by predictor.
 
-    The temperatures of a predictor come from the held-back views of all other sequences, for each quantity, map and
-    subset of pixels: the mean of its best scales, and the geometric mean of its z_68². With a single sequence they are
-    those of the run itself (`in_sample`).
+    The temperatures of a predictor come from the held-back views, or the surfaces, of all other sequences, for each
+    quantity, map and subset of pixels: the mean of its best scales, and the geometric mean of its z_68². With a single
+    sequence they are those of the run itself (`in_sample`).
     """
     scales = [_best_scales(run, predictors) for run in runs]
     found = []
@@ -49,10 +53,9 @@ def score_runs(runs: Sequence[Run], predictors: Sequence[Predictor] = PREDICTORS
         others = [scale for other, scale in zip(runs, scales, strict=True) if other.source != run.source]
         of_kind = dict[Kind, dict[str, Any]]()
         for kind, arrays in run.samples.items():
-            fitted_on = Kind(kind.quantity, kind.map, HELD_BACK)
             subset_scores = dict[str, Any]()
             for subset, pixels in subsets(kind, arrays).items():
-                fitted = [scale.get((fitted_on, subset), {}) for scale in others or [own]]
+                fitted = [scale.get((_fitted_on(kind), subset), {}) for scale in others or [own]]
                 rows = _score(kind, arrays, pixels, predictors, _transferred(fitted))
                 subset_scores[subset] = {"pixels": int(pixels.sum()), "in_sample": not others, "predictors": rows}
             of_kind[kind] = subset_scores
@@ -63,12 +66,19 @@ def score_runs(runs: Sequence[Run], predictors: Sequence[Predictor] = PREDICTORS
 def subsets(kind: Kind, arrays: Arrays) -> dict[str, NDArray[np.bool_]]:
     """Return which pixels are scored, by name. Depth is only known where the map covers the pixel."""
     covered = arrays["alpha"] > COVERED_ALPHA
+    if kind.quantity == "surface":
+        return {VISIBLE: covered}
     if kind.quantity == "depth":
         return {COVERED: covered}
     return {ALL: np.ones_like(covered), READ: arrays["reading"] > 0, COVERED: covered}
 
 
-def predicted(predictor: Predictor, arrays: Arrays, pixels: NDArray[np.bool_]) -> tuple[Any, Any]:
+def _fitted_on(kind: Kind) -> Kind:
+    """Return the kind of samples that temperatures come from: held-back views, or surfaces with any reference."""
+    return Kind(kind.quantity, kind.map, "" if kind.quantity == "surface" else HELD_BACK)
+
+
+def predicted(predictor: AnyPredictor, arrays: Arrays, pixels: NDArray[np.bool_]) -> tuple[Any, Any]:
     """Return the variance (in its unit, or at its best scale if it has none) and the squared error of some pixels."""
     variance, error2 = arrays[f"variance {predictor.name}"][pixels], arrays["squared_error"][pixels]
     if predictor.scaled:
@@ -84,14 +94,14 @@ class Scales:
     coverage_68: float
 
 
-def _best_scales(run: Run, predictors: Sequence[Predictor]) -> dict[tuple[Kind, str], dict[str, Scales]]:
-    """Return the scales of each predictor on the held-back views, by kind and subset of pixels."""
+def _best_scales(run: Run, predictors: Sequence[AnyPredictor]) -> dict[tuple[Kind, str], dict[str, Scales]]:
+    """Return the scales of each predictor on the held-back views and on the surface, by `_fitted_on` and subset."""
     return {
-        (kind, subset): {
+        (_fitted_on(kind), subset): {
             p.name: _scales_of(*predicted(p, arrays, pixels)) for p in predictors if p.quantity == kind.quantity
         }
         for kind, arrays in run.samples.items()
-        if kind.views == HELD_BACK
+        if kind.views != AWAY
         for subset, pixels in subsets(kind, arrays).items()
     }
 
@@ -115,7 +125,7 @@ def _score(
     kind: Kind,
     arrays: Arrays,
     pixels: NDArray[np.bool_],
-    predictors: Sequence[Predictor],
+    predictors: Sequence[AnyPredictor],
     temperatures: Mapping[str, Scales],
 ) -> dict[str, Any]:
     """Return the scores of each predictor on some pixels."""
@@ -150,13 +160,13 @@ def _scores_of(
     }
 
 
-def sparsification_charts(kind: Kind, arrays: Arrays, predictors: Sequence[Predictor] = PREDICTORS) -> list[Chart]:
+def sparsification_charts(kind: Kind, arrays: Arrays, predictors: Sequence[AnyPredictor] = EVERY) -> list[Chart]:
     """Return charts of the RMSE after the pixels of largest variance are removed, a few predictors in each.
 
     A curve ends where it rises more than `HEADROOM` above its start.
     """
     wanted = [p for p in predictors if p.quantity == kind.quantity]
-    quantity, unit = ("colour", "0 to 1") if kind.quantity == "color" else ("depth", "m")
+    quantity, unit = ("colour", "0 to 1") if kind.quantity == "color" else (kind.quantity, "m")
     error2 = arrays["squared_error"]
     top = HEADROOM * float(np.sqrt(error2.mean()))
 
@@ -169,5 +179,14 @@ def sparsification_charts(kind: Kind, arrays: Arrays, predictors: Sequence[Predi
         some = zip(wanted[first : first + len(CURVES)], CURVES, strict=False)
         curves = [curve(p.name, arrays[f"variance {p.name}"], colour) for p, colour in some]
         title = f"{quantity}, {kind.map}, {kind.views}: RMSE, {unit}"
-        charts.append(Chart(title, "pixels removed, %", "", [*curves, oracle], from_zero=True, y_limits=(0.0, top)))
+        charts.append(
+            Chart(
+                title,
+                "vertices removed, %" if kind.quantity == "surface" else "pixels removed, %",
+                "",
+                [*curves, oracle],
+                from_zero=True,
+                y_limits=(0.0, top),
+            )
+        )
     return charts

@@ -46,7 +46,8 @@ def write_splats(
         raise ConfigError(f"{path} has no learned σ, so --sigma-below cannot be used; give a run or its PLY")
     if bounds.std_below_m is not None and std is None:
         raise ConfigError(
-            f"{path} has no calibrated uncertainty, so --std-below-m cannot be used; give a run with uncertainty.json"
+            f"{path} has no calibrated uncertainty, so --std-below-m cannot be used; give a run with uncertainty.json "
+            "(run older runs again)"
         )
     result, total = bounds.applied(field, std), len(field)
     if total and result.dropped == total:

@@ -20,7 +20,7 @@ from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.tensors import open_tensors, write_tensors
 from sigmasplat.model.component import Component
 from sigmasplat.model.field import GaussianField
-from sigmasplat.model.map_uncertainty import SPLAT_COLUMNS, MapUncertainty, SplatStd, splat_std
+from sigmasplat.model.map_uncertainty import SPLAT_COLUMNS, MapUncertainty, SplatStd
 from sigmasplat.model.trajectory import Trajectory
 
 PROGRAM = "sigmasplat"
@@ -251,13 +251,14 @@ class RunFolder:
         Raises RunError if a file is damaged, or does not have one row for each splat; SourceError as `read_map` does.
         """
         uncertainty = self.read_uncertainty()
-        if uncertainty is None:
+        if uncertainty is None or uncertainty.std is None:
             return None
-        field = self.read_map()
-        if uncertainty.splats.shape != (len(field), len(SPLAT_COLUMNS)):
+        field, std = self.read_map(), uncertainty.std
+        fits = std.depth_std_m.shape == std.color_std.shape == (len(field),)
+        if uncertainty.splats.shape != (len(field), len(SPLAT_COLUMNS)) or not fits:
             rows = len(uncertainty.splats)
             raise RunError(f"{self.path} has uncertainties of {rows} rows for {len(field)} splats; run it again")
-        return field, splat_std(field, uncertainty)
+        return field, std
 
     def map_bytes(self) -> int:
         """Return the size of map.ply. Raises RunError if it is missing."""

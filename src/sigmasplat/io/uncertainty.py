@@ -13,21 +13,29 @@ from sigmasplat.model.map_uncertainty import (
     Background,
     Calibration,
     MapUncertainty,
+    SplatStd,
 )
 
 JSON, TENSORS = "uncertainty.json", "uncertainty.safetensors"
+STD_TENSORS = ("depth_std_m", "color_std")
 
 
 def write_uncertainty(folder: Path, uncertainty: MapUncertainty) -> None:
     """Write both files. Raises RunError if they cannot be written."""
-    write_tensors(folder / TENSORS, {"variances": uncertainty.splats.cpu()}, {"columns": ",".join(SPLAT_COLUMNS)})
+    tensors, std = {"variances": uncertainty.splats.cpu()}, uncertainty.std
+    if std is not None:
+        tensors |= {name: values.cpu() for name, values in vars(std).items()}
+    write_tensors(folder / TENSORS, tensors, {"columns": ",".join(SPLAT_COLUMNS)})
     calibration, background = uncertainty.calibration, asdict(uncertainty.background)
     values = {"probes": uncertainty.probes, "background": background}
     write_json(folder / JSON, values | {"color": dict(calibration.color), "depth": dict(calibration.depth)})
 
 
 def read_uncertainty(folder: Path) -> MapUncertainty | None:
-    """Read both files; None if there is no uncertainty.json. Raises RunError if one is damaged."""
+    """Read both files; None if there is no uncertainty.json. Raises RunError if one is damaged.
+
+    Files of older versions have no standard deviations of the splats.
+    """
     path = folder / JSON
     if not path.is_file():
         return None
@@ -41,4 +49,6 @@ def read_uncertainty(folder: Path) -> MapUncertainty | None:
     except (KeyError, TypeError, ValueError) as problem:
         raise RunError(f"{path} is not the uncertainty of a map: {problem!r}; run it again") from problem
     with open_tensors(folder / TENSORS, "uncertainty") as file:
-        return MapUncertainty(file.get_tensor("variances"), known, Calibration(color, depth), probes)
+        found = {name: file.get_tensor(name) for name in STD_TENSORS if name in file.keys()}  # noqa: SIM118
+        std = SplatStd(**found) if len(found) == len(STD_TENSORS) else None
+        return MapUncertainty(file.get_tensor("variances"), known, Calibration(color, depth), probes, std)

@@ -3,10 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
-
-from sigmasplat.model.field import GaussianField
 
 COLOR_PARTS = ("mixture", "residual", "unexplained", "edges", "floor")
 """Parts of the predicted variance of colour, in the order of `render.predictive.variance_parts`."""
@@ -44,25 +41,9 @@ class Background:
 
 
 @dataclass(frozen=True, eq=False)
-class MapUncertainty:
-    """How sure a map is.
-
-    splats [N, 3], columns as `SPLAT_COLUMNS`: the variance of each splat's residuals at the keyframes, of colour (mean
-    over channels) and of depth (m²); the variance of its own depth (m²): the squared mean of its residuals, plus their
-    variance about the mean over the number of readings. calibration: weights of the parts; probes: the number of probe
-    views that it was fitted on.
-    """
-
-    splats: Tensor
-    background: Background
-    calibration: Calibration
-    probes: int = 0
-
-
-@dataclass(frozen=True, eq=False)
 class SplatStd:
-    """Standard deviation of the surface that each splat shows: depth_std_m [N] of rendered depth about the true depth,
-    m; color_std [N], the root of the variance averaged over red, green and blue, for colours in [0, 1]."""
+    """Standard deviation of what each splat shows (`fit.splat_std`): depth_std_m [N] of its surface, m; color_std [N],
+    the root of the variance averaged over red, green and blue, for colours in [0, 1]."""
 
     depth_std_m: Tensor
     color_std: Tensor
@@ -72,18 +53,18 @@ class SplatStd:
         return SplatStd(self.depth_std_m[rows], self.color_std[rows])
 
 
-def splat_std(field: GaussianField, uncertainty: MapUncertainty) -> SplatStd:
-    """Return what a map predicts (`render.predictive.predicted`) for a pixel that one splat covers alone.
+@dataclass(frozen=True, eq=False)
+class MapUncertainty:
+    """How sure a map is.
 
-    Of the parts of such a pixel, only three are not 0: mixture (the splat's σ²), residual and floor. Pixels with
-    several splats have more parts, so these are lower bounds of the standard deviation of a view. A splat without a
-    reading of depth takes the variance of its readings, which starts at the mean of the map.
+    splats [N, 3], columns as `SPLAT_COLUMNS`: the variance of each splat's residuals at the keyframes, of colour (mean
+    over channels) and of depth (m²); the variance of its own depth (m²): the squared mean of its residuals, plus their
+    variance about the mean over the number of readings. calibration: weights of the parts; probes: the number of probe
+    views that it was fitted on. std: the standard deviations of the splats, None if they were not measured.
     """
-    color, reading_m2, depth_m2 = uncertainty.splats.cpu().unbind(1)
-    for_color, for_depth = uncertainty.calibration.color, uncertainty.calibration.depth
-    own_m2 = torch.where(depth_m2 > 0.0, depth_m2, reading_m2)
-    mixture = for_color["mixture"] * field.variances.detach().cpu().mean(1)
-    return SplatStd(
-        (for_depth["residual"] * own_m2 + for_depth["floor"]).sqrt(),
-        (mixture + for_color["residual"] * color + for_color["floor"]).sqrt(),
-    )
+
+    splats: Tensor
+    background: Background
+    calibration: Calibration
+    probes: int = 0
+    std: SplatStd | None = None

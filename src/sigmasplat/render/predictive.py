@@ -24,7 +24,7 @@ from sigmasplat.model.map_uncertainty import (
     Calibration,
     MapUncertainty,
 )
-from sigmasplat.render.blended_values import blend_values
+from sigmasplat.render.blended_values import BlendedValues, blend_values
 from sigmasplat.render.render import on_device
 
 COVERED = 0.5
@@ -35,7 +35,7 @@ COVERED = 0.5
 class VarianceParts:
     """Unweighted parts of the variance of a view: color [5, H, W] as `COLOR_PARTS`, depth [6, H, W] as `DEPTH_PARTS`,
     systematic [H, W]: the part of depth that takes the place of residual for the depth of the map itself; with what was
-    rendered: image Ĉ [H, W, 3], depth_m D̂/A [H, W], alpha [H, W].
+    rendered: image Ĉ [H, W, 3], depth_m D̂/A [H, W], alpha [H, W]; seen: the blend of the splats.
 
     Colour: mixture = Σw(σ²+c²) − |Ĉ|²/A, the variance among the splats of a pixel; residual = Σ w r², r² the squared
     residual of a splat at the keyframes; unexplained = T (σ_b² + A |c_b − Ĉ/A|²), T = 1 − A, of a background of mean
@@ -50,6 +50,7 @@ class VarianceParts:
     image: Tensor
     depth_m: Tensor
     alpha: Tensor
+    seen: BlendedValues
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,10 +86,12 @@ def variance_parts(
     T_camera_map: NDArray[np.floating],
     options: RenderConfig,
     backend: str,
+    gather: bool = False,
 ) -> VarianceParts:
-    """Render the parts of a map's variance at a pose (4×4); splats [N, 3] as in `MapUncertainty`."""
+    """Render the parts of a map's variance at a pose (4×4); splats [N, 3] as in `MapUncertainty`, gather as in
+    `blend_values`."""
     field = on_device(field, backend)
-    seen = blend_values(field, camera, T_camera_map, splats, options, backend)
+    seen = blend_values(field, camera, T_camera_map, splats, options, backend, gather=gather)
     alpha = seen.alpha
     some, covered = alpha.clamp(min=1e-6), alpha.clamp(min=COVERED)
     depth_m = seen.depth / covered
@@ -112,7 +115,7 @@ def variance_parts(
         torch.ones_like(alpha),
     ]
     systematic = seen.values[..., 2] / covered
-    return VarianceParts(torch.stack(color), torch.stack(depth), systematic, seen.color, depth_m, alpha)
+    return VarianceParts(torch.stack(color), torch.stack(depth), systematic, seen.color, depth_m, alpha, seen)
 
 
 def slope2(image: Tensor, camera: Camera) -> Tensor:

@@ -1,7 +1,7 @@
 """Measure how sure a map is: variances of its splats, and weights calibrated on probe views."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 from sigmasplat.config import Config
 from sigmasplat.fit.calibration import fit_weights
 from sigmasplat.fit.splat_residuals import background_of, splat_residuals, squared_errors
+from sigmasplat.fit.splat_std import splat_std
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
@@ -29,6 +30,8 @@ from sigmasplat.types import Matrix
 
 PIXELS = 4000
 """About this many pixels of a probe view, every k-th one, calibrate the weights."""
+STD_KEYFRAMES = 60
+"""At most this many keyframes, evenly spread, decide the standard deviations of the splats."""
 LIMITS = {"color": np.inf, "depth": 4.0}
 """Limit of errors in the fit (`fit_weights`). Depth errors at silhouettes are as large as the depth step there, so a
 few pixels would decide."""
@@ -73,7 +76,10 @@ def map_uncertainty(
     splats = splat_residuals(field, keyframes, config.render, config.backend)
     probes = probe_views(store, anchors, (view.alpha.shape[0], view.alpha.shape[1]))
     calibration = calibrate(field, splats, background, probes, config, pulled_to)
-    return MapUncertainty(splats, background, calibration, len(probes))
+    known = MapUncertainty(splats, background, calibration, len(probes))
+    rows = np.unique(np.linspace(0, len(keyframes) - 1, min(STD_KEYFRAMES, len(keyframes))).round().astype(int))
+    std = splat_std(field, known, (keyframes[int(row)] for row in rows), config.render, config.backend)
+    return replace(known, std=std)
 
 
 def calibrate(

@@ -1,0 +1,87 @@
+"""Compare the surface of a run with the true surface: the distance of each vertex that the path sees."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sigmasplat.config import Config
+from sigmasplat.evaluation.finished_run import FinishedRun
+from sigmasplat.evaluation.view_selection import evenly_spread, working_frame
+from sigmasplat.metrics.reconstruction import BEHIND_M, Mask, distances, visible_points
+from sigmasplat.metrics.trajectory import associate, truth_in_estimate
+from sigmasplat.model import isosurface, se3
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.mesh import Mesh
+from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.model.tsdf import Tsdf
+from sigmasplat.render import FieldRenderer
+from sigmasplat.render.mesh import mesh_depth
+from sigmasplat.slam.fusion import TRUNCATION_VOXELS, VOXEL_M, count_keyframes, fuse, fusion_views
+from sigmasplat.sources.base import Source
+from sigmasplat.types import Matrix, Progress, no_progress
+
+VERTICES = 100_000
+"""At most this many vertices, drawn at random, are measured."""
+REFERENCE_FRAMES = 100
+"""At most this many frames, evenly spread, are fused into a reference surface."""
+SEEING_FRAMES = 40
+"""At most this many true poses, evenly spread, decide which vertices are visible."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceErrors:
+    """Vertices [V, 3] of a run's mesh, m, in the world, that the path sees, and their distance [V] to the reference,
+    m. exact: the reference is the true surface; else it is fused from the sensor's depth at the true poses."""
+
+    vertices: Matrix
+    distance_m: Matrix
+    exact: bool
+
+
+def surface_errors(
+    run: FinishedRun, source: Source, renderer: FieldRenderer, progress: Progress = no_progress
+) -> SurfaceErrors | None:
+    """Fuse the surface of a run as `sigmasplat mesh` does, and measure it; None if the true path is unknown.
+
+    The true path is aligned to the estimated one as for the ATE. A vertex counts if it is in the image of a true pose,
+    at most `BEHIND_M` behind the reference, and if the reference has a surface at this pixel. Calls
+    `progress(keyframes done, total)`.
+    """
+    truth = source.truth()
+    if truth is None or not run.believed.any():
+        return None
+    path = run.path.at(run.believed)
+    T_estimate_truth = truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], truth)
+    surface = source.true_surface()
+    reference = (_fused(run.config, source, truth) if surface is None else surface).moved(T_estimate_truth)
+    outside = frozenset(range(len(run.store))) - frozenset(run.members)
+    total = count_keyframes(run.store, outside)
+    found = fuse(fusion_views(run.store, run.anchors, outside), total, run.config, renderer=renderer, progress=progress)
+    _, rows = associate(path.timestamps_s, truth.timestamps_s)
+    poses = T_estimate_truth @ truth.T_world_camera[evenly_spread(rows.tolist(), SEEING_FRAMES)]
+    vertices = found.vertices.astype(np.float64)
+    seen = np.flatnonzero(_seen(vertices, reference, run.camera, poses))
+    vertices = vertices[np.random.default_rng(run.config.seed).permutation(seen)[:VERTICES]]
+    return SurfaceErrors(vertices, distances(vertices, reference), surface is not None)
+
+
+def _fused(config: Config, source: Source, truth: Trajectory) -> Mesh:
+    """Fuse the sensor's depth at true poses into a surface in the frame of the truth."""
+    volume = Tsdf(VOXEL_M, TRUNCATION_VOXELS * VOXEL_M)
+    times = np.array([source.timestamp_s(i) for i in range(len(source))])
+    rows, at = associate(times, truth.timestamps_s)
+    for k in evenly_spread(range(len(rows)), REFERENCE_FRAMES):
+        frame = working_frame(source, config.input, int(rows[k]))
+        volume.integrate(frame.depth_m, frame.color, frame.camera, truth.T_world_camera[at[k]])
+    return isosurface.surface(volume)
+
+
+def _seen(vertices: Matrix, reference: Mesh, camera: Camera, T_world_camera: Iterable[Matrix]) -> Mask:
+    """Return which vertices [V] are seen from a pose where the reference has a surface."""
+    seen = np.zeros(len(vertices), bool)
+    for T in T_world_camera:
+        depth_m, _ = mesh_depth(reference, camera, se3.inverse(T))
+        known = np.where(depth_m > 0, depth_m, np.float32(-np.inf))
+        seen |= visible_points(vertices, known, camera, T, BEHIND_M)
+    return seen
