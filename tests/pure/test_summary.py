@@ -139,13 +139,16 @@ def test_a_fast_final_map_and_one_without_iterations_are_not_shortened() -> None
 
 
 def test_regions_to_scan_again_are_summed_up() -> None:
-    plan = SimpleNamespace(regions=[RescanRegion((0, 0), 0.3, area, why, "") for area, why in
-                                    ((2.0, "unseen"), (1.5, "unseen"), (0.4, "unsure"))])  # fmt: skip
+    areas = ((2.0, "unseen"), (1.5, "unseen"), (0.4, "unsure"))
+    regions = [RescanRegion((0, 0), 0.3, area, why, "") for area, why in areas]
+    plan = SimpleNamespace(regions=regions, predicted_errors=True)
     assert rescan_sentences(GOOD, None) == []
-    (sentence,) = rescan_sentences(GOOD, plan)
+    sentence, rule = rescan_sentences(GOOD, plan)
+    assert "above 5 cm" in rule
     assert "2 not observed (3.5 m²), 1 mapped with high uncertainty (0.4 m²)" in sentence
-    lost = rescan_sentences(GOOD | {"lost_frames": [3, 4, 5, 9]}, SimpleNamespace(regions=[]))
-    assert len(lost) == 1 and "3–5, 9" in lost[0]
+    empty = SimpleNamespace(regions=[], predicted_errors=False)
+    lost, rule = rescan_sentences(GOOD | {"lost_frames": [3, 4, 5, 9]}, empty)
+    assert "3–5, 9" in lost and "no predicted errors" in rule
     both = rescan_sentences(GOOD | {"lost_frames": [3], "apart_frames": [4, 5]}, None)
     assert len(both) == 2 and "4–5" in both[1]
 

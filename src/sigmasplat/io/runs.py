@@ -250,14 +250,22 @@ class RunFolder:
 
         Raises RunError if a file is damaged, or does not have one row for each splat; SourceError as `read_map` does.
         """
-        uncertainty = self.read_uncertainty()
-        if uncertainty is None:
+        if not (self.path / uncertainty_files.JSON).is_file():
             return None
         field = self.read_map()
-        if uncertainty.splats.shape != (len(field), len(SPLAT_COLUMNS)):
+        uncertainty = self.uncertainty_of(field)
+        return None if uncertainty is None else (field, splat_std(field, uncertainty))
+
+    def uncertainty_of(self, field: GaussianField) -> MapUncertainty | None:
+        """Return how sure `field`, the map of the run, is; None if the run has not measured it.
+
+        Raises RunError if a file is damaged, or does not have one row for each splat.
+        """
+        uncertainty = self.read_uncertainty()
+        if uncertainty is not None and uncertainty.splats.shape != (len(field), len(SPLAT_COLUMNS)):
             rows = len(uncertainty.splats)
             raise RunError(f"{self.path} has uncertainties of {rows} rows for {len(field)} splats; run it again")
-        return field, splat_std(field, uncertainty)
+        return uncertainty
 
     def map_bytes(self) -> int:
         """Return the size of map.ply. Raises RunError if it is missing."""

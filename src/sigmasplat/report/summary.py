@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
+from sigmasplat.floorplan.rescan import unsure_rule
 from sigmasplat.report.tables import format_ranges, number
 
 if TYPE_CHECKING:
@@ -153,7 +154,7 @@ def rescan_sentences(metrics: Metrics, plan: "FloorPlan | None") -> list[str]:
     parts = [f"{len(found)} {reasons[why]} ({number(sum(found), 1)} m²)" for why, found in areas.items() if found]
     if parts:
         sentences.append(f"Regions near the path to scan again: {', '.join(parts)}.")
-    return sentences
+    return [*sentences, unsure_rule(plan.predicted_errors)]
 
 
 def advice(metrics: Metrics, run: str, again: str, settings: dict[str, Any]) -> list[Advice]:
