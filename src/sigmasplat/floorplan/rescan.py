@@ -81,7 +81,7 @@ def unsure_rule(predicted_errors: bool) -> str:
         )
     return (
         "This run has no predicted errors (uncertainty.probes), so a region is unsure if splats along a ray are more "
-        f"than {depth} apart, or if their σ is {MAX_COLOR_SIGMA_RATIO:g} times the median of this plan."
+        f"than {depth} apart, or if their learned colour deviation is {MAX_COLOR_SIGMA_RATIO:g} times the median."
     )
 
 

@@ -97,8 +97,8 @@ class ControlPanel:
                 "hide uncertain", 0, 99, 1, 0, hint="hide this percentage of the splats: those with the largest σ"
             )
             self.max_std = gui.add_slider(
-                "hide error above, m", 0.005, MOST_STD_M, 0.005, MOST_STD_M, visible=False,
-                hint="hide splats with a larger predicted error of depth, one standard deviation; right end: none hidden",
+                "hide above, m", 0.005, MOST_STD_M, 0.005, MOST_STD_M, visible=False,
+                hint="hide splats with a larger predicted standard deviation of depth; at the right end none is hidden",
             )  # fmt: skip
             self.min_opacity = gui.add_slider(
                 "minimum opacity", 0.0, 0.99, 0.01, 0.0, hint="hide splats with a lower opacity"
