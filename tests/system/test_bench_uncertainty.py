@@ -14,7 +14,7 @@ from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.evaluation.finished_run import FinishedRun, run_slam
 from sigmasplat.evaluation.splat_statistics import MapFacts, TrainingView, fisher, map_facts, ridge, splat_values
 from sigmasplat.evaluation.uncertainty_benchmark import HELD_BACK, Job, Kind, Samples, Study, measure
-from sigmasplat.evaluation.uncertainty_scores import ALL, COVERED, Run, score_runs
+from sigmasplat.evaluation.uncertainty_scores import ALL, COVERED, Run, score_runs, sparsification_charts
 from sigmasplat.evaluation.unseen_views import held_back_views
 from sigmasplat.evaluation.view_predictors import PREDICTORS, see
 from sigmasplat.fit.target import Keyframe, Target
@@ -231,3 +231,20 @@ def test_pixels_of_all_views_are_mixed() -> None:
     joined = drawn.joined()
     curve = sparsification(joined["variance constant"], joined["squared_error"], 20)
     np.testing.assert_allclose(curve, curve[0], rtol=0.05)
+
+
+@pytest.mark.parametrize("quantity, unit", [("color", "RMSE, 0 to 1"), ("depth", "RMSE, m")])
+def test_sparsification_charts_compare_each_predictor_with_the_calibrated_one(quantity, unit) -> None:
+    random = np.random.default_rng(0)
+    wanted = [p for p in PREDICTORS if p.quantity == quantity]
+    arrays = {f"variance {p.name}": random.uniform(0.1, 1.0, 400).astype(np.float32) for p in wanted}
+    arrays["squared_error"] = arrays[f"variance {wanted[-1].name}"] * random.uniform(0.5, 1.5, 400).astype(np.float32)
+    charts = sparsification_charts(Kind(quantity, "final", HELD_BACK), arrays)
+    ours = {p.name for p in wanted if p.calibrated}
+    for chart in charts:
+        names = [curve.name for curve in chart.curves]
+        assert ours | {"true error"} <= set(names) and len({curve.colour for curve in chart.curves}) == len(names)
+        assert chart.y_label == unit and "final map, held-back views" in chart.title and "removed" in chart.x_label
+        oracle = next(curve for curve in chart.curves if curve.name == "true error").points
+        assert (np.diff(oracle[:, 1]) <= 1e-6).all(), "the true error removes the largest errors first"
+    assert {curve.name for chart in charts for curve in chart.curves} == {p.name for p in wanted} | {"true error"}

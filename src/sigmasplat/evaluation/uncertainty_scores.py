@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.drawing.plot import ACCENT, BLUE, FAINT, GREEN, PURPLE, Chart, Curve
-from sigmasplat.evaluation.uncertainty_benchmark import HELD_BACK, Kind
+from sigmasplat.evaluation.uncertainty_benchmark import AWAY, HELD_BACK, Kind
 from sigmasplat.evaluation.view_predictors import PREDICTORS, Predictor
 from sigmasplat.metrics.scored_view import COVERED_ALPHA
 from sigmasplat.metrics.uncertainty import (
@@ -23,7 +23,10 @@ from sigmasplat.metrics.uncertainty import (
 
 Arrays = Mapping[str, NDArray[np.float32]]
 ALL, READ, COVERED = "all pixels", "pixels with a reading", "covered pixels"
-CURVES = (ACCENT, BLUE, GREEN, PURPLE)
+CURVES = (BLUE, GREEN, PURPLE)
+X_LABEL = "pixels removed, largest predicted variance first, %"
+MAP_TITLES = {"final": "final map"}
+VIEW_TITLES = {HELD_BACK: "held-back views", AWAY: "views away from the path"}
 HEADROOM = 1.15
 """Largest RMSE in a sparsification chart, as a multiple of the RMSE of all pixels."""
 
@@ -151,23 +154,32 @@ def _scores_of(
 
 
 def sparsification_charts(kind: Kind, arrays: Arrays, predictors: Sequence[Predictor] = PREDICTORS) -> list[Chart]:
-    """Return charts of the RMSE after the pixels of largest variance are removed, a few predictors in each.
+    """Return charts of the RMSE after the pixels of largest variance are removed.
 
-    A curve ends where it rises more than `HEADROOM` above its start.
+    Each chart compares the calibrated predictors and the true error with a few others. A curve ends where it rises more
+    than `HEADROOM` above its start.
     """
     wanted = [p for p in predictors if p.quantity == kind.quantity]
-    quantity, unit = ("colour", "0 to 1") if kind.quantity == "color" else ("depth", "m")
+    ours, others = [p for p in wanted if p.calibrated], [p for p in wanted if not p.calibrated]
+    quantity, y_label = ("Colour", "RMSE, 0 to 1") if kind.quantity == "color" else ("Depth", "RMSE, m")
+    title = f"{quantity}, {MAP_TITLES.get(kind.map, kind.map)}, {VIEW_TITLES.get(kind.views, kind.views)}"
     error2 = arrays["squared_error"]
     top = HEADROOM * float(np.sqrt(error2.mean()))
 
-    def curve(name: str, order_by: NDArray[np.float32], colour: int) -> Curve:
+    def curve(name: str, order_by: NDArray[np.float32], colour: int, width: float = 2.0) -> Curve:
         rmse = sparsification(order_by, error2)
-        return Curve(name, np.stack([np.arange(len(rmse)), np.where(rmse <= top, rmse, np.nan)], 1), colour)
+        points = np.stack([np.arange(len(rmse)), np.where(rmse <= top, rmse, np.nan)], 1)
+        return Curve(name, points, colour, width=width)
 
-    oracle, charts = curve("true error", error2, FAINT), list[Chart]()
-    for first in range(0, len(wanted), len(CURVES)):
-        some = zip(wanted[first : first + len(CURVES)], CURVES, strict=False)
-        curves = [curve(p.name, arrays[f"variance {p.name}"], colour) for p, colour in some]
-        title = f"{quantity}, {kind.map}, {kind.views}: RMSE, {unit}"
-        charts.append(Chart(title, "pixels removed, %", "", [*curves, oracle], from_zero=True, y_limits=(0.0, top)))
-    return charts
+    def of(predictor: Predictor, colour: int, width: float = 2.0) -> Curve:
+        return curve(predictor.name, arrays[f"variance {predictor.name}"], colour, width)
+
+    best = [*(of(p, ACCENT, 3.0) for p in ours), curve("true error", error2, FAINT)]
+    groups = [others[first : first + len(CURVES)] for first in range(0, len(others), len(CURVES))] or [[]]
+    return [
+        Chart(
+            title, X_LABEL, y_label, [*(of(p, colour) for p, colour in zip(some, CURVES, strict=False)), *best],
+            from_zero=True, y_limits=(0.0, top),
+        )
+        for some in groups
+    ]  # fmt: skip
