@@ -1,13 +1,16 @@
 """Floor plans of a synthetic room: walls, objects and rescan regions are at their true places in any world frame."""
 
 import json
+from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from box_room import CAMERA, CHEST, HIGH, LOW, PILLAR, pose, seer, splats, walk
+from box_room import CAMERA, CHEST, HIGH, LOW, PILLAR, cast, pose, seer, splats, walk
 from sigmasplat.drawing.plot import DARK, LIGHT
 from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.floorplan.floor_plan import (
@@ -23,10 +26,13 @@ from sigmasplat.floorplan.floor_plan import (
 )
 from sigmasplat.floorplan.ground import floor_frame
 from sigmasplat.floorplan.picture import draw_floor_plan, draw_kinds
+from sigmasplat.floorplan.rescan import RescanRegion, unsure_rule
 from sigmasplat.floorplan.surface_samples import sample_surface, sample_surfaces
 from sigmasplat.io.json_files import write_json
 from sigmasplat.model import se3
+from sigmasplat.model.camera import Camera
 from sigmasplat.model.trajectory import Trajectory
+from sigmasplat.render.predictive import Predicted
 
 WORLD = se3.exp(np.array([3.0, -2.0, 1.0, 1.9, 0.4, -0.3]))
 UPRIGHT = np.eye(4)
@@ -42,10 +48,29 @@ def patch(low: tuple[float, float], high: tuple[float, float]):
 
 
 def plan_of(T_world_room: np.ndarray = UPRIGHT, **known) -> FloorPlan:
-    sigma = known.pop("sigma", None)
+    sigma, predictor = known.pop("sigma", None), known.pop("predictor", None)
     return floor_plan(
-        splats(T_world_room, sigma), walk(T_world_room), CAMERA, renderer=seer(T_world_room, **known)
+        splats(T_world_room, sigma), walk(T_world_room), CAMERA, renderer=seer(T_world_room, **known),
+        predictor=predictor,
     )  # fmt: skip
+
+
+def seer_of_errors(
+    T_world_room: np.ndarray,
+    depth_std_m: Callable[[np.ndarray], np.ndarray],
+    color_std: Callable[[np.ndarray], np.ndarray],
+) -> Callable[..., Predicted]:
+    """Return a predictor of standard deviations that are functions of the place in the room [..., 3]."""
+
+    def predict(camera: Camera, T_camera_world: np.ndarray) -> Predicted:
+        T_room_camera = se3.inverse(T_world_room) @ se3.inverse(T_camera_world)
+        rays = camera.rays().astype(float) @ T_room_camera[:3, :3].T
+        eye = T_room_camera[:3, 3]
+        at = eye + rays * cast(eye, rays, [PILLAR, CHEST])[..., None]
+        color, depth = (torch.tensor(std(at) ** 2, dtype=torch.float32) for std in (color_std, depth_std_m))
+        return Predicted(0.5 * color, 0.5 * color, 0.25 * depth, 0.75 * depth, depth)
+
+    return predict
 
 
 @cache
@@ -135,6 +160,46 @@ def test_uncertain_and_thin_regions_are_found_within_a_cell(T_world_room: np.nda
         assert len(here) == 1, (why, plan.regions)
         assert here[0].area_m2 == pytest.approx(area_m2, rel=0.3) and here[0].found.startswith(words)
     assert [r.area_m2 for r in plan.regions] == sorted([r.area_m2 for r in plan.regions], reverse=True)
+
+
+@pytest.mark.parametrize("T_world_room", [UPRIGHT, WORLD])
+def test_predicted_errors_give_regions_in_metres_and_shares_of_pixels(T_world_room: np.ndarray) -> None:
+    """Predicted errors replace the spread of depth and σ, which are large elsewhere here."""
+    deep, wrong, spread = (
+        patch((-1.2, -1.2), (-0.8, -0.8)),
+        patch((0.6, -1.3), (1.1, -0.8)),
+        patch((-1.4, 1), (-1, 1.4)),
+    )
+    errors = seer_of_errors(
+        T_world_room, lambda at: np.where(deep(at), 0.08, 0.02), lambda at: np.where(wrong(at), 0.2, 0.02)
+    )
+    plan = plan_of(
+        T_world_room,
+        predictor=errors,
+        sigma_m=lambda at: np.where(spread(at), 0.2, 0.01),
+        sigma=lambda at: np.where(spread(at), 0.1, 0.01),
+    )
+    found = {region.found.split(",")[0]: region for region in plan.regions if region.why == "unsure"}
+    assert set(found) == {"depth uncertain by 8 cm", "62 % of the pixels expected wrong by more than 0.1"}
+    for words, place in (("depth", (-1.0, -1.3)), ("62", (0.85, -1.35))):
+        (region,) = [region for name, region in found.items() if name.startswith(words)]
+        np.testing.assert_allclose(region.center_m, place, atol=CELL_M)
+    assert plan.predicted_errors and plan.record()["predicted_errors"]
+    assert plan.wrong_share is not None and np.nanmax(plan.wrong_share) == pytest.approx(0.617, abs=0.01)
+
+
+def test_a_plan_without_predicted_errors_compares_the_map_with_itself() -> None:
+    plan = plain_plan()
+    assert not plan.predicted_errors and plan.wrong_share is None and not plan.record()["predicted_errors"]
+    assert "no predicted errors" in unsure_rule(False) and "median" not in unsure_rule(True)
+
+
+def test_the_list_of_regions_fits_the_picture() -> None:
+    """The longest line ends before the margin on the right."""
+    words = "depth uncertain by 8 cm, 62 % of the pixels expected wrong by more than 0.1"
+    plan = replace(plain_plan(), regions=(RescanRegion((-10.0, -10.0), 0.1, 10.0, "unsure", words),))
+    picture, panels = (np.asarray(draw_floor_plan(plan, list_regions=listed)) for listed in (True, False))
+    assert (picture[panels.shape[0] :, -20:] == LIGHT.background).all()
 
 
 def test_a_certain_map_has_only_unobserved_regions_such_as_behind_the_pillar() -> None:

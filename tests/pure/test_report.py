@@ -10,7 +10,7 @@ from PIL import Image, ImageFont
 
 from sigmasplat.drawing import colormap, plot
 from sigmasplat.drawing.view_panels import GAP, HEAD, PANEL_WIDTH, draw_view_strip, predicted_panels, view_panels
-from sigmasplat.floorplan.rescan import RescanMaps, RescanRegion, find_rescan_regions
+from sigmasplat.floorplan.rescan import RescanMaps, RescanRegion, find_rescan_regions, unsure_rule
 from sigmasplat.io.frames import RunFrames
 from sigmasplat.metrics.scored_view import PredictedErrors, ScoredView
 from sigmasplat.model.trajectory import Trajectory
@@ -39,7 +39,7 @@ def some_view(seed: int = 0) -> ScoredView:
 
 def some_prediction() -> PredictedErrors:
     """Predict a standard deviation of 0.5 for colour, aleatoric 0.3 and epistemic 0.4, and of 0.2 m for depth."""
-    return PredictedErrors(*(np.full((30, 40), value, np.float32) for value in (0.09, 0.16, 0.04)))
+    return PredictedErrors(*(np.full((30, 40), value, np.float32) for value in (0.09, 0.16, 0.04, 0.01)))
 
 
 @pytest.mark.parametrize("colours", [colormap.VIRIDIS, colormap.INFERNO])
@@ -76,6 +76,7 @@ def test_the_font_has_every_character_of_the_panels() -> None:
     texts = [word for panel in panels for word in (panel.title, panel.caption, *panel.ends)]
     texts += [region.sentence("sq m") for region in regions_of_every_kind()]
     assert {text.split(":")[0] for text in texts} >= {"unseen", "thin", "unsure"}
+    texts += [unsure_rule(predicted_errors) for predicted_errors in (True, False)]
     missing = bytes(font.getmask("\uffff"))
     assert not [c for c in sorted({*"".join(texts)} - {" "}) if bytes(font.getmask(c)) == missing]
 
@@ -115,7 +116,7 @@ def test_a_strip_shows_the_five_panels_of_a_view() -> None:
 def test_predicted_errors_are_shown_at_the_scale_of_the_errors() -> None:
     """The largest colour error of the view is about 0.1, the prediction 0.5; depth errors are 0.1 m, predicted 0.2."""
     panels = predicted_panels(some_view(), some_prediction())
-    assert [panel.ends[1] for panel in panels] == ["0.500"] * 4 + ["0.200 m"] * 2
+    assert [panel.ends[1] for panel in panels] == ["0.500"] * 4 + ["0.200 m"] * 4
     assert all(panel.caption.endswith(".") for panel in panels)
     color, aleatoric, epistemic = (panels[i].pixels.astype(float).sum(-1) for i in (1, 2, 3))
     assert (color > epistemic).all() and (epistemic > aleatoric).all(), "brighter is less certain"

@@ -17,7 +17,7 @@ from sigmasplat.io.runs import RunFolder
 from sigmasplat.presets import preset
 from sigmasplat.report.page import rerun_command, write_page
 from sigmasplat.report.summary import advice, rescan_sentences, summary_sentences
-from sigmasplat.report.tables import headline, state_rows
+from sigmasplat.report.tables import headline, score_tables, state_rows
 from sigmasplat.report.view_strips import PanelFigure, data_uri, file_data_uri
 
 GOOD = {
@@ -59,6 +59,15 @@ def test_a_good_run_in_words() -> None:
             "measured 71 % (colour), 64 % (depth)",
         ),
         ({"predictive": {"views": 9, "color": {"coverage_68": 0.713}, "depth": None}}, "measured 71 % (colour)."),
+        ({"predictive": {"views": 9, "color": {"coverage_68": 0.713}}}, "error of colour has the right size"),
+        (
+            {"predictive": {"views": 9, "depth": {"coverage_68": 0.5, "z_68": 1.524}}},
+            "error of depth is too small; multiply it by 1.52",
+        ),
+        ({"predictive": {"views": 9, "depth": {"coverage_68": 0.9, "z_68": 0.6}}}, "too large; multiply it by 0.60"),
+        ({"predictive": {"views": 9, "color": {"coverage_68": 0.7}}, "calibration": {"probes": 22}}, "22 probe views"),
+        ({"predictive": {"views": 9, "color": {"coverage_68": 0.7}}, "calibration": {"probes": 0}}, "of the preset"),
+        ({"predictive": None, "calibration": None}, "has no predicted errors"),
         (
             {"pose_covariance": {"window_frames": 50, "windows": {"position_coverage_90": 0.934}}},
             "90 % of the position errors over 50 frames should be within the covariance of the poses: measured 93 %",
@@ -101,6 +110,8 @@ def test_unknown_figures_are_left_out() -> None:
         ({"frames_per_s": 1.2, "finish_s": 430.0}, {}, "took 430 s, all frames took 417 s", "final.iterations=750"),
         ({"finish_s": 80.0}, {"final.iterations": "300"}, "took 80 s, all frames took 37 s", "final.iterations=150"),
         ({"submaps": 5}, {}, "End a scan where it started", ""),
+        ({"calibration": None}, {"uncertainty.probes": "0"}, "kept no probe views", "uncertainty.probes=2"),
+        ({"calibration": None}, {"uncertainty.probes": "2"}, "did not make its final map", RUN),
     ],
 )
 def test_commands_of_the_advice_can_be_run(changes: dict, settings: dict, words: str, command: str) -> None:
@@ -139,13 +150,16 @@ def test_a_fast_final_map_and_one_without_iterations_are_not_shortened() -> None
 
 
 def test_regions_to_scan_again_are_summed_up() -> None:
-    plan = SimpleNamespace(regions=[RescanRegion((0, 0), 0.3, area, why, "") for area, why in
-                                    ((2.0, "unseen"), (1.5, "unseen"), (0.4, "unsure"))])  # fmt: skip
+    areas = ((2.0, "unseen"), (1.5, "unseen"), (0.4, "unsure"))
+    regions = [RescanRegion((0, 0), 0.3, area, why, "") for area, why in areas]
+    plan = SimpleNamespace(regions=regions, predicted_errors=True)
     assert rescan_sentences(GOOD, None) == []
-    (sentence,) = rescan_sentences(GOOD, plan)
+    sentence, rule = rescan_sentences(GOOD, plan)
+    assert "above 5 cm" in rule
     assert "2 not observed (3.5 m²), 1 mapped with high uncertainty (0.4 m²)" in sentence
-    lost = rescan_sentences(GOOD | {"lost_frames": [3, 4, 5, 9]}, SimpleNamespace(regions=[]))
-    assert len(lost) == 1 and "3–5, 9" in lost[0]
+    empty = SimpleNamespace(regions=[], predicted_errors=False)
+    lost, rule = rescan_sentences(GOOD | {"lost_frames": [3, 4, 5, 9]}, empty)
+    assert "3–5, 9" in lost and "no predicted errors" in rule
     both = rescan_sentences(GOOD | {"lost_frames": [3], "apart_frames": [4, 5]}, None)
     assert len(both) == 2 and "4–5" in both[1]
 
@@ -157,6 +171,22 @@ def test_tables_count_the_states() -> None:
     assert rows["lost"][2] == "3–4"
     assert {"Frames apart", "Silent failures"} <= {row[0] for row in headline(found | {"failures": {"silent": 3}})}
     assert len(state_rows(GOOD)) == 2
+
+
+def test_tables_show_coverage_and_calibration_or_that_there_are_no_predicted_errors() -> None:
+    known = {
+        "calibration": {"probes": 7, "color": {"residual": 1.5}, "depth": {"residual": 0.25, "sensor": 3e-6}},
+        "predictive": {"views": 9, "color": {"coverage_68": 0.7}, "depth": {"coverage_68": 0.61}},
+    }
+    known = GOOD | known | {"uncertainty": None}
+    figures = {name: (value, unit) for name, value, unit in headline(known)}
+    assert figures["Within the predicted error, depth"] == ("61", "% (ideal 68)")
+    (rows,) = [rows for title, rows in score_tables(known) if title.startswith("Calibration of predicted")]
+    cells = {row[0]: row[1:] for row in rows[1:]}
+    assert "7 probe views" in rows[0][0] and (cells["residual"][0], cells["residual"][2]) == ("1.5", "0.25")
+    assert cells["sensor"][:2] == ["", ""] and cells["sensor"][2] == "3e-06"
+    assert "none" in {value for _, value, _ in headline(GOOD | {"calibration": None})}
+    assert "none" not in {value for _, value, _ in headline(GOOD)}, "files of older versions do not say"
 
 
 def test_the_page_is_one_file(tmp_path) -> None:

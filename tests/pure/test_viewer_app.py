@@ -10,14 +10,27 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+
+from room_map import room_map
+from sigmasplat.model.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 
 viser = pytest.importorskip("viser", reason="viser is not installed (pip install 'sigmasplat[viewer]')")
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 from sigmasplat.viewer.app import ViewerApp  # noqa: E402
 from sigmasplat.viewer.live import LiveView  # noqa: E402
-from sigmasplat.viewer.panel import MODE_LABELS, VIEW_MODES  # noqa: E402
+from sigmasplat.viewer.panel import (  # noqa: E402
+    COLOURINGS,
+    ERROR_PARTS,
+    FINAL_MAP,
+    MODE_LABELS,
+    PREDICTED_MODES,
+    SUBMAPS,
+    VIEW_MODES,
+)
 from sigmasplat.viewer.server import HOST, close, open_server  # noqa: E402
+from sigmasplat.viewer.snapshot import EMPTY_PATH, Piece, Snapshot  # noqa: E402
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 viewer_memory = importlib.import_module("viewer_memory")
@@ -86,7 +99,9 @@ def test_a_growing_run_is_shown_and_the_controls_follow(
     texts = panel.hidden_text.content
     panel.hidden.value = 50
     wait_until(lambda: panel.hidden_text.content != texts)
-    for mode in (*VIEW_MODES[1:], VIEW_MODES[0]):
+    offered = [mode for mode in VIEW_MODES if MODE_LABELS[mode] in panel.mode.options]
+    assert set(VIEW_MODES) - set(offered) == set(PREDICTED_MODES), "submaps have no predicted errors"
+    for mode in (*offered[1:], offered[0]):
         before = len(client)
         panel.mode.value = MODE_LABELS[mode]
         wait_until(lambda before=before: len(client) > before)  # type: ignore[misc]
@@ -97,3 +112,33 @@ def test_a_growing_run_is_shown_and_the_controls_follow(
         control.value = False
         wait_until(lambda before=before: len(client) > before)  # type: ignore[misc]
     assert "viewer:" not in capsys.readouterr().err, "no error while drawing"
+
+
+def test_predicted_errors_are_offered_for_the_final_map_only(
+    app: ViewerApp, client: list[int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The errors have a legend in metres, and the slider hides splats with a larger error."""
+    field, panel = room_map(), app.panel
+    half = torch.arange(len(field)) % 2 == 0
+    variances = torch.where(half[:, None], torch.tensor([0.01, 1e-4, 1e-4]), torch.tensor([0.01, 0.04, 0.04]))
+    std = SplatStd(torch.where(half, 0.01, 0.2), torch.full((len(field),), 0.1))
+    known = MapUncertainty(variances, Background((0.5, 0.5, 0.5), 0.1, 1.0), SHIPPED, 4, std)
+    app.show(Snapshot("room", EMPTY_PATH, Piece(None, field, uncertainty=known), (Piece(0, field),)))
+    wait_until(lambda: panel.max_std.visible)
+    everything, legend = panel.facts.content, panel.legend.image
+    panel.colouring.value = COLOURINGS["depth error"]
+    wait_until(lambda: panel.legend.visible and panel.legend.image is not legend)
+    panel.max_std.value = 0.05
+    wait_until(lambda: "0.05 m" in panel.hidden_text.content)
+    assert panel.facts.content != everything and f"{int(half.sum()):,} of {len(field):,}" in panel.facts.content
+    for mode in PREDICTED_MODES:
+        panel.mode.value = MODE_LABELS[mode]
+        wait_until(lambda: panel.error_part.visible)
+        for part in ERROR_PARTS.values():
+            before = len(client)
+            panel.error_part.value = part
+            wait_until(lambda before=before: len(client) > before)  # type: ignore[misc]
+    panel.part.value = SUBMAPS
+    wait_until(lambda: not panel.max_std.visible)
+    assert panel.mode.value == MODE_LABELS["splats"] and not panel.error_part.visible
+    assert panel.part.value != FINAL_MAP and "viewer:" not in capsys.readouterr().err, "no error while drawing"

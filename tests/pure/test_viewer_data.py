@@ -11,22 +11,27 @@ from sigmasplat.drawing import colormap
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 from sigmasplat.model.splat_filter import sigmas
 from sigmasplat.render import render
+from sigmasplat.render.predictive import predict
 from sigmasplat.viewer import lines
-from sigmasplat.viewer.layers import Legend, browser_camera, draw_legend, render_layer
+from sigmasplat.viewer.layers import Legend, browser_camera, draw_legend, render_layer, render_predicted
 from sigmasplat.viewer.snapshot import CameraPath, Piece, Snapshot, thin, within_budget
 from sigmasplat.viewer.splats import (
     VisibilityFilter,
     covariances,
     merge_pieces,
-    sigma_range,
+    merged_uncertainty,
+    palette_range,
+    sorted_depth_stds,
     sorted_sigmas,
     splat_arrays,
     visibility_filter,
 )
 
 OPTIONS = RenderConfig()
+ERROR_PARTS = ("all", "aleatoric", "epistemic")
 
 
 def field_of(count: int, seed: int = 0) -> GaussianField:
@@ -82,31 +87,31 @@ def test_the_filter_hides_the_requested_share_and_splats_of_low_opacity() -> Non
     ordered = sorted_sigmas(pieces)
     assert len(ordered) == 1000 and (np.diff(ordered) >= 0).all()
     visible = visibility_filter(ordered, 0.25, 0.0)
-    kept = [visible.mask(piece.field) for piece in pieces]
+    kept = [visible.mask(piece) for piece in pieces]
     assert sum(int(k.sum()) for k in kept) == pytest.approx(750, abs=1)
     hidden = torch.cat([~k for k in kept])
     σ = torch.cat([p.field.variances.mean(1).sqrt() for p in pieces])
     assert σ[hidden].min() >= σ[~hidden].max()
-    faint = VisibilityFilter(min_opacity=0.5).mask(pieces[0].field)
+    faint = VisibilityFilter(min_opacity=0.5).mask(pieces[0])
     assert torch.equal(faint, pieces[0].field.opacities >= 0.5) and 0 < faint.sum() < 600
-    assert visibility_filter(ordered, 0.0, 0.0).mask(pieces[0].field).all()
+    assert visibility_filter(ordered, 0.0, 0.0).mask(pieces[0]).all()
     assert (
         len(sorted_sigmas(())) == 0
         and visibility_filter(sorted_sigmas(()), 0.5, 0.0) == VisibilityFilter()
-        and sigma_range(sorted_sigmas(())) == (0.0, 1.0)
+        and palette_range(sorted_sigmas(())) == (0.0, 1.0)
     )
 
 
 def test_splats_are_coloured_by_their_own_colour_or_by_sigma() -> None:
     field = field_of(50)
-    plain = splat_arrays(field, "colour", (0.0, 1.0), VisibilityFilter())
+    plain = splat_arrays(Piece(None, field), "colour", (0.0, 1.0), VisibilityFilter())
     np.testing.assert_array_equal(plain.colors, (field.colors.numpy() * 255).round().astype(np.uint8))
-    tinted = splat_arrays(field, "σ", (0.0, 0.3), VisibilityFilter())
+    tinted = splat_arrays(Piece(None, field), "σ", (0.0, 0.3), VisibilityFilter())
     np.testing.assert_array_equal(tinted.colors, colormap.apply(sigmas(field).numpy(), 0.0, 0.3, colormap.INFERNO))
     np.testing.assert_array_equal(tinted.centers, field.means.numpy())
     most, least = int(sigmas(field).numpy().argmax()), int(sigmas(field).numpy().argmin())
     assert tinted.colors[most].sum() > tinted.colors[least].sum() + 200
-    half = splat_arrays(field, "σ", (0.0, 0.3), VisibilityFilter(float(np.median(sigmas(field).numpy()))))
+    half = splat_arrays(Piece(None, field), "σ", (0.0, 0.3), VisibilityFilter(float(np.median(sigmas(field).numpy()))))
     assert len(half) == len(half.covariances) == len(half.colors) == 25
 
 
@@ -115,7 +120,7 @@ def test_merged_pieces_hold_the_visible_splats_in_the_world_frame() -> None:
     pieces = (Piece(0, field_of(30)), Piece(1, field_of(20, seed=1), T))
     visible = visibility_filter(sorted_sigmas(pieces), 0.4, 0.0)
     whole = merge_pieces(pieces, visible)
-    moved = pieces[1].field.moved(torch.from_numpy(T)).means[visible.mask(pieces[1].field)]
+    moved = pieces[1].field.moved(torch.from_numpy(T)).means[visible.mask(pieces[1])]
     torch.testing.assert_close(whole.means[-len(moved) :], moved)
     assert len(whole) == 30 and len(pieces[0].field) == 30
 
@@ -218,6 +223,60 @@ def test_u_is_the_spread_of_depth_about_the_rendered_depth() -> None:
     about = (w1 * 1 + w2 * 2) / (w1 + w2)
     expected = np.sqrt((w1 * (1 - about) ** 2 + w2 * (2 - about) ** 2) / (w1 + w2))
     assert made.legend is not None and made.legend.high == pytest.approx(expected, rel=1e-3)
+
+
+def uncertain(count: int, seed: int = 0) -> Piece:
+    """Return a final map with known errors, each splat of another one."""
+    random = torch.Generator().manual_seed(seed)
+    background = Background((0.2, 0.5, 0.8), 0.1, 1.0)
+    std = SplatStd(*torch.rand(2, count, generator=random))
+    known = MapUncertainty(0.01 * torch.rand(count, 3, generator=random), background, SHIPPED, 4, std)
+    return Piece(None, field_of(count, seed), uncertainty=known)
+
+
+def test_splats_with_a_large_depth_error_are_hidden_and_coloured_in_metres() -> None:
+    piece = uncertain(200)
+    std_m = piece.uncertainty.std.depth_std_m  # type: ignore[union-attr]
+    limit_m = float(std_m.median())
+    visible = VisibilityFilter(max_std_m=limit_m)
+    assert torch.equal(visible.mask(piece), std_m <= limit_m)
+    assert visible.mask(Piece(0, piece.field)).all(), "submaps have no predicted error"
+    high = palette_range(sorted_depth_stds([piece]))[1]
+    drawn = splat_arrays(piece, "depth error", (0.0, high), visible)
+    expected = colormap.apply(std_m[std_m <= limit_m].numpy(), 0.0, high, colormap.INFERNO)
+    np.testing.assert_array_equal(drawn.colors, expected)
+    merged, known = merge_pieces([piece], visible), merged_uncertainty([piece], visible)
+    assert known is not None and len(known.splats) == len(merged) == len(drawn)
+    assert merged_uncertainty([piece, piece], visible) is None
+
+
+def test_thinned_splats_keep_their_own_errors() -> None:
+    piece = uncertain(100)
+    few = piece.thinned(30)
+    assert few.uncertainty is not None and piece.uncertainty is not None
+    for mean, row in zip(few.field.means, few.uncertainty.splats, strict=True):
+        (same,) = (piece.field.means == mean).all(1).nonzero()[0]
+        assert torch.equal(piece.uncertainty.splats[same], row)
+
+
+def test_layers_of_predicted_errors_show_the_prediction_and_its_parts() -> None:
+    piece, camera, T = uncertain(400), Camera(40, 30, 30.0, 30.0, 19.5, 14.5), np.eye(4)
+    known, how = piece.uncertainty, (OPTIONS, "auto")
+    assert known is not None
+    found = predict(piece.field, known, camera, T, OPTIONS)
+    covered = (render(piece.field, camera, T).alpha > 0.5).numpy()
+    for layer, std, where, unit in (
+        ("depth error", found.depth_std_m, covered, " m"),
+        ("color error", found.color.sqrt(), np.ones_like(covered), ""),
+    ):
+        shown = {p: render_predicted(piece.field, known, camera, T, layer, p, *how) for p in ERROR_PARTS}
+        whole = shown["all"]
+        assert whole.legend is not None and whole.legend.unit == unit
+        assert whole.legend.high == pytest.approx(np.percentile(std.numpy()[where], 99), rel=1e-4)
+        np.testing.assert_array_equal((whole.pixels == colormap.NO_READING).all(-1), ~where)
+        assert {made.legend[2:] for made in shown.values() if made.legend} == {whole.legend[2:]}, "one scale"
+        brightness = {p: int(made.pixels[where].sum()) for p, made in shown.items()}
+        assert brightness["all"] > max(brightness["aleatoric"], brightness["epistemic"])
 
 
 def test_a_legend_shows_the_palette_from_end_to_end() -> None:

@@ -27,7 +27,7 @@ from sigmasplat.evaluation.uncertainty_benchmark import (
     Study,
     measure,
 )
-from sigmasplat.evaluation.uncertainty_scores import ALL, COVERED, VISIBLE, Run, score_runs
+from sigmasplat.evaluation.uncertainty_scores import ALL, COVERED, VISIBLE, Run, score_runs, sparsification_charts
 from sigmasplat.evaluation.unseen_views import held_back_views
 from sigmasplat.evaluation.view_predictors import PREDICTORS, see
 from sigmasplat.fit.target import Keyframe, Target
@@ -289,3 +289,20 @@ def test_the_temperature_of_a_surface_comes_from_surfaces_with_any_reference() -
     assert second[Kind("surface", MESH, FUSED)][VISIBLE]["predictors"]["ridge"]["temperature"] == pytest.approx(
         4.0, rel=0.05
     )
+
+
+@pytest.mark.parametrize("quantity, unit", [("color", "RMSE, 0 to 1"), ("depth", "RMSE, m")])
+def test_sparsification_charts_compare_each_predictor_with_the_calibrated_one(quantity, unit) -> None:
+    random = np.random.default_rng(0)
+    wanted = [p for p in PREDICTORS if p.quantity == quantity]
+    arrays = {f"variance {p.name}": random.uniform(0.1, 1.0, 400).astype(np.float32) for p in wanted}
+    arrays["squared_error"] = arrays[f"variance {wanted[-1].name}"] * random.uniform(0.5, 1.5, 400).astype(np.float32)
+    charts = sparsification_charts(Kind(quantity, "final", HELD_BACK), arrays)
+    ours = {p.name for p in wanted if p.calibrated}
+    for chart in charts:
+        names = [curve.name for curve in chart.curves]
+        assert ours | {"true error"} <= set(names) and len({curve.colour for curve in chart.curves}) == len(names)
+        assert chart.y_label == unit and "final map, held-back views" in chart.title and "removed" in chart.x_label
+        oracle = next(curve for curve in chart.curves if curve.name == "true error").points
+        assert (np.diff(oracle[:, 1]) <= 1e-6).all(), "the true error removes the largest errors first"
+    assert {curve.name for chart in charts for curve in chart.curves} == {p.name for p in wanted} | {"true error"}

@@ -19,6 +19,8 @@ PREDICTED_CAPTIONS = (
     "The part that more or better views would reduce.",
     "Difference between the depth reading and the rendered depth.",
     "One standard deviation, including the noise of the sensor: 68 % of the errors should be smaller.",
+    "Noise of the sensor, and surfaces that the map does not show sharply; more views do not reduce it.",
+    "Edges and gaps in the map: the part that more or better views would reduce.",
 )
 """What each panel of `predicted_panels` means."""
 
@@ -72,24 +74,28 @@ def view_panels(view: ScoredView) -> list[ViewPanel]:
 
 
 def predicted_panels(view: ScoredView, predicted: PredictedErrors) -> list[ViewPanel]:
-    """Return six panels: the errors of colour and depth, and the standard deviations that the map predicts for them.
+    """Return eight panels: the errors of colour and depth, the standard deviations that the map predicts for them, and
+    their parts.
 
-    All panels of colour have one range, and both panels of depth. Colour is predicted where the map is empty too.
+    All panels of colour have one range, and all panels of depth. Colour is predicted where the map is empty too.
     """
     everywhere, mapped = np.ones_like(view.valid), view.alpha > COVERED_ALPHA
     error, total = np.sqrt(view.squared_error), np.sqrt(predicted.color)
     error_m, total_m = np.sqrt(view.depth_squared_error), np.sqrt(predicted.reading_m2)
     aleatoric, epistemic = np.sqrt(predicted.color_aleatoric), np.sqrt(predicted.color_epistemic)
+    aleatoric_m, epistemic_m = np.sqrt(predicted.reading_aleatoric_m2), np.sqrt(predicted.depth_epistemic_m2)
     color = 0.0, max(_from_zero(error, view.valid)[1], _from_zero(total, everywhere)[1])
     depth_m = 0.0, max(_from_zero(error_m, view.depth_compared)[1], _from_zero(total_m, mapped)[1])
     inferno = colormap.INFERNO
     panels = [
         _coloured("colour error, RMS", error, view.valid, color, inferno),
         _coloured("predicted colour error", total, everywhere, color, inferno),
-        _coloured("... aleatoric part", aleatoric, everywhere, color, inferno),
-        _coloured("... epistemic part", epistemic, everywhere, color, inferno),
+        _coloured("colour: aleatoric part", aleatoric, everywhere, color, inferno),
+        _coloured("colour: epistemic part", epistemic, everywhere, color, inferno),
         _coloured("depth error", error_m, view.depth_compared, depth_m, inferno, " m"),
         _coloured("predicted depth error", total_m, mapped, depth_m, inferno, " m"),
+        _coloured("depth: aleatoric part", aleatoric_m, mapped, depth_m, inferno, " m"),
+        _coloured("depth: epistemic part", epistemic_m, mapped, depth_m, inferno, " m"),
     ]
     return [replace(panel, caption=caption) for panel, caption in zip(panels, PREDICTED_CAPTIONS, strict=True)]
 

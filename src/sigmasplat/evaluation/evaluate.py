@@ -76,6 +76,7 @@ def evaluate(
     scores = _score_views(config, source, maps, chosen, predictions, strips, renderer, progress)
     facts = _facts(run, source, records, field, loops) | score_states(run, frames, None if problem else truth)
     metrics = facts | path_scores | scores | {"reconstruction": None, "test_views": None}
+    metrics["calibration"] = _calibration(run) if standard else None
     if mesh:
         known = source.true_surface(), None if problem else truth
         metrics["reconstruction"] = reconstruct.fuse_and_score(run, source.camera, *known, renderer, progress)
@@ -124,6 +125,14 @@ def _with_prediction(
         return predict(field, known, camera, T_camera_world, config.render, config.backend)
 
     return replace(maps, predict=predict_view), views.PredictionScores(_probe_frames(run, frames))
+
+
+def _calibration(run: RunFolder) -> dict[str, Any] | None:
+    """Return the number of probe views and the fitted weights of the predicted variances; None if not measured."""
+    known = run.read_uncertainty()
+    if known is None:
+        return None
+    return {"probes": known.probes, "color": dict(known.calibration.color), "depth": dict(known.calibration.depth)}
 
 
 def _probe_frames(run: RunFolder, frames: RunFrames) -> frozenset[int]:

@@ -27,7 +27,15 @@ AnyPredictor = Predictor | SurfacePredictor
 EVERY: tuple[AnyPredictor, ...] = (*PREDICTORS, *SURFACE_PREDICTORS)
 ALL, READ, COVERED = "all pixels", "pixels with a reading", "covered pixels"
 VISIBLE = "visible vertices"
-CURVES = (ACCENT, BLUE, GREEN, PURPLE)
+CURVES = (BLUE, GREEN, PURPLE)
+MAP_TITLES = {"final": "final map"}
+VIEW_TITLES = {HELD_BACK: "held-back views", AWAY: "views away from the path"}
+QUANTITIES = {
+    "color": ("Colour", "RMSE, 0 to 1", "pixels"),
+    "depth": ("Depth", "RMSE, m", "pixels"),
+    "surface": ("Surface", "RMSE, m", "vertices"),
+}
+"""Title, label of the error, and what is removed in a sparsification chart."""
 HEADROOM = 1.15
 """Largest RMSE in a sparsification chart, as a multiple of the RMSE of all pixels."""
 
@@ -161,32 +169,33 @@ def _scores_of(
 
 
 def sparsification_charts(kind: Kind, arrays: Arrays, predictors: Sequence[AnyPredictor] = EVERY) -> list[Chart]:
-    """Return charts of the RMSE after the pixels of largest variance are removed, a few predictors in each.
+    """Return charts of the RMSE after the pixels of largest variance are removed.
 
-    A curve ends where it rises more than `HEADROOM` above its start.
+    Each chart compares the calibrated predictors and the true error with a few others. A curve ends where it rises more
+    than `HEADROOM` above its start.
     """
     wanted = [p for p in predictors if p.quantity == kind.quantity]
-    quantity, unit = ("colour", "0 to 1") if kind.quantity == "color" else (kind.quantity, "m")
+    ours, others = [p for p in wanted if p.calibrated], [p for p in wanted if not p.calibrated]
+    quantity, y_label, removed = QUANTITIES[kind.quantity]
+    title = f"{quantity}, {MAP_TITLES.get(kind.map, kind.map)}, {VIEW_TITLES.get(kind.views, kind.views)}"
+    x_label = f"{removed} removed, largest predicted variance first, %"
     error2 = arrays["squared_error"]
     top = HEADROOM * float(np.sqrt(error2.mean()))
 
-    def curve(name: str, order_by: NDArray[np.float32], colour: int) -> Curve:
+    def curve(name: str, order_by: NDArray[np.float32], colour: int, width: float = 2.0) -> Curve:
         rmse = sparsification(order_by, error2)
-        return Curve(name, np.stack([np.arange(len(rmse)), np.where(rmse <= top, rmse, np.nan)], 1), colour)
+        points = np.stack([np.arange(len(rmse)), np.where(rmse <= top, rmse, np.nan)], 1)
+        return Curve(name, points, colour, width=width)
 
-    oracle, charts = curve("true error", error2, FAINT), list[Chart]()
-    for first in range(0, len(wanted), len(CURVES)):
-        some = zip(wanted[first : first + len(CURVES)], CURVES, strict=False)
-        curves = [curve(p.name, arrays[f"variance {p.name}"], colour) for p, colour in some]
-        title = f"{quantity}, {kind.map}, {kind.views}: RMSE, {unit}"
-        charts.append(
-            Chart(
-                title,
-                "vertices removed, %" if kind.quantity == "surface" else "pixels removed, %",
-                "",
-                [*curves, oracle],
-                from_zero=True,
-                y_limits=(0.0, top),
-            )
+    def of(predictor: AnyPredictor, colour: int, width: float = 2.0) -> Curve:
+        return curve(predictor.name, arrays[f"variance {predictor.name}"], colour, width)
+
+    best = [*(of(p, ACCENT, 3.0) for p in ours), curve("true error", error2, FAINT)]
+    groups = [others[first : first + len(CURVES)] for first in range(0, len(others), len(CURVES))] or [[]]
+    return [
+        Chart(
+            title, x_label, y_label, [*(of(p, colour) for p, colour in zip(some, CURVES, strict=False)), *best],
+            from_zero=True, y_limits=(0.0, top),
         )
-    return charts
+        for some in groups
+    ]  # fmt: skip

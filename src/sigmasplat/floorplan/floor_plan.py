@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sigmasplat.errors import ConfigError
 from sigmasplat.floorplan.ground import floor_frame
 from sigmasplat.floorplan.rescan import RescanMaps, RescanRegion, find_rescan_regions
-from sigmasplat.floorplan.surface_samples import SurfaceRenderer, SurfaceSample, sample_surfaces
+from sigmasplat.floorplan.surface_samples import SurfacePredictor, SurfaceRenderer, SurfaceSample, sample_surfaces
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
@@ -43,9 +43,12 @@ class FloorPlan:
 
     T_floor_world: z up, floor at 0, x and y along the walls; origin_m: x, y of the outer corner of row 0, column 0.
     kind: UNOBSERVED, FLOOR_UNOBSERVED, FREE, OBJECT or WALL. color_sigma: mean √σ² of the splats in the cell (colour, 0
-    to 1); depth_sigma_m: mean standard deviation of depth of the surfaces in the cell; alpha: their mean opacity. These
-    three are nan in cells without a surface. path_m [N, 2]: the camera path. regions: where to scan again, the largest
-    first.
+    to 1); depth_sigma_m: mean standard deviation of depth of the surfaces in the cell; alpha: their mean opacity;
+    wrong_share: the share of their pixels whose colour is expected to be wrong (`WRONG_BY`). These four are nan in
+    cells without a surface. path_m [N, 2]: the camera path. regions: where to scan again, the largest first.
+
+    With predicted errors, depth_sigma_m is the predicted standard deviation. Without them it is the spread of the
+    splats along a ray, and wrong_share is None.
     """
 
     cell_m: float
@@ -57,6 +60,12 @@ class FloorPlan:
     alpha: Grid
     path_m: Matrix
     regions: tuple[RescanRegion, ...]
+    wrong_share: Grid | None = None
+
+    @property
+    def predicted_errors(self) -> bool:
+        """Return whether the uncertainty consists of predicted errors."""
+        return self.wrong_share is not None
 
     def area_m2(self, *kinds: int) -> float:
         """Return the total area of the cells of these kinds."""
@@ -74,6 +83,7 @@ class FloorPlan:
             "axes": "x right, y up on the plan, z up from the floor; row 0 at the lowest y, column 0 at the lowest x",
             "T_floor_world": self.T_floor_world,
             "free_m2": self.area_m2(FREE),
+            "predicted_errors": self.predicted_errors,
             "legend": dict(zip(SIGNS, MEANINGS, strict=True)),
             "cells": ["".join(SIGNS[kind] for kind in row) for row in self.kind],
             "scan_again": [
@@ -89,16 +99,18 @@ def floor_plan(
     *,
     cell_m: float = CELL_M,
     renderer: SurfaceRenderer = render,
+    predictor: SurfacePredictor | None = None,
     progress: Progress = no_progress,
 ) -> FloorPlan:
     """Make the floor plan of a map from poses along its path; `camera` gives the field of view.
 
-    Calls `progress(poses done, total)`. Raises ConfigError unless 1 mm ≤ cell_m ≤ 1 m; SigmaSplatError if no surface is
+    predictor: predicts the errors of the map, if they are known (`render.predictive.predict`). Calls
+    `progress(poses done, total)`. Raises ConfigError unless 1 mm ≤ cell_m ≤ 1 m; SigmaSplatError if no surface is
     visible.
     """
     if not 0.001 <= cell_m <= 1.0:
         raise ConfigError(f"a cell of the floor plan must be 0.001 to 1 m wide, found {cell_m}")
-    samples = list(sample_surfaces(field, trajectory, camera, renderer, progress=progress))
+    samples = list(sample_surfaces(field, trajectory, camera, renderer, progress=progress, predictor=predictor))
     T_floor_world = floor_frame(samples)
     to_floor = partial(_transformed, T_floor_world)
     path = to_floor(trajectory.T_world_camera[:, :3, 3])
@@ -107,15 +119,17 @@ def floor_plan(
         grid.add_rays(to_floor(sample.points), to_floor(sample.T_world_camera[None, :3, 3])[0])
     for sample in samples:
         grid.add_points(to_floor(sample.points), sample)
-    kind, (alpha, depth_sigma_m) = grid.kinds(), grid.means()
+    kind, (alpha, depth_sigma_m, wrong) = grid.kinds(), grid.means()
+    wrong_share = None if predictor is None else wrong
     color_sigma = grid.color_sigma(to_floor(field.means.numpy()), field)
     color_sigma[np.isnan(alpha)] = np.nan
     maps = RescanMaps(
-        kind == UNOBSERVED, kind == FLOOR_UNOBSERVED, kind == FREE, color_sigma, depth_sigma_m, alpha
+        kind == UNOBSERVED, kind == FLOOR_UNOBSERVED, kind == FREE, color_sigma, depth_sigma_m, alpha, wrong_share
     )  # fmt: skip
     regions = find_rescan_regions(maps, cell_m, grid.origin_m)
     return FloorPlan(
-        cell_m, grid.origin_m, T_floor_world, kind, color_sigma, depth_sigma_m, alpha, path[:, :2], tuple(regions)
+        cell_m, grid.origin_m, T_floor_world, kind, color_sigma, depth_sigma_m, alpha, path[:, :2], tuple(regions),
+        wrong_share,
     )  # fmt: skip
 
 
@@ -131,7 +145,7 @@ class _Cells:
         size = shape[0] * shape[1]
         self.layers = round((HIGH_M - LOW_M) / LAYER_M)
         self.points, self.passed = np.zeros((size, self.layers)), np.zeros(size)
-        self.weight, self.sums = np.zeros(size), np.zeros((2, size))
+        self.weight, self.sums = np.zeros(size), np.zeros((3, size))
 
     @staticmethod
     def around(points: Sequence[Matrix], path: Matrix, cell_m: float) -> "_Cells":
@@ -162,15 +176,17 @@ class _Cells:
             self.passed[np.unique(cell[inside])] += 1
 
     def add_points(self, points: Matrix, sample: SurfaceSample) -> None:
-        """Add surface points: their number per layer of height, and their alpha and depth sigma."""
+        """Add surface points: their number per layer of height, and their measurements."""
         cell, inside = self.cell_index(points)
         standing = inside & (points[:, 2] > LOW_M) & (points[:, 2] < HIGH_M)
         layer = np.minimum(((points[standing, 2] - LOW_M) / LAYER_M).astype(int), self.layers - 1)
         np.add.at(self.points, (cell[standing], layer), 1)
         used = inside & (points[:, 2] > -LOW_M) & (points[:, 2] < HIGH_M)
-        for total, values in ((self.weight, None), (self.sums[0], sample.alpha), (self.sums[1], sample.depth_sigma_m)):
-            area = sample.area_m2[used].astype(np.float64)
-            total += np.bincount(cell[used], area if values is None else area * values[used], len(total))
+        area = sample.area_m2[used].astype(np.float64)
+        self.weight += np.bincount(cell[used], area, len(self.weight))
+        measured = sample.alpha, sample.depth_sigma_m, sample.wrong_share
+        for total, values in zip(self.sums, measured, strict=True):
+            total += np.bincount(cell[used], area * values[used], len(total))
 
     def kinds(self) -> NDArray[np.uint8]:
         """Return the kind of each cell [rows, columns]."""
@@ -181,9 +197,9 @@ class _Cells:
         return kind.astype(np.uint8).reshape(self.shape)
 
     def means(self) -> Grid:
-        """Return mean alpha and depth sigma, weighted by area, [2, rows, columns]; nan without a surface."""
+        """Return means weighted by area, [3, rows, columns]: alpha, depth sigma, wrong share; nan without a surface."""
         means = np.divide(self.sums, self.weight, out=np.full_like(self.sums, np.nan), where=self.weight > 0)
-        return np.asarray(means.reshape(2, *self.shape), np.float32)
+        return np.asarray(means.reshape(3, *self.shape), np.float32)
 
     def color_sigma(self, centers: Matrix, field: GaussianField) -> Grid:
         """Return the mean colour σ of the splats in each cell, weighted by opacity and size; nan without splats."""

@@ -1,5 +1,6 @@
 """Draw a floor plan as a picture: what is there, the uncertainty of colour and depth, and where to scan again."""
 
+import textwrap
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,13 +10,15 @@ from PIL import Image, ImageDraw, ImageFont
 from sigmasplat.drawing import colormap
 from sigmasplat.drawing.plot import ACCENT, BLUE, DRAW_SCALE, GREEN, LIGHT, PURPLE, Colour, Theme, nice_ticks
 from sigmasplat.floorplan.floor_plan import FLOOR_UNOBSERVED, FREE, OBJECT, UNOBSERVED, WALL, FloorPlan
+from sigmasplat.floorplan.rescan import unsure_rule
+from sigmasplat.floorplan.surface_samples import WRONG_BY
 
 PANEL_PX = 440
 """The longer side of a panel."""
 NARROW_PX, NARROW_TALLEST = 376, 1.3
 """Width of a panel on a phone, and the largest height relative to this width."""
 GAP, NARROW_GAP, HEAD, FOOT, LINE = 24, 12, 40, 44, 24
-MIN_WIDTH, DOT = 760, 9
+MIN_WIDTH, DOT, INDENT, RULE_COLUMNS = 760, 9, 28, 100
 REASON_COLOURS = {"unseen": BLUE, "thin": PURPLE, "unsure": ACCENT}
 UNOBSERVED_SHADE, OBJECT_SHADE, FLOOR_UNOBSERVED_SHADE = 0.14, 0.45, 0.2
 """Share of the text colour that is mixed into the background, for the first two; the last is the share of blue."""
@@ -40,12 +43,12 @@ def draw_narrow_floor_plan(plan: FloorPlan, theme: Theme = LIGHT) -> Image.Image
 def _drawn(sheet: "_Sheet") -> Image.Image:
     """Draw all parts of a plan."""
     plan, theme = sheet.plan, sheet.theme
-    color_high, depth_high = _scale_end(plan.color_sigma), _scale_end(plan.depth_sigma_m)
+    depth_high, (color, title, color_high, color_end) = _scale_end(plan.depth_sigma_m), _color_values(plan)
     sheet.panel(0, draw_kinds(plan, theme), "What is there")
-    sheet.panel(1, _draw_values(plan, plan.color_sigma, color_high, theme), "Colour: standard deviation")
+    sheet.panel(1, _draw_values(plan, color, color_high, theme), title)
     sheet.panel(2, _draw_values(plan, plan.depth_sigma_m, depth_high, theme), "Depth: standard deviation")
     sheet.scale()
-    sheet.bar(1, f"{color_high:.2g}")
+    sheet.bar(1, color_end)
     sheet.bar(2, f"{100.0 * depth_high:.2g} cm")
     sheet.path()
     sheet.region_circles()
@@ -53,6 +56,15 @@ def _drawn(sheet: "_Sheet") -> Image.Image:
     if sheet.list_regions:
         sheet.region_list()
     return sheet.finished()
+
+
+def _color_values(plan: FloorPlan) -> tuple[Floats, str, float, str]:
+    """Return what the panel of colour shows: values of the cells, title, end of the scale and its label."""
+    if plan.wrong_share is None:
+        high = _scale_end(plan.color_sigma)
+        return plan.color_sigma, "Colour: standard deviation", high, f"{high:.2g}"
+    high = _scale_end(plan.wrong_share)
+    return plan.wrong_share, f"Colour: pixels wrong by > {WRONG_BY:g}", high, f"{100.0 * high:.0f} %"
 
 
 def draw_kinds(plan: FloorPlan, theme: Theme) -> colormap.Rgb:
@@ -132,12 +144,22 @@ class _Sheet:
         self.width, self.height = round(columns * self.cell_px), round(rows * self.cell_px)
         across, down = (1, 3) if self.stacked else (3, 1)
         self.below = down * (HEAD + self.height + FOOT) + GAP // 2
-        total_width = max(across * (self.width + self.gap) + self.gap, layout.min_width)
+        self.listed = self._listed() if list_regions else []
+        widest = max((_text_width(words, 14) for words in self.listed), default=0.0) + INDENT + 2 * self.gap
+        total_width = max(across * (self.width + self.gap) + self.gap, layout.min_width, round(widest))
         self.legend_rows = self._legend_rows(total_width)
-        lines = len(self.legend_rows) + (3 + max(1, len(plan.regions)) if list_regions else 0)
+        lines = len(self.legend_rows) + (2 + len(self.listed) if list_regions else 0)
         size = (total_width, self.below + lines * LINE)
         self.image = Image.new("RGB", (size[0] * DRAW_SCALE, size[1] * DRAW_SCALE), theme.background)
         self.pen = ImageDraw.Draw(self.image)
+
+    def _listed(self) -> list[str]:
+        """Return the lines of the list of regions: the regions, then the rule for unsure ones."""
+        regions = [region.sentence("sq m") for region in self.plan.regions]
+        return [
+            *(regions or ["No regions: everything was observed, and the map is certain."]),
+            *textwrap.wrap(unsure_rule(self.plan.predicted_errors), RULE_COLUMNS),
+        ]
 
     def _legend_rows(self, total_width: int) -> list[list[tuple[str, Colour]]]:
         """Break the entries of the legend into lines."""
@@ -252,12 +274,12 @@ class _Sheet:
                 x += 36 + self.text(x + 18, y, words, 13)
 
     def region_list(self) -> None:
-        """List the regions to scan again, with reason, size and position."""
+        """List the regions to scan again, with reason, size and position, and the rule for unsure ones."""
         y = self.below + (len(self.legend_rows) + 1.0) * LINE
         self.text(self.gap, y, "Where to scan again", 17)
-        if not self.plan.regions:
-            self.text(self.gap, y + LINE, "No regions: everything was observed, and the map is certain.", 14)
-        for number, region in enumerate(self.plan.regions, 1):
+        for number, words in enumerate(self.listed, 1):
             y += LINE
-            self.numbered_dot(self.gap + DOT, y, number, self.theme.curves[REASON_COLOURS[region.why]])
-            self.text(self.gap + 28, y, region.sentence("sq m"), 14)
+            if number <= len(self.plan.regions):
+                why = self.plan.regions[number - 1].why
+                self.numbered_dot(self.gap + DOT, y, number, self.theme.curves[REASON_COLOURS[why]])
+            self.text(self.gap + (INDENT if self.plan.regions else 0), y, words, 14)

@@ -10,11 +10,14 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 from skimage.draw import polygon
 
+from sigmasplat.floorplan.surface_samples import WRONG_BY
 from sigmasplat.types import Matrix
 
 MAX_DEPTH_SIGMA_M = 0.05
+MAX_WRONG_SHARE = 0.5
+"""With predicted errors: the largest share of pixels whose colour is expected to be wrong."""
 MAX_COLOR_SIGMA_RATIO = 3.0
-"""Relative to the median of the plan: the absolute size of σ depends on how the map was trained."""
+"""Without predicted errors: relative to the median of the plan, because the size of σ depends on the training."""
 MIN_ALPHA = 0.9
 """As for surface fusion: below this alpha a surface is partly transparent."""
 MIN_AREA_M2 = 0.03
@@ -24,6 +27,8 @@ MAX_REGIONS = 12
 
 Grid = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
+Describe = Callable[[Mask], str]
+"""Describes a part of the cells of one reason in words."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +58,7 @@ class RescanMaps:
     """Maps of a plan [rows, columns] that show where to scan again.
 
     unobserved, floor_unobserved, free: cells of these kinds; the measurements are nan in cells without a surface.
+    wrong_share: as in `FloorPlan`; None without predicted errors.
     """
 
     unobserved: Mask
@@ -61,6 +67,22 @@ class RescanMaps:
     color_sigma: Grid
     depth_sigma_m: Grid
     alpha: Grid
+    wrong_share: Grid | None = None
+
+
+def unsure_rule(predicted_errors: bool) -> str:
+    """Return a sentence that says when a region is unsure."""
+    depth = f"{100.0 * MAX_DEPTH_SIGMA_M:g} cm"
+    if predicted_errors:
+        return (
+            f"A region is unsure if the predicted error of depth is above {depth} (one standard deviation), or if more "
+            f"than {100.0 * MAX_WRONG_SHARE:g} % of the pixels are expected wrong by more than {WRONG_BY:g} (colour, "
+            "0 to 1)."
+        )
+    return (
+        "This run has no predicted errors (uncertainty.probes), so a region is unsure if splats along a ray are more "
+        f"than {depth} apart, or if their learned colour deviation is {MAX_COLOR_SIGMA_RATIO:g} times the median."
+    )
 
 
 def find_rescan_regions(maps: RescanMaps, cell_m: float, origin_m: Matrix) -> list[RescanRegion]:
@@ -78,19 +100,11 @@ def find_rescan_regions(maps: RescanMaps, cell_m: float, origin_m: Matrix) -> li
     return sorted(found, key=lambda region: -region.area_m2)[:MAX_REGIONS]
 
 
-def _reasons(maps: RescanMaps, cell_m: float) -> list[tuple[str, Mask, Callable[[Mask], str]]]:
+def _reasons(maps: RescanMaps, cell_m: float) -> list[tuple[str, Mask, Describe]]:
     """Return for each reason its name, its cells, and a function that describes a part of these cells."""
-    median_sigma = float(np.nanmedian(maps.color_sigma)) if np.isfinite(maps.color_sigma).any() else 1.0
     with np.errstate(invalid="ignore"):
         thin = np.asarray(maps.alpha < MIN_ALPHA)
-        unsure_depth = maps.depth_sigma_m > MAX_DEPTH_SIGMA_M
-        unsure_color = maps.color_sigma > MAX_COLOR_SIGMA_RATIO * median_sigma
-
-    def describe_uncertainty(at: Mask) -> str:
-        depth = f"depth ± {100.0 * np.nanmean(maps.depth_sigma_m[at]):.1f} cm"
-        color = f"colour uncertainty {np.nanmean(maps.color_sigma[at]) / median_sigma:.1f} times the median"
-        return ", ".join(words for words, cause in ((depth, unsure_depth), (color, unsure_color)) if cause[at].any())
-
+    unsure, describe_unsure = _unsure(maps) if maps.wrong_share is None else _unsure_predicted(maps, maps.wrong_share)
     return [
         (
             "unseen",
@@ -99,8 +113,37 @@ def _reasons(maps: RescanMaps, cell_m: float) -> list[tuple[str, Mask, Callable[
         ),
         ("unseen", maps.floor_unobserved, lambda at: "floor not observed"),
         ("thin", thin, lambda at: f"surface {100.0 * (1.0 - np.nanmean(maps.alpha[at])):.0f} % transparent"),
-        ("unsure", np.asarray((unsure_depth | unsure_color) & ~thin), describe_uncertainty),
+        ("unsure", np.asarray(unsure & ~thin), describe_unsure),
     ]
+
+
+def _unsure_predicted(maps: RescanMaps, wrong_share: Grid) -> tuple[Mask, Describe]:
+    """Return the cells with a large predicted error, and a function that describes a part of them."""
+    with np.errstate(invalid="ignore"):
+        of_depth, of_color = maps.depth_sigma_m > MAX_DEPTH_SIGMA_M, wrong_share > MAX_WRONG_SHARE
+
+    def describe(at: Mask) -> str:
+        depth = f"depth uncertain by {100.0 * np.nanmean(maps.depth_sigma_m[at]):.0f} cm"
+        share = 100.0 * np.nanmean(wrong_share[at])
+        color = f"{share:.0f} % of the pixels expected wrong by more than {WRONG_BY:g}"
+        return ", ".join(words for words, cause in ((depth, of_depth), (color, of_color)) if cause[at].any())
+
+    return np.asarray(of_depth | of_color), describe
+
+
+def _unsure(maps: RescanMaps) -> tuple[Mask, Describe]:
+    """Return the cells with a large spread of depth or a large σ, and a function that describes a part of them."""
+    median_sigma = float(np.nanmedian(maps.color_sigma)) if np.isfinite(maps.color_sigma).any() else 1.0
+    with np.errstate(invalid="ignore"):
+        of_depth = maps.depth_sigma_m > MAX_DEPTH_SIGMA_M
+        of_color = maps.color_sigma > MAX_COLOR_SIGMA_RATIO * median_sigma
+
+    def describe(at: Mask) -> str:
+        depth = f"depth ± {100.0 * np.nanmean(maps.depth_sigma_m[at]):.1f} cm"
+        color = f"colour uncertainty {np.nanmean(maps.color_sigma[at]) / median_sigma:.1f} times the median"
+        return ", ".join(words for words, cause in ((depth, of_depth), (color, of_color)) if cause[at].any())
+
+    return np.asarray(of_depth | of_color), describe
 
 
 def _open(mask: Mask) -> Mask:

@@ -250,15 +250,25 @@ class RunFolder:
 
         Raises RunError if a file is damaged, or does not have one row for each splat; SourceError as `read_map` does.
         """
-        uncertainty = self.read_uncertainty()
-        if uncertainty is None or uncertainty.std is None:
+        if not (self.path / uncertainty_files.JSON).is_file():
             return None
-        field, std = self.read_map(), uncertainty.std
-        fits = std.depth_std_m.shape == std.color_std.shape == (len(field),)
+        field = self.read_map()
+        uncertainty = self.uncertainty_of(field)
+        return None if uncertainty is None or uncertainty.std is None else (field, uncertainty.std)
+
+    def uncertainty_of(self, field: GaussianField) -> MapUncertainty | None:
+        """Return how sure `field`, the map of the run, is; None if the run has not measured it.
+
+        Raises RunError if a file is damaged, or does not have one row for each splat.
+        """
+        uncertainty = self.read_uncertainty()
+        if uncertainty is None:
+            return None
+        std, rows = uncertainty.std, len(uncertainty.splats)
+        fits = std is None or std.depth_std_m.shape == std.color_std.shape == (len(field),)
         if uncertainty.splats.shape != (len(field), len(SPLAT_COLUMNS)) or not fits:
-            rows = len(uncertainty.splats)
             raise RunError(f"{self.path} has uncertainties of {rows} rows for {len(field)} splats; run it again")
-        return field, std
+        return uncertainty
 
     def map_bytes(self) -> int:
         """Return the size of map.ply. Raises RunError if it is missing."""

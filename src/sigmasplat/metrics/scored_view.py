@@ -14,11 +14,17 @@ COVERED_ALPHA = 0.5
 @dataclass(frozen=True, eq=False)
 class PredictedErrors:
     """What a map predicts of the errors of a view, variances [H, W]: of colour (mean over channels, colour²) in two
-    parts, and of the difference between rendered depth and a reading of the sensor (m²)."""
+    parts, and of the difference between rendered depth and a reading of the sensor (m²), with its epistemic part."""
 
     color_aleatoric: NDArray[np.float32]
     color_epistemic: NDArray[np.float32]
     reading_m2: NDArray[np.float32]
+    depth_epistemic_m2: NDArray[np.float32]
+
+    @property
+    def reading_aleatoric_m2(self) -> NDArray[np.float32]:
+        """Return the part of reading_m2 that more views do not reduce [H, W]."""
+        return np.asarray(np.maximum(self.reading_m2 - self.depth_epistemic_m2, 0.0), np.float32)
 
     @property
     def color(self) -> NDArray[np.float32]:

@@ -97,7 +97,8 @@ def scored_view(frame: Frame, rendered: Render, kind: str, notes: tuple[str, ...
 
 def predicted_errors(found: Predicted) -> PredictedErrors:
     """Return the predictive variances of a view as arrays."""
-    return PredictedErrors(_array(found.color_aleatoric), _array(found.color_epistemic), _array(found.reading_m2))
+    variances = found.color_aleatoric, found.color_epistemic, found.reading_m2, found.depth_epistemic_m2
+    return PredictedErrors(*map(_array, variances))
 
 
 def sample_pixels(view: ScoredView) -> NDArray[np.float32]:

@@ -1,7 +1,7 @@
 """What a map predicts its errors with: variances of its splats, the background, and the weights of each part."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from torch import Tensor
 
@@ -68,3 +68,8 @@ class MapUncertainty:
     calibration: Calibration
     probes: int = 0
     std: SplatStd | None = None
+
+    def at(self, rows: Tensor) -> "MapUncertainty":
+        """Return the values of the splats selected by a mask [N] or by indices."""
+        std = None if self.std is None else self.std.at(rows)
+        return replace(self, splats=self.splats.cpu()[rows], std=std)

@@ -70,6 +70,12 @@ pre { white-space: pre-wrap; overflow-wrap: anywhere; margin: 0;
 """.replace("NARROW", NARROW)
 
 
+PREDICTED_EXPLANATION = (
+    "<p class=soft>Below each held-out view: its errors, and the predicted errors, one standard deviation each. Their "
+    "aleatoric part is noise and detail that the map cannot show; their epistemic part shows where to scan again.</p>"
+)
+
+
 @dataclass(frozen=True)
 class Contents:
     """What a report shows.
@@ -184,6 +190,8 @@ def _strips(contents: Contents) -> str:
         "each ray. The root of V and the RMS error have separate colour scales. Where both look alike, V predicts "
         "the error well. Slate pixels: no depth reading, or no surface in the map.</p>"
     )
+    if contents.metrics.get("calibration"):
+        explanation += PREDICTED_EXPLANATION
     parts = ["<h2>Views</h2>", explanation]
     for kind, strips in contents.strips.items():
         if strips:

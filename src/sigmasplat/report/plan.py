@@ -1,10 +1,13 @@
 """Make the floor plan of a run: the report and the exported plan use this one function, so that both agree."""
 
+from functools import partial
+
 from sigmasplat.floorplan.floor_plan import CELL_M, FloorPlan, floor_plan
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import FieldRenderer
+from sigmasplat.render.predictive import predict
 from sigmasplat.types import Progress, no_progress
 
 
@@ -13,10 +16,15 @@ def run_floor_plan(
 ) -> FloorPlan:
     """Make the floor plan of a run's map.
 
-    path: the believed poses; camera: that of the images the run worked on. It is
-    rendered with the run's settings. Calls `progress(poses done, total)`. Raises RunError without a map; ConfigError
-    unless 1 mm ≤ cell_m ≤ 1 m; SigmaSplatError if no surface is visible.
+    path: the believed poses; camera: that of the images the run worked on. It is rendered with the run's settings, and
+    its errors are predicted if the run has measured how sure its map is. Calls `progress(poses done, total)`. Raises
+    RunError without a map, or if the uncertainty belongs to another map; ConfigError unless 1 mm ≤ cell_m ≤ 1 m;
+    SigmaSplatError if no surface is visible.
     """
     config, field = run.config(), run.read_map()
     renderer = FieldRenderer(config.render, config.backend)
-    return floor_plan(field, path, camera, cell_m=cell_m, renderer=renderer, progress=progress)
+    known = run.uncertainty_of(field)
+    predictor = None
+    if known is not None:
+        predictor = partial(predict, field, known, options=config.render, backend=config.backend)
+    return floor_plan(field, path, camera, cell_m=cell_m, renderer=renderer, predictor=predictor, progress=progress)

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
+from sigmasplat.floorplan.rescan import unsure_rule
 from sigmasplat.report.tables import format_ranges, number
 
 if TYPE_CHECKING:
@@ -16,6 +17,8 @@ RANK_WORDS = ((0.5, "well"), (0.3, "fairly well"), (0.1, "weakly"))
 DEPTH_WORDS = ((0.01, "very accurate"), (0.03, "good"))
 OVERFIT_DB = 3.0
 """If training views are better than held-out views by this much, there are too few keyframes."""
+NOMINAL, CALIBRATED = 0.683, 0.05
+"""Coverage of one standard deviation, and the largest difference from it that counts as calibrated."""
 SLOW_PER_S = 5.0
 """Below this number of images per second a run is slow."""
 
@@ -117,14 +120,40 @@ def _uncertainty(metrics: Metrics) -> list[str]:
 
 def _predicted_errors(metrics: Metrics) -> list[str]:
     found = metrics.get("predictive") or {}
-    measured = [
-        f"{number(found[key]['coverage_68'], 0, 100.0)} % ({name})"
-        for key, name in (("color", "colour"), ("depth", "depth"))
-        if found.get(key)
-    ]
+    measured = {name: found[key] for key, name in (("color", "colour"), ("depth", "depth")) if found.get(key)}
     if not measured:
+        return _unknown_errors(metrics)
+    shares = ", ".join(f"{number(of['coverage_68'], 0, 100.0)} % ({name})" for name, of in measured.items())
+    verdicts = [_verdict(name, of) for name, of in measured.items()]
+    return [
+        f"{_calibrated_on(metrics)}68 % of the errors should be within one predicted standard deviation: measured "
+        f"{shares}. {' '.join(verdicts)}"
+    ]
+
+
+def _calibrated_on(metrics: Metrics) -> str:
+    probes = (metrics.get("calibration") or {}).get("probes")
+    if probes is None:
+        return ""
+    if not probes:
+        return "The run kept no probe view, so predicted errors have the weights of the preset. "
+    return f"Predicted errors were calibrated on {probes} probe views, to which no map was fitted. "
+
+
+def _verdict(name: str, scores: Metrics) -> str:
+    """Return whether a predicted error has the right size, and the factor that corrects it."""
+    off = scores["coverage_68"] - NOMINAL
+    if abs(off) <= CALIBRATED:
+        return f"The predicted error of {name} has the right size."
+    size, factor = "small" if off < 0 else "large", scores.get("z_68")
+    correction = "" if factor is None else f"; multiply it by {number(factor, 2)}"
+    return f"The predicted error of {name} is too {size}{correction}."
+
+
+def _unknown_errors(metrics: Metrics) -> list[str]:
+    if "calibration" not in metrics or metrics["calibration"] is not None:
         return []
-    return [f"68 % of the errors should be within one predicted standard deviation: measured {', '.join(measured)}."]
+    return ["The run has no predicted errors of colour and depth: the size of V is not calibrated."]
 
 
 def _pose_covariance(metrics: Metrics) -> list[str]:
@@ -153,7 +182,7 @@ def rescan_sentences(metrics: Metrics, plan: "FloorPlan | None") -> list[str]:
     parts = [f"{len(found)} {reasons[why]} ({number(sum(found), 1)} m²)" for why, found in areas.items() if found]
     if parts:
         sentences.append(f"Regions near the path to scan again: {', '.join(parts)}.")
-    return sentences
+    return [*sentences, unsure_rule(plan.predicted_errors)]
 
 
 def advice(metrics: Metrics, run: str, again: str, settings: dict[str, Any]) -> list[Advice]:
@@ -161,9 +190,7 @@ def advice(metrics: Metrics, run: str, again: str, settings: dict[str, Any]) -> 
 
     run: the run folder; again: the command that makes the run again; settings: the values of its config.json.
     """
-    found = [
-        rule(metrics, again, settings) for rule in (_lost, _apart, _few_keyframes, _blurred, _holes, _slow, _no_loop)
-    ]
+    found = [rule(metrics, again, settings) for rule in RULES]
     view = ("View the map in 3D, and hide uncertain splats:", f"sigmasplat view {run}")
     mesh = ("Export a mesh for other programs:", f"sigmasplat mesh {run} --out room.glb")
     return [*filter(None, found), view, mesh]
@@ -262,3 +289,19 @@ def _no_loop(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice |
     if (metrics.get("submaps") or 1) < 3 or (metrics.get("loops") or {}).get("accepted"):
         return None
     return "No loop was closed, so drift could not be corrected. End a scan where it started.", ""
+
+
+def _no_prediction(metrics: Metrics, again: str, settings: dict[str, Any]) -> Advice | None:
+    if "calibration" not in metrics or metrics["calibration"] is not None:
+        return None
+    if (settings.get("uncertainty") or {}).get("probes"):
+        return "The run has no predicted errors, because it did not make its final map. Make it again:", again
+    return (
+        "The run has no predicted errors of colour and depth, because it kept no probe views. Keep two in each submap; "
+        "this does not change the map:",
+        f"{again} --set uncertainty.probes=2",
+    )
+
+
+RULES = (_lost, _apart, _few_keyframes, _blurred, _holes, _slow, _no_loop, _no_prediction)
+"""What to check, the most important first."""

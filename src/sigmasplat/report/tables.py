@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
+from sigmasplat.model.map_uncertainty import SHIPPED
 
 
 def number(value: float | None, digits: int, scale: float = 1.0) -> str:
@@ -42,6 +43,7 @@ def headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
         *in_submaps,
         ("Depth L1, held-out", number(held_out.get("depth_l1_m"), 2, 100.0), "cm"),
         *surface,
+        *_coverage_figures(metrics),
         ("Spearman V ~ error²", number((metrics.get("uncertainty") or {}).get("spearman"), 3), ""),
         ("Speed", number(metrics.get("frames_per_s"), 2), "frames/s"),
         ("Longest frame after the first", number(metrics.get("worst_frame_s"), 0, 1e3), "ms"),
@@ -52,6 +54,20 @@ def headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
         *_state_figures(metrics),
         *_submap_figures(metrics),
     ]
+
+
+def _coverage_figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Return the coverage of the predicted errors, or that there are none; nothing if they were not looked for."""
+    found = metrics.get("predictive") or {}
+    kinds = (("colour", found.get("color")), ("depth", found.get("depth")))
+    known = [
+        (f"Within the predicted error, {name}", number(scores["coverage_68"], 0, 100.0), "% (ideal 68)")
+        for name, scores in kinds
+        if scores
+    ]
+    if known or "calibration" not in metrics or metrics["calibration"] is not None:
+        return known
+    return [("Predicted errors", "none", "(uncertainty.probes)")]
 
 
 def _total_times(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
@@ -102,6 +118,7 @@ def score_tables(metrics: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
         ("Uncertainty V, held-out, final map", _uncertainty_rows(metrics.get("uncertainty_final"))),
         (f"Calibration of V, {views}", _calibration_rows(metrics.get("uncertainty"))),
         ("Predicted errors, held-out, final map", _predictive_rows(metrics.get("predictive"))),
+        ("Calibration of predicted errors", _weight_rows(metrics.get("calibration"))),
         ("Covariance of poses", _covariance_rows(metrics.get("pose_covariance"))),
     ]
 
@@ -237,6 +254,17 @@ def _predictive_rows(scores: dict[str, Any] | None) -> list[list[str]]:
     kinds = [scores.get(key) or {} for key in ("color", "depth")]
     return [[f"{scores['views']} views", "colour", "depth"]] + [
         [label, *(number(kind.get(key), digits, scale) for kind in kinds)] for label, key, digits, scale in lines
+    ]
+
+
+def _weight_rows(calibration: dict[str, Any] | None) -> list[list[str]]:
+    """Return the fitted weight of each part of the predicted variances, and that of the preset."""
+    if not calibration:
+        return []
+    parts = dict.fromkeys([*calibration["color"], *calibration["depth"]])
+    columns = [calibration["color"], SHIPPED.color, calibration["depth"], SHIPPED.depth]
+    return [[f"weights, {calibration['probes']} probe views", "colour", "… preset", "depth", "… preset"]] + [
+        [part, *("" if part not in weights else f"{weights[part]:.2g}" for weights in columns)] for part in parts
     ]
 
 

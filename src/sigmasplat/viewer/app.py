@@ -11,15 +11,24 @@ import viser
 from sigmasplat.drawing.colormap import INFERNO
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.viewer import lines
-from sigmasplat.viewer.layers import LayerImage, Legend, browser_camera, draw_legend, render_layer
-from sigmasplat.viewer.panel import ControlPanel, ControlState
+from sigmasplat.viewer.layers import (
+    LayerImage,
+    Legend,
+    browser_camera,
+    draw_legend,
+    render_layer,
+    render_predicted,
+)
+from sigmasplat.viewer.panel import PREDICTED_MODES, ControlPanel, ControlState
 from sigmasplat.viewer.scene import ViserScene, camera_pose, move_camera, set_initial_camera
 from sigmasplat.viewer.snapshot import BUDGET, Piece, Snapshot, within_budget
 from sigmasplat.viewer.splats import (
     Floats,
     VisibilityFilter,
     merge_pieces,
-    sigma_range,
+    merged_uncertainty,
+    palette_range,
+    sorted_depth_stds,
     sorted_sigmas,
     splat_arrays,
     visibility_filter,
@@ -64,7 +73,9 @@ class ViewerApp:
         self.scene = ViserScene(server, self._clicked)
         self._snapshot: Snapshot | None = None
         self._drawn: dict[Any, Any] = {}
-        self._sigmas: tuple[list[IdentityKey], Floats] = ([], sorted_sigmas(()))
+        self._values: tuple[list[IdentityKey], dict[str, Floats]] = (
+            [], {"σ": sorted_sigmas(()), "depth error": sorted_depth_stds(())}
+        )  # fmt: skip
         self._merged: tuple[Any, Any] = (None, None)
         self._wake, self._stop = threading.Event(), threading.Event()
         server.on_client_connect(self._welcome)
@@ -111,16 +122,22 @@ class ViewerApp:
         self.panel.adapt(len(path), snapshot.live, snapshot.true_positions is not None, has_final and has_submaps)
         controls = self.panel.state()
         pieces = snapshot.visible_pieces(controls.final_map, controls.row)
-        ordered = self._sigmas_of(pieces)
-        visible = visibility_filter(ordered, controls.hidden_share, controls.min_opacity)
-        span = sigma_range(ordered)
+        self.panel.offer_predicted(any(piece.uncertainty is not None for piece in pieces))
+        controls = self.panel.state()
+        ordered = self._values_of(pieces)
+        visible = visibility_filter(
+            ordered["σ"], controls.hidden_share, controls.min_opacity, controls.max_std_m
+        )  # fmt: skip
+        span = palette_range(ordered["depth error" if controls.colouring == "depth error" else "σ"])
         with self.server.atomic():
             self._draw_path(snapshot, controls)
             self._draw_splats(pieces, controls, span, visible)
         self._draw_keyframes(snapshot, controls)
         self._show_texts(snapshot, controls, pieces, visible)
         self._follow(snapshot, controls)
-        legend = Legend(INFERNO, *span, "") if controls.mode == "splats" and controls.colouring == "σ" else None
+        legend = None
+        if controls.mode == "splats" and controls.colouring != "colour":
+            legend = Legend(INFERNO, *span, " m" if controls.colouring == "depth error" else "")
         for client in self.server.get_clients().values():
             legend = self._draw_layer(client, snapshot, controls, pieces, visible) or legend
         if self._is_new("legend", legend and legend[1:]):
@@ -133,11 +150,12 @@ class ViewerApp:
         self._drawn[what] = state
         return True
 
-    def _sigmas_of(self, pieces: tuple[Piece, ...]) -> Floats:
+    def _values_of(self, pieces: tuple[Piece, ...]) -> dict[str, Floats]:
+        """Return σ and depth errors of the splats in ascending order."""
         fields = [IdentityKey(piece.field) for piece in pieces]
-        if self._sigmas[0] != fields:
-            self._sigmas = (fields, sorted_sigmas(pieces))
-        return self._sigmas[1]
+        if self._values[0] != fields:
+            self._values = (fields, {"σ": sorted_sigmas(pieces), "depth error": sorted_depth_stds(pieces)})
+        return self._values[1]
 
     def _draw_path(self, snapshot: Snapshot, controls: ControlState) -> None:
         path, row = snapshot.path, controls.row
@@ -159,11 +177,11 @@ class ViewerApp:
     ) -> None:
         if controls.layer is not None:
             pieces = ()
-        ends = span if controls.colouring == "σ" else None  # the splats' own colours do not depend on the range of σ
+        ends = None if controls.colouring == "colour" else span  # own colours do not depend on the range
         state = ([(p.name, IdentityKey(p.field)) for p in pieces], controls.colouring, ends, visible)
         if self._is_new("splats", state):
             sent = within_budget(pieces, BUDGET)  # a large final map is rendered completely, but sent thinned
-            drawn = {p.name: (splat_arrays(p.field, controls.colouring, span, visible), p.T_world_piece) for p in sent}
+            drawn = {p.name: (splat_arrays(p, controls.colouring, span, visible), p.T_world_piece) for p in sent}
             self.scene.show_splats(drawn)
         else:
             self.scene.place_splats({piece.name: piece.T_world_piece for piece in pieces})
@@ -186,15 +204,18 @@ class ViewerApp:
                 client.scene.set_background_image(None)
             return None
         pose, splats = camera_pose(c), ([(IdentityKey(p.field), p.T_world_piece.tobytes()) for p in pieces], visible)
-        state = (controls.layer, pose.tobytes(), c.fov, c.aspect, splats)
+        state = (controls.layer, controls.error_part, pose.tobytes(), c.fov, c.aspect, splats)
         drawn = self._drawn.get(key)
         if drawn is None or drawn[0] != state:
             if self._merged[0] != splats:
-                self._merged = (splats, merge_pieces(pieces, visible))
+                self._merged = (splats, (merge_pieces(pieces, visible), merged_uncertainty(pieces, visible)))
             camera = browser_camera(c.fov, c.aspect, LIVE_ROWS if snapshot.live else ROWS)
-            made: LayerImage = render_layer(
-                self._merged[1], camera, pose, controls.layer, snapshot.options, snapshot.backend
-            )
+            (field, known), how = self._merged[1], (snapshot.options, snapshot.backend)
+            made: LayerImage
+            if controls.layer in PREDICTED_MODES and known is not None:
+                made = render_predicted(field, known, camera, pose, controls.layer, controls.error_part, *how)
+            else:
+                made = render_layer(field, camera, pose, controls.layer, *how)
             if client.client_id not in self.server.get_clients():
                 return None  # the client has disconnected in the meantime
             client.scene.set_background_image(made.pixels, "jpeg", jpeg_quality=85)
@@ -206,7 +227,7 @@ class ViewerApp:
         self, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...], visible: VisibilityFilter
     ) -> None:
         path = snapshot.path
-        splats, kept = sum(len(p.field) for p in pieces), sum(int(visible.mask(p.field).sum()) for p in pieces)
+        splats, kept = sum(len(p.field) for p in pieces), sum(int(visible.mask(p).sum()) for p in pieces)
         submaps = int(path.submaps[-1]) + 1 if len(path) else 0
         outside = int((~path.inside & ~path.lost).sum())
         apart = f", {outside} apart (not shown)" if outside else ""
@@ -215,7 +236,9 @@ class ViewerApp:
             f"{int(path.lost.sum())} lost{apart}, {submaps} submap{'s' * (submaps != 1)}  \n"
             f"{kept:,} of {splats:,} splats shown"
         )
-        hidden = "" if visible.max_sigma == float("inf") else f"hidden: σ above {visible.max_sigma:.3g}"
+        limits = [f"σ above {visible.max_sigma:.3g}"] if visible.max_sigma < float("inf") else []
+        limits += [f"error of depth above {visible.max_std_m:g} m"] if visible.max_std_m < float("inf") else []
+        hidden = f"hidden: {', '.join(limits)}" if limits else ""
         self.panel.show_texts(facts, hidden, _frame_text(snapshot, controls.row))
 
     def _follow(self, snapshot: Snapshot, controls: ControlState) -> None:

@@ -38,7 +38,7 @@ ShowSnapshot = Callable[[Snapshot], None]
 def finished_snapshot(run: RunFolder, source: Source | None = None, budget: int = BUDGET) -> Snapshot:
     """Read the snapshot of a finished run; `source` provides keyframe images that the run did not keep.
 
-    Raises RunError if the run stopped before it had a map.
+    Raises RunError if the run stopped before it had a map, or if its uncertainty belongs to another map.
     """
     frames, final, tensors = run.read_frames(), run.read_map(), run.read_checkpoint()[0]
     config, true_file = run.config(), run.path / TRUTH
@@ -53,7 +53,7 @@ def finished_snapshot(run: RunFolder, source: Source | None = None, budget: int 
     return Snapshot(
         run.path.resolve().name,
         _final_path(frames, tensors),
-        Piece(None, without_moments(final)),
+        Piece(None, without_moments(final), uncertainty=run.uncertainty_of(final)),
         within_budget(pieces, budget),
         read_trajectory(true_file).T_world_camera[:, :3, 3] if true_file.is_file() else None,
         _camera(run, cache, source),

@@ -14,10 +14,13 @@ from sigmasplat.metrics.scored_view import COVERED_ALPHA
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.map_uncertainty import MapUncertainty
 from sigmasplat.render import render
+from sigmasplat.render.predictive import predicted, variance_parts
 from sigmasplat.types import Matrix
 
-Layer = Literal["colour", "depth", "V", "U", "opacity"]
+Layer = Literal["colour", "depth", "V", "U", "opacity", "color error", "depth error"]
+ErrorPart = Literal["all", "aleatoric", "epistemic"]
 Floats = NDArray[np.float32]
 GREY = np.array([(0, 0, 0), (255, 255, 255)], np.float64)
 LEGEND_SIZE, LEGEND_BAR, INK, PAPER = (280, 34), 14, (233, 237, 242), (36, 40, 46)
@@ -71,6 +74,31 @@ def render_layer(
         assert spread is not None
         about = np.sqrt(np.maximum(_array(spread), 0.0) / np.maximum(alpha, COVERED_ALPHA))
         return _from_zero(about, covered, " m")
+
+
+def render_predicted(
+    field: GaussianField, known: MapUncertainty, camera: Camera, T_world_camera: Matrix, layer: Layer,
+    part: ErrorPart, options: RenderConfig, backend: str,
+) -> LayerImage:  # fmt: skip
+    """Draw the predicted standard deviation of colour ("color error") or of depth in m ("depth error"), or a part.
+
+    The scale ends at the 99th percentile of the whole error, so that the parts can be compared. Depth is drawn only
+    where A > ½; colour is predicted where the map is empty too.
+    """
+    T_camera_world = se3.inverse(T_world_camera)
+    with torch.no_grad():
+        parts = variance_parts(field, known.splats, known.background, camera, T_camera_world, options, backend)
+        found = predicted(parts, known.calibration)
+    covered = _array(parts.alpha) > COVERED_ALPHA
+    if layer == "color error":
+        aleatoric, epistemic = found.color_aleatoric, found.color_epistemic
+        covered, unit = np.ones_like(covered), ""
+    else:
+        aleatoric, epistemic, unit = found.depth_aleatoric_m2, found.depth_epistemic_m2, " m"
+    total = aleatoric + epistemic
+    shown = {"all": total, "aleatoric": aleatoric, "epistemic": epistemic}[part]
+    ends = 0.0, colormap.value_range(_array(total.sqrt()), covered)[1]
+    return _mapped(_array(shown.sqrt()), covered, ends, colormap.INFERNO, unit)
 
 
 def draw_legend(legend: Legend) -> colormap.Rgb:

@@ -61,7 +61,7 @@ class LiveView:
         poses, keyframes = slam.atlas.T_world_camera(), tuple(slam.keyframe_indices)
         path = CameraPath(poses, lost, submaps, keyframes, outside_world(states))
         self._add_finished()
-        final = Piece(None, thin(slam.field, self.budget)) if finished else None
+        final = Piece(None, slam.field, uncertainty=slam.uncertainty).thinned(self.budget) if finished else None
         pieces = tuple(piece for piece in (*self._finished, *self._active()) if piece.submap not in outside)
         mapped = slam.mapper.keyframes
         return Snapshot(

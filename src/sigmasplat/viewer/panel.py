@@ -8,11 +8,13 @@ import numpy as np
 import viser
 
 from sigmasplat.drawing.colormap import NO_READING, Rgb
-from sigmasplat.viewer.layers import LEGEND_SIZE, Layer
+from sigmasplat.viewer.layers import LEGEND_SIZE, ErrorPart, Layer
 from sigmasplat.viewer.splats import Colouring
 
-ViewMode = Literal["splats", "colour", "depth", "V", "U", "opacity"]
-VIEW_MODES: tuple[ViewMode, ...] = ("splats", "colour", "depth", "V", "U", "opacity")
+ViewMode = Literal["splats", "colour", "depth", "V", "U", "opacity", "color error", "depth error"]
+VIEW_MODES: tuple[ViewMode, ...] = ("splats", "colour", "depth", "V", "U", "opacity", "color error", "depth error")
+PREDICTED_MODES: tuple[ViewMode, ...] = ("color error", "depth error")
+"""Only for maps with predicted errors."""
 MODE_LABELS: dict[ViewMode, str] = {
     "splats": "splats, drawn by the browser",
     "colour": "colour, rendered by SigmaSplat",
@@ -20,7 +22,17 @@ MODE_LABELS: dict[ViewMode, str] = {
     "V": "√V: standard deviation of colour",
     "U": "√U: standard deviation of depth",
     "opacity": "opacity",
+    "color error": "predicted error of colour",
+    "depth error": "predicted error of depth",
 }
+COLOURINGS: dict[Colouring, str] = {"colour": "colour", "σ": "σ", "depth error": "predicted error of depth"}
+ERROR_PARTS: dict[ErrorPart, str] = {
+    "all": "all",
+    "aleatoric": "aleatoric: noise and detail",
+    "epistemic": "epistemic: more views reduce it",
+}
+MOST_STD_M = 0.3
+"""End of the slider for predicted errors of depth; there, no splat is hidden."""
 FINAL_MAP, SUBMAPS = "final map", "submaps"
 
 
@@ -31,8 +43,10 @@ class ControlState:
     mode: ViewMode
     colouring: Colouring
     final_map: bool
+    error_part: ErrorPart
     hidden_share: float
     min_opacity: float
+    max_std_m: float
     row: int
     path: bool
     keyframes: bool
@@ -65,11 +79,15 @@ class ControlPanel:
 
     def _add_map_controls(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("Map"):
-            self.mode = gui.add_dropdown("show", tuple(MODE_LABELS[mode] for mode in VIEW_MODES))
-            self.colouring = gui.add_dropdown(
+            self.mode: Any = gui.add_dropdown("show", _mode_options(predicted=False))
+            self.error_part = gui.add_dropdown(
+                "part of the error", tuple(ERROR_PARTS.values()), visible=False,
+                hint="one standard deviation of the whole predicted error or of a part, on the scale of the whole",
+            )  # fmt: skip
+            self.colouring: Any = gui.add_dropdown(
                 "splat colour",
-                ("colour", "σ"),
-                hint="the splats' own colours, or σ of their colour: bright = uncertain",
+                _colouring_options(predicted=False),
+                hint="the splats' own colours, σ of their colour, or predicted error of depth: bright = uncertain",
             )
             self.part = gui.add_dropdown(
                 "map", (FINAL_MAP, SUBMAPS), hint="the final map, or the submaps from which it was made"
@@ -78,6 +96,10 @@ class ControlPanel:
             self.hidden = gui.add_slider(
                 "hide uncertain", 0, 99, 1, 0, hint="hide this percentage of the splats: those with the largest σ"
             )
+            self.max_std = gui.add_slider(
+                "hide above, m", 0.005, MOST_STD_M, 0.005, MOST_STD_M, visible=False,
+                hint="hide splats with a larger predicted standard deviation of depth; at the right end none is hidden",
+            )  # fmt: skip
             self.min_opacity = gui.add_slider(
                 "minimum opacity", 0.0, 0.99, 0.01, 0.0, hint="hide splats with a lower opacity"
             )
@@ -96,18 +118,20 @@ class ControlPanel:
 
     def _controls(self) -> tuple[Any, ...]:
         return (
-            self.mode, self.colouring, self.part, self.hidden, self.min_opacity, self.row, self.follow, self.path,
-            self.keyframes, self.thumbnails, self.true_path,
+            self.mode, self.error_part, self.colouring, self.part, self.hidden, self.max_std, self.min_opacity,
+            self.row, self.follow, self.path, self.keyframes, self.thumbnails, self.true_path,
         )  # fmt: skip
 
     def state(self) -> ControlState:
         """Return the current values of the controls."""
         return ControlState(
             next(mode for mode in VIEW_MODES if MODE_LABELS[mode] == self.mode.value),
-            "σ" if self.colouring.value == "σ" else "colour",
+            next(name for name, label in COLOURINGS.items() if label == self.colouring.value),
             self.part.value == FINAL_MAP,
+            next(name for name, label in ERROR_PARTS.items() if label == self.error_part.value),
             self.hidden.value / 100.0,
             float(self.min_opacity.value),
+            float(self.max_std.value) if self.max_std.visible and self.max_std.value < MOST_STD_M else float("inf"),
             int(self.row.value),
             self.path.value,
             self.keyframes.value,
@@ -128,6 +152,17 @@ class ControlPanel:
                 self.row.value = last
         self.follow.visible, self.true_path.visible, self.part.visible = live, truth_known, can_choose_map
 
+    def offer_predicted(self, known: bool) -> None:
+        """Offer the controls of predicted errors if the shown map has them."""
+        for control, options in (
+            (self.mode, _mode_options(known)),
+            (self.colouring, _colouring_options(known)),
+        ):
+            if control.options != options:
+                control.options = options
+        self.max_std.visible = known
+        self.error_part.visible = known and self.mode.value in {MODE_LABELS[mode] for mode in PREDICTED_MODES}
+
     def show_texts(self, facts: str, hidden: str, frame: str) -> None:
         """Show texts about the run, about the hidden splats, and about the selected frame."""
         self.facts.content, self.hidden_text.content, self.frame.content = facts, hidden, frame
@@ -144,3 +179,11 @@ class ControlPanel:
         if pixels is not None:
             self.image.image = pixels
         self.image.visible = pixels is not None
+
+
+def _mode_options(predicted: bool) -> tuple[str, ...]:
+    return tuple(MODE_LABELS[mode] for mode in VIEW_MODES if predicted or mode not in PREDICTED_MODES)
+
+
+def _colouring_options(predicted: bool) -> tuple[str, ...]:
+    return tuple(label for name, label in COLOURINGS.items() if predicted or name != "depth error")

@@ -12,6 +12,7 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.drawing.colormap import Rgb
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
+from sigmasplat.model.map_uncertainty import MapUncertainty
 from sigmasplat.types import Matrix
 
 BUDGET = 300_000
@@ -25,17 +26,29 @@ class Piece:
     """A part of the map: splats in their own frame, and the pose T_world_piece of that frame.
 
     submap: its number, or None for the final map. If splats change, the piece gets a new field object; an unchanged
-    object means unchanged splats.
+    object means unchanged splats. uncertainty: how sure the splats are, None if it was not measured.
     """
 
     submap: int | None
     field: GaussianField
     T_world_piece: Matrix = dataclass_field(default_factory=lambda: np.eye(4))
+    uncertainty: MapUncertainty | None = None
 
     @property
     def name(self) -> str:
         """Return the piece's name in the scene."""
         return "map" if self.submap is None else f"submap-{self.submap}"
+
+    @property
+    def depth_std_m(self) -> Tensor | None:
+        """Return the predicted standard deviation of the depth that each splat shows [N], m; None if not measured."""
+        std = None if self.uncertainty is None else self.uncertainty.std
+        return None if std is None else std.depth_std_m
+
+    def thinned(self, most: int) -> "Piece":
+        """Return a copy with at most `most` splats (`thin`)."""
+        known = None if self.uncertainty is None else self.uncertainty.at(thinned_rows(len(self.field), most))
+        return replace(self, field=thin(self.field, most), uncertainty=known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,14 +124,18 @@ def without_moments(splats: GaussianField) -> GaussianField:
     return field_without_moments(splats.params, {name: rows.params for name, rows in splats.attributes.items()})
 
 
+def thinned_rows(n: int, most: int) -> Tensor:
+    """Return the rows of at most `most` of `n` splats, spread evenly."""
+    return torch.arange(n) if n <= most else (torch.arange(max(most, 0)) * n).div(most, rounding_mode="floor")
+
+
 def thin(splats: GaussianField, most: int) -> GaussianField:
     """Return a copy on the host of at most `most` splats, spread evenly over the rows.
 
     The remaining splats are enlarged, so that the covered area stays the same.
     """
     n = len(splats)
-    rows = torch.arange(n) if n <= most else (torch.arange(max(most, 0)) * n).div(most, rounding_mode="floor")
-    rows = rows.to(splats.params.device)
+    rows = thinned_rows(n, most).to(splats.params.device)
     kept = field_without_moments(
         splats.params[rows].cpu(), {name: extra.params[rows].cpu() for name, extra in splats.attributes.items()}
     )
@@ -137,4 +154,4 @@ def within_budget(pieces: Sequence[Piece], budget: int) -> tuple[Piece, ...]:
     if total <= budget:
         return tuple(pieces)
     share = 0.75 * budget / total
-    return tuple(replace(piece, field=thin(piece.field, int(share * len(piece.field)))) for piece in pieces)
+    return tuple(piece.thinned(int(share * len(piece.field))) for piece in pieces)

@@ -1,4 +1,4 @@
-"""Turn a field into the arrays that a browser draws; select and colour splats by σ."""
+"""Turn a field into the arrays that a browser draws; select and colour splats by σ or by predicted error."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,14 +12,15 @@ from torch import Tensor
 from sigmasplat.drawing import colormap
 from sigmasplat.model import harmonics, se3
 from sigmasplat.model.field import ATTRIBUTES, COLUMNS, GaussianField, left_factor, quaternion_of, transformed
+from sigmasplat.model.map_uncertainty import MapUncertainty
 from sigmasplat.model.splat_filter import sigmas
 from sigmasplat.viewer.snapshot import Piece, field_without_moments
 
-Colouring = Literal["colour", "σ"]
+Colouring = Literal["colour", "σ", "depth error"]
 Floats = NDArray[np.float32]
 
 MIN_VISIBLE_OPACITY = 0.1
-"""Splats with a lower opacity are ignored when the range of σ is computed."""
+"""Splats with a lower opacity are ignored when the range of σ or of the depth error is computed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,43 +39,66 @@ class SplatArrays:
 
 @dataclass(frozen=True)
 class VisibilityFilter:
-    """Hides splats whose σ is above `max_sigma` or whose opacity is below `min_opacity`."""
+    """Hides splats whose σ is above `max_sigma`, whose opacity is below `min_opacity`, or whose depth_std_m is above
+    `max_std_m`, if it is known."""
 
     max_sigma: float = float("inf")
     min_opacity: float = 0.0
+    max_std_m: float = float("inf")
 
-    def mask(self, field: GaussianField) -> Tensor:
+    def mask(self, piece: Piece) -> Tensor:
         """Return which splats are shown, bool [N]."""
-        return (sigmas(field) <= self.max_sigma) & (field.opacities >= self.min_opacity)
+        shown = (sigmas(piece.field) <= self.max_sigma) & (piece.field.opacities >= self.min_opacity)
+        return shown if piece.depth_std_m is None else shown & (piece.depth_std_m <= self.max_std_m)
 
 
 def sorted_sigmas(pieces: Sequence[Piece]) -> Floats:
     """Return σ of all visible splats in ascending order; of all splats if none is visible."""
-    found = [sigmas(piece.field)[piece.field.opacities >= MIN_VISIBLE_OPACITY].numpy() for piece in pieces]
+    return _sorted([(piece, sigmas(piece.field)) for piece in pieces])
+
+
+def sorted_depth_stds(pieces: Sequence[Piece]) -> Floats:
+    """Return depth_std_m of the splats of all pieces that have it, selected and sorted as `sorted_sigmas`."""
+    return _sorted([(piece, piece.depth_std_m) for piece in pieces if piece.depth_std_m is not None])
+
+
+def _sorted(values: Sequence[tuple[Piece, Tensor]]) -> Floats:
+    found = [of_piece[piece.field.opacities >= MIN_VISIBLE_OPACITY].numpy() for piece, of_piece in values]
     if not sum(map(len, found)):
-        found = [sigmas(piece.field).numpy() for piece in pieces]
+        found = [of_piece.numpy() for _, of_piece in values]
     return np.sort(np.concatenate([np.empty(0, np.float32), *found]))
 
 
-def visibility_filter(ordered: Floats, hidden_share: float, min_opacity: float) -> VisibilityFilter:
+def visibility_filter(
+    ordered: Floats, hidden_share: float, min_opacity: float, max_std_m: float = float("inf")
+) -> VisibilityFilter:
     """Return the filter that hides this share of the splats, those with the largest σ; `ordered` is sorted."""
-    if hidden_share <= 0.0 or not len(ordered):
-        return VisibilityFilter(min_opacity=min_opacity)
-    return VisibilityFilter(float(np.quantile(ordered, max(1.0 - hidden_share, 0.0))), min_opacity)
+    max_sigma = float("inf")
+    if hidden_share > 0.0 and len(ordered):
+        max_sigma = float(np.quantile(ordered, max(1.0 - hidden_share, 0.0)))
+    return VisibilityFilter(max_sigma, min_opacity, max_std_m)
 
 
-def sigma_range(ordered: Floats) -> tuple[float, float]:
-    """Return the range of σ that the palette covers: from 0 to a high percentile."""
+def palette_range(ordered: Floats) -> tuple[float, float]:
+    """Return the range of values that the palette covers: from 0 to a high percentile."""
     return 0.0, colormap.value_range(ordered, np.ones(len(ordered), bool))[1]
 
 
 def splat_arrays(
-    field: GaussianField, colouring: Colouring, span: tuple[float, float], visible: VisibilityFilter
+    piece: Piece, colouring: Colouring, span: tuple[float, float], visible: VisibilityFilter
 ) -> SplatArrays:
-    """Return the visible splats in their own colours, or coloured by σ over the range `span`."""
-    chosen = field_without_moments(field.params[visible.mask(field)], {})
+    """Return the visible splats in their own colours, or coloured by σ or depth error over the range `span`.
+
+    Splats without a known depth error are grey.
+    """
+    mask = visible.mask(piece)
+    chosen = field_without_moments(piece.field.params[mask], {})
     if colouring == "σ":
         colors = colormap.apply(sigmas(chosen).numpy(), *span, colormap.INFERNO)
+    elif colouring == "depth error" and piece.depth_std_m is None:
+        colors = np.full((len(chosen), 3), colormap.NO_READING, np.uint8)
+    elif colouring == "depth error" and piece.depth_std_m is not None:
+        colors = colormap.apply(piece.depth_std_m[mask].numpy(), *span, colormap.INFERNO)
     else:
         colors = np.asarray((chosen.colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8))
     return SplatArrays(
@@ -90,7 +114,7 @@ def covariances(quats_wxyz: Floats, scales: Floats) -> Floats:
 
 def merge_pieces(pieces: Sequence[Piece], visible: VisibilityFilter) -> GaussianField:
     """Return the visible splats of all pieces as one field in the world frame."""
-    parts = [(piece, visible.mask(piece.field)) for piece in pieces]
+    parts = [(piece, visible.mask(piece)) for piece in pieces]
     params = [piece.field.params[kept] for piece, kept in parts] or [GaussianField.empty().params]
     names = {name for piece, _ in parts for name in piece.field.attributes}
     attributes: dict[str, list[Tensor]] = {name: [] for name in sorted(names)}
@@ -102,6 +126,14 @@ def merge_pieces(pieces: Sequence[Piece], visible: VisibilityFilter) -> Gaussian
     return field_without_moments(
         torch.cat(params), {name: torch.cat(all_rows) for name, all_rows in attributes.items()}
     )
+
+
+def merged_uncertainty(pieces: Sequence[Piece], visible: VisibilityFilter) -> MapUncertainty | None:
+    """Return how sure the splats of `merge_pieces` are; None unless it was measured for the only piece."""
+    if len(pieces) != 1 or pieces[0].uncertainty is None:
+        return None
+    known = pieces[0].uncertainty
+    return known.at(visible.mask(pieces[0]))
 
 
 def _move(params: Tensor, T_world_piece: Tensor) -> None:
