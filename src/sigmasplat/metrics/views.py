@@ -114,7 +114,8 @@ def mean_scores(rows: list[dict[str, float]]) -> dict[str, Any]:
 def score_uncertainty(samples: list[NDArray[np.float32]], judged_on: str = "held-out") -> dict[str, Any] | None:
     """Score V against the squared error over all sampled pixels (`uncertainty.score`); None without pixels.
 
-    Adds judged_on (the kind of the views), spearman_covered (only pixels that the map covers) and spearman_per_view (mean of the correlations per view).
+    Adds judged_on (the kind of the views), spearman_covered (only pixels that the map covers) and spearman_per_view
+    (mean of the correlations per view).
     """
     if not sum(part.shape[1] for part in samples):
         return None
