@@ -42,7 +42,7 @@ class World:
     """
 
     def __init__(self, config: Config | None = None, store: SubmapStore | None = None) -> None:
-        self.config = config or preset(default_preset())
+        self.config = (config or preset(default_preset())).checked()
         self.random = np.random.default_rng(self.config.seed)
         self.store = MemoryStore() if store is None else store
         self.atlas = Atlas()
