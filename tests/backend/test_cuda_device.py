@@ -190,7 +190,7 @@ def test_a_pose_is_found_without_the_host(parametrisation: Any, room: int | None
 def test_a_descent_stops_where_the_loop_stops() -> None:
     crawling = dataclasses.replace(TRACKING, lr_rotation=1e-9, lr_translation=1e-9, exposure=False)
     assert followed(dataclasses.replace(crawling, update_stop=1e-6), 100).steps == 1
-    assert followed(dataclasses.replace(crawling, plateau_stop=1e-3), 100).steps == 2
+    assert followed(dataclasses.replace(crawling, plateau_stop=1e-3, plateau_window=5), 100).steps == 6
 
 
 @pytest.mark.parametrize("average", ["image", "kept"])

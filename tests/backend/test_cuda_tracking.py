@@ -270,10 +270,11 @@ def test_it_stops_where_the_loop_stops(name: str) -> None:
     crawling = dataclasses.replace(still, lr_rotation=1e-9, lr_translation=1e-9)
     got, want = both_ways(crawling, 30)
     assert got.steps == want.steps == 1
-    flat = dataclasses.replace(crawling, update_stop=0.0, plateau_stop=1e-3)
+    flat = dataclasses.replace(crawling, update_stop=0.0, plateau_stop=1e-3, plateau_window=5)
     got, want = both_ways(flat, 30)
-    assert got.steps == want.steps == 2
-    got, want = both_ways(dataclasses.replace(WAYS[name], lr_rotation=1e-3, lr_translation=3e-3, plateau_stop=1e-2), 30)
+    assert got.steps == want.steps == 6
+    fast = dataclasses.replace(WAYS[name], lr_rotation=1e-3, lr_translation=3e-3)
+    got, want = both_ways(dataclasses.replace(fast, plateau_stop=1e-2, plateau_window=2), 30)
     assert_same_descent(got, want, 1e-5)
     assert 3 < got.steps < 30
 

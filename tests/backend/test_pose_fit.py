@@ -8,8 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from sigmasplat.config import TrackingConfig
+from sigmasplat.config import RegistrationConfig, TrackingConfig
 from sigmasplat.fit.backends import fits_of
+from sigmasplat.fit.descent import descend
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
@@ -18,6 +19,7 @@ from sigmasplat.model.frame import Frame
 from sigmasplat.render import render
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
+from sigmasplat.slam.loop_closure.registration import tracking_of
 from splat_fields import OPTIONS
 from splat_scenes import assert_same_vector, twist_gradient
 from splat_wall import CAMERA, TRUTH, Array, assert_near, lower_median, seen_from, wall
@@ -172,9 +174,44 @@ def test_exposure_is_found_where_asked() -> None:
     assert fit_pose_adam(wall(), view, target, TRUTH, STEPS, 5).exposure == (0.0, 0.0)
 
 
+@pytest.mark.parametrize("tracked", [TrackingConfig(), TrackingConfig(average="kept", outlier_factor_color=2.0)])
+def test_registration_minimises_the_loss_of_the_paper(tracked: TrackingConfig, view: View) -> None:
+    """VarSplat §5: means over all pixels, of colour over its channels too; no setting of tracking changes the loss."""
+    target, params = damaged(view), wall()
+    params[::3, 10] = 0.0  # some splats are half transparent
+    view.forward(params, TRUTH)
+    h, w = CAMERA.height, CAMERA.width
+    fits_of(view).tracking_loss(view, target, tracking_of(RegistrationConfig(), tracked), PLAIN)
+    sums = view.sums[:, :h, :w].clone().requires_grad_()
+    maps, alpha = sums.double(), view.alpha[:h, :w].double()
+    used = (target.depth_image > 0) & (alpha > 0.95)
+    log = ((maps[4:] - maps[:3] ** 2).detach().clamp(min=0) + 1e-6).log()
+    weights = torch.stack([torch.exp(-(one - lower_median(one[used])) / 50.0) for one in log]).clamp(1 / 3, 3)
+    color = (used * alpha * weights * (maps[:3] - target.image.movedim(-1, 0)).abs()).mean()
+    depth = (used * alpha * (maps[3] - target.depth_image).abs()).mean()
+    (0.95 * color + 0.05 * depth).backward()
+    assert sums.grad is not None and 0 < int(used.sum()) < h * w
+    got, want = view.g_sums[:4, :h, :w].flatten().double(), sums.grad[:4].flatten().double()
+    torch.testing.assert_close(got / got.norm(), want / want.norm(), rtol=1e-4, atol=1e-7)
+
+
 def test_descent_that_stands_still_stops(view: View) -> None:
     crawling = dataclasses.replace(STEPS, lr_rotation=1e-9, lr_translation=1e-9, update_stop=1e-6)
     assert descended(view, crawling, iterations=9).iterations == 1
     crawling = dataclasses.replace(crawling, update_stop=0.0)
     assert descended(view, crawling, iterations=9).iterations == 9
-    assert descended(view, dataclasses.replace(crawling, plateau_stop=1e-3), iterations=9).iterations == 2
+    flat = dataclasses.replace(crawling, plateau_stop=1e-3, plateau_window=4)
+    assert descended(view, flat, iterations=9).iterations == 5
+
+
+def test_descent_goes_on_after_one_step_without_progress() -> None:
+    """Two equal losses are no plateau; as many steps without progress as the window has are one."""
+    view, losses = make_view("reference", CAMERA, OPTIONS), iter([9.0, 9.0, 8.0, 8.5, 7.0, 7.0, 7.0, 7.0, 1.0])
+
+    def scripted(*_: object) -> tuple[float, torch.Tensor]:
+        view.g_sums.zero_()
+        return next(losses), torch.zeros(2)
+
+    config = dataclasses.replace(STEPS, plateau_stop=1e-4, plateau_window=3)
+    found = descend(wall(), view, seen_from(view, TRUTH), TRUTH, config, 9, scripted)
+    assert (found.steps, found.loss) == (8, 7.0)

@@ -528,7 +528,8 @@ def test_a_wrong_depth_unit_gives_a_warning(corridor: Corridor, capsys: pytest.C
 
 
 def test_eval_and_export_read_what_run_wrote(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
-    exit_code("run", "corridor", "--no-eval", "--out", "mine", "--limit", "5")
+    exit_code("run", "corridor", "--no-eval", "--out", "mine", "--limit", "5", "--hold-out", "3")
+    assert RunFolder.open(Path("mine")).config().input.hold_every == 3
     assert exit_code("eval", "mine") == 0
     assert "27.31" in capsys.readouterr().out
     assert RunFolder.open(Path("mine")).read_metrics()["frames"] == 6

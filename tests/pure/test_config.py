@@ -12,7 +12,7 @@ from sigmasplat import env
 from sigmasplat.config import Config
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError
-from sigmasplat.presets import preset
+from sigmasplat.presets import list_presets, preset
 
 
 def test_override_converts_to_each_type() -> None:
@@ -74,6 +74,16 @@ def test_override_refuses(name: str, text: str, says: str) -> None:
     with pytest.raises(ConfigError, match=says) as refused:
         override(Config(), {name: text})
     assert "\n" not in str(refused.value)
+
+
+def test_settings_that_exclude_each_other_are_refused_before_a_run() -> None:
+    """The default preset has a term that full colour covariances have no map for; the error line says how to go on."""
+    full = {"mapping.color_covariance": "full"}
+    with pytest.raises(ConfigError, match=r"--set mapping\.weight_moment=0") as refused:
+        override(preset("sigma"), full).checked()
+    assert "\n" not in str(refused.value)
+    override(preset("sigma"), full | {"mapping.weight_moment": "0"}).checked()
+    assert all(preset(name).checked() == preset(name) for name in list_presets())
 
 
 def test_settings_split_at_the_first_equals_sign() -> None:

@@ -83,6 +83,15 @@ def test_only_the_window_is_looked_at_all_of_it_in_every_step(looked_at: list[li
     assert all(sorted(batch) == [0, 3, 4] for batch in last), "the newest, the one before it, the one that shares most"
 
 
+def test_a_submap_that_inherits_splats_chooses_its_window_by_them(looked_at: list[list[int]]) -> None:
+    """The first keyframe of such a submap is not fitted, but later windows compare it with the newest keyframe."""
+    before = mapper(replace(FITTED, window=3, covisibility="splats"))
+    before.config = before.config.changed(submaps={"inherit": True})
+    made = mapped(mapped(before, (0.0,)).successor(view(), np.eye(4)), (0.0, 3.0, 3.2, 3.1, 0.05))
+    assert [keyframe.index for keyframe in made.keyframes] == [0, 1, 2, 3, 4]
+    assert sorted(looked_at[-1]) == [0, 3, 4], "the newest, the one before it, and the first"
+
+
 def test_one_of_the_window_a_step(looked_at: list[list[int]]) -> None:
     mapped(mapper(replace(FITTED, window=2, frames_per_step=1, iterations=30)), (0.0, 0.1, 0.2))
     assert {len(batch) for batch in looked_at} == {1}

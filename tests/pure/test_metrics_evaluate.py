@@ -120,6 +120,7 @@ def test_training_and_held_out_views_are_separate(run: RunFolder) -> None:
 
 def test_uncertainty_is_scored_on_held_out_views(run: RunFolder) -> None:
     scores = score(run, HandMade(None), renderer=KnownErrors(training=0.3))["uncertainty"]
+    assert scores["judged_on"] == "held-out"
     assert scores["pixels"] == 15 * 36 * 32, "only pixels with a depth reading"
     assert scores["spearman"] == pytest.approx(1.0, abs=1e-3) and scores["ause"] == pytest.approx(0.0, abs=1e-3)
     assert scores["mean_variance"] == pytest.approx(scores["mean_squared_error"], rel=1e-3)
@@ -261,12 +262,14 @@ def test_an_interrupted_run_is_scored_up_to_its_last_pose(run: RunFolder) -> Non
     assert metrics["frames"] == 9 and metrics["ate"]["pairs"] == 9
 
 
-def test_a_run_of_keyframes_only_has_no_held_out_views(run: RunFolder) -> None:
+def test_a_run_of_keyframes_only_is_judged_on_training_views(run: RunFolder) -> None:
     lines = [json.loads(line) | {"is_keyframe": True} for line in (run.path / "log.jsonl").read_text().splitlines()]
     (run.path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     metrics = score(run, HandMade(None), renderer=KnownErrors(), views_per_kind=4)
-    assert metrics["held_out"] == {"views": 0} and metrics["uncertainty"] is None and metrics["ate"] is None
-    assert (run.path / "report.html").exists()
+    assert metrics["held_out"] == {"views": 0} and metrics["ate"] is None
+    assert metrics["uncertainty"]["judged_on"] == "training" and metrics["uncertainty"]["pixels"] > 0
+    page = (run.path / "report.html").read_text()
+    assert "Uncertainty V, training" in page and "at training views" in page
 
 
 def test_truth_of_another_recording_is_reported_after_everything_is_written(run: RunFolder) -> None:

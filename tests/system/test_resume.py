@@ -18,6 +18,7 @@ from sigmasplat.config.text import override
 from sigmasplat.errors import RunError
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.state import read_state, write_state
+from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.presets import preset
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
@@ -70,6 +71,27 @@ def test_a_resumed_run_with_probe_views_gives_the_same_bytes(tmp_path: Path) -> 
     assert found is not None and found.probes > 0
 
 
+def test_a_run_killed_in_its_final_map_gives_the_same_bytes(tmp_path: Path) -> None:
+    """The second start continues after the last saved step, here with view-dependent colours."""
+    steps = ["final.iterations=400", "final.prune_every=20", "final.sh_every=60", "final.sh_degree=2"]
+    more = [word for step in steps for word in ("--set", step)]
+    assert exit_code(*arguments(tmp_path / "whole", "sigma"), *more) == 0
+    run = RunFolder(tmp_path / "cut")
+    command = [sys.executable, "-m", "sigmasplat.cli", *arguments(run.path, "sigma"), *more]
+    process, deadline_s = subprocess.Popen(command, env=os.environ, stdout=subprocess.DEVNULL), time.monotonic() + 300
+    while not run.refinement.exists():
+        assert process.poll() is None and time.monotonic() < deadline_s
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert 0 < read_state(run.refinement, (GaussianField, Rows), {})["done"] < 400
+    assert not (run.path / "map.ply").exists()
+    assert exit_code("resume", str(run.path), "--no-eval") == 0
+    for file in SAME:
+        assert (run.path / file).read_bytes() == (tmp_path / "whole" / file).read_bytes(), file
+    assert not run.refinement.exists()
+
+
 @pytest.mark.parametrize("name, after", [("sigma", 13), ("cgslam-fast", 7)])
 def test_a_resumed_run_gives_the_same_bytes(tmp_path: Path, name: str, after: int) -> None:
     assert exit_code(*arguments(tmp_path / "whole", name)) == 0
@@ -111,7 +133,7 @@ def test_slam_can_resume_from_every_frame(tmp_path: Path) -> None:
 
 def test_the_resume_line_has_the_frame() -> None:
     assert resume_line(FRAMES - 1, FRAMES) == "resuming at frame 23 of 24"
-    assert resume_line(FRAMES, FRAMES) == "all 24 frames are done: making the final map again"
+    assert resume_line(FRAMES, FRAMES) == "all 24 frames are done: making the final map"
 
 
 def test_runs_that_cannot_be_resumed_are_refused_in_one_line(

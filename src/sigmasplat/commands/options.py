@@ -211,6 +211,14 @@ class InputOptions:
         None
     )
     end: Annotated[Number, arg(metavar="S", help="stop S seconds after the first frame", help_behavior_hint="")] = None
+    hold_out: Annotated[
+        Whole,
+        arg(
+            metavar="N",
+            help="hold back every N-th frame: it is tracked but not mapped, so that it can test the map",
+            help_behavior_hint="",
+        ),
+    ] = None
     strict: Annotated[bool, arg(help="stop at an unreadable image instead of skipping it", help_behavior_hint="")] = (
         False
     )
@@ -250,7 +258,7 @@ class InputOptions:
         for name in ("limit", "stride"):
             if (value := getattr(self, name)) is not None and value < 1:
                 raise ConfigError(f"--{name} must be at least 1, found {value}")
-        names = {"start": "start_s", "end": "end_s"}
+        names = {"start": "start_s", "end": "end_s", "hold_out": "hold_every"}
         given = {field.name: getattr(self, field.name) for field in fields(self)}
         given["register_depth"] = None if self.register_depth == "auto" else self.register_depth
         given["calibration"] = self.calibration and self.calibration.resolve()  # a later eval may run in another folder
@@ -285,10 +293,10 @@ def configured(
     like: Config | None = None,
 ) -> Config:  # fmt: skip
     """Return a preset's settings, changed by --set, the input options and --seed; with `like`, working images are made
-    as in these settings unless --set says otherwise. Raises ConfigError."""
+    as in these settings unless --set says otherwise. Raises ConfigError, also if settings exclude each other."""
     given = (working_images(like) if like else {}) | split_settings(settings) | input_options.settings()
     config = override(preset_of(preset), given)
-    return config if seed is None else override(config, {"seed": str(seed)})
+    return (config if seed is None else override(config, {"seed": str(seed)})).checked()
 
 
 def working_images(config: Config) -> dict[str, str]:

@@ -114,7 +114,7 @@ def resume(
 def resume_line(next_index: int, frames: int) -> str:
     """Return the text that says where a run resumes."""
     if next_index >= frames:
-        return f"all {frames} frames are done: making the final map again"
+        return f"all {frames} frames are done: making the final map"
     return f"resuming at frame {next_index} of {frames}"
 
 
@@ -171,12 +171,13 @@ def _run_and_score(
     Raises KeyboardInterrupt if Ctrl-C came before the first frame was done.
     """
     from sigmasplat.render.cuda import stages as cuda_stages
-    from sigmasplat.run.resume import StateFile
+    from sigmasplat.run.resume import RefinementFile, StateFile
     from sigmasplat.run.session import Session
     from sigmasplat.sources.live import LiveSource
 
     cuda_stages.measure(run_options.profile)
     state = StateFile(start.slam, folder, run_options.save_every)
+    start.slam.saved_refinement = RefinementFile(start.slam, folder, run_options.save_every)
     with _progress(screen, start, source, viewer) as callback:
         outcome = Session(
             start.slam, source, folder, callback, state, start.next_index, start.wall_s, run_options.all_poses

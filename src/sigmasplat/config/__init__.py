@@ -55,6 +55,18 @@ class Config:
         new = {name: dataclasses.replace(getattr(self, name), **values) for name, values in sections.items()}
         return dataclasses.replace(self, **new)
 
+    def checked(self) -> "Config":
+        """Return the settings. Raises ConfigError if some of them exclude each other."""
+        m = self.mapping
+        if m.color_covariance == "full" and (m.weight_alignment or m.weight_moment or m.frames_per_step != 1):
+            raise ConfigError(
+                "mapping.color_covariance=full does not support mapping.weight_alignment, mapping.weight_moment (its "
+                "render has no maps for them) and more than one keyframe per step, found "
+                f"{m.weight_alignment:g}, {m.weight_moment:g} and frames_per_step={m.frames_per_step}; add --set "
+                "mapping.weight_alignment=0 --set mapping.weight_moment=0 --set mapping.frames_per_step=1"
+            )
+        return self
+
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as nested dicts, as in a run's config.json."""
         return dataclasses.asdict(self)

@@ -228,7 +228,10 @@ class TrackingConfig:
     update_stop: float = 0.0
     """Adam stops when a step is smaller than this (metres and radians); 0 = run every iteration."""
     plateau_stop: float = 0.0
-    """Adam, or a level of alignment, stops when a step changes the loss by less than this share of it; 0 = off."""
+    """Adam stops when `plateau_window` steps have not lowered the loss by this share; a level of alignment stops when
+    one step changes the loss by less than this share; 0 = off."""
+    plateau_window: int = 10
+    """Number of Adam steps within which the loss must fall by the share `plateau_stop`."""
     cuda_graphs: bool = True
     """On a CUDA device, whether several iterations of descent are launched as one CUDA graph; off = each kernel is
     launched on its own."""

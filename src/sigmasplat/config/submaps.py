@@ -69,12 +69,17 @@ class RegistrationConfig:
     lr_translation: float = 5e-3
     """Learning rate of translation in registration, metres per step."""
     plateau_stop: float = 1e-4
-    """The steps of registration end when one changes the loss by less than this share of it; 0 = run every
+    """The steps of registration end when `plateau_window` steps have not lowered the loss by this share; 0 = run every
     iteration."""
+    plateau_window: int = 10
+    """Number of steps within which the loss of registration must fall by the share `plateau_stop`."""
     exposure: bool = True
     """Whether a factor and an offset of the colour are fitted too, because submaps may differ in exposure."""
     weight_color: float = 0.95
     """λ_c, the weight of the colour loss in registration; the depth loss has 1 − λ_c."""
+    color_mean: Literal["values", "pixels"] = "values"
+    """How the colour errors of registration are averaged: values = over pixels and channels (paper); pixels = over
+    pixels, with the sum over the three channels, which weights colour three times as much."""
     uncertainty: bool = True
     """Whether pixels are weighted by the V of the other submap; off = LoopSplat."""
     tau: float = 50.0

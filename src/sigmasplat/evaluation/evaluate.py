@@ -165,10 +165,11 @@ def _score_views(
     predictions: views.PredictionScores, strips: ViewStrips, renderer: views.Renderer, progress: Progress,
 ) -> dict[str, Any]:  # fmt: skip
     """Render the chosen views from the final map and from their submaps; average scores per kind and map; judge V and
-    the predictive variances.
+    the predictive variances. V is judged on held-out views, or on training views if every frame was mapped.
     """
-    scores = {kind: views.ViewScores(keep_samples=kind == "held-out") for kind in chosen}
-    before = {kind: views.ViewScores(keep_samples=kind == "held-out") for kind in chosen}
+    judged_on = "held-out" if chosen["held-out"] else "training"
+    scores = {kind: views.ViewScores(keep_samples=kind == judged_on) for kind in chosen}
+    before = {kind: views.ViewScores(keep_samples=kind == judged_on) for kind in chosen}
     shown = {(kind, r["index"]) for kind, records in chosen.items() for r in evenly_spread(records, strips.per_kind)}
     total = sum(len(records) for records in chosen.values())
     frame_of = partial(working_frame, source, config.input)
@@ -183,7 +184,7 @@ def _score_views(
                 strips.add(in_submap, ", in their submaps")
         progress(done, total)
     kept = maps.T_world_submap is not None
-    judged, judged_before = (views.score_uncertainty(found["held-out"].samples) for found in (scores, before))
+    judged, judged_before = (views.score_uncertainty(found[judged_on].samples, judged_on) for found in (scores, before))
     return {
         **{kind.replace("-", "_"): views.mean_scores(found.rows) for kind, found in scores.items()},
         **{

@@ -32,16 +32,17 @@ def descend(
     """Minimise L_track over the parameters that `parametrisation` makes of the pose; return the best iterate.
 
     params [N, 17] and target are on the view's device; `tracking_loss` computes the loss on that device. The descent
-    stops early when a step is below `update_stop`, or when the relative change of the loss is below `plateau_stop`.
-    Without common pixels the guess is returned.
+    stops early when a step is below `update_stop`, or when `plateau_window` steps have not lowered the loss by the
+    share `plateau_stop`. One step is not enough: the loss of Adam is not monotone. Without common pixels the guess is
+    returned.
     """
     way = parametrisation(config, T_camera_world)
     numbers, exposure = way.start, np.zeros(2)
     adam, adam_exposure = VectorAdam.of(len(numbers)), VectorAdam.of(2)
     rates = np.array([config.lr_rotation] * way.rotations + [config.lr_translation] * 3)
     rate_exposure = np.full(2, exposure_rate(config))
-    best, best_T, best_exposure, first, previous = np.inf, T_camera_world, np.zeros(2), np.inf, np.inf
-    steps = 0
+    best, best_T, best_exposure, first = np.inf, T_camera_world, np.zeros(2), np.inf
+    lowered, waited, steps = np.inf, 0, 0
     for steps in range(1, iterations + 1):
         T = way.pose(numbers)
         view.forward(params, T)
@@ -53,9 +54,10 @@ def descend(
         moved = adam.step(way.gradient(numbers, view.backward_pose(params)), rates)
         numbers += moved
         exposure += adam_exposure.step(g_exposure.double().cpu().numpy(), rate_exposure)
-        if np.abs(moved).max() < config.update_stop or abs(loss - previous) < config.plateau_stop * loss:
+        lowered, waited = (loss, 0) if loss < (1.0 - config.plateau_stop) * lowered else (lowered, waited + 1)
+        on_plateau = config.plateau_stop > 0 and waited >= config.plateau_window
+        if np.abs(moved).max() < config.update_stop or on_plateau:
             break
-        previous = loss
     a, b = best_exposure.tolist()
     return Descent(best_T, (a, b), first, best, steps)
 

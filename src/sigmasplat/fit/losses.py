@@ -119,7 +119,11 @@ def isotropy_ratio(scales: Tensor) -> Tensor:
 
 @term
 def nll_color(color: Tensor, color_target: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
-    """Return the Gaussian NLL of colours [H, W, 3] under V [H, W, 3] (VarSplat §2, L_var); trains variance only."""
+    """Return the Gaussian NLL of colours [H, W, 3] under V [H, W, 3] (VarSplat §2, L_var).
+
+    The residual has no gradient, V has: it trains σ², and, because V = Σ w (σ² + c²) − Ĉ², also colours, shapes and
+    poses.
+    """
     return gaussian_nll(color - color_target, variance, valid)
 
 
@@ -143,7 +147,7 @@ def gaussian_nll(residual: Tensor, variance: Tensor, valid: Tensor) -> Tensor:
 
 @term
 def nll_color_full(color: Tensor, color_target: Tensor, covariance: Tensor, valid: Tensor) -> Tensor:
-    """Return the Gaussian NLL of colours [H, W, 3] under the full V [H, W, 6]; trains V only, as `nll_color` does.
+    """Return the Gaussian NLL of colours [H, W, 3] under the full V [H, W, 6]; it trains what `nll_color` does.
 
     The mean over valid pixels × 3 of ½ rᵀ (V+εI)⁻¹ r + ½ log det (V+εI). For a diagonal V it equals `nll_color`. With
     V+εI = L diag(d) Lᵀ, where L has a unit diagonal, it is ½ y²/d + ½ log d with L y = r. For a true covariance no d is

@@ -52,8 +52,8 @@ def fit_pose_adam(
     host.
 
     params [N, 17] and σ² are fixed (VarSplat §3). The descent stops early when a step is below `update_stop`, or when
-    the relative change of the loss is below `plateau_stop`. Without common pixels the guess is returned. Raises
-    BackendError if a CUDA device has too many pairs of splats and tiles.
+    `plateau_window` steps have not lowered the loss by the share `plateau_stop`. Without common pixels the guess is
+    returned. Raises BackendError if a CUDA device has too many pairs of splats and tiles.
     """
     params, target = params.to(view.sums.device), target.to(view.sums.device)
     found = fits_of(view).descend(params, view, target, T_camera_world, config, iterations)

@@ -30,6 +30,8 @@ MESH = "mesh.ply"
 """The surface, written by `sigmasplat mesh`."""
 STATE = "state.safetensors"
 """The state from which an unfinished run resumes."""
+REFINEMENT = "refinement.safetensors"
+"""The final map of an unfinished run between two steps of its refinement."""
 ALL_POSES = "trajectory_all.txt"
 """The poses of all frames, written if requested."""
 FILES = (
@@ -122,7 +124,7 @@ class RunFolder:
 
     def _clear(self) -> None:
         """Remove the files of an earlier run, and keep files that the user added."""
-        for name in (*FILES, ALL_POSES, MESH, STATE):
+        for name in (*FILES, ALL_POSES, MESH, STATE, REFINEMENT):
             (self.path / name).unlink(missing_ok=True)
         for picture in self.images.glob("*.png"):
             picture.unlink()
@@ -143,6 +145,11 @@ class RunFolder:
     def state(self) -> Path:
         """Return the path of the state from which an unfinished run resumes."""
         return self.path / STATE
+
+    @property
+    def refinement(self) -> Path:
+        """Return the path of the partly refined final map from which an unfinished run resumes."""
+        return self.path / REFINEMENT
 
     def config(self) -> Config:
         """Read the settings of the run. Raises ConfigError if they cannot be read."""

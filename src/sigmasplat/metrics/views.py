@@ -112,16 +112,18 @@ def mean_scores(rows: list[dict[str, float]]) -> dict[str, Any]:
     return {"views": len(rows)} | {name: _mean(column) for name, column in columns.items()}
 
 
-def score_uncertainty(samples: list[NDArray[np.float32]]) -> dict[str, Any] | None:
+def score_uncertainty(samples: list[NDArray[np.float32]], judged_on: str = "held-out") -> dict[str, Any] | None:
     """Score V against the squared error over all sampled pixels (`uncertainty.score`); None without pixels.
 
-    Adds spearman_covered (only pixels that the map covers) and spearman_per_view (mean of the correlations per view).
+    Adds judged_on (the kind of the views), spearman_covered (only pixels that the map covers) and spearman_per_view
+    (mean of the correlations per view).
     """
     if not sum(part.shape[1] for part in samples):
         return None
     variance, squared_error, alpha = np.concatenate(samples, axis=1)
     covered = alpha > COVERED_ALPHA
     return uncertainty.score(variance, squared_error) | {
+        "judged_on": judged_on,
         "spearman_covered": uncertainty.spearman(variance[covered], squared_error[covered]),
         "spearman_per_view": _mean(np.array([uncertainty.spearman(part[0], part[1]) for part in samples])),
     }

@@ -110,6 +110,7 @@ FAST = Config(
         lr_translation=1e-3,
         lr_rotation=1e-3,
         tau=10.0,
+        color_mean="pixels",
     ),
     final=FinalConfig(iterations=1500),  # half a minute; 500 lose 2 dB on livingroom
 )

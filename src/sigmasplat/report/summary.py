@@ -109,13 +109,15 @@ def _depth(metrics: Metrics) -> list[str]:
 
 
 def _uncertainty(metrics: Metrics) -> list[str]:
-    rank = (metrics.get("uncertainty") or {}).get("spearman")
+    judged = metrics.get("uncertainty") or {}
+    rank = judged.get("spearman")
     if rank is None:
         return []
     rating = next(
         (f"V predicts {words} where" for least, words in RANK_WORDS if rank >= least), "V does not show where"
     )
-    return [f"The uncertainty {rating} the rendered colours are wrong (rank correlation {number(rank, 2)})."]
+    views = " at training views, because no view was held back" if judged.get("judged_on") == "training" else ""
+    return [f"The uncertainty {rating} the rendered colours are wrong{views} (rank correlation {number(rank, 2)})."]
 
 
 def _predicted_errors(metrics: Metrics) -> list[str]:

@@ -28,7 +28,7 @@ def format_ranges(indices: list[int], most: int = 4) -> str:
 
 def headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     """Return the headline figures as (name, value, unit), for the top of the page and the table of the command line."""
-    held_out = metrics.get("held_out") or {}
+    held_out, judged = metrics.get("held_out") or {}, metrics.get("uncertainty") or {}
     path = [("ATE RMSE", number(metrics["ate"]["rmse_m"], 2, 100.0), "cm")] if metrics.get("ate") else []
     found = metrics.get("reconstruction")
     surface = [("Surface F1 at 1 cm", number(found["f1"], 1, 100.0), "%")] if found else []
@@ -44,7 +44,7 @@ def headline(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
         ("Depth L1, held-out", number(held_out.get("depth_l1_m"), 2, 100.0), "cm"),
         *surface,
         *_coverage_figures(metrics),
-        ("Spearman V ~ error²", number((metrics.get("uncertainty") or {}).get("spearman"), 3), ""),
+        (f"Spearman V ~ error²{_if_training(judged)}", number(judged.get("spearman"), 3), ""),
         ("Speed", number(metrics.get("frames_per_s"), 2), "frames/s"),
         ("Longest frame after the first", number(metrics.get("worst_frame_s"), 0, 1e3), "ms"),
         *_total_times(metrics),
@@ -68,6 +68,11 @@ def _coverage_figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
     if known or "calibration" not in metrics or metrics["calibration"] is not None:
         return known
     return [("Predicted errors", "none", "(uncertainty.probes)")]
+
+
+def _if_training(judged: dict[str, Any]) -> str:
+    """Return words to add to the name of a score of V if no view was held back to judge V on."""
+    return ", training views" if judged.get("judged_on") == "training" else ""
 
 
 def _total_times(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
@@ -109,13 +114,14 @@ def state_rows(metrics: dict[str, Any]) -> list[list[str]]:
 
 def score_tables(metrics: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
     """Return the tables of scores with their titles. A table without figures has at most a head."""
-    views = "held-out, in submaps" if metrics.get("held_out_submaps") else "held-out"
+    kind = (metrics.get("uncertainty") or {}).get("judged_on", "held-out")
+    views = f"{kind}, in submaps" if metrics.get("held_out_submaps") else kind
     return [
         ("Rendered images", _image_rows(metrics)),
         ("Path", _path_rows(metrics)),
         ("Surface", _surface_rows(metrics)),
         (f"Uncertainty V, {views}", _uncertainty_rows(metrics.get("uncertainty"))),
-        ("Uncertainty V, held-out, final map", _uncertainty_rows(metrics.get("uncertainty_final"))),
+        (f"Uncertainty V, {kind}, final map", _uncertainty_rows(metrics.get("uncertainty_final"))),
         (f"Calibration of V, {views}", _calibration_rows(metrics.get("uncertainty"))),
         ("Predicted errors, held-out, final map", _predictive_rows(metrics.get("predictive"))),
         ("Calibration of predicted errors", _weight_rows(metrics.get("calibration"))),

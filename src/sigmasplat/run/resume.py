@@ -3,11 +3,14 @@
 import time
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from sigmasplat.errors import RunError
 from sigmasplat.io.atomic import write_text
 from sigmasplat.io.json_files import read_text
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.state import read_state, write_state
+from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
 from sigmasplat.sources.base import Source
@@ -38,8 +41,41 @@ class StateFile:
         self.last_s = time.perf_counter()
 
     def delete(self) -> None:
-        """Delete the state of a complete run."""
+        """Delete the state of a complete run, and its partly refined final map."""
         self.run.state.unlink(missing_ok=True)
+        self.run.refinement.unlink(missing_ok=True)
+
+
+@dataclass(eq=False)
+class RefinementFile:
+    """Saves the partly refined final map in refinement.safetensors of a run folder, at most every `every_s` seconds.
+
+    With every_s = 0 nothing is saved. A file of another number of frames is not used.
+    """
+
+    slam: Slam
+    run: RunFolder
+    every_s: float = 0.0
+    last_s: float = field(default_factory=time.perf_counter)
+
+    def save(self, done: int, field: GaussianField, random: np.random.Generator) -> None:
+        """Save the map after `done` steps if a save is due. Raises RunError if it cannot be written."""
+        if not self.every_s or time.perf_counter() - self.last_s < self.every_s:
+            return
+        numbers = random.bit_generator.state
+        tree = {"frames": len(self.slam.steps), "done": done, "field": field, "numbers": numbers}
+        write_state(self.run.refinement, tree, (GaussianField, Rows), {})
+        self.last_s = time.perf_counter()
+
+    def load(self, random: np.random.Generator) -> tuple[int, GaussianField] | None:
+        """Return the steps done and the map, and restore the random numbers; None if nothing usable is saved."""
+        if not self.run.refinement.is_file():
+            return None
+        tree = read_state(self.run.refinement, (GaussianField, Rows), {})
+        if tree["frames"] != len(self.slam.steps):
+            return None
+        random.bit_generator.state = tree["numbers"]
+        return tree["done"], tree["field"]
 
 
 @dataclass(frozen=True)

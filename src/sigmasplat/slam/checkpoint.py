@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sigmasplat.model.atlas import Atlas
-from sigmasplat.model.field import GaussianField
+from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.slam.loop_closure.pose_graph import Edge
 from sigmasplat.slam.path_covariance import recorded
@@ -16,11 +16,11 @@ from sigmasplat.slam.path_covariance import recorded
 def checkpoint_of(
     active: GaussianField, path: Trajectory, atlas: Atlas, keyframes: Sequence[int], edges: Sequence[Edge]
 ) -> dict[str, Tensor]:
-    """Return the active submap's field with its optimiser state, poses, times, keyframes, anchors, the submap of each
-    frame, and the errors of the path, in host memory."""
+    """Return the active submap's field with its attributes and its optimiser state, poses, times, keyframes, anchors,
+    the submap of each frame, and the errors of the path, in host memory."""
     return {
-        **{name: getattr(active, name).cpu() for name in ("params", "moment1", "moment2", "last_step")},
-        "adam_steps": torch.tensor(active.steps),
+        **_rows_of(active, ""),
+        **{key: part for name, rows in active.attributes.items() for key, part in _rows_of(rows, f"{name}_").items()},
         "timestamps_s": torch.from_numpy(path.timestamps_s),
         "T_world_camera": torch.from_numpy(path.T_world_camera),
         "T_world_camera_odometry": torch.from_numpy(atlas.T_world_camera(loops=False)),
@@ -30,3 +30,9 @@ def checkpoint_of(
         "frame_submap": torch.tensor([place.submap for place in atlas.places], dtype=torch.int64),
         **recorded(atlas, edges),
     }
+
+
+def _rows_of(rows: Rows, prefix: str) -> dict[str, Tensor]:
+    """Return the parameters and the optimiser state of rows, in host memory, with a prefix to each name."""
+    parts = {f"{prefix}{name}": getattr(rows, name).cpu() for name in ("params", "moment1", "moment2", "last_step")}
+    return parts | {f"{prefix}adam_steps": torch.tensor(rows.steps)}

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -29,6 +30,16 @@ CACHE_BYTES = 64 << 20
 """Memory for prepared pictures; other pictures are read again when they are drawn."""
 
 
+class SavedRefinement(Protocol):
+    """Keeps the refinement of a final map between its steps, so that a stopped run does not repeat them."""
+
+    def save(self, done: int, field: GaussianField, random: np.random.Generator) -> None:
+        """Save the map after `done` steps, and the state of the random numbers, if a save is due."""
+
+    def load(self, random: np.random.Generator) -> tuple[int, GaussianField] | None:
+        """Return the steps done and the map, and restore the random numbers; None if nothing is saved."""
+
+
 def final_map(
     store: SubmapStore,
     anchors: Sequence[Matrix],
@@ -36,22 +47,25 @@ def final_map(
     view: View,
     random: np.random.Generator,
     progress: Progress = no_progress,
+    saved: SavedRefinement | None = None,
 ) -> GaussianField:
     """Return the map in the world: made from submaps at `anchors` (T_world_submap [4, 4] each), then refined with
     `view`.
 
-    Calls `progress(steps done, total)`. Memory contains this map, one submap and some pictures. Raises SigmaSplatError
-    if there is no submap, a submap has no anchor, or its camera is not the view's; ConfigError on settings out of
-    range.
+    Calls `progress(steps done, total)`. With `saved`, refinement continues after the last saved step, and the result
+    has the same bytes as that of an uninterrupted refinement. Memory contains this map, one submap and some pictures.
+    Raises SigmaSplatError if there is no submap, a submap has no anchor, or its camera is not the view's; ConfigError
+    on settings out of range.
     """
     _refuse_misfits(store, anchors, config.final)
     seed = seeded_on_surface if config.final.seed_from == "mesh" else merged
-    field = seed(store, anchors, config)
+    found = None if saved is None else saved.load(random)
+    done, field = found or (0, seed(store, anchors, config))
     if not config.final.iterations:
         return field
     on_device = field.to(view.sums.device)
-    refine(on_device, KeyframeReader(store, anchors, view), config, view, random, progress)
-    return on_device.to(field.params.device)
+    refine(on_device, KeyframeReader(store, anchors, view), config, view, random, progress, done, saved)
+    return on_device.to(torch.device("cpu"))
 
 
 def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix], final: FinalConfig) -> None:
@@ -214,20 +228,26 @@ def refine(
     view: View,
     random: np.random.Generator,
     progress: Progress,
+    done: int = 0,
+    saved: SavedRefinement | None = None,
 ) -> list[float]:
     """Fit the field to keyframes drawn uniformly, with fixed poses; prune regularly; return the loss of each step.
 
-    Every `sh_every` steps, colours gain one degree of view dependence.
+    Every `sh_every` steps, colours gain one degree of view dependence. `done`: the number of steps that the field has
+    already had. `saved` is offered the field after each pruning and each new degree.
     """
     final, mapping, losses = config.final, refinement(config), list[float]()
-    drawn = _draw(keyframes, final.iterations, random, progress)
-    while (done := len(losses)) < final.iterations:
+    drawn = _draw(keyframes, range(done, final.iterations), random, progress)
+    while done < final.iterations:
         until_event = min(every - done % every for every in (final.prune_every, final.sh_every))
         degree = min(final.sh_degree, done // final.sh_every)
         fit = fit_field(field, view, islice(drawn, until_event), mapping, degree=degree)
         losses += fit.losses
-        if len(losses) % final.prune_every == 0:
+        done += len(fit.losses)
+        if done % final.prune_every == 0:
             field.keep(field.opacities > final.prune_opacity)
+        if saved is not None:
+            saved.save(done, field, random)
     progress(final.iterations, final.iterations)
     return losses
 
@@ -239,9 +259,9 @@ def refinement(config: Config) -> MappingConfig:
 
 
 def _draw(
-    keyframes: KeyframeReader, steps: int, random: np.random.Generator, progress: Progress
+    keyframes: KeyframeReader, steps: range, random: np.random.Generator, progress: Progress
 ) -> Iterator[Sequence[Keyframe]]:
     """Draw one keyframe per step, uniformly; call `progress` before each."""
-    for step in range(steps):
-        progress(step, steps)
+    for step in steps:
+        progress(step, steps.stop)
         yield [keyframes[int(random.integers(len(keyframes)))]]

@@ -47,13 +47,14 @@ class Mapper:
     ) -> FieldFit:
         """Map one keyframe: seed, choose the window of keyframes, fit, densify and prune, fit again, prune again.
 
-        A submap that inherits splats has mapped its first keyframe before; this keyframe is only added to the list.
+        The first keyframe of a submap that inherits splats is already mapped; it is only added to the list.
         """
         self.field = self.field.to(view.sums.device)  # the active field stays on the view's device
         c, first_new, begun = self.config.mapping, self.field.next_id, len(self.field) > 0
         fixed = not self.keyframes
         self.keyframes.append(Keyframe(index, target, T_world_camera, fixed, descriptor=descriptor, detail=detail))
         if begun and len(self.keyframes) == 1:
+            self._note_visible(view)
             return FieldFit()
         self._seed(view, target, T_world_camera)
         steps = c.iterations if begun else c.first_iterations
@@ -75,11 +76,15 @@ class Mapper:
         c = self.config.mapping
         if not c.window:
             return self.keyframes[::-1]
-        if c.covisibility == "splats":
+        self._note_visible(view)
+        return choose_window(self.keyframes, c.window, c.covisibility)
+
+    def _note_visible(self, view: View) -> None:
+        """Record which splats the newest keyframe sees, if windows are chosen by them."""
+        if self.config.mapping.window and self.config.mapping.covisibility == "splats":
             newest = self.keyframes[-1]
             view.forward(self.field.params, se3.inverse(newest.T_world_camera), layers=True)
             newest.visible_ids = dominating(view, self.field)
-        return choose_window(self.keyframes, c.window, c.covisibility)
 
     def _fit(
         self,

@@ -78,7 +78,7 @@ class Slam(World):
         self._connect_components()
         members = self.atlas.members(0)
         store, anchors = StorePart(self.store, members), [self.atlas.anchors[s] for s in members]
-        self._final = final_map(store, anchors, self.config, self.view, self.random, progress)
+        self._final = final_map(store, anchors, self.config, self.view, self.random, progress, self.saved_refinement)
         self.uncertainty = final_uncertainty(self._final, store, anchors, self.config, self.view)
         progress(total, total)
 

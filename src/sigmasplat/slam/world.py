@@ -19,6 +19,7 @@ from sigmasplat.render.view import View
 from sigmasplat.slam.checkpoint import checkpoint_of
 from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.features import make_extractor
+from sigmasplat.slam.final import SavedRefinement
 from sigmasplat.slam.localisation.confidence import Confidence
 from sigmasplat.slam.localisation.recovery import Recovery
 from sigmasplat.slam.localisation.relocaliser import Relocaliser
@@ -41,7 +42,7 @@ class World:
     """
 
     def __init__(self, config: Config | None = None, store: SubmapStore | None = None) -> None:
-        self.config = config or preset(default_preset())
+        self.config = (config or preset(default_preset())).checked()
         self.random = np.random.default_rng(self.config.seed)
         self.store = MemoryStore() if store is None else store
         self.atlas = Atlas()
@@ -61,6 +62,8 @@ class World:
         self._view: View | None = None
         self._resample = False
         self._final: GaussianField | None = None
+        self.saved_refinement: SavedRefinement | None = None
+        """Where `finish` saves the refinement of the final map and continues it; None = nowhere."""
         self.uncertainty: MapUncertainty | None = None
         """How sure the final map is; None before `finish`, or without probe views (`uncertainty.probes`)."""
         self._timer = StepTimer()

@@ -36,7 +36,7 @@ STATE = np.dtype(
     [
         ("numbers", "f8", 7), ("moment1", "f8", 9), ("moment2", "f8", 9), ("exposure", "f8", 2),
         ("best_exposure", "f8", 2), ("T", "f8", (3, 4)), ("best_T", "f8", (3, 4)), ("first", "f8"), ("best", "f8"),
-        ("previous", "f8"), ("steps", "i8"), ("stopped", "i8"), ("missing", "i8"),
+        ("lowered", "f8"), ("waited", "i8"), ("steps", "i8"), ("stopped", "i8"), ("missing", "i8"),
     ]
 )  # fmt: skip
 """The layout of the kernels' `Descending` (native/cuda/descend.cuh)."""
@@ -162,7 +162,7 @@ def _at_rest(T_camera_world: Matrix, config: TrackingConfig) -> NDArray[np.void]
     way, state = parametrisation(config, T_camera_world), np.zeros((), STATE)
     numbers = way.start
     state["numbers"][: len(numbers)], state["T"], state["best_T"] = numbers, way.pose(numbers)[:3], T_camera_world[:3]
-    state["first"] = state["best"] = state["previous"] = np.inf
+    state["first"] = state["best"] = state["lowered"] = np.inf
     return state
 
 
@@ -175,7 +175,8 @@ def _settings(T_camera_world: Matrix, config: TrackingConfig) -> Matrix:
     """Return the kernels' `DescentNumbers`."""
     c = config
     rates = [c.lr_rotation, c.lr_translation, exposure_rate(c)]
-    return np.array([*T_camera_world[:3].ravel(), BETA1, BETA2, EPSILON, *rates, c.update_stop, c.plateau_stop])
+    stops = [c.update_stop, c.plateau_stop, c.plateau_window]
+    return np.array([*T_camera_world[:3].ravel(), BETA1, BETA2, EPSILON, *rates, *stops], np.float64)
 
 
 def _found(state: np.void) -> Descent:

@@ -2,11 +2,12 @@
 
 Columns: x y z, nx ny nz (0), f_dc_0..2 = (colour − ½)/C0, f_rest_0..44 for view-dependent colours (all harmonics of
 red, then green, then blue), opacity (logit), scale_0..2 (log metres), rot_0..3 (wxyz), and our own at the end:
-log_variance_0..2, then depth_std_m and color_std if they are known. Our reader ignores the last two. Readers that find
-columns by name skip ours: SuperSplat and splat-transform (PlayCanvas), antimatter15/splat, nianticlabs/spz. Readers
-that assume the fixed 62-float layout and ignore the names would read garbage: the original 3DGS viewer (SIBR),
-3DGS.cpp, older Unity importers. `plain` writes exactly these 62 columns, with f_rest 0 if a map has no harmonics. The
-header has no comments, because SIBR expects the number of splats in line 3.
+log_variance_0..2, correlation_0..2 if the map has full colour covariances, then depth_std_m and color_std if they are
+known. Our reader ignores the last two. Readers that find columns by name skip ours: SuperSplat and splat-transform
+(PlayCanvas), antimatter15/splat, nianticlabs/spz. Readers that assume the fixed 62-float layout and ignore the names
+would read garbage: the original 3DGS viewer (SIBR), 3DGS.cpp, older Unity importers. `plain` writes exactly these 62
+columns, with f_rest 0 if a map has no harmonics. The header has no comments, because SIBR expects the number of splats
+in line 3.
 """
 
 from pathlib import Path
@@ -35,6 +36,7 @@ PLY_COLUMNS: dict[str, list[str]] = {
 BEFORE_HARMONICS = [*PLY_COLUMNS["means"], "nx", "ny", "nz", *PLY_COLUMNS["colors"]]
 AFTER_HARMONICS = ["opacity", *PLY_COLUMNS["log_scales"], *PLY_COLUMNS["quats"]]
 REST = "f_rest_"
+CORRELATIONS = [f"correlation_{i}" for i in range(ATTRIBUTES["correlations"])]
 STD_COLUMNS = ("depth_std_m", "color_std")
 
 
@@ -46,7 +48,8 @@ def write_field(path: Path, field: GaussianField, *, plain: bool = False, std: S
     params = field.params.detach().cpu().numpy().astype(np.float32)
     harmonics = _by_channel(field)
     rest = [f"{REST}{i}" for i in range(ATTRIBUTES["harmonics"] if plain else harmonics.shape[1])]
-    ours = [] if plain else PLY_COLUMNS["log_variances"]
+    correlations = field.attributes.get("correlations")
+    ours = [] if plain else [*PLY_COLUMNS["log_variances"], *(CORRELATIONS if correlations is not None else [])]
     of_std = {} if plain or std is None else {name: getattr(std, name) for name in STD_COLUMNS}
     names_in_file = [*BEFORE_HARMONICS, *rest, *AFTER_HARMONICS, *ours, *of_std]
     rows = np.zeros(len(params), np.dtype([(name, "<f4") for name in names_in_file]))
@@ -58,6 +61,9 @@ def write_field(path: Path, field: GaussianField, *, plain: bool = False, std: S
             rows[name] = values[:, i]
     for i, name in enumerate(rest[: harmonics.shape[1]]):
         rows[name] = harmonics[:, i]
+    if correlations is not None and not plain:
+        for i, name in enumerate(CORRELATIONS):
+            rows[name] = correlations.params[:, i].detach().cpu().numpy()
     for name, column in of_std.items():
         rows[name] = column.numpy()
     properties = "".join(f"property float {name}\n" for name in names_in_file)
@@ -89,6 +95,10 @@ def read_field(path: Path) -> GaussianField:
     field, harmonics = GaussianField(torch.from_numpy(_params(rows, path))), _harmonics(rows, path)
     if harmonics is not None:
         field.attributes["harmonics"] = Rows(torch.from_numpy(harmonics))
+    if set(CORRELATIONS) <= set(rows.dtype.names or ()):
+        correlations = np.stack([rows[name] for name in CORRELATIONS], 1).astype(np.float32)
+        check_finite(correlations, path)
+        field.attributes["correlations"] = Rows(torch.from_numpy(correlations))
     return field
 
 

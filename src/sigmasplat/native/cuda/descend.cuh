@@ -16,11 +16,11 @@ struct Descending {                        // layout: fit/cuda/descent.py
     double numbers[7], moment1[9], moment2[9];        // pose parameters, rotation first; Adam's moments, exposure's last
     double exposure[2], best_exposure[2];             // (a, b)
     double T[12], best_T[12];                         // T_camera_world, rows of [R | t]: now, and at the smallest loss
-    double first, best, previous;                     // losses
-    long long steps, stopped, missing;                // missing: number of pairs needed if not all fit
+    double first, best, lowered;                      // losses; lowered: when it last fell by the share of a plateau
+    long long waited, steps, stopped, missing;        // waited: steps since then; missing: pairs needed if not all fit
 };
 struct DescentNumbers {                    // guess: rows of T_camera_world
-    double guess[12], beta1, beta2, epsilon, lr_rotation, lr_translation, lr_exposure, update_stop, plateau_stop;
+    double guess[12], beta1, beta2, epsilon, lr_rotation, lr_translation, lr_exposure, update_stop, plateau_stop, plateau_window;
 };
 struct Shown { float pose[16], gain, offset; };       // the pose and exposure that render and loss use
 
@@ -153,8 +153,10 @@ KERNEL descend(Descending* descending, Shown* shown, DescentNumbers n, int axis,
         still = still && fabs(moved) < n.update_stop;
     }
     for (int k = 0; k < 2; k++) d.exposure[k] += adam_update(d, n, 7 + k, loss[1 + k], n.lr_exposure);
-    d.stopped = still || fabs(loss[0] - d.previous) < n.plateau_stop * loss[0];
-    d.previous = loss[0];
+    const bool lower = loss[0] < (1.0 - n.plateau_stop) * d.lowered;
+    d.waited = lower ? 0 : d.waited + 1;
+    if (lower) d.lowered = loss[0];
+    d.stopped = still || (n.plateau_stop > 0.0 && double(d.waited) >= n.plateau_window);
     if (axis) pose_of_axis(d.numbers, d.T);
     else pose_of_quaternion(d.numbers, n.guess, d.T);
     for (int k = 0; k < 12; k++) shown->pose[k] = float(d.T[k]);

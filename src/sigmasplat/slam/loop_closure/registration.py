@@ -158,12 +158,21 @@ class Registrar:
 
 
 def tracking_of(registration: RegistrationConfig, tracking: TrackingConfig) -> TrackingConfig:
-    """Return the settings for localising keyframes: those of tracking, with the weights and rates of registration."""
+    """Return the settings for localising keyframes: alignment as in tracking, the loss and its descent as in
+    registration.
+
+    The loss is a mean over all pixels (VarSplat §5). Tracking sums the colour errors over the channels; where
+    registration takes their mean, the weight of colour is a third of that. Adam does not depend on the loss's scale.
+    """
     r = registration
+    weight_color = r.weight_color
+    if r.color_mean == "values":
+        weight_color /= weight_color + 3.0 * (1.0 - weight_color)
     return dataclasses.replace(
-        tracking, uncertainty=r.uncertainty, tau=r.tau, weight_max=r.weight_max, weight_color=r.weight_color,
+        tracking, uncertainty=r.uncertainty, tau=r.tau, weight_max=r.weight_max, weight_color=weight_color,
         lr_rotation=r.lr_rotation, lr_translation=r.lr_translation, exposure=r.exposure, plateau_stop=r.plateau_stop,
-        alpha_power=1.0, alpha_above=OPAQUE, outlier_factor=0.0, align_depth_by="V",
+        plateau_window=r.plateau_window, alpha_power=1.0, alpha_above=OPAQUE, outlier_factor=0.0,
+        outlier_factor_color=0.0, average="image", parametrisation="quaternion", align_depth_by="V",
     )  # fmt: skip
 
 
