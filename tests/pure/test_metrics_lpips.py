@@ -7,51 +7,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from lpips_weights import TRUNK_FILES, write_weights
 from sigmasplat.errors import ConfigError
 from sigmasplat.metrics.lpips import Lpips, Net, find_lpips
 
-CHANNELS = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}
 TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
 """Numbers of the ReLUs whose outputs the public package compares."""
-TRUNK_FILES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
-
-
-def alexnet() -> nn.Sequential:
-    """Return torchvision's `alexnet().features`."""
-    return nn.Sequential(
-        nn.Conv2d(3, 64, kernel_size=11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(kernel_size=3, stride=2),
-        nn.Conv2d(64, 192, kernel_size=5, padding=2), nn.ReLU(), nn.MaxPool2d(kernel_size=3, stride=2),
-        nn.Conv2d(192, 384, kernel_size=3, padding=1), nn.ReLU(),
-        nn.Conv2d(384, 256, kernel_size=3, padding=1), nn.ReLU(),
-        nn.Conv2d(256, 256, kernel_size=3, padding=1), nn.ReLU(), nn.MaxPool2d(kernel_size=3, stride=2),
-    )  # fmt: skip
-
-
-def vgg16() -> nn.Sequential:
-    """Return torchvision's `vgg16().features`."""
-    layers, inputs = list[nn.Module](), 3
-    for outputs in (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512, 0):
-        if outputs:
-            layers += [nn.Conv2d(inputs, outputs, kernel_size=3, padding=1), nn.ReLU()]
-            inputs = outputs
-        else:
-            layers.append(nn.MaxPool2d(kernel_size=2, stride=2))
-    return nn.Sequential(*layers)
-
-
-NETWORKS = {"alex": alexnet, "vgg": vgg16}
-
-
-def write(folder: Path, net: Net) -> tuple[nn.Sequential, list[Tensor]]:
-    """Write both files of a network with random weights, as torchvision and lpips save them; return what they hold."""
-    torch.manual_seed(3)
-    features = NETWORKS[net]()
-    folder.mkdir(parents=True, exist_ok=True)
-    trunk = {f"features.{name}": tensor for name, tensor in features.state_dict().items()}
-    torch.save(trunk | {"classifier.6.bias": torch.zeros(1000)}, folder / TRUNK_FILES[net])
-    linear = [torch.rand(1, channels, 1, 1) for channels in CHANNELS[net]]
-    torch.save({f"lin{i}.model.1.weight": weight for i, weight in enumerate(linear)}, folder / f"{net}.pth")
-    return features, linear
 
 
 def images(height: int = 70, width: int = 93) -> tuple[np.ndarray, np.ndarray]:
@@ -81,7 +42,7 @@ def by_layers(features: nn.Sequential, linear: list[Tensor], net: Net, a: np.nda
 
 @pytest.mark.parametrize("net", ["alex", "vgg"])
 def test_each_layer_equals_plain_torch(tmp_path: Path, net: Net) -> None:
-    features, linear = write(tmp_path, net)
+    features, linear = write_weights(tmp_path, net)
     a, b = images()
     with torch.inference_mode():
         expected = by_layers(features, linear, net, a, b)
@@ -91,13 +52,13 @@ def test_each_layer_equals_plain_torch(tmp_path: Path, net: Net) -> None:
 
 
 def test_files_may_be_in_a_folder_of_the_network(tmp_path: Path) -> None:
-    write(tmp_path / "alex", "alex")
+    write_weights(tmp_path / "alex", "alex")
     found, problem = find_lpips(tmp_path)
     assert found is not None and found.net == "alex" and not problem
 
 
 def test_an_image_without_features_has_no_distance(tmp_path: Path) -> None:
-    write(tmp_path, "alex")
+    write_weights(tmp_path, "alex")
     lpips = Lpips.load(tmp_path)
     assert np.isnan(lpips.distance(*images(30, 80))) and np.isfinite(lpips.distance(*images(31, 31)))
 
@@ -105,7 +66,7 @@ def test_an_image_without_features_has_no_distance(tmp_path: Path) -> None:
 def test_a_missing_file_is_named_with_the_command_that_downloads_it(tmp_path: Path) -> None:
     found, problem = find_lpips(tmp_path)
     assert found is None and "alex.pth" in problem and "sigmasplat download lpips alex" in problem
-    write(tmp_path, "alex")
+    write_weights(tmp_path, "alex")
     (tmp_path / TRUNK_FILES["alex"]).unlink()
     assert "alexnet-owt-*.pth" in find_lpips(tmp_path)[1]
     with pytest.raises(ConfigError, match="alexnet-owt"):
@@ -113,7 +74,7 @@ def test_a_missing_file_is_named_with_the_command_that_downloads_it(tmp_path: Pa
 
 
 def test_wrong_files_are_refused_with_the_tensor(tmp_path: Path) -> None:
-    write(tmp_path, "alex")
+    write_weights(tmp_path, "alex")
     trunk = torch.load(tmp_path / TRUNK_FILES["alex"])
     for change, words in (
         ({"features.3.weight": torch.zeros(192, 64, 3, 3)}, r"features\.3\.weight is 192 × 64 × 3 × 3, expected"),

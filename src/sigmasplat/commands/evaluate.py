@@ -31,6 +31,9 @@ class EvalOptions:
             help_behavior_hint="(default: that of the data set)",
         ),
     ] = None
+    random_views: Annotated[
+        int, arg(metavar="N", help="number of random views that score the depth of mesh.ply; papers use 1000")
+    ] = 1000
     full_resolution: Annotated[
         bool, arg(help="also score the views at the resolution of the recording", help_behavior_hint="")
     ] = False
@@ -99,7 +102,8 @@ def score(
         with screen.counting("evaluation") as progress:
             metrics = evaluate(
                 folder, source, mesh=mesh or true_mesh is not None, true_mesh=true_mesh,
-                full_resolution=eval_options.full_resolution, lpips=lpips, progress=progress,
+                random_views=eval_options.random_views, full_resolution=eval_options.full_resolution, lpips=lpips,
+                progress=progress,
             )  # fmt: skip
         screen.results(metrics)
         return unscored

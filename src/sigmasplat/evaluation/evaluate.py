@@ -19,6 +19,7 @@ from sigmasplat.io.runs import TRUTH, RunFolder
 from sigmasplat.io.trajectory import write_trajectory
 from sigmasplat.metrics import views
 from sigmasplat.metrics.lpips import Lpips
+from sigmasplat.metrics.published_reconstruction import VIEWS
 from sigmasplat.metrics.trajectory import aligned_truth, score_path, truth_in_estimate
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
@@ -44,6 +45,7 @@ def evaluate(
     strips_per_kind: int = 3,
     mesh: bool = False,
     true_mesh: Mesh | None = None,
+    random_views: int = VIEWS,
     full_resolution: bool = False,
     lpips: Lpips | None = None,
     progress: Progress = no_progress,
@@ -58,19 +60,14 @@ def evaluate(
     run has uncertainty.json and no `renderer` is given, the predictive variances are scored too. LPIPS is scored if
     its network is given. With `full_resolution` the views are also scored at the size of the recording.
     Calls `progress(done, total)` with views. With `mesh` the keyframes are fused into mesh.ply, which is scored if the
-    source knows its true surface, or if `true_mesh` is given, in the world frame of the truth.
+    source knows its true surface, or if `true_mesh` is given, in the world frame of the truth; `random_views` is the
+    number of random views for its depth (`metrics.published_reconstruction`).
 
     Raises RunError if the run stopped before it had a map; SourceError if truth and run share no timestamps, after
     everything else has been written.
     """
-    records = run.read_log()
-    if not records:
-        raise RunError(f"run {run.path} stopped before its first frame: its log.jsonl is empty; run it again")
-    path, field = run.read_trajectory(), run.read_map()
-    frames = RunFrames.of(records, path)
+    frames, field = _read_frames(run), run.read_map()
     records, log = frames.log, frames.posed_log()
-    if len(path) and not log:
-        raise RunError(f"run {run.path}: trajectory.txt and log.jsonl share no timestamps; do they belong to one run?")
     truth = source.truth() if log else None  # without a believed pose nothing can be aligned
     path_scores, problem = score_path(frames.path, _believed_odometry(run, frames), truth)
     known = None if problem else truth
@@ -85,13 +82,11 @@ def evaluate(
     )
     metrics = _facts(run, source, records, field, loops) | score_states(run, frames, known) | path_scores
     metrics |= score_frame_sets(run, frames, known) | _score_views(scoring, config.final, predictions, strips, progress)
-    metrics |= {"lpips_network": lpips.net if lpips else None, "full_resolution": None}
-    if full_resolution:
-        metrics["full_resolution"] = score_full_resolution(scoring, progress)
-    metrics |= {"reconstruction": None, "reconstruction_published": None}
+    metrics |= {"lpips_network": lpips.net if lpips else None, "reconstruction": None, "reconstruction_published": None}
+    metrics["full_resolution"] = score_full_resolution(scoring, progress) if full_resolution else None
     if mesh:
         surface = true_mesh or reconstruct.known_surface(source)
-        metrics |= reconstruct.fuse_and_score(run, source.camera, surface, known, renderer, progress)
+        metrics |= reconstruct.fuse_and_score(run, source.camera, surface, known, random_views, renderer, progress)
     metrics["pose_covariance"] = score_pose_covariance(run, frames, known)
     metrics["test_views"] = score_test_views(scoring, config.input, strips)
     run.write_metrics(metrics)
@@ -101,6 +96,17 @@ def evaluate(
     if problem:
         raise problem
     return metrics
+
+
+def _read_frames(run: RunFolder) -> RunFrames:
+    """Read the frames of a run. Raises RunError if it has none, or if its log and its path do not match."""
+    records, path = run.read_log(), run.read_trajectory()
+    if not records:
+        raise RunError(f"run {run.path} stopped before its first frame: its log.jsonl is empty; run it again")
+    frames = RunFrames.of(records, path)
+    if len(path) and not len(frames.rows):
+        raise RunError(f"run {run.path}: trajectory.txt and log.jsonl share no timestamps; do they belong to one run?")
+    return frames
 
 
 def _alignment(frames: RunFrames, truth: Trajectory | None) -> NDArray[np.float64] | None:

@@ -16,7 +16,7 @@ from sigmasplat.errors import RunError
 from sigmasplat.io.mesh import read_mesh, write_mesh
 from sigmasplat.io.runs import MESH, RunFolder
 from sigmasplat.metrics import reconstruction
-from sigmasplat.metrics.published_reconstruction import score_published
+from sigmasplat.metrics.published_reconstruction import VIEWS, score_published
 from sigmasplat.metrics.splats import score_splats
 from sigmasplat.metrics.trajectory import align_rigid, associate, pair_poses
 from sigmasplat.model import se3
@@ -116,6 +116,7 @@ def fuse_and_score(
     camera: Camera,
     true_surface: Mesh | None,
     true_path: Trajectory | None,
+    random_views: int = VIEWS,
     renderer: Renderer | None = None,
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
@@ -126,11 +127,16 @@ def fuse_and_score(
     write_mesh(run.path / MESH, mesh)
     if true_surface is None or true_path is None:
         return {"reconstruction": None, "reconstruction_published": None}
-    return score(fusion_input, mesh, true_surface, true_path, progress)
+    return score(fusion_input, mesh, true_surface, true_path, random_views, progress)
 
 
 def score(
-    fusion_input: FusionInput, mesh: Mesh, true_surface: Mesh, true_path: Trajectory, progress: Progress = no_progress
+    fusion_input: FusionInput,
+    mesh: Mesh,
+    true_surface: Mesh,
+    true_path: Trajectory,
+    random_views: int = VIEWS,
+    progress: Progress = no_progress,
 ) -> dict[str, Any]:
     """Score a run's mesh and its splats against the true surface, after the same alignment as for the ATE.
 
@@ -153,5 +159,5 @@ def score(
     of_mesh = reconstruction.score(found, *reference, seen=(seen_true, seen_found), progress=progress)
     opacities = field.opacities.numpy().astype(np.float64)
     of_splats = score_splats(centers, opacities, *reference, seen=(seen_true, seen_splats))
-    published = score_published(found, truth, seen_true, seen_found, progress=progress)
+    published = score_published(found, truth, seen_true, seen_found, views=random_views, progress=progress)
     return {"reconstruction": asdict(of_mesh) | asdict(of_splats), "reconstruction_published": asdict(published)}

@@ -64,12 +64,14 @@ def score_published(
     *,
     points: int = POINTS,
     views: int = VIEWS,
+    camera: Camera = VIEW_CAMERA,
     seed: int = 0,
     progress: Progress = no_progress,
 ) -> PublishedScores:
     """Score mesh `found` against mesh `truth`, both in the frame of the truth, after aligning them by ICP.
 
-    seen_true, seen_found: the faces of each that count (`reconstruction.visible_parts`). Calls `progress` with views.
+    seen_true, seen_found: the faces of each that count (`reconstruction.visible_parts`); camera: of the random views.
+    Calls `progress(views done, total)`.
     """
     ours, theirs = found.with_faces(seen_found), truth.with_faces(seen_true)
     T = aligned_by_icp(ours.vertices.astype(np.float64), theirs.vertices.astype(np.float64))
@@ -79,7 +81,7 @@ def score_published(
     ours_dense, theirs_dense = dense_points(ours, theirs, seed + 2)
     precision = _share(nearest_m(ours_dense, theirs_dense), CORRECT_M)
     recall = _share(nearest_m(theirs_dense, ours_dense), CORRECT_M)
-    errors = depth_errors(ours, truth, seen_true, views=views, seed=seed, progress=progress)
+    errors = depth_errors(ours, truth, seen_true, views=views, camera=camera, seed=seed, progress=progress)
     return PublishedScores(
         _mean(accuracy), _mean(completion), (_mean(accuracy) + _mean(completion)) / 2, _share(completion, COMPLETE_M),
         precision, recall, f1(precision, recall), _mean(errors), len(errors),
@@ -123,13 +125,20 @@ def aligned_by_icp(points: Matrix, target: Matrix, most: int = POINTS) -> Matrix
 
 
 def depth_errors(
-    found: Mesh, truth: Mesh, seen_true: Mask, *, views: int = VIEWS, seed: int = 0, progress: Progress = no_progress
+    found: Mesh,
+    truth: Mesh,
+    seen_true: Mask,
+    *,
+    views: int = VIEWS,
+    camera: Camera = VIEW_CAMERA,
+    seed: int = 0,
+    progress: Progress = no_progress,
 ) -> Matrix:
     """Return the mean |depth difference| of each random view, m, over pixels where both have a surface and the true
     one was seen."""
     errors = list[float]()
-    for done, (T, depth_m, counted) in enumerate(random_views(truth, seen_true, views, seed), 1):
-        ours, _ = mesh_depth(found, VIEW_CAMERA, se3.inverse(T))
+    for done, (T, depth_m, counted) in enumerate(random_views(truth, seen_true, views, camera, seed), 1):
+        ours, _ = mesh_depth(found, camera, se3.inverse(T))
         both = counted & (ours > 0)
         if both.any():
             errors.append(float(np.abs(ours[both].astype(np.float64) - depth_m[both]).mean()))
@@ -138,7 +147,7 @@ def depth_errors(
 
 
 def random_views(
-    truth: Mesh, seen_true: Mask, views: int, seed: int
+    truth: Mesh, seen_true: Mask, views: int, camera: Camera, seed: int
 ) -> Iterator[tuple[Matrix, NDArray[np.float32], Mask]]:
     """Yield at most `views` views inside the room: pose, true depth, and which pixels show a seen true face.
 
@@ -153,7 +162,7 @@ def random_views(
     for _ in range(DRAWS_PER_VIEW * views):
         place, toward = rng.uniform(-0.5, 0.5, (2, 3))
         T = looking(center + axes @ (place * sides * BOX_SHARES), toward, axes[:, 0])
-        depth_m, face = mesh_depth(truth, VIEW_CAMERA, se3.inverse(T))
+        depth_m, face = mesh_depth(truth, camera, se3.inverse(T))
         hit = face >= 0
         counted = hit & seen_true[face]
         if counted.any() and (hit & ~counted).mean() <= UNSEEN_SHARE:
