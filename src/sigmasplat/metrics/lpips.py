@@ -178,7 +178,7 @@ def _find(folder: Path, net: Net, name: str) -> Path:
     for place in (folder, folder / net):
         if found := sorted(place.glob(name)):
             return found[-1]
-    raise ConfigError(f"no {name} in {folder}; `sigmasplat download lpips {net}` downloads it")
+    raise ConfigError(f"no {name} in {folder}; download it with: sigmasplat download lpips {net}")
 
 
 def _tensors(path: Path) -> _TensorFile:
