@@ -526,7 +526,7 @@ def test_full_resolution_has_its_own_scores(run: RunFolder) -> None:
     expected = np.mean([-10 * np.log10(((image.astype(float) - 0.45) ** 2).mean()) for image in inner])
     assert full["training"]["psnr_image_db"] == pytest.approx(expected, abs=1e-4)
     assert full["held_out"]["views"] == 15 and full["test_views"]["views"] == FRAMES - 1
-    assert metrics["training"]["psnr_image_db"] > expected + 3, "at half the size noise is averaged"
+    assert metrics["training"]["psnr_image_db"] > expected + 2, "at half the size noise is averaged"
     assert full["training_submaps"] is None and "uncertainty" not in full
     page = (run.path / "report.html").read_text()
     assert "Rendered images, full resolution: 40 × 28" in page

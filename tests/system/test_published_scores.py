@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from command_line import exit_code
 from layouts import Sample, opengl, rows, save, save_text, transforms
@@ -12,6 +13,7 @@ from lpips_weights import write_weights
 from sigmasplat.io.mesh import write_mesh
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.mesh import Mesh
 from sigmasplat.sources import SyntheticRoom
 from sigmasplat.sources.base import Source
 
@@ -25,6 +27,13 @@ OPTIONS = [word for pair in SETTINGS.items() for word in ("--set", "=".join(pair
 @pytest.fixture(scope="module")
 def room() -> SyntheticRoom:
     return SyntheticRoom(frames=120, width=96, height=72, test_views=3)
+
+
+def walls(room: SyntheticRoom, shift_m: float = 0.0) -> Mesh:
+    """Return the box around the true surface, 12 large faces, without the furniture."""
+    surface = room.true_surface()
+    box = trimesh.creation.box(bounds=[surface.vertices.min(0) - shift_m, surface.vertices.max(0) + shift_m])
+    return Mesh(box.vertices.astype(np.float32), box.faces.astype(np.int32))
 
 
 def sample(source: Source, poses: np.ndarray, count: int) -> Sample:
@@ -51,28 +60,24 @@ def test_replicas_layout_has_all_scores_of_the_papers(
     save_text(folder / "traj.txt", "".join(rows(T).replace("\n", " ").strip() + "\n" for T in s.T_world_camera))
     camera = {"w": c.width, "h": c.height, "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy, "scale": 1000.0}
     save_text(tmp_path / "cam_params.json", json.dumps({"camera": camera}))
-    write_mesh(tmp_path / "room0_mesh.ply", room.true_surface())
+    write_mesh(tmp_path / "room0_mesh.ply", walls(room))
     write_weights(tmp_path / "weights", "alex")
 
     extra = ("--mesh", "--full-resolution", "--random-views", "6", "--lpips", str(tmp_path / "weights"))
     metrics = scored(folder, tmp_path / "run", *extra)
     published, ours = metrics["reconstruction_published"], metrics["reconstruction"]
-    assert published["depth_views"] <= 6 and 0 < published["accuracy_m"] < 0.1
+    assert 1 <= published["depth_views"] <= 6 and 0 < published["depth_l1_m"] < 1
     assert published["chamfer_m"] == pytest.approx((published["accuracy_m"] + published["completion_m"]) / 2)
-    assert published["accuracy_m"] == pytest.approx(ours["accuracy_m"], abs=0.02)
-    assert 0 < published["f1"] <= 1 and published["completion_ratio"] == pytest.approx(
-        ours["completion_ratio"], abs=0.1
-    )
+    assert 0 < published["f1"] <= 1 and 0 < published["completion_ratio"] <= 1
     assert metrics["full_resolution"]["width"] == 96 and metrics["full_resolution"]["training"]["lpips"] > 0
     assert metrics["training"]["lpips"] > 0 and metrics["ate_keyframes"]["rmse_m"] < 0.1
     assert "LPIPS" not in capsys.readouterr().out
 
-    shifted = room.true_surface().vertices + np.array([0.0, 0.0, 0.5], np.float32)
-    write_mesh(tmp_path / "other.ply", type(room.true_surface())(shifted, room.true_surface().faces))
+    write_mesh(tmp_path / "other.ply", walls(room, shift_m=0.3))
     other = ("--true-mesh", str(tmp_path / "other.ply"), "--random-views", "0")
     assert exit_code("eval", str(tmp_path / "run"), *other) == 0
     given = RunFolder.open(tmp_path / "run").read_metrics()
-    assert given["reconstruction"]["accuracy_m"] > 2 * ours["accuracy_m"]
+    assert given["reconstruction"]["accuracy_m"] > ours["accuracy_m"]
     assert "no alex.pth in" in capsys.readouterr().out
     assert exit_code("eval", str(tmp_path / "run"), "--true-mesh", str(tmp_path / "nothing.ply")) == 2
     assert exit_code("eval", str(tmp_path / "run"), "--lpips", str(tmp_path)) == 2

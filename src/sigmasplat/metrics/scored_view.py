@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.metrics.image import depth_l1, ms_ssim, psnr, ssim
+from sigmasplat.metrics.image import SSIM_LEAST_PX, depth_l1, ms_ssim, psnr, similarity_factors, ssim
 from sigmasplat.metrics.lpips import Lpips
 
 COVERED_ALPHA = 0.5
@@ -80,12 +80,13 @@ class ScoredView:
         """
         valid = self.valid
         covered = float((self.rendered_depth_m > 0)[valid].mean()) if valid.any() else float("nan")
+        factors = similarity_factors(self.rendered, self.recorded) if min(valid.shape) >= SSIM_LEAST_PX else None
         return {
             "psnr_db": psnr(self.rendered, self.recorded, valid),
-            "ssim": ssim(self.rendered, self.recorded, valid),
+            "ssim": ssim(self.rendered, self.recorded, valid, factors),
             "depth_l1_m": depth_l1(self.rendered_depth_m, self.recorded_depth_m),
             "depth_coverage": covered,
             "psnr_image_db": psnr(self.rendered, self.recorded),
-            "ms_ssim": ms_ssim(self.rendered, self.recorded),
+            "ms_ssim": ms_ssim(self.rendered, self.recorded, factors),
             "lpips": lpips.distance(self.rendered, self.recorded) if lpips else float("nan"),
         }
