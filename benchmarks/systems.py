@@ -74,7 +74,8 @@ def with_surface(job: accuracy.Job, result: dict[str, Any], runs: Path, before: 
     try:
         metrics = RunFolder.open(run).read_metrics()
         if metrics["reconstruction"] is None and open_source(job.path).true_surface() is not None:
-            command = [*before, sys.executable, "-m", "sigmasplat.cli", "eval", str(run), "--mesh"]
+            command = [*before, sys.executable, "-m", "sigmasplat.cli", "eval", str(run)]
+            command += ["--mesh", "--random-views", "0"]
             problem, _ = accuracy.call(command, run.parent / "surface.txt")
             if problem:
                 return result | {"problem": f"eval --mesh: {problem}"}

@@ -94,7 +94,7 @@ def test_a_surface_is_scored_once_and_where_it_is_known(
         assert found["figures"]["floaters"] == 0.125 and found["figures"]["lost"] == 3 and found["problem"] is None
     run = str(job.folder(tmp_path) / "run")
     assert len(called) == 1 and called[0] == ["taskset", "-c", "0", sys.executable, "-m", "sigmasplat.cli", "eval", run,
-                                              "--mesh"]  # fmt: skip
+                                              "--mesh", "--random-views", "0"]  # fmt: skip
 
 
 class Surfaceless:

@@ -113,6 +113,16 @@ def test_meshes_of_other_programs_are_read(tmp_path: Path) -> None:
     assert read_mesh(by_hand(tmp_path / "b.ply", "little", rows, struct.pack("<B3IB", 3, 0, 1, 2, 0))).colors is None
 
 
+def test_polygons_are_divided_into_triangles(tmp_path: Path) -> None:
+    rows = struct.pack("<15d", *range(15))
+    quads = struct.pack("<B4IB", 4, 0, 1, 2, 3, 0) + struct.pack("<B4IB", 4, 4, 3, 2, 1, 0)
+    mesh = read_mesh(by_hand(tmp_path / "quads.ply", "little", rows, quads, count=5, number=2))
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [4, 3, 2], [4, 2, 1]]
+    fives = struct.pack("<B5IB", 5, 0, 1, 2, 3, 4, 0)
+    mesh = read_mesh(by_hand(tmp_path / "fives.ply", "little", rows, fives, count=5, number=1))
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 3, 4]]
+
+
 def refused(path: Path) -> str:
     with pytest.raises(SourceError) as caught:
         read_mesh(path)
@@ -135,13 +145,15 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         (whole.replace(b"property float y", b"property float q"), "needs vertices with x, y, z"),
         (whole[: whole.index(b"element face")] + b"end_header\n" + bytes(50 * 15), "is it a point cloud"),
         (whole[:-13] + struct.pack("<B3i", 3, 0, 1, 50), "vertices that do not exist"),
-        (whole[:-13] + struct.pack("<B3i", 4, 0, 1, 2), "not all faces are triangles"),
+        (whole[:-13] + struct.pack("<B3i", 4, 0, 1, 2), "not all faces have the same number of vertices"),
     ):
         path.write_bytes(content)
         assert words in refused(path), words
     rows = struct.pack("<12d", *range(12))
-    quads = struct.pack("<B4IB", 4, 0, 1, 2, 3, 0) * 3
-    assert "not all faces are triangles" in refused(by_hand(path, "little", rows, quads, count=4, number=3))
+    mixed = struct.pack("<B4IB", 4, 0, 1, 2, 3, 0) + struct.pack("<B3IB", 3, 0, 1, 2, 0) * 2
+    for faces in (mixed, struct.pack("<B2IB", 2, 0, 1, 0) * 3):
+        message = refused(by_hand(path, "little", rows, faces, count=4, number=3))
+        assert "not all faces have the same number of vertices" in message
     nan = struct.pack("<9d", *range(8), float("nan"))
     assert "nan or inf" in refused(by_hand(path, "little", nan, struct.pack("<B3IB", 3, 0, 1, 2, 0)))
 

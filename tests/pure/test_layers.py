@@ -95,7 +95,9 @@ def words_in_code(tree: ast.AST) -> Iterator[str]:
 
 def reads_truth(tree: ast.AST) -> bool:
     return any(
-        isinstance(node, ast.Attribute) and node.attr in {"truth", "true_surface"} and isinstance(node.ctx, ast.Load)
+        isinstance(node, ast.Attribute)
+        and node.attr in {"truth", "true_surface", "true_surface_file"}
+        and isinstance(node.ctx, ast.Load)
         for node in ast.walk(tree)
     )
 

@@ -12,12 +12,14 @@ import pytest
 import torch
 from PIL import Image
 
+from lpips_weights import write_weights
 from sigmasplat.config import Config, FinalConfig, InputConfig
 from sigmasplat.drawing.view_panels import FOOT, GAP, HEAD, PANEL_WIDTH
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.evaluation.evaluate import evaluate
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.submaps import DiskStore
+from sigmasplat.metrics.lpips import Lpips
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.component import Component
@@ -482,3 +484,68 @@ def test_novel_views_need_the_truth(run: RunFolder) -> None:
     assert score(run, HandMade(truth_of()))["test_views"] is None
     assert score(run, WithViews(None, NovelViews(truth_of())))["test_views"] is None
     assert score(run, WithViews(truth_of(), NovelViews(None)))["test_views"] is None
+
+
+def test_the_path_is_scored_on_keyframes_and_on_all_frames(run: RunFolder) -> None:
+    """Frames that are not keyframes alternate by ±20 cm; lost frame 6 is off by 1 m in the checkpoint."""
+    rewritten_log(run, lambda line: {"state": "lost" if line["index"] == 6 else "tracked", "lost": line["index"] == 6})
+    estimate = poses()
+    estimate[1::4, 1, 3] += 0.2
+    estimate[3::4, 1, 3] -= 0.2
+    estimate[6, 1, 3] += 1.0
+    believed = [i for i in range(FRAMES) if i != 6]
+    run.write_trajectory(Trajectory(TIMES[believed], estimate[believed]))
+    run.write_checkpoint({"T_world_camera": torch.from_numpy(estimate)}, {})
+    metrics = score(
+        run, HandMade(truth_of()), renderer=lambda field, camera, T: KnownErrors()(field, camera, nearest(T))
+    )
+    assert metrics["ate_keyframes"]["pairs"] == 5 and metrics["ate_keyframes"]["rmse_m"] < 1e-9
+    assert metrics["ate"]["pairs"] == FRAMES - 1 and 0.1 < metrics["ate"]["rmse_m"] < 0.15
+    assert metrics["ate_all_frames"]["pairs"] == FRAMES and metrics["ate_all_frames"]["max_m"] > 0.8
+    page = (run.path / "report.html").read_text()
+    assert "ATE rmse of keyframes (5 poses), cm" in page and "with lost ones (20 poses)" in page
+    unknown = score(run, HandMade(None), renderer=lambda field, camera, T: KnownErrors()(field, camera, nearest(T)))
+    assert unknown["ate_keyframes"] is unknown["ate_all_frames"] is None
+
+
+class Gray:
+    """Renders gray at any size; the depth is exact."""
+
+    def __call__(self, field: GaussianField, camera: Camera, T_camera_world: np.ndarray) -> Any:
+        size = camera.height, camera.width
+        maps = {"color": (*size, 3), "depth": size, "alpha": size, "variance": (*size, 3)}
+        values = {"color": 0.45, "depth": 2.0, "alpha": 1.0, "variance": 0.01}
+        return SimpleNamespace(**{name: torch.full(shape, values[name]) for name, shape in maps.items()})
+
+
+def test_full_resolution_has_its_own_scores(run: RunFolder) -> None:
+    config = replace(CONFIG, input=InputConfig(width=24, max_depth_m=4.0, crop_px=2))
+    (run.path / "config.json").write_text(json.dumps(config.to_dict()))
+    source = WithViews(truth_of(), NovelViews(truth_of()))
+    metrics = score(run, source, renderer=Gray(), full_resolution=True)
+    full = metrics["full_resolution"]
+    assert (full["width"], full["height"]) == (40, 28), "the edge of 2 pixels of 24 is one of 4 pixels of 48"
+    inner = [picture(i)[4:-4, 4:-4] for i in range(0, FRAMES, 4)]
+    expected = np.mean([-10 * np.log10(((image.astype(float) - 0.45) ** 2).mean()) for image in inner])
+    assert full["training"]["psnr_image_db"] == pytest.approx(expected, abs=1e-4)
+    assert full["held_out"]["views"] == 15 and full["test_views"]["views"] == FRAMES - 1
+    assert metrics["training"]["psnr_image_db"] > expected + 2, "at half the size noise is averaged"
+    assert full["training_submaps"] is None and "uncertainty" not in full
+    page = (run.path / "report.html").read_text()
+    assert "Rendered images, full resolution: 40 × 28" in page
+    assert score(run, source, renderer=Gray())["full_resolution"] is None
+    assert "full resolution" not in (run.path / "report.html").read_text()
+
+
+def test_lpips_is_scored_with_its_weights_only(run: RunFolder, tmp_path: Path) -> None:
+    write_weights(tmp_path / "weights", "alex")
+    lpips = Lpips.load(tmp_path / "weights")
+    metrics = score(run, HandMade(None), renderer=Gray(), lpips=lpips)
+    gray = np.full((36, 48, 3), 0.45, np.float32)
+    expected = np.mean([lpips.distance(gray, picture(i)) for i in range(0, FRAMES, 4)])
+    assert metrics["training"]["lpips"] == pytest.approx(expected) and metrics["lpips_network"] == "alex"
+    assert "LPIPS (alex)" in (run.path / "report.html").read_text()
+    without = score(run, HandMade(None), renderer=Gray())
+    assert without["training"]["lpips"] is without["lpips_network"] is None
+    assert "LPIPS (no weights)" in (run.path / "report.html").read_text()
+    assert metrics["training"]["ms_ssim"] is None, "five scales need 161 pixels"

@@ -1,11 +1,13 @@
-"""PSNR, SSIM and depth L1 against scikit-image and values known by hand."""
+"""PSNR, SSIM, MS-SSIM and depth L1 against scikit-image, pytorch-msssim and values known by hand."""
 
 import numpy as np
 import pytest
+import pytorch_msssim
+import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from sigmasplat.errors import SigmaSplatError
-from sigmasplat.metrics.image import depth_l1, psnr, ssim, ssim_map
+from sigmasplat.metrics.image import depth_l1, ms_ssim, psnr, similarity_factors, ssim
 
 
 def pair(seed: int, height: int = 37, width: int = 52) -> tuple[np.ndarray, np.ndarray]:
@@ -42,7 +44,8 @@ def test_masked_pixels_do_not_count() -> None:
     inner = np.zeros_like(valid)
     inner[13:25, 15:35] = True
     assert ssim(a, spoilt, inner) == pytest.approx(ssim(a, b, inner), abs=1e-12)
-    assert ssim(a, b, inner) == pytest.approx(ssim_map(a, b)[8:20, 10:30].mean())
+    luminance, contrast = similarity_factors(a, b)
+    assert ssim(a, b, inner) == pytest.approx((luminance * contrast)[8:20, 10:30].mean())
 
 
 def test_scores_of_equal_images_and_of_no_pixels() -> None:
@@ -61,3 +64,24 @@ def test_depth_l1_uses_pixels_with_both_readings() -> None:
     assert depth_l1(rendered, measured) == pytest.approx(0.2, abs=1e-6)
     assert depth_l1(rendered, measured, np.array([[True, True, True, False]])) == pytest.approx(0.1, abs=1e-6)
     assert np.isnan(depth_l1(rendered, np.zeros_like(measured)))
+
+
+@pytest.mark.parametrize("size", [(161, 200), (163, 175), (240, 321), (176, 176)])
+def test_ms_ssim_equals_pytorch_msssim(size: tuple[int, int]) -> None:
+    a, b = pair(size[0], *size)
+    nchw = [torch.from_numpy(image).double().permute(2, 0, 1)[None] for image in (a, b)]
+    assert ms_ssim(a, b) == pytest.approx(pytorch_msssim.ms_ssim(*nchw, data_range=1.0).item(), abs=1e-6)
+    factors = similarity_factors(a, b)
+    assert ms_ssim(a, b, factors) == ms_ssim(a, b) and ssim(a, b, None, factors) == ssim(a, b)
+    assert ms_ssim(a, b) < 0.99 and ms_ssim(a, a) == pytest.approx(1.0)
+
+
+def test_ms_ssim_of_a_negative_counts_as_zero() -> None:
+    a, _ = pair(4, 170, 180)
+    nchw = [torch.from_numpy(image).double().permute(2, 0, 1)[None] for image in (a, 1 - a)]
+    assert ms_ssim(a, 1 - a) == pytorch_msssim.ms_ssim(*nchw, data_range=1.0).item() == 0.0
+
+
+def test_ms_ssim_needs_161_pixels_in_each_direction() -> None:
+    a, b = pair(0, 160, 400)
+    assert np.isnan(ms_ssim(a, b)) and np.isnan(ms_ssim(a.swapaxes(0, 1), b.swapaxes(0, 1)))

@@ -91,3 +91,12 @@ def test_fewer_poses_than_images(replica):
     (replica / "traj.txt").write_text((replica / "traj.txt").read_text().splitlines()[0])
     with pytest.raises(SourceError, match="1 poses, but the last image has number 2"):
         open_source(replica)
+
+
+def test_the_true_surface_is_found_beside_the_sequence_or_in_it(replica):
+    assert open_source(replica).true_surface_file() is None
+    within, beside = replica / "room0_mesh.ply", replica.parent / "room0_mesh.ply"
+    within.touch()
+    assert open_source(replica).true_surface_file() == within
+    beside.touch()
+    assert open_source(replica).true_surface_file() == open_source(replica, limit=2).true_surface_file() == beside

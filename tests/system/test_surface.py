@@ -149,7 +149,9 @@ def test_each_keyframe_renders_its_own_submap(run: RunFolder) -> None:
 
 
 def test_evaluation_scores_the_mesh_in_the_truths_frame(run: RunFolder) -> None:
-    found = evaluate(run, WallAhead(), renderer=KnownView(off_m=0.005), strips_per_kind=0, mesh=True)["reconstruction"]
+    found = evaluate(run, WallAhead(), renderer=KnownView(off_m=0.005), strips_per_kind=0, mesh=True, random_views=0)[
+        "reconstruction"
+    ]
     assert found["accuracy_m"] == pytest.approx(0.005, rel=0.05) and found["precision"] > 0.999
     assert found["depth_l1_m"] == pytest.approx(0.005, rel=0.2)
     assert 0.5 < found["recall"] < found["completion_ratio"] < 0.9, (
@@ -166,7 +168,9 @@ def test_evaluation_scores_the_splats_in_the_truths_frame(run: RunFolder) -> Non
     params = torch.ones(3, 17)
     params[:, :3] = torch.tensor([[0.0, 0.0, 1.7], [0.3, 0.1, WALL_M], [1.0, 1.0, 9.0]])
     run.write_map(GaussianField(params))
-    found = evaluate(run, WallAhead(), renderer=KnownView(), strips_per_kind=0, mesh=True)["reconstruction"]
+    found = evaluate(run, WallAhead(), renderer=KnownView(), strips_per_kind=0, mesh=True, random_views=0)[
+        "reconstruction"
+    ]
     assert found["splats_accuracy_m"] == pytest.approx(0.15, rel=1e-4), "the third one is hidden"
     assert found["floaters"] == pytest.approx(2 / 3)
     assert found["splats_chamfer_m"] == pytest.approx((0.15 + found["splats_completion_m"]) / 2, rel=1e-4)
@@ -175,7 +179,7 @@ def test_evaluation_scores_the_splats_in_the_truths_frame(run: RunFolder) -> Non
 
 
 def test_without_a_true_surface_the_mesh_has_no_score(run: RunFolder) -> None:
-    metrics = evaluate(run, WallAhead(known=False), renderer=KnownView(), strips_per_kind=0, mesh=True)
+    metrics = evaluate(run, WallAhead(known=False), renderer=KnownView(), strips_per_kind=0, mesh=True, random_views=0)
     assert metrics["reconstruction"] is None and (run.path / "mesh.ply").exists()
     (run.path / "mesh.ply").unlink()
     metrics = evaluate(run, WallAhead(), renderer=KnownView(), strips_per_kind=0)

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 arg = tyro.conf.arg
 SetName = Annotated[
-    str, tyro.conf.Positional, arg(metavar="SET", help="tum, replica, icl, 7scenes, bonn, redwood; or list")
+    str, tyro.conf.Positional, arg(metavar="SET", help="tum, replica, icl, 7scenes, bonn, redwood; lpips; or list")
 ]
 Names = Annotated[
     tuple[str, ...],
@@ -38,7 +38,7 @@ def download(
     overwrite: Overwrite = False,
     keep_archive: KeepArchive = False,
 ) -> int:
-    """Download recordings of a public data set: resumable, verified, safely unpacked.
+    """Download recordings of a public data set, or weights: resumable, verified, safely unpacked.
 
     example: sigmasplat download tum fr1/desk
     """
@@ -51,6 +51,9 @@ def download(
         return 0
     for public_set, name in [find_recording(dataset, name) for name in names or ("",)]:
         target = _download(screen, public_set, name, out, overwrite, keep_archive)
+        if not public_set.sequences:
+            screen.say("next: sigmasplat eval RUN")
+            continue
         start = target / public_set.recordings[name].start
         _check_readable(start)
         screen.say(f"next: sigmasplat run {start}")

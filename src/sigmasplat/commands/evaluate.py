@@ -1,17 +1,72 @@
 """Command `sigmasplat eval`: score a run."""
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
 
 from sigmasplat.commands import options
-from sigmasplat.commands.options import prepare_torch, source_of
+from sigmasplat.commands.options import arg, prepare_torch, source_of
 
 if TYPE_CHECKING:
     from sigmasplat.io.runs import RunFolder
+    from sigmasplat.metrics.lpips import Lpips
     from sigmasplat.run.terminal import Screen
     from sigmasplat.sources.base import Source
 
+LPIPS_FOLDER = Path("data/lpips")
+"""Where `sigmasplat download lpips` puts the weights."""
 
-def evaluate_run(run: options.RunPath, mesh: options.WithMesh = False, moved_to: options.MovedSource = None) -> int:
+
+@dataclass(frozen=True)
+class EvalOptions:
+    """Options of eval: what to score besides path, views and uncertainty."""
+
+    true_mesh: Annotated[
+        Path | None,
+        arg(
+            metavar="FILE",
+            help="also write mesh.ply, and score it against this PLY in the world frame of the true path",
+            help_behavior_hint="(default: that of the data set)",
+        ),
+    ] = None
+    random_views: Annotated[
+        int, arg(metavar="N", help="number of random views that score the depth of mesh.ply; papers use 1000")
+    ] = 1000
+    full_resolution: Annotated[
+        bool, arg(help="also score the views at the resolution of the recording", help_behavior_hint="")
+    ] = False
+    lpips: Annotated[
+        Path | None,
+        arg(
+            metavar="DIR",
+            help="folder of the weights of LPIPS; `sigmasplat download lpips alex` gets them",
+            help_behavior_hint=f"(default: {LPIPS_FOLDER}, if it exists)",
+        ),
+    ] = None
+    lpips_net: Annotated[Literal["alex", "vgg"], arg(help="network of LPIPS; papers use alex")] = "alex"
+
+    def network(self) -> tuple["Lpips | None", str]:
+        """Load the network of LPIPS, or return the line that says why it is not scored. Raises ConfigError if weights
+        are damaged, or missing in a folder that was given."""
+        from sigmasplat.metrics.lpips import Lpips, find_lpips
+
+        if self.lpips is not None:
+            return Lpips.load(self.lpips, self.lpips_net), ""
+        return find_lpips(LPIPS_FOLDER, self.lpips_net)
+
+
+DEFAULT_EVAL_OPTIONS = EvalOptions()
+EvalOptionsFlat = Annotated[EvalOptions, arg(name=""), tyro.conf.OmitArgPrefixes]
+
+
+def evaluate_run(
+    run: options.RunPath,
+    mesh: options.WithMesh = False,
+    moved_to: options.MovedSource = None,
+    eval_options: EvalOptionsFlat = DEFAULT_EVAL_OPTIONS,
+) -> int:
     """Score an existing run again. This replaces its metrics, pictures and report.
 
     example: sigmasplat eval runs/kitchen-sigma
@@ -19,21 +74,39 @@ def evaluate_run(run: options.RunPath, mesh: options.WithMesh = False, moved_to:
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.run.terminal import Screen
 
-    folder = RunFolder.open(run)
+    folder, screen = RunFolder.open(run), Screen()
     source = source_of(folder, moved_to)
     prepare_torch()
-    score(Screen(), folder, source, mesh)
+    if unscored := score(screen, folder, source, mesh, eval_options):
+        screen.say(unscored)
     return 0
 
 
-def score(screen: "Screen", folder: "RunFolder", source: "Source", mesh: bool = False) -> None:
-    """Score the run; print the scores and the path of the report, which exists even if the truth does not match."""
+def score(
+    screen: "Screen",
+    folder: "RunFolder",
+    source: "Source",
+    mesh: bool = False,
+    eval_options: EvalOptions = DEFAULT_EVAL_OPTIONS,
+) -> str:
+    """Score the run; print the scores and the path of the report, which exists even if the truth does not match.
+
+    Returns the line that says why LPIPS is not scored, or "".
+    """
     from sigmasplat.evaluation.evaluate import evaluate
+    from sigmasplat.io.mesh import read_mesh
 
     try:
+        lpips, unscored = eval_options.network()
+        true_mesh = read_mesh(eval_options.true_mesh) if eval_options.true_mesh else None
         with screen.counting("evaluation") as progress:
-            metrics = evaluate(folder, source, mesh=mesh, progress=progress)
+            metrics = evaluate(
+                folder, source, mesh=mesh or true_mesh is not None, true_mesh=true_mesh,
+                random_views=eval_options.random_views, full_resolution=eval_options.full_resolution, lpips=lpips,
+                progress=progress,
+            )  # fmt: skip
         screen.results(metrics)
+        return unscored
     except Exception as problem:
         problem.add_note(f"the run is in {folder.path}")
         raise

@@ -76,6 +76,29 @@ REDWOOD_MD5 = {
 REDWOOD_URL = "https://github.com/isl-org/open3d_downloads/releases/download/augmented-icl-nuim"
 
 
+LPIPS_URL = "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1"
+TORCH_URL = "https://download.pytorch.org/models"
+LPIPS_FILES = {
+    "alex": (
+        ("alex.pth", 6_009, "sha256:df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"),
+        ("alexnet-owt-7be5be79.pth", 244_408_911, "sha256:7be5be79"),
+    ),
+    "vgg": (
+        ("vgg.pth", 7_289, "sha256:a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"),
+        ("vgg16-397923af.pth", 553_433_881, "sha256:397923af"),
+    ),
+}
+"""For each network the linear layers of lpips 0.1.4 and torchvision's weights: name, size, checksum."""
+
+
+def _lpips(net: str) -> PublicRecording:
+    linear, trunk = LPIPS_FILES[net]
+    files = ((LPIPS_URL, *linear), (TORCH_URL, *trunk))
+    return PublicRecording(
+        net, tuple(RemoteFile(f"{url}/{name}", size, digest, into=name) for url, name, size, digest in files)
+    )
+
+
 def _tum(name: str, rough_mb: int | None) -> PublicRecording:
     camera, scene = name.split("/")
     part = camera.replace("fr", "freiburg")
@@ -178,6 +201,17 @@ SETS: Mapping[str, PublicSet | RestrictedSet] = {
         recordings={name: _redwood(name) for name in REDWOOD_MD5},
         max_bytes=3 * GB,
         max_files=20_000,
+    ),
+    "lpips": PublicSet(
+        title="Weights of LPIPS: linear layers, and AlexNet or VGG16 of torchvision",
+        page="https://github.com/richzhang/PerceptualSimilarity",
+        licence="BSD 2-Clause (lpips), BSD 3-Clause (torchvision)",
+        folder="lpips",
+        recordings={net: _lpips(net) for net in LPIPS_FILES},
+        max_bytes=GB,
+        max_files=10,
+        disk_ratio=1.0,
+        sequences=False,
     ),
     "scannet": RestrictedSet("ScanNet", "http://www.scan-net.org (terms of use to sign)"),
     "scannetpp": RestrictedSet(

@@ -10,9 +10,9 @@ from urllib.parse import urlsplit
 class RemoteFile:
     """A file on a server: an archive, recognised by its name, or a plain file.
 
-    size_bytes: of the download, None if not published; checksum: "sha256:…" or "md5:…", or "" if unknown, and then the
-    size is approximate; into: the folder it is unpacked to, below the recording's folder (for a plain file: its name);
-    nested: whether it contains further archives.
+    size_bytes: of the download, None if not published; checksum: "sha256:…" or "md5:…", or the start of one, or "" if
+    unknown, and then the size is approximate; into: the folder it is unpacked to, below the recording's folder (for a
+    plain file: its name); nested: whether it contains further archives.
     """
 
     url: str
@@ -48,7 +48,7 @@ class PublicSet:
 
     folder: below the data folder; recordings: by short name, "" if there is only one; max_bytes, max_files: limits on
     the size of an archive and the number of files in it; disk_ratio: bytes on disk during unpacking, per byte of the
-    archive; prefix: optional prefix of the short names.
+    archive; prefix: optional prefix of the short names; sequences: whether the recordings are sequences, not weights.
     """
 
     title: str
@@ -60,6 +60,7 @@ class PublicSet:
     max_files: int
     disk_ratio: float = 1.3
     prefix: str = ""
+    sequences: bool = True
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """Score a finished run; only this folder reads ground truth. Writes metrics.json, images/ and report.html."""
 
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,16 +10,20 @@ from sigmasplat.config import Config, FinalConfig
 from sigmasplat.errors import RunError
 from sigmasplat.evaluation import reconstruct
 from sigmasplat.evaluation.frame_states import score_states
-from sigmasplat.evaluation.novel_views import score_novel_views
+from sigmasplat.evaluation.path_scores import score_frame_sets
 from sigmasplat.evaluation.pose_covariance import score_pose_covariance
-from sigmasplat.evaluation.view_selection import evenly_spread, working_frame
+from sigmasplat.evaluation.view_scoring import ViewScoring, score_full_resolution, score_test_views
+from sigmasplat.evaluation.view_selection import evenly_spread
 from sigmasplat.io.frames import RunFrames
 from sigmasplat.io.runs import TRUTH, RunFolder
 from sigmasplat.io.trajectory import write_trajectory
 from sigmasplat.metrics import views
+from sigmasplat.metrics.lpips import Lpips
+from sigmasplat.metrics.published_reconstruction import VIEWS
 from sigmasplat.metrics.trajectory import aligned_truth, score_path, truth_in_estimate
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.predictive import Predicted, predict
@@ -41,6 +44,10 @@ def evaluate(
     views_per_kind: int = 40,
     strips_per_kind: int = 3,
     mesh: bool = False,
+    true_mesh: Mesh | None = None,
+    random_views: int = VIEWS,
+    full_resolution: bool = False,
+    lpips: Lpips | None = None,
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
     """Score trajectory, map and uncertainty of a run against its source, and return the metrics written.
@@ -50,49 +57,63 @@ def evaluate(
     `views_per_kind` of each are scored, evenly spread. They are rendered from the final map at the estimated poses and
     the run's working resolution, with the run's render settings unless a `renderer` is given. If the run kept its
     submaps, each view is also rendered from the submap of its frame, as it was before the final map was made. If the
-    run has uncertainty.json and no `renderer` is given, the predictive variances are scored too.
+    run has uncertainty.json and no `renderer` is given, the predictive variances are scored too. LPIPS is scored if
+    its network is given. With `full_resolution` the views are also scored at the size of the recording.
     Calls `progress(done, total)` with views. With `mesh` the keyframes are fused into mesh.ply, which is scored if the
-    source knows its true surface.
+    source knows its true surface, or if `true_mesh` is given, in the world frame of the truth; `random_views` is the
+    number of random views for its depth (`metrics.published_reconstruction`).
 
     Raises RunError if the run stopped before it had a map; SourceError if truth and run share no timestamps, after
     everything else has been written.
     """
-    records = run.read_log()
-    if not records:
-        raise RunError(f"run {run.path} stopped before its first frame: its log.jsonl is empty; run it again")
-    path, field = run.read_trajectory(), run.read_map()
-    frames = RunFrames.of(records, path)
+    frames, field = _read_frames(run), run.read_map()
     records, log = frames.log, frames.posed_log()
-    if len(path) and not log:
-        raise RunError(f"run {run.path}: trajectory.txt and log.jsonl share no timestamps; do they belong to one run?")
     truth = source.truth() if log else None  # without a believed pose nothing can be aligned
     path_scores, problem = score_path(frames.path, _believed_odometry(run, frames), truth)
+    known = None if problem else truth
     chosen = {kind: evenly_spread(views, views_per_kind) for kind, views in _kinds(log).items()}
     strips, config, loops = ViewStrips(run, strips_per_kind), run.config(), run.read_loops()
     standard = renderer is None
     renderer = renderer or FieldRenderer(config.render, config.backend)
     maps = views.MapSources(field, run.submaps, _anchors(run, records, config.final))
     maps, predictions = _with_prediction(maps, run, frames, config) if standard else (maps, views.PredictionScores())
-    scores = _score_views(config, source, maps, chosen, predictions, strips, renderer, progress)
-    facts = _facts(run, source, records, field, loops) | score_states(run, frames, None if problem else truth)
-    metrics = facts | path_scores | scores | {"reconstruction": None, "test_views": None}
+    scoring = ViewScoring(
+        source, config.input, maps, chosen, renderer, views_per_kind, _alignment(frames, known), lpips
+    )
+    metrics = _facts(run, source, records, field, loops) | score_states(run, frames, known) | path_scores
+    metrics |= score_frame_sets(run, frames, known) | _score_views(scoring, config.final, predictions, strips, progress)
+    metrics |= {"lpips_network": lpips.net if lpips else None, "reconstruction": None, "reconstruction_published": None}
+    metrics["full_resolution"] = score_full_resolution(scoring, progress) if full_resolution else None
     metrics["calibration"] = _calibration(run) if standard else None
     if mesh:
-        known = source.true_surface(), None if problem else truth
-        metrics["reconstruction"] = reconstruct.fuse_and_score(run, source.camera, *known, renderer, progress)
-    metrics["pose_covariance"] = score_pose_covariance(run, frames, None if problem else truth)
-    novel = source.test_views()
-    if novel is not None and truth is not None and problem is None:
-        believed = frames.path
-        poses = novel.truth(), truth_in_estimate(believed.timestamps_s, believed.T_world_camera[:, :3, 3], truth)
-        metrics["test_views"] = score_novel_views(novel, *poses, field, config.input, renderer, strips, views_per_kind)
+        surface = true_mesh or reconstruct.known_surface(source)
+        metrics |= reconstruct.fuse_and_score(run, source.camera, surface, known, random_views, renderer, progress)
+    metrics["pose_covariance"] = score_pose_covariance(run, frames, known)
+    metrics["test_views"] = score_test_views(scoring, config.input, strips)
     run.write_metrics(metrics)
-    plots = _draw_plots(run, frames, None if problem else truth, loops)
+    plots = _draw_plots(run, frames, known, loops)
     plan = report_plan(run, frames.path, source.camera) if standard else None
     write_page(run, metrics, strips.figures, plots, [str(problem)] if problem else [], plan)
     if problem:
         raise problem
     return metrics
+
+
+def _read_frames(run: RunFolder) -> RunFrames:
+    """Read the frames of a run. Raises RunError if it has none, or if its log and its path do not match."""
+    records, path = run.read_log(), run.read_trajectory()
+    if not records:
+        raise RunError(f"run {run.path} stopped before its first frame: its log.jsonl is empty; run it again")
+    frames = RunFrames.of(records, path)
+    if len(path) and not len(frames.rows):
+        raise RunError(f"run {run.path}: trajectory.txt and log.jsonl share no timestamps; do they belong to one run?")
+    return frames
+
+
+def _alignment(frames: RunFrames, truth: Trajectory | None) -> NDArray[np.float64] | None:
+    """Return T_estimate_truth [4, 4], the alignment of the ATE; None without a truth."""
+    path = frames.path
+    return None if truth is None else truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], truth)
 
 
 def _anchors(run: RunFolder, records: Log, final: FinalConfig) -> NDArray[np.float64] | None:
@@ -161,38 +182,32 @@ def _kinds(log: Log) -> dict[str, Log]:
 
 
 def _score_views(
-    config: Config, source: Source, maps: views.MapSources, chosen: dict[str, Log],
-    predictions: views.PredictionScores, strips: ViewStrips, renderer: views.Renderer, progress: Progress,
+    scoring: ViewScoring, final: FinalConfig, predictions: views.PredictionScores, strips: ViewStrips,
+    progress: Progress,
 ) -> dict[str, Any]:  # fmt: skip
     """Render the chosen views from the final map and from their submaps; average scores per kind and map; judge V and
     the predictive variances. V is judged on held-out views, or on training views if every frame was mapped.
     """
+    chosen, maps = scoring.chosen, scoring.maps
     judged_on = "held-out" if chosen["held-out"] else "training"
-    scores = {kind: views.ViewScores(keep_samples=kind == judged_on) for kind in chosen}
-    before = {kind: views.ViewScores(keep_samples=kind == judged_on) for kind in chosen}
+    scores = {kind: views.ViewScores(kind == judged_on, scoring.lpips) for kind in chosen}
+    before = {kind: views.ViewScores(kind == judged_on, scoring.lpips) for kind in chosen}
     shown = {(kind, r["index"]) for kind, records in chosen.items() for r in evenly_spread(records, strips.per_kind)}
-    total = sum(len(records) for records in chosen.values())
-    frame_of = partial(working_frame, source, config.input)
-    for done, (final, in_submap) in enumerate(views.render_views(frame_of, maps, chosen, renderer), 1):
-        scores[final.kind].add(final)
-        predictions.add(final)
-        if (final.kind, final.index) in shown:
-            strips.add(final)
+    for done, (view, in_submap) in enumerate(scoring.rendered(scoring.input), 1):
+        scores[view.kind].add(view)
+        predictions.add(view)
+        if (view.kind, view.index) in shown:
+            strips.add(view)
         if in_submap:
-            before[final.kind].add(in_submap)
-            if final.kind == "held-out" and (final.kind, final.index) in shown:
+            before[view.kind].add(in_submap)
+            if view.kind == "held-out" and (view.kind, view.index) in shown:
                 strips.add(in_submap, ", in their submaps")
-        progress(done, total)
+        progress(done, scoring.count)
     kept = maps.T_world_submap is not None
     judged, judged_before = (views.score_uncertainty(found[judged_on].samples, judged_on) for found in (scores, before))
-    return {
-        **{kind.replace("-", "_"): views.mean_scores(found.rows) for kind, found in scores.items()},
-        **{
-            f"{kind.replace('-', '_')}_submaps": views.mean_scores(before[kind].rows) if kept else None
-            for kind in chosen
-        },
+    return views.kind_scores(scores, before, maps) | {
         "uncertainty": judged_before if kept else judged,
-        "uncertainty_final": judged if kept and _keeps_variance(config.final) else None,
+        "uncertainty_final": judged if kept and _keeps_variance(final) else None,
         "predictive": predictions.scores(),
     }
 

@@ -36,7 +36,7 @@ def _failures(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> di
     if truth is None:
         return None
     times_s = np.array([record["timestamp_s"] for record in frames.log])
-    positions = _positions(run, frames)
+    positions = final_positions(run, frames)
     rows, truth_rows = associate(times_s, truth.timestamps_s)
     true_positions = np.full_like(positions, np.nan)
     true_positions[rows] = truth.T_world_camera[truth_rows, :3, 3]
@@ -48,7 +48,7 @@ def _failures(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> di
     return scores | {"silent_frames": [frames.log[row]["index"] for row in silent_rows]}
 
 
-def _positions(run: RunFolder, frames: RunFrames) -> NDArray[np.float64]:
+def final_positions(run: RunFolder, frames: RunFrames) -> NDArray[np.float64]:
     """Return the final positions [F, 3], m, of believed frames and, from the checkpoint, of lost ones; else nan."""
     positions = np.full((len(frames), 3), np.nan)
     lost = np.flatnonzero((np.array(frames.states) == LOST) & ~frames.outside())

@@ -9,6 +9,7 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.evaluation.view_selection import evenly_spread, working_frame
 from sigmasplat.metrics import views
+from sigmasplat.metrics.lpips import Lpips
 from sigmasplat.metrics.trajectory import associate
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
@@ -26,14 +27,15 @@ def score_novel_views(
     field: GaussianField,
     settings: InputConfig,
     renderer: views.Renderer,
-    strips: ViewStrips,
+    strips: ViewStrips | None,
     most: int,
+    lpips: Lpips | None = None,
 ) -> dict[str, Any] | None:
     """Render the final map at the true poses of at most `most` test views, and return their mean scores.
 
     `T_estimate_truth`, the alignment of the ATE, transforms the poses to the estimate's world. So errors of the path
-    lower these scores, as in the papers. Adds a few views to the strips. Unreadable views and those without a pose are
-    skipped. Returns the scores as `views.mean_scores` does, or None if no poses are known.
+    lower these scores, as in the papers. Adds a few views to `strips`, if given. Unreadable views and those without a
+    pose are skipped. Returns the scores as `views.mean_scores` does, or None if no poses are known.
     """
     if poses is None:
         return None
@@ -47,6 +49,7 @@ def score_novel_views(
         if len(rows):
             T_camera_world = se3.inverse(T_estimate_truth @ poses.T_world_camera[found[0]])
             rendered.append(views.scored_view(frame, renderer(field, frame.camera, T_camera_world), KIND))
-    for view in rendered[:: max(1, len(rendered) // max(strips.per_kind, 1))][: strips.per_kind]:
-        strips.add(view)
-    return views.mean_scores([view.scores() for view in rendered])
+    if strips is not None:
+        for view in rendered[:: max(1, len(rendered) // max(strips.per_kind, 1))][: strips.per_kind]:
+            strips.add(view)
+    return views.mean_scores([view.scores(lpips) for view in rendered])

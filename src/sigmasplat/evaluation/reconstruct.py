@@ -14,9 +14,10 @@ from torch import Tensor
 
 from sigmasplat.config import Config
 from sigmasplat.errors import RunError
-from sigmasplat.io.mesh import write_mesh
+from sigmasplat.io.mesh import read_mesh, write_mesh
 from sigmasplat.io.runs import MESH, RunFolder
 from sigmasplat.metrics import reconstruction
+from sigmasplat.metrics.published_reconstruction import VIEWS, score_published
 from sigmasplat.metrics.splats import score_splats
 from sigmasplat.metrics.trajectory import align_rigid, associate, pair_poses
 from sigmasplat.model import se3
@@ -26,9 +27,12 @@ from sigmasplat.model.map_uncertainty import SplatStd
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.slam.fusion import VOXEL_M, FusionView, Renderer, count_keyframes, fuse, fusion_views
+from sigmasplat.sources.base import Source
 from sigmasplat.types import Matrix, Progress, no_progress
 
 OPAQUE = 0.5
+LARGEST_EDGE_M = 0.1
+"""Larger true faces are divided: whether a part of the surface was seen is decided for each face."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,29 +108,46 @@ def nearest_opaque(field: GaussianField, points: Matrix) -> NDArray[np.intp] | N
     return np.asarray(opaque[nearest], np.intp)
 
 
+def known_surface(source: Source) -> Mesh | None:
+    """Return the true surface of a source: exact, or read from the file beside the sequence; None without one.
+
+    Raises SourceError if the file cannot be read.
+    """
+    path = source.true_surface_file()
+    return source.true_surface() if path is None else read_mesh(path)
+
+
 def fuse_and_score(
     run: RunFolder,
     camera: Camera,
     true_surface: Mesh | None,
     true_path: Trajectory | None,
+    random_views: int = VIEWS,
     renderer: Renderer | None = None,
     progress: Progress = no_progress,
-) -> dict[str, Any] | None:
-    """Write the run's mesh.ply and return its scores, or None if the true surface or the true path is unknown."""
+) -> dict[str, Any]:
+    """Write the run's mesh.ply and return its scores, as `score` does; they are None if the true surface or the true
+    path is unknown."""
     fusion_input = FusionInput.of(run, camera)
     mesh = fusion_input.surface(VOXEL_M, renderer, progress)
     write_mesh(run.path / MESH, mesh)
     if true_surface is None or true_path is None:
-        return None
-    return score(fusion_input, mesh, true_surface, true_path, progress)
+        return {"reconstruction": None, "reconstruction_published": None}
+    return score(fusion_input, mesh, true_surface, true_path, random_views, progress)
 
 
 def score(
-    fusion_input: FusionInput, mesh: Mesh, true_surface: Mesh, true_path: Trajectory, progress: Progress = no_progress
-) -> dict[str, float]:
+    fusion_input: FusionInput,
+    mesh: Mesh,
+    true_surface: Mesh,
+    true_path: Trajectory,
+    random_views: int = VIEWS,
+    progress: Progress = no_progress,
+) -> dict[str, Any]:
     """Score a run's mesh and its splats against the true surface, after the same alignment as for the ATE.
 
-    The training views are the true poses of the keyframes. Raises SourceError if path and truth share no timestamps.
+    Returns `reconstruction`, our scores, and `reconstruction_published`, those of the papers' protocol. The training
+    views are the true poses of the keyframes. Raises SourceError if path and truth share no timestamps.
     """
     frames, tensors = fusion_input.run.read_frames(), fusion_input.checkpoint
     ours, theirs = pair_poses(frames.path, true_path)
@@ -134,10 +155,15 @@ def score(
     keyframes = tensors["keyframes"].numpy()
     keyframes = keyframes[frames.believed[keyframes]]
     _, rows = associate(tensors["timestamps_s"].numpy()[keyframes], true_path.timestamps_s)
-    views = true_path.T_world_camera[rows]
-    reference = (true_surface, fusion_input.camera, views)
-    of_mesh = reconstruction.score(mesh.moved(T_truth_world), *reference, progress=progress)
+    truth, found = true_surface.subdivided(LARGEST_EDGE_M), mesh.moved(T_truth_world)
     field = fusion_input.run.read_map()
     centers = field.means.numpy().astype(np.float64) @ T_truth_world[:3, :3].T + T_truth_world[:3, 3]
-    of_splats = score_splats(centers, field.opacities.numpy().astype(np.float64), *reference)
-    return asdict(of_mesh) | asdict(of_splats)
+    reference = truth, fusion_input.camera, true_path.T_world_camera[rows]
+    points = np.concatenate([found.corners.mean(1), centers])
+    seen_true, seen_points = reconstruction.visible_parts(truth, points, *reference[1:], progress)
+    seen_found, seen_splats = seen_points[: len(found.faces)], seen_points[len(found.faces) :]
+    of_mesh = reconstruction.score(found, *reference, seen=(seen_true, seen_found), progress=progress)
+    opacities = field.opacities.numpy().astype(np.float64)
+    of_splats = score_splats(centers, opacities, *reference, seen=(seen_true, seen_splats))
+    published = score_published(found, truth, seen_true, seen_found, views=random_views, progress=progress)
+    return {"reconstruction": asdict(of_mesh) | asdict(of_splats), "reconstruction_published": asdict(published)}

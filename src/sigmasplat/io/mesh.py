@@ -36,8 +36,9 @@ def check_ending(path: Path) -> None:
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Read a binary PLY of triangles from SigmaSplat or another program; colours are bytes or floats in [0, 1].
+    """Read a binary PLY from SigmaSplat or another program; colours are bytes or floats in [0, 1].
 
+    All faces have the same number of vertices; polygons such as the quads of Replica are divided into triangles.
     Raises SourceError if it is missing, truncated, not such a PLY, or not a valid mesh.
     """
     with open_binary(path, "cannot read mesh") as file:
@@ -47,10 +48,13 @@ def read_mesh(path: Path) -> Mesh:
     if vertices is None or faces is None or not {"x", "y", "z"} <= set(vertices.dtype.names or ()):
         raise SourceError(f"{path} is not a mesh: it needs vertices with x, y, z and faces; is it a point cloud?")
     corners = [name for name in ("vertex_indices", "vertex_index") if name in (faces.dtype.names or ())]
-    if not corners or (faces[f"{corners[0]} count"] != 3).any():
-        raise SourceError(f"{path}: not all faces are triangles; triangulate the mesh first")
+    polygons = faces[corners[0]].astype(np.int64) if corners else np.empty((0, 0), np.int64)
+    sides = polygons.shape[1]
+    if sides < 3 or (faces[f"{corners[0]} count"] != sides).any():
+        raise SourceError(f"{path}: not all faces have the same number of vertices; triangulate the mesh first")
     points = np.stack([vertices[name] for name in "xyz"], -1).astype(np.float32)
-    chosen = faces[corners[0]].astype(np.int64)
+    fans = [polygons[:, [0, k, k + 1]] for k in range(1, sides - 1)]
+    chosen = np.stack(fans, 1).reshape(-1, 3)
     if not np.isfinite(points).all() or (chosen.size and not 0 <= chosen.min() <= chosen.max() < len(points)):
         raise SourceError(f"{path}: the mesh has nan or inf, or faces with vertices that do not exist")
     return Mesh(points, chosen.astype(np.int32), _colors(vertices))
@@ -88,22 +92,33 @@ def _header(file: BinaryIO, path: Path) -> tuple[str, list[ElementHeader]]:
 def _rows(
     file: BinaryIO, path: Path, order: str, name: str, count: int, properties: list[list[str]]
 ) -> NDArray[np.void]:
-    """Read one element. Lists are read as three values each; their lengths are returned as column "NAME count"."""
+    """Read one element. All lists are read with the length of the first one; their lengths are returned as column
+    "NAME count"."""
     fields: list[tuple[str, str] | tuple[str, str, int]] = []
+    length = 0
     for words in properties:
         kinds = [PLY_TYPES.get(word) for word in words[:-1] if word != "list"]
         if None in kinds or len(kinds) != (2 if words[0] == "list" else 1):
             raise SourceError(f"{path}: cannot read the PLY's properties ({' '.join(words)})")
         if len(kinds) == 2:
-            fields += [(f"{words[-1]} count", f"{order}{kinds[0]}"), (words[-1], f"{order}{kinds[1]}", 3)]
+            length = length or _length_after(file, np.dtype([*fields, ("length", f"{order}{kinds[0]}")]))
+            fields += [(f"{words[-1]} count", f"{order}{kinds[0]}"), (words[-1], f"{order}{kinds[1]}", length)]
         else:
             fields.append((words[-1], f"{order}{kinds[0]}"))
     row = np.dtype(fields)
     data = file.read(count * row.itemsize)
     whole = np.frombuffer(data[: len(data) // max(row.itemsize, 1) * row.itemsize], row)
-    if len(whole) < count and not any((whole[k] != 3).any() for k in row.names or () if k.endswith(" count")):
+    if len(whole) < count and not any((whole[k] != length).any() for k in row.names or () if k.endswith(" count")):
         raise SourceError(f"{path} is truncated: its header says {count} of element {name}, found {len(whole)}")
     return whole
+
+
+def _length_after(file: BinaryIO, start: np.dtype[np.void]) -> int:
+    """Return the length of a list of the first row, whose columns before it and its length are `start`; 3 at the end of
+    the file."""
+    place, data = file.tell(), file.read(start.itemsize)
+    file.seek(place)
+    return int(np.frombuffer(data, start)["length"][0]) if len(data) == start.itemsize else 3
 
 
 def _ply(mesh: Mesh) -> bytes:

@@ -68,28 +68,26 @@ def score(
     points: int = POINTS,
     novel_views: int = NOVEL_VIEWS,
     seed: int = 0,
+    seen: tuple[Mask, Mask] | None = None,
     progress: Progress = no_progress,
 ) -> MeshScores:
     """Score mesh `found` against mesh `truth`, both in the frame of the truth, as seen from true poses [K, 4, 4].
 
     The true faces should be small (a few cm). A true face counts if a training view shows it at a pixel, or if its
     centre is at most `SLACK_M` behind the depth rendered there. A reconstructed face counts if its centre is in a
-    training view and at most `BEHIND_M` behind the true surface. Calls `progress(views done, total)`. Scores without
-    data are nan.
+    training view and at most `BEHIND_M` behind the true surface. `seen` gives both if they are known (`visible_parts`).
+    Calls `progress(novel views done, total)`. Scores without data are nan.
     """
-    total = len(T_world_camera) + novel_views
-    seen_true, seen_found = visible_parts(
-        truth, found.corners.mean(1), camera, T_world_camera, lambda at, _: progress(at, total)
-    )
+    seen_true, seen_found = seen or visible_parts(truth, found.corners.mean(1), camera, T_world_camera)
     ours, theirs = found.with_faces(seen_found), truth.with_faces(seen_true)
     to_truth = distances(ours.sampled(points, seed), theirs)
     to_found = distances(theirs.sampled(points, seed + 1), ours)
     precision, recall = _share(to_truth, CORRECT_M), _share(to_found, CORRECT_M)
     views = sample_novel_views(truth, camera, T_world_camera, novel_views, seed)
     compared = []
-    for done, (T, depth_m, face) in enumerate(views, len(T_world_camera) + 1):
+    for done, (T, depth_m, face) in enumerate(views, 1):
         compared.append(_depth_pairs(found, seen_true, camera, T, depth_m, face))
-        progress(done, total)
+        progress(done, novel_views)
     both = np.concatenate([*compared, np.empty((2, 0))], axis=1)
     has = both[0] > 0
     return MeshScores(
@@ -181,7 +179,7 @@ def _dot(a: Matrix, b: Matrix) -> Matrix:
 
 def sample_novel_views(
     truth: Mesh, camera: Camera, T_world_camera: Matrix, views: int, seed: int
-) -> list[tuple[Matrix, NDArray[np.float32], NDArray[np.intp]]]:
+) -> list[tuple[Matrix, NDArray[np.float32], NDArray[np.int32]]]:
     """Sample at most `views` novel views. Return their poses, true depth and true faces (see `NOVEL_SHIFT_M`)."""
     rng, found = np.random.default_rng(seed), []
     for _ in range(4 * views if len(T_world_camera) else 0):
@@ -196,7 +194,7 @@ def sample_novel_views(
 
 
 def _depth_pairs(
-    found: Mesh, seen_true: Mask, camera: Camera, T: Matrix, depth_m: NDArray[np.float32], face: NDArray[np.intp]
+    found: Mesh, seen_true: Mask, camera: Camera, T: Matrix, depth_m: NDArray[np.float32], face: NDArray[np.int32]
 ) -> Matrix:
     """Return reconstructed and true depth [2, P] where a training view saw the true face; 0 = no reconstruction."""
     ours, _ = mesh_depth(found, camera, se3.inverse(T))

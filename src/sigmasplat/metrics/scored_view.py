@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.metrics.image import depth_l1, psnr, ssim
+from sigmasplat.metrics.image import SSIM_LEAST_PX, depth_l1, ms_ssim, psnr, similarity_factors, ssim
+from sigmasplat.metrics.lpips import Lpips
 
 COVERED_ALPHA = 0.5
 """Above this alpha a pixel counts as covered by the map: its depth is Σwz / Σw."""
@@ -54,7 +55,7 @@ class ScoredView:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """Return which pixels have a depth reading [H, W]. Every score uses only these pixels."""
+        """Return which pixels have a depth reading [H, W]. Scores use only these pixels, unless they say otherwise."""
         return self.recorded_depth_m > 0
 
     @property
@@ -77,13 +78,21 @@ class ScoredView:
         """Return the squared difference of rendered depth and reading [H, W], m²; it counts where `depth_compared`."""
         return np.asarray((self.rendered_depth_m - self.recorded_depth_m) ** 2, np.float32)
 
-    def scores(self) -> dict[str, float]:
-        """Return PSNR (dB), SSIM, depth L1 (m) and the share of depth readings that the map covers, on valid pixels."""
+    def scores(self, lpips: Lpips | None = None) -> dict[str, float]:
+        """Return the scores of the view.
+
+        PSNR (dB), SSIM, depth L1 (m) and the share of depth readings that the map covers use the valid pixels. PSNR of
+        the image (dB), MS-SSIM and LPIPS use all pixels, as published systems do; nan if they are not known.
+        """
         valid = self.valid
         covered = float((self.rendered_depth_m > 0)[valid].mean()) if valid.any() else float("nan")
+        factors = similarity_factors(self.rendered, self.recorded) if min(valid.shape) >= SSIM_LEAST_PX else None
         return {
             "psnr_db": psnr(self.rendered, self.recorded, valid),
-            "ssim": ssim(self.rendered, self.recorded, valid),
+            "ssim": ssim(self.rendered, self.recorded, valid, factors),
             "depth_l1_m": depth_l1(self.rendered_depth_m, self.recorded_depth_m),
             "depth_coverage": covered,
+            "psnr_image_db": psnr(self.rendered, self.recorded),
+            "ms_ssim": ms_ssim(self.rendered, self.recorded, factors),
+            "lpips": lpips.distance(self.rendered, self.recorded) if lpips else float("nan"),
         }

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sigmasplat.metrics.reconstruction import POINTS, distances, visible_parts
+from sigmasplat.metrics.reconstruction import POINTS, Mask, distances, visible_parts
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.types import Matrix
@@ -40,14 +40,15 @@ def score_splats(
     *,
     points: int = POINTS,
     seed: int = 0,
+    seen: tuple[Mask, Mask] | None = None,
 ) -> SplatScores:
     """Score splats, centers [N, 3] m and opacities [N], in the frame of the truth, as seen from true poses [K, 4, 4].
 
     The Chamfer distance uses splats of every opacity, and only parts that a training view could see
     (`reconstruction.score`). It is never 0 because there are gaps between splat centres. Floaters are measured against
-    the whole true surface, and splats hidden behind it count too.
+    the whole true surface, and splats hidden behind it count too. `seen`: the visible faces and splats, if known.
     """
-    seen_true, seen_splats = visible_parts(truth, centers, camera, T_world_camera)
+    seen_true, seen_splats = seen or visible_parts(truth, centers, camera, T_world_camera)
     theirs, ours = truth.with_faces(seen_true), centers[seen_splats]
     accuracy, completion = _mean(distances(ours, theirs)), _mean(_to_nearest(theirs.sampled(points, seed), ours))
     floating = distances(centers[opacities > OPAQUE], truth) > FLOATER_M

@@ -120,8 +120,13 @@ def ate(estimate: Trajectory, truth: Trajectory, max_difference_s: float = 0.02)
     Raises SourceError if no timestamps match.
     """
     ours, theirs = pair_poses(estimate, truth, max_difference_s)
-    T = align_rigid(ours[:, :3, 3], theirs[:, :3, 3])
-    distance = np.linalg.norm(ours[:, :3, 3] @ T[:3, :3].T + T[:3, 3] - theirs[:, :3, 3], axis=1)
+    return absolute_error(ours[:, :3, 3], theirs[:, :3, 3])
+
+
+def absolute_error(estimate: Matrix, truth: Matrix) -> AbsoluteError:
+    """Measure the distances between positions [N, 3], N ≥ 1, after `align_rigid`."""
+    T = align_rigid(estimate, truth)
+    distance = np.linalg.norm(estimate @ T[:3, :3].T + T[:3, 3] - truth, axis=1)
     return AbsoluteError(
         _root_mean_square(distance),
         float(distance.mean()),

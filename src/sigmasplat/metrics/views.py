@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.metrics import uncertainty
+from sigmasplat.metrics.lpips import Lpips
 from sigmasplat.metrics.scored_view import COVERED_ALPHA, PredictedErrors, ScoredView
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
@@ -31,15 +32,17 @@ PIXELS_PER_VIEW = 20_000
 
 @dataclass(eq=False)
 class ViewScores:
-    """Scores of the views of one kind. With `keep_samples`, pixels are sampled to score V over all views."""
+    """Scores of the views of one kind, with LPIPS if given. With `keep_samples`, pixels are sampled to score V over
+    all views."""
 
     keep_samples: bool
+    lpips: Lpips | None = None
     rows: list[dict[str, float]] = field(default_factory=list)
     samples: list[NDArray[np.float32]] = field(default_factory=list)
 
     def add(self, view: ScoredView) -> None:
         """Score a view."""
-        self.rows.append(view.scores())
+        self.rows.append(view.scores(self.lpips))
         if self.keep_samples:
             self.samples.append(sample_pixels(view))
 
@@ -110,6 +113,16 @@ def mean_scores(rows: list[dict[str, float]]) -> dict[str, Any]:
     """Average each score over the views that have it; None if no view has it. `views` is the number of views."""
     columns = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
     return {"views": len(rows)} | {name: _mean(column) for name, column in columns.items()}
+
+
+def kind_scores(final: Mapping[str, ViewScores], before: Mapping[str, ViewScores], maps: MapSources) -> dict[str, Any]:
+    """Return the mean scores of each kind of views in the final map, and in their submaps (None if they are not
+    kept)."""
+    kept = maps.T_world_submap is not None
+    names = {kind: kind.replace("-", "_") for kind in final}
+    return {name: mean_scores(final[kind].rows) for kind, name in names.items()} | {
+        f"{name}_submaps": mean_scores(before[kind].rows) if kept else None for kind, name in names.items()
+    }
 
 
 def score_uncertainty(samples: list[NDArray[np.float32]], judged_on: str = "held-out") -> dict[str, Any] | None:

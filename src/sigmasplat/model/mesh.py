@@ -95,6 +95,34 @@ class Mesh:
         of_vertices = (None if values is None else values[used] for values in (self.colors, self.depth_std_m))
         return Mesh(self.vertices[used], number[faces], *of_vertices)
 
+    def subdivided(self, largest_edge_m: float) -> "Mesh":
+        """Return the same surface in faces without a longer edge; a mesh of small faces is returned unchanged.
+
+        Each larger face is divided into four at the middle of its edges, until all are small. New vertices are not
+        merged, and the result has no colours. Raises SigmaSplatError unless largest_edge_m > 0.
+        """
+        if not largest_edge_m > 0:
+            raise SigmaSplatError(f"the largest edge must be more than 0 m, found {largest_edge_m}")
+        large = self._longest_edges() > largest_edge_m
+        if not large.any():
+            return self
+        small, mesh = [replace(self.with_faces(~large), colors=None, depth_std_m=None)], self.with_faces(large)
+        while len(mesh.faces):
+            a, b, c = np.moveaxis(mesh.corners, 1, 0)
+            ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+            parts = np.stack([np.stack(part, 1) for part in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))], 1)
+            vertices = parts.reshape(-1, 3).astype(np.float32)
+            mesh = Mesh(vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3))
+            large = mesh._longest_edges() > largest_edge_m
+            small.append(mesh.with_faces(~large))
+            mesh = mesh.with_faces(large)
+        return Mesh.concatenated(small)
+
+    def _longest_edges(self) -> NDArray[np.float64]:
+        corners = self.corners
+        lengths = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+        return np.asarray(lengths.max(1, initial=0.0))
+
     def without_small_parts(self, vertices: int) -> "Mesh":
         """Remove connected parts of fewer than `vertices` vertices (VarSplat §7: 200), and vertices without a face."""
         if not len(self.faces):

@@ -105,6 +105,17 @@ def align_images(
     T: Array,
     sums: Array,
 ) -> tuple[int, int]: ...
+def mesh_depth(
+    u: Array,
+    v: Array,
+    z: Array,
+    faces: Array,
+    width: int,
+    height: int,
+    near_m: float,
+    depth: Array,
+    face: Array,
+) -> None: ...
 
 class Level:
     def __init__(

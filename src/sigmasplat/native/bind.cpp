@@ -17,6 +17,7 @@
 #include <nanobind/stl/vector.h>
 
 #include "kernels.h"
+#include "mesh.h"
 
 namespace nb = nanobind;
 
@@ -45,6 +46,8 @@ using ConstFloats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using Ints = nb::ndarray<int, nb::c_contig, nb::device::cpu>;
 using Bytes = nb::ndarray<uint8_t, nb::c_contig, nb::device::cpu>;
 using Doubles = nb::ndarray<double, nb::c_contig, nb::device::cpu>;
+using ConstDoubles = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
+using ConstInts = nb::ndarray<const int, nb::c_contig, nb::device::cpu>;
 template <class T> using Maybe = std::optional<T>;
 
 static std::vector<const Kernels*> supported() {
@@ -254,6 +257,12 @@ NB_MODULE(_core, m) {
                                weight_gray.data(), weight_depth.data());
     }, nb::arg("sums"), nb::arg("alpha"), nb::arg("moment").none(), nb::arg("width"), nb::arg("height"), nb::arg("options"), nb::arg("uncertainty"),
        nb::arg("gray"), nb::arg("depth"), nb::arg("weight_gray"), nb::arg("weight_depth"));
+    m.def("mesh_depth", [](ConstDoubles u, ConstDoubles v, ConstDoubles z, ConstInts faces, int width, int height, double near_m, Floats depth, Ints face) {
+        need(u.size() == z.size() && v.size() == z.size() && faces.ndim() == 2 && faces.shape(1) == 3, "mesh_depth: [V] three times, [F, 3]");
+        need(depth.size() == size_t(width) * height && face.size() == depth.size(), "mesh_depth: two images");
+        nb::gil_scoped_release unlocked;
+        mesh_depth({u.data(), v.data(), z.data(), faces.data(), faces.shape(0)}, width, height, near_m, depth.data(), face.data());
+    });
     nb::class_<Level>(m, "Level")
         .def(nb::init<ConstFloats, ConstFloats, Maybe<ConstFloats>, Maybe<ConstFloats>, ConstFloats, ConstFloats, std::vector<float>, std::vector<float>>(),
              nb::arg("reference_gray"), nb::arg("reference_depth"), nb::arg("weight_gray").none(), nb::arg("weight_depth").none(), nb::arg("live_gray"),

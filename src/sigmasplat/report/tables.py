@@ -118,8 +118,10 @@ def score_tables(metrics: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
     views = f"{kind}, in submaps" if metrics.get("held_out_submaps") else kind
     return [
         ("Rendered images", _image_rows(metrics)),
+        _full_resolution_table(metrics),
         ("Path", _path_rows(metrics)),
         ("Surface", _surface_rows(metrics)),
+        ("Surface, by the protocol of published systems", _published_rows(metrics)),
         (f"Uncertainty V, {views}", _uncertainty_rows(metrics.get("uncertainty"))),
         (f"Uncertainty V, {kind}, final map", _uncertainty_rows(metrics.get("uncertainty_final"))),
         (f"Calibration of V, {views}", _calibration_rows(metrics.get("uncertainty"))),
@@ -176,10 +178,21 @@ def _image_rows(metrics: dict[str, Any]) -> list[list[str]]:
         columns |= {"training, in submaps": "training_submaps", "held-out, in submaps": "held_out_submaps"}
     kinds = [metrics.get(key) or {} for key in columns.values()]
     lines = [("Views", "views", 0, 1.0), ("PSNR, dB", "psnr_db", 2, 1.0), ("SSIM", "ssim", 4, 1.0),
-             ("Depth L1, cm", "depth_l1_m", 2, 100.0), ("Depth covered, %", "depth_coverage", 1, 100.0)]  # fmt: skip
+             ("Depth L1, cm", "depth_l1_m", 2, 100.0), ("Depth covered, %", "depth_coverage", 1, 100.0),
+             ("PSNR, all pixels, dB", "psnr_image_db", 2, 1.0), ("MS-SSIM, all pixels", "ms_ssim", 4, 1.0)]  # fmt: skip
+    network = metrics.get("lpips_network")
+    lines.append((f"LPIPS ({network or 'no weights'}), all pixels", "lpips", 4, 1.0))
     return [["", *columns]] + [
         [label, *(number(kind.get(key), digits, scale) for kind in kinds)] for label, key, digits, scale in lines
     ]
+
+
+def _full_resolution_table(metrics: dict[str, Any]) -> tuple[str, list[list[str]]]:
+    found = metrics.get("full_resolution")
+    if not found:
+        return "", []
+    rows = _image_rows(found | {"lpips_network": metrics.get("lpips_network")})
+    return f"Rendered images, full resolution: {found['width']} × {found['height']}", rows
 
 
 def _path_rows(metrics: dict[str, Any]) -> list[list[str]]:
@@ -187,6 +200,10 @@ def _path_rows(metrics: dict[str, Any]) -> list[list[str]]:
     if not ate or not rpe:
         return []
     rows = [[f"ATE {name}, cm", number(ate[f"{name}_m"], 3, 100.0)] for name in ("rmse", "mean", "median", "max")]
+    kinds = {"keyframes": metrics.get("ate_keyframes"), "all frames, with lost ones": metrics.get("ate_all_frames")}
+    for kind, found in kinds.items():
+        if found and found["pairs"] != ate["pairs"]:
+            rows.append([f"ATE rmse of {kind} ({found['pairs']} poses), cm", number(found["rmse_m"], 3, 100.0)])
     without = metrics.get("ate_odometry")
     if without:
         rows.append(["ATE rmse without loop closure, cm", number(without["rmse_m"], 3, 100.0)])
@@ -224,6 +241,19 @@ def _surface_rows(metrics: dict[str, Any]) -> list[list[str]]:
              ("Chamfer distance of splats, cm", "splats_chamfer_m", 2),
              ("Floaters (> 10 cm) among opaque splats, %", "floaters", 2)]  # fmt: skip
     return [["parts visible from keyframes", "mesh.ply, map.ply"]] + [
+        [label, number(found.get(key), digits, 100.0)] for label, key, digits in lines
+    ]
+
+
+def _published_rows(metrics: dict[str, Any]) -> list[list[str]]:
+    found = metrics.get("reconstruction_published")
+    if not found:
+        return []
+    lines = [("Accuracy, cm", "accuracy_m", 2), ("Completion, cm", "completion_m", 2),
+             ("Chamfer distance, cm", "chamfer_m", 2), ("Completion ratio (< 5 cm), %", "completion_ratio", 1),
+             ("Precision (< 1 cm), %", "precision", 1), ("Recall (< 1 cm), %", "recall", 1), ("F1 (1 cm), %", "f1", 1),
+             ("Depth L1, random views, cm", "depth_l1_m", 2)]  # fmt: skip
+    return [["points on both surfaces", f"{number(found['depth_views'], 0)} random views"]] + [
         [label, number(found.get(key), digits, 100.0)] for label, key, digits in lines
     ]
 

@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +80,11 @@ class Source(ABC):
 
     def true_surface(self) -> Mesh | None:
         """Return the true surface in `truth`'s world frame, with hidden parts, faces of a few cm; None if unknown."""
+        return None
+
+    def true_surface_file(self) -> Path | None:
+        """Return the PLY file of the true surface, in `truth`'s world frame, if the data set has one beside the
+        sequence; else None."""
         return None
 
     def __iter__(self) -> Iterator[Frame]:
@@ -165,6 +171,10 @@ class Subset(Source):
     def true_surface(self) -> Mesh | None:
         """Return the true surface of the whole source."""
         return self._whole.true_surface()
+
+    def true_surface_file(self) -> Path | None:
+        """Return the file of the true surface of the whole source."""
+        return self._whole.true_surface_file()
 
 
 def _within(whole: Source, settings: InputConfig) -> range:

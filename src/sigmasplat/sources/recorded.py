@@ -62,10 +62,11 @@ class RecordedSource(Source):
         skipped: Sequence[str] = (),
         test: Source | None = None,
         gyroscope: Gyroscope | None = None,
+        surface: Path | None = None,
     ) -> None:
         """Store image pairs in order of time; `truth` is the path of the colour camera; `skipped` lists files left out.
 
-        test: separate test views; gyroscope: in the axes of the colour camera.
+        test: separate test views; gyroscope: in the axes of the colour camera; surface: file of the true surface.
         Raises SourceError if the first images do not match the calibration, no image has a depth reading, or no image
         was taken while the gyroscope measured.
         """
@@ -76,6 +77,7 @@ class RecordedSource(Source):
         self.registrable = calibration.depth_camera is not None
         self.skipped = list(skipped)
         self._images, self._truth, self._test, self._gyroscope = images, truth, test, gyroscope
+        self._surface = surface
         self._refuse_sizes_of_first()
         self._refuse_other_clock()
         refuse_without_depth(self)
@@ -112,6 +114,10 @@ class RecordedSource(Source):
     def test_views(self) -> Source | None:
         """Return the separate test views, None without them."""
         return self._test
+
+    def true_surface_file(self) -> Path | None:
+        """Return the file of the true surface, None without one."""
+        return self._surface
 
     def _refuse_sizes_of_first(self) -> None:
         """Raise SourceError before a run if the image sizes do not match the calibration."""

@@ -2,6 +2,7 @@
 
 results/frame000000.jpg  results/depth000000.png  traj.txt     one row-major camera-to-world 4×4 per line
 cam_params.json                                                here or in the parent folder
+../room0_mesh.ply                                              optional: the true surface, named after the folder
 """
 
 import re
@@ -28,7 +29,8 @@ def open_replica(folder: Path, settings: InputConfig) -> RecordedSource:
     size = (recorded.camera.width, recorded.camera.height)
     calibration = resolve_calibration(folder, recorded, size, settings, recorded.depth_units_per_metre)
     truth = _truth(folder / "traj.txt", numbers)
-    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped)
+    name, surface = folder.resolve().name, _surface(folder.resolve())
+    return RecordedSource(name, images, calibration, settings, truth, skipped, surface=surface)
 
 
 def _numbered(folder: Path, stem: str) -> dict[int, Path]:
@@ -46,6 +48,12 @@ def _calibration(folder: Path) -> Calibration:
         if path.is_file():
             return read_replica_calibration(path)
     return REPLICA
+
+
+def _surface(folder: Path) -> Path | None:
+    """Return the file of the true surface, in the parent folder or here; None without one."""
+    files = (place / f"{folder.name}_mesh.ply" for place in (folder.parent, folder))
+    return next((path for path in files if path.is_file()), None)
 
 
 def _truth(path: Path, numbers: list[int]) -> Trajectory | None:

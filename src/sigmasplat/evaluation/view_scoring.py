@@ -1,0 +1,88 @@
+"""Render and score the views of a run: at working resolution, at the resolution of the recording, and test views.
+
+Scores at different resolutions are never mixed: each resolution has its own object in metrics.json.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.config import InputConfig
+from sigmasplat.evaluation.novel_views import score_novel_views
+from sigmasplat.evaluation.view_selection import working_frame
+from sigmasplat.metrics import views
+from sigmasplat.metrics.lpips import Lpips
+from sigmasplat.metrics.scored_view import ScoredView
+from sigmasplat.report.view_strips import ViewStrips
+from sigmasplat.sources.base import Source
+from sigmasplat.types import Progress, no_progress
+
+
+@dataclass(frozen=True, eq=False)
+class ViewScoring:
+    """What every scoring of views needs.
+
+    input: the run's settings of working images; chosen: the log records of the scored views by kind; most: the largest
+    number of test views; T_estimate_truth [4, 4]: the alignment of the ATE, None without a truth; lpips: the network of
+    LPIPS, if it is scored.
+    """
+
+    source: Source
+    input: InputConfig
+    maps: views.MapSources
+    chosen: Mapping[str, list[dict[str, Any]]]
+    renderer: views.Renderer
+    most: int
+    T_estimate_truth: NDArray[np.float64] | None
+    lpips: Lpips | None = None
+
+    @property
+    def count(self) -> int:
+        """Return the number of chosen views."""
+        return sum(len(records) for records in self.chosen.values())
+
+    def rendered(self, settings: InputConfig) -> Iterator[tuple[ScoredView, ScoredView | None]]:
+        """Render the chosen views at the size of `settings` (`views.render_views`)."""
+        return views.render_views(partial(working_frame, self.source, settings), self.maps, self.chosen, self.renderer)
+
+
+def full_input(settings: InputConfig, source: Source) -> InputConfig:
+    """Return input settings that keep the size of the recording; the cropped edge covers the same part of the image."""
+    scale = source.camera.width / settings.width if settings.width else 1.0
+    return replace(settings, width=0, crop_px=round(settings.crop_px * scale))
+
+
+def score_full_resolution(scoring: ViewScoring, progress: Progress = no_progress) -> dict[str, Any]:
+    """Score the chosen views and the test views at the size of the recording.
+
+    Returns width, height, and the keys of the scores at working resolution: training, held_out, both in their submaps,
+    and test_views. Calls `progress(done, total)` with the chosen views.
+    """
+    settings, chosen = full_input(scoring.input, scoring.source), scoring.chosen
+    camera = scoring.source.camera.prepared(settings.width, settings.crop_px)
+    final, before = ({kind: views.ViewScores(False, scoring.lpips) for kind in chosen} for _ in range(2))
+    unpredicted = replace(scoring, maps=replace(scoring.maps, predict=None))
+    for done, (view, in_submap) in enumerate(unpredicted.rendered(settings), 1):
+        final[view.kind].add(view)
+        if in_submap:
+            before[view.kind].add(in_submap)
+        progress(done, scoring.count)
+    scores = views.kind_scores(final, before, scoring.maps) | {"test_views": score_test_views(scoring, settings)}
+    return {"width": camera.width, "height": camera.height} | scores
+
+
+def score_test_views(
+    scoring: ViewScoring, settings: InputConfig, strips: ViewStrips | None = None
+) -> dict[str, Any] | None:
+    """Score the source's test views at the size of `settings`; None without test views or without a truth."""
+    test_views, T_estimate_truth = scoring.source.test_views(), scoring.T_estimate_truth
+    if test_views is None or T_estimate_truth is None:
+        return None
+    return score_novel_views(
+        test_views, test_views.truth(), T_estimate_truth, scoring.maps.final, settings, scoring.renderer, strips,
+        scoring.most, scoring.lpips,
+    )  # fmt: skip
