@@ -77,18 +77,17 @@ def evaluate(
     renderer = renderer or FieldRenderer(config.render, config.backend)
     maps = views.MapSources(field, run.submaps, _anchors(run, records, config.final))
     maps, predictions = _with_prediction(maps, run, frames, config) if standard else (maps, views.PredictionScores())
-    scoring = ViewScoring(
-        source, config.input, maps, chosen, renderer, views_per_kind, _alignment(frames, known), lpips
-    )
+    aligned = _alignment(frames, known)
+    scoring = ViewScoring(source, config.input, maps, chosen, renderer, views_per_kind, aligned, lpips)
     metrics = _facts(run, source, records, field, loops) | score_states(run, frames, known) | path_scores
     metrics |= score_frame_sets(run, frames, known) | _score_views(scoring, config.final, predictions, strips, progress)
     metrics |= {"lpips_network": lpips.net if lpips else None, "reconstruction": None, "reconstruction_published": None}
     metrics["full_resolution"] = score_full_resolution(scoring, progress) if full_resolution else None
-    metrics["calibration"] = _calibration(run) if standard else None
     if mesh:
         surface = true_mesh or reconstruct.known_surface(source)
         metrics |= reconstruct.fuse_and_score(run, source.camera, surface, known, random_views, renderer, progress)
     metrics["pose_covariance"] = score_pose_covariance(run, frames, known)
+    metrics["calibration"] = _calibration(run) if standard else None
     metrics["test_views"] = score_test_views(scoring, config.input, strips)
     run.write_metrics(metrics)
     plots = _draw_plots(run, frames, known, loops)
