@@ -14,7 +14,7 @@ from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.evaluation.finished_run import FinishedRun, run_slam
 from sigmasplat.evaluation.splat_statistics import MapFacts, TrainingView, fisher, map_facts, ridge, splat_values
-from sigmasplat.evaluation.surface_errors import surface_errors
+from sigmasplat.evaluation.surface_errors import aligned, surface_errors
 from sigmasplat.evaluation.surface_predictors import SURFACE_PREDICTORS
 from sigmasplat.evaluation.uncertainty_benchmark import (
     EXACT,
@@ -289,3 +289,13 @@ def test_the_temperature_of_a_surface_comes_from_surfaces_with_any_reference() -
     assert second[Kind("surface", MESH, FUSED)][VISIBLE]["predictors"]["ridge"]["temperature"] == pytest.approx(
         4.0, rel=0.05
     )
+
+
+def test_a_straight_path_is_aligned_by_its_rotations_too() -> None:
+    """The positions of a straight path do not fix the rotation about it."""
+    random = np.random.default_rng(0)
+    wanted = se3.exp(np.array([1.0, -2.0, 0.5, 0.3, 0.8, -0.4]))
+    true = np.stack([se3.exp(np.array([0.1 * i, 0.0, 0.0, 0.0, 0.02 * i, 0.0])) for i in range(20)])
+    true[:, 1:3, 3] = 0.0
+    noise = np.stack([se3.exp(twist) for twist in 0.002 * random.normal(size=(20, 6))])
+    np.testing.assert_allclose(aligned(true, wanted @ true @ noise), wanted, atol=0.003)
