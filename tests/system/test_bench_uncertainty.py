@@ -14,7 +14,7 @@ from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.evaluation.finished_run import FinishedRun, run_slam
 from sigmasplat.evaluation.splat_statistics import MapFacts, TrainingView, fisher, map_facts, ridge, splat_values
-from sigmasplat.evaluation.surface_errors import surface_errors
+from sigmasplat.evaluation.surface_errors import aligned, surface_errors
 from sigmasplat.evaluation.surface_predictors import SURFACE_PREDICTORS
 from sigmasplat.evaluation.uncertainty_benchmark import (
     EXACT,
@@ -306,3 +306,13 @@ def test_sparsification_charts_compare_each_predictor_with_the_calibrated_one(qu
         oracle = next(curve for curve in chart.curves if curve.name == "true error").points
         assert (np.diff(oracle[:, 1]) <= 1e-6).all(), "the true error removes the largest errors first"
     assert {curve.name for chart in charts for curve in chart.curves} == {p.name for p in wanted} | {"true error"}
+
+
+def test_a_straight_path_is_aligned_by_its_rotations_too() -> None:
+    """The positions of a straight path do not fix the rotation about it."""
+    random = np.random.default_rng(0)
+    wanted = se3.exp(np.array([1.0, -2.0, 0.5, 0.3, 0.8, -0.4]))
+    true = np.stack([se3.exp(np.array([0.1 * i, 0.0, 0.0, 0.0, 0.02 * i, 0.0])) for i in range(20)])
+    true[:, 1:3, 3] = 0.0
+    noise = np.stack([se3.exp(twist) for twist in 0.002 * random.normal(size=(20, 6))])
+    np.testing.assert_allclose(aligned(true, wanted @ true @ noise), wanted, atol=0.003)

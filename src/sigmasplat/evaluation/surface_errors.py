@@ -9,7 +9,7 @@ from sigmasplat.config import Config
 from sigmasplat.evaluation.finished_run import FinishedRun
 from sigmasplat.evaluation.view_selection import evenly_spread, working_frame
 from sigmasplat.metrics.reconstruction import BEHIND_M, Mask, distances, visible_points
-from sigmasplat.metrics.trajectory import associate, truth_in_estimate
+from sigmasplat.metrics.trajectory import associate
 from sigmasplat.model import isosurface, se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.mesh import Mesh
@@ -42,28 +42,43 @@ class SurfaceErrors:
 def surface_errors(
     run: FinishedRun, source: Source, renderer: FieldRenderer, progress: Progress = no_progress
 ) -> SurfaceErrors | None:
-    """Fuse the surface of a run as `sigmasplat mesh` does, and measure it; None if the true path is unknown.
+    """Fuse the surface of a run as `sigmasplat mesh` does, and measure it; None without a true path.
 
-    The true path is aligned to the estimated one as for the ATE. A vertex counts if it is in the image of a true pose,
+    The true path is aligned to the estimated one with `aligned`. A vertex counts if it is in the image of a true pose,
     at most `BEHIND_M` behind the reference, and if the reference has a surface at this pixel. Calls
     `progress(keyframes done, total)`.
     """
-    truth = source.truth()
-    if truth is None or not run.believed.any():
+    truth, path = source.truth(), run.path.at(run.believed)
+    if truth is None:
         return None
-    path = run.path.at(run.believed)
-    T_estimate_truth = truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], truth)
+    rows, true_rows = associate(path.timestamps_s, truth.timestamps_s)
+    if not len(rows):
+        return None
+    T_estimate_truth = aligned(truth.T_world_camera[true_rows], path.T_world_camera[rows])
     surface = source.true_surface()
     reference = (_fused(run.config, source, truth) if surface is None else surface).moved(T_estimate_truth)
     outside = frozenset(range(len(run.store))) - frozenset(run.members)
     total = count_keyframes(run.store, outside)
     found = fuse(fusion_views(run.store, run.anchors, outside), total, run.config, renderer=renderer, progress=progress)
-    _, rows = associate(path.timestamps_s, truth.timestamps_s)
-    poses = T_estimate_truth @ truth.T_world_camera[evenly_spread(rows.tolist(), SEEING_FRAMES)]
+    poses = T_estimate_truth @ truth.T_world_camera[evenly_spread(true_rows.tolist(), SEEING_FRAMES)]
     vertices = found.vertices.astype(np.float64)
     seen = np.flatnonzero(_seen(vertices, reference, run.camera, poses))
     vertices = vertices[np.random.default_rng(run.config.seed).permutation(seen)[:VERTICES]]
     return SurfaceErrors(vertices, distances(vertices, reference), surface is not None)
+
+
+def aligned(T_truth_camera: Matrix, T_estimate_camera: Matrix) -> Matrix:
+    """Return T_estimate_truth [4, 4] from poses [K, 4, 4] of the same frames: the mean rotation, and the mean shift.
+
+    The alignment of the ATE uses positions only. On a short or straight path they do not fix the rotation, which would
+    move a surface by more than its errors.
+    """
+    rotations = T_estimate_camera[:, :3, :3] @ T_truth_camera[:, :3, :3].swapaxes(1, 2)
+    u, _, vt = np.linalg.svd(rotations.sum(0))
+    found = np.eye(4)
+    found[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    found[:3, 3] = (T_estimate_camera[:, :3, 3] - T_truth_camera[:, :3, 3] @ found[:3, :3].T).mean(0)
+    return found
 
 
 def _fused(config: Config, source: Source, truth: Trajectory) -> Mesh:
