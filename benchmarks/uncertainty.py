@@ -107,7 +107,31 @@ def sections(measured: dict[str, Any]) -> list[Section]:
         for views, subsets in found.items()
         for subset in subsets
     )
-    return [kind_table(runs, kind) for kind in kinds]
+    coverage = coverage_table(runs)
+    return [*([coverage] if coverage.rows else []), *(kind_table(runs, kind) for kind in kinds)]
+
+
+def coverage_table(runs: list[dict[str, Any]]) -> Section:
+    """Tabulate the coverage of the predicted errors of the final map: one row per sequence and kind of views."""
+    lines = list[list[str]]()
+    views = dict.fromkeys(kind for run in runs for kind in run["scores"].get("color", {}).get("final", {}))
+    for kind in views:
+        for source in dict.fromkeys(run["source"] for run in runs):
+            cells = list[str]()
+            for quantity, subset in (("color", "all pixels"), ("depth", "covered pixels")):
+                of_source = [run["scores"].get(quantity, {}) for run in runs if run["source"] == source]
+                found = [of_run.get("final", {}).get(kind, {}).get(subset) for of_run in of_source]
+                predictors = [scores["predictors"] for scores in found if scores]
+                rows = [of["predictive"]["before"] for of in predictors if "predictive" in of]
+                for key, digits, scale in (("coverage_68", 0, 100.0), ("coverage_95", 0, 100.0), ("auce", 3, 1.0)):
+                    cells.append(written([scale * row[key] for row in rows], digits) if rows else "–")
+            if set(cells) != {"–"}:
+                lines.append([source, kind, *cells])
+    head = [
+        f"{name}: {what}" for name in ("colour", "depth") for what in ("within 1 std, %", "within 1.96 std, %", "AUCE")
+    ]
+    note = "Ideal: 68.3 % and 95 %; AUCE 0. Colour: all pixels; depth: where the map covers the pixel."
+    return Section("Coverage of predicted errors, final map", ["sequence", "views", *head], lines, note)
 
 
 def kind_table(runs: list[dict[str, Any]], kind: tuple[str, str, str, str]) -> Section:

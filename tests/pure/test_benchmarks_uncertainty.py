@@ -44,6 +44,24 @@ def test_results_are_kept_by_name_and_laid_out() -> None:
     assert "other sequences" in section.note and len(section.columns) == len(section.rows[0])
 
 
+def test_the_coverage_of_predicted_errors_has_a_row_per_sequence_and_kind_of_views() -> None:
+    made = runs()
+    for run in made:
+        for quantity, subset in (("color", "all pixels"), ("depth", "covered pixels")):
+            found = scores(-2.0)["color"]["final"]["held back"]["all pixels"]
+            found["predictors"]["predictive"] = found["predictors"]["V"]
+            run["scores"].setdefault(quantity, {"final": {}})["final"] |= {"held back": {subset: found}}
+    made[0]["scores"]["color"]["final"]["away from the path"] = made[0]["scores"]["color"]["final"]["held back"]
+    coverage, *_ = uncertainty.sections({"figures": uncertainty.kept({"config": {}, "hold_every": 8, "runs": made})})
+    assert [row[:2] for row in coverage.rows] == [
+        ["kitchen", "held back"],
+        ["hall", "held back"],
+        ["kitchen", "away from the path"],
+    ]
+    assert coverage.rows[1][2:] == ["70", "90", "0.100"] * 2 and coverage.rows[2][5:] == ["–"] * 3
+    assert len(coverage.columns) == len(coverage.rows[0])
+
+
 def test_options_are_those_of_the_command(tmp_path: Path) -> None:
     options = uncertainty.Options(sources=("synthetic",), seeds=2, limit=30, runs=tmp_path)
     command = options.command()

@@ -89,9 +89,12 @@ def test_predicted_errors_are_scored_and_shown(run: Path) -> None:
         assert 0 < found["coverage_68"] <= found["coverage_95"] <= 1 and found["pixels"] > 100
         assert 0 <= found["auce"] <= 0.5 and found["ause"] > 0 and found["nll"] < 0
     page = (run / "report.html").read_text()
-    pictures = list((run / "images").glob("view-held-out-predicted-*.png"))
+    pictures = list((run / "images").glob("view-held-out-predicted-color-*.png"))
     assert pictures and page.count("alt='predicted colour error'") == len(pictures)
-    assert page.count("alt='predicted depth error'") == len(pictures)
+    for part in ("predicted depth error", "depth: aleatoric part", "depth: epistemic part", "colour: epistemic part"):
+        assert page.count(f"alt='{part}'") == len(pictures), part
+    assert "probe views, to which no map was fitted" in page and "Calibration of predicted errors" in page
+    assert "A region is unsure if the predicted error of depth is above" in page
     measured = f"measured {100 * scores['color']['coverage_68']:.0f} % (colour)"
     assert measured in page and "Predicted errors, held-out, final map" in page
 
@@ -113,7 +116,9 @@ def test_without_the_uncertainty_of_the_map_nothing_is_predicted(run: Path, tmp_
         (copy / name).unlink()
     sigmasplat("eval", str(copy))
     assert json.loads((copy / "metrics.json").read_text())["predictive"] is None
-    assert not list((copy / "images").glob("*predicted*")) and "predicted" not in (copy / "report.html").read_text()
+    page = (copy / "report.html").read_text()
+    assert not list((copy / "images").glob("*predicted*")) and "predicted depth error" not in page
+    assert "The run has no predicted errors" in page and "This run has no predicted errors" in page
 
 
 def test_the_uncertainty_of_another_map_is_refused(

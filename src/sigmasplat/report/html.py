@@ -72,7 +72,7 @@ pre { white-space: pre-wrap; overflow-wrap: anywhere; margin: 0;
 
 PREDICTED_EXPLANATION = (
     "<p class=soft>Below each held-out view: its errors, and the predicted errors, one standard deviation each. Their "
-    "aleatoric part is noise and detail that the map cannot show; their epistemic part shows where to scan again.</p>"
+    "aleatoric part is noise and detail that the map cannot show; more or better views reduce the epistemic part.</p>"
 )
 
 

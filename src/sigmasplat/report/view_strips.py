@@ -42,13 +42,15 @@ class ViewStrips:
             old.unlink()
 
     def add(self, view: ScoredView, place: str = "") -> None:
-        """Draw one view, and a second strip if its errors were predicted; `place` is added to the heading if the view
-        was not rendered from the final map.
+        """Draw one view, and strips of its predicted errors of colour and depth if they are known; `place` is added to
+        the heading if the view was not rendered from the final map.
         """
         name, heading = f"view-{view.kind.replace(' ', '-')}", HEADINGS.get(view.kind, f"{view.kind} views") + place
         self._draw(f"{name}{place and '-submap'}-{view.index:06d}.png", heading, view_panels(view))
         if view.predicted is not None:
-            self._draw(f"{name}-predicted-{view.index:06d}.png", heading, predicted_panels(view, view.predicted))
+            panels = predicted_panels(view, view.predicted)
+            for quantity, of_quantity in (("color", panels[:4]), ("depth", panels[4:])):
+                self._draw(f"{name}-predicted-{quantity}-{view.index:06d}.png", heading, of_quantity)
 
     def _draw(self, name: str, heading: str, panels: list[ViewPanel]) -> None:
         """Write a strip, and keep its panels for the page."""
