@@ -137,9 +137,9 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     limit_cm = significant(100 * measured["config"]["uncertainty_m"])
     note = (
         f"Rule *covariance*: a submap ends where the camera's position in it is uncertain by more than {limit_cm} cm. "
-        "Rule *V*: it ends where the sum of the mean V of the tracked frames exceeds a limit, with which it fires about "
-        "as often. Hops lead from keyframe to keyframe; errors are relative to the ground truth, which no rule uses. "
-        "Spearman: rank correlation of the error of a hop with what it adds to the rule's value."
+        "Rule *V*: it ends where the sum of the mean V of the tracked frames exceeds a limit, with which it fires "
+        "about as often. Hops lead from keyframe to keyframe; errors are relative to the ground truth, which no rule "
+        "uses. Spearman: rank correlation of the error of a hop with what it adds to the rule's value."
     )
     return [Section("Uncertainty rule", head, rows, note)]
 
