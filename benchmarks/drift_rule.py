@@ -1,7 +1,9 @@
-"""Measure whether the uncertainty rule cuts submaps where tracking is weak (VarSplat §2, issue 4).
+"""Measure whether the uncertainty rules cut submaps where tracking is weak (VarSplat §2, issues 4 and 18).
 
-Runs SLAM with `submaps.uncertainty_m` as the only rule. Compares the motion from each keyframe to the next (a hop) with
-the ground truth, where the rule fires and where it does not.
+Runs SLAM with `submaps.uncertainty_m` (the covariance of tracking) as the only rule, then with `submaps.variance_sum`
+(V of the tracked frames, the paper's reading). The limit of the second rule is chosen so that it fires about as often.
+Compares the motion from each keyframe to the next (a hop) with the ground truth, where a rule fires and where it does
+not, and ranks the hops by what each rule adds there.
 Writes benchmarks/results/drift_rule-<machine>.json and prints tables.
 
 example: python benchmarks/drift_rule.py --sources hololens --limit 120
@@ -20,8 +22,11 @@ import tyro
 from numpy.typing import NDArray
 from tables import Section, significant
 
-from sigmasplat.config import SubmapConfig
+from sigmasplat.commands.options import Settings
+from sigmasplat.config import Config, SubmapConfig
+from sigmasplat.config.text import override, split_settings
 from sigmasplat.metrics.trajectory import associate
+from sigmasplat.metrics.uncertainty import spearman
 from sigmasplat.model import se3
 from sigmasplat.presets import default_preset, preset as preset_of
 from sigmasplat.slam.slam import Slam
@@ -29,11 +34,17 @@ from sigmasplat.sources import open_source
 
 arg = tyro.conf.arg
 Matrix = NDArray[np.float64]
+NEVER = 1e9
+"""A limit that no sum of V reaches: the sum is recorded and ends no submap."""
+SUMS = ("drift_m", "variance_sum")
+"""Values in the log of a keyframe: the standard deviation of its position in the submap, and the sum of V."""
+ADDED = {"covariance": "added_m2", "V": "variance"}
+"""What a hop adds to the value of each rule."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Cut submaps by accumulated uncertainty only, and measure the true error there."""
+    """Cut submaps by accumulated uncertainty only, by two rules, and measure the true error there."""
 
     sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = (
         "livingroom",
@@ -42,17 +53,32 @@ class Options:
     )
     preset: Annotated[str, arg(help="preset to start from")] = default_preset()
     uncertainty_m: Annotated[float, arg(help="limit of the rule, metres")] = 0.02
+    settings: Settings = ()
     limit: Annotated[int | None, arg(help="number of frames at most")] = None
     name: Annotated[str, arg(help="name of the results")] = "drift-rule"
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
 
 
-def measure(path: str, options: Options) -> dict[str, Any]:
-    """Run one sequence; return its hops and its number of submaps. Raises SourceError if it cannot be read."""
-    config = preset_of(options.preset)
-    rule = SubmapConfig(uncertainty_m=options.uncertainty_m, inherit=config.submaps.inherit)
-    config = replace(config, submaps=rule, loops=replace(config.loops, close=False))
-    source, slam = open_source(path, limit=options.limit), Slam(config)
+def measure(path: str, options: Options) -> list[dict[str, Any]]:
+    """Run one sequence once per rule; return the hops and the number of submaps of each. Raises SourceError if it
+    cannot be read."""
+    config = override(preset_of(options.preset), split_settings(options.settings))
+    both = SubmapConfig(uncertainty_m=options.uncertainty_m, variance_sum=NEVER, inherit=config.submaps.inherit)
+    first = followed(path, replace(config, submaps=both), options.limit)
+    increases = sum(hop["variance"] for hop in first["hops"])
+    limit = increases / first["submaps"] if increases else NEVER
+    by_variance = SubmapConfig(variance_sum=limit, inherit=config.submaps.inherit)
+    second = followed(path, replace(config, submaps=by_variance), options.limit)
+    return [
+        {"rule": "covariance", "limit": options.uncertainty_m, **first},
+        {"rule": "V", "limit": round(limit, 6), **second},
+    ]
+
+
+def followed(path: str, config: Config, limit: int | None) -> dict[str, Any]:
+    """Run one sequence with given settings, without loops; return its hops, its frames and its number of submaps."""
+    config = replace(config, loops=replace(config.loops, close=False))
+    source, slam = open_source(path, config.input, limit=limit), Slam(config)
     for frame in source:
         slam.step(frame)
     truth = source.truth()
@@ -65,18 +91,24 @@ def measure(path: str, options: Options) -> dict[str, Any]:
 
 
 def hops_of(slam: Slam, path: Matrix, known: dict[int, Matrix]) -> dict[str, Any]:
-    """Return each hop: its last frame, its submap, the uncertainty there, whether a submap ended, the true error, m."""
+    """Return each hop: its last frame, its submap, what it adds to δ² (m²) and to the sum of V, whether a submap ended,
+    and the true error, m."""
     hops = []
     for before, after in pairwise(slam.keyframe_indices):
         if before not in known or after not in known:
             continue
         estimate, truth = (se3.inverse(p[before]) @ p[after] for p in (path, known))
         submap = slam.steps[before].submap
+        drift, sum_of_V = ([slam.steps[k].tracking.get(name, 0.0) for k in (before, after)] for name in SUMS)
+        if before == 0 or (before - 1 >= 0 and slam.steps[before - 1].submap != submap):
+            drift[0] = sum_of_V[0] = 0.0  # the submap begins with this keyframe
         hops.append(
             {
                 "frame": after,
                 "submap": submap,
-                "drift_m": round(slam.steps[after].tracking["drift_m"], 6),
+                "drift_m": round(drift[1], 6),
+                "added_m2": drift[1] ** 2 - drift[0] ** 2,
+                "variance": sum_of_V[1] - sum_of_V[0],
                 "cut": slam.steps[after].submap != submap,
                 "error_m": round(float(np.linalg.norm((se3.inverse(truth) @ estimate)[:3, 3])), 6),
             }
@@ -91,22 +123,31 @@ Rows = list[dict[str, Any]]
 
 
 def sections(measured: dict[str, Any]) -> list[Section]:
-    """Return one table: a row for each sequence."""
+    """Return one table: a row for each sequence and rule."""
     rows = []
     for found in measured["figures"]["sources"]:
         hops: Rows = found["hops"]
+        rule = found.get("rule", "covariance")
         errors_cm = {cut: [100 * hop["error_m"] for hop in hops if hop["cut"] is cut] for cut in (True, False)}
         counts = [str(len(hops)), str(found["submaps"]), str(found["lost"])]
         cells = [level(errors_cm[cut], share) for cut in (True, False) for share in (0.5, 0.9)]
-        rows.append([found["source"], *counts, *cells])
-    head = ["sequence", "hops", "submaps", "lost frames", "error of hops where the rule fires, cm: median", "… 90 %"]
-    head += ["where it does not fire, cm: median", "… 90 %"]
+        rows.append([found["source"], rule, *counts, *cells, rank(hops, ADDED[rule])])
+    head = ["sequence", "rule", "hops", "submaps", "lost frames", "error of hops where the rule fires, cm: median"]
+    head += ["… 90 %", "where it does not fire, cm: median", "… 90 %", "Spearman of added uncertainty and error"]
     limit_cm = significant(100 * measured["config"]["uncertainty_m"])
     note = (
-        f"A submap ends where the camera's position in it is uncertain by more than {limit_cm} cm. Hops lead from "
-        "keyframe to keyframe; errors are relative to the ground truth, which the rule does not use."
+        f"Rule *covariance*: a submap ends where the camera's position in it is uncertain by more than {limit_cm} cm. "
+        "Rule *V*: it ends where the sum of the mean V of the tracked frames exceeds a limit, with which it fires "
+        "about as often. Hops lead from keyframe to keyframe; errors are relative to the ground truth, which no rule "
+        "uses. Spearman: rank correlation of the error of a hop with what it adds to the rule's value."
     )
     return [Section("Uncertainty rule", head, rows, note)]
+
+
+def rank(hops: Rows, added: str) -> str:
+    """Return the rank correlation of what hops add to a rule's value with their errors; a dash if it is not known."""
+    known = [(hop[added], hop["error_m"]) for hop in hops if added in hop and np.isfinite(hop[added])]
+    return significant(float(spearman(*np.array(known).T)), 2) if len(known) > 2 else "–"
 
 
 def level(errors: list[float], share: float) -> str:
@@ -116,7 +157,7 @@ def level(errors: list[float], share: float) -> str:
 
 def measure_all(options: Options) -> dict[str, Any]:
     """Measure every sequence."""
-    found = [{"source": Path(s).name, **measure(accuracy.located(s), options)} for s in options.sources]
+    found = [{"source": Path(s).name, **run} for s in options.sources for run in measure(accuracy.located(s), options)]
     return {"sources": found}
 
 

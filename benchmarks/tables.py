@@ -22,7 +22,7 @@ import record
 import tyro
 
 SUBJECTS = {
-    "Whole runs": ("accuracy", "systems"),
+    "Whole runs": ("accuracy", "systems", "every_preset"),
     "Other systems": ("peers",),
     "Effect of σ²": ("ablation", "color_covariance"),
     "Uncertainty": ("uncertainty", "pose_covariance"),

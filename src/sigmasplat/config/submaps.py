@@ -9,8 +9,8 @@ class SubmapConfig:
     """Rules that end the active submap and start the next one; checked at each keyframe (VarSplat §2)."""
 
     distance_m: float = 0.0
-    """A new submap starts if the camera is farther than this from the submap's first pose; 0 = off. If all four rules
-    are off, the map is one submap."""
+    """A new submap starts if the camera is farther than this from the submap's first pose; 0 = off. If all rules are
+    off, the map is one submap."""
     angle_deg: float = 0.0
     """A new submap starts if the camera has rotated by more than this from the submap's first pose; 0 = off."""
     frames: int = 0
@@ -18,6 +18,10 @@ class SubmapConfig:
     uncertainty_m: float = 0.0
     """A new submap starts if the standard deviation of the camera's position in the submap, accumulated from keyframe
     to keyframe, exceeds this (`slam.drift`); 0 = off."""
+    variance_sum: float = 0.0
+    """A new submap starts if the mean V rendered at each tracked frame, summed since the submap began, exceeds this
+    (colours 0 to 1, squared); 0 = off. It reads the paper's accumulated uncertainty as V, and costs a render per
+    frame."""
     inherit: bool = False
     """Whether a new submap starts with copies of the splats in view, which are then mapped like any others; off = it
     starts empty (paper)."""

@@ -5,7 +5,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.model import se3
+from sigmasplat.model.field import GaussianField
+from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 
 HOP_M, HOP_RAD = 0.002, 0.002
@@ -13,6 +16,8 @@ HOP_M, HOP_RAD = 0.002, 0.002
 FLOOR = np.diag(np.repeat([0.005**2, 0.003**2], 3))
 """Minimum covariance of a pose between two maps, or in another map, m² and rad²: two maps of the same wall differ by
 about this much."""
+OPAQUE = 0.95
+"""V is averaged where the rendered alpha is above this; elsewhere V has no meaning."""
 UNKNOWN = np.diag([1.0] * 6)
 """Covariance of a hop between images without overlap, m² and rad²."""
 BIAS = 0.02
@@ -26,7 +31,8 @@ class Drift:
 
     Each frame is tracked against the newest keyframe, so errors accumulate per keyframe, not per frame. First order:
     hops are independent, and their covariances add after transformation to the submap's frame. `covariance` sums the
-    estimates of alignment; `usual` sums the constant errors that alignment cannot estimate.
+    estimates of alignment; `usual` sums the constant errors that alignment cannot estimate. `variance_sum` sums the
+    mean V of tracked frames, if a rule reads it.
     """
 
     covariance: Matrix = field(default_factory=lambda: np.zeros((6, 6)))
@@ -34,6 +40,7 @@ class Drift:
     travelled_m: float = 0.0
     turned_rad: float = 0.0
     last: Matrix = field(default_factory=lambda: np.eye(4))
+    variance_sum: float = 0.0
 
     def hop(self, T_submap_camera: Matrix, covariance: Matrix | None) -> None:
         """Add a hop to the keyframe at T_submap_camera [4, 4], `covariance` [6, 6] of T_camera_reference's left twist.
@@ -67,6 +74,16 @@ class Drift:
         """
         bent = np.repeat([(BIAS * self.travelled_m) ** 2, (BIAS * self.turned_rad) ** 2], 3)
         return symmetric(np.asarray(np.linalg.inv(self.covariance + self.usual + np.diag(bent)), np.float64))
+
+
+def mean_variance(field: GaussianField, view: View, T_camera_submap: Matrix) -> float:
+    """Return the mean of V over the channels and the pixels that the map covers, rendered at a pose [4, 4]; 0 if it
+    covers none. The view must have planes for σ²."""
+    view.forward(field.params, T_camera_submap)
+    maps = PoseMaps.of(view)
+    assert maps.variance is not None
+    covered = maps.alpha > OPAQUE
+    return float(maps.variance.clamp(min=0.0)[covered].double().mean()) if bool(covered.any()) else 0.0
 
 
 def symmetric(matrix: Matrix) -> Matrix:

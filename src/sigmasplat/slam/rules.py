@@ -25,11 +25,16 @@ def is_held_back(index: int, every: int) -> bool:
 
 
 def ends_submap(
-    T_submap_camera: NDArray[np.float64], frames_since: int, uncertainty_m: float, config: SubmapConfig
+    T_submap_camera: NDArray[np.float64],
+    frames_since: int,
+    uncertainty_m: float,
+    config: SubmapConfig,
+    variance_sum: float = 0.0,
 ) -> str:
     """Return the name of the rule that ends the active submap at this keyframe, or "" if none does (VarSplat §2).
 
-    frames_since: frames since the submap began; uncertainty_m: `Drift.position_m` of the keyframe.
+    frames_since: frames since the submap began; uncertainty_m: `Drift.position_m` of the keyframe; variance_sum:
+    `Drift.variance_sum` of the submap.
     """
     c = config
     found = {
@@ -37,6 +42,7 @@ def ends_submap(
         "angle": (float(np.rad2deg(se3.rotation_angle(T_submap_camera[:3, :3]))), c.angle_deg),
         "frames": (float(frames_since), c.frames - 1e-9 if c.frames else 0.0),
         "uncertainty": (uncertainty_m, c.uncertainty_m),
+        "variance": (variance_sum, c.variance_sum),
     }
     return next((rule for rule, (value, limit) in found.items() if limit and value > limit), "")
 

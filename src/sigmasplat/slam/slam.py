@@ -12,7 +12,7 @@ from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import StorePart
-from sigmasplat.slam.drift import Drift
+from sigmasplat.slam.drift import Drift, mean_variance
 from sigmasplat.slam.final import final_map
 from sigmasplat.slam.found import Found
 from sigmasplat.slam.localisation.confidence import std_of
@@ -120,6 +120,9 @@ class Slam(World):
         self.recovery.count(lost, self.tracker.doubtful > 0, seen)
         found = Found.of(fit, se3.inverse(fit.T_camera_world), lost)
         if not lost:
+            if self.config.submaps.variance_sum:
+                self.drift.variance_sum += mean_variance(self.mapper.field, self.view, fit.T_camera_world)
+                found.tracking["variance_sum"] = self.drift.variance_sum
             certain = self.recovery.is_steady and self._is_certain(fit)
             found.mapped = certain and not held_back and self._is_keyframe(fit.overlap)
             if found.mapped:
@@ -190,7 +193,7 @@ class Slam(World):
 
     def _submap_ends(self, T_submap_camera: Matrix) -> bool:
         since, moved_m = len(self.steps) - self.mapper.keyframes[0].index, self.drift.position_m(T_submap_camera)
-        return bool(ends_submap(T_submap_camera, since, moved_m, self.config.submaps))
+        return bool(ends_submap(T_submap_camera, since, moved_m, self.config.submaps, self.drift.variance_sum))
 
     def _cut(self, T_submap_camera: Matrix) -> list[Loop]:
         """Finish the active submap and start the next one at its newest keyframe; return the loops tried."""

@@ -123,7 +123,7 @@ class World:
     def _cuts(self) -> bool:
         """Return whether any rule may end a submap."""
         s = self.config.submaps
-        return bool(s.distance_m or s.angle_deg or s.frames or s.uncertainty_m)
+        return bool(s.distance_m or s.angle_deg or s.frames or s.uncertainty_m or s.variance_sum)
 
     @property
     def _describes(self) -> bool:

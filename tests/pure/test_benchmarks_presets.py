@@ -1,0 +1,47 @@
+"""The benchmarks of presets and of the rules that end submaps: their settings and their tables."""
+
+import importlib
+from typing import Any
+
+import pytest
+
+from benchmark_results import laid_out
+from sigmasplat.config.text import override, split_settings
+from sigmasplat.presets import list_presets, preset
+
+every_preset = importlib.import_module("every_preset")
+
+
+@pytest.mark.parametrize("name", list_presets())
+def test_a_shortened_preset_stays_what_it_is_and_cuts_often(name: str) -> None:
+    whole, short = preset(name), override(preset(name), split_settings(every_preset.shortened(preset(name))))
+    assert short.mapping.iterations <= 8 and short.final.iterations <= 40 and short.input.width == 160
+    assert bool(short.submaps.frames) == any(
+        (whole.submaps.distance_m, whole.submaps.angle_deg, whole.submaps.frames, whole.submaps.uncertainty_m)
+    )
+    assert (short.mapping.window, short.mapping.covisibility) == (whole.mapping.window, whole.mapping.covisibility)
+
+
+def test_presets_that_fail_are_listed_with_their_last_line() -> None:
+    def result(name: str, problem: str | None, **figures: Any) -> dict[str, Any]:
+        return {"job": {"source": "kitchen", "preset": name, "seed": 0}, "problem": problem, "figures": figures}
+
+    good = result("sigma", None, frames=75, submaps=5, ate_m=0.0123, judged_on="training")
+    shown, failed = laid_out("every_preset", {"jobs": [good, result("other", "no list of splats")]}).values()
+    assert shown.title == "kitchen" and shown.rows == [
+        ["sigma", "75", "–", "–", "5", "–", "–", "–", "1.23", "–", "–", "training"]
+    ]
+    assert any("no list of splats" in cell for row in failed.rows for cell in row)
+
+
+def test_both_rules_are_judged_by_the_errors_where_they_fire() -> None:
+    def hop(error_m: float, added: float, cut: bool) -> dict[str, Any]:
+        return {"error_m": error_m, "added_m2": added, "variance": -added, "cut": cut}
+
+    hops = [hop(0.01, 1.0, False), hop(0.02, 2.0, False), hop(0.05, 3.0, True)]
+    runs = [{"source": "kitchen", "rule": rule, "submaps": 2, "lost": 0, "hops": hops} for rule in ("covariance", "V")]
+    (section,) = laid_out("drift_rule", {"sources": runs}, config={"uncertainty_m": 0.02}).values()
+    by_covariance, by_v = section.rows
+    assert by_covariance[:2] == ["kitchen", "covariance"] and by_v[:2] == ["kitchen", "V"]
+    assert by_covariance[5] == "5.00" and by_covariance[7] == "1.50"
+    assert (by_covariance[-1], by_v[-1]) == ("1.0", "-1.0")
