@@ -29,10 +29,10 @@ def room() -> SyntheticRoom:
     return SyntheticRoom(frames=120, width=96, height=72, test_views=3)
 
 
-def walls(room: SyntheticRoom, shift_m: float = 0.0) -> Mesh:
+def walls(room: SyntheticRoom) -> Mesh:
     """Return the box around the true surface, 12 large faces, without the furniture."""
     surface = room.true_surface()
-    box = trimesh.creation.box(bounds=[surface.vertices.min(0) - shift_m, surface.vertices.max(0) + shift_m])
+    box = trimesh.creation.box(bounds=[surface.vertices.min(0), surface.vertices.max(0)])
     return Mesh(box.vertices.astype(np.float32), box.faces.astype(np.int32))
 
 
@@ -50,8 +50,9 @@ def scored(folder: Path, run: Path, *options: str) -> dict[str, object]:
 
 
 def test_replicas_layout_has_all_scores_of_the_papers(
-    room: SyntheticRoom, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    room: SyntheticRoom, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.chdir(tmp_path)  # weights in data/lpips would be found
     s = sample(room, room.truth().T_world_camera, FRAMES)
     folder, c = tmp_path / "room0", room.camera
     for n in range(FRAMES):
@@ -65,20 +66,18 @@ def test_replicas_layout_has_all_scores_of_the_papers(
 
     extra = ("--mesh", "--full-resolution", "--random-views", "6", "--lpips", str(tmp_path / "weights"))
     metrics = scored(folder, tmp_path / "run", *extra)
-    published, ours = metrics["reconstruction_published"], metrics["reconstruction"]
-    assert 1 <= published["depth_views"] <= 6 and 0 < published["depth_l1_m"] < 1
+    published = metrics["reconstruction_published"]
     assert published["chamfer_m"] == pytest.approx((published["accuracy_m"] + published["completion_m"]) / 2)
     assert 0 < published["f1"] <= 1 and 0 < published["completion_ratio"] <= 1
+    assert published.keys() >= {"precision", "recall", "depth_l1_m", "depth_views"}
     assert metrics["full_resolution"]["width"] == 96 and metrics["full_resolution"]["training"]["lpips"] > 0
     assert metrics["training"]["lpips"] > 0 and metrics["ate_keyframes"]["rmse_m"] < 0.1
     assert "LPIPS" not in capsys.readouterr().out
 
-    write_mesh(tmp_path / "other.ply", walls(room, shift_m=0.3))
-    other = ("--true-mesh", str(tmp_path / "other.ply"), "--random-views", "0")
-    assert exit_code("eval", str(tmp_path / "run"), *other) == 0
-    given = RunFolder.open(tmp_path / "run").read_metrics()
-    assert given["reconstruction"]["accuracy_m"] > ours["accuracy_m"]
+    assert exit_code("eval", str(tmp_path / "run")) == 0
     assert "no alex.pth in" in capsys.readouterr().out
+    without = RunFolder.open(tmp_path / "run").read_metrics()
+    assert without["reconstruction"] is without["full_resolution"] is without["training"]["lpips"] is None
     assert exit_code("eval", str(tmp_path / "run"), "--true-mesh", str(tmp_path / "nothing.ply")) == 2
     assert exit_code("eval", str(tmp_path / "run"), "--lpips", str(tmp_path)) == 2
 

@@ -178,6 +178,19 @@ def test_evaluation_scores_the_splats_in_the_truths_frame(run: RunFolder) -> Non
     assert "66.67" in page and "15.00" in page
 
 
+def test_a_given_mesh_is_the_true_surface(run: RunFolder) -> None:
+    """A wall of two faces, 1 cm behind the one that the source knows."""
+    corners = np.array([[-3, -3, WALL_M + 0.01], [3, -3, WALL_M + 0.01], [3, 3, WALL_M + 0.01], [-3, 3, WALL_M + 0.01]])
+    given = Mesh(corners.astype(np.float32), np.array([[0, 1, 2], [0, 2, 3]], np.int32)).moved(WORLD)
+    metrics = evaluate(
+        run, WallAhead(), renderer=KnownView(), strips_per_kind=0, mesh=True, true_mesh=given, random_views=0
+    )
+    assert metrics["reconstruction"]["accuracy_m"] == pytest.approx(0.01, rel=0.05)
+    published = metrics["reconstruction_published"]
+    assert published["completion_ratio"] == pytest.approx(metrics["reconstruction"]["completion_ratio"], abs=0.02)
+    assert "Surface, by the protocol of published systems" in (run.path / "report.html").read_text()
+
+
 def test_without_a_true_surface_the_mesh_has_no_score(run: RunFolder) -> None:
     metrics = evaluate(run, WallAhead(known=False), renderer=KnownView(), strips_per_kind=0, mesh=True, random_views=0)
     assert metrics["reconstruction"] is None and (run.path / "mesh.ply").exists()
