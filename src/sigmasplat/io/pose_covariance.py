@@ -17,7 +17,8 @@ from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.types import Matrix
 
 WORLD = (
-    "world = camera of the first frame; axes x right, y down, z forward; its pose is known, its covariance stands for 0"
+    "world = camera of the first frame, whose pose is known (written as 0.01 mm, 0.01 mrad); "
+    "axes x right, y down, z forward"
 )
 KNOWN = 1e-10 * np.eye(6)
 """Covariance written for a pose that is known exactly: standard deviations of 10 µm and 10 µrad, far below any error of
