@@ -21,8 +21,7 @@ from tables import Section, significant
 
 from sigmasplat.config.text import override
 from sigmasplat.errors import SourceError
-from sigmasplat.evaluation.pose_covariance import score_motions
-from sigmasplat.metrics.trajectory import associate
+from sigmasplat.evaluation.pose_covariance import MOTIONS, score_path_covariance
 from sigmasplat.presets import default_preset, preset as preset_of
 from sigmasplat.slam.path_covariance import PathCovariance
 from sigmasplat.slam.slam import Slam
@@ -30,8 +29,6 @@ from sigmasplat.sources import open_source
 
 arg = tyro.conf.arg
 NOISY = f"{accuracy.SYNTHETIC},noise=1"
-NAMES = {"hops": "keyframe to keyframe", "windows": "50 frames", "from_start": "from the start"}
-"""Kinds of motions, and their names in the table."""
 POOLED = "mean of the rooms with noise"
 
 
@@ -67,9 +64,7 @@ def measure(path: str, options: Options) -> dict[str, Any]:
     errors = PathCovariance.of(slam.checkpoint())
     assert errors is not None
     believed = np.flatnonzero(slam.believed())
-    rows, true_rows = associate(slam.trajectory().timestamps_s[believed], truth.timestamps_s)
-    true = dict(zip(believed[rows].tolist(), truth.T_world_camera[true_rows], strict=True))
-    found = score_motions(errors, true, [frame for frame in slam.keyframe_indices if frame in true])
+    found = score_path_covariance(errors, slam.trajectory().at(believed), believed, slam.keyframe_indices, truth)
     loops = sum(loop.accepted for loop in slam.loops)
     return {"frames": len(slam.steps), "submaps": len(slam.atlas.anchors), "loops": loops, **found}
 
@@ -77,12 +72,12 @@ def measure(path: str, options: Options) -> dict[str, Any]:
 def sections(measured: dict[str, Any]) -> list[Section]:
     """Return one table: rows for each sequence and kind of motion."""
     found = measured["figures"]["sources"]
-    rows = [cells(NAMES[kind], kind, [run]) for run in found for kind in NAMES]
-    for row, run in zip(rows, [run for run in found for _ in NAMES], strict=True):
+    rows = [cells(MOTIONS[kind], kind, [run]) for run in found for kind in MOTIONS]
+    for row, run in zip(rows, [run for run in found for _ in MOTIONS], strict=True):
         row.insert(0, run["source"])
     noisy = [run for run in found if "noise=1" in run["source"]]
     if len(noisy) > 1:
-        rows += [[POOLED, *cells(NAMES[kind], kind, noisy)] for kind in NAMES]
+        rows += [[POOLED, *cells(MOTIONS[kind], kind, noisy)] for kind in MOTIONS]
     head = ["sequence", "motion", "motions", "NEES, mean", "… median", "in the 90 % ellipsoid, %"]
     head += ["position: in its 90 % ellipsoid, %", "… k"]
     note = (

@@ -18,7 +18,16 @@ from ablation import short
 from tables import Section
 
 from sigmasplat.commands import options as described
-from sigmasplat.commands.bench_uncertainty import COLUMNS, DEFAULT_PRESET, Uncertainty, written
+from sigmasplat.commands.bench_uncertainty import (
+    COLUMNS,
+    DEFAULT_PRESET,
+    FAILURE_COLUMNS,
+    POSE_COLUMNS,
+    Uncertainty,
+    failure_rows,
+    pose_rows,
+    written,
+)
 from sigmasplat.errors import SigmaSplatError
 
 arg = tyro.conf.arg
@@ -26,6 +35,7 @@ SYNTHETIC = "synthetic:frames=240,noise=1,test_views=24,seed={seed}"
 """A different room for each seed."""
 SOURCES = ("synthetic", "livingroom", "redkitchen", "cubicles", "hololens")
 RUNS = record.ROOT / "runs" / "bench" / "uncertainty"
+FAILURES = "AUROC: how often p_off is higher for a frame that is off than for one that is not; ½ is random."
 KEPT = (
     "ause",
     "spearman",
@@ -97,7 +107,8 @@ def _thinned(scores: dict[str, Any]) -> dict[str, Any]:
 
 
 def sections(measured: dict[str, Any]) -> list[Section]:
-    """Return a table per quantity, map, kind of views and subset of pixels: one row per sequence and predictor."""
+    """Return a table per quantity, map, kind of views and subset of pixels: one row per sequence and predictor; then
+    the tables of poses and failures."""
     runs = measured["figures"]["runs"]
     kinds = dict.fromkeys(
         (quantity, map_name, views, subset)
@@ -108,7 +119,7 @@ def sections(measured: dict[str, Any]) -> list[Section]:
         for subset in subsets
     )
     coverage = coverage_table(runs)
-    return [*([coverage] if coverage.rows else []), *(kind_table(runs, kind) for kind in kinds)]
+    return [*([coverage] if coverage.rows else []), *(kind_table(runs, kind) for kind in kinds), *path_tables(runs)]
 
 
 def coverage_table(runs: list[dict[str, Any]]) -> Section:
@@ -132,6 +143,22 @@ def coverage_table(runs: list[dict[str, Any]]) -> Section:
     ]
     note = "Ideal: 68.3 % and 95 %; AUCE 0. Colour: all pixels; depth: where the map covers the pixel."
     return Section("Coverage of predicted errors, final map", ["sequence", "views", *head], lines, note)
+
+
+def path_tables(runs: list[dict[str, Any]]) -> list[Section]:
+    """Tabulate the scores of pose covariances and of `p_off`, if they were measured."""
+    sources = {
+        name: [run for run in runs if run["source"] == name] for name in dict.fromkeys(r["source"] for r in runs)
+    }
+    poses = [[name, *row] for name, of_source in sources.items() for row in pose_rows(of_source)]
+    failures = [[name, *row] for name, of_source in sources.items() for row in failure_rows(of_source)]
+    head = ["sequence", "motion", *(name for name, _, _ in POSE_COLUMNS)]
+    note = "NEES should be 6 on average, k = 1 (the variances of the position are k times too small)."
+    made = [
+        Section("Poses", head, poses, note),
+        Section("Failures", ["sequence", "frames", *(name for name, _, _ in FAILURE_COLUMNS)], failures, FAILURES),
+    ]
+    return [section for section in made if section.rows]
 
 
 def kind_table(runs: list[dict[str, Any]], kind: tuple[str, str, str, str]) -> Section:

@@ -62,6 +62,21 @@ def test_the_coverage_of_predicted_errors_has_a_row_per_sequence_and_kind_of_vie
     assert len(coverage.columns) == len(coverage.rows[0])
 
 
+def test_poses_and_failures_have_tables_of_their_own() -> None:
+    motion = {"count": 39, "nees_mean": 6.0, "nees_median": 5.0, "coverage_90": 0.9}
+    motion |= {"position_coverage_90": 0.85, "position_k": 1.1}
+    poses = {"window_frames": 50, "hops": motion, "windows": None, "from_start": motion | {"count": 199}}
+    failures = {"frames": 200, "off": 3, "auroc": 0.97, "brier": 0.01}
+    unknown, known = {"poses": None, "failures": None}, {"poses": poses, "failures": failures}
+    made = [run | (known if run["source"] == "/data/kitchen" else unknown) for run in runs()]
+    *_, of_poses, of_failures = uncertainty.sections({"figures": {"runs": made}})
+    assert [row[:3] for row in of_poses.rows] == [
+        ["/data/kitchen", "keyframe to keyframe", "39 ± 0"], ["/data/kitchen", "from the start", "199 ± 0"],
+    ]  # fmt: skip
+    assert [row[1] for row in of_failures.rows] == ["200 ± 0"] and of_failures.rows[0][3] == "0.970 ± 0.000"
+    assert all(len(section.columns) == len(row) for section in (of_poses, of_failures) for row in section.rows)
+
+
 def test_options_are_those_of_the_command(tmp_path: Path) -> None:
     options = uncertainty.Options(sources=("synthetic",), seeds=2, limit=30, runs=tmp_path)
     command = options.command()

@@ -203,6 +203,10 @@ def test_samples_have_every_predictor_and_both_maps(run: FinishedRun) -> None:
         assert all(np.isfinite(values).all() and values.min() >= 0.0 for values in arrays.values() if len(values))
 
     assert found.facts["frames"] == 13 and found.facts["held_back"] == 3 and found.facts["ate_m"] < 0.1
+    poses, failures = found.facts["poses"], found.facts["failures"]
+    assert poses["hops"]["count"] == found.facts["keyframes"] - 1 and poses["from_start"]["count"] == 12
+    assert poses["windows"] is None and 0.0 < poses["hops"]["nees_mean"] < 100.0
+    assert failures["frames"] == 13 and failures["off"] == 0
 
 
 def test_the_command_writes_scores_tables_and_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -211,7 +215,9 @@ def test_the_command_writes_scores_tables_and_pictures(tmp_path: Path, capsys: p
     assert command.run() == 0
     text = capsys.readouterr().out
     assert "AUSE" in text and "V" in text and "in-sample" in text
+    assert "keyframe to keyframe" in text and "AUROC" in text
     (scored,) = json.loads((out / "uncertainty.json").read_text())["runs"]
+    assert {"nees_mean", "coverage_90", "position_k"} <= scored["poses"]["from_start"].keys()
     row = scored["scores"]["color"]["final"][HELD_BACK]["all pixels"]["predictors"]["V + T prior"]
     assert {"ause", "spearman", "before", "after", "temperature"} <= row.keys()
     assert len(list(out.glob("*.png"))) >= 4

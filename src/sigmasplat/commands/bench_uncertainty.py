@@ -1,4 +1,5 @@
-"""Score predicted variances at views that the map was not fitted to: sigmasplat bench uncertainty."""
+"""Score predicted variances at views that the map was not fitted to, and those of poses: sigmasplat bench
+uncertainty."""
 
 import statistics
 from collections.abc import Callable, Iterator, Sequence
@@ -28,7 +29,8 @@ IN_SAMPLE = "after: after the temperature T of this sequence itself (in-sample);
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Score how well predicted variances match the errors of rendered views, and compare with simple baselines.
+    """Score how well predicted variances match the errors of rendered views, and compare with simple baselines. Also
+    score the covariance of poses and the probability of a wrong pose.
 
     Frames are held back from the map (input.hold_every) and rendered afterwards. Temperatures come from the other
     sequences, so give several. Finished runs in DIR are reused.
@@ -87,7 +89,8 @@ class Uncertainty:
         if not screen.out.is_terminal:
             screen.out.width = WIDTH
         for source in study.sources:
-            for made in tables(source, [run for run in runs if run["source"] == source]):
+            of_source = [run for run in runs if run["source"] == source]
+            for made in (*tables(source, of_source), *path_tables(source, of_source)):
                 screen.out.print(made)
         screen.say(f"{len(runs)} runs: {self.out / SCORES}")
         return 0
@@ -117,6 +120,57 @@ def tables(source: str, runs: Sequence[dict[str, Any]]) -> Iterator["Table"]:
                     yield _table(title, [scores for scores in found if scores])
 
 
+def path_tables(source: str, runs: Sequence[dict[str, Any]]) -> Iterator["Table"]:
+    """Yield a table of the scores of pose covariances and one of those of `p_off`, where they are known."""
+    from rich.table import Table
+
+    for title, head, columns, rows in (
+        ("poses", "motion", POSE_COLUMNS, pose_rows(runs)),
+        ("failures", "frames", FAILURE_COLUMNS, failure_rows(runs)),
+    ):
+        made = Table(head, title=f"{source}: {title}")
+        for name, _, _ in columns:
+            made.add_column(name, justify="right")
+        for cells in rows:
+            made.add_row(*cells)
+        if rows:
+            yield made
+
+
+def pose_rows(runs: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """Return a row for each kind of motion that was scored: its name, and the cells of `POSE_COLUMNS`."""
+    from sigmasplat.evaluation.pose_covariance import MOTIONS
+
+    rows = []
+    for kind, name in MOTIONS.items():
+        scores = [run["poses"][kind] for run in runs if run.get("poses") and run["poses"][kind]]
+        if scores:
+            rows.append([name, *(written([value(row) for row in scores], n) for _, n, value in POSE_COLUMNS)])
+    return rows
+
+
+def failure_rows(runs: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """Return one row if the truth is known: the mean number of frames, and the cells of `FAILURE_COLUMNS`."""
+    scores = [run["failures"] for run in runs if run.get("failures")]
+    if not scores:
+        return []
+    frames = written([row["frames"] for row in scores], 0)
+    return [[frames, *(written([value(row) for row in scores], digits) for _, digits, value in FAILURE_COLUMNS)]]
+
+
+POSE_COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], Any]], ...] = (
+    ("motions", 0, lambda row: row["count"]),
+    ("NEES, mean", 2, lambda row: row["nees_mean"]),
+    ("NEES, median", 2, lambda row: row["nees_median"]),
+    ("in 90 %, %", 1, lambda row: _percent(row["coverage_90"])),
+    ("position in 90 %, %", 1, lambda row: _percent(row["position_coverage_90"])),
+    ("k of position", 2, lambda row: row["position_k"]),
+)
+FAILURE_COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], Any]], ...] = (
+    ("off by > 5 cm", 0, lambda row: row["off"]),
+    ("AUROC of p_off", 3, lambda row: row["auroc"]),
+    ("Brier", 4, lambda row: row["brier"]),
+)
 COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], Any]], ...] = (
     ("NLL", 2, lambda row: row["before"]["nll"]),
     ("T", 2, lambda row: row["temperature"]),

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config
+from sigmasplat.evaluation.pose_covariance import score_path_covariance
 from sigmasplat.metrics.failures import score_failures
 from sigmasplat.metrics.trajectory import associate, truth_in_estimate
 from sigmasplat.model.camera import Camera
@@ -15,6 +16,7 @@ from sigmasplat.model.map_uncertainty import MapUncertainty
 from sigmasplat.model.submap import MemoryStore, SubmapStore
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.run.protocols import Callback
+from sigmasplat.slam.path_covariance import PathCovariance
 from sigmasplat.slam.rules import is_held_back
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources.base import Source
@@ -27,7 +29,8 @@ class FinishedRun:
 
     field: the final map in the world; store: its submaps; anchors: T_world_submap of each; members: the submaps that
     are connected to the world; submap_of [F]: the submap of each frame; believed [F]: whether its pose is believed;
-    indices [F]: its number in the source; p_off [F]; uncertainty: how sure the final map is, if it was measured.
+    indices [F]: its number in the source; p_off [F]; uncertainty: how sure the final map is, if it was measured;
+    errors: those of the path; keyframes: their rows.
     """
 
     config: Config
@@ -43,6 +46,8 @@ class FinishedRun:
     p_off: NDArray[np.float64]
     counts: dict[str, int]
     uncertainty: MapUncertainty | None
+    errors: PathCovariance | None
+    keyframes: list[int]
 
     @staticmethod
     def of(slam: Slam) -> "FinishedRun":
@@ -59,7 +64,7 @@ class FinishedRun:
             slam.config, slam.view.camera, slam.field, store, slam.atlas.anchors, slam.atlas.members(0),
             slam.trajectory(), [place.submap for place in slam.atlas.places], slam.believed(),
             [step.index for step in slam.steps], np.array([step.p_off for step in slam.steps]), counts,
-            slam.uncertainty,
+            slam.uncertainty, PathCovariance.of(slam.checkpoint()), slam.keyframe_indices,
         )  # fmt: skip
 
     @property
@@ -81,16 +86,15 @@ def run_slam(config: Config, source: Source, show: Callback | None = None) -> Fi
 
 
 def run_facts(run: FinishedRun, source: Source) -> dict[str, Any]:
-    """Return counts, and the scores of poses and of `p_off` if the truth is known.
-
-    "poses" is the place for NEES and coverage of pose covariances; it stays None until frames have a covariance.
-    """
+    """Return counts, and, if the truth is known, the scores of positions ("ate_m"), of `p_off` ("failures") and of the
+    covariance of poses ("poses")."""
     unknown = {"ate_m": None, "failures": None, "poses": None}
     return run.counts | {"held_back": len(run.held_back)} | unknown | _path_scores(run, source)
 
 
 def _path_scores(run: FinishedRun, source: Source) -> dict[str, Any]:
-    """Return the ATE and the scores of `p_off`; nothing without a truth that shares timestamps with the path."""
+    """Return the ATE, the scores of `p_off` and of the covariance of poses; nothing without a truth that shares
+    timestamps with the path."""
     truth, believed = source.truth(), run.believed
     if truth is None or not believed.any():
         return {}
@@ -104,4 +108,8 @@ def _path_scores(run: FinishedRun, source: Source) -> dict[str, Any]:
     error_m[rows] = np.linalg.norm(positions[rows] - true, axis=1)
     at = np.isfinite(error_m) & believed
     ate_m = float(np.sqrt(np.mean(error_m[at] ** 2)))
-    return {"ate_m": ate_m, "failures": score_failures(error_m, run.p_off, believed)}
+    found = {"ate_m": ate_m, "failures": score_failures(error_m, run.p_off, believed)}
+    if run.errors is not None:
+        at = np.flatnonzero(believed)
+        found["poses"] = score_path_covariance(run.errors, run.path.at(at), at, run.keyframes, truth)
+    return found

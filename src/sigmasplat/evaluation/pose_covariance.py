@@ -1,11 +1,12 @@
 """Score the covariance of a run's poses against the truth: hops between keyframes, windows, and from the start."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sigmasplat.io.frames import RunFrames
 from sigmasplat.io.runs import RunFolder
@@ -17,6 +18,8 @@ from sigmasplat.slam.path_covariance import PathCovariance
 from sigmasplat.types import Matrix
 
 WINDOW_FRAMES = 50
+MOTIONS = {"hops": "keyframe to keyframe", "windows": f"{WINDOW_FRAMES} frames", "from_start": "from the start"}
+"""Kinds of motions, and their names in tables."""
 
 
 def score_pose_covariance(run: RunFolder, frames: RunFrames, truth: Trajectory | None) -> dict[str, Any] | None:
@@ -29,9 +32,20 @@ def score_pose_covariance(run: RunFolder, frames: RunFrames, truth: Trajectory |
     errors = PathCovariance.of(run.read_checkpoint()[0])
     if errors is None or len(errors) <= frames.rows[-1]:
         return None
-    rows, true_rows = associate(frames.path.timestamps_s, truth.timestamps_s)
-    true = dict(zip(frames.rows[rows].tolist(), truth.T_world_camera[true_rows], strict=True))
-    return score_motions(errors, true, [frame for frame in true if frames.log[frame]["is_keyframe"]])
+    keyframes = [row for row, record in enumerate(frames.log) if record["is_keyframe"]]
+    return score_path_covariance(errors, frames.path, frames.rows, keyframes, truth)
+
+
+def score_path_covariance(
+    errors: PathCovariance, path: Trajectory, rows: NDArray[np.intp], keyframes: Iterable[int], truth: Trajectory
+) -> dict[str, Any]:
+    """Score the motions of `score_motions` between the believed frames with a true pose.
+
+    path: poses of the believed frames; rows: their numbers [B]; keyframes: the numbers of all keyframes.
+    """
+    matched, true_rows = associate(path.timestamps_s, truth.timestamps_s)
+    true = dict(zip(rows[matched].tolist(), truth.T_world_camera[true_rows], strict=True))
+    return score_motions(errors, true, [frame for frame in keyframes if frame in true])
 
 
 def score_motions(

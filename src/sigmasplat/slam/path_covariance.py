@@ -5,7 +5,8 @@ All errors are small. Three kinds of error move a hop:
   keyframes after they were tracked: independent from hop to hop;
 - the mean of this disagreement over all hops: the same in all hops, in the camera's axes;
 - the systematic error of alignment, which its estimate does not contain (`fit.align.BIAS_PX`): the same in all hops.
-The disagreement is measured in the run itself, so no constant describes how well tracking and mapping agree.
+The disagreement is measured in the run itself, so no constant describes how well tracking and mapping agree. Closed
+loops measure two more numbers in the run: factors on the variances of loops and of the systematic error (`Factors`).
 
 A pose is a linear function of all errors, and so is the motion between two poses. The closed loops are part of this
 function: it is the pose graph's solution.
@@ -14,19 +15,27 @@ function: it is the pose graph's solution.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order
 from torch import Tensor
 
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import Atlas
 from sigmasplat.slam.drift import UNKNOWN
 from sigmasplat.slam.loop_closure.pose_graph import Edge, Sensitivity
+from sigmasplat.slam.variance_factors import variance_factors
 from sigmasplat.types import Matrix
 
 Numbers = NDArray[np.int64]
+BIAS, MEAN = -2, -1
+"""Columns of the errors that are the same in all hops."""
+LOOPS_MOST = 40
+"""At most this many loops, evenly spread, determine `Factors`: a few already do, and the time grows with the cube."""
 
 
 def recorded(atlas: Atlas, edges: Sequence[Edge]) -> dict[str, Tensor]:
@@ -62,6 +71,14 @@ class Hops:
         """Return the covariance [6, 6] that tracking estimated for one hop, with its bias; None if it is not known."""
         covariance = self.covariance[row]
         return covariance + np.diag(self.bias[row] ** 2) if np.isfinite(covariance).all() else None
+
+
+class Factors(NamedTuple):
+    """Factors on variances, measured in a run: of its loops, whose claimed covariance is careful, and of the systematic
+    error. Both are 1 without a loop."""
+
+    loops: float = 1.0
+    bias: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +151,44 @@ class PathCovariance:
         """Return the poses of the frames [F, 4, 4]."""
         return np.asarray(self.anchors[self.frame_submap] @ self.T_submap_keyframe[self._row] @ self.T_keyframe_camera)
 
+    @cached_property
+    def factors(self) -> Factors:
+        """Return the factors on variances that make the disagreement of the loops with the chain of hops most probable.
+
+        A loop from a to b and the chain both measure T_a_b. The twist between the two is the loop's error minus that of
+        the chain. Loops between neighbouring submaps share most of the chain, so they show the errors of loops alone.
+        """
+        loops = [number for number, edge in enumerate(self.edges) if edge.loop]
+        if not loops:
+            return Factors()
+        chosen = [loops[i] for i in np.unique(np.linspace(0, len(loops) - 1, LOOPS_MOST).round().astype(int))]
+        chain, twists, errors = self._without_loops(), [], []
+        claimed = np.zeros((len(chosen), 6, len(chosen), 6))
+        for i, edge in enumerate(self.edges[number] for number in chosen):
+            T_a_world = se3.inverse(chain.anchors[edge.a])
+            twists.append(se3.log(T_a_world @ chain.anchors[edge.b] @ se3.inverse(edge.T_a_b)))
+            error = chain._error_of_submap(edge.b) - chain._error_of_submap(edge.a)
+            errors.append(np.einsum("ij,jnk->ink", se3.adjoint(T_a_world), error))
+            claimed[i, :, i] = np.linalg.inv(edge.information)
+        size = 6 * len(chosen)
+        joint = np.concatenate(errors)
+        bias, rest = joint[:, BIAS], np.delete(joint, BIAS, 1).reshape(size, -1)
+        parts = [claimed.reshape(size, size), bias @ bias.T]
+        return Factors(*variance_factors(np.concatenate(twists), rest @ rest.T, parts))
+
+    def _without_loops(self) -> "PathCovariance":
+        """Return the path as the trusted edges alone give it."""
+        edges = tuple(edge for edge in self.edges if not edge.loop)
+        motions = {(edge.a, edge.b): edge.T_a_b for edge in edges}
+        motions |= {(edge.b, edge.a): se3.inverse(edge.T_a_b) for edge in edges}
+        a, b = np.array(list(motions), np.intp).reshape(-1, 2).T
+        connected, anchors = coo_array((np.ones(len(a)), (a, b)), shape=(len(self.anchors),) * 2), self.anchors.copy()
+        for first in np.unique(self.components, return_index=True)[1]:
+            order, before = breadth_first_order(connected, first)
+            for submap in order[1:]:
+                anchors[submap] = anchors[before[submap]] @ motions[before[submap], submap]
+        return replace(self, anchors=anchors, edges=edges)
+
     # ---- rows of keyframes ----
 
     @cached_property
@@ -176,11 +231,15 @@ class PathCovariance:
         submap = int(self.keyframe_submap[row])
         error = self._error_of_submap(submap).copy()
         self._add_hops(error, se3.adjoint(self.anchors[submap]), self._rows_of_hops(submap, row))
+        loops = len(self.keyframe_submap) + np.flatnonzero([edge.loop for edge in self.edges])
+        error[:, loops] *= np.sqrt(self.factors.loops)
+        error[:, BIAS] *= np.sqrt(self.factors.bias)
         return error.reshape(6, -1)
 
     @lru_cache(maxsize=8)  # noqa: B019
     def _error_of_submap(self, submap: int) -> Matrix:
-        """Return the error of an anchor as a matrix [6, n, 6]: n is K hops, then all edges, then `_shared`."""
+        """Return the error of an anchor as a matrix [6, n, 6], before `factors`: n is K hops, then all edges, then
+        `_shared`."""
         count = len(self.keyframe_submap)
         error = np.zeros((6, count + len(self.edges) + len(self._shared), 6))
         graph = self._graphs[int(self.components[submap])]
@@ -198,7 +257,7 @@ class PathCovariance:
     def _add_hops(self, error: Matrix, A: Matrix, rows: slice) -> None:
         """Add the errors of a chain of hops, transformed by A [6, 6]."""
         error[:, rows] += np.swapaxes(A @ self._independent[rows], 0, 1)
-        for shared, column in zip(self._shared, (-2, -1), strict=True):
+        for shared, column in zip(self._shared, (BIAS, MEAN), strict=True):
             error[:, column] += A @ shared[rows].sum(0)
 
     @cached_property
