@@ -12,8 +12,9 @@ from sigmasplat.model.map_uncertainty import MapUncertainty, SplatStd
 from sigmasplat.render.predictive import COVERED, predicted, variance_parts
 from sigmasplat.render.render import on_device
 
-PSEUDO_PIXELS = 0.03
-"""Weight of the background's variance, in pixels: it decides for splats that no keyframe shows."""
+PSEUDO_PIXELS = 0.003
+"""Weight of the background's variance, in pixels: it decides for splats that no keyframe shows. A larger weight would
+count for small splats that one keyframe shows."""
 LEAST = 1e-12
 """Least variance of a pixel, colour² and m²: its logarithm is finite."""
 
