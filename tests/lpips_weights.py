@@ -41,6 +41,9 @@ def write_weights(folder: Path, net: Net) -> tuple[nn.Sequential, list[Tensor]]:
     """Write both files of a network with random weights, as torchvision and lpips save them; return what they hold."""
     torch.manual_seed(3)
     features = NETWORKS[net]()
+    for layer in features:
+        if isinstance(layer, nn.Conv2d):
+            nn.init.kaiming_normal_(layer.weight)  # features of the last layers then still differ
     folder.mkdir(parents=True, exist_ok=True)
     trunk = {f"features.{name}": tensor for name, tensor in features.state_dict().items()}
     torch.save(trunk | {"classifier.6.bias": torch.zeros(1000)}, folder / TRUNK_FILES[net])

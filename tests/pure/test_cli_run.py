@@ -18,9 +18,11 @@ import torch
 from rich.console import Console
 
 from command_line import exit_code
+from lpips_weights import write_weights
 from sigmasplat import cli
 from sigmasplat.config import Config
 from sigmasplat.errors import SigmaSplatError, SourceError
+from sigmasplat.io.mesh import write_mesh
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.splats.ply import read_field
 from sigmasplat.io.submaps import DiskStore
@@ -29,6 +31,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.component import Component
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render.cuda import stages as cuda_stages
@@ -185,9 +188,14 @@ def corridor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Corridor:
     return source
 
 
-def evaluate(run: RunFolder, source: Source, *, mesh: bool, progress: Callable[[int, int], None]) -> dict[str, Any]:
+GIVEN = dict[str, Any]()
+"""The options of the last evaluation."""
+
+
+def evaluate(run: RunFolder, source: Source, *, progress: Callable[[int, int], None], **options: Any) -> dict[str, Any]:
     """Replace the evaluation."""
     progress(1, 1)
+    GIVEN.update(options)
     log = run.read_log()
     lost = [record["index"] for record in log if record["lost"]]
     metrics = METRICS | {"frames": len(log), "lost": len(lost), "lost_frames": lost}
@@ -525,6 +533,20 @@ def test_a_wrong_depth_unit_gives_a_warning(corridor: Corridor, capsys: pytest.C
     err = capsys.readouterr().err
     assert err.startswith("warning: ")
     assert "2000 m" in err
+
+
+def test_options_of_eval_reach_the_evaluation(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code("run", "corridor", "--out", "mine") == 0
+    plain = {"mesh": False, "true_mesh": None, "random_views": 1000, "full_resolution": False, "lpips": None}
+    assert plain == GIVEN and "LPIPS" not in capsys.readouterr().out
+    write_mesh(Path("wall.ply"), Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32)))
+    write_weights(Path("data/lpips/alex"), "alex")
+    given = ("--true-mesh", "wall.ply", "--random-views", "7", "--full-resolution")
+    assert exit_code("eval", "mine", *given) == 0
+    assert GIVEN["mesh"] and len(GIVEN["true_mesh"].faces) == 1 and GIVEN["lpips"].net == "alex"
+    assert (GIVEN["random_views"], GIVEN["full_resolution"]) == (7, True)
+    assert exit_code("eval", "mine", "--lpips-net", "vgg") == 0
+    assert GIVEN["lpips"] is None and "no vgg.pth in data/lpips" in capsys.readouterr().out
 
 
 def test_eval_and_export_read_what_run_wrote(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
