@@ -41,7 +41,7 @@ def splats(n: int) -> torch.Tensor:
     return torch.rand(n, 3, generator=torch.Generator().manual_seed(4)) * 0.01
 
 
-def test_mixture_and_unexplained_light_are_the_variance_of_a_drawn_color() -> None:
+def test_mixture_and_unexplained_light_are_the_squared_error_of_the_render_against_a_drawn_color() -> None:
     """A pixel shows splat i with probability w_i, with noise σ_i, and the background with probability 1 − A."""
     s = scene("random", 40, WIDE)
     field, T = field_of(s), s.T_camera_world.numpy()
@@ -57,12 +57,14 @@ def test_mixture_and_unexplained_light_are_the_variance_of_a_drawn_color() -> No
     drawn = means[chosen] + stds[chosen] * rng.normal(size=(len(chosen), 3))
     total = parts.color[COLOR_PARTS.index("mixture")] + parts.color[COLOR_PARTS.index("unexplained")]
     assert 0.1 < weights.sum() < 0.999
-    assert float(total[row, column]) == pytest.approx(drawn.var(0).mean(), rel=0.01)
+    error2 = (drawn - parts.image[row, column].numpy()) ** 2
+    assert float(total[row, column]) == pytest.approx(error2.mean(), rel=0.01)
 
 
 def test_where_the_map_is_empty_the_background_alone_is_predicted() -> None:
     parts = variance_parts(GaussianField.empty(), torch.zeros(0, 3), BACKGROUND, WIDE, np.eye(4), OPTIONS, "reference")
-    expected = {"unexplained": BACKGROUND.color_variance, "floor": 1.0}
+    black2 = sum(c**2 for c in BACKGROUND.color) / 3
+    expected = {"unexplained": BACKGROUND.color_variance + black2, "floor": 1.0}
     for name, plane in zip(COLOR_PARTS, parts.color, strict=True):
         assert torch.allclose(plane, torch.full_like(plane, expected.get(name, 0.0))), name
     for name, plane in zip(DEPTH_PARTS, parts.depth, strict=True):

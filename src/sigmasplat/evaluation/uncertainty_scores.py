@@ -16,6 +16,7 @@ from sigmasplat.metrics.uncertainty import (
     best_scale,
     calibration_scores,
     gaussian_nll,
+    over_channels,
     ranking_scores,
     sparsification,
     z_scores,
@@ -69,7 +70,8 @@ def subsets(kind: Kind, arrays: Arrays) -> dict[str, NDArray[np.bool_]]:
 
 
 def predicted(predictor: Predictor, arrays: Arrays, pixels: NDArray[np.bool_]) -> tuple[Any, Any]:
-    """Return the variance (in its unit, or at its best scale if it has none) and the squared error of some pixels."""
+    """Return the variance [P] (in its unit, or at its best scale if it has none) and the squared errors of some pixels,
+    [P, C] for each channel."""
     variance, error2 = arrays[f"variance {predictor.name}"][pixels], arrays["squared_error"][pixels]
     if predictor.scaled:
         variance = (variance + np.float32(EPSILON)) * np.float32(best_scale(variance, error2))
@@ -157,7 +159,7 @@ def sparsification_charts(kind: Kind, arrays: Arrays, predictors: Sequence[Predi
     """
     wanted = [p for p in predictors if p.quantity == kind.quantity]
     quantity, unit = ("colour", "0 to 1") if kind.quantity == "color" else ("depth", "m")
-    error2 = arrays["squared_error"]
+    error2 = over_channels(arrays["alpha"], arrays["squared_error"])
     top = HEADROOM * float(np.sqrt(error2.mean()))
 
     def curve(name: str, order_by: NDArray[np.float32], colour: int) -> Curve:

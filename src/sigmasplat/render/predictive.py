@@ -38,9 +38,10 @@ class VarianceParts:
     rendered: image Ĉ [H, W, 3], depth_m D̂/A [H, W], alpha [H, W].
 
     Colour: mixture = Σw(σ²+c²) − |Ĉ|²/A, the variance among the splats of a pixel; residual = Σ w r², r² the squared
-    residual of a splat at the keyframes; unexplained = T (σ_b² + A |c_b − Ĉ/A|²), T = 1 − A, of a background of mean
-    c_b and variance σ_b²; edges = |∇Ĉ|² per rad², the effect of a shift of the image; floor = 1. The first and the
-    third sum to the law of total variance. Depth: ray = U/A about D̂/A; residual, unexplained and edges as for colour;
+    residual of a splat at the keyframes; unexplained = T (σ_b² + A |c_b − Ĉ/A|²) + T² |c_b|², T = 1 − A, of a
+    background of mean c_b and variance σ_b²; edges = |∇Ĉ|² per rad², the effect of a shift of the image; floor = 1.
+    The first and the third sum to the mean squared error of Ĉ by the law of total variance; Ĉ leaves out the
+    background, which is the T² |c_b|² of it. Depth: ray = U/A about D̂/A; residual, unexplained and edges as for colour;
     sensor = depth⁴; floor = 1.
     """
 
@@ -95,11 +96,13 @@ def variance_parts(
     about = blend_values(field, camera, T_camera_map, splats[:, :0], options, backend, depth_m).moment
     assert about is not None, "a blend with a depth reference has a moment"
     missing = (1.0 - alpha).clamp(min=0.0)
-    away = (seen.color.new_tensor(background.color) - seen.color / some[..., None]).square().mean(-1)
+    behind = seen.color.new_tensor(background.color)
+    away = (behind - seen.color / some[..., None]).square().mean(-1)
+    left_out = missing.square() * behind.square().mean()
     color = [
         (seen.second - seen.color.square() / some[..., None]).mean(-1).clamp(min=0.0),
         seen.values[..., 0],
-        missing * (background.color_variance + alpha * away),
+        missing * (background.color_variance + alpha * away) + left_out,
         slope2(seen.color, camera).mean(-1),
         torch.ones_like(alpha),
     ]
