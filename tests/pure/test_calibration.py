@@ -47,3 +47,10 @@ def test_a_limit_keeps_gross_errors_from_deciding() -> None:
     errors[::200] += 1.0
     plain, limited = (fit_weights(parts, errors, START, 2000, limit)["c"] for limit in (np.inf, 3.0))
     assert limited < 3 * TRUE["c"] < plain
+
+
+def test_a_firm_weight_stays_near_the_given_one() -> None:
+    parts, errors = drawn(4000)
+    free, firm = (fit_weights(parts, errors, START, 10, firm=names) for names in ((), ("b",)))
+    assert firm["b"] == pytest.approx(START["b"], rel=0.1) and abs(np.log(free["b"] / START["b"])) > 0.3
+    assert firm["a"] < 0.7 * START["a"], "the others are fitted"

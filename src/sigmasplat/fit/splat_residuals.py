@@ -16,7 +16,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.map_uncertainty import Background
 from sigmasplat.render.blended_values import BlendedValues, blend_values
-from sigmasplat.render.predictive import COVERED
+from sigmasplat.render.predictive import COVERED, directions_toward
 from sigmasplat.render.render import on_device
 
 UPDATES = 2
@@ -53,7 +53,8 @@ def splat_residuals(
     backend: str,
     updates: int = UPDATES,
 ) -> Tensor:
-    """Return the variances of each splat [N, 3] (`SPLAT_COLUMNS`) from keyframes with poses in the map's frame.
+    """Return the variances and the mean viewing direction of each splat [N, 6] (`SPLAT_COLUMNS`) from keyframes with
+    poses in the map's frame.
 
     The first two start at the squared mean of the absolute residuals, which outliers hardly change. The third is
     m² + v/n: m is the mean of the splat's depth residuals, v their variance about it, n the number of readings.
@@ -61,21 +62,22 @@ def splat_residuals(
     field = on_device(field, backend)
     sums = torch.zeros(len(field), 4, dtype=torch.float64)
     moments = torch.zeros(len(field), 2, dtype=torch.float64)
-    start = torch.zeros(len(field), 2)
-    for seen, errors, known, off_m in _residuals(field, keyframes, start, options, backend):
+    start, directions = torch.zeros(len(field), 2), torch.zeros(len(field), 3, dtype=torch.float64)
+    for seen, errors, known, off_m, toward in _residuals(field, keyframes, start, options, backend):
         limited = off_m.clamp(-FARTHEST_M, FARTHEST_M)
         planes = torch.cat([errors.sqrt() * known, known, torch.stack([limited, limited.square()], -1)], -1)
         found = seen.gather(planes).cpu().double()
         sums, moments = sums + found[:, :4], moments + found[:, 4:]
+        directions += found[:, 2:3] * toward
     usual = sums[:, :2].sum(0) / sums[:, 2:].sum(0).clamp(min=1e-12)
     variances = ((sums[:, :2] + PSEUDO_PIXELS * usual) / (sums[:, 2:] + PSEUDO_PIXELS)).square().clamp(min=1e-12)
     first, prior = variances, torch.tensor([background.color_variance, background.depth_variance_m2])
-    readings = sums[:, 3]
+    readings, directions = sums[:, 3], directions / sums[:, 2:3].clamp(min=1e-12)
     mean, square = (moments / readings.clamp(min=1e-3)[:, None]).T
     own = mean**2 + (square - mean**2).clamp(min=0.0) / readings.clamp(min=1.0)
     for _ in range(updates):
         sums = torch.zeros_like(sums)
-        for seen, errors, known, _ in _residuals(field, keyframes, variances.float(), options, backend):
+        for seen, errors, known, _, _ in _residuals(field, keyframes, variances.float(), options, backend):
             share, missing = _share(seen), (1.0 - seen.alpha).clamp(min=0.0)[..., None]
             V = seen.values * share + missing * prior.to(missing) + missing.new_tensor(FLOOR)
             limited = torch.minimum(errors, LIMIT**2 * V)
@@ -84,21 +86,21 @@ def splat_residuals(
             )
         above, below = sums[:, :2] + PSEUDO_PIXELS * first / variances**2, sums[:, 2:] + PSEUDO_PIXELS / variances
         variances = variances * (above / below).clamp(1.0 / CHANGE, CHANGE)
-    return torch.cat([variances, own[:, None]], 1).float()
+    return torch.cat([variances, own[:, None], directions], 1).float()
 
 
 def _residuals(
     field: GaussianField, keyframes: Iterable[Keyframe], values: Tensor, options: RenderConfig, backend: str
-) -> Iterator[tuple[BlendedValues, Tensor, Tensor, Tensor]]:
+) -> Iterator[tuple[BlendedValues, Tensor, Tensor, Tensor, Tensor]]:
     """Yield each keyframe rendered with values [N, 2]: squared errors [H, W, 2] of colour and depth, which are known,
-    and the error of depth [H, W] m, 0 if not known."""
+    the error of depth [H, W] m, 0 if not known, and unit vectors from the splats to its camera [N, 3]."""
     for keyframe in keyframes:
         target, T_camera_map = keyframe.target, se3.inverse(keyframe.T_world_camera)
         seen = blend_values(field, target.camera, T_camera_map, values, options, backend, gather=True)
         image, depth = (plane.to(seen.alpha) for plane in (target.image, target.depth_image))
         errors, known = squared_errors(seen.color, seen.depth, seen.alpha, image, depth)
         off_m = (seen.depth / seen.alpha.clamp(min=COVERED) - depth) * known[..., 1]
-        yield seen, errors, known, off_m
+        yield seen, errors, known, off_m, directions_toward(field, keyframe.T_world_camera).cpu().double()
 
 
 def squared_errors(

@@ -20,7 +20,7 @@ from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.tensors import open_tensors, write_tensors
 from sigmasplat.model.component import Component
 from sigmasplat.model.field import GaussianField
-from sigmasplat.model.map_uncertainty import SPLAT_COLUMNS, MapUncertainty, SplatStd, splat_std
+from sigmasplat.model.map_uncertainty import SPLAT_COLUMNS, VARIANCES, MapUncertainty, SplatStd, splat_std
 from sigmasplat.model.trajectory import Trajectory
 
 PROGRAM = "sigmasplat"
@@ -254,7 +254,8 @@ class RunFolder:
         if uncertainty is None:
             return None
         field = self.read_map()
-        if uncertainty.splats.shape != (len(field), len(SPLAT_COLUMNS)):
+        columns = uncertainty.splats.shape[1]
+        if len(uncertainty.splats) != len(field) or columns not in (VARIANCES, len(SPLAT_COLUMNS)):
             rows = len(uncertainty.splats)
             raise RunError(f"{self.path} has uncertainties of {rows} rows for {len(field)} splats; run it again")
         return field, splat_std(field, uncertainty)
