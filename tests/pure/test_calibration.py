@@ -51,6 +51,7 @@ def test_a_limit_keeps_gross_errors_from_deciding() -> None:
 
 def test_a_firm_weight_stays_near_the_given_one() -> None:
     parts, errors = drawn(4000)
-    free, firm = (fit_weights(parts, errors, START, 10, firm=names) for names in ((), ("b",)))
-    assert firm["b"] == pytest.approx(START["b"], rel=0.1) and abs(np.log(free["b"] / START["b"])) > 0.3
-    assert firm["a"] < 0.7 * START["a"], "the others are fitted"
+    free, firm = (fit_weights(parts, errors, START, 3, firm=names) for names in ((), ("b",)))
+    moved = [abs(np.log(found["b"] / START["b"])) for found in (free, firm)]
+    assert moved[1] < 0.3 * moved[0]
+    assert firm["a"] < 0.9 * START["a"], "the others are fitted"
