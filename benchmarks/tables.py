@@ -25,7 +25,7 @@ SUBJECTS = {
     "Whole runs": ("accuracy", "systems", "every_preset"),
     "Other systems": ("peers",),
     "Effect of σ²": ("ablation", "color_covariance"),
-    "Uncertainty": ("uncertainty", "pose_covariance"),
+    "Uncertainty": ("uncertainty", "uncertainty_weights", "pose_covariance"),
     "Camera tracking": ("tracking", "pose_gradient", "relocalisation"),
     "Robustness": ("robustness", "failure_probability"),
     "Loops and submaps": ("loops", "drift_rule"),

@@ -7,6 +7,7 @@ import torch
 from sigmasplat.config import RenderConfig
 from sigmasplat.fit.splat_residuals import splat_residuals
 from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.map_uncertainty import (
     COLOR_PARTS,
@@ -18,7 +19,7 @@ from sigmasplat.model.map_uncertainty import (
 )
 from sigmasplat.render import render
 from sigmasplat.render.blended_values import blend_values
-from sigmasplat.render.predictive import predict, variance_parts
+from sigmasplat.render.predictive import novelty, predict, variance_parts
 from splat_scenes import WIDE, Scene, assert_same_vector, scene
 
 BACKGROUND = Background((0.4, 0.5, 0.3), 0.05, 0.8)
@@ -40,7 +41,12 @@ def splats(n: int) -> torch.Tensor:
     return torch.rand(n, 3, generator=torch.Generator().manual_seed(4)) * 0.01
 
 
-def test_mixture_and_unexplained_light_are_the_variance_of_a_drawn_color() -> None:
+def directions(n: int) -> torch.Tensor:
+    """Draw unit vectors."""
+    return torch.nn.functional.normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(5)), dim=1)
+
+
+def test_mixture_and_unexplained_light_are_the_squared_error_of_the_render_against_a_drawn_color() -> None:
     """A pixel shows splat i with probability w_i, with noise σ_i, and the background with probability 1 − A."""
     s = scene("random", 40, WIDE)
     field, T = field_of(s), s.T_camera_world.numpy()
@@ -56,12 +62,14 @@ def test_mixture_and_unexplained_light_are_the_variance_of_a_drawn_color() -> No
     drawn = means[chosen] + stds[chosen] * rng.normal(size=(len(chosen), 3))
     total = parts.color[COLOR_PARTS.index("mixture")] + parts.color[COLOR_PARTS.index("unexplained")]
     assert 0.1 < weights.sum() < 0.999
-    assert float(total[row, column]) == pytest.approx(drawn.var(0).mean(), rel=0.01)
+    error2 = (drawn - parts.image[row, column].numpy()) ** 2
+    assert float(total[row, column]) == pytest.approx(error2.mean(), rel=0.01)
 
 
 def test_where_the_map_is_empty_the_background_alone_is_predicted() -> None:
     parts = variance_parts(GaussianField.empty(), torch.zeros(0, 3), BACKGROUND, WIDE, np.eye(4), OPTIONS, "reference")
-    expected = {"unexplained": BACKGROUND.color_variance, "floor": 1.0}
+    black2 = sum(c**2 for c in BACKGROUND.color) / 3
+    expected = {"unexplained": BACKGROUND.color_variance + black2, "floor": 1.0}
     for name, plane in zip(COLOR_PARTS, parts.color, strict=True):
         assert torch.allclose(plane, torch.full_like(plane, expected.get(name, 0.0))), name
     for name, plane in zip(DEPTH_PARTS, parts.depth, strict=True):
@@ -71,7 +79,8 @@ def test_where_the_map_is_empty_the_background_alone_is_predicted() -> None:
 
 def test_every_backend_renders_the_same_parts(kernels: str) -> None:
     s = scene("random", 60, WIDE)
-    field, T, values = field_of(s), s.T_camera_world.numpy(), splats(60)
+    field, T = field_of(s), s.T_camera_world.numpy()
+    values = torch.cat([splats(60), 0.9 * directions(60)], 1)
     exact = variance_parts(field, values.double(), BACKGROUND, WIDE, T, OPTIONS, "reference")
     single = GaussianField(field.params.float())
     found = variance_parts(single, values, BACKGROUND, WIDE, T, OPTIONS, kernels)
@@ -138,3 +147,25 @@ def test_the_depth_of_a_splat_is_surer_than_a_reading_unless_all_readings_disagr
     own = splat_residuals(field, keyframes, OPTIONS, "cpu")[:, 2].sqrt()
     assert float(own[at[:, 0] < 18].median()) < 0.02
     assert float(own[at[:, 0] > 26].median()) == pytest.approx(0.1, rel=0.2)
+
+
+def test_only_views_beyond_the_seen_directions_are_extrapolated() -> None:
+    field, _ = wall()
+    seen = render(field, WIDE, np.eye(4))
+    target = Target(WIDE, seen.color.movedim(-1, 0).contiguous(), seen.depth / seen.alpha, seen.depth.numel())
+    sideways, far = (camera_beside_the_wall(angle) for angle in (0.15, 0.9))
+    keyframes = [Keyframe(0, target, np.eye(4)), Keyframe(1, target, sideways)]
+    seen_from = splat_residuals(field, keyframes, NOTHING, OPTIONS, "cpu")[:, 3:]
+    both = (seen_from != 0.0).any(1) & (seen_from.norm(dim=1) < 0.999)
+    assert both.sum() > 100, "splats that both keyframes see"
+    for T_map_camera in (np.eye(4), sideways):
+        assert float(novelty(field, seen_from, se3.inverse(T_map_camera))[both].quantile(0.9)) < 0.1
+    assert float(novelty(field, seen_from, se3.inverse(far))[both].min()) > 0.9
+    assert not novelty(field, seen_from[:, :0], se3.inverse(far)).any(), "directions are not known"
+
+
+def camera_beside_the_wall(angle_rad: float) -> np.ndarray:
+    """Return T_map_camera of a camera that is turned about a vertical axis through the wall at 2 m."""
+    T = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, angle_rad, 0.0]))
+    T[:3, 3] = np.array([0.0, 0.0, 2.0]) - T[:3, :3] @ np.array([0.0, 0.0, 2.0])
+    return T

@@ -47,3 +47,11 @@ def test_a_limit_keeps_gross_errors_from_deciding() -> None:
     errors[::200] += 1.0
     plain, limited = (fit_weights(parts, errors, START, 2000, limit)["c"] for limit in (np.inf, 3.0))
     assert limited < 3 * TRUE["c"] < plain
+
+
+def test_a_firm_weight_stays_near_the_given_one() -> None:
+    parts, errors = drawn(4000)
+    free, firm = (fit_weights(parts, errors, START, 3, firm=names) for names in ((), ("b",)))
+    moved = [abs(np.log(found["b"] / START["b"])) for found in (free, firm)]
+    assert moved[1] < 0.3 * moved[0]
+    assert firm["a"] < 0.9 * START["a"], "the others are fitted"

@@ -12,6 +12,7 @@ from sigmasplat.metrics.uncertainty import (
     calibration_scores,
     coverage,
     gaussian_nll,
+    ranking_scores,
     reliability,
     score,
     sparsification,
@@ -89,6 +90,18 @@ def test_intervals_of_a_true_variance_contain_their_share() -> None:
     assert scores["coverage_68"] == pytest.approx(0.6827, abs=0.01)
     assert scores["coverage_95"] == pytest.approx(0.95, abs=0.01)
     assert scores["z_rms"] == pytest.approx(1.0, abs=0.02) and scores["z_68"] == pytest.approx(1.0, abs=0.02)
+
+
+def test_intervals_of_a_color_contain_their_share_of_the_errors_of_single_channels() -> None:
+    """The mean of three independent channels is closer to V than a channel: its coverage is wrong for the true V."""
+    v, _ = noise()
+    channels = v[:, None] * np.random.default_rng(5).normal(size=(len(v), 3)) ** 2
+    scores = calibration_scores(v, channels, 0.0)
+    assert scores["auce"] < 0.005 and scores["coverage_68"] == pytest.approx(0.6827, abs=0.01)
+    assert auce(v, channels.mean(1), 0.0) > 0.1
+    assert scores["nll"] == pytest.approx(gaussian_nll(v, channels.mean(1), 0.0))
+    assert best_scale(v, channels) == pytest.approx(best_scale(v, channels.mean(1)))
+    assert ranking_scores(v, channels) == ranking_scores(v, channels.mean(1))
 
 
 @pytest.mark.parametrize("factor", [2.0, 0.5])

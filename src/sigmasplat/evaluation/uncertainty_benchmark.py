@@ -103,8 +103,9 @@ class Kind:
 
 @dataclass(eq=False)
 class Samples:
-    """Pixels of many views: squared error [P], alpha [P], whether there is a depth reading [P], and the variance [P]
-    that each predictor gives, by name."""
+    """Pixels of many views: squared error [P, C] of C channels (3 of colour, 1 of depth), alpha [P], whether there is
+    a depth reading [P], and the variance [P] that each predictor gives, by name.
+    """
 
     squared_error: list[Floats] = field(default_factory=list)
     alpha: list[Floats] = field(default_factory=list)
@@ -224,19 +225,19 @@ def _pixels(
     Colour is scored on all pixels; depth where the view has a reading and the map covers the pixel.
     """
     alpha, frame = _array(seen.rendered.alpha), view.frame
-    color_error2 = ((np.clip(_array(seen.rendered.color), 0.0, 1.0) - frame.color) ** 2).mean(-1)
+    color_error2 = (np.clip(_array(seen.rendered.color), 0.0, 1.0) - frame.color) ** 2
     known = (frame.depth_m > 0) & (alpha > COVERED_ALPHA)
     errors = {
         "color": (color_error2, np.arange(alpha.size)),
-        "depth": ((_array(seen.depth_m) - frame.depth_m) ** 2, np.flatnonzero(known)),
+        "depth": (((_array(seen.depth_m) - frame.depth_m) ** 2)[..., None], np.flatnonzero(known)),
     }
     planes = {(p.quantity, p.name): _array(p.plane(seen)).ravel() for p in predictors}
     found = dict[str, dict[str, Floats]]()
     for quantity, (error2, rows) in errors.items():
         chosen = random.permutation(rows)[:PIXELS_PER_VIEW]
         reading = (frame.depth_m > 0).astype(np.float32)
-        values = {"squared_error": error2, "alpha": alpha, "reading": reading}
-        columns = {name: plane.ravel()[chosen] for name, plane in values.items()}
+        columns = {"squared_error": error2.reshape(-1, error2.shape[-1])[chosen]}
+        columns |= {name: plane.ravel()[chosen] for name, plane in (("alpha", alpha), ("reading", reading))}
         mine = {name: plane[chosen] for (of, name), plane in planes.items() if of == quantity}
         found[quantity] = columns | {f"variance {name}": values for name, values in mine.items()}
     return found

@@ -17,6 +17,7 @@ from sigmasplat.metrics.uncertainty import (
     best_scale,
     calibration_scores,
     gaussian_nll,
+    over_channels,
     ranking_scores,
     sparsification,
     z_scores,
@@ -87,7 +88,8 @@ def _fitted_on(kind: Kind) -> Kind:
 
 
 def predicted(predictor: AnyPredictor, arrays: Arrays, pixels: NDArray[np.bool_]) -> tuple[Any, Any]:
-    """Return the variance (in its unit, or at its best scale if it has none) and the squared error of some pixels."""
+    """Return the variance [P] (in its unit, or at its best scale if it has none) and the squared errors of some pixels,
+    [P, C] for each channel."""
     variance, error2 = arrays[f"variance {predictor.name}"][pixels], arrays["squared_error"][pixels]
     if predictor.scaled:
         variance = (variance + np.float32(EPSILON)) * np.float32(best_scale(variance, error2))
@@ -179,7 +181,7 @@ def sparsification_charts(kind: Kind, arrays: Arrays, predictors: Sequence[AnyPr
     quantity, y_label, removed = QUANTITIES[kind.quantity]
     title = f"{quantity}, {MAP_TITLES.get(kind.map, kind.map)}, {VIEW_TITLES.get(kind.views, kind.views)}"
     x_label = f"{removed} removed, largest predicted variance first, %"
-    error2 = arrays["squared_error"]
+    error2 = over_channels(arrays["alpha"], arrays["squared_error"])
     top = HEADROOM * float(np.sqrt(error2.mean()))
 
     def curve(name: str, order_by: NDArray[np.float32], colour: int, width: float = 2.0) -> Curve:

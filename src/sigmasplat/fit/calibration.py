@@ -1,6 +1,6 @@
 """Fit the weights of the parts of a predicted variance to squared errors, by maximum likelihood."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,8 @@ PIXELS_PER_VIEW = 30.0
 """Number of independent pixels that a view counts as: errors of neighbouring pixels are correlated."""
 PULL = 1.0
 """Standard deviation of the logarithm of a weight about the weight that it is pulled to."""
+FIRM_PULL = 0.1
+"""The same for weights that the views of a run say little about."""
 RANGE = 9.0
 """A weight changes at most by the exponential of this."""
 REWEIGHTED = 6
@@ -24,34 +26,36 @@ def fit_weights(
     pulled_to: Mapping[str, float],
     views: int,
     limit: float = np.inf,
+    firm: Collection[str] = (),
 ) -> dict[str, float]:
     """Return the weights a > 0 that maximise the Gaussian likelihood of errors with variance V = Σ_k a_k V_k, and a
     log-normal prior about `pulled_to`.
 
     parts: planes V_k [P] by name; squared_error [P]; views: number of views that the pixels come from. Without pixels
     the weights are those of `pulled_to`. limit: squared errors above limit² V count as limit² V, so that the weights
-    describe most pixels rather than the largest errors.
+    describe most pixels rather than the largest errors. firm: weights that hardly move from `pulled_to`.
     """
     names = list(pulled_to)
     center = np.log([pulled_to[name] for name in names])
     if not len(squared_error):
         return dict(pulled_to)
+    pull = np.array([FIRM_PULL if name in firm else PULL for name in names])
     planes = np.stack([parts[name] for name in names]).astype(np.float64)
     strength, logs, errors = PIXELS_PER_VIEW * views, center, squared_error.astype(np.float64)
     for _ in range(REWEIGHTED if np.isfinite(limit) else 1):
-        logs = _maximised(planes, errors, center, logs, strength)
+        logs = _maximised(planes, errors, center, logs, strength, pull)
         if np.isfinite(limit):
             errors = np.minimum(squared_error, limit**2 * (np.exp(logs) @ planes))
     return dict(zip(names, np.exp(logs).tolist(), strict=True))
 
 
-def _maximised(planes: Values, errors: Values, center: Values, start: Values, strength: float) -> Values:
+def _maximised(planes: Values, errors: Values, center: Values, start: Values, strength: float, pull: Values) -> Values:
     """Return the logarithms of the best weights."""
 
     def cost(logs: Values) -> tuple[float, Values]:
         weights = np.exp(logs)
         variance = weights @ planes
-        ratio, off = errors / variance, (logs - center) / PULL**2
+        ratio, off = errors / variance, (logs - center) / pull**2
         value = strength * 0.5 * np.mean(ratio + np.log(variance)) + 0.5 * float(off @ (logs - center))
         slope = strength * 0.5 * (planes @ ((1.0 - ratio) / variance)) / len(errors) * weights
         return float(value), slope + off

@@ -16,7 +16,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.map_uncertainty import Background
 from sigmasplat.render.blended_values import blend_values
-from sigmasplat.render.predictive import COVERED
+from sigmasplat.render.predictive import COVERED, directions_toward
 from sigmasplat.render.render import on_device
 
 SQUARE_OF_MEAN = (3.0 * math.pi / 8.0, math.pi / 2.0)
@@ -41,13 +41,14 @@ def background_of(keyframes: Iterable[Keyframe]) -> Background:
 
 
 def splat_residuals(field: GaussianField, keyframes: Iterable[Keyframe], options: RenderConfig, backend: str) -> Tensor:
-    """Return the variances of each splat [N, 3] (`SPLAT_COLUMNS`) from keyframes with poses in the map's frame.
+    """Return the variances and the mean viewing direction of each splat [N, 6] (`SPLAT_COLUMNS`) from keyframes with
+    poses in the map's frame.
 
     The first two are from mean absolute residuals, which outliers change less than mean squares. The third is
     m² + v/n: m is the mean of the splat's depth residuals, v their variance about it, n the number of readings.
     """
     field = on_device(field, backend)
-    sums = torch.zeros(len(field), 6, dtype=torch.float64)
+    sums, directions = torch.zeros(len(field), 6, dtype=torch.float64), torch.zeros(len(field), 3, dtype=torch.float64)
     nothing = torch.zeros(len(field), 0)
     for keyframe in keyframes:
         target, T_camera_map = keyframe.target, se3.inverse(keyframe.T_world_camera)
@@ -56,7 +57,9 @@ def splat_residuals(field: GaussianField, keyframes: Iterable[Keyframe], options
         errors, known = squared_errors(seen.color, seen.depth, seen.alpha, image, depth)
         off_m = (seen.depth / seen.alpha.clamp(min=COVERED) - depth) * known[..., 1]
         off_m = off_m.clamp(-FARTHEST_M, FARTHEST_M)[..., None]
-        sums += seen.gather(torch.cat([errors.sqrt() * known, known, off_m, off_m.square()], -1)).cpu().double()
+        found = seen.gather(torch.cat([errors.sqrt() * known, known, off_m, off_m.square()], -1)).cpu().double()
+        sums += found
+        directions += found[:, 2:3] * directions_toward(field, keyframe.T_world_camera).cpu().double()
     absolute, weights, moments = sums[:, :2], sums[:, 2:4], sums[:, 4:]
     usual = absolute.sum(0) / weights.sum(0).clamp(min=1e-12)
     means = (absolute + PSEUDO_PIXELS * usual) / (weights + PSEUDO_PIXELS)
@@ -64,7 +67,7 @@ def splat_residuals(field: GaussianField, keyframes: Iterable[Keyframe], options
     readings = weights[:, 1]
     mean, square = (moments / readings.clamp(min=1e-3)[:, None]).T
     own = mean**2 + (square - mean**2).clamp(min=0.0) / readings.clamp(min=1.0)
-    return torch.cat([variances, own[:, None]], 1).float()
+    return torch.cat([variances, own[:, None], directions / weights[:, :1].clamp(min=1e-12)], 1).float()
 
 
 def squared_errors(

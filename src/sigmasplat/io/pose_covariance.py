@@ -66,7 +66,7 @@ def write_ros(path: Path, trajectory: Trajectory, covariance: Matrix) -> None:
 
 def _definite(covariance: Matrix) -> Matrix:
     """Replace covariances [N, 6, 6] of 0 by `KNOWN`."""
-    return np.where(covariance.any((1, 2))[:, None, None], covariance, KNOWN)
+    return np.where(np.any(covariance, (1, 2), keepdims=True), covariance, KNOWN)
 
 
 def _write(path: Path, header: list[str], trajectory: Trajectory, numbers: Matrix) -> None:

@@ -20,7 +20,7 @@ from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.tensors import open_tensors, write_tensors
 from sigmasplat.model.component import Component
 from sigmasplat.model.field import GaussianField
-from sigmasplat.model.map_uncertainty import SPLAT_COLUMNS, MapUncertainty, SplatStd
+from sigmasplat.model.map_uncertainty import SPLAT_COLUMNS, VARIANCES, MapUncertainty, SplatStd
 from sigmasplat.model.trajectory import Trajectory
 
 PROGRAM = "sigmasplat"
@@ -271,9 +271,9 @@ class RunFolder:
         uncertainty = self.read_uncertainty()
         if uncertainty is None:
             return None
-        std, rows = uncertainty.std, len(uncertainty.splats)
+        std, (rows, columns) = uncertainty.std, uncertainty.splats.shape
         fits = std is None or std.depth_std_m.shape == std.color_std.shape == (len(field),)
-        if uncertainty.splats.shape != (len(field), len(SPLAT_COLUMNS)) or not fits:
+        if rows != len(field) or columns not in (VARIANCES, len(SPLAT_COLUMNS)) or not fits:
             raise RunError(f"{self.path} has uncertainties of {rows} rows for {len(field)} splats; run it again")
         return uncertainty
 

@@ -1,5 +1,6 @@
 """Write how sure a map is, and read it back: uncertainty.json, and the values of splats in uncertainty.safetensors."""
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
@@ -16,6 +17,8 @@ from sigmasplat.model.map_uncertainty import (
     SplatStd,
 )
 
+ADDED_PARTS = frozenset({"extrapolated"})
+"""Parts that older files do not have."""
 JSON, TENSORS = "uncertainty.json", "uncertainty.safetensors"
 STD_TENSORS = ("depth_std_m", "color_std")
 
@@ -25,7 +28,7 @@ def write_uncertainty(folder: Path, uncertainty: MapUncertainty) -> None:
     tensors, std = {"variances": uncertainty.splats.cpu()}, uncertainty.std
     if std is not None:
         tensors |= {name: values.cpu() for name, values in vars(std).items()}
-    write_tensors(folder / TENSORS, tensors, {"columns": ",".join(SPLAT_COLUMNS)})
+    write_tensors(folder / TENSORS, tensors, {"columns": ",".join(SPLAT_COLUMNS[: uncertainty.splats.shape[1]])})
     calibration, background = uncertainty.calibration, asdict(uncertainty.background)
     values = {"probes": uncertainty.probes, "background": background}
     write_json(folder / JSON, values | {"color": dict(calibration.color), "depth": dict(calibration.depth)})
@@ -43,8 +46,8 @@ def read_uncertainty(folder: Path) -> MapUncertainty | None:
     try:
         background = dict(values["background"])
         red, green, blue = background.pop("color")
-        color = {name: float(values["color"][name]) for name in COLOR_PARTS}
-        depth = {name: float(values["depth"][name]) for name in DEPTH_PARTS}
+        color = {name: _weight(values["color"], name) for name in COLOR_PARTS}
+        depth = {name: _weight(values["depth"], name) for name in DEPTH_PARTS}
         known, probes = Background((red, green, blue), **background), int(values["probes"])
     except (KeyError, TypeError, ValueError) as problem:
         raise RunError(f"{path} is not the uncertainty of a map: {problem!r}; run it again") from problem
@@ -52,3 +55,8 @@ def read_uncertainty(folder: Path) -> MapUncertainty | None:
         found = {name: file.get_tensor(name) for name in STD_TENSORS if name in file.keys()}  # noqa: SIM118
         std = SplatStd(**found) if len(found) == len(STD_TENSORS) else None
         return MapUncertainty(file.get_tensor("variances"), known, Calibration(color, depth), probes, std)
+
+
+def _weight(weights: Mapping[str, float], name: str) -> float:
+    """Return the weight of a part; 0 for a part that runs of older versions do not have."""
+    return float(weights.get(name, 0.0) if name in ADDED_PARTS else weights[name])

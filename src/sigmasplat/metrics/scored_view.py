@@ -64,9 +64,14 @@ class ScoredView:
         return np.asarray(np.maximum(self.variance.mean(-1), 0.0), np.float32)
 
     @property
+    def squared_errors(self) -> NDArray[np.float32]:
+        """Return (Ĉ − C)² of each channel [H, W, 3], colour²."""
+        return np.asarray((self.rendered - self.recorded) ** 2, np.float32)
+
+    @property
     def squared_error(self) -> NDArray[np.float32]:
         """Return (Ĉ − C)² averaged over the channels [H, W], colour²."""
-        return np.asarray(((self.rendered - self.recorded) ** 2).mean(-1), np.float32)
+        return np.asarray(self.squared_errors.mean(-1), np.float32)
 
     @property
     def depth_compared(self) -> NDArray[np.bool_]:

@@ -1,7 +1,9 @@
 """Score a predicted variance against the squared error: rank correlation, likelihood, coverage, sparsification.
 
-Every function takes two arrays of one shape: predicted variance V and squared error r², both in colour² (or m²). They
-hold valid pixels only.
+Every function takes two arrays: predicted variance V [P] and squared error r² [P], both in colour² (or m²). They hold
+valid pixels only. Functions of calibration also take squared errors [P, C] of the C channels of a colour, with V their
+common variance: the share of errors inside an interval is then of errors of single channels. The mean over independent
+channels is closer to V than any of them, so that its coverage would be wrong even for the true V.
 """
 
 from dataclasses import asdict, dataclass
@@ -42,7 +44,7 @@ def gaussian_nll(variance: Values, squared_error: Values, epsilon: float = EPSIL
 
     A negative V counts as 0.
     """
-    v = np.maximum(variance.astype(np.float64), 0.0) + epsilon
+    v = _positive(variance, squared_error, epsilon)
     return float(np.mean(0.5 * squared_error / v + 0.5 * np.log(v))) if v.size else float("nan")
 
 
@@ -54,7 +56,7 @@ def best_scale(variance: Values, squared_error: Values, epsilon: float = EPSILON
     """
     if not squared_error.size:
         return float("nan")
-    return float(np.mean(squared_error / (np.maximum(variance.astype(np.float64), 0.0) + epsilon)))
+    return float(np.mean(squared_error / _positive(variance, squared_error, epsilon)))
 
 
 def coverage(variance: Values, squared_error: Values, levels: Values, epsilon: float = EPSILON) -> Values:
@@ -64,7 +66,7 @@ def coverage(variance: Values, squared_error: Values, levels: Values, epsilon: f
     """
     if not squared_error.size:
         return np.full(len(levels), np.nan)
-    z2 = squared_error.ravel() / (np.maximum(variance.ravel().astype(np.float64), 0.0) + epsilon)
+    z2 = (squared_error / _positive(variance, squared_error, epsilon)).ravel()
     limits = norm.ppf(0.5 + 0.5 * levels) ** 2
     counts = np.bincount(np.searchsorted(limits, z2, side="left"), minlength=len(limits) + 1)
     return np.asarray(np.cumsum(counts)[: len(limits)] / z2.size)
@@ -114,7 +116,7 @@ def z_scores(variance: Values, squared_error: Values, epsilon: float = EPSILON) 
     """
     if not squared_error.size:
         return {"z_rms": float("nan"), "z_68": float("nan")}
-    z2 = squared_error / (np.maximum(variance.astype(np.float64), 0.0) + epsilon)
+    z2 = squared_error / _positive(variance, squared_error, epsilon)
     return {"z_rms": float(np.sqrt(z2.mean())), "z_68": float(np.sqrt(np.quantile(z2, 0.6827)))}
 
 
@@ -131,8 +133,9 @@ def calibration_scores(variance: Values, squared_error: Values, epsilon: float =
 
 
 def ranking_scores(variance: Values, squared_error: Values) -> dict[str, float]:
-    """Return the scores that only depend on the order of V: ause, spearman."""
-    return {"ause": ause(variance, squared_error), "spearman": spearman(variance, squared_error)}
+    """Return the scores that only depend on the order of V: ause, spearman, of errors averaged over their channels."""
+    mean = over_channels(variance, squared_error)
+    return {"ause": ause(variance, mean), "spearman": spearman(variance, mean)}
 
 
 def score(variance: Values, squared_error: Values) -> dict[str, Any]:
@@ -146,3 +149,14 @@ def score(variance: Values, squared_error: Values) -> dict[str, Any]:
         "mean_squared_error": float(squared_error.mean()) if variance.size else float("nan"),
         "reliability": [asdict(row) for row in reliability(variance, squared_error)],
     }
+
+
+def over_channels(variance: Values, squared_error: Values) -> Values:
+    """Return the squared errors averaged over their channels, in the shape of the variance."""
+    return squared_error.mean(-1) if squared_error.ndim > variance.ndim else squared_error
+
+
+def _positive(variance: Values, squared_error: Values, epsilon: float) -> Values:
+    """Return V+ε, at least ε, in the shape that divides the squared errors: with channels [P, 1], else [P]."""
+    v = np.maximum(variance.astype(np.float64), 0.0) + epsilon
+    return v[..., None] if squared_error.ndim > variance.ndim else v

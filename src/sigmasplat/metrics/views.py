@@ -144,7 +144,8 @@ def score_uncertainty(samples: list[NDArray[np.float32]], judged_on: str = "held
 
 @dataclass(eq=False)
 class PredictionScores:
-    """Samples of views with predictive variances, of the pixels that V is scored on: (variance, squared error) [2, P].
+    """Samples of views with predictive variances, of the pixels that V is scored on: variance and the squared error of
+    each channel, [1 + C, P].
 
     Frames in `calibrated_on` are left out, because the weights of the parts were fitted to them.
     """
@@ -159,7 +160,7 @@ class PredictionScores:
         if found is None or view.index in self.calibrated_on:
             return
         read, compared = view.valid, view.depth_compared
-        self.color.append(_every_kth(np.stack([found.color[read], view.squared_error[read]])))
+        self.color.append(_every_kth(np.stack([found.color[read], *view.squared_errors[read].T])))
         self.depth.append(_every_kth(np.stack([found.reading_m2[compared], view.depth_squared_error[compared]])))
 
     def scores(self) -> dict[str, Any] | None:
@@ -171,10 +172,12 @@ class PredictionScores:
 
 def _calibrated(samples: list[NDArray[np.float32]]) -> dict[str, Any] | None:
     """Return all scores of a variance with a unit; None without pixels."""
-    variance, squared_error = np.concatenate(samples, axis=1)
+    variance, *channels = np.concatenate(samples, axis=1)
     if not variance.size:
         return None
-    return uncertainty.score(variance, squared_error) | uncertainty.calibration_scores(variance, squared_error)
+    squared_error = np.stack(channels, -1)
+    of_mean = uncertainty.score(variance, uncertainty.over_channels(variance, squared_error))
+    return of_mean | uncertainty.calibration_scores(variance, squared_error)
 
 
 def _every_kth(values: NDArray[np.float32]) -> NDArray[np.float32]:

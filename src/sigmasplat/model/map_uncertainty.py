@@ -5,14 +5,16 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
-COLOR_PARTS = ("mixture", "residual", "unexplained", "edges", "floor")
+COLOR_PARTS = ("mixture", "residual", "unexplained", "edges", "extrapolated", "floor")
 """Parts of the predicted variance of colour, in the order of `render.predictive.variance_parts`."""
-DEPTH_PARTS = ("ray", "residual", "unexplained", "edges", "sensor", "floor")
+DEPTH_PARTS = ("ray", "residual", "unexplained", "edges", "extrapolated", "sensor", "floor")
 """Parts of the predicted variance of depth, as `COLOR_PARTS`."""
-EPISTEMIC = frozenset({"unexplained", "edges"})
+EPISTEMIC = frozenset({"unexplained", "edges", "extrapolated"})
 """Parts that more or better views can reduce; the others are aleatoric: noise, and detail that the map cannot show."""
-SPLAT_COLUMNS = ("color", "reading_m2", "depth_m2")
-"""Columns of `MapUncertainty.splats`."""
+SPLAT_COLUMNS = ("color", "reading_m2", "depth_m2", "toward_x", "toward_y", "toward_z")
+"""Columns of `MapUncertainty.splats`. Values without the last three know no viewing directions."""
+VARIANCES = 3
+"""How many of `SPLAT_COLUMNS` are variances."""
 
 
 @dataclass(frozen=True)
@@ -24,10 +26,26 @@ class Calibration:
 
 
 SHIPPED = Calibration(
-    color={"mixture": 0.01, "residual": 0.9, "unexplained": 0.4, "edges": 2e-6, "floor": 1e-6},
-    depth={"ray": 0.1, "residual": 0.3, "unexplained": 0.02, "edges": 5e-6, "sensor": 3e-6, "floor": 1e-7},
+    color={
+        "mixture": 0.035,
+        "residual": 1.1,
+        "unexplained": 0.9,
+        "edges": 7.7e-7,
+        "extrapolated": 9.0,
+        "floor": 4e-7,
+    },
+    depth={
+        "ray": 0.0085,
+        "residual": 1.4,
+        "unexplained": 0.023,
+        "edges": 1e-6,
+        "extrapolated": 0.77,
+        "sensor": 1.9e-8,
+        "floor": 7.4e-8,
+    },
 )
-"""Weights of the presets, fitted on probe views of several sequences with `sigma`. The fit of a run starts at them."""
+"""Weights of the presets, fitted by `benchmarks/uncertainty_weights.py` to several sequences with `sigma`. The fit of a
+run starts at them."""
 
 
 @dataclass(frozen=True)
@@ -57,10 +75,12 @@ class SplatStd:
 class MapUncertainty:
     """How sure a map is.
 
-    splats [N, 3], columns as `SPLAT_COLUMNS`: the variance of each splat's residuals at the keyframes, of colour (mean
+    splats [N, 6], columns as `SPLAT_COLUMNS`: the variance of each splat's residuals at the keyframes, of colour (mean
     over channels) and of depth (m²); the variance of its own depth (m²): the squared mean of its residuals, plus their
-    variance about the mean over the number of readings. calibration: weights of the parts; probes: the number of probe
-    views that it was fitted on. std: the standard deviations of the splats, None if they were not measured.
+    variance about the mean over the number of readings; the mean of the unit vectors from the splat to the keyframes'
+    cameras, in the map's frame: it is shorter than 1 if the directions differ. calibration: weights of the parts;
+    probes: the number of probe views that it was fitted on. std: the standard deviations of the splats, None if they
+    were not measured.
     """
 
     splats: Tensor

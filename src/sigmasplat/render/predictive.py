@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
+from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.map_uncertainty import (
     COLOR_PARTS,
     DEPTH_PARTS,
     EPISTEMIC,
+    VARIANCES,
     Background,
     Calibration,
     MapUncertainty,
@@ -27,21 +29,27 @@ from sigmasplat.model.map_uncertainty import (
 from sigmasplat.render.blended_values import BlendedValues, blend_values
 from sigmasplat.render.render import on_device
 
+NEW_ANGLE = 0.004
+"""1 − cos 5°: at this distance from the directions that a splat was seen from, half of it counts as extrapolated."""
+SPREADS = 2.0
+"""Directions within this multiple of the spread 1 − |m| of the seen ones about their mean m are not new."""
 COVERED = 0.5
 """Depth is divided by at least this alpha: where the map covers less of a pixel, it has no depth."""
 
 
 @dataclass(frozen=True, eq=False)
 class VarianceParts:
-    """Unweighted parts of the variance of a view: color [5, H, W] as `COLOR_PARTS`, depth [6, H, W] as `DEPTH_PARTS`,
+    """Unweighted parts of the variance of a view: color [6, H, W] as `COLOR_PARTS`, depth [7, H, W] as `DEPTH_PARTS`,
     systematic [H, W]: the part of depth that takes the place of residual for the depth of the map itself; with what was
     rendered: image Ĉ [H, W, 3], depth_m D̂/A [H, W], alpha [H, W]; seen: the blend of the splats.
 
     Colour: mixture = Σw(σ²+c²) − |Ĉ|²/A, the variance among the splats of a pixel; residual = Σ w r², r² the squared
-    residual of a splat at the keyframes; unexplained = T (σ_b² + A |c_b − Ĉ/A|²), T = 1 − A, of a background of mean
-    c_b and variance σ_b²; edges = |∇Ĉ|² per rad², the effect of a shift of the image; floor = 1. The first and the
-    third sum to the law of total variance. Depth: ray = U/A about D̂/A; residual, unexplained and edges as for colour;
-    sensor = depth⁴; floor = 1.
+    residual of a splat at the keyframes; unexplained = T (σ_b² + A |c_b − Ĉ/A|²) + T² |c_b|², T = 1 − A, of a
+    background of mean c_b and variance σ_b²; edges = |∇Ĉ|² per rad², the effect of a shift of the image;
+    extrapolated = residual · G, G the mean of `novelty` over the splats of a pixel; floor = 1. The first and the third
+    sum to the mean squared error of Ĉ by the law of total variance; T² |c_b|² is in it because Ĉ leaves out the
+    background. Depth: ray = U/A about D̂/A; residual, unexplained and edges as for colour; extrapolated = ray · G: from
+    a new direction, another splat of the ray may be the surface; sensor = depth⁴; floor = 1.
     """
 
     color: Tensor
@@ -88,22 +96,27 @@ def variance_parts(
     backend: str,
     gather: bool = False,
 ) -> VarianceParts:
-    """Render the parts of a map's variance at a pose (4×4); splats [N, 3] as in `MapUncertainty`, gather as in
+    """Render the parts of a map's variance at a pose (4×4); splats [N, 6] as in `MapUncertainty`, gather as in
     `blend_values`."""
     field = on_device(field, backend)
-    seen = blend_values(field, camera, T_camera_map, splats, options, backend, gather=gather)
+    new = novelty(field, splats[:, VARIANCES:], T_camera_map)
+    values = torch.cat([splats[:, :VARIANCES].to(new), new[:, None]], 1)
+    seen = blend_values(field, camera, T_camera_map, values, options, backend, gather=gather)
     alpha = seen.alpha
     some, covered = alpha.clamp(min=1e-6), alpha.clamp(min=COVERED)
     depth_m = seen.depth / covered
     about = blend_values(field, camera, T_camera_map, splats[:, :0], options, backend, depth_m).moment
     assert about is not None, "a blend with a depth reference has a moment"
-    missing = (1.0 - alpha).clamp(min=0.0)
-    away = (seen.color.new_tensor(background.color) - seen.color / some[..., None]).square().mean(-1)
+    missing, new = (1.0 - alpha).clamp(min=0.0), seen.values[..., VARIANCES] / some
+    behind = seen.color.new_tensor(background.color)
+    away = (behind - seen.color / some[..., None]).square().mean(-1)
+    left_out = missing.square() * behind.square().mean()
     color = [
         (seen.second - seen.color.square() / some[..., None]).mean(-1).clamp(min=0.0),
         seen.values[..., 0],
-        missing * (background.color_variance + alpha * away),
+        missing * (background.color_variance + alpha * away) + left_out,
         slope2(seen.color, camera).mean(-1),
+        seen.values[..., 0] * new,
         torch.ones_like(alpha),
     ]
     depth = [
@@ -111,11 +124,33 @@ def variance_parts(
         seen.values[..., 1] / covered,
         missing * background.depth_variance_m2,
         slope2(depth_m[..., None], camera)[..., 0],
+        about.clamp(min=0.0) / covered * new,
         depth_m.square().square(),
         torch.ones_like(alpha),
     ]
     systematic = seen.values[..., 2] / covered
     return VarianceParts(torch.stack(color), torch.stack(depth), systematic, seen.color, depth_m, alpha, seen)
+
+
+def directions_toward(field: GaussianField, T_map_camera: NDArray[np.floating]) -> Tensor:
+    """Return the unit vectors [N, 3] from each splat to a camera (4×4)."""
+    away = torch.as_tensor(T_map_camera[:3, 3]).to(field.means) - field.means.detach()
+    return torch.nn.functional.normalize(away, dim=1)
+
+
+def novelty(field: GaussianField, seen_from: Tensor, T_camera_map: NDArray[np.floating]) -> Tensor:
+    """Return for each splat [N], in [0, 1), how far a view is from the directions that the splat was seen from.
+
+    seen_from [N, 3]: the mean m of unit vectors to the keyframes' cameras; 0 where it is 0, or without columns. With
+    the angle θ between m and the direction to the view, x = 1 − cos θ − 2 (1 − |m|), it is x / (x + 1 − cos 5°).
+    """
+    if not seen_from.shape[1]:
+        return torch.zeros(len(field)).to(field.means)
+    mean = seen_from.to(field.means)
+    length = mean.norm(dim=1)
+    cosine = (mean * directions_toward(field, se3.inverse(np.asarray(T_camera_map)))).sum(1) / length.clamp(min=1e-6)
+    beyond = (1.0 - cosine - SPREADS * (1.0 - length)).clamp(min=0.0) * (length > 0.0)
+    return torch.as_tensor(beyond / (beyond + NEW_ANGLE))
 
 
 def slope2(image: Tensor, camera: Camera) -> Tensor:

@@ -1,10 +1,11 @@
 """Measure how sure a map is: variances of its splats, and weights calibrated on probe views."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import Config
@@ -30,11 +31,14 @@ from sigmasplat.types import Matrix
 
 PIXELS = 4000
 """About this many pixels of a probe view, every k-th one, calibrate the weights."""
-STD_KEYFRAMES = 60
+STD_KEYFRAMES = 30
 """At most this many keyframes, evenly spread, decide the standard deviations of the splats."""
-LIMITS = {"color": np.inf, "depth": 4.0}
-"""Limit of errors in the fit (`fit_weights`). Depth errors at silhouettes are as large as the depth step there, so a
-few pixels would decide."""
+LIMIT = 4.0
+"""Limit of errors in the fit (`fit_weights`). Depth errors at silhouettes are as large as the depth step there, and
+colour errors of moved objects as large as their contrast, so a few pixels would decide."""
+
+FIRM = ("extrapolated",)
+"""Weights that stay near `pulled_to`: probe views are on the path, so they say little about views away from it."""
 
 
 def probe_views(store: SubmapStore, anchors: Sequence[Matrix], size: tuple[int, int]) -> list[Keyframe]:
@@ -52,11 +56,15 @@ def probe_views(store: SubmapStore, anchors: Sequence[Matrix], size: tuple[int, 
 def final_uncertainty(
     field: GaussianField, store: SubmapStore, anchors: Sequence[Matrix], config: Config, view: View
 ) -> MapUncertainty | None:
-    """Return how sure a map in the world is, from its submaps' keyframes and probe views; None if `uncertainty.probes`
-    is 0 or there is no splat."""
+    """Return how sure a map in the world is and the standard deviations of its splats, from its submaps' keyframes and
+    probe views; None if `uncertainty.probes` is 0 or there is no splat."""
     if not config.uncertainty.probes or not len(field):
         return None
-    return map_uncertainty(field, store, anchors, config, view)
+    known = map_uncertainty(field, store, anchors, config, view)
+    keyframes = KeyframeReader(store, anchors, view)
+    rows = np.unique(np.linspace(0, len(keyframes) - 1, STD_KEYFRAMES).round().astype(int))
+    std = splat_std(field, known, (keyframes[int(row)] for row in rows), config.render, config.backend)
+    return replace(known, std=std)
 
 
 def map_uncertainty(
@@ -76,10 +84,7 @@ def map_uncertainty(
     splats = splat_residuals(field, keyframes, config.render, config.backend)
     probes = probe_views(store, anchors, (view.alpha.shape[0], view.alpha.shape[1]))
     calibration = calibrate(field, splats, background, probes, config, pulled_to)
-    known = MapUncertainty(splats, background, calibration, len(probes))
-    rows = np.unique(np.linspace(0, len(keyframes) - 1, min(STD_KEYFRAMES, len(keyframes))).round().astype(int))
-    std = splat_std(field, known, (keyframes[int(row)] for row in rows), config.render, config.backend)
-    return replace(known, std=std)
+    return MapUncertainty(splats, background, calibration, len(probes))
 
 
 def calibrate(
@@ -91,6 +96,14 @@ def calibrate(
     pulled_to: Calibration = SHIPPED,
 ) -> Calibration:
     """Fit the weights of the parts of a map's variance to its errors at probe views."""
+    color, depth = probe_samples(field, splats, background, probes, config)
+    return Calibration(color.fitted(pulled_to.color), depth.fitted(pulled_to.depth))
+
+
+def probe_samples(
+    field: GaussianField, splats: Tensor, background: Background, probes: Iterable[Keyframe], config: Config
+) -> "tuple[Samples, Samples]":
+    """Return the samples of colour and of depth of a map at probe views, with poses in the map's frame."""
     color, depth = Samples(COLOR_PARTS), Samples(DEPTH_PARTS)
     for probe in probes:
         target, T_camera_map = probe.target, se3.inverse(probe.T_world_camera)
@@ -98,14 +111,15 @@ def calibrate(
         image, depth_m = target.image.to(parts.alpha), target.depth_image.to(parts.alpha)
         raw_depth = parts.depth_m * parts.alpha.clamp(min=COVERED)
         errors, known = squared_errors(parts.image, raw_depth, parts.alpha, image, depth_m)
-        color.add(parts.color, errors[..., 0], known[..., 0] > 0)
-        depth.add(parts.depth, errors[..., 1], known[..., 1] > 0)
-    return Calibration(color.fitted(pulled_to.color, LIMITS["color"]), depth.fitted(pulled_to.depth, LIMITS["depth"]))
+        channels = (parts.image.clamp(0.0, 1.0) - image).square()
+        color.add(parts.color, channels, torch.ones_like(known[..., 0], dtype=torch.bool))
+        depth.add(parts.depth, errors[..., 1:], known[..., 1] > 0)
+    return color, depth
 
 
 @dataclass(eq=False)
 class Samples:
-    """Pixels of probe views: parts of the variance by name, and squared errors."""
+    """Pixels of probe views: parts of the variance by name, and squared errors of each channel."""
 
     names: Sequence[str]
 
@@ -113,18 +127,25 @@ class Samples:
         self.parts, self.errors, self.views = list[Tensor](), list[Tensor](), 0
 
     def add(self, parts: Tensor, errors: Tensor, known: Tensor) -> None:
-        """Add every k-th known pixel of a view: parts [K, H, W], errors and known [H, W]."""
-        step = max(1, errors.numel() // PIXELS)
-        rows = torch.arange(0, errors.numel(), step, device=errors.device)
+        """Add every k-th known pixel of a view: parts [K, H, W], errors [H, W, C] and known [H, W]."""
+        step = max(1, known.numel() // PIXELS)
+        rows = torch.arange(0, known.numel(), step, device=errors.device)
         rows = rows[known.reshape(-1)[rows]]
         self.parts.append(parts.reshape(len(self.names), -1)[:, rows].cpu())
-        self.errors.append(errors.reshape(-1)[rows].cpu())
+        self.errors.append(errors.reshape(known.numel(), -1)[rows].cpu())
         self.views += 1
 
-    def fitted(self, pulled_to: Mapping[str, float], limit: float) -> dict[str, float]:
+    def fitted(self, pulled_to: Mapping[str, float]) -> dict[str, float]:
         """Return the best weights by name."""
         if not self.errors:
             return dict(pulled_to)
-        planes = torch.cat(self.parts, 1).double().numpy()
-        errors = torch.cat(self.errors).double().numpy()
-        return fit_weights(dict(zip(self.names, planes, strict=True)), errors, pulled_to, self.views, limit)
+        planes, errors = self.joined()
+        return fit_weights(
+            dict(zip(self.names, planes, strict=True)), errors.mean(1), pulled_to, self.views, LIMIT, FIRM
+        )
+
+    def joined(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the parts [K, P] and the squared errors [P, C] of all pixels."""
+        if not self.errors:
+            return np.zeros((len(self.names), 0)), np.zeros((0, 1))
+        return torch.cat(self.parts, 1).double().numpy(), torch.cat(self.errors).double().numpy()
