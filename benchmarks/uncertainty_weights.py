@@ -115,7 +115,7 @@ def collected(run: FinishedRun, held: Sequence[tuple[int, Keyframe]]) -> Arrays:
         anchors = run.anchors if s is None else [np.eye(4)]
         keyframes = KeyframeReader(run.store if s is None else StorePart(run.store, [s]), anchors, view)
         background = background_of(keyframes)
-        splats = splat_residuals(field, keyframes, background, run.config.render, run.config.backend)
+        splats = splat_residuals(field, keyframes, run.config.render, run.config.backend)
         T_map_world = np.eye(4) if s is None else se3.inverse(run.anchors[s])
         near = [p for p, of in zip(probes, owner, strict=True) if s is None or of == s]
         far = sorted((abs(of - s), i) for i, of in enumerate(owner) if s is not None and of != s)[:OTHERS]

@@ -155,7 +155,7 @@ def test_only_views_beyond_the_seen_directions_are_extrapolated() -> None:
     target = Target(WIDE, seen.color.movedim(-1, 0).contiguous(), seen.depth / seen.alpha, seen.depth.numel())
     sideways, far = (camera_beside_the_wall(angle) for angle in (0.15, 0.9))
     keyframes = [Keyframe(0, target, np.eye(4)), Keyframe(1, target, sideways)]
-    seen_from = splat_residuals(field, keyframes, NOTHING, OPTIONS, "cpu")[:, 3:]
+    seen_from = splat_residuals(field, keyframes, OPTIONS, "cpu")[:, 3:]
     both = (seen_from != 0.0).any(1) & (seen_from.norm(dim=1) < 0.999)
     assert both.sum() > 100, "splats that both keyframes see"
     for T_map_camera in (np.eye(4), sideways):
