@@ -10,7 +10,7 @@ example: python benchmarks/uncertainty_weights.py --sources redkitchen livingroo
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -87,10 +87,12 @@ def samples_of(options: Options, source: str) -> Arrays:
     (job,) = study.jobs()
     opened = open_source(full_path(job.path), job.config.input)
     run = run_slam(job.config, opened)
-    held = [
-        (view.submap, Keyframe(view.frame.index, Target.of(view.frame, size_of(run)), view.T_world_camera, fixed=True))
-        for view in held_back_views(run, opened, options.views)
-    ]
+    held = list[tuple[int, Keyframe]]()
+    for view in held_back_views(run, opened, options.views):
+        # The weights are those of readings of the sensor; an exact depth is not a reading.
+        frame = replace(view.frame, depth_m=np.zeros_like(view.frame.depth_m)) if view.exact else view.frame
+        target = Target.of(frame, size_of(run))
+        held.append((view.submap, Keyframe(frame.index, target, view.T_world_camera, fixed=True)))
     found = collected(run, held)
     options.runs.mkdir(parents=True, exist_ok=True)
     np.savez(file, **found)

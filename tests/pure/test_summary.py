@@ -110,7 +110,7 @@ def test_unknown_figures_are_left_out() -> None:
         ({"frames_per_s": 1.2, "finish_s": 430.0}, {}, "took 430 s, all frames took 417 s", "final.iterations=750"),
         ({"finish_s": 80.0}, {"final.iterations": "300"}, "took 80 s, all frames took 37 s", "final.iterations=150"),
         ({"submaps": 5}, {}, "End a scan where it started", ""),
-        ({"calibration": None}, {"uncertainty.probes": "0"}, "kept no probe views", "uncertainty.probes=2"),
+        ({"calibration": None}, {"uncertainty.probes": "0"}, "kept no probe views", "uncertainty.probes=4"),
         ({"calibration": None}, {"uncertainty.probes": "2"}, "did not make its final map", RUN),
     ],
 )

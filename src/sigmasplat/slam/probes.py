@@ -24,7 +24,8 @@ class Probe:
 class Probes:
     """The probe views of the active submap: at most `most`, one per keyframe, spread over the submap.
 
-    every: frames between keyframes. The frame half way to the next keyframe is the one farthest from both.
+    every: frames between keyframes. The distance from a probe to its keyframe changes from keyframe to keyframe, so that
+    probes are as near to keyframes as other frames are: the farthest ones would have larger errors than a usual view.
     """
 
     most: int
@@ -32,9 +33,9 @@ class Probes:
     kept: list[Probe] = field(default_factory=list)
 
     def offer(self, index: int, keyframe: int, since: int, T_keyframe_camera: Matrix, target: Target) -> None:
-        """Keep a frame if it is nearer to half way between keyframes than the one kept; since: frames since the
-        keyframe."""
-        if not self.most or since > max(1, self.every // 2):
+        """Keep a frame if it is nearer to the wanted distance from its keyframe than the one kept; since: frames since
+        the keyframe."""
+        if not self.most or since > 1 + keyframe % max(1, self.every - 1):
             return
         self.kept = [probe for probe in self.kept if probe.keyframe != keyframe]
         self.kept.append(Probe(index, keyframe, T_keyframe_camera, target.picture()))
