@@ -1,4 +1,4 @@
-"""Score predicted variances at views held back from the map, on five sequences, with `sigmasplat bench uncertainty`.
+"""Score predicted variances at views held back from the map, on six sequences, with `sigmasplat bench uncertainty`.
 
 Finished runs are kept in runs/bench/uncertainty/NAME and are not repeated while code and settings are unchanged.
 Writes benchmarks/results/<name>-<machine>.json; `python benchmarks/tables.py` writes its tables into the documents.
@@ -31,9 +31,10 @@ from sigmasplat.commands.bench_uncertainty import (
 from sigmasplat.errors import SigmaSplatError
 
 arg = tyro.conf.arg
-SYNTHETIC = "synthetic:frames=240,noise=1,test_views=24,seed={seed}"
-"""A different room for each seed."""
-SOURCES = ("synthetic", "livingroom", "redkitchen", "cubicles", "hololens")
+ROOM = "synthetic:frames=240,noise=1,test_views=24,seed={seed}"
+SYNTHETIC = {"synthetic": ROOM, "synthetic, steady exposure": f"{ROOM},exposure_change=0"}
+"""A different room for each seed. The test views have exposure gain 1; the frames do only if the exposure is steady."""
+SOURCES = (*SYNTHETIC, "livingroom", "redkitchen", "cubicles", "hololens")
 RUNS = record.ROOT / "runs" / "bench" / "uncertainty"
 FAILURES = "AUROC: how often p_off is higher for a frame that is off than for one that is not; ½ is random."
 KEPT = (
@@ -79,15 +80,15 @@ class Options:
 def located(name: str) -> str:
     """Return the path of a sequence in the data folder, or the name unchanged if it is not there."""
     known = record.data_root() / name
-    return SYNTHETIC if name == "synthetic" else str(known.resolve()) if known.is_dir() else name
+    return SYNTHETIC.get(name, str(known.resolve()) if known.is_dir() else name)
 
 
 def kept(results: dict[str, Any]) -> dict[str, Any]:
     """Return the runs for the committed results: with names instead of paths, without reliability tables."""
-    runs = []
+    names, runs = {source: name for name, source in SYNTHETIC.items()}, []
     for run in results["runs"]:
         named = run | {
-            "source": short(run["source"]),
+            "source": names.get(run["source"], short(run["source"])),
             "path": Path(run["path"]).name,
             "scores": _thinned(run["scores"]),
         }

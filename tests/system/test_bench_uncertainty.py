@@ -14,7 +14,7 @@ from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.evaluation.finished_run import FinishedRun, run_slam
 from sigmasplat.evaluation.splat_statistics import MapFacts, TrainingView, fisher, map_facts, ridge, splat_values
-from sigmasplat.evaluation.surface_errors import aligned, surface_errors
+from sigmasplat.evaluation.surface_errors import surface_errors
 from sigmasplat.evaluation.surface_predictors import SURFACE_PREDICTORS
 from sigmasplat.evaluation.uncertainty_benchmark import (
     EXACT,
@@ -31,6 +31,7 @@ from sigmasplat.evaluation.uncertainty_scores import ALL, COVERED, VISIBLE, Run,
 from sigmasplat.evaluation.unseen_views import held_back_views
 from sigmasplat.evaluation.view_predictors import PREDICTORS, see
 from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.metrics.trajectory import aligned_poses
 from sigmasplat.metrics.uncertainty import sparsification
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
@@ -321,4 +322,4 @@ def test_a_straight_path_is_aligned_by_its_rotations_too() -> None:
     true = np.stack([se3.exp(np.array([0.1 * i, 0.0, 0.0, 0.0, 0.02 * i, 0.0])) for i in range(20)])
     true[:, 1:3, 3] = 0.0
     noise = np.stack([se3.exp(twist) for twist in 0.002 * random.normal(size=(20, 6))])
-    np.testing.assert_allclose(aligned(true, wanted @ true @ noise), wanted, atol=0.003)
+    np.testing.assert_allclose(aligned_poses(true, wanted @ true @ noise), wanted, atol=0.003)

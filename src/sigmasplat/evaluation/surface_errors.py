@@ -9,7 +9,7 @@ from sigmasplat.config import Config
 from sigmasplat.evaluation.finished_run import FinishedRun
 from sigmasplat.evaluation.view_selection import evenly_spread, working_frame
 from sigmasplat.metrics.reconstruction import BEHIND_M, Mask, distances, visible_points
-from sigmasplat.metrics.trajectory import associate
+from sigmasplat.metrics.trajectory import aligned_poses, associate
 from sigmasplat.model import isosurface, se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.mesh import Mesh
@@ -44,7 +44,7 @@ def surface_errors(
 ) -> SurfaceErrors | None:
     """Fuse the surface of a run as `sigmasplat mesh` does, and measure it; None without a true path.
 
-    The true path is aligned to the estimated one with `aligned`. A vertex counts if it is in the image of a true pose,
+    The true path is aligned to the estimated one with `aligned_poses`. A vertex counts if it is in the image of a true pose,
     at most `BEHIND_M` behind the reference, and if the reference has a surface at this pixel. Calls
     `progress(keyframes done, total)`.
     """
@@ -54,7 +54,7 @@ def surface_errors(
     rows, true_rows = associate(path.timestamps_s, truth.timestamps_s)
     if not len(rows):
         return None
-    T_estimate_truth = aligned(truth.T_world_camera[true_rows], path.T_world_camera[rows])
+    T_estimate_truth = aligned_poses(truth.T_world_camera[true_rows], path.T_world_camera[rows])
     surface = source.true_surface()
     reference = (_fused(run.config, source, truth) if surface is None else surface).moved(T_estimate_truth)
     outside = frozenset(range(len(run.store))) - frozenset(run.members)
@@ -65,20 +65,6 @@ def surface_errors(
     seen = np.flatnonzero(_seen(vertices, reference, run.camera, poses))
     vertices = vertices[np.random.default_rng(run.config.seed).permutation(seen)[:VERTICES]]
     return SurfaceErrors(vertices, distances(vertices, reference), surface is not None)
-
-
-def aligned(T_truth_camera: Matrix, T_estimate_camera: Matrix) -> Matrix:
-    """Return T_estimate_truth [4, 4] from poses [K, 4, 4] of the same frames: the mean rotation, and the mean shift.
-
-    The alignment of the ATE uses positions only. On a short or straight path they do not fix the rotation, which would
-    move a surface by more than its errors.
-    """
-    rotations = T_estimate_camera[:, :3, :3] @ T_truth_camera[:, :3, :3].swapaxes(1, 2)
-    u, _, vt = np.linalg.svd(rotations.sum(0))
-    found = np.eye(4)
-    found[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    found[:3, 3] = (T_estimate_camera[:, :3, 3] - T_truth_camera[:, :3, 3] @ found[:3, :3].T).mean(0)
-    return found
 
 
 def _fused(config: Config, source: Source, truth: Trajectory) -> Mesh:

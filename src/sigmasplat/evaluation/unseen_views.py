@@ -7,7 +7,7 @@ import numpy as np
 from sigmasplat.config import Config
 from sigmasplat.evaluation.finished_run import FinishedRun
 from sigmasplat.evaluation.view_selection import evenly_spread, working_frame
-from sigmasplat.metrics.trajectory import associate, truth_in_estimate
+from sigmasplat.metrics.trajectory import aligned_poses, associate
 from sigmasplat.model.frame import Frame, resized_depth
 from sigmasplat.sources.base import Source
 from sigmasplat.types import Matrix
@@ -33,13 +33,16 @@ def held_back_views(run: FinishedRun, source: Source, most: int) -> list[UnseenV
 
 
 def away_views(run: FinishedRun, source: Source, most: int) -> list[UnseenView]:
-    """Return the source's test views at their true poses, which the alignment of the ATE moves to the world."""
+    """Return the source's test views at their true poses, moved to the world by `aligned_poses` of the path."""
     away, truth = source.test_views(), source.truth()
     poses = None if away is None else away.truth()
     if away is None or poses is None or truth is None or not run.believed.any():
         return []
     path = run.path.at(run.believed)
-    T_estimate_truth = truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], truth)
+    matched, true_rows = associate(path.timestamps_s, truth.timestamps_s)
+    if not len(matched):
+        return []
+    T_estimate_truth = aligned_poses(truth.T_world_camera[true_rows], path.T_world_camera[matched])
     found = list[UnseenView]()
     for i in evenly_spread(range(len(away)), most):
         rows, at = associate(np.array([away.timestamp_s(i)]), poses.timestamps_s)

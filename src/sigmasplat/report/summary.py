@@ -299,8 +299,8 @@ def _no_prediction(metrics: Metrics, again: str, settings: dict[str, Any]) -> Ad
     if (settings.get("uncertainty") or {}).get("probes"):
         return "The run has no predicted errors, because it did not make its final map. Make it again:", again
     return (
-        "The run has no predicted errors of colour and depth, because it kept no probe views. Keep four in each submap; "
-        "this does not change the map:",
+        "The run has no predicted errors of colour and depth, because it kept no probe views. Keep four in each "
+        "submap; this does not change the map:",
         f"{again} --set uncertainty.probes=4",
     )
 
