@@ -44,8 +44,8 @@ def surface_errors(
 ) -> SurfaceErrors | None:
     """Fuse the surface of a run as `sigmasplat mesh` does, and measure it; None without a true path.
 
-    The true path is aligned to the estimated one with `aligned_poses`. A vertex counts if it is in the image of a true pose,
-    at most `BEHIND_M` behind the reference, and if the reference has a surface at this pixel. Calls
+    The true path is aligned to the estimated one with `aligned_poses`. A vertex counts if it is in the image of a true
+    pose, at most `BEHIND_M` behind the reference, and if the reference has a surface at this pixel. Calls
     `progress(keyframes done, total)`.
     """
     truth, path = source.truth(), run.path.at(run.believed)
