@@ -27,21 +27,21 @@ class Calibration:
 
 SHIPPED = Calibration(
     color={
-        "mixture": 0.035,
-        "residual": 1.1,
-        "unexplained": 0.9,
-        "edges": 7.7e-7,
-        "extrapolated": 9.0,
-        "floor": 4e-7,
+        "mixture": 0.036,
+        "residual": 0.78,
+        "unexplained": 0.78,
+        "edges": 7.2e-07,
+        "extrapolated": 5.8,
+        "floor": 1.6e-07,
     },
     depth={
-        "ray": 0.0085,
-        "residual": 1.4,
-        "unexplained": 0.023,
-        "edges": 1e-6,
-        "extrapolated": 0.77,
-        "sensor": 1.9e-8,
-        "floor": 7.4e-8,
+        "ray": 0.0026,
+        "residual": 0.8,
+        "unexplained": 0.013,
+        "edges": 1.2e-06,
+        "extrapolated": 0.59,
+        "sensor": 3.3e-09,
+        "floor": 4.2e-08,
     },
 )
 """Weights of the presets, fitted by `benchmarks/uncertainty_weights.py` to several sequences with `sigma`. The fit of a
