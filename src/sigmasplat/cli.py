@@ -7,6 +7,7 @@ import tyro
 
 import sigmasplat
 from sigmasplat import env
+from sigmasplat.commands.batch import batch
 from sigmasplat.commands.bench import bench
 from sigmasplat.commands.completion import completion
 from sigmasplat.commands.doctor import doctor
@@ -33,6 +34,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "inspect": inspect,
     "run": run,
     "resume": resume,
+    "batch": batch,
     "localise": localise,
     "view": view,
     "eval": evaluate_run,
