@@ -76,8 +76,8 @@ class Batch:
             return
         estimate.add(job, self._seconds(job))
         left_s = estimate.left_s(waiting)
-        rest = f"; {len(waiting)} runs left, about {duration(left_s)}" if waiting and left_s is not None else ""
-        screen.say(f"{count} {job.name} finished after {duration(elapsed_s)}{rest}")
+        rest = f", {len(waiting)} runs left, about {duration(left_s)}" if waiting and left_s is not None else ""
+        screen.say(f"{count} {job.name} finished; {duration(elapsed_s)} passed{rest}")
 
     def _find_sequences(
         self, surveyed: Mapping[str, Sequences], jobs: Sequence[Job], screen: "Screen"
@@ -105,7 +105,8 @@ class Batch:
 def open_road(data: Sequence[str], jobs: int, scheduler: str | None, save_every_s: float) -> Road:
     """Return the road to make runs by: `jobs` processes on this machine, or the Dask cluster of a scheduler.
 
-    data: folders of the sequences, ROOT or WORKER=ROOT; save_every_s: time between two saved states of a run. Raises ConfigError.
+    data: folders of the sequences, ROOT or WORKER=ROOT; save_every_s: time between two saved states of a run.
+    Raises ConfigError.
     """
     roots = DataRoots.read(data)
     if scheduler:

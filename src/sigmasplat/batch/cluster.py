@@ -73,8 +73,8 @@ class ClusterRoad:
         write_text(out / TOKEN, token)
         futures = {
             self.client.submit(
-                _make, job.to_json(), str(out.resolve()), token, self.data, installed_code(), self.save_every_s, key=f"{job.name}-{token}",
-                workers=self.having.get(job.name) or None, priority=-number, pure=False,
+                _make, job.to_json(), str(out.resolve()), token, self.data, installed_code(), self.save_every_s,
+                key=f"{job.name}-{token}", workers=self.having.get(job.name) or None, priority=-number, pure=False,
             ): job
             for number, job in enumerate(jobs)
         }  # fmt: skip

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sigmasplat.batch.definition import MEAN, Cell, Table
-from sigmasplat.batch.scores import PAPER, Row, Value, rows, run_record
+from sigmasplat.batch.scores import Row, Value, rows, run_record
 from sigmasplat.io.atomic import make_folder, write_text
 from sigmasplat.report.tables import number
 
@@ -37,8 +37,7 @@ class Written:
     ) -> "Written":  # fmt: skip
         """Read the scores of the finished runs, given by the names of their jobs."""
         records = {cell.job.name: run_record(folder / cell.job.name) for cell in cells if cell.job.name in finished}
-        sources = [f"{published.system}, {PAPER}: {published.source}" for published in table.published]
-        lines = [*remarks, *table.notes, *dict.fromkeys(sources)]
+        lines = [*remarks, *table.notes, *_sources(table)]
         return Written(table, cells, rows(table, cells, records), lines, conditions)
 
     def save(self, folder: Path) -> None:
@@ -102,6 +101,14 @@ class Written:
                 for cell in self.cells
             ],
         }
+
+
+def _sources(table: Table) -> list[str]:
+    """Return a line per source of published numbers, with the systems whose numbers are from there."""
+    systems = dict[str, list[str]]()
+    for published in table.published:
+        systems.setdefault(published.source, []).append(published.system)
+    return [f"Published: {source} ({', '.join(names)})." for source, names in systems.items()]
 
 
 def _line(words: Sequence[str]) -> str:
