@@ -79,7 +79,7 @@ class ClusterRoad:
             for number, job in enumerate(jobs)
         }  # fmt: skip
         try:
-            for future in distributed.as_completed(futures, raise_errors=False):
+            for future in distributed.as_completed(futures, loop=self.client.loop, raise_errors=False):
                 yield futures[future], self._ended(future, futures[future], out)
         finally:
             self.client.cancel(list(futures), force=True)
