@@ -22,6 +22,16 @@ pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built
 SAME = ("trajectory.txt", "map.ply", "loops.json", "checkpoint.safetensors", "config.json")
 TABLES = ("table.md", "table.tex", "table.json")
 DEADLINE_S = 240
+BLIND = """
+from pathlib import Path
+read_text = Path.read_text
+def blind(path, *more, **named):
+    if path.name == ".batch":
+        raise FileNotFoundError(path)
+    return read_text(path, *more, **named)
+Path.read_text = blind
+"""
+"""Hides the folder of a table from a worker on the same machine."""
 
 
 def arguments(
@@ -169,21 +179,21 @@ def test_a_worker_that_dies_changes_nothing(tmp_path: Path, replica: Path, whole
     assert_same(out, whole)
 
 
-def test_a_worker_without_the_folder_sends_its_files(tmp_path: Path) -> None:
-    """The folder is hidden from the worker by a token that it cannot read."""
-    cluster_module = pytest.importorskip("sigmasplat.batch.cluster")
-    run = tmp_path / "run"
-    (run / "submaps").mkdir(parents=True)
-    (run / "images").mkdir()
-    (run / "images/a.png").write_bytes(b"picture")
-    (run / "map.ply").write_bytes(b"map" * 1000)
-    (run / "submaps/0.safetensors").write_bytes(b"large")
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out/run").mkdir()
-    (tmp_path / "out/run/old.txt").write_text("of an earlier run")
-    cluster_module.unpack(cluster_module.pack(run), tmp_path / "out" / "run")
-    found = {str(path.relative_to(tmp_path / "out/run")): path for path in (tmp_path / "out/run").rglob("*.*")}
-    assert set(found) == {"images/a.png", "map.ply"} and found["map.ply"].read_bytes() == b"map" * 1000
+def test_a_worker_that_does_not_see_the_folder_sends_its_files(
+    tmp_path: Path, replica: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "blind").mkdir()
+    (tmp_path / "blind/sitecustomize.py").write_text(BLIND)
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "blind"), os.environ.get("PYTHONPATH", "")]))
+        with cluster(tmp_path, ("other",)) as (address, _):
+            elsewhere.undo()
+            out = tmp_path / "table"
+            assert exit_code(*arguments(out, replica, "--scenes", "room0", "--scheduler", address)) == 0
+    sent = out / "runs/room0-varsplat-seed0"
+    for name in SAME:
+        assert (sent / name).read_bytes() == (whole / "runs/room0-varsplat-seed0" / name).read_bytes(), name
+    assert not (sent / "submaps").exists() and (sent / "report.html").exists()
 
 
 def test_a_batch_keeps_what_is_done_and_names_what_is_missing(
