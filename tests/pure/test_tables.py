@@ -119,7 +119,7 @@ def test_text_of_a_table(table: Table) -> None:
     cells: list[Cell] = table.cells(1, {})
     made = Written(table, cells, rows(table, cells, {cells[0].job.name: ate(0.02)}), ["Missing: b."], {})
     text, latex = made.markdown(), made.latex()
-    assert "| ATE [cm] | ours & theirs (ours) | 2.00 | – | 2.00 (1 of 2 scenes) |" in text and "- Missing: b." in text
+    assert "| ATE [cm] ↓ | ours & theirs (ours) | 2.00 | – | 2.00 (1 of 2 scenes) |" in text and "- Missing: b." in text
     assert r"ours \& theirs (paper) & 1.50 & -- & 2.00 \\" in latex
     assert made.values()["rows"][2]["values"]["a"]["mean"] == pytest.approx(2)
 
@@ -204,4 +204,4 @@ def test_the_list_of_tables_is_printed(capsys: pytest.CaptureFixture[str]) -> No
 
 def test_scores_say_which_direction_is_better() -> None:
     assert {score.better for name in list_tables() for score in Table.read(name).scores} == {"less", "more"}
-    assert Score("x", ["a"], "cm").title == "x [cm]" and Score("x", ["a"]).title == "x"
+    assert Score("x", ["a"], "cm").title == "x [cm] ↓" and Score("x", ["a"], better="more").title == "x ↑"

@@ -76,7 +76,11 @@ def whole(replica: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def assert_same(out: Path, whole: Path) -> None:
     for name in TABLES:
         assert (out / name).read_text() == (whole / name).read_text()
-    for run in ("room0-varsplat-seed0", "office0-varsplat-seed0"):
+    assert_same_runs(out, whole, "room0-varsplat-seed0", "office0-varsplat-seed0")
+
+
+def assert_same_runs(out: Path, whole: Path, *runs: str) -> None:
+    for run in runs:
         for name in SAME:
             assert (out / "runs" / run / name).read_bytes() == (whole / "runs" / run / name).read_bytes(), (run, name)
 
@@ -190,9 +194,8 @@ def test_a_worker_that_does_not_see_the_folder_sends_its_files(
             elsewhere.undo()
             out = tmp_path / "table"
             assert exit_code(*arguments(out, replica, "--scenes", "room0", "--scheduler", address)) == 0
+    assert_same_runs(out, whole, "room0-varsplat-seed0")
     sent = out / "runs/room0-varsplat-seed0"
-    for name in SAME:
-        assert (sent / name).read_bytes() == (whole / "runs/room0-varsplat-seed0" / name).read_bytes(), name
     assert not (sent / "submaps").exists() and (sent / "report.html").exists()
 
 
@@ -210,12 +213,12 @@ def test_a_batch_keeps_what_is_done_and_names_what_is_missing(
 
 def test_ctrl_c_saves_the_running_run(tmp_path: Path, replica: Path, whole: Path) -> None:
     out, log, run = tmp_path / "table", tmp_path / "log", "office0-varsplat-seed0"
-    words = [word if word != "0.001" else "0" for word in arguments(out, replica)]
+    words = [word if word != "0.001" else "0" for word in arguments(out, replica, "--scenes", "office0")]
     process = started(*words, log=log)
     wait_for(lambda: frames_logged(out, run) >= 3, log, process)
     process.send_signal(signal.SIGINT)
     assert process.wait(DEADLINE_S) == 130 and "repeat the command" in log.read_text()
     facts = RunFolder(out / "runs" / run).facts()
     assert facts["status"] in ("interrupted", "complete")
-    assert exit_code(*arguments(out, replica)) == 0
-    assert_same(out, whole)
+    assert exit_code(*words) == 0
+    assert_same_runs(out, whole, run)

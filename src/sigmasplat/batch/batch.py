@@ -102,17 +102,19 @@ class Batch:
         return float(sum(known or 0.0 for known in (facts["wall_s"], facts["finish_s"], facts[FACT]["scoring_s"])))
 
 
-def open_road(data: Sequence[str], jobs: int, scheduler: str | None, save_every_s: float) -> Road:
+def open_road(
+    data: Sequence[str], jobs: int, scheduler: str | None, save_every_s: float, say: Callable[[str], None]
+) -> Road:
     """Return the road to make runs by: `jobs` processes on this machine, or the Dask cluster of a scheduler.
 
-    data: folders of the sequences, ROOT or WORKER=ROOT; save_every_s: time between two saved states of a run.
-    Raises ConfigError.
+    data: folders of the sequences, ROOT or WORKER=ROOT; save_every_s: time between two saved states of a run;
+    say: prints a line. Raises ConfigError.
     """
     roots = DataRoots.read(data)
     if scheduler:
         from sigmasplat.batch.cluster import ClusterRoad
 
-        return ClusterRoad(scheduler, roots, save_every_s)
+        return ClusterRoad(scheduler, roots, save_every_s, say)
     if jobs < 1:
         raise ConfigError(f"--jobs must be at least 1, found {jobs}")
     if roots.by_worker:

@@ -12,7 +12,7 @@ import shutil
 import socket
 import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ LEFT_OUT = ("submaps", "state.safetensors")
 class ClusterRoad:
     """Makes runs on the workers of the scheduler at `address`, one at a time on each thread of a worker."""
 
-    def __init__(self, address: str, data: DataRoots, save_every_s: float) -> None:
+    def __init__(self, address: str, data: DataRoots, save_every_s: float, say: Callable[[str], None]) -> None:
         """Connect, and wait for the first worker. Raises ConfigError if Dask is missing or no scheduler answers."""
         self.data, self.save_every_s = data, save_every_s
         distributed = _distributed()
@@ -43,6 +43,8 @@ class ClusterRoad:
             raise ConfigError(
                 f"no Dask scheduler answers at {address} within {CONNECT_S} s; start one with: dask scheduler"
             ) from problem
+        if not self.client.nthreads():
+            say(f"waiting for the first worker of {address}")
         self.client.wait_for_workers(1)
         self.having = dict[str, list[str]]()
 

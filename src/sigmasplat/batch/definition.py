@@ -49,8 +49,9 @@ class Score:
 
     @property
     def title(self) -> str:
-        """Return name and unit."""
-        return f"{self.name} [{self.unit}]" if self.unit else self.name
+        """Return name, unit, and an arrow in the better direction."""
+        arrow = "↑" if self.better == "more" else "↓"
+        return f"{self.name} [{self.unit}] {arrow}" if self.unit else f"{self.name} {arrow}"
 
     def value(self, record: Mapping[str, Any]) -> float | None:
         """Return the score of a run in its unit, None if the run does not have it."""

@@ -15,7 +15,7 @@ FILES = ("table.md", "table.tex", "table.json")
 LATEX = str.maketrans(
     {
         "±": r"$\pm$", "−": r"$-$", "–": "--", "\u202f": r"\,", "%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#",
-        "²": r"$^2$", "σ": r"$\sigma$", "×": r"$\times$",
+        "²": r"$^2$", "σ": r"$\sigma$", "×": r"$\times$", "↑": r"$\uparrow$", "↓": r"$\downarrow$",
     }
 )  # fmt: skip
 

@@ -48,7 +48,7 @@ def batch(
     screen, made = Screen(), Batch(planned, out or OUT)
     made.refuse_other_runs(overwrite)
     try:
-        made.make(open_road(data, jobs, scheduler, save_every), screen, lambda: None)
+        made.make(open_road(data, jobs, scheduler, save_every, screen.say), screen, lambda: None)
     except KeyboardInterrupt:
         screen.say(f"stopped; repeat the command to make the other runs in {made.out}")
         raise

@@ -63,7 +63,7 @@ class PaperTable:
         out = self.out or Path("runs") / table.name
         batch = Batch([cell.job for cell in cells], out / "runs")
         batch.refuse_other_runs(self.overwrite)
-        road = open_road(self.data, self.jobs, self.scheduler, self.save_every)
+        road = open_road(self.data, self.jobs, self.scheduler, self.save_every, screen.say)
         try:
             batch.make(road, screen, lambda: self._write(table, cells, batch, settings, out))
         except KeyboardInterrupt:
@@ -89,17 +89,16 @@ class PaperTable:
 
     def _conditions(self, settings: Mapping[str, str]) -> dict[str, Any]:
         from sigmasplat.batch.job import installed_code
-        from sigmasplat.io.machine import code_version
 
-        conditions = {"settings": dict(settings), "limit": self.limit, "seeds": self.seeds}
-        return conditions | {"commit": code_version(), "code": installed_code()}
+        return {"settings": dict(settings), "limit": self.limit, "seeds": self.seeds, "code": installed_code()}
 
     def _remarks(self, batch: "Batch", settings: Mapping[str, str], scene: Mapping[str, str]) -> list[str]:
         """Return the conditions of our numbers, and what is missing, as lines below the table."""
-        from sigmasplat.io.machine import code_version
+        from sigmasplat.batch.job import installed_code
+        from sigmasplat.io.machine import package_version
 
         seeds = f"{self.seeds} seeds, mean ± standard deviation" if self.seeds > 1 else "one seed"
-        lines = [f"Ours: SigmaSplat {code_version()}, {seeds}."]
+        lines = [f"Ours: SigmaSplat {package_version()} (code {installed_code()}), {seeds}."]
         changed = [f"{name}={value}" for name, value in settings.items()]
         changed += [f"the first {self.limit} frames"] if self.limit else []
         if changed:
