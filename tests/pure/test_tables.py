@@ -1,6 +1,5 @@
 """Tables of papers: every definition is valid, means and deviations follow from the runs, mistakes are one line."""
 
-import dataclasses
 import sys
 from pathlib import Path
 from typing import Any
@@ -136,12 +135,13 @@ def test_scenes_are_found_in_the_folders_of_a_table(tmp_path: Path) -> None:
 
 
 def test_scenes_and_systems_can_be_chosen(table: Table) -> None:
-    part = table.with_parts(["b"], ["sigma"])
-    assert [(scene.name, system.name) for scene in part.scenes for system in part.systems] == [("b", "sigma")]
-    assert table.with_parts([], []) == dataclasses.replace(table)
-    for scenes, systems, says in ((["c"], [], "no scene 'c'"), ([], ["quick"], "no system 'quick'")):
-        with pytest.raises(ConfigError, match=says):
-            table.with_parts(scenes, systems)
+    part = table.with_systems(["sigma"])
+    assert [(cell.scene, cell.system) for cell in part.cells(1, {}, scenes=["b"])] == [("b", "sigma")]
+    assert table.with_systems([]) == table
+    with pytest.raises(ConfigError, match="no scene 'c'"):
+        table.cells(1, {}, scenes=["c"])
+    with pytest.raises(ConfigError, match="no system 'quick'"):
+        table.with_systems(["quick"])
 
 
 def test_the_time_left_follows_from_presets_and_lengths(table: Table) -> None:

@@ -1,7 +1,7 @@
 """The definition of a table: scenes, systems, scores and published numbers. The format: docs/tables.md."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from sigmasplat.batch.job import Job
@@ -110,34 +110,37 @@ class Table:
                 raise ConfigError(f"table {name} is not valid: {published.system} has numbers of {strange[0]!r}")
         return table
 
-    def with_parts(self, scenes: Sequence[str], systems: Sequence[str]) -> "Table":
-        """Return the table with some of its scenes and systems only; a preset can be given as a system.
+    def with_systems(self, names: Sequence[str]) -> "Table":
+        """Return the table with some of its systems only, or presets; without names, with its default systems.
 
-        Without names, all scenes and the default systems are kept. Raises ConfigError on an unknown name.
+        Raises ConfigError on an unknown name.
         """
-        of_scene = {scene.name: scene for scene in self.scenes}
-        of_system = {system.name: system for system in self.systems}
-        known = of_system | {name: System(name, name) for name in list_presets() if name not in of_system}
-        for given, names, what in ((scenes, of_scene, "scene"), (systems, known, "system")):
-            for name in given:
-                if name not in names:
-                    there = ", ".join(of_scene) if what == "scene" else f"{', '.join(of_system)}, and all presets"
-                    raise ConfigError(f"table {self.name} has no {what} {name!r}{nearest(name, names)}; it has {there}")
-        return Table(
-            **vars(self)
-            | {
-                "scenes": tuple(of_scene[name] for name in dict.fromkeys(scenes)) or tuple(self.scenes),
-                "systems": tuple(known[name] for name in dict.fromkeys(systems))
-                or tuple(system for system in self.systems if system.default),
-            }
-        )
+        of_table = {system.name: system for system in self.systems}
+        known = of_table | {name: System(name, name) for name in list_presets() if name not in of_table}
+        for name in names:
+            if name not in known:
+                there = f"{', '.join(of_table)}, and all presets"
+                raise ConfigError(f"table {self.name} has no system {name!r}{nearest(name, known)}; it has {there}")
+        chosen = [known[name] for name in dict.fromkeys(names)]
+        return replace(self, systems=tuple(chosen or (system for system in self.systems if system.default)))
 
-    def cells(self, seeds: int, settings: Mapping[str, str], limit: int | None = None) -> list["Cell"]:
-        """List the runs: each seed of each scene with each system. `settings` apply to all of them."""
+    def cells(
+        self, seeds: int, settings: Mapping[str, str], limit: int | None = None, scenes: Sequence[str] = ()
+    ) -> list["Cell"]:
+        """List the runs: each seed of each scene, or of `scenes`, with each system. `settings` apply to all of them.
+
+        Raises ConfigError on an unknown scene or setting.
+        """
+        known = [scene.name for scene in self.scenes]
+        for name in scenes:
+            if name not in known:
+                there = ", ".join(known)
+                raise ConfigError(f"table {self.name} has no scene {name!r}{nearest(name, known)}; it has {there}")
         return [
             Cell(scene.name, system.name, seed, self._job(scene, system, seed, settings, limit))
             for seed in range(seeds)
             for scene in self.scenes
+            if not scenes or scene.name in scenes
             for system in self.systems
         ]
 

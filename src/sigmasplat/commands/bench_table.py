@@ -57,9 +57,9 @@ class PaperTable:
         if not self.data:
             raise ConfigError("no --data given; give the folder that contains the scenes of the data set")
         screen = Screen()
-        table = Table.read(self.table).with_parts(self.scenes, self.systems)
+        table = Table.read(self.table).with_systems(self.systems)
         settings = split_settings(self.settings)
-        cells = table.cells(self.seeds, settings, self.limit)
+        cells = table.cells(self.seeds, settings, self.limit, self.scenes)
         out = self.out or Path("runs") / table.name
         batch = Batch([cell.job for cell in cells], out / "runs")
         batch.refuse_other_runs(self.overwrite)
