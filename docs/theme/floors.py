@@ -48,6 +48,7 @@ FLOORS = (
     Floor(("checks",), "results", "check an installation, a recording"),
     Floor(("run",), "programs", "run SLAM on a sequence"),
     Floor(("evaluation",), "programs", "score runs, compare them"),
+    Floor(("batch",), "programs", "many runs, one table"),
     Floor(("exports",), "programs", "formats of other programs"),
     Floor(("viewer",), "programs", "a run in the browser"),
     Floor(("download",), "programs", "public data sets"),

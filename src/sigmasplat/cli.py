@@ -7,6 +7,7 @@ import tyro
 
 import sigmasplat
 from sigmasplat import env
+from sigmasplat.commands.batch import batch
 from sigmasplat.commands.bench import bench
 from sigmasplat.commands.completion import completion
 from sigmasplat.commands.doctor import doctor
@@ -33,6 +34,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "inspect": inspect,
     "run": run,
     "resume": resume,
+    "batch": batch,
     "localise": localise,
     "view": view,
     "eval": evaluate_run,
@@ -60,8 +62,8 @@ def _run_command(arguments: Sequence[str]) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run a command and exit: 0 done, 1 problems found (doctor, inspect) or no image found (localise), 2 refused with
-    one line, 130 interrupted."""
+    """Run a command and exit: 0 done, 1 problems found (doctor, inspect), no image found (localise) or a run failed
+    (batch, bench table), 2 refused with one line, 130 interrupted."""
     given = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if given == ["--version"]:
         print(f"sigmasplat {sigmasplat.__version__}")

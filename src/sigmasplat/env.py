@@ -1,4 +1,4 @@
-"""Read the environment variables, once. This module must be imported before anything that loads OpenMP.
+"""Read the environment variables, once; folders that commands share. This module must be imported before anything that loads OpenMP.
 
 | variable | values | meaning |
 |---|---|---|
@@ -12,6 +12,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Literal, cast, get_args
 
 from sigmasplat.errors import ConfigError
@@ -21,6 +22,9 @@ Backend = Literal["auto", "cpu", "cuda", "reference"]
 
 # libgomp reads this when it is loaded. Idle threads then sleep instead of spinning: 5× faster on a busy machine.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+LPIPS_FOLDER = Path("data/lpips")
+"""Where `sigmasplat download lpips` puts the weights."""
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from documents import DOCUMENTS, ROOT, prose
 from sigmasplat.config import Config
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.presets import list_presets, preset
+from sigmasplat.presets.table_files import list_tables
 
 PACKAGE = ROOT / "src" / "sigmasplat"
 SECTIONS = [f.name for f in dataclasses.fields(Config) if dataclasses.is_dataclass(getattr(Config(), f.name))]
@@ -43,7 +44,7 @@ def test_links_lead_somewhere() -> None:
 
 
 def unknown_names(path: Path) -> list[str]:
-    """Return the tests, files, settings and presets that a document names and that do not exist."""
+    """Return the tests, files, settings, presets and tables that a document names and that do not exist."""
     text = prose(path)
     tests = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text)
     files = re.findall(rf"`((?:{'|'.join(FOLDERS)})/[\w/]+\.\w+)`", text)
@@ -62,7 +63,7 @@ def unknown_names(path: Path) -> list[str]:
         *(f"{file}::{name}" for file, name in tests if f"def {name}(" not in (ROOT / file).read_text(encoding="utf-8")),
         *(file for file in files if not (PACKAGE / file).is_file()),
         *(f"{section}.{name}" for section, name in settings if not is_known(section, name)),
-        *(name for name in presets if name not in list_presets()),
+        *(name for name in presets if name not in {*list_presets(), *list_tables()}),
     ]
 
 

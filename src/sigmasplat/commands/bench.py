@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from sigmasplat.commands import options
+from sigmasplat.commands.bench_table import PaperTable
 from sigmasplat.commands.bench_uncertainty import Uncertainty
 from sigmasplat.commands.options import prepare_torch
 from sigmasplat.errors import ConfigError
@@ -87,11 +88,12 @@ class Ablation:
 def bench(
     which: Annotated[
         Annotated[Ablation, tyro.conf.subcommand("ablation")]
-        | Annotated[Uncertainty, tyro.conf.subcommand("uncertainty")],
+        | Annotated[Uncertainty, tyro.conf.subcommand("uncertainty")]
+        | Annotated[PaperTable, tyro.conf.subcommand("table")],
         tyro.conf.arg(name="", prefix_name=False),
     ],
 ) -> int:
-    """Measure over many runs what each use of uncertainty contributes, and how good the uncertainty is.
+    """Measure over many runs: what each use of uncertainty contributes, how good it is, and the tables of papers.
 
     example: sigmasplat bench ablation data/kitchen --seeds 5
     """

@@ -8,15 +8,13 @@ import tyro
 
 from sigmasplat.commands import options
 from sigmasplat.commands.options import arg, prepare_torch, source_of
+from sigmasplat.env import LPIPS_FOLDER
 
 if TYPE_CHECKING:
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.metrics.lpips import Lpips
     from sigmasplat.run.terminal import Screen
     from sigmasplat.sources.base import Source
-
-LPIPS_FOLDER = Path("data/lpips")
-"""Where `sigmasplat download lpips` puts the weights."""
 
 
 @dataclass(frozen=True)

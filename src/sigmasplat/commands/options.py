@@ -91,6 +91,14 @@ AllPoses = Annotated[
     bool,
     arg(help="also write trajectory_all.txt with the poses of all frames, including lost ones", help_behavior_hint=""),
 ]
+Log = Annotated[
+    str,
+    arg(
+        metavar="NAMES",
+        help="also write the values of every frame to logs/ in RUN: csv, tensorboard, rerun, or several by commas",
+        help_behavior_hint="",
+    ),
+]
 View = Annotated[
     bool, arg(help="show the run in the browser while it runs, and afterwards until Ctrl-C", help_behavior_hint="")
 ]
@@ -273,12 +281,13 @@ InputOptionsFlat = Annotated[InputOptions, arg(name=""), tyro.conf.OmitArgPrefix
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of run and resume: scoring, profile, saving, all poses, viewer."""
+    """Options of run and resume: scoring, profile, saving, all poses, logs, viewer."""
 
     evaluate: Evaluate = True
     profile: Profile = False
     save_every: SaveEvery = 60.0
     all_poses: AllPoses = False
+    log: Log = ""
     view: View = False
     host: Host = HOST
     port: Port = PORT

@@ -70,9 +70,11 @@ def run(
     from sigmasplat.run.finished_map import FinishedMap, continue_map
     from sigmasplat.run.resume import StartPoint
     from sigmasplat.run.session import new_folder, removed_on_early_failure
+    from sigmasplat.run.step_logs import log_names
     from sigmasplat.run.terminal import Screen
     from sigmasplat.slam.slam import Slam
 
+    log_names(run_options.log)
     screen, earlier = Screen(), FinishedMap.of(RunFolder.open(onto)) if onto else None
     config = configured(preset, settings, seed, input_options, earlier.config if earlier else None)
     if earlier:
@@ -99,8 +101,10 @@ def resume(
     """
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.run.resume import resume as resumed
+    from sigmasplat.run.step_logs import log_names
     from sigmasplat.run.terminal import Screen
 
+    log_names(run_options.log)
     screen, folder = Screen(), RunFolder.open(run)
     source = source_of(folder, moved_to)
     prepare_torch()
@@ -178,7 +182,7 @@ def _run_and_score(
     cuda_stages.measure(run_options.profile)
     state = StateFile(start.slam, folder, run_options.save_every)
     start.slam.saved_refinement = RefinementFile(start.slam, folder, run_options.save_every)
-    with _progress(screen, start, source, viewer) as callback:
+    with _progress(screen, start, source, folder, run_options, viewer) as callback:
         outcome = Session(
             start.slam, source, folder, callback, state, start.next_index, start.wall_s, run_options.all_poses
         ).execute()
@@ -204,18 +208,24 @@ def _run_and_score(
 
 @contextmanager
 def _progress(
-    screen: "Screen", start: "StartPoint", source: "Source", viewer: "ViewerApp | None"
-) -> Iterator["Callback"]:
-    """Yield the callback that shows the session on the terminal, and in the viewer if there is one."""
+    screen: "Screen", start: "StartPoint", source: "Source", folder: "RunFolder",
+    run_options: options.RunOptions, viewer: "ViewerApp | None",
+) -> Iterator["Callback"]:  # fmt: skip
+    """Yield the callback that shows the session on the terminal, in the requested logs, and in the viewer if there is
+    one."""
     from sigmasplat.run.protocols import CallbackList
+    from sigmasplat.run.step_logs import log_names, step_logs
 
-    with screen.steps(None if source.live else len(source), start.next_index) as steps:
+    with (
+        screen.steps(None if source.live else len(source), start.next_index) as steps,
+        step_logs(log_names(run_options.log), folder, start.next_index) as logs,
+    ):
         if viewer is None:
-            yield steps
+            yield CallbackList(steps, *logs)
             return
         from sigmasplat.viewer.live import LiveView
 
-        yield CallbackList(steps, LiveView(start.slam, viewer.show, source.name))
+        yield CallbackList(steps, *logs, LiveView(start.slam, viewer.show, source.name))
 
 
 def _warn_of_skipped_frames(screen: "Screen", source: "Source") -> None:

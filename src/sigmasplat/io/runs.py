@@ -1,5 +1,6 @@
 """Write and read the folder of a run, which is valid at any time."""
 
+import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -128,6 +129,7 @@ class RunFolder:
             (self.path / name).unlink(missing_ok=True)
         for picture in self.images.glob("*.png"):
             picture.unlink()
+        shutil.rmtree(self.logs, ignore_errors=True)
         self.submaps.clear()
         self.write_components(())
 
@@ -135,6 +137,11 @@ class RunFolder:
     def images(self) -> Path:
         """Return the folder of images, images/."""
         return self.path / "images"
+
+    @property
+    def logs(self) -> Path:
+        """Return the folder of logs for other programs, logs/, which `run --log` writes."""
+        return self.path / "logs"
 
     @property
     def submaps(self) -> DiskStore:

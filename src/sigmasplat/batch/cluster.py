@@ -1,0 +1,157 @@
+"""Make runs on the workers of a Dask cluster, each in a process of its own.
+
+If a worker sees the folder of the batch, it makes the run there, and another worker can resume it. Otherwise it makes
+the run in a temporary folder and sends the files back, without submaps/.
+"""
+
+import importlib
+import io
+import os
+import secrets
+import shutil
+import socket
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from sigmasplat.batch.job import Job, installed_code
+from sigmasplat.batch.process import RunProcesses
+from sigmasplat.batch.road import DataRoots, Sequences, sequences_of
+from sigmasplat.env import install_extra
+from sigmasplat.errors import ConfigError, RunError
+from sigmasplat.io.atomic import write_text
+
+TOKEN = ".batch"
+"""File in the folder of the batch with a random text: a worker that reads the same text sees the same folder."""
+CONNECT_S = 10
+LEFT_OUT = ("submaps", "state.safetensors")
+"""Parts of a run folder that are not sent: they are large, and the scores need them on the worker only."""
+
+
+class ClusterRoad:
+    """Makes runs on the workers of the scheduler at `address`, one at a time on each thread of a worker."""
+
+    def __init__(self, address: str, data: DataRoots, save_every_s: float, say: Callable[[str], None]) -> None:
+        """Connect, and wait for the first worker. Raises ConfigError if Dask is missing or no scheduler answers."""
+        self.data, self.save_every_s = data, save_every_s
+        distributed = _distributed()
+        try:
+            self.client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
+        except (OSError, TimeoutError, ValueError) as problem:
+            raise ConfigError(
+                f"no Dask scheduler answers at {address} within {CONNECT_S} s; start one with: dask scheduler"
+            ) from problem
+        if not self.client.nthreads():
+            say(f"waiting for the first worker of {address}")
+        self.client.wait_for_workers(1)
+        self.having = dict[str, list[str]]()
+
+    @property
+    def slots(self) -> int:
+        """Return the number of runs that are made at the same time: the threads of all workers."""
+        threads: Mapping[str, int] = self.client.nthreads()
+        return max(1, sum(threads.values()))
+
+    def survey(self, jobs: Sequence[Job]) -> Mapping[str, Sequences]:
+        """Return the sequences of each worker. Raises RunError if a worker has other code."""
+        try:
+            found = self.client.run(_survey, [job.to_json() for job in jobs], self.data)
+        except ImportError as problem:
+            raise RunError(f"a worker cannot import SigmaSplat: {problem}; install the same release there") from problem
+        for address, (code, _) in found.items():
+            if code != installed_code():
+                raise RunError(f"the worker at {address} has other code than this machine; install the same release")
+        for job in jobs:
+            having = [address for address, (_, sequences) in found.items() if job.name in sequences.frames]
+            self.having[job.name] = having if len(having) < len(found) else []
+        return {address: sequences for address, (_, sequences) in found.items()}
+
+    def make(self, jobs: Sequence[Job], out: Path) -> Iterator[tuple[Job, str | None]]:
+        """Make the runs. The runs of a worker that dies are made by another one."""
+        distributed, token = _distributed(), secrets.token_hex(16)
+        out.mkdir(parents=True, exist_ok=True)
+        write_text(out / TOKEN, token)
+        futures = {
+            self.client.submit(
+                _make, job.to_json(), str(out.resolve()), token, self.data, installed_code(), self.save_every_s,
+                key=f"{job.name}-{token}", workers=self.having.get(job.name) or None, priority=-number, pure=False,
+            ): job
+            for number, job in enumerate(jobs)
+        }  # fmt: skip
+        try:
+            for future in distributed.as_completed(futures, loop=self.client.loop, raise_errors=False):
+                yield futures[future], self._ended(future, futures[future], out)
+        finally:
+            self.client.cancel(list(futures), force=True)
+            (out / TOKEN).unlink(missing_ok=True)
+
+    def _ended(self, future: Any, job: Job, out: Path) -> str | None:
+        """Return why a run failed, None if it is finished; write the files that its worker sent."""
+        if future.status != "finished":
+            problem = future.exception() if future.status == "error" else None
+            return f"the worker failed: {problem!r}" if problem else "the scheduler cancelled the run"
+        why, files = future.result()
+        if files is not None:
+            unpack(files, out / job.name)
+        return str(why) if why else None
+
+
+def _distributed() -> Any:
+    """Import Dask's scheduler client. Raises ConfigError with the command that installs it."""
+    try:
+        return importlib.import_module("distributed")
+    except ImportError as problem:
+        raise ConfigError(f"--scheduler needs the package distributed: {install_extra('cluster')}") from problem
+
+
+def _survey(jobs: Sequence[str], data: DataRoots, dask_worker: Any = None) -> tuple[str, Sequences]:
+    """Return this worker's code and sequences. Dask fills in `dask_worker`."""
+    return installed_code(), sequences_of([Job.from_json(text) for text in jobs], _root(data, dask_worker))
+
+
+def _root(data: DataRoots, worker: Any) -> str | None:
+    return data.of(str(worker.name), socket.gethostname())
+
+
+def _make(
+    text: str, out: str, token: str, data: DataRoots, code: str, save_every_s: float
+) -> tuple[str | None, bytes | None]:
+    """Make a run on this worker; return why it failed, if so, and its files, if this worker does not see `out`."""
+    if code != installed_code():
+        return "the worker has other code than the machine that started the batch; install the same release", None
+    job, root = Job.from_json(text), _root(data, _distributed().get_worker())
+    processes = RunProcesses(save_every_s)
+    if _sees(Path(out), token):
+        return processes.make(job, Path(out) / job.name, root), None
+    with tempfile.TemporaryDirectory(prefix="sigmasplat-batch-") as temporary:
+        folder = Path(temporary) / job.name
+        why = processes.make(job, folder, root)
+        return why, None if why else pack(folder)
+
+
+def _sees(out: Path, token: str) -> bool:
+    try:
+        return (out / TOKEN).read_text(encoding="utf-8") == token
+    except OSError:
+        return False
+
+
+def pack(folder: Path) -> bytes:
+    """Return the files of a run folder, without its submaps, as one archive."""
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as packed:
+        for path in sorted(folder.rglob("*")):
+            if path.is_file() and path.relative_to(folder).parts[0] not in LEFT_OUT:
+                packed.write(path, path.relative_to(folder))
+    return archive.getvalue()
+
+
+def unpack(files: bytes, folder: Path) -> None:
+    """Write a packed run folder; an earlier one is replaced."""
+    with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as temporary:
+        zipfile.ZipFile(io.BytesIO(files)).extractall(Path(temporary) / "run")
+        if folder.exists():
+            shutil.rmtree(folder)
+        os.replace(Path(temporary) / "run", folder)

@@ -1,0 +1,106 @@
+"""Make one run in this process: python -m sigmasplat.batch.make_run JOB FOLDER SECONDS [DATA].
+
+SECONDS is the time between two saved states.
+
+A stopped run is resumed from its last saved state; the result has the same bytes as an uninterrupted run. The process
+ends when its standard input is closed, so it does not outlive the program that started it, even if that was killed.
+"""
+
+import fcntl
+import os
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import torch
+
+from sigmasplat import env
+from sigmasplat.batch.job import Job
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.evaluation.evaluate import evaluate
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.metrics.lpips import find_lpips
+from sigmasplat.run.resume import RefinementFile, StartPoint, StateFile, resume
+from sigmasplat.run.session import Session, new_folder
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources import open_source
+from sigmasplat.sources.base import Source
+
+REFUSED, INTERRUPTED = 2, 130
+
+
+def make_run(job: Job, folder: Path, data: str | None, save_every_s: float) -> None:
+    """Make, resume or only score the run of a job, whichever is left to do.
+
+    Raises SigmaSplatError if the sequence or the run cannot be used, KeyboardInterrupt if Ctrl-C stopped the run.
+    """
+    with only_one(folder):
+        if job.finished_in(folder):
+            return
+        path = job.sequence(data)
+        source = open_source(path, job.config.input)
+        run = RunFolder(folder)
+        if not (job.started_in(folder) and run.facts().get("status") == "complete"):
+            run, start = _started(job, folder, source, path)
+            state = StateFile(start.slam, run, save_every_s)
+            start.slam.saved_refinement = RefinementFile(start.slam, run, save_every_s)
+            outcome = Session(
+                start.slam, source, run, checkpointer=state, first_index=start.next_index, wall_s=start.wall_s
+            ).execute()
+            if outcome.status == "interrupted":
+                raise KeyboardInterrupt
+        started_s = time.perf_counter()
+        lpips, _ = find_lpips(env.LPIPS_FOLDER)
+        evaluate(run, source, mesh=job.mesh, lpips=lpips)
+        run.note(batch=job.facts() | {"scored": True, "scoring_s": time.perf_counter() - started_s})
+
+
+def _started(job: Job, folder: Path, source: Source, path: str) -> tuple[RunFolder, StartPoint]:
+    """Resume the run in a folder if it is one of this job and has a state, else begin it."""
+    if job.started_in(folder) and RunFolder(folder).state.is_file():
+        with suppress(SigmaSplatError):  # a damaged state costs time, not the table
+            run = RunFolder.open(folder)
+            start = resume(run, source)
+            run.note(status="running", source_path=path)
+            return run, start
+    run = new_folder(folder, job.config, source, overwrite=True, source_path=path, batch=job.facts())
+    return run, StartPoint(Slam(job.config, run.submaps))
+
+
+@contextmanager
+def only_one(folder: Path) -> Iterator[None]:
+    """Hold a lock file beside the folder, so that two processes never write one run; a second one waits."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with folder.with_name(f".{folder.name}.lock").open("w") as file:
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _end_with_parent() -> None:
+    """Wait until standard input is closed, then end the process at once."""
+    while os.read(0, 4096):
+        pass
+    os._exit(INTERRUPTED)
+
+
+def main(job_text: str, folder: str, save_every_s: str, data: str | None = None) -> int:
+    """Make the run of a job, and return the exit code; an error is one line on standard error."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    try:
+        if env.switches().threads:
+            torch.set_num_threads(env.switches().threads)
+        make_run(Job.from_json(job_text), Path(folder), data, float(save_every_s))
+    except SigmaSplatError as problem:
+        print(problem, file=sys.stderr)
+        return REFUSED
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

@@ -1,0 +1,93 @@
+"""Command `sigmasplat batch`: run SLAM on many recordings. torch is loaded only when it is needed."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sigmasplat.commands import batch_options, options
+from sigmasplat.config.text import full_path
+from sigmasplat.errors import ConfigError, SourceError
+from sigmasplat.presets import default_preset
+
+if TYPE_CHECKING:
+    from sigmasplat.batch.batch import Batch
+    from sigmasplat.run.terminal import Screen
+
+OK, FAILED = 0, 1
+DEFAULT_PRESET = default_preset()
+OUT = Path("runs/batch")
+
+
+def batch(
+    recordings: batch_options.Recordings,
+    preset: options.PresetName = DEFAULT_PRESET,
+    settings: options.Settings = (),
+    seed: options.Seed = None,
+    input_options: options.InputOptionsFlat = options.DEFAULT_INPUT_OPTIONS,
+    data: batch_options.DataFolders = (),
+    mesh: options.WithMesh = False,
+    out: batch_options.BatchFolder = None,
+    overwrite: batch_options.ReplaceRuns = False,
+    jobs: batch_options.Jobs = 1,
+    scheduler: batch_options.Scheduler = None,
+    save_every: options.SaveEvery = 60.0,
+) -> int:
+    """Run SLAM on many recordings, each in a run folder in DIR (default: runs/batch), and score them.
+
+    Finished runs are kept, stopped ones resume. example: sigmasplat batch data/kitchen data/hall --jobs 2
+    """
+    from sigmasplat.batch.batch import Batch, open_road
+    from sigmasplat.batch.job import Job
+    from sigmasplat.run.terminal import Screen
+
+    if not recordings:
+        raise ConfigError("no FOLDER given; give one or more recordings")
+    config = options.configured(preset, settings, seed, input_options)
+    paths = tuple(dict.fromkeys(recordings if data else map(full_path, recordings)))
+    planned = [Job(name, (path,), config, mesh) for name, path in zip(_names(paths), paths, strict=True)]
+    screen, made = Screen(), Batch(planned, out or OUT)
+    made.refuse_other_runs(overwrite)
+    try:
+        made.make(open_road(data, jobs, scheduler, save_every, screen.say), screen, lambda: None)
+    except KeyboardInterrupt:
+        screen.say(f"stopped; repeat the command to make the other runs in {made.out}")
+        raise
+    if len(made.missing) == len(planned):
+        raise SourceError(next(iter(made.missing.values())))
+    _show(screen, made)
+    return FAILED if made.failed or made.missing else OK
+
+
+def _names(paths: Sequence[str]) -> list[str]:
+    """Return a folder name for each recording: the last part of its path, numbered if several have the same."""
+    names = list[str]()
+    for path in paths:
+        plain = "".join(c if c.isalnum() or c in "._-" else "-" for c in Path(path).name).strip("-.") or "run"
+        name, number = plain, 1
+        while name in names:
+            number += 1
+            name = f"{plain}-{number}"
+        names.append(name)
+    return names
+
+
+def _show(screen: "Screen", made: "Batch") -> None:
+    """Print the main figures of every finished run."""
+    from rich.table import Table
+
+    from sigmasplat.io.runs import RunFolder
+    from sigmasplat.report.tables import number
+
+    table = Table("run", "frames", "lost", "ATE RMSE, cm", "PSNR, dB", "frames/s")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for job in made.finished():
+        metrics = RunFolder(made.out / job.name).read_metrics()
+        table.add_row(
+            job.name, str(metrics["frames"]), str(metrics["lost"]),
+            number((metrics["ate"] or {}).get("rmse_m"), 2, 100.0),
+            number(((metrics["held_out"] or metrics["training"]) or {}).get("psnr_db"), 2),
+            number(metrics["frames_per_s"], 2),
+        )  # fmt: skip
+    screen.out.print(table)
+    screen.say(f"{len(made.finished())} of {len(made.jobs)} runs: {made.out}")

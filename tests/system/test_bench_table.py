@@ -1,0 +1,224 @@
+"""`bench table` and `batch`: every layout goes through; a killed command or a dead worker changes no result."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+import paper_data
+from command_line import exit_code
+from sigmasplat.batch.definition import Table
+from sigmasplat.io.runs import RunFolder
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+
+SAME = ("trajectory.txt", "map.ply", "loops.json", "checkpoint.safetensors", "config.json")
+TABLES = ("table.md", "table.tex", "table.json")
+DEADLINE_S = 240
+BLIND = """
+from pathlib import Path
+read_text = Path.read_text
+def blind(path, *more, **named):
+    if path.name == ".batch":
+        raise FileNotFoundError(path)
+    return read_text(path, *more, **named)
+Path.read_text = blind
+"""
+"""Hides the folder of a table from a worker on the same machine."""
+
+
+def arguments(
+    out: Path, data: Path, *more: str, table: str = "varsplat-replica", system: str = "VarSplat"
+) -> list[str]:
+    """Return a tiny table of one system; the state of its runs is saved after every frame."""
+    chosen = ["--systems", system, "--seeds", "1", "--save-every", "0.001"]
+    return ["bench", "table", table, "--data", str(data), "--out", str(out), *chosen, *paper_data.tiny_options(), *more]
+
+
+def started(*words: str, log: Path) -> subprocess.Popen:
+    with log.open("w") as file:
+        return subprocess.Popen([sys.executable, "-m", "sigmasplat", *words], stdout=file, stderr=subprocess.STDOUT)
+
+
+def wait_for(condition: Callable[[], bool], log: Path, process: subprocess.Popen | None = None) -> None:
+    deadline_s = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < deadline_s, log.read_text()
+        assert process is None or process.poll() is None, log.read_text()
+        time.sleep(0.01)
+
+
+def frames_logged(out: Path, run: str) -> int:
+    log = out / "runs" / run / "log.jsonl"
+    return log.read_text().count("\n") if log.exists() else 0
+
+
+@pytest.fixture(scope="module")
+def replica(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return paper_data.write_replica(tmp_path_factory.mktemp("replica"))
+
+
+@pytest.fixture(scope="module")
+def whole(replica: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a table that was made without a break, one run after the other."""
+    out = tmp_path_factory.mktemp("whole") / "table"
+    assert exit_code(*arguments(out, replica)) == 0
+    return out
+
+
+def assert_same(out: Path, whole: Path) -> None:
+    for name in TABLES:
+        assert (out / name).read_text() == (whole / name).read_text()
+    assert_same_runs(out, whole, "room0-varsplat-seed0", "office0-varsplat-seed0")
+
+
+def assert_same_runs(out: Path, whole: Path, *runs: str) -> None:
+    for run in runs:
+        for name in SAME:
+            assert (out / "runs" / run / name).read_bytes() == (whole / "runs" / run / name).read_bytes(), (run, name)
+
+
+def test_a_table_has_the_scores_of_the_scenes_that_exist(whole: Path) -> None:
+    values = json.loads((whole / "table.json").read_text())
+    ate = {
+        row["origin"]: row["values"]
+        for row in values["rows"]
+        if row["score"] == "ATE RMSE" and row["system"] == "VarSplat"
+    }
+    measured = {
+        scene: 100 * RunFolder(whole / "runs" / f"{scene}-varsplat-seed0").read_metrics()["ate"]["rmse_m"]
+        for scene in ("room0", "office0")
+    }
+    assert {scene: ate["ours"][scene]["mean"] for scene in measured} == pytest.approx(measured)
+    assert (
+        ate["ours"]["mean"]["mean"] == pytest.approx(sum(measured.values()) / 2) and ate["ours"]["mean"]["scenes"] == 2
+    )
+    assert ate["paper"]["mean"]["mean"] == 0.23
+    text = (whole / "table.md").read_text()
+    assert "room1" in text and "Not the settings of the paper" in text and "(2 of 8 scenes)" in text
+    assert (whole / "table.tex").read_text().count(r" \\") == text.count("\n| ") - 1
+
+
+def test_a_finished_table_is_not_run_again(whole: Path, replica: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path: path.stat().st_mtime_ns for path in (whole / "runs").rglob("log.jsonl")}
+    assert exit_code(*arguments(whole, replica)) == 0
+    assert {path: path.stat().st_mtime_ns for path in (whole / "runs").rglob("log.jsonl")} == before
+    assert "no room1 in" in capsys.readouterr().out
+    assert exit_code(*arguments(whole, replica, "--set", "mapping.iterations=2")) == 2
+    assert "runs of other settings" in capsys.readouterr().err
+
+
+def test_a_killed_table_ends_as_one_that_was_not_stopped(tmp_path: Path, replica: Path, whole: Path) -> None:
+    out, log, run = tmp_path / "table", tmp_path / "log", "office0-varsplat-seed0"
+    process = started(*arguments(out, replica), log=log)
+    after = 2 + os.getpid() % (paper_data.FRAMES - 3)
+    wait_for(lambda: frames_logged(out, run) >= after, log, process)
+    process.kill()
+    process.wait()
+    logged = frames_logged(out, run)
+    assert exit_code(*arguments(out, replica)) == 0, f"killed after {logged} frames"
+    assert_same(out, whole)
+
+
+@pytest.mark.parametrize(
+    ("write", "table", "system", "score"),
+    [
+        (paper_data.write_tum, "cgslam-tum", "CG-SLAM", "ATE RMSE"),
+        (paper_data.write_scannet, "varsplat-ablation", "+registration", "ATE RMSE"),
+        (paper_data.write_scannetpp, "varsplat-scannetpp", "VarSplat", "novel view PSNR"),
+        (paper_data.write_replica, "cgslam-runtime", "CG-SLAM", "mapping per iteration"),
+    ],
+    ids=["tum", "scannet", "scannetpp", "runtime"],
+)
+def test_every_layout_goes_through(
+    write: Callable[[Path], Path], table: str, system: str, score: str, tmp_path: Path
+) -> None:
+    assert exit_code(*arguments(tmp_path / "out", write(tmp_path / "data"), table=table, system=system)) == 0
+    rows = json.loads((tmp_path / "out/table.json").read_text())["rows"]
+    (ours,) = [row for row in rows if row["score"] == score and row["origin"] == "ours"]
+    scenes = {scene.name for scene in Table.read(table).scenes}
+    assert any(value["mean"] > 0 for scene, value in ours["values"].items() if scene in scenes)
+
+
+@contextlib.contextmanager
+def cluster(tmp_path: Path, names: tuple[str, ...]) -> Iterator[tuple[str, dict[str, subprocess.Popen]]]:
+    """Start a Dask scheduler and workers with these names, each in a process of its own."""
+    pytest.importorskip("distributed", reason="distributed is not installed (extra `cluster`)")
+    address_file, log = tmp_path / "scheduler.json", tmp_path / "dask.log"
+    with log.open("w") as file:
+        dask = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
+        options = ["--port", "0", "--no-dashboard", "--host", "127.0.0.1", "--scheduler-file", str(address_file)]
+        processes = {"": subprocess.Popen([*dask, *options], stdout=file, stderr=file)}
+        try:
+            wait_for(lambda: address_file.exists() and address_file.stat().st_size > 0, log, processes[""])
+            address = json.loads(address_file.read_text())["address"]
+            for name in names:
+                worker = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--name", name]
+                options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path / name)]
+                processes[name] = subprocess.Popen([*worker, *options], stdout=file, stderr=file)
+            yield address, processes
+        finally:
+            for process in processes.values():
+                process.kill()
+                process.wait()
+
+
+def test_a_worker_that_dies_changes_nothing(tmp_path: Path, replica: Path, whole: Path) -> None:
+    out, log = tmp_path / "table", tmp_path / "log"
+    (tmp_path / "elsewhere").symlink_to(replica)
+    roots = ("--data", f"two={tmp_path / 'elsewhere'}")
+    with cluster(tmp_path, ("one", "two")) as (address, processes):
+        process = started(*arguments(out, replica, *roots, "--scheduler", address), log=log)
+        runs = ("room0-varsplat-seed0", "office0-varsplat-seed0")
+        wait_for(lambda: all(frames_logged(out, run) >= 2 for run in runs), log, process)
+        processes["one"].kill()
+        assert process.wait(DEADLINE_S) == 0, log.read_text()
+    assert_same(out, whole)
+
+
+def test_a_worker_that_does_not_see_the_folder_sends_its_files(
+    tmp_path: Path, replica: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "blind").mkdir()
+    (tmp_path / "blind/sitecustomize.py").write_text(BLIND)
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "blind"), os.environ.get("PYTHONPATH", "")]))
+        with cluster(tmp_path, ("other",)) as (address, _):
+            elsewhere.undo()
+            out = tmp_path / "table"
+            assert exit_code(*arguments(out, replica, "--scenes", "room0", "--scheduler", address)) == 0
+    assert_same_runs(out, whole, "room0-varsplat-seed0")
+    sent = out / "runs/room0-varsplat-seed0"
+    assert not (sent / "submaps").exists() and (sent / "report.html").exists()
+
+
+def test_a_batch_keeps_what_is_done_and_names_what_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    room = f"synthetic:frames=40,width={paper_data.WIDTH},height={paper_data.HEIGHT}"
+    words = ["batch", room, str(tmp_path / "absent"), "--out", str(tmp_path / "out"), "--limit", "6"]
+    assert exit_code(*words, *paper_data.tiny_options()) == 1
+    said = capsys.readouterr().out
+    assert "missing: no such folder or file" in said and "1 of 2 runs" in said
+    assert exit_code(*words, *paper_data.tiny_options()) == 1
+    assert "1 of 2 runs are finished" in capsys.readouterr().out
+
+
+def test_ctrl_c_saves_the_running_run(tmp_path: Path, replica: Path, whole: Path) -> None:
+    out, log, run = tmp_path / "table", tmp_path / "log", "office0-varsplat-seed0"
+    words = [word if word != "0.001" else "0" for word in arguments(out, replica, "--scenes", "office0")]
+    process = started(*words, log=log)
+    wait_for(lambda: frames_logged(out, run) >= 3, log, process)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(DEADLINE_S) == 130 and "repeat the command" in log.read_text()
+    facts = RunFolder(out / "runs" / run).facts()
+    assert facts["status"] in ("interrupted", "complete")
+    assert exit_code(*words) == 0
+    assert_same_runs(out, whole, run)
