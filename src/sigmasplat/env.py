@@ -1,4 +1,4 @@
-"""Read the environment variables, once; folders that commands share. This module must be imported before anything that loads OpenMP.
+"""Read the environment variables, once; folders that commands share. Import this before anything that loads OpenMP.
 
 | variable | values | meaning |
 |---|---|---|
