@@ -23,15 +23,20 @@ def accumulate(view: View, params: Tensor, T_camera_world: Matrix, planes: Tenso
     its gradient planes are 0. Rows and planes may be in host memory; the result is on the device of the planes.
     """
     params = params.to(view.sums.device)
-    g_params = torch.empty_like(params)
     view.forward(params, T_camera_world)
+    return gather(view, params, planes).to(planes.device, copy=True)
+
+
+def gather(view: View, params: Tensor, planes: Tensor) -> Tensor:
+    """Return the sums of `accumulate` for the view's last forward pass, of rows `params`; all on the view's device."""
+    g_params = torch.empty_like(params)
     view.g_sums.zero_()
     view.g_alpha.zero_()
     height, width = planes.shape[-2:]
     view.g_sums[:CHANNELS, :height, :width] = planes
     view.backward(params, g_params)
     view.g_sums.zero_()
-    return g_params[:, COLUMNS["colors"]].to(planes.device, copy=True)
+    return g_params[:, COLUMNS["colors"]]
 
 
 def render_values(view: View, params: Tensor, T_camera_world: Matrix, values: Tensor) -> Tensor:

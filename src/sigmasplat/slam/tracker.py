@@ -290,7 +290,7 @@ class Tracker:
         self.keyframe_features, self.keyframe_front = seen.image, self.front
         if self.config.method == "align" or fits_of(view).aligns:  # otherwise nothing aligns to it
             T_camera_world = se3.inverse(T_world_camera)
-            self.keyframe = keyframe_reference(field.params, view, seen.live, T_camera_world, self.config)
+            self.keyframe = keyframe_reference(field.params, view, seen.live, T_camera_world, self.config, seen.target)
             if seen.image is not None:
                 self.keyframe_features = seen.image.weighed(self.keyframe.weights)
 

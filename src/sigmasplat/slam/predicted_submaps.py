@@ -1,0 +1,44 @@
+"""Measure the residuals of finished submaps, for weights by predicted variance."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field as dataclass_field
+
+from torch import Tensor
+
+from sigmasplat.config import Config
+from sigmasplat.fit.predicted_variance import with_residuals
+from sigmasplat.fit.splat_residuals import background_of, splat_residuals
+from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.model.map_uncertainty import Background
+from sigmasplat.model.submap import Submap, SubmapStore
+
+
+@dataclass(eq=False)
+class PredictedSubmaps:
+    """Residuals of the submaps of a store, measured when a submap is first asked for: one pass over its keyframes."""
+
+    config: Config
+    store: SubmapStore
+    _known: dict[int, tuple[Tensor, Background]] = dataclass_field(default_factory=dict)
+
+    def rows(self, submap: Submap) -> Tensor:
+        """Return the rows of a submap's splats [N, 17] with their residuals in σ² (`with_residuals`)."""
+        return with_residuals(submap.field.params, self._measured(submap)[0])
+
+    def background(self, submap: Submap) -> Background:
+        """Return mean and variance of the colours of a submap's keyframes."""
+        return self._measured(submap)[1]
+
+    def _measured(self, submap: Submap) -> tuple[Tensor, Background]:
+        if submap.index not in self._known:
+            background = background_of(self._keyframes(submap))
+            options, backend = self.config.render, self.config.backend
+            found = splat_residuals(submap.field, self._keyframes(submap), background, options, backend, updates=0)
+            self._known[submap.index] = found[:, 0].clone(), background
+        return self._known[submap.index]
+
+    def _keyframes(self, submap: Submap) -> Iterator[Keyframe]:
+        size = submap.camera.height, submap.camera.width
+        for k, T_submap_camera in enumerate(submap.T_submap_camera):
+            target = Target.of_picture(self.store.picture(submap.index, k), submap.camera, size)
+            yield Keyframe(k, target, T_submap_camera, fixed=True)
