@@ -103,6 +103,18 @@ def test_where_submaps_overlap_one_of_them_stays(uncertainty: bool) -> None:
     assert away.max() < SPACING_M * np.sqrt(3), "no hole"
 
 
+@pytest.mark.parametrize("variance", ["published", "predicted"])
+def test_the_predicted_variance_keeps_the_submap_whose_colors_agree_with_its_keyframes(variance: str) -> None:
+    store = make_store()
+    second = store.submaps[1].field.params
+    second[:, COLUMNS["colors"]] = 1.0 - second[:, COLUMNS["colors"]]  # its σ² are the lower ones all the same
+    field = merged(store, ANCHORS, config(variance=variance))
+    kept_second = field.params[:, COLUMNS["log_variances"]].mean(1) == LOG_VARIANCES[1]
+    both = (field.means[:, 0] > -0.05) & (field.means[:, 0] < 0.25)
+    assert bool(kept_second[both].all()) is (variance == "published")
+    assert bool(kept_second[both].any()) is (variance == "published")
+
+
 def test_every_voxel_keeps_exactly_one_submap() -> None:
     rng = np.random.default_rng(1)
     means, owner, unsteady = rng.uniform(-1, 1, (3000, 3)), rng.integers(0, 4, 3000), rng.normal(size=3000)

@@ -1,0 +1,175 @@
+"""Tabulate the results of weights.py: values, differences at equal seeds, and verdicts over all sequences."""
+
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from tables import Section
+from weights import DEFAULT
+
+from sigmasplat.evaluation.paired_comparison import (
+    Figure,
+    PairedDifference,
+    by_seed,
+    deviation,
+    passed_by_chance,
+    rows,
+)
+
+Runs = list[dict[str, Any]]
+FIGURES: dict[str, tuple[Figure, ...]] = {
+    "path": (
+        Figure("ate_m", "ATE", "cm", -1, 100.0),
+        Figure("rpe_m", "RPE", "mm", -1, 1000.0),
+        Figure("rpe_deg", "RPE", "°", -1, digits=3),
+        Figure("psnr_before_db", "PSNR of submaps", "dB", +1),
+        Figure("depth_l1_before_m", "depth L1 of submaps", "cm", -1, 100.0),
+        Figure("psnr_db", "PSNR", "dB", +1),
+        Figure("depth_l1_m", "depth L1", "cm", -1, 100.0),
+        Figure("lost", "lost", "", -1, digits=1, judged=False),
+        Figure("loops", "loops", "", 0, digits=1, judged=False),
+        Figure("splats", "splats", "k", 0, 1e-3, digits=1, judged=False),
+    ),
+    "final": (
+        Figure("psnr_db", "PSNR", "dB", +1),
+        Figure("depth_l1_m", "depth L1", "cm", -1, 100.0),
+        Figure("splats", "splats", "k", 0, 1e-3, digits=1, judged=False),
+    ),
+    "registration": (
+        Figure("registration_m", "error", "cm", -1, 100.0),
+        Figure("registration_deg", "error", "°", -1),
+        Figure("accepted", "accepted", "", +1, digits=1),
+        Figure("pairs", "pairs", "", 0, digits=1, judged=False),
+    ),
+    "gate": (Figure("average_precision", "average precision", "%", +1, 100.0),),
+}
+"""Figures by what is measured; those of views are of held-back frames, "of submaps" before the final map is made."""
+TITLES = {"path": "Complete runs", "final": "Final maps", "registration": "Registrations", "gate": "Loop gate"}
+
+
+@dataclass(frozen=True)
+class Change:
+    """Two variants to compare: what `changed` differs in from `against`, in words."""
+
+    what: str
+    group: str
+    changed: str
+    against: str
+
+
+CHANGES = (
+    Change("all weights by V", "path", DEFAULT, "no weights at all"),
+    Change("tracking by V", "path", DEFAULT, "tracking: no weights"),
+    Change("tracking by V, τ 2", "path", "tracking: V, τ 2", "tracking: no weights"),
+    Change("tracking by the predicted variance", "path", "tracking: predicted", "tracking: no weights"),
+    Change("tracking by the predicted variance, τ 2", "path", "tracking: predicted, τ 2", "tracking: no weights"),
+    Change(
+        "tracking by both predicted variances, τ 2", "path", "tracking: predicted, depth too, τ 2",
+        "tracking: no weights",
+    ),
+    Change("tracking: predicted instead of V", "path", "tracking: predicted", DEFAULT),
+    Change("tracking: depth by U instead of V", "path", "tracking: depth by U", DEFAULT),
+    Change("mapping: U in the loss", "path", DEFAULT, "mapping: no U"),
+    Change("mapping: alignment in the loss", "path", "mapping: with alignment", DEFAULT),
+    Change("pruning: fading by ν", "path", DEFAULT, "pruning: no fading"),
+    Change("pruning: fading by residuals", "path", "pruning: by residuals", "pruning: no fading"),
+    Change("registration by V", "registration", "V", "no weights"),
+    Change("registration by the predicted variance", "registration", "predicted", "no weights"),
+    Change("registration by V, τ 2", "registration", "V, τ 2", "no weights"),
+    Change("registration by the predicted variance, τ 2", "registration", "predicted, τ 2", "no weights"),
+    Change("loop gate by σ²", "gate", "V", "no weights"),
+    Change("loop gate by the predicted variance", "gate", "predicted", "no weights"),
+    Change("loop gate by σ², τ 2", "gate", "V, τ 2", "no weights"),
+    Change("loop gate by the predicted variance, τ 2", "gate", "predicted, τ 2", "no weights"),
+    Change("merging and refinement by σ²", "final", "V", "no weights"),
+    Change("merging by the predicted variance, refinement by σ²", "final", "predicted", "no weights"),
+    Change("merging: predicted instead of σ²", "final", "predicted", "V"),
+)  # fmt: skip
+
+
+def sections(measured: dict[str, Any]) -> list[Section]:
+    """Return the tables of results: verdicts, differences of each kind, and the values of each sequence."""
+    runs = measured["figures"]["runs"]
+    made = [verdicts(runs), *(differences(runs, group) for group in FIGURES)]
+    made += [values(runs, group, source) for group in FIGURES for source in sources_of(runs)]
+    return [section for section in made if section.rows]
+
+
+def sources_of(runs: Runs) -> list[str]:
+    """List the sequences in the order of the runs."""
+    return list(dict.fromkeys(run["source"] for run in runs))
+
+
+def of(runs: Runs, group: str, source: str) -> Runs:
+    """Return the rows of one kind and sequence."""
+    return [run for run in runs if run["group"] == group and run["source"] == source]
+
+
+def difference(runs: Runs, change: Change, figure: Figure) -> PairedDifference | None:
+    """Return the paired difference of a change on one sequence; None without seeds that both variants have."""
+    changed, against = by_seed(runs, change.changed, figure), by_seed(runs, change.against, figure)
+    found = [changed[seed] - against[seed] for seed in against if seed in changed]
+    return PairedDifference(figure, statistics.fmean(found), deviation(found)) if found else None
+
+
+def verdicts(runs: Runs) -> Section:
+    """List where each change helps or harms beyond the seeds, and a verdict."""
+    laid_out = []
+    for change in CHANGES:
+        helped, harmed, compared = list[str](), list[str](), 0
+        for source in sources_of(runs):
+            for figure in (figure for figure in FIGURES[change.group] if figure.judged):
+                found = difference(of(runs, change.group, source), change, figure)
+                compared += found is not None
+                if found and found.verdict in ("helps", "harms"):
+                    (helped if found.verdict == "helps" else harmed).append(f"{source}: {figure.head}")
+        if compared:
+            named = [", ".join(names) or "–" for names in (helped, harmed)]
+            laid_out.append([change.what, judgement(helped, harmed), f"{compared}", *named])
+    seeds = len({run["seed"] for run in runs})
+    note = (
+        "Beyond the seeds: the mean of the differences at equal seeds exceeds their standard deviation; "
+        f"{passed_by_chance(seeds):.0%} of figures do so by chance. A change helps if figures of at least two "
+        "sequences are better beyond the seeds and at most a quarter as many are worse; it hurts in the opposite case."
+    )
+    head = ["change", "verdict", "figures", "better beyond the seeds", "worse beyond the seeds"]
+    return Section("Verdicts", head, laid_out, note if seeds > 1 else "")
+
+
+def judgement(helped: Sequence[str], harmed: Sequence[str]) -> str:
+    """Return the verdict on a change from the figures, "SEQUENCE: FIGURE", that it makes better and worse."""
+
+    def several(names: Sequence[str], others: Sequence[str]) -> bool:
+        return len({name.partition(":")[0] for name in names}) > 1 and 4 * len(others) <= len(names)
+
+    return "helps" if several(helped, harmed) else "hurts" if several(harmed, helped) else "no effect"
+
+
+def differences(runs: Runs, group: str) -> Section:
+    """Tabulate the differences at equal seeds of one kind; those beyond the seeds are bold."""
+    judged, laid_out = [figure for figure in FIGURES[group] if figure.judged], []
+    for change in (change for change in CHANGES if change.group == group):
+        for source in sources_of(runs):
+            found = [difference(of(runs, group, source), change, figure) for figure in judged]
+            if any(found):
+                laid_out.append([change.what, source, *map(written, found)])
+    note = "Mean ± standard deviation of the differences at equal seeds; bold: beyond the seeds."
+    title = f"{TITLES[group]}, differences"
+    return Section(title, ["change", "sequence", *(figure.title for figure in judged)], laid_out, note)
+
+
+def written(found: PairedDifference | None) -> str:
+    """Format a difference; bold if it is beyond the seeds, a dash without one."""
+    if found is None:
+        return "–"
+    return f"**{found.written()}**" if found.verdict in ("helps", "harms") else found.written()
+
+
+def values(runs: Runs, group: str, source: str) -> Section:
+    """Tabulate the values of one kind on a sequence: one row per variant, the best of each column bold."""
+    found = of(runs, group, source)
+    variants, figures = list(dict.fromkeys(run["variant"] for run in found)), FIGURES[group]
+    laid_out = rows(found, variants, lambda text: f"**{text}**", figures)
+    note = f"Mean ± standard deviation of {len({run['seed'] for run in found})} seeds."
+    return Section(f"{TITLES[group]}, {source}", ["variant", *(f.head for f in figures)], laid_out, note)
