@@ -1,7 +1,7 @@
 """Tabulate the results of weights.py: values, differences at equal seeds, and verdicts over all sequences."""
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,7 @@ FIGURES: dict[str, tuple[Figure, ...]] = {
     "path": (
         Figure("ate_m", "ATE", "cm", -1, 100.0),
         Figure("rpe_m", "RPE", "mm", -1, 1000.0),
-        Figure("rpe_deg", "RPE", "°", -1, digits=3),
+        Figure("rpe_deg", "RPE of rotation", "°", -1, digits=3),
         Figure("psnr_before_db", "PSNR of submaps", "dB", +1),
         Figure("depth_l1_before_m", "depth L1 of submaps", "cm", -1, 100.0),
         Figure("psnr_db", "PSNR", "dB", +1),
@@ -38,7 +38,7 @@ FIGURES: dict[str, tuple[Figure, ...]] = {
     ),
     "registration": (
         Figure("registration_m", "error", "cm", -1, 100.0),
-        Figure("registration_deg", "error", "°", -1),
+        Figure("registration_deg", "error of rotation", "°", -1),
         Figure("accepted", "accepted", "", +1, digits=1),
         Figure("pairs", "pairs", "", 0, digits=1, judged=False),
     ),
@@ -114,36 +114,53 @@ def difference(runs: Runs, change: Change, figure: Figure) -> PairedDifference |
 
 
 def verdicts(runs: Runs) -> Section:
-    """List where each change helps or harms beyond the seeds, and a verdict."""
+    """List where each change makes figures better or worse beyond the seeds, and a verdict."""
     laid_out = []
     for change in CHANGES:
-        helped, harmed, compared = list[str](), list[str](), 0
-        for source in sources_of(runs):
-            for figure in (figure for figure in FIGURES[change.group] if figure.judged):
-                found = difference(of(runs, change.group, source), change, figure)
-                compared += found is not None
-                if found and found.verdict in ("helps", "harms"):
-                    (helped if found.verdict == "helps" else harmed).append(f"{source}: {figure.head}")
-        if compared:
-            named = [", ".join(names) or "–" for names in (helped, harmed)]
-            laid_out.append([change.what, judgement(helped, harmed), f"{compared}", *named])
+        found = found_of(runs, change)
+        if found:
+            better, worse = (
+                {s: names for s, names in by.items() if names} for by in (named(found, "helps"), named(found, "harms"))
+            )
+            cells = [
+                "; ".join(f"{source}: {', '.join(names)}" for source, names in by.items()) for by in (better, worse)
+            ]
+            laid_out.append([change.what, judgement(better, worse, len(found)), *(cell or "–" for cell in cells)])
     seeds = len({run["seed"] for run in runs})
     note = (
         "Beyond the seeds: the mean of the differences at equal seeds exceeds their standard deviation; "
-        f"{passed_by_chance(seeds):.0%} of figures do so by chance. A change helps if figures of at least two "
-        "sequences are better beyond the seeds and at most a quarter as many are worse; it hurts in the opposite case."
+        f"{passed_by_chance(seeds):.0%} of figures do so by chance. *helps*: at least a fifth of all figures, on at "
+        "least two sequences, are better beyond the seeds, and at most a quarter as many are worse; *hurts*: the opposite. "
+        "Otherwise *no effect* if at most a quarter of all figures differ beyond the seeds, *mixed* if more do."
     )
-    head = ["change", "verdict", "figures", "better beyond the seeds", "worse beyond the seeds"]
+    head = ["change", "verdict", "better beyond the seeds", "worse beyond the seeds"]
     return Section("Verdicts", head, laid_out, note if seeds > 1 else "")
 
 
-def judgement(helped: Sequence[str], harmed: Sequence[str]) -> str:
-    """Return the verdict on a change from the figures, "SEQUENCE: FIGURE", that it makes better and worse."""
+def found_of(runs: Runs, change: Change) -> list[tuple[str, PairedDifference]]:
+    """Return the paired differences of a change with their sequences, over all judged figures."""
+    judged = [figure for figure in FIGURES[change.group] if figure.judged]
+    pairs = ((s, difference(of(runs, change.group, s), change, figure)) for s in sources_of(runs) for figure in judged)
+    return [(source, found) for source, found in pairs if found]
 
-    def several(names: Sequence[str], others: Sequence[str]) -> bool:
-        return len({name.partition(":")[0] for name in names}) > 1 and 4 * len(others) <= len(names)
 
-    return "helps" if several(helped, harmed) else "hurts" if several(harmed, helped) else "no effect"
+def named(found: Sequence[tuple[str, PairedDifference]], verdict: str) -> dict[str, list[str]]:
+    """Return the titles of the figures with a verdict, by sequence."""
+    return {
+        source: [d.figure.title for s, d in found if s == source and d.verdict == verdict]
+        for source in dict.fromkeys(source for source, _ in found)
+    }
+
+
+def judgement(better: Mapping[str, Sequence[str]], worse: Mapping[str, Sequence[str]], compared: int) -> str:
+    """Return the verdict on a change from the figures that it makes better and worse, by sequence; compared: the number
+    of all figures."""
+    gains, losses = (sum(map(len, by.values())) for by in (better, worse))
+    if len(better) > 1 and 5 * gains >= compared and 4 * losses <= gains:
+        return "helps"
+    if len(worse) > 1 and 5 * losses >= compared and 4 * gains <= losses:
+        return "hurts"
+    return "no effect" if 4 * (gains + losses) <= compared else "mixed"
 
 
 def differences(runs: Runs, group: str) -> Section:

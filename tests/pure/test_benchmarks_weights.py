@@ -17,13 +17,14 @@ weights, weights_runs, weights_tables = map(importlib.import_module, ("weights",
 
 def row(source: str, seed: int, variant: str, ate_m: float, group: str = "path") -> dict[str, Any]:
     """Return the row of a run."""
-    names = [figure.name for figure in weights_tables.FIGURES[group]]
-    figures = dict.fromkeys(names, 1.0) | ({"ate_m": ate_m} if group == "path" else {})
+    figures = {
+        f.name: ate_m if f.name in ("ate_m", "rpe_m", "depth_l1_m") else 1.0 for f in weights_tables.FIGURES[group]
+    }
     return {"source": source, "seed": seed, "group": group, "variant": variant, "figures": figures}
 
 
 def made_up() -> list[dict[str, Any]]:
-    """Return runs in which weights improve the ATE of two sequences and nothing else."""
+    """Return runs in which weights improve the errors of two sequences and nothing else."""
     runs = []
     for source, gain in (("kitchen", 0.01), ("hall", 0.02), ("office", 0.0)):
         for seed in range(5):
@@ -52,14 +53,25 @@ def test_a_change_helps_only_beyond_the_seeds_of_several_sequences() -> None:
     tables = laid_out("weights", {"runs": made_up()})
     verdict = {cells[0]: cells for cells in tables["Verdicts"].rows}
     assert verdict["tracking by V"][1] == "helps"
-    assert verdict["tracking by V"][3] == "kitchen: ATE, cm, hall: ATE, cm" and verdict["tracking by V"][4] == "–"
+    assert verdict["tracking by V"][2:] == ["kitchen: ATE, RPE, depth L1; hall: ATE, RPE, depth L1", "–"]
     assert verdict["loop gate by σ²"][1] == "no effect"
     assert "merging by σ²" not in verdict  # nothing was measured of it
     one = next(cells for cells in tables["Complete runs, differences"].rows if cells[1] == "kitchen")
-    assert one[2] == "**−1.00 ± 0.16 cm**" and one[3] == "0"
-    assert weights_tables.judgement(["a: x"], []) == "no effect"
-    assert weights_tables.judgement(["a: x", "b: x"], ["c: x"]) == "no effect"
-    assert weights_tables.judgement([], ["a: x", "b: y"]) == "hurts"
+    assert one[2] == "**−1.00 ± 0.16 cm**" and one[4] == "0"
+
+
+@pytest.mark.parametrize(
+    ("better", "worse", "verdict"),
+    [
+        ({"a": ["x", "y", "z"]}, {}, "mixed"),
+        ({"a": ["x"], "b": ["x"]}, {}, "helps"),
+        ({"a": ["x"], "b": ["x"]}, {"c": ["x"]}, "mixed"),
+        ({}, {"a": ["x"], "b": ["y"]}, "hurts"),
+    ],
+)
+def test_a_verdict_needs_several_sequences(better: dict, worse: dict, verdict: str) -> None:
+    assert weights_tables.judgement(better, worse, 10) == verdict
+    assert weights_tables.judgement(better, worse, 100) == "no effect"
 
 
 def test_average_precision_is_one_if_true_pairs_come_first() -> None:
