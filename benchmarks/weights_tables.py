@@ -130,8 +130,8 @@ def verdicts(runs: Runs) -> Section:
     note = (
         "Beyond the seeds: the mean of the differences at equal seeds exceeds their standard deviation; "
         f"{passed_by_chance(seeds):.0%} of figures do so by chance. *helps*: at least a fifth of all figures, on at "
-        "least two sequences, are better beyond the seeds, and at most a quarter as many are worse; *hurts*: the opposite. "
-        "Otherwise *no effect* if at most a quarter of all figures differ beyond the seeds, *mixed* if more do."
+        "least two sequences, are better beyond the seeds, and at most a quarter as many are worse; *hurts*: the "
+        "opposite. Otherwise *no effect* if at most a quarter of all figures differ beyond the seeds, else *mixed*."
     )
     head = ["change", "verdict", "better beyond the seeds", "worse beyond the seeds"]
     return Section("Verdicts", head, laid_out, note if seeds > 1 else "")
