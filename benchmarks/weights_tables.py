@@ -2,7 +2,7 @@
 
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from tables import Section
@@ -91,7 +91,8 @@ CHANGES = (
 def sections(measured: dict[str, Any]) -> list[Section]:
     """Return the tables of results: verdicts, differences of each kind, and the values of each sequence."""
     runs = measured["figures"]["runs"]
-    made = [verdicts(runs), *(differences(runs, group) for group in FIGURES)]
+    made = [verdicts(runs), *(mean_of_sequences(runs, group) for group in FIGURES)]
+    made += [differences(runs, group) for group in FIGURES]
     made += [values(runs, group, source) for group in FIGURES for source in sources_of(runs)]
     return [section for section in made if section.rows]
 
@@ -161,6 +162,34 @@ def judgement(better: Mapping[str, Sequence[str]], worse: Mapping[str, Sequence[
     if len(worse) > 1 and 5 * losses >= compared and 4 * gains <= losses:
         return "hurts"
     return "no effect" if 4 * (gains + losses) <= compared else "mixed"
+
+
+def mean_of_sequences(runs: Runs, group: str) -> Section:
+    """Tabulate the mean of the differences over the sequences, in percent of the value without the change."""
+    judged, laid_out = [figure for figure in FIGURES[group] if figure.judged], list[list[str]]()
+    for change in (change for change in CHANGES if change.group == group):
+        found = [[relative(of(runs, group, source), change, f) for source in sources_of(runs)] for f in judged]
+        known = [[value for value in values if value is not None] for values in found]
+        if any(known):
+            laid_out.append([change.what, *map(pooled, judged, known)])
+    note = "Mean ± standard deviation over the sequences of the mean differences; bold: larger than one deviation."
+    return Section(f"{TITLES[group]}, mean of sequences", ["change", *(f.title for f in judged)], laid_out, note)
+
+
+def relative(runs: Runs, change: Change, figure: Figure) -> float | None:
+    """Return the mean difference of a change in percent of the mean before; decibels as they are."""
+    found, before = difference(runs, change, figure), list(by_seed(runs, change.against, figure).values())
+    if found is None or figure.unit == "dB":
+        return None if found is None else found.mean
+    level = statistics.fmean(before)
+    return 100.0 * found.mean / level if level else None
+
+
+def pooled(figure: Figure, values: Sequence[float]) -> str:
+    """Format mean ± standard deviation over the sequences; bold if the mean is larger."""
+    unit = figure.unit if figure.unit == "dB" else "%"
+    shown = replace(figure, unit=unit, digits=2 if unit == "dB" else 1)
+    return written(PairedDifference(shown, statistics.fmean(values), deviation(values)) if values else None)
 
 
 def differences(runs: Runs, group: str) -> Section:

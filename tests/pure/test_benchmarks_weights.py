@@ -55,6 +55,8 @@ def test_a_change_helps_only_beyond_the_seeds_of_several_sequences() -> None:
     assert verdict["tracking by V"][1] == "helps"
     assert verdict["tracking by V"][2:] == ["kitchen: ATE, RPE, depth L1; hall: ATE, RPE, depth L1", "–"]
     assert verdict["loop gate by σ²"][1] == "no effect"
+    (mean,) = tables["Complete runs, mean of sequences"].rows
+    assert mean[1] == "−20.0 ± 20.0 %" and mean[3] == "0"  # kitchen 20 %, hall 40 %, office none
     assert "merging by σ²" not in verdict  # nothing was measured of it
     one = next(cells for cells in tables["Complete runs, differences"].rows if cells[1] == "kitchen")
     assert one[2] == "**−1.00 ± 0.16 cm**" and one[4] == "0"
