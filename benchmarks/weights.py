@@ -171,9 +171,8 @@ def measure(options: Options) -> dict[str, Any]:
             file.write(json.dumps(result, allow_nan=False) + "\n")
         job = Job(**{**result["job"], "settings": tuple(result["job"]["settings"])})
         done[key(job)] = result
-        print(
-            f"{len(done)}/{len(listed)} {job.source}, {job.variant}, seed {job.seed}: {result['wall_s']} s", flush=True
-        )
+        made = sum(key(one) in done for one in listed)
+        print(f"{made}/{len(listed)} {job.source}, {job.variant}, seed {job.seed}: {result['wall_s']} s", flush=True)
     return {"runs": [run for job in listed if key(job) in done for run in _runs(done[key(job)])]}
 
 

@@ -126,7 +126,8 @@ def verdicts(runs: Runs) -> Section:
             cells = [
                 "; ".join(f"{source}: {', '.join(names)}" for source, names in by.items()) for by in (better, worse)
             ]
-            laid_out.append([change.what, judgement(better, worse, len(found)), *(cell or "–" for cell in cells)])
+            judged = judgement(better, worse, len(found))
+            laid_out.append([change.what, judged, f"{common_seeds(runs, change)}", *(cell or "–" for cell in cells)])
     seeds = len({run["seed"] for run in runs})
     note = (
         "Beyond the seeds: the mean of the differences at equal seeds exceeds their standard deviation; "
@@ -134,8 +135,16 @@ def verdicts(runs: Runs) -> Section:
         "least two sequences, are better beyond the seeds, and at most a quarter as many are worse; *hurts*: the "
         "opposite. Otherwise *no effect* if at most a quarter of all figures differ beyond the seeds, else *mixed*."
     )
-    head = ["change", "verdict", "better beyond the seeds", "worse beyond the seeds"]
+    head = ["change", "verdict", "seeds", "better beyond the seeds", "worse beyond the seeds"]
     return Section("Verdicts", head, laid_out, note if seeds > 1 else "")
+
+
+def common_seeds(runs: Runs, change: Change) -> int:
+    """Return the number of seeds that both variants have on every sequence."""
+    keys = [{(r["source"], r["seed"]) for r in runs if r["group"] == change.group and r["variant"] == v}
+            for v in (change.changed, change.against)]  # fmt: skip
+    both = keys[0] & keys[1]
+    return min(sum(source == s for s, _ in both) for source in {s for s, _ in both})
 
 
 def found_of(runs: Runs, change: Change) -> list[tuple[str, PairedDifference]]:

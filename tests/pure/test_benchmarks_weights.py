@@ -53,7 +53,7 @@ def test_a_change_helps_only_beyond_the_seeds_of_several_sequences() -> None:
     tables = laid_out("weights", {"runs": made_up()})
     verdict = {cells[0]: cells for cells in tables["Verdicts"].rows}
     assert verdict["tracking by V"][1] == "helps"
-    assert verdict["tracking by V"][2:] == ["kitchen: ATE, RPE, depth L1; hall: ATE, RPE, depth L1", "–"]
+    assert verdict["tracking by V"][2:] == ["5", "kitchen: ATE, RPE, depth L1; hall: ATE, RPE, depth L1", "–"]
     assert verdict["loop gate by σ²"][1] == "no effect"
     (mean,) = tables["Complete runs, mean of sequences"].rows
     assert mean[1] == "−20.0 ± 20.0 %" and mean[3] == "0"  # kitchen 20 %, hall 40 %, office none
