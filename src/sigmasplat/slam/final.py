@@ -79,7 +79,7 @@ def merged(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> Gau
         part = _in_world(store, anchors, index)
         owner.append(np.full(len(part), index))
         is_predicted = config.final.uncertainty and config.final.variance == "predicted"
-        variances.append(_log_variance(predicted.rows(store.load(index)) if is_predicted else part.params))
+        variances.append(_log_variance(predicted.rows(index) if is_predicted else part.params))
         field.append(part)
     log_variance = np.asarray(torch.cat(variances).double()) if config.final.uncertainty else None
     keep = survivors(field.means.numpy(), np.concatenate(owner), log_variance, config.final.spacing_m)

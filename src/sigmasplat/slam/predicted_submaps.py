@@ -10,7 +10,7 @@ from sigmasplat.fit.predicted_variance import with_residuals
 from sigmasplat.fit.splat_residuals import background_of, splat_residuals
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model.map_uncertainty import Background
-from sigmasplat.model.submap import Submap, SubmapStore
+from sigmasplat.model.submap import SubmapStore
 
 
 @dataclass(eq=False)
@@ -21,24 +21,28 @@ class PredictedSubmaps:
     store: SubmapStore
     _known: dict[int, tuple[Tensor, Background]] = dataclass_field(default_factory=dict)
 
-    def rows(self, submap: Submap) -> Tensor:
-        """Return the rows of a submap's splats [N, 17] with their residuals in σ² (`with_residuals`)."""
-        return with_residuals(submap.field.params, self._measured(submap)[0])
+    def rows(self, index: int) -> Tensor:
+        """Return the rows of a submap's splats [N, 17] with their residuals in σ² (`with_residuals`).
 
-    def background(self, submap: Submap) -> Background:
+        index: the number of the submap in the store.
+        """
+        return with_residuals(self.store.load(index).field.params, self._measured(index)[0])
+
+    def background(self, index: int) -> Background:
         """Return mean and variance of the colours of a submap's keyframes."""
-        return self._measured(submap)[1]
+        return self._measured(index)[1]
 
-    def _measured(self, submap: Submap) -> tuple[Tensor, Background]:
-        if submap.index not in self._known:
-            background = background_of(self._keyframes(submap))
+    def _measured(self, index: int) -> tuple[Tensor, Background]:
+        if index not in self._known:
+            field, background = self.store.load(index).field, background_of(self._keyframes(index))
             options, backend = self.config.render, self.config.backend
-            found = splat_residuals(submap.field, self._keyframes(submap), background, options, backend, updates=0)
-            self._known[submap.index] = found[:, 0].clone(), background
-        return self._known[submap.index]
+            found = splat_residuals(field, self._keyframes(index), background, options, backend, updates=0)
+            self._known[index] = found[:, 0].clone(), background
+        return self._known[index]
 
-    def _keyframes(self, submap: Submap) -> Iterator[Keyframe]:
+    def _keyframes(self, index: int) -> Iterator[Keyframe]:
+        submap = self.store.load(index)
         size = submap.camera.height, submap.camera.width
         for k, T_submap_camera in enumerate(submap.T_submap_camera):
-            target = Target.of_picture(self.store.picture(submap.index, k), submap.camera, size)
+            target = Target.of_picture(self.store.picture(index, k), submap.camera, size)
             yield Keyframe(k, target, T_submap_camera, fixed=True)

@@ -124,7 +124,7 @@ class LoopCloser:
         """Return the variance-weighted opacity ratio of a submap (VarSplat §4)."""
         c, rows = self.config.loops, submap.field.params
         if c.uncertainty and c.variance == "predicted":
-            rows = self.predicted.rows(submap)
+            rows = self.predicted.rows(submap.index)
         log_variances = rows[:, COLUMNS["log_variances"]].numpy()
         return opacity_ratio(submap.field.opacities.numpy(), log_variances, c.tau, c.weight_max)
 

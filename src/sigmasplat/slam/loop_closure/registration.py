@@ -141,7 +141,7 @@ class Registrar:
         c, device = self.config, self.view.sums.device
         if not c.uncertainty or c.variance == "published":
             return WeighedMap(submap.field.params.to(device))
-        return WeighedMap(self.predicted.rows(submap).to(device), self.predicted.background(submap))
+        return WeighedMap(self.predicted.rows(submap.index).to(device), self.predicted.background(submap.index))
 
     def _aligned(self, other: WeighedMap, live: Pyramid, guess: Matrix) -> PoseFit:
         """Align a keyframe to the map rendered at a guess, then again to the map rendered at the result."""
