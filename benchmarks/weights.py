@@ -51,7 +51,6 @@ DEFAULT = "default"
 """The run of the preset itself, of which the maps are measured too."""
 NO_WEIGHTS = tuple(f"{part}.uncertainty=false" for part in ("tracking", "loops", "registration", "final"))
 PREDICTED = tuple(f"{part}.variance=predicted" for part in ("tracking", "loops", "registration", "final"))
-TRACKED = ("tracking.variance=predicted",)
 PATH: dict[str, tuple[str, ...]] = {
     "no weights at all": NO_WEIGHTS,
     "tracking: no weights": ("tracking.uncertainty=false",),
@@ -59,11 +58,8 @@ PATH: dict[str, tuple[str, ...]] = {
     "mapping: no U": ("mapping.weight_moment=0",),
     "mapping: with alignment": ("mapping.weight_alignment=0.25",),
     "pruning: no fading": ("primitives.uncertain_m2=0",),
-    "tracking: V, τ 2": ("tracking.tau=2",),
-    "tracking: predicted": TRACKED,
-    "tracking: predicted, τ 2": (*TRACKED, "tracking.tau=2"),
+    "tracking: predicted": ("tracking.variance=predicted",),
     "pruning: by residuals": ("primitives.uncertain_by=residual",),
-    "tracking: predicted, depth too, τ 2": (*TRACKED, "tracking.tau=2", "tracking.align_depth_by=U"),
 }
 """Settings of the complete runs that are compared with `default`, the preset: V as published in every weight, U in the
 loss, and fading."""

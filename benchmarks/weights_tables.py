@@ -61,13 +61,7 @@ class Change:
 CHANGES = (
     Change("all weights by V", "path", DEFAULT, "no weights at all"),
     Change("tracking by V", "path", DEFAULT, "tracking: no weights"),
-    Change("tracking by V, τ 2", "path", "tracking: V, τ 2", "tracking: no weights"),
     Change("tracking by the predicted variance", "path", "tracking: predicted", "tracking: no weights"),
-    Change("tracking by the predicted variance, τ 2", "path", "tracking: predicted, τ 2", "tracking: no weights"),
-    Change(
-        "tracking by both predicted variances, τ 2", "path", "tracking: predicted, depth too, τ 2",
-        "tracking: no weights",
-    ),
     Change("tracking: predicted instead of V", "path", "tracking: predicted", DEFAULT),
     Change("tracking: depth by U instead of V", "path", "tracking: depth by U", DEFAULT),
     Change("mapping: U in the loss", "path", DEFAULT, "mapping: no U"),
