@@ -63,6 +63,14 @@ def weights_of_variance(results: Results) -> str:
     )
 
 
+def uses_of_uncertainty(results: Results) -> str:
+    """Name the uses of an uncertainty that help on several sequences, and those that hurt."""
+    (verdicts,) = (s for s in tables.sections(results.measured("weights")) if s.title == "Verdicts")
+    by = {word: [row[0] for row in verdicts.rows if row[1] == word] for word in ("helps", "hurts")}
+    named = "; ".join(f"{word}: {', '.join(found) or '–'}" for word, found in by.items())
+    return f"of {len(verdicts.rows)} changes, {named}; the others differ by sequence or have no effect"
+
+
 def systems(results: Results) -> str:
     """Compare the presets on the real sequence."""
     presets = ("varsplat-fast", "loopsplat-fast", "cgslam-fast", "sigma")
@@ -151,6 +159,7 @@ ROWS: tuple[tuple[str, Callable[[Results], str], tuple[str, ...]], ...] = (
     ("Held-out views, depth L1, cm", each(MAP, "depth L1 held-out, cm"), ("accuracy",)),
     ("Does V rank the errors? (Spearman, 1 = perfectly)", each(MAP, "Spearman V ~ error²"), ("accuracy",)),
     ("Do the weights of σ² help?", weights_of_variance, ("ablation",)),
+    ("Which other uses of an uncertainty help?", uses_of_uncertainty, ("weights",)),
     ("Which preset? (ATE, PSNR)", systems, ("systems",)),
     ("Alignment or Adam for tracking?", alignment, ("tracking",)),
     ("Does the pose covariance cover the error?", coverage, ("tracking",)),

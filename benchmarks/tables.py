@@ -24,7 +24,7 @@ import tyro
 SUBJECTS = {
     "Whole runs": ("accuracy", "systems", "every_preset"),
     "Other systems": ("peers",),
-    "Effect of σ²": ("ablation", "color_covariance"),
+    "Effect of σ²": ("ablation", "weights", "color_covariance"),
     "Uncertainty": ("uncertainty", "uncertainty_weights", "pose_covariance"),
     "Camera tracking": ("tracking", "pose_gradient", "relocalisation"),
     "Robustness": ("robustness", "failure_probability"),

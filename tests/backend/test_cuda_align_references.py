@@ -23,7 +23,7 @@ from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.render.view import View
 from sigmasplat.slam.localisation.sight import Sight
 from sigmasplat.slam.localisation.verdict import Usual
-from sigmasplat.slam.loop_closure.registration import Registrar
+from sigmasplat.slam.loop_closure.registration import Registrar, WeighedMap
 from sigmasplat.slam.tracker import Tracker
 from splat_fields import CPU, OPTIONS
 from splat_fits import Watch
@@ -129,8 +129,8 @@ def test_a_keyframe_is_aligned_to_a_submap_as_on_the_cpu() -> None:
     found = []
     for view in views():
         registrar = Registrar(preset(default_preset()), MemoryStore(), view)
-        fit = registrar._aligned(thick(), live(view), TRUTH)
-        found.append((fit, *registrar._checked(thick(), live(view), TRUTH)))
+        fit = registrar._aligned(WeighedMap(thick()), live(view), TRUTH)
+        found.append((fit, *registrar._checked(WeighedMap(thick()), live(view), TRUTH)))
     assert all(fit.alignment is not None for fit, *_ in found)
     np.testing.assert_allclose(found[0][0].T_camera_world, found[1][0].T_camera_world, atol=5e-4)
     deviations = [np.sqrt(np.diag(covariance)) for _, covariance, _ in found]

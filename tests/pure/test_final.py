@@ -14,11 +14,12 @@ from sigmasplat.fit.adam import ATTRIBUTE_RATES
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
-from sigmasplat.model.submap import MemoryStore, Picture, Submap
+from sigmasplat.model.submap import MemoryStore, Picture, StorePart, Submap
 from sigmasplat.render import render
 from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.slam.final import KeyframeReader, final_map, merged, survivors
 from sigmasplat.slam.fusion import FusionView, count_keyframes, fuse, fusion_views
+from sigmasplat.slam.predicted_submaps import PredictedSubmaps
 
 CAMERA = Camera(20, 15, 16.0, 16.0, 9.5, 7.0)
 CONFIG = Config(backend="reference", mapping=MappingConfig(weight_nll_color=1e-3, prune_opacity=0.1))
@@ -101,6 +102,25 @@ def test_where_submaps_overlap_one_of_them_stays(uncertainty: bool) -> None:
     everything = torch.cat([wall(-1.4, 0.4).means, wall(-0.2, 1.6).means])
     away = cKDTree(field.means.numpy()).query(everything.numpy())[0]
     assert away.max() < SPACING_M * np.sqrt(3), "no hole"
+
+
+@pytest.mark.parametrize("variance", ["published", "predicted"])
+def test_the_predicted_variance_keeps_the_submap_whose_colors_agree_with_its_keyframes(variance: str) -> None:
+    store = make_store()
+    second = store.submaps[1].field.params
+    second[:, COLUMNS["colors"]] = 1.0 - second[:, COLUMNS["colors"]]  # its σ² are the lower ones all the same
+    field = merged(store, ANCHORS, config(variance=variance))
+    kept_second = field.params[:, COLUMNS["log_variances"]].mean(1) == LOG_VARIANCES[1]
+    both = (field.means[:, 0] > -0.05) & (field.means[:, 0] < 0.25)
+    assert bool(kept_second[both].all()) is (variance == "published")
+    assert bool(kept_second[both].any()) is (variance == "published")
+
+
+def test_the_predicted_variance_of_some_submaps_is_that_of_the_same_submaps_in_their_store() -> None:
+    whole, settings = make_store(0.1), config(variance="predicted")
+    some = PredictedSubmaps(settings, StorePart(whole, [1]))
+    assert torch.equal(some.rows(0), PredictedSubmaps(settings, whole).rows(1))
+    assert some.background(0) == PredictedSubmaps(settings, whole).background(1)
 
 
 def test_every_voxel_keeps_exactly_one_submap() -> None:

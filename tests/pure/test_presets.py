@@ -348,6 +348,10 @@ NEW = [
     "tracking.outlier_factor_color",
     "tracking.average",
     "tracking.align_depth_by",
+    "tracking.variance",
+    "loops.variance",
+    "registration.variance",
+    "final.variance",
 ]
 
 

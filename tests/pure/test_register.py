@@ -5,17 +5,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config, RegistrationConfig, RenderConfig, SeedConfig, TrackingConfig
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
+from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.model.submap import MemoryStore, Submap
 from sigmasplat.render.backend import make_view
 from sigmasplat.slam.drift import FLOOR
 from sigmasplat.slam.loop_closure import registration
 from sigmasplat.slam.loop_closure.candidates import Candidate, SubmapPair
+from sigmasplat.slam.loop_closure.closer import LoopCloser
 from sigmasplat.slam.loop_closure.registration import Localisation, Registrar, Registration
 from sigmasplat.slam.seeding import make_splats
 from small_room import frame_at, walk
@@ -46,7 +48,9 @@ def piece(store: MemoryStore, frames: Sequence[int], brighter: float = 1.0) -> S
     return submap
 
 
-def registered(a: Sequence[int], b: Sequence[int], error: Matrix, brighter: float = 1.0) -> tuple[Registration, Matrix]:
+def registered(
+    a: Sequence[int], b: Sequence[int], error: Matrix, brighter: float = 1.0, settings: Config = CONFIG
+) -> tuple[Registration, Matrix]:
     """Register submaps of frames a and b, told a T_a_b that is wrong by `error`; return the verdict and the truth."""
     store = MemoryStore()
     ours, theirs = piece(store, a), piece(store, b, brighter)
@@ -54,12 +58,36 @@ def registered(a: Sequence[int], b: Sequence[int], error: Matrix, brighter: floa
     T_a_b = se3.inverse(truth[a[0]]) @ truth[b[0]]
     pair = SubmapPair(Candidate(0, 0, 1, 0, 1.0, 1.0), (0, 1), (0, 1))
     view = make_view("cpu", walk().camera, RenderConfig())
-    return Registrar(CONFIG, store, view).register(pair, ours, theirs, error @ T_a_b), T_a_b
+    return Registrar(settings, store, view).register(pair, ours, theirs, error @ T_a_b), T_a_b
 
 
 def off(found: Matrix, truth: Matrix) -> tuple[float, float]:
     E = se3.inverse(truth) @ found
     return float(np.linalg.norm(E[:3, 3])), float(np.rad2deg(se3.rotation_angle(E[:3, :3])))
+
+
+def test_the_predicted_variance_can_weigh_a_registration() -> None:
+    error = se3.exp(np.array([0.05, -0.03, 0.03, 0.02, 0.03, -0.02]))
+    found, truth = registered((0, 5), (3, 8), error, 1.0, CONFIG.changed(registration={"variance": "predicted"}))
+    by_V, _ = registered((0, 5), (3, 8), error)
+    assert found.accepted and found.localised == 4
+    assert off(found.T_a_b, truth)[0] < 0.01 and off(found.T_a_b, truth)[1] < 0.3
+    assert not np.array_equal(found.T_a_b, by_V.T_a_b)
+
+
+def test_the_gate_can_read_the_predicted_variance() -> None:
+    """Splats that contradict their keyframes are faint: the opaque ones have smaller residuals, all σ² are equal."""
+    store = MemoryStore()
+    submap = piece(store, (0, 5))
+    wrong = torch.arange(len(submap.field)) % 8 == 0
+    submap.field.params[wrong, COLUMNS["colors"]] = 1.0 - submap.field.params[wrong, COLUMNS["colors"]].round()
+    submap.field.params[wrong, COLUMNS["opacity_logits"]] = -1.0
+    by_sigma, predicted = (
+        LoopCloser(CONFIG.changed(loops={"variance": variance}), store).opacity_ratio(submap)
+        for variance in ("published", "predicted")
+    )
+    assert by_sigma == pytest.approx(1.0)
+    assert predicted > 1.002
 
 
 @pytest.mark.parametrize("brighter", [1.0, 0.85])

@@ -13,6 +13,9 @@ class DensifyConfig:
     """A splat is uncertain if the mean squared difference between its depth and the depth readings at its pixels, over
     the window, is above this (ν > τ, CG-SLAM eq. 13). It fades halfway through the steps of a keyframe, and is removed
     at the end unless it has recovered; 0 = off."""
+    uncertain_by: Literal["centre", "residual"] = "centre"
+    """What is compared with the depth readings: centre = the depth of the splat's centre at the pixels it owns (paper);
+    residual = the rendered depth at all pixels that the splat contributes to, weighted by its share (ours)."""
     owner: Literal["dominant", "median"] = "dominant"
     """Which splat of a pixel is compared with its depth reading: the one with the largest weight (paper), or the one at
     the median depth (CG-SLAM's code)."""

@@ -187,6 +187,10 @@ class TrackingConfig:
     """λ_c, the weight of the colour loss; the depth loss has 1 − λ_c."""
     uncertainty: bool = True
     """Whether pixels are weighted by exp(−(log V − median)/τ); off = LoopSplat."""
+    variance: Literal["published", "predicted"] = "published"
+    """The variance in the weights of the newest keyframe: published = V and U of the papers; predicted = the variance
+    of colour, and with `align_depth_by` U that of depth, which the map predicts there (ours). predicted needs `method`
+    align."""
     tau: float = 50.0
     """τ of the pixel weights, in units of log V: at 50, a V of ten times the median lowers the weight by 5 %. A smaller
     τ gives V more influence."""

@@ -53,6 +53,9 @@ class LoopConfig:
     """Maximum number of pairs registered per finished submap, the most similar first; 0 = no limit."""
     uncertainty: bool = True
     """Whether similarity is multiplied by a gate from the variance-weighted opacity ratio; off = LoopSplat."""
+    variance: Literal["published", "predicted"] = "published"
+    """The variance of a splat in that ratio: published = σ²; predicted = σ² and its residuals at the keyframes of the
+    submap, weighted as in the predicted variance (ours)."""
     tau: float = 10.0
     """τ of the splat weights in that opacity ratio, computed from σ². A smaller τ separates certain from uncertain
     splats more sharply."""
@@ -86,6 +89,9 @@ class RegistrationConfig:
     pixels, with the sum over the three channels, which weights colour three times as much."""
     uncertainty: bool = True
     """Whether pixels are weighted by the V of the other submap; off = LoopSplat."""
+    variance: Literal["published", "predicted"] = "published"
+    """The variance in these weights: published = V (VarSplat §1); predicted = the variance of colour that the other
+    submap predicts, from the residuals of its splats at its keyframes (ours)."""
     tau: float = 50.0
     """τ of the pixel weights in registration, as `tracking.tau`."""
     weight_max: float = 3.0
@@ -129,3 +135,6 @@ class FinalConfig:
     """Splats with at most this opacity, 0 to 1, are removed during refinement."""
     uncertainty: bool = True
     """Whether variance is used to merge submaps and still learned during refinement; off = paper."""
+    variance: Literal["published", "predicted"] = "published"
+    """The variance of a splat that merging compares: published = σ²; predicted = σ² and its residuals at the keyframes
+    of its submap, weighted as in the predicted variance (ours)."""

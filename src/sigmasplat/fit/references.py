@@ -8,10 +8,12 @@ from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison, compare
 from sigmasplat.fit.gray import Image
+from sigmasplat.fit.predicted_variance import predicted_at, use_predicted_depth_variance, use_predicted_variance
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.target import Target
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.map_uncertainty import Background
 from sigmasplat.model.submap import Picture
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
@@ -47,34 +49,60 @@ def picture_images(view: View, picture: Picture, camera: Camera) -> tuple[Target
     return target, live_image(view, picture.unit_color, picture.depth_m, target)
 
 
-def map_reference(params: Tensor, view: View, T_camera_world: Matrix, config: TrackingConfig) -> Reference:
+def map_reference(
+    params: Tensor,
+    view: View,
+    T_camera_world: Matrix,
+    config: TrackingConfig,
+    background: Background | None = None,
+) -> Reference:
     """Render the map as a reference: gray C/A and depth D/A in m where it is opaque, weighted by w̃ (VarSplat §3).
 
     params: rows [N, 17]; T_camera_world [4, 4]: the pose to render from. To weight depth by U the map is rendered
-    twice, because U refers to the surface that the first render finds.
+    twice, because U refers to the surface that the first render finds. With a background, V is replaced by the
+    predicted variance; params are then rows of `with_residuals`.
     """
     fits = fits_of(view)
-    view.forward(params, T_camera_world)
+    _render(view, params, T_camera_world, None, background)
     maps = fits.reference_maps(view, config, None)
     if config.align_depth_by == "U":
-        view.forward(params, T_camera_world, fits.images.as_tensor(maps.depth))
+        _render(view, params, T_camera_world, fits.images.as_tensor(maps.depth), background)
         maps = fits.reference_maps(view, config, view.moment)
     image = Pyramid.of(maps.gray, maps.depth, view.camera, backend=view.backend)
     return Reference(image.weighed(*maps.weights), T_camera_world)
 
 
 def keyframe_reference(
-    params: Tensor, view: View, image: Pyramid, T_camera_world: Matrix, config: TrackingConfig
+    params: Tensor,
+    view: View,
+    image: Pyramid,
+    T_camera_world: Matrix,
+    config: TrackingConfig,
+    target: Target | None = None,
 ) -> Reference:
     """Make a reference from a keyframe's own image; each pixel is weighted by w̃ of the map at its pose (VarSplat §3).
 
     params: rows [N, 17]; image: its gray and depth (m) pyramid; T_camera_world [4, 4]: its pose. The sensor's surface
     is unbiased, while a young map still renders surfaces too close; the map only supplies the pixel weights. Depth can
-    be weighted by U about the sensor's depth instead (CG-SLAM eq. 10).
+    be weighted by U about the sensor's depth instead (CG-SLAM eq. 10). With `config.variance` predicted and the
+    keyframe's `target`, V and U are replaced by the predicted variances.
     """
     if not config.uncertainty:
         return Reference(image, T_camera_world)
-    by_U, fits = config.align_depth_by == "U", fits_of(view)
-    view.forward(params, T_camera_world, fits.images.as_tensor(image.depth[0]) if by_U else None)
+    by_U, fits, background = config.align_depth_by == "U", fits_of(view), None
+    if config.variance == "predicted" and target is not None:
+        params, background = predicted_at(params, view, target, T_camera_world)
+    _render(view, params, T_camera_world, fits.images.as_tensor(image.depth[0]) if by_U else None, background)
+    if by_U and background is not None:
+        use_predicted_depth_variance(view)
     maps = fits.reference_maps(view, config, view.moment if by_U else None)
     return Reference(image.weighed(*maps.weights), T_camera_world)
+
+
+def _render(
+    view: View, params: Tensor, T_camera_world: Matrix, depth_m: Tensor | None, background: Background | None
+) -> None:
+    """Render the map, with U about a depth [H, W] if given; with a background, V becomes the predicted variance."""
+    view.forward(params, T_camera_world, depth_m)
+    if background is not None:
+        use_predicted_variance(view, background)

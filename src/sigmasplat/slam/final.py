@@ -24,6 +24,7 @@ from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.tsdf import packed
 from sigmasplat.render.view import View
 from sigmasplat.slam.fusion import count_keyframes, fuse, fusion_views
+from sigmasplat.slam.predicted_submaps import PredictedSubmaps
 from sigmasplat.types import Matrix, Progress, no_progress
 
 CACHE_BYTES = 64 << 20
@@ -86,12 +87,15 @@ def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix], final: FinalC
 def merged(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> GaussianField:
     """Merge the splats of all submaps in the world (anchors: T_world_submap [4, 4]), without duplicates
     (`survivors`)."""
-    field, owner = GaussianField.empty(), list[NDArray[np.int64]]()
+    field, owner, variances = GaussianField.empty(), list[NDArray[np.int64]](), list[Tensor]()
+    predicted = PredictedSubmaps(config, store)
     for index in range(len(store)):
         part = _in_world(store, anchors, index)
         owner.append(np.full(len(part), index))
+        is_predicted = config.final.uncertainty and config.final.variance == "predicted"
+        variances.append(_log_variance(predicted.rows(index) if is_predicted else part.params))
         field.append(part)
-    log_variance = _log_variance(field) if config.final.uncertainty else None
+    log_variance = np.asarray(torch.cat(variances).double()) if config.final.uncertainty else None
     keep = survivors(field.means.numpy(), np.concatenate(owner), log_variance, config.final.spacing_m)
     field.keep(torch.from_numpy(keep))
     return field
@@ -105,9 +109,9 @@ def _in_world(store: SubmapStore, anchors: Sequence[Matrix], index: int) -> Gaus
     )
 
 
-def _log_variance(field: GaussianField) -> NDArray[np.float64]:
-    """Return log σ² of each splat [N], mean over the channels."""
-    return np.asarray(field.params[:, COLUMNS["log_variances"]].mean(1).double())
+def _log_variance(rows: Tensor) -> Tensor:
+    """Return log σ² of rows [N, 17], mean over the channels."""
+    return rows[:, COLUMNS["log_variances"]].mean(1)
 
 
 def survivors(

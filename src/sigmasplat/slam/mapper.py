@@ -21,7 +21,7 @@ from sigmasplat.model.frame import Detail
 from sigmasplat.model.submap import Picture, Submap
 from sigmasplat.render.view import View
 from sigmasplat.slam.densify import densify_mask, multiply, split, too_large
-from sigmasplat.slam.pruning import fade, splat_uncertainty, still_uncertain
+from sigmasplat.slam.pruning import fade, splat_depth_residuals, splat_uncertainty, still_uncertain
 from sigmasplat.slam.rules import draw_keyframes
 from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats, thin_out
 from sigmasplat.slam.window import choose_window, dominating
@@ -170,16 +170,22 @@ class Mapper:
         p = self.config.primitives
         if not p.uncertain_m2:
             return self.field.ids[:0]
-        nu, _ = splat_uncertainty(self.field, view, self._judging_keyframes(window), p.owner)
-        return fade(self.field, nu > p.uncertain_m2, p.faded_opacity)
+        return fade(self.field, self._uncertainty_m2(view, window) > p.uncertain_m2, p.faded_opacity)
 
     def _still_uncertain(self, view: View, window: list[Keyframe], faded: Tensor) -> Tensor:
         """Return which faded splats did not recover, bool [N]."""
         p = self.config.primitives
         if not len(faded):
             return torch.zeros_like(self.field.ids, dtype=torch.bool)
-        nu, _ = splat_uncertainty(self.field, view, self._judging_keyframes(window), p.owner)
-        return still_uncertain(self.field, faded, nu, p.uncertain_m2, p.least_opacity)
+        nu_m2 = self._uncertainty_m2(view, window)
+        return still_uncertain(self.field, faded, nu_m2, p.uncertain_m2, p.least_opacity)
+
+    def _uncertainty_m2(self, view: View, window: list[Keyframe]) -> Tensor:
+        """Return how far each splat [N] is from the depth readings, m²."""
+        p, keyframes = self.config.primitives, self._judging_keyframes(window)
+        if p.uncertain_by == "residual":
+            return splat_depth_residuals(self.field, view, keyframes)
+        return splat_uncertainty(self.field, view, keyframes, p.owner)[0]
 
     def _prune(self, view: View, also: Tensor | None = None) -> None:
         """Remove splats that are too faint or too large, and those marked in `also` [N]."""

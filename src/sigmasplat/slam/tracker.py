@@ -7,6 +7,7 @@ from dataclasses import dataclass, field as dataclass_field
 import numpy as np
 
 from sigmasplat.config import TrackingConfig
+from sigmasplat.errors import ConfigError
 from sigmasplat.fit.align import Alignment, align
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison
@@ -57,6 +58,7 @@ class Tracker:
     R_inertial_camera: that of the last frame; lost: tracking of the last frame failed; doubtful: number of frames in a
     row whose best pose the images contradict (`_contradicted`); front: what was in front of the scene in the last
     frame, None if there was nothing or the frame was lost; keyframe_front: the same for the newest keyframe.
+    Raises ConfigError on settings that do not fit together.
     """
 
     config: TrackingConfig
@@ -77,6 +79,11 @@ class Tracker:
     doubtful: int = 0
     started: bool = False
     """Whether a frame has been tracked yet."""
+
+    def __post_init__(self) -> None:
+        c = self.config
+        if c.uncertainty and c.variance == "predicted" and c.method == "adam":
+            raise ConfigError("tracking.variance=predicted needs tracking.method=align; set it, or variance=published")
 
     def start(self, seen: Sight, R_inertial_camera: Matrix | None = None) -> None:
         """Fix the gauge: the first camera is the world. R_inertial_camera: as in `Frame`."""
@@ -290,7 +297,7 @@ class Tracker:
         self.keyframe_features, self.keyframe_front = seen.image, self.front
         if self.config.method == "align" or fits_of(view).aligns:  # otherwise nothing aligns to it
             T_camera_world = se3.inverse(T_world_camera)
-            self.keyframe = keyframe_reference(field.params, view, seen.live, T_camera_world, self.config)
+            self.keyframe = keyframe_reference(field.params, view, seen.live, T_camera_world, self.config, seen.target)
             if seen.image is not None:
                 self.keyframe_features = seen.image.weighed(self.keyframe.weights)
 

@@ -55,10 +55,11 @@ class Observation(Sight):
 
 def view_of(camera: Camera, config: Config) -> View:
     """Make the view for working images of a camera, with planes for σ² if the run learns it or weighs by it."""
-    mapping, tracking = config.mapping, config.tracking
+    mapping, tracking, registration = config.mapping, config.tracking, config.registration
     learned = bool(mapping.weight_nll_color or mapping.weight_nll_depth)
     read = tracking.uncertainty and tracking.align_depth_by == "V"
-    return make_view(config.backend, camera, config.render, variance=learned or read)
+    predicted = any(c.uncertainty and c.variance == "predicted" for c in (tracking, registration))
+    return make_view(config.backend, camera, config.render, variance=learned or read or predicted)
 
 
 def working_frame(frame: Frame, config: Config, camera: Camera | None = None) -> Frame:

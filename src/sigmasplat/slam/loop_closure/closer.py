@@ -27,6 +27,7 @@ from sigmasplat.slam.loop_closure.candidates import (
 from sigmasplat.slam.loop_closure.descriptors import Descriptor, OrientationGrid
 from sigmasplat.slam.loop_closure.pose_graph import Edge, LoopVerdict, optimise
 from sigmasplat.slam.loop_closure.registration import Registrar, Registration
+from sigmasplat.slam.predicted_submaps import PredictedSubmaps
 from sigmasplat.types import Matrix
 
 RIGID = np.diag(np.repeat([1e-4, 1e-5], 3) ** -2.0)
@@ -91,6 +92,9 @@ class LoopCloser:
     closed: list[Edge] = field(default_factory=list)
     loops: list[Loop] = field(default_factory=list)
 
+    def __post_init__(self) -> None:
+        self.predicted = PredictedSubmaps(self.config, self.store)
+
     def connect(self, a: int, b: int, T_a_b: Matrix, information: Matrix) -> None:
         """Add a trusted edge between two submaps, such as odometry to the next one or a relocalisation: T_a_b [4, 4],
         and the information [6, 6] of its left twist (m, rad)."""
@@ -114,10 +118,15 @@ class LoopCloser:
         return self.odometry + [e for e, loop in zip(self.closed, registered, strict=True) if loop.accepted]
 
     def _described(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]]) -> SubmapDescriptor:
-        c, field = self.config.loops, submap.field
-        log_variances = field.params[:, COLUMNS["log_variances"]].numpy()
-        ratio = opacity_ratio(field.opacities.numpy(), log_variances, c.tau, c.weight_max)
-        return SubmapDescriptor(submap.index, np.stack(descriptors), ratio)
+        return SubmapDescriptor(submap.index, np.stack(descriptors), self.opacity_ratio(submap))
+
+    def opacity_ratio(self, submap: Submap) -> float:
+        """Return the variance-weighted opacity ratio of a submap (VarSplat §4)."""
+        c, rows = self.config.loops, submap.field.params
+        if c.uncertainty and c.variance == "predicted":
+            rows = self.predicted.rows(submap.index)
+        log_variances = rows[:, COLUMNS["log_variances"]].numpy()
+        return opacity_ratio(submap.field.opacities.numpy(), log_variances, c.tau, c.weight_max)
 
     def submap_finished(
         self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], atlas: Atlas, view: View
@@ -157,7 +166,8 @@ class LoopCloser:
         """Register a pair, with `a` as the query, and record the result, accepted or not."""
         b = self.store.load(pair.best.database_submap)
         known = se3.inverse(atlas.anchors[a.index]) @ atlas.anchors[b.index]
-        found = Registrar(self.config, self.store, view, self.extractor).register(pair, a, b, known)
+        registrar = Registrar(self.config, self.store, view, self.extractor, self.predicted)
+        found = registrar.register(pair, a, b, known)
         loop = described(pair.best, a, b, found, known)
         self.loops.append(loop)
         if found.accepted:

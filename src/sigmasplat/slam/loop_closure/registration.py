@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,6 +17,7 @@ from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import map_reference, picture_images
 from sigmasplat.model import se3
+from sigmasplat.model.map_uncertainty import Background
 from sigmasplat.model.submap import Submap, SubmapStore
 from sigmasplat.render.view import View
 from sigmasplat.slam.drift import FLOOR, symmetric
@@ -24,6 +26,7 @@ from sigmasplat.slam.localisation.feature_image import pose_by_features
 from sigmasplat.slam.localisation.known_map import KnownKeyframe
 from sigmasplat.slam.localisation.verdict import confirmed
 from sigmasplat.slam.loop_closure.candidates import SubmapPair
+from sigmasplat.slam.predicted_submaps import PredictedSubmaps
 from sigmasplat.types import Matrix
 
 HOPELESS = 0.5
@@ -49,6 +52,13 @@ class Localisation:
     comparison: Comparison | None = None
 
 
+class WeighedMap(NamedTuple):
+    """The rows [N, 17] of a submap whose variance weighs pixels; background: of the predicted variance, None = V."""
+
+    params: Tensor
+    background: Background | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Registration:
     """T_a_b [4, 4] between submaps a and b, or the reason why the registration was refused.
@@ -70,8 +80,16 @@ class Registrar:
     """Registers submaps of one store; all of them share the camera of the view. With an extractor, features give
     another guess where alignment from the known poses fits poorly, such as between wide angles."""
 
-    def __init__(self, config: Config, store: SubmapStore, view: View, extractor: Extractor | None = None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        store: SubmapStore,
+        view: View,
+        extractor: Extractor | None = None,
+        predicted: PredictedSubmaps | None = None,
+    ) -> None:
         self.config, self.store, self.view, self.extractor = config.registration, store, view, extractor
+        self.predicted = predicted or PredictedSubmaps(config, store)
         self.verify, self.seed = config.tracking.verify, config.seed
         self.tracking = tracking_of(config.registration, config.tracking)
 
@@ -88,18 +106,19 @@ class Registrar:
     ) -> Localisation:
         """Localise a keyframe of `own` in `other`: align from the expected pose and from the poses of similar
         keyframes, then refine the best one by gradient descent on the uncertainty-weighted loss with exposure."""
-        T_own_camera, params = own.T_submap_camera[keyframe], other.field.params.to(self.view.sums.device)
+        T_own_camera, other_map = own.T_submap_camera[keyframe], self._map_of(other)
         target, live = picture_images(self.view, self.store.picture(own.index, keyframe), own.camera)
         expected = se3.inverse(T_own_camera) @ T_own_other
         guesses = [expected, *(se3.inverse(other.T_submap_camera[k]) for k in alike)]
-        fit = max((self._aligned(params, live, guess) for guess in guesses), key=score)
+        fit = max((self._aligned(other_map, live, guess) for guess in guesses), key=score)
         if score(fit) < DOUBTFUL:
-            found = (self._aligned(params, live, guess) for guess in self._by_features(own, keyframe, other, alike))
+            found = (self._aligned(other_map, live, guess) for guess in self._by_features(own, keyframe, other, alike))
             fit = max((fit, *found), key=score)
         if fit.alignment is None or score(fit) > HOPELESS * self.config.share_least:
-            fit = fit_pose_adam(params, self.view, target, fit.T_camera_world, self.tracking, self.config.iterations)
+            start, steps = fit.T_camera_world, self.config.iterations
+            fit = fit_pose_adam(other_map.params, self.view, target, start, self.tracking, steps)
         A = se3.adjoint(T_own_camera)
-        covariance, comparison = self._checked(params, live, fit.T_camera_world)
+        covariance, comparison = self._checked(other_map, live, fit.T_camera_world)
         T_own_other = T_own_camera @ fit.T_camera_world
         return Localisation(T_own_other, fit.loss, A @ covariance @ A.T, fit.agreement, fit.overlap, comparison)
 
@@ -117,21 +136,29 @@ class Registrar:
     def _known(self, submap: Submap, keyframe: int) -> KnownKeyframe:
         return KnownKeyframe(self.store.picture(submap.index, keyframe), submap.T_submap_camera[keyframe])
 
-    def _aligned(self, params: Tensor, live: Pyramid, guess: Matrix) -> PoseFit:
+    def _map_of(self, submap: Submap) -> WeighedMap:
+        """Return a submap as the weights read it: with V as published, or with the predicted variance."""
+        c, device = self.config, self.view.sums.device
+        if not c.uncertainty or c.variance == "published":
+            return WeighedMap(submap.field.params.to(device))
+        return WeighedMap(self.predicted.rows(submap.index).to(device), self.predicted.background(submap.index))
+
+    def _aligned(self, other: WeighedMap, live: Pyramid, guess: Matrix) -> PoseFit:
         """Align a keyframe to the map rendered at a guess, then again to the map rendered at the result."""
         if not fits_of(self.view).aligns:
             return PoseFit(guess, 0.0, 0.0, np.nan, np.nan, 0)  # alignment needs the compiled kernels
         for _ in range(2):
-            fit = fit_pose_align(map_reference(params, self.view, guess, self.tracking), live, guess, self.tracking)
+            reference = map_reference(other.params, self.view, guess, self.tracking, other.background)
+            fit = fit_pose_align(reference, live, guess, self.tracking)
             guess = fit.T_camera_world
         return fit
 
-    def _checked(self, params: Tensor, live: Pyramid, T_camera_map: Matrix) -> tuple[Matrix, Comparison | None]:
+    def _checked(self, other: WeighedMap, live: Pyramid, T_camera_map: Matrix) -> tuple[Matrix, Comparison | None]:
         """Return the covariance [6, 6] of T_camera_map's left twist, estimated by alignment to the map at that pose,
         and, if poses are verified, the comparison with the map there."""
         if not fits_of(self.view).aligns:
             return np.zeros((6, 6)), None
-        reference = map_reference(params, self.view, T_camera_map, self.tracking)
+        reference = map_reference(other.params, self.view, T_camera_map, self.tracking, other.background)
         covariance = align(reference.pyramid, live, np.eye(4), 0, self.tracking.align_weight_color).covariance
         comparison = compare(reference.pyramid, live, np.eye(4)) if self.verify else None
         return covariance if np.isfinite(covariance).all() else np.eye(6), comparison
