@@ -11,7 +11,7 @@ CHANNELS = 3
 
 
 def gather(view: View, params: Tensor, planes: Tensor) -> Tensor:
-    """Return Σ_p w_ip g_p [N, 3] of three planes g [3, H, W] for the view's last forward pass, of rows `params` [N, 17];
+    """Return Σ_p w_ip g_p [N, 3] of three planes g [3, H, W] for the last forward pass of a view, of rows [N, 17];
     all on the view's device.
 
     The colour of a pixel is linear in the splats' colours, so this is the gradient of the colours if g is the gradient
