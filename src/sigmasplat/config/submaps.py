@@ -33,9 +33,10 @@ class LoopConfig:
 
     close: bool = True
     """Whether loops are searched and closed."""
-    descriptor: Literal["grid", "netvlad"] = "grid"
+    descriptor: Literal["grid", "netvlad", "netvlad-or-grid"] = "grid"
     """Image descriptor: grid = built in (`slam.loop_closure.descriptors.OrientationGrid`); netvlad = with the weights
-    of the file `weights`."""
+    of the file `weights`; netvlad-or-grid = NetVLAD (papers) if `weights` is set, otherwise the built-in one, with a
+    warning."""
     weights: str = ""
     """File of NetVLAD weights, needed by descriptor=netvlad; read at the start."""
     min_similarity: float = 0.5
