@@ -243,7 +243,7 @@ def refine(
         until_event = min(every - done % every for every in (final.prune_every, final.sh_every))
         degree = min(final.sh_degree, done // final.sh_every)
         rates = decaying(mapping, final, done) if final.lr_means_last else None
-        fit = fit_field(field, view, islice(drawn, until_event), mapping, rates, degree=degree)
+        fit = fit_field(field, view, islice(drawn, until_event), mapping, schedule=rates, degree=degree)
         losses += fit.losses
         done += len(fit.losses)
         if done % final.prune_every == 0:
