@@ -47,7 +47,7 @@ ORIGINS: dict[str, dict[str, str]] = {
         "loops.most": "ours", "loops.tau": "paper", "loops.weight_max": "paper",
         "registration.keyframes": "paper", "registration.iterations": "paper", "registration.lr_rotation": "paper",
         "registration.lr_translation": "paper", "registration.plateau_stop": "ours",
-        "registration.plateau_window": "ours", "registration.target": "paper", "registration.exposure": "paper",
+        "registration.plateau_window": "ours", "registration.target": "ours", "registration.exposure": "paper",
         "registration.weight_color": "paper", "registration.tau": "paper; scannet, scannetpp: code",
         "registration.weight_max": "paper", "registration.overlap_least": "paper", "registration.overlap_m": "paper",
         "registration.agreement_least": "ours", "registration.share_least": "ours", "registration.spread_m": "ours",
@@ -171,7 +171,7 @@ def _value(config: Any, name: str) -> str:
     value = getattr(getattr(config, section), setting)
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return value if isinstance(value, str) else f"{value:.6g}"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ def test_each_setting_of_a_papers_preset_has_an_origin(tables: ModuleType, syste
 
 @pytest.mark.parametrize("system", SYSTEMS)
 def test_each_setting_of_a_released_preset_is_in_a_table(tables: ModuleType, system: str) -> None:
-    """Every setting in which a scene differs from the presets of the paper is a column or a row of the code's tables."""
+    """Each setting in which a scene differs from the paper's presets is a column or a row of the code's tables."""
     names = [name for name in list_presets() if name.startswith(f"{system}-released-")]
     shown = {line.split("`")[1] for line in tables.method_table(system).splitlines() if line.startswith("| `")}
     for name in names:

@@ -1,4 +1,5 @@
-"""Presets of VarSplat and LoopSplat. Values that the papers do not give are those of the released code.
+"""Presets of VarSplat and LoopSplat. Numbers that the papers do not give are those of the released code; methods that
+only the code has are in `varsplat_released`.
 
 `varsplat-*` follow VarSplat (arXiv 2603.09673) §2–3. `loopsplat-*` are the same without any uncertainty weight, which
 is the front end of LoopSplat (arXiv 2408.10154). `*-fast` are ours, sized for two CPU cores. Where each number comes
