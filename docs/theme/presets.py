@@ -34,7 +34,7 @@ ORIGINS: dict[str, dict[str, str]] = {
         "mapping.weight_nll_depth": "paper", "mapping.lr_means": "paper", "mapping.lr_quats": "paper",
         "mapping.lr_log_scales": "paper", "mapping.lr_opacity_logits": "paper", "mapping.lr_colors": "paper",
         "mapping.lr_log_variances": "paper", "mapping.freeze_old_colors": "code", "mapping.freeze_new_colors": "ours",
-        "mapping.fresh_adam": "ours", "mapping.prune_opacity": "paper",
+        "mapping.exposure": "ours", "mapping.fresh_adam": "ours", "mapping.prune_opacity": "paper",
         "tracking.iterations": "paper", "tracking.lr_rotation": "paper", "tracking.lr_translation": "paper",
         "tracking.amsgrad": "ours", "tracking.weight_color": "paper", "tracking.tau": "paper; scannet, scannetpp: code",
         "tracking.weight_max": "paper", "tracking.alpha_power": "paper; scannetpp: code",
@@ -89,7 +89,7 @@ ORIGINS: dict[str, dict[str, str]] = {
 SCENES: dict[str, tuple[str, ...]] = {
     "varsplat": (
         "tracking.tau", "loops.tau", "registration.tau", "mapping.weight_nll_depth", "input.crop_px", "input.limit",
-        "input.max_depth_m", "loops.min_interval", "registration.target",
+        "input.max_depth_m", "loops.min_interval", "registration.target", "mapping.exposure",
     ),
     "cgslam": (
         "tracking.iterations", "tracking.lr_rotation", "tracking.lr_translation", "tracking.weight_color",

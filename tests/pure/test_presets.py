@@ -245,6 +245,7 @@ def test_each_released_varsplat_preset_holds_the_row_of_its_scene() -> None:
         tau, tau_loops, nll_depth, crop = map(float, numbers)
         assert (config.tracking.tau, config.loops.tau, config.registration.tau) == (tau, tau_loops, 3.0), scene
         assert (config.mapping.weight_nll_depth, config.input.crop_px) == (nll_depth * 1e-4, crop), scene
+        assert config.mapping.exposure == config.tracking.exposure == (dataset == "scannet"), scene
         assert (
             config.loops.min_interval, config.registration.target, config.input.limit
         ) == PER_DATASET[dataset], scene  # fmt: skip
@@ -252,7 +253,7 @@ def test_each_released_varsplat_preset_holds_the_row_of_its_scene() -> None:
 
 def test_released_varsplat_presets_differ_from_the_papers_by_the_methods_of_the_code_alone() -> None:
     rows = {"tracking.tau", "loops.tau", "registration.tau", "mapping.weight_nll_depth", "input.crop_px"}
-    rows |= {"loops.min_interval", "registration.target", "input.limit", "input.max_depth_m"}
+    rows |= {"loops.min_interval", "registration.target", "input.limit", "input.max_depth_m", "mapping.exposure"}
     methods = {
         "seeding.outlier_first": False, "mapping.freeze_new_colors": True, "mapping.freeze_until": "half",
         "mapping.fresh_adam": True, "tracking.amsgrad": True, "submaps.uncertainty_m": 0.0, "loops.most": 0,

@@ -1,7 +1,9 @@
 """Presets of papers and released code that cut submaps: each runs whole on a few small frames, with few iterations."""
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from sigmasplat.config import Config
@@ -31,3 +33,19 @@ def test_a_preset_of_varsplat_maps_cuts_and_refines(name: str) -> None:
     assert len(slam.store) >= 2 and len(slam.field) > 50
     assert bool(slam.field.params.isfinite().all())
     assert all(math.isfinite(step.T_world_camera.sum()) for step in steps)
+
+
+@pytest.mark.parametrize("corrected", [False, True])
+def test_a_darker_frame_is_mapped_in_the_exposure_of_the_map(corrected: bool) -> None:
+    """A frame of which everything is 0.6 times as bright: the picture of its keyframe is as bright as the others."""
+    bright = frames(3)
+    dark = replace(bright[2], color=bright[2].color * np.float32(0.6))
+    settings = {"tracking.iterations": "60", "mapping.first_iterations": "60", "submaps.frames": "0"}
+    config = override(short("varsplat-released-scene0000"), settings | {"input.width": "96"})
+    slam = Slam(config.changed(mapping={"exposure": corrected}))
+    for frame in (*bright[:2], dark):
+        slam.step(frame)
+    assert slam.keyframe_indices == [0, 1, 2]
+    brightness = [float(keyframe.target.image.mean()) for keyframe in slam.mapper.keyframes]
+    ratio = brightness[2] / brightness[1]
+    assert 0.85 < ratio < 1.15 if corrected else ratio < 0.7

@@ -141,6 +141,9 @@ class MappingConfig:
     """Whether the new splats of a keyframe keep the colour of their pixel (VarSplat's code)."""
     freeze_until: Literal["end", "half"] = "end"
     """How long colours are frozen: in all steps of a keyframe, or only in the first half (VarSplat's code)."""
+    exposure: bool = False
+    """Whether keyframes are mapped in the exposure of the map: the exposure that `tracking.exposure` found is removed
+    from their colours (VarSplat's code for ScanNet)."""
     fresh_adam: bool = False
     """Whether each keyframe starts with a new Adam optimiser, without the moments of earlier keyframes (VarSplat's
     code)."""

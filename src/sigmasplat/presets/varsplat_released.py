@@ -46,7 +46,7 @@ def _released(base: Config, min_interval: int, max_depth_m: float, registration:
 # As in the code, no reading is removed: the PNGs of TUM and ScanNet end at 13 and 66 m.
 _REPLICA = _released(REPLICA, 3, 10.0)
 _TUM = _released(TUM, 4, 13.5)
-_SCANNET = _released(SCANNET, 5, 66.0, "rendered")
+_SCANNET = _released(SCANNET, 5, 66.0, "rendered").changed(mapping={"exposure": True})
 _SCANNETPP = _released(SCANNETPP, 2, 66.0).changed(input={"limit": 250})
 
 SCENES = {
