@@ -29,7 +29,7 @@ MOST = {
     "final.iterations": 40, "final.sh_every": 10,
 }  # fmt: skip
 """Settings that are lowered to these values where the preset has larger ones."""
-CUT = {"submaps.frames": 15, "loops.near_m": 2.0, "loops.near_deg": 60.0}
+CUT = {"submaps.frames": 15, "loops.min_interval": 2, "loops.near_m": 2.0, "loops.near_deg": 60.0}
 """Settings of presets that cut submaps."""
 
 
