@@ -85,7 +85,7 @@ def test_a_rule_is_a_function_and_a_descriptor_a_class(package: Path, run: Calla
             "\n\nclass MeanColor:\n    def describe(self, color, depth_m):\n"
             "        mean = color.mean((0, 1))\n        return mean / np.linalg.norm(mean)\n"
         )
-    replace(package / "config" / "submaps.py", 'Literal["grid", "netvlad"]', 'Literal["grid", "netvlad", "mean"]')
+    replace(package / "config" / "submaps.py", 'Literal["grid", "netvlad",', 'Literal["grid", "mean", "netvlad",')
     replace(loops / "closer.py", "import Descriptor, OrientationGrid", "import Descriptor, MeanColor, OrientationGrid")
     replace(
         loops / "closer.py",

@@ -549,6 +549,15 @@ def test_options_of_eval_reach_the_evaluation(corridor: Corridor, capsys: pytest
     assert GIVEN["lpips"] is None and "no vgg.pth in data/lpips" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("preset", ["varsplat-fast", "varsplat-tum", "cgslam-tum", "cgslam-released-fr1-desk"])
+def test_a_preset_with_netvlad_gives_a_warning_without_weights(
+    corridor: Corridor, capsys: pytest.CaptureFixture[str], preset: str
+) -> None:
+    assert exit_code("run", "corridor", "--preset", preset, "--no-eval") == 0
+    warned = "no NetVLAD weights, so the built-in descriptor is used" in capsys.readouterr().err
+    assert warned == (preset in ("varsplat-tum", "cgslam-released-fr1-desk"))
+
+
 def test_eval_and_export_read_what_run_wrote(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     exit_code("run", "corridor", "--no-eval", "--out", "mine", "--limit", "5", "--hold-out", "3")
     assert RunFolder.open(Path("mine")).config().input.hold_every == 3

@@ -229,7 +229,10 @@ def test_degrees_grow_and_faded_splats_go(monkeypatch: pytest.MonkeyPatch) -> No
     store.submaps[1].field.params[-5:, 10] = -8.0
     used = []
 
-    def fit(field: GaussianField, view: object, order: object, mapping: MappingConfig, degree: int) -> object:
+    def fit(
+        field: GaussianField, view: object, order: object, mapping: MappingConfig, degree: int, schedule: object
+    ) -> object:
+        assert schedule is None, "the rate of the means stays the same"
         steps = len(list(order))  # type: ignore[call-overload]
         used.append((steps, degree, len(field)))
         return type("Fit", (), {"losses": [0.0] * steps})()
@@ -239,6 +242,22 @@ def test_degrees_grow_and_faded_splats_go(monkeypatch: pytest.MonkeyPatch) -> No
     field = refined(store, config(iterations=25, sh_degree=2, sh_every=6, prune_every=10))
     assert [(steps, degree) for steps, degree, _ in used] == [(6, 0), (4, 1), (2, 1), (6, 2), (2, 2), (4, 2), (1, 2)]
     assert [n for *_, n in used] == [full] * 2 + [full - 10] * 5 and len(field) == full - 10
+
+
+def test_the_rate_of_the_means_falls_to_its_last_value_across_pruning(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The learning rates of all steps fall evenly in their logarithm, whatever interrupts the steps."""
+    used: list[float] = []
+
+    def fit(field: GaussianField, view: object, order: object, mapping: MappingConfig, **more: object) -> object:
+        rates = [rates.per_column for _, rates in zip(order, more["schedule"], strict=False)]  # type: ignore[call-overload]
+        used.extend(float(columns[COLUMNS["means"]][0]) for columns in rates)
+        assert all(float(columns[COLUMNS["colors"]][0]) == pytest.approx(2.5e-3) for columns in rates)
+        return type("Fit", (), {"losses": [0.0] * len(rates)})()
+
+    monkeypatch.setattr("sigmasplat.slam.final.fit_field", fit)
+    refined(make_store(), config(iterations=25, prune_every=10, sh_every=7, lr_means_last=1.6e-6))
+    assert used[0] == pytest.approx(1e-4) and used[-1] == pytest.approx(1.6e-6)
+    assert np.allclose(np.diff(np.log(used)), np.log(1.6e-2) / 24, rtol=1e-3)
 
 
 def around(angle: float) -> np.ndarray:

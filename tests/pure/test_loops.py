@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from sigmasplat.config import Config, LoopConfig
+from sigmasplat.errors import ConfigError
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.camera import Camera
@@ -157,3 +158,6 @@ def test_components_that_have_joined_share_a_pose_graph(monkeypatch: pytest.Monk
 
 def test_the_descriptor_by_its_name() -> None:
     assert isinstance(make_descriptor(LoopConfig()), OrientationGrid)
+    assert isinstance(make_descriptor(LoopConfig(descriptor="netvlad-or-grid")), OrientationGrid)
+    with pytest.raises(ConfigError, match="No such file"):
+        make_descriptor(LoopConfig(descriptor="netvlad-or-grid", weights="absent.pth"))

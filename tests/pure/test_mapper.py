@@ -88,3 +88,26 @@ def test_old_colours_are_frozen_where_asked(frozen: bool) -> None:
     assert len(fit.losses) == 2 and len(made.field) > old
     assert torch.equal(made.field.params[:old, colors], before[:, colors]) is frozen
     assert not torch.equal(made.field.params[:old, COLUMNS["means"]], before[:, COLUMNS["means"]])
+
+
+@pytest.mark.parametrize("until", ["end", "half"])
+def test_all_colours_are_frozen_to_the_end_or_to_half_of_the_steps(until: str) -> None:
+    mapping = replace(NO_FIT, iterations=6, first_iterations=6, freeze_new_colors=True, freeze_until=until)
+    made = mapper(replace(EVERY_PIXEL, opacity=0.6), mapping)
+    made.map(view(), 0, target(), np.eye(4))
+    seeds = target().image.reshape(-1, 3)
+    assert torch.equal(made.field.params[:, COLUMNS["colors"]], seeds) == (until == "end")
+    before = made.field.params[:, COLUMNS["colors"]].clone()
+    made.map(view(), 1, target(object_columns=5), np.eye(4))
+    assert torch.equal(made.field.params[: len(before), COLUMNS["colors"]], before) == (until == "end")
+
+
+def test_a_keyframe_forgets_adams_moments_where_asked() -> None:
+    """Without a step at the second keyframe, only forgetting changes the moments of the first one."""
+    for fresh in (False, True):
+        mapping = replace(NO_FIT, first_iterations=3, fresh_adam=fresh)
+        made = mapper(replace(EVERY_PIXEL, opacity=0.95), mapping)
+        made.map(view(), 0, target(), np.eye(4))
+        assert made.field.steps == 3 and bool(made.field.moment2.any())
+        made.map(view(), 1, target(), np.eye(4))
+        assert bool(made.field.moment2.any()) == (not fresh) and made.field.steps == (0 if fresh else 3)

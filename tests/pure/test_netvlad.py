@@ -128,6 +128,17 @@ def cell(*items: Any) -> np.ndarray:
     return out
 
 
+def state_dict_openibl(n: Net, module: str = "", whiten: bool = True) -> dict[str, torch.Tensor]:
+    """Lay a network out as OpenIBL's published file; its training adds `module.` and has no whitening."""
+    tensors = {f"{module}net_vlad.centroids": n.centroids, f"{module}net_vlad.conv.weight": n.assign[:, :, None, None]}
+    for layer, kernel, b in zip(LAYERS, n.kernels, n.biases, strict=True):
+        tensors |= {f"{module}base_model.base.{layer}.weight": kernel, f"{module}base_model.base.{layer}.bias": b}
+    if whiten:
+        rows = n.whiten.reshape(len(n.whiten), -1)[:, :, None, None]
+        tensors |= {f"{module}pca_layer.weight": rows, f"{module}pca_layer.bias": n.whiten_bias}
+    return {name: torch.tensor(value) for name, value in tensors.items()}
+
+
 def imagenet(color: np.ndarray) -> np.ndarray:
     return ((color - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]).transpose(2, 0, 1)
 
@@ -138,6 +149,34 @@ def test_a_checkpoint_gives_the_papers_descriptor(tmp_path: Path) -> None:
         found = described(save_checkpoint(tmp_path / "c.pth.tar", state_dict(n, module, bias, whiten)))
         assert found.dtype == np.float32 and np.linalg.norm(found) == pytest.approx(1.0, abs=1e-6)
         np.testing.assert_allclose(found, expected(n, imagenet(picture()), bias, whiten), atol=2e-6)
+
+
+def test_openibls_file_gives_the_papers_descriptor_of_255_rgb_less_the_mean(tmp_path: Path) -> None:
+    n = net(4)
+    image = (picture() * 255 - np.array([123.68, 116.779, 103.939])).transpose(2, 0, 1)
+    torch.save(state_dict_openibl(n), tmp_path / "vgg16_netvlad.pth")
+    np.testing.assert_allclose(described(tmp_path / "vgg16_netvlad.pth"), expected(n, image, False, True), atol=2e-6)
+    trained = save_checkpoint(tmp_path / "model_best.pth.tar", state_dict_openibl(n, "module.", whiten=False))
+    np.testing.assert_allclose(described(trained), expected(n, image, False, False), atol=2e-6)
+
+
+def test_openibls_true_shapes_load(tmp_path: Path) -> None:
+    """VGG16 with 64 clusters of 512 features; the whitening has 5 of the published 4096 rows, which are 0.5 GB."""
+    widths = (3, 64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512)
+    random = np.random.default_rng(0)
+
+    def draw(*shape: int) -> np.ndarray:
+        return 0.05 * random.standard_normal(shape, np.float32)
+
+    kernels = [draw(o, i, 3, 3) for i, o in pairwise(widths)]
+    biases = [draw(o) for o in widths[1:]]
+    n = Net(kernels, biases, draw(64, 512), draw(64), draw(64, 512), draw(5, 64, 512), draw(5))
+    torch.save(state_dict_openibl(n), tmp_path / "vgg16_netvlad.pth")
+    weights = NetVladWeights.load(tmp_path / "vgg16_netvlad.pth")
+    assert [tuple(kernel.shape) for kernel, _ in weights.convolutions] == [kernel.shape for kernel in kernels]
+    assert np.array_equal(weights.centroids.numpy(), n.centroids) and np.array_equal(weights.assign.numpy(), n.assign)
+    vector = NetVlad(weights).describe(picture(), np.zeros((37, 50), np.float32))
+    assert vector.shape == (5,) and np.linalg.norm(vector) == pytest.approx(1.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("mean_size", [1, 4])

@@ -190,19 +190,87 @@ def test_released_presets_share_the_settings_of_the_code() -> None:
         assert (p.uncertain_m2, p.owner, p.clone, p.split_gradient) == (0.0, "median", False, 0.002), scene
         assert (t.first_iterations, t.first_lr_rotation) == (200, 0.003), scene
         assert not config.render.covariance_pose_gradient, scene
+        assert config.loops.descriptor == "netvlad-or-grid" and not config.loops.close, scene
         assert config.input == preset(base_of(scene)).input, scene
 
 
 def test_presets_and_rows_of_the_table_match() -> None:
-    released = {name.removeprefix("cgslam-released-") for name in list_presets() if "-released-" in name}
-    assert released == set(SCENES)
+    released = [name.partition("-released-") for name in list_presets() if "-released-" in name]
+    assert {scene for system, _, scene in released if system == "cgslam"} == set(SCENES)
+    assert {scene for system, _, scene in released if system == "varsplat"} == set(VARSPLAT_SCENES)
 
 
-# ---- ours
+# ---- VarSplat's code
+# scene: data set, tau of tracking, tau of loops, NLL of depth, crop px
+
+VARSPLAT_TABLE = """
+room0      replica   10  10 1 0
+room1      replica   100 30 1 0
+room2      replica   10  10 1 0
+office0    replica   100 30 1 0
+office1    replica   10  5  1 0
+office2    replica   10  5  1 0
+office3    replica   10  5  1 0
+office4    replica   100 30 1 0
+fr1-desk   tum       50  10 0 50
+fr1-desk2  tum       50  10 1 50
+fr1-room   tum       100 30 0 50
+fr2-xyz    tum       50  10 0 8
+fr3-office tum       50  10 0 50
+scene0000  scannet   10  5  0 12
+scene0054  scannet   30  10 0 12
+scene0059  scannet   5   3  1 12
+scene0106  scannet   5   3  0 12
+scene0169  scannet   5   3  0 12
+scene0181  scannet   20  5  0 12
+scene0207  scannet   30  10 0 12
+scene0233  scannet   30  10 0 12
+scene0465  scannet   30  10 1 12
+281bc17764 scannetpp 20  5  1 0
+2e74812d00 scannetpp .5  5  1 0
+8b5caf3398 scannetpp 3   5  1 0
+b20a261fdf scannetpp 3   5  1 0
+fb05e13ad1 scannetpp 30  5  0 0
+"""
+VARSPLAT_SCENES = {row.split()[0]: row.split()[1:] for row in VARSPLAT_TABLE.strip().splitlines()}
+PER_DATASET = {  # loops.min_interval (the code asks for more than its number), registration.target, input.limit
+    "replica": (2 + 1, "recorded", 0), "tum": (3 + 1, "recorded", 0), "scannet": (4 + 1, "rendered", 0),
+    "scannetpp": (2, "recorded", 250),
+}  # fmt: skip
+
+
+def test_each_released_varsplat_preset_holds_the_row_of_its_scene() -> None:
+    for scene, (dataset, *numbers) in VARSPLAT_SCENES.items():
+        config = preset(f"varsplat-released-{scene}")
+        tau, tau_loops, nll_depth, crop = map(float, numbers)
+        assert (config.tracking.tau, config.loops.tau, config.registration.tau) == (tau, tau_loops, 3.0), scene
+        assert (config.mapping.weight_nll_depth, config.input.crop_px) == (nll_depth * 1e-4, crop), scene
+        assert config.mapping.exposure == config.tracking.exposure == (dataset == "scannet"), scene
+        assert (
+            config.loops.min_interval, config.registration.target, config.input.limit
+        ) == PER_DATASET[dataset], scene  # fmt: skip
+
+
+def test_released_varsplat_presets_differ_from_the_papers_by_the_methods_of_the_code_alone() -> None:
+    rows = {"tracking.tau", "loops.tau", "registration.tau", "mapping.weight_nll_depth", "input.crop_px"}
+    rows |= {"loops.min_interval", "registration.target", "input.limit", "input.max_depth_m", "mapping.exposure"}
+    methods = {
+        "seeding.outlier_first": False, "mapping.freeze_new_colors": True, "mapping.freeze_until": "half",
+        "mapping.fresh_adam": True, "tracking.amsgrad": True, "submaps.uncertainty_m": 0.0, "loops.most": 0,
+        "final.lr_means_last": 1.6e-6,
+    }  # fmt: skip
+    for scene, (dataset, *_) in VARSPLAT_SCENES.items():
+        released, paper = preset(f"varsplat-released-{scene}"), preset(f"varsplat-{dataset}")
+        assert {name: value_of(released, name) for name in methods} == methods, scene
+        assert changed_settings(released, paper) - rows == set(methods), scene
+        assert released.mapping.freeze_old_colors and released.input.min_depth_m == 0.0, scene
+
+
+# ---- the papers' values
 
 
 def test_varsplats_presets_hold_the_papers_numbers() -> None:
-    replica, tum, scannet = (preset(f"varsplat-{name}") for name in ("replica", "tum", "scannet"))
+    replica, tum, scannet = (preset(f"varsplat-{name}") for name in DATASETS)
     assert [c.tracking.iterations for c in (replica, tum, scannet)] == [60, 200, 200]
     assert [c.tracking.weight_color for c in (replica, tum, scannet)] == [0.95, 0.6, 0.6]
     assert [c.tracking.lr_rotation for c in (replica, tum, scannet)] == [2e-4, 2e-3, 2e-3]
@@ -225,6 +293,8 @@ def test_varsplats_presets_hold_the_papers_numbers() -> None:
         assert (config.mapping.weight_l1, config.mapping.weight_ssim) == (0.8, 0.2)
         assert config.mapping.newest_probability == 0.4
         assert (config.loops.min_similarity, config.loops.tau, config.loops.near_m) == (0.5, 10.0, 0.0)
+        assert config.loops.descriptor == "netvlad-or-grid"
+        assert (config.render.near_m, config.input.min_depth_m) == (0.2, 0.0)
         assert (config.registration.keyframes, config.registration.iterations) == (2, 100)
         assert (config.registration.weight_color, config.registration.overlap_least) == (0.95, 0.2)
         assert config.registration.lr_rotation == pytest.approx(3 * config.registration.lr_translation)
@@ -236,13 +306,33 @@ def test_varsplats_presets_hold_the_papers_numbers() -> None:
     assert scannet.submaps.frames == 50
     assert [c.registration.lr_translation for c in (replica, tum, scannet)] == [1e-3, 5e-3, 5e-3]
     assert [c.registration.tau for c in (replica, tum)] == [10.0, 50.0]
+    assert [c.loops.min_interval for c in (replica, tum, scannet)] == [2, 3, 4]
+    masks = [(c.tracking.alpha_above, c.tracking.outlier_factor) for c in (replica, tum, scannet)]
+    assert masks == [(0.0, 50.0), (0.0, 0.0), (0.98, 50.0)]
+    assert [c.input.crop_px for c in (replica, tum, scannet)] == [0, 16, 12]
+
+
+def test_varsplats_preset_for_scannetpp_holds_the_papers_numbers() -> None:
+    """The first two rows are the paper's; the others are the code's, where the paper gives none."""
+    config, tum = preset("varsplat-scannetpp"), preset("varsplat-tum")
+    t, m, s = config.tracking, config.mapping, config.seeding
+    assert (s.first_uniform, s.later_max, m.every, m.first_iterations, m.iterations) == (400_000, 100_000, 2, 500, 500)
+    assert (t.weight_color, t.iterations, m.weight_nll_depth, m.prune_opacity) == (0.5, 300, 1e-4, 0.5)
+    assert (config.submaps.frames, config.submaps.distance_m, config.submaps.angle_deg) == (100, 0.0, 0.0)
+    assert (config.loops.min_similarity, config.registration.lr_translation) == (0.34, 5e-3)
+    assert (t.lr_rotation, t.lr_translation) == (tum.tracking.lr_rotation, tum.tracking.lr_translation)
+    assert s.min_distance_m**2 == pytest.approx(1e-8) and s.outlier_neighbours == 0
+    assert (t.alpha_above, t.outlier_factor, t.alpha_power, t.reinit_factor) == (0.98, 50.0, 0.0, 50.0)
+
+
+# ---- ours
 
 
 def test_the_baseline_differs_by_uncertainty_alone() -> None:
     switches = {"tracking.uncertainty", "loops.uncertainty", "registration.uncertainty"}
     optional = {"mapping.weight_nll_depth", "final.uncertainty"}
     always = {*switches, "mapping.weight_nll_color", "submaps.uncertainty_m"}
-    for dataset in (*DATASETS, "fast"):
+    for dataset in (*DATASETS, "scannetpp", "fast"):
         ours, baseline = preset(f"varsplat-{dataset}"), preset(f"loopsplat-{dataset}")
         assert always <= changed_settings(ours, baseline) <= always | optional, dataset
         assert not any(value_of(baseline, name) for name in (*switches, "final.uncertainty")), dataset
@@ -319,7 +409,7 @@ def test_families_are_few_and_leave_no_preset_out() -> None:
     ("name", "message"),
     [
         ("fast", "no preset 'fast'; known: cgslam-fast, cgslam-loops-fast, loopsplat-fast, varsplat-fast (and "),
-        ("fr1-desk", "no preset 'fr1-desk'; known: cgslam-released-fr1-desk (and "),
+        ("fr1-desk", "no preset 'fr1-desk'; known: cgslam-released-fr1-desk, varsplat-released-fr1-desk (and "),
         ("cgslam-loops", "no preset 'cgslam-loops'; known: cgslam-loops-fast, cgslam-loops-replica, "),
         ("varsplat-fst", "no preset 'varsplat-fst' (did you mean varsplat-fast?); known: cgslam-fast, "),
         ("quick", f"no preset 'quick'; known: {', '.join(list_presets())}"),
@@ -333,7 +423,6 @@ def test_an_unknown_preset_suggests_similar_ones(name: str, message: str) -> Non
 
 
 NEW = [
-    "input.crop_px",
     "seeding.push_back",
     "mapping.weight_isotropy_ratio",
     "mapping.weight_alignment",

@@ -49,7 +49,7 @@ def piece(store: MemoryStore, frames: Sequence[int], brighter: float = 1.0) -> S
 
 
 def registered(
-    a: Sequence[int], b: Sequence[int], error: Matrix, brighter: float = 1.0, settings: Config = CONFIG
+    a: Sequence[int], b: Sequence[int], error: Matrix, brighter: float = 1.0, config: Config = CONFIG
 ) -> tuple[Registration, Matrix]:
     """Register submaps of frames a and b, told a T_a_b that is wrong by `error`; return the verdict and the truth."""
     store = MemoryStore()
@@ -58,7 +58,7 @@ def registered(
     T_a_b = se3.inverse(truth[a[0]]) @ truth[b[0]]
     pair = SubmapPair(Candidate(0, 0, 1, 0, 1.0, 1.0), (0, 1), (0, 1))
     view = make_view("cpu", walk().camera, RenderConfig())
-    return Registrar(settings, store, view).register(pair, ours, theirs, error @ T_a_b), T_a_b
+    return Registrar(config, store, view).register(pair, ours, theirs, error @ T_a_b), T_a_b
 
 
 def off(found: Matrix, truth: Matrix) -> tuple[float, float]:
@@ -101,6 +101,18 @@ def test_submaps_of_one_place_find_each_other_from_afar_and_in_another_light(bri
     assert degrees < 0.3
     assert found.overlap > 0.8
     assert np.linalg.eigvalsh(found.information)[0] > 0.0
+
+
+def test_the_images_that_submaps_render_register_them_without_the_recorded_ones(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(MemoryStore, "picture", None)
+    config = CONFIG.changed(registration={"target": "rendered"})
+    error = se3.exp(np.array([0.1, -0.05, 0.05, 0.03, 0.06, -0.02]))
+    found, truth = registered((0, 5), (3, 8), error, config=config)
+    assert found.accepted, found.reason
+    metres, degrees = off(found.T_a_b, truth)
+    assert metres < 0.01 and degrees < 0.3
 
 
 def test_what_is_known_before_does_not_matter_where_the_views_are_alike() -> None:

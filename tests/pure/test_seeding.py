@@ -247,6 +247,17 @@ def test_a_stray_reading_is_removed_where_asked() -> None:
     assert np.linalg.norm(kept.means.numpy() - POSE[:3, 3], axis=1).max() < 5 and len(kept) > 0.8 * len(everything)
 
 
+def test_a_stray_reading_stays_in_an_empty_map_where_asked() -> None:
+    depth = np.full(SIZE, 2.0, np.float32)
+    depth[4, 3] = 7.9
+    old = field_at(np.array([[50.0, 0.0, 0.0]]))
+    first, later = (
+        made(SOME, depth, field=field, outlier_neighbours=8, outlier_first=False)[0] for field in (None, old)
+    )
+    assert np.linalg.norm(first.means.numpy() - POSE[:3, 3], axis=1).max() > 5
+    assert np.linalg.norm(later.means.numpy() - POSE[:3, 3], axis=1).max() < 5
+
+
 def test_the_number_of_pixels_is_the_number_of_splats() -> None:
     for count, scale_from in itertools.product([0, 1, 3], ["pixel", "neighbours"]):
         pixels = np.zeros(SIZE, bool)

@@ -9,6 +9,8 @@ from PIL import Image
 import layouts
 from documents import ROOT
 from layouts import FRAMES, LAYOUTS, SMALL_CAMERA, sample
+from sigmasplat.checks.recording import inspect_source
+from sigmasplat.config import InputConfig
 from sigmasplat.model.camera import Camera
 from sigmasplat.sources import open_source
 from sigmasplat.sources.opening import format_of, formats
@@ -129,6 +131,11 @@ def test_test_views_are_separate_with_poses_in_the_same_world(tmp_path):
     assert np.abs(views.frame(0).depth_m - written.depth_mm[3] / 1000).max() < 1e-6
     assert np.abs(views.truth().T_world_camera[0] - written.T_world_camera[3]).max() < 1e-9
     assert open_source("synthetic:frames=2").test_views() is None
+
+
+def test_the_papers_presets_for_it_are_suggested(tmp_path):
+    rows = dict(inspect_source(layouts.scannetpp(tmp_path, sample()), InputConfig()).rows)
+    assert "loopsplat-scannetpp, varsplat-scannetpp" in rows["suggested preset"]
 
 
 def test_without_lists_photographs_are_sorted_by_name(tmp_path):

@@ -5,7 +5,7 @@ import torch
 from numpy.typing import NDArray
 
 from sigmasplat.config import MappingConfig, RenderConfig
-from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, VectorAdam
+from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, VectorAdam, VectorAmsgrad
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model import se3
@@ -54,6 +54,21 @@ def test_updates_are_those_of_torch() -> None:
         position += ours.step(g, RATES)
         np.testing.assert_allclose(position, torch.cat(halves).detach().numpy(), rtol=1e-10, atol=1e-15)
     assert ours.steps == 40
+
+
+def test_updates_with_the_largest_moment_are_those_of_torch() -> None:
+    random = np.random.default_rng(3)
+    gradients = random.normal(size=(20, 6)) * np.geomspace(1.0, 1e-3, 20)[:, None]  # so that the largest moment matters
+    numbers = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    theirs = torch.optim.Adam([numbers], lr=RATES[0], betas=(BETA1, BETA2), eps=EPSILON, amsgrad=True)
+    ours, plain, at, at_plain = VectorAmsgrad.of(6), VectorAdam.of(6), np.zeros(6), np.zeros(6)
+    for gradient in gradients:
+        numbers.grad = torch.as_tensor(gradient)
+        theirs.step()
+        at += ours.step(gradient, np.full(6, RATES[0]))
+        at_plain += plain.step(gradient, np.full(6, RATES[0]))
+        np.testing.assert_allclose(at, numbers.detach().numpy(), rtol=1e-9)
+    assert np.abs(at - at_plain).max() > 1e-6
 
 
 def test_a_step_is_as_long_as_its_rate_whatever_the_gradients_size() -> None:

@@ -173,7 +173,8 @@ def _brightness_warnings(frames: list[Frame]) -> list[str]:
 
 def _suggested(format_name: str) -> str:
     """Return the default preset, and the presets with the settings of the papers for this data set."""
-    papers = [name for name in list_presets() if name.endswith(f"-{format_name.lower()}") and name.count("-") == 1]
+    data_set = format_name.lower().replace("++", "pp")
+    papers = [name for name in list_presets() if name.endswith(f"-{data_set}") and name.count("-") == 1]
     return default_preset() + (f" (settings of the papers, slow on CPUs: {', '.join(papers)})" if papers else "")
 
 

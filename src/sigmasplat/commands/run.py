@@ -139,7 +139,16 @@ def _opened(screen: "Screen", path: str, config: "Config", record: Path | None) 
         screen.warn(warning)
     if source.registrable and not source.depth_registered:
         screen.warn("depth and colour come from different cameras; --register-depth on aligns them (see inspect)")
+    _warn_without_weights(screen, config)
     return source, config
+
+
+def _warn_without_weights(screen: "Screen", config: "Config") -> None:
+    """Print a warning if the built-in descriptor replaces the NetVLAD that the preset asks for."""
+    from sigmasplat.slam.loop_closure.closer import lacks_weights
+
+    if lacks_weights(config.loops) and (config.loops.close or config.mapping.covisibility == "descriptor"):
+        screen.warn("no NetVLAD weights, so the built-in descriptor is used; to use NetVLAD: --set loops.weights=FILE")
 
 
 def _viewer(screen: "Screen", run_options: options.RunOptions) -> AbstractContextManager["ViewerApp | None"]:

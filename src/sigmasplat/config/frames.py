@@ -67,6 +67,8 @@ class SeedConfig:
     """Share of the chosen pixels of a later keyframe that become splats."""
     outlier_neighbours: int = 0
     """Number of neighbours for statistical outlier removal; 0 = off."""
+    outlier_first: bool = True
+    """Whether outliers are also removed from the seeds of an empty map; off = VarSplat's code."""
     max_splats: int = 0
     """Maximum number of splats in a submap; 0 = no limit."""
 
@@ -135,6 +137,16 @@ class MappingConfig:
     """Whether a splat has one colour variance per channel (paper) or a full 3×3 covariance."""
     freeze_old_colors: bool = False
     """Whether splats older than the keyframe keep their colours."""
+    freeze_new_colors: bool = False
+    """Whether the new splats of a keyframe keep the colour of their pixel (VarSplat's code)."""
+    freeze_until: Literal["end", "half"] = "end"
+    """How long colours are frozen: in all steps of a keyframe, or only in the first half (VarSplat's code)."""
+    exposure: bool = False
+    """Whether keyframes are mapped in the exposure of the map: the exposure that `tracking.exposure` found is removed
+    from their colours (VarSplat's code for ScanNet)."""
+    fresh_adam: bool = False
+    """Whether each keyframe starts with a new Adam optimiser, without the moments of earlier keyframes (VarSplat's
+    code)."""
     prune_opacity: float = 0.5
     """Splats with at most this opacity are removed after the steps of a keyframe. A lower value keeps faint splats, a
     higher one makes holes."""
@@ -171,6 +183,9 @@ class TrackingConfig:
     """Alignment ends a pyramid level when a step is smaller than this (metres and radians)."""
     align_weight_color: float = 0.5
     """Weight of gray residuals in alignment; depth residuals have 1 minus this."""
+    amsgrad: bool = False
+    """Whether Adam divides by the largest second moment so far (AMSGrad, VarSplat's code). On a CUDA device such a
+    descent runs on the host."""
     parametrisation: Literal["quaternion", "axis-angle"] = "quaternion"
     """What Adam optimises: a quaternion and a translation relative to the initial guess (VarSplat's code), or the
     axis-angle rotation and the position of the camera (CG-SLAM)."""

@@ -33,9 +33,10 @@ class LoopConfig:
 
     close: bool = True
     """Whether loops are searched and closed."""
-    descriptor: Literal["grid", "netvlad"] = "grid"
+    descriptor: Literal["grid", "netvlad", "netvlad-or-grid"] = "grid"
     """Image descriptor: grid = built in (`slam.loop_closure.descriptors.OrientationGrid`); netvlad = with the weights
-    of the file `weights`."""
+    of the file `weights`; netvlad-or-grid = NetVLAD (papers) if `weights` is set, otherwise the built-in one, with a
+    warning."""
     weights: str = ""
     """File of NetVLAD weights, needed by descriptor=netvlad; read at the start."""
     min_similarity: float = 0.5
@@ -80,6 +81,9 @@ class RegistrationConfig:
     iteration."""
     plateau_window: int = 10
     """Number of steps within which the loss of registration must fall by the share `plateau_stop`."""
+    target: Literal["recorded", "rendered"] = "recorded"
+    """Which image of a keyframe is localised in the other submap: the recorded one, or the one that its own submap
+    renders at its pose (VarSplat's code for ScanNet)."""
     exposure: bool = True
     """Whether a factor and an offset of the colour are fitted too, because submaps may differ in exposure."""
     weight_color: float = 0.95
@@ -123,6 +127,9 @@ class FinalConfig:
     (paper)."""
     iterations: int = 0
     """Number of refinement steps over all keyframes; 0 = no refinement."""
+    lr_means_last: float = 0.0
+    """Learning rate of positions in the last refinement step; it decays exponentially from `mapping.lr_means` (3DGS). 0
+    = `mapping.lr_means` throughout."""
     sh_degree: int = 0
     """Degree of view-dependent colour reached during refinement, 0 to 3."""
     sh_every: int = 1000

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import torch
@@ -116,10 +117,10 @@ class VectorAdam:
     moment2: NDArray[np.float64]
     steps: int = 0
 
-    @staticmethod
-    def of(size: int) -> "VectorAdam":
+    @classmethod
+    def of(cls, size: int) -> Self:
         """Return a new state for a vector of `size` numbers, with zero moments."""
-        return VectorAdam(np.zeros(size), np.zeros(size))
+        return cls(np.zeros(size), np.zeros(size))
 
     def step(self, gradient: NDArray[np.float64], rates: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the update for a gradient, with one learning rate per number."""
@@ -127,5 +128,19 @@ class VectorAdam:
         self.moment1 += (1 - BETA1) * (gradient - self.moment1)
         self.moment2 += (1 - BETA2) * (gradient**2 - self.moment2)
         unbiased1 = self.moment1 / (1 - BETA1**self.steps)
-        unbiased2 = self.moment2 / (1 - BETA2**self.steps)
+        unbiased2 = self._spread() / (1 - BETA2**self.steps)
         return np.asarray(-rates * unbiased1 / (np.sqrt(unbiased2) + EPSILON))
+
+    def _spread(self) -> NDArray[np.float64]:
+        """Return the second moment that steps are divided by."""
+        return self.moment2
+
+
+class VectorAmsgrad(VectorAdam):
+    """AMSGrad (Reddi et al. 2018) for a small vector: Adam with the largest second moment so far."""
+
+    _largest: NDArray[np.float64] | float = 0.0
+
+    def _spread(self) -> NDArray[np.float64]:
+        self._largest = np.maximum(self._largest, self.moment2)
+        return self._largest

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
-from sigmasplat.fit.adam import VectorAdam
+from sigmasplat.fit.adam import VectorAdam, VectorAmsgrad
 from sigmasplat.fit.interface import Descent
 from sigmasplat.fit.motion import parametrisation
 from sigmasplat.fit.target import Target
@@ -38,7 +38,8 @@ def descend(
     """
     way = parametrisation(config, T_camera_world)
     numbers, exposure = way.start, np.zeros(2)
-    adam, adam_exposure = VectorAdam.of(len(numbers)), VectorAdam.of(2)
+    optimiser = VectorAmsgrad if config.amsgrad else VectorAdam
+    adam, adam_exposure = optimiser.of(len(numbers)), optimiser.of(2)
     rates = np.array([config.lr_rotation] * way.rotations + [config.lr_translation] * 3)
     rate_exposure = np.full(2, exposure_rate(config))
     best, best_T, best_exposure, first = np.inf, T_camera_world, np.zeros(2), np.inf

@@ -58,6 +58,12 @@ class Target:
         depth[: self.camera.height, : self.camera.width] = torch.from_numpy(depth_m)
         return Target(self.camera, self.color, depth, int((depth_m > 0).sum()))
 
+    def without_exposure(self, a: float, b: float) -> "Target":
+        """Return the same depth with the colours before an exposure exp(a) · colour + b, in [0, 1]."""
+        color, inside = torch.zeros_like(self.color), np.s_[:, : self.camera.height, : self.camera.width]
+        color[inside] = ((self.color[inside] - b) / np.exp(a)).clamp(0.0, 1.0)
+        return Target(self.camera, color, self.depth, self.valid_pixels)
+
     def picture(self) -> Picture:
         """Return the image; colour is rounded to 256 steps, as a camera delivers it."""
         color = (self.image.numpy() * 255.0).round().clip(0, 255).astype(np.uint8)

@@ -65,6 +65,13 @@ class Rows:
             mine.copy_(theirs)
         self.steps = other.steps
 
+    def forget(self) -> None:
+        """Start Adam again: zero moments, no step taken."""
+        self.moment1.zero_()
+        self.moment2.zero_()
+        self.last_step.zero_()
+        self.steps = 0
+
     @property
     def _tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         return self.params, self.moment1, self.moment2, self.last_step
@@ -191,6 +198,12 @@ class GaussianField(Rows):
     def to(self, device: torch.device) -> "GaussianField":
         """Return the field itself if it is already on a device, else a copy on it."""
         return self if self.params.device == device else self.copy_to(device)
+
+    def forget(self) -> None:
+        """Start Adam again: zero moments, no step taken, for attributes too."""
+        super().forget()
+        for attribute in self.attributes.values():
+            attribute.forget()
 
     def keep(self, rows: Tensor) -> None:
         """Keep the splats selected by a bool mask [N] or an index tensor."""

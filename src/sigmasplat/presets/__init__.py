@@ -5,9 +5,9 @@ import dataclasses
 from sigmasplat.config import Config
 from sigmasplat.config.text import nearest
 from sigmasplat.errors import ConfigError
-from sigmasplat.presets import cgslam, cgslam_released, sigma, varsplat
+from sigmasplat.presets import cgslam, cgslam_released, sigma, varsplat, varsplat_released
 
-SYSTEMS = (varsplat.PRESETS, cgslam.PRESETS, cgslam_released.PRESETS, sigma.PRESETS)
+SYSTEMS = (varsplat.PRESETS, varsplat_released.PRESETS, cgslam.PRESETS, cgslam_released.PRESETS, sigma.PRESETS)
 PRESETS = {name: dataclasses.replace(config, name=name) for presets in SYSTEMS for name, config in presets.items()}
 
 

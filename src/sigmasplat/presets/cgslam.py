@@ -15,6 +15,7 @@ from sigmasplat.config import (
     Config,
     DensifyConfig,
     FinalConfig,
+    InputConfig,
     LoopConfig,
     MappingConfig,
     RegistrationConfig,
@@ -26,6 +27,7 @@ from sigmasplat.config import (
 from sigmasplat.presets import varsplat
 
 PAPER = Config(
+    input=InputConfig(min_depth_m=0.0),  # as in the code, no reading is removed
     render=RenderConfig(alpha_min=15.0 / 255.0, near_m=0.2),
     seeding=SeedConfig(
         first_uniform=10_000_000,  # more than the number of pixels of any image: selects every pixel with a reading

@@ -1,9 +1,9 @@
 """Presets with the values of CG-SLAM's released code: a row per scene, and the code's methods where the paper differs.
 
 In the code, bundle adjustment moves only the newest pose, with a gradient without the path through the covariance. The
-window is chosen by image similarity (NetVLAD; here `loops.descriptor=netvlad` and its weights). Uncertain splats are
-not pruned, the splat at the median depth owns a pixel, no splat is cloned, and the second frame has its own number of
-iterations. Bugs of the code are not reproduced.
+window is chosen by the similarity of NetVLAD; without a file of weights (`loops.weights`) the built-in descriptor is
+used, with a warning. Uncertain splats are not pruned, the splat at the median depth owns a pixel, no splat is cloned,
+and the second frame has its own number of iterations. Bugs of the code are not reproduced.
 """
 
 from typing import NamedTuple
@@ -66,6 +66,7 @@ def _released(scene: ReleasedScene, **rates: float) -> Config:
         },
         render={"covariance_pose_gradient": False},
         primitives={"uncertain_m2": 0.0, "owner": "median", "clone": False},
+        loops={"descriptor": "netvlad-or-grid"},
     )  # fmt: skip
     return sized(config, s.extent, **rates)
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from sigmasplat.config import Config, FinalConfig, MappingConfig
 from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField, Rows
@@ -245,7 +246,8 @@ def refine(
     while done < final.iterations:
         until_event = min(every - done % every for every in (final.prune_every, final.sh_every))
         degree = min(final.sh_degree, done // final.sh_every)
-        fit = fit_field(field, view, islice(drawn, until_event), mapping, degree=degree)
+        rates = decaying(mapping, final, done) if final.lr_means_last else None
+        fit = fit_field(field, view, islice(drawn, until_event), mapping, schedule=rates, degree=degree)
         losses += fit.losses
         done += len(fit.losses)
         if done % final.prune_every == 0:
@@ -254,6 +256,15 @@ def refine(
             saved.save(done, field, random)
     progress(final.iterations, final.iterations)
     return losses
+
+
+def decaying(mapping: MappingConfig, final: FinalConfig, done: int) -> Iterator[Rates]:
+    """Yield the rates of the refinement steps after `done`. That of the means decays exponentially from
+    `mapping.lr_means` to `final.lr_means_last`."""
+    for step in range(done, final.iterations):
+        rates, share = Rates.of(mapping), step / max(final.iterations - 1, 1)
+        rates.per_column[COLUMNS["means"]] = mapping.lr_means ** (1.0 - share) * final.lr_means_last**share
+        yield rates
 
 
 def refinement(config: Config) -> MappingConfig:

@@ -13,7 +13,8 @@ from sigmasplat.types import Matrix
 @dataclass(eq=False)
 class Found:
     """Where a frame is: T_submap_camera [4, 4] in the active submap, its state, values of tracking, whether it is to be
-    mapped, the hop to it from the last keyframe, and the loops that were tried meanwhile."""
+    mapped, the hop to it from the last keyframe, the loops that were tried meanwhile, and its exposure (a, b) relative
+    to the map."""
 
     T_submap_camera: Matrix
     state: str = TRACKED
@@ -21,8 +22,9 @@ class Found:
     mapped: bool = False
     hop: Hop = UNKNOWN_HOP
     loops: list[Loop] = field(default_factory=list)
+    exposure: tuple[float, float] = (0.0, 0.0)
 
     @staticmethod
     def of(fit: PoseFit, T_submap_camera: Matrix, lost: bool) -> "Found":
         """Return the result of tracking."""
-        return Found(T_submap_camera, LOST if lost else TRACKED, metrics_of(fit))
+        return Found(T_submap_camera, LOST if lost else TRACKED, metrics_of(fit), exposure=fit.exposure)

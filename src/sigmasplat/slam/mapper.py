@@ -57,17 +57,19 @@ class Mapper:
             self._note_visible(view)
             return FieldFit()
         self._seed(view, target, T_world_camera)
+        if c.fresh_adam:
+            self.field.forget()
         steps = c.iterations if begun else c.first_iterations
         rates = iter([Rates.of(c)] * steps if begun else Rates.falling(c, steps))
         window = self._window(view)
         stats = DensifyStats.of(self.keyframes[-1], len(self.field), self.field.params.device)
         self._choose_movable(c.poses_from == "start")
-        fit = self._fit(view, window, steps // 2, rates, first_new, stats)
+        fit = self._fit(view, window, steps // 2, rates, self._frozen_below(first_new, "half"), stats)
         self._densify(view, stats)
         self._prune(view)
         faded = self._fade_uncertain(view, window)
         self._choose_movable(True)
-        fit.join(self._fit(view, window, steps - steps // 2, rates, first_new, None))
+        fit.join(self._fit(view, window, steps - steps // 2, rates, self._frozen_below(first_new, "end"), None))
         self._prune(view, self._still_uncertain(view, window, faded))
         return fit
 
@@ -92,16 +94,26 @@ class Mapper:
         window: list[Keyframe],
         steps: int,
         rates: Iterator[Rates],
-        first_new: int,
+        frozen_below: int,
         stats: DensifyStats | None,
     ) -> FieldFit:
-        """Fit the field to the window; splats with ids below `first_new` are the old ones."""
+        """Fit the field to the window; splats with ids below `frozen_below` keep their colours."""
         c = self.config.mapping
         together, history = c.frames_per_step or len(window), c.keyframe_history
         batches = draw_keyframes(window[::-1], steps, c.newest_probability, history, self.random, together)
-        frozen = int((self.field.ids < first_new).sum()) if c.freeze_old_colors else 0
+        frozen = int((self.field.ids < frozen_below).sum())
         wanted = stats if self.config.primitives.split_gradient > 0 else None
         return fit_field(self.field, view, batches, c, rates, frozen, stats=wanted)
+
+    def _frozen_below(self, first_new: int, until: str) -> int:
+        """Return the id below which splats keep their colours until half or the end of a keyframe's steps; `first_new`
+        is the id of the first new splat."""
+        c = self.config.mapping
+        if until == "end" and c.freeze_until == "half":
+            return 0
+        if c.freeze_new_colors:
+            return self.field.next_id
+        return first_new if c.freeze_old_colors else 0
 
     def _choose_movable(self, poses: bool) -> None:
         """Mark the keyframes whose poses the next fit may move: all, the newest, or none."""

@@ -110,7 +110,8 @@ def _neighbour_spread(
     if len(near) and config.min_distance_m > 0:
         nearest = cKDTree(near).query(points, distance_upper_bound=config.min_distance_m)[0]
         keep = np.asarray(nearest) > config.min_distance_m
-    if config.outlier_neighbours and len(points) > config.outlier_neighbours:
+    judged = config.outlier_neighbours > 0 and (config.outlier_first or len(means) > 0)
+    if judged and len(points) > config.outlier_neighbours:
         mean = np.asarray(cKDTree(points).query(points, config.outlier_neighbours + 1)[0])[:, 1:].mean(1)
         keep &= mean < mean.mean() + 2.0 * mean.std()
     everything = np.concatenate([points, near]) if len(near) else points

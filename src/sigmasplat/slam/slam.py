@@ -52,6 +52,8 @@ class Slam(World):
         found = self._localise(seen) if self.steps else self._begin(seen)
         if found.mapped:
             seen = seen.without(self.tracker.front, self.view)
+            if self.config.mapping.exposure:
+                seen = seen.without_exposure(found.exposure)
             found.T_submap_camera = self._map(seen, found.T_submap_camera, found.hop)
             if self._submap_ends(found.T_submap_camera):
                 found.loops += self._cut(found.T_submap_camera)

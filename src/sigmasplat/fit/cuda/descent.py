@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.fit.adam import BETA1, BETA2, EPSILON
-from sigmasplat.fit.descent import exposure_rate
+from sigmasplat.fit.descent import descend, exposure_rate
 from sigmasplat.fit.interface import Descent
 from sigmasplat.fit.motion import parametrisation
 from sigmasplat.fit.target import Target
@@ -45,8 +45,10 @@ STATE = np.dtype(
 def descend_on_device(
     params: Tensor, view: CudaView, target: Target, T_camera_world: Matrix, config: TrackingConfig, iterations: int
 ) -> Descent:
-    """Minimise the tracking loss as `descend` does. Raises BackendError if there are too many pairs of splats and
-    tiles."""
+    """Minimise the tracking loss as `descend` does; AMSGrad runs on the host. Raises BackendError if there are too many
+    pairs of splats and tiles."""
+    if config.amsgrad:
+        return descend(params, view, target, T_camera_world, config, iterations)
     if view.raster.capacity is None:
         view.forward(params, T_camera_world)  # measures how many pairs to expect
     return CudaDescent(params, view, target, T_camera_world, config).run(iterations)

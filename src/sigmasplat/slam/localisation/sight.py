@@ -41,6 +41,10 @@ class Sight:
         depth_m = np.where(front.hidden, np.float32(HIDDEN_M), self.target.depth_image.numpy())
         return replace(self.without(front, view), live=self._with_depth(depth_m, view)[1])
 
+    def without_exposure(self, exposure: tuple[float, float]) -> Self:
+        """Return the frame with the exposure (a, b) of exp(a) · colour + b removed from its target."""
+        return replace(self, target=self.target.without_exposure(*exposure))
+
     def _with_depth(self, depth_m: NDArray[np.float32], view: View) -> tuple[Target, Pyramid]:
         target = self.target.with_depth(depth_m)
         return target, live_image(view, target.image.numpy(), depth_m, target)

@@ -73,11 +73,18 @@ def make_descriptor(config: LoopConfig) -> Descriptor:
     """Make the descriptor of keyframes. Raises ConfigError if NetVLAD has no weights file or cannot load it."""
     if config.descriptor == "grid":
         return OrientationGrid()
+    if lacks_weights(config):
+        return OrientationGrid()
     if not config.weights:
         raise ConfigError("loops.descriptor=netvlad needs a file of weights: --set loops.weights=FILE")
     from sigmasplat.slam.loop_closure.netvlad import NetVlad, NetVladWeights
 
     return NetVlad(NetVladWeights.load(config.weights))
+
+
+def lacks_weights(config: LoopConfig) -> bool:
+    """Return whether the built-in descriptor replaces NetVLAD because no file of weights is set."""
+    return config.descriptor == "netvlad-or-grid" and not config.weights
 
 
 @dataclass(eq=False)

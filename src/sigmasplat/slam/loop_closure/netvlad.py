@@ -25,7 +25,12 @@ LAYER_NUMBERS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
 VLAD_LAYER, WHITEN_LAYER = 30, 33
 """Numbers of the NetVLAD layer and the whitening layer in the Matlab network."""
 IMAGENET_MEAN, IMAGENET_STD = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
-FORMATS = "a pytorch-NetVlad checkpoint, hloc's VGG16-NetVLAD-Pitts30K.mat or a file NetVladWeights.save wrote"
+CAFFE_MEAN, CAFFE_STD = torch.tensor([123.68, 116.779, 103.939]) / 255.0, torch.full((3,), 1.0 / 255.0)
+"""The input of OpenIBL: RGB in 0…255 minus the mean, as in the original network."""
+FORMATS = (
+    "a pytorch-NetVlad checkpoint, OpenIBL's vgg16_netvlad.pth, hloc's VGG16-NetVLAD-Pitts30K.mat or a file "
+    "NetVladWeights.save wrote"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +53,7 @@ class NetVladWeights:
 
     @staticmethod
     def load(path: Path | str) -> "NetVladWeights":
-        """Read a weights file of any of the three formats, which are recognised by content.
+        """Read a weights file of any of the four formats, which are recognised by content.
 
         Raises ConfigError naming the file, and the tensor with its actual and expected shape, if a tensor does not fit.
         """
@@ -182,10 +187,9 @@ def _read_safetensors(path: Path) -> _TensorFile:
 
 
 def _read_checkpoint(path: Path) -> _TensorFile:
-    """Read pytorch-NetVlad's state_dict, either wrapped or not; Patch-NetVLAD adds the whitening.
+    """Read a state_dict of pytorch-NetVlad or OpenIBL, either wrapped or not.
 
-    It was trained with torchvision's normalisation. Apart from tensors, the file may contain only numpy numbers (its
-    scores).
+    Apart from tensors, the file may contain only numpy numbers (its scores).
     """
     numbers: list[Any] = [np.dtype, type(np.dtype(np.float64)), type(np.dtype(np.int64))]
     scalar = np.float64(0.0).__reduce__()[0]
@@ -193,14 +197,30 @@ def _read_checkpoint(path: Path) -> _TensorFile:
     with torch.serialization.safe_globals(numbers):
         loaded = torch.load(path, map_location="cpu", weights_only=True)
     tensors = {name: tensor for name, tensor in loaded.get("state_dict", loaded).items() if isinstance(tensor, Tensor)}
-    module = ".module" if "pool.module.centroids" in tensors else ""  # trained on several GPUs
+    tensors = {name.removeprefix("module."): tensor for name, tensor in tensors.items()}  # trained on several GPUs
+    openibl = any(name.startswith("net_vlad.") for name in tensors)
+    alias = _alias_openibl() if openibl else _alias_pytorch_netvlad("pool.module.centroids" in tensors)
+    named = {ours: tensors[theirs] for ours, theirs in alias.items() if theirs in tensors}
+    mean, std = (CAFFE_MEAN, CAFFE_STD) if openibl else (IMAGENET_MEAN, IMAGENET_STD)
+    named |= {"input.scale": torch.ones(1), "input.mean": mean, "input.std": std}
+    return _TensorFile(path, named, alias)
+
+
+def _alias_pytorch_netvlad(several_gpus: bool) -> dict[str, str]:
+    """Map the names used here to those of pytorch-NetVlad; Patch-NetVLAD adds the whitening."""
+    module = ".module" if several_gpus else ""
     alias = _alias(f"encoder{module}.{{}}.weight", f"encoder{module}.{{}}.bias")
     alias |= {"vlad.centroids": f"pool{module}.centroids"}
     for part in ("weight", "bias"):
         alias |= {f"vlad.assign.{part}": f"pool{module}.conv.{part}", f"whiten.{part}": f"WPCA.0.{part}"}
-    named = {ours: tensors[theirs] for ours, theirs in alias.items() if theirs in tensors}
-    named |= {"input.scale": torch.ones(1), "input.mean": IMAGENET_MEAN, "input.std": IMAGENET_STD}
-    return _TensorFile(path, named, alias)
+    return alias
+
+
+def _alias_openibl() -> dict[str, str]:
+    """Map the names used here to those of OpenIBL; checkpoints of its training have no whitening."""
+    alias = _alias("base_model.base.{}.weight", "base_model.base.{}.bias")
+    alias |= {"vlad.centroids": "net_vlad.centroids", "vlad.assign.weight": "net_vlad.conv.weight"}
+    return alias | {f"whiten.{part}": f"pca_layer.{part}" for part in ("weight", "bias")}
 
 
 def _read_matlab(path: Path) -> _TensorFile:

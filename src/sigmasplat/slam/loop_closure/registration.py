@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -16,9 +17,10 @@ from sigmasplat.fit.compare import Comparison, compare
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import map_reference, picture_images
+from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.model import se3
 from sigmasplat.model.map_uncertainty import Background
-from sigmasplat.model.submap import Submap, SubmapStore
+from sigmasplat.model.submap import Picture, Submap, SubmapStore
 from sigmasplat.render.view import View
 from sigmasplat.slam.drift import FLOOR, symmetric
 from sigmasplat.slam.features import Extractor
@@ -107,7 +109,7 @@ class Registrar:
         """Localise a keyframe of `own` in `other`: align from the expected pose and from the poses of similar
         keyframes, then refine the best one by gradient descent on the uncertainty-weighted loss with exposure."""
         T_own_camera, other_map = own.T_submap_camera[keyframe], self._map_of(other)
-        target, live = picture_images(self.view, self.store.picture(own.index, keyframe), own.camera)
+        target, live = picture_images(self.view, self._picture(own, keyframe), own.camera)
         expected = se3.inverse(T_own_camera) @ T_own_other
         guesses = [expected, *(se3.inverse(other.T_submap_camera[k]) for k in alike)]
         fit = max((self._aligned(other_map, live, guess) for guess in guesses), key=score)
@@ -121,6 +123,14 @@ class Registrar:
         covariance, comparison = self._checked(other_map, live, fit.T_camera_world)
         T_own_other = T_own_camera @ fit.T_camera_world
         return Localisation(T_own_other, fit.loss, A @ covariance @ A.T, fit.agreement, fit.overlap, comparison)
+
+    def _picture(self, own: Submap, keyframe: int) -> Picture:
+        """Return a keyframe's recorded image, or the one that its own submap renders at its pose."""
+        if self.config.target == "recorded":
+            return self.store.picture(own.index, keyframe)
+        T_camera_own = se3.inverse(own.T_submap_camera[keyframe])
+        self.view.forward(own.field.params.to(self.view.sums.device), T_camera_own)
+        return rendered_picture(PoseMaps.of(self.view))
 
     def _by_features(self, own: Submap, keyframe: int, other: Submap, alike: Sequence[int]) -> Iterator[Matrix]:
         """Yield T_camera_other by features of the similar keyframes of the other submap, where they give a pose."""
@@ -184,6 +194,13 @@ class Registrar:
         return Registration(mean, information(agreed, mean), residual, len(agreed), overlap, True, "accepted")
 
 
+def rendered_picture(maps: PoseMaps) -> Picture:
+    """Return the opaque part of a render as an image; elsewhere there is no reading."""
+    depth_m = torch.where(maps.alpha > OPAQUE, maps.depth, 0.0)
+    color = (maps.color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+    return Picture(color.cpu().numpy(), depth_m.cpu().numpy())
+
+
 def tracking_of(registration: RegistrationConfig, tracking: TrackingConfig) -> TrackingConfig:
     """Return the settings for localising keyframes: alignment as in tracking, the loss and its descent as in
     registration.
@@ -199,7 +216,7 @@ def tracking_of(registration: RegistrationConfig, tracking: TrackingConfig) -> T
         tracking, uncertainty=r.uncertainty, tau=r.tau, weight_max=r.weight_max, weight_color=weight_color,
         lr_rotation=r.lr_rotation, lr_translation=r.lr_translation, exposure=r.exposure, plateau_stop=r.plateau_stop,
         plateau_window=r.plateau_window, alpha_power=1.0, alpha_above=OPAQUE, outlier_factor=0.0,
-        outlier_factor_color=0.0, average="image", parametrisation="quaternion", align_depth_by="V",
+        outlier_factor_color=0.0, average="image", parametrisation="quaternion", align_depth_by="V", amsgrad=False,
     )  # fmt: skip
 
 

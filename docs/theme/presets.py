@@ -1,0 +1,181 @@
+"""Write the tables of presets in docs/varsplat.md and docs/cgslam.md: PYTHONPATH=src python docs/theme/presets.py.
+
+The values are those of the presets. Where each one comes from is written here. A test compares the documents with the
+output of this script, and checks that no setting of a preset is left out.
+"""
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+DATA_SETS = {
+    "varsplat": ("replica", "tum", "scannet", "scannetpp"),
+    "cgslam": ("replica", "tum", "scannet"),
+}
+"""The columns of the tables of the papers' presets."""
+
+# paper: its text. code: the released code, where the paper gives no value. ours: neither gives a value.
+# After a semicolon, data sets whose value comes from elsewhere.
+ORIGINS: dict[str, dict[str, str]] = {
+    "varsplat": {
+        "input.crop_px": "code", "input.min_depth_m": "code", "input.max_depth_m": "code; tum, scannet: ours",
+        "render.alpha_min": "code", "render.transmittance_stop": "code", "render.low_pass_px2": "code",
+        "render.near_m": "code",
+        "seeding.first_uniform": "paper", "seeding.first_gradient": "paper", "seeding.first_edges": "paper",
+        "seeding.later_max": "paper", "seeding.alpha_below": "paper", "seeding.depth_error_factor": "paper",
+        "seeding.min_distance_m": "paper; scannetpp: code", "seeding.opacity": "paper", "seeding.scale_from": "paper",
+        "seeding.push_back": "code", "seeding.outlier_neighbours": "paper; scannetpp: code",
+        "seeding.outlier_first": "ours",
+        "mapping.every": "paper", "mapping.iterations": "paper", "mapping.first_iterations": "paper",
+        "mapping.newest_probability": "paper", "mapping.weight_l1": "paper", "mapping.weight_ssim": "paper",
+        "mapping.weight_depth": "paper", "mapping.weight_isotropy": "paper", "mapping.weight_nll_color": "paper",
+        "mapping.weight_nll_depth": "paper", "mapping.lr_means": "paper", "mapping.lr_quats": "paper",
+        "mapping.lr_log_scales": "paper", "mapping.lr_opacity_logits": "paper", "mapping.lr_colors": "paper",
+        "mapping.lr_log_variances": "paper", "mapping.freeze_old_colors": "code", "mapping.freeze_new_colors": "ours",
+        "mapping.exposure": "ours", "mapping.fresh_adam": "ours", "mapping.prune_opacity": "paper",
+        "tracking.iterations": "paper", "tracking.lr_rotation": "paper", "tracking.lr_translation": "paper",
+        "tracking.amsgrad": "ours", "tracking.weight_color": "paper", "tracking.tau": "paper; scannet, scannetpp: code",
+        "tracking.weight_max": "paper", "tracking.alpha_power": "paper; scannetpp: code",
+        "tracking.alpha_above": "code", "tracking.outlier_factor": "code", "tracking.motion_model": "paper",
+        "tracking.reinit_factor": "code", "tracking.exposure": "paper", "tracking.lr_exposure": "paper",
+        "tracking.lost_agreement": "ours", "tracking.lost_share": "ours",
+        "submaps.distance_m": "paper", "submaps.angle_deg": "paper", "submaps.frames": "paper",
+        "submaps.uncertainty_m": "ours",
+        "loops.descriptor": "paper", "loops.min_similarity": "paper", "loops.min_interval": "paper; scannetpp: code",
+        "loops.most": "ours", "loops.tau": "paper", "loops.weight_max": "paper",
+        "registration.keyframes": "paper", "registration.iterations": "paper", "registration.lr_rotation": "paper",
+        "registration.lr_translation": "paper", "registration.plateau_stop": "ours",
+        "registration.plateau_window": "ours", "registration.target": "ours", "registration.exposure": "paper",
+        "registration.weight_color": "paper", "registration.tau": "paper; scannet, scannetpp: code",
+        "registration.weight_max": "paper", "registration.overlap_least": "paper", "registration.overlap_m": "paper",
+        "registration.agreement_least": "ours", "registration.share_least": "ours", "registration.spread_m": "ours",
+        "registration.spread_deg": "ours",
+        "final.seed_from": "paper", "final.spacing_m": "paper", "final.iterations": "paper", "final.sh_degree": "paper",
+        "final.sh_every": "paper", "final.prune_every": "paper", "final.prune_opacity": "paper",
+        "final.lr_means_last": "ours", "final.uncertainty": "paper",
+    },
+    "cgslam": {
+        "input.crop_px": "code", "input.min_depth_m": "code", "input.max_depth_m": "code",
+        "render.alpha_min": "code", "render.transmittance_stop": "code", "render.low_pass_px2": "code",
+        "render.near_m": "code",
+        "seeding.first_uniform": "paper", "seeding.first_gradient": "paper", "seeding.first_edges": "paper",
+        "seeding.later_max": "paper", "seeding.alpha_below": "paper", "seeding.depth_error_factor": "paper",
+        "seeding.min_distance_m": "code", "seeding.opacity": "code", "seeding.scale_from": "code",
+        "seeding.push_back": "code", "seeding.outlier_neighbours": "code",
+        "mapping.every": "paper", "mapping.iterations": "paper", "mapping.first_iterations": "code",
+        "mapping.weight_l1": "paper", "mapping.weight_ssim": "paper", "mapping.weight_depth": "paper",
+        "mapping.weight_alignment": "paper", "mapping.weight_isotropy": "paper",
+        "mapping.weight_isotropy_ratio": "paper", "mapping.weight_moment": "paper",
+        "mapping.weight_nll_color": "paper", "mapping.weight_nll_depth": "paper",
+        "mapping.lr_means_first": "code", "mapping.lr_means": "code", "mapping.lr_quats": "code",
+        "mapping.lr_log_scales": "code", "mapping.lr_opacity_logits": "code", "mapping.lr_colors": "code",
+        "mapping.lr_pose_rotation": "paper", "mapping.lr_pose_translation": "paper", "mapping.poses": "paper",
+        "mapping.poses_from": "code", "mapping.prune_opacity": "code", "mapping.window": "paper",
+        "mapping.covisibility": "ours", "mapping.frames_per_step": "paper",
+        "primitives.uncertain_m2": "paper", "primitives.owner": "paper", "primitives.faded_opacity": "ours",
+        "primitives.least_opacity": "ours", "primitives.split_gradient": "code", "primitives.split_scale_m": "code",
+        "primitives.clone": "paper", "primitives.most_scale_m": "code", "primitives.most_radius_px": "code",
+        "tracking.parametrisation": "paper", "tracking.iterations": "paper", "tracking.lr_rotation": "paper",
+        "tracking.lr_translation": "paper", "tracking.weight_color": "paper", "tracking.uncertainty": "paper",
+        "tracking.alpha_power": "paper", "tracking.alpha_above": "code", "tracking.outlier_factor": "code",
+        "tracking.outlier_factor_color": "code", "tracking.average": "code", "tracking.motion_model": "paper",
+        "tracking.reinit_factor": "ours", "tracking.lost_agreement": "ours", "tracking.lost_share": "ours",
+        "loops.close": "paper", "loops.uncertainty": "paper", "registration.uncertainty": "paper",
+        "final.iterations": "paper", "final.uncertainty": "paper",
+    },
+}  # fmt: skip
+SCENES: dict[str, tuple[str, ...]] = {
+    "varsplat": (
+        "tracking.tau", "loops.tau", "registration.tau", "mapping.weight_nll_depth", "input.crop_px", "input.limit",
+        "input.max_depth_m", "loops.min_interval", "registration.target", "mapping.exposure",
+    ),
+    "cgslam": (
+        "tracking.iterations", "tracking.lr_rotation", "tracking.lr_translation", "tracking.weight_color",
+        "mapping.iterations", "mapping.every", "mapping.window", "mapping.weight_l1", "mapping.weight_depth",
+        "mapping.weight_alignment", "mapping.weight_moment", "mapping.lr_means_first", "mapping.lr_means",
+        "mapping.lr_log_scales", "primitives.split_scale_m", "primitives.most_scale_m",
+    ),
+}  # fmt: skip
+"""Settings that differ between the scenes of the released code: the columns of their table."""
+
+
+def paper_table(system: str) -> str:
+    """Return the table of a paper's presets: a row per setting, a column per data set, and where the value is from."""
+    from sigmasplat.presets import preset
+
+    columns = DATA_SETS[system]
+    rows = [f"| setting | {' | '.join(columns)} | from |", "|---" * (len(columns) + 2) + "|"]
+    for name, origin in ORIGINS[system].items():
+        values = [_value(preset(f"{system}-{column}"), name) for column in columns]
+        rows.append(f"| `{name}` | {' | '.join(values)} | {origin} |")
+    return "\n".join(rows)
+
+
+def scene_table(system: str) -> str:
+    """Return the table of the released code's scenes: a row per preset, a column per setting; all from the code."""
+    from sigmasplat.presets import list_presets, preset
+
+    columns = SCENES[system]
+    rows = [f"| scene | {' | '.join(f'`{name}`' for name in columns)} |", "|---" * (len(columns) + 1) + "|"]
+    prefix = f"{system}-released-"
+    for name in (name for name in list_presets() if name.startswith(prefix)):
+        values = [_value(preset(name), column) for column in columns]
+        rows.append(f"| `{name.removeprefix(prefix)}` | {' | '.join(values)} |")
+    return "\n".join(rows)
+
+
+def method_table(system: str) -> str:
+    """Return the table of what all presets of the released code change: the setting, the paper's value, the code's."""
+    from sigmasplat.config import Config
+    from sigmasplat.presets import list_presets, preset
+
+    released = [preset(name) for name in list_presets() if name.startswith(f"{system}-released-")]
+    rows = ["| setting | paper's presets | released | from |", "|---|---|---|---|"]
+    for name in changed_by_all(released, [preset(f"{system}-{column}") for column in DATA_SETS[system]], Config()):
+        if name not in SCENES[system]:
+            theirs = " / ".join(dict.fromkeys(_value(preset(f"{system}-{c}"), name) for c in DATA_SETS[system]))
+            rows.append(f"| `{name}` | {theirs} | {_value(released[0], name)} | code |")
+    return "\n".join(rows)
+
+
+def changed_by_all(released: list[Any], papers: list[Any], default: Any) -> list[str]:
+    """List the settings with one value in all `released` that no preset of `papers` has, in the order of `default`."""
+    names = [
+        f"{section}.{name}"
+        for section, values in default.to_dict().items()
+        if isinstance(values, dict)
+        for name in values
+    ]
+    chosen = []
+    for name in names:
+        theirs, ours = ({_value(config, name) for config in configs} for configs in (papers, released))
+        if len(ours) == 1 and not ours & theirs:
+            chosen.append(name)
+    return chosen
+
+
+def rewritten(text: str) -> str:
+    """Return a document with its tables between <!-- presets:KIND SYSTEM --> and <!-- /presets --> made again."""
+    kinds = {"paper": paper_table, "scenes": scene_table, "methods": method_table}
+
+    def made(found: re.Match[str]) -> str:
+        return f"<!-- presets:{found[1]} {found[2]} -->\n{kinds[found[1]](found[2])}\n<!-- /presets -->"
+
+    return re.sub(r"<!-- presets:(\w+) (\w+) -->.*?<!-- /presets -->", made, text, flags=re.DOTALL)
+
+
+def _value(config: Any, name: str) -> str:
+    section, _, setting = name.partition(".")
+    value = getattr(getattr(config, section), setting)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(ROOT / "src"))
+    for system in DATA_SETS:
+        page = ROOT / "docs" / f"{system}.md"
+        page.write_text(rewritten(page.read_text(encoding="utf-8")), encoding="utf-8")
