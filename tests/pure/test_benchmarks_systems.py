@@ -33,7 +33,7 @@ def test_systems_are_compared_on_the_same_input_only() -> None:
     pair = ("varsplat-fast", "varsplat-tum")
     with pytest.raises(ConfigError, match=r"input\.width is 320 in varsplat-fast and 0 in .*--set input\.width=0"):
         systems.refuse_unequal_input(pair, ())
-    systems.refuse_unequal_input(pair, ("input.width=160",))
+    systems.refuse_unequal_input(pair, ("input.width=160", "input.crop_px=0", "input.min_depth_m=0.1"))
     systems.refuse_unequal_input(("varsplat-fast", "loopsplat-fast"), ())
     assert systems.main(systems.Options(presets=pair)) == systems.main(systems.Options(presets=("nothing",))) == 2
 
