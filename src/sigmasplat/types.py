@@ -13,3 +13,8 @@ Progress = Callable[[int, int], None]
 
 def no_progress(done: int, total: int) -> None:
     """Ignore the progress of a task: the default where a `Progress` is optional."""
+
+
+def part_of(progress: Progress, first: int, total: int) -> Progress:
+    """Return the progress of one part of a task: its steps are added to the `first` ones, of `total`."""
+    return lambda done, _: progress(first + done, total)

@@ -63,6 +63,18 @@ def test_probe_views_change_no_bit_of_the_map() -> None:
     assert with_probes.uncertainty.calibration != SHIPPED
 
 
+def test_measuring_the_uncertainty_is_part_of_the_progress() -> None:
+    config, told = settings(2), list[tuple[int, int]]()
+    slam = Slam(config)
+    for frame in open_source(ROOM, config.input):
+        slam.step(frame)
+    slam.finish(lambda done, total: told.append((done, total)))
+    done, totals = zip(*told, strict=True)
+    assert len(set(totals)) == 1 and list(done) == sorted(done)
+    assert done[0] == 0 and done[-1] == totals[0] > config.final.iterations
+    assert len([step for step in done if step > config.final.iterations]) > len(slam.store)
+
+
 def test_a_negative_number_of_probe_views_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"uncertainty\.probes"):
         settings(-1)

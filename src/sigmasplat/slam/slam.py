@@ -27,7 +27,7 @@ from sigmasplat.slam.rules import ends_submap, is_held_back, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.slam.uncertainty import final_uncertainty
 from sigmasplat.slam.world import World
-from sigmasplat.types import Matrix, no_progress
+from sigmasplat.types import Matrix, no_progress, part_of
 
 LAST_TRIES = 3
 """Number of keyframes per submap that is apart with which other components are searched at the end."""
@@ -68,20 +68,23 @@ class Slam(World):
     def finish(self, progress: Callable[[int, int], None] = no_progress) -> None:
         """Finish the last submap, look for its loops, and make the final map (VarSplat §7); call it once, at the end.
 
-        Calls `progress(done, total)` with the steps of refinement, from 0 to the last one; without refinement the total
-        is 1. Does nothing when no rule cuts submaps and `final.iterations` is 0. Components that are not connected to
-        the world are left out of the final map.
+        Calls `progress(done, total)` with the steps of refinement, from 0 to the last one, and then the keyframes that
+        the uncertainty is measured at; without both the total is 1. Does nothing when no rule cuts submaps and
+        `final.iterations` is 0. Components that are not connected to the world are left out of the final map.
         """
         if not self.steps or not (len(self.store) or self._cuts or self.config.final.iterations):
             return
-        total = self.config.final.iterations or 1
+        steps, measures = self.config.final.iterations, self.config.uncertainty.probes > 0
+        total = max(1, steps + measures * sum(map(len, self.atlas.keyframe_poses)))
         progress(0, total)
         self._finish_submap()
         self._connect_components()
         members = self.atlas.members(0)
         store, anchors = StorePart(self.store, members), [self.atlas.anchors[s] for s in members]
-        self._final = final_map(store, anchors, self.config, self.view, self.random, progress, self.saved_refinement)
-        self.uncertainty = final_uncertainty(self._final, store, anchors, self.config, self.view)
+        inputs = store, anchors, self.config, self.view
+        refining, measuring = (part_of(progress, first, total) for first in (0, steps))
+        self._final = final_map(*inputs, self.random, refining, self.saved_refinement)
+        self.uncertainty = final_uncertainty(self._final, *inputs, measuring)
         progress(total, total)
 
     def _observe(self, frame: Frame) -> Observation:

@@ -1,6 +1,6 @@
 """Measure how sure a map is: variances of its splats, and weights calibrated on probe views."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,7 +27,7 @@ from sigmasplat.model.submap import SubmapStore
 from sigmasplat.render.predictive import COVERED, variance_parts
 from sigmasplat.render.view import View
 from sigmasplat.slam.final import KeyframeReader
-from sigmasplat.types import Matrix
+from sigmasplat.types import Matrix, Progress, no_progress
 
 PIXELS = 4000
 """About this many pixels of a probe view, every k-th one, calibrate the weights."""
@@ -54,13 +54,18 @@ def probe_views(store: SubmapStore, anchors: Sequence[Matrix], size: tuple[int, 
 
 
 def final_uncertainty(
-    field: GaussianField, store: SubmapStore, anchors: Sequence[Matrix], config: Config, view: View
+    field: GaussianField,
+    store: SubmapStore,
+    anchors: Sequence[Matrix],
+    config: Config,
+    view: View,
+    progress: Progress = no_progress,
 ) -> MapUncertainty | None:
     """Return how sure a map in the world is and the standard deviations of its splats, from its submaps' keyframes and
-    probe views; None if `uncertainty.probes` is 0 or there is no splat."""
+    probe views; None if `uncertainty.probes` is 0 or there is no splat. Calls `progress(keyframes read, total)`."""
     if not config.uncertainty.probes or not len(field):
         return None
-    known = map_uncertainty(field, store, anchors, config, view)
+    known = map_uncertainty(field, store, anchors, config, view, progress=progress)
     keyframes = KeyframeReader(store, anchors, view)
     rows = np.unique(np.linspace(0, len(keyframes) - 1, STD_KEYFRAMES).round().astype(int))
     std = splat_std(field, known, (keyframes[int(row)] for row in rows), config.render, config.backend)
@@ -74,17 +79,26 @@ def map_uncertainty(
     config: Config,
     view: View,
     pulled_to: Calibration = SHIPPED,
+    progress: Progress = no_progress,
 ) -> MapUncertainty:
     """Return how sure a map is that was fitted to the keyframes of submaps at `anchors` (T_map_submap [4, 4] each).
 
     The weights are fitted to the submaps' probe views and pulled to `pulled_to`; without probe views they equal it.
+    Calls `progress(keyframes read, total)`.
     """
     keyframes = KeyframeReader(store, anchors, view)
     background = background_of(keyframes)
-    splats = splat_residuals(field, keyframes, config.render, config.backend)
+    splats = splat_residuals(field, _counted(keyframes, progress), config.render, config.backend)
     probes = probe_views(store, anchors, (view.alpha.shape[0], view.alpha.shape[1]))
     calibration = calibrate(field, splats, background, probes, config, pulled_to)
     return MapUncertainty(splats, background, calibration, len(probes))
+
+
+def _counted(keyframes: KeyframeReader, progress: Progress) -> Iterator[Keyframe]:
+    """Yield the keyframes; call `progress` before each."""
+    for done, keyframe in enumerate(keyframes):
+        progress(done, len(keyframes))
+        yield keyframe
 
 
 def calibrate(
