@@ -32,7 +32,7 @@ from sigmasplat.evaluation.unseen_views import held_back_views
 from sigmasplat.fit.calibration import fit_weights
 from sigmasplat.fit.splat_residuals import background_of, splat_residuals
 from sigmasplat.fit.target import Keyframe, Target
-from sigmasplat.metrics.uncertainty import calibration_scores
+from sigmasplat.metrics.uncertainty import calibration_scores, z_scores
 from sigmasplat.model import se3
 from sigmasplat.model.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, SHIPPED
 from sigmasplat.model.submap import StorePart
@@ -43,6 +43,7 @@ from sigmasplat.sources import open_source
 
 arg = tyro.conf.arg
 RUNS = record.ROOT / "runs" / "bench" / "uncertainty-weights"
+TAUGHT_BY = tuple(name for name in SOURCES if "steady" not in name)
 PARTS = {"color": COLOR_PARTS, "depth": DEPTH_PARTS}
 PULLED_TO = {"color": SHIPPED.color, "depth": SHIPPED.depth}
 PROBES, OTHER_SUBMAPS, HELD_BACK = "probes", "probes of other submaps", "held back"
@@ -63,7 +64,7 @@ Weights = dict[str, float]
 class Options:
     """Fit the weights of the parts of predicted variances to several sequences, and score them on the one left out."""
 
-    sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = SOURCES
+    sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = TAUGHT_BY
     settings: described.Settings = ("input.width=240",)
     limit: described.Limit = 100
     hold_every: described.HoldEvery = 8
@@ -160,14 +161,36 @@ def fitted(sequences: Sequence[Arrays], quantity: str) -> Weights:
     return fit_weights(parts, np.concatenate(errors), PULLED_TO[quantity], round(views), LIMIT)
 
 
-def scored(arrays: Arrays, quantity: str, kind: str, weights: Weights, calibrated: bool) -> dict[str, float]:
-    """Return the scores of weights at views of one kind; calibrated: after a fit to the run's own probe views."""
-    own = weights
-    if calibrated:
-        parts = dict(zip(PARTS[quantity], arrays[f"{PROBES}|{quantity}|parts"], strict=True))
-        views = round(float(arrays[f"{PROBES}|{quantity}|views"]))
-        own = fit_weights(parts, arrays[f"{PROBES}|{quantity}|squared_error"].mean(1), weights, views, LIMIT, FIRM)
-    variance = np.array([own[name] for name in PARTS[quantity]]) @ arrays[f"{kind}|{quantity}|parts"]
+def own_weights(arrays: Arrays, quantity: str, weights: Weights) -> Weights:
+    """Return weights after a fit to the run's own probe views."""
+    parts = dict(zip(PARTS[quantity], arrays[f"{PROBES}|{quantity}|parts"], strict=True))
+    views = round(float(arrays[f"{PROBES}|{quantity}|views"]))
+    return fit_weights(parts, arrays[f"{PROBES}|{quantity}|squared_error"].mean(1), weights, views, LIMIT, FIRM)
+
+
+def variance_of(arrays: Arrays, quantity: str, kind: str, weights: Weights) -> NDArray[np.float64]:
+    """Return the weighted sum of the parts [P] at views of one kind."""
+    return np.array([weights[name] for name in PARTS[quantity]]) @ arrays[f"{kind}|{quantity}|parts"]
+
+
+def temperature(sequences: Sequence[Arrays], quantity: str, weights: Weights) -> float:
+    """Return the temperature (`Calibration`): the geometric mean of 1 and of the factor of V with which 68 % of the
+    errors at probe views are within one standard deviation; mean over the sequences."""
+    logs = list[float]()
+    for arrays in sequences:
+        variance = variance_of(arrays, quantity, PROBES, own_weights(arrays, quantity, weights))
+        squared = arrays[f"{PROBES}|{quantity}|squared_error"]
+        logs.append(float(np.log(z_scores(variance, squared, 0.0)["z_68"])))
+    return float(np.exp(np.mean(logs)))
+
+
+def scored(
+    arrays: Arrays, quantity: str, kind: str, weights: Weights, calibrated: bool, scale: float
+) -> dict[str, float]:
+    """Return the scores of weights at views of one kind; calibrated: after a fit to the run's own probe views, and
+    times the temperature `scale`."""
+    own = own_weights(arrays, quantity, weights) if calibrated else weights
+    variance = (scale if calibrated else 1.0) * variance_of(arrays, quantity, kind, own)
     found = calibration_scores(variance, arrays[f"{kind}|{quantity}|squared_error"], 0.0)
     return {name: found[name] for name in ("nll", "auce", "coverage_68", "coverage_95")}
 
@@ -176,20 +199,27 @@ def measure(options: Options) -> dict[str, Any]:
     """Fit to all sequences and to all but one, and score both on each sequence."""
     prepare_torch()
     sequences = {short(source): samples_of(options, source) for source in options.sources}
-    shipped = {quantity: fitted(list(sequences.values()), quantity) for quantity in PARTS}
+    every = list(sequences.values())
+    shipped = {quantity: fitted(every, quantity) for quantity in PARTS}
+    temperatures = {quantity: temperature(every, quantity, weights) for quantity, weights in shipped.items()}
     rows = []
     for source, arrays in sequences.items():
         others = [other for name, other in sequences.items() if name != source]
         for quantity in PARTS:
-            choices = {"all": shipped[quantity], "others": fitted(others or [arrays], quantity)}
+            of_others = fitted(others or [arrays], quantity)
+            choices = {
+                "all": (shipped[quantity], temperatures[quantity]),
+                "others": (of_others, temperature(others or [arrays], quantity, of_others)),
+            }
             rows += [
                 {"source": source, "quantity": quantity, "views": kind, "calibrated": calibrated}
-                | {fit: scored(arrays, quantity, kind, weights, calibrated) for fit, weights in choices.items()}
+                | {"temperature_of_others": choices["others"][1]}
+                | {fit: scored(arrays, quantity, kind, of[0], calibrated, of[1]) for fit, of in choices.items()}
                 for kind in (HELD_BACK, OTHER_SUBMAPS)
                 for calibrated in (False, True)
                 if len(arrays[f"{kind}|{quantity}|squared_error"])
             ]
-    return {"weights": shipped, "scores": rows}
+    return {"weights": shipped, "temperatures": temperatures, "scores": rows}
 
 
 # ---- tables ----
@@ -200,10 +230,13 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     figures = measured["figures"]
     names = list(dict.fromkeys(name for weights in figures["weights"].values() for name in weights))
     weights = [
-        [quantity.replace("color", "colour"), *(f"{of[name]:.2g}" if name in of else "–" for name in names)]
+        [
+            quantity.replace("color", "colour"), *(f"{of[name]:.2g}" if name in of else "–" for name in names),
+            f"{figures['temperatures'][quantity]:.2f}",
+        ]
         for quantity, of in figures["weights"].items()
-    ]
-    made = [Section("Weights fitted to all sequences", ["quantity", *names], weights)]
+    ]  # fmt: skip
+    made = [Section("Weights fitted to all sequences", ["quantity", *names, "temperature"], weights)]
     for quantity in figures["weights"]:
         rows = [cells(row) for row in figures["scores"] if row["quantity"] == quantity]
         head = ["sequence", "views", "fit to its probes", "NLL", "… fitted to the others"]

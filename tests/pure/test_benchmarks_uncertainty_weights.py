@@ -34,8 +34,22 @@ def test_weights_are_fitted_to_all_sequences_and_scored_on_one() -> None:
         ratios = [found[name] / weights.PULLED_TO[quantity][name] for name in names]
         assert np.median(ratios) == pytest.approx(2.0, rel=0.2)
         for calibrated in (False, True):
-            scores = weights.scored(sequence(2), quantity, weights.HELD_BACK, found, calibrated)
+            scores = weights.scored(sequence(2), quantity, weights.HELD_BACK, found, calibrated, 1.0)
             assert scores["auce"] < 0.03 and scores["coverage_68"] == pytest.approx(0.68, abs=0.04)
+
+
+def test_the_temperature_is_half_way_to_68_percent() -> None:
+    """Errors of a tenth of the pixels are three times as large: likelihood makes V too large for the others."""
+    heavy = sequence(0)
+    for quantity in weights.PARTS:
+        heavy[f"{weights.PROBES}|{quantity}|squared_error"][::10] *= 9.0
+        at_likelihood = weights.PULLED_TO[quantity]
+        scale = weights.temperature([heavy], quantity, at_likelihood)
+        covered = [
+            weights.scored(heavy, quantity, weights.PROBES, at_likelihood, True, factor)["coverage_68"]
+            for factor in (1.0, scale, scale**2)
+        ]
+        assert scale < 1.0 and covered[0] > covered[1] > covered[2] == pytest.approx(0.6827, abs=0.01)
 
 
 def test_the_tables_have_a_row_for_each_sequence_and_kind_of_view(monkeypatch: pytest.MonkeyPatch) -> None:

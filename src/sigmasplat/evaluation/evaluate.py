@@ -148,11 +148,12 @@ def _with_prediction(
 
 
 def _calibration(run: RunFolder) -> dict[str, Any] | None:
-    """Return the number of probe views and the fitted weights of the predicted variances; None if not measured."""
+    """Return the number of probe views, the fitted weights and the temperatures of the predicted variances; None if
+    not measured."""
     known = run.read_uncertainty()
     if known is None:
         return None
-    return {"probes": known.probes, "color": dict(known.calibration.color), "depth": dict(known.calibration.depth)}
+    return {"probes": known.probes} | {name: dict(of) for name, of in vars(known.calibration).items()}
 
 
 def _probe_frames(run: RunFolder, frames: RunFrames) -> frozenset[int]:

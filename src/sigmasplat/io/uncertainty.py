@@ -31,7 +31,8 @@ def write_uncertainty(folder: Path, uncertainty: MapUncertainty) -> None:
     write_tensors(folder / TENSORS, tensors, {"columns": ",".join(SPLAT_COLUMNS[: uncertainty.splats.shape[1]])})
     calibration, background = uncertainty.calibration, asdict(uncertainty.background)
     values = {"probes": uncertainty.probes, "background": background}
-    write_json(folder / JSON, values | {"color": dict(calibration.color), "depth": dict(calibration.depth)})
+    values |= {name: dict(of) for name, of in vars(calibration).items()}
+    write_json(folder / JSON, values)
 
 
 def read_uncertainty(folder: Path) -> MapUncertainty | None:
@@ -48,13 +49,14 @@ def read_uncertainty(folder: Path) -> MapUncertainty | None:
         red, green, blue = background.pop("color")
         color = {name: _weight(values["color"], name) for name in COLOR_PARTS}
         depth = {name: _weight(values["depth"], name) for name in DEPTH_PARTS}
+        temperature = {name: float(T) for name, T in values.get("temperature", {}).items()}
         known, probes = Background((red, green, blue), **background), int(values["probes"])
     except (KeyError, TypeError, ValueError) as problem:
         raise RunError(f"{path} is not the uncertainty of a map: {problem!r}; run it again") from problem
     with open_tensors(folder / TENSORS, "uncertainty") as file:
         found = {name: file.get_tensor(name) for name in STD_TENSORS if name in file.keys()}  # noqa: SIM118
         std = SplatStd(**found) if len(found) == len(STD_TENSORS) else None
-        return MapUncertainty(file.get_tensor("variances"), known, Calibration(color, depth), probes, std)
+        return MapUncertainty(file.get_tensor("variances"), known, Calibration(color, depth, temperature), probes, std)
 
 
 def _weight(weights: Mapping[str, float], name: str) -> float:

@@ -167,11 +167,12 @@ def predicted(parts: VarianceParts, calibration: Calibration) -> Predicted:
 
     The depth of the map itself has no sensor noise, and its residual part is `systematic`.
     """
-    color = _sums(parts.color, COLOR_PARTS, calibration.color)
-    reading = sum(_sums(parts.depth, DEPTH_PARTS, calibration.depth))
+    color = _sums(parts.color, COLOR_PARTS, calibration.weights("color"))
+    weights = calibration.weights("depth")
+    reading = sum(_sums(parts.depth, DEPTH_PARTS, weights))
     own = parts.depth.clone()
     own[DEPTH_PARTS.index("residual")] = parts.systematic
-    depth = _sums(own, DEPTH_PARTS, {**calibration.depth, "sensor": 0.0})
+    depth = _sums(own, DEPTH_PARTS, {**weights, "sensor": 0.0})
     return Predicted(*color, *depth, torch.as_tensor(reading))
 
 

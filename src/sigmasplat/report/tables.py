@@ -294,14 +294,17 @@ def _predictive_rows(scores: dict[str, Any] | None) -> list[list[str]]:
 
 
 def _weight_rows(calibration: dict[str, Any] | None) -> list[list[str]]:
-    """Return the fitted weight of each part of the predicted variances, and that of the preset."""
+    """Return the fitted weight of each part of the predicted variances, and that of the preset; the temperatures."""
     if not calibration:
         return []
     parts = dict.fromkeys([*calibration["color"], *calibration["depth"]])
     columns = [calibration["color"], SHIPPED.color, calibration["depth"], SHIPPED.depth]
-    return [[f"weights, {calibration['probes']} probe views", "colour", "… preset", "depth", "… preset"]] + [
-        [part, *("" if part not in weights else f"{weights[part]:.2g}" for weights in columns)] for part in parts
-    ]
+    temperatures = calibration.get("temperature", {}), SHIPPED.temperature
+    return (
+        [[f"weights, {calibration['probes']} probe views", "colour", "… preset", "depth", "… preset"]]
+        + [[part, *("" if part not in weights else f"{weights[part]:.2g}" for weights in columns)] for part in parts]
+        + [["temperature", *(f"{of.get(name, 1.0):.2g}" for name in ("color", "depth") for of in temperatures)]]
+    )
 
 
 def _covariance_rows(scores: dict[str, Any] | None) -> list[list[str]]:

@@ -111,7 +111,7 @@ def calibrate(
 ) -> Calibration:
     """Fit the weights of the parts of a map's variance to its errors at probe views."""
     color, depth = probe_samples(field, splats, background, probes, config)
-    return Calibration(color.fitted(pulled_to.color), depth.fitted(pulled_to.depth))
+    return Calibration(color.fitted(pulled_to.color), depth.fitted(pulled_to.depth), pulled_to.temperature)
 
 
 def probe_samples(
