@@ -58,8 +58,9 @@ def use_predicted_variance(view: View, background: Background) -> None:
     color, second, alpha = view.sums[:3, :h, :w], view.sums[4:7, :h, :w], view.alpha[:h, :w]
     mean = color / alpha.clamp(min=1e-6)
     of_splats = (second - color * mean).mean(0).clamp(min=0.0)
-    away = (mean - mean.new_tensor(background.color)[:, None, None]).square().mean(0)
-    unexplained = (1.0 - alpha).clamp(min=0.0) * (background.color_variance + alpha * away)
+    behind, missing = mean.new_tensor(background.color), (1.0 - alpha).clamp(min=0.0)
+    away = (mean - behind[:, None, None]).square().mean(0)
+    unexplained = missing * (background.color_variance + alpha * away) + missing.square() * behind.square().mean()
     edges = slope2(color.movedim(0, -1), view.camera).mean(-1)
     variance = a["mixture"] * of_splats + a["unexplained"] * unexplained + a["edges"] * edges
     second.copy_(color.square() + variance)

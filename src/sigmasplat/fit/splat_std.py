@@ -31,7 +31,7 @@ def splat_std(
     The variance of splat i is the weighted geometric mean of the variance V_p that the map predicts for pixels,
     exp(Σ_p w_ip log V_p / Σ_p w_ip): of depth over the pixels that the map covers, of colour over all pixels. Few
     pixels at silhouettes have a variance of depth that is thousands of times larger, and would decide an arithmetic
-    mean. Each keyframe is rendered twice forwards and once backwards.
+    mean. Each keyframe is rendered once, forwards and backwards.
     """
     field = on_device(field, backend)
     sums = torch.zeros(len(field), 4, dtype=torch.float64)

@@ -14,29 +14,34 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render.backend import backend_module
-from sigmasplat.render.channels import features_of
 from sigmasplat.render.render import colors_from
 
-OWN = 7
-"""Channels of `features_of`: colour, depth, second moment of colour."""
+OWN = 6
+"""Channels before the values: colour, depth, second moments of colour and of depth."""
 
 
 @dataclass(frozen=True, eq=False)
 class BlendedValues:
-    """Sums over the splats of each pixel: color Σwc [H, W, 3], depth Σwz [H, W] m, second Σw(σ²+c²) [H, W, 3], values
-    Σwv [H, W, K], alpha Σw [H, W]; moment: U about a reference depth, m², None without one."""
+    """Sums over the splats of each pixel: color Σwc [H, W, 3], depth Σwz [H, W] m, second Σw(σ²+c²) [H, W] mean over
+    the channels, values Σwv [H, W, K], alpha Σw [H, W]."""
 
     color: Tensor
     depth: Tensor
     second: Tensor
     values: Tensor
     alpha: Tensor
-    moment: Tensor | None
+    _depth_second: Tensor
+    _center_m: float
     _sums: Tensor
     _features: Tensor
 
+    def moment_about(self, depth_m: Tensor) -> Tensor:
+        """Return U = Σw(z − D)² ≥ 0 about reference depths D [H, W] m (CG-SLAM eq. 10)."""
+        off, depth = depth_m - self._center_m, self.depth - self.alpha * self._center_m
+        return (self._depth_second - 2.0 * off * depth + off.square() * self.alpha).clamp(min=0.0)
+
     def gather(self, planes: Tensor) -> Tensor:
-        """Return Σ_p w_ip g_p [N, k] of planes g [H, W, k] with k ≤ 7 + K; call it once, on a blend with `gather`.
+        """Return Σ_p w_ip g_p [N, k] of planes g [H, W, k] with k ≤ 6 + K; call it once, on a blend with `gather`.
 
         A pixel is linear in the values of its splats, so this is the gradient of the values if g is that of the image.
         """
@@ -54,7 +59,6 @@ def blend_values(
     values: Tensor,
     options: RenderConfig,
     backend: str,
-    depth_reference: Tensor | None = None,
     gather: bool = False,
 ) -> BlendedValues:
     """Blend values [N, K] of a field's splats at a pose (4×4), on the device that holds the field.
@@ -64,13 +68,18 @@ def blend_values(
     kernels, T = backend_module(backend, field.params.device), torch.as_tensor(T_camera_map)
     with torch.no_grad():
         p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
-        features = torch.cat([features_of(colors_from(field, T), p.z, field.variances), values.to(p.z)], 1)
+        seen_z = p.z[p.radii[:, 0] > 0]
+        center_m = float(seen_z.mean()) if len(seen_z) else 0.0  # keeps the squares small: float32 loses digits
+        colors = colors_from(field, T)
+        second = (field.variances + colors.square()).mean(1)
+        own = torch.cat([colors, torch.stack([p.z, second, (p.z - center_m).square()], 1)], 1)
+        features = torch.cat([own, values.to(p.z)], 1)
         opacities = field.opacities
     with torch.set_grad_enabled(gather):
         features.requires_grad_(gather)
-        b = kernels.blend(*p, opacities, features, depth_reference, camera, options)
+        b = kernels.blend(*p, opacities, features, None, camera, options)
     sums = b.sums.detach()
     return BlendedValues(
-        sums[..., :3], sums[..., 3], sums[..., 4:OWN], sums[..., OWN:], b.alpha.detach(),
-        None if b.moment is None else b.moment.detach(), b.sums, features,
+        sums[..., :3], sums[..., 3], sums[..., 4], sums[..., OWN:], b.alpha.detach(),
+        sums[..., 5], center_m, b.sums, features,
     )  # fmt: skip

@@ -105,14 +105,13 @@ def variance_parts(
     alpha = seen.alpha
     some, covered = alpha.clamp(min=1e-6), alpha.clamp(min=COVERED)
     depth_m = seen.depth / covered
-    about = blend_values(field, camera, T_camera_map, splats[:, :0], options, backend, depth_m).moment
-    assert about is not None, "a blend with a depth reference has a moment"
+    ray = seen.moment_about(depth_m) / covered
     missing, new = (1.0 - alpha).clamp(min=0.0), seen.values[..., VARIANCES] / some
     behind = seen.color.new_tensor(background.color)
     away = (behind - seen.color / some[..., None]).square().mean(-1)
     left_out = missing.square() * behind.square().mean()
     color = [
-        (seen.second - seen.color.square() / some[..., None]).mean(-1).clamp(min=0.0),
+        (seen.second - seen.color.square().mean(-1) / some).clamp(min=0.0),
         seen.values[..., 0],
         missing * (background.color_variance + alpha * away) + left_out,
         slope2(seen.color, camera).mean(-1),
@@ -120,11 +119,11 @@ def variance_parts(
         torch.ones_like(alpha),
     ]
     depth = [
-        about.clamp(min=0.0) / covered,
+        ray,
         seen.values[..., 1] / covered,
         missing * background.depth_variance_m2,
         slope2(depth_m[..., None], camera)[..., 0],
-        about.clamp(min=0.0) / covered * new,
+        ray * new,
         depth_m.square().square(),
         torch.ones_like(alpha),
     ]

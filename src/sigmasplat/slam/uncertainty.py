@@ -31,8 +31,10 @@ from sigmasplat.types import Matrix, Progress, no_progress
 
 PIXELS = 4000
 """About this many pixels of a probe view, every k-th one, calibrate the weights."""
-STD_KEYFRAMES = 30
+STD_KEYFRAMES = 24
 """At most this many keyframes, evenly spread, decide the standard deviations of the splats."""
+PROBES_MOST = 32
+"""At most this many probe views, evenly spread, calibrate the weights."""
 LIMIT = 4.0
 """Limit of errors in the fit (`fit_weights`). Depth errors at silhouettes are as large as the depth step there, and
 colour errors of moved objects as large as their contrast, so a few pixels would decide."""
@@ -67,9 +69,8 @@ def final_uncertainty(
         return None
     known = map_uncertainty(field, store, anchors, config, view, progress=progress)
     keyframes = KeyframeReader(store, anchors, view)
-    rows = np.unique(np.linspace(0, len(keyframes) - 1, STD_KEYFRAMES).round().astype(int))
-    std = splat_std(field, known, (keyframes[int(row)] for row in rows), config.render, config.backend)
-    return replace(known, std=std)
+    chosen = (keyframes[row] for row in _spread(len(keyframes), STD_KEYFRAMES))
+    return replace(known, std=splat_std(field, known, chosen, config.render, config.backend))
 
 
 def map_uncertainty(
@@ -90,8 +91,14 @@ def map_uncertainty(
     background = background_of(keyframes)
     splats = splat_residuals(field, _counted(keyframes, progress), config.render, config.backend)
     probes = probe_views(store, anchors, (view.alpha.shape[0], view.alpha.shape[1]))
-    calibration = calibrate(field, splats, background, probes, config, pulled_to)
-    return MapUncertainty(splats, background, calibration, len(probes))
+    chosen = [probes[row] for row in _spread(len(probes), PROBES_MOST)]
+    calibration = calibrate(field, splats, background, chosen, config, pulled_to)
+    return MapUncertainty(splats, background, calibration, len(chosen))
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """Return at most `most` of the numbers below count, evenly spread."""
+    return [round(i) for i in np.linspace(0, count - 1, min(count, most))]
 
 
 def _counted(keyframes: KeyframeReader, progress: Progress) -> Iterator[Keyframe]:
