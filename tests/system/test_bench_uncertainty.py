@@ -303,6 +303,7 @@ def test_sparsification_charts_compare_each_predictor_with_the_calibrated_one(qu
     random = np.random.default_rng(0)
     wanted = [p for p in PREDICTORS if p.quantity == quantity]
     arrays = {f"variance {p.name}": random.uniform(0.1, 1.0, 400).astype(np.float32) for p in wanted}
+    arrays["alpha"] = np.ones(400, np.float32)
     arrays["squared_error"] = arrays[f"variance {wanted[-1].name}"] * random.uniform(0.5, 1.5, 400).astype(np.float32)
     charts = sparsification_charts(Kind(quantity, "final", HELD_BACK), arrays)
     ours = {p.name for p in wanted if p.calibrated}
