@@ -13,7 +13,6 @@ from sigmasplat.evaluation.frame_states import score_states
 from sigmasplat.evaluation.path_scores import score_frame_sets
 from sigmasplat.evaluation.pose_covariance import score_pose_covariance
 from sigmasplat.evaluation.view_scoring import ViewScoring, score_full_resolution, score_test_views
-from sigmasplat.evaluation.view_selection import evenly_spread
 from sigmasplat.io.frames import RunFrames
 from sigmasplat.io.runs import TRUTH, RunFolder
 from sigmasplat.io.trajectory import write_trajectory
@@ -24,6 +23,7 @@ from sigmasplat.metrics.trajectory import aligned_truth, score_path, truth_in_es
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.mesh import Mesh
+from sigmasplat.model.selection import evenly_spread
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.predictive import Predicted, predict

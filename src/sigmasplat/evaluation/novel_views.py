@@ -7,12 +7,13 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
-from sigmasplat.evaluation.view_selection import evenly_spread, working_frame
+from sigmasplat.evaluation.view_selection import working_frame
 from sigmasplat.metrics import views
 from sigmasplat.metrics.lpips import Lpips
 from sigmasplat.metrics.trajectory import associate
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.selection import evenly_spread
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.report.view_strips import ViewStrips
 from sigmasplat.sources.base import Source

@@ -7,12 +7,13 @@ import numpy as np
 
 from sigmasplat.config import Config
 from sigmasplat.evaluation.finished_run import FinishedRun
-from sigmasplat.evaluation.view_selection import evenly_spread, working_frame
+from sigmasplat.evaluation.view_selection import working_frame
 from sigmasplat.metrics.reconstruction import BEHIND_M, Mask, distances, visible_points
 from sigmasplat.metrics.trajectory import aligned_poses, associate
 from sigmasplat.model import isosurface, se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.mesh import Mesh
+from sigmasplat.model.selection import evenly_spread
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.model.tsdf import Tsdf
 from sigmasplat.render import FieldRenderer

@@ -22,11 +22,11 @@ from sigmasplat.evaluation.surface_errors import surface_errors
 from sigmasplat.evaluation.surface_predictors import surface_columns
 from sigmasplat.evaluation.unseen_views import UnseenView, away_views, held_back_views
 from sigmasplat.evaluation.view_predictors import PREDICTORS, Predictor, SeenView, see
-from sigmasplat.evaluation.view_selection import evenly_spread
 from sigmasplat.metrics.scored_view import COVERED_ALPHA
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.map_uncertainty import MapUncertainty
+from sigmasplat.model.selection import evenly_spread
 from sigmasplat.model.submap import StorePart
 from sigmasplat.presets import preset as preset_of
 from sigmasplat.render import FieldRenderer

@@ -6,9 +6,10 @@ import numpy as np
 
 from sigmasplat.config import Config
 from sigmasplat.evaluation.finished_run import FinishedRun
-from sigmasplat.evaluation.view_selection import evenly_spread, working_frame
+from sigmasplat.evaluation.view_selection import working_frame
 from sigmasplat.metrics.trajectory import aligned_poses, associate
 from sigmasplat.model.frame import Frame, resized_depth
+from sigmasplat.model.selection import evenly_spread
 from sigmasplat.sources.base import Source
 from sigmasplat.types import Matrix
 

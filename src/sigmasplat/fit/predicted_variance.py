@@ -12,7 +12,7 @@ from sigmasplat.fit.splat_residuals import PSEUDO_PIXELS, background_of
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model.field import COLUMNS
 from sigmasplat.model.map_uncertainty import SHIPPED, Background
-from sigmasplat.render.predictive import COVERED, slope2
+from sigmasplat.render.predictive import COVERED, slope2, unexplained
 from sigmasplat.render.splat_sums import gather
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
@@ -56,13 +56,10 @@ def use_predicted_variance(view: View, background: Background) -> None:
     variance."""
     h, w, a = view.camera.height, view.camera.width, SHIPPED.color
     color, second, alpha = view.sums[:3, :h, :w], view.sums[4:7, :h, :w], view.alpha[:h, :w]
-    mean = color / alpha.clamp(min=1e-6)
-    of_splats = (second - color * mean).mean(0).clamp(min=0.0)
-    behind, missing = mean.new_tensor(background.color), (1.0 - alpha).clamp(min=0.0)
-    away = (mean - behind[:, None, None]).square().mean(0)
-    unexplained = missing * (background.color_variance + alpha * away) + missing.square() * behind.square().mean()
-    edges = slope2(color.movedim(0, -1), view.camera).mean(-1)
-    variance = a["mixture"] * of_splats + a["unexplained"] * unexplained + a["edges"] * edges
+    of_splats = (second - color.square() / alpha.clamp(min=1e-6)).mean(0).clamp(min=0.0)
+    image = color.movedim(0, -1)
+    empty, edges = unexplained(image, alpha, background), slope2(image, view.camera).mean(-1)
+    variance = a["mixture"] * of_splats + a["unexplained"] * empty + a["edges"] * edges
     second.copy_(color.square() + variance)
 
 

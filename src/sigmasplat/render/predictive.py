@@ -107,13 +107,10 @@ def variance_parts(
     depth_m = seen.depth / covered
     ray = seen.moment_about(depth_m) / covered
     missing, new = (1.0 - alpha).clamp(min=0.0), seen.values[..., VARIANCES] / some
-    behind = seen.color.new_tensor(background.color)
-    away = (behind - seen.color / some[..., None]).square().mean(-1)
-    left_out = missing.square() * behind.square().mean()
     color = [
         (seen.second - seen.color.square().mean(-1) / some).clamp(min=0.0),
         seen.values[..., 0],
-        missing * (background.color_variance + alpha * away) + left_out,
+        unexplained(seen.color, alpha, background),
         slope2(seen.color, camera).mean(-1),
         seen.values[..., 0] * new,
         torch.ones_like(alpha),
@@ -150,6 +147,13 @@ def novelty(field: GaussianField, seen_from: Tensor, T_camera_map: NDArray[np.fl
     cosine = (mean * directions_toward(field, se3.inverse(np.asarray(T_camera_map)))).sum(1) / length.clamp(min=1e-6)
     beyond = (1.0 - cosine - SPREADS * (1.0 - length)).clamp(min=0.0) * (length > 0.0)
     return torch.as_tensor(beyond / (beyond + NEW_ANGLE))
+
+
+def unexplained(color: Tensor, alpha: Tensor, background: Background) -> Tensor:
+    """Return T (σ_b² + A |c_b − Ĉ/A|²) + T² |c_b|² [H, W] of a rendered colour Ĉ [H, W, 3], as in `VarianceParts`."""
+    missing, behind = (1.0 - alpha).clamp(min=0.0), color.new_tensor(background.color)
+    away = (behind - color / alpha.clamp(min=1e-6)[..., None]).square().mean(-1)
+    return missing * (background.color_variance + alpha * away) + missing.square() * behind.square().mean()
 
 
 def slope2(image: Tensor, camera: Camera) -> Tensor:

@@ -26,6 +26,7 @@ from torch import Tensor
 
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import Atlas
+from sigmasplat.model.selection import evenly_spread
 from sigmasplat.slam.drift import UNKNOWN
 from sigmasplat.slam.loop_closure.pose_graph import Edge, Sensitivity
 from sigmasplat.slam.variance_factors import variance_factors
@@ -161,7 +162,7 @@ class PathCovariance:
         loops = [number for number, edge in enumerate(self.edges) if edge.loop]
         if not loops:
             return Factors()
-        chosen = [loops[i] for i in np.unique(np.linspace(0, len(loops) - 1, LOOPS_MOST).round().astype(int))]
+        chosen = evenly_spread(loops, LOOPS_MOST)
         chain, twists, errors = self._without_loops(), [], []
         claimed = np.zeros((len(chosen), 6, len(chosen), 6))
         for i, edge in enumerate(self.edges[number] for number in chosen):

@@ -23,6 +23,7 @@ from sigmasplat.model.map_uncertainty import (
     Calibration,
     MapUncertainty,
 )
+from sigmasplat.model.selection import evenly_spread
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.render.predictive import COVERED, variance_parts
 from sigmasplat.render.view import View
@@ -69,7 +70,7 @@ def final_uncertainty(
         return None
     known = map_uncertainty(field, store, anchors, config, view, progress=progress)
     keyframes = KeyframeReader(store, anchors, view)
-    chosen = (keyframes[row] for row in _spread(len(keyframes), STD_KEYFRAMES))
+    chosen = (keyframes[row] for row in evenly_spread(range(len(keyframes)), STD_KEYFRAMES))
     return replace(known, std=splat_std(field, known, chosen, config.render, config.backend))
 
 
@@ -91,14 +92,9 @@ def map_uncertainty(
     background = background_of(keyframes)
     splats = splat_residuals(field, _counted(keyframes, progress), config.render, config.backend)
     probes = probe_views(store, anchors, (view.alpha.shape[0], view.alpha.shape[1]))
-    chosen = [probes[row] for row in _spread(len(probes), PROBES_MOST)]
+    chosen = evenly_spread(probes, PROBES_MOST)
     calibration = calibrate(field, splats, background, chosen, config, pulled_to)
     return MapUncertainty(splats, background, calibration, len(chosen))
-
-
-def _spread(count: int, most: int) -> list[int]:
-    """Return at most `most` of the numbers below count, evenly spread."""
-    return [round(i) for i in np.linspace(0, count - 1, min(count, most))]
 
 
 def _counted(keyframes: KeyframeReader, progress: Progress) -> Iterator[Keyframe]:
