@@ -14,8 +14,10 @@ from splat_scenes import KINDS, assert_same_vector, gradients, probe, render, sc
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 from sigmasplat.fit.adam import Rates
+from sigmasplat.fit.backends import CPU
 from sigmasplat.fit.cpu.mapping_step import CompiledStep
 from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.target import Target
 from sigmasplat.model.field import GaussianField
 from sigmasplat.native import _core
 from sigmasplat.render.cpu import operators as cpu
@@ -121,6 +123,21 @@ def step() -> Outputs:
     return {"params": field.params, "moment1": field.moment1, "moment2": field.moment2, "twists": torch.cat(twists)}
 
 
+def shiny_step() -> Outputs:
+    """Take three steps with view-dependent colours on a crowd."""
+    s = crowd()
+    field, view, rates = GaussianField(params_of(s)), CpuView(s.camera, OPTIONS), Rates(torch.full((17,), 1e-2))
+    view_step, target = CPU.view_dependent_step(CPU.mapping_step(view), 3), torch.zeros(view.alpha.shape)
+    twists = []
+    for field.steps in (1, 2, 3):
+        black = Target(s.camera, torch.zeros(3, *target.shape), target, 0)
+        view_step.forward(field, s.T_camera_world.numpy(), black, {})
+        view.g_sums[:] = torch.as_tensor(np.random.default_rng(field.steps).normal(size=view.g_sums.shape))
+        twists.append(torch.as_tensor(view_step.splats(field, rates, {}, 0)[0]))
+    h = field.attributes["harmonics"]
+    return {"params": field.params, "harmonics": h.params, "moment2": h.moment2, "twists": torch.cat(twists)}
+
+
 def align() -> Outputs:
     """Take the normal equations of one alignment."""
     (a, near), (b, far) = images(4), images(5)
@@ -138,7 +155,7 @@ def align() -> Outputs:
     return {"H": torch.as_tensor(H), "b": torch.as_tensor(g), "S": torch.as_tensor(S), "sums": torch.as_tensor(sums)}
 
 
-@pytest.mark.parametrize("work", [seam, view, losses, step, align], ids=lambda work: work.__name__)
+@pytest.mark.parametrize("work", [seam, view, losses, step, shiny_step, align], ids=lambda work: work.__name__)
 def test_any_number_of_threads_gives_the_same_bytes(
     isa: str, work: Callable[[], Outputs], set_threads: Callable[[int], None]
 ) -> None:

@@ -1,5 +1,6 @@
 """The step of view-dependent colour: its gradients against finite differences, kernels against the definition."""
 
+from collections.abc import Callable
 from copy import deepcopy
 from itertools import repeat
 
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from sigmasplat.config import MappingConfig
 from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.backends import step_for
+from sigmasplat.fit.backends import fits_of, step_for
 from sigmasplat.fit.field import fit_field, loss_weights
 from sigmasplat.fit.mapping_step import TorchStep
 from sigmasplat.fit.target import Keyframe, Target
@@ -54,10 +55,11 @@ def target_of(view: View) -> Target:
 
 def gradients(field: GaussianField, view: View, T: np.ndarray, degree: int) -> tuple[Tensor, Tensor, Tensor]:
     """Read the gradients [N, 17], [N, 45] of a first step off Adam's first moments (0.1 g), and the twist [6]."""
-    step = ViewDependentStep(TorchStep(view), degree)
+    fits = fits_of(view)
+    step = fits.view_dependent_step(fits.mapping_step(view), degree)
     step.forward(field, T, target_of(view), {})
     draw_gradients(view)
-    twist, _ = step.splats(field, DESCENT, {}, 0)
+    twist, _ = step.splats(field, Rates(DESCENT.per_column.to(field.params)), {}, 0)
     return field.moment1 * 10, field.attributes["harmonics"].moment1 * 10, torch.as_tensor(twist)
 
 
@@ -80,6 +82,7 @@ def test_gradients_are_those_of_finite_differences(degree: int) -> None:
         return float((torch.cat([seen.color, seen.depth[..., None], second], -1) * weights).sum())
 
     nothing = (torch.zeros_like(found[0]), torch.zeros_like(found[1]), torch.zeros(6).double())
+    kernels = on_kernels(lambda: gradients(shiny(s, torch.float32), CpuView(SMALL, OPTIONS), T, degree))
     for part, columns in [(0, c) for c in COLUMNS.values()] + [(1, slice(0, 3 * count(degree))), (2, slice(0, 6))]:
         direction = torch.zeros_like(nothing[part])
         direction[..., columns] = torch.as_tensor(rng.normal(size=direction[..., columns].shape))
@@ -91,12 +94,27 @@ def test_gradients_are_those_of_finite_differences(degree: int) -> None:
         want = (ends[0] - ends[1]) / 2e-6
         got = float((found[part] * direction).sum())
         assert got == pytest.approx(want, rel=1e-6, abs=1e-7) and abs(want) > 1e-3
+        for isa, of_kernels in kernels.items():
+            assert float((of_kernels[part].double() * direction).sum()) == pytest.approx(want, rel=1e-4), isa
     assert torch.count_nonzero(found[1][:, 3 * count(degree) :]) == 0, "degrees not in use are left alone"
 
 
+def on_kernels(work: Callable[[], tuple[Tensor, ...]]) -> dict[str, tuple[Tensor, ...]]:
+    """Return the results of some work on the kernels of each instruction set that this processor supports."""
+    try:
+        from sigmasplat.native import _core
+    except ImportError:
+        return {}
+    before, found = _core.isa_name(), {}
+    for isa in _core.supported_isas():
+        _core.set_isa(isa)
+        found[isa] = work()
+    _core.set_isa(before)
+    return found
+
+
 @pytest.mark.parametrize("kind", ["random", "near_plane", "off_screen"])
-def test_both_backends_agree(kind: str) -> None:
-    pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+def test_both_backends_agree(isa: str, kind: str) -> None:
     s = scene(kind, 60)
     T, exact, kernels = s.T_camera_world.numpy(), exact_view(WIDE, True), CpuView(WIDE, OPTIONS)
     want, got = gradients(shiny(s), exact, T, 3), gradients(shiny(s, torch.float32), kernels, T, 3)
@@ -175,6 +193,40 @@ def test_fits_agree_on_both_backends() -> None:
                  (a.attributes["harmonics"].params, b.attributes["harmonics"].params)):  # fmt: skip
         assert 0 < float((x - y).norm()) < 0.1 * float(y.norm())
     assert a.attributes["harmonics"].steps == 10 and losses_a[-1] < losses_a[4]
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_steps_of_the_kernels_are_those_of_torch(isa: str, degree: int) -> None:
+    """Compare the harmonics, moments and steps after eight views, of which each shows only a part of the splats."""
+    fields, cameras = [], [se3.exp(np.array([0.9 * side, 0, 0, 0, 0, 0.0])) for side in (-1, 1, 1, -1, -1, 1, 1, -1)]
+    for fused in (False, True):
+        view, field = CpuView(CAMERA, OPTIONS), shiny_wall()
+        step = (
+            fits_of(view).view_dependent_step(TorchStep(view), degree)
+            if fused
+            else ViewDependentStep(TorchStep(view), degree)
+        )
+        rates = Rates(torch.zeros(17))
+        rates.per_column[COLUMNS["colors"]] = 0.02
+        for T in cameras:
+            field.steps += 1
+            step.forward(field, T, target_of(view), {})
+            draw_gradients(view)
+            twist, _ = step.splats(field, rates, {}, 20)
+        fields.append((field, torch.as_tensor(twist)))
+    (want, want_twist), (got, got_twist) = fields
+    h, k = want.attributes["harmonics"], got.attributes["harmonics"]
+    assert torch.equal(h.last_step, k.last_step) and len(h.last_step.unique()) > 1, "some rows were not in every view"
+    assert h.steps == k.steps == len(cameras)
+    started = shiny_wall().attributes["harmonics"].params
+    for a, b, what in ((k.params - started, h.params - started, "harmonics"), (k.moment1, h.moment1, "moment1"),
+                       (k.moment2, h.moment2, "moment2"), (got.params, want.params, "rows")):  # fmt: skip
+        assert_same_vector(a, b, 2e-4, f"{isa} {what}")
+        assert torch.count_nonzero(b) > 0
+    assert_same_vector(got_twist, want_twist, 1e-4, f"{isa} twist")
+    used = 3 * count(degree)
+    assert torch.equal(k.params[:, used:], started[:, used:]), "degrees not in use are left alone"
+    assert torch.equal(k.params[:20], started[:20]), "frozen colours keep their harmonics"
 
 
 def test_frozen_colours_keep_their_harmonics_too() -> None:

@@ -14,6 +14,7 @@ from sigmasplat.fit.color_covariance import FullCovarianceStep
 from sigmasplat.fit.cpu import adam as cpu_adam, images as cpu_images, tracking_loss as cpu_tracking_loss
 from sigmasplat.fit.cpu.mapping_step import CompiledImages, CompiledStep
 from sigmasplat.fit.cpu.reference_maps import reference_maps as cpu_reference_maps
+from sigmasplat.fit.cpu.view_dependent import CompiledViewDependentStep
 from sigmasplat.fit.cuda import descent as cuda_descent, images as cuda_images, rows as cuda_rows
 from sigmasplat.fit.cuda.mapping_step import CudaStep, covariance_step
 from sigmasplat.fit.cuda.view_dependent import CudaViewDependentStep
@@ -22,9 +23,10 @@ from sigmasplat.fit.fused_terms import fused_terms
 from sigmasplat.fit.interface import DeviceFits, MappingStep, Twist, Weights
 from sigmasplat.fit.mapping_step import OwnTermsStep, TorchStep
 from sigmasplat.fit.reference_maps import reference_arrays, reference_maps
-from sigmasplat.fit.view_dependent import ViewDependentStep
+from sigmasplat.fit.view_dependent import ImageStep, ViewDependentStep
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render.backend import make_covariance_view
+from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.view import CorrelationView, View
 from sigmasplat.types import Matrix
 
@@ -39,6 +41,14 @@ def _torch_covariance_step(view: CorrelationView) -> FullCovarianceStep:
 
 def _cpu_covariance_step(view: CorrelationView) -> FullCovarianceStep:
     return FullCovarianceStep(view, CompiledImages(view))
+
+
+def _cpu_view_dependent_step(base: ImageStep, degree: int) -> MappingStep:
+    """Return the fused step, or the one in torch for views that the kernels do not render (full colour covariance)."""
+    view = base.view
+    return (
+        CompiledViewDependentStep(base, view, degree) if isinstance(view, CpuView) else ViewDependentStep(base, degree)
+    )
 
 
 TORCH = DeviceFits(
@@ -58,6 +68,7 @@ CPU = replace(
     TORCH,
     mapping_step=CompiledStep,
     covariance_step=_cpu_covariance_step,
+    view_dependent_step=_cpu_view_dependent_step,
     settle=cpu_adam.settle,
     tracking_loss=cpu_tracking_loss.tracking_gradient,
     descend=partial(descend, tracking_loss=cpu_tracking_loss.tracking_gradient),

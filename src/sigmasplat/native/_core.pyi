@@ -130,6 +130,19 @@ class Level:
         options: list[float],
     ) -> None: ...
 
+class Harmonics:
+    def __init__(
+        self,
+        params: Array,
+        moment1: Array,
+        moment2: Array,
+        last_step: Array,
+        degree: int,
+        step: int,
+        rate: float,
+        camera_moves_colors: bool,
+    ) -> None: ...
+
 class Rasteriser:
     def __init__(self) -> None: ...
     @property
@@ -170,6 +183,7 @@ class Rasteriser:
         self,
         view: Array,
         params: Array,
+        harmonics: Harmonics | None,
         k: int,
         alpha_min: float,
         stop: float,
@@ -214,6 +228,7 @@ class Rasteriser:
         step: int,
         isotropy: list[float],
         frozen_colors: int,
+        harmonics: Harmonics | None,
         pull: Array | None,
         g_twist: Array,
         seconds: Array,

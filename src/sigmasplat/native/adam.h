@@ -2,13 +2,17 @@
 // are stepped. Dense Adam would also move the other rows, because their moments decay slowly. This missed motion is
 // added when a row is visible again, or by `adam_settle`. fit/adam.py is the definition.
 
-struct AdamRates {
-    alignas(64) float rate[ROW * W];                  // rates of W consecutive rows: 17 whole vectors
+struct AdamStep {
     float beta1, beta2, epsilon, unbias1, unbias2;
     int step;
-    explicit AdamRates(const AdamOptions& o)
-        : beta1(o.beta1), beta2(o.beta2), epsilon(o.epsilon), unbias1(1.f / (1.f - __builtin_powf(o.beta1, float(o.step)))),
-          unbias2(1.f / (1.f - __builtin_powf(o.beta2, float(o.step)))), step(o.step) {
+    AdamStep(const AdamOptions& o, int number)
+        : beta1(o.beta1), beta2(o.beta2), epsilon(o.epsilon), unbias1(1.f / (1.f - __builtin_powf(o.beta1, float(number)))),
+          unbias2(1.f / (1.f - __builtin_powf(o.beta2, float(number)))), step(number) {}
+};
+
+struct AdamRates : AdamStep {
+    alignas(64) float rate[ROW * W];                  // rates of W consecutive rows: 17 whole vectors
+    explicit AdamRates(const AdamOptions& o) : AdamStep(o, o.step) {
         for (int i = 0; i < ROW * W; i++) rate[i] = o.rates[i % ROW];
     }
 };
@@ -17,7 +21,7 @@ struct AdamRates {
 struct Absence {
     float decay1, decay2;                             // decay of both moments up to step `to`
     float coasted, unbias1, unbias2;                  // missed motion in steps like the last: Σ (β1/√β2)^j, j = 1 … to − last (− 1)
-    Absence(const AdamRates& a, int last, bool stepped) {
+    Absence(const AdamStep& a, int last, bool stepped) {
         const int age = a.step - last, missed = stepped ? age - 1 : age;
         decay1 = __builtin_powf(a.beta1, float(age));
         decay2 = __builtin_powf(a.beta2, float(age));
@@ -28,7 +32,7 @@ struct Absence {
     }
 };
 
-SIGMA_INLINE void adam_vector(const AdamRates& a, const Absence& away, vf g, vf rate, float* p, float* m1, float* m2, bool stepped) {
+SIGMA_INLINE void adam_vector(const AdamStep& a, const Absence& away, vf g, vf rate, float* p, float* m1, float* m2, bool stepped) {
     const vf m0 = load(m1), v0 = load(m2), m = fma(splat(away.decay1), m0, (1.f - a.beta1) * g),
              v = fma(splat(away.decay2), v0, (1.f - a.beta2) * g * g);
     vf value = load(p);

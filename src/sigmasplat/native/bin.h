@@ -124,9 +124,9 @@ SIGMA_INLINE void store_columns(float* rows, unsigned live, const vf* geometry, 
 
 // Store W footprints and their features (lanes, padded to ROW_FLOATS - GEOMETRY features). Returns how many tiles they
 // reach; `before` is the number of slots of the chunk already in use. The bounds are those of alpha ≥ alpha_min, not
-// three sigma, so the image does not depend on the tiling.
-template <int ROW_FLOATS>
-SIGMA_INLINE int pack(Render& r, const Footprint<vf>& f, vf opacity, Mask seen, int64_t i, int before, const float (*features)[W]) {
+// three sigma, so the image does not depend on the tiling. `fill(live)` computes the features if any splat reaches a tile.
+template <int ROW_FLOATS, class Fill>
+SIGMA_INLINE int pack(Render& r, const Footprint<vf>& f, vf opacity, Mask seen, int64_t i, int before, const float (*features)[W], Fill fill) {
     const vf log_opacity = log2(max(opacity, splat(1e-30f)));
     const vf reach = log_opacity - splat(__builtin_log2f(r.options.alpha_min));
     seen = both(seen, gt(reach, splat(0.f)));
@@ -144,6 +144,7 @@ SIGMA_INLINE int pack(Render& r, const Footprint<vf>& f, vf opacity, Mask seen, 
     memset(&r.tiles_of[i], 0, W * sizeof(int));
     store(&r.depths[i], f.z);
     if (!live) return 0;
+    fill(live);
     alignas(64) int box[4][W], tag[W];
     store(box[0], to_int(x0)); store(box[1], to_int(y0)); store(box[2], to_int(x1)); store(box[3], to_int(y1));
     int used = before;

@@ -92,6 +92,27 @@ struct Level {
     }
 };
 
+// The harmonics of the splats, with Adam's state and the number and rate of the step. Keeps references to the arrays.
+struct Harmonics {
+    Floats params, moment1, moment2;
+    Ints last_step;
+    int degree, step;
+    float rate;
+    bool camera_moves_colors;
+
+    Harmonics(Floats p, Floats m1, Floats m2, Ints last, int degree_used, int number, float learning_rate, bool camera_moves)
+        : params(p), moment1(m1), moment2(m2), last_step(last), degree(degree_used), step(number), rate(learning_rate),
+          camera_moves_colors(camera_moves) {
+        need(p.ndim() == 2 && p.shape(1) == 45 && degree >= 1 && degree <= 3, "harmonics are [N, 45], of degree 1 to 3");
+        need(last.size() == p.shape(0) && m1.size() == p.size() && m2.size() == p.size(), "Adam's state must fit the rows");
+    }
+    ViewColors colors() const { return {params.data(), degree}; }
+    HarmonicsStep stepped() const {
+        return {params.data(), {moment1.data(), moment2.data(), last_step.data()}, degree, step, rate, camera_moves_colors};
+    }
+};
+static void need_rows(const Harmonics* h, size_t n) { need(!h || h->params.shape(0) == n, "harmonics must fit the rows"); }
+
 static TrackOptions track_options(const std::vector<float>& v, bool uncertainty, bool kept = false) {
     need(v.size() == 7, "tracking has seven numbers");
     return {v[0], v[1], v[2], v[3], v[4], v[5], v[6], uncertainty, kept};
@@ -124,7 +145,7 @@ public:
         kernels->blend_backward(context, {g_sums.data(), pointer(g_moment), pointer(g_alpha)},
                                 {g_means2d.data(), g_conics.data(), g_z.data(), g_opacities.data(), g_features.data()});
     }
-    void view_forward(ConstFloats view, ConstFloats params, int k, float alpha_min, float stop, Maybe<ConstFloats> reference,
+    void view_forward(ConstFloats view, ConstFloats params, const Harmonics* harmonics, int k, float alpha_min, float stop, Maybe<ConstFloats> reference,
                       Floats sums, Maybe<Floats> moment, Floats alpha, Maybe<Ints> median_id, Maybe<Floats> median_weight,
                       Maybe<Ints> dominant_id, Maybe<Floats> dominant_weight, Maybe<Floats> median_depth, Doubles seconds) {
         Outputs o = outputs(sums, moment, alpha, median_id, median_weight, dominant_id, dominant_weight);
@@ -133,8 +154,9 @@ public:
         need(k == 4 || k == 7, "a view has 4 features (colour, depth) or 7 (and variance)");
         need(!o.moment == !reference, "a moment needs a reference depth");
         need(seconds.size() >= 3, "seconds needs 3 places");
+        need_rows(harmonics, params.shape(0));
         nb::gil_scoped_release unlocked;
-        kernels->view_forward(context, view.data(), params.data(), int64_t(params.shape(0)), k, pointer(reference),
+        kernels->view_forward(context, view.data(), params.data(), harmonics ? harmonics->colors() : ViewColors{}, int64_t(params.shape(0)), k, pointer(reference),
                               {alpha_min, stop}, o, seconds.data());
     }
     void view_backward(ConstFloats params, ConstFloats g_sums, Maybe<ConstFloats> g_moment, Maybe<ConstFloats> g_alpha, Maybe<Ints> median_id, Maybe<ConstFloats> g_median_depth,
@@ -148,7 +170,9 @@ public:
     }
     double step(Floats params, Floats moment1, Floats moment2, Ints last_step, ConstFloats g_sums, Maybe<ConstFloats> g_moment,
                 Maybe<Ints> median_id, Maybe<ConstFloats> g_median_depth, ConstFloats rates, float beta1, float beta2,
-                float epsilon, int step, std::vector<float> isotropy, int64_t frozen_colors, Maybe<Floats> pull, Doubles g_twist, Doubles seconds) {
+                float epsilon, int step, std::vector<float> isotropy, int64_t frozen_colors, const Harmonics* harmonics,
+                Maybe<Floats> pull, Doubles g_twist, Doubles seconds) {
+        need_rows(harmonics, params.shape(0));
         need(isotropy.size() == 2 && !median_id == !g_median_depth, "a step has two isotropy weights; a median depth's gradient goes with the medians");
         need(!pull || pull->size() == params.shape(0), "pull must fit the rows");
         need(g_twist.size() == 6 && seconds.size() >= 2 && rates.size() == 17, "g_twist has 6 numbers, seconds 2, rates 17");
@@ -156,7 +180,7 @@ public:
         nb::gil_scoped_release unlocked;
         return kernels->view_step(context, params.data(), {g_sums.data(), pointer(g_moment), nullptr, pointer(median_id), pointer(g_median_depth)},
                                   {moment1.data(), moment2.data(), last_step.data()}, {rates.data(), beta1, beta2, epsilon, step},
-                                  {isotropy[0], isotropy[1], frozen_colors}, pointer(pull), g_twist.data(), seconds.data());
+                                  {isotropy[0], isotropy[1], frozen_colors}, harmonics ? harmonics->stepped() : HarmonicsStep{}, pointer(pull), g_twist.data(), seconds.data());
     }
     void backward_pose(ConstFloats params, ConstFloats g_sums, Doubles g_twist, Doubles seconds) {
         need(g_twist.size() == 6 && seconds.size() >= 1, "g_twist has 6 numbers, seconds 1");
@@ -287,6 +311,9 @@ NB_MODULE(_core, m) {
         }
         return std::make_pair(steps, degenerate);
     });
+    nb::class_<Harmonics>(m, "Harmonics")
+        .def(nb::init<Floats, Floats, Floats, Ints, int, int, float, bool>(), nb::arg("params"), nb::arg("moment1"), nb::arg("moment2"),
+             nb::arg("last_step"), nb::arg("degree"), nb::arg("step"), nb::arg("rate"), nb::arg("camera_moves_colors"));
     nb::class_<Rasteriser>(m, "Rasteriser")
         .def(nb::init<>())
         .def_prop_ro("bytes", &Rasteriser::bytes)
@@ -295,14 +322,14 @@ NB_MODULE(_core, m) {
              nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(), nb::arg("median_weight").none(), nb::arg("dominant_id").none(), nb::arg("dominant_weight").none())
         .def("blend_backward", &Rasteriser::blend_backward, nb::arg("g_sums"), nb::arg("g_moment").none(),
              nb::arg("g_alpha").none(), nb::arg("g_means2d"), nb::arg("g_conics"), nb::arg("g_z"), nb::arg("g_opacities"), nb::arg("g_features"))
-        .def("view_forward", &Rasteriser::view_forward, nb::arg("view"), nb::arg("params"), nb::arg("k"), nb::arg("alpha_min"), nb::arg("stop"), nb::arg("reference").none(),
+        .def("view_forward", &Rasteriser::view_forward, nb::arg("view"), nb::arg("params"), nb::arg("harmonics").none(), nb::arg("k"), nb::arg("alpha_min"), nb::arg("stop"), nb::arg("reference").none(),
              nb::arg("sums"), nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(), nb::arg("median_weight").none(), nb::arg("dominant_id").none(),
              nb::arg("dominant_weight").none(), nb::arg("median_depth").none(), nb::arg("seconds"))
         .def("view_backward", &Rasteriser::view_backward, nb::arg("params"), nb::arg("g_sums"),
              nb::arg("g_moment").none(), nb::arg("g_alpha").none(), nb::arg("median_id").none(), nb::arg("g_median_depth").none(), nb::arg("g_params"),
              nb::arg("pull").none(), nb::arg("g_twist"), nb::arg("seconds"))
         .def("step", &Rasteriser::step, nb::arg("params"), nb::arg("moment1"), nb::arg("moment2"), nb::arg("last_step"), nb::arg("g_sums"), nb::arg("g_moment").none(), nb::arg("median_id").none(), nb::arg("g_median_depth").none(), nb::arg("rates"),
-             nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"), nb::arg("step"), nb::arg("isotropy"), nb::arg("frozen_colors"), nb::arg("pull").none(),
+             nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"), nb::arg("step"), nb::arg("isotropy"), nb::arg("frozen_colors"), nb::arg("harmonics").none(), nb::arg("pull").none(),
              nb::arg("g_twist"), nb::arg("seconds"))
         .def("backward_pose", &Rasteriser::backward_pose)
         .def("visible", &Rasteriser::visible);

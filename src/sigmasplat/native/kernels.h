@@ -37,6 +37,13 @@ struct AdamOptions { const float* rates; float beta1, beta2, epsilon; int step; 
 struct StepOptions { float isotropy, isotropy_ratio; int64_t frozen_colors; };
 struct AdamState { float *moment1, *moment2; int* last_step; };                       // last_step: when a row was last stepped
 
+struct ViewColors { const float* harmonics; int degree; };   // harmonics [n, 45]; degree 0: colours do not depend on the view
+struct HarmonicsStep {                     // Adam's step of the harmonics, with one learning rate
+    float* params; AdamState state;
+    int degree, step; float rate;
+    bool camera_moves_colors;              // whether the pose gradient includes the path through the colours
+};
+
 struct Plane { int width, height; size_t stride, plane; };   // distance in floats of rows, and of image planes
 
 struct TrackOptions {                      // settings of TrackingConfig
@@ -63,13 +70,14 @@ struct Kernels {
                           const float* reference, BlendOptions, Outputs);
     void (*blend_backward)(Context*, OutputGradients, SplatGradients);
     // Fused: from rows of raw parameters [n, 17] to images of (r, g, b, z[, q, q, q]) with q = σ² + c².
-    void (*view_forward)(Context*, const float* view, const float* params, int64_t n, int k, const float* reference,
+    void (*view_forward)(Context*, const float* view, const float* params, ViewColors, int64_t n, int k, const float* reference,
                          BlendOptions, Outputs, double* seconds);
     // pull [n], or null: |∂L/∂mean| in the image, per half image size.
     void (*view_backward)(Context*, const float* params, OutputGradients, float* g_params, float* pull, double* g_twist,
                           double* seconds);
-    double (*view_step)(Context*, float* params, OutputGradients, AdamState, AdamOptions, StepOptions, float* pull,
-                        double* g_twist, double* seconds);
+    // harmonics.degree: 0 without view-dependent colours.
+    double (*view_step)(Context*, float* params, OutputGradients, AdamState, AdamOptions, StepOptions, HarmonicsStep harmonics,
+                        float* pull, double* g_twist, double* seconds);
     void (*adam_settle)(float* params, int64_t n, AdamState, AdamOptions);
     void (*view_backward_pose)(Context*, const float* params, OutputGradients, double* g_twist, double* seconds);
     void (*view_visible)(const Context*, uint8_t* visible);

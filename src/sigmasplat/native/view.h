@@ -44,7 +44,7 @@ template <int K> static void pack_given(Render& r, const float* means2d, const f
             load_rows<2>(radii, i, n, t);
             for (int l = 0; l < W && i + l < n; l++)
                 for (int q = 0; q < k; q++) lanes[q][l] = features[size_t(i + l) * k + q];
-            total += pack<row_floats<K>>(r, f, opacity, gt(load(t[0]), splat(0.f)), i, total, lanes);
+            total += pack<row_floats<K>>(r, f, opacity, gt(load(t[0]), splat(0.f)), i, total, lanes, [](unsigned) {});
         }
         r.chunk_begin[c] = total;
     }
@@ -119,7 +119,7 @@ template <bool VARIANCE> SIGMA_INLINE Splats activate(const float (*row)[W]) {  
     return s;
 }
 
-template <int K> static void pack_view(Render& r, const float* params) {
+template <int K> static void pack_view(Render& r, const float* params, const ViewColors& colors) {
     const int64_t n = r.n, chunks = (n + CHUNK - 1) / CHUNK;
 #pragma omp parallel for schedule(static)
     for (int64_t c = 0; c < chunks; c++) {
@@ -128,26 +128,32 @@ template <int K> static void pack_view(Render& r, const float* params) {
             alignas(64) float row[ROW][W], f[8][W];
             load_rows<ROW>(params, i, n, row);
             for (int l = 0; l <= W; l++) __builtin_prefetch(params + (i + 2 * W + l) * ROW);
-            const Splats s = activate<(K > 4)>(row);
+            Splats s = activate<(K > 4)>(row);
             const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
-            for (int q = 0; q < 3; q++) store(f[q], s.color[q]);
-            store(f[3], p.z);
-            for (int q = 0; q < 3; q++) store(f[4 + q], K > 4 ? fma(s.color[q], s.color[q], s.variance[q]) : splat(0.f));
-            store(f[7], splat(0.f));
-            total += pack<row_floats<K>>(r, p, s.opacity, gt(p.z, splat(r.view.near_m)), i, total, f);
+            const auto fill = [&](unsigned live) {
+                if (colors.degree) {
+                    alignas(64) float harmonics[HARMONICS][W];
+                    show_colors(r.view, colors, i, live, s.shape.mean, s.color, harmonics);
+                }
+                for (int q = 0; q < 3; q++) store(f[q], s.color[q]);
+                store(f[3], p.z);
+                for (int q = 0; q < 3; q++) store(f[4 + q], K > 4 ? fma(s.color[q], s.color[q], s.variance[q]) : splat(0.f));
+                store(f[7], splat(0.f));
+            };
+            total += pack<row_floats<K>>(r, p, s.opacity, gt(p.z, splat(r.view.near_m)), i, total, f, fill);
         }
         r.chunk_begin[c] = total;
     }
 }
 
-static void view_forward(Context* context, const float* view_numbers, const float* params, int64_t n, int k,
+static void view_forward(Context* context, const float* view_numbers, const float* params, ViewColors colors, int64_t n, int k,
                          const float* reference, BlendOptions options, Outputs o, double* seconds) {
     Render& r = *reinterpret_cast<Render*>(context);
     const double t0 = omp_get_wtime();
     r.view = read_view(view_numbers);
     r.prepare(n, k, int(r.view.width), int(r.view.height), options);
     r.reference = reference;
-    k <= 4 ? pack_view<4>(r, params) : pack_view<7>(r, params);
+    k <= 4 ? pack_view<4>(r, params, colors) : pack_view<7>(r, params, colors);
     const double t1 = omp_get_wtime();
     bin(r);
     const double t2 = omp_get_wtime();
@@ -171,11 +177,11 @@ static const float* gather_median(Render& r, OutputGradients g) {
 }
 
 // Propagate the summed records of all splats to the pose twist and to parameter rows. If any of W splats is seen,
-// `sink(i, seen, splats, gradient lanes)` receives ∂L/∂params; otherwise `unseen(i)` is called. g_median: result of
-// `gather_median`. pull [n], or null: |∂L/∂mean| in the image, per half image size, 0 for unseen splats.
+// `sink(i, seen, splats, gradient lanes, harmonics lanes)` receives ∂L/∂params, where the colours are those seen from this
+// view; otherwise `unseen(i)` is called. g_median: result of `gather_median`. pull [n], or null: |∂L/∂mean| in the image, per half image size, 0 for unseen splats.
 template <int K, bool MOMENT, class Sink, class Unseen>
-static void chain_to_params(const Render& r, const float* params, const float* g_median, float* pull, double* g_twist, Sink sink,
-                            Unseen unseen) {
+static void chain_to_params(const Render& r, const float* params, const ViewColors& colors, const float* g_median, float* pull,
+                            double* g_twist, Sink sink, Unseen unseen) {
     constexpr int RECORD = record_floats<K, MOMENT>;
     const float half_width = 0.5f * float(r.width), half_height = 0.5f * float(r.height);
     if (pull) memset(pull, 0, size_t(r.n) * sizeof(float));
@@ -191,11 +197,12 @@ static void chain_to_params(const Render& r, const float* params, const float* g
             unsigned seen_bits = 0;
             for (int l = 0; l < W && i + l < r.n; l++) seen_bits |= unsigned(r.tiles_of[i + l] > 0) << l;
             if (!seen_bits) { unseen(i); continue; }
-            alignas(64) float row[ROW][W], sums[RECORD][W], gradient[ROW][W];
+            alignas(64) float row[ROW][W], sums[RECORD][W], gradient[ROW][W], harmonics[HARMONICS][W];
             const Mask seen = mask_of_bits(seen_bits);
             load_rows<ROW>(params, i, r.n, row);
             reduce_records<RECORD>(r, i, slot, sums);
-            const Splats s = activate<(K > 4)>(row);
+            Splats s = activate<(K > 4)>(row);
+            if (colors.degree) show_colors(r.view, colors, i, seen_bits, s.shape.mean, s.color, harmonics);
             const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
             FootprintGradient<vf> g = footprint_gradient(moments_of(sums), p.l1, p.l2, p.l3);
             g.z = weight_sum(sums, 3);
@@ -220,7 +227,7 @@ static void chain_to_params(const Render& r, const float* params, const float* g
                 store(gradient[11 + q], only(seen, fma(2.f * s.color[q], g_square, weight_sum(sums, q))));
                 store(gradient[14 + q], only(seen, g_square * s.variance[q]));
             }
-            sink(i, seen_bits, s, gradient);
+            sink(i, seen_bits, s, gradient, harmonics);
         }
         for (int q = 0; q < 6; q++) partial[c * 6 + q] = lane_sum(twist[q]);
     }
@@ -230,12 +237,13 @@ static void chain_to_params(const Render& r, const float* params, const float* g
     }
 }
 template <class Sink, class Unseen>
-static void chain_any(Render& r, const float* params, OutputGradients g, float* pull, double* g_twist, Sink sink, Unseen unseen) {
+static void chain_any(Render& r, const float* params, const ViewColors& colors, OutputGradients g, float* pull, double* g_twist, Sink sink,
+                      Unseen unseen) {
     const float* g_median = gather_median(r, g);
     const auto chain = [&](auto k) {
         constexpr int K = decltype(k)::value;
-        g.moment ? chain_to_params<K, true>(r, params, g_median, pull, g_twist, sink, unseen)
-                 : chain_to_params<K, false>(r, params, g_median, pull, g_twist, sink, unseen);
+        g.moment ? chain_to_params<K, true>(r, params, colors, g_median, pull, g_twist, sink, unseen)
+                 : chain_to_params<K, false>(r, params, colors, g_median, pull, g_twist, sink, unseen);
     };
     r.k <= 4 ? chain(std_int<4>{}) : chain(std_int<7>{});
 }
@@ -246,8 +254,8 @@ static void view_backward(Context* context, const float* params, OutputGradients
     const double t0 = omp_get_wtime();
     blend_gradients(r, g);
     const double t1 = omp_get_wtime();
-    chain_any(r, params, g, pull, g_twist,
-        [&](int64_t i, unsigned, const Splats&, const float (*gradient)[W]) { store_rows<ROW>(g_params, i, r.n, gradient); },
+    chain_any(r, params, {}, g, pull, g_twist,
+        [&](int64_t i, unsigned, const Splats&, const float (*gradient)[W], const float (*)[W]) { store_rows<ROW>(g_params, i, r.n, gradient); },
         [&](int64_t i) { memset(g_params + i * ROW, 0, size_t(r.n - i < W ? r.n - i : W) * ROW * sizeof(float)); });
     if (seconds) { seconds[0] += t1 - t0; seconds[1] += omp_get_wtime() - t1; }
 }
@@ -256,30 +264,44 @@ static void view_backward(Context* context, const float* params, OutputGradients
 // stepped now (adam.h), and have no isotropy term: |s − mean(s)| is a mean over all splats, max(s)/min(s) − 1 over
 // those in view. Returns the weighted cost of both.
 static double view_step(Context* context, float* params, OutputGradients g, AdamState state, AdamOptions options,
-                        StepOptions terms, float* pull, double* g_twist, double* seconds) {
+                        StepOptions terms, HarmonicsStep harmonics, float* pull, double* g_twist, double* seconds) {
     Render& r = *reinterpret_cast<Render*>(context);
     const double t0 = omp_get_wtime();
     blend_gradients(r, g);
     const double t1 = omp_get_wtime();
     const AdamRates adam(options);
+    const AdamStep adam_harmonics(options, harmonics.step);
     int64_t visible = 0;
     if (terms.isotropy_ratio > 0.f)
         for (int64_t i = 0; i < r.n; i++) visible += r.tiles_of[i] > 0;
     const float scale = terms.isotropy / (3.f * float(r.n > 0 ? r.n : 1)), scale_ratio = terms.isotropy_ratio / float(visible > 0 ? visible : 1);
     Buffer<double> cost;
     cost.reserve(r.n / W + 1);                        // zero where nothing is seen
-    chain_any(r, params, g, pull, g_twist,
-        [&](int64_t i, unsigned seen, const Splats& s, float (*gradient)[W]) {
+    Buffer<float> moved;                              // gradient of W means through the colours
+    if (harmonics.degree) moved.reserve((r.n / W + 1) * 3);
+    chain_any(r, params, {harmonics.params, harmonics.degree}, g, pull, g_twist,
+        [&](int64_t i, unsigned seen, const Splats& s, float (*gradient)[W], float (*lanes)[W]) {
             cost[i / W] = double(scale) * add_isotropy(s.shape.scale, mask_of_bits(seen), scale, gradient + 7);
             if (terms.isotropy_ratio > 0.f)
                 cost[i / W] += double(scale_ratio) * add_isotropy_ratio(s.shape.scale, mask_of_bits(seen), scale_ratio, gradient + 7);
             for (int64_t l = 0; l < W && i + l < terms.frozen_colors; l++)
                 for (int q = 11; q < 14; q++) gradient[q][l] = 0.f;
+            if (harmonics.degree) {
+                vf on_mean[3];
+                step_harmonics(r.view, harmonics, adam_harmonics, i, seen, s.shape.mean, gradient, lanes, on_mean);
+                for (int q = 0; q < 3; q++) moved[i / W * 3 + q] = lane_sum(on_mean[q]);
+            }
             adam_rows(adam, params, state, i, r.n, seen, gradient);
         },
         [](int64_t) {});
     double sum = 0;
     for (int64_t i = 0; i * W < r.n; i++) sum += cost[i];
+    if (harmonics.degree && harmonics.camera_moves_colors)   // a camera motion ρ acts like a splat motion −ρ
+        for (int q = 0; q < 3; q++) {
+            double on_mean = 0;
+            for (int64_t i = 0; i * W < r.n; i++) on_mean += moved[i * 3 + q];
+            for (int d = 0; d < 3; d++) g_twist[d] += r.view.R[3 * d + q] * on_mean;
+        }
     if (seconds) { seconds[0] += t1 - t0; seconds[1] += omp_get_wtime() - t1; }
     return sum;
 }

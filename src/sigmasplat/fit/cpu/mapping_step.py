@@ -1,5 +1,7 @@
 """One mapping step, fused in the compiled CPU kernels. Tests compare it with `TorchStep`."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -13,6 +15,30 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
+
+if TYPE_CHECKING:
+    from sigmasplat.native import _core
+
+
+def step_rows(
+    view: CpuView,
+    field: GaussianField,
+    rates: Rates,
+    weights: Weights,
+    frozen_colors: int,
+    grad2d: Tensor | None,
+    harmonics: "_core.Harmonics | None",
+) -> tuple[Matrix, float]:
+    """Propagate the view's gradient planes to the splats in view and step them, and their harmonics if given, in one
+    pass that stores no gradient rows in memory. Returns what `MappingStep.splats` returns."""
+    twist = np.zeros(6)
+    cost = view.raster.step(
+        field.params, field.moment1, field.moment2, field.last_step, view.g_sums, *view.depth_gradients(),
+        rates.per_column.numpy(), BETA1, BETA2, EPSILON, field.steps,
+        kernel_weights(SHAPE_TERMS, weights, "cpu").tolist(), frozen_colors, harmonics, grad2d, twist,
+        view.seconds[3:],
+    )  # fmt: skip
+    return twist, cost
 
 
 class CompiledImages:
@@ -59,14 +85,8 @@ class CompiledStep(CompiledImages):
     def splats(
         self, field: GaussianField, rates: Rates, weights: Weights, frozen_colors: int, grad2d: Tensor | None = None
     ) -> tuple[Matrix, float]:
-        """Step the splats as `TorchStep.splats` does, in one pass that stores no gradient rows in memory."""
-        twist, v = np.zeros(6), self.view
-        cost = v.raster.step(
-            field.params, field.moment1, field.moment2, field.last_step, v.g_sums, *v.depth_gradients(),
-            rates.per_column.numpy(), BETA1, BETA2, EPSILON, field.steps,
-            kernel_weights(SHAPE_TERMS, weights, "cpu").tolist(), frozen_colors, grad2d, twist, v.seconds[3:],
-        )  # fmt: skip
-        return twist, cost
+        """Step the splats as `TorchStep.splats` does."""
+        return step_rows(self.view, field, rates, weights, frozen_colors, grad2d, None)
 
     def accumulator(self, field: GaussianField) -> GradientAccumulator:
         """Allocate the gradient sum of several images."""

@@ -7,34 +7,7 @@ namespace sigmasplat {
 
 constexpr int PARAMS = 17;                 // columns of GaussianField.params
 
-struct Dual { float value, by[3]; };       // a number and its derivatives with respect to x, y, z
-inline Dual operator+(Dual a, Dual b) { return {a.value + b.value, {a.by[0] + b.by[0], a.by[1] + b.by[1], a.by[2] + b.by[2]}}; }
-inline Dual operator-(Dual a, Dual b) { return {a.value - b.value, {a.by[0] - b.by[0], a.by[1] - b.by[1], a.by[2] - b.by[2]}}; }
-inline Dual operator*(float a, Dual b) { return {a * b.value, {a * b.by[0], a * b.by[1], a * b.by[2]}}; }
-inline Dual operator*(Dual a, Dual b) {
-    return {a.value * b.value, {a.by[0] * b.value + a.value * b.by[0], a.by[1] * b.value + a.value * b.by[1],
-                                a.by[2] * b.value + a.value * b.by[2]}};
-}
-
-// Call take(number, value) for each harmonic of degrees 1 to `degree` in the direction (x, y, z), in order.
-template <class Number, class Take> inline void each_harmonic(Number x, Number y, Number z, int degree, Take take) {
-    const float a1 = 0.4886025119029199f;                                  // √(3/4π)
-    take(0, -a1 * y); take(1, a1 * z); take(2, -a1 * x);
-    if (degree < 2) return;
-    const float a2 = 1.0925484305920792f, b2 = 0.31539156525252005f;       // √(15/4π), √(5/16π)
-    const Number xx = x * x, yy = y * y, zz = z * z, both = xx + yy, apart = xx - yy;
-    take(3, a2 * (x * y)); take(4, -a2 * (y * z)); take(5, b2 * (2.f * zz - both)); take(6, -a2 * (x * z)); take(7, 0.5f * a2 * apart);
-    if (degree < 3) return;
-    const float a3 = 0.5900435899266435f, b3 = 1.445305721320277f,         // √(35/32π), √(210/32π)
-        c3 = 0.4570457994644658f, d3 = 0.3731763325901154f;                // √(21/32π), √(14/32π)
-    take(8, -a3 * (y * (3.f * xx - yy)));
-    take(9, 2.f * b3 * (x * y * z));
-    take(10, -c3 * (y * (4.f * zz - both)));
-    take(11, d3 * (z * (2.f * zz - 3.f * both)));
-    take(12, -c3 * (x * (4.f * zz - both)));
-    take(13, b3 * (z * apart));
-    take(14, -a3 * (x * (xx - 3.f * yy)));
-}
+#include "harmonics.h"
 
 struct Eye { float position[3], R[9], t[3]; };   // a camera: its position, and T_camera_world
 
@@ -75,8 +48,8 @@ KERNEL carry_colors(const float* params, const float* harmonics, const unsigned 
         const float shown[3] = {on_row[11], on_row[12], on_row[13]};
         float unit[3], on_unit[3] = {};
         const float length = direction_to(mean, eye, unit);
-        const Dual x = {unit[0], {1.f, 0.f, 0.f}}, y = {unit[1], {0.f, 1.f, 0.f}}, z = {unit[2], {0.f, 0.f, 1.f}};
-        each_harmonic(x, y, z, degree, [&](int k, Dual value) {
+        const Dual<float> x = {unit[0], {1.f, 0.f, 0.f}}, y = {unit[1], {0.f, 1.f, 0.f}}, z = {unit[2], {0.f, 0.f, 1.f}};
+        each_harmonic(x, y, z, degree, [&](int k, Dual<float> value) {
             float on_value = 0.f;
             for (int c = 0; c < 3; c++) {
                 on_value = fmaf(own[3 * k + c], shown[c], on_value);

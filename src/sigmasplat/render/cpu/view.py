@@ -1,5 +1,7 @@
 """A view on the compiled CPU kernels."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -9,6 +11,9 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.render.kernel_params import view_params
 from sigmasplat.render.view import NO_LAYERS, Layers
 from sigmasplat.types import Matrix
+
+if TYPE_CHECKING:
+    from sigmasplat.native import _core
 
 
 class CpuView:
@@ -33,9 +38,17 @@ class CpuView:
         self.seconds = np.zeros(5)
 
     def forward(
-        self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
+        self,
+        params: Tensor,
+        T_camera_world: Matrix,
+        depth_reference: Tensor | None = None,
+        layers: bool = False,
+        harmonics: "_core.Harmonics | None" = None,
     ) -> None:
-        """Render rows [N, 17] as `View.forward` does: planes [K, rows, columns], m and m², padded to whole tiles."""
+        """Render rows [N, 17] as `View.forward` does: planes [K, rows, columns], m and m², padded to whole tiles.
+
+        harmonics: the view-dependent part of the colours, if any.
+        """
         o, reference_depth, moment = self.options, None, None
         if depth_reference is not None:
             self._reference[: self.camera.height, : self.camera.width] = depth_reference
@@ -43,7 +56,7 @@ class CpuView:
         self._made = (depth_reference is not None, layers)
         view, planes = view_params(self.camera, T_camera_world, o), self.layers if layers else NO_LAYERS
         self.raster.view_forward(
-            view, params, self._k, o.alpha_min, o.transmittance_stop, reference_depth,
+            view, params, harmonics, self._k, o.alpha_min, o.transmittance_stop, reference_depth,
             self.sums, moment, self.alpha, *planes, self.seconds[:3],
         )  # fmt: skip
 
