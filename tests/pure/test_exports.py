@@ -137,9 +137,17 @@ def test_films_follow_the_path_or_an_orbit(reader: RunReader, tmp_path: Path, pa
     with Image.open(tmp_path / "film.gif") as film:
         assert (film.size, film.n_frames, count) == ((3 * 64, 48 + 40), 5, 5)
         first = np.asarray(film.convert("RGB"))
-    assert calls == [(i, 5) for i in range(1, 6)]
+    assert calls == [(i, 5) for i in range(6)]
     assert np.abs(first[8:40, 4:60].astype(int) - 128).max() < 12, "colour on the left"
     assert first[8:40, 64:128].std(axis=(0, 1)).max() > 10, "depth in the middle"
+
+
+def test_a_film_of_colour_alone_has_one_panel_and_no_legend(reader: RunReader, tmp_path: Path) -> None:
+    options = VideoOptions(width_px=64, fps=5.0, seconds=1.0, panels="color")
+    assert export_video(reader, tmp_path / "film.gif", options, renderer=seer(WORLD)) == 5
+    with Image.open(tmp_path / "film.gif") as film:
+        assert film.size == (64, 48)
+        assert np.abs(np.asarray(film.convert("RGB")).astype(int) - 128).max() < 12
 
 
 def test_the_orbit_view_removes_the_ceiling_and_shows_the_whole_room() -> None:
@@ -192,10 +200,11 @@ def test_film_options_out_of_range_are_refused() -> None:
         ({"fps": 0.0}, "1 to 120 images/s"),
         ({"seconds": -1.0}, "last 0.04 s to 1 h"),
         ({"path": "up"}, "'run' or 'orbit', found 'up'"),
+        ({"panels": "depth"}, "'all' or 'color', found 'depth'"),
     ):
         with pytest.raises(ConfigError, match=words):
             VideoOptions(**wrong)
-    assert VideoOptions().images(0.5) == 100 and VideoOptions(fps=10.0).images(500.0) == 600
+    assert VideoOptions().images(0.5) == 100 and VideoOptions(fps=10.0).images(500.0) == 200
     assert VideoOptions(path="orbit", fps=10.0).images(500.0) == 120
     camera = film_camera(Camera(321, 241, 200.0, 200.0, 160.0, 120.0), 0)
     assert (camera.width, camera.height) == (320, 240)

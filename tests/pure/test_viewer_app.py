@@ -9,11 +9,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from room_map import room_map
 from sigmasplat.model.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
+from sigmasplat.model.mesh import Mesh
 
 viser = pytest.importorskip("viser", reason="viser is not installed (pip install 'sigmasplat[viewer]')")
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -100,16 +102,17 @@ def test_a_growing_run_is_shown_and_the_controls_follow(
     panel.hidden.value = 50
     wait_until(lambda: panel.hidden_text.content != texts)
     offered = [mode for mode in VIEW_MODES if MODE_LABELS[mode] in panel.mode.options]
-    assert set(VIEW_MODES) - set(offered) == set(PREDICTED_MODES), "submaps have no predicted errors"
+    assert set(VIEW_MODES) - set(offered) == {*PREDICTED_MODES, "mesh"}, "submaps have no predicted errors and no mesh"
+    assert not panel.keyframes.value and not panel.thumbnails.value, "the viewer opens without frusta and images"
     for mode in (*offered[1:], offered[0]):
         before = len(client)
         panel.mode.value = MODE_LABELS[mode]
         wait_until(lambda before=before: len(client) > before)  # type: ignore[misc]
     panel.row.value = 3
     wait_until(lambda: "3" in panel.frame.content)
-    for control in (panel.thumbnails, panel.keyframes, panel.path):
+    for control in (panel.keyframes, panel.thumbnails, panel.path):
         before = len(client)
-        control.value = False
+        control.value = not control.value
         wait_until(lambda before=before: len(client) > before)  # type: ignore[misc]
     assert "viewer:" not in capsys.readouterr().err, "no error while drawing"
 
@@ -142,3 +145,19 @@ def test_predicted_errors_are_offered_for_the_final_map_only(
     wait_until(lambda: not panel.max_std.visible)
     assert panel.mode.value == MODE_LABELS["splats"] and not panel.error_part.visible
     assert panel.part.value != FINAL_MAP and "viewer:" not in capsys.readouterr().err, "no error while drawing"
+
+
+def test_the_mesh_of_a_run_is_shown_instead_of_its_splats(
+    app: ViewerApp, client: list[int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    corners = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1]], np.float32)
+    mesh = Mesh(corners, np.array([[0, 1, 2]], np.int32), np.ones((3, 3), np.float32))
+    app.show(Snapshot("room", final=Piece(None, room_map()), mesh=mesh))
+    wait_until(lambda: MODE_LABELS["mesh"] in app.panel.mode.options)
+    for mode in ("mesh", "splats"):
+        before = len(client)
+        app.panel.mode.value = MODE_LABELS[mode]
+        wait_until(lambda before=before: len(client) > before)  # type: ignore[misc]
+    app.show(Snapshot("another room", final=Piece(None, room_map())))
+    wait_until(lambda: MODE_LABELS["mesh"] not in app.panel.mode.options)
+    assert "viewer:" not in capsys.readouterr().err, "no error while drawing"

@@ -16,7 +16,14 @@ from sigmasplat.model.splat_filter import sigmas
 from sigmasplat.render import render
 from sigmasplat.render.predictive import predict
 from sigmasplat.viewer import lines
-from sigmasplat.viewer.layers import Legend, browser_camera, draw_legend, render_layer, render_predicted
+from sigmasplat.viewer.layers import (
+    Legend,
+    browser_camera,
+    draw_legend,
+    render_layer,
+    render_predicted,
+    surface_normals,
+)
 from sigmasplat.viewer.snapshot import CameraPath, Piece, Snapshot, thin, within_budget
 from sigmasplat.viewer.splats import (
     VisibilityFilter,
@@ -210,6 +217,19 @@ def test_layers_show_the_maps_of_the_renderer() -> None:
     assert legend is not None and legend.high == pytest.approx(np.percentile(root[covered], 99), rel=1e-5)
     depth = shown["depth"].legend
     assert depth is not None and 2.0 < depth.low < depth.high < 4.5 and depth.unit == " m"
+
+
+def test_the_normals_of_a_tilted_plane_are_its_normal_and_point_to_the_camera() -> None:
+    camera, normal = Camera(40, 30, 50.0, 45.0, 18.0, 16.0), np.array([0.36, -0.48, -0.8])
+    v, u = np.mgrid[:30, :40]
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones((30, 40))], -1)
+    depth_m = (-2.0 / (rays @ normal)).astype(np.float32)
+    depth_m[10, 10] = 0.0
+    found = surface_normals(depth_m, camera)
+    inside = found[1:-1, 1:-1].reshape(-1, 3)
+    known = (inside != 0.0).any(1)
+    assert known.sum() == 28 * 38 - 5, "the pixel without depth and its four neighbours have no normal"
+    assert np.abs(inside[known] - normal).max() < 0.02
 
 
 def test_u_is_the_spread_of_depth_about_the_rendered_depth() -> None:

@@ -25,6 +25,7 @@ class ExportOptions:
     fps: options.FilmRate = 25.0
     seconds: options.FilmSeconds = None
     path: options.FilmPath = "run"
+    panels: options.FilmPanels = "all"
     cell_m: options.CellM = 0.05
     source: options.MovedSource = None
 

@@ -201,11 +201,14 @@ FilmSeconds = Annotated[
     arg(
         metavar="S",
         help="length of a video in seconds",
-        help_behavior_hint="(default: that of the path, 4 to 60; orbit: 12)",
+        help_behavior_hint="(default: that of the path, 4 to 20; orbit: 12)",
     ),
 ]
 FilmPath = Annotated[
     Literal["run", "orbit"], arg(help="camera path of a video: along the run's path, or in a circle above the room")
+]
+FilmPanels = Annotated[
+    Literal["all", "color"], arg(help="panels of a video: colour, depth and uncertainty side by side, or colour alone")
 ]
 
 

@@ -56,10 +56,15 @@ class FilmScale:
         return FilmScale(colormap.value_range(depth_m, mapped), (0.0, colormap.value_range(deviation, mapped)[1]))
 
 
+def color_bytes(maps: FilmMaps) -> colormap.Rgb:
+    """Return the colours as uint8 [H, W, 3]."""
+    return np.asarray(np.rint(maps.color * 255.0).astype(np.uint8))
+
+
 def film_image(maps: FilmMaps, scale: FilmScale, strip: colormap.Rgb) -> colormap.Rgb:
     """Draw one image: three panels with the legend strip below, uint8 [H + strip, 3 W, 3]."""
     panels = [
-        np.rint(maps.color * 255.0).astype(np.uint8),
+        color_bytes(maps),
         colormap.apply_masked(maps.depth_m, maps.mapped, *scale.depth_m, colormap.VIRIDIS),
         colormap.apply_masked(maps.deviation, maps.mapped, *scale.deviation, colormap.INFERNO),
     ]

@@ -38,11 +38,11 @@ class ViewPanel:
     bar: NDArray[np.float64] | None = None
     ends: tuple[str, str] = ("", "")
 
-    def picture(self, height: int) -> Image.Image:
-        """Return the pixels as a picture `PANEL_WIDTH` wide; small maps with a colour bar keep sharp pixels."""
-        enlarged = self.pixels.shape[1] < PANEL_WIDTH
+    def picture(self, width: int, height: int) -> Image.Image:
+        """Return the pixels as a picture of this size; small maps with a colour bar keep sharp pixels."""
+        enlarged = self.pixels.shape[1] < width
         how = Image.Resampling.NEAREST if enlarged and self.bar is not None else Image.Resampling.LANCZOS
-        return Image.fromarray(self.pixels).resize((PANEL_WIDTH, height), how)
+        return Image.fromarray(self.pixels).resize((width, height), how)
 
 
 def draw_view_strip(panels: Sequence[ViewPanel]) -> Image.Image:
@@ -128,7 +128,7 @@ def _draw(strip: Image.Image, panel: ViewPanel, left: int, height: int) -> None:
     """Draw one panel in the strip: title above, picture, bar or caption below."""
     draw = ImageDraw.Draw(strip)
     draw.text((left + 2, HEAD // 2), panel.title, TEXT, ImageFont.load_default(18), anchor="lm")
-    strip.paste(panel.picture(height), (left, HEAD))
+    strip.paste(panel.picture(PANEL_WIDTH, height), (left, HEAD))
     middle = HEAD + height + FOOT // 2
     small = ImageFont.load_default(16)
     if panel.bar is None:

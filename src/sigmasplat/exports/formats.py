@@ -268,10 +268,12 @@ def _points(source: ExportSource, target: Path, *, voxel_m: float) -> str:
         return f"{export_points(surface, target):,} points"
 
 
-def _video(source: ExportSource, target: Path, *, size: int, fps: float, seconds: float | None, path: str) -> str:
+def _video(
+    source: ExportSource, target: Path, *, size: int, fps: float, seconds: float | None, path: str, panels: str
+) -> str:
     from sigmasplat.exports.video import VideoOptions, export_video
 
-    options = VideoOptions(size, fps, seconds, path)  # type: ignore[arg-type]
+    options = VideoOptions(size, fps, seconds, path, panels)  # type: ignore[arg-type]
     with _counting("film") as progress:
         count = export_video(source.reader(), target, options, progress=progress)
     return f"{count:,} images, {count / fps:.1f} s"
@@ -303,7 +305,13 @@ FORMATS = (
     ExportFormat("nerfstudio", (".json",), "views as nerfstudio's transforms.json", _nerfstudio, True),
     ExportFormat("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap, True),
     ExportFormat("points", (".points.ply",), "the surface as points with normals", _points, True),
-    ExportFormat("video", (".webm", ".mp4", ".gif", ".webp"), "a video of colour, depth and uncertainty", _video, True),
+    ExportFormat(
+        "video",
+        (".webm", ".mp4", ".gif", ".webp"),
+        "a video: colour, depth, uncertainty",
+        _video,
+        True,
+    ),
     ExportFormat("plan", (".plan.png", ".png"), "a floor plan with regions to scan again", _plan, True),
 )
 """All formats. The first one is the default."""

@@ -1,4 +1,4 @@
-"""Render a run as a video: colour, depth and uncertainty side by side, along its path or on an orbit above the room."""
+"""Render a run as a video along its path or on an orbit: colour alone, or with depth and uncertainty beside it."""
 
 import os
 import sys
@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from sigmasplat.drawing.colormap import Rgb
-from sigmasplat.drawing.film import FilmMaps, FilmScale, film_image, legend_strip
+from sigmasplat.drawing.film import FilmMaps, FilmScale, color_bytes, film_image, legend_strip
 from sigmasplat.env import install_package
 from sigmasplat.errors import BackendError, ConfigError, RunError
 from sigmasplat.exports.run_reader import RunReader
@@ -29,7 +29,7 @@ from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render import FieldRenderer
 from sigmasplat.types import Matrix, Progress, no_progress
 
-SHORTEST_S, LONGEST_S, ORBIT_S = 4.0, 60.0, 12.0
+SHORTEST_S, LONGEST_S, ORBIT_S = 4.0, 20.0, 12.0
 SAMPLES = 12
 """Number of images from which the film's colour scale is computed."""
 SURFACE_VIEWS = 20
@@ -41,8 +41,9 @@ CEILING_M = 0.1
 class VideoOptions:
     """The options of a video.
 
-    width_px: width of each of the three panels (0: that of the run's images); fps: images per second; seconds: length
-    (None: that of the path, within 4 to 60 s; 12 s for an orbit); path: along the run's path or on an orbit.
+    width_px: width of a panel (0: that of the run's images); fps: images per second; seconds: length (None: that of the
+    path, within 4 to 20 s; 12 s for an orbit); path: along the run's path or on an orbit; panels: colour, depth and
+    uncertainty side by side ("all"), or colour alone ("color").
 
     Raises ConfigError on a size, rate or length out of range.
     """
@@ -51,6 +52,7 @@ class VideoOptions:
     fps: float = 25.0
     seconds: float | None = None
     path: Literal["run", "orbit"] = "run"
+    panels: Literal["all", "color"] = "all"
 
     def __post_init__(self) -> None:
         if not (self.width_px == 0 or 32 <= self.width_px <= 4096):
@@ -61,6 +63,8 @@ class VideoOptions:
             )
         if self.path not in ("run", "orbit"):
             raise ConfigError(f"a video's path must be 'run' or 'orbit', found {self.path!r}")
+        if self.panels not in ("all", "color"):
+            raise ConfigError(f"a video's panels must be 'all' or 'color', found {self.panels!r}")
 
     def images(self, path_s: float) -> int:
         """Return the number of images of the film, for a path that lasts `path_s` seconds."""
@@ -76,7 +80,7 @@ def export_video(
     renderer: SurfaceRenderer | None = None,
     progress: Progress = no_progress,
 ) -> int:
-    """Write a video and return its number of images. Calls `progress(done, total)` after each image.
+    """Write a video and return its number of images. Calls `progress(done, total)` at the start and after each image.
 
     Raises RunError on an unknown ending, or without a map or path; BackendError without OpenCV for .webm and .mp4.
     """
@@ -91,7 +95,9 @@ def export_video(
     else:
         poses = smooth_path(path, count)
     show = partial(_show, renderer, field, camera)
-    write_video(target, _images(show, poses, camera.width, progress), options.fps)
+    draw = _color_images if options.panels == "color" else _images
+    progress(0, count)
+    write_video(target, draw(show, poses, camera.width, progress), options.fps)
     return count
 
 
@@ -132,6 +138,13 @@ def _images(show: Callable[[Matrix], FilmMaps], poses: Matrix, width: int, progr
     strip = legend_strip(scale, width)
     for done, pose in enumerate(poses, 1):
         yield film_image(show(pose), scale, strip)
+        progress(done, len(poses))
+
+
+def _color_images(show: Callable[[Matrix], FilmMaps], poses: Matrix, width: int, progress: Progress) -> Iterator[Rgb]:
+    """Yield the colours of a video."""
+    for done, pose in enumerate(poses, 1):
+        yield color_bytes(show(pose))
         progress(done, len(poses))
 
 

@@ -47,6 +47,8 @@ figure img { display: block; width: 100%; height: auto; border-radius: 10px; bor
 figcaption { font-size: 14px; margin-top: 6px; }
 .view { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 10px;
   background: #15181d; color: #e9edf2; border-radius: 10px; padding: 10px; font-size: 13px; line-height: 1.4; }
+.view.large { grid-template-columns: repeat(6, 1fr); } .view.large div { grid-column: span 2; }
+.view.large div:nth-child(-n+2) { grid-column: span 3; }
 .view img { border: 0; border-radius: 4px; margin: 4px 0; }
 .view span { color: #9aa2ac; }
 .bar { display: grid; grid-template-columns: auto 1fr auto; gap: 6px; align-items: center; white-space: nowrap; }
@@ -66,6 +68,7 @@ pre { white-space: pre-wrap; overflow-wrap: anywhere; margin: 0;
 @media NARROW {
   main { padding: 24px 12px 56px; } h1 { font-size: 24px; } h2 { margin-top: 36px; }
   .tiles { gap: 8px; grid-template-columns: 1fr 1fr; } .tile b { font-size: 22px; }
+  .view.large div, .view.large div:nth-child(-n+2) { grid-column: span 6; }
   th, td { padding: 6px; } .card { padding: 12px; } }
 """.replace("NARROW", NARROW)
 
@@ -196,8 +199,14 @@ def _strips(contents: Contents) -> str:
     for kind, strips in contents.strips.items():
         if strips:
             parts.append(f"<h3>{html.escape(kind)}</h3>")
-            parts += [f"<figure class=view>{''.join(map(_panel, panels))}</figure>" for panels in strips]
+            parts += map(_view, strips)
     return "".join(parts)
+
+
+def _view(panels: list[PanelFigure]) -> str:
+    """Show the panels of a view. With five of them, the image and its render are half as wide as the page."""
+    large = " large" if len(panels) == 5 else ""
+    return f"<figure class='view{large}'>{''.join(map(_panel, panels))}</figure>"
 
 
 def _panel(panel: PanelFigure) -> str:

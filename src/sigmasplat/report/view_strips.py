@@ -13,6 +13,8 @@ from sigmasplat.io.runs import RunFolder
 from sigmasplat.metrics.scored_view import ScoredView
 
 QUALITY = 86
+PAGE_WIDTH = 1152
+"""Width of the page's text column at twice the resolution of a panel, in pixels."""
 HEADINGS = {"test": "novel views"}
 """Headings of kinds of views; without an entry "<kind> views"."""
 
@@ -59,10 +61,14 @@ class ViewStrips:
 
 
 def panel_figure(panel: ViewPanel) -> PanelFigure:
-    """Return a panel for the page, with its picture as a data: URI."""
-    height = round(PANEL_WIDTH * panel.pixels.shape[0] / panel.pixels.shape[1])
+    """Return a panel for the page, with its picture as a data: URI.
+
+    Pictures larger than a panel of a strip keep their size, up to `PAGE_WIDTH`.
+    """
+    width = min(max(PANEL_WIDTH, panel.pixels.shape[1]), PAGE_WIDTH)
+    height = round(width * panel.pixels.shape[0] / panel.pixels.shape[1])
     colours = () if panel.bar is None else tuple(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in panel.bar)
-    return PanelFigure(panel.title, data_uri(panel.picture(height)), panel.caption, colours, panel.ends)
+    return PanelFigure(panel.title, data_uri(panel.picture(width, height)), panel.caption, colours, panel.ends)
 
 
 def data_uri(picture: Image.Image, lossless: bool = False) -> str:

@@ -36,8 +36,10 @@ from sigmasplat.viewer.splats import (
 
 REST_S, LIVE_REST_S = 0.05, 0.5
 """Pause after each drawing, so that mouse moves do not keep the CPU busy and do not slow SLAM down."""
-ROWS, LIVE_ROWS = 480, 240
-"""Height in pixels of the images that SigmaSplat renders."""
+ROWS, LIVE_ROWS, SHARP_ROWS = 480, 240, 1080
+"""Height in pixels of the images that SigmaSplat renders: of a finished run, of a live one, and of a finished run after
+the view has been still for `STILL_S`, at most the height of the browser's window."""
+STILL_S = 0.3
 BACK_M, UP_M = 0.7, 0.25
 """Position of the following camera: behind and above the camera of the run."""
 
@@ -78,6 +80,7 @@ class ViewerApp:
         )  # fmt: skip
         self._merged: tuple[Any, Any] = (None, None)
         self._wake, self._stop = threading.Event(), threading.Event()
+        self._sharp, self._can_sharpen = False, False
         server.on_client_connect(self._welcome)
         server.on_client_disconnect(lambda client: self._drawn.pop(("layer", client.client_id), None))
         self._thread = threading.Thread(target=self._work, name="viewer", daemon=True)
@@ -101,10 +104,11 @@ class ViewerApp:
     def _work(self) -> None:
         trimmed: Snapshot | None = None
         while True:
-            self._wake.wait()
+            self._sharp = not self._wake.wait(STILL_S if self._can_sharpen else None)
             if self._stop.is_set():
                 return
             self._wake.clear()
+            self._can_sharpen = False
             snapshot = self._snapshot
             if snapshot is not None:
                 try:
@@ -122,7 +126,7 @@ class ViewerApp:
         self.panel.adapt(len(path), snapshot.live, snapshot.true_positions is not None, has_final and has_submaps)
         controls = self.panel.state()
         pieces = snapshot.visible_pieces(controls.final_map, controls.row)
-        self.panel.offer_predicted(any(piece.uncertainty is not None for piece in pieces))
+        self.panel.offer(any(piece.uncertainty is not None for piece in pieces), snapshot.mesh is not None)
         controls = self.panel.state()
         ordered = self._values_of(pieces)
         visible = visibility_filter(
@@ -132,6 +136,7 @@ class ViewerApp:
         with self.server.atomic():
             self._draw_path(snapshot, controls)
             self._draw_splats(pieces, controls, span, visible)
+            self._draw_mesh(snapshot, controls)
         self._draw_keyframes(snapshot, controls)
         self._show_texts(snapshot, controls, pieces, visible)
         self._follow(snapshot, controls)
@@ -175,7 +180,7 @@ class ViewerApp:
     def _draw_splats(
         self, pieces: tuple[Piece, ...], controls: ControlState, span: tuple[float, float], visible: VisibilityFilter
     ) -> None:
-        if controls.layer is not None:
+        if controls.mode != "splats":
             pieces = ()
         ends = None if controls.colouring == "colour" else span  # own colours do not depend on the range
         state = ([(p.name, IdentityKey(p.field)) for p in pieces], controls.colouring, ends, visible)
@@ -185,6 +190,11 @@ class ViewerApp:
             self.scene.show_splats(drawn)
         else:
             self.scene.place_splats({piece.name: piece.T_world_piece for piece in pieces})
+
+    def _draw_mesh(self, snapshot: Snapshot, controls: ControlState) -> None:
+        mesh = snapshot.mesh if controls.mode == "mesh" else None
+        if self._is_new("mesh", IdentityKey(mesh)):
+            self.scene.show_mesh(mesh)
 
     def _draw_keyframes(self, snapshot: Snapshot, controls: ControlState) -> None:
         path = snapshot.path
@@ -205,11 +215,13 @@ class ViewerApp:
             return None
         pose, splats = camera_pose(c), ([(IdentityKey(p.field), p.T_world_piece.tobytes()) for p in pieces], visible)
         state = (controls.layer, controls.error_part, pose.tobytes(), c.fov, c.aspect, splats)
-        drawn = self._drawn.get(key)
-        if drawn is None or drawn[0] != state:
+        drawn, rows = self._drawn.get(key), LIVE_ROWS if snapshot.live else ROWS
+        sharp_rows = rows if snapshot.live else max(rows, min(SHARP_ROWS, c.image_height))
+        rows = sharp_rows if self._sharp else rows
+        if drawn is None or drawn[0] != state or drawn[2] < rows:
             if self._merged[0] != splats:
                 self._merged = (splats, (merge_pieces(pieces, visible), merged_uncertainty(pieces, visible)))
-            camera = browser_camera(c.fov, c.aspect, LIVE_ROWS if snapshot.live else ROWS)
+            camera = browser_camera(c.fov, c.aspect, rows)
             (field, known), how = self._merged[1], (snapshot.options, snapshot.backend)
             made: LayerImage
             if controls.layer in PREDICTED_MODES and known is not None:
@@ -219,7 +231,8 @@ class ViewerApp:
             if client.client_id not in self.server.get_clients():
                 return None  # the client has disconnected in the meantime
             client.scene.set_background_image(made.pixels, "jpeg", jpeg_quality=85)
-            drawn = self._drawn[key] = (state, made.legend)
+            drawn = self._drawn[key] = (state, made.legend, rows)
+        self._can_sharpen |= drawn[2] < sharp_rows
         legend: Legend | None = drawn[1]
         return legend
 

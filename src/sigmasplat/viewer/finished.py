@@ -12,11 +12,13 @@ from torch import Tensor
 from sigmasplat.drawing.colormap import Rgb
 from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.io.frames import RunFrames
-from sigmasplat.io.runs import TRUTH, RunFolder
+from sigmasplat.io.mesh import read_mesh
+from sigmasplat.io.runs import MESH, TRUTH, RunFolder
 from sigmasplat.io.trajectory import read_trajectory
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.component import outside_world, submaps_outside
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.mesh import Mesh
 from sigmasplat.sources.base import Source
 from sigmasplat.types import Matrix
 from sigmasplat.viewer.snapshot import (
@@ -61,6 +63,7 @@ def finished_snapshot(run: RunFolder, source: Source | None = None, budget: int 
         config.render,
         config.backend,
         status=str(run.facts().get("status")),
+        mesh=_mesh(run),
     )
 
 
@@ -141,6 +144,14 @@ class SubmapCache:
         self.pieces = dict(zip(self.pieces, fitting, strict=True))
         for k, row in enumerate(submap.frames):
             self._keyframes.setdefault(row, (index, k))
+
+
+def _mesh(run: RunFolder) -> Mesh | None:
+    """Read the mesh that `sigmasplat mesh` has written into the run folder; None without one, or if it is damaged."""
+    try:
+        return read_mesh(run.path / MESH) if (run.path / MESH).is_file() else None
+    except SigmaSplatError:
+        return None
 
 
 def _final_path(frames: RunFrames, tensors: Mapping[str, Tensor]) -> CameraPath:

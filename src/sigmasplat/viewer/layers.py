@@ -19,7 +19,7 @@ from sigmasplat.render import render
 from sigmasplat.render.predictive import predicted, variance_parts
 from sigmasplat.types import Matrix
 
-Layer = Literal["colour", "depth", "V", "U", "opacity", "color error", "depth error"]
+Layer = Literal["colour", "depth", "normals", "V", "U", "opacity", "color error", "depth error"]
 ErrorPart = Literal["all", "aleatoric", "epistemic"]
 Floats = NDArray[np.float32]
 GREY = np.array([(0, 0, 0), (255, 255, 255)], np.float64)
@@ -53,8 +53,9 @@ def render_layer(
 ) -> LayerImage:
     """Render a field and draw one layer of the result.
 
-    Layers: colour; depth D̂/A in m; V: √V averaged over the channels, colours being 0 to 1 (VarSplat §1); U: √U about
-    that depth, in m (CG-SLAM eq. 10); opacity A. Depth, V and U are drawn only where A > ½.
+    Layers: colour; depth D̂/A in m; normals of the surface at that depth (`surface_normals`); V: √V averaged over the
+    channels, colours being 0 to 1 (VarSplat §1); U: √U about that depth, in m (CG-SLAM eq. 10); opacity A. Depth,
+    normals, V and U are drawn only where A > ½.
     """
     T_camera_world = se3.inverse(T_world_camera)
     with torch.no_grad():
@@ -68,6 +69,8 @@ def render_layer(
             return LayerImage(colormap.apply(alpha, 0.0, 1.0, GREY), Legend(GREY, 0.0, 1.0, ""))
         if layer == "depth":
             return _mapped(depth_m, covered, colormap.value_range(depth_m, covered), colormap.VIRIDIS, " m")
+        if layer == "normals":
+            return LayerImage(_drawn_normals(surface_normals(depth_m, camera)))
         if layer == "V":
             return _from_zero(_array(seen.variance.mean(2).clamp(min=0.0).sqrt()), covered, "")
         spread = render(field, camera, T_camera_world, torch.from_numpy(depth_m), options, backend).uncertainty
@@ -99,6 +102,31 @@ def render_predicted(
     shown = {"all": total, "aleatoric": aleatoric, "epistemic": epistemic}[part]
     ends = 0.0, colormap.value_range(_array(total.sqrt()), covered)[1]
     return _mapped(_array(shown.sqrt()), covered, ends, colormap.INFERNO, unit)
+
+
+def surface_normals(depth_m: Floats, camera: Camera) -> Floats:
+    """Return the unit normals [H, W, 3] of a depth image [H, W] m (0 = no surface), in the camera's frame, towards it.
+
+    A normal is the cross product of the differences between neighbouring surface points; 0 where one of them has no
+    depth.
+    """
+    v, u = np.mgrid[: depth_m.shape[0], : depth_m.shape[1]].astype(np.float32)
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+    points = rays * depth_m[..., None]
+    along_u, along_v = np.gradient(points, axis=1), np.gradient(points, axis=0)
+    normals = np.cross(along_v, along_u)
+    padded = np.pad(depth_m > 0, 1, constant_values=True)
+    known = padded[1:-1, :-2] & padded[1:-1, 2:] & padded[:-2, 1:-1] & padded[2:, 1:-1] & (depth_m > 0)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    return np.where(known[..., None] & (length > 0), normals / np.maximum(length, 1e-20), 0.0).astype(np.float32)
+
+
+def _drawn_normals(normals: Floats) -> colormap.Rgb:
+    """Draw normals as colours: red = to the right, green = up, blue = towards the camera."""
+    colors = 127.5 + 127.5 * normals * np.array([1.0, -1.0, -1.0], np.float32)
+    missing = (normals == 0.0).all(-1)
+    colors[missing] = colormap.NO_READING
+    return np.asarray(colors.round().astype(np.uint8))
 
 
 def draw_legend(legend: Legend) -> colormap.Rgb:

@@ -11,14 +11,18 @@ from sigmasplat.drawing.colormap import NO_READING, Rgb
 from sigmasplat.viewer.layers import LEGEND_SIZE, ErrorPart, Layer
 from sigmasplat.viewer.splats import Colouring
 
-ViewMode = Literal["splats", "colour", "depth", "V", "U", "opacity", "color error", "depth error"]
-VIEW_MODES: tuple[ViewMode, ...] = ("splats", "colour", "depth", "V", "U", "opacity", "color error", "depth error")
+ViewMode = Literal["splats", "mesh", "colour", "depth", "normals", "V", "U", "opacity", "color error", "depth error"]
+VIEW_MODES: tuple[ViewMode, ...] = (
+    "splats", "mesh", "colour", "depth", "normals", "V", "U", "opacity", "color error", "depth error",
+)  # fmt: skip
 PREDICTED_MODES: tuple[ViewMode, ...] = ("color error", "depth error")
 """Only for maps with predicted errors."""
 MODE_LABELS: dict[ViewMode, str] = {
     "splats": "splats, drawn by the browser",
+    "mesh": "mesh",
     "colour": "colour, rendered by SigmaSplat",
     "depth": "depth",
+    "normals": "normals of the surface",
     "V": "√V: standard deviation of colour",
     "U": "√U: standard deviation of depth",
     "opacity": "opacity",
@@ -56,8 +60,8 @@ class ControlState:
 
     @property
     def layer(self) -> Layer | None:
-        """Return the layer that SigmaSplat renders, or None if the browser draws splats."""
-        return None if self.mode == "splats" else self.mode
+        """Return the layer that SigmaSplat renders, or None if the browser draws the scene."""
+        return None if self.mode == "splats" or self.mode == "mesh" else self.mode
 
 
 class ControlPanel:
@@ -69,7 +73,7 @@ class ControlPanel:
         gui = server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(214, 90, 30))
         self.facts = gui.add_markdown("waiting for the first frame")
-        self.caption = gui.add_markdown("Click a keyframe to move there and see its image.")
+        self.caption = gui.add_markdown("")
         self.image = gui.add_image(np.full((3, 4, 3), NO_READING, np.uint8), visible=False, jpeg_quality=90)
         self._add_map_controls(gui)
         self._add_path_controls(gui)
@@ -79,7 +83,7 @@ class ControlPanel:
 
     def _add_map_controls(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("Map"):
-            self.mode: Any = gui.add_dropdown("show", _mode_options(predicted=False))
+            self.mode: Any = gui.add_dropdown("show", _mode_options(frozenset((*PREDICTED_MODES, "mesh"))))
             self.error_part = gui.add_dropdown(
                 "part of the error", tuple(ERROR_PARTS.values()), visible=False,
                 hint="one standard deviation of the whole predicted error or of a part, on the scale of the whole",
@@ -106,14 +110,16 @@ class ControlPanel:
             self.hidden_text = gui.add_markdown("")
 
     def _add_path_controls(self, gui: viser.GuiApi) -> None:
-        with gui.add_folder("Path"):  # Any: mypy takes `value` for read-only
+        with gui.add_folder("Path", expand_by_default=False):  # Any: mypy takes `value` for read-only
             self.row: Any = gui.add_slider("frame", 0, 1, 1, 1, hint="show the path and the submaps up to this frame")
             self.frame = gui.add_markdown("")
             self.look = gui.add_button("look from here")
             self.follow = gui.add_checkbox("follow the camera", False, visible=False)
             self.path = gui.add_checkbox("path", True)
-            self.keyframes = gui.add_checkbox("keyframes", True)
-            self.thumbnails: Any = gui.add_checkbox("keyframe images", True)
+            self.keyframes = gui.add_checkbox(
+                "keyframes", False, hint="click a keyframe to move there and to see its image"
+            )
+            self.thumbnails: Any = gui.add_checkbox("keyframe images", False)
             self.true_path = gui.add_checkbox("ground truth", True, visible=False)
 
     def _controls(self) -> tuple[Any, ...]:
@@ -152,10 +158,11 @@ class ControlPanel:
                 self.row.value = last
         self.follow.visible, self.true_path.visible, self.part.visible = live, truth_known, can_choose_map
 
-    def offer_predicted(self, known: bool) -> None:
-        """Offer the controls of predicted errors if the shown map has them."""
+    def offer(self, known: bool, has_mesh: bool) -> None:
+        """Offer the controls of predicted errors if the shown map has them (`known`), and the mesh if there is one."""
+        absent = frozenset((() if known else PREDICTED_MODES) + (() if has_mesh else ("mesh",)))
         for control, options in (
-            (self.mode, _mode_options(known)),
+            (self.mode, _mode_options(absent)),
             (self.colouring, _colouring_options(known)),
         ):
             if control.options != options:
@@ -181,8 +188,8 @@ class ControlPanel:
         self.image.visible = pixels is not None
 
 
-def _mode_options(predicted: bool) -> tuple[str, ...]:
-    return tuple(MODE_LABELS[mode] for mode in VIEW_MODES if predicted or mode not in PREDICTED_MODES)
+def _mode_options(absent: frozenset[str]) -> tuple[str, ...]:
+    return tuple(MODE_LABELS[mode] for mode in VIEW_MODES if mode not in absent)
 
 
 def _colouring_options(predicted: bool) -> tuple[str, ...]:

@@ -5,12 +5,14 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
+import trimesh
 import viser
 from PIL import Image
 
 from sigmasplat.drawing.colormap import Rgb
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.mesh import Mesh
 from sigmasplat.types import Matrix
 from sigmasplat.viewer.lines import LOST_COLOUR, Bytes, Floats, Segments
 from sigmasplat.viewer.splats import SplatArrays
@@ -54,6 +56,17 @@ class ViserScene:
         for name, T in T_world_piece.items():
             if name in self._splats:
                 _place(self._splats[name], T)
+
+    def show_mesh(self, mesh: Mesh | None) -> None:
+        """Show a mesh in its own colours without light and shadow, or remove it if None."""
+        self._drop("mesh")
+        if mesh is not None and len(mesh.faces):
+            grey = np.full_like(mesh.vertices, 0.7)
+            colors = np.rint(255.0 * (grey if mesh.colors is None else mesh.colors)).astype(np.uint8)
+            drawn = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
+            self._marks["mesh"] = self.server.scene.add_mesh_trimesh(
+                "/mesh", drawn, cast_shadow=False, receive_shadow=False
+            )
 
     def show_lines(self, name: Literal["path", "truth"], segments: Segments | None) -> None:
         """Show line segments under a name, or remove them if None."""

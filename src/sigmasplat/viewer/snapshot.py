@@ -13,6 +13,7 @@ from sigmasplat.drawing.colormap import Rgb
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.model.map_uncertainty import MapUncertainty
+from sigmasplat.model.mesh import Mesh
 from sigmasplat.types import Matrix
 
 BUDGET = 300_000
@@ -84,7 +85,8 @@ class Snapshot:
 
     final: the final map, None before it is made; pieces: the submaps, which may be missing if there is a final map.
     true_positions [M, 3] m in the run's world, None unless an evaluation has stored them. image(row) returns the image
-    of the keyframe at a row of the path, or None if it was not kept.
+    of the keyframe at a row of the path, or None if it was not kept. mesh: the surface that `sigmasplat mesh` has
+    written, None without one.
     """
 
     title: str
@@ -98,6 +100,7 @@ class Snapshot:
     backend: str = "auto"
     live: bool = False
     status: str = ""
+    mesh: Mesh | None = None
 
     def visible_pieces(self, final_map: bool, row: int) -> tuple[Piece, ...]:
         """Return the final map if it exists and is requested, else the submaps started up to frame `row`."""
