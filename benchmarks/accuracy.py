@@ -103,14 +103,19 @@ def jobs_of(options: Options) -> list[Job]:
     return jobs
 
 
-def finished(job: Job, runs: Path) -> dict[str, Any] | None:
-    """Return the result of an earlier run of the same job with the same code; None without one or if it failed."""
+def ended(job: Job, runs: Path) -> dict[str, Any] | None:
+    """Return the result of an earlier run of the same job with the same code, also if it failed; None without one."""
     try:
         result = record.read(job.folder(runs) / "result.json")
     except (OSError, ValueError):
         return None
-    same = json.loads(json.dumps(job.key())) == result["key"]
-    return result if same and result["problem"] is None else None
+    return result if json.loads(json.dumps(job.key())) == result["key"] else None
+
+
+def finished(job: Job, runs: Path) -> dict[str, Any] | None:
+    """Return the result of an earlier run of the same job with the same code; None without one or if it failed."""
+    result = ended(job, runs)
+    return result if result and result["problem"] is None else None
 
 
 def call(command: Sequence[str], output: Path) -> tuple[str | None, float]:

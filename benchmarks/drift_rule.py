@@ -78,7 +78,7 @@ def measure(path: str, options: Options) -> list[dict[str, Any]]:
 def followed(path: str, config: Config, limit: int | None) -> dict[str, Any]:
     """Run one sequence with given settings, without loops; return its hops, its frames and its number of submaps."""
     config = replace(config, loops=replace(config.loops, close=False))
-    source, slam = open_source(path, config.input, limit=limit), Slam(config)
+    source, slam = open_source(path, config.input, limit=limit or config.input.limit), Slam(config)
     for frame in source:
         slam.step(frame)
     truth = source.truth()

@@ -3,10 +3,12 @@
 Presets that cut submaps cut every 15 frames and try loops between all submaps, so that each stage runs: mapping,
 tracking, cuts, loops, registration, final map, scores. The figures show that a preset works, not how good it is.
 Writes benchmarks/results/every-preset-<machine>.json and prints a table for each sequence; exit code 1 if a run failed.
+Finished runs are read, not repeated. --collect only reads what has ended, for instance while another process runs.
 
 example: python benchmarks/every_preset.py --sources redkitchen --presets cgslam-loops-fast
 """
 
+import sys
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -43,8 +45,9 @@ class Options(accuracy.Options):
     )
     presets: Annotated[tuple[str, ...], arg(help="presets to run")] = tuple(list_presets())
     seeds: Annotated[tuple[int, ...], arg(help="random seeds, one run for each")] = (0,)
-    limit: Annotated[int | None, arg(help="number of frames at most")] = 75
+    limit: Annotated[int | None, arg(help="number of frames at most")] = 45
     name: Annotated[str, arg(help="name of the results; use another name with other --set")] = "every-preset"
+    collect: Annotated[bool, arg(help="run nothing; tabulate the runs that have ended")] = False
 
 
 def shortened(config: Config) -> tuple[str, ...]:
@@ -125,8 +128,13 @@ def main(options: Options) -> int:
             job.key()
     except SigmaSplatError as problem:
         return program.refuse("every_preset", problem)
-    results = accuracy.run_all(jobs, options)
-    found = [with_submaps(job, result, options) for job, result in zip(jobs, results, strict=True)]
+    if options.collect:
+        results: list[dict[str, Any] | None] = [accuracy.ended(job, options.runs) for job in jobs]
+        count = sum(result is not None for result in results)
+        print(f"{count} of {len(jobs)} runs have ended in {options.runs}", file=sys.stderr)
+    else:
+        results = list(accuracy.run_all(jobs, options))
+    found = [with_submaps(job, result, options) for job, result in zip(jobs, results, strict=True) if result]
     return accuracy.publish("every_preset", found, options)
 
 

@@ -1,14 +1,19 @@
 """The benchmarks of presets and of the rules that end submaps: their settings and their tables."""
 
 import importlib
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from benchmark_results import laid_out
 from sigmasplat.config.text import override, split_settings
+from sigmasplat.io.runs import RunFolder
 from sigmasplat.presets import list_presets, preset
 
+accuracy = importlib.import_module("accuracy")
 every_preset = importlib.import_module("every_preset")
 
 
@@ -32,6 +37,32 @@ def test_presets_that_fail_are_listed_with_their_last_line() -> None:
         ["sigma", "75", "–", "–", "5", "–", "–", "–", "1.23", "–", "–", "training"]
     ]
     assert any("no list of splats" in cell for row in failed.rows for cell in row)
+
+
+def test_a_collection_has_the_runs_that_ended_and_runs_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = {"varsplat-fast": None, "sigma": "no list of splats", "loopsplat-fast": None}
+    options = every_preset.Options(
+        sources=("kitchen",), presets=(*names, "cgslam-fast"), runs=tmp_path / "runs", out=tmp_path, collect=True
+    )
+    counts = {"submaps": 4, "loops": {"tried": 3, "accepted": 1}, "uncertainty": None}
+    for job in accuracy.jobs_of(options):
+        job = replace(job, settings=every_preset.shortened(preset(job.preset)))
+        if job.preset not in names:
+            continue
+        (job.folder(options.runs) / "run").mkdir(parents=True)
+        (job.folder(options.runs) / "run/metrics.json").write_text(json.dumps(counts))
+        result = {"job": asdict(job), "key": job.key(), "problem": names[job.preset], "figures": {"frames": 45}}
+        if job.preset == "loopsplat-fast":
+            result["key"] = {**result["key"], "code": "older code"}
+        (job.folder(options.runs) / "result.json").write_text(json.dumps(result))
+    monkeypatch.setattr(RunFolder, "open", lambda folder: RunFolder(folder))
+    monkeypatch.setattr(accuracy, "perform", lambda *job: pytest.fail("a run was started"))
+    assert every_preset.main(options) == 1  # one of the runs that ended had failed
+    said = capsys.readouterr()
+    assert "2 of 4 runs" in said.err and "varsplat-fast" in said.out and "no list of splats" in said.out
+    assert "loopsplat-fast" not in said.out and "cgslam-fast" not in said.out
 
 
 def test_both_rules_are_judged_by_the_errors_where_they_fire() -> None:

@@ -8,12 +8,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 import paper_data
 from command_line import exit_code
+from sigmasplat.batch import dispatch
 from sigmasplat.batch.definition import Table
 from sigmasplat.io.runs import RunFolder
 
@@ -147,10 +149,18 @@ def test_every_layout_goes_through(
     assert any(value["mean"] > 0 for scene, value in ours["values"].items() if scene in scenes)
 
 
+def dask_worker(address: str, name: str, tmp_path: Path) -> subprocess.Popen:
+    """Start a Dask worker with one thread in a process of its own."""
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--name", name, "--nthreads", "1"]
+    options = ["--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path / name)]
+    with (tmp_path / "dask.log").open("a") as file:
+        return subprocess.Popen([*worker, *options], stdout=file, stderr=file)
+
+
 @contextlib.contextmanager
 def cluster(tmp_path: Path, names: tuple[str, ...]) -> Iterator[tuple[str, dict[str, subprocess.Popen]]]:
     """Start a Dask scheduler and workers with these names, each in a process of its own."""
-    pytest.importorskip("distributed", reason="distributed is not installed (extra `cluster`)")
+    distributed = pytest.importorskip("distributed", reason="distributed is not installed (extra `cluster`)")
     address_file, log = tmp_path / "scheduler.json", tmp_path / "dask.log"
     with log.open("w") as file:
         dask = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
@@ -160,9 +170,9 @@ def cluster(tmp_path: Path, names: tuple[str, ...]) -> Iterator[tuple[str, dict[
             wait_for(lambda: address_file.exists() and address_file.stat().st_size > 0, log, processes[""])
             address = json.loads(address_file.read_text())["address"]
             for name in names:
-                worker = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--name", name]
-                options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path / name)]
-                processes[name] = subprocess.Popen([*worker, *options], stdout=file, stderr=file)
+                processes[name] = dask_worker(address, name, tmp_path)
+            with distributed.Client(address, set_as_default=False) as client:
+                client.wait_for_workers(len(names), timeout=DEADLINE_S)
             yield address, processes
         finally:
             for process in processes.values():
@@ -181,6 +191,43 @@ def test_a_worker_that_dies_changes_nothing(tmp_path: Path, replica: Path, whole
         processes["one"].kill()
         assert process.wait(DEADLINE_S) == 0, log.read_text()
     assert_same(out, whole)
+
+
+@pytest.mark.parametrize("comes_back", [False, True])
+def test_a_scene_that_only_a_dead_worker_has_is_missing_unless_another_worker_brings_it(
+    comes_back: bool, tmp_path: Path, replica: Path, whole: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    part, out, run = tmp_path / "part", tmp_path / "table", "office0-varsplat-seed0"
+    part.mkdir()
+    for name in ("office0", "cam_params.json"):
+        (part / name).symlink_to(replica / name)
+    other = tmp_path / "other"
+    other.mkdir()
+    for name in ("room0", "cam_params.json"):
+        (other / name).symlink_to(replica / name)
+    roots = ["--data", f"one={part}", "--data", f"two={other}", "--data", f"three={part}"]
+    monkeypatch.setattr(dispatch, "REJOIN_S", DEADLINE_S if comes_back else 1.0)
+    with cluster(tmp_path, ("one", "two")) as (address, processes), ThreadPoolExecutor() as pool:
+
+        def change_workers() -> None:
+            wait_for(lambda: frames_logged(out, run) >= 2, tmp_path / "dask.log")
+            processes["one"].kill()
+            if comes_back:
+                processes["three"] = dask_worker(address, "three", tmp_path)
+
+        changed = pool.submit(change_workers)
+        code = exit_code(*arguments(out, other, *roots, "--scheduler", address))
+        changed.result()
+    said = capsys.readouterr()
+    (line,) = [line for line in (said.out + said.err).splitlines() if "office0" in line and "waiting" in line]
+    assert "one" in line and code == 0
+    text = (out / "table.md").read_text()
+    if comes_back:
+        assert_same(out, whole)
+    else:
+        assert_same_runs(out, whole, "room0-varsplat-seed0")
+        assert "office0" in next(line for line in text.splitlines() if "Missing" in line)
 
 
 def test_a_worker_that_does_not_see_the_folder_sends_its_files(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from sigmasplat.batch.job import FACT, Job, has_other_run
 from sigmasplat.batch.local import LocalRoad
 from sigmasplat.batch.progress import Estimate, duration, frames_counted
-from sigmasplat.batch.road import DataRoots, Road, Sequences
+from sigmasplat.batch.road import DataRoots, Outcome, Road, Sequences
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.io.runs import RunFolder
 
@@ -60,15 +60,19 @@ class Batch:
             frames_counted(left, frames, self.out, show),
         ):
             waiting, started_s = list(left), time.perf_counter()
-            for job, why in road.make(left, self.out):
-                waiting.remove(job)
-                self._note(job, why, estimate, waiting, screen, time.perf_counter() - started_s)
+            for outcome in road.make(left, self.out):
+                waiting.remove(outcome.job)
+                self._note(outcome, estimate, waiting, screen, time.perf_counter() - started_s)
                 ended()
 
     def _note(
-        self, job: Job, why: str | None, estimate: Estimate, waiting: Sequence[Job], screen: "Screen", elapsed_s: float
+        self, outcome: Outcome, estimate: Estimate, waiting: Sequence[Job], screen: "Screen", elapsed_s: float
     ) -> None:
         """Print the end of a run, and the time left."""
+        job, why = outcome.job, outcome.problem
+        if outcome.missing:
+            self._note_missing(job, why or "", screen)
+            return
         count = f"[{len(self.jobs) - len(self.missing) - len(waiting)}/{len(self.jobs) - len(self.missing)}]"
         if why is not None:
             self.failed[job.name] = why
@@ -84,14 +88,16 @@ class Batch:
     ) -> dict[str, int]:
         """Return the number of frames by job; print one line per sequence that no worker has."""
         frames = {name: count for sequences in surveyed.values() for name, count in sequences.frames.items()}
-        said = set[str]()
         for job in jobs:
             if job.name not in frames:
-                self.missing[job.name] = why = next(s.problems[job.name] for s in surveyed.values())
-                if why not in said:
-                    screen.say(f"missing: {why}")
-                said.add(why)
+                self._note_missing(job, next(s.problems[job.name] for s in surveyed.values()), screen)
         return frames
+
+    def _note_missing(self, job: Job, why: str, screen: "Screen") -> None:
+        """Note that a job has no sequence; print why, once for all its jobs."""
+        if why not in self.missing.values():
+            screen.say(f"missing: {why}")
+        self.missing[job.name] = why
 
     def _frames(self, job: Job) -> int:
         return int(RunFolder(self.out / job.name).read_metrics()["frames"])

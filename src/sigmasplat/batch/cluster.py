@@ -16,9 +16,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from sigmasplat.batch.dispatch import Dispatch, Worker
 from sigmasplat.batch.job import Job, installed_code
 from sigmasplat.batch.process import RunProcesses
-from sigmasplat.batch.road import DataRoots, Sequences, sequences_of
+from sigmasplat.batch.road import DataRoots, Outcome, Sequences, sequences_of
 from sigmasplat.env import install_extra
 from sigmasplat.errors import ConfigError, RunError
 from sigmasplat.io.atomic import write_text
@@ -26,6 +27,8 @@ from sigmasplat.io.atomic import write_text
 TOKEN = ".batch"
 """File in the folder of the batch with a random text: a worker that reads the same text sees the same folder."""
 CONNECT_S = 10
+FETCH_S = 600.0
+"""Time for the files of a run to arrive."""
 LEFT_OUT = ("submaps", "state.safetensors")
 """Parts of a run folder that are not sent: they are large, and the scores need them on the worker only."""
 
@@ -46,7 +49,7 @@ class ClusterRoad:
         if not self.client.nthreads():
             say(f"waiting for the first worker of {address}")
         self.client.wait_for_workers(1)
-        self.having = dict[str, list[str]]()
+        self.say, self.workers = say, dict[str, Worker]()
 
     @property
     def slots(self) -> int:
@@ -60,39 +63,62 @@ class ClusterRoad:
             found = self.client.run(_survey, [job.to_json() for job in jobs], self.data)
         except ImportError as problem:
             raise RunError(f"a worker cannot import SigmaSplat: {problem}; install the same release there") from problem
-        for address, (code, _) in found.items():
+        for address, (code, *_) in found.items():
             if code != installed_code():
                 raise RunError(f"the worker at {address} has other code than this machine; install the same release")
-        for job in jobs:
-            having = [address for address, (_, sequences) in found.items() if job.name in sequences.frames]
-            self.having[job.name] = having if len(having) < len(found) else []
-        return {address: sequences for address, (_, sequences) in found.items()}
+        self.workers = {address: Worker(name, frozenset(s.frames)) for address, (_, name, s) in found.items()}
+        return {address: sequences for address, (*_, sequences) in found.items()}
 
-    def make(self, jobs: Sequence[Job], out: Path) -> Iterator[tuple[Job, str | None]]:
-        """Make the runs. The runs of a worker that dies are made by another one."""
-        distributed, token = _distributed(), secrets.token_hex(16)
+    def make(self, jobs: Sequence[Job], out: Path) -> Iterator[Outcome]:
+        """Make the runs. The runs of a worker that dies are made by another one that has their sequence."""
+        token = secrets.token_hex(16)
         out.mkdir(parents=True, exist_ok=True)
         write_text(out / TOKEN, token)
-        futures = {
-            self.client.submit(
+
+        def submit(job: Job, address: str) -> Any:
+            return self.client.submit(
                 _make, job.to_json(), str(out.resolve()), token, self.data, installed_code(), self.save_every_s,
-                key=f"{job.name}-{token}", workers=self.having.get(job.name) or None, priority=-number, pure=False,
-            ): job
-            for number, job in enumerate(jobs)
-        }  # fmt: skip
+                key=f"{job.name}-{secrets.token_hex(16)}", workers=[address], pure=False,
+            )  # fmt: skip
+
+        def look(addresses: Sequence[str]) -> Mapping[str, Worker]:
+            return self._joined(jobs, addresses)
+
+        def fetch(future: Any, job: Job) -> str | None:
+            return self._fetched(future, job, out)
+
         try:
-            for future in distributed.as_completed(futures, loop=self.client.loop, raise_errors=False):
-                yield futures[future], self._ended(future, futures[future], out)
+            yield from Dispatch(self.client, self.workers, look, submit, fetch, self.say).make(jobs)
         finally:
-            self.client.cancel(list(futures), force=True)
             (out / TOKEN).unlink(missing_ok=True)
 
-    def _ended(self, future: Any, job: Job, out: Path) -> str | None:
-        """Return why a run failed, None if it is finished; write the files that its worker sent."""
+    def _joined(self, jobs: Sequence[Job], addresses: Sequence[str]) -> dict[str, Worker]:
+        """Return the workers at some addresses; one that cannot make runs is a line and has no sequences."""
+        if not addresses:
+            return {}
+        texts = [job.to_json() for job in jobs]
+        found = self.client.run(_survey, texts, self.data, workers=list(addresses), on_error="return")
+        joined = dict[str, Worker]()
+        for address, answer in found.items():
+            if isinstance(answer, OSError):
+                continue  # it has left again
+            if isinstance(answer, Exception) or answer[0] != installed_code():
+                why = repr(answer) if isinstance(answer, Exception) else "it has other code"
+                self.say(f"the worker at {address} gets no runs: {why}; install the same release")
+                joined[address] = Worker(address, frozenset())
+            else:
+                joined[address] = Worker(answer[1], frozenset(answer[2].frames))
+        return joined
+
+    def _fetched(self, future: Any, job: Job, out: Path) -> str | None:
+        """Return why a run failed, None if it is finished; write the files that its worker sent.
+
+        Raises TimeoutError if the worker left with the result.
+        """
         if future.status != "finished":
             problem = future.exception() if future.status == "error" else None
             return f"the worker failed: {problem!r}" if problem else "the scheduler cancelled the run"
-        why, files = future.result()
+        why, files = future.result(timeout=FETCH_S)
         if files is not None:
             unpack(files, out / job.name)
         return str(why) if why else None
@@ -106,9 +132,13 @@ def _distributed() -> Any:
         raise ConfigError(f"--scheduler needs the package distributed: {install_extra('cluster')}") from problem
 
 
-def _survey(jobs: Sequence[str], data: DataRoots, dask_worker: Any = None) -> tuple[str, Sequences]:
-    """Return this worker's code and sequences. Dask fills in `dask_worker`."""
-    return installed_code(), sequences_of([Job.from_json(text) for text in jobs], _root(data, dask_worker))
+def _survey(jobs: Sequence[str], data: DataRoots, dask_worker: Any = None) -> tuple[str, str, Sequences]:
+    """Return this worker's code, name and sequences. Dask fills in `dask_worker`."""
+    return (
+        installed_code(),
+        str(dask_worker.name),
+        sequences_of([Job.from_json(text) for text in jobs], _root(data, dask_worker)),
+    )
 
 
 def _root(data: DataRoots, worker: Any) -> str | None:

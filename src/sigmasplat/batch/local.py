@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sigmasplat.batch.job import Job
 from sigmasplat.batch.process import RunProcesses
-from sigmasplat.batch.road import Sequences, sequences_of
+from sigmasplat.batch.road import Outcome, Sequences, sequences_of
 from sigmasplat.io.machine import usable_cores
 
 THIS_MACHINE = "this machine"
@@ -27,7 +27,7 @@ class LocalRoad:
         """Return the sequences on this machine."""
         return {THIS_MACHINE: sequences_of(jobs, self.data)}
 
-    def make(self, jobs: Sequence[Job], out: Path) -> Iterator[tuple[Job, str | None]]:
+    def make(self, jobs: Sequence[Job], out: Path) -> Iterator[Outcome]:
         """Make the runs; if this is interrupted, running ones save their state."""
         threads = max(1, usable_cores() // self.slots) if self.slots > 1 else 0
         processes = RunProcesses(self.save_every_s, threads)
@@ -35,7 +35,7 @@ class LocalRoad:
             try:
                 made = {pool.submit(processes.make, job, out / job.name, self.data): job for job in jobs}
                 for future in as_completed(made):
-                    yield made[future], future.result()
+                    yield Outcome(made[future], future.result())
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 processes.stop()

@@ -10,6 +10,15 @@ from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.sources import open_source
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """How a job ended: finished, or with one line that says why it failed or why its sequence is missing."""
+
+    job: Job
+    problem: str | None = None
+    missing: bool = False
+
+
 class Road(Protocol):
     """Makes runs in the folder of a batch."""
 
@@ -21,8 +30,8 @@ class Road(Protocol):
     def survey(self, jobs: Sequence[Job]) -> Mapping[str, "Sequences"]:
         """Return the sequences of the jobs that each worker has, by the worker's name."""
 
-    def make(self, jobs: Sequence[Job], out: Path) -> Iterator[tuple[Job, str | None]]:
-        """Make the runs in folders of `out`; yield each job when it ends, with None or one line: why it failed."""
+    def make(self, jobs: Sequence[Job], out: Path) -> Iterator[Outcome]:
+        """Make the runs in folders of `out`; yield each job when it ends."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,98 @@
+"""`download lpips` against a local server, with files of random weights of the true shapes, then `find_lpips`."""
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import file_server as acts
+from file_server import FileServer, serving
+from lpips_weights import TRUNK_FILES, write_weights
+from sigmasplat.download import download_recording
+from sigmasplat.download.catalogue import SETS
+from sigmasplat.download.entries import PublicSet, RemoteFile
+from sigmasplat.download.fetch import RetryPolicy
+from sigmasplat.errors import DownloadError
+from sigmasplat.metrics.lpips import Lpips, Net, find_lpips
+
+HASTY = RetryPolicy(max_attempts=2, first_wait_s=0.001)
+
+
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[FileServer]:
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    with serving() as server:
+        yield server
+
+
+def served(server: FileServer, net: Net, weights: Path) -> PublicSet:
+    """Serve files of a network; return the set of the catalogue with their addresses, sizes and checksums.
+
+    The checksums are as long as those of the catalogue: whole, or the start that is in the name of the file.
+    """
+    public = SETS["lpips"]
+    assert isinstance(public, PublicSet)
+
+    def local(file: RemoteFile) -> RemoteFile:
+        name = file.url.rpartition("/")[2]
+        content = (weights / name).read_bytes()
+        server.files[f"/{name}"] = content
+        algorithm, _, digest = file.checksum.partition(":")
+        checksum = f"{algorithm}:{hashlib.new(algorithm, content).hexdigest()[: len(digest)]}"
+        return replace(file, url=server.url(f"/{name}"), size_bytes=len(content), checksum=checksum)
+
+    recording = public.recordings[net]
+    archives = tuple(map(local, recording.archives))
+    return replace(public, recordings={net: replace(recording, archives=archives)})
+
+
+def download(public: PublicSet, net: Net, out: Path) -> Path:
+    """Download a network; return the folder in which `eval` looks for it."""
+    download_recording(public, net, out, lambda *counts: None, retry=HASTY)
+    return out / public.folder
+
+
+def assert_same_weights(found: Lpips, expected: Lpips) -> None:
+    pairs = zip(found.convolutions, expected.convolutions, strict=True)
+    assert all(torch.equal(x, y) for a, b in pairs for x, y in zip(a, b, strict=True))
+    assert all(torch.equal(x, y) for x, y in zip(found.linear, expected.linear, strict=True))
+
+
+@pytest.mark.parametrize("net", ["alex", "vgg"])
+def test_downloaded_weights_are_found_and_loaded(net: Net, server: FileServer, tmp_path: Path) -> None:
+    write_weights(tmp_path / "public", net)
+    folder = download(served(server, net, tmp_path / "public"), net, tmp_path / "data")
+    found, problem = find_lpips(folder, net)
+    assert found is not None and not problem
+    assert_same_weights(found, Lpips.load(tmp_path / "public", net))
+
+
+def test_a_broken_download_of_weights_is_resumed(server: FileServer, tmp_path: Path) -> None:
+    write_weights(tmp_path / "public", "alex")
+    public = served(server, "alex", tmp_path / "public")
+    server.acts = [acts.whole, acts.drop_after(3_000_000), acts.status(503), acts.status(503)]
+    with pytest.raises(DownloadError, match="3,000,000 bytes are kept"):
+        download(public, "alex", tmp_path / "data")
+    assert find_lpips(tmp_path / "data/lpips")[0] is None
+    asked = len(server.ranges)
+    found, _ = find_lpips(download(public, "alex", tmp_path / "data"))
+    assert server.ranges[asked:] == ["bytes=3000000-"]
+    assert found is not None
+    assert_same_weights(found, Lpips.load(tmp_path / "public"))
+
+
+def test_damaged_weights_are_removed_and_never_loaded(server: FileServer, tmp_path: Path) -> None:
+    write_weights(tmp_path / "public", "alex")
+    public, name = served(server, "alex", tmp_path / "public"), f"/{TRUNK_FILES['alex']}"
+    good = server.files[name]
+    server.files[name] = good[:5_000_000] + bytes([good[5_000_000] ^ 1]) + good[5_000_001:]
+    with pytest.raises(DownloadError, match="was damaged and has been removed"):
+        download(public, "alex", tmp_path / "data")
+    found, problem = find_lpips(tmp_path / "data/lpips")
+    assert found is None and "sigmasplat download lpips alex" in problem
+    server.files[name] = good
+    found, _ = find_lpips(download(public, "alex", tmp_path / "data"))
+    assert found is not None
