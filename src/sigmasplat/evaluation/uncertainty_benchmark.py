@@ -31,7 +31,7 @@ from sigmasplat.model.submap import StorePart
 from sigmasplat.presets import preset as preset_of
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.backend import make_view
-from sigmasplat.slam.final import KeyframeReader
+from sigmasplat.slam.refinement import KeyframeReader
 from sigmasplat.slam.uncertainty import map_uncertainty
 from sigmasplat.sources.base import Source
 from sigmasplat.types import Matrix, Progress, no_progress
