@@ -32,7 +32,16 @@ SIGMA_INLINE vf load(const float* p) { vf r; memcpy(&r, p, sizeof r); return r; 
 SIGMA_INLINE vi load(const int* p) { vi r; memcpy(&r, p, sizeof r); return r; }
 SIGMA_INLINE void store(float* p, vf a) { memcpy(p, &a, sizeof a); }
 SIGMA_INLINE void store(int* p, vi a) { memcpy(p, &a, sizeof a); }
-// Store the first COUNT lanes, a multiple of 4.
+// Load COUNT lanes; the others are 0.
+template <int COUNT> SIGMA_INLINE vf load_first(const float* p) {
+    if constexpr (COUNT == W) return load(p);
+#if defined(__AVX512F__)
+    else return (vf)_mm512_maskz_loadu_ps(__mmask16((1u << COUNT) - 1u), p);
+#else
+    else { vf r{}; memcpy(&r, p, COUNT * sizeof(float)); return r; }
+#endif
+}
+// Store the first COUNT lanes.
 template <int COUNT> SIGMA_INLINE void store_first(float* p, vf a) {
     if constexpr (COUNT == W) store(p, a);
 #if defined(__AVX512F__)

@@ -133,6 +133,7 @@ template <int K> static void pack_view(Render& r, const float* params, const Vie
             const auto fill = [&](unsigned live) {
                 if (colors.degree) {
                     alignas(64) float harmonics[HARMONICS][W];
+                    prefetch_harmonics(colors.harmonics, colors.degree, i + W, n);
                     show_colors(r.view, colors, i, live, s.shape.mean, s.color, harmonics);
                 }
                 for (int q = 0; q < 3; q++) store(f[q], s.color[q]);
@@ -287,6 +288,8 @@ static double view_step(Context* context, float* params, OutputGradients g, Adam
             for (int64_t l = 0; l < W && i + l < terms.frozen_colors; l++)
                 for (int q = 11; q < 14; q++) gradient[q][l] = 0.f;
             if (harmonics.degree) {
+                for (const float* rows : {harmonics.params, harmonics.state.moment1, harmonics.state.moment2})
+                    prefetch_harmonics(rows, harmonics.degree, i + W, r.n);
                 vf on_mean[3];
                 step_harmonics(r.view, harmonics, adam_harmonics, i, seen, s.shape.mean, gradient, lanes, on_mean);
                 for (int q = 0; q < 3; q++) moved[i / W * 3 + q] = lane_sum(on_mean[q]);

@@ -11,6 +11,12 @@ template <class F> SIGMA_INLINE void with_degree(int degree, F f) {
     }
 }
 
+// Load the harmonics of splats i … i+W−1 to the cache, if the array has them.
+SIGMA_INLINE void prefetch_harmonics(const float* rows, int degree, int64_t i, int64_t n) {
+    for (int64_t l = i; l < i + W && l < n; l++)
+        for (int q = 0; q < columns_of(degree); q += 16) __builtin_prefetch(rows + l * HARMONICS + q);
+}
+
 struct Sight { vf unit[3], inverse_length; };         // the direction from the camera to each splat
 
 SIGMA_INLINE Sight sight_of(const View<float>& view, const vf* mean) {
@@ -48,13 +54,13 @@ static void show_colors(const View<float>& view, const ViewColors& colors, int64
 template <int COLUMNS>
 SIGMA_INLINE void adam_harmonics(const AdamStep& a, const Absence& away, const float* g, vf rate, float* p, float* m1, float* m2) {
     constexpr int VECTOR = COLUMNS < W ? COLUMNS : W, LAST = COLUMNS - VECTOR;
-    alignas(64) float t[4][W] = {};
+    alignas(64) float t[4][W];
     const float* from[4] = {p + LAST, m1 + LAST, m2 + LAST, g + LAST};
-    for (int k = 0; k < 4; k++) memcpy(t[k], from[k], VECTOR * sizeof(float));
+    for (int k = 0; k < 4; k++) store(t[k], load_first<VECTOR>(from[k]));
     adam_vector(a, away, load(t[3]), rate, t[0], t[1], t[2], true);
     for (int q = 0; q < LAST; q += W) adam_vector(a, away, load(g + q), rate, p + q, m1 + q, m2 + q, true);
     float* to[3] = {p + LAST, m1 + LAST, m2 + LAST};
-    for (int k = 0; k < 3; k++) memcpy(to[k], t[k], VECTOR * sizeof(float));
+    for (int k = 0; k < 3; k++) store_first<VECTOR>(to[k], load(t[k]));
 }
 
 // Propagate the gradient of W view-dependent colours (rows 11–13 of `gradient`) to their harmonics, which are stepped,
