@@ -140,6 +140,10 @@ class FinalConfig:
     """Number of refinement steps between removals of splats with low opacity (`prune_opacity`)."""
     prune_opacity: float = 0.005
     """Splats with at most this opacity, 0 to 1, are removed during refinement."""
+    width: int = 0
+    """Width in pixels of the images that the last stage of refinement uses, before `input.crop_px`, at most that of the
+    recording; −1 = as in the recording. If it is above `input.width`, colours of keyframes are kept at this size. 0 =
+    no such stage."""
     uncertainty: bool = True
     """Whether variance is used to merge submaps and still learned during refinement; off = paper."""
     variance: Literal["published", "predicted"] = "published"

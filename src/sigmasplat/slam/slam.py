@@ -179,7 +179,8 @@ class Slam(World):
             descriptor = self.descriptor.describe(frame.color, frame.depth_m) if self._describes else None
         with self._timer.stage("map"):
             detail = None if seen.image is None else seen.image.detail
-            fit = self.mapper.map(self.view, index, seen.target, T_submap_camera, descriptor, detail)
+            photo = seen.photo(self.config)
+            fit = self.mapper.map(self.view, index, seen.target, T_submap_camera, descriptor, detail, photo)
         self._timer.add(fit.seconds, prefix="map_")
         if self.keyframe_indices[-1:] != [index]:  # a keyframe that two submaps share is counted once
             self.keyframe_indices.append(index)
