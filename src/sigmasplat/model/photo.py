@@ -11,8 +11,8 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame, resized_color
 
 JPEG_QUALITY = 95
-"""Errors of 48 dB PSNR, far below those of any map, at 110 kB for 640×480 pixels. A WebP file of this quality is a third
-smaller, but takes 7 times as long to write."""
+"""Errors of 48 dB PSNR, far below those of any map, at 110 kB for 640×480 pixels. A WebP file of this quality is a
+third smaller, but takes 7 times as long to write."""
 SAME_SURFACE = 1.03
 """Neighbouring depths up to this ratio are on one surface, so depth between them is interpolated."""
 
