@@ -37,7 +37,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, SHIPPED
 from sigmasplat.model.submap import StorePart
 from sigmasplat.render.backend import make_view
-from sigmasplat.slam.final import KeyframeReader
+from sigmasplat.slam.refinement import KeyframeReader
 from sigmasplat.slam.uncertainty import FIRM, LIMIT, Samples, probe_samples, probe_views
 from sigmasplat.sources import open_source
 

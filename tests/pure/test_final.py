@@ -17,9 +17,10 @@ from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.model.submap import MemoryStore, Picture, StorePart, Submap
 from sigmasplat.render import render
 from sigmasplat.render.reference.view import ReferenceView
-from sigmasplat.slam.final import KeyframeReader, final_map, merged, survivors
+from sigmasplat.slam.final import final_map, merged, survivors
 from sigmasplat.slam.fusion import FusionView, count_keyframes, fuse, fusion_views
 from sigmasplat.slam.predicted_submaps import PredictedSubmaps
+from sigmasplat.slam.refinement import KeyframeReader
 
 CAMERA = Camera(20, 15, 16.0, 16.0, 9.5, 7.0)
 CONFIG = Config(backend="reference", mapping=MappingConfig(weight_nll_color=1e-3, prune_opacity=0.1))
@@ -73,7 +74,7 @@ def make_store(spoil: float = 0.0) -> MemoryStore:
 
 def refined(store: MemoryStore, settings: Config, seed: int = 0) -> GaussianField:
     view = ReferenceView(CAMERA, settings.render)
-    return final_map(store, ANCHORS, settings, view, np.random.default_rng(seed))
+    return final_map(store, ANCHORS, settings, view, np.random.default_rng(seed)).field
 
 
 def psnr_of_held(field: GaussianField, true: GaussianField) -> float:
@@ -214,12 +215,12 @@ def test_refinement_improves_views_of_keyframes(uncertainty: bool) -> None:
     start = refined(store, config(uncertainty=uncertainty))
     settings, view = config(uncertainty=uncertainty, iterations=30), ReferenceView(CAMERA, CONFIG.render)
     settings = replace(settings, mapping=replace(settings.mapping, lr_colors=0.04, lr_pose_rotation=1.0))
-    field = final_map(store, ANCHORS, settings, view, np.random.default_rng(0), lambda *at: told.append(at))
+    field = final_map(store, ANCHORS, settings, view, np.random.default_rng(0), lambda *at: told.append(at)).field
     assert psnr_of_held(field, true) > psnr_of_held(start, true) + 3.0
     assert told == [(i, 30) for i in range(31)]
     likelihood_trained = not torch.equal(field.params[:, 14:], start.params[:, 14:])
     assert likelihood_trained is uncertainty, "σ² learns only where it is asked for"
-    again = final_map(store, ANCHORS, settings, view, np.random.default_rng(0))
+    again = final_map(store, ANCHORS, settings, view, np.random.default_rng(0)).field
     assert torch.equal(again.params, field.params), "the same draw gives the same map"
 
 
@@ -237,7 +238,7 @@ def test_degrees_grow_and_faded_splats_go(monkeypatch: pytest.MonkeyPatch) -> No
         used.append((steps, degree, len(field)))
         return type("Fit", (), {"losses": [0.0] * steps})()
 
-    monkeypatch.setattr("sigmasplat.slam.final.fit_field", fit)
+    monkeypatch.setattr("sigmasplat.slam.refinement.fit_field", fit)
     full = len(refined(store, config()))
     field = refined(store, config(iterations=25, sh_degree=2, sh_every=6, prune_every=10))
     assert [(steps, degree) for steps, degree, _ in used] == [(6, 0), (4, 1), (2, 1), (6, 2), (2, 2), (4, 2), (1, 2)]
@@ -254,7 +255,7 @@ def test_the_rate_of_the_means_falls_to_its_last_value_across_pruning(monkeypatc
         assert all(float(columns[COLUMNS["colors"]][0]) == pytest.approx(2.5e-3) for columns in rates)
         return type("Fit", (), {"losses": [0.0] * len(rates)})()
 
-    monkeypatch.setattr("sigmasplat.slam.final.fit_field", fit)
+    monkeypatch.setattr("sigmasplat.slam.refinement.fit_field", fit)
     refined(make_store(), config(iterations=25, prune_every=10, sh_every=7, lr_means_last=1.6e-6))
     assert used[0] == pytest.approx(1e-4) and used[-1] == pytest.approx(1.6e-6)
     assert np.allclose(np.diff(np.log(used)), np.log(1.6e-2) / 24, rtol=1e-3)
@@ -291,12 +292,11 @@ def test_pictures_are_read_when_drawn_and_kept_while_there_is_room(monkeypatch: 
     store, read = make_store(), list[tuple[int, int]]()
     monkeypatch.setattr(store, "picture", lambda s, k: read.append((s, k)) or store.pictures[s][k])
     view = ReferenceView(CAMERA, CONFIG.render)
-    monkeypatch.setattr("sigmasplat.slam.final.CACHE_BYTES", 2 * 16 * 20 * 15)
+    monkeypatch.setattr("sigmasplat.slam.refinement.CACHE_BYTES", 2 * 16 * 20 * 15)
     keyframes = KeyframeReader(store, ANCHORS, view)
     assert len(keyframes) == 6 and not read
     for i in (0, 5, 0, 5, 3, 0):
         found = keyframes[i]
-        assert found.fixed
         np.testing.assert_allclose(found.T_world_camera, poses(i // 3)[i % 3], atol=1e-12)
         np.testing.assert_array_equal(found.target.depth_image.numpy(), store.pictures[i // 3][i % 3].depth_m)
     assert read == [(0, 0), (1, 2), (1, 0), (0, 0)], "two fit: the third drives out the one not asked for longest"

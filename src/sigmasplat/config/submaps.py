@@ -127,6 +127,11 @@ class FinalConfig:
     (paper)."""
     iterations: int = 0
     """Number of refinement steps over all keyframes; 0 = no refinement."""
+    lr_pose_translation: float = 0.0
+    """Learning rate of keyframe positions during refinement, in metres; the poses of frames follow their keyframes. 0 =
+    fixed (paper)."""
+    lr_pose_rotation: float = 0.0
+    """Learning rate of keyframe rotations during refinement, in rad; 0 = fixed (paper)."""
     lr_means_last: float = 0.0
     """Learning rate of positions in the last refinement step; it decays exponentially from `mapping.lr_means` (3DGS). 0
     = `mapping.lr_means` throughout."""

@@ -75,7 +75,8 @@ def evaluate(
     strips, config, loops = ViewStrips(run, strips_per_kind), run.config(), run.read_loops()
     standard = renderer is None
     renderer = renderer or FieldRenderer(config.render, config.backend)
-    maps = views.MapSources(field, run.submaps, _anchors(run, records, config.final))
+    anchors = _anchors(run, records, config.final)
+    maps = views.MapSources(field, run.submaps, anchors, T_submap_camera=_poses_in_submaps(run, len(records)))
     maps, predictions = _with_prediction(maps, run, frames, config) if standard else (maps, views.PredictionScores())
     aligned = _alignment(frames, known)
     scoring = ViewScoring(source, config.input, maps, chosen, renderer, views_per_kind, aligned, lpips)
@@ -125,6 +126,12 @@ def _anchors(run: RunFolder, records: Log, final: FinalConfig) -> NDArray[np.flo
         return None
     anchors = run.read_checkpoint()[0].get("T_world_submap")
     return None if anchors is None or len(anchors) != count else np.asarray(anchors, np.float64)
+
+
+def _poses_in_submaps(run: RunFolder, frames: int) -> NDArray[np.float64] | None:
+    """Return T_submap_camera of all frames [F, 4, 4]; None if the checkpoint does not have them."""
+    poses = run.read_checkpoint()[0].get("T_submap_camera")
+    return None if poses is None or len(poses) != frames else np.asarray(poses, np.float64)
 
 
 def _with_prediction(

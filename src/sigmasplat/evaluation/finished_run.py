@@ -1,5 +1,6 @@
 """Run SLAM in memory and keep what is measured of it afterwards: maps, path, which frames were held back."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,7 @@ from sigmasplat.metrics.trajectory import associate, truth_in_estimate
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.map_uncertainty import MapUncertainty
-from sigmasplat.model.submap import MemoryStore, SubmapStore
+from sigmasplat.model.submap import MemoryStore, RefinedStore, StorePart, SubmapStore
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.run.protocols import Callback
 from sigmasplat.slam.path_covariance import PathCovariance
@@ -28,9 +29,10 @@ class FinishedRun:
     """What is measured of a run: its settings, maps and path.
 
     field: the final map in the world; store: its submaps; anchors: T_world_submap of each; members: the submaps that
-    are connected to the world; submap_of [F]: the submap of each frame; believed [F]: whether its pose is believed;
-    indices [F]: its number in the source; p_off [F]; uncertainty: how sure the final map is, if it was measured;
-    errors: those of the path; keyframes: their rows.
+    are connected to the world; refined: T_submap_camera of their keyframes as the final map has moved them, by submap;
+    submap_of [F], T_submap_camera [F, 4, 4]: the submap of each frame and its pose there; believed [F]: whether its
+    pose is believed; indices [F]: its number in the source; p_off [F]; uncertainty: how sure the final map is, if it
+    was measured; errors: those of the path; keyframes: their rows.
     """
 
     config: Config
@@ -39,8 +41,10 @@ class FinishedRun:
     store: SubmapStore
     anchors: list[Matrix]
     members: list[int]
+    refined: dict[int, list[Matrix]]
     path: Trajectory
     submap_of: list[int]
+    T_submap_camera: Matrix
     believed: NDArray[np.bool_]
     indices: list[int]
     p_off: NDArray[np.float64]
@@ -62,10 +66,16 @@ class FinishedRun:
         }  # fmt: skip
         return FinishedRun(
             slam.config, slam.view.camera, slam.field, store, slam.atlas.anchors, slam.atlas.members(0),
-            slam.trajectory(), [place.submap for place in slam.atlas.places], slam.believed(),
+            slam.atlas.refined, slam.trajectory(), [place.submap for place in slam.atlas.places],
+            slam.atlas.T_submap_camera, slam.believed(),
             [step.index for step in slam.steps], np.array([step.p_off for step in slam.steps]), counts,
             slam.uncertainty, PathCovariance.of(slam.checkpoint()), slam.keyframe_indices,
         )  # fmt: skip
+
+    def part(self, members: Sequence[int], refined: bool = False) -> SubmapStore:
+        """Return some submaps; with `refined`, their keyframes have the poses of the final map."""
+        part = StorePart(self.store, members)
+        return RefinedStore(part, [self.refined[s] for s in members]) if refined and self.refined else part
 
     @property
     def held_back(self) -> list[int]:

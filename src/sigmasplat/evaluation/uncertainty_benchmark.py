@@ -27,11 +27,11 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.map_uncertainty import MapUncertainty
 from sigmasplat.model.selection import evenly_spread
-from sigmasplat.model.submap import StorePart
+from sigmasplat.model.submap import SubmapStore
 from sigmasplat.presets import preset as preset_of
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.backend import make_view
-from sigmasplat.slam.final import KeyframeReader
+from sigmasplat.slam.refinement import KeyframeReader
 from sigmasplat.slam.uncertainty import map_uncertainty
 from sigmasplat.sources.base import Source
 from sigmasplat.types import Matrix, Progress, no_progress
@@ -143,24 +143,25 @@ class RunMaps:
     def final(self) -> MapFacts:
         """Return the facts of the map in the world."""
         members = self.run.members
-        return self._facts(self.run.field, members, [self.run.anchors[s] for s in members], self.run.uncertainty)
+        part, anchors = self.run.part(members, refined=True), [self.run.anchors[s] for s in members]
+        return self._facts(self.run.field, part, anchors, self.run.uncertainty)
 
     def submap(self, index: int) -> MapFacts:
         """Return the facts of a submap in its own frame."""
-        splats, part, whole = self.run.store.load(index).field, StorePart(self.run.store, [index]), self.run.uncertainty
+        splats, part, whole = self.run.store.load(index).field, self.run.part([index]), self.run.uncertainty
         known = None
         if whole is not None:
             known = map_uncertainty(splats, part, [np.eye(4)], self.run.config, self.view, whole.calibration)
-        return self._facts(splats, [index], [np.eye(4)], known)
+        return self._facts(splats, part, [np.eye(4)], known)
 
     def _facts(
         self,
         splats: GaussianField,
-        members: Sequence[int],
+        part: SubmapStore,
         anchors: Sequence[Matrix],
         uncertainty: MapUncertainty | None,
     ) -> MapFacts:
-        reader = KeyframeReader(StorePart(self.run.store, members), anchors, self.view)
+        reader = KeyframeReader(part, anchors, self.view)
         chosen = [reader[i] for i in evenly_spread(range(len(reader)), TRAINING_VIEWS)]
         return replace(map_facts(splats, chosen, self.renderer), uncertainty=uncertainty)
 
@@ -208,7 +209,7 @@ def _seen_views(
         values = splat_values(facts)
         for view in views[HELD_BACK]:
             if view.submap == index:
-                T_camera_submap = se3.inverse(view.T_world_camera) @ maps.run.anchors[index]
+                T_camera_submap = se3.inverse(view.T_submap_camera)
                 yield (
                     HELD_BACK,
                     SUBMAPS,

@@ -1,6 +1,6 @@
 """Collect views that a map was not fitted to: frames that were held back, and test views of the source."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,19 +16,24 @@ from sigmasplat.types import Matrix
 
 @dataclass(frozen=True, eq=False)
 class UnseenView:
-    """A recorded view to predict, and its pose in the world; exact: whether its depth is the true depth."""
+    """A recorded view to predict, and its pose in the world; exact: whether its depth is the true depth;
+    T_submap_camera: the pose of a frame of the run in its submap."""
 
     frame: Frame
     T_world_camera: Matrix
     submap: int
     exact: bool
+    T_submap_camera: Matrix = field(default_factory=lambda: np.eye(4))
 
 
 def held_back_views(run: FinishedRun, source: Source, most: int) -> list[UnseenView]:
     """Return the frames that were held back and whose pose is believed, evenly spread, at the estimated poses."""
     rows = [row for row in run.held_back if run.believed[row]]
     return [
-        _unseen_view(run.config, source, run.indices[row], run.path.T_world_camera[row], run.submap_of[row])
+        replace(
+            _unseen_view(run.config, source, run.indices[row], run.path.T_world_camera[row], run.submap_of[row]),
+            T_submap_camera=run.T_submap_camera[row],
+        )
         for row in evenly_spread(rows, most)
     ]
 

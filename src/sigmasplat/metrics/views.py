@@ -52,12 +52,25 @@ class MapSources:
     """The maps that views are rendered from: the final map, and the submaps if T_world_submap [S, 4, 4] is known.
 
     predict: predicts the variances of views of the final map; None if it was not measured how sure the map is.
+    T_submap_camera [F, 4, 4]: the pose of each frame in its submap, which differs from the pose in the world if the
+    refinement of the final map has moved keyframes; None: it follows from the pose in the world.
     """
 
     final: GaussianField
     store: SubmapStore
     T_world_submap: NDArray[np.float64] | None
     predict: Predictor | None = None
+    T_submap_camera: NDArray[np.float64] | None = None
+
+    def T_camera_submap(self, record: Mapping[str, Any]) -> NDArray[np.float64] | None:
+        """Return the pose [4, 4] of a view that the splats of its submap were fitted to; None if the run kept no
+        submaps."""
+        if self.T_world_submap is None:
+            return None
+        if self.T_submap_camera is not None and "row" in record:
+            return se3.inverse(self.T_submap_camera[record["row"]])
+        T_world_submap = self.T_world_submap[record.get("submap", 0)]
+        return np.asarray(se3.inverse(record["T_world_camera"]) @ T_world_submap)
 
     def submap(self, index: int) -> GaussianField | None:
         """Return the splats of a submap in its own frame; None if the run kept no submaps."""
@@ -82,8 +95,9 @@ def render_views(
             if maps.predict is not None and kind == HELD_OUT:
                 final = replace(final, predicted=predicted_errors(maps.predict(frame.camera, T_camera_world)))
             before = None
-            if submap is not None and maps.T_world_submap is not None:
-                rendered = renderer(submap, frame.camera, T_camera_world @ maps.T_world_submap[index])
+            T_camera_submap = maps.T_camera_submap(record)
+            if submap is not None and T_camera_submap is not None:
+                rendered = renderer(submap, frame.camera, T_camera_submap)
                 before = scored_view(frame, rendered, kind, (f"in submap {index}",))
             yield final, before
 

@@ -42,6 +42,8 @@ class Atlas:
     keyframe_poses: T_submap_camera of each submap's keyframes; those of the last submap change while it is mapped.
     hops: how tracking found each keyframe from the keyframe before it in the submap.
     places: one per frame.
+    refined: T_submap_camera of the keyframes of each submap in the final map, after its refinement has moved them; the
+    world poses of keyframes and of their frames then come from these.
     components: one number per submap. Submaps of a component are connected, and their anchors are in one frame: the
     world for component 0, else the first camera of the component. A component joins another when a place is recognised.
     """
@@ -52,6 +54,7 @@ class Atlas:
     hops: list[list[Hop]] = field(default_factory=list)
     places: list[Place] = field(default_factory=list)
     components: list[int] = field(default_factory=list)
+    refined: dict[int, list[Matrix]] = field(default_factory=dict)
 
     def begin_submap(self, T_parent_submap: Matrix | None = None, parent: int = -1) -> None:
         """Append a submap at its pose in a parent submap, the last one by default; without a pose, a new component
@@ -106,10 +109,17 @@ class Atlas:
 
     def T_world_camera(self, loops: bool = True) -> Matrix:
         """Return the poses of all frames [F, 4, 4]; without `loops` those of tracking alone."""
-        anchors = self.anchors if loops else self.odometry
-        poses = [anchors[s] @ self.keyframe_poses[s][k] @ T_keyframe_camera for s, k, T_keyframe_camera in self.places]
+        anchors, refined = (self.anchors, self.refined) if loops else (self.odometry, dict[int, list[Matrix]]())
+        keyframes = [refined.get(s, poses) for s, poses in enumerate(self.keyframe_poses)]
+        poses = [anchors[s] @ keyframes[s][k] @ T_keyframe_camera for s, k, T_keyframe_camera in self.places]
         return np.array(poses).reshape(-1, 4, 4)
+
+    @property
+    def T_submap_camera(self) -> Matrix:
+        """Return the poses of all frames in their submaps [F, 4, 4], to which the splats of the submaps were fitted."""
+        return np.array([self.keyframe_poses[s][k] @ T for s, k, T in self.places]).reshape(-1, 4, 4)
 
     def T_world_keyframe(self, submap: int) -> Matrix:
         """Return the poses of a submap's keyframes [K, 4, 4]."""
-        return np.array([self.anchors[submap] @ T for T in self.keyframe_poses[submap]]).reshape(-1, 4, 4)
+        poses = self.refined.get(submap, self.keyframe_poses[submap])
+        return np.array([self.anchors[submap] @ T for T in poses]).reshape(-1, 4, 4)

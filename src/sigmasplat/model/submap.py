@@ -1,13 +1,14 @@
 """Submaps, and the stores that keep finished ones."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field as dataclass_field
+from dataclasses import dataclass, field as dataclass_field, replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.errors import SigmaSplatError
+from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Detail
@@ -128,6 +129,41 @@ class StorePart:
     def probe(self, index: int, probe: int) -> Picture:
         """Return the images of one probe view of a submap."""
         return self.store.probe(self.members[index], probe)
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedStore:
+    """The submaps of a store with the poses of their keyframes that the refinement of the final map has moved. Probe
+    views follow their keyframe. It can only be read.
+
+    keyframe_poses: T_submap_camera [4, 4] of each submap's keyframes. The splats of the submaps fit the old poses.
+    """
+
+    store: SubmapStore
+    keyframe_poses: Sequence[Sequence[Matrix]]
+
+    def __len__(self) -> int:
+        return len(self.store)
+
+    def save(self, submap: Submap, pictures: list[Picture], probes: Sequence[Picture] = ()) -> None:
+        """Raise SigmaSplatError: the final map is complete."""
+        raise SigmaSplatError(f"submap {submap.index} cannot be saved after the final map is made")
+
+    def load(self, index: int) -> Submap:
+        """Return a submap with the moved poses."""
+        submap, poses = self.store.load(index), np.array(self.keyframe_poses[index]).reshape(-1, 4, 4)
+        keyframe = np.searchsorted(submap.frames, submap.probe_frames, side="right") - 1
+        before = submap.T_submap_camera[keyframe]
+        probes = poses[keyframe] @ se3.inverse(before) @ submap.T_submap_probe
+        return replace(submap, T_submap_camera=poses, T_submap_probe=probes)
+
+    def picture(self, index: int, keyframe: int) -> Picture:
+        """Return the images of one keyframe of a submap."""
+        return self.store.picture(index, keyframe)
+
+    def probe(self, index: int, probe: int) -> Picture:
+        """Return the images of one probe view of a submap."""
+        return self.store.probe(index, probe)
 
 
 def refuse_misfit(submap: Submap, pictures: Sequence[Picture], next_index: int, probes: Sequence[Picture] = ()) -> None:

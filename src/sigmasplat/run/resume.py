@@ -3,17 +3,20 @@
 import time
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from sigmasplat.errors import RunError
+from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.io.atomic import write_text
 from sigmasplat.io.json_files import read_text
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.state import read_state, write_state
 from sigmasplat.model.field import GaussianField, Rows
+from sigmasplat.slam.refinement import Refined
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
 from sigmasplat.sources.base import Source
+
+REFINEMENT_CLASSES: tuple[type, ...] = (GaussianField, Refined, Rows, VectorAdam)
+"""The classes that a partly refined final map contains."""
 
 
 @dataclass(eq=False)
@@ -58,24 +61,22 @@ class RefinementFile:
     every_s: float = 0.0
     last_s: float = field(default_factory=time.perf_counter)
 
-    def save(self, done: int, field: GaussianField, random: np.random.Generator) -> None:
-        """Save the map after `done` steps if a save is due. Raises RunError if it cannot be written."""
+    def save(self, state: Refined) -> None:
+        """Save a refinement if a save is due. Raises RunError if it cannot be written."""
         if not self.every_s or time.perf_counter() - self.last_s < self.every_s:
             return
-        numbers = random.bit_generator.state
-        tree = {"frames": len(self.slam.steps), "done": done, "field": field, "numbers": numbers}
-        write_state(self.run.refinement, tree, (GaussianField, Rows), {})
+        write_state(self.run.refinement, {"frames": len(self.slam.steps), "refined": state}, REFINEMENT_CLASSES, {})
         self.last_s = time.perf_counter()
 
-    def load(self, random: np.random.Generator) -> tuple[int, GaussianField] | None:
-        """Return the steps done and the map, and restore the random numbers; None if nothing usable is saved."""
+    def load(self) -> Refined | None:
+        """Return the saved refinement; None if nothing usable is saved."""
         if not self.run.refinement.is_file():
             return None
-        tree = read_state(self.run.refinement, (GaussianField, Rows), {})
+        tree = read_state(self.run.refinement, REFINEMENT_CLASSES, {})
         if tree["frames"] != len(self.slam.steps):
             return None
-        random.bit_generator.state = tree["numbers"]
-        return tree["done"], tree["field"]
+        refined: Refined = tree["refined"]
+        return refined
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,10 @@ def checkpoint_of(
         "T_world_camera": torch.from_numpy(path.T_world_camera),
         "T_world_camera_odometry": torch.from_numpy(atlas.T_world_camera(loops=False)),
         "keyframes": torch.tensor(keyframes, dtype=torch.int64),
+        "T_world_keyframe": torch.from_numpy(
+            np.concatenate([np.empty((0, 4, 4)), *map(atlas.T_world_keyframe, range(len(atlas.anchors)))])
+        ),
+        "T_submap_camera": torch.from_numpy(atlas.T_submap_camera),
         "T_world_submap": torch.from_numpy(np.array(atlas.anchors).reshape(-1, 4, 4)),
         "submap_component": torch.tensor(atlas.components, dtype=torch.int64),
         "frame_submap": torch.tensor([place.submap for place in atlas.places], dtype=torch.int64),

@@ -1,11 +1,8 @@
 """The final map: merge all submaps, or seed new splats on their surface, and refine over all keyframes (VarSplat
 §7)."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from functools import lru_cache
-from itertools import islice
-from typing import Protocol
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,11 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from sigmasplat.config import Config, FinalConfig, MappingConfig
+from sigmasplat.config import Config, FinalConfig
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.fit.adam import Rates
-from sigmasplat.fit.field import fit_field
-from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField, Rows
 from sigmasplat.model.harmonics import count
 from sigmasplat.model.mesh import Mesh
@@ -26,20 +21,16 @@ from sigmasplat.model.tsdf import packed
 from sigmasplat.render.view import View
 from sigmasplat.slam.fusion import count_keyframes, fuse, fusion_views
 from sigmasplat.slam.predicted_submaps import PredictedSubmaps
+from sigmasplat.slam.refinement import KeyframeReader, SavedRefinement, refine
 from sigmasplat.types import Matrix, Progress, no_progress
 
-CACHE_BYTES = 64 << 20
-"""Memory for prepared pictures; other pictures are read again when they are drawn."""
 
+class FinalMap(NamedTuple):
+    """The global map in the world, in host memory, and the poses of its keyframes: T_submap_camera [4, 4] of each
+    submap's keyframes, as refinement has moved them; None if it has moved none."""
 
-class SavedRefinement(Protocol):
-    """Keeps the refinement of a final map between its steps, so that a stopped run does not repeat them."""
-
-    def save(self, done: int, field: GaussianField, random: np.random.Generator) -> None:
-        """Save the map after `done` steps, and the state of the random numbers, if a save is due."""
-
-    def load(self, random: np.random.Generator) -> tuple[int, GaussianField] | None:
-        """Return the steps done and the map, and restore the random numbers; None if nothing is saved."""
+    field: GaussianField
+    keyframe_poses: list[list[Matrix]] | None = None
 
 
 def final_map(
@@ -50,7 +41,7 @@ def final_map(
     random: np.random.Generator,
     progress: Progress = no_progress,
     saved: SavedRefinement | None = None,
-) -> GaussianField:
+) -> FinalMap:
     """Return the map in the world: made from submaps at `anchors` (T_world_submap [4, 4] each), then refined with
     `view`.
 
@@ -61,13 +52,22 @@ def final_map(
     """
     _refuse_misfits(store, anchors, config.final)
     seed = seeded_on_surface if config.final.seed_from == "mesh" else merged
-    found = None if saved is None else saved.load(random)
-    done, field = found or (0, seed(store, anchors, config))
+    found = None if saved is None else saved.load()
+    field = seed(store, anchors, config) if found is None else found.field
     if not config.final.iterations:
-        return field
-    on_device = field.to(view.sums.device)
-    refine(on_device, KeyframeReader(store, anchors, view), config, view, random, progress, done, saved)
-    return on_device.to(torch.device("cpu"))
+        return FinalMap(field)
+    on_device, keyframes = field.to(view.sums.device), KeyframeReader(store, anchors, view)
+    if found is not None:
+        keyframes.poses, keyframes.motions = found.poses, found.motions
+        random.bit_generator.state = found.numbers
+    done = 0 if found is None else found.done
+    refine(on_device, keyframes, config, view, random, progress, done, saved)
+    moves = config.final.lr_pose_translation or config.final.lr_pose_rotation
+    poses = [
+        [se3.inverse(T) @ pose for pose in of_submap]
+        for T, of_submap in zip(anchors, keyframes.poses_by_submap(), strict=False)
+    ]
+    return FinalMap(on_device.to(torch.device("cpu")), poses if moves else None)
 
 
 def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix], final: FinalConfig) -> None:
@@ -183,100 +183,3 @@ def nearest_log_variances(points: Matrix, store: SubmapStore, anchors: Sequence[
         found[nearer] = part.params[which[nearer], COLUMNS["log_variances"]]
         distance[nearer] = away[nearer]
     return found
-
-
-# ---- refinement ----
-
-
-class KeyframeReader:
-    """All keyframes of all submaps with their poses in the world; pictures are read from the store on demand.
-
-    anchors: T_world_submap [4, 4] of each submap; `poses`: T_world_camera [4, 4] of each keyframe. Raises
-    SigmaSplatError if there is none, or a submap's camera is not the view's.
-    """
-
-    def __init__(self, store: SubmapStore, anchors: Sequence[Matrix], view: View) -> None:
-        self.store, self.camera = store, view.camera
-        self.size = (view.alpha.shape[0], view.alpha.shape[1])
-        self.places: list[tuple[int, int]] = []
-        self.poses: list[Matrix] = []
-        for index in range(len(store)):
-            self._add(index, anchors[index])
-        if not self.places:
-            raise SigmaSplatError("the submaps have no keyframes, so the final map cannot be refined")
-        self._target = lru_cache(max(1, CACHE_BYTES // (16 * view.alpha.numel())))(self._read)
-
-    def _add(self, index: int, T_world_submap: Matrix) -> None:
-        submap = self.store.load(index)
-        if submap.camera != self.camera:
-            raise SigmaSplatError(f"the camera of submap {index} is {submap.camera}, but the view has {self.camera}")
-        self.places += [(index, k) for k in range(len(submap.frames))]
-        self.poses += [T_world_submap @ T for T in submap.T_submap_camera]
-
-    def __len__(self) -> int:
-        return len(self.places)
-
-    def __iter__(self) -> Iterator[Keyframe]:
-        return (self[i] for i in range(len(self)))
-
-    def __getitem__(self, i: int) -> Keyframe:
-        return Keyframe(i, self._target(i), self.poses[i], fixed=True)
-
-    def _read(self, i: int) -> Target:
-        return Target.of_picture(self.store.picture(*self.places[i]), self.camera, self.size)
-
-
-def refine(
-    field: GaussianField,
-    keyframes: KeyframeReader,
-    config: Config,
-    view: View,
-    random: np.random.Generator,
-    progress: Progress,
-    done: int = 0,
-    saved: SavedRefinement | None = None,
-) -> list[float]:
-    """Fit the field to keyframes drawn uniformly, with fixed poses; prune regularly; return the loss of each step.
-
-    Every `sh_every` steps, colours gain one degree of view dependence. `done`: the number of steps that the field has
-    already had. `saved` is offered the field after each pruning and each new degree.
-    """
-    final, mapping, losses = config.final, refinement(config), list[float]()
-    drawn = _draw(keyframes, range(done, final.iterations), random, progress)
-    while done < final.iterations:
-        until_event = min(every - done % every for every in (final.prune_every, final.sh_every))
-        degree = min(final.sh_degree, done // final.sh_every)
-        rates = decaying(mapping, final, done) if final.lr_means_last else None
-        fit = fit_field(field, view, islice(drawn, until_event), mapping, schedule=rates, degree=degree)
-        losses += fit.losses
-        done += len(fit.losses)
-        if done % final.prune_every == 0:
-            field.keep(field.opacities > final.prune_opacity)
-        if saved is not None:
-            saved.save(done, field, random)
-    progress(final.iterations, final.iterations)
-    return losses
-
-
-def decaying(mapping: MappingConfig, final: FinalConfig, done: int) -> Iterator[Rates]:
-    """Yield the rates of the refinement steps after `done`. That of the means decays exponentially from
-    `mapping.lr_means` to `final.lr_means_last`."""
-    for step in range(done, final.iterations):
-        rates, share = Rates.of(mapping), step / max(final.iterations - 1, 1)
-        rates.per_column[COLUMNS["means"]] = mapping.lr_means ** (1.0 - share) * final.lr_means_last**share
-        yield rates
-
-
-def refinement(config: Config) -> MappingConfig:
-    """Return the mapping settings for refinement: fixed poses, and no likelihood if `final.uncertainty` is off."""
-    fixed = replace(config.mapping, lr_pose_translation=0.0, lr_pose_rotation=0.0)
-    return fixed if config.final.uncertainty else replace(fixed, weight_nll_color=0.0, weight_nll_depth=0.0)
-
-
-def _draw(
-    keyframes: KeyframeReader, steps: range, random: np.random.Generator, progress: Progress
-) -> Iterator[Sequence[Keyframe]]:
-    """Draw one keyframe per step, uniformly; call `progress` before each."""
-    for step in steps:
-        progress(step, steps.stop)
-        yield [keyframes[int(random.integers(len(keyframes)))]]

@@ -11,7 +11,7 @@ from sigmasplat.model.atlas import UNKNOWN_HOP, Hop
 from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
-from sigmasplat.model.submap import StorePart
+from sigmasplat.model.submap import RefinedStore, StorePart
 from sigmasplat.slam.drift import Drift, mean_variance
 from sigmasplat.slam.final import final_map
 from sigmasplat.slam.found import Found
@@ -81,10 +81,13 @@ class Slam(World):
         self._connect_components()
         members = self.atlas.members(0)
         store, anchors = StorePart(self.store, members), [self.atlas.anchors[s] for s in members]
-        inputs = store, anchors, self.config, self.view
         refining, measuring = (part_of(progress, first, total) for first in (0, steps))
-        self._final = final_map(*inputs, self.random, refining, self.saved_refinement)
-        self.uncertainty = final_uncertainty(self._final, *inputs, measuring)
+        final = final_map(store, anchors, self.config, self.view, self.random, refining, self.saved_refinement)
+        self._final, refined = final.field, None
+        if final.keyframe_poses is not None:
+            self.atlas.refined = dict(zip(members, final.keyframe_poses, strict=True))
+            refined = RefinedStore(store, final.keyframe_poses)
+        self.uncertainty = final_uncertainty(self._final, refined or store, anchors, self.config, self.view, measuring)
         progress(total, total)
 
     def _observe(self, frame: Frame) -> Observation:

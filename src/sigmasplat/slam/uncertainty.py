@@ -27,7 +27,7 @@ from sigmasplat.model.selection import evenly_spread
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.render.predictive import COVERED, variance_parts
 from sigmasplat.render.view import View
-from sigmasplat.slam.final import KeyframeReader
+from sigmasplat.slam.refinement import KeyframeReader
 from sigmasplat.types import Matrix, Progress, no_progress
 
 PIXELS = 4000

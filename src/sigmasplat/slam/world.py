@@ -19,7 +19,6 @@ from sigmasplat.render.view import View
 from sigmasplat.slam.checkpoint import checkpoint_of
 from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.features import make_extractor
-from sigmasplat.slam.final import SavedRefinement
 from sigmasplat.slam.localisation.confidence import Confidence
 from sigmasplat.slam.localisation.recovery import Recovery
 from sigmasplat.slam.localisation.relocaliser import Relocaliser
@@ -28,6 +27,7 @@ from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descripto
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.merged import components_apart, merged_field
 from sigmasplat.slam.probes import Probes
+from sigmasplat.slam.refinement import SavedRefinement
 from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.slam.tracker import Tracker
 
