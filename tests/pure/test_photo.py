@@ -28,14 +28,14 @@ def frame(camera: Camera = WHOLE) -> Frame:
 
 def test_photos_are_wanted_only_if_they_are_larger_than_the_working_images() -> None:
     assert photo_size(WHOLE, 32, 0, 0) is None
-    assert photo_size(WHOLE, 0, 0, -1) is None and photo_size(WHOLE, 64, 0, -1) is None
+    assert photo_size(WHOLE, 0, 0, 640) is None and photo_size(WHOLE, 64, 0, 640) is None
     assert photo_size(WHOLE, 32, 0, 32) is None and photo_size(WHOLE, 32, 0, 16) is None
-    assert photo_size(WHOLE, 32, 0, -1) == photo_size(WHOLE, 32, 0, 64) == photo_size(WHOLE, 32, 0, 999) == (WHOLE, 0)
+    assert photo_size(WHOLE, 32, 0, 640) == photo_size(WHOLE, 32, 0, 64) == photo_size(WHOLE, 32, 0, 999) == (WHOLE, 0)
     assert photo_size(WHOLE, 16, 0, 32) == (WHOLE.prepared(32), 0)
 
 
 def test_a_cropped_photo_shows_the_same_part_as_the_working_image() -> None:
-    size = photo_size(WHOLE, 32, 2, -1)
+    size = photo_size(WHOLE, 32, 2, 640)
     assert size == (WHOLE.prepared(64, 4), 4)
     photo = Photo.of(frame(), *size)
     assert photo.camera.share_seen_by(WHOLE.prepared(32, 2)) == WHOLE.prepared(32, 2).share_seen_by(photo.camera) == 1.0

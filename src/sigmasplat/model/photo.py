@@ -55,9 +55,9 @@ def photo_size(camera: Camera, input_width: int, crop_px: int, width: int) -> tu
     images.
 
     camera: of the recording; input_width, crop_px: `Camera.prepared` makes the working camera with these. Photos are
-    `width` pixels wide before the crop, but not wider than `camera`; −1 = as wide, 0 = no photos.
+    `width` pixels wide before the crop, but not wider than `camera`.
     """
-    wide, working = camera.width if width < 0 else min(width, camera.width), input_width or camera.width
+    wide, working = min(width, camera.width), input_width or camera.width
     if wide <= working:
         return None
     crop = round(crop_px * wide / working)

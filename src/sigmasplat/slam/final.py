@@ -19,6 +19,7 @@ from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.tsdf import packed
 from sigmasplat.render.view import View
+from sigmasplat.slam.full_resolution import refine_on_photos
 from sigmasplat.slam.fusion import count_keyframes, fuse, fusion_views
 from sigmasplat.slam.predicted_submaps import PredictedSubmaps
 from sigmasplat.slam.refinement import KeyframeReader, SavedRefinement, refine
@@ -62,6 +63,8 @@ def final_map(
         random.bit_generator.state = found.numbers
     done = 0 if found is None else found.done
     refine(on_device, keyframes, config, view, random, progress, done, saved)
+    done = max(done, config.final.iterations)
+    refine_on_photos(on_device, keyframes, config, view, random, progress, done, saved)
     moves = config.final.lr_pose_translation or config.final.lr_pose_rotation
     poses = [
         [se3.inverse(T) @ pose for pose in of_submap]
