@@ -61,6 +61,7 @@ def run(
     record: options.Record = None,
     run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
     onto: options.OntoRun = None,
+    final_width: options.FinalWidth = None,
 ) -> int:
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
@@ -76,6 +77,7 @@ def run(
 
     log_names(run_options.log)
     screen, earlier = Screen(), FinishedMap.of(RunFolder.open(onto)) if onto else None
+    settings = settings if final_width is None else (*settings, f"final.width={final_width}")
     config = configured(preset, settings, seed, input_options, earlier.config if earlier else None)
     if earlier:
         earlier.refuse_other_size(config)

@@ -12,7 +12,7 @@ from sigmasplat.evaluation import reconstruct
 from sigmasplat.evaluation.frame_states import score_states
 from sigmasplat.evaluation.path_scores import score_frame_sets
 from sigmasplat.evaluation.pose_covariance import score_pose_covariance
-from sigmasplat.evaluation.view_scoring import ViewScoring, score_full_resolution, score_test_views
+from sigmasplat.evaluation.view_scoring import ViewScoring, full_width, score_full_resolution, score_test_views
 from sigmasplat.io.frames import RunFrames
 from sigmasplat.io.runs import TRUTH, RunFolder
 from sigmasplat.io.trajectory import write_trajectory
@@ -58,7 +58,8 @@ def evaluate(
     the run's working resolution, with the run's render settings unless a `renderer` is given. If the run kept its
     submaps, each view is also rendered from the submap of its frame, as it was before the final map was made. If the
     run has uncertainty.json and no `renderer` is given, the predictive variances are scored too. LPIPS is scored if
-    its network is given. With `full_resolution` the views are also scored at the size of the recording.
+    its network is given. With `full_resolution` the views are also scored at the size of the recording;
+    without it at the size of the final map's last stage, if that used larger images than tracking (`final.width`).
     Calls `progress(done, total)` with views. With `mesh` the keyframes are fused into mesh.ply, which is scored if the
     source knows its true surface, or if `true_mesh` is given, in the world frame of the truth; `random_views` is the
     number of random views for its depth (`metrics.published_reconstruction`).
@@ -83,7 +84,8 @@ def evaluate(
     metrics = _facts(run, source, records, field, loops) | score_states(run, frames, known) | path_scores
     metrics |= score_frame_sets(run, frames, known) | _score_views(scoring, config.final, predictions, strips, progress)
     metrics |= {"lpips_network": lpips.net if lpips else None, "reconstruction": None, "reconstruction_published": None}
-    metrics["full_resolution"] = score_full_resolution(scoring, progress) if full_resolution else None
+    width = source.camera.width if full_resolution else full_width(config, source.camera)
+    metrics["full_resolution"] = score_full_resolution(scoring, width, progress) if width else None
     if mesh:
         surface = true_mesh or reconstruct.known_surface(source)
         metrics |= reconstruct.fuse_and_score(run, source.camera, surface, known, random_views, renderer, progress)
