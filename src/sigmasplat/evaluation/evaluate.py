@@ -77,7 +77,8 @@ def evaluate(
     standard = renderer is None
     renderer = renderer or FieldRenderer(config.render, config.backend)
     anchors = _anchors(run, records, config.final)
-    maps = views.MapSources(field, run.submaps, anchors, T_submap_camera=_poses_in_submaps(run, len(records)))
+    in_submaps = None if anchors is None else _poses_in_submaps(run, len(records))
+    maps = views.MapSources(field, run.submaps, anchors, T_submap_camera=in_submaps)
     maps, predictions = _with_prediction(maps, run, frames, config) if standard else (maps, views.PredictionScores())
     aligned = _alignment(frames, known)
     scoring = ViewScoring(source, config.input, maps, chosen, renderer, views_per_kind, aligned, lpips)
