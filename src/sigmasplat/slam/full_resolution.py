@@ -55,8 +55,11 @@ def photo_view(store: SubmapStore, view: View, config: Config) -> View | None:
     """Return a view like `view` for images as large as the largest photos; None without photos. A submap has photos of
     one camera."""
     found = [store.picture(index, 0).photo for index in range(len(store)) if store.load(index).frames]
-    camera = max((photo.camera for photo in found if photo), key=lambda camera: camera.width, default=None)
-    return camera and make_view(config.backend, camera, config.render, variance=len(view.sums) >= 7)
+    cameras = [photo.camera for photo in found if photo is not None]
+    if not cameras:
+        return None
+    largest = max(cameras, key=lambda camera: camera.width)
+    return make_view(config.backend, largest, config.render, variance=len(view.sums) >= 7)
 
 
 def refine_on_photos(
