@@ -142,15 +142,6 @@ OntoRun = Annotated[
     Path | None,
     arg(metavar="RUN", help="continue the map of a finished run in a new run folder", help_behavior_hint=""),
 ]
-FinalWidth = Annotated[
-    str | None,
-    arg(
-        metavar="working|camera|PIXELS",
-        help="width of the images that the final map is refined on at the end: as tracking, as the camera, or a number "
-        "of pixels; short for --set final.width",
-        help_behavior_hint="(default: that of the preset)",
-    ),
-]
 PosesFile = Annotated[
     Path | None,
     arg(

@@ -12,7 +12,7 @@ from sigmasplat.evaluation import reconstruct
 from sigmasplat.evaluation.frame_states import score_states
 from sigmasplat.evaluation.path_scores import score_frame_sets
 from sigmasplat.evaluation.pose_covariance import score_pose_covariance
-from sigmasplat.evaluation.view_scoring import ViewScoring, full_width, score_full_resolution, score_test_views
+from sigmasplat.evaluation.view_scoring import ViewScoring, score_full_resolution, score_test_views
 from sigmasplat.io.frames import RunFrames
 from sigmasplat.io.runs import TRUTH, RunFolder
 from sigmasplat.io.trajectory import write_trajectory
@@ -55,14 +55,13 @@ def evaluate(
     Path and views are scored on the frames whose pose is believed: those of trajectory.txt, without lost frames.
     Training views are the run's keyframes; held-out views are the frames that no map was fitted to. At most
     `views_per_kind` of each are scored, evenly spread. They are rendered from the final map at the estimated poses and
-    the run's working resolution, with the run's render settings unless a `renderer` is given. If the run kept its
-    submaps, each view is also rendered from the submap of its frame, as it was before the final map was made. If the
-    run has uncertainty.json and no `renderer` is given, the predictive variances are scored too. LPIPS is scored if
-    its network is given. With `full_resolution` the views are also scored at the size of the recording;
-    without it at the size of the final map's last stage, if that used larger images than tracking (`final.width`).
-    Calls `progress(done, total)` with views. With `mesh` the keyframes are fused into mesh.ply, which is scored if the
-    source knows its true surface, or if `true_mesh` is given, in the world frame of the truth; `random_views` is the
-    number of random views for its depth (`metrics.published_reconstruction`).
+    the run's working resolution, with `renderer` or the run's render settings. If the run kept its submaps, each view
+    is also rendered from the submap of its frame, as it was before the final map was made. If the run has
+    uncertainty.json and no `renderer` is given, the predictive variances are scored too. LPIPS is scored if its network
+    is given. With `full_resolution` the views are also scored at the size of the recording, else at that of the final
+    map's last stage if its images are larger than those of tracking. Calls `progress(done, total)` with views. With
+    `mesh` the keyframes are fused into mesh.ply, which is scored if the source knows its true surface, or if
+    `true_mesh` is given, in the world frame of the truth; `random_views`: the number of random views for its depth.
 
     Raises RunError if the run stopped before it had a map; SourceError if truth and run share no timestamps, after
     everything else has been written.
@@ -74,8 +73,7 @@ def evaluate(
     known = None if problem else truth
     chosen = {kind: evenly_spread(views, views_per_kind) for kind, views in _kinds(log).items()}
     strips, config, loops = ViewStrips(run, strips_per_kind), run.config(), run.read_loops()
-    standard = renderer is None
-    renderer = renderer or FieldRenderer(config.render, config.backend)
+    standard, renderer = renderer is None, renderer or FieldRenderer(config.render, config.backend)
     anchors = _anchors(run, records, config.final)
     in_submaps = None if anchors is None else _poses_in_submaps(run, len(records))
     maps = views.MapSources(field, run.submaps, anchors, T_submap_camera=in_submaps)
@@ -85,8 +83,7 @@ def evaluate(
     metrics = _facts(run, source, records, field, loops) | score_states(run, frames, known) | path_scores
     metrics |= score_frame_sets(run, frames, known) | _score_views(scoring, config.final, predictions, strips, progress)
     metrics |= {"lpips_network": lpips.net if lpips else None, "reconstruction": None, "reconstruction_published": None}
-    width = source.camera.width if full_resolution else full_width(config, source.camera)
-    metrics["full_resolution"] = score_full_resolution(scoring, width, progress) if width else None
+    metrics["full_resolution"] = score_full_resolution(scoring, config, full_resolution, progress)
     if mesh:
         surface = true_mesh or reconstruct.known_surface(source)
         metrics |= reconstruct.fuse_and_score(run, source.camera, surface, known, random_views, renderer, progress)

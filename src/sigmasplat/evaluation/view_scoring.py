@@ -68,12 +68,18 @@ def input_of_width(settings: InputConfig, source: Source, width: int) -> InputCo
     return replace(settings, width=width, crop_px=round(settings.crop_px * scale))
 
 
-def score_full_resolution(scoring: ViewScoring, width: int, progress: Progress = no_progress) -> dict[str, Any]:
-    """Score the chosen views and the test views at a width that is not the working width, such as the recording's.
+def score_full_resolution(
+    scoring: ViewScoring, config: Config, recorded: bool, progress: Progress = no_progress
+) -> dict[str, Any] | None:
+    """Score the chosen views and the test views at the size of the recording if `recorded`, else at that of the final
+    map's last stage; None without that stage.
 
     Returns width, height, and the keys of the scores at working resolution: training, held_out, both in their submaps,
     and test_views. Calls `progress(done, total)` with the chosen views.
     """
+    width = scoring.source.camera.width if recorded else full_width(config, scoring.source.camera)
+    if width is None:
+        return None
     settings, chosen = input_of_width(scoring.input, scoring.source, width), scoring.chosen
     camera = scoring.source.camera.prepared(settings.width, settings.crop_px)
     final, before = ({kind: views.ViewScores(False, scoring.lpips) for kind in chosen} for _ in range(2))
