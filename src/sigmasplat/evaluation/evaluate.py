@@ -74,9 +74,7 @@ def evaluate(
     chosen = {kind: evenly_spread(views, views_per_kind) for kind, views in _kinds(log).items()}
     strips, config, loops = ViewStrips(run, strips_per_kind), run.config(), run.read_loops()
     standard, renderer = renderer is None, renderer or FieldRenderer(config.render, config.backend)
-    anchors = _anchors(run, records, config.final)
-    in_submaps = None if anchors is None else _poses_in_submaps(run, len(records))
-    maps = views.MapSources(field, run.submaps, anchors, T_submap_camera=in_submaps)
+    maps = _maps(run, field, records, config.final)
     maps, predictions = _with_prediction(maps, run, frames, config) if standard else (maps, views.PredictionScores())
     aligned = _alignment(frames, known)
     scoring = ViewScoring(source, config.input, maps, chosen, renderer, views_per_kind, aligned, lpips)
@@ -114,6 +112,13 @@ def _alignment(frames: RunFrames, truth: Trajectory | None) -> NDArray[np.float6
     """Return T_estimate_truth [4, 4], the alignment of the ATE; None without a truth."""
     path = frames.path
     return None if truth is None else truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], truth)
+
+
+def _maps(run: RunFolder, field: GaussianField, records: Log, final: FinalConfig) -> views.MapSources:
+    """Return the final map, and the submaps if they are kept."""
+    anchors = _anchors(run, records, final)
+    in_submaps = None if anchors is None else _poses_in_submaps(run, len(records))
+    return views.MapSources(field, run.submaps, anchors, T_submap_camera=in_submaps)
 
 
 def _anchors(run: RunFolder, records: Log, final: FinalConfig) -> NDArray[np.float64] | None:
