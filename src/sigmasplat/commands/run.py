@@ -35,7 +35,7 @@ FinalWidth = Annotated[
     arg(
         metavar="working|camera|PIXELS",
         help="width of the images that the final map is refined on at the end: as tracking, as the camera, or a number "
-        "of pixels; short for --set final.width",
+        "of pixels; short form of --set final.width=…",
         help_behavior_hint="(default: that of the preset)",
     ),
 ]
@@ -70,6 +70,7 @@ def run(
     record: options.Record = None,
     run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
     onto: options.OntoRun = None,
+    final_seconds: options.FinalSeconds = None,
     final_width: FinalWidth = None,
 ) -> int:
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
@@ -85,8 +86,9 @@ def run(
     from sigmasplat.slam.slam import Slam
 
     log_names(run_options.log)
+    settings += () if final_seconds is None else (f"final.seconds={final_seconds:g}",)
+    settings += () if final_width is None else (f"final.width={final_width}",)
     screen, earlier = Screen(), FinishedMap.of(RunFolder.open(onto)) if onto else None
-    settings = settings if final_width is None else (*settings, f"final.width={final_width}")
     config = configured(preset, settings, seed, input_options, earlier.config if earlier else None)
     if earlier:
         earlier.refuse_other_size(config)

@@ -57,11 +57,11 @@ def evaluate(
     `views_per_kind` of each are scored, evenly spread. They are rendered from the final map at the estimated poses and
     the run's working resolution, with `renderer` or the run's render settings. If the run kept its submaps, each view
     is also rendered from the submap of its frame, as it was before the final map was made. If the run has
-    uncertainty.json and no `renderer` is given, the predictive variances are scored too. LPIPS is scored if its network
-    is given. With `full_resolution` the views are also scored at the size of the recording, else at that of the final
-    map's last stage if its images are larger than those of tracking. Calls `progress(done, total)` with views. With
-    `mesh` the keyframes are fused into mesh.ply, which is scored if the source knows its true surface, or if
-    `true_mesh` is given, in the world frame of the truth; `random_views`: the number of random views for its depth.
+    uncertainty.json and no `renderer` is given, the predictive variances are scored too. LPIPS needs its network. With
+    `full_resolution` the views are also scored at the size of the recording, else at that of the final map's last stage
+    if its images are larger than those of tracking. Calls `progress(done, total)` with views. With `mesh` the keyframes
+    are fused into mesh.ply, which is scored against `true_mesh`, in the world frame of the truth, or the true surface
+    of the source; `random_views`: the number of random views for its depth (`metrics.published_reconstruction`).
 
     Raises RunError if the run stopped before it had a map; SourceError if truth and run share no timestamps, after
     everything else has been written.
@@ -73,8 +73,9 @@ def evaluate(
     known = None if problem else truth
     chosen = {kind: evenly_spread(views, views_per_kind) for kind, views in _kinds(log).items()}
     strips, config, loops = ViewStrips(run, strips_per_kind), run.config(), run.read_loops()
-    standard, renderer = renderer is None, renderer or FieldRenderer(config.render, config.backend)
-    maps = _maps(run, field, records, config.final)
+    standard = renderer is None
+    renderer = renderer or FieldRenderer(config.render, config.backend)
+    maps = _map_sources(run, field, records, config.final)
     maps, predictions = _with_prediction(maps, run, frames, config) if standard else (maps, views.PredictionScores())
     aligned = _alignment(frames, known)
     scoring = ViewScoring(source, config.input, maps, chosen, renderer, views_per_kind, aligned, lpips)
@@ -114,13 +115,6 @@ def _alignment(frames: RunFrames, truth: Trajectory | None) -> NDArray[np.float6
     return None if truth is None else truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], truth)
 
 
-def _maps(run: RunFolder, field: GaussianField, records: Log, final: FinalConfig) -> views.MapSources:
-    """Return the final map, and the submaps if they are kept."""
-    anchors = _anchors(run, records, final)
-    in_submaps = None if anchors is None else _poses_in_submaps(run, len(records))
-    return views.MapSources(field, run.submaps, anchors, T_submap_camera=in_submaps)
-
-
 def _anchors(run: RunFolder, records: Log, final: FinalConfig) -> NDArray[np.float64] | None:
     """Return T_world_submap [S, 4, 4] if the run kept the submaps of all its frames, else None.
 
@@ -133,10 +127,12 @@ def _anchors(run: RunFolder, records: Log, final: FinalConfig) -> NDArray[np.flo
     return None if anchors is None or len(anchors) != count else np.asarray(anchors, np.float64)
 
 
-def _poses_in_submaps(run: RunFolder, frames: int) -> NDArray[np.float64] | None:
-    """Return T_submap_camera of all frames [F, 4, 4]; None if the checkpoint does not have them."""
-    poses = run.read_checkpoint()[0].get("T_submap_camera")
-    return None if poses is None or len(poses) != frames else np.asarray(poses, np.float64)
+def _map_sources(run: RunFolder, field: GaussianField, records: Log, final: FinalConfig) -> views.MapSources:
+    """Return the final map and the submaps, with the poses of the frames in them if the checkpoint has these."""
+    anchors = _anchors(run, records, final)
+    poses = None if anchors is None else run.read_checkpoint()[0].get("T_submap_camera")
+    known = None if poses is None or len(poses) != len(records) else np.asarray(poses, np.float64)
+    return views.MapSources(field, run.submaps, anchors, T_submap_camera=known)
 
 
 def _with_prediction(
@@ -245,6 +241,7 @@ def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField, loops
         "onto": (run.facts().get("onto") or {}).get("run"),
         "loops": {"tried": len(loops), "accepted": sum(bool(loop.get("accepted")) for loop in loops)},
         "finish_s": run.facts().get("finish_s"),
+        "final_steps": run.facts().get("final_steps"),
         "total_s": _total_s(run),
     }
 

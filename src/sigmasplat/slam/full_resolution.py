@@ -15,7 +15,7 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
-from sigmasplat.slam.refinement import KeyframeReader, Refined, SavedRefinement, refinement
+from sigmasplat.slam.refinement import Clock, KeyframeReader, Refined, SavedRefinement, refinement
 from sigmasplat.types import Progress
 
 CACHE_BYTES = 64 << 20
@@ -69,23 +69,25 @@ def refine_on_photos(
     view: View,
     random: np.random.Generator,
     progress: Progress,
-    done: int = 0,
-    saved: SavedRefinement | None = None,
-) -> None:
+    done: int,
+    saved: SavedRefinement | None,
+    clock: Clock,
+) -> int:
     """Fit the field to photos of keyframes, if there are any, and to their working images, in turns, at fixed poses.
 
-    view: that of the working images. `done`: the number of steps that the field has already had, counted from
-    `final.iterations`, the first step of this stage. Calls `progress(steps done, total)`, counted in the same way.
-    `saved` is offered the state every `BLOCK_STEPS`.
+    view: that of the working images. `done`: the number of steps that the field has already had; those of this stage
+    are counted from `final.iterations` on. Returns their number at the end, which is lower if the time budget is spent.
+    Calls `progress(steps done, total)`. `saved` is offered the state every `TURN_STEPS`.
     """
     final, large = config.final, photo_view(keyframes.store, view, config)
-    if large is None or not final.width_iterations:
-        return
+    if large is None or not final.width_iterations or clock.is_over:
+        return done
     photos, total = PhotoReader(keyframes, large), final.iterations + final.width_iterations
     mapping = replace(refinement(config), lr_pose_translation=0.0, lr_pose_rotation=0.0)
     degree = min(final.sh_degree, final.iterations // final.sh_every)
     turns: tuple[tuple[View, PhotoReader | KeyframeReader], ...] = (large, photos), (view, keyframes)
-    while done < total:
+    done = max(done, final.iterations)
+    while done < total and not clock.is_over:
         since = done - final.iterations
         of_view, images = turns[since // TURN_STEPS % 2]
         steps = range(done, min(done + TURN_STEPS - since % TURN_STEPS, total))
@@ -94,8 +96,10 @@ def refine_on_photos(
         field.keep(field.opacities > final.prune_opacity)
         done = steps.stop
         if saved is not None:
-            saved.save(Refined(done, field, keyframes.poses, keyframes.motions, dict(random.bit_generator.state)))
+            numbers, k = dict(random.bit_generator.state), keyframes
+            saved.save(Refined(done, field, k.poses, k.motions, list(k.left), clock.spent_s, numbers))
     progress(total, total)
+    return done
 
 
 def falling(mapping: MappingConfig, share: float) -> Rates:
