@@ -86,6 +86,14 @@ def test_settings_that_exclude_each_other_are_refused_before_a_run() -> None:
     assert all(preset(name).checked() == preset(name) for name in list_presets())
 
 
+@pytest.mark.parametrize("text", ["big", "-3", "1.5", ""])
+def test_the_width_of_the_final_map_is_a_word_or_a_number(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"final\.width must be working, camera or a number"):
+        override(Config(), {"final.width": text}).checked()
+    for good in ("working", "camera", "640"):
+        assert override(Config(), {"final.width": good}).checked().final.width == good
+
+
 def test_settings_split_at_the_first_equals_sign() -> None:
     assert split_settings(["a.b=1", "name=x=y", "a.b=2"]) == {"a.b": "2", "name": "x=y"}
     with pytest.raises(ConfigError, match=r"SECTION\.NAME=VALUE, found 'tau'"):

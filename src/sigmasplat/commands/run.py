@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from sigmasplat.commands import options
 from sigmasplat.commands.evaluate import score
-from sigmasplat.commands.options import configured, prepare_torch, source_of
+from sigmasplat.commands.options import arg, configured, prepare_torch, source_of
 from sigmasplat.commands.view import keep_showing, serve_viewer
 from sigmasplat.config.text import full_path
 from sigmasplat.errors import ConfigError
@@ -30,6 +30,15 @@ if TYPE_CHECKING:
 OK, INTERRUPTED = 0, 130
 DEFAULT_PRESET = default_preset()
 DEMO_FOLDER, DEMO_FRAMES = Path("runs/demo"), 120
+FinalWidth = Annotated[
+    str | None,
+    arg(
+        metavar="working|camera|PIXELS",
+        help="width of the images that the final map is refined on at the end: as tracking, as the camera, or a number "
+        "of pixels; short form of --set final.width=…",
+        help_behavior_hint="(default: that of the preset)",
+    ),
+]
 
 
 def demo(
@@ -62,6 +71,7 @@ def run(
     run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
     onto: options.OntoRun = None,
     final_seconds: options.FinalSeconds = None,
+    final_width: FinalWidth = None,
 ) -> int:
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
@@ -77,6 +87,7 @@ def run(
 
     log_names(run_options.log)
     settings += () if final_seconds is None else (f"final.seconds={final_seconds:g}",)
+    settings += () if final_width is None else (f"final.width={final_width}",)
     screen, earlier = Screen(), FinishedMap.of(RunFolder.open(onto)) if onto else None
     config = configured(preset, settings, seed, input_options, earlier.config if earlier else None)
     if earlier:

@@ -70,6 +70,7 @@ class Config:
                 "submaps.variance_sum needs variances that mapping learns; set mapping.weight_nll_color above 0, or "
                 "submaps.variance_sum=0"
             )
+        _ = self.final.width_px  # raises ConfigError
         return self
 
     def to_dict(self) -> dict[str, Any]:

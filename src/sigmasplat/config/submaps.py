@@ -1,7 +1,10 @@
 """Settings of the work per submap: when to start a new one, loops, registration, the final map."""
 
+import sys
 from dataclasses import dataclass
 from typing import Literal
+
+from sigmasplat.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -164,8 +167,23 @@ class FinalConfig:
     """Number of refinement steps between removals of splats with low opacity (`prune_opacity`)."""
     prune_opacity: float = 0.005
     """Splats with at most this opacity, 0 to 1, are removed during refinement."""
+    width: str = "working"
+    """Width of the images in the last stage of refinement: working = no such stage, only working images are used;
+    camera = as recorded; or a number of pixels, at most the recorded width. If it is above `input.width`, the colour of
+    each keyframe is kept at this size."""
+    width_iterations: int = 1000
+    """Number of refinement steps of the stage with images of `width`, after those of `iterations`, if `iterations` is
+    above 0. Half of them use working images, so that the map stays sharp at that size too."""
     uncertainty: bool = True
     """Whether variance is used to merge submaps and still learned during refinement; off = paper."""
     variance: Literal["published", "predicted"] = "published"
     """The variance of a splat that merging compares: published = σ²; predicted = σ² and its residuals at the keyframes
     of its submap, weighted as in the predicted variance (ours)."""
+
+    @property
+    def width_px(self) -> int:
+        """Return `width` in pixels; 0 = working, a very large number = camera. Raises ConfigError on other text."""
+        named = {"working": 0, "camera": sys.maxsize}
+        if self.width not in named and not self.width.isdecimal():
+            raise ConfigError(f"final.width must be working, camera or a number of pixels, found {self.width!r}")
+        return named[self.width] if self.width in named else int(self.width)

@@ -55,13 +55,13 @@ def evaluate(
     Path and views are scored on the frames whose pose is believed: those of trajectory.txt, without lost frames.
     Training views are the run's keyframes; held-out views are the frames that no map was fitted to. At most
     `views_per_kind` of each are scored, evenly spread. They are rendered from the final map at the estimated poses and
-    the run's working resolution, with the run's render settings unless a `renderer` is given. If the run kept its
-    submaps, each view is also rendered from the submap of its frame, as it was before the final map was made. If the
-    run has uncertainty.json and no `renderer` is given, the predictive variances are scored too. LPIPS is scored if
-    its network is given. With `full_resolution` the views are also scored at the size of the recording.
-    Calls `progress(done, total)` with views. With `mesh` the keyframes are fused into mesh.ply, which is scored if the
-    source knows its true surface, or if `true_mesh` is given, in the world frame of the truth; `random_views` is the
-    number of random views for its depth (`metrics.published_reconstruction`).
+    the run's working resolution, with `renderer` or the run's render settings. If the run kept its submaps, each view
+    is also rendered from the submap of its frame, as it was before the final map was made. If the run has
+    uncertainty.json and no `renderer` is given, the predictive variances are scored too. LPIPS needs its network. With
+    `full_resolution` the views are also scored at the size of the recording, else at that of the final map's last stage
+    if its images are larger than those of tracking. Calls `progress(done, total)` with views. With `mesh` the keyframes
+    are fused into mesh.ply, which is scored against `true_mesh`, in the world frame of the truth, or the true surface
+    of the source; `random_views`: the number of random views for its depth (`metrics.published_reconstruction`).
 
     Raises RunError if the run stopped before it had a map; SourceError if truth and run share no timestamps, after
     everything else has been written.
@@ -82,7 +82,7 @@ def evaluate(
     metrics = _facts(run, source, records, field, loops) | score_states(run, frames, known) | path_scores
     metrics |= score_frame_sets(run, frames, known) | _score_views(scoring, config.final, predictions, strips, progress)
     metrics |= {"lpips_network": lpips.net if lpips else None, "reconstruction": None, "reconstruction_published": None}
-    metrics["full_resolution"] = score_full_resolution(scoring, progress) if full_resolution else None
+    metrics["full_resolution"] = score_full_resolution(scoring, config, full_resolution, progress)
     if mesh:
         surface = true_mesh or reconstruct.known_surface(source)
         metrics |= reconstruct.fuse_and_score(run, source.camera, surface, known, random_views, renderer, progress)

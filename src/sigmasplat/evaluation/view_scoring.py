@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.config import InputConfig
+from sigmasplat.config import Config, InputConfig
 from sigmasplat.evaluation.novel_views import score_novel_views
 from sigmasplat.evaluation.view_selection import working_frame
 from sigmasplat.metrics import views
 from sigmasplat.metrics.lpips import Lpips
 from sigmasplat.metrics.scored_view import ScoredView
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.photo import photo_size
 from sigmasplat.report.view_strips import ViewStrips
 from sigmasplat.sources.base import Source
 from sigmasplat.types import Progress, no_progress
@@ -50,19 +52,35 @@ class ViewScoring:
         return views.render_views(partial(working_frame, self.source, settings), self.maps, self.chosen, self.renderer)
 
 
-def full_input(settings: InputConfig, source: Source) -> InputConfig:
-    """Return input settings that keep the size of the recording; the cropped edge covers the same part of the image."""
-    scale = source.camera.width / settings.width if settings.width else 1.0
-    return replace(settings, width=0, crop_px=round(settings.crop_px * scale))
+def full_width(config: Config, camera: Camera) -> int | None:
+    """Return the width of the images that the last stage of the final map used; None without that stage.
+
+    camera: of the recording.
+    """
+    final, settings = config.final, config.input
+    size = photo_size(camera, settings.width, settings.crop_px, final.width_px)
+    return min(final.width_px, camera.width) if size and final.iterations and final.width_iterations else None
 
 
-def score_full_resolution(scoring: ViewScoring, progress: Progress = no_progress) -> dict[str, Any]:
-    """Score the chosen views and the test views at the size of the recording.
+def input_of_width(settings: InputConfig, source: Source, width: int) -> InputConfig:
+    """Return input settings for images of another width; the cropped edge covers the same part of the image."""
+    scale = width / (settings.width or source.camera.width)
+    return replace(settings, width=width, crop_px=round(settings.crop_px * scale))
+
+
+def score_full_resolution(
+    scoring: ViewScoring, config: Config, recorded: bool, progress: Progress = no_progress
+) -> dict[str, Any] | None:
+    """Score the chosen views and the test views at the size of the recording if `recorded`, else at that of the final
+    map's last stage; None without that stage.
 
     Returns width, height, and the keys of the scores at working resolution: training, held_out, both in their submaps,
     and test_views. Calls `progress(done, total)` with the chosen views.
     """
-    settings, chosen = full_input(scoring.input, scoring.source), scoring.chosen
+    width = scoring.source.camera.width if recorded else full_width(config, scoring.source.camera)
+    if width is None:
+        return None
+    settings, chosen = input_of_width(scoring.input, scoring.source, width), scoring.chosen
     camera = scoring.source.camera.prepared(settings.width, settings.crop_px)
     final, before = ({kind: views.ViewScores(False, scoring.lpips) for kind in chosen} for _ in range(2))
     unpredicted = replace(scoring, maps=replace(scoring.maps, predict=None))

@@ -11,6 +11,7 @@ from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Detail, Frame
+from sigmasplat.model.photo import Photo
 from sigmasplat.model.submap import Picture
 
 
@@ -95,10 +96,12 @@ class Keyframe:
     descriptor: NDArray[np.float32] | None = None
     detail: Detail | None = None
     """The gray image in which features are found."""
+    photo: Photo | None = None
+    """The colour at the camera's own size, for the final map."""
 
     def picture(self) -> Picture:
         """Return the images that a finished submap keeps of it."""
-        return replace(self.target.picture(), detail=self.detail)
+        return replace(self.target.picture(), detail=self.detail, photo=self.photo)
 
     def move(self, gradient: NDArray[np.float64], rates: NDArray[np.float64]) -> None:
         """Take an Adam step on the pose; gradient [6] with respect to the left twist of T_camera_world, rates [6] in m

@@ -17,6 +17,7 @@ from sigmasplat.io.tensors import open_tensors, write_tensors
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import ATTRIBUTES, GaussianField, Rows
 from sigmasplat.model.frame import Detail
+from sigmasplat.model.photo import Photo
 from sigmasplat.model.submap import Picture, Submap, refuse_misfit
 
 OURS = re.compile(r"submap-\d{5,}\.safetensors")
@@ -65,6 +66,11 @@ class DiskStore:
         if details and len(details) == len(pictures):
             tensors["details"] = torch.from_numpy(np.stack([detail.gray for detail in details]))
             text["detail_camera"] = json.dumps(asdict(details[0].camera))
+        photos = [picture.photo for picture in pictures if picture.photo is not None]
+        if photos and len(photos) == len(pictures):  # files of different lengths, one after the other
+            tensors["photos"] = torch.from_numpy(np.concatenate([photo.jpeg for photo in photos]))
+            tensors["photo_ends"] = torch.tensor([len(photo.jpeg) for photo in photos]).cumsum(0)
+            text["photo_camera"] = json.dumps(asdict(photos[0].camera))
         write_tensors(self.path(submap.index), tensors, text)
 
     def load(self, index: int) -> Submap:
@@ -87,10 +93,7 @@ class DiskStore:
         """Read the images of one keyframe. Raises RunError if the submap is missing or damaged."""
         with self._opened(index) as file:
             color, depth_m = (file.get_slice(name)[keyframe].numpy() for name in ("colors", "depths_m"))
-            if "details" not in file.keys():  # noqa: SIM118
-                return Picture(color, depth_m)
-            camera = Camera(**json.loads(file.metadata()["detail_camera"]))
-            return Picture(color, depth_m, Detail(file.get_slice("details")[keyframe].numpy(), camera))
+            return Picture(color, depth_m, _detail(file, keyframe), _photo(file, keyframe))
 
     def probe(self, index: int, probe: int) -> Picture:
         """Read the images of one probe view. Raises RunError if the submap is missing or damaged."""
@@ -122,3 +125,20 @@ class DiskStore:
             raise RunError(f"no submap {index} in {self.folder}: {path.name} is missing; run it again")
         with open_tensors(path, "submap") as file:
             yield file
+
+
+def _detail(file: Any, keyframe: int) -> Detail | None:
+    """Read the gray image of a keyframe from the file of a submap, if it was kept."""
+    if "details" not in file.keys():  # noqa: SIM118
+        return None
+    camera = Camera(**json.loads(file.metadata()["detail_camera"]))
+    return Detail(file.get_slice("details")[keyframe].numpy(), camera)
+
+
+def _photo(file: Any, keyframe: int) -> Photo | None:
+    """Read the colour of a keyframe at the camera's size from the file of a submap, if it was kept."""
+    if "photos" not in file.keys():  # noqa: SIM118
+        return None
+    ends = [0, *file.get_tensor("photo_ends").tolist()]
+    camera = Camera(**json.loads(file.metadata()["photo_camera"]))
+    return Photo(file.get_slice("photos")[ends[keyframe] : ends[keyframe + 1]].numpy(), camera)

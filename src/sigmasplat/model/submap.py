@@ -12,17 +12,19 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Detail
+from sigmasplat.model.photo import Photo
 from sigmasplat.types import Matrix
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
     """The images of a keyframe: color [H, W, 3] uint8 RGB, depth_m [H, W] float32 metres, 0 = no reading; detail: the
-    gray image in which features are found, if it was kept."""
+    gray image in which features are found, and photo: the colour at the camera's own size, if they were kept."""
 
     color: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
     detail: Detail | None = None
+    photo: Photo | None = None
 
     @property
     def unit_color(self) -> NDArray[np.float32]:

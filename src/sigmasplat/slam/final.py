@@ -18,9 +18,10 @@ from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.tsdf import packed
 from sigmasplat.render.view import View
+from sigmasplat.slam.full_resolution import refine_on_photos
 from sigmasplat.slam.fusion import count_keyframes, fuse, fusion_views
 from sigmasplat.slam.predicted_submaps import PredictedSubmaps
-from sigmasplat.slam.refinement import KeyframeReader, SavedRefinement, refine
+from sigmasplat.slam.refinement import Clock, KeyframeReader, SavedRefinement, refine
 from sigmasplat.types import Matrix, Progress, no_progress
 
 
@@ -61,10 +62,13 @@ def final_map(
         keyframes.take(found)
         random.bit_generator.state = found.numbers
     done, spent_s = (found.done, found.spent_s) if found else (0, 0.0)
-    losses = refine(on_device, keyframes, config, view, random, progress, done, saved, spent_s)
+    clock = Clock(config.final, spent_s)
+    if done <= config.final.iterations:
+        done += len(refine(on_device, keyframes, config, view, random, progress, done, saved, spent_s))
+    done = refine_on_photos(on_device, keyframes, config, view, random, progress, done, saved, clock)
     moves = config.final.lr_pose_translation or config.final.lr_pose_rotation
     poses = keyframes.poses_in(anchors) if moves else None
-    return FinalMap(on_device.to(torch.device("cpu")), poses, done + len(losses))
+    return FinalMap(on_device.to(torch.device("cpu")), poses, done)
 
 
 def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix], final: FinalConfig) -> None:

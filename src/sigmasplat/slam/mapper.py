@@ -18,6 +18,7 @@ from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.frame import Detail
+from sigmasplat.model.photo import Photo
 from sigmasplat.model.submap import Picture, Submap
 from sigmasplat.render.view import View
 from sigmasplat.slam.densify import densify_mask, multiply, split, too_large
@@ -44,6 +45,7 @@ class Mapper:
         T_world_camera: NDArray[np.float64],
         descriptor: NDArray[np.float32] | None = None,
         detail: Detail | None = None,
+        photo: Photo | None = None,
     ) -> FieldFit:
         """Map one keyframe: seed, choose the window of keyframes, fit, densify and prune, fit again, prune again.
 
@@ -52,7 +54,9 @@ class Mapper:
         self.field = self.field.to(view.sums.device)  # the active field stays on the view's device
         c, first_new, begun = self.config.mapping, self.field.next_id, len(self.field) > 0
         fixed = not self.keyframes
-        self.keyframes.append(Keyframe(index, target, T_world_camera, fixed, descriptor=descriptor, detail=detail))
+        self.keyframes.append(
+            Keyframe(index, target, T_world_camera, fixed, descriptor=descriptor, detail=detail, photo=photo)
+        )
         if begun and len(self.keyframes) == 1:
             self._note_visible(view)
             return FieldFit()

@@ -125,7 +125,7 @@ def refine(
     dependence. `done`, `spent_s`: the steps that the field has already had, and their seconds. `saved` is offered the
     state after each pruning and each new degree.
     """
-    final, mapping, losses, clock = config.final, refinement(config), list[float](), _Clock(config.final, spent_s)
+    final, mapping, losses, clock = config.final, refinement(config), list[float](), Clock(config.final, spent_s)
     if not done:
         prune_by_weight(field, view, keyframes, final.prune_weight_px, final.max_splats)
     while done < final.iterations and not clock.is_over:
@@ -148,7 +148,7 @@ def refine(
 
 
 @dataclass(frozen=True)
-class _Clock:
+class Clock:
     """Measures a refinement against its time budget; spent_s: seconds of an earlier start of the same refinement."""
 
     final: FinalConfig
@@ -176,7 +176,7 @@ def _changes_rates(final: FinalConfig) -> bool:
     return bool(final.lr_means_last) or (final.lr_factor, final.lr_decay) != (1.0, 1.0)
 
 
-def decaying(mapping: MappingConfig, final: FinalConfig, done: int, clock: _Clock) -> Iterator[Rates]:
+def decaying(mapping: MappingConfig, final: FinalConfig, done: int, clock: Clock) -> Iterator[Rates]:
     """Yield the rates of the refinement steps after `done`.
 
     All rates start at `final.lr_factor` times those of mapping, and decay exponentially to the share `final.lr_decay`
@@ -191,7 +191,7 @@ def decaying(mapping: MappingConfig, final: FinalConfig, done: int, clock: _Cloc
         yield rates
 
 
-def _share(step: int, final: FinalConfig, clock: _Clock) -> float:
+def _share(step: int, final: FinalConfig, clock: Clock) -> float:
     """Return the share of the refinement that is done before a step, of its steps or of its time budget, 0 to 1."""
     return min(1.0, max(step / max(final.iterations - 1, 1), clock.share))
 
@@ -208,7 +208,7 @@ def refinement(config: Config) -> MappingConfig:
 
 def _draw(
     keyframes: KeyframeReader, steps: range, config: Config, random: np.random.Generator, progress: Progress,
-    clock: _Clock,
+    clock: Clock,
 ) -> Iterator[Sequence[Keyframe]]:  # fmt: skip
     """Draw one keyframe per step; call `progress` before each, and keep its moved pose after it. End early if the time
     budget is spent."""

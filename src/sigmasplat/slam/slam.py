@@ -74,7 +74,7 @@ class Slam(World):
         """
         if not self.steps or not (len(self.store) or self._cuts or self.config.final.iterations):
             return
-        steps, measures = self.config.final.iterations, self.config.uncertainty.probes > 0
+        steps, measures = self._refinement_steps(), self.config.uncertainty.probes > 0
         total = max(1, steps + measures * sum(map(len, self.atlas.keyframe_poses)))
         progress(0, total)
         self._finish_submap()
@@ -89,6 +89,11 @@ class Slam(World):
             refined = RefinedStore(store, final.keyframe_poses)
         self.uncertainty = final_uncertainty(self._final, refined or store, anchors, self.config, self.view, measuring)
         progress(total, total)
+
+    def _refinement_steps(self) -> int:
+        """Return the number of steps of the final map's refinement, at working size and on photos."""
+        final, photos = self.config.final, any(keyframe.photo for keyframe in self.mapper.keyframes)
+        return final.iterations + final.width_iterations * (photos and final.iterations > 0)
 
     def _observe(self, frame: Frame) -> Observation:
         """Resize a frame to working size and prepare it for the fits."""
@@ -182,7 +187,8 @@ class Slam(World):
             descriptor = self.descriptor.describe(frame.color, frame.depth_m) if self._describes else None
         with self._timer.stage("map"):
             detail = None if seen.image is None else seen.image.detail
-            fit = self.mapper.map(self.view, index, seen.target, T_submap_camera, descriptor, detail)
+            photo = seen.photo(self.config)
+            fit = self.mapper.map(self.view, index, seen.target, T_submap_camera, descriptor, detail, photo)
         self._timer.add(fit.seconds, prefix="map_")
         if self.keyframe_indices[-1:] != [index]:  # a keyframe that two submaps share is counted once
             self.keyframe_indices.append(index)

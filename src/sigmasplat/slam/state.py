@@ -10,6 +10,7 @@ from sigmasplat.model.atlas import Atlas, Hop, Place
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.frame import Detail
+from sigmasplat.model.photo import Photo
 from sigmasplat.model.submap import Picture
 from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.localisation.confidence import Confidence
@@ -29,7 +30,7 @@ from sigmasplat.slam.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
     Atlas, Camera, Confidence, Detail, Drift, Edge, FeatureImage, Foreground, GaussianField, Hop, Keyframe, Link, Loop,
-    LoopCloser, Mapper, Picture, Place, Probe, Probes, Pyramid, Recovery, Reference, Relocaliser, Rows, Step,
+    LoopCloser, Mapper, Photo, Picture, Place, Probe, Probes, Pyramid, Recovery, Reference, Relocaliser, Rows, Step,
     SubmapDescriptor, Target, Tracker, Usual, VectorAdam,
 )  # fmt: skip
 """The classes that a state may contain."""

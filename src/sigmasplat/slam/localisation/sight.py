@@ -12,6 +12,7 @@ from sigmasplat.fit.references import Reference, live_image
 from sigmasplat.fit.target import Target
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.photo import Photo, photo_size
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
@@ -52,9 +53,20 @@ class Sight:
 
 @dataclass(eq=False)
 class Observation(Sight):
-    """A frame in the forms that tracking and mapping need."""
+    """A frame in the forms that tracking and mapping need: also the working frame, and the whole one as it was read."""
 
     frame: Frame = field(kw_only=True)
+    whole: Frame = field(kw_only=True)
+
+    def without_exposure(self, exposure: tuple[float, float]) -> "Observation":
+        """Return the frame with the exposure (a, b) of exp(a) · colour + b removed from its target and its photo."""
+        color = np.clip((self.whole.color - np.float32(exposure[1])) / np.float32(np.exp(exposure[0])), 0.0, 1.0)
+        return replace(super().without_exposure(exposure), whole=replace(self.whole, color=color))
+
+    def photo(self, config: Config) -> Photo | None:
+        """Return the colour at the size of the final map's last stage; None if working images are as large."""
+        size = photo_size(self.whole.camera, config.input.width, config.input.crop_px, config.final.width_px)
+        return None if size is None else Photo.of(self.whole, *size)
 
 
 def view_of(camera: Camera, config: Config) -> View:
@@ -83,7 +95,7 @@ def observe(whole: Frame, working: Frame, view: View, config: Config, extractor:
     live, image = live_image(view, working.color, working.depth_m, target), None
     if extractor is not None:
         image = FeatureImage(detail_of(whole, config.features.width), working.depth_m, working.camera)
-    return Observation(target, live, image, frame=working)
+    return Observation(target, live, image, frame=working, whole=whole)
 
 
 @dataclass(eq=False)

@@ -1,0 +1,118 @@
+"""The last stage of the final map: refine it on images of the camera's own size, after it was refined at working
+size."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from sigmasplat.config import Config, MappingConfig
+from sigmasplat.fit.adam import Rates
+from sigmasplat.fit.field import fit_field
+from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.model.field import GaussianField
+from sigmasplat.model.submap import SubmapStore
+from sigmasplat.render.backend import make_view
+from sigmasplat.render.view import View
+from sigmasplat.slam.refinement import Clock, KeyframeReader, Refined, SavedRefinement, refinement
+from sigmasplat.types import Progress
+
+CACHE_BYTES = 64 << 20
+"""Memory for prepared images; other photos are decoded again when they are drawn."""
+TURN_STEPS = 25
+"""After this many steps on photos come as many on working images, and so on. Then the map is sharp at both sizes, and a
+step on a working image costs a third."""
+LAST_RATE = 0.1
+"""Learning rates in the last step, relative to the first: steps on single images leave noise in the splats."""
+
+
+class PhotoReader:
+    """The keyframes of a reader that have photos, with images of the view's camera; a photo is decoded when it is
+    drawn."""
+
+    def __init__(self, keyframes: KeyframeReader, view: View) -> None:
+        self.keyframes, self.camera = keyframes, view.camera
+        self.size = (view.alpha.shape[0], view.alpha.shape[1])
+        store, places = keyframes.store, keyframes.places
+        self.rows = [row for row, place in enumerate(places) if store.picture(*place).photo is not None]
+        self._target = lru_cache(max(1, CACHE_BYTES // (16 * view.alpha.numel())))(self._read)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, i: int) -> Keyframe:
+        row = self.rows[i]
+        return Keyframe(row, self._target(row), self.keyframes.poses[row], fixed=True)
+
+    def _read(self, row: int) -> Target:
+        picture = self.keyframes.store.picture(*self.keyframes.places[row])
+        assert picture.photo is not None
+        return Target.of(picture.photo.frame(picture.depth_m, self.keyframes.camera, self.camera), self.size)
+
+
+def photo_view(store: SubmapStore, view: View, config: Config) -> View | None:
+    """Return a view like `view` for images as large as the largest photos; None without photos. A submap has photos of
+    one camera."""
+    found = [store.picture(index, 0).photo for index in range(len(store)) if store.load(index).frames]
+    cameras = [photo.camera for photo in found if photo is not None]
+    if not cameras:
+        return None
+    largest = max(cameras, key=lambda camera: camera.width)
+    return make_view(config.backend, largest, config.render, variance=len(view.sums) >= 7)
+
+
+def refine_on_photos(
+    field: GaussianField,
+    keyframes: KeyframeReader,
+    config: Config,
+    view: View,
+    random: np.random.Generator,
+    progress: Progress,
+    done: int,
+    saved: SavedRefinement | None,
+    clock: Clock,
+) -> int:
+    """Fit the field to photos of keyframes, if there are any, and to their working images, in turns, at fixed poses.
+
+    view: that of the working images. `done`: the number of steps that the field has already had; those of this stage
+    are counted from `final.iterations` on. Returns their number at the end, which is lower if the time budget is spent.
+    Calls `progress(steps done, total)`. `saved` is offered the state every `TURN_STEPS`.
+    """
+    final, large = config.final, photo_view(keyframes.store, view, config)
+    if large is None or not final.width_iterations or clock.is_over:
+        return done
+    photos, total = PhotoReader(keyframes, large), final.iterations + final.width_iterations
+    mapping = replace(refinement(config), lr_pose_translation=0.0, lr_pose_rotation=0.0)
+    degree = min(final.sh_degree, final.iterations // final.sh_every)
+    turns: tuple[tuple[View, PhotoReader | KeyframeReader], ...] = (large, photos), (view, keyframes)
+    done = max(done, final.iterations)
+    while done < total and not clock.is_over:
+        since = done - final.iterations
+        of_view, images = turns[since // TURN_STEPS % 2]
+        steps = range(done, min(done + TURN_STEPS - since % TURN_STEPS, total))
+        rates = (falling(mapping, (step - final.iterations) / final.width_iterations) for step in steps)
+        fit_field(field, of_view, _draw(images, steps, total, random, progress), mapping, rates, degree=degree)
+        field.keep(field.opacities > final.prune_opacity)
+        done = steps.stop
+        if saved is not None:
+            numbers, k = dict(random.bit_generator.state), keyframes
+            saved.save(Refined(done, field, k.poses, k.motions, list(k.left), clock.spent_s, numbers))
+    progress(total, total)
+    return done
+
+
+def falling(mapping: MappingConfig, share: float) -> Rates:
+    """Return the rates at a share of the stage, 0 to 1: they decay exponentially to `LAST_RATE` of the settings."""
+    rates = Rates.of(mapping)
+    rates.per_column.mul_(LAST_RATE**share)
+    return rates
+
+
+def _draw(
+    images: PhotoReader | KeyframeReader, steps: range, total: int, random: np.random.Generator, progress: Progress
+) -> Iterator[Sequence[Keyframe]]:
+    """Draw one keyframe per step, uniformly; call `progress` before each."""
+    for step in steps:
+        progress(step, total)
+        yield [images[int(random.integers(len(images)))]]
