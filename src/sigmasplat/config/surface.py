@@ -8,11 +8,11 @@ from sigmasplat.errors import ConfigError
 
 @dataclass(frozen=True)
 class SurfaceConfig:
-    """The mesh of a finished run: which depth is fused, and what is removed. Raises ConfigError on invalid values."""
+    """The mesh of a finished run. Raises ConfigError on invalid values."""
 
     depth: Literal["map", "map+sensor"] = "map"
-    """Depth that is fused at each keyframe: map = rendered from its submap (VarSplat §7); map+sensor = the keyframe's
-    own readings, and the final map where the sensor has none (ours)."""
+    """Depth that is fused at each keyframe: map = rendered from its submap (VarSplat §7); map+sensor = rendered from
+    the final map, and the readings of the keyframe, weighted by their variances (ours)."""
 
     def __post_init__(self) -> None:
         if self.depth not in ("map", "map+sensor"):
