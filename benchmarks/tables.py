@@ -23,7 +23,7 @@ import tyro
 
 SUBJECTS = {
     "Whole runs": ("accuracy", "systems", "every_preset", "paper_presets"),
-    "Other systems": ("peers",),
+    "Other systems": ("peers", "mesh_quality"),
     "Effect of σ²": ("ablation", "weights", "color_covariance"),
     "Uncertainty": ("uncertainty", "uncertainty_weights", "pose_covariance"),
     "Camera tracking": ("tracking", "pose_gradient", "relocalisation"),

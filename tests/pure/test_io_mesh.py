@@ -1,8 +1,11 @@
 """Mesh files: they are read back by our reader and by handmade readers; other files are refused."""
 
 import json
+import shutil
 import struct
+import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +37,7 @@ def test_ply_is_read_back_unchanged(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.ply", "b.PLY"]
 
 
-@pytest.mark.parametrize("ending", ["ply", "obj", "glb"])
+@pytest.mark.parametrize("ending", ["ply", "obj", "glb", "stl"])
 def test_a_mesh_without_faces_or_colours_can_be_written(tmp_path: Path, ending: str) -> None:
     for mesh in (EMPTY, some_mesh(colors=False)):
         write_mesh(tmp_path / f"a.{ending}", mesh)
@@ -47,13 +50,16 @@ def test_ply_has_the_layout_of_its_header(tmp_path: Path) -> None:
     write_mesh(tmp_path / "a.ply", mesh)
     header, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
     lines = header.decode().splitlines()
-    assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 50"]
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"] and lines[2].startswith("comment ")
+    assert lines[3] == "element vertex 50"
     assert lines[-2:] == ["element face 80", "property list uchar int vertex_indices"]
     assert [line.split()[-1] for line in lines if line.startswith("property ") and "list" not in line] == [
-        "x", "y", "z", "red", "green", "blue",
+        "x", "y", "z", "nx", "ny", "nz", "red", "green", "blue",
     ]  # fmt: skip
-    assert len(body) == 50 * 15 + 80 * 13
-    assert struct.unpack("<3f3B", body[15:30]) == (*mesh.vertices[1], *(mesh.colors[1] * 255).round().astype(int))
+    assert len(body) == 50 * 27 + 80 * 13
+    second = struct.unpack("<6f3B", body[27:54])
+    assert second[:3] + second[6:] == (*mesh.vertices[1], *(mesh.colors[1] * 255).round().astype(int))
+    np.testing.assert_allclose(second[3:6], mesh.normals()[1], atol=1e-6)
     assert struct.unpack("<B3i", body[-13:]) == (3, *mesh.faces[-1])
 
 
@@ -62,15 +68,26 @@ def test_obj_has_the_same_values(tmp_path: Path) -> None:
     write_mesh(tmp_path / "a.obj", mesh)
     words = [line.split() for line in (tmp_path / "a.obj").read_text().splitlines()]
     vertices = np.array([w[1:] for w in words if w[0] == "v"], float)
-    faces = np.array([w[1:] for w in words if w[0] == "f"], int)
+    normals = np.array([w[1:] for w in words if w[0] == "vn"], float)
+    faces = np.array([[corner.split("//") for corner in w[1:]] for w in words if w[0] == "f"], int)
     np.testing.assert_allclose(vertices, np.hstack([mesh.vertices, mesh.colors]), atol=1e-4)
-    np.testing.assert_array_equal(faces, mesh.faces + 1)
+    np.testing.assert_allclose(normals, mesh.normals(), atol=1e-4)
+    np.testing.assert_array_equal(faces, np.repeat(mesh.faces[..., None] + 1, 2, axis=2))
 
 
-def test_glb_has_the_same_values_and_stands_upright(tmp_path: Path) -> None:
+def test_stl_has_the_same_triangles_and_no_text_header(tmp_path: Path) -> None:
     mesh = some_mesh()
-    write_mesh(tmp_path / "a.glb", mesh)
-    data = (tmp_path / "a.glb").read_bytes()
+    write_mesh(tmp_path / "a.stl", mesh, "axes z-up")
+    data = (tmp_path / "a.stl").read_bytes()
+    assert b"axes z-up" in data[:80] and not data.startswith(b"solid")
+    assert struct.unpack("<I", data[80:84]) == (80,) and len(data) == 84 + 80 * 50
+    rows = np.frombuffer(data[84:], np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("unused", "<u2")]))
+    np.testing.assert_array_equal(rows["corners"], mesh.vertices[mesh.faces])
+
+
+def parts_of_glb(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Read a GLB by hand: its scene, and the arrays of its only primitive."""
+    data = path.read_bytes()
     magic, version, length, size, kind = struct.unpack("<4sIII4s", data[:20])
     assert (magic, version, length, kind, size % 4) == (b"glTF", 2, len(data), b"JSON", 0)
     scene = json.loads(data[20 : 20 + size])
@@ -78,16 +95,60 @@ def test_glb_has_the_same_values_and_stands_upright(tmp_path: Path) -> None:
     assert struct.unpack("<I4s", data[20 + size : 28 + size]) == (len(binary), b"BIN\0")
     assert scene["buffers"] == [{"byteLength": len(binary)}]
     primitive = scene["meshes"][0]["primitives"][0]
-    arrays = []
-    for number, kind in ((primitive["attributes"]["POSITION"], "<f4"), (primitive["indices"], "<u4")):
-        view = scene["bufferViews"][scene["accessors"][number]["bufferView"]]
+    arrays = {}
+    for name, number in (*primitive["attributes"].items(), ("indices", primitive["indices"])):
+        accessor = scene["accessors"][number]
+        view = scene["bufferViews"][accessor["bufferView"]]
         part = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
-        arrays.append(np.frombuffer(part, kind).reshape(-1, 3))
-    np.testing.assert_array_equal(arrays[0], mesh.vertices)
-    np.testing.assert_array_equal(arrays[1], mesh.faces)
+        type_ = {5126: "<f4", 5125: "<u4", 5123: "<u2"}[accessor["componentType"]]
+        arrays[name] = np.frombuffer(part, type_).reshape(accessor["count"], -1)
+    return scene, arrays
+
+
+def test_glb_has_the_same_values_and_axes(tmp_path: Path) -> None:
+    mesh = some_mesh()
+    write_mesh(tmp_path / "a.glb", mesh)
+    scene, arrays = parts_of_glb(tmp_path / "a.glb")
+    np.testing.assert_array_equal(arrays["POSITION"], mesh.vertices)
+    np.testing.assert_array_equal(arrays["indices"].reshape(-1, 3), mesh.faces)
     assert scene["accessors"][0]["max"] == pytest.approx(mesh.vertices.max(0).tolist())
-    x, y, z, w = scene["nodes"][0]["rotation"]
-    assert (x, y, z, w) == (1, 0, 0, 0), "a rotation by 180° about x: down becomes −y, forward −z"
+    assert set(scene["nodes"][0]) & {"rotation", "matrix", "scale"} == set(), "y is up in the vertices themselves"
+    np.testing.assert_allclose(np.linalg.norm(arrays["NORMAL"], axis=1), 1.0, atol=1e-6)
+
+
+def test_glb_shows_the_recorded_colours_in_every_viewer(tmp_path: Path) -> None:
+    """glTF's default material is metal, its colours are linear, and its faces have one side."""
+    gray = np.array([[0.5, 0.5, 0.5], [0.0, 1.0, 0.04], [0.2, 0.7, 0.9]], np.float32)
+    write_mesh(tmp_path / "a.glb", Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), gray))
+    scene, arrays = parts_of_glb(tmp_path / "a.glb")
+    material = scene["materials"][scene["meshes"][0]["primitives"][0]["material"]]
+    assert material["doubleSided"] and "KHR_materials_unlit" in material["extensions"]
+    assert material["pbrMetallicRoughness"]["metallicFactor"] == 0 and "KHR_materials_unlit" in scene["extensionsUsed"]
+    shown = arrays["COLOR_0"][:, :3] / 65535.0
+    assert shown[0] == pytest.approx([0.2140] * 3, abs=1e-3), "0.5 in sRGB is 21 % of the light"
+    np.testing.assert_allclose(
+        np.where(shown > 0.0031308, 1.055 * shown ** (1 / 2.4) - 0.055, 12.92 * shown), gray, atol=1e-3
+    )
+
+
+GLTF_VALIDATOR = """
+const validator = require("gltf-validator");
+validator.validateBytes(new Uint8Array(require("fs").readFileSync(process.argv[1])))
+  .then(report => console.log(JSON.stringify(report.issues)));
+"""
+
+
+@pytest.mark.parametrize("mesh", [some_mesh(), some_mesh(colors=False), EMPTY], ids=["coloured", "gray", "empty"])
+def test_khronos_validator_accepts_the_glb(tmp_path: Path, mesh: Mesh) -> None:
+    if (
+        shutil.which("node") is None
+        or subprocess.run(["node", "-e", "require('gltf-validator')"], capture_output=True).returncode
+    ):
+        pytest.skip("needs node and npm's gltf-validator; set NODE_PATH to its node_modules")
+    write_mesh(tmp_path / "a.glb", mesh)
+    command = ["node", "-e", GLTF_VALIDATOR, str(tmp_path / "a.glb")]
+    issues = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    assert issues["numErrors"] == issues["numWarnings"] == 0, issues["messages"]
 
 
 def by_hand(
@@ -143,7 +204,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         (whole.replace(b"binary_little_endian", b"ascii"), "is not binary"),
         (whole.replace(b"property float y", b"property text y"), "cannot read the PLY's properties"),
         (whole.replace(b"property float y", b"property float q"), "needs vertices with x, y, z"),
-        (whole[: whole.index(b"element face")] + b"end_header\n" + bytes(50 * 15), "is it a point cloud"),
+        (whole[: whole.index(b"element face")] + b"end_header\n" + bytes(50 * 27), "is it a point cloud"),
         (whole[:-13] + struct.pack("<B3i", 3, 0, 1, 50), "vertices that do not exist"),
         (whole[:-13] + struct.pack("<B3i", 4, 0, 1, 2), "not all faces have the same number of vertices"),
     ):
@@ -159,7 +220,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_unknown_endings_and_unwritable_folders_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match=r"a\.stl; give a name that ends in \.ply, \.obj, \.glb"):
-        write_mesh(tmp_path / "a.stl", some_mesh())
+    with pytest.raises(RunError, match=r"a\.fbx; give a name that ends in \.ply, \.obj, \.glb, \.stl"):
+        write_mesh(tmp_path / "a.fbx", some_mesh())
     with pytest.raises(RunError, match="choose a writable place"):
         write_mesh(tmp_path / "missing" / "a.ply", some_mesh())

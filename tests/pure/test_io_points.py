@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sigmasplat.exports.points import write_points
+from sigmasplat.io.glb import linear
 from sigmasplat.io.mesh import read_mesh, write_mesh
 from sigmasplat.model.mesh import Mesh
 
@@ -71,13 +72,21 @@ def test_vertices_are_loaded_with_their_standard_deviation(tmp_path: Path) -> No
     np.testing.assert_array_equal(read_mesh(tmp_path / "a.ply").vertices, mesh.vertices)
 
 
-@pytest.mark.parametrize("ending", ["ply", "obj", "glb"])
+@pytest.mark.parametrize("ending", ["ply", "obj", "glb", "stl"])
 def test_meshes_are_loaded_by_a_standard_loader(tmp_path: Path, ending: str) -> None:
     mesh = ball()
     write_mesh(tmp_path / f"a.{ending}", mesh)
-    loaded = trimesh.load(tmp_path / f"a.{ending}", process=False, maintain_order=True, force="mesh")
-    upright = mesh.vertices * ([1, -1, -1] if ending == "glb" else [1, 1, 1])  # in glTF y points up
-    np.testing.assert_allclose(loaded.vertices, upright, atol=1e-5)
-    np.testing.assert_array_equal(loaded.faces, mesh.faces)
-    np.testing.assert_allclose(loaded.visual.vertex_colors[:, :3], np.rint(mesh.colors * 255), atol=1)
+    loaded = trimesh.load_scene(tmp_path / f"a.{ending}", process=False, maintain_order=True)
+    (loaded,) = loaded.geometry.values()
+    np.testing.assert_allclose(loaded.triangles, mesh.corners, atol=1e-5)
+    if ending == "stl":
+        loaded.merge_vertices()  # every triangle has its own
+    else:
+        np.testing.assert_array_equal(loaded.faces, mesh.faces)
+        np.testing.assert_allclose(loaded.vertex_normals, mesh.normals(), atol=2e-4)
+    if ending == "glb":  # linear, 16 bits, beside the material
+        shown = loaded.visual.vertex_attributes["color"][:, :3] / 65535.0
+        np.testing.assert_allclose(shown, linear(mesh.colors), atol=1e-4)
+    elif ending != "stl":
+        np.testing.assert_allclose(loaded.visual.vertex_colors[:, :3], np.rint(mesh.colors * 255), atol=1)
     assert loaded.is_watertight and loaded.volume == pytest.approx(4 / 3 * np.pi * 0.125, rel=0.07)

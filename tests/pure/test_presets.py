@@ -367,7 +367,7 @@ def test_sigma_adds_to_fast_and_removes_nothing() -> None:
     uncertainty = {"mapping.iterations", "mapping.weight_moment", "primitives.uncertain_m2", "uncertainty.probes"}
     assert added == uncertainty | {
         "input.denoise_depth", "tracking.features", "tracking.verify",
-        "recovery.relocalise", "recovery.new_map_after", "recovery.steady_frames",
+        "recovery.relocalise", "recovery.new_map_after", "recovery.steady_frames", "surface.depth",
     }  # fmt: skip
     assert sigma.mapping.weight_nll_color == fast.mapping.weight_nll_color > 0
     assert sigma.tracking.uncertainty and sigma.loops.uncertainty and sigma.registration.uncertainty

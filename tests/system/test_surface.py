@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from command_line import exit_code
 from sigmasplat.config import Config, InputConfig
@@ -239,8 +240,17 @@ def test_the_command_makes_a_mesh_of_a_real_run(tmp_path: Path, capsys: pytest.C
     assert len(mesh.faces) > 1000 and np.median(off) < 0.03
     assert exit_code("mesh", out, "--voxel-m", "0.05") == 0, "the run's own mesh is replaced"
     assert (tmp_path / "run" / "mesh.ply").read_bytes() == first, "and the same"
+    budget = ["--voxel-m", "0.05", "--triangles", "500"]
+    assert exit_code("mesh", out, *budget, "--out", str(tmp_path / "z.ply"), "--axes", "z-up") == 0
+    assert exit_code("mesh", out, *budget, "--out", str(tmp_path / "y.stl")) == 0
+    z_up, y_up = read_mesh(tmp_path / "z.ply"), trimesh.load(tmp_path / "y.stl", process=False)
+    assert 250 < len(z_up.faces) <= 500 and len(y_up.faces) == len(z_up.faces)
+    np.testing.assert_allclose(y_up.triangles, z_up.corners[..., [0, 2, 1]] * [1, 1, -1], atol=1e-5)
+    np.testing.assert_allclose(np.sqrt(z_up.areas().sum() / mesh.areas().sum()), 1.0, atol=0.1, err_msg="still metres")
     for refused, words in (
-        (["--out", str(tmp_path / "a.stl")], "give a name that ends in .ply, .obj, .glb"),
+        (["--out", str(tmp_path / "a.fbx")], "give a name that ends in .ply, .obj, .glb, .stl"),
+        (["--out", str(tmp_path / "a.glb"), "--axes", "z-up"], "a GLB has y up by definition"),
+        (["--triangles", "-1"], "--triangles must be at least 0"),
         (["--out", str(tmp_path / "run" / "mesh.ply")], "exists; give another --out"),
         (["--voxel-m", "-1"], "a voxel must be above 0"),
         (["--source", str(tmp_path / "nowhere")], "no such folder"),

@@ -1,32 +1,59 @@
 """Extract a surface from a run's map: sigmasplat mesh."""
 
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 from sigmasplat.commands import options
 from sigmasplat.commands.options import prepare_torch, refuse_existing, source_of
+from sigmasplat.errors import ConfigError
+
+if TYPE_CHECKING:
+    from sigmasplat.exports.axes import Axes
 
 
 def make_mesh(
     run: options.RunPath,
     voxel_m: options.VoxelM = 0.01,
+    triangles: options.Triangles = 300_000,
+    axes: options.MeshAxes = None,
     out: options.MeshFile = None,
     overwrite: options.Overwrite = False,
     moved_to: options.MovedSource = None,
 ) -> int:
-    """Extract a coloured triangle mesh from a run's map, by fusing renders at its keyframes.
+    """Extract a coloured triangle mesh from a run's map, upright and in metres.
 
     example: sigmasplat mesh runs/kitchen-sigma --out kitchen.glb
     """
     from sigmasplat.evaluation.reconstruct import FusionInput
+    from sigmasplat.exports.axes import levelled, transform_to
+    from sigmasplat.exports.run_reader import RunReader
     from sigmasplat.io.mesh import check_ending, write_mesh
     from sigmasplat.io.runs import MESH, RunFolder
+    from sigmasplat.model.decimation import decimated, refuse_budget
     from sigmasplat.run.terminal import Screen
 
     screen, folder, target = Screen(), RunFolder.open(run), out or run / MESH
     check_ending(target)
+    chosen = _axes_of(target, axes, own=out is None)
+    refuse_budget(triangles)
     refuse_existing(out, overwrite)
     source = source_of(folder, moved_to)
     prepare_torch()
+    fusion_input = FusionInput.of(folder, source.camera)
     with screen.counting("surface") as progress:
-        surface = FusionInput.of(folder, source.camera).surface(voxel_m, progress=progress)
-    write_mesh(target, surface)
-    screen.say(f"{len(surface.vertices):,} vertices, {len(surface.faces):,} triangles: {target}")
+        surface = fusion_input.surface(voxel_m, progress=progress)
+    if len(surface.faces) > triangles > 0:
+        screen.say(f"{len(surface.faces):,} triangles are reduced to {triangles:,} (--triangles)")
+        surface = decimated(surface, triangles)
+    if chosen != "camera":
+        surface = surface.moved(transform_to(chosen, levelled(RunReader(folder, lambda: source))))
+    write_mesh(target, surface, f"sigmasplat, unit metre, axes {chosen}")
+    screen.say(f"{len(surface.vertices):,} vertices, {len(surface.faces):,} triangles, axes {chosen}: {target}")
     return 0
+
+
+def _axes_of(target: Path, axes: "Axes | None", own: bool) -> "Axes":
+    """Return the axes of a file; the run's own mesh.ply has those of the run's other files unless they are given."""
+    if target.suffix.lower() == ".glb" and axes not in (None, "y-up"):
+        raise ConfigError(f"a GLB has y up by definition, so --axes {axes} cannot be used; leave --axes out")
+    return axes or ("camera" if own else "y-up")

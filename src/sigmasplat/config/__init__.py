@@ -14,13 +14,14 @@ from sigmasplat.config.frames import MappingConfig, RenderConfig, SeedConfig, Tr
 from sigmasplat.config.input import InputConfig
 from sigmasplat.config.recovery import RecoveryConfig
 from sigmasplat.config.submaps import FinalConfig, LoopConfig, RegistrationConfig, SubmapConfig
+from sigmasplat.config.surface import SurfaceConfig
 from sigmasplat.config.uncertainty import UncertaintyConfig
 from sigmasplat.errors import ConfigError
 
 __all__ = [
     "Config", "DensifyConfig", "FeatureConfig", "FinalConfig", "InputConfig", "LoopConfig", "MappingConfig",
-    "RecoveryConfig", "RegistrationConfig", "RenderConfig", "SeedConfig", "SubmapConfig", "TrackingConfig",
-    "UncertaintyConfig",
+    "RecoveryConfig", "RegistrationConfig", "RenderConfig", "SeedConfig", "SubmapConfig", "SurfaceConfig",
+    "TrackingConfig", "UncertaintyConfig",
 ]  # fmt: skip
 
 
@@ -48,6 +49,7 @@ class Config:
     loops: LoopConfig = field(default_factory=LoopConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     final: FinalConfig = field(default_factory=FinalConfig)
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     uncertainty: UncertaintyConfig = field(default_factory=UncertaintyConfig)
 
     def changed(self, **sections: Mapping[str, Any]) -> "Config":

@@ -1,6 +1,7 @@
 """Extract a surface from a run's map: render depth and colour at every keyframe, fuse, mesh, clean (VarSplat §7).
 
-Only images rendered from the map are fused, never a recorded image or the ground truth.
+The ground truth is never fused, only images rendered from the map and, with `surface.depth=map+sensor`, those of the
+keyframes.
 """
 
 from collections.abc import Iterable
@@ -26,7 +27,7 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.model.map_uncertainty import SplatStd
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.slam.fusion import VOXEL_M, FusionView, Renderer, count_keyframes, fuse, fusion_views
+from sigmasplat.slam.fusion import VOXEL_M, FusionView, Renderer, count_keyframes, fuse, surface_views
 from sigmasplat.sources.base import Source
 from sigmasplat.types import Matrix, Progress, no_progress
 
@@ -59,7 +60,7 @@ class FusionInput:
         return FusionInput(run, config, checkpoint, camera)
 
     def views(self) -> tuple[Iterable[FusionView], int]:
-        """Return a view of each keyframe's own submap, or of the one map of a run without submaps, and their number.
+        """Return the views to fuse (`surface_views`) and their number; without submaps, renders of the one map.
 
         Submaps that are not connected to the world are left out.
         Raises RunError if there is no map, or if the checkpoint lacks the pose of a submap.
@@ -75,7 +76,10 @@ class FusionInput:
                 "run it again"
             )
         outside = self.run.read_frames().submaps_outside() if self.run.component_numbers() else frozenset[int]()
-        return fusion_views(submaps, list(anchors), outside), count_keyframes(submaps, outside)
+        moved = tensors.get("T_world_keyframe")
+        T_world_keyframe = None if moved is None else np.asarray(moved, np.float64)
+        views = surface_views(self.run.read_map(), submaps, list(anchors), self.config, outside, T_world_keyframe)
+        return views, count_keyframes(submaps, outside)
 
     def surface(
         self, voxel_m: float = VOXEL_M, renderer: Renderer | None = None, progress: Progress = no_progress

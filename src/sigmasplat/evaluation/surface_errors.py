@@ -18,7 +18,7 @@ from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.model.tsdf import Tsdf
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.mesh import mesh_depth
-from sigmasplat.slam.fusion import TRUNCATION_VOXELS, VOXEL_M, count_keyframes, fuse, fusion_views
+from sigmasplat.slam.fusion import TRUNCATION_VOXELS, VOXEL_M, count_keyframes, fuse, surface_views
 from sigmasplat.sources.base import Source
 from sigmasplat.types import Matrix, Progress, no_progress
 
@@ -60,7 +60,8 @@ def surface_errors(
     reference = (_fused(run.config, source, truth) if surface is None else surface).moved(T_estimate_truth)
     outside = frozenset(range(len(run.store))) - frozenset(run.members)
     total = count_keyframes(run.store, outside)
-    found = fuse(fusion_views(run.store, run.anchors, outside), total, run.config, renderer=renderer, progress=progress)
+    views = surface_views(run.field, run.store, run.anchors, run.config, outside)
+    found = fuse(views, total, run.config, renderer=renderer, progress=progress)
     poses = T_estimate_truth @ truth.T_world_camera[evenly_spread(true_rows.tolist(), SEEING_FRAMES)]
     vertices = found.vertices.astype(np.float64)
     seen = np.flatnonzero(_seen(vertices, reference, run.camera, poses))

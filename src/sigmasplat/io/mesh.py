@@ -1,7 +1,8 @@
-"""Write surfaces as PLY, OBJ or GLB with a colour per vertex; read PLY. PLY and GLB also hold depth_std_m, if known."""
+"""Write surfaces as PLY, OBJ or GLB with a normal and a colour per vertex, or as STL; read PLY.
 
-import json
-import struct
+PLY and GLB also contain depth_std_m, if it is known. The unit is the metre.
+"""
+
 from pathlib import Path
 from typing import BinaryIO
 
@@ -11,20 +12,23 @@ from numpy.typing import NDArray
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.io.atomic import replacing
 from sigmasplat.io.binary import open_binary
+from sigmasplat.io.glb import GRAY, glb
 from sigmasplat.io.ply_elements import BYTE_ORDERS, MAX_HEADER_BYTES, PLY_TYPES
 from sigmasplat.model.mesh import Mesh
 
 ElementHeader = tuple[str, int, list[list[str]]]
 
-FLOAT32, UINT32, VERTEX_TARGET, INDEX_TARGET = 5126, 5125, 34962, 34963
-"""Constants of the glTF 2.0 specification."""
+NOTE = "sigmasplat, unit metre"
 
 
-def write_mesh(path: Path, mesh: Mesh) -> None:
-    """Write a mesh in the format of the path's ending, atomically. Raises RunError on an unknown ending or if the file
-    cannot be written."""
+def write_mesh(path: Path, mesh: Mesh, note: str = NOTE) -> None:
+    """Write a mesh in the format of the path's ending, atomically; the axes of the vertices stay as they are.
+
+    Vertices for GLB have y up, as glTF requires. note: one line of ASCII for the header of PLY, OBJ and STL, for
+    instance its axes. Raises RunError on an unknown ending or if the file cannot be written.
+    """
     check_ending(path)
-    content = _FORMATS[path.suffix.lower()](mesh)
+    content = _FORMATS[path.suffix.lower()](mesh, note)
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 
@@ -121,74 +125,58 @@ def _length_after(file: BinaryIO, start: np.dtype[np.void]) -> int:
     return int(np.frombuffer(data, start)["length"][0]) if len(data) == start.itemsize else 3
 
 
-def _ply(mesh: Mesh) -> bytes:
-    """Return the mesh as binary little-endian PLY: float x y z, uchar red green blue, float depth_std_m if it is known,
-    faces as lists of int."""
-    columns = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+def _ply(mesh: Mesh, note: str) -> bytes:
+    """Return the mesh as binary little-endian PLY: float x y z, float nx ny nz, uchar red green blue, float depth_std_m
+    if it is known, faces as lists of int."""
+    points, normals, colors = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
+    columns = [(name, "<f4") for name in (*points, *normals)] + [(name, "u1") for name in colors]
     columns += [] if mesh.depth_std_m is None else [("depth_std_m", "<f4")]
     vertices = np.zeros(len(mesh.vertices), np.dtype(columns))
-    for k, name in enumerate("xyz"):
-        vertices[name] = mesh.vertices[:, k]
-    for k, name in enumerate(("red", "green", "blue")):
-        vertices[name] = _bytes(mesh)[:, k]
+    for names, values in ((points, mesh.vertices), (normals, mesh.normals()), (colors, _bytes(mesh))):
+        for k, name in enumerate(names):
+            vertices[name] = values[:, k]
     if mesh.depth_std_m is not None:
         vertices["depth_std_m"] = mesh.depth_std_m
     faces = np.zeros(len(mesh.faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
     faces["count"], faces["corners"] = 3, mesh.faces
     properties = [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in columns]
     header = [
-        "ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}", *properties,
+        "ply", "format binary_little_endian 1.0", f"comment {note}", f"element vertex {len(vertices)}", *properties,
         f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header",
     ]  # fmt: skip
     return "".join(f"{line}\n" for line in header).encode("ascii") + vertices.tobytes() + faces.tobytes()
 
 
-def _obj(mesh: Mesh) -> bytes:
+def _obj(mesh: Mesh, note: str) -> bytes:
     """Return the mesh as Wavefront OBJ; the colour follows each vertex, as MeshLab and Blender read it."""
     rows = np.concatenate([mesh.vertices.astype(np.float64), _bytes(mesh) / 255.0], 1)
+    normals = mesh.normals()
     vertices = ("v %.5f %.5f %.5f %.4f %.4f %.4f\n" * len(rows)) % tuple(rows.ravel().tolist())
-    faces = ("f %d %d %d\n" * len(mesh.faces)) % tuple((mesh.faces + 1).ravel().tolist())
-    return (vertices + faces).encode("ascii")
+    directions = ("vn %.4f %.4f %.4f\n" * len(rows)) % tuple(normals.ravel().tolist())
+    corners = np.repeat(mesh.faces.ravel() + 1, 2)  # a vertex and its normal have the same number
+    faces = ("f %d//%d %d//%d %d//%d\n" * len(mesh.faces)) % tuple(corners.tolist())
+    return (f"# {note}\n" + vertices + directions + faces).encode("ascii")
 
 
-def _glb(mesh: Mesh) -> bytes:
-    """Return the mesh as binary glTF 2.0, rotated by 180° about x, since glTF's y axis points up.
+def _stl(mesh: Mesh, note: str) -> bytes:
+    """Return the mesh as binary STL, which has neither colours nor shared vertices."""
+    corners = mesh.corners
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(across, axis=1, keepdims=True)
+    rows = np.zeros(len(corners), np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("unused", "<u2")]))
+    rows["normal"] = np.divide(across, length, out=np.zeros_like(across), where=length > 0)
+    rows["corners"] = corners
+    header = f"binary STL, {note}".encode("ascii")[:80].ljust(80)  # must not begin with "solid", as a text STL does
+    return header + len(rows).to_bytes(4, "little") + rows.tobytes()
 
-    depth_std_m becomes `_DEPTH_STD_M`: glTF requires an underscore before the names of own attributes.
-    """
-    own = [] if mesh.depth_std_m is None else [mesh.depth_std_m.astype("<f4")]
-    colors = (_bytes(mesh) / np.float32(255.0)).astype("<f4")
-    arrays = [mesh.vertices.astype("<f4"), colors, *own, mesh.faces.astype("<u4")]
-    starts = np.cumsum([0, *(array.nbytes for array in arrays)]).tolist()
-    targets = [VERTEX_TARGET] * (len(arrays) - 1) + [INDEX_TARGET]
-    views = [
-        {"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": target}
-        for array, start, target in zip(arrays, starts, targets, strict=False)
-    ]
-    bounds = {"min": mesh.vertices.min(0).tolist(), "max": mesh.vertices.max(0).tolist()} if len(mesh.vertices) else {}
-    accessors = [
-        {"bufferView": 0, "componentType": FLOAT32, "count": len(mesh.vertices), "type": "VEC3"} | bounds,
-        {"bufferView": 1, "componentType": FLOAT32, "count": len(mesh.vertices), "type": "VEC3"},
-        *[{"bufferView": 2, "componentType": FLOAT32, "count": len(mesh.vertices), "type": "SCALAR"} for _ in own],
-        {"bufferView": 2 + len(own), "componentType": UINT32, "count": mesh.faces.size, "type": "SCALAR"},
-    ]
-    attributes = {"POSITION": 0, "COLOR_0": 1} | ({"_DEPTH_STD_M": 2} if own else {})
-    primitive = {"attributes": attributes, "indices": 2 + len(own)}
-    scene = {
-        "asset": {"version": "2.0", "generator": "sigmasplat"}, "scene": 0, "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": [1.0, 0.0, 0.0, 0.0]}], "meshes": [{"primitives": [primitive]}],
-        "buffers": [{"byteLength": starts[-1]}], "bufferViews": views, "accessors": accessors,
-    }  # fmt: skip
-    text = json.dumps(scene).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", starts[-1], b"BIN\0")
-    binary = b"".join(array.tobytes() for array in arrays)
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks) + len(binary)) + chunks + binary
+
+def _glb(mesh: Mesh, note: str) -> bytes:
+    return glb(mesh)
 
 
 def _bytes(mesh: Mesh) -> NDArray[np.uint8]:
     """Return the vertices' colours as bytes [V, 3]; gray if the mesh has no colours."""
-    return color_bytes(np.full(mesh.vertices.shape, 0.7, np.float32) if mesh.colors is None else mesh.colors)
+    return color_bytes(np.full(mesh.vertices.shape, GRAY, np.float32) if mesh.colors is None else mesh.colors)
 
 
 def color_bytes(colors: NDArray[np.floating]) -> NDArray[np.uint8]:
@@ -196,4 +184,4 @@ def color_bytes(colors: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.asarray(np.rint(np.clip(colors, 0.0, 1.0) * 255.0), np.uint8)
 
 
-_FORMATS = {".ply": _ply, ".obj": _obj, ".glb": _glb}
+_FORMATS = {".ply": _ply, ".obj": _obj, ".glb": _glb, ".stl": _stl}

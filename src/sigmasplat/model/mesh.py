@@ -68,7 +68,7 @@ class Mesh:
             [np.bincount(self.faces.ravel(), np.repeat(across[:, k], 3), len(self.vertices)) for k in range(3)]
         )
         length = np.linalg.norm(sums, axis=0)
-        return np.asarray(np.divide(sums, length, out=np.zeros_like(sums), where=length > 0).T)
+        return np.asarray(np.divide(sums, length, out=np.zeros(sums.shape), where=length > 0).T)
 
     def sampled(self, points: int, seed: int) -> NDArray[np.float64]:
         """Draw random points [points, 3], uniform over the area; no points if the area is 0."""
@@ -123,12 +123,14 @@ class Mesh:
         lengths = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
         return np.asarray(lengths.max(1, initial=0.0))
 
-    def without_small_parts(self, vertices: int) -> "Mesh":
-        """Remove connected parts of fewer than `vertices` vertices (VarSplat §7: 200), and vertices without a face."""
+    def without_small_parts(self, vertices: int, share: float = 0.0) -> "Mesh":
+        """Remove connected parts of fewer than `vertices` vertices (VarSplat §7: 200) or of less than `share` of the
+        area of the largest part, and vertices without a face."""
         if not len(self.faces):
             return self.with_faces(np.zeros(0, bool))
         start, end = self.faces[:, [0, 1]].ravel(), self.faces[:, [1, 2]].ravel()
         n = len(self.vertices)
         edges = coo_array((np.ones(len(start), bool), (start, end)), shape=(n, n))
         _, part = connected_components(edges, directed=False)
-        return self.with_faces((np.bincount(part) >= vertices)[part[self.faces[:, 0]]])
+        area = np.bincount(part[self.faces[:, 0]], self.areas())
+        return self.with_faces(((np.bincount(part) >= vertices) & (area >= share * area.max()))[part[self.faces[:, 0]]])

@@ -1,6 +1,7 @@
 """Fuse a surface from the map: render at keyframes, integrate, extract, clean (VarSplat §7).
 
-Only renders of the map are fused, never recorded images.
+By default only renders of the map are fused. With `surface.depth=map+sensor` (ours) the readings of the keyframes are
+fused too: the map averages the noise of many views and closes holes, a reading is sharp and has no bias of the fit.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -17,7 +18,7 @@ from sigmasplat.model import isosurface, se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.mesh import Mesh
-from sigmasplat.model.submap import SubmapStore
+from sigmasplat.model.submap import Picture, SubmapStore
 from sigmasplat.model.tsdf import Tsdf
 from sigmasplat.render import FieldRenderer, Render
 from sigmasplat.types import Matrix, Progress, no_progress
@@ -27,6 +28,8 @@ TRUNCATION_VOXELS = 4
 """VarSplat §7: 1 cm, truncated at 4 cm."""
 LEAST_ALPHA = 0.9
 """A pixel counts if its alpha reaches this value; its depth is then Σwz / Σw."""
+STEP_SHARE, AGREE_SHARE, RENDER_WEIGHT = 0.05, 0.05, np.float32(1.0)
+"""Of fusion with readings: `silhouettes`, `with_readings`; the variance of a reading by that of a render."""
 LEAST_VERTICES = 200
 """Connected parts with fewer vertices are dropped (VarSplat §7)."""
 
@@ -36,12 +39,42 @@ Renderer = Callable[[GaussianField, Camera, Matrix], Render]
 
 @dataclass(frozen=True, eq=False)
 class FusionView:
-    """A view to render and fuse: a field, a camera, and its pose in the field's frame and in the world."""
+    """A view to render and fuse: a field, a camera, and its pose in the field's frame and in the world; picture: the
+    recorded images of the view, if they are fused too."""
 
     field: GaussianField
     camera: Camera
     T_camera_field: Matrix
     T_world_camera: Matrix
+    picture: Picture | None = None
+
+
+def surface_views(
+    field: GaussianField,
+    store: SubmapStore,
+    anchors: Sequence[Matrix],
+    config: Config,
+    outside: Collection[int] = (),
+    T_world_keyframe: Matrix | None = None,
+) -> Iterator[FusionView]:
+    """Yield the views of a finished run's surface at its keyframes, as `surface.depth` says.
+
+    field: the final map in the world; anchors: T_world_submap of each submap; outside: the submaps that are not
+    connected to the world, which are skipped; T_world_keyframe [K, 4, 4]: the poses of all keyframes of all submaps, if
+    the final map has moved them.
+    """
+    if config.surface.depth == "map":
+        yield from fusion_views(store, anchors, outside)
+        return
+    first = 0
+    for index in range(len(store)):
+        submap = store.load(index)
+        poses = anchors[index] @ submap.T_submap_camera
+        if T_world_keyframe is not None:
+            poses = T_world_keyframe[first : first + len(poses)]
+        first += len(poses)
+        for k, T in enumerate(poses) if index not in outside else ():
+            yield FusionView(field, submap.camera, se3.inverse(T), T, store.picture(index, k))
 
 
 def fusion_views(store: SubmapStore, anchors: Sequence[Matrix], outside: Collection[int] = ()) -> Iterator[FusionView]:
@@ -77,8 +110,9 @@ def fuse(
 ) -> Mesh:
     """Fuse depth and colour, rendered at `total` views, into a mesh in the world.
 
-    Depth outside the range of the input settings is ignored. weigh: weight pixels by their colour uncertainty, w̃ with
-    the τ of tracking (VarSplat §3). Calls `progress(views done, total)`. Raises ConfigError unless voxel_m > 0.
+    A view with a picture is fused with its readings (`with_readings`). Depth outside the range of the input settings is
+    ignored. weigh: weight the other pixels by their colour uncertainty, w̃ with the τ of tracking (VarSplat §3). Calls
+    `progress(views done, total)`. Raises ConfigError unless voxel_m > 0.
     """
     volume = Tsdf(voxel_m, TRUNCATION_VOXELS * voxel_m)
     renderer = renderer or FieldRenderer(config.render, config.backend)
@@ -87,6 +121,8 @@ def fuse(
             seen = renderer(at.field, at.camera, at.T_camera_field)
         depth_m, color = surface_of(seen, config)
         weight = certainty(seen, config) if weigh else None
+        if at.picture is not None:
+            depth_m, color, weight = with_readings(depth_m, color, at.picture)
         volume.integrate(depth_m, color, at.camera, at.T_world_camera, weight)
         progress(done, total)
     mesh = isosurface.surface(volume)
@@ -101,6 +137,43 @@ def surface_of(seen: Render, config: Config) -> tuple[Floats, Floats]:
     depth_m = np.where(alpha >= LEAST_ALPHA, _array(seen.depth) / opaque, np.float32(0.0))
     depth_m[(depth_m < config.input.min_depth_m) | (depth_m > config.input.max_depth_m)] = 0.0
     return depth_m, np.clip(_array(seen.color) / opaque[..., None], 0.0, 1.0)
+
+
+def with_readings(depth_m: Floats, color: Floats, picture: Picture) -> tuple[Floats, Floats, Floats]:
+    """Combine rendered depth [H, W] and colour [H, W, 3] with a keyframe's readings; return both and the weight [H, W].
+
+    Depth is the mean of the render and the reading, weighted by the inverse of their variances. Where they differ by
+    more than `AGREE_SHARE` of the depth, only the reading counts; where there is no reading, only the render. A render
+    has no depth at silhouettes: a pixel there mixes two surfaces.
+    """
+    reading_m = picture.depth_m
+    rendered_m = np.where(silhouettes(depth_m), np.float32(0.0), depth_m)
+    of_reading = _inverse_variance(reading_m)
+    agree = np.abs(rendered_m - reading_m) < AGREE_SHARE * reading_m
+    of_render = np.where((reading_m > 0) & ~agree, np.float32(0.0), RENDER_WEIGHT * _inverse_variance(rendered_m))
+    weight = of_reading + of_render
+    mean_m = (of_reading * reading_m + of_render * rendered_m) / np.maximum(weight, np.float32(1e-12))
+    shown = np.where(reading_m[..., None] > 0, picture.unit_color, color)
+    return np.asarray(mean_m, np.float32), np.asarray(shown, np.float32), np.asarray(weight, np.float32)
+
+
+def silhouettes(depth_m: Floats) -> NDArray[np.bool_]:
+    """Return the pixels [H, W] whose depth differs from that of a neighbour by more than `STEP_SHARE` of it."""
+    out = np.zeros(depth_m.shape, bool)
+    for axis in (0, 1):
+        near, far = np.moveaxis(depth_m, axis, 0)[:-1], np.moveaxis(depth_m, axis, 0)[1:]
+        step = np.abs(near - far) > STEP_SHARE * np.minimum(near, far)
+        marked = np.moveaxis(out, axis, 0)
+        marked[:-1] |= step
+        marked[1:] |= step
+    return out
+
+
+def _inverse_variance(depth_m: Floats) -> Floats:
+    """Return the inverse variance of depth [H, W] relative to that at 1 m, 0 without depth: structured light
+    (Nguyen 2012)."""
+    sigma = 1.2 + 1.9 * (depth_m - np.float32(0.4)) ** 2
+    return np.where(depth_m > 0, (np.float32(1.2 + 1.9 * 0.36) / sigma) ** 2, np.float32(0.0)).astype(np.float32)
 
 
 def certainty(seen: Render, config: Config) -> Floats:
