@@ -5,12 +5,11 @@ from pathlib import Path
 from sigmasplat.errors import SourceError
 from sigmasplat.io.binary import open_binary
 from sigmasplat.io.ply_elements import read_header
-from sigmasplat.io.splats import compressed_ply, ply, splat, spz
+from sigmasplat.io.splats import compressed_ply, ply, splat, spz, spz_container
 from sigmasplat.model.field import GaussianField
 
 READABLE = ".ply, .compressed.ply, .splat or .spz"
 OTHER_FILES = {
-    b"NGSP": "is SPZ of version 4 or without gzip; save it as SPZ version 3, or as PLY",
     b"PK\x03\x04": "is a zip archive, perhaps SuperSplat's SOG; unpack it, or save the map as PLY",
     b"glTF": "is a GLB model; save the map as PLY",
     b"version https://git-lfs": "is a Git LFS pointer, not the map itself; run: git lfs pull",
@@ -30,7 +29,7 @@ def read_any(path: Path) -> GaussianField:
         raise SourceError(f"{path} is a folder, not a map; give a file: {READABLE}")
     with open_binary(path, "cannot read map") as file:
         start = file.read(32)
-    if start.startswith(b"\x1f\x8b\x08"):
+    if start.startswith((spz_container.GZIP, spz_container.MAGIC)):
         return spz.read_field(path)
     return _read_ply(path) if start[:3] == b"ply" and start[3:4].isspace() else _read_headerless(path, start)
 
