@@ -3,15 +3,16 @@
 One prim, /map, with positions, orientations, scales (metres), opacities (0 to 1) and the harmonics of each splat from
 degree 0 (which is (colour − ½)/C0) on, as float32. Our own attributes, which other readers skip: `primvars:sigma`, the
 standard deviation of each colour channel; `primvars:depth_std_m` and `primvars:color_std` if they are known. The reader
-ignores the last two. Unit is the metre. Axes are x right, y up, z back (`upAxis` Y); with `up="z"` the field must have
-the vertical axis z, and is written as it is. Layers that a file refers to are not read. Schema: OpenUSD, UsdVol.
+ignores the last two. Unit is the metre. Axes are x right, y up, z back (`upAxis` Y): the writer rotates maps by 180°
+about x, the reader rotates them back. The reader also reads z up. Layers that a file refers to are not read. Schema:
+OpenUSD, UsdVol.
 """
 
 import tempfile
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,18 +35,17 @@ EXTENT_SIGMAS = 3.0
 """A splat is assumed to end this many standard deviations from its centre."""
 
 
-def write_field(path: Path, field: GaussianField, *, std: SplatStd | None = None, up: Literal["y", "z"] = "y") -> None:
+def write_field(path: Path, field: GaussianField, *, std: SplatStd | None = None) -> None:
     """Write the splats atomically: as text if the name ends in .usda, else as binary.
 
     `std` adds its two attributes. Raises SigmaSplatError without usd-core, RunError if the file cannot be written.
     """
     Sdf, Vt = _pxr("Sdf"), _pxr("Vt")
-    values = SplatValues.of(field)
-    values = values if up == "z" else values.turned_about_x()
+    values = SplatValues.of(field).turned_about_x()
     suffix = ".usda" if path.suffix.lower() == ".usda" else ".usdc"
     layer = Sdf.Layer.CreateAnonymous(suffix)
     layer.defaultPrim = "map"
-    layer.pseudoRoot.SetInfo("upAxis", up.upper())
+    layer.pseudoRoot.SetInfo("upAxis", "Y")
     layer.pseudoRoot.SetInfo("metersPerUnit", 1.0)
     prim = Sdf.PrimSpec(layer, "map", Sdf.SpecifierDef, SCHEMA)
     names = Sdf.ValueTypeNames
