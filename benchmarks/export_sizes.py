@@ -2,7 +2,8 @@
 
 The map of a finished run is exported in every format of splats, read back with our reader and rendered at the run's
 held-out views. The rows with fewer splats are exported with --max-splats. The area is that of the surface that
-`sigmasplat mesh` extracts with voxels of 4 cm. Writes benchmarks/results/export-sizes-<machine>.json and prints a table.
+`sigmasplat mesh` extracts with voxels of 4 cm.
+Writes benchmarks/results/export-sizes-<machine>.json and prints a table.
 
 example: sigmasplat run data/redkitchen --hold-out 10 --out runs/kitchen; python benchmarks/export_sizes.py runs/kitchen
 """
@@ -182,7 +183,7 @@ def sections(measured: dict[str, Any]) -> list[Section]:
 
 def main(options: Options) -> int:
     """Measure, write the results, print them; return the exit code."""
-    return program.run("export_sizes", options, measure, config={"run": options.run.name})
+    return program.run("export_sizes", options, measure, run=options.run.name)
 
 
 if __name__ == "__main__":

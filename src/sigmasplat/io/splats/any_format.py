@@ -10,6 +10,8 @@ from sigmasplat.io.splats import compressed_ply, gltf, ply, sog, splat, spz, spz
 from sigmasplat.model.field import GaussianField
 
 READABLE = ".ply, .compressed.ply, .splat, .spz, .sog, .glb, .gltf, .usda, .usdc or .usd"
+START = 4096
+"""The first bytes of a file, which decide its format. A .gltf nearly always says `asset` in them."""
 READERS: dict[bytes, Callable[[Path], GaussianField]] = {
     spz_container.GZIP: spz.read_field,
     spz_container.MAGIC: spz.read_field,
@@ -37,7 +39,7 @@ def read_any(path: Path) -> GaussianField:
     if path.is_dir():
         raise SourceError(f"{path} is a folder, not a map; give a file: {READABLE}")
     with open_binary(path, "cannot read map") as file:
-        start = file.read(32)
+        start = file.read(START)
     if start[:3] == b"ply" and start[3:4].isspace():
         return _read_ply(path)
     for magic, read in READERS.items():
@@ -57,7 +59,7 @@ def _read_headerless(path: Path, start: bytes) -> GaussianField:
     try:
         return splat.read_field(path)
     except SourceError as problem:
-        if start.lstrip().startswith(b"{") and path.suffix.lower() == ".gltf":
+        if start.lstrip().startswith(b"{") and (b'"asset"' in start or path.suffix.lower() == ".gltf"):
             return gltf.read_field(path)
         for magic, what in OTHER_FILES.items():
             if start.lstrip().startswith(magic):
