@@ -2,13 +2,35 @@
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from sigmasplat.commands import options
 from sigmasplat.commands.options import prepare_torch, refuse_existing, source_of
 from sigmasplat.exports.formats import FORMATS, ExportSource, choose, listed, refuse_unused
+
+MaxSplats = Annotated[
+    options.Whole,
+    tyro.conf.arg(
+        metavar="N",
+        help="keep at most N splats, those that fill the most pixels of the run's views",
+        help_behavior_hint="(default: all)",
+    ),
+]
+MapAxes = Annotated[
+    Literal["y-up", "z-up", "y-down", "camera"] | None,
+    tyro.conf.arg(
+        metavar="{y-up,z-up,y-down,camera}",
+        help="axes of a map: y-up, z-up and y-down are levelled; camera: those of the run's path; y-up and camera only "
+        "for SPZ, glTF and OpenUSD",
+        help_behavior_hint="(default: y-up for SPZ, glTF and OpenUSD, else y-down)",
+    ),
+]
+SpzVersion = Annotated[
+    options.Whole,
+    tyro.conf.arg(metavar="{2,3,4}", help="version of SPZ", help_behavior_hint="(default: 3, which most viewers read)"),
+]
 
 
 @dataclass(frozen=True)
@@ -18,6 +40,9 @@ class ExportOptions:
     sigma_below: options.SigmaBelow = None
     std_below_m: options.StdBelowM = None
     opacity_above: options.OpacityAbove = None
+    max_splats: MaxSplats = None
+    axes: MapAxes = None
+    spz_version: SpzVersion = None
     plain: options.Plain = False
     pictures: options.Pictures = False
     voxel_m: options.VoxelM = 0.01

@@ -7,11 +7,11 @@ import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sigmasplat.errors import ConfigError, RunError
+from sigmasplat.exports import splat_formats
 
 if TYPE_CHECKING:
     from sigmasplat.exports.run_reader import RunReader
@@ -151,44 +151,6 @@ def _counting(title: str) -> "Iterator[Progress]":
         yield progress
 
 
-def _ply(
-    source: ExportSource,
-    target: Path,
-    *,
-    sigma_below: float | None,
-    std_below_m: float | None,
-    opacity_above: float | None,
-    plain: bool,
-) -> str:
-    from sigmasplat.exports.splats import Bounds, write_splats
-    from sigmasplat.io.splats import ply
-
-    bounds = Bounds(sigma_below, std_below_m, opacity_above)
-    return write_splats(
-        source.path, source.splats, bounds, lambda field, std: ply.write_field(target, field, plain=plain, std=std)
-    )
-
-
-def _splats_without_std(module: str) -> Callable[..., str]:
-    """Return the writer of a format without standard deviations, made of `write_field` of a module of io/splats."""
-
-    def write(
-        source: ExportSource,
-        target: Path,
-        *,
-        sigma_below: float | None,
-        std_below_m: float | None,
-        opacity_above: float | None,
-    ) -> str:
-        from sigmasplat.exports.splats import Bounds, write_splats
-
-        written = import_module(f"sigmasplat.io.splats.{module}").write_field
-        bounds = Bounds(sigma_below, std_below_m, opacity_above)
-        return write_splats(source.path, source.splats, bounds, lambda field, _: written(target, field))
-
-    return write
-
-
 def _trajectory(source: ExportSource, target: Path) -> str:
     from sigmasplat.io.trajectory import write_trajectory
 
@@ -289,15 +251,18 @@ def _plan(source: ExportSource, target: Path, *, cell_m: float) -> str:
 
 
 FORMATS = (
-    ExportFormat("ply", (".ply",), "3DGS PLY with σ², for every viewer", _ply),
+    ExportFormat("ply", (".ply",), "3DGS PLY with σ², for every viewer", splat_formats.ply),
     ExportFormat(
         "compressed-ply",
         (".compressed.ply",),
         "SuperSplat's compressed PLY, a fifth of the size",
-        _splats_without_std("compressed_ply"),
+        splat_formats.like_ply("compressed_ply"),
     ),
-    ExportFormat("splat", (".splat",), "32 bytes per splat, for web viewers", _splats_without_std("splat")),
-    ExportFormat("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", _splats_without_std("spz")),
+    ExportFormat("splat", (".splat",), "32 bytes per splat, for web viewers", splat_formats.like_ply("splat")),
+    ExportFormat("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", splat_formats.spz),
+    ExportFormat("sog", (".sog",), "SuperSplat's SOG, the smallest", splat_formats.like_ply("sog")),
+    ExportFormat("gltf", (".glb", ".gltf"), "glTF with splats (KHR) and σ", splat_formats.scene("gltf")),
+    ExportFormat("usd", (".usdc", ".usda", ".usd"), "OpenUSD with splats and σ", splat_formats.scene("usd")),
     ExportFormat("trajectory", (".txt",), "the path as TUM text", _trajectory),
     ExportFormat("covariance", (".cov.txt",), "the path as TUM text with the covariance of each pose", _covariance),
     ExportFormat("ros-covariance", (".ros.txt",), "the same as geometry_msgs/PoseWithCovariance", _ros_covariance),

@@ -1,6 +1,6 @@
 """Convert fields to the arrays that splat files are packed from, and back."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from sigmasplat.errors import SourceError
 from sigmasplat.io.splats.quaternions import Doubles, unit
 from sigmasplat.model.field import ATTRIBUTES, COLUMNS, INITIAL_LOG_VARIANCE, WIDTH, GaussianField, Rows
-from sigmasplat.model.harmonics import DEGREES, count
+from sigmasplat.model.harmonics import DEGREES, count, turned
 
 SH_C0 = 0.28209479177387814
 """Y₀₀ = 1/(2√π): the constant spherical harmonic."""
+R_RUB_RDF = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+"""Rotates axes x right, y down, z forward to x right, y up, z back, and back."""
 MORTON_BITS, ROUNDING = 20, 1e-6
 
 
@@ -54,6 +56,17 @@ class SplatValues:
     def ordered(self, rows: NDArray[np.intp]) -> "SplatValues":
         """Return the splats selected by an index array, in its order."""
         return SplatValues(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+    def turned_about_x(self) -> "SplatValues":
+        """Return the splats rotated by 180° about x: from axes x right, y down, z forward to x right, y up, z back.
+
+        It is its own inverse. Only signs change: of means, quaternions and harmonics.
+        """
+        xyz = R_RUB_RDF.diagonal().numpy()
+        ones = torch.ones(1, ATTRIBUTES["harmonics"], dtype=torch.float64)
+        signs = turned(ones, R_RUB_RDF).round().numpy()[:, : self.harmonics.shape[1]]
+        quats = self.quats * np.array([1.0, *xyz])
+        return replace(self, means=self.means * xyz, quats=quats, harmonics=self.harmonics * signs)
 
     def field(self, path: Path) -> GaussianField:
         """Return a field of the values read from `path`, with initial σ². Raises SourceError unless all are finite."""
