@@ -30,6 +30,7 @@ SUBJECTS = {
     "Robustness": ("robustness", "failure_probability"),
     "Loops and submaps": ("loops", "drift_rule"),
     "Consistent maps": ("consistency",),
+    "Geometry": ("four_frames",),
     "Kernels": ("cpu", "versus", "gpu", "kernels"),
     "Long runs": ("long_run", "viewer_memory"),
 }
