@@ -40,10 +40,14 @@ from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.presets import default_preset, preset as preset_of
 from sigmasplat.render import render
-from sigmasplat.render.backend import make_view
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.sources import open_source
 from sigmasplat.sources.base import Source
+
+try:
+    from sigmasplat.render.backend import make_view
+except ImportError:  # an older checkout
+    from sigmasplat.render.view import make_view  # type: ignore[attr-defined, no-redef]
 
 arg = tyro.conf.arg
 Matrix = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""The test of geometry on four frames: it scores the pixels that the frames have seen, and tabulates what it measured."""
+"""The test of geometry on four frames: it scores the pixels that the frames have seen."""
 
 import importlib
 from typing import Any

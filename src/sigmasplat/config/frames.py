@@ -94,6 +94,9 @@ class MappingConfig:
     """Weight of the loss 1 − SSIM, which compares structure rather than brightness (VarSplat §2)."""
     weight_depth: float = 1.0
     """Weight of the loss |D̂ − D| in metres. Use less if the sensor's depth is worse than its colour (VarSplat §2)."""
+    weight_mean_depth: float = 0.0
+    """Weight of the loss |D̂/A − D| in metres where the alpha A is above ½ (ours). D̂/A is the mean depth of the splats;
+    D̂ alone is too small where light passes the map. Instead of `weight_depth` it keeps splats on the surface."""
     weight_isotropy: float = 1.0
     """Weight of the loss |s − mean(s)| of the scales s in metres (VarSplat §2)."""
     weight_isotropy_ratio: float = 0.0

@@ -147,14 +147,14 @@ public:
                                g_params.data(), pointer(pull), g_twist.data(), seconds.data());
     }
     double step(Floats params, Floats moment1, Floats moment2, Ints last_step, ConstFloats g_sums, Maybe<ConstFloats> g_moment,
-                Maybe<Ints> median_id, Maybe<ConstFloats> g_median_depth, ConstFloats rates, float beta1, float beta2,
+                Maybe<ConstFloats> g_alpha, Maybe<Ints> median_id, Maybe<ConstFloats> g_median_depth, ConstFloats rates, float beta1, float beta2,
                 float epsilon, int step, std::vector<float> isotropy, int64_t frozen_colors, Maybe<Floats> pull, Doubles g_twist, Doubles seconds) {
         need(isotropy.size() == 2 && !median_id == !g_median_depth, "a step has two isotropy weights; a median depth's gradient goes with the medians");
         need(!pull || pull->size() == params.shape(0), "pull must fit the rows");
         need(g_twist.size() == 6 && seconds.size() >= 2 && rates.size() == 17, "g_twist has 6 numbers, seconds 2, rates 17");
         need(last_step.size() == params.shape(0) && moment1.size() == params.size() && moment2.size() == params.size(), "Adam's state must fit the rows");
         nb::gil_scoped_release unlocked;
-        return kernels->view_step(context, params.data(), {g_sums.data(), pointer(g_moment), nullptr, pointer(median_id), pointer(g_median_depth)},
+        return kernels->view_step(context, params.data(), {g_sums.data(), pointer(g_moment), pointer(g_alpha), pointer(median_id), pointer(g_median_depth)},
                                   {moment1.data(), moment2.data(), last_step.data()}, {rates.data(), beta1, beta2, epsilon, step},
                                   {isotropy[0], isotropy[1], frozen_colors}, pointer(pull), g_twist.data(), seconds.data());
     }
@@ -227,18 +227,20 @@ NB_MODULE(_core, m) {
         nb::gil_scoped_release unlocked;
         return active->ssim(image.data(), target.data(), cache.data(), width, height, image.shape(2), image.shape(1) * image.shape(2), pointer(mask), weight, gradient.data());
     }, nb::arg("image"), nb::arg("target"), nb::arg("cache"), nb::arg("width"), nb::arg("height"), nb::arg("mask").none(), nb::arg("weight"), nb::arg("gradient"));
-    m.def("mapping_losses", [](ConstFloats sums, Maybe<ConstFloats> median_depth, Maybe<ConstFloats> moment, ConstFloats target_color, ConstFloats target_depth,
-                               int height, std::vector<float> weights, double valid_pixels, Floats g_sums, Maybe<Floats> g_median_depth, Maybe<Floats> g_moment,
-                               Doubles losses) {
-        need(weights.size() == 6 && losses.size() == 6, "mapping_losses: six weights, six losses");
-        need(!median_depth == !g_median_depth && !moment == !g_moment, "a gradient goes with its plane");
+    m.def("mapping_losses", [](ConstFloats sums, Maybe<ConstFloats> median_depth, Maybe<ConstFloats> moment, Maybe<ConstFloats> alpha,
+                               ConstFloats target_color, ConstFloats target_depth, int height, std::vector<float> weights, double valid_pixels, Floats g_sums,
+                               Maybe<Floats> g_median_depth, Maybe<Floats> g_moment, Maybe<Floats> g_alpha, Doubles losses) {
+        need(weights.size() == LOSS_TERMS && losses.size() == LOSS_TERMS, "mapping_losses: seven weights, seven losses");
+        need(!median_depth == !g_median_depth && !moment == !g_moment && !alpha == !g_alpha, "a gradient goes with its plane");
         const size_t stride = sums.shape(2), plane = sums.shape(1) * stride;
+        const LossWeights w{weights[0], weights[1], weights[2], weights[3], weights[4], weights[5], weights[6]};
         nb::gil_scoped_release unlocked;
         active->mapping_losses(sums.data(), target_color.data(), target_depth.data(), height, stride, plane, sums.shape(0) >= 7,
-                               {pointer(median_depth), pointer(moment)}, {weights[0], weights[1], weights[2], weights[3], weights[4], weights[5]}, valid_pixels,
-                               g_sums.data(), {pointer(g_median_depth), pointer(g_moment)}, losses.data());
-    }, nb::arg("sums"), nb::arg("median_depth").none(), nb::arg("moment").none(), nb::arg("target_color"), nb::arg("target_depth"), nb::arg("height"),
-       nb::arg("weights"), nb::arg("valid_pixels"), nb::arg("g_sums"), nb::arg("g_median_depth").none(), nb::arg("g_moment").none(), nb::arg("losses"));
+                               {pointer(median_depth), pointer(moment), pointer(alpha)}, w, valid_pixels,
+                               g_sums.data(), {pointer(g_median_depth), pointer(g_moment), pointer(g_alpha)}, losses.data());
+    }, nb::arg("sums"), nb::arg("median_depth").none(), nb::arg("moment").none(), nb::arg("alpha").none(), nb::arg("target_color"), nb::arg("target_depth"),
+       nb::arg("height"), nb::arg("weights"), nb::arg("valid_pixels"), nb::arg("g_sums"), nb::arg("g_median_depth").none(), nb::arg("g_moment").none(),
+       nb::arg("g_alpha").none(), nb::arg("losses"));
     m.def("tracking_loss", [](ConstFloats sums, ConstFloats alpha, ConstFloats target_color, ConstFloats target_depth, int width, int height,
                               std::vector<float> options, bool uncertainty, bool kept, float gain, float offset, Floats g_sums, Doubles g_exposure) {
         need(g_exposure.size() == 2, "g_exposure has 2 numbers");
@@ -301,7 +303,7 @@ NB_MODULE(_core, m) {
         .def("view_backward", &Rasteriser::view_backward, nb::arg("params"), nb::arg("g_sums"),
              nb::arg("g_moment").none(), nb::arg("g_alpha").none(), nb::arg("median_id").none(), nb::arg("g_median_depth").none(), nb::arg("g_params"),
              nb::arg("pull").none(), nb::arg("g_twist"), nb::arg("seconds"))
-        .def("step", &Rasteriser::step, nb::arg("params"), nb::arg("moment1"), nb::arg("moment2"), nb::arg("last_step"), nb::arg("g_sums"), nb::arg("g_moment").none(), nb::arg("median_id").none(), nb::arg("g_median_depth").none(), nb::arg("rates"),
+        .def("step", &Rasteriser::step, nb::arg("params"), nb::arg("moment1"), nb::arg("moment2"), nb::arg("last_step"), nb::arg("g_sums"), nb::arg("g_moment").none(), nb::arg("g_alpha").none(), nb::arg("median_id").none(), nb::arg("g_median_depth").none(), nb::arg("rates"),
              nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"), nb::arg("step"), nb::arg("isotropy"), nb::arg("frozen_colors"), nb::arg("pull").none(),
              nb::arg("g_twist"), nb::arg("seconds"))
         .def("backward_pose", &Rasteriser::backward_pose)

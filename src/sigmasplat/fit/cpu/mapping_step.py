@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates
-from sigmasplat.fit.fused_terms import SHAPE_TERMS, kernel_weights, pixel_weights
+from sigmasplat.fit.fused_terms import PIXEL_TERMS, SHAPE_TERMS, kernel_weights, pixel_weights
 from sigmasplat.fit.interface import Weights
 from sigmasplat.fit.mapping_step import GradientAccumulator, render_for
 from sigmasplat.fit.target import Target
@@ -23,7 +23,8 @@ class CompiledImages:
 
         self.core, self.planes = _core, planes
         self.cache = torch.zeros(_core.ssim_cache_floats(planes.camera.width, planes.camera.height))
-        self.parts = np.zeros(6)
+        self.parts = np.zeros(1 + max(term.index or 0 for term in PIXEL_TERMS.values()))
+        planes.g_alpha.zero_()  # only the term of mean depth writes it
 
     def images(self, target: Target, weights: Weights) -> float:
         """Write the gradient of every image term to the view's gradient planes; return the loss."""
@@ -31,9 +32,10 @@ class CompiledImages:
         of_pixels = pixel_weights(weights, "cpu", variance=len(v.sums) >= 7)
         median, g_median = (v.layers.median_depth, v.g_median_depth) if weights.get("median_depth") else (None, None)
         moment, g_moment = (v.moment, v.g_moment) if weights.get("moment") else (None, None)
+        alpha, g_alpha = (v.alpha, v.g_alpha) if weights.get("mean_depth") else (None, None)
         self.core.mapping_losses(
-            v.sums, median, moment, target.color, target.depth, height, of_pixels.tolist(), target.valid_pixels,
-            v.g_sums, g_median, g_moment, self.parts,
+            v.sums, median, moment, alpha, target.color, target.depth, height, of_pixels.tolist(),
+            target.valid_pixels, v.g_sums, g_median, g_moment, g_alpha, self.parts,
         )  # fmt: skip
         loss = float(np.dot(of_pixels, self.parts))
         if weights["ssim"]:
@@ -61,8 +63,10 @@ class CompiledStep(CompiledImages):
     ) -> tuple[Matrix, float]:
         """Step the splats as `TorchStep.splats` does, in one pass that stores no gradient rows in memory."""
         twist, v = np.zeros(6), self.view
+        g_moment, *g_median = v.depth_gradients()
         cost = v.raster.step(
-            field.params, field.moment1, field.moment2, field.last_step, v.g_sums, *v.depth_gradients(),
+            field.params, field.moment1, field.moment2, field.last_step, v.g_sums, g_moment,
+            v.g_alpha if weights.get("mean_depth") else None, *g_median,
             rates.per_column.numpy(), BETA1, BETA2, EPSILON, field.steps,
             kernel_weights(SHAPE_TERMS, weights, "cpu").tolist(), frozen_colors, grad2d, twist, v.seconds[3:],
         )  # fmt: skip
