@@ -23,7 +23,7 @@ class CompiledImages:
 
         self.core, self.planes = _core, planes
         self.cache = torch.zeros(_core.ssim_cache_floats(planes.camera.width, planes.camera.height))
-        self.parts = np.zeros(1 + max(term.index or 0 for term in PIXEL_TERMS.values()))
+        self.parts = np.zeros_like(kernel_weights(PIXEL_TERMS, {}, "cpu"))
         planes.g_alpha.zero_()  # only the term of mean depth writes it
 
     def images(self, target: Target, weights: Weights) -> float:
