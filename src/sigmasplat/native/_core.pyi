@@ -175,6 +175,7 @@ class Rasteriser:
         k: int,
         alpha_min: float,
         stop: float,
+        ray_depth: bool,
         reference: Array | None,
         sums: Array,
         moment: Array | None,

@@ -124,7 +124,7 @@ public:
         kernels->blend_backward(context, {g_sums.data(), pointer(g_moment), pointer(g_alpha)},
                                 {g_means2d.data(), g_conics.data(), g_z.data(), g_opacities.data(), g_features.data()});
     }
-    void view_forward(ConstFloats view, ConstFloats params, int k, float alpha_min, float stop, Maybe<ConstFloats> reference,
+    void view_forward(ConstFloats view, ConstFloats params, int k, float alpha_min, float stop, bool ray_depth, Maybe<ConstFloats> reference,
                       Floats sums, Maybe<Floats> moment, Floats alpha, Maybe<Ints> median_id, Maybe<Floats> median_weight,
                       Maybe<Ints> dominant_id, Maybe<Floats> dominant_weight, Maybe<Floats> median_depth, Doubles seconds) {
         Outputs o = outputs(sums, moment, alpha, median_id, median_weight, dominant_id, dominant_weight);
@@ -135,7 +135,7 @@ public:
         need(seconds.size() >= 3, "seconds needs 3 places");
         nb::gil_scoped_release unlocked;
         kernels->view_forward(context, view.data(), params.data(), int64_t(params.shape(0)), k, pointer(reference),
-                              {alpha_min, stop}, o, seconds.data());
+                              {alpha_min, stop, ray_depth}, o, seconds.data());
     }
     void view_backward(ConstFloats params, ConstFloats g_sums, Maybe<ConstFloats> g_moment, Maybe<ConstFloats> g_alpha, Maybe<Ints> median_id, Maybe<ConstFloats> g_median_depth,
                        Floats g_params, Maybe<Floats> pull, Doubles g_twist, Doubles seconds) {
@@ -180,12 +180,12 @@ static void project_double(Doubles view, Doubles means, Doubles quats, Doubles s
         memcpy(s.quat, quats.data() + 4 * i, sizeof s.quat);
         memcpy(s.scale, scales.data() + 3 * i, sizeof s.scale);
         const auto f = scalar::project(v, s, v.near_m);
-        const double out[6] = {f.u, f.v, f.z, f.l1, f.l2, f.l3};
-        memcpy(footprint.data() + 6 * i, out, sizeof out);
+        const double out[8] = {f.u, f.v, f.z, f.l1, f.l2, f.l3, f.slope_u, f.slope_v};
+        memcpy(footprint.data() + 8 * i, out, sizeof out);
         scalar::FootprintGradient<double> gf;
-        memcpy(&gf, g.data() + 6 * i, sizeof gf);
+        memcpy(&gf, g.data() + 8 * i, sizeof gf);
         scalar::ShapeGradient<double> gs;
-        scalar::project_backward(v, s, v.near_m, gf, gs);
+        scalar::project_backward<true>(v, s, v.near_m, gf, gs);
         memcpy(gradient.data() + 16 * i, &gs, sizeof gs);
     }
 }
@@ -297,9 +297,9 @@ NB_MODULE(_core, m) {
              nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(), nb::arg("median_weight").none(), nb::arg("dominant_id").none(), nb::arg("dominant_weight").none())
         .def("blend_backward", &Rasteriser::blend_backward, nb::arg("g_sums"), nb::arg("g_moment").none(),
              nb::arg("g_alpha").none(), nb::arg("g_means2d"), nb::arg("g_conics"), nb::arg("g_z"), nb::arg("g_opacities"), nb::arg("g_features"))
-        .def("view_forward", &Rasteriser::view_forward, nb::arg("view"), nb::arg("params"), nb::arg("k"), nb::arg("alpha_min"), nb::arg("stop"), nb::arg("reference").none(),
-             nb::arg("sums"), nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(), nb::arg("median_weight").none(), nb::arg("dominant_id").none(),
-             nb::arg("dominant_weight").none(), nb::arg("median_depth").none(), nb::arg("seconds"))
+        .def("view_forward", &Rasteriser::view_forward, nb::arg("view"), nb::arg("params"), nb::arg("k"), nb::arg("alpha_min"), nb::arg("stop"), nb::arg("ray_depth"),
+             nb::arg("reference").none(), nb::arg("sums"), nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(),
+             nb::arg("median_weight").none(), nb::arg("dominant_id").none(), nb::arg("dominant_weight").none(), nb::arg("median_depth").none(), nb::arg("seconds"))
         .def("view_backward", &Rasteriser::view_backward, nb::arg("params"), nb::arg("g_sums"),
              nb::arg("g_moment").none(), nb::arg("g_alpha").none(), nb::arg("median_id").none(), nb::arg("g_median_depth").none(), nb::arg("g_params"),
              nb::arg("pull").none(), nb::arg("g_twist"), nb::arg("seconds"))

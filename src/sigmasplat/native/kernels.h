@@ -10,7 +10,7 @@ struct Context;                            // buffers of one render, private to 
 
 struct PadSize { int tile_width, tile_height, lanes; };
 
-struct BlendOptions { float alpha_min, transmittance_stop; };
+struct BlendOptions { float alpha_min, transmittance_stop; bool ray_depth = false; };   // ray_depth: views only
 
 struct Outputs {                           // planes of Hp × Wp, padded to whole tiles
     float* sums;                           // [K] planes
