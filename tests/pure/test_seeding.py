@@ -237,11 +237,11 @@ def test_no_seed_is_placed_in_a_full_voxel() -> None:
 
 def test_a_map_that_is_dense_enough_gets_no_seeds() -> None:
     depth = np.full(SIZE, 2.0, np.float32)
-    settings: dict[str, object] = {"scale_from": "pixel", "voxel_m": 0.2, "voxel_most": 3}
-    first, _ = made(SOME, depth, **settings)
-    assert 0 < len(first) < SOME.sum()
-    again, _ = made(SOME, depth, field=first, **(settings | {"voxel_most": 1}))
-    assert len(again) == 0 and len(made(SOME, depth, field=first, **(settings | {"voxel_m": 0.0}))[0]) == SOME.sum()
+    dense, _ = made(np.ones(SIZE, bool), depth, scale_from="pixel")
+    assert len(made(SOME, depth, field=dense, scale_from="pixel")[0]) == SOME.sum()
+    assert len(made(SOME, depth, field=dense, scale_from="pixel", voxel_m=0.2, voxel_most=1)[0]) == 0
+    some = made(SOME, depth, scale_from="pixel", voxel_m=0.5, voxel_most=3)[0]
+    assert 0 < len(some) < SOME.sum()
 
 
 def slanted(normal: tuple[float, float, float], through_m: float = 2.0) -> Array:

@@ -99,8 +99,9 @@ def make_splats(
     scales, quats = np.repeat(np.maximum(spread * config.scale_factor, 1e-4)[:, None], 3, 1), None
     if config.thickness != 1.0:
         axes, stretch = discs(target, pixels)
-        scales *= np.where(stretch[:, None] > 0, np.stack([stretch, *np.broadcast_arrays(1.0, stretch)], 1), 1.0)
-        scales[stretch > 0, 2] *= config.thickness
+        on_surface = stretch > 0
+        scales[on_surface, 0] *= stretch[on_surface]
+        scales[on_surface, 2] *= config.thickness
         turned = Rotation.from_matrix(T_world_camera[:3, :3] @ axes[keep]).as_quat(scalar_first=True)
         quats = torch.as_tensor(turned, dtype=torch.float32)
     return GaussianField.from_values(
