@@ -13,6 +13,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.presets import preset
 from sigmasplat.render import render
+from sigmasplat.render.backend import options_on
 from sigmasplat.render.blended_values import blend_values
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda.view import CudaView
@@ -109,6 +110,9 @@ def test_a_render_and_a_view_have_the_same_depth() -> None:
 def test_what_has_no_depth_along_the_ray_refuses_it() -> None:
     with pytest.raises(BackendError, match=r"render\.depth=center"):
         CudaView(WIDE, RAY, True, CPU)
+    with pytest.warns(UserWarning, match="CUDA"):
+        assert options_on("cuda", RAY) == RenderConfig()
+    assert options_on("cpu", RAY) is RAY
     settings: Config = preset("varsplat-fast").changed(mapping={"color_covariance": "full"})
     with pytest.raises(ConfigError, match=r"render\.depth=center"):
         replace(settings, render=RAY).checked()

@@ -19,7 +19,7 @@ class RenderConfig:
     """Added to the diagonal of the 2D covariance, in px²."""
     depth: Literal["center", "ray"] = "center"
     """Depth of a splat at a pixel: center = that of its centre (papers); ray = where the ray meets it most densely, so
-    that a flat splat can show a slanted surface (RaDe-GS). CUDA has only center."""
+    that a flat splat can show a slanted surface (RaDe-GS). On CUDA it is center, with a warning."""
     covariance_pose_gradient: bool = True
     """Whether the pose gradient includes the path through the 2D covariance."""
     mean_pose_gradient: bool = True

@@ -13,7 +13,7 @@ from torch import Tensor
 from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
-from sigmasplat.render.backend import backend_module
+from sigmasplat.render.backend import backend_module, backend_name, options_on
 from sigmasplat.render.ray_depth import depth_of, plane_features
 from sigmasplat.render.reference.operators import depth_slopes
 from sigmasplat.render.render import colors_from
@@ -70,6 +70,7 @@ def blend_values(
     Raises BackendError if the backend is not available.
     """
     kernels, T = backend_module(backend, field.params.device), torch.as_tensor(T_camera_map)
+    options = options_on(backend_name(backend, field.params.device), options)
     with torch.no_grad():
         p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
         seen_z = p.z[p.radii[:, 0] > 0]

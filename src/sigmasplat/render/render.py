@@ -12,7 +12,7 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.harmonics import view_colors
-from sigmasplat.render.backend import backend_module, backend_name
+from sigmasplat.render.backend import backend_module, backend_name, options_on
 from sigmasplat.render.channels import covariance_features, covariance_of, features_of, variance_of
 from sigmasplat.render.cuda import launch as cuda_launch
 from sigmasplat.render.ray_depth import depth_at, depth_of, plane_features
@@ -82,7 +82,8 @@ def render(
     The pose gradient is the sum of the paths that `options` enables: through 2D means, 2D covariances, depths, and the
     viewing directions of `harmonics`. Raises BackendError if the backend is not available.
     """
-    kernels, options = backend_module(backend, field.params.device), options or RenderConfig()
+    kernels = backend_module(backend, field.params.device)
+    options = options_on(backend_name(backend, field.params.device), options or RenderConfig())
     field = on_device(field, backend)
     T = torch.as_tensor(T_camera_world)
     p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
