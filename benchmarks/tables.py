@@ -31,6 +31,7 @@ SUBJECTS = {
     "Loops and submaps": ("loops", "drift_rule"),
     "Consistent maps": ("consistency",),
     "Exported maps": ("export_sizes",),
+    "Geometry": ("four_frames",),
     "Kernels": ("cpu", "versus", "gpu", "kernels"),
     "Long runs": ("long_run", "viewer_memory"),
 }

@@ -17,9 +17,9 @@ from splat_fields import crowd, params_of
 
 WEIGHTS = {
     "l1": 0.8, "ssim": 0.2, "depth": 1.0, "nll_color": 1e-2, "nll_depth": 2e-2, "median_depth": 0.3, "moment": 0.2,
-    "isotropy": 1.0, "isotropy_ratio": 0.1,
+    "mean_depth": 0.4, "isotropy": 1.0, "isotropy_ratio": 0.1,
 }  # fmt: skip
-TERMS = ("l1", "ssim", "depth", "nll_color", "nll_depth", "median_depth", "moment")
+TERMS = ("l1", "ssim", "depth", "nll_color", "nll_depth", "median_depth", "moment", "mean_depth")
 
 
 def target_of(camera: Camera, size: tuple[int, int], valid_share: float = 0.8) -> Target:
@@ -39,6 +39,7 @@ def draw_planes(view: Any, target: Target) -> None:
     view.sums[3] = target.depth + 0.1 * torch.as_tensor(rng.normal(size=target.depth.shape))
     view.layers.median_depth[:] = target.depth + 0.1 * torch.as_tensor(rng.normal(size=target.depth.shape))
     view.layers.median_depth[torch.as_tensor(rng.random(target.depth.shape) < 0.2)] = 0.0
+    view.alpha[:] = torch.as_tensor(rng.uniform(0.2, 1.0, target.depth.shape))
     view.moment[:] = torch.as_tensor(rng.uniform(0.0, 0.1, target.depth.shape))
     if len(view.sums) == 7:
         variance = torch.as_tensor(rng.uniform(1e-3, 0.2, color.shape))

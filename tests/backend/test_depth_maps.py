@@ -34,7 +34,7 @@ CG = MappingConfig(
     weight_isotropy=0.0, weight_nll_color=0.0, weight_l1=0.7, weight_ssim=0.1, weight_depth=0.25, weight_alignment=0.25,
     weight_isotropy_ratio=0.1, weight_moment=0.15,
 )  # fmt: skip
-WEIGHTS = loss_weights(CG)
+WEIGHTS = loss_weights(replace(CG, weight_mean_depth=0.5))
 RATES = Rates(torch.linspace(1e-4, 5e-3, 17))
 
 
@@ -125,7 +125,7 @@ def difference(f: Callable[[float], float], h: float) -> float:
     return (8.0 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12.0 * h)
 
 
-@pytest.mark.parametrize("name", ["median_depth", "moment"])
+@pytest.mark.parametrize("name", ["median_depth", "moment", "mean_depth"])
 def test_each_new_term_by_finite_differences(name: str) -> None:
     """Along random directions of rows and pose, in double; steps so small that no pixel changes its median splat."""
     s = scene("random", 12)
@@ -133,6 +133,7 @@ def test_each_new_term_by_finite_differences(name: str) -> None:
     target = seen(s, tuple(view.alpha.shape))
     target.color, target.depth = target.color.double(), target.depth.double()
     assert loss_of(view, params, T, target, name) > 1e-3
+    assert bool(view.g_alpha.any()) == (name == "mean_depth"), "the mean D̂/A depends on alpha"
     rows = torch.empty_like(params)
     twist = view.backward(params, rows)
     for seed in range(6):
@@ -172,6 +173,31 @@ def test_alignment_pulls_both_sides_and_only_where_there_is_a_median() -> None:
     assert depth.grad is not None and median.grad is not None
     assert torch.equal(depth.grad, -median.grad)
     assert torch.count_nonzero(depth.grad[:2]) == 0 and torch.count_nonzero(depth.grad[2:]) == 8
+
+
+def test_mean_depth_does_not_depend_on_how_opaque_the_splats_of_one_depth_are() -> None:
+    """D̂ of a half transparent wall is too small, and its loss pulls; D̂/A is the depth of the wall."""
+    depth, alpha = torch.full((3, 4), 1.2, requires_grad=True), torch.full((3, 4), 0.6, requires_grad=True)
+    valid, target = torch.ones(3, 4, dtype=torch.bool), torch.full((3, 4), 2.0)
+    assert float(losses.mean_depth(depth, alpha, target, valid).detach()) == pytest.approx(0.0, abs=1e-6)
+    assert float(losses.depth(depth, target, valid).detach()) == pytest.approx(0.8)
+    thin = torch.full((3, 4), 0.5)
+    assert float(losses.mean_depth(0.9 * depth, thin, target, valid).detach()) == 0.0, "no depth where alpha is small"
+    value = losses.mean_depth(1.1 * depth, alpha, target, valid)
+    value.backward()
+    assert depth.grad is not None and alpha.grad is not None
+    torch.testing.assert_close(alpha.grad, torch.full((3, 4), -1.32 / 0.36 / 12))
+
+
+def test_a_fit_without_mean_depth_ignores_what_another_fit_left_on_alpha() -> None:
+    s = scene("random", 60)
+    config, rows = MappingConfig(weight_isotropy=0.0), []
+    for stale in (0.0, 7.0):
+        view, field = CpuView(s.camera, OPTIONS), GaussianField(params_of(s))
+        view.g_alpha.fill_(stale)
+        fit_field(field, view, [keyframes_of(s, view, (0.0, 0.2))], config)
+        rows.append(field.params)
+    assert torch.equal(*rows)
 
 
 @pytest.mark.parametrize("n", [16, 17, 2003])

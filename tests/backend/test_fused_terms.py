@@ -57,7 +57,7 @@ def test_a_term_that_the_kernels_do_not_have_counts_all_the_same(
 ) -> None:
     monkeypatch.setitem(losses.TERMS, OWN, darkness)
     if fused_elsewhere:
-        monkeypatch.setitem(fused_terms.PIXEL_TERMS, OWN, FusedTerm(6, frozenset({OTHER[kernels]})))
+        monkeypatch.setitem(fused_terms.PIXEL_TERMS, OWN, FusedTerm(7, frozenset({OTHER[kernels]})))
     plain = loss_weights(MappingConfig(color_covariance=color_covariance, weight_nll_color=1e-2))
     weights = plain | {OWN: 0.3}
     got, gradient = loss_on(view_on(kernels, WIDE), weights)

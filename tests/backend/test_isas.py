@@ -83,18 +83,20 @@ def losses() -> Outputs:
     """Run SSIM, the pixel losses of mapping, and tracking's loss and reference."""
     (sums, depth_seen), (target, depth) = images(1), images(2)
     target, size = target[:3], (BIG.width, BIG.height)
-    gradient, parts = torch.full_like(sums, torch.nan), np.zeros(6)
+    gradient, parts = torch.full_like(sums, torch.nan), np.zeros(7)
     median, moment = depth_seen.roll(3, 0).contiguous(), (0.1 * depth_seen).contiguous()
-    g_median, g_moment = torch.full_like(median, torch.nan), torch.full_like(moment, torch.nan)
+    alpha = (depth_seen / 4.0).contiguous()
+    g_median, g_moment, g_alpha = (torch.full_like(plane, torch.nan) for plane in (median, moment, alpha))
     valid = float((depth > 0).sum())
-    weights = [0.8, 1.0, 1e-2, 1e-2, 0.3, 0.2]
+    weights = [0.8, 1.0, 1e-2, 1e-2, 0.3, 0.2, 0.4]
     _core.mapping_losses(
-        sums, median, moment, target, depth, BIG.height, weights, valid, gradient, g_median, g_moment, parts
-    )
+        sums, median, moment, alpha, target, depth, BIG.height, weights, valid, gradient, g_median, g_moment, g_alpha,
+        parts,
+    )  # fmt: skip
     cache = torch.zeros(_core.ssim_cache_floats(*size))
     _core.ssim_target(target, depth, *size, cache)
     similarity = _core.ssim(sums[:3], target, cache, *size, depth, -0.2, gradient[:3])
-    alpha, pull, g_exposure = (depth_seen / 4.0).contiguous(), torch.full_like(sums, torch.nan), np.zeros(2)
+    pull, g_exposure = torch.full_like(sums, torch.nan), np.zeros(2)
     numbers = [0.1, 3.0, 5.0, 4.0, 0.6, 2.0, 3.0]
     loss = _core.tracking_loss(sums, alpha, target, depth, *size, numbers, True, True, 1.1, 0.02, pull, g_exposure)
     maps = [np.zeros((BIG.height, BIG.width), np.float32) for _ in range(4)]

@@ -34,9 +34,11 @@ def both_ways(kernels: str, camera: Camera, weights: dict[str, float], variance:
         sums=view.sums.double(), g_sums=torch.zeros_like(view.sums).double(), moment=view.moment.double(),
         layers=SimpleNamespace(median_depth=view.layers.median_depth.double()),
         g_moment=torch.zeros_like(view.moment).double(), g_median_depth=torch.zeros_like(view.moment).double(),
+        alpha=view.alpha.double(), g_alpha=torch.zeros_like(view.alpha).double(),
     )  # fmt: skip
-    for plane, name in ((view.g_sums, ""), (view.g_median_depth, "median_depth"), (view.g_moment, "moment")):
-        plane.fill_(torch.nan if weights.get(name, 1.0) else 0.0)  # whatever was there must go
+    needed_by = {"g_sums": "", "g_median_depth": "median_depth", "g_moment": "moment", "g_alpha": "mean_depth"}
+    for plane, name in needed_by.items():
+        getattr(view, plane).fill_(torch.nan if weights.get(name, 1.0) else 0.0)  # whatever was there must go
     losses = float(fits_of(view).mapping_step(view).images(target, weights)), TorchStep(exact).images(target, weights)
     outside = gradients_of(view)
     outside[:, : camera.height, : camera.width] = 0.0
@@ -46,8 +48,8 @@ def both_ways(kernels: str, camera: Camera, weights: dict[str, float], variance:
 
 
 def gradients_of(view: Any) -> torch.Tensor:
-    """Stack the gradient planes: of the sums, of the median depth, of U."""
-    return torch.cat([view.g_sums, view.g_median_depth[None], view.g_moment[None]])
+    """Stack the gradient planes: of the sums, of the median depth, of U, of alpha."""
+    return torch.cat([view.g_sums, view.g_median_depth[None], view.g_moment[None], view.g_alpha[None]])
 
 
 @pytest.mark.parametrize("variance", [False, True], ids=["K4", "K7"])

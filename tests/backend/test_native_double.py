@@ -30,8 +30,8 @@ def in_front(s: Scene) -> Scene:
 
 
 def native(s: Scene, T: Array, shape: Array, g: Array) -> tuple[Array, Array]:
-    """Project rows of (mean, quat, scale) [N, 10]; return footprints (u, v, z, l1, l2, l3) and gradients [N, 16]."""
-    footprint, gradient = np.empty((len(shape), 6)), np.empty((len(shape), 16))
+    """Project rows of (mean, quat, scale) [N, 10]; return footprints (u, v, z, conic, slopes) and gradients [N, 16]."""
+    footprint, gradient = np.empty((len(shape), 8)), np.empty((len(shape), 16))
     columns = [np.ascontiguousarray(shape[:, PARTS[name]]) for name in ("mean", "quat", "scale")]
     _core.project_double(view_params(s.camera, T, s.options, np.float64), *columns, g, footprint, gradient)
     return footprint, gradient
@@ -62,7 +62,7 @@ def differences(s: Scene, g: Array) -> Array:
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_equal_finite_differences(kind: str) -> None:
     s = in_front(scene(kind, 60))
-    g = np.random.default_rng(1).normal(size=(len(s.means), 6))
+    g = np.random.default_rng(1).normal(size=(len(s.means), 8))
     got, want = native(s, s.T_camera_world.numpy(), rows(s), g)[1], differences(s, g)
     for name, columns in PARTS.items():
         error = np.linalg.norm(got[:, columns] - want[:, columns], axis=1)
@@ -77,12 +77,13 @@ def test_projection_and_gradients_equal_the_reference(kind: str, switched_off: s
     s = in_front(scene(kind, 60))
     if switched_off:
         s = s.with_options(**{switched_off: False})
-    g = np.random.default_rng(2).normal(size=(len(s.means), 6))
+    g = np.random.default_rng(2).normal(size=(len(s.means), 8))
     footprint, gradient = native(s, s.T_camera_world.numpy(), rows(s), g)
 
     x = s.requiring_grad()
     p = reference.project(x.means, x.quats, x.scales, x.T_camera_world, x.camera, x.options)
-    maps = torch.cat([p.means2d, p.z[:, None], p.conics], 1)
+    slopes = reference.depth_slopes(x.means, x.quats, x.scales, x.T_camera_world, x.camera, x.options)
+    maps = torch.cat([p.means2d, p.z[:, None], p.conics, slopes], 1)
     np.testing.assert_allclose(footprint, maps.detach().numpy(), rtol=1e-9, atol=1e-11)
     (maps * torch.as_tensor(g)).sum().backward()
     for name, leaf in (("mean", x.means), ("quat", x.quats), ("scale", x.scales)):
@@ -96,7 +97,7 @@ def test_projection_and_gradients_equal_the_reference(kind: str, switched_off: s
 
 def test_the_norm_of_a_quaternion_means_nothing() -> None:
     s = in_front(scene("needles", 30))
-    T, g = s.T_camera_world.numpy(), np.ones((len(s.means), 6))
+    T, g = s.T_camera_world.numpy(), np.ones((len(s.means), 8))
     longer = rows(s)
     longer[:, PARTS["quat"]] *= 7.0
     (a, ga), (b, gb) = native(s, T, rows(s), g), native(s, T, longer, g)

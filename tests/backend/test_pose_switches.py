@@ -199,8 +199,8 @@ def turns_by_kernels(s: Scene, p: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
     from sigmasplat.render.kernel_params import view_params
 
     numbers = view_params(s.camera, s.T_camera_world.numpy(), options_of(SINGLE[1]), np.float64)
-    footprint, out = np.empty((len(p), 6)), np.empty((len(p), 16))
-    on_conics = np.concatenate([np.zeros((len(p), 3)), g.numpy()], 1)
+    footprint, out = np.empty((len(p), 8)), np.empty((len(p), 16))
+    on_conics = np.concatenate([np.zeros((len(p), 3)), g.numpy(), np.zeros((len(p), 2))], 1)
     shape = [np.ascontiguousarray(x.numpy()) for x in (s.means, s.quats, s.scales)]
     _core.project_double(numbers, *shape, on_conics, footprint, out)
     twist = torch.as_tensor(out[:, 10:])

@@ -12,8 +12,8 @@ from sigmasplat.errors import ConfigError
 from sigmasplat.fit import losses
 
 H, W = 24, 31
-IMAGE_TERMS = ("l1", "ssim", "depth", "nll_color", "nll_color_full", "nll_depth", "moment")
-RENDERED = ("color", "depth", "variance", "covariance", "moment")
+IMAGE_TERMS = ("l1", "ssim", "depth", "nll_color", "nll_color_full", "nll_depth", "moment", "mean_depth")
+RENDERED = ("color", "depth", "alpha", "variance", "covariance", "moment")
 
 
 def maps(seed: int = 0, valid: Tensor | None = None) -> dict[str, Tensor]:
@@ -24,6 +24,7 @@ def maps(seed: int = 0, valid: Tensor | None = None) -> dict[str, Tensor]:
         return torch.tensor(rng.uniform(0.05, 1.0, shape), requires_grad=True)
 
     rendered = {"color": leaf(H, W, 3), "depth": leaf(H, W), "variance": leaf(H, W, 3), "moment": leaf(H, W)}
+    rendered["alpha"] = torch.tensor(rng.uniform(0.6, 1.0, (H, W)), requires_grad=True)
     target = {"color_target": leaf(H, W, 3).detach(), "depth_target": leaf(H, W).detach(), "scales": leaf(7, 3)}
     rendered["covariance"] = six(rng.normal(size=(H, W, 3, 3))).requires_grad_()
     return rendered | target | {"valid": torch.ones(H, W, dtype=torch.bool) if valid is None else valid}

@@ -15,7 +15,8 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
-from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats, thin_out
+from sigmasplat.render.reference.operators import rotations
+from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats, thin_out, with_room
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -224,6 +225,55 @@ def test_a_splats_size_is_the_mean_distance_of_three_neighbours_old_and_new() ->
     found = sizes([beside_the_first])
     assert found[0] == pytest.approx(np.sqrt((0.25 + 1 + 4) / 3), rel=1e-4)
     assert found[3] == pytest.approx(end, rel=1e-4), "the others keep theirs"
+
+
+def test_no_seed_is_placed_in_a_full_voxel() -> None:
+    points = np.array([[0.01, 0, 0], [0.02, 0, 0], [0.03, 0, 0], [0.31, 0, 0], [0.32, 0, 0], [-0.01, 0, 0]])
+    old = torch.tensor([[0.05, 0.05, 0.05], [0.35, 0.0, 0.0], [0.36, 0.0, 0.0]])
+    assert with_room(points, old, 0.1, 2).tolist() == [True, False, False, False, False, True]
+    assert with_room(points, old[:0], 0.1, 2).tolist() == [True, True, False, True, True, True]
+    assert with_room(points[:0], old, 0.1, 2).tolist() == []
+
+
+def test_a_map_that_is_dense_enough_gets_no_seeds() -> None:
+    depth = np.full(SIZE, 2.0, np.float32)
+    dense, _ = made(np.ones(SIZE, bool), depth, scale_from="pixel")
+    assert len(made(SOME, depth, field=dense, scale_from="pixel")[0]) == SOME.sum()
+    assert len(made(SOME, depth, field=dense, scale_from="pixel", voxel_m=0.2, voxel_most=1)[0]) == 0
+    some = made(SOME, depth, scale_from="pixel", voxel_m=0.5, voxel_most=3)[0]
+    assert 0 < len(some) < SOME.sum()
+
+
+def slanted(normal: tuple[float, float, float], through_m: float = 2.0) -> Array:
+    """Make the depth of a plane that crosses the optical axis at a distance."""
+    n = np.array(normal) / np.linalg.norm(normal)
+    return np.asarray(through_m * n[2] / (CAMERA.rays() @ n), np.float32)
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.6, 0.0, 0.8), (-0.3, 0.5, 1.0)])
+def test_discs_lie_on_the_surface(normal: tuple[float, float, float]) -> None:
+    depth, n = slanted(normal), np.array(normal) / np.linalg.norm(normal)
+    field, _ = made(SOME, depth, scale_from="pixel", thickness=0.2, scale_factor=0.8)
+    round_ones, _ = made(SOME, depth, scale_from="pixel", scale_factor=0.8)
+    rays = CAMERA.rays()[SOME]
+    cosine = np.abs(rays @ n) / np.linalg.norm(rays, axis=1)
+    axes = POSE[:3, :3].T @ rotations(field.quats).numpy()
+    np.testing.assert_allclose(np.abs(axes[:, :, 2] @ n), 1.0, atol=1e-4)
+    shape = field.scales.numpy() / round_ones.scales.numpy()
+    np.testing.assert_allclose(shape, np.stack([1.0 / cosine, 1.0 + 0 * cosine, 0.2 + 0 * cosine], 1), rtol=1e-3)
+    np.testing.assert_array_equal(field.means.numpy(), round_ones.means.numpy())
+
+
+def test_a_seed_beside_a_hole_or_a_step_is_round() -> None:
+    depth = np.full(SIZE, 2.0, np.float32)
+    depth[:, 31:] = 3.0
+    depth[10, 10] = 0.0
+    pixels = np.zeros(SIZE, bool)
+    pixels[[10, 20, 20, 30], [11, 30, 31, 12]] = True
+    field, _ = made(pixels, depth, scale_from="pixel", thickness=0.1)
+    ratio = (field.scales.amin(1) / field.scales.amax(1)).numpy()
+    np.testing.assert_allclose(ratio, [1.0, 1.0, 1.0, 0.1], atol=0.01)
+    assert made(pixels * False, depth, thickness=0.1)[0].params.shape == (0, 17)
 
 
 def test_new_splats_keep_their_distance_from_old_ones() -> None:

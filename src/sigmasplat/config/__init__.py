@@ -67,6 +67,10 @@ class Config:
                 f"{m.weight_alignment:g}, {m.weight_moment:g} and frames_per_step={m.frames_per_step}; add --set "
                 "mapping.weight_alignment=0 --set mapping.weight_moment=0 --set mapping.frames_per_step=1"
             )
+        if m.color_covariance == "full" and self.render.depth == "ray":
+            raise ConfigError(
+                "mapping.color_covariance=full does not support render.depth=ray; add --set render.depth=center"
+            )
         if self.submaps.variance_sum and not (m.weight_nll_color or m.weight_nll_depth):
             raise ConfigError(
                 "submaps.variance_sum needs variances that mapping learns; set mapping.weight_nll_color above 0, or "

@@ -17,6 +17,9 @@ class RenderConfig:
     surfaces."""
     low_pass_px2: float = 0.3
     """Added to the diagonal of the 2D covariance, in px²."""
+    depth: Literal["center", "ray"] = "center"
+    """Depth of a splat at a pixel: center = that of its centre (papers); ray = where the ray meets it most densely, so
+    that a flat splat can show a slanted surface (RaDe-GS). On CUDA it is center, with a warning."""
     covariance_pose_gradient: bool = True
     """Whether the pose gradient includes the path through the 2D covariance."""
     mean_pose_gradient: bool = True
@@ -60,6 +63,9 @@ class SeedConfig:
     a pixel at that depth × spacing of the seeds."""
     scale_factor: float = 1.0
     """Factor on the size from `scale_from`. A larger one closes gaps, a smaller one keeps edges."""
+    thickness: float = 1.0
+    """Size of a seed along the surface's normal, as a share of its size along the surface; 1 = a sphere (papers). Below
+    1 seeds are discs on the surface that the depth image shows, and wider where they are seen at an angle."""
     push_back: float = 1.005
     """Factor on the depth of seeds. Blending with closer splats makes the rendered depth too small at first; a factor
     above 1 compensates for this (VarSplat's code)."""
@@ -69,6 +75,10 @@ class SeedConfig:
     """Number of neighbours for statistical outlier removal; 0 = off."""
     outlier_first: bool = True
     """Whether outliers are also removed from the seeds of an empty map; off = VarSplat's code."""
+    voxel_m: float = 0.0
+    """Edge of the voxels in which splats are counted before seeding, in metres; 0 = off (papers)."""
+    voxel_most: int = 8
+    """With `voxel_m`: no seed is placed in a voxel that has this many splats."""
     max_splats: int = 0
     """Maximum number of splats in a submap; 0 = no limit."""
 
@@ -94,6 +104,9 @@ class MappingConfig:
     """Weight of the loss 1 − SSIM, which compares structure rather than brightness (VarSplat §2)."""
     weight_depth: float = 1.0
     """Weight of the loss |D̂ − D| in metres. Use less if the sensor's depth is worse than its colour (VarSplat §2)."""
+    weight_mean_depth: float = 0.0
+    """Weight of the loss |D̂/A − D| in metres where the alpha A is above ½ (ours). D̂/A is the mean depth of the splats;
+    D̂ alone is too small where light passes the map. Instead of `weight_depth` it keeps splats on the surface."""
     weight_isotropy: float = 1.0
     """Weight of the loss |s − mean(s)| of the scales s in metres (VarSplat §2)."""
     weight_isotropy_ratio: float = 0.0

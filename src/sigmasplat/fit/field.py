@@ -57,6 +57,7 @@ def loss_weights(config: MappingConfig) -> dict[str, float]:
         "isotropy_ratio": config.weight_isotropy_ratio,
         "median_depth": config.weight_alignment,
         "moment": config.weight_moment,
+        "mean_depth": config.weight_mean_depth,
     }
     own = {name: getattr(config, f"weight_{name}", 0.0) for name in losses.TERMS if name not in weights}
     return weights | own

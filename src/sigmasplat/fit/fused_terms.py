@@ -25,6 +25,7 @@ PIXEL_TERMS = {
     "nll_depth": FusedTerm(3, COMPILED),
     "median_depth": FusedTerm(4, COMPILED),
     "moment": FusedTerm(5, COMPILED),
+    "mean_depth": FusedTerm(6, COMPILED),
 }
 """Terms per pixel, in the order of `LossWeights` (native/kernels.h, native/cuda/fit.cu)."""
 WINDOW_TERMS = {"ssim": FusedTerm(None, COMPILED)}

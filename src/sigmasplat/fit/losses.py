@@ -4,9 +4,10 @@
 parameters are the maps it takes. `total` passes each term its maps by name, so a new term needs one function and one
 weight.
 
-Maps: color, color_target [H, W, 3] in [0, 1]; depth, depth_target [H, W] m; variance [H, W, 3] (V, VarSplat §1);
-covariance [H, W, 6] (V with its off-diagonal: rr, gg, bb, rg, rb, gb); moment [H, W] m² (U, CG-SLAM eq. 10);
-median_depth [H, W] m, 0 = none (CG-SLAM eq. 8); valid [H, W] bool, pixels with a depth reading; scales [N, 3] m.
+Maps: color, color_target [H, W, 3] in [0, 1]; depth D̂ = Σwz, depth_target [H, W] m; alpha A = Σw [H, W];
+variance [H, W, 3] (V, VarSplat §1); covariance [H, W, 6] (V with its off-diagonal: rr, gg, bb, rg, rb, gb); moment
+[H, W] m² (U, CG-SLAM eq. 10); median_depth [H, W] m, 0 = none (CG-SLAM eq. 8); valid [H, W] bool, pixels with a depth
+reading; scales [N, 3] m.
 
 Every image term is a mean over valid pixels (and channels), except SSIM, which is a mean over all pixels of the masked
 images. Without valid pixels a term is 0 with zero gradient, never NaN.
@@ -23,6 +24,8 @@ from sigmasplat.errors import ConfigError
 
 TERMS: dict[str, Callable[..., Tensor]] = {}
 NLL_EPS = 1e-6
+COVERED = 0.5
+"""Above this alpha a pixel has a depth: D̂/A."""
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 
 
@@ -100,6 +103,18 @@ def depth(depth: Tensor, depth_target: Tensor, valid: Tensor) -> Tensor:
     """Return the mean of |D̂ − D| of depths [H, W] m over valid [H, W] with a reading, m (VarSplat §2, L_depth)."""
     valid = valid & (depth_target > 0)
     return mean_over(masked(depth - depth_target, valid).abs(), valid)
+
+
+@term
+def mean_depth(depth: Tensor, alpha: Tensor, depth_target: Tensor, valid: Tensor) -> Tensor:
+    """Return the mean of |D̂/A − D| over valid [H, W] with a reading, m; 0 where the alpha A is at most `COVERED`.
+
+    D̂/A is the mean depth of the splats of a pixel. D̂ alone is too small wherever light passes the map, and a loss on it
+    moves splats away from the surface.
+    """
+    counted = valid & (depth_target > 0) & (alpha > COVERED)
+    error = masked(masked(depth, counted) / masked(alpha, counted, fill=1.0) - depth_target, counted)
+    return error.abs().sum() / valid.sum().clamp(min=1)
 
 
 @term

@@ -46,6 +46,8 @@ def image_gradients(view: View, target: Target, weights: Weights) -> tuple[Tenso
     planes = {"sums": (v.sums, v.g_sums)}
     if used.get("moment"):
         planes["moment"] = v.moment, v.g_moment
+    if used.get("mean_depth"):
+        planes["alpha"] = v.alpha, v.g_alpha
     if used.get("median_depth"):
         planes["median_depth"] = v.layers.median_depth, v.g_median_depth
     leaves = {name: values.detach().clone().requires_grad_() for name, (values, _) in planes.items()}
@@ -98,6 +100,7 @@ class TorchStep:
 
     def __init__(self, view: View) -> None:
         self.view = view
+        view.g_alpha.zero_()  # only the term of mean depth writes it
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
         """Render the field into the view's planes."""

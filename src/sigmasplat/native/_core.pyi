@@ -55,6 +55,7 @@ def mapping_losses(
     sums: Array,
     median_depth: Array | None,
     moment: Array | None,
+    alpha: Array | None,
     target_color: Array,
     target_depth: Array,
     height: int,
@@ -63,6 +64,7 @@ def mapping_losses(
     g_sums: Array,
     g_median_depth: Array | None,
     g_moment: Array | None,
+    g_alpha: Array | None,
     losses: Array,
 ) -> None: ...
 def tracking_loss(
@@ -187,6 +189,7 @@ class Rasteriser:
         k: int,
         alpha_min: float,
         stop: float,
+        ray_depth: bool,
         reference: Array | None,
         sums: Array,
         moment: Array | None,
@@ -219,6 +222,7 @@ class Rasteriser:
         last_step: Array,
         g_sums: Array,
         g_moment: Array | None,
+        g_alpha: Array | None,
         median_id: Array | None,
         g_median_depth: Array | None,
         rates: Array,

@@ -53,6 +53,10 @@ struct Scratch {                                      // buffers of one thread f
 };
 
 
+// With depth along the ray (options.ray_depth) a row of at most eight features holds a splat's slopes in two of their
+// places: the depth itself is in the geometry.
+constexpr int SLOPE_U = 3, SLOPE_V = 7;
+
 // The compiled feature counts; other counts are padded with zeros.
 constexpr int feature_slots(int k) { return k <= 4 ? 4 : k <= 7 ? 7 : k <= 11 ? 11 : 16; }
 // Number of floats in a row. The shortest rows fill a cache line, so that no row crosses two lines.
@@ -78,7 +82,7 @@ struct Render {                                       // what a forward pass sto
     Buffer<Box> boxes;
     Buffer<int> tiles_of, tile_begin, histogram, chunk_begin;   // chunk_begin: first slot of each chunk
     Buffer<uint64_t> items;
-    Buffer<float> median_gradient;
+    Buffer<float> median_gradient;                    // with depth along the ray three numbers a splat, else one
     Scratch* scratch = nullptr;
     int threads = 0;
 

@@ -145,7 +145,7 @@ public:
         kernels->blend_backward(context, {g_sums.data(), pointer(g_moment), pointer(g_alpha)},
                                 {g_means2d.data(), g_conics.data(), g_z.data(), g_opacities.data(), g_features.data()});
     }
-    void view_forward(ConstFloats view, ConstFloats params, const Harmonics* harmonics, int k, float alpha_min, float stop, Maybe<ConstFloats> reference,
+    void view_forward(ConstFloats view, ConstFloats params, const Harmonics* harmonics, int k, float alpha_min, float stop, bool ray_depth, Maybe<ConstFloats> reference,
                       Floats sums, Maybe<Floats> moment, Floats alpha, Maybe<Ints> median_id, Maybe<Floats> median_weight,
                       Maybe<Ints> dominant_id, Maybe<Floats> dominant_weight, Maybe<Floats> median_depth, Doubles seconds) {
         Outputs o = outputs(sums, moment, alpha, median_id, median_weight, dominant_id, dominant_weight);
@@ -157,7 +157,7 @@ public:
         need_rows(harmonics, params.shape(0));
         nb::gil_scoped_release unlocked;
         kernels->view_forward(context, view.data(), params.data(), harmonics ? harmonics->colors() : ViewColors{}, int64_t(params.shape(0)), k, pointer(reference),
-                              {alpha_min, stop}, o, seconds.data());
+                              {alpha_min, stop, ray_depth}, o, seconds.data());
     }
     void view_backward(ConstFloats params, ConstFloats g_sums, Maybe<ConstFloats> g_moment, Maybe<ConstFloats> g_alpha, Maybe<Ints> median_id, Maybe<ConstFloats> g_median_depth,
                        Floats g_params, Maybe<Floats> pull, Doubles g_twist, Doubles seconds) {
@@ -169,7 +169,7 @@ public:
                                g_params.data(), pointer(pull), g_twist.data(), seconds.data());
     }
     double step(Floats params, Floats moment1, Floats moment2, Ints last_step, ConstFloats g_sums, Maybe<ConstFloats> g_moment,
-                Maybe<Ints> median_id, Maybe<ConstFloats> g_median_depth, ConstFloats rates, float beta1, float beta2,
+                Maybe<ConstFloats> g_alpha, Maybe<Ints> median_id, Maybe<ConstFloats> g_median_depth, ConstFloats rates, float beta1, float beta2,
                 float epsilon, int step, std::vector<float> isotropy, int64_t frozen_colors, const Harmonics* harmonics,
                 Maybe<Floats> pull, Doubles g_twist, Doubles seconds) {
         need_rows(harmonics, params.shape(0));
@@ -178,7 +178,7 @@ public:
         need(g_twist.size() == 6 && seconds.size() >= 2 && rates.size() == 17, "g_twist has 6 numbers, seconds 2, rates 17");
         need(last_step.size() == params.shape(0) && moment1.size() == params.size() && moment2.size() == params.size(), "Adam's state must fit the rows");
         nb::gil_scoped_release unlocked;
-        return kernels->view_step(context, params.data(), {g_sums.data(), pointer(g_moment), nullptr, pointer(median_id), pointer(g_median_depth)},
+        return kernels->view_step(context, params.data(), {g_sums.data(), pointer(g_moment), pointer(g_alpha), pointer(median_id), pointer(g_median_depth)},
                                   {moment1.data(), moment2.data(), last_step.data()}, {rates.data(), beta1, beta2, epsilon, step},
                                   {isotropy[0], isotropy[1], frozen_colors}, harmonics ? harmonics->stepped() : HarmonicsStep{}, pointer(pull), g_twist.data(), seconds.data());
     }
@@ -204,12 +204,12 @@ static void project_double(Doubles view, Doubles means, Doubles quats, Doubles s
         memcpy(s.quat, quats.data() + 4 * i, sizeof s.quat);
         memcpy(s.scale, scales.data() + 3 * i, sizeof s.scale);
         const auto f = scalar::project(v, s, v.near_m);
-        const double out[6] = {f.u, f.v, f.z, f.l1, f.l2, f.l3};
-        memcpy(footprint.data() + 6 * i, out, sizeof out);
+        const double out[8] = {f.u, f.v, f.z, f.l1, f.l2, f.l3, f.slope_u, f.slope_v};
+        memcpy(footprint.data() + 8 * i, out, sizeof out);
         scalar::FootprintGradient<double> gf;
-        memcpy(&gf, g.data() + 6 * i, sizeof gf);
+        memcpy(&gf, g.data() + 8 * i, sizeof gf);
         scalar::ShapeGradient<double> gs;
-        scalar::project_backward(v, s, v.near_m, gf, gs);
+        scalar::project_backward<true>(v, s, v.near_m, gf, gs);
         memcpy(gradient.data() + 16 * i, &gs, sizeof gs);
     }
 }
@@ -251,18 +251,20 @@ NB_MODULE(_core, m) {
         nb::gil_scoped_release unlocked;
         return active->ssim(image.data(), target.data(), cache.data(), width, height, image.shape(2), image.shape(1) * image.shape(2), pointer(mask), weight, gradient.data());
     }, nb::arg("image"), nb::arg("target"), nb::arg("cache"), nb::arg("width"), nb::arg("height"), nb::arg("mask").none(), nb::arg("weight"), nb::arg("gradient"));
-    m.def("mapping_losses", [](ConstFloats sums, Maybe<ConstFloats> median_depth, Maybe<ConstFloats> moment, ConstFloats target_color, ConstFloats target_depth,
-                               int height, std::vector<float> weights, double valid_pixels, Floats g_sums, Maybe<Floats> g_median_depth, Maybe<Floats> g_moment,
-                               Doubles losses) {
-        need(weights.size() == 6 && losses.size() == 6, "mapping_losses: six weights, six losses");
-        need(!median_depth == !g_median_depth && !moment == !g_moment, "a gradient goes with its plane");
+    m.def("mapping_losses", [](ConstFloats sums, Maybe<ConstFloats> median_depth, Maybe<ConstFloats> moment, Maybe<ConstFloats> alpha,
+                               ConstFloats target_color, ConstFloats target_depth, int height, std::vector<float> weights, double valid_pixels, Floats g_sums,
+                               Maybe<Floats> g_median_depth, Maybe<Floats> g_moment, Maybe<Floats> g_alpha, Doubles losses) {
+        need(weights.size() == LOSS_TERMS && losses.size() == LOSS_TERMS, "mapping_losses: seven weights, seven losses");
+        need(!median_depth == !g_median_depth && !moment == !g_moment && !alpha == !g_alpha, "a gradient goes with its plane");
         const size_t stride = sums.shape(2), plane = sums.shape(1) * stride;
+        const LossWeights w{weights[0], weights[1], weights[2], weights[3], weights[4], weights[5], weights[6]};
         nb::gil_scoped_release unlocked;
         active->mapping_losses(sums.data(), target_color.data(), target_depth.data(), height, stride, plane, sums.shape(0) >= 7,
-                               {pointer(median_depth), pointer(moment)}, {weights[0], weights[1], weights[2], weights[3], weights[4], weights[5]}, valid_pixels,
-                               g_sums.data(), {pointer(g_median_depth), pointer(g_moment)}, losses.data());
-    }, nb::arg("sums"), nb::arg("median_depth").none(), nb::arg("moment").none(), nb::arg("target_color"), nb::arg("target_depth"), nb::arg("height"),
-       nb::arg("weights"), nb::arg("valid_pixels"), nb::arg("g_sums"), nb::arg("g_median_depth").none(), nb::arg("g_moment").none(), nb::arg("losses"));
+                               {pointer(median_depth), pointer(moment), pointer(alpha)}, w, valid_pixels,
+                               g_sums.data(), {pointer(g_median_depth), pointer(g_moment), pointer(g_alpha)}, losses.data());
+    }, nb::arg("sums"), nb::arg("median_depth").none(), nb::arg("moment").none(), nb::arg("alpha").none(), nb::arg("target_color"), nb::arg("target_depth"),
+       nb::arg("height"), nb::arg("weights"), nb::arg("valid_pixels"), nb::arg("g_sums"), nb::arg("g_median_depth").none(), nb::arg("g_moment").none(),
+       nb::arg("g_alpha").none(), nb::arg("losses"));
     m.def("tracking_loss", [](ConstFloats sums, ConstFloats alpha, ConstFloats target_color, ConstFloats target_depth, int width, int height,
                               std::vector<float> options, bool uncertainty, bool kept, float gain, float offset, Floats g_sums, Doubles g_exposure) {
         need(g_exposure.size() == 2, "g_exposure has 2 numbers");
@@ -322,13 +324,13 @@ NB_MODULE(_core, m) {
              nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(), nb::arg("median_weight").none(), nb::arg("dominant_id").none(), nb::arg("dominant_weight").none())
         .def("blend_backward", &Rasteriser::blend_backward, nb::arg("g_sums"), nb::arg("g_moment").none(),
              nb::arg("g_alpha").none(), nb::arg("g_means2d"), nb::arg("g_conics"), nb::arg("g_z"), nb::arg("g_opacities"), nb::arg("g_features"))
-        .def("view_forward", &Rasteriser::view_forward, nb::arg("view"), nb::arg("params"), nb::arg("harmonics").none(), nb::arg("k"), nb::arg("alpha_min"), nb::arg("stop"), nb::arg("reference").none(),
-             nb::arg("sums"), nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(), nb::arg("median_weight").none(), nb::arg("dominant_id").none(),
-             nb::arg("dominant_weight").none(), nb::arg("median_depth").none(), nb::arg("seconds"))
+        .def("view_forward", &Rasteriser::view_forward, nb::arg("view"), nb::arg("params"), nb::arg("harmonics").none(), nb::arg("k"), nb::arg("alpha_min"), nb::arg("stop"), nb::arg("ray_depth"),
+             nb::arg("reference").none(), nb::arg("sums"), nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(),
+             nb::arg("median_weight").none(), nb::arg("dominant_id").none(), nb::arg("dominant_weight").none(), nb::arg("median_depth").none(), nb::arg("seconds"))
         .def("view_backward", &Rasteriser::view_backward, nb::arg("params"), nb::arg("g_sums"),
              nb::arg("g_moment").none(), nb::arg("g_alpha").none(), nb::arg("median_id").none(), nb::arg("g_median_depth").none(), nb::arg("g_params"),
              nb::arg("pull").none(), nb::arg("g_twist"), nb::arg("seconds"))
-        .def("step", &Rasteriser::step, nb::arg("params"), nb::arg("moment1"), nb::arg("moment2"), nb::arg("last_step"), nb::arg("g_sums"), nb::arg("g_moment").none(), nb::arg("median_id").none(), nb::arg("g_median_depth").none(), nb::arg("rates"),
+        .def("step", &Rasteriser::step, nb::arg("params"), nb::arg("moment1"), nb::arg("moment2"), nb::arg("last_step"), nb::arg("g_sums"), nb::arg("g_moment").none(), nb::arg("g_alpha").none(), nb::arg("median_id").none(), nb::arg("g_median_depth").none(), nb::arg("rates"),
              nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"), nb::arg("step"), nb::arg("isotropy"), nb::arg("frozen_colors"), nb::arg("harmonics").none(), nb::arg("pull").none(),
              nb::arg("g_twist"), nb::arg("seconds"))
         .def("backward_pose", &Rasteriser::backward_pose)

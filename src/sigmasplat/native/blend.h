@@ -49,7 +49,8 @@ SIGMA_INLINE void list_blocks(Scratch& s, int n) {
 }
 
 // Copy a tile's splats, near to far, with coordinates relative to the tile's centre, and list them per block.
-template <int ROW_FLOATS, bool BACKWARD> static Tile gather_tile(const Render& r, Scratch& s, int index) {
+// SLOPES: the depth of a row is moved to the tile's centre.
+template <int ROW_FLOATS, bool BACKWARD, bool SLOPES> static Tile gather_tile(const Render& r, Scratch& s, int index) {
     const int begin = r.tile_begin[index], n = r.tile_begin[index + 1] - begin;
     const int tx = index % r.tiles_x, ty = index / r.tiles_x;
     const Tile tile{index, tx * TILE_WIDTH, ty * TILE_HEIGHT, n};
@@ -74,6 +75,7 @@ template <int ROW_FLOATS, bool BACKWARD> static Tile gather_tile(const Render& r
         const float u = g.u - cx, v = g.v - cy;
         g.u = -(g.l1 * u + g.l2 * v);                 // p = l1·x + l2·y + g.u, q = l3·y + g.v with x, y from the tile's centre
         g.v = -g.l3 * v;
+        if (SLOPES) g.z -= to[GEOMETRY + SLOPE_U] * u + to[GEOMETRY + SLOPE_V] * v;
         if (BACKWARD) {
             const int columns = box.x1 / BLOCKS_X - box.x0 / BLOCKS_X + 1;
             g.tag += r.chunk_begin[i / CHUNK] + (ty - box.y0 / BLOCKS_Y) * columns + (tx - box.x0 / BLOCKS_X);
@@ -136,7 +138,8 @@ template <int ROW_FLOATS> SIGMA_INLINE int live_alphas(const float* rows, const 
     return n;
 }
 
-template <int K, bool MOMENT, bool IDS> static void blend_tiles(Render& r, Outputs o) {
+// SLOPES: a splat's depth at a pixel is that along the ray.
+template <int K, bool MOMENT, bool IDS, bool SLOPES> static void blend_tiles(Render& r, Outputs o) {
     constexpr int ROW_FLOATS = row_floats<K>;
     const size_t plane = r.plane(), stride = r.padded_width();
     const float log_alpha_min = __builtin_log2f(r.options.alpha_min);
@@ -146,7 +149,7 @@ template <int K, bool MOMENT, bool IDS> static void blend_tiles(Render& r, Outpu
         Scratch& s = r.scratch[omp_get_thread_num()];
 #pragma omp for schedule(dynamic, 1)
         for (int index = 0; index < r.tiles_x * r.tiles_y; index++) {
-            const Tile tile = gather_tile<ROW_FLOATS, false>(r, s, index);
+            const Tile tile = gather_tile<ROW_FLOATS, false, SLOPES>(r, s, index);
             const float* rows = s.rows.data;
             for (int b = 0; b < BLOCKS; b++) {
                 const vf x = block_x(b), y = block_y(b);
@@ -171,8 +174,11 @@ template <int K, bool MOMENT, bool IDS> static void blend_tiles(Render& r, Outpu
                         const Mask before_half = ge(T, half);
                         T = fnma(T, a, T);
                         T_end = select(on, T, T_end);
-                        for (int c = 0; c < K; c++) sum[c] = fma(w, splat(f[c]), sum[c]);
-                        if (MOMENT) { const vf d = geometry.z - ref; moment = fma(w * d, d, moment); }
+                        vf depth;
+                        if constexpr (SLOPES) depth = fma(splat(f[SLOPE_V]), y, fma(splat(f[SLOPE_U]), x, splat(geometry.z)));
+                        else depth = splat(geometry.z);
+                        for (int c = 0; c < K; c++) sum[c] = fma(w, SLOPES && c == 3 ? depth : splat(f[c]), sum[c]);
+                        if (MOMENT) { const vf d = depth - ref; moment = fma(w * d, d, moment); }
                         if (IDS) {
                             const vi id = splat(geometry.tag);
                             const Mask more = gt(w, best), crossing = both(before_half, gt(w, zero));
@@ -180,7 +186,7 @@ template <int K, bool MOMENT, bool IDS> static void blend_tiles(Render& r, Outpu
                             dominant = select(more, id, dominant);
                             median = select(crossing, id, median);
                             median_w = select(crossing, w, median_w);
-                            median_z = select(crossing, splat(geometry.z), median_z);
+                            median_z = select(crossing, depth, median_z);
                         }
                     }
                     if (!any(ge(T, stop))) break;

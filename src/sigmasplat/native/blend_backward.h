@@ -1,12 +1,15 @@
 // Stage 3 backwards: gradients on pixels → a record per tile and splat → sums per splat. Derivation: docs/kernels.md.
 
 // The record of a splat's gradient in one tile. First 8 interleaved pairs (even: sums of g·{1, x, y, xx, xy, yy}; odd:
-// sums of w·∂L/∂feature), then the remaining features. With a moment there are two more w-sums: 2·∂L/∂moment and its
-// product with −ref.
-template <int K, bool MOMENT> constexpr int weight_columns = K + (MOMENT ? 2 : 0);
-template <int K, bool MOMENT> constexpr int extra_floats =
-    weight_columns<K, MOMENT> <= 8 ? 0 : (weight_columns<K, MOMENT> - 8 + W - 1) / W * W;
-template <int K, bool MOMENT> constexpr int record_floats = 16 + extra_floats<K, MOMENT>;
+// sums of w·∂L/∂feature), then the remaining w-sums. SLOPES: ∂L/∂depth times x and y. MOMENT: 2·∂L/∂moment, with SLOPES
+// times {1, x, y, xx, xy, yy}, and its product with −ref, with SLOPES times {1, x, y}.
+template <int K, bool MOMENT, bool SLOPES = false> constexpr int moment_column = K + (SLOPES ? 2 : 0);
+template <int K, bool MOMENT, bool SLOPES = false> constexpr int weight_columns =
+    moment_column<K, MOMENT, SLOPES> + (!MOMENT ? 0 : SLOPES ? 9 : 2);
+template <int K, bool MOMENT, bool SLOPES = false> constexpr int extra_floats =
+    weight_columns<K, MOMENT, SLOPES> <= 8 ? 0 : (weight_columns<K, MOMENT, SLOPES> - 8 + W - 1) / W * W;
+template <int K, bool MOMENT, bool SLOPES = false> constexpr int record_floats = 16 + extra_floats<K, MOMENT, SLOPES>;
+constexpr int weight_place(int c) { return c < 8 ? 2 * c + 1 : 8 + c; }   // where a record has w-sum c
 
 #if defined(__AVX512F__)
 SIGMA_INLINE void store_pairs(float* out, vf g, vf w) {
@@ -44,18 +47,24 @@ template <int K, bool MOMENT> SIGMA_INLINE PixelGradients<K> gradients_at(const 
 
 // The factors of each pixel's pair (g, w): one row per pixel, in the order of `store_pairs`, and one column per sum of
 // the record.
-template <int K, bool MOMENT> using Basis = float[W][record_floats<K, MOMENT>];
-template <int K, bool MOMENT> SIGMA_INLINE void store_basis(const PixelGradients<K>& on_pixels, vf x, vf y, Basis<K, MOMENT>& basis) {
-    constexpr int COLUMNS = record_floats<K, MOMENT>;
+template <int K, bool MOMENT, bool SLOPES> using Basis = float[W][record_floats<K, MOMENT, SLOPES>];
+template <int K, bool MOMENT, bool SLOPES>
+SIGMA_INLINE void store_basis(const PixelGradients<K>& on_pixels, vf x, vf y, Basis<K, MOMENT, SLOPES>& basis) {
+    constexpr int COLUMNS = record_floats<K, MOMENT, SLOPES>, AT = moment_column<K, MOMENT, SLOPES>;
     vf columns[COLUMNS];
     for (auto& c : columns) c = splat(0.f);
     const vf moments[6] = {splat(1.f), x, y, x * x, x * y, y * y};
     for (int c = 0; c < 6; c++) columns[2 * c] = moments[c];
-    const auto weighed = [&](int c, vf v) { columns[c < 8 ? 2 * c + 1 : 8 + c] = v; };
+    const auto weighed = [&](int c, vf v) { columns[weight_place(c)] = v; };
     for (int c = 0; c < K; c++) weighed(c, on_pixels.sums[c]);
-    if (MOMENT) {
-        weighed(K, 2.f * on_pixels.moment);
-        weighed(K + 1, -2.f * on_pixels.moment * on_pixels.ref);
+    if constexpr (SLOPES) {
+        weighed(K, on_pixels.sums[3] * x);
+        weighed(K + 1, on_pixels.sums[3] * y);
+    }
+    if constexpr (MOMENT) {
+        const vf twice = 2.f * on_pixels.moment, by_ref = -2.f * on_pixels.moment * on_pixels.ref;
+        for (int q = 0; q < (SLOPES ? 6 : 1); q++) weighed(AT + q, q ? twice * moments[q] : twice);
+        for (int q = 0; q < (SLOPES ? 3 : 1); q++) weighed(AT + (SLOPES ? 6 : 1) + q, q ? by_ref * moments[q] : by_ref);
     }
     for (int h = 0; h < COLUMNS; h += W) {
         transpose(columns + h);
@@ -65,7 +74,7 @@ template <int K, bool MOMENT> SIGMA_INLINE void store_basis(const PixelGradients
 
 // Near to far: store alpha, weight w and gain G = ∂L/∂w of each splat that reaches a live pixel. Returns the number of
 // these splats.
-template <int ROW_FLOATS, int K, bool MOMENT>
+template <int ROW_FLOATS, int K, bool MOMENT, bool SLOPES>
 SIGMA_INLINE int walk_out(const float* rows, const int* list, int count, vf x, vf y, const PixelGradients<K>& on_pixels,
                           float log_alpha_min, vf stop, Walk& walk) {
     Pixels *const alphas = walk.alpha.data, *const weights = walk.weight.data, *const gains = walk.gain.data;
@@ -80,9 +89,11 @@ SIGMA_INLINE int walk_out(const float* rows, const int* list, int count, vf x, v
             const vf a = load(alphas[e]);
             const Mask on = ge(T, stop);
             vf gain = on_pixels.alpha;
-            for (int c = 0; c < K; c++) gain = fma(on_pixels.sums[c], splat(row[GEOMETRY + c]), gain);
+            vf depth = splat(reinterpret_cast<const Geometry*>(row)->z);
+            if constexpr (SLOPES) depth = fma(splat(row[GEOMETRY + SLOPE_V]), y, fma(splat(row[GEOMETRY + SLOPE_U]), x, depth));
+            for (int c = 0; c < K; c++) gain = fma(on_pixels.sums[c], SLOPES && c == 3 ? depth : splat(row[GEOMETRY + c]), gain);
             if (MOMENT) {
-                const vf d = reinterpret_cast<const Geometry*>(row)->z - on_pixels.ref;
+                const vf d = depth - on_pixels.ref;
                 gain = fma(on_pixels.moment * d, d, gain);
             }
             store(weights[e], only(on, T * a));
@@ -94,8 +105,9 @@ SIGMA_INLINE int walk_out(const float* rows, const int* list, int count, vf x, v
 }
 
 // Add one splat's sums over a block's pixels to its record: pairs times basis.
-template <int K, bool MOMENT> SIGMA_INLINE void add_to_record(const float* pairs, const Basis<K, MOMENT>& basis, float* record) {
-    constexpr int EXTRA = extra_floats<K, MOMENT>;
+template <int K, bool MOMENT, bool SLOPES>
+SIGMA_INLINE void add_to_record(const float* pairs, const Basis<K, MOMENT, SLOPES>& basis, float* record) {
+    constexpr int EXTRA = extra_floats<K, MOMENT, SLOPES>;
     vf acc[16 / W][2], rest[EXTRA ? EXTRA / W : 1];       // two chains of additions, so that each waits half as long
     for (int h = 0; h < 16 / W; h++) { acc[h][0] = load(record + h * W); acc[h][1] = splat(0.f); }
     for (int h = 0; h < EXTRA / W; h++) rest[h] = load(record + 16 + h * W);
@@ -115,8 +127,8 @@ template <int K, bool MOMENT> SIGMA_INLINE void add_to_record(const float* pairs
 // Far to near. C is the gain of one unit of light from behind a splat: ∂L/∂α = T·(G − C), then C ← (1 − α)·C + α·G. C
 // is not computed as a difference of sums over all splats: where T is small, opaque splats in front would leave only
 // rounding errors in it.
-template <int K, bool MOMENT>
-SIGMA_INLINE void walk_back(int n, const Basis<K, MOMENT>& basis, Walk& walk, float* records) {
+template <int K, bool MOMENT, bool SLOPES>
+SIGMA_INLINE void walk_back(int n, const Basis<K, MOMENT, SLOPES>& basis, Walk& walk, float* records) {
     const Pixels *const alphas = walk.alpha.data, *const weights = walk.weight.data, *const gains = walk.gain.data;
     const int* const entries = walk.entry.data;
     const vf one = splat(1.f), top = splat(ALPHA_MAX);
@@ -129,34 +141,34 @@ SIGMA_INLINE void walk_back(int n, const Basis<K, MOMENT>& basis, Walk& walk, fl
             behind = fma(one - a, behind, a * gain);
         }
         for (int e = begin; e < end; e++)
-            add_to_record<K, MOMENT>(walk.pairs[e - begin], basis, records + size_t(entries[e]) * record_floats<K, MOMENT>);
+            add_to_record<K, MOMENT, SLOPES>(walk.pairs[e - begin], basis, records + size_t(entries[e]) * record_floats<K, MOMENT, SLOPES>);
     }
 }
 
 // Process every tile's pixels again and pass its records to `finish(scratch, tile)`. The first K of a row's ROW_K
 // features have gradients; the others are skipped.
-template <int ROW_K, int K, bool MOMENT, class Finish>
+template <int ROW_K, int K, bool MOMENT, bool SLOPES, class Finish>
 static void blend_tiles_backward(Render& r, OutputGradients g, Finish finish) {
-    constexpr int RECORD = record_floats<K, MOMENT>;
+    constexpr int RECORD = record_floats<K, MOMENT, SLOPES>;
     const float log_alpha_min = __builtin_log2f(r.options.alpha_min);
     const vf stop = splat(r.options.transmittance_stop);
 #pragma omp parallel
     {
         Scratch& s = r.scratch[omp_get_thread_num()];
-        alignas(64) Basis<K, MOMENT> basis;
+        alignas(64) Basis<K, MOMENT, SLOPES> basis;
 #pragma omp for schedule(dynamic, 1)
         for (int index = 0; index < r.tiles_x * r.tiles_y; index++) {
-            const Tile tile = gather_tile<row_floats<ROW_K>, true>(r, s, index);
+            const Tile tile = gather_tile<row_floats<ROW_K>, true, SLOPES>(r, s, index);
             memset(s.records.reserve(size_t(tile.count + W) * RECORD), 0, size_t(tile.count + W) * RECORD * sizeof(float));
             s.walk.reserve(tile.count + 4);
             for (int b = 0; b < BLOCKS; b++) {
                 if (!s.counts[b]) continue;
                 const vf x = block_x(b), y = block_y(b);
                 const PixelGradients<K> on_pixels = gradients_at<K, MOMENT>(r, g, block_at(tile, b, r.padded_width()));
-                store_basis<K, MOMENT>(on_pixels, x, y, basis);
-                const int n = walk_out<row_floats<ROW_K>, K, MOMENT>(s.rows.data, &s.lists[b * s.list_capacity], s.counts[b], x, y,
-                                                                     on_pixels, log_alpha_min, stop, s.walk);
-                walk_back<K, MOMENT>(n, basis, s.walk, s.records.data);
+                store_basis<K, MOMENT, SLOPES>(on_pixels, x, y, basis);
+                const int n = walk_out<row_floats<ROW_K>, K, MOMENT, SLOPES>(s.rows.data, &s.lists[b * s.list_capacity], s.counts[b], x, y,
+                                                                             on_pixels, log_alpha_min, stop, s.walk);
+                walk_back<K, MOMENT, SLOPES>(n, basis, s.walk, s.records.data);
             }
             finish(s, tile);
         }
@@ -173,11 +185,28 @@ template <class T> SIGMA_INLINE void shift_moments(T m0, T& mx, T& my, T& mxx, T
     my -= v * m0;
 }
 
+// The same for the w-sums of depth, `at(c)` is the place of sum c.
+template <int K, bool MOMENT, class T, class At> SIGMA_INLINE void shift_depth_sums(At at, T u, T v) {
+    const T on_depth = at(3);
+    at(K) -= u * on_depth;
+    at(K + 1) -= v * on_depth;
+    if constexpr (MOMENT) {
+        constexpr int M = moment_column<K, true, true>;
+        shift_moments(T(at(M)), at(M + 1), at(M + 2), at(M + 3), at(M + 4), at(M + 5), u, v);
+        const T by_ref = at(M + 6);
+        at(M + 7) -= u * by_ref;
+        at(M + 8) -= v * by_ref;
+    }
+}
+
 // Copy a tile's records to each splat's own slots; the moments are now about the splat's mean.
-template <int RECORD> static void flush_records(Render& r, Scratch& s, const Tile& tile) {
+template <int K, bool MOMENT, bool SLOPES> static void flush_records(Render& r, Scratch& s, const Tile& tile) {
+    constexpr int RECORD = record_floats<K, MOMENT, SLOPES>;
     for (int k = 0; k < tile.count; k++) {
         float* m = &s.records[size_t(k) * RECORD];
         shift_moments(m[0], m[2], m[4], m[6], m[8], m[10], s.centers[k].u, s.centers[k].v);
+        if constexpr (SLOPES)
+            shift_depth_sums<K, MOMENT>([&](int c) -> float& { return m[weight_place(c)]; }, s.centers[k].u, s.centers[k].v);
     }
     for (int k = 0; k < tile.count; k++) {
         const Geometry& g = *reinterpret_cast<const Geometry*>(&s.rows[size_t(k) * r.row]);
@@ -203,7 +232,7 @@ template <int RECORD> SIGMA_INLINE void reduce_records(const Render& r, int64_t 
 }
 
 // ∂L/∂feature c of W splats, from their summed records.
-SIGMA_INLINE vf weight_sum(const float (*sums)[W], int c) { return load(sums[c < 8 ? 2 * c + 1 : 8 + c]); }
+SIGMA_INLINE vf weight_sum(const float (*sums)[W], int c) { return load(sums[weight_place(c)]); }
 
 // ∂L/∂(mean, conic) of W splats. power = −½(p² + q²), so every derivative is a moment of g about the splat's mean.
 struct Moments { vf m[6]; };                           // Σ g·{1, x, y, xx, xy, yy} about the splat's mean
@@ -223,4 +252,23 @@ SIGMA_INLINE FootprintGradient<vf> footprint_gradient(const Moments& moments, vf
     g.l3 = -l3 * myy;
     g.z = splat(0.f);
     return g;
+}
+
+// Add ∂L/∂(depth at the pixels) of W splats to the gradient of their footprints, from w-sums about their means.
+template <int K, bool MOMENT>
+SIGMA_INLINE void add_depth_gradient(const float (*sums)[W], const Footprint<vf>& p, FootprintGradient<vf>& g) {
+    vf on_depth = weight_sum(sums, 3), on_u = weight_sum(sums, K), on_v = weight_sum(sums, K + 1);
+    if constexpr (MOMENT) {                           // 2·w·∂L/∂U·(z + slopes·(x, y) − ref), times 1, x and y
+        constexpr int M = moment_column<K, true, true>;
+        vf m[9];
+        for (int q = 0; q < 9; q++) m[q] = weight_sum(sums, M + q);
+        on_depth += fma(p.z, m[0], fma(p.slope_u, m[1], fma(p.slope_v, m[2], m[6])));
+        on_u += fma(p.z, m[1], fma(p.slope_u, m[3], fma(p.slope_v, m[4], m[7])));
+        on_v += fma(p.z, m[2], fma(p.slope_u, m[4], fma(p.slope_v, m[5], m[8])));
+    }
+    g.z = on_depth;
+    g.slope_u = on_u;
+    g.slope_v = on_v;
+    g.u = fnma(p.slope_u, on_depth, g.u);
+    g.v = fnma(p.slope_v, on_depth, g.v);
 }

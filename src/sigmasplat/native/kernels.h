@@ -10,7 +10,7 @@ struct Context;                            // buffers of one render, private to 
 
 struct PadSize { int tile_width, tile_height, lanes; };
 
-struct BlendOptions { float alpha_min, transmittance_stop; };
+struct BlendOptions { float alpha_min, transmittance_stop; bool ray_depth = false; };   // ray_depth: views only
 
 struct Outputs {                           // planes of Hp × Wp, padded to whole tiles
     float* sums;                           // [K] planes
@@ -29,9 +29,10 @@ struct OutputGradients {                   // planes like Outputs; all but sums 
 
 struct SplatGradients { float *means2d, *conics, *z, *opacities, *features; };
 
-struct LossWeights { float l1, depth, nll_color, nll_depth, median_depth, moment; };
-struct DepthMaps { const float *median_depth, *moment; };                              // null where their weight is 0
-struct DepthGradients { float *median_depth, *moment; };
+constexpr int LOSS_TERMS = 7;
+struct LossWeights { float l1, depth, nll_color, nll_depth, median_depth, moment, mean_depth; };
+struct DepthMaps { const float *median_depth, *moment, *alpha; };                      // null where their weight is 0
+struct DepthGradients { float *median_depth, *moment, *alpha; };
 
 struct AdamOptions { const float* rates; float beta1, beta2, epsilon; int step; };   // rates: one per column
 struct StepOptions { float isotropy, isotropy_ratio; int64_t frozen_colors; };

@@ -1,6 +1,6 @@
 // The mapping loss on image planes and its gradient, in one pass; fit/losses.py defines every term. `sums` are planes
 // (r, g, b, z[, q, q, q]). A pixel counts if its target depth is above 0. All values of the gradient planes are written
-// (0 at pixels that do not count); those of the median depth and of U only if given.
+// (0 at pixels that do not count); those of the median depth, of U and of alpha only if given.
 constexpr float NLL_EPSILON = 1e-6f;
 
 SIGMA_INLINE vf signed_weight(vf error, float weight) {
@@ -12,10 +12,10 @@ static void mapping_losses(const float* sums, const float* target_color, const f
                            float* g_sums, DepthGradients gradients, double* losses) {
     const float per_pixel = float(1.0 / (valid_pixels > 1 ? valid_pixels : 1)), per_value = per_pixel / 3.f;
     Buffer<double> rows;
-    rows.reserve(size_t(height) * 6);
+    rows.reserve(size_t(height) * LOSS_TERMS);
 #pragma omp parallel for schedule(static)
     for (int y = 0; y < height; y++) {
-        vf total[6];
+        vf total[LOSS_TERMS];
         for (auto& t : total) t = splat(0.f);
         for (size_t x = 0; x < stride; x += W) {
             const size_t at = size_t(y) * stride + x;
@@ -37,6 +37,14 @@ static void mapping_losses(const float* sums, const float* target_color, const f
                 total[5] += abs(U);
                 store(gradients.moment + at, signed_weight(U, weights.moment * per_pixel));
             }
+            if (maps.alpha) {                         // D̂/A; no gradient where A is small
+                const vf A = load(maps.alpha + at), half = splat(0.5f), inv = 1.f / max(A, half), mean = load(sums + 3 * plane + at) * inv;
+                const vf off = only(both(valid, gt(A, half)), mean - depth);
+                const vf g = signed_weight(off, weights.mean_depth * per_pixel) * inv;
+                total[6] += abs(off);
+                g_depth += g;
+                store(gradients.alpha + at, zero - g * mean);
+            }
             store(g_sums + 3 * plane + at, g_depth);
             for (int c = 0; c < 3; c++) {
                 const vf color = load(sums + c * plane + at), error = only(valid, color - load(target_color + c * plane + at));
@@ -57,12 +65,12 @@ static void mapping_losses(const float* sums, const float* target_color, const f
                 store(g_sums + c * plane + at, g);
             }
         }
-        for (int k = 0; k < 6; k++) rows[size_t(y) * 6 + k] = lane_sum(total[k]);
+        for (int k = 0; k < LOSS_TERMS; k++) rows[size_t(y) * LOSS_TERMS + k] = lane_sum(total[k]);
     }
-    const double scale[6] = {1.0 / 3, 1.0, 1.0 / 3, 1.0 / 3, 1.0, 1.0};
-    for (int k = 0; k < 6; k++) {
+    const double scale[LOSS_TERMS] = {1.0 / 3, 1.0, 1.0 / 3, 1.0 / 3, 1.0, 1.0, 1.0};
+    for (int k = 0; k < LOSS_TERMS; k++) {
         losses[k] = 0;
-        for (int y = 0; y < height; y++) losses[k] += rows[size_t(y) * 6 + k];
+        for (int y = 0; y < height; y++) losses[k] += rows[size_t(y) * LOSS_TERMS + k];
         losses[k] *= scale[k] * per_pixel;
     }
     const auto clear_padding = [&](float* gradient) {   // the rows below the image
@@ -71,6 +79,7 @@ static void mapping_losses(const float* sums, const float* target_color, const f
     for (int c = 0; c < (variance ? 7 : 4); c++) clear_padding(g_sums + c * plane);
     if (maps.median_depth) clear_padding(gradients.median_depth);
     if (maps.moment) clear_padding(gradients.moment);
+    if (maps.alpha) clear_padding(gradients.alpha);
 }
 
 // |s − mean(s)| summed over the axes of W splats (losses.isotropy; the caller divides by 3n). Returns the sum over

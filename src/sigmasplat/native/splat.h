@@ -19,9 +19,10 @@ template <class T> struct Footprint {     // its image: mean, Cholesky conic, de
     T u, v, z;
     T l1, l2, l3;
     T var_u, var_v;
+    T slope_u, slope_v;                   // its depth at a pixel is z + slope_u·(x − u) + slope_v·(y − v), m/px
 };
 
-template <class T> struct FootprintGradient { T u, v, z, l1, l2, l3; };
+template <class T> struct FootprintGradient { T u, v, z, l1, l2, l3, slope_u, slope_v; };
 template <class T> struct ShapeGradient { T mean[3], quat[4], scale[3], twist[6]; };
 
 template <class T> struct Intermediate {  // shared by forward and backward
@@ -94,21 +95,36 @@ inline __attribute__((always_inline)) Footprint<T> project(const View<S>& view, 
     f.l2 = -(m.cb * f.l3 * inv_sqrt_det);
     f.var_u = m.ca;
     f.var_v = m.cc;
+    // Slopes: covariance of depth and image position times the inverse of the covariance in the image (RaDe-GS).
+    const T with_u = dot3(m.a, m.V + 6), with_v = dot3(m.b, m.V + 6), along = f.l1 * with_u + f.l2 * with_v;
+    f.slope_u = f.l1 * along;
+    f.slope_v = f.l2 * along + f.l3 * f.l3 * with_v;
     return f;
 }
 
-// Propagate a gradient on the footprint to the splat and, as a left twist (ρ, φ), to the pose (cg-slam.md §2.1).
-template <class T, class S>
+// Propagate a gradient on the footprint to the splat and, as a left twist (ρ, φ), to the pose (cg-slam.md §2.1). The
+// slopes depend on the pose by the path of the covariance. SLOPES: whether they have a gradient.
+template <bool SLOPES = false, class T, class S>
 inline __attribute__((always_inline)) void project_backward(
     const View<S>& view, const Shape<T>& s, T safe_z_floor, const FootprintGradient<T>& g, ShapeGradient<T>& out) {
     Intermediate<T> m;
     intermediate(view, s, safe_z_floor, m);
     const T l3 = S(1) / sqrt(m.cc), inv_sqrt_det = S(1) / sqrt(m.det);
     const T l1 = sqrt(m.cc) * inv_sqrt_det, l2 = -(m.cb * l3 * inv_sqrt_det);
+    T g_l1 = g.l1, g_l2 = g.l2, g_l3 = g.l3, g_with_u, g_with_v;
+    if constexpr (SLOPES) {
+        const T with_u = dot3(m.a, m.V + 6), with_v = dot3(m.b, m.V + 6), along = l1 * with_u + l2 * with_v;
+        const T g_along = g.slope_u * l1 + g.slope_v * l2;
+        g_l1 = g_l1 + g.slope_u * along + g_along * with_u;
+        g_l2 = g_l2 + g.slope_v * along + g_along * with_v;
+        g_l3 = g_l3 + S(2) * l3 * with_v * g.slope_v;
+        g_with_u = g_along * l1;
+        g_with_v = g_along * l2 + l3 * l3 * g.slope_v;
+    }
     // (l1, l2, l3) → (det, cb, cc) → rows a, b of A
-    const T g_det = -(g.l1 * l1 + g.l2 * l2) / (S(2) * m.det);
-    const T g_cb = -(g.l2 * l3 * inv_sqrt_det);
-    const T g_cc = (g.l1 * l1 - g.l2 * l2 - g.l3 * l3) / (S(2) * m.cc);
+    const T g_det = -(g_l1 * l1 + g_l2 * l2) / (S(2) * m.det);
+    const T g_cb = -(g_l2 * l3 * inv_sqrt_det);
+    const T g_cc = (g_l1 * l1 - g_l2 * l2 - g_l3 * l3) / (S(2) * m.cc);
     T bn[3], na[3], ga[3], gb[3];
     cross(m.b, m.n, bn);
     cross(m.n, m.a, na);
@@ -116,12 +132,18 @@ inline __attribute__((always_inline)) void project_backward(
         ga[j] = S(2) * g_det * (bn[j] + view.low_pass * m.a[j]) + g_cb * m.b[j];
         gb[j] = S(2) * g_det * (na[j] + view.low_pass * m.b[j]) + g_cb * m.a[j] + S(2) * g_cc * m.b[j];
     }
+    if constexpr (SLOPES)
+        for (int j = 0; j < 3; j++) {
+            ga[j] = ga[j] + g_with_u * m.V[6 + j];
+            gb[j] = gb[j] + g_with_v * m.V[6 + j];
+        }
     // A = J·V: gradients of V and of the entries of J
     T gV[9];
     for (int j = 0; j < 3; j++) {
         gV[j] = m.fxz * ga[j];
         gV[3 + j] = m.fyz * gb[j];
         gV[6 + j] = -(m.jx * ga[j] + m.jy * gb[j]);
+        if constexpr (SLOPES) gV[6 + j] = gV[6 + j] + (g_with_u * m.a[j] + g_with_v * m.b[j]);
     }
     const T g_fxz = dot3(ga, m.V), g_jx = -dot3(ga, m.V + 6), g_fyz = dot3(gb, m.V + 3), g_jy = -dot3(gb, m.V + 6);
     const auto free_x = both(ge(m.xn, m.xc), ge(m.xc, m.xn)), free_y = both(ge(m.yn, m.yc), ge(m.yc, m.yn));

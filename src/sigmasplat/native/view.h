@@ -4,19 +4,27 @@
 static void blend(Render& r, Outputs o) {
     with_features(r.k, [&](auto k) {
         constexpr int K = decltype(k)::value;
-        if (o.moment) o.dominant_id ? blend_tiles<K, true, true>(r, o) : blend_tiles<K, true, false>(r, o);
-        else o.dominant_id ? blend_tiles<K, false, true>(r, o) : blend_tiles<K, false, false>(r, o);
+        const auto maps = [&](auto slopes) {
+            constexpr bool SLOPES = decltype(slopes)::value != 0;
+            if (o.moment) o.dominant_id ? blend_tiles<K, true, true, SLOPES>(r, o) : blend_tiles<K, true, false, SLOPES>(r, o);
+            else o.dominant_id ? blend_tiles<K, false, true, SLOPES>(r, o) : blend_tiles<K, false, false, SLOPES>(r, o);
+        };
+        if constexpr (K <= 7) r.options.ray_depth ? maps(std_int<1>{}) : maps(std_int<0>{});
+        else maps(std_int<0>{});
     });
 }
 static void blend_gradients(Render& r, OutputGradients g) {   // to each splat's slots
     with_features(r.k, [&](auto k) {
-        const auto to_slots = [&](auto moment) {
-            constexpr int K = decltype(k)::value, RECORD = record_floats<K, decltype(moment)::value != 0>;
-            r.partials.reserve(size_t(r.intersections + 1) * RECORD);
-            blend_tiles_backward<K, K, decltype(moment)::value != 0>(
-                r, g, [&](Scratch& s, const Tile& tile) { flush_records<RECORD>(r, s, tile); });
+        constexpr int K = decltype(k)::value;
+        const auto to_slots = [&](auto moment, auto slopes) {
+            constexpr bool MOMENT = decltype(moment)::value != 0, SLOPES = decltype(slopes)::value != 0;
+            r.partials.reserve(size_t(r.intersections + 1) * record_floats<K, MOMENT, SLOPES>);
+            blend_tiles_backward<K, K, MOMENT, SLOPES>(
+                r, g, [&](Scratch& s, const Tile& tile) { flush_records<K, MOMENT, SLOPES>(r, s, tile); });
         };
-        g.moment ? to_slots(std_int<1>{}) : to_slots(std_int<0>{});
+        if constexpr (K <= 7)
+            if (r.options.ray_depth) return g.moment ? to_slots(std_int<1>{}, std_int<1>{}) : to_slots(std_int<0>{}, std_int<1>{});
+        g.moment ? to_slots(std_int<1>{}, std_int<0>{}) : to_slots(std_int<0>{}, std_int<0>{});
     });
 }
 
@@ -137,9 +145,9 @@ template <int K> static void pack_view(Render& r, const float* params, const Vie
                     show_colors(r.view, colors, i, live, s.shape.mean, s.color, harmonics);
                 }
                 for (int q = 0; q < 3; q++) store(f[q], s.color[q]);
-                store(f[3], p.z);
+                store(f[3], r.options.ray_depth ? p.slope_u : p.z);
                 for (int q = 0; q < 3; q++) store(f[4 + q], K > 4 ? fma(s.color[q], s.color[q], s.variance[q]) : splat(0.f));
-                store(f[7], splat(0.f));
+                store(f[7], r.options.ray_depth ? p.slope_v : splat(0.f));
             };
             total += pack<row_floats<K>>(r, p, s.opacity, gt(p.z, splat(r.view.near_m)), i, total, f, fill);
         }
@@ -162,17 +170,24 @@ static void view_forward(Context* context, const float* view_numbers, const floa
     if (seconds) { seconds[0] += t1 - t0; seconds[1] += t2 - t1; seconds[2] += omp_get_wtime() - t2; }
 }
 
-// Add ∂L/∂(median depth) of each pixel to the depth of one splat, in the order of the pixels, so that sums do not
-// depend on threads.
+// Add ∂L/∂(median depth) of each pixel to the depth of one splat, with depth along the ray also to its slopes, in the
+// order of the pixels, so that sums do not depend on threads.
 static const float* gather_median(Render& r, OutputGradients g) {
     if (!g.median_depth) return nullptr;
-    float* sums = r.median_gradient.reserve(r.n + W);
-    memset(sums, 0, size_t(r.n + W) * sizeof(float));
+    const size_t splats = size_t(r.n) + W, numbers = (r.options.ray_depth ? 3 : 1) * splats;
+    float* sums = r.median_gradient.reserve(numbers);
+    memset(sums, 0, numbers * sizeof(float));
     const size_t stride = r.padded_width();
     for (int y = 0; y < r.height; y++)
         for (int x = 0; x < r.width; x++) {
             const size_t at = size_t(y) * stride + x;
-            if (g.median_id[at] >= 0) sums[g.median_id[at]] += g.median_depth[at];
+            const int id = g.median_id[at];
+            if (id < 0) continue;
+            sums[id] += g.median_depth[at];
+            if (!r.options.ray_depth) continue;
+            const Geometry& splat = r.geometry(id);
+            sums[splats + id] += g.median_depth[at] * (float(x) - splat.u);
+            sums[2 * splats + id] += g.median_depth[at] * (float(y) - splat.v);
         }
     return sums;
 }
@@ -180,10 +195,10 @@ static const float* gather_median(Render& r, OutputGradients g) {
 // Propagate the summed records of all splats to the pose twist and to parameter rows. If any of W splats is seen,
 // `sink(i, seen, splats, gradient lanes, harmonics lanes)` receives ∂L/∂params, where the colours are those seen from this
 // view; otherwise `unseen(i)` is called. g_median: result of `gather_median`. pull [n], or null: |∂L/∂mean| in the image, per half image size, 0 for unseen splats.
-template <int K, bool MOMENT, class Sink, class Unseen>
+template <int K, bool MOMENT, bool SLOPES, class Sink, class Unseen>
 static void chain_to_params(const Render& r, const float* params, const ViewColors& colors, const float* g_median, float* pull,
                             double* g_twist, Sink sink, Unseen unseen) {
-    constexpr int RECORD = record_floats<K, MOMENT>;
+    constexpr int RECORD = record_floats<K, MOMENT, SLOPES>;
     const float half_width = 0.5f * float(r.width), half_height = 0.5f * float(r.height);
     if (pull) memset(pull, 0, size_t(r.n) * sizeof(float));
     const int64_t chunks = (r.n + CHUNK - 1) / CHUNK;
@@ -206,9 +221,21 @@ static void chain_to_params(const Render& r, const float* params, const ViewColo
             if (colors.degree) show_colors(r.view, colors, i, seen_bits, s.shape.mean, s.color, harmonics);
             const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
             FootprintGradient<vf> g = footprint_gradient(moments_of(sums), p.l1, p.l2, p.l3);
-            g.z = weight_sum(sums, 3);
-            if constexpr (MOMENT) g.z += fma(p.z, weight_sum(sums, K), weight_sum(sums, K + 1));
-            if (g_median) g.z += load(g_median + i);
+            if constexpr (SLOPES) {
+                add_depth_gradient<K, MOMENT>(sums, p, g);
+                if (g_median) {
+                    const vf on_depth = load(g_median + i);
+                    g.z += on_depth;
+                    g.slope_u += load(g_median + r.n + W + i);
+                    g.slope_v += load(g_median + 2 * (r.n + W) + i);
+                    g.u = fnma(p.slope_u, on_depth, g.u);
+                    g.v = fnma(p.slope_v, on_depth, g.v);
+                }
+            } else {
+                g.z = weight_sum(sums, 3);
+                if constexpr (MOMENT) g.z += fma(p.z, weight_sum(sums, K), weight_sum(sums, K + 1));
+                if (g_median) g.z += load(g_median + i);
+            }
             if (pull) {
                 alignas(64) float lanes[W];
                 const vf u = half_width * g.u, v = half_height * g.v;
@@ -216,7 +243,7 @@ static void chain_to_params(const Render& r, const float* params, const ViewColo
                 for (int l = 0; l < W && i + l < r.n; l++) pull[i + l] = lanes[l];
             }
             ShapeGradient<vf> out;
-            project_backward(r.view, s.shape, splat(r.view.near_m), g, out);
+            project_backward<SLOPES>(r.view, s.shape, splat(r.view.near_m), g, out);
             for (int q = 0; q < 6; q++) twist[q] += only(seen, out.twist[q]);
             for (int q = 0; q < 3; q++) store(gradient[q], only(seen, out.mean[q]));
             for (int q = 0; q < 4; q++) store(gradient[3 + q], only(seen, out.quat[q]));
@@ -241,12 +268,14 @@ template <class Sink, class Unseen>
 static void chain_any(Render& r, const float* params, const ViewColors& colors, OutputGradients g, float* pull, double* g_twist, Sink sink,
                       Unseen unseen) {
     const float* g_median = gather_median(r, g);
-    const auto chain = [&](auto k) {
+    const auto chain = [&](auto k, auto slopes) {
         constexpr int K = decltype(k)::value;
-        g.moment ? chain_to_params<K, true>(r, params, colors, g_median, pull, g_twist, sink, unseen)
-                 : chain_to_params<K, false>(r, params, colors, g_median, pull, g_twist, sink, unseen);
+        constexpr bool SLOPES = decltype(slopes)::value != 0;
+        g.moment ? chain_to_params<K, true, SLOPES>(r, params, colors, g_median, pull, g_twist, sink, unseen)
+                 : chain_to_params<K, false, SLOPES>(r, params, colors, g_median, pull, g_twist, sink, unseen);
     };
-    r.k <= 4 ? chain(std_int<4>{}) : chain(std_int<7>{});
+    if (r.options.ray_depth) r.k <= 4 ? chain(std_int<4>{}, std_int<1>{}) : chain(std_int<7>{}, std_int<1>{});
+    else r.k <= 4 ? chain(std_int<4>{}, std_int<0>{}) : chain(std_int<7>{}, std_int<0>{});
 }
 
 static void view_backward(Context* context, const float* params, OutputGradients g, float* g_params, float* pull,
@@ -316,7 +345,8 @@ static void view_backward_pose(Context* context, const float* params, OutputGrad
     const int tiles = r.tiles_x * r.tiles_y;
     Buffer<double> partial;
     partial.reserve(size_t(tiles) * 6);
-    const auto finish = [&](Scratch& scratch, const Tile& tile) {
+    const auto finish = [&](auto slopes, Scratch& scratch, const Tile& tile) {
+        constexpr bool SLOPES = decltype(slopes)::value != 0;
         const uint64_t* items = r.items.data + r.tile_begin[tile.index];
         vf twist[6];
         for (auto& x : twist) x = splat(0.f);
@@ -334,14 +364,27 @@ static void view_backward_pose(Context* context, const float* params, OutputGrad
             const Splats s = activate<false>(row);
             const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
             FootprintGradient<vf> f = footprint_gradient(a, p.l1, p.l2, p.l3);
-            f.z = weight_sum(sums, 3);
+            if constexpr (SLOPES) {
+                vf weighed[6];
+                for (int c = 3; c < 6; c++) weighed[c] = weight_sum(sums, c);
+                shift_depth_sums<4, false>([&](int c) -> vf& { return weighed[c]; }, load(center[0]), load(center[1]));
+                for (int c = 3; c < 6; c++) store(sums[weight_place(c)], weighed[c]);
+                add_depth_gradient<4, false>(sums, p, f);
+            } else {
+                f.z = weight_sum(sums, 3);
+            }
             ShapeGradient<vf> out;
-            project_backward(r.view, s.shape, splat(r.view.near_m), f, out);
+            project_backward<SLOPES>(r.view, s.shape, splat(r.view.near_m), f, out);
             for (int q = 0; q < 6; q++) twist[q] += only(first_lanes(count), out.twist[q]);
         }
         for (int q = 0; q < 6; q++) partial[tile.index * 6 + q] = lane_sum(twist[q]);
     };
-    r.k <= 4 ? blend_tiles_backward<4, 4, false>(r, g, finish) : blend_tiles_backward<7, 4, false>(r, g, finish);
+    const auto walk = [&](auto slopes) {
+        constexpr bool SLOPES = decltype(slopes)::value != 0;
+        const auto each = [&](Scratch& scratch, const Tile& tile) { finish(slopes, scratch, tile); };
+        r.k <= 4 ? blend_tiles_backward<4, 4, false, SLOPES>(r, g, each) : blend_tiles_backward<7, 4, false, SLOPES>(r, g, each);
+    };
+    r.options.ray_depth ? walk(std_int<1>{}) : walk(std_int<0>{});
     for (int q = 0; q < 6; q++) {
         g_twist[q] = 0;
         for (int t = 0; t < tiles; t++) g_twist[q] += partial[t * 6 + q];

@@ -4,6 +4,8 @@ Only this module and the table of the fits (fit/backends.py) choose by device. T
 view gets here.
 """
 
+import warnings
+from dataclasses import replace
 from types import ModuleType
 
 import torch
@@ -56,6 +58,14 @@ def backend_module(asked: str, device: torch.device | None = None) -> ModuleType
     return cpu
 
 
+def options_on(backend: str, options: RenderConfig) -> RenderConfig:
+    """Return the options that a backend (by name) renders with: CUDA has only `render.depth=center`, and warns."""
+    if backend != "cuda" or options.depth == "center":
+        return options
+    warnings.warn("render.depth=ray does not run on CUDA yet; depth is that of the splats' centres", stacklevel=3)
+    return replace(options, depth="center")
+
+
 def make_view(backend: str, camera: Camera, options: RenderConfig, variance: bool = True) -> View:
     """Make a view on a backend by name (one of `BACKENDS`). Raises BackendError as `backend_module` does."""
     backend_module(backend)  # raises BackendError if the kernels are missing
@@ -67,7 +77,7 @@ def make_view(backend: str, camera: Camera, options: RenderConfig, variance: boo
     if name == "cuda":
         from sigmasplat.render.cuda.view import CudaView
 
-        return CudaView(camera, options, variance)
+        return CudaView(camera, options_on(name, options), variance)
     from sigmasplat.render.cpu.view import CpuView
 
     return CpuView(camera, options, variance)

@@ -13,7 +13,9 @@ from torch import Tensor
 from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
-from sigmasplat.render.backend import backend_module
+from sigmasplat.render.backend import backend_module, backend_name, options_on
+from sigmasplat.render.ray_depth import depth_of, plane_features
+from sigmasplat.render.reference.operators import depth_slopes
 from sigmasplat.render.render import colors_from
 
 OWN = 6
@@ -22,7 +24,8 @@ OWN = 6
 
 @dataclass(frozen=True, eq=False)
 class BlendedValues:
-    """Sums over the splats of each pixel: color Σwc [H, W, 3], depth Σwz [H, W] m, second Σw(σ²+c²) [H, W] mean over
+    """Sums over the splats of each pixel: color Σwc [H, W, 3], depth Σwz [H, W] m (z along the ray with
+    `render.depth=ray`), second Σw(σ²+c²) [H, W] mean over
     the channels, values Σwv [H, W, K], alpha Σw [H, W]."""
 
     color: Tensor
@@ -30,14 +33,15 @@ class BlendedValues:
     second: Tensor
     values: Tensor
     alpha: Tensor
+    _center_depth: Tensor
     _depth_second: Tensor
     _center_m: float
     _sums: Tensor
     _features: Tensor
 
     def moment_about(self, depth_m: Tensor) -> Tensor:
-        """Return U = Σw(z − D)² ≥ 0 about reference depths D [H, W] m (CG-SLAM eq. 10)."""
-        off, depth = depth_m - self._center_m, self.depth - self.alpha * self._center_m
+        """Return U = Σw(z − D)² ≥ 0 of the splats' centres about reference depths D [H, W] m (CG-SLAM eq. 10)."""
+        off, depth = depth_m - self._center_m, self._center_depth - self.alpha * self._center_m
         return (self._depth_second - 2.0 * off * depth + off.square() * self.alpha).clamp(min=0.0)
 
     def gather(self, planes: Tensor) -> Tensor:
@@ -66,6 +70,7 @@ def blend_values(
     Raises BackendError if the backend is not available.
     """
     kernels, T = backend_module(backend, field.params.device), torch.as_tensor(T_camera_map)
+    options = options_on(backend_name(backend, field.params.device), options)
     with torch.no_grad():
         p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
         seen_z = p.z[p.radii[:, 0] > 0]
@@ -74,12 +79,16 @@ def blend_values(
         second = (field.variances + colors.square()).mean(1)
         own = torch.cat([colors, torch.stack([p.z, second, (p.z - center_m).square()], 1)], 1)
         features = torch.cat([own, values.to(p.z)], 1)
+        end = features.shape[1]
+        if options.depth == "ray":
+            slopes = depth_slopes(field.means, field.quats, field.scales, T, camera, options)
+            features = torch.cat([features, plane_features(p, slopes, camera)], 1)
         opacities = field.opacities
     with torch.set_grad_enabled(gather):
         features.requires_grad_(gather)
         b = kernels.blend(*p, opacities, features, None, camera, options)
     sums = b.sums.detach()
     return BlendedValues(
-        sums[..., :3], sums[..., 3], sums[..., 4], sums[..., OWN:], b.alpha.detach(),
-        sums[..., 5], center_m, b.sums, features,
+        sums[..., :3], depth_of(sums[..., end:], camera) if options.depth == "ray" else sums[..., 3],
+        sums[..., 4], sums[..., OWN:end], b.alpha.detach(), sums[..., 3], sums[..., 5], center_m, b.sums, features,
     )  # fmt: skip

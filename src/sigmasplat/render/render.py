@@ -12,20 +12,23 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField, Rows
 from sigmasplat.model.harmonics import view_colors
-from sigmasplat.render.backend import backend_module, backend_name
+from sigmasplat.render.backend import backend_module, backend_name, options_on
 from sigmasplat.render.channels import covariance_features, covariance_of, features_of, variance_of
 from sigmasplat.render.cuda import launch as cuda_launch
+from sigmasplat.render.ray_depth import depth_at, depth_of, plane_features
+from sigmasplat.render.reference.operators import depth_slopes
 
 
 @dataclass(frozen=True, eq=False)
 class Render:
     """The maps that a camera sees of a field, all [H, W] or [H, W, 3], covariance [H, W, 6].
 
-    color Ĉ = Σ w c; depth D̂ = Σ w z (m, not divided by alpha); alpha A = Σ w; variance V = Σ w (σ² + c²) − Ĉ², the law
-    of total variance (VarSplat §1); uncertainty U = Σ w (z − D)² about a reference depth D (m², CG-SLAM eq. 10), None
-    without a reference; median_depth: z where half of the light is absorbed, 0 if it never is (CG-SLAM eq. 8);
-    median_id, dominant_id: the splat at that depth, and the splat of largest weight, −1 = none; covariance: V with its
-    off-diagonal, in the order rr, gg, bb, rg, rb, gb, None if the field has no `correlations`.
+    color Ĉ = Σ w c; depth D̂ = Σ w z (m, not divided by alpha), with `render.depth=ray` z along the ray; alpha A = Σ w;
+    variance V = Σ w (σ² + c²) − Ĉ², the law of total variance (VarSplat §1); uncertainty U = Σ w (z − D)² of the
+    splats' centres about a reference depth D (m², CG-SLAM eq. 10), None without a reference; median_depth: z where half
+    of the light is absorbed, 0 if it never is (CG-SLAM eq. 8); median_id, dominant_id: the splat at that depth, and the
+    splat of largest weight, −1 = none; covariance: V with its off-diagonal, in the order rr, gg, bb, rg, rb, gb, None
+    if the field has no `correlations`.
     """
 
     color: Tensor
@@ -79,25 +82,33 @@ def render(
     The pose gradient is the sum of the paths that `options` enables: through 2D means, 2D covariances, depths, and the
     viewing directions of `harmonics`. Raises BackendError if the backend is not available.
     """
-    kernels, options = backend_module(backend, field.params.device), options or RenderConfig()
+    kernels = backend_module(backend, field.params.device)
+    options = options_on(backend_name(backend, field.params.device), options or RenderConfig())
     field = on_device(field, backend)
     T = torch.as_tensor(T_camera_world)
     p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
     features = _features_from(field, p.z, T if options.color_pose_gradient else T.detach())
+    channels, rays = features.shape[1], options.depth == "ray" and len(field) > 0
+    if rays:
+        slopes = depth_slopes(field.means, field.quats, field.scales, T, camera, options)
+        features = torch.cat([features, plane_features(p, slopes, camera)], 1)
     b = kernels.blend(*p, field.opacities, features, depth_reference, camera, options)
-    crossed = b.median_id >= 0
-    nearest = p.z[b.median_id.clamp(min=0).long()] if len(field) else torch.zeros_like(b.alpha)
+    sums, depth = b.sums[..., :channels], b.sums[..., 3]
+    crossed, rows = b.median_id >= 0, b.median_id.clamp(min=0).long()
+    nearest = p.z[rows] if len(field) else torch.zeros_like(b.alpha)
+    if rays:
+        depth, nearest = depth_of(b.sums[..., channels:], camera), depth_at(rows, p, slopes, camera)
     return Render(
-        b.sums[..., 0:3],
-        b.sums[..., 3],
+        sums[..., 0:3],
+        depth,
         b.alpha,
-        variance_of(b.sums),
+        variance_of(sums),
         b.moment,
         torch.where(crossed, nearest, 0.0),
         b.median_id,
         b.dominant_id,
         b.dominant_weight,
-        covariance_of(b.sums[..., :3], b.sums[..., 4:]) if "correlations" in field.attributes else None,
+        covariance_of(sums[..., :3], sums[..., 4:]) if "correlations" in field.attributes else None,
     )
 
 

@@ -5,6 +5,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from skimage.feature import canny
 from torch import Tensor
 
@@ -13,8 +14,12 @@ from sigmasplat.fit.gray import gradient_magnitude, gray_of
 from sigmasplat.fit.target import Target
 from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.tsdf import packed
 
 Mask = NDArray[np.bool_]
+SAME_SURFACE = 0.05
+"""Neighbouring readings show one surface if they differ by less than this share of the depth."""
+STRETCH_MOST = 3.0
 
 
 def first_pixels(target: Target, config: SeedConfig, random: np.random.Generator) -> Mask:
@@ -72,7 +77,8 @@ def make_splats(
     field: GaussianField,
     config: SeedConfig,
 ) -> GaussianField:
-    """Unproject pixels to splats: opacity from the settings, colour from the image, isotropic scale, σ² = e⁻⁷.
+    """Unproject pixels to splats: opacity from the settings, colour from the image, σ² = e⁻⁷, isotropic scale, or discs
+    with `thickness` below 1.
 
     pixels: bool [H, W], all with depth. T_world_camera [4, 4] is the pose in the frame of `field`, the existing splats.
     The scale follows the distance to the 3 nearest neighbours, old and new; with `scale_from` "pixel" it is the size of
@@ -88,13 +94,71 @@ def make_splats(
         keep = np.ones(len(world), bool)
     else:
         keep, spread = _neighbour_spread(world, field.means, config)
-    scales = np.maximum(spread * config.scale_factor, 1e-4)[keep]
+    if config.voxel_m > 0:
+        keep &= with_room(world, field.means, config.voxel_m, config.voxel_most)
+    scales, quats = np.repeat(np.maximum(spread * config.scale_factor, 1e-4)[:, None], 3, 1), None
+    if config.thickness != 1.0:
+        axes, stretch = discs(target, pixels)
+        on_surface = stretch > 0
+        scales[on_surface, 0] *= stretch[on_surface]
+        scales[on_surface, 2] *= config.thickness
+        turned = Rotation.from_matrix(T_world_camera[:3, :3] @ axes[keep]).as_quat(scalar_first=True)
+        quats = torch.as_tensor(turned, dtype=torch.float32)
     return GaussianField.from_values(
         torch.as_tensor(world[keep], dtype=torch.float32),
-        torch.as_tensor(scales, dtype=torch.float32)[:, None].repeat(1, 3),
+        torch.as_tensor(scales[keep], dtype=torch.float32),
         torch.as_tensor(colors[keep], dtype=torch.float32),
+        quats=quats,
         opacities=config.opacity,
     )
+
+
+def discs(target: Target, pixels: Mask) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the axes of discs on the surface at pixels [H, W] with depth: camera frame, [P, 3, 3], and their stretch
+    [P].
+
+    Columns: along the surface away from the camera, across it, and the normal. The first axis is longer than the second
+    by the stretch 1 / cos of the viewing angle, at most `STRETCH_MOST`; the stretch is 0, and the axes are those of the
+    camera, where a neighbour has no reading or shows another surface.
+    """
+    depth, rays = target.depth_image.numpy().astype(np.float64), target.camera.rays()
+    points = np.pad(rays * depth[..., None], ((1, 1), (1, 1), (0, 0)))
+    right, below = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
+    around = np.pad(depth, 1)
+    neighbours = np.stack([around[1:-1, 2:], around[1:-1, :-2], around[2:, 1:-1], around[:-2, 1:-1]])
+    known = (np.abs(neighbours - depth) < SAME_SURFACE * depth).all(0) & (neighbours > 0).all(0)
+    normal = np.cross(right, below)[pixels]
+    view = rays[pixels] / np.linalg.norm(rays[pixels], axis=1, keepdims=True)
+    length = np.linalg.norm(normal, axis=1)
+    normal /= np.maximum(length, 1e-12)[:, None]
+    cosine = (normal * view).sum(1)
+    away = view - cosine[:, None] * normal
+    off = np.linalg.norm(away, axis=1)
+    frontal = np.cross(np.eye(3)[1], normal)  # any direction on a surface seen at a right angle
+    away = np.where(off[:, None] > 1e-3, away / np.maximum(off, 1e-12)[:, None], frontal)
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+    axes = np.stack([away, np.cross(normal, away), normal], 2)
+    disc = known[pixels] & (length > 0)
+    stretch = np.where(disc, np.minimum(1.0 / np.maximum(np.abs(cosine), 1e-6), STRETCH_MOST), 0.0)
+    return np.where(disc[:, None, None], axes, np.eye(3)), stretch
+
+
+def with_room(points: NDArray[np.float64], means: Tensor, voxel_m: float, most: int) -> Mask:
+    """Return which points [P, 3] m are among the first `most` splats of their voxel, bool [P]; the splats of the map
+    (means [N, 3]) come first, then the points in their order."""
+    own, old = (_voxels(x, voxel_m) for x in (points, means.cpu().numpy()))
+    occupied, counts = np.unique(old, return_counts=True)
+    place = np.searchsorted(occupied, own).clip(max=max(len(occupied) - 1, 0))
+    before = np.where(occupied[place] == own, counts[place], 0) if len(occupied) else np.zeros(len(own), np.int64)
+    order = np.argsort(own, kind="stable")
+    starts = np.flatnonzero(np.diff(own[order], prepend=own[order][:1] - 1))
+    rank = np.empty(len(own), np.int64)
+    rank[order] = np.arange(len(own)) - np.repeat(starts, np.diff(starts, append=len(own)))
+    return np.asarray(before + rank < most)
+
+
+def _voxels(points: NDArray[np.floating], voxel_m: float) -> NDArray[np.int64]:
+    return packed(np.floor(points / voxel_m).astype(np.int64))
 
 
 def _neighbour_spread(

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sigmasplat.fit.adam import BETA1, BETA2, EPSILON, Rates
-from sigmasplat.fit.fused_terms import SHAPE_TERMS, kernel_weights, pixel_weights
+from sigmasplat.fit.fused_terms import PIXEL_TERMS, SHAPE_TERMS, kernel_weights, pixel_weights
 from sigmasplat.fit.interface import Weights
 from sigmasplat.fit.mapping_step import GradientAccumulator, render_for
 from sigmasplat.fit.target import Target
@@ -31,9 +31,10 @@ def step_rows(
 ) -> tuple[Matrix, float]:
     """Propagate the view's gradient planes to the splats in view and step them, and their harmonics if given, in one
     pass that stores no gradient rows in memory. Returns what `MappingStep.splats` returns."""
-    twist = np.zeros(6)
+    twist, (g_moment, *g_median) = np.zeros(6), view.depth_gradients()
     cost = view.raster.step(
-        field.params, field.moment1, field.moment2, field.last_step, view.g_sums, *view.depth_gradients(),
+        field.params, field.moment1, field.moment2, field.last_step, view.g_sums, g_moment,
+        view.g_alpha if weights.get("mean_depth") else None, *g_median,
         rates.per_column.numpy(), BETA1, BETA2, EPSILON, field.steps,
         kernel_weights(SHAPE_TERMS, weights, "cpu").tolist(), frozen_colors, harmonics, grad2d, twist,
         view.seconds[3:],
@@ -49,7 +50,8 @@ class CompiledImages:
 
         self.core, self.planes = _core, planes
         self.cache = torch.zeros(_core.ssim_cache_floats(planes.camera.width, planes.camera.height))
-        self.parts = np.zeros(6)
+        self.parts = np.zeros_like(kernel_weights(PIXEL_TERMS, {}, "cpu"))
+        planes.g_alpha.zero_()  # only the term of mean depth writes it
 
     def images(self, target: Target, weights: Weights) -> float:
         """Write the gradient of every image term to the view's gradient planes; return the loss."""
@@ -57,9 +59,10 @@ class CompiledImages:
         of_pixels = pixel_weights(weights, "cpu", variance=len(v.sums) >= 7)
         median, g_median = (v.layers.median_depth, v.g_median_depth) if weights.get("median_depth") else (None, None)
         moment, g_moment = (v.moment, v.g_moment) if weights.get("moment") else (None, None)
+        alpha, g_alpha = (v.alpha, v.g_alpha) if weights.get("mean_depth") else (None, None)
         self.core.mapping_losses(
-            v.sums, median, moment, target.color, target.depth, height, of_pixels.tolist(), target.valid_pixels,
-            v.g_sums, g_median, g_moment, self.parts,
+            v.sums, median, moment, alpha, target.color, target.depth, height, of_pixels.tolist(),
+            target.valid_pixels, v.g_sums, g_median, g_moment, g_alpha, self.parts,
         )  # fmt: skip
         loss = float(np.dot(of_pixels, self.parts))
         if weights["ssim"]:

@@ -34,6 +34,7 @@ class CudaStep:
         self._size, self._pixels = (width, height), width * height
         self._derivatives = torch.empty(3 * CHANNELS, height, width, device=device)
         self._taps = _gaussian_taps()
+        view.g_alpha.zero_()  # only the term of mean depth writes it
 
     def forward(self, field: GaussianField, T_camera_world: Matrix, target: Target, weights: Weights) -> None:
         """Render the field into the view's planes."""
@@ -45,7 +46,8 @@ class CudaStep:
         of_pixels = pixel_weights(weights, "cuda", variance=len(v.sums) >= 7).astype(np.float32)
         median, on_median = (v.layers.median_depth, v.g_median_depth) if weights.get("median_depth") else (None, None)
         moment, on_moment = (v.moment, v.g_moment) if weights.get("moment") else (None, None)
-        planes = (v.sums, target.color, target.depth, median, moment, v.g_sums, on_median, on_moment)
+        alpha, on_alpha = (v.alpha, v.g_alpha) if weights.get("mean_depth") else (None, None)
+        planes = (v.sums, target.color, target.depth, median, moment, alpha, v.g_sums, on_median, on_moment, on_alpha)
         blocks = blocks_for(self._pixels)
         sums = v.raster.empty(blocks, 1, dtype=torch.float64)
         v.raster.launch_fit(

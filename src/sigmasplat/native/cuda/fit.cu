@@ -11,11 +11,11 @@ inline float signed_weight(float error, float weight) { return error > 0.f ? wei
 
 // ---- the mapping loss -----------------------------------------------------------------------------------------------
 
-struct LossPlanes {                        // median_depth, moment and their gradients are null if their weight is 0
-    const float *sums, *color, *depth, *median_depth, *moment;
-    float *on_sums, *on_median_depth, *on_moment;
+struct LossPlanes {                        // median_depth, moment, alpha and their gradients are null if their weight is 0
+    const float *sums, *color, *depth, *median_depth, *moment, *alpha;
+    float *on_sums, *on_median_depth, *on_moment, *on_alpha;
 };
-struct LossWeights { float l1, depth, nll_color, nll_depth, median_depth, moment; };
+struct LossWeights { float l1, depth, nll_color, nll_depth, median_depth, moment, mean_depth; };
 
 // Store, per block, the sums of the weighted terms over valid pixels. All values of every gradient plane are written.
 KERNEL mapping_losses(LossPlanes p, int pixels, int variance, float per_pixel, LossWeights weights, double* sums) {
@@ -38,6 +38,14 @@ KERNEL mapping_losses(LossPlanes p, int pixels, int variance, float per_pixel, L
             const float U = valid ? p.moment[at] : 0.f;
             cost += weights.moment * per_pixel * fabsf(U);
             p.on_moment[at] = signed_weight(U, weights.moment * per_pixel);
+        }
+        if (p.alpha) {                     // D̂/A; no gradient where A is small
+            const float A = p.alpha[at], inverse = 1.f / fmaxf(A, 0.5f), mean = depth * inverse;
+            const float off = valid && A > 0.5f ? mean - reading : 0.f;
+            const float pull = signed_weight(off, weights.mean_depth * per_pixel) * inverse;
+            cost += weights.mean_depth * per_pixel * fabsf(off);
+            on_depth += pull;
+            p.on_alpha[at] = -pull * mean;
         }
         p.on_sums[3 * size_t(pixels) + at] = on_depth;
         for (int c = 0; c < 3; c++) {

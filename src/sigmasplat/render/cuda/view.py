@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 from sigmasplat.config import RenderConfig
+from sigmasplat.errors import BackendError
 from sigmasplat.model.camera import Camera
 from sigmasplat.render.cuda import launch as cuda_launch
 from sigmasplat.render.cuda.raster import Planes, Raster
@@ -26,6 +27,8 @@ class CudaView:
     def __init__(
         self, camera: Camera, options: RenderConfig, variance: bool = True, device: torch.device | None = None
     ) -> None:
+        if options.depth == "ray":
+            raise BackendError("render.depth=ray does not run on CUDA yet; add --set render.depth=center")
         device = device or cuda_launch.this_device()
         self.camera, self.options = camera, options
         self.raster = Raster(cuda_launch.launcher_for(device), device)

@@ -66,7 +66,7 @@ def project(
         for on in (options.mean_pose_gradient, options.covariance_pose_gradient, options.depth_pose_gradient)
     )
     means2d = _pinhole(_to_camera(means, T_mean, in_view), camera)
-    A = _footprints(means, quats, scales, T_covariance, in_view, camera)
+    A, _ = _footprints(means, quats, scales, T_covariance, in_view, camera)
     conics, radii = _whiten(A, options.low_pass_px2)
     z = means @ T_depth[2, :3] + T_depth[2, 3]
     seen = in_view[:, None]
@@ -76,6 +76,27 @@ def project(
         torch.where(in_view, z, z.detach()),
         torch.where(seen, radii, 0.0),
     )
+
+
+def depth_slopes(
+    means: Tensor, quats: Tensor, scales: Tensor, T_camera_world: Tensor, camera: Camera, options: RenderConfig
+) -> Tensor:
+    """Return how the depth of each splat changes over the image, m/px [N, 2]; 0 for a culled splat.
+
+    Along the ray of a pixel, a splat is densest at depth z + slopes · (pixel − mean): the mean of depth for a given
+    image position under the projected Gaussian, with low-pass (RaDe-GS, with z instead of the distance). The pose
+    gradient is the path through the covariance.
+    """
+    T = T_camera_world.to(means)
+    in_view = (means @ T[:3, :3].T + T[:3, 3])[:, 2].detach() > options.near_m
+    A, along_axis = _footprints(
+        means, quats, scales, T if options.covariance_pose_gradient else T.detach(), in_view, camera
+    )
+    l1, l2, l3 = _whiten(A, options.low_pass_px2)[0].unbind(1)
+    with_u, with_v = (A * along_axis[:, None]).sum(2).unbind(1)
+    shared = l1 * with_u + l2 * with_v
+    slopes = torch.stack([l1 * shared, l2 * shared + l3 * l3 * with_v], 1)
+    return torch.where(in_view[:, None], slopes, 0.0)
 
 
 def _to_camera(means: Tensor, T: Tensor, in_view: Tensor) -> Tensor:
@@ -89,10 +110,14 @@ def _pinhole(p: Tensor, camera: Camera) -> Tensor:
     return torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
 
 
-def _footprints(means: Tensor, quats: Tensor, scales: Tensor, T: Tensor, in_view: Tensor, camera: Camera) -> Tensor:
-    """Build A = J R_cw R_q diag(s), [N, 2, 3] px: the splat's axes in the image, Σ2D = A Aᵀ + low-pass."""
+def _footprints(
+    means: Tensor, quats: Tensor, scales: Tensor, T: Tensor, in_view: Tensor, camera: Camera
+) -> tuple[Tensor, Tensor]:
+    """Build A = J R_cw R_q diag(s), [N, 2, 3] px: the splat's axes in the image, Σ2D = A Aᵀ + low-pass; and the axes
+    along the optical axis, [N, 3] m."""
     J = _projection_jacobian(_to_camera(means, T, in_view), camera)
-    return J @ T[:3, :3] @ (rotations(quats) * scales[:, None, :])
+    axes = rotations(quats) * scales[:, None, :]
+    return J @ T[:3, :3] @ axes, (T[2, :3] @ axes)
 
 
 def _projection_jacobian(p: Tensor, camera: Camera) -> Tensor:
@@ -142,13 +167,15 @@ def blend(
     ref_depth: Tensor | None,
     camera: Camera,
     options: RenderConfig,
+    slopes: Tensor | None = None,
 ) -> Blended:
     """Composite splats front to back at every pixel (3DGS eq. 3; VarSplat §1; CG-SLAM eq. 3, 6, 8-10).
 
     means2d, conics, z, radii as `project` returns them; opacities [N]; features [N, K]; ref_depth [H, W] m or None.
     Splats are sorted by z, equal ones by index. A pair of splat and pixel counts if o·exp(power) ≥ alpha_min and the
     light before the splat is at least transmittance_stop. There is no other limit, so the result does not depend on
-    tiles. Ids and their weights have no gradient.
+    tiles. Ids and their weights have no gradient. With slopes [N, 2] m/px the moment is that of the depth along the ray
+    (`depth_slopes`); only this definition has them.
     """
     order = torch.sort(z.detach(), stable=True).indices
     order = order[radii[order, 0] > 0]
@@ -160,7 +187,7 @@ def blend(
         _blend_pixels(
             _alphas(some_pixels, means2d[order], conics[order], opacities[order], options),
             features[order],
-            z[order],
+            z[order, None] if slopes is None else _depths(some_pixels, means2d[order], z[order], slopes[order]),
             some_ref,
             order,
             options.transmittance_stop,
@@ -182,10 +209,15 @@ def _alphas(pixels: Tensor, means2d: Tensor, conics: Tensor, opacities: Tensor, 
     return torch.where(raw >= options.alpha_min, raw.clamp(max=ALPHA_MAX), 0.0)
 
 
+def _depths(pixels: Tensor, means2d: Tensor, z: Tensor, slopes: Tensor) -> Tensor:
+    """Return the depth along the ray [N, P] of N splats at P pixels."""
+    return z[:, None] + ((pixels[None] - means2d[:, None]) * slopes[:, None]).sum(-1)
+
+
 def _blend_pixels(
     alphas: Tensor, features: Tensor, z: Tensor, ref: Tensor, order: Tensor, stop: float
 ) -> tuple[Tensor, ...]:
-    """Composite sorted splats at P pixels; returns `Blended`'s maps flat.
+    """Composite sorted splats of depths z [N, 1] or [N, P] at P pixels; returns `Blended`'s maps flat.
 
     A row with id −1 and α = 0 is added in front. With it, the light before each splat is the light after the previous
     row, and `argmax` finds this row if no splat qualifies.
@@ -196,7 +228,7 @@ def _blend_pixels(
     before = torch.cat([torch.ones_like(air), after[:-1]])
     counts = before >= stop
     w = torch.where(counts, alphas * before, 0.0)
-    off = torch.where(ref > 0, z[:, None] - ref, 0.0)
+    off = torch.where(ref > 0, z - ref, 0.0)
     ids = torch.cat([order.new_full((1,), -1), order]).int()
     median = (counts & (before >= 0.5) & (after < 0.5)).int().argmax(0, keepdim=True)
     dominant = w.detach().argmax(0, keepdim=True)

@@ -9,6 +9,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render.channels import features_of
 from sigmasplat.render.pose_gradient import twist_matrix
+from sigmasplat.render.ray_depth import PLANES, depth_at, depth_of, plane_features
 from sigmasplat.render.reference import operators as reference
 from sigmasplat.render.view import Layers
 from sigmasplat.types import Matrix
@@ -38,18 +39,31 @@ class ReferenceView:
         f = GaussianField(self._leaf)
         p = reference.project(f.means, f.quats, f.scales, T, self.camera, self.options)
         features = features_of(f.colors, p.z, f.variances)[:, : self._k]
-        b = reference.blend(*p, f.opacities, features, depth_reference, self.camera, self.options)
-        self._maps, self._means2d = [(b.sums.movedim(-1, 0), self.g_sums), (b.alpha, self.g_alpha)], p.means2d
+        slopes = None
+        if self.options.depth == "ray":
+            slopes = reference.depth_slopes(f.means, f.quats, f.scales, T, self.camera, self.options)
+            features = torch.cat([features, plane_features(p, slopes, self.camera)], 1)
+        b = reference.blend(*p, f.opacities, features, depth_reference, self.camera, self.options, slopes)
+        sums = b.sums
+        if slopes is not None:
+            depth = depth_of(sums[..., -PLANES:], self.camera)[..., None]
+            sums = torch.cat([sums[..., :3], depth, sums[..., 4:-PLANES]], -1)
+        self._maps, self._means2d = [(sums.movedim(-1, 0), self.g_sums), (b.alpha, self.g_alpha)], p.means2d
         self._visible = reaches(p, f.opacities.detach(), self.camera, self.options)
-        self.sums.copy_(b.sums.detach().movedim(-1, 0))
+        self.sums.copy_(sums.detach().movedim(-1, 0))
         self.alpha.copy_(b.alpha.detach())
         if b.moment is not None:
             self.moment.copy_(b.moment.detach())
             self._maps.append((b.moment, self.g_moment))
         if layers:
             self.layers.fill(b, p.z.detach())
-            nearest = p.z[b.median_id.clamp(min=0).long()] if len(f) else torch.zeros_like(b.alpha)
-            self._maps.append((torch.where(b.median_id >= 0, nearest, 0.0), self.g_median_depth))
+            rows = b.median_id.clamp(min=0).long()
+            nearest = p.z[rows] if len(f) else torch.zeros_like(b.alpha)
+            if slopes is not None and len(f):
+                nearest = depth_at(rows, p, slopes, self.camera)
+            median_depth = torch.where(b.median_id >= 0, nearest, 0.0)
+            self.layers.median_depth.copy_(median_depth.detach())
+            self._maps.append((median_depth, self.g_median_depth))
 
     def backward(self, params: Tensor, g_params: Tensor, grad2d: Tensor | None = None) -> Matrix:
         """Write the gradient of the rows to g_params [N, 17], and grad2d [N] if given. Return the pose twist (ρ, φ)
