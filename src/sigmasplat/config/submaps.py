@@ -139,7 +139,8 @@ class FinalConfig:
     """Order of the keyframes in refinement: random = drawn for each step (paper); epochs = every keyframe once, in
     random order, before any is used again."""
     lr_factor: float = 1.0
-    """Factor on the learning rates of mapping (`mapping.lr_…`) for the splats in the first refinement step."""
+    """Factor on the learning rates of mapping (`mapping.lr_…`) in the first refinement step, except that of
+    positions."""
     lr_decay: float = 1.0
     """Learning rates of splats and poses in the last refinement step, as a share of those in the first; they decay
     exponentially. 1 = constant."""
@@ -164,6 +165,8 @@ class FinalConfig:
     """Number of refinement steps between removals of splats with low opacity (`prune_opacity`)."""
     prune_opacity: float = 0.005
     """Splats with at most this opacity, 0 to 1, are removed during refinement."""
+    weight_moment: bool = True
+    """Whether the depth uncertainty U stays in the loss of refinement (`mapping.weight_moment`); off is faster."""
     uncertainty: bool = True
     """Whether variance is used to merge submaps and still learned during refinement; off = paper."""
     variance: Literal["published", "predicted"] = "published"
