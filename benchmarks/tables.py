@@ -22,7 +22,7 @@ import record
 import tyro
 
 SUBJECTS = {
-    "Whole runs": ("accuracy", "systems", "every_preset", "paper_presets"),
+    "Whole runs": ("accuracy", "systems", "map_quality", "every_preset", "paper_presets"),
     "Other systems": ("peers", "mesh_quality"),
     "Effect of σ²": ("ablation", "weights", "color_covariance"),
     "Uncertainty": ("uncertainty", "uncertainty_weights", "pose_covariance"),
