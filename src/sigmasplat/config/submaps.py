@@ -142,7 +142,8 @@ class FinalConfig:
     """Order of the keyframes in refinement: random = drawn for each step (paper); epochs = every keyframe once, in
     random order, before any is used again."""
     lr_factor: float = 1.0
-    """Factor on the learning rates of mapping (`mapping.lr_…`) for the splats in the first refinement step."""
+    """Factor on the learning rates of mapping (`mapping.lr_…`) in the first refinement step, except that of
+    positions."""
     lr_decay: float = 1.0
     """Learning rates of splats and poses in the last refinement step, as a share of those in the first; they decay
     exponentially. 1 = constant."""
@@ -171,9 +172,11 @@ class FinalConfig:
     """Width of the images in the last stage of refinement: working = no such stage, only working images are used;
     camera = as recorded; or a number of pixels, at most the recorded width. If it is above `input.width`, the colour of
     each keyframe is kept at this size."""
-    width_iterations: int = 1000
+    width_iterations: int = 1500
     """Number of refinement steps of the stage with images of `width`, after those of `iterations`, if `iterations` is
-    above 0. Half of them use working images, so that the map stays sharp at that size too."""
+    above 0. Two thirds of them use working images, so that the map stays sharp at that size too."""
+    weight_moment: bool = True
+    """Whether the depth uncertainty U stays in the loss of refinement (`mapping.weight_moment`); off is faster."""
     uncertainty: bool = True
     """Whether variance is used to merge submaps and still learned during refinement; off = paper."""
     variance: Literal["published", "predicted"] = "published"
