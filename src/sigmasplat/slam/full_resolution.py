@@ -21,8 +21,9 @@ from sigmasplat.types import Progress
 CACHE_BYTES = 64 << 20
 """Memory for prepared images; other photos are decoded again when they are drawn."""
 TURN_STEPS = 25
-"""After this many steps on photos come as many on working images, and so on. Then the map is sharp at both sizes, and a
-step on a working image costs a third."""
+WORKING_TURNS = 2
+"""After one turn of steps on photos come this many turns on working images, whose steps cost a third. With one turn,
+livingroom gains 1.4 dB more at full size, but loses 0.5 dB at working size. With two it gains 0.5 dB there."""
 LAST_RATE = 0.1
 """Learning rates in the last step, relative to the first: steps on single images leave noise in the splats."""
 
@@ -85,11 +86,11 @@ def refine_on_photos(
     photos, total = PhotoReader(keyframes, large), final.iterations + final.width_iterations
     mapping = replace(refinement(config), lr_pose_translation=0.0, lr_pose_rotation=0.0)
     degree = min(final.sh_degree, final.iterations // final.sh_every)
-    turns: tuple[tuple[View, PhotoReader | KeyframeReader], ...] = (large, photos), (view, keyframes)
+    turns: list[tuple[View, PhotoReader | KeyframeReader]] = [(large, photos)] + [(view, keyframes)] * WORKING_TURNS
     done = max(done, final.iterations)
     while done < total and not clock.is_over:
         since = done - final.iterations
-        of_view, images = turns[since // TURN_STEPS % 2]
+        of_view, images = turns[since // TURN_STEPS % len(turns)]
         steps = range(done, min(done + TURN_STEPS - since % TURN_STEPS, total))
         rates = (falling(mapping, (step - final.iterations) / final.width_iterations) for step in steps)
         fit_field(field, of_view, _draw(images, steps, total, random, progress), mapping, rates, degree=degree)
