@@ -43,7 +43,7 @@ SEQUENCES = ("livingroom", "redkitchen", "synthetic")
 START_S = {"redkitchen": 16.0}
 """Where a sequence begins: before this time the true path of redkitchen contradicts the depth by up to 10 cm."""
 SETTINGS = ("input.width=240", "final.iterations=0")
-"""Settings of every run. Poses are final when refinement of the map begins, so it is left out."""
+"""Settings of every run. Poses of tracking are measured, so refinement of the final map is left out."""
 RUNS = record.ROOT / "runs" / "robustness"
 TIMEOUT_S = 900
 

@@ -8,7 +8,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
-from sigmasplat.model.submap import MemoryStore, Picture, StorePart, Submap
+from sigmasplat.model.submap import MemoryStore, Picture, RefinedStore, StorePart, Submap
 
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
 
@@ -52,6 +52,28 @@ def test_a_frame_follows_its_keyframe() -> None:
     moved = motion(5)
     atlas.keyframe_poses[1][1] = moved @ atlas.keyframe_poses[1][1]
     assert np.allclose(atlas.T_world_camera()[3], atlas.anchors[1] @ moved @ se3.inverse(atlas.anchors[1]) @ world[3])
+
+
+def test_frames_follow_the_refined_poses_of_their_keyframes() -> None:
+    atlas, world = two_submaps()
+    moved = motion(6)
+    atlas.refined = {1: [moved @ T for T in atlas.keyframe_poses[1]]}
+    at = atlas.anchors[1] @ moved @ se3.inverse(atlas.anchors[1])
+    assert np.allclose(atlas.T_world_camera(), [*world[:2], at @ world[2], at @ world[3]])
+    assert np.allclose(atlas.T_world_camera(loops=False), world), "tracking alone knows of no refinement"
+    assert np.allclose(atlas.T_submap_camera[2:], se3.inverse(atlas.anchors[1]) @ np.array(world[2:]))
+    assert np.allclose(atlas.T_world_keyframe(1), [atlas.anchors[1] @ T for T in atlas.refined[1]])
+
+
+def test_probe_views_follow_their_keyframe_in_the_final_map() -> None:
+    T, probe, moved = np.array([motion(1), motion(2)]), motion(3), [motion(4), motion(5)]
+    store, picture = MemoryStore(), Picture(np.zeros((3, 4, 3), np.uint8), np.ones((3, 4), np.float32))
+    store.save(Submap(0, GaussianField.empty(), (0, 8), T, CAMERA, (5,), probe[None]), [picture] * 2, [picture])
+    submap = RefinedStore(store, [moved]).load(0)
+    assert np.allclose(submap.T_submap_camera, moved)
+    assert np.allclose(submap.T_submap_probe[0], moved[0] @ se3.inverse(T[0]) @ probe)
+    with pytest.raises(SigmaSplatError, match="submap 1 cannot be saved after the final map is made"):
+        RefinedStore(store, [moved]).save(Submap(1, GaussianField.empty(), (0,), T[:1], CAMERA), [picture])
 
 
 def test_an_atlas_without_frames_has_no_poses() -> None:

@@ -1,7 +1,8 @@
 """The final map on plain torch: two submaps before one wall, merged without doubles, seeded anew, refined."""
 
+import itertools
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import dataclass, field as dataclass_field, replace
 
 import numpy as np
 import pytest
@@ -20,7 +21,8 @@ from sigmasplat.render.reference.view import ReferenceView
 from sigmasplat.slam.final import final_map, merged, survivors
 from sigmasplat.slam.fusion import FusionView, count_keyframes, fuse, fusion_views
 from sigmasplat.slam.predicted_submaps import PredictedSubmaps
-from sigmasplat.slam.refinement import KeyframeReader
+from sigmasplat.slam.pruning import largest_weights, prune_by_weight
+from sigmasplat.slam.refinement import KeyframeReader, Refined, refine
 
 CAMERA = Camera(20, 15, 16.0, 16.0, 9.5, 7.0)
 CONFIG = Config(backend="reference", mapping=MappingConfig(weight_nll_color=1e-3, prune_opacity=0.1))
@@ -30,7 +32,7 @@ LOG_VARIANCES = (-3.0, -6.0)
 
 
 def config(**final: object) -> Config:
-    return replace(CONFIG, final=FinalConfig(**{"spacing_m": SPACING_M, **final}))  # type: ignore[arg-type]
+    return replace(CONFIG, final=FinalConfig(**{"spacing_m": SPACING_M, "merge_m": SPACING_M, **final}))  # type: ignore[arg-type]
 
 
 def color_at(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -224,6 +226,104 @@ def test_refinement_improves_views_of_keyframes(uncertainty: bool) -> None:
     assert torch.equal(again.params, field.params), "the same draw gives the same map"
 
 
+def test_free_poses_lower_the_loss_and_recover_a_perturbed_keyframe() -> None:
+    """One keyframe is off by 8 cm; the splats are right and fixed, so that only its pose can explain its picture."""
+    store, away_m = make_store(), 0.08
+    true = store.submaps[0].T_submap_camera.copy()
+    store.submaps[0].T_submap_camera[1, 0, 3] += away_m
+    given, losses, found = store.submaps[0].T_submap_camera[1].copy(), dict[str, list[float]](), {}
+    still = {f"lr_{name}": 0.0 for name in COLUMNS}
+    for name, rate in (("free", 3e-2), ("fixed", 0.0)):
+        settings = config(iterations=60, lr_pose_translation=rate, order="epochs", lr_decay=0.03)
+        settings = replace(settings, mapping=replace(settings.mapping, **still))
+        view = ReferenceView(CAMERA, settings.render)
+        keyframes, field = KeyframeReader(store, ANCHORS, view), wall(-1.4, 1.6)
+        losses[name] = refine(field, keyframes, settings, view, np.random.default_rng(0), lambda done, total: None)
+        found[name] = keyframes.poses_in(ANCHORS)[0]
+    assert sum(losses["free"][-6:]) < sum(losses["fixed"][-6:])
+    np.testing.assert_allclose(found["fixed"][1], given, atol=1e-12)
+    assert abs(found["free"][1] - true[1])[0, 3] < away_m / 4
+    np.testing.assert_allclose(found["free"][0], true[0], atol=1e-12, err_msg="the first keyframe fixes the gauge")
+
+
+FREE = {"lr_pose_translation": 2e-3, "lr_pose_rotation": 1e-3, "order": "epochs", "lr_decay": 0.1}
+
+
+class Interrupted(Exception):
+    pass
+
+
+@dataclass
+class InMemory:
+    """Keeps a deep copy of every state that it is offered, and stops after `stop` of them."""
+
+    stop: int = 0
+    states: list[Refined] = dataclass_field(default_factory=list)
+
+    def save(self, state: Refined) -> None:
+        self.states.append(deepcopy(state))
+        if len(self.states) == self.stop:
+            raise Interrupted
+
+    def load(self) -> Refined | None:
+        return self.states[-1] if self.states else None
+
+
+def test_a_stopped_refinement_continues_to_the_same_bytes() -> None:
+    settings = config(iterations=40, prune_every=7, **FREE)
+    view = ReferenceView(CAMERA, settings.render)
+    whole = final_map(make_store(0.1), ANCHORS, settings, view, np.random.default_rng(0))
+    saved = InMemory(stop=3)
+    with pytest.raises(Interrupted):
+        final_map(make_store(0.1), ANCHORS, settings, view, np.random.default_rng(0), saved=saved)
+    again = final_map(
+        make_store(0.1), ANCHORS, settings, view, np.random.default_rng(5), saved=InMemory(0, saved.states)
+    )
+    assert torch.equal(again.field.params, whole.field.params) and again.steps == whole.steps == 40
+    np.testing.assert_array_equal(again.keyframe_poses, whole.keyframe_poses)
+    assert not np.array_equal(whole.keyframe_poses[1], make_store().submaps[1].T_submap_camera), "poses have moved"
+
+
+def test_epochs_use_every_keyframe_equally_often() -> None:
+    keyframes, random = (
+        KeyframeReader(make_store(), ANCHORS, ReferenceView(CAMERA, CONFIG.render)),
+        np.random.default_rng(0),
+    )
+    drawn = [keyframes.draw("epochs", random) for _ in range(12)]
+    assert sorted(drawn[:6]) == sorted(drawn[6:]) == list(range(6)) and drawn[:6] != drawn[6:]
+
+
+def test_splats_that_no_keyframe_shows_are_removed_and_the_budget_holds() -> None:
+    """A second wall hides behind the first; after that, the splats that contribute least go first."""
+    view, hidden = ReferenceView(CAMERA, CONFIG.render), wall(-0.5, 0.5)
+    keyframes = KeyframeReader(make_store(), ANCHORS, view)
+    hidden.params[:, 2] += 0.5
+    front = wall(-1.4, 1.6)
+    front.params[:, COLUMNS["opacity_logits"]] = 8.0
+    front.params[:, COLUMNS["log_scales"]] += 0.5
+    for most in (0, 100):
+        field = front.copy_to(torch.device("cpu"))
+        field.append(hidden)
+        weights = largest_weights(field, view, keyframes)
+        prune_by_weight(field, view, keyframes, 0.5, most)
+        kept = torch.isin(torch.arange(len(weights)), field.ids)
+        assert float(field.means[:, 2].max()) < WALL_M + 0.1 and len(field) > 50
+        assert bool((weights[kept] >= 0.5).all()) and (len(field) == 100) is bool(most)
+        if most:
+            assert float(weights[kept].min()) >= float(weights[~kept].max())
+
+
+def test_a_time_budget_ends_refinement_early(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each look at the clock takes a hundredth of a second."""
+    ticks = itertools.count(0.0, 0.01)
+    monkeypatch.setattr("sigmasplat.slam.refinement.time.perf_counter", lambda: next(ticks))
+    told, settings = list[tuple[int, int]](), config(iterations=1000, seconds=3.0, lr_decay=0.1)
+    view = ReferenceView(CAMERA, settings.render)
+    made = final_map(make_store(), ANCHORS, settings, view, np.random.default_rng(0), lambda *at: told.append(at))
+    assert 10 < made.steps < 100
+    assert told == sorted(told) and told[-1] == (1000, 1000) and told[-2][0] > 900, "progress follows the clock"
+
+
 def test_degrees_grow_and_faded_splats_go(monkeypatch: pytest.MonkeyPatch) -> None:
     store = make_store()
     store.submaps[0].field.params[:5, 10] = -8.0
@@ -327,6 +427,8 @@ def test_what_no_map_can_be_made_of_is_refused() -> None:
     [
         ({"sh_degree": 4}, "degrees 0 to 3, found 4"),
         ({"spacing_m": 0.0}, r"final\.spacing_m must be above 0, found 0\.0"),
+        ({"merge_m": 0.0}, r"final\.merge_m must be above 0"),
+        ({"lr_decay": 0.0}, r"final\.lr_decay must be above 0"),
         ({"sh_every": 0}, r"final\.sh_every must be above 0"),
         ({"prune_every": -1}, r"final\.prune_every must be above 0"),
     ],

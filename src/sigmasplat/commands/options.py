@@ -142,6 +142,14 @@ OntoRun = Annotated[
     Path | None,
     arg(metavar="RUN", help="continue the map of a finished run in a new run folder", help_behavior_hint=""),
 ]
+FinalSeconds = Annotated[
+    Number,
+    arg(
+        metavar="S",
+        help="time budget of the final map's refinement in seconds: short form of --set final.seconds=S",
+        help_behavior_hint="(default: no limit)",
+    ),
+]
 PosesFile = Annotated[
     Path | None,
     arg(

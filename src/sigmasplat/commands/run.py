@@ -61,6 +61,7 @@ def run(
     record: options.Record = None,
     run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
     onto: options.OntoRun = None,
+    final_seconds: options.FinalSeconds = None,
 ) -> int:
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
@@ -75,6 +76,7 @@ def run(
     from sigmasplat.slam.slam import Slam
 
     log_names(run_options.log)
+    settings += () if final_seconds is None else (f"final.seconds={final_seconds:g}",)
     screen, earlier = Screen(), FinishedMap.of(RunFolder.open(onto)) if onto else None
     config = configured(preset, settings, seed, input_options, earlier.config if earlier else None)
     if earlier:

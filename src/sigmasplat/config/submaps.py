@@ -132,6 +132,17 @@ class FinalConfig:
     fixed (paper)."""
     lr_pose_rotation: float = 0.0
     """Learning rate of keyframe rotations during refinement, in rad; 0 = fixed (paper)."""
+    seconds: float = 0.0
+    """Time budget of the refinement in seconds: it ends at the latest then, even if steps are left, and learning rates
+    fall in time. The result then depends on the speed of the machine. 0 = no limit."""
+    order: Literal["random", "epochs"] = "random"
+    """Order of the keyframes in refinement: random = drawn for each step (paper); epochs = every keyframe once, in
+    random order, before any is used again."""
+    lr_factor: float = 1.0
+    """Factor on the learning rates of mapping (`mapping.lr_…`) for the splats in the first refinement step."""
+    lr_decay: float = 1.0
+    """Learning rates of splats and poses in the last refinement step, as a share of those in the first; they decay
+    exponentially. 1 = constant."""
     lr_means_last: float = 0.0
     """Learning rate of positions in the last refinement step; it decays exponentially from `mapping.lr_means` (3DGS). 0
     = `mapping.lr_means` throughout."""
@@ -141,6 +152,14 @@ class FinalConfig:
     """Number of refinement steps after which the degree of view-dependent colour rises by one."""
     spacing_m: float = 0.02
     """Distance between the splats seeded on the mesh."""
+    merge_m: float = 0.02
+    """Edge in metres of the voxels in which merging keeps the splats of one submap only."""
+    max_splats: int = 0
+    """Largest number of splats of the final map; those that contribute least to the images of keyframes are removed. 0
+    = no limit."""
+    prune_weight_px: float = 0.0
+    """Before and after refinement, splats are removed if their weights in every keyframe sum to less than this, in
+    pixels. 0 = none are removed."""
     prune_every: int = 500
     """Number of refinement steps between removals of splats with low opacity (`prune_opacity`)."""
     prune_opacity: float = 0.005

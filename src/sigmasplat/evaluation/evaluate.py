@@ -75,9 +75,7 @@ def evaluate(
     strips, config, loops = ViewStrips(run, strips_per_kind), run.config(), run.read_loops()
     standard = renderer is None
     renderer = renderer or FieldRenderer(config.render, config.backend)
-    anchors = _anchors(run, records, config.final)
-    in_submaps = None if anchors is None else _poses_in_submaps(run, len(records))
-    maps = views.MapSources(field, run.submaps, anchors, T_submap_camera=in_submaps)
+    maps = _map_sources(run, field, records, config.final)
     maps, predictions = _with_prediction(maps, run, frames, config) if standard else (maps, views.PredictionScores())
     aligned = _alignment(frames, known)
     scoring = ViewScoring(source, config.input, maps, chosen, renderer, views_per_kind, aligned, lpips)
@@ -129,10 +127,12 @@ def _anchors(run: RunFolder, records: Log, final: FinalConfig) -> NDArray[np.flo
     return None if anchors is None or len(anchors) != count else np.asarray(anchors, np.float64)
 
 
-def _poses_in_submaps(run: RunFolder, frames: int) -> NDArray[np.float64] | None:
-    """Return T_submap_camera of all frames [F, 4, 4]; None if the checkpoint does not have them."""
-    poses = run.read_checkpoint()[0].get("T_submap_camera")
-    return None if poses is None or len(poses) != frames else np.asarray(poses, np.float64)
+def _map_sources(run: RunFolder, field: GaussianField, records: Log, final: FinalConfig) -> views.MapSources:
+    """Return the final map and the submaps, with the poses of the frames in them if the checkpoint has these."""
+    anchors = _anchors(run, records, final)
+    poses = None if anchors is None else run.read_checkpoint()[0].get("T_submap_camera")
+    known = None if poses is None or len(poses) != len(records) else np.asarray(poses, np.float64)
+    return views.MapSources(field, run.submaps, anchors, T_submap_camera=known)
 
 
 def _with_prediction(
@@ -241,6 +241,7 @@ def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField, loops
         "onto": (run.facts().get("onto") or {}).get("run"),
         "loops": {"tried": len(loops), "accepted": sum(bool(loop.get("accepted")) for loop in loops)},
         "finish_s": run.facts().get("finish_s"),
+        "final_steps": run.facts().get("final_steps"),
         "total_s": _total_s(run),
     }
 

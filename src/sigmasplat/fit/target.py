@@ -79,7 +79,8 @@ class Target:
 class Keyframe:
     """A target with its camera pose T_world_camera, float64 [4, 4].
 
-    A `fixed` pose never moves. A fit moves the other poses if they are `movable`, which is set before the fit.
+    A `fixed` pose never moves. A fit moves the other poses if they are `movable`, which is set before the fit;
+    pose_rate: factor on the learning rates of its pose.
     """
 
     index: int
@@ -87,6 +88,7 @@ class Keyframe:
     T_world_camera: NDArray[np.float64]
     fixed: bool = False
     movable: bool = True
+    pose_rate: float = 1.0
     motion: VectorAdam = dataclass_field(default_factory=lambda: VectorAdam.of(6))
     visible_ids: NDArray[np.int64] | None = None
     """Sorted ids of the splats that dominate at least one of its pixels; None if not computed."""
@@ -101,5 +103,5 @@ class Keyframe:
     def move(self, gradient: NDArray[np.float64], rates: NDArray[np.float64]) -> None:
         """Take an Adam step on the pose; gradient [6] with respect to the left twist of T_camera_world, rates [6] in m
         and rad."""
-        update = self.motion.step(gradient, rates)
+        update = self.motion.step(gradient, self.pose_rate * rates)
         self.T_world_camera = se3.orthonormalise(self.T_world_camera @ se3.exp(-update))

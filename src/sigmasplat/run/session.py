@@ -212,7 +212,7 @@ class Session:
 
         before, started_s = len(self.slam.loops), time.perf_counter()
         self.slam.finish(progress)
-        self.run.note(finish_s=time.perf_counter() - started_s)
+        self.run.note(finish_s=time.perf_counter() - started_s, final_steps=self.slam.refinement_steps)
         self.callback.last_loops(self.slam.loops[before:])
 
     def _write_results(self) -> None:

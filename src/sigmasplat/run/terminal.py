@@ -139,6 +139,7 @@ class _StepShow:
     def __init__(self, say: Callable[[str], None], begin: Begin, total: int | None, done: int = 0) -> None:
         self.say, self.begin, self.show = say, begin, begin("SLAM", total)
         self.show_final: Show | None = None
+        self.final_from = 0, 0.0
         self.started_s = time.perf_counter()
         self.done, self.lost, self.earlier = done, 0, done
         self.lost_since: int | None = None
@@ -155,9 +156,13 @@ class _StepShow:
         self.show(self.done, None, f"{warning}{speed:.1f} frames/s  {step.splats:,} splats  {self.lost} lost")
 
     def finishing(self, done: int, total: int) -> None:
-        """Show the progress of the final map."""
-        self.show_final = self.show_final or self.begin("final map", total)
-        self.show_final(done, total, "")
+        """Show the progress of the final map and the time left."""
+        now_s = time.perf_counter()
+        if self.show_final is None:
+            self.show_final, self.final_from = self.begin("final map", total), (done, now_s)
+        first, began_s = self.final_from
+        left_s = (total - done) * (now_s - began_s) / (done - first) if done > first else None
+        self.show_final(done, total, f"about {left_s:.0f} s left" if left_s and done < total else "")
 
     def last_loops(self, loops: Sequence[LoopResult]) -> None:
         """Print the loops closed after the last frame."""

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from sigmasplat.config import Config, FinalConfig
 from sigmasplat.errors import ConfigError, SigmaSplatError
-from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField, Rows
 from sigmasplat.model.harmonics import count
 from sigmasplat.model.mesh import Mesh
@@ -26,11 +25,12 @@ from sigmasplat.types import Matrix, Progress, no_progress
 
 
 class FinalMap(NamedTuple):
-    """The global map in the world, in host memory, and the poses of its keyframes: T_submap_camera [4, 4] of each
-    submap's keyframes, as refinement has moved them; None if it has moved none."""
+    """The global map in the world, in host memory; the poses of its keyframes, T_submap_camera [4, 4] of each submap's
+    keyframes, as refinement has moved them (None: it has moved none); the number of refinement steps."""
 
     field: GaussianField
     keyframe_poses: list[list[Matrix]] | None = None
+    steps: int = 0
 
 
 def final_map(
@@ -58,16 +58,13 @@ def final_map(
         return FinalMap(field)
     on_device, keyframes = field.to(view.sums.device), KeyframeReader(store, anchors, view)
     if found is not None:
-        keyframes.poses, keyframes.motions = found.poses, found.motions
+        keyframes.take(found)
         random.bit_generator.state = found.numbers
-    done = 0 if found is None else found.done
-    refine(on_device, keyframes, config, view, random, progress, done, saved)
+    done, spent_s = (found.done, found.spent_s) if found else (0, 0.0)
+    losses = refine(on_device, keyframes, config, view, random, progress, done, saved, spent_s)
     moves = config.final.lr_pose_translation or config.final.lr_pose_rotation
-    poses = [
-        [se3.inverse(T) @ pose for pose in of_submap]
-        for T, of_submap in zip(anchors, keyframes.poses_by_submap(), strict=False)
-    ]
-    return FinalMap(on_device.to(torch.device("cpu")), poses if moves else None)
+    poses = keyframes.poses_in(anchors) if moves else None
+    return FinalMap(on_device.to(torch.device("cpu")), poses, done + len(losses))
 
 
 def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix], final: FinalConfig) -> None:
@@ -77,7 +74,7 @@ def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix], final: FinalC
             f"the final map needs submaps and one anchor for each, found {len(store)} and {len(anchors)}"
         )
     count(final.sh_degree)
-    for name in ("spacing_m", "sh_every", "prune_every"):
+    for name in ("spacing_m", "merge_m", "sh_every", "prune_every", "lr_factor", "lr_decay"):
         if not getattr(final, name) > 0:
             raise ConfigError(f"final.{name} must be above 0, found {getattr(final, name)}")
 
@@ -97,7 +94,7 @@ def merged(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> Gau
         variances.append(_log_variance(predicted.rows(index) if is_predicted else part.params))
         field.append(part)
     log_variance = np.asarray(torch.cat(variances).double()) if config.final.uncertainty else None
-    keep = survivors(field.means.numpy(), np.concatenate(owner), log_variance, config.final.spacing_m)
+    keep = survivors(field.means.numpy(), np.concatenate(owner), log_variance, config.final.merge_m)
     field.keep(torch.from_numpy(keep))
     return field
 

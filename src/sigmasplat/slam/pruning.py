@@ -1,6 +1,6 @@
 """Measure the uncertainty of single splats against depth readings; fade uncertain ones, then prune (CG-SLAM §4)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Literal
 
 import numpy as np
@@ -11,7 +11,7 @@ from sigmasplat.fit.target import Keyframe
 from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.render.predictive import COVERED
-from sigmasplat.render.splat_sums import gather
+from sigmasplat.render.splat_sums import CHANNELS, gather
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 
@@ -55,6 +55,32 @@ def splat_depth_residuals(field: GaussianField, view: View, keyframes: Sequence[
         planes = torch.stack([squared, known, torch.zeros_like(known)])
         sums += gather(view, field.params, planes)[:, :2].double()
     return sums[:, 0] / sums[:, 1].clamp(min=1.0)
+
+
+def largest_weights(field: GaussianField, view: View, keyframes: Iterable[Keyframe]) -> Tensor:
+    """Return the sum of each splat's blending weights over the pixels of the keyframe where it is largest [N], px."""
+    largest = field.params.new_zeros(len(field))
+    planes = torch.zeros(CHANNELS, view.camera.height, view.camera.width).to(view.sums)
+    planes[0] = 1.0
+    for keyframe in keyframes:
+        view.forward(field.params, se3.inverse(keyframe.T_world_camera))
+        torch.maximum(largest, gather(view, field.params, planes)[:, 0], out=largest)
+    return largest
+
+
+def prune_by_weight(
+    field: GaussianField, view: View, keyframes: Iterable[Keyframe], least_px: float, most: int
+) -> None:
+    """Remove the splats whose weights sum to less than `least_px` pixels in every keyframe (2DGS-SLAM: in the nearest
+    one), and then those with the smallest sums until `most` are left; 0 turns either off."""
+    if not least_px and not (most and len(field) > most):
+        return
+    weights = largest_weights(field, view, keyframes)
+    keep = weights >= least_px
+    if most and int(keep.sum()) > most:
+        order = torch.where(keep, weights, -1.0).sort(descending=True, stable=True).indices
+        keep[order[most:]] = False
+    field.keep(keep)
 
 
 def depths(points: Tensor, T_camera_world: Matrix) -> Tensor:

@@ -1,7 +1,8 @@
 """Refine a map over all keyframes: splats and keyframe poses together (VarSplat §7; poses are ours)."""
 
+import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field as dataclass_field, replace
 from functools import lru_cache
 from typing import Any, Protocol
 
@@ -12,9 +13,11 @@ from sigmasplat.errors import SigmaSplatError
 from sigmasplat.fit.adam import Rates, VectorAdam
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.render.view import View
+from sigmasplat.slam.pruning import prune_by_weight
 from sigmasplat.types import Matrix, Progress
 
 CACHE_BYTES = 64 << 20
@@ -24,12 +27,14 @@ CACHE_BYTES = 64 << 20
 @dataclass(eq=False)
 class Refined:
     """A refinement between two steps: the steps done, the map, the keyframes' poses T_world_camera [4, 4] with their
-    Adam states, and the state of the random numbers."""
+    Adam states, the keyframes left in this epoch, the seconds spent, and the state of the random numbers."""
 
     done: int
     field: GaussianField
     poses: list[Matrix]
     motions: list[VectorAdam]
+    left: list[int]
+    spent_s: float
     numbers: dict[str, Any]
 
 
@@ -47,8 +52,8 @@ class KeyframeReader:
     """All keyframes of all submaps with their poses in the world; pictures are read from the store on demand.
 
     anchors: T_world_submap [4, 4] of each submap; `places`: submap and number of each keyframe; `poses`: their
-    T_world_camera [4, 4], which `refine` may move; `motions`: Adam's state of each pose. Raises SigmaSplatError if
-    there is no keyframe, or a submap's camera is not the view's.
+    T_world_camera [4, 4], which `refine` may move; `motions`: Adam's state of each pose; `left`: the keyframes left in
+    the current epoch. Raises SigmaSplatError if there is no keyframe, or a submap's camera is not the view's.
     """
 
     def __init__(self, store: SubmapStore, anchors: Sequence[Matrix], view: View) -> None:
@@ -60,7 +65,7 @@ class KeyframeReader:
             self._add(index, anchors[index])
         if not self.places:
             raise SigmaSplatError("the submaps have no keyframes, so the final map cannot be refined")
-        self.motions = [VectorAdam.of(6) for _ in self.poses]
+        self.motions, self.left = [VectorAdam.of(6) for _ in self.poses], list[int]()
         self._target = lru_cache(max(1, CACHE_BYTES // (16 * view.alpha.numel())))(self._read)
 
     def _add(self, index: int, T_world_submap: Matrix) -> None:
@@ -80,11 +85,22 @@ class KeyframeReader:
         """Return a keyframe. Its pose can move, except that of the first keyframe, which fixes the gauge."""
         return Keyframe(i, self._target(i), self.poses[i], fixed=i == 0, motion=self.motions[i])
 
-    def poses_by_submap(self) -> list[list[Matrix]]:
-        """Return the poses T_world_camera [4, 4] of each submap's keyframes."""
+    def draw(self, order: str, random: np.random.Generator) -> int:
+        """Return the number of the next keyframe: uniformly drawn, or the next one of an epoch (`final.order`)."""
+        if order == "random":
+            return int(random.integers(len(self)))
+        self.left = self.left or random.permutation(len(self)).tolist()
+        return self.left.pop()
+
+    def take(self, state: Refined) -> None:
+        """Take over the keyframes' part of a saved refinement."""
+        self.poses, self.motions, self.left = state.poses, state.motions, state.left
+
+    def poses_in(self, anchors: Sequence[Matrix]) -> list[list[Matrix]]:
+        """Return T_submap_camera [4, 4] of the keyframes of each submap; anchors: T_world_submap [4, 4] of each."""
         found: list[list[Matrix]] = [[] for _ in range(len(self.store))]
         for (submap, _), T in zip(self.places, self.poses, strict=True):
-            found[submap].append(T)
+            found[submap].append(se3.inverse(anchors[submap]) @ T)
         return found
 
     def _read(self, i: int) -> Target:
@@ -100,37 +116,84 @@ def refine(
     progress: Progress,
     done: int = 0,
     saved: SavedRefinement | None = None,
+    spent_s: float = 0.0,
 ) -> list[float]:
-    """Fit the field to keyframes drawn uniformly, and their poses with it; return the loss of each step.
+    """Fit the field to all keyframes, one per step, and their poses with it; return the loss of each step.
 
     Poses move at the rates `final.lr_pose_translation` and `final.lr_pose_rotation`; `keyframes.poses` has the moved
-    ones. Splats are pruned regularly. Every `sh_every` steps, colours gain one degree of view dependence. `done`: the
-    number of steps that the field has already had. `saved` is offered the state after each pruning and each new degree.
+    ones. Splats are pruned before, regularly, and at the end. Every `sh_every` steps, colours gain one degree of view
+    dependence. `done`, `spent_s`: the steps that the field has already had, and their seconds. `saved` is offered the
+    state after each pruning and each new degree.
     """
-    final, mapping, losses = config.final, refinement(config), list[float]()
-    while done < final.iterations:
+    final, mapping, losses, clock = config.final, refinement(config), list[float](), _Clock(config.final, spent_s)
+    if not done:
+        prune_by_weight(field, view, keyframes, final.prune_weight_px, final.max_splats)
+    while done < final.iterations and not clock.is_over:
         until_event = min(every - done % every for every in (final.prune_every, final.sh_every))
         steps = range(done, min(done + until_event, final.iterations))
         degree = min(final.sh_degree, done // final.sh_every)
-        rates = decaying(mapping, final, done) if final.lr_means_last else None
-        drawn = _draw(keyframes, steps, final.iterations, random, progress)
-        losses += fit_field(field, view, drawn, mapping, schedule=rates, degree=degree).losses
-        done = steps.stop
+        rates = decaying(mapping, final, done, clock) if _changes_rates(final) else None
+        drawn = _draw(keyframes, steps, config, random, progress, clock)
+        losses += (fitted := fit_field(field, view, drawn, mapping, schedule=rates, degree=degree).losses)
+        done += len(fitted)
         if done % final.prune_every == 0:
             field.keep(field.opacities > final.prune_opacity)
-        if saved is not None:
-            saved.save(Refined(done, field, keyframes.poses, keyframes.motions, dict(random.bit_generator.state)))
+        if saved is not None and done == steps.stop:
+            left, spent_s = list(keyframes.left), clock.spent_s
+            numbers = dict(random.bit_generator.state)
+            saved.save(Refined(done, field, keyframes.poses, keyframes.motions, left, spent_s, numbers))
+    prune_by_weight(field, view, keyframes, final.prune_weight_px, final.max_splats)
     progress(final.iterations, final.iterations)
     return losses
 
 
-def decaying(mapping: MappingConfig, final: FinalConfig, done: int) -> Iterator[Rates]:
-    """Yield the rates of the refinement steps after `done`. That of the means decays exponentially from
-    `mapping.lr_means` to `final.lr_means_last`."""
-    for step in range(done, final.iterations):
-        rates, share = Rates.of(mapping), step / max(final.iterations - 1, 1)
-        rates.per_column[COLUMNS["means"]] = mapping.lr_means ** (1.0 - share) * final.lr_means_last**share
+@dataclass(frozen=True)
+class _Clock:
+    """Measures a refinement against its time budget; spent_s: seconds of an earlier start of the same refinement."""
+
+    final: FinalConfig
+    earlier_s: float
+    started_s: float = dataclass_field(default_factory=lambda: time.perf_counter())
+
+    @property
+    def spent_s(self) -> float:
+        """Return the seconds spent so far."""
+        return self.earlier_s + time.perf_counter() - self.started_s
+
+    @property
+    def share(self) -> float:
+        """Return the share of the time budget that is spent; 0 without one."""
+        return self.spent_s / self.final.seconds if self.final.seconds else 0.0
+
+    @property
+    def is_over(self) -> bool:
+        """Return whether the time budget is spent."""
+        return self.share >= 1.0
+
+
+def _changes_rates(final: FinalConfig) -> bool:
+    """Return whether the learning rates differ from those of mapping."""
+    return bool(final.lr_means_last) or (final.lr_factor, final.lr_decay) != (1.0, 1.0)
+
+
+def decaying(mapping: MappingConfig, final: FinalConfig, done: int, clock: _Clock) -> Iterator[Rates]:
+    """Yield the rates of the refinement steps after `done`.
+
+    All rates start at `final.lr_factor` times those of mapping, and decay exponentially to the share `final.lr_decay`
+    of the first; that of the means decays from
+    `mapping.lr_means` to `final.lr_means_last` if this is set.
+    """
+    for step in range(done, final.iterations + 1):
+        rates, share = Rates.of(mapping), _share(step, final, clock)
+        rates.per_column.mul_(final.lr_factor * final.lr_decay**share)
+        if final.lr_means_last:
+            rates.per_column[COLUMNS["means"]] = mapping.lr_means ** (1.0 - share) * final.lr_means_last**share
         yield rates
+
+
+def _share(step: int, final: FinalConfig, clock: _Clock) -> float:
+    """Return the share of the refinement that is done before a step, of its steps or of its time budget, 0 to 1."""
+    return min(1.0, max(step / max(final.iterations - 1, 1), clock.share))
 
 
 def refinement(config: Config) -> MappingConfig:
@@ -144,12 +207,17 @@ def refinement(config: Config) -> MappingConfig:
 
 
 def _draw(
-    keyframes: KeyframeReader, steps: range, total: int, random: np.random.Generator, progress: Progress
-) -> Iterator[Sequence[Keyframe]]:
-    """Draw one keyframe per step, uniformly; call `progress` before each, and keep its moved pose after it."""
+    keyframes: KeyframeReader, steps: range, config: Config, random: np.random.Generator, progress: Progress,
+    clock: _Clock,
+) -> Iterator[Sequence[Keyframe]]:  # fmt: skip
+    """Draw one keyframe per step; call `progress` before each, and keep its moved pose after it. End early if the time
+    budget is spent."""
     for step in steps:
-        progress(step, total)
-        i = int(random.integers(len(keyframes)))
+        if clock.is_over:
+            return
+        progress(max(step, int(clock.share * config.final.iterations)), config.final.iterations)
+        i = keyframes.draw(config.final.order, random)
         keyframe = keyframes[i]
+        keyframe.pose_rate = config.final.lr_decay ** _share(step, config.final, clock)
         yield [keyframe]
         keyframes.poses[i] = keyframe.T_world_camera

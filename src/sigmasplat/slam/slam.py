@@ -83,7 +83,7 @@ class Slam(World):
         store, anchors = StorePart(self.store, members), [self.atlas.anchors[s] for s in members]
         refining, measuring = (part_of(progress, first, total) for first in (0, steps))
         final = final_map(store, anchors, self.config, self.view, self.random, refining, self.saved_refinement)
-        self._final, refined = final.field, None
+        self._final, self.refinement_steps, refined = final.field, final.steps, None
         if final.keyframe_poses is not None:
             self.atlas.refined = dict(zip(members, final.keyframe_poses, strict=True))
             refined = RefinedStore(store, final.keyframe_poses)

@@ -62,6 +62,8 @@ class World:
         self._view: View | None = None
         self._resample = False
         self._final: GaussianField | None = None
+        self.refinement_steps: int | None = None
+        """Number of refinement steps of the final map; None before `finish`."""
         self.saved_refinement: SavedRefinement | None = None
         """Where `finish` saves the refinement of the final map and continues it; None = nowhere."""
         self.uncertainty: MapUncertainty | None = None
