@@ -135,7 +135,9 @@ def spikes(field: GaussianField, camera: Camera, T_camera_world: Matrix, near_m:
     T = torch.as_tensor(T_camera_world).to(field.params)
     p = project(field.means, field.quats, field.scales, T, camera, RenderConfig())
     ratio = field.scales.amax(1) / field.scales.amin(1)
-    l1, l2, l3 = (column.double().clamp(min=1e-12) if k != 1 else column.double() for k, column in enumerate(p.conics.T))
+    l1, l2, l3 = (
+        column.double().clamp(min=1e-12) if k != 1 else column.double() for k, column in enumerate(p.conics.T)
+    )
     var_v = 1.0 / l3**2
     var_u = (l2**2 * var_v + 1.0) / l1**2
     half = 0.5 * (var_u + var_v)

@@ -164,6 +164,10 @@ class FinalConfig:
     """Number of refinement steps between removals of splats with low opacity (`prune_opacity`)."""
     prune_opacity: float = 0.005
     """Splats with at most this opacity, 0 to 1, are removed during refinement."""
+    max_axis_ratio: float = 0.0
+    """Largest ratio of a splat's longest axis to its shortest; refinement lengthens shorter axes. 0 = no limit."""
+    max_needle_ratio: float = 0.0
+    """Largest ratio of a splat's longest axis to its second longest; refinement shortens the longest. 0 = no limit."""
     uncertainty: bool = True
     """Whether variance is used to merge submaps and still learned during refinement; off = paper."""
     variance: Literal["published", "predicted"] = "published"
