@@ -177,6 +177,10 @@ class FinalConfig:
     above 0. Two thirds of them use working images, so that the map stays sharp at that size too."""
     weight_moment: bool = True
     """Whether the depth uncertainty U stays in the loss of refinement (`mapping.weight_moment`); off is faster."""
+    max_axis_ratio: float = 0.0
+    """Largest ratio of a splat's longest axis to its shortest; refinement lengthens shorter axes. 0 = no limit."""
+    max_needle_ratio: float = 0.0
+    """Largest ratio of a splat's longest axis to its second longest; refinement shortens the longest. 0 = no limit."""
     uncertainty: bool = True
     """Whether variance is used to merge submaps and still learned during refinement; off = paper."""
     variance: Literal["published", "predicted"] = "published"

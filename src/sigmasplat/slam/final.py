@@ -81,6 +81,9 @@ def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix], final: FinalC
     for name in ("spacing_m", "merge_m", "sh_every", "prune_every", "lr_factor", "lr_decay"):
         if not getattr(final, name) > 0:
             raise ConfigError(f"final.{name} must be above 0, found {getattr(final, name)}")
+    for name in ("max_axis_ratio", "max_needle_ratio"):
+        if getattr(final, name) != 0 and not getattr(final, name) >= 1:
+            raise ConfigError(f"final.{name} must be 0 or at least 1, found {getattr(final, name)}")
 
 
 # ---- merging ----

@@ -18,6 +18,7 @@ from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.render.view import View
 from sigmasplat.slam.pruning import prune_by_weight
+from sigmasplat.slam.shape_limits import limit_shapes
 from sigmasplat.types import Matrix, Progress
 
 CACHE_BYTES = 64 << 20
@@ -121,9 +122,9 @@ def refine(
     """Fit the field to all keyframes, one per step, and their poses with it; return the loss of each step.
 
     Poses move at the rates `final.lr_pose_translation` and `final.lr_pose_rotation`; `keyframes.poses` has the moved
-    ones. Splats are pruned before, regularly, and at the end. Every `sh_every` steps, colours gain one degree of view
-    dependence. `done`, `spent_s`: the steps that the field has already had, and their seconds. `saved` is offered the
-    state after each pruning and each new degree.
+    ones. Splats are pruned before, regularly, and at the end. Their shapes are limited (`slam.shape_limits`). Every
+    `sh_every` steps, colours gain one degree of view dependence. `done`, `spent_s`: the steps that the field has
+    already had, and their seconds. `saved` is offered the state after each pruning and each new degree.
     """
     final, mapping, losses, clock = config.final, refinement(config), list[float](), Clock(config.final, spent_s)
     if not done:
@@ -136,6 +137,7 @@ def refine(
         drawn = _draw(keyframes, steps, config, random, progress, clock)
         losses += (fitted := fit_field(field, view, drawn, mapping, schedule=rates, degree=degree).losses)
         done += len(fitted)
+        limit_shapes(field, final.max_axis_ratio, final.max_needle_ratio)
         if done % final.prune_every == 0:
             field.keep(field.opacities > final.prune_opacity)
         if saved is not None and done == steps.stop:

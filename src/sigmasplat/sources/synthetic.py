@@ -15,7 +15,7 @@ from sigmasplat.sources.base import Source
 from sigmasplat.sources.files.images import color_from_bytes
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.room.furnish import furnish_rooms
-from sigmasplat.sources.room.render import build_scene, render_scene
+from sigmasplat.sources.room.render import RoomScene, build_scene, render_scene
 from sigmasplat.sources.room.sensor import drifted_depth, measured_color, measured_depth
 from sigmasplat.sources.room.solid import triangulate
 from sigmasplat.sources.room.walk import camera_path
@@ -107,7 +107,14 @@ class SyntheticRoom(Source):
         """Return exact views (no noise, gain 1) up to 0.7 m and 40° away from the path; None without `test_views`."""
         if not self._test_views:
             return None
-        return _ViewsAway(self.camera, self._rooms, self._seed, self._T_world_camera, self._test_views)
+        return self.views_away(self._test_views, AWAY_M, AWAY_RAD)
+
+    def views_away(self, count: int, away_m: Matrix, away_rad: Matrix) -> Source:
+        """Return exact views (no noise, gain 1) near the path: moved by at most away_m [3] along the axes of the camera
+        and rotated by a vector of at most away_rad [3]."""
+        scene = build_scene(self._rooms, self._seed)
+        random = np.random.default_rng((self._seed, 11))
+        return _ViewsAway(self.camera, scene, random, self._T_world_camera, count, (away_m, away_rad))
 
     def truth(self) -> Trajectory:
         """Return the exact pose of every frame, in the room's frame (z up)."""
@@ -127,17 +134,25 @@ class SyntheticRoom(Source):
 class _ViewsAway(Source):
     """Exact views of the room away from a camera path, in free space: nothing is nearer than `CLEARANCE_M`."""
 
-    def __init__(self, camera: Camera, rooms: int, seed: int, T_world_path: Matrix, count: int) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        scene: RoomScene,
+        random: np.random.Generator,
+        T_world_path: Matrix,
+        count: int,
+        away: tuple[Matrix, Matrix],
+    ) -> None:
         super().__init__("synthetic test views", camera)
-        self._scene, random = build_scene(rooms, seed), np.random.default_rng((seed, 11))
+        self._scene, (self._away_m, self._away_rad) = scene, away
         on_path = T_world_path[np.linspace(0, len(T_world_path) - 1, count).round().astype(int)]
         self._images = [self._image_near(T, random) for T in on_path]
 
     def _image_near(self, T_world_path: Matrix, random: np.random.Generator) -> tuple[Matrix, Floats, Floats]:
         """Draw poses near one of the path until one is free; return it with its colour and depth."""
         while True:
-            T_path_camera = se3.exp(np.concatenate([np.zeros(3), random.uniform(-1, 1, 3) * AWAY_RAD]))
-            T_path_camera[:3, 3] = random.uniform(-1, 1, 3) * AWAY_M
+            T_path_camera = se3.exp(np.concatenate([np.zeros(3), random.uniform(-1, 1, 3) * self._away_rad]))
+            T_path_camera[:3, 3] = random.uniform(-1, 1, 3) * self._away_m
             T_world_camera = se3.orthonormalise(T_world_path @ T_path_camera)
             color, depth_m = render_scene(self._scene, self.camera, T_world_camera)
             if depth_m[depth_m > 0].min(initial=np.inf) > CLEARANCE_M and (depth_m > 0).any():
