@@ -32,6 +32,8 @@ STEP_SHARE, AGREE_SHARE, RENDER_WEIGHT = 0.05, 0.05, np.float32(1.0)
 """Of fusion with readings: `silhouettes`, `with_readings`; the variance of a reading by that of a render."""
 LEAST_VERTICES = 200
 """Connected parts with fewer vertices are dropped (VarSplat §7)."""
+FLOATER_SHARE = 5e-4
+"""With readings, parts below this share of the largest part's area are dropped too: 300 cm² in a room of 60 m²."""
 
 Floats = NDArray[np.float32]
 Renderer = Callable[[GaussianField, Camera, Matrix], Render]
@@ -127,7 +129,7 @@ def fuse(
         progress(done, total)
     mesh = isosurface.surface(volume)
     del volume  # free memory: cleaning needs as much again
-    return mesh.without_small_parts(LEAST_VERTICES)
+    return mesh.without_small_parts(LEAST_VERTICES, FLOATER_SHARE if config.surface.depth == "map+sensor" else 0.0)
 
 
 def surface_of(seen: Render, config: Config) -> tuple[Floats, Floats]:
