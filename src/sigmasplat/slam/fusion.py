@@ -52,7 +52,7 @@ class FusionView:
 
 
 def surface_views(
-    field: GaussianField,
+    read_field: Callable[[], GaussianField],
     store: SubmapStore,
     anchors: Sequence[Matrix],
     config: Config,
@@ -61,14 +61,14 @@ def surface_views(
 ) -> Iterator[FusionView]:
     """Yield the views of a finished run's surface at its keyframes, as `surface.depth` says.
 
-    field: the final map in the world; anchors: T_world_submap of each submap; outside: the submaps that are not
-    connected to the world, which are skipped; T_world_keyframe [K, 4, 4]: the poses of all keyframes of all submaps, if
-    the final map has moved them.
+    read_field: returns the final map in the world, called if it is fused; anchors: T_world_submap of each submap;
+    outside: the submaps that are not connected to the world, which are skipped; T_world_keyframe [K, 4, 4]: the poses
+    of all keyframes of all submaps, if the final map has moved them.
     """
     if config.surface.depth == "map":
         yield from fusion_views(store, anchors, outside)
         return
-    first = 0
+    field, first = read_field(), 0
     for index in range(len(store)):
         submap = store.load(index)
         poses = anchors[index] @ submap.T_submap_camera
