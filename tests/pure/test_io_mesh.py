@@ -136,19 +136,55 @@ const validator = require("gltf-validator");
 validator.validateBytes(new Uint8Array(require("fs").readFileSync(process.argv[1])))
   .then(report => console.log(JSON.stringify(report.issues)));
 """
+THREE = """
+const THREE = require("three"), fs = require("fs"), path = require("path"), { pathToFileURL } = require("url");
+const loader = path.join(path.dirname(require.resolve("three")), "../examples/jsm/loaders/GLTFLoader.js");
+globalThis.self = globalThis;
+import(pathToFileURL(loader)).then(async ({ GLTFLoader }) => {
+  const T = await import(pathToFileURL(path.join(path.dirname(require.resolve("three")), "three.module.js")));
+  const data = new Uint8Array(fs.readFileSync(process.argv[1])).buffer;
+  const { scene } = await new GLTFLoader().parseAsync(data, "");
+  scene.updateMatrixWorld(true);
+  const looks = JSON.parse(process.argv[2]).map(([from, along]) => {
+    const ray = new T.Raycaster(new T.Vector3(...from), new T.Vector3(...along));
+    const [hit] = ray.intersectObject(scene, true);
+    const { material, geometry } = hit.object, colors = geometry.getAttribute("color");
+    const at = hit.face.a, linear = new T.Color(colors.getX(at), colors.getY(at), colors.getZ(at));
+    const shown = linear.convertLinearToSRGB();
+    return { lit: material.type !== "MeshBasicMaterial", colored: material.vertexColors, point: hit.point.toArray(),
+             shown: shown.toArray() };
+  });
+  console.log(JSON.stringify(looks));
+});
+"""
+
+
+def node(package: str, program: str, *arguments: str) -> Any:
+    """Run a program in node and return its JSON; skip the test where node or the package is missing."""
+    found = shutil.which("node") and subprocess.run(["node", "-e", f"require('{package}')"], capture_output=True)
+    if not found or found.returncode:
+        pytest.skip(f"needs node and npm's {package}; set NODE_PATH to its node_modules")
+    command = ["node", "-e", program, *arguments]
+    return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 
 @pytest.mark.parametrize("mesh", [some_mesh(), some_mesh(colors=False), EMPTY], ids=["coloured", "gray", "empty"])
 def test_khronos_validator_accepts_the_glb(tmp_path: Path, mesh: Mesh) -> None:
-    if (
-        shutil.which("node") is None
-        or subprocess.run(["node", "-e", "require('gltf-validator')"], capture_output=True).returncode
-    ):
-        pytest.skip("needs node and npm's gltf-validator; set NODE_PATH to its node_modules")
     write_mesh(tmp_path / "a.glb", mesh)
-    command = ["node", "-e", GLTF_VALIDATOR, str(tmp_path / "a.glb")]
-    issues = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    issues = node("gltf-validator", GLTF_VALIDATOR, str(tmp_path / "a.glb"))
     assert issues["numErrors"] == issues["numWarnings"] == 0, issues["messages"]
+
+
+def test_three_js_shows_recorded_colours_from_both_sides(tmp_path: Path) -> None:
+    """A wall one metre ahead, of one colour, is hit by a ray of three.js from the front and from behind."""
+    corners = np.array([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1]], np.float32)
+    color = np.tile(np.array([[0.2, 0.5, 0.8]], np.float32), (4, 1))
+    write_mesh(tmp_path / "a.glb", Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), color))
+    rays = [[[0.1, 0.3, 0], [0, 0, -1]], [[0.1, 0.3, -3], [0, 0, 1]]]
+    for seen in node("three", THREE, str(tmp_path / "a.glb"), json.dumps(rays)):
+        assert not seen["lit"] and seen["colored"]
+        assert seen["shown"] == pytest.approx([0.2, 0.5, 0.8], abs=2e-3)
+        assert seen["point"] == pytest.approx([0.1, 0.3, -1.0], abs=1e-5)
 
 
 def by_hand(

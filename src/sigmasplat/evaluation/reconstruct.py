@@ -78,7 +78,7 @@ class FusionInput:
         outside = self.run.read_frames().submaps_outside() if self.run.component_numbers() else frozenset[int]()
         moved = tensors.get("T_world_keyframe")
         T_world_keyframe = None if moved is None else np.asarray(moved, np.float64)
-        views = surface_views(self.run.read_map(), submaps, list(anchors), self.config, outside, T_world_keyframe)
+        views = surface_views(self.run.read_map, submaps, list(anchors), self.config, outside, T_world_keyframe)
         return views, count_keyframes(submaps, outside)
 
     def surface(

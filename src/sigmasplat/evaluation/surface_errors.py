@@ -60,7 +60,7 @@ def surface_errors(
     reference = (_fused(run.config, source, truth) if surface is None else surface).moved(T_estimate_truth)
     outside = frozenset(range(len(run.store))) - frozenset(run.members)
     total = count_keyframes(run.store, outside)
-    views = surface_views(run.field, run.store, run.anchors, run.config, outside)
+    views = surface_views(lambda: run.field, run.store, run.anchors, run.config, outside)
     found = fuse(views, total, run.config, renderer=renderer, progress=progress)
     poses = T_estimate_truth @ truth.T_world_camera[evenly_spread(true_rows.tolist(), SEEING_FRAMES)]
     vertices = found.vertices.astype(np.float64)

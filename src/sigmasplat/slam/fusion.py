@@ -32,6 +32,8 @@ STEP_SHARE, AGREE_SHARE, RENDER_WEIGHT = 0.05, 0.05, np.float32(1.0)
 """Of fusion with readings: `silhouettes`, `with_readings`; the variance of a reading by that of a render."""
 LEAST_VERTICES = 200
 """Connected parts with fewer vertices are dropped (VarSplat §7)."""
+FLOATER_SHARE = 5e-4
+"""With readings, parts below this share of the largest part's area are dropped too: 300 cm² in a room of 60 m²."""
 
 Floats = NDArray[np.float32]
 Renderer = Callable[[GaussianField, Camera, Matrix], Render]
@@ -50,7 +52,7 @@ class FusionView:
 
 
 def surface_views(
-    field: GaussianField,
+    read_field: Callable[[], GaussianField],
     store: SubmapStore,
     anchors: Sequence[Matrix],
     config: Config,
@@ -59,14 +61,14 @@ def surface_views(
 ) -> Iterator[FusionView]:
     """Yield the views of a finished run's surface at its keyframes, as `surface.depth` says.
 
-    field: the final map in the world; anchors: T_world_submap of each submap; outside: the submaps that are not
-    connected to the world, which are skipped; T_world_keyframe [K, 4, 4]: the poses of all keyframes of all submaps, if
-    the final map has moved them.
+    read_field: returns the final map in the world, called if it is fused; anchors: T_world_submap of each submap;
+    outside: the submaps that are not connected to the world, which are skipped; T_world_keyframe [K, 4, 4]: the poses
+    of all keyframes of all submaps, if the final map has moved them.
     """
     if config.surface.depth == "map":
         yield from fusion_views(store, anchors, outside)
         return
-    first = 0
+    field, first = read_field(), 0
     for index in range(len(store)):
         submap = store.load(index)
         poses = anchors[index] @ submap.T_submap_camera
@@ -127,7 +129,7 @@ def fuse(
         progress(done, total)
     mesh = isosurface.surface(volume)
     del volume  # free memory: cleaning needs as much again
-    return mesh.without_small_parts(LEAST_VERTICES)
+    return mesh.without_small_parts(LEAST_VERTICES, FLOATER_SHARE if config.surface.depth == "map+sensor" else 0.0)
 
 
 def surface_of(seen: Render, config: Config) -> tuple[Floats, Floats]:
