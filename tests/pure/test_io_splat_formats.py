@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import zstandard
 
 from room_map import psnr_db, room_map
-from sigmasplat.errors import RunError
-from sigmasplat.io.splats import any_format, compressed_ply, ply, splat, spz
+from sigmasplat.errors import ConfigError, RunError
+from sigmasplat.io.splats import any_format, compressed_ply, gltf, ply, sog, splat, spz, usd
+from sigmasplat.io.splats.codebooks import levels
 from sigmasplat.io.splats.quaternions import from_smallest_three, smallest_three
 from sigmasplat.io.splats.values import SplatValues, morton_order
 from sigmasplat.model.field import GaussianField, Rows
@@ -25,8 +27,11 @@ WRITERS: dict[str, Writer] = {
     ".compressed.ply": compressed_ply.write_field,
     ".splat": splat.write_field,
     ".spz": spz.write_field,
+    ".sog": sog.write_field,
+    ".glb": gltf.write_field,
+    ".gltf": gltf.write_field,
 }
-COMPRESSED = [".compressed.ply", ".splat", ".spz"]
+COMPRESSED = [".compressed.ply", ".splat", ".spz", ".sog"]
 
 
 def again(path: Path, field: GaussianField) -> GaussianField:
@@ -64,7 +69,7 @@ def test_ply_gives_the_same_render(tmp_path: Path, degree: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("ending", "degree"), [(".compressed.ply", 0), (".compressed.ply", 3), (".spz", 0), (".spz", 3)]
+    ("ending", "degree"), [(".compressed.ply", 0), (".compressed.ply", 3), (".spz", 0), (".spz", 3), (".sog", 0)]
 )
 def test_a_quarter_of_the_size_gives_nearly_the_same_render(tmp_path: Path, ending: str, degree: int) -> None:
     field = room_map(degree)
@@ -112,7 +117,7 @@ def test_the_same_map_gives_the_same_bytes_and_no_other_files(tmp_path: Path, en
 
 
 def test_maps_of_any_number_of_splats(tmp_path: Path) -> None:
-    for n, ending in itertools.product([0, 1, 256, 257], [".ply", ".compressed.ply", ".spz"]):
+    for n, ending in itertools.product([0, 1, 256, 257], [".ply", ".compressed.ply", ".spz", ".sog"]):
         assert len(again(tmp_path / f"a{ending}", some(n))) == n
 
 
@@ -238,6 +243,59 @@ def test_spz_has_the_documented_layout(tmp_path: Path) -> None:
             )
             k = [(b - 128) / 128 for b in data[at[5] + each * i :][:each]]
             assert np.abs(np.array(k) - was.harmonics[row]).max(initial=0) <= 0.5 / 128 + 1e-5
+
+
+def test_spz_4_has_the_streams_of_spz_3_behind_a_table(tmp_path: Path) -> None:
+    for degree, given in ((0, 5), (2, 6)):
+        field = some(50, degree)
+        for version in (3, 4):
+            spz.write_field(tmp_path / f"{version}.spz", field, version=version)
+        plain = gzip.decompress((tmp_path / "3.spz").read_bytes())[16:]
+        data = (tmp_path / "4.spz").read_bytes()
+        assert struct.unpack_from("<IIIBBBBI12s", data) == (0x5053474E, 4, 50, degree, 12, 0, given, 32, bytes(12))
+        table = [struct.unpack_from("<QQ", data, 32 + 16 * i) for i in range(given)]
+        at, found = 32 + 16 * given, b""
+        for packed, size in table:
+            found += zstandard.ZstdDecompressor().decompress(data[at : at + packed], max_output_size=size)
+            at += packed
+        assert found == plain and at == len(data)
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_spz_of_every_version_gives_the_same_map(tmp_path: Path, version: int) -> None:
+    field = room_map()
+    spz.write_field(tmp_path / "a.spz", field, version=version)
+    assert psnr_db(any_format.read_any(tmp_path / "a.spz"), field) > 35.0
+    with pytest.raises(ConfigError, match="versions 2, 3 and 4"):
+        spz.write_field(tmp_path / "a.spz", field, version=5)
+
+
+@pytest.mark.parametrize("ending", [".glb", ".gltf", ".usdc", ".usda"])
+def test_scene_formats_keep_sigma_and_the_render(tmp_path: Path, ending: str) -> None:
+    if "usd" in ending:
+        pytest.importorskip("pxr", reason="usd-core is not installed (pip install 'sigmasplat[usd]')")
+    field = room_map(1)
+    (usd if "usd" in ending else gltf).write_field(tmp_path / f"a{ending}", field)
+    back = any_format.read_any((tmp_path / f"a{ending}").rename(tmp_path / "map"))
+    assert len(back) == len(field) and psnr_db(back, field) > 60.0
+    torch.testing.assert_close(back.params[:, 14:], field.params[:, 14:], atol=1e-5, rtol=0.0)
+
+
+def test_gltf_keeps_colour_correlations(tmp_path: Path) -> None:
+    field = some(20)
+    field.get_or_create("correlations").params += torch.linspace(-1.0, 1.0, 20)[:, None]
+    back = again(tmp_path / "a.glb", field)
+    torch.testing.assert_close(back.attributes["correlations"].params, field.attributes["correlations"].params)
+
+
+def test_codebooks_are_as_fine_as_their_values() -> None:
+    values = np.random.default_rng(0).normal(size=(5000, 3))
+    book, index = levels(values)
+    assert index.shape == values.shape and (np.diff(book) >= 0).all()
+    assert np.abs(book[index] - values).mean() < 0.01
+    few = np.array([[0.0, 1.0], [0.0, 1.0]])
+    book, index = levels(few)
+    assert (book[index] == few).all()
 
 
 def test_spz_of_version_2_is_read(tmp_path: Path) -> None:
