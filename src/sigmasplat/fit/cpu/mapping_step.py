@@ -63,11 +63,11 @@ class CompiledStep(CompiledImages):
     ) -> tuple[Matrix, float]:
         """Step the splats as `TorchStep.splats` does, in one pass that stores no gradient rows in memory."""
         twist, v = np.zeros(6), self.view
-        g_moment, *g_median = v.depth_gradients()
+        g_moment, median_id, g_median_depth = v.depth_gradients()
+        g_alpha = v.g_alpha if weights.get("mean_depth") else None
         cost = v.raster.step(
             field.params, field.moment1, field.moment2, field.last_step, v.g_sums, g_moment,
-            v.g_alpha if weights.get("mean_depth") else None, *g_median,
-            rates.per_column.numpy(), BETA1, BETA2, EPSILON, field.steps,
+            g_alpha, median_id, g_median_depth, rates.per_column.numpy(), BETA1, BETA2, EPSILON, field.steps,
             kernel_weights(SHAPE_TERMS, weights, "cpu").tolist(), frozen_colors, grad2d, twist, v.seconds[3:],
         )  # fmt: skip
         return twist, cost
