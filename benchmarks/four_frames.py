@@ -173,7 +173,7 @@ def score(sequence: TrueSequence, field: GaussianField, config: Config, T_map_wo
 
 
 def measure_fit(sequence: TrueSequence, options: Options, start: int, seed: int) -> dict[str, Any]:
-    """Fit four frames from `start` on; return the mean scores of the next views after each stage."""
+    """Fit four frames from `start` on; return the mean scores of the next views, by seen pixels, after each stage."""
     config = options.config(seed)
     fitted = [start + k * options.spacing for k in range(FITTED)]
     later = [i for i in range(fitted[-1] + 1, len(sequence))][: options.views : options.every]
@@ -183,7 +183,8 @@ def measure_fit(sequence: TrueSequence, options: Options, start: int, seed: int)
     result: dict[str, Any] = {"start": start, "seed": seed, "views": len(views)}
     for stage, field in fit(sequence, config, fitted, options.steps).items():
         rows = [score(sequence, field, config, T_map_world, i, pixels[i]) for i in views]
-        result[stage] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+        weights = [pixels[i].sum() for i in views]
+        result[stage] = {name: float(np.average([row[name] for row in rows], weights=weights)) for name in rows[0]}
         result[stage]["splats"] = len(field)
     return result
 

@@ -82,7 +82,10 @@ def test_settings_that_exclude_each_other_are_refused_before_a_run() -> None:
     with pytest.raises(ConfigError, match=r"--set mapping\.weight_moment=0") as refused:
         override(preset("sigma"), full).checked()
     assert "\n" not in str(refused.value)
-    override(preset("sigma"), full | {"mapping.weight_moment": "0"}).checked()
+    without_moment = full | {"mapping.weight_moment": "0"}
+    with pytest.raises(ConfigError, match=r"--set render\.depth=center"):
+        override(preset("sigma"), without_moment).checked()
+    override(preset("sigma"), without_moment | {"render.depth": "center"}).checked()
     assert all(preset(name).checked() == preset(name) for name in list_presets())
 
 

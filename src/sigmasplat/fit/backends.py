@@ -113,6 +113,8 @@ def step_for(field: GaussianField, view: View, weights: Weights, degree: int) ->
         raise ConfigError(
             "mapping.color_covariance=full does not support weight_alignment or weight_moment; set both to 0"
         )
+    if full and view.options.depth == "ray":
+        raise ConfigError("mapping.color_covariance=full does not support render.depth=ray; set it to center")
     fits = fits_of(view)
     if full:
         step = fits.covariance_step(make_covariance_view(view, field.get_or_create("correlations")))

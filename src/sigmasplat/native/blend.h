@@ -174,11 +174,17 @@ template <int K, bool MOMENT, bool IDS, bool SLOPES> static void blend_tiles(Ren
                         const Mask before_half = ge(T, half);
                         T = fnma(T, a, T);
                         T_end = select(on, T, T_end);
-                        vf depth;
-                        if constexpr (SLOPES) depth = fma(splat(f[SLOPE_V]), y, fma(splat(f[SLOPE_U]), x, splat(geometry.z)));
-                        else depth = splat(geometry.z);
-                        for (int c = 0; c < K; c++) sum[c] = fma(w, SLOPES && c == 3 ? depth : splat(f[c]), sum[c]);
-                        if (MOMENT) { const vf d = depth - ref; moment = fma(w * d, d, moment); }
+                        vf depth;                     // two versions: the compiler rounds a shared one differently
+                        if constexpr (SLOPES) {
+                            depth = fma(splat(f[SLOPE_V]), y, fma(splat(f[SLOPE_U]), x, splat(geometry.z)));
+                            for (int c = 0; c < 3; c++) sum[c] = fma(w, splat(f[c]), sum[c]);
+                            sum[3] = fma(w, depth, sum[3]);
+                            for (int c = 4; c < K; c++) sum[c] = fma(w, splat(f[c]), sum[c]);
+                            if (MOMENT) { const vf d = depth - ref; moment = fma(w * d, d, moment); }
+                        } else {
+                            for (int c = 0; c < K; c++) sum[c] = fma(w, splat(f[c]), sum[c]);
+                            if (MOMENT) { const vf d = geometry.z - ref; moment = fma(w * d, d, moment); }
+                        }
                         if (IDS) {
                             const vi id = splat(geometry.tag);
                             const Mask more = gt(w, best), crossing = both(before_half, gt(w, zero));
@@ -186,7 +192,7 @@ template <int K, bool MOMENT, bool IDS, bool SLOPES> static void blend_tiles(Ren
                             dominant = select(more, id, dominant);
                             median = select(crossing, id, median);
                             median_w = select(crossing, w, median_w);
-                            median_z = select(crossing, depth, median_z);
+                            median_z = select(crossing, SLOPES ? depth : splat(geometry.z), median_z);
                         }
                     }
                     if (!any(ge(T, stop))) break;

@@ -63,8 +63,12 @@ SIGMA_INLINE void store_basis(const PixelGradients<K>& on_pixels, vf x, vf y, Ba
     }
     if constexpr (MOMENT) {
         const vf twice = 2.f * on_pixels.moment, by_ref = -2.f * on_pixels.moment * on_pixels.ref;
-        for (int q = 0; q < (SLOPES ? 6 : 1); q++) weighed(AT + q, q ? twice * moments[q] : twice);
-        for (int q = 0; q < (SLOPES ? 3 : 1); q++) weighed(AT + (SLOPES ? 6 : 1) + q, q ? by_ref * moments[q] : by_ref);
+        weighed(AT, twice);
+        weighed(AT + (SLOPES ? 6 : 1), by_ref);
+        if constexpr (SLOPES) {
+            for (int q = 1; q < 6; q++) weighed(AT + q, twice * moments[q]);
+            for (int q = 1; q < 3; q++) weighed(AT + 6 + q, by_ref * moments[q]);
+        }
     }
     for (int h = 0; h < COLUMNS; h += W) {
         transpose(columns + h);
@@ -89,12 +93,22 @@ SIGMA_INLINE int walk_out(const float* rows, const int* list, int count, vf x, v
             const vf a = load(alphas[e]);
             const Mask on = ge(T, stop);
             vf gain = on_pixels.alpha;
-            vf depth = splat(reinterpret_cast<const Geometry*>(row)->z);
-            if constexpr (SLOPES) depth = fma(splat(row[GEOMETRY + SLOPE_V]), y, fma(splat(row[GEOMETRY + SLOPE_U]), x, depth));
-            for (int c = 0; c < K; c++) gain = fma(on_pixels.sums[c], SLOPES && c == 3 ? depth : splat(row[GEOMETRY + c]), gain);
-            if (MOMENT) {
-                const vf d = depth - on_pixels.ref;
-                gain = fma(on_pixels.moment * d, d, gain);
+            if constexpr (SLOPES) {
+                vf depth = splat(reinterpret_cast<const Geometry*>(row)->z);
+                depth = fma(splat(row[GEOMETRY + SLOPE_V]), y, fma(splat(row[GEOMETRY + SLOPE_U]), x, depth));
+                for (int c = 0; c < K; c++)
+                    if (c != 3) gain = fma(on_pixels.sums[c], splat(row[GEOMETRY + c]), gain);
+                gain = fma(on_pixels.sums[3], depth, gain);
+                if (MOMENT) {
+                    const vf d = depth - on_pixels.ref;
+                    gain = fma(on_pixels.moment * d, d, gain);
+                }
+            } else {
+                for (int c = 0; c < K; c++) gain = fma(on_pixels.sums[c], splat(row[GEOMETRY + c]), gain);
+                if (MOMENT) {
+                    const vf d = reinterpret_cast<const Geometry*>(row)->z - on_pixels.ref;
+                    gain = fma(on_pixels.moment * d, d, gain);
+                }
             }
             store(weights[e], only(on, T * a));
             store(gains[e], only(on, gain));

@@ -126,7 +126,7 @@ def discs(target: Target, pixels: Mask) -> tuple[NDArray[np.float64], NDArray[np
     right, below = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
     around = np.pad(depth, 1)
     neighbours = np.stack([around[1:-1, 2:], around[1:-1, :-2], around[2:, 1:-1], around[:-2, 1:-1]])
-    known = (np.abs(neighbours - depth) < SAME_SURFACE * depth).all(0) & (neighbours > 0).all(0)
+    known: Mask = np.all((np.abs(neighbours - depth) < SAME_SURFACE * depth) & (neighbours > 0), axis=0)
     normal = np.cross(right, below)[pixels]
     view = rays[pixels] / np.linalg.norm(rays[pixels], axis=1, keepdims=True)
     length = np.linalg.norm(normal, axis=1)
