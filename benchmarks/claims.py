@@ -22,6 +22,7 @@ import tyro
 from pose_gradient import ONE_MAP, RATES
 
 import sigmasplat
+from sigmasplat.commands.options import Settings
 from sigmasplat.config import Config
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError, SigmaSplatError
@@ -36,10 +37,12 @@ COMMON = (
     "seeding.first_uniform=9600", "seeding.first_gradient=3840",
 )  # fmt: skip
 """Settings of all runs; --set adds to them. Seeds are as dense as those of the preset at its own width."""
-DESCENT = ("tracking.method=adam", "tracking.iterations=15", f"tracking.lr_translation={RATES['CG-SLAM'][1]}")
+DESCENT = ("tracking.method=adam", "tracking.iterations=30", f"tracking.lr_translation={RATES['CG-SLAM'][1]}")
 TERMS_OFF = ("mapping.weight_alignment=0", "mapping.weight_moment=0")
 DOUBLE = "double width"
-"""The others are the light form of it. It is left out where the images are not larger."""
+"""The others are the light form of it."""
+SURFACE = ("full", "without both", "without alignment", "without variance", "without isotropy", "without fading")
+"""Variants that are made of the synthetic room too, whose true surface is known."""
 
 
 @dataclass(frozen=True)
@@ -52,10 +55,7 @@ class Group:
     variants: dict[str, tuple[str, ...]]
 
 
-SHORT = {
-    "redkitchen": ("input.stride=2", "input.limit=50"),
-    "livingroom": ("input.stride=2", "input.limit=50"),
-}
+SHORT = {"redkitchen": ("input.limit=40",), "livingroom": ("input.limit=40",)}
 GROUPS: dict[str, Group] = {
     "varsplat": Group(
         "varsplat-fast",
@@ -69,7 +69,7 @@ GROUPS: dict[str, Group] = {
     ),
     "cgslam": Group(
         "cgslam-fast",
-        SHORT | {"synthetic": ("input.limit=40",)},
+        SHORT | {"synthetic": ("input.limit=30",)},
         (
             *DESCENT, "tracking.lr_rotation=0.0015", "tracking.parametrisation=axis-angle",
             "tracking.weight_color=0.625", "tracking.uncertainty=false", "tracking.alpha_power=0",
@@ -126,7 +126,7 @@ class Options:
         tuple[str, ...], arg(help="runs to make", help_behavior_hint="(default: all of the group)")
     ] = ()
     seeds: Annotated[tuple[int, ...], arg(help="random seeds, one run for each")] = (0, 1, 2)
-    settings: Annotated[tuple[str, ...], arg(name="set", help="settings of all runs")] = ()
+    settings: Settings = ()
     collect: Annotated[bool, arg(help="make no run; write the results of the finished jobs")] = False
     name: Annotated[str, arg(help="name of the results; use another name with other --set")] = "claims"
     runs: Annotated[Path, arg(help="folder of finished jobs")] = RUNS
@@ -181,7 +181,8 @@ def jobs_of(options: Options) -> list[Job]:
         if not options.variants or variant in options.variants
         for seed in options.seeds
         for source, ours in group.sources.items()
-        if (not options.sources or source in options.sources) and (variant, source) != (DOUBLE, "synthetic")
+        if not options.sources or source in options.sources
+        if source != "synthetic" or variant in SURFACE
     ]
     for job in listed:
         job.config()
