@@ -41,7 +41,7 @@ DESCENT = ("tracking.method=adam", "tracking.iterations=30", f"tracking.lr_trans
 TERMS_OFF = ("mapping.weight_alignment=0", "mapping.weight_moment=0")
 DOUBLE = "double width"
 """The others are the light form of it."""
-SURFACE = ("full", "without both", "without alignment", "without variance", "without isotropy", "without fading")
+SURFACE = ("full", "without both", "without alignment", "without variance")
 """Variants that are made of the synthetic room too, whose true surface is known."""
 
 
@@ -93,7 +93,7 @@ GROUPS: dict[str, Group] = {
         "varsplat-fast",
         {
             "redkitchen": ("input.stride=2", "input.limit=120"),
-            "livingroom": ("input.stride=2", "input.limit=120"),
+            "livingroom": ("input.limit=120",),
             "hololens": ("input.limit=80",),
         },
         (*ONE_MAP, "submaps.frames=20", "submaps.variance_sum=1e9"),
