@@ -37,7 +37,7 @@ COMMON = (
     "seeding.first_uniform=9600", "seeding.first_gradient=3840",
 )  # fmt: skip
 """Settings of all runs; --set adds to them. Seeds are as dense as those of the preset at its own width."""
-DESCENT = ("tracking.method=adam", "tracking.iterations=30", f"tracking.lr_translation={RATES['CG-SLAM'][1]}")
+DESCENT = ("tracking.method=adam", "tracking.iterations=15", f"tracking.lr_translation={RATES['CG-SLAM'][1]}")
 TERMS_OFF = ("mapping.weight_alignment=0", "mapping.weight_moment=0")
 DOUBLE = "double width"
 """The others are the light form of it."""
@@ -55,11 +55,10 @@ class Group:
     variants: dict[str, tuple[str, ...]]
 
 
-SHORT = {"redkitchen": ("input.limit=40",), "livingroom": ("input.limit=40",)}
 GROUPS: dict[str, Group] = {
     "varsplat": Group(
         "varsplat-fast",
-        SHORT,
+        {name: ("input.stride=2", "input.limit=50") for name in ("redkitchen", "livingroom")},
         (*ONE_MAP, *DESCENT, f"tracking.lr_rotation={RATES['CG-SLAM'][0]}", "tracking.weight_color=0.6"),
         {
             "V in tracking": (),
@@ -69,9 +68,9 @@ GROUPS: dict[str, Group] = {
     ),
     "cgslam": Group(
         "cgslam-fast",
-        SHORT | {"synthetic": ("input.limit=30",)},
+        {"redkitchen": ("input.limit=30",), "livingroom": ("input.limit=30",), "synthetic": ("input.limit=20",)},
         (
-            *DESCENT, "tracking.lr_rotation=0.0015", "tracking.parametrisation=axis-angle",
+            *DESCENT, "tracking.iterations=30", "tracking.lr_rotation=0.0015", "tracking.parametrisation=axis-angle",
             "tracking.weight_color=0.625", "tracking.uncertainty=false", "tracking.alpha_power=0",
             "tracking.alpha_above=0.99", "tracking.outlier_factor=10", "tracking.outlier_factor_color=10",
             "tracking.average=kept",
@@ -93,7 +92,7 @@ GROUPS: dict[str, Group] = {
         "varsplat-fast",
         {
             "redkitchen": ("input.stride=2", "input.limit=120"),
-            "livingroom": ("input.limit=120",),
+            "livingroom": ("input.stride=2", "input.limit=120"),
             "hololens": ("input.limit=80",),
         },
         (*ONE_MAP, "submaps.frames=20", "submaps.variance_sum=1e9"),
