@@ -31,6 +31,36 @@ def of_jobs(measured: dict[str, Any]) -> Runs:
     ]
 
 
+def of_scenes(measured: dict[str, Any]) -> Runs:
+    """Read consistency.py: its scenes with their seeds as one sequence, whose differences are pooled."""
+    jobs = [result for result in measured["figures"]["jobs"] if result["problem"] is None]
+    scenes = list(dict.fromkeys(result["job"]["source"] for result in jobs))
+    return [
+        {
+            "source": f"{len(scenes)} scenes",
+            "variant": result["variant"],
+            "seed": scenes.index(result["job"]["source"]) + len(scenes) * result["job"]["seed"],
+            "figures": result["figures"],
+        }
+        for result in jobs
+    ]
+
+
+def of_ways(measured: dict[str, Any]) -> Runs:
+    """Read the sequences of pose_gradient.py as one, whose differences are pooled; a variant is a list of paths."""
+    runs = [run for run in measured["figures"]["sequence"] if run["problem"] is None]
+    sources = list(dict.fromkeys(run["source"] for run in runs))
+    return [
+        {
+            "source": f"{len(sources)} sequences",
+            "variant": run["way"],
+            "seed": sources.index(run["source"]) + len(sources) * run["seed"],
+            "figures": run["figures"],
+        }
+        for run in runs
+    ]
+
+
 def of_scores(quantity: str, pixels: str) -> Callable[[dict[str, Any]], Runs]:
     """Return what reads uncertainty.py: scores of held-back views of final maps; a variant is a predictor."""
 
@@ -68,7 +98,7 @@ def of_loops(measured: dict[str, Any]) -> Runs:
 class Evidence:
     """Where a figure is measured: results by name, what reads them, and the variants to compare.
 
-    Without `against`, the figure itself is compared with 0.
+    Without `against`, the figure itself is compared with 0. repeats: what the runs of a sequence differ in.
     """
 
     results: str
@@ -76,6 +106,7 @@ class Evidence:
     figure: Figure
     changed: str
     against: str | None = None
+    repeats: str = "seeds"
 
 
 @dataclass(frozen=True)

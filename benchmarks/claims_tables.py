@@ -12,7 +12,7 @@ from typing import Any
 
 import record
 from claims_evidence import Claim, Evidence
-from claims_papers import ATE, CHAMFER, CPU, DEPTH, ERROR, HOPS, PAPERS, PSNR, RANK, SPLATS, STEPS
+from claims_papers import ATE, CHAMFER, CPU, DEPTH, ERROR, FLOATERS, HOPS, PAPERS, PSNR, RANK, SPLATS, STEPS
 from tables import Section
 
 from sigmasplat.evaluation.paired_comparison import (
@@ -130,7 +130,7 @@ def row(claim: Claim, folder: Path) -> list[str]:
     what = f"{evidence.changed} − {evidence.against}" if evidence.against else evidence.changed
     text = f"{title}, *{what}*: {'; '.join(cells)}" + (f" ({claim.remark})" if claim.remark else "")
     counts = counted(claim, [*found.values()])
-    provenance = f"{results}, {seeds(evidence, measured)} seeds, {(measured['commit'] or 'no commit')[:9]}"
+    provenance = f"{results}, {seeds(evidence, measured)} {evidence.repeats}, {(measured['commit'] or 'no commit')[:9]}"
     return [claim.said, claim.published, text, f"**{judgement}**: {counts}", provenance]
 
 
@@ -182,7 +182,7 @@ def note() -> str:
 
 VALUES: dict[str, tuple[Figure, ...]] = {
     "varsplat": (ATE, PSNR, DEPTH, RANK, CPU),
-    "cgslam": (ATE, CHAMFER, Figure("floaters", "floaters", "%", -1, 100.0), PSNR, DEPTH, SPLATS, CPU),
+    "cgslam": (ATE, CHAMFER, FLOATERS, PSNR, DEPTH, SPLATS, CPU),
     "hops": (HOPS,),
     "registration": (
         ERROR,
