@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import claims_tables
 import record
 import tables
 from ablation import verdict_counts
@@ -69,6 +70,16 @@ def uses_of_uncertainty(results: Results) -> str:
     by = {word: [row[0] for row in verdicts.rows if row[1] == word] for word in ("helps", "hurts")}
     named = "; ".join(f"{word}: {', '.join(found) or '–'}" for word, found in by.items())
     return f"of {len(verdicts.rows)} changes, {named}; the others differ by sequence or have no effect"
+
+
+def claims(results: Results) -> str:
+    """Count the verdicts on the claims of each paper."""
+    counts = {paper: claims_tables.verdict_counts(paper, results.folder) for paper in claims_tables.PAPERS}
+    return "; ".join(
+        f"{paper}: {count['reproduced']} of {count.total()} reproduced, {count[claims_tables.NOT_MEASURABLE]} not "
+        "measurable here"
+        for paper, count in counts.items()
+    )
 
 
 def systems(results: Results) -> str:
@@ -160,6 +171,7 @@ ROWS: tuple[tuple[str, Callable[[Results], str], tuple[str, ...]], ...] = (
     ("Does V rank the errors? (Spearman, 1 = perfectly)", each(MAP, "Spearman V ~ error²"), ("accuracy",)),
     ("Do the weights of σ² help?", weights_of_variance, ("ablation",)),
     ("Which other uses of an uncertainty help?", uses_of_uncertainty, ("weights",)),
+    ("Which claims of the papers hold here?", claims, ("claims",)),
     ("Which preset? (ATE, PSNR)", systems, ("systems",)),
     ("Alignment or Adam for tracking?", alignment, ("tracking",)),
     ("Does the pose covariance cover the error?", coverage, ("tracking",)),

@@ -4,7 +4,7 @@ A document holds <!-- bench:NAME --> … <!-- /bench -->, or bench:NAME/SECTION 
 `python benchmarks/tables.py` replaces the text between them, in README.md and docs/*.md. NAME is the name of results
 (the newest from any machine) or a file name without .json; SECTION is the title of a table, as in path-and-speed.
 bench:* shows all results, each under its own heading, and bench:contents lists these headings; bench:summary is the
-table of summary.py.
+table of summary.py, bench:verdicts those of claims_tables.py.
 """
 
 import ast
@@ -24,6 +24,7 @@ import tyro
 SUBJECTS = {
     "Whole runs": ("accuracy", "systems", "map_quality", "every_preset", "paper_presets"),
     "Other systems": ("peers", "mesh_quality"),
+    "Claims of the papers": ("claims",),
     "Effect of σ²": ("ablation", "weights", "color_covariance"),
     "Uncertainty": ("uncertainty", "uncertainty_weights", "pose_covariance"),
     "Camera tracking": ("tracking", "pose_gradient", "relocalisation"),
@@ -150,7 +151,15 @@ def summary(folder: Path = record.RESULTS) -> str:
     return made
 
 
-WHOLE: dict[str, Callable[[Path], str]] = {"*": everything, "contents": contents, "summary": summary}
+def verdicts(folder: Path = record.RESULTS) -> str:
+    """Write the claims of the papers with verdicts (see claims_tables.py). Raises KeyError if it lacks a result."""
+    made: str = importlib.import_module("claims_tables").table(folder)
+    return made
+
+
+WHOLE: dict[str, Callable[[Path], str]] = {
+    "*": everything, "contents": contents, "summary": summary, "verdicts": verdicts,
+}  # fmt: skip
 """Blocks that show more than the results of one name."""
 
 

@@ -1,0 +1,132 @@
+"""Make the runs of claims.py in this process: a whole run, and what is measured of its maps."""
+
+import time
+from typing import Any
+
+import numpy as np
+import torch
+from claims import Job
+from drift_rule import ADDED, hops_of
+from localise import Search, disturbed
+from weights_runs import VIEWS, mean, registrations, rendered, true_submaps
+
+from sigmasplat.evaluation.finished_run import FinishedRun
+from sigmasplat.evaluation.unseen_views import UnseenView, held_back_views
+from sigmasplat.fit.pose import fit_pose_adam
+from sigmasplat.fit.target import Target
+from sigmasplat.metrics.scored_view import ScoredView
+from sigmasplat.metrics.splats import score_splats
+from sigmasplat.metrics.trajectory import align_rigid, associate, score_path
+from sigmasplat.metrics.uncertainty import spearman
+from sigmasplat.metrics.views import sample_pixels, score_uncertainty
+from sigmasplat.model import se3
+from sigmasplat.slam.loop_closure.registration import tracking_of
+from sigmasplat.slam.predicted_submaps import PredictedSubmaps
+from sigmasplat.slam.slam import Slam
+from sigmasplat.sources import open_source
+from sigmasplat.sources.base import Source
+
+Rows = list[dict[str, Any]]
+Settings = dict[str, tuple[str, ...]]
+SUBMAPS = "submaps"
+SEARCH = Search(off_m=0.02, off_deg=1.0, steps=100, weight_color=0.0)
+"""How far held-back frames are moved before they are localised, and the number of steps at most."""
+LOCALISED = 6
+
+
+def rows(job: Job, registered: Settings, plateaus: Settings) -> Rows:
+    """Make a run; return its figures and, for the group of submaps, those of hops, registrations, localisations."""
+    torch.set_num_threads(1)
+    source, slam = open_source(job.path, job.config().input), Slam(job.config())
+    cpu_s = 0.0
+    for frame in source:
+        start_s = time.process_time()
+        slam.step(frame)
+        cpu_s += time.process_time() - start_s
+    slam.finish()
+    done = FinishedRun.of(slam)
+    views = held_back_views(done, source, VIEWS)
+    figures = path_figures(slam, done, source, views) | {"cpu_s": cpu_s / len(slam.steps)}
+    found = [{"group": job.group, "variant": job.variant, "figures": figures}]
+    if job.group == SUBMAPS:
+        truth, predicted = true_submaps(slam, source), PredictedSubmaps(slam.config, slam.store)
+        found += hop_ranks(slam, source)
+        found += registrations(job, slam, truth, predicted, registered)
+        found += localisations(job, slam, done, views, plateaus)
+    return found
+
+
+def path_figures(slam: Slam, done: FinishedRun, source: Source, views: list[UnseenView]) -> dict[str, Any]:
+    """Return the figures of path, views and, if the true surface is known, splats."""
+    scores, _ = score_path(done.path.at(done.believed), None, source.truth())
+    scored = [seen(done, view) for view in views]
+    judged = score_uncertainty([sample_pixels(view) for view in scored]) or {}
+    of_views = mean(scored)
+    return {
+        "ate_m": scores["ate"]["rmse_m"],
+        "rpe_m": scores["rpe"]["translation_rmse_m"],
+        "rpe_deg": scores["rpe"]["rotation_rmse_deg"],
+        "psnr_db": of_views["psnr_db"],
+        "depth_l1_m": of_views["depth_l1_m"],
+        "spearman": judged.get("spearman"),
+        "lost": int((~done.believed).sum()),
+        "splats": len(done.field),
+        **surface_figures(slam, done, source),
+    }
+
+
+def seen(done: FinishedRun, view: UnseenView) -> ScoredView:
+    """Render a view from the submap of its frame."""
+    T_camera_submap = se3.inverse(view.T_world_camera) @ done.anchors[view.submap]
+    return rendered(done, view, done.store.load(view.submap).field, T_camera_submap)
+
+
+def surface_figures(slam: Slam, done: FinishedRun, source: Source) -> dict[str, float]:
+    """Return the distances between the centres of the splats and the true surface, aligned as for the ATE."""
+    surface, truth = source.true_surface(), source.truth()
+    if surface is None or truth is None:
+        return {}
+    own, theirs = associate(done.path.timestamps_s, truth.timestamps_s)
+    T_true = truth.T_world_camera[theirs]
+    T_truth_world = align_rigid(done.path.T_world_camera[own][:, :3, 3], T_true[:, :3, 3])
+    centers = slam.field.means.detach().numpy().astype(np.float64) @ T_truth_world[:3, :3].T + T_truth_world[:3, 3]
+    opacities = slam.field.opacities.detach().numpy().astype(np.float64)
+    keyframes = np.isin(own, slam.keyframe_indices)
+    scores = score_splats(centers, opacities, surface.subdivided(0.2), slam.view.camera, T_true[keyframes])
+    return {"splats_chamfer_m": scores.splats_chamfer_m, "splats_accuracy_m": scores.splats_accuracy_m,
+            "floaters": scores.floaters}  # fmt: skip
+
+
+def hop_ranks(slam: Slam, source: Source) -> Rows:
+    """Return the rank correlation of the true errors of hops with what they add to each rule's value."""
+    truth = source.truth()
+    assert truth is not None, "every sequence of this benchmark has a true path"
+    own, theirs = associate(np.array([step.timestamp_s for step in slam.steps]), truth.timestamps_s)
+    known = dict(zip(own.tolist(), truth.T_world_camera[theirs], strict=True))
+    hops = hops_of(slam, slam.trajectory().T_world_camera, known)["hops"]
+    found = Rows()
+    for rule, added in ADDED.items():
+        pairs = np.array([(hop[added], hop["error_m"]) for hop in hops if np.isfinite(hop[added])]).reshape(-1, 2)
+        rank = float(spearman(*pairs.T)) if len(pairs) > 2 else None
+        found.append({"group": "hops", "variant": rule, "figures": {"rank": rank, "hops": len(pairs)}})
+    return found
+
+
+def localisations(job: Job, slam: Slam, done: FinishedRun, views: list[UnseenView], ways: Settings) -> Rows:
+    """Localise held-back frames in their submap by the descent of registration; return how far from their tracked
+    pose they end, and the number of steps."""
+    found, size = Rows(), (slam.view.sums.shape[1], slam.view.sums.shape[2])
+    for name, changes in ways.items():
+        settings, random = job.config(changes), np.random.default_rng(job.seed)
+        tracking, errors_m, steps = tracking_of(settings.registration, settings.tracking), [], []
+        for view in views[:LOCALISED]:
+            T_camera_submap = se3.inverse(view.T_world_camera) @ done.anchors[view.submap]
+            start = disturbed(T_camera_submap, SEARCH, random)
+            params = done.store.load(view.submap).field.params
+            fit = fit_pose_adam(params, slam.view, Target.of(view.frame, size), start, tracking, SEARCH.steps)
+            apart = se3.inverse(fit.T_camera_world)[:3, 3] - se3.inverse(T_camera_submap)[:3, 3]
+            errors_m.append(float(np.linalg.norm(apart)))
+            steps.append(fit.iterations)
+        figures = {"localised_m": float(np.median(errors_m)), "steps": float(np.mean(steps))}
+        found.append({"group": "localisation", "variant": name, "figures": figures})
+    return found
