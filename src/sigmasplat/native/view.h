@@ -137,7 +137,8 @@ template <int K> static void pack_view(Render& r, const float* params) {
             load_rows<ROW>(params, i, n, row);
             for (int l = 0; l <= W; l++) __builtin_prefetch(params + (i + 2 * W + l) * ROW);
             const Splats s = activate<(K > 4)>(row);
-            const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
+            Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
+            if (r.options.ray_depth) add_slopes_to(r.view, s.shape, p);
             for (int q = 0; q < 3; q++) store(f[q], s.color[q]);
             store(f[3], r.options.ray_depth ? p.slope_u : p.z);
             for (int q = 0; q < 3; q++) store(f[4 + q], K > 4 ? fma(s.color[q], s.color[q], s.variance[q]) : splat(0.f));
@@ -211,7 +212,8 @@ static void chain_to_params(const Render& r, const float* params, const float* g
             load_rows<ROW>(params, i, r.n, row);
             reduce_records<RECORD>(r, i, slot, sums);
             const Splats s = activate<(K > 4)>(row);
-            const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
+            Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
+            if constexpr (SLOPES) add_slopes_to(r.view, s.shape, p);
             FootprintGradient<vf> g = footprint_gradient(moments_of(sums), p.l1, p.l2, p.l3);
             if constexpr (SLOPES) {
                 add_depth_gradient<K, MOMENT>(sums, p, g);
@@ -337,7 +339,8 @@ static void view_backward_pose(Context* context, const float* params, OutputGrad
             Moments a = moments_of(sums);
             shift_moments(a.m[0], a.m[1], a.m[2], a.m[3], a.m[4], a.m[5], load(center[0]), load(center[1]));
             const Splats s = activate<false>(row);
-            const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
+            Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
+            if constexpr (SLOPES) add_slopes_to(r.view, s.shape, p);
             FootprintGradient<vf> f = footprint_gradient(a, p.l1, p.l2, p.l3);
             if constexpr (SLOPES) {
                 vf weighed[6];
