@@ -203,7 +203,8 @@ static void project_double(Doubles view, Doubles means, Doubles quats, Doubles s
         memcpy(s.mean, means.data() + 3 * i, sizeof s.mean);
         memcpy(s.quat, quats.data() + 4 * i, sizeof s.quat);
         memcpy(s.scale, scales.data() + 3 * i, sizeof s.scale);
-        const auto f = scalar::project(v, s, v.near_m);
+        auto f = scalar::project(v, s, v.near_m);
+        scalar::add_slopes(v, s, v.near_m, f);
         const double out[8] = {f.u, f.v, f.z, f.l1, f.l2, f.l3, f.slope_u, f.slope_v};
         memcpy(footprint.data() + 8 * i, out, sizeof out);
         scalar::FootprintGradient<double> gf;

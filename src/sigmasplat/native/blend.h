@@ -75,7 +75,7 @@ template <int ROW_FLOATS, bool BACKWARD, bool SLOPES> static Tile gather_tile(co
         const float u = g.u - cx, v = g.v - cy;
         g.u = -(g.l1 * u + g.l2 * v);                 // p = l1·x + l2·y + g.u, q = l3·y + g.v with x, y from the tile's centre
         g.v = -g.l3 * v;
-        if (SLOPES) g.z -= to[GEOMETRY + SLOPE_U] * u + to[GEOMETRY + SLOPE_V] * v;
+        if constexpr (SLOPES) g.z -= to[GEOMETRY + SLOPE_U] * u + to[GEOMETRY + SLOPE_V] * v;
         if (BACKWARD) {
             const int columns = box.x1 / BLOCKS_X - box.x0 / BLOCKS_X + 1;
             g.tag += r.chunk_begin[i / CHUNK] + (ty - box.y0 / BLOCKS_Y) * columns + (tx - box.x0 / BLOCKS_X);
@@ -174,7 +174,7 @@ template <int K, bool MOMENT, bool IDS, bool SLOPES> static void blend_tiles(Ren
                         const Mask before_half = ge(T, half);
                         T = fnma(T, a, T);
                         T_end = select(on, T, T_end);
-                        vf depth;                     // two versions: the compiler rounds a shared one differently
+                        vf depth;
                         if constexpr (SLOPES) {
                             depth = fma(splat(f[SLOPE_V]), y, fma(splat(f[SLOPE_U]), x, splat(geometry.z)));
                             for (int c = 0; c < 3; c++) sum[c] = fma(w, splat(f[c]), sum[c]);

@@ -52,6 +52,11 @@ SIGMA_INLINE Shape<vf> load_shape(const float* means, const float* quats, const 
     return s;
 }
 
+// Not inlined: beside `project` the compiler would contract its sums in another order, and change bytes.
+__attribute__((noinline)) static void add_slopes_to(const View<float>& view, const Shape<vf>& s, Footprint<vf>& f) {
+    add_slopes(view, s, splat(view.near_m), f);
+}
+
 static void project_forward(const float* view_numbers, const float* means, const float* quats, const float* scales,
                             int64_t n, float* means2d, float* conics, float* z, float* radii) {
     const View<float> view = read_view(view_numbers);

@@ -19,7 +19,7 @@ template <class T> struct Footprint {     // its image: mean, Cholesky conic, de
     T u, v, z;
     T l1, l2, l3;
     T var_u, var_v;
-    T slope_u, slope_v;                   // its depth at a pixel is z + slope_u·(x − u) + slope_v·(y − v), m/px
+    T slope_u, slope_v;                   // set by add_slopes: its depth at a pixel is z + slope_u·(x − u) + slope_v·(y − v), m/px
 };
 
 template <class T> struct FootprintGradient { T u, v, z, l1, l2, l3, slope_u, slope_v; };
@@ -95,11 +95,18 @@ inline __attribute__((always_inline)) Footprint<T> project(const View<S>& view, 
     f.l2 = -(m.cb * f.l3 * inv_sqrt_det);
     f.var_u = m.ca;
     f.var_v = m.cc;
-    // Slopes: covariance of depth and image position times the inverse of the covariance in the image (RaDe-GS).
+    return f;
+}
+
+// Set the slopes of a projected footprint: the covariance of depth and image position times the inverse of the
+// covariance in the image (RaDe-GS).
+template <class T, class S>
+inline __attribute__((always_inline)) void add_slopes(const View<S>& view, const Shape<T>& s, T safe_z_floor, Footprint<T>& f) {
+    Intermediate<T> m;
+    intermediate(view, s, safe_z_floor, m);
     const T with_u = dot3(m.a, m.V + 6), with_v = dot3(m.b, m.V + 6), along = f.l1 * with_u + f.l2 * with_v;
     f.slope_u = f.l1 * along;
     f.slope_v = f.l2 * along + f.l3 * f.l3 * with_v;
-    return f;
 }
 
 // Propagate a gradient on the footprint to the splat and, as a left twist (ρ, φ), to the pose (cg-slam.md §2.1). The

@@ -137,7 +137,8 @@ template <int K> static void pack_view(Render& r, const float* params, const Vie
             load_rows<ROW>(params, i, n, row);
             for (int l = 0; l <= W; l++) __builtin_prefetch(params + (i + 2 * W + l) * ROW);
             Splats s = activate<(K > 4)>(row);
-            const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
+            Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
+            if (r.options.ray_depth) add_slopes_to(r.view, s.shape, p);
             const auto fill = [&](unsigned live) {
                 if (colors.degree) {
                     alignas(64) float harmonics[HARMONICS][W];
@@ -219,7 +220,8 @@ static void chain_to_params(const Render& r, const float* params, const ViewColo
             reduce_records<RECORD>(r, i, slot, sums);
             Splats s = activate<(K > 4)>(row);
             if (colors.degree) show_colors(r.view, colors, i, seen_bits, s.shape.mean, s.color, harmonics);
-            const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
+            Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
+            if (r.options.ray_depth) add_slopes_to(r.view, s.shape, p);
             FootprintGradient<vf> g = footprint_gradient(moments_of(sums), p.l1, p.l2, p.l3);
             if constexpr (SLOPES) {
                 add_depth_gradient<K, MOMENT>(sums, p, g);
@@ -362,7 +364,8 @@ static void view_backward_pose(Context* context, const float* params, OutputGrad
             Moments a = moments_of(sums);
             shift_moments(a.m[0], a.m[1], a.m[2], a.m[3], a.m[4], a.m[5], load(center[0]), load(center[1]));
             const Splats s = activate<false>(row);
-            const Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
+            Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
+            if constexpr (SLOPES) add_slopes_to(r.view, s.shape, p);
             FootprintGradient<vf> f = footprint_gradient(a, p.l1, p.l2, p.l3);
             if constexpr (SLOPES) {
                 vf weighed[6];

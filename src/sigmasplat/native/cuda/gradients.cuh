@@ -237,7 +237,7 @@ KERNEL project_splats_backward(View<float> view, const float* pose, const float*
         view = posed(view, pose);
         const bool seen = radii[2 * size_t(i)] > 0.f;
         const FootprintGradient<float> g = {on_means2d[2 * size_t(i)], on_means2d[2 * size_t(i) + 1], on_z[i], on_conics[3 * size_t(i)],
-                                            on_conics[3 * size_t(i) + 1], on_conics[3 * size_t(i) + 2]};
+                                            on_conics[3 * size_t(i) + 1], on_conics[3 * size_t(i) + 2], 0.f, 0.f};
         ShapeGradient<float> out;
         project_backward(view, shape_at(means, quats, scales, i), view.near_m, g, out);
         for (int k = 0; k < 6; k++) twist[k] = only(seen, out.twist[k]);
