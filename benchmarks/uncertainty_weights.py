@@ -35,7 +35,6 @@ from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.metrics.uncertainty import calibration_scores, z_scores
 from sigmasplat.model import se3
 from sigmasplat.model.map_uncertainty import COLOR_PARTS, DEPTH_PARTS, SHIPPED
-from sigmasplat.model.submap import StorePart
 from sigmasplat.render.backend import make_view
 from sigmasplat.slam.refinement import KeyframeReader
 from sigmasplat.slam.uncertainty import FIRM, LIMIT, Samples, probe_samples, probe_views
@@ -109,18 +108,20 @@ def size_of(run: FinishedRun) -> tuple[int, int]:
 def collected(run: FinishedRun, held: Sequence[tuple[int, Keyframe]]) -> Arrays:
     """Return "KIND|QUANTITY|parts" [K, P], "…|squared_error" [P, C] and "…|views" of a run's final map and submaps."""
     view = make_view(run.config.backend, run.camera, run.config.render, variance=False)
+    whole = run.part(range(len(run.store)), refined=len(run.refined) == len(run.store))
     probes = probe_views(run.store, run.anchors, size_of(run))
+    refined_probes = probe_views(whole, run.anchors, size_of(run))
     owner = [s for s in range(len(run.store)) for _ in run.store.load(s).probe_frames]
     samples = dict[str, list[tuple[Samples, Samples]]]()
     chosen = np.unique(np.linspace(0, len(run.store) - 1, SUBMAPS).round().astype(int)).tolist()
     for s in [None, *chosen]:
         field = run.field if s is None else run.store.load(s).field
         anchors = run.anchors if s is None else [np.eye(4)]
-        keyframes = KeyframeReader(run.store if s is None else StorePart(run.store, [s]), anchors, view)
+        keyframes = KeyframeReader(whole if s is None else run.part([s]), anchors, view)
         background = background_of(keyframes)
         splats = splat_residuals(field, keyframes, run.config.render, run.config.backend)
         T_map_world = np.eye(4) if s is None else se3.inverse(run.anchors[s])
-        near = [p for p, of in zip(probes, owner, strict=True) if s is None or of == s]
+        near = refined_probes if s is None else [p for p, of in zip(probes, owner, strict=True) if of == s]
         far = sorted((abs(of - s), i) for i, of in enumerate(owner) if s is not None and of != s)[:OTHERS]
         kinds = {
             PROBES: near,

@@ -93,7 +93,7 @@ def submap_scores(done: FinishedRun, views: list[UnseenView]) -> dict[str, float
     return mean([
         rendered(
             done, view, done.store.load(view.submap).field,
-            se3.inverse(view.T_world_camera) @ done.anchors[view.submap],
+            se3.inverse(view.T_submap_camera),
         )
         for view in views
     ])  # fmt: skip
@@ -123,7 +123,7 @@ def final_maps(
     for name in (name for name in weights if "τ" not in name):  # merging has no τ
         random, store = np.random.default_rng(job.seed), StorePart(done.store, members)
         anchors = [done.anchors[s] for s in members]
-        field = final_map(store, anchors, job.config(weights[name]), slam.view, random)
+        field = final_map(store, anchors, job.config(weights[name]), slam.view, random).field
         scores = view_scores(done, views, field)
         figures = {"psnr_db": scores["psnr_db"], "depth_l1_m": scores["depth_l1_m"], "splats": len(field)}
         found.append({"group": "final", "variant": name, "figures": figures})
