@@ -90,7 +90,8 @@ def test_the_progress_covers_the_last_stage() -> None:
 
 
 def arguments(out: Path) -> list[str]:
-    changed = [word for key, value in SETTINGS.items() for word in ("--set", f"{key}={value}")]
+    long = SETTINGS | {"final.width_iterations": "1000"}  # so that there is time to kill it
+    changed = [word for key, value in long.items() for word in ("--set", f"{key}={value}")]
     return ["run", ROOM, "--out", str(out), "--no-eval", "--save-every", "0.001", *changed]
 
 
