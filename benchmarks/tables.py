@@ -22,7 +22,7 @@ import record
 import tyro
 
 SUBJECTS = {
-    "Whole runs": ("accuracy", "systems", "every_preset"),
+    "Whole runs": ("accuracy", "systems", "map_quality", "every_preset"),
     "Other systems": ("peers",),
     "Effect of σ²": ("ablation", "weights", "color_covariance"),
     "Uncertainty": ("uncertainty", "uncertainty_weights", "pose_covariance"),

@@ -117,7 +117,7 @@ class MadeUpSlam:
         self.config, self.store = config, store
         self.loops: list[MadeUpLoop] = []
         self.finished = 0
-        self.uncertainty = None
+        self.uncertainty, self.refinement_steps = None, None
         self.field = GaussianField.from_values(torch.rand(2, 3), torch.full((2,), 0.1), torch.rand(2, 3))
         self.steps: list[MadeUpStep] = []
         MadeUpSlam.latest = self

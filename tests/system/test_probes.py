@@ -11,6 +11,7 @@ from sigmasplat.config.text import override
 from sigmasplat.errors import ConfigError
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.model.map_uncertainty import SHIPPED
+from sigmasplat.model.submap import RefinedStore
 from sigmasplat.presets import preset
 from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import open_source
@@ -40,13 +41,15 @@ def finished(probes: int, folder: Path | None = None) -> Slam:
 def test_probe_views_are_tracked_frames_that_nothing_is_fitted_to(tmp_path: Path) -> None:
     slam = finished(2, tmp_path / "submaps")
     path, found = slam.trajectory().T_world_camera, []
+    refined = RefinedStore(slam.store, [slam.atlas.refined[s] for s in range(len(slam.store))])
     for s in range(len(slam.store)):
         submap = slam.store.load(s)
         assert len(submap.probe_frames) <= 2
         for k, (frame, pose) in enumerate(zip(submap.probe_frames, submap.T_submap_probe, strict=True)):
             assert frame not in slam.keyframe_indices and frame % HOLD != HOLD - 1
             assert slam.steps[frame].state == "tracked" and slam.steps[frame].submap == s
-            assert np.allclose(slam.atlas.anchors[s] @ pose, path[frame])
+            assert np.allclose(pose, slam.atlas.T_submap_camera[frame])
+            assert np.allclose(slam.atlas.anchors[s] @ refined.load(s).T_submap_probe[k], path[frame])
             image = slam.store.probe(s, k)
             assert image.color.shape == (60, 80, 3) and image.depth_m.shape == (60, 80)
             found.append(frame)

@@ -139,7 +139,8 @@ class FinalConfig:
     """Order of the keyframes in refinement: random = drawn for each step (paper); epochs = every keyframe once, in
     random order, before any is used again."""
     lr_factor: float = 1.0
-    """Factor on the learning rates of mapping (`mapping.lr_…`) for the splats in the first refinement step."""
+    """Factor on the learning rates of mapping (`mapping.lr_…`) in the first refinement step, except that of
+    positions."""
     lr_decay: float = 1.0
     """Learning rates of splats and poses in the last refinement step, as a share of those in the first; they decay
     exponentially. 1 = constant."""
@@ -168,6 +169,8 @@ class FinalConfig:
     """Largest ratio of a splat's longest axis to its shortest; refinement lengthens shorter axes. 0 = no limit."""
     max_needle_ratio: float = 0.0
     """Largest ratio of a splat's longest axis to its second longest; refinement shortens the longest. 0 = no limit."""
+    weight_moment: bool = True
+    """Whether the depth uncertainty U stays in the loss of refinement (`mapping.weight_moment`); off is faster."""
     uncertainty: bool = True
     """Whether variance is used to merge submaps and still learned during refinement; off = paper."""
     variance: Literal["published", "predicted"] = "published"

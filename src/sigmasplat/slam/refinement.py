@@ -181,13 +181,14 @@ def _changes_rates(final: FinalConfig) -> bool:
 def decaying(mapping: MappingConfig, final: FinalConfig, done: int, clock: _Clock) -> Iterator[Rates]:
     """Yield the rates of the refinement steps after `done`.
 
-    All rates start at `final.lr_factor` times those of mapping, and decay exponentially to the share `final.lr_decay`
-    of the first; that of the means decays from
+    All rates start at `final.lr_factor` times those of mapping, that of the means at the one of mapping. They decay
+    exponentially to the share `final.lr_decay` of the first; that of the means decays from
     `mapping.lr_means` to `final.lr_means_last` if this is set.
     """
     for step in range(done, final.iterations + 1):
         rates, share = Rates.of(mapping), _share(step, final, clock)
         rates.per_column.mul_(final.lr_factor * final.lr_decay**share)
+        rates.per_column[COLUMNS["means"]] /= final.lr_factor
         if final.lr_means_last:
             rates.per_column[COLUMNS["means"]] = mapping.lr_means ** (1.0 - share) * final.lr_means_last**share
         yield rates
@@ -199,11 +200,14 @@ def _share(step: int, final: FinalConfig, clock: _Clock) -> float:
 
 
 def refinement(config: Config) -> MappingConfig:
-    """Return the mapping settings for refinement: the rates of its poses, and no likelihood if `final.uncertainty` is
-    off."""
+    """Return the mapping settings for refinement: the rates of its poses, no U if `final.weight_moment` is off, and no
+    likelihood if `final.uncertainty` is off."""
     final = config.final
     ours = replace(
-        config.mapping, lr_pose_translation=final.lr_pose_translation, lr_pose_rotation=final.lr_pose_rotation
+        config.mapping,
+        lr_pose_translation=final.lr_pose_translation,
+        lr_pose_rotation=final.lr_pose_rotation,
+        weight_moment=config.mapping.weight_moment if final.weight_moment else 0.0,
     )
     return ours if final.uncertainty else replace(ours, weight_nll_color=0.0, weight_nll_depth=0.0)
 
