@@ -48,7 +48,7 @@ def make_mesh(
     if chosen != "camera":
         surface = surface.moved(transform_to(chosen, levelled(RunReader(folder, lambda: source))))
     write_mesh(target, surface, f"sigmasplat, unit metre, axes {chosen}")
-    screen.say(f"{len(surface.vertices):,} vertices, {len(surface.faces):,} triangles, axes {chosen}: {target}")
+    screen.say(f"axes {chosen}, {len(surface.vertices):,} vertices, {len(surface.faces):,} triangles: {target}")
     return 0
 
 
