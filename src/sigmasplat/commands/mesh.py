@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sigmasplat.commands import options
+from sigmasplat.commands import mesh_options, options
 from sigmasplat.commands.options import prepare_torch, refuse_existing, source_of
 from sigmasplat.errors import ConfigError
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 def make_mesh(
     run: options.RunPath,
     voxel_m: options.VoxelM = 0.01,
-    triangles: options.Triangles = 300_000,
-    axes: options.MeshAxes = None,
-    out: options.MeshFile = None,
+    triangles: mesh_options.Triangles = 300_000,
+    axes: mesh_options.MeshAxes = None,
+    out: mesh_options.MeshFile = None,
     overwrite: options.Overwrite = False,
     moved_to: options.MovedSource = None,
 ) -> int:
@@ -48,7 +48,7 @@ def make_mesh(
     if chosen != "camera":
         surface = surface.moved(transform_to(chosen, levelled(RunReader(folder, lambda: source))))
     write_mesh(target, surface, f"sigmasplat, unit metre, axes {chosen}")
-    screen.say(f"{len(surface.vertices):,} vertices, {len(surface.faces):,} triangles, axes {chosen}: {target}")
+    screen.say(f"axes {chosen}, {len(surface.vertices):,} vertices, {len(surface.faces):,} triangles: {target}")
     return 0
 
 

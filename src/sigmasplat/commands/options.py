@@ -128,24 +128,6 @@ Record = Annotated[
         help_behavior_hint="(default: recording/ in the run folder)",
     ),
 ]
-MeshFile = Annotated[
-    Path | None,
-    arg(
-        metavar="FILE",
-        help="file to write: .glb, .ply, .obj or .stl (no colours)",
-        help_behavior_hint="(default: mesh.ply in RUN)",
-    ),
-]
-Triangles = Annotated[int, arg(metavar="N", help="largest number of triangles; 0 = no limit")]
-MeshAxes = Annotated[
-    Literal["y-up", "z-up", "y-down", "camera"] | None,
-    arg(
-        metavar="{y-up,z-up,y-down,camera}",
-        help="axes of the file: y-up for viewers, z-up for CAD, y-down, or camera, those of the run's path; all but "
-        "camera are levelled (docs/exports.md)",
-        help_behavior_hint="(default: y-up; mesh.ply in RUN: camera)",
-    ),
-]
 VoxelM = Annotated[float, arg(metavar="M", help="edge of a voxel in metres; the truncation distance is 4 voxels")]
 WithMesh = Annotated[
     bool,
