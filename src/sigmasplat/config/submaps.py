@@ -168,6 +168,15 @@ class FinalConfig:
     """Number of refinement steps between removals of splats with low opacity (`prune_opacity`)."""
     prune_opacity: float = 0.005
     """Splats with at most this opacity, 0 to 1, are removed during refinement."""
+    width: str = "working"
+    """Width of the images in the last stage of refinement: working = no such stage, only working images are used;
+    camera = as recorded; or a number of pixels, at most the recorded width. If it is above `input.width`, the colour of
+    each keyframe is kept at this size."""
+    width_iterations: int = 1500
+    """Number of refinement steps of the stage with images of `width`, after those of `iterations`, if `iterations` is
+    above 0. Two thirds of them use working images, so that the map stays sharp at that size too."""
+    weight_moment: bool = True
+    """Whether the depth uncertainty U stays in the loss of refinement (`mapping.weight_moment`); off is faster."""
     max_axis_ratio: float = 0.0
     """Largest ratio of a splat's longest axis to its shortest; refinement lengthens shorter axes. 0 = no limit."""
     max_needle_ratio: float = 0.0
