@@ -31,11 +31,11 @@ def step_rows(
 ) -> tuple[Matrix, float]:
     """Propagate the view's gradient planes to the splats in view and step them, and their harmonics if given, in one
     pass that stores no gradient rows in memory. Returns what `MappingStep.splats` returns."""
-    twist, (g_moment, *g_median) = np.zeros(6), view.depth_gradients()
+    twist, (g_moment, median_id, g_median_depth) = np.zeros(6), view.depth_gradients()
+    g_alpha = view.g_alpha if weights.get("mean_depth") else None
     cost = view.raster.step(
         field.params, field.moment1, field.moment2, field.last_step, view.g_sums, g_moment,
-        view.g_alpha if weights.get("mean_depth") else None, *g_median,
-        rates.per_column.numpy(), BETA1, BETA2, EPSILON, field.steps,
+        g_alpha, median_id, g_median_depth, rates.per_column.numpy(), BETA1, BETA2, EPSILON, field.steps,
         kernel_weights(SHAPE_TERMS, weights, "cpu").tolist(), frozen_colors, harmonics, grad2d, twist,
         view.seconds[3:],
     )  # fmt: skip
