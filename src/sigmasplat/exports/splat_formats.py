@@ -12,7 +12,7 @@ from sigmasplat.errors import ConfigError
 
 if TYPE_CHECKING:
     from sigmasplat.exports.axes import Axes
-    from sigmasplat.exports.formats import ExportSource
+    from sigmasplat.exports.source import ExportSource
 
 
 def ply(

@@ -16,7 +16,7 @@ from sigmasplat.model.splat_filter import FilterResult, filter_splats, has_learn
 from sigmasplat.types import Matrix
 
 if TYPE_CHECKING:
-    from sigmasplat.exports.formats import ExportSource
+    from sigmasplat.exports.source import ExportSource
 
 Y_UP_FORMATS: tuple[Axes, ...] = ("y-up", "camera")
 """The axes of formats that define y as up. `camera` is not levelled, only rotated by 180° about x."""
