@@ -7,16 +7,12 @@ from sigmasplat.presets import varsplat
 # contradict depth readings. Fading and removing keep the map usable when the camera moves fast. Two parts are not used.
 # The window: a map with loops to close must keep older parts. The median-depth loss: it brings nothing in addition to
 # U, and costs an eighth of the speed. There are fewer iterations, to compensate for the cost of U.
-# Depth is ours: the mean depth of the splats is fitted to the sensor, splats start as discs on the surface, and their
-# depth is that along the ray. With the sizes' higher rate of `varsplat-fast` discs become round and large. The
-# refinement of the final map is ours, too (docs/final-map.md).
+# Depth is ours: the mean depth of the splats, D̂/A, is fitted to the sensor. Depth along the ray (`render.depth=ray`) and
+# seeds as discs (`seeding.thickness`) make the depth of exact recordings better, but the path of the noisy synthetic
+# room is worse with them. The refinement of the final map is ours, too (docs/final-map.md).
 SIGMA = varsplat.FAST.changed(
     input={"denoise_depth": True},
-    render={"depth": "ray"},
-    seeding={"thickness": 0.2},
-    mapping={
-        "iterations": 15, "weight_moment": 0.1, "weight_depth": 0.0, "weight_mean_depth": 1.0, "lr_log_scales": 5e-3,
-    },
+    mapping={"iterations": 15, "weight_moment": 0.1, "weight_depth": 0.0, "weight_mean_depth": 1.0},
     tracking={"features": True, "verify": True},
     recovery={"relocalise": True, "new_map_after": 20, "steady_frames": 2},
     primitives={"uncertain_m2": 0.025, "faded_opacity": 0.07},
@@ -33,6 +29,6 @@ SIGMA = varsplat.FAST.changed(
         "weight_moment": False,  # U does not improve the final map, and costs an eighth of the time
         "prune_weight_px": 0.5,
     },
-)  # fmt: skip
+)
 
 PRESETS = {"sigma": SIGMA}
