@@ -97,8 +97,8 @@ class Works:
         """Render all: colour, depth, σ² + c², moment about the sensor's depth, alpha, median and dominant splat."""
         maps, ids, weights = self.maps, self.ids, self.weights
         self.raster.view_forward(
-            self.numbers, self.params, None, 7, RENDER.alpha_min, RENDER.transmittance_stop, self.reference,
-            maps[:7], maps[7], maps[8], ids[0], weights[0], ids[1], weights[1], None, np.zeros(3),
+            self.numbers, self.params, None, 7, RENDER.alpha_min, RENDER.transmittance_stop, RENDER.depth == "ray",
+            self.reference, maps[:7], maps[7], maps[8], ids[0], weights[0], ids[1], weights[1], None, np.zeros(3),
         )  # fmt: skip
 
     def forward(self) -> None:

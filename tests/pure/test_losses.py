@@ -206,7 +206,14 @@ def test_full_nll_stays_finite_for_a_covariance_with_rounding_errors(dtype: torc
 @pytest.mark.parametrize("name", IMAGE_TERMS)
 def test_gradients_equal_finite_differences(name: str) -> None:
     m = maps(valid=half())
-    trains = {"l1": "color", "ssim": "color", "depth": "depth", "moment": "moment", "nll_color_full": "covariance"}
+    trains = {
+        "l1": "color",
+        "ssim": "color",
+        "depth": "depth",
+        "mean_depth": "depth",
+        "moment": "moment",
+        "nll_color_full": "covariance",
+    }
     trained = trains.get(name, "variance")
     direction = torch.tensor(np.random.default_rng(1).normal(size=tuple(m[trained].shape)))
     losses.total({name: 1.0}, m).backward()

@@ -28,7 +28,6 @@ SIGMA = varsplat.FAST.changed(
         "lr_pose_rotation": 1e-4,  # with 5e-4 m and 3e-4 rad the ATE of a small room grows
         "weight_moment": False,  # U does not improve the final map, and costs an eighth of the time
         "prune_weight_px": 0.5,
-        "max_axis_ratio": 10.0,  # else refinement makes spikes
     },
 )
 
