@@ -7,9 +7,9 @@ from sigmasplat.presets import varsplat
 # contradict depth readings. Fading and removing keep the map usable when the camera moves fast. Two parts are not used.
 # The window: a map with loops to close must keep older parts. The median-depth loss: it brings nothing in addition to
 # U, and costs an eighth of the speed. There are fewer iterations, to compensate for the cost of U.
-# Depth is ours: the mean depth of the splats, D̂/A, is fitted to the sensor. Depth along the ray (`render.depth=ray`) and
-# seeds as discs (`seeding.thickness`) make the depth of exact recordings better, but the path of the noisy synthetic
-# room is worse with them. The refinement of the final map is ours, too (docs/final-map.md).
+# Depth is ours: the mean depth of the splats, D̂/A, is fitted to the sensor. Depth along the ray (`render.depth=ray`)
+# and seeds as discs (`seeding.thickness`) make the depth of exact recordings better, but the path of the noisy
+# synthetic room gets worse with them. The refinement of the final map is ours, too (docs/final-map.md).
 SIGMA = varsplat.FAST.changed(
     input={"denoise_depth": True},
     mapping={"iterations": 15, "weight_moment": 0.1, "weight_depth": 0.0, "weight_mean_depth": 1.0},
