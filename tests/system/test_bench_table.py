@@ -20,6 +20,7 @@ from sigmasplat.batch import dispatch
 from sigmasplat.batch.definition import Table
 from sigmasplat.batch.scores import run_record
 from sigmasplat.io.runs import RunFolder
+from sigmasplat.run.terminal import Screen
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -246,9 +247,8 @@ def test_a_worker_that_dies_changes_nothing(tmp_path: Path, replica: Path, whole
 
 @pytest.mark.parametrize("comes_back", [False, True])
 def test_a_scene_that_only_a_dead_worker_has_is_missing_unless_another_worker_brings_it(
-    comes_back: bool, tmp_path: Path, replica: Path, whole: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    comes_back: bool, tmp_path: Path, replica: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     part, out, run = tmp_path / "part", tmp_path / "table", "office0-varsplat-seed0"
     part.mkdir()
     for name in ("office0", "cam_params.json"):
@@ -258,6 +258,8 @@ def test_a_scene_that_only_a_dead_worker_has_is_missing_unless_another_worker_br
     for name in ("room0", "cam_params.json"):
         (other / name).symlink_to(replica / name)
     roots = ["--data", f"one={part}", "--data", f"two={other}", "--data", f"three={part}"]
+    said, say = list[str](), Screen.say
+    monkeypatch.setattr(Screen, "say", lambda screen, line: (said.append(line), say(screen, line))[1])
     monkeypatch.setattr(dispatch, "REJOIN_S", DEADLINE_S if comes_back else 1.0)
     with cluster(tmp_path, ("one", "two")) as (address, processes), ThreadPoolExecutor() as pool:
 
@@ -265,13 +267,13 @@ def test_a_scene_that_only_a_dead_worker_has_is_missing_unless_another_worker_br
             wait_for(lambda: frames_logged(out, run) >= 2, tmp_path / "dask.log")
             processes["one"].kill()
             if comes_back:
+                wait_for(lambda: any("waiting" in line for line in said), tmp_path / "dask.log")
                 processes["three"] = dask_worker(address, "three", tmp_path)
 
         changed = pool.submit(change_workers)
         code = exit_code(*arguments(out, other, *roots, "--scheduler", address))
         changed.result()
-    said = capsys.readouterr()
-    (line,) = [line for line in (said.out + said.err).splitlines() if "office0" in line and "waiting" in line]
+    (line,) = [line for line in said if "office0" in line and "waiting" in line]
     assert "one" in line and code == 0
     text = (out / "table.md").read_text()
     if comes_back:
