@@ -182,7 +182,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 def test_a_finished_run_shows_its_map_and_its_uncertainty(finished: RunFolder, tmp_path: Path) -> None:
     with sigmasplat("view", str(finished.path)) as (process, url), browser(url, tmp_path / "profile") as page:
         assert url.startswith("http://127.0.0.1:")
-        wait_for(lambda: "14 frames" in page.text() and colours(page.scene()) > 20)
+        wait_for(lambda: "14 frames" in page.text() and colours(page.scene()) > 8)
         plain = page.screenshot()
         keep(plain, "finished")
         page.choose("splat colour", "σ")
@@ -207,7 +207,7 @@ def test_a_live_run_shows_its_map_while_it_grows_and_stays_until_ctrl_c(tmp_path
     options = [word for pair in QUICK.items() for word in ("--set", "=".join(pair))]
     room = ["synthetic:frames=4000,width=64,height=48", "--out", str(out), "--no-eval", "--view"]
     with sigmasplat("run", *room, *options) as (process, url), browser(url, tmp_path / "profile") as page:
-        wait_for(lambda: "(running)" in page.text() and colours(page.scene()) > 20)
+        wait_for(lambda: "(running)" in page.text() and colours(page.scene()) > 8)
         before = len(RunFolder(out).read_log())
         keep(page.screenshot(), "live")
         wait_for(lambda: len(RunFolder(out).read_log()) > before + 20)
