@@ -4,7 +4,7 @@ Sequences × seeds; each run is a process that holds back every 8th frame and sc
 sigmasplat of another checkout, which is measured beside this one. Finished runs are read, not repeated, unless --fresh.
 Writes benchmarks/results/<name>-<machine>.json and prints tables.
 
-example: python benchmarks/map_quality.py --before ../before/.venv/bin/sigmasplat --sequences redkitchen --seeds 0
+example: python benchmarks/map_quality.py --before 'env -u PYTHONPATH ../before/.venv/bin/sigmasplat' --seeds 0
 """
 
 import json
@@ -81,7 +81,7 @@ class Job:
         """Return the command line of the run."""
         path = SYNTHETIC if self.sequence == "synthetic" else accuracy.located(self.sequence)
         words = [*self.command, "run", path, "--seed", str(self.seed), "--out", str(run), "--overwrite"]
-        words += ["--hold-out", str(HOLD_OUT), "--save-every", "0"]
+        words += ["--set", f"input.hold_every={HOLD_OUT}"]  # options that earlier checkouts have too
         words += ["--limit", str(options.limit)] if options.limit else []
         return words + [word for setting in options.settings for word in ("--set", setting)]
 

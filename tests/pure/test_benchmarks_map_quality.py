@@ -49,7 +49,7 @@ def test_this_checkout_and_the_one_before_take_turns(tmp_path: Path) -> None:
     ]  # fmt: skip
     words = jobs[1].words(options, tmp_path)
     assert words[:2] == ["old/sigmasplat", "run"] and len(jobs) == 8
-    for pair in (["--limit", "9"], ["--set", "a.b=1"], ["--hold-out", "8"], ["--seed", "0"]):
+    for pair in (["--limit", "9"], ["--set", "a.b=1"], ["--set", "input.hold_every=8"], ["--seed", "0"]):
         assert any(words[i : i + 2] == pair for i in range(len(words)))
 
 
