@@ -62,7 +62,15 @@ def spz(
 
 def like_ply(module: str) -> Callable[..., str]:
     """Return the writer of a format with the axes of PLY and without σ², made of `write_field` of io/splats/MODULE."""
+    return _writer(module, scene_format=False)
 
+
+def scene(module: str) -> Callable[..., str]:
+    """Return the writer of a scene format, which defines y as up and keeps σ, made of io/splats/MODULE."""
+    return _writer(module, scene_format=True)
+
+
+def _writer(module: str, scene_format: bool) -> Callable[..., str]:
     def write(
         source: "ExportSource",
         target: Path,
@@ -74,33 +82,14 @@ def like_ply(module: str) -> Callable[..., str]:
         axes: "Axes | None",
     ) -> str:
         from sigmasplat.exports.axes import AXES
-        from sigmasplat.exports.splats import SplatChoice, SplatTarget, write_splats
-
-        write_field = import_module(f"sigmasplat.io.splats.{module}").write_field
-        choice = SplatChoice(sigma_below, std_below_m, opacity_above, max_splats, axes)
-        return write_splats(source, choice, SplatTarget(lambda field, _: write_field(target, field), "y-down", AXES))
-
-    return write
-
-
-def scene(module: str) -> Callable[..., str]:
-    """Return the writer of a scene format, which defines y as up and keeps σ, made of io/splats/MODULE."""
-
-    def write(
-        source: "ExportSource",
-        target: Path,
-        *,
-        sigma_below: float | None,
-        std_below_m: float | None,
-        opacity_above: float | None,
-        max_splats: int | None,
-        axes: "Axes | None",
-    ) -> str:
         from sigmasplat.exports.splats import Y_UP_FORMATS, SplatChoice, SplatTarget, write_splats
 
         write_field = import_module(f"sigmasplat.io.splats.{module}").write_field
         choice = SplatChoice(sigma_below, std_below_m, opacity_above, max_splats, axes)
-        written = SplatTarget(lambda field, std: write_field(target, field, std=std), "y-up", Y_UP_FORMATS)
+        if scene_format:
+            written = SplatTarget(lambda field, std: write_field(target, field, std=std), "y-up", Y_UP_FORMATS)
+        else:
+            written = SplatTarget(lambda field, _: write_field(target, field), "y-down", AXES)
         return write_splats(source, choice, written)
 
     return write

@@ -12,10 +12,9 @@ from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model.field import GaussianField
-from sigmasplat.model.submap import SubmapStore
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
-from sigmasplat.slam.refinement import Clock, KeyframeReader, Refined, SavedRefinement, refinement
+from sigmasplat.slam.refinement import Clock, KeyframeReader, SavedRefinement, refinement
 from sigmasplat.types import Progress
 
 CACHE_BYTES = 64 << 20
@@ -52,10 +51,10 @@ class PhotoReader:
         return Target.of(picture.photo.frame(picture.depth_m, self.keyframes.camera, self.camera), self.size)
 
 
-def photo_view(store: SubmapStore, view: View, config: Config) -> View | None:
+def photo_view(keyframes: KeyframeReader, view: View, config: Config) -> View | None:
     """Return a view like `view` for images as large as the largest photos; None without photos. A submap has photos of
     one camera."""
-    found = [store.picture(index, 0).photo for index in range(len(store)) if store.load(index).frames]
+    found = [keyframes.store.picture(*place).photo for place in keyframes.places if place[1] == 0]
     cameras = [photo.camera for photo in found if photo is not None]
     if not cameras:
         return None
@@ -80,8 +79,8 @@ def refine_on_photos(
     are counted from `final.iterations` on. Returns their number at the end, which is lower if the time budget is spent.
     Calls `progress(steps done, total)`. `saved` is offered the state every `TURN_STEPS`.
     """
-    final, large = config.final, photo_view(keyframes.store, view, config)
-    if large is None or not final.width_iterations or clock.is_over:
+    final = config.final
+    if not final.width_iterations or clock.is_over or (large := photo_view(keyframes, view, config)) is None:
         return done
     photos, total = PhotoReader(keyframes, large), final.iterations + final.width_iterations
     mapping = replace(refinement(config), lr_pose_translation=0.0, lr_pose_rotation=0.0)
@@ -97,8 +96,7 @@ def refine_on_photos(
         field.keep(field.opacities > final.prune_opacity)
         done = steps.stop
         if saved is not None:
-            numbers, k = dict(random.bit_generator.state), keyframes
-            saved.save(Refined(done, field, k.poses, k.motions, list(k.left), clock.spent_s, numbers))
+            saved.save(keyframes.state(done, field, clock.spent_s, random))
     progress(total, total)
     return done
 

@@ -93,6 +93,11 @@ class KeyframeReader:
         self.left = self.left or random.permutation(len(self)).tolist()
         return self.left.pop()
 
+    def state(self, done: int, field: GaussianField, spent_s: float, random: np.random.Generator) -> Refined:
+        """Return a refinement after `done` steps, to be saved."""
+        numbers = dict(random.bit_generator.state)
+        return Refined(done, field, self.poses, self.motions, list(self.left), spent_s, numbers)
+
     def take(self, state: Refined) -> None:
         """Take over the keyframes' part of a saved refinement."""
         self.poses, self.motions, self.left = state.poses, state.motions, state.left
@@ -141,9 +146,7 @@ def refine(
         if done % final.prune_every == 0:
             field.keep(field.opacities > final.prune_opacity)
         if saved is not None and done == steps.stop:
-            left, spent_s = list(keyframes.left), clock.spent_s
-            numbers = dict(random.bit_generator.state)
-            saved.save(Refined(done, field, keyframes.poses, keyframes.motions, left, spent_s, numbers))
+            saved.save(keyframes.state(done, field, clock.spent_s, random))
     prune_by_weight(field, view, keyframes, final.prune_weight_px, final.max_splats)
     progress(final.iterations, final.iterations)
     return losses
