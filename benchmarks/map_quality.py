@@ -1,6 +1,6 @@
 """Compare the maps of two checkouts: image quality, depth, path, size, memory and time of the final map.
 
-Sequences × seeds; each run is a process that holds back every 8th frame and scores itself. `--before` names the
+Sequences × seeds; each run is a process that scores itself, on views that are not keyframes. `--before` names the
 sigmasplat of another checkout, which is measured beside this one. Finished runs are read, not repeated, unless --fresh.
 Writes benchmarks/results/<name>-<machine>.json and prints tables.
 
@@ -36,7 +36,6 @@ from sigmasplat.model.field import GaussianField
 arg = tyro.conf.arg
 SYNTHETIC = "synthetic:frames=200,noise=1"
 SEQUENCES = ("redkitchen", "livingroom", "hololens", "cubicles", "synthetic")
-HOLD_OUT = 8
 SPIKE_RATIO, SPIKE_PX = 20.0, 20.0
 """A spike is a splat whose longest axis is this many times the second, and this long (2 σ) in the nearest keyframe."""
 CELL_M = 0.05
@@ -60,6 +59,10 @@ class Options:
     seeds: Annotated[tuple[int, ...], arg(help="seeds, one run for each")] = (0, 1, 2)
     before: Annotated[str, arg(help="sigmasplat of another checkout", help_behavior_hint="(default: none)")] = ""
     limit: Annotated[int, arg(help="use at most this many frames; 0 = all")] = 0
+    hold_out: Annotated[
+        int, arg(help="score every N-th frame, which is never mapped (input.hold_every; new checkouts only)",
+                 help_behavior_hint="(default: 0 = frames that are not keyframes)")
+    ] = 0  # fmt: skip
     settings: Settings = ()
     name: Annotated[str, arg(help="name of the results")] = "map-quality"
     fresh: Annotated[bool, arg(help="repeat runs that exist already")] = False
@@ -81,7 +84,7 @@ class Job:
         """Return the command line of the run."""
         path = SYNTHETIC if self.sequence == "synthetic" else accuracy.located(self.sequence)
         words = [*self.command, "run", path, "--seed", str(self.seed), "--out", str(run), "--overwrite"]
-        words += ["--set", f"input.hold_every={HOLD_OUT}"]  # options that earlier checkouts have too
+        words += ["--set", f"input.hold_every={options.hold_out}"] if options.hold_out else []
         words += ["--limit", str(options.limit)] if options.limit else []
         return words + [word for setting in options.settings for word in ("--set", setting)]
 
