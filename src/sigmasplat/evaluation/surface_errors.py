@@ -58,10 +58,9 @@ def surface_errors(
     T_estimate_truth = aligned_poses(truth.T_world_camera[true_rows], path.T_world_camera[rows])
     surface = source.true_surface()
     reference = (_fused(run.config, source, truth) if surface is None else surface).moved(T_estimate_truth)
-    outside = frozenset(range(len(run.store))) - frozenset(run.members)
-    total = count_keyframes(run.store, outside)
-    views = surface_views(lambda: run.field, run.store, run.anchors, run.config, outside)
-    found = fuse(views, total, run.config, renderer=renderer, progress=progress)
+    part, anchors = run.part(run.members, refined=True), [run.anchors[s] for s in run.members]
+    views = surface_views(lambda: run.field, part, anchors, run.config)
+    found = fuse(views, count_keyframes(part), run.config, renderer=renderer, progress=progress)
     poses = T_estimate_truth @ truth.T_world_camera[evenly_spread(true_rows.tolist(), SEEING_FRAMES)]
     vertices = found.vertices.astype(np.float64)
     seen = np.flatnonzero(_seen(vertices, reference, run.camera, poses))
