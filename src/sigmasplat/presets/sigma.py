@@ -7,25 +7,29 @@ from sigmasplat.presets import varsplat
 # contradict depth readings. Fading and removing keep the map usable when the camera moves fast. Two parts are not used.
 # The window: a map with loops to close must keep older parts. The median-depth loss: it brings nothing in addition to
 # U, and costs an eighth of the speed. There are fewer iterations, to compensate for the cost of U.
-# Depth is ours: the mean depth of the splats, D̂/A, is fitted to the sensor. Depth along the ray (`render.depth=ray`)
-# and seeds as discs (`seeding.thickness`) make the depth of exact recordings better, but the path of the noisy
-# synthetic room gets worse with them. The refinement of the final map is ours, too (docs/final-map.md).
+# Depth is ours: the mean depth of the splats along the ray, D̂/A, is fitted to the sensor. Seeds as discs
+# (`seeding.thickness`) are not used: they make the path of the noisy synthetic room worse. The refinement of the final
+# map is ours, too (docs/final-map.md).
 SIGMA = varsplat.FAST.changed(
     input={"denoise_depth": True},
     mapping={"iterations": 15, "weight_moment": 0.1, "weight_depth": 0.0, "weight_mean_depth": 1.0},
+    render={"depth": "ray"},
     tracking={"features": True, "verify": True},
     recovery={"relocalise": True, "new_map_after": 20, "steady_frames": 2},
     primitives={"uncertain_m2": 0.025, "faded_opacity": 0.07},
     surface={"depth": "map+sensor"},
     uncertainty={"probes": 4},
     final={
-        "iterations": 3000,
+        "iterations": 2000,
         "merge_m": 0.05,  # 40 % fewer splats than with 0.02, and no seams between neighbouring voxels
         "order": "epochs",
-        "lr_factor": 8.0,  # the rates of mapping are too small for 3000 steps: shapes hardly change
+        "lr_factor": 8.0,  # the rates of mapping are too small for 2000 steps: shapes hardly change
         "lr_decay": 0.05,
-        "lr_pose_translation": 2e-4,
-        "lr_pose_rotation": 1e-4,  # with 5e-4 m and 3e-4 rad the ATE of a small room grows
+        "lr_pose_translation": 3e-4,
+        "lr_pose_rotation": 2e-4,
+        "sh_degree": 3,
+        "sh_every": 100,
+        "max_needle_ratio": 8.0,
         "weight_moment": False,  # U does not improve the final map, and costs an eighth of the time
         "prune_weight_px": 0.5,
     },
