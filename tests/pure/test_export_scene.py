@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from command_line import exit_code
@@ -42,11 +43,16 @@ def test_film_plan_and_points_are_written_with_their_progress(here: Path, capsys
         assert drawn.size == (192, 88) and drawn.n_frames == 2
     assert exit_code("export", "kitchen", "--format", "plan", "--cell-m", "0.1") == 0
     assert json.loads((here / "kitchen.plan.json").read_text())["resolution_m"] == 0.1
-    assert exit_code("export", "kitchen", "--out", "a.points.ply", "--voxel-m", "0.1") == 0
+    for name, axes in (("a", ()), ("own", ("--axes", "camera"))):
+        assert exit_code("export", "kitchen", "--out", f"{name}.points.ply", "--voxel-m", "0.1", *axes) == 0
+    upright, own = (trimesh.load(f"{name}.points.ply").vertices for name in ("a", "own"))
+    turn = np.linalg.lstsq(own, upright, rcond=None)[0]  # y up, z back: 180° about x if the first camera is level
+    assert np.allclose(own @ turn, upright, atol=1e-4) and np.isclose(np.linalg.det(turn), 1.0, atol=1e-4)
+    assert turn[1, 1] < -0.8
     said = capsys.readouterr().out
     assert "film …\n" in said and "surface …\n" in said and "floor plan …\n" in said
     assert "a.gif: 2 images, 0.5 s" in said and "to scan again, also in kitchen.plan.json" in said
-    assert "a.points.ply: " in said and " points, " in said
+    assert "a.points.ply: " in said and " points, axes y-up" in said
 
 
 def test_options_of_other_formats_and_wrong_values_are_refused(here: Path, capsys: pytest.CaptureFixture[str]) -> None:

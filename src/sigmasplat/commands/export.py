@@ -22,9 +22,9 @@ MapAxes = Annotated[
     Literal["y-up", "z-up", "y-down", "camera"] | None,
     tyro.conf.arg(
         metavar="{y-up,z-up,y-down,camera}",
-        help="axes of a map: y-up, z-up and y-down are levelled; camera: those of the run's path; y-up and camera only "
-        "for SPZ, glTF and OpenUSD",
-        help_behavior_hint="(default: y-up for SPZ, glTF and OpenUSD, else y-down)",
+        help="axes of a map or of points: y-up, z-up and y-down are levelled; camera: those of the run's path; y-up "
+        "and camera only for SPZ, glTF and OpenUSD",
+        help_behavior_hint="(default: y-up for points, SPZ, glTF and OpenUSD, else y-down)",
     ),
 ]
 SpzVersion = Annotated[

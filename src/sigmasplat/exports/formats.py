@@ -15,6 +15,7 @@ from sigmasplat.exports import splat_formats
 from sigmasplat.exports.source import ExportSource as ExportSource
 
 if TYPE_CHECKING:
+    from sigmasplat.exports.axes import Axes
     from sigmasplat.exports.run_reader import RunReader
     from sigmasplat.model.trajectory import Trajectory
     from sigmasplat.types import Matrix, Progress
@@ -169,14 +170,17 @@ def _export_views(
         return f"{count:,} views with their pictures{reader.left_out(keyframes=True)}"
 
 
-def _points(source: ExportSource, target: Path, *, voxel_m: float) -> str:
+def _points(source: ExportSource, target: Path, *, voxel_m: float, axes: "Axes | None") -> str:
     from sigmasplat.evaluation.reconstruct import FusionInput
+    from sigmasplat.exports.axes import levelled, transform_to
     from sigmasplat.exports.points import export_points
 
-    reader = source.reader()
+    reader, chosen = source.reader(), axes or "y-up"
     with _counting("surface") as progress:
         surface = FusionInput.at(reader.run, reader.camera).surface(voxel_m, progress=progress)
-        return f"{export_points(surface, target):,} points"
+    if chosen != "camera":
+        surface = surface.moved(transform_to(chosen, levelled(reader)))
+    return f"{export_points(surface, target):,} points, axes {chosen}"
 
 
 def _video(
