@@ -60,17 +60,18 @@ class Config:
     def checked(self) -> "Config":
         """Return the settings. Raises ConfigError if some of them exclude each other."""
         m = self.mapping
-        if m.color_covariance == "full" and (m.weight_alignment or m.weight_moment or m.frames_per_step != 1):
-            raise ConfigError(
-                "mapping.color_covariance=full does not support mapping.weight_alignment, mapping.weight_moment (its "
-                "render has no maps for them) and more than one keyframe per step, found "
-                f"{m.weight_alignment:g}, {m.weight_moment:g} and frames_per_step={m.frames_per_step}; add --set "
-                "mapping.weight_alignment=0 --set mapping.weight_moment=0 --set mapping.frames_per_step=1"
-            )
-        if m.color_covariance == "full" and self.render.depth == "ray":
-            raise ConfigError(
-                "mapping.color_covariance=full does not support render.depth=ray; add --set render.depth=center"
-            )
+        if m.color_covariance == "full":
+            needed: dict[str, tuple[object, object]] = {  # its render has no maps for the others
+                "mapping.weight_alignment": (m.weight_alignment, 0),
+                "mapping.weight_moment": (m.weight_moment, 0),
+                "mapping.frames_per_step": (m.frames_per_step, 1),
+                "render.depth": (self.render.depth, "center"),
+            }
+            wrong = {name: pair for name, pair in needed.items() if pair[0] != pair[1]}
+            if wrong:
+                found = ", ".join(f"{name}={value}" for name, (value, _) in wrong.items())
+                remedy = " ".join(f"--set {name}={value}" for name, (_, value) in wrong.items())
+                raise ConfigError(f"mapping.color_covariance=full does not support {found}; add {remedy}")
         if self.submaps.variance_sum and not (m.weight_nll_color or m.weight_nll_depth):
             raise ConfigError(
                 "submaps.variance_sum needs variances that mapping learns; set mapping.weight_nll_color above 0, or "
