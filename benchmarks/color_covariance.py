@@ -40,6 +40,8 @@ from sigmasplat.slam.slam import Slam
 from sigmasplat.sources import open_source
 
 arg = tyro.conf.arg
+EXCLUDED = {"weight_moment": 0.0, "weight_alignment": 0.0}
+"""Terms that full covariances exclude; both maps are made without them, and with the depth of centres."""
 KINDS = ("diagonal", "full")
 CHANNELS = 3
 
@@ -61,7 +63,7 @@ class Options:
     def config(self, seed: int, kind: str) -> Config:
         """Return a run's settings, with a single submap. Raises ConfigError for an unknown preset."""
         config = replace(preset_of(self.preset), seed=seed, submaps=SubmapConfig())
-        return replace(config, mapping=replace(config.mapping, color_covariance=kind))
+        return config.changed(mapping={"color_covariance": kind} | EXCLUDED, render={"depth": "center"}).checked()
 
 
 def measure(path: str, options: Options, seed: int) -> dict[str, Any]:
