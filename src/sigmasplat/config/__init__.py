@@ -71,6 +71,10 @@ class Config:
             raise ConfigError(
                 "mapping.color_covariance=full does not support render.depth=ray; add --set render.depth=center"
             )
+        if m.color_covariance == "full" and self.render.depth_gate_m:
+            raise ConfigError(
+                "mapping.color_covariance=full does not support render.depth_gate_m; add --set render.depth_gate_m=0"
+            )
         if self.submaps.variance_sum and not (m.weight_nll_color or m.weight_nll_depth):
             raise ConfigError(
                 "submaps.variance_sum needs variances that mapping learns; set mapping.weight_nll_color above 0, or "
