@@ -138,11 +138,11 @@ template <int ROW_FLOATS> SIGMA_INLINE int live_alphas(const float* rows, const 
     return n;
 }
 
-// The median gate pulls the depth of splats behind the median depth towards it: δ = depth − median > 0 becomes β·δ,
-// β = exp(−(δ/s)²). `depth` is the gated depth, `slope` its derivative by depth, with the median held fixed.
+// The median gate moves depths behind the median depth towards it: δ = depth − median > 0 becomes β·δ, β = exp(−(δ/s)²).
+// `depth` is the gated depth, `slope` its derivative by depth, with the median held fixed.
 struct GatedDepth { vf depth, slope; };
 SIGMA_INLINE GatedDepth gate_depth(vf depth, vf median, Mask after_median, vf inverse_s) {
-    const vf off = depth - median, q = off * inverse_s, square = min(q * q, splat(60.f));   // 60: the limit of exp2_alpha
+    const vf off = depth - median, q = off * inverse_s, square = min(q * q, splat(60.f));   // 60: in the range of exp2_alpha
     const vf beta = exp2_alpha(square * -LOG2_E);
     const Mask gated = both(after_median, gt(off, splat(0.f)));
     return {select(gated, fma(beta, off, median), depth), select(gated, beta * fnma(square, splat(2.f), splat(1.f)), splat(1.f))};
