@@ -66,6 +66,7 @@ class Config:
                 "mapping.weight_moment": (m.weight_moment, 0),
                 "mapping.frames_per_step": (m.frames_per_step, 1),
                 "render.depth": (self.render.depth, "center"),
+                "render.depth_gate_m": (self.render.depth_gate_m, 0),
             }
             wrong = {name: pair for name, pair in needed.items() if pair[0] != pair[1]}
             if wrong:

@@ -1,12 +1,15 @@
 """Settings of the work per frame: rendering, seeding, mapping, tracking."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
+
+from sigmasplat.errors import ConfigError
 
 
 @dataclass(frozen=True)
 class RenderConfig:
-    """Rendering of splats; the thresholds are those of 3DGS."""
+    """Rendering of splats; the thresholds are those of 3DGS. Raises ConfigError on invalid values."""
 
     alpha_min: float = 1.0 / 255.0
     """A splat is ignored at pixels where its alpha is below this."""
@@ -20,6 +23,10 @@ class RenderConfig:
     depth: Literal["center", "ray"] = "center"
     """Depth of a splat at a pixel: center = that of its centre (papers); ray = where the ray meets it most densely, so
     that a flat splat can show a slanted surface (RaDe-GS). On CUDA it is center, with a warning."""
+    depth_gate_m: float = 0.0
+    """Scale s of the median gate, in metres; 0 = off (papers). In the rendered depth a splat at a distance δ behind the
+    median depth counts as at δ·exp(−(δ/s)²) behind it, so that splats far behind the surface do not change the depth
+    (GauS-SLAM). Not supported on CUDA."""
     covariance_pose_gradient: bool = True
     """Whether the pose gradient includes the path through the 2D covariance."""
     mean_pose_gradient: bool = True
@@ -29,6 +36,10 @@ class RenderConfig:
     """Whether the pose gradient includes the path through the splats' depths; the depth loss needs it."""
     color_pose_gradient: bool = True
     """Whether the pose gradient includes the path through view-dependent colours."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.depth_gate_m < math.inf:
+            raise ConfigError(f"render.depth_gate_m must be finite and not negative, found {self.depth_gate_m}")
 
 
 @dataclass(frozen=True)

@@ -115,6 +115,8 @@ def step_for(field: GaussianField, view: View, weights: Weights, degree: int) ->
         )
     if full and view.options.depth == "ray":
         raise ConfigError("mapping.color_covariance=full does not support render.depth=ray; set it to center")
+    if full and view.options.depth_gate_m:
+        raise ConfigError("mapping.color_covariance=full does not support render.depth_gate_m; set it to 0")
     fits = fits_of(view)
     if full:
         step = fits.covariance_step(make_covariance_view(view, field.get_or_create("correlations")))

@@ -190,6 +190,7 @@ class Rasteriser:
         alpha_min: float,
         stop: float,
         ray_depth: bool,
+        depth_gate_m: float,
         reference: Array | None,
         sums: Array,
         moment: Array | None,

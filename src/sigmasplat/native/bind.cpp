@@ -145,19 +145,20 @@ public:
         kernels->blend_backward(context, {g_sums.data(), pointer(g_moment), pointer(g_alpha)},
                                 {g_means2d.data(), g_conics.data(), g_z.data(), g_opacities.data(), g_features.data()});
     }
-    void view_forward(ConstFloats view, ConstFloats params, const Harmonics* harmonics, int k, float alpha_min, float stop, bool ray_depth, Maybe<ConstFloats> reference,
+    void view_forward(ConstFloats view, ConstFloats params, const Harmonics* harmonics, int k, float alpha_min, float stop, bool ray_depth, float depth_gate_m, Maybe<ConstFloats> reference,
                       Floats sums, Maybe<Floats> moment, Floats alpha, Maybe<Ints> median_id, Maybe<Floats> median_weight,
                       Maybe<Ints> dominant_id, Maybe<Floats> dominant_weight, Maybe<Floats> median_depth, Doubles seconds) {
         Outputs o = outputs(sums, moment, alpha, median_id, median_weight, dominant_id, dominant_weight);
         o.median_depth = pointer(median_depth);
         need(params.ndim() == 2 && params.shape(1) == 17, "params must be [N, 17]");
+        need(depth_gate_m >= 0.f, "depth_gate_m must not be negative");
         need(k == 4 || k == 7, "a view has 4 features (colour, depth) or 7 (and variance)");
         need(!o.moment == !reference, "a moment needs a reference depth");
         need(seconds.size() >= 3, "seconds needs 3 places");
         need_rows(harmonics, params.shape(0));
         nb::gil_scoped_release unlocked;
         kernels->view_forward(context, view.data(), params.data(), harmonics ? harmonics->colors() : ViewColors{}, int64_t(params.shape(0)), k, pointer(reference),
-                              {alpha_min, stop, ray_depth}, o, seconds.data());
+                              {alpha_min, stop, ray_depth, depth_gate_m}, o, seconds.data());
     }
     void view_backward(ConstFloats params, ConstFloats g_sums, Maybe<ConstFloats> g_moment, Maybe<ConstFloats> g_alpha, Maybe<Ints> median_id, Maybe<ConstFloats> g_median_depth,
                        Floats g_params, Maybe<Floats> pull, Doubles g_twist, Doubles seconds) {
@@ -325,7 +326,7 @@ NB_MODULE(_core, m) {
              nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(), nb::arg("median_weight").none(), nb::arg("dominant_id").none(), nb::arg("dominant_weight").none())
         .def("blend_backward", &Rasteriser::blend_backward, nb::arg("g_sums"), nb::arg("g_moment").none(),
              nb::arg("g_alpha").none(), nb::arg("g_means2d"), nb::arg("g_conics"), nb::arg("g_z"), nb::arg("g_opacities"), nb::arg("g_features"))
-        .def("view_forward", &Rasteriser::view_forward, nb::arg("view"), nb::arg("params"), nb::arg("harmonics").none(), nb::arg("k"), nb::arg("alpha_min"), nb::arg("stop"), nb::arg("ray_depth"),
+        .def("view_forward", &Rasteriser::view_forward, nb::arg("view"), nb::arg("params"), nb::arg("harmonics").none(), nb::arg("k"), nb::arg("alpha_min"), nb::arg("stop"), nb::arg("ray_depth"), nb::arg("depth_gate_m"),
              nb::arg("reference").none(), nb::arg("sums"), nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(),
              nb::arg("median_weight").none(), nb::arg("dominant_id").none(), nb::arg("dominant_weight").none(), nb::arg("median_depth").none(), nb::arg("seconds"))
         .def("view_backward", &Rasteriser::view_backward, nb::arg("params"), nb::arg("g_sums"),

@@ -10,7 +10,12 @@ struct Context;                            // buffers of one render, private to 
 
 struct PadSize { int tile_width, tile_height, lanes; };
 
-struct BlendOptions { float alpha_min, transmittance_stop; bool ray_depth = false; };   // ray_depth: views only
+struct BlendOptions {
+    float alpha_min, transmittance_stop;
+    bool ray_depth = false;                // views only, like the gate
+    float depth_gate_m = 0.f;              // scale s of the median gate; 0: no gate
+    bool slopes() const { return ray_depth || depth_gate_m > 0.f; }   // whether rows hold slopes; with a gate they may be 0
+};
 
 struct Outputs {                           // planes of Hp × Wp, padded to whole tiles
     float* sums;                           // [K] planes

@@ -1,30 +1,38 @@
 // Stages 1–3 together: the two operators `project` and `blend`, and the fused path from raw parameter rows to images
 // and back.
 
+// Call f(slopes, gate): which depth of views is compiled in.
+template <class F> SIGMA_INLINE void with_depth(const BlendOptions& o, F f) {
+    if (o.depth_gate_m > 0.f) f(std_int<1>{}, std_int<1>{});
+    else o.ray_depth ? f(std_int<1>{}, std_int<0>{}) : f(std_int<0>{}, std_int<0>{});
+}
+
 static void blend(Render& r, Outputs o) {
     with_features(r.k, [&](auto k) {
         constexpr int K = decltype(k)::value;
-        const auto maps = [&](auto slopes) {
-            constexpr bool SLOPES = decltype(slopes)::value != 0;
-            if (o.moment) o.dominant_id ? blend_tiles<K, true, true, SLOPES>(r, o) : blend_tiles<K, true, false, SLOPES>(r, o);
-            else o.dominant_id ? blend_tiles<K, false, true, SLOPES>(r, o) : blend_tiles<K, false, false, SLOPES>(r, o);
+        const auto maps = [&](auto slopes, auto gate) {
+            constexpr bool SLOPES = decltype(slopes)::value != 0, GATE = decltype(gate)::value != 0;
+            if (o.moment) o.dominant_id ? blend_tiles<K, true, true, SLOPES, GATE>(r, o) : blend_tiles<K, true, false, SLOPES, GATE>(r, o);
+            else o.dominant_id ? blend_tiles<K, false, true, SLOPES, GATE>(r, o) : blend_tiles<K, false, false, SLOPES, GATE>(r, o);
         };
-        if constexpr (K <= 7) r.options.ray_depth ? maps(std_int<1>{}) : maps(std_int<0>{});
-        else maps(std_int<0>{});
+        if constexpr (K <= 7) with_depth(r.options, maps);
+        else maps(std_int<0>{}, std_int<0>{});
     });
 }
 static void blend_gradients(Render& r, OutputGradients g) {   // to each splat's slots
     with_features(r.k, [&](auto k) {
         constexpr int K = decltype(k)::value;
-        const auto to_slots = [&](auto moment, auto slopes) {
-            constexpr bool MOMENT = decltype(moment)::value != 0, SLOPES = decltype(slopes)::value != 0;
+        const auto to_slots = [&](auto moment, auto slopes, auto gate) {
+            constexpr bool MOMENT = decltype(moment)::value != 0, SLOPES = decltype(slopes)::value != 0, GATE = decltype(gate)::value != 0;
             r.partials.reserve(size_t(r.intersections + 1) * record_floats<K, MOMENT, SLOPES>);
-            blend_tiles_backward<K, K, MOMENT, SLOPES>(
+            blend_tiles_backward<K, K, MOMENT, SLOPES, GATE>(
                 r, g, [&](Scratch& s, const Tile& tile) { flush_records<K, MOMENT, SLOPES>(r, s, tile); });
         };
-        if constexpr (K <= 7)
-            if (r.options.ray_depth) return g.moment ? to_slots(std_int<1>{}, std_int<1>{}) : to_slots(std_int<0>{}, std_int<1>{});
-        g.moment ? to_slots(std_int<1>{}, std_int<0>{}) : to_slots(std_int<0>{}, std_int<0>{});
+        const auto any_moment = [&](auto slopes, auto gate) {
+            g.moment ? to_slots(std_int<1>{}, slopes, gate) : to_slots(std_int<0>{}, slopes, gate);
+        };
+        if constexpr (K <= 7) with_depth(r.options, any_moment);
+        else any_moment(std_int<0>{}, std_int<0>{});
     });
 }
 
@@ -114,6 +122,15 @@ static void blend_backward(Context* context, OutputGradients g, SplatGradients o
 
 // ---- fused: rows of raw parameters to images and back ----------------------------------------------------------------
 
+// Depths of centres with the median gate have slopes 0, which are constants.
+SIGMA_INLINE void set_slopes(const Render& r, const Shape<vf>& s, Footprint<vf>& p) {
+    if (r.options.ray_depth) add_slopes_to(r.view, s, p);
+    else p.slope_u = p.slope_v = splat(0.f);
+}
+SIGMA_INLINE void drop_slopes(const BlendOptions& o, FootprintGradient<vf>& g) {
+    if (!o.ray_depth) g.slope_u = g.slope_v = splat(0.f);
+}
+
 struct Splats { Shape<vf> shape; vf opacity, color[3], variance[3]; };
 
 template <bool VARIANCE> SIGMA_INLINE Splats activate(const float (*row)[W]) {   // GaussianField's columns, activated
@@ -138,7 +155,7 @@ template <int K> static void pack_view(Render& r, const float* params, const Vie
             for (int l = 0; l <= W; l++) __builtin_prefetch(params + (i + 2 * W + l) * ROW);
             Splats s = activate<(K > 4)>(row);
             Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
-            if (r.options.ray_depth) add_slopes_to(r.view, s.shape, p);
+            set_slopes(r, s.shape, p);
             const auto fill = [&](unsigned live) {
                 if (colors.degree) {
                     alignas(64) float harmonics[HARMONICS][W];
@@ -146,9 +163,9 @@ template <int K> static void pack_view(Render& r, const float* params, const Vie
                     show_colors(r.view, colors, i, live, s.shape.mean, s.color, harmonics);
                 }
                 for (int q = 0; q < 3; q++) store(f[q], s.color[q]);
-                store(f[3], r.options.ray_depth ? p.slope_u : p.z);
+                store(f[3], r.options.slopes() ? p.slope_u : p.z);
                 for (int q = 0; q < 3; q++) store(f[4 + q], K > 4 ? fma(s.color[q], s.color[q], s.variance[q]) : splat(0.f));
-                store(f[7], r.options.ray_depth ? p.slope_v : splat(0.f));
+                store(f[7], r.options.slopes() ? p.slope_v : splat(0.f));
             };
             total += pack<row_floats<K>>(r, p, s.opacity, gt(p.z, splat(r.view.near_m)), i, total, f, fill);
         }
@@ -171,11 +188,11 @@ static void view_forward(Context* context, const float* view_numbers, const floa
     if (seconds) { seconds[0] += t1 - t0; seconds[1] += t2 - t1; seconds[2] += omp_get_wtime() - t2; }
 }
 
-// Add ∂L/∂(median depth) of each pixel to the depth of one splat, with depth along the ray also to its slopes, in the
-// order of the pixels, so that sums do not depend on threads.
+// Add ∂L/∂(median depth) of each pixel to the depth of one splat, and to its slopes if rows hold them, in the order of
+// the pixels, so that sums do not depend on threads.
 static const float* gather_median(Render& r, OutputGradients g) {
     if (!g.median_depth) return nullptr;
-    const size_t splats = size_t(r.n) + W, numbers = (r.options.ray_depth ? 3 : 1) * splats;
+    const size_t splats = size_t(r.n) + W, numbers = (r.options.slopes() ? 3 : 1) * splats;
     float* sums = r.median_gradient.reserve(numbers);
     memset(sums, 0, numbers * sizeof(float));
     const size_t stride = r.padded_width();
@@ -185,7 +202,7 @@ static const float* gather_median(Render& r, OutputGradients g) {
             const int id = g.median_id[at];
             if (id < 0) continue;
             sums[id] += g.median_depth[at];
-            if (!r.options.ray_depth) continue;
+            if (!r.options.slopes()) continue;
             const Geometry& splat = r.geometry(id);
             sums[splats + id] += g.median_depth[at] * (float(x) - splat.u);
             sums[2 * splats + id] += g.median_depth[at] * (float(y) - splat.v);
@@ -221,7 +238,7 @@ static void chain_to_params(const Render& r, const float* params, const ViewColo
             Splats s = activate<(K > 4)>(row);
             if (colors.degree) show_colors(r.view, colors, i, seen_bits, s.shape.mean, s.color, harmonics);
             Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
-            if (r.options.ray_depth) add_slopes_to(r.view, s.shape, p);
+            if constexpr (SLOPES) set_slopes(r, s.shape, p);
             FootprintGradient<vf> g = footprint_gradient(moments_of(sums), p.l1, p.l2, p.l3);
             if constexpr (SLOPES) {
                 add_depth_gradient<K, MOMENT>(sums, p, g);
@@ -233,6 +250,7 @@ static void chain_to_params(const Render& r, const float* params, const ViewColo
                     g.u = fnma(p.slope_u, on_depth, g.u);
                     g.v = fnma(p.slope_v, on_depth, g.v);
                 }
+                drop_slopes(r.options, g);
             } else {
                 g.z = weight_sum(sums, 3);
                 if constexpr (MOMENT) g.z += fma(p.z, weight_sum(sums, K), weight_sum(sums, K + 1));
@@ -276,7 +294,7 @@ static void chain_any(Render& r, const float* params, const ViewColors& colors, 
         g.moment ? chain_to_params<K, true, SLOPES>(r, params, colors, g_median, pull, g_twist, sink, unseen)
                  : chain_to_params<K, false, SLOPES>(r, params, colors, g_median, pull, g_twist, sink, unseen);
     };
-    if (r.options.ray_depth) r.k <= 4 ? chain(std_int<4>{}, std_int<1>{}) : chain(std_int<7>{}, std_int<1>{});
+    if (r.options.slopes()) r.k <= 4 ? chain(std_int<4>{}, std_int<1>{}) : chain(std_int<7>{}, std_int<1>{});
     else r.k <= 4 ? chain(std_int<4>{}, std_int<0>{}) : chain(std_int<7>{}, std_int<0>{});
 }
 
@@ -365,7 +383,7 @@ static void view_backward_pose(Context* context, const float* params, OutputGrad
             shift_moments(a.m[0], a.m[1], a.m[2], a.m[3], a.m[4], a.m[5], load(center[0]), load(center[1]));
             const Splats s = activate<false>(row);
             Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
-            if constexpr (SLOPES) add_slopes_to(r.view, s.shape, p);
+            if constexpr (SLOPES) set_slopes(r, s.shape, p);
             FootprintGradient<vf> f = footprint_gradient(a, p.l1, p.l2, p.l3);
             if constexpr (SLOPES) {
                 vf weighed[6];
@@ -373,6 +391,7 @@ static void view_backward_pose(Context* context, const float* params, OutputGrad
                 shift_depth_sums<4, false>([&](int c) -> vf& { return weighed[c]; }, load(center[0]), load(center[1]));
                 for (int c = 3; c < 6; c++) store(sums[weight_place(c)], weighed[c]);
                 add_depth_gradient<4, false>(sums, p, f);
+                drop_slopes(r.options, f);
             } else {
                 f.z = weight_sum(sums, 3);
             }
@@ -382,12 +401,12 @@ static void view_backward_pose(Context* context, const float* params, OutputGrad
         }
         for (int q = 0; q < 6; q++) partial[tile.index * 6 + q] = lane_sum(twist[q]);
     };
-    const auto walk = [&](auto slopes) {
-        constexpr bool SLOPES = decltype(slopes)::value != 0;
+    const auto walk = [&](auto slopes, auto gate) {
+        constexpr bool SLOPES = decltype(slopes)::value != 0, GATE = decltype(gate)::value != 0;
         const auto each = [&](Scratch& scratch, const Tile& tile) { finish(slopes, scratch, tile); };
-        r.k <= 4 ? blend_tiles_backward<4, 4, false, SLOPES>(r, g, each) : blend_tiles_backward<7, 4, false, SLOPES>(r, g, each);
+        r.k <= 4 ? blend_tiles_backward<4, 4, false, SLOPES, GATE>(r, g, each) : blend_tiles_backward<7, 4, false, SLOPES, GATE>(r, g, each);
     };
-    r.options.ray_depth ? walk(std_int<1>{}) : walk(std_int<0>{});
+    with_depth(r.options, walk);
     for (int q = 0; q < 6; q++) {
         g_twist[q] = 0;
         for (int t = 0; t < tiles; t++) g_twist[q] += partial[t * 6 + q];

@@ -18,6 +18,9 @@ from sigmasplat.model.field import Rows
 from sigmasplat.render.view import CorrelationView, View
 
 BACKENDS = ("auto", "cpu", "cuda", "reference")
+NO_GATE_ON_CUDA = (
+    "render.depth_gate_m does not run on CUDA; add --set render.depth_gate_m=0, or render with --set backend=cpu"
+)
 
 
 def backend_name(asked: str, device: torch.device | None = None) -> str:
@@ -59,8 +62,15 @@ def backend_module(asked: str, device: torch.device | None = None) -> ModuleType
 
 
 def options_on(backend: str, options: RenderConfig) -> RenderConfig:
-    """Return the options that a backend (by name) renders with: CUDA has only `render.depth=center`, and warns."""
-    if backend != "cuda" or options.depth == "center":
+    """Return the options that a backend (by name) renders with: CUDA has only `render.depth=center`, and warns.
+
+    Raises BackendError if the backend does not support `render.depth_gate_m`.
+    """
+    if backend != "cuda":
+        return options
+    if options.depth_gate_m:
+        raise BackendError(NO_GATE_ON_CUDA)
+    if options.depth == "center":
         return options
     warnings.warn("render.depth=ray does not run on CUDA yet; depth is that of the splats' centres", stacklevel=3)
     return replace(options, depth="center")

@@ -14,6 +14,7 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render.backend import backend_module, backend_name, options_on
+from sigmasplat.render.gated_depth import gated_depth
 from sigmasplat.render.ray_depth import depth_of, plane_features
 from sigmasplat.render.reference.operators import depth_slopes
 from sigmasplat.render.render import colors_from
@@ -25,8 +26,8 @@ OWN = 6
 @dataclass(frozen=True, eq=False)
 class BlendedValues:
     """Sums over the splats of each pixel: color Σwc [H, W, 3], depth Σwz [H, W] m (z along the ray with
-    `render.depth=ray`), second Σw(σ²+c²) [H, W] mean over
-    the channels, values Σwv [H, W, K], alpha Σw [H, W]."""
+    `render.depth=ray`, behind the median gate with `render.depth_gate_m`), second Σw(σ²+c²) [H, W] mean over the
+    channels, values Σwv [H, W, K], alpha Σw [H, W]."""
 
     color: Tensor
     depth: Tensor
@@ -70,7 +71,8 @@ def blend_values(
     Raises BackendError if the backend is not available.
     """
     kernels, T = backend_module(backend, field.params.device), torch.as_tensor(T_camera_map)
-    options = options_on(backend_name(backend, field.params.device), options)
+    name = backend_name(backend, field.params.device)
+    options = options_on(name, options)
     with torch.no_grad():
         p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
         seen_z = p.z[p.radii[:, 0] > 0]
@@ -88,7 +90,10 @@ def blend_values(
         features.requires_grad_(gather)
         b = kernels.blend(*p, opacities, features, None, camera, options)
     sums = b.sums.detach()
+    depth = depth_of(sums[..., end:], camera) if options.depth == "ray" else sums[..., 3]
+    if options.depth_gate_m:
+        depth = gated_depth(field.params.detach(), T, camera, options, name)
     return BlendedValues(
-        sums[..., :3], depth_of(sums[..., end:], camera) if options.depth == "ray" else sums[..., 3],
-        sums[..., 4], sums[..., OWN:end], b.alpha.detach(), sums[..., 3], sums[..., 5], center_m, b.sums, features,
+        sums[..., :3], depth, sums[..., 4], sums[..., OWN:end], b.alpha.detach(), sums[..., 3], sums[..., 5],
+        center_m, b.sums, features,
     )  # fmt: skip

@@ -15,6 +15,7 @@ from sigmasplat.model.harmonics import view_colors
 from sigmasplat.render.backend import backend_module, backend_name, options_on
 from sigmasplat.render.channels import covariance_features, covariance_of, features_of, variance_of
 from sigmasplat.render.cuda import launch as cuda_launch
+from sigmasplat.render.gated_depth import gated_depth
 from sigmasplat.render.ray_depth import depth_at, depth_of, plane_features
 from sigmasplat.render.reference.operators import depth_slopes
 
@@ -23,7 +24,8 @@ from sigmasplat.render.reference.operators import depth_slopes
 class Render:
     """The maps that a camera sees of a field, all [H, W] or [H, W, 3], covariance [H, W, 6].
 
-    color Ĉ = Σ w c; depth D̂ = Σ w z (m, not divided by alpha), with `render.depth=ray` z along the ray; alpha A = Σ w;
+    color Ĉ = Σ w c; depth D̂ = Σ w z (m, not divided by alpha), with `render.depth=ray` z along the ray, with
+    `render.depth_gate_m` behind the median gate; alpha A = Σ w;
     variance V = Σ w (σ² + c²) − Ĉ², the law of total variance (VarSplat §1); uncertainty U = Σ w (z − D)² of the
     splats' centres about a reference depth D (m², CG-SLAM eq. 10), None without a reference; median_depth: z where half
     of the light is absorbed, 0 if it never is (CG-SLAM eq. 8); median_id, dominant_id: the splat at that depth, and the
@@ -82,8 +84,8 @@ def render(
     The pose gradient is the sum of the paths that `options` enables: through 2D means, 2D covariances, depths, and the
     viewing directions of `harmonics`. Raises BackendError if the backend is not available.
     """
-    kernels = backend_module(backend, field.params.device)
-    options = options_on(backend_name(backend, field.params.device), options or RenderConfig())
+    kernels, name = backend_module(backend, field.params.device), backend_name(backend, field.params.device)
+    options = options_on(name, options or RenderConfig())
     field = on_device(field, backend)
     T = torch.as_tensor(T_camera_world)
     p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
@@ -98,6 +100,8 @@ def render(
     nearest = p.z[rows] if len(field) else torch.zeros_like(b.alpha)
     if rays:
         depth, nearest = depth_of(b.sums[..., channels:], camera), depth_at(rows, p, slopes, camera)
+    if options.depth_gate_m:
+        depth = gated_depth(field.params, T, camera, options, name)
     return Render(
         sums[..., 0:3],
         depth,

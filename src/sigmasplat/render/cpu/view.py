@@ -56,8 +56,8 @@ class CpuView:
         self._made = (depth_reference is not None, layers)
         view, planes = view_params(self.camera, T_camera_world, o), self.layers if layers else NO_LAYERS
         self.raster.view_forward(
-            view, params, harmonics, self._k, o.alpha_min, o.transmittance_stop, o.depth == "ray", reference_depth,
-            self.sums, moment, self.alpha, *planes, self.seconds[:3],
+            view, params, harmonics, self._k, o.alpha_min, o.transmittance_stop, o.depth == "ray", o.depth_gate_m,
+            reference_depth, self.sums, moment, self.alpha, *planes, self.seconds[:3],
         )  # fmt: skip
 
     def depth_gradients(self) -> tuple[Tensor | None, Tensor | None, Tensor | None]:

@@ -49,6 +49,9 @@ class Blended(NamedTuple):
     """[H, W] int32, the splat of largest w, the nearest one if several are equal; −1 = none."""
     dominant_weight: Tensor
     """[H, W] its w, detached; 0 = none."""
+    gated_depth: Tensor | None = None
+    """[H, W] Σ w d of the depths d behind the median gate, m; None without `render.depth_gate_m`. Only this definition
+    and the views have it."""
 
 
 def project(
@@ -174,8 +177,8 @@ def blend(
     means2d, conics, z, radii as `project` returns them; opacities [N]; features [N, K]; ref_depth [H, W] m or None.
     Splats are sorted by z, equal ones by index. A pair of splat and pixel counts if o·exp(power) ≥ alpha_min and the
     light before the splat is at least transmittance_stop. There is no other limit, so the result does not depend on
-    tiles. Ids and their weights have no gradient. With slopes [N, 2] m/px the moment is that of the depth along the ray
-    (`depth_slopes`); only this definition has them.
+    tiles. Ids and their weights have no gradient. With slopes [N, 2] m/px the moment and the gated depth are those of
+    the depth along the ray (`depth_slopes`); only this definition has them.
     """
     order = torch.sort(z.detach(), stable=True).indices
     order = order[radii[order, 0] > 0]
@@ -190,14 +193,15 @@ def blend(
             z[order, None] if slopes is None else _depths(some_pixels, means2d[order], z[order], slopes[order]),
             some_ref,
             order,
-            options.transmittance_stop,
+            options,
         )
         for some_pixels, some_ref in zip(torch.split(pixels, step), torch.split(ref, step), strict=True)
     ]
     size = (camera.height, camera.width)
-    sums, moment, *maps = (torch.cat(part) for part in zip(*parts, strict=True))
+    sums, moment, gated, *maps = (torch.cat(part) for part in zip(*parts, strict=True))
     images = [m.reshape(size) for m in maps]
-    return Blended(sums.reshape(*size, -1), None if ref_depth is None else moment.reshape(size), *images)
+    b = Blended(sums.reshape(*size, -1), None if ref_depth is None else moment.reshape(size), *images)
+    return b._replace(gated_depth=gated.reshape(size)) if options.depth_gate_m else b
 
 
 def _alphas(pixels: Tensor, means2d: Tensor, conics: Tensor, opacities: Tensor, options: RenderConfig) -> Tensor:
@@ -214,10 +218,22 @@ def _depths(pixels: Tensor, means2d: Tensor, z: Tensor, slopes: Tensor) -> Tenso
     return z[:, None] + ((pixels[None] - means2d[:, None]) * slopes[:, None]).sum(-1)
 
 
+def gated_depths(depths: Tensor, median: Tensor, behind: Tensor, scale_m: float) -> Tensor:
+    """Return the depths of splats behind the median gate: βd + (1 − β)m with β = exp(−((d − m)/s)²) (GauS-SLAM).
+
+    behind: the splats after the median splat, front to back. Of these, splats with d > m are moved; all others keep
+    their depth. The median depth m is a constant in the gradient.
+    """
+    off = depths - median.detach()
+    moved = behind & (off.detach() > 0)
+    return torch.where(moved, median.detach() + off * (-((off / scale_m) ** 2)).exp(), depths)
+
+
 def _blend_pixels(
-    alphas: Tensor, features: Tensor, z: Tensor, ref: Tensor, order: Tensor, stop: float
+    alphas: Tensor, features: Tensor, z: Tensor, ref: Tensor, order: Tensor, options: RenderConfig
 ) -> tuple[Tensor, ...]:
-    """Composite sorted splats of depths z [N, 1] or [N, P] at P pixels; returns `Blended`'s maps flat.
+    """Composite sorted splats of depths z [N, 1] or [N, P] at P pixels; returns the depth behind the median gate and
+    `Blended`'s maps, flat.
 
     A row with id −1 and α = 0 is added in front. With it, the light before each splat is the light after the previous
     row, and `argmax` finds this row if no splat qualifies.
@@ -226,15 +242,21 @@ def _blend_pixels(
     alphas = torch.cat([air, alphas])
     after = torch.cumprod(1.0 - alphas, 0)
     before = torch.cat([torch.ones_like(air), after[:-1]])
-    counts = before >= stop
+    counts = before >= options.transmittance_stop
     w = torch.where(counts, alphas * before, 0.0)
     off = torch.where(ref > 0, z - ref, 0.0)
     ids = torch.cat([order.new_full((1,), -1), order]).int()
     median = (counts & (before >= 0.5) & (after < 0.5)).int().argmax(0, keepdim=True)
     dominant = w.detach().argmax(0, keepdim=True)
+    gated = torch.zeros_like(ref)
+    if options.depth_gate_m:
+        depths = z.expand(-1, len(ref))
+        nearest = torch.cat([torch.zeros_like(air), depths]).gather(0, median)
+        gated = (w[1:] * gated_depths(depths, nearest, before[1:] < 0.5, options.depth_gate_m)).sum(0)
     return (
         w[1:].T @ features,
         (w[1:] * off**2).sum(0),
+        gated,
         w.sum(0),
         *(m for pick in (median, dominant) for m in (ids[pick[0]], w.detach().gather(0, pick)[0])),
     )
