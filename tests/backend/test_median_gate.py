@@ -79,14 +79,12 @@ def test_planes_and_gradients_follow_the_definition(kind: str, depth: str, varia
 
 @pytest.mark.parametrize("depth", DEPTHS)
 def test_every_instruction_set_follows_it(isa: str, depth: str) -> None:
-    s = crowd()
-    params, options = params_of(s), gated(depth)
-    got, want = (
-        carried(CpuView(s.camera, options), params, s, True),
-        carried(exact(s.camera, options), params.double(), s, True),
-    )
+    s, options = scene("random", 60), gated(depth)
+    params = params_of(s)
+    got = carried(CpuView(s.camera, options), params, s, True)
+    want = carried(exact(s.camera, options), params.double(), s, True)
     for name, value in want.items():
-        assert_same_vector(got[name], value, 2e-3, f"{isa} {name}")
+        assert_same_vector(got[name], value, 1e-3 if name == "planes" else 2e-4, f"{isa} {name}")
 
 
 class Definition:
@@ -98,7 +96,6 @@ class Definition:
         light = 1.0 - torch.cumsum(weights[..., order], -1)
         ahead = torch.cat([torch.ones_like(light[..., :1]), light[..., :-1]], -1)
         at = ((ahead >= 0.5) & (light < 0.5)).int()
-        self.crossed = at.amax(-1) > 0
         first = order[at.argmax(-1)]
         self.median = depths.gather(-1, first[..., None])
         self.behind = torch.zeros_like(weights, dtype=torch.bool)
@@ -137,12 +134,10 @@ def test_its_gradient_is_that_of_finite_differences_with_the_median_held_fixed(d
     slopes = None
     if depth == "ray":
         slopes = reference.depth_slopes(field.means, field.quats, field.scales, s.T_camera_world, s.camera, options)
-    b = reference.blend(*p, field.opacities, field.features, None, s.camera, options, slopes)
-    assert b.gated_depth is not None
-    torch.testing.assert_close(b.gated_depth.detach(), definition(*definition.leaves()))
-    assert bool(((b.gated_depth - definition(*definition.leaves())).abs() < 1e-12).all())
+    found = reference.blend_gated_depth(*p, field.opacities, s.camera, options, slopes)
+    assert float((found.detach() - definition(*definition.leaves())).abs().max()) < 1e-12
     leaves, step = (field.means, field.quats, field.scales, field.opacities), 1e-6
-    gradients = torch.autograd.grad((b.gated_depth * on_pixels).sum(), leaves)
+    gradients = torch.autograd.grad((found * on_pixels).sum(), leaves)
     for k, gradient in enumerate(gradients):
         differences = torch.zeros_like(gradient)
         for i in range(gradient.numel()):

@@ -37,7 +37,7 @@ class Layers(NamedTuple):
 
     def fill(self, b: reference.Blended, z: Tensor) -> None:
         """Copy the result of a blend of splats at depths z [N] m."""
-        for plane, image in zip(self[:4], b[3:7], strict=True):
+        for plane, image in zip(self[:4], b[3:], strict=True):
             plane.copy_(image)
         self.fill_depth(z)
 

@@ -49,9 +49,6 @@ class Blended(NamedTuple):
     """[H, W] int32, the splat of largest w, the nearest one if several are equal; −1 = none."""
     dominant_weight: Tensor
     """[H, W] its w, detached; 0 = none."""
-    gated_depth: Tensor | None = None
-    """[H, W] Σ w d of the depths d behind the median gate, m; None without `render.depth_gate_m`. Only this definition
-    and the views have it."""
 
 
 def project(
@@ -177,13 +174,10 @@ def blend(
     means2d, conics, z, radii as `project` returns them; opacities [N]; features [N, K]; ref_depth [H, W] m or None.
     Splats are sorted by z, equal ones by index. A pair of splat and pixel counts if o·exp(power) ≥ alpha_min and the
     light before the splat is at least transmittance_stop. There is no other limit, so the result does not depend on
-    tiles. Ids and their weights have no gradient. With slopes [N, 2] m/px the moment and the gated depth are those of
-    the depth along the ray (`depth_slopes`); only this definition has them.
+    tiles. Ids and their weights have no gradient. With slopes [N, 2] m/px the moment is that of the depth along the ray
+    (`depth_slopes`); only this definition has them.
     """
-    order = torch.sort(z.detach(), stable=True).indices
-    order = order[radii[order, 0] > 0]
-    v, u = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
-    pixels = torch.stack([u, v], -1).reshape(-1, 2).to(means2d)
+    order, pixels = _near_to_far(z, radii), _pixels(camera).to(means2d)
     ref = torch.zeros(len(pixels)).to(z) if ref_depth is None else ref_depth.detach().reshape(-1).to(z)
     step = max(1, PAIRS_AT_ONCE // (len(order) + 1))
     parts = [
@@ -193,15 +187,60 @@ def blend(
             z[order, None] if slopes is None else _depths(some_pixels, means2d[order], z[order], slopes[order]),
             some_ref,
             order,
-            options,
+            options.transmittance_stop,
         )
         for some_pixels, some_ref in zip(torch.split(pixels, step), torch.split(ref, step), strict=True)
     ]
     size = (camera.height, camera.width)
-    sums, moment, gated, *maps = (torch.cat(part) for part in zip(*parts, strict=True))
+    sums, moment, *maps = (torch.cat(part) for part in zip(*parts, strict=True))
     images = [m.reshape(size) for m in maps]
-    b = Blended(sums.reshape(*size, -1), None if ref_depth is None else moment.reshape(size), *images)
-    return b._replace(gated_depth=gated.reshape(size)) if options.depth_gate_m else b
+    return Blended(sums.reshape(*size, -1), None if ref_depth is None else moment.reshape(size), *images)
+
+
+def blend_gated_depth(
+    means2d: Tensor,
+    conics: Tensor,
+    z: Tensor,
+    radii: Tensor,
+    opacities: Tensor,
+    camera: Camera,
+    options: RenderConfig,
+    slopes: Tensor | None = None,
+) -> Tensor:
+    """Sum the depths Σ w g(d) [H, W], m, behind the median gate of `options.depth_gate_m` > 0 (GauS-SLAM).
+
+    Arguments and weights w are those of `blend`; d is z, with slopes the depth along the ray. The median splat has
+    depth m at the pixel. A splat after it, front to back, with d > m has g(d) = βd + (1 − β)m, β = exp(−((d − m)/s)²);
+    all others have g(d) = d. m is a constant in the gradient.
+    """
+    order, size = _near_to_far(z, radii), (camera.height, camera.width)
+    if not len(order):
+        return z.new_zeros(size)
+    parts = []
+    for pixels in torch.split(_pixels(camera).to(means2d), max(1, PAIRS_AT_ONCE // (len(order) + 1))):
+        alphas = _alphas(pixels, means2d[order], conics[order], opacities[order], options)
+        along = means2d.new_zeros(len(order), 2) if slopes is None else slopes[order]
+        depths = _depths(pixels, means2d[order], z[order], along)
+        after = torch.cumprod(1.0 - alphas, 0)
+        before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
+        w = torch.where(before >= options.transmittance_stop, alphas * before, 0.0)
+        at_median = ((before >= 0.5) & (after < 0.5)).int().argmax(0, keepdim=True)
+        m = depths.detach().gather(0, at_median)
+        gated = m + (depths - m) * (-(((depths - m) / options.depth_gate_m) ** 2)).exp()
+        parts.append((w * torch.where((before < 0.5) & (depths.detach() > m), gated, depths)).sum(0))
+    return torch.cat(parts).reshape(size)
+
+
+def _near_to_far(z: Tensor, radii: Tensor) -> Tensor:
+    """Return the rows of the splats that are not culled, sorted by z, equal ones by index."""
+    order = torch.sort(z.detach(), stable=True).indices
+    return order[radii[order, 0] > 0]
+
+
+def _pixels(camera: Camera) -> Tensor:
+    """Return the pixels (u, v) of an image, row by row, [H·W, 2]."""
+    v, u = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    return torch.stack([u, v], -1).reshape(-1, 2)
 
 
 def _alphas(pixels: Tensor, means2d: Tensor, conics: Tensor, opacities: Tensor, options: RenderConfig) -> Tensor:
@@ -218,22 +257,10 @@ def _depths(pixels: Tensor, means2d: Tensor, z: Tensor, slopes: Tensor) -> Tenso
     return z[:, None] + ((pixels[None] - means2d[:, None]) * slopes[:, None]).sum(-1)
 
 
-def gated_depths(depths: Tensor, median: Tensor, behind: Tensor, scale_m: float) -> Tensor:
-    """Return the depths of splats behind the median gate: βd + (1 − β)m with β = exp(−((d − m)/s)²) (GauS-SLAM).
-
-    behind: the splats after the median splat, front to back. Of these, splats with d > m are moved; all others keep
-    their depth. The median depth m is a constant in the gradient.
-    """
-    off = depths - median.detach()
-    moved = behind & (off.detach() > 0)
-    return torch.where(moved, median.detach() + off * (-((off / scale_m) ** 2)).exp(), depths)
-
-
 def _blend_pixels(
-    alphas: Tensor, features: Tensor, z: Tensor, ref: Tensor, order: Tensor, options: RenderConfig
+    alphas: Tensor, features: Tensor, z: Tensor, ref: Tensor, order: Tensor, stop: float
 ) -> tuple[Tensor, ...]:
-    """Composite sorted splats of depths z [N, 1] or [N, P] at P pixels; returns the depth behind the median gate and
-    `Blended`'s maps, flat.
+    """Composite sorted splats of depths z [N, 1] or [N, P] at P pixels; returns `Blended`'s maps flat.
 
     A row with id −1 and α = 0 is added in front. With it, the light before each splat is the light after the previous
     row, and `argmax` finds this row if no splat qualifies.
@@ -242,21 +269,15 @@ def _blend_pixels(
     alphas = torch.cat([air, alphas])
     after = torch.cumprod(1.0 - alphas, 0)
     before = torch.cat([torch.ones_like(air), after[:-1]])
-    counts = before >= options.transmittance_stop
+    counts = before >= stop
     w = torch.where(counts, alphas * before, 0.0)
     off = torch.where(ref > 0, z - ref, 0.0)
     ids = torch.cat([order.new_full((1,), -1), order]).int()
     median = (counts & (before >= 0.5) & (after < 0.5)).int().argmax(0, keepdim=True)
     dominant = w.detach().argmax(0, keepdim=True)
-    gated = torch.zeros_like(ref)
-    if options.depth_gate_m:
-        depths = z.expand(-1, len(ref))
-        nearest = torch.cat([torch.zeros_like(air), depths]).gather(0, median)
-        gated = (w[1:] * gated_depths(depths, nearest, before[1:] < 0.5, options.depth_gate_m)).sum(0)
     return (
         w[1:].T @ features,
         (w[1:] * off**2).sum(0),
-        gated,
         w.sum(0),
         *(m for pick in (median, dominant) for m in (ids[pick[0]], w.detach().gather(0, pick)[0])),
     )
