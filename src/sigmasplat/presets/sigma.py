@@ -30,6 +30,7 @@ SIGMA = varsplat.FAST.changed(
         "sh_degree": 3,
         "sh_every": 100,
         "max_needle_ratio": 8.0,
+        "max_axis_ratio": 19.0,
         "weight_moment": False,  # U does not improve the final map, and costs an eighth of the time
         "prune_weight_px": 0.5,
     },
