@@ -1,6 +1,7 @@
 """benchmarks/map_quality.py: which runs it makes, and how it counts spikes, surface and figures."""
 
 import importlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +42,7 @@ def test_the_surface_is_that_of_occupied_cells() -> None:
 
 def test_this_checkout_and_the_one_before_take_turns(tmp_path: Path) -> None:
     options = map_quality.Options(
-        ("livingroom", "synthetic"), (0, 1), before="old/sigmasplat", limit=9, settings=("a.b=1",)
+        ("livingroom", "synthetic"), (0, 1), before="old/sigmasplat", limit=9, hold_out=8, settings=("a.b=1",)
     )
     jobs = map_quality.jobs_of(options)
     assert [(job.sequence, job.seed, job.code) for job in jobs[:4]] == [
@@ -51,6 +52,8 @@ def test_this_checkout_and_the_one_before_take_turns(tmp_path: Path) -> None:
     assert words[:2] == ["old/sigmasplat", "run"] and len(jobs) == 8
     for pair in (["--limit", "9"], ["--set", "a.b=1"], ["--set", "input.hold_every=8"], ["--seed", "0"]):
         assert any(words[i : i + 2] == pair for i in range(len(words)))
+    keyframes_only = jobs[1].words(replace(options, hold_out=0), tmp_path)
+    assert not any("hold_every" in word for word in keyframes_only)
 
 
 def test_a_failed_run_is_reported_and_repeated(tmp_path: Path) -> None:
