@@ -32,7 +32,7 @@ SUBJECTS = {
     "Loops and submaps": ("loops", "drift_rule"),
     "Consistent maps": ("consistency",),
     "Exported maps": ("export_sizes",),
-    "Geometry": ("four_frames",),
+    "Geometry": ("four_frames", "away_from_path"),
     "Kernels": ("cpu", "versus", "gpu", "kernels"),
     "Long runs": ("long_run", "viewer_memory"),
 }
