@@ -10,7 +10,6 @@ from torch import Tensor
 from sigmasplat.config import Config, RenderConfig
 from sigmasplat.config.text import override
 from sigmasplat.errors import BackendError, ConfigError
-from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.presets import preset
 from sigmasplat.render import render
@@ -19,8 +18,7 @@ from sigmasplat.render.blended_values import blend_values
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.reference import operators as reference
-from sigmasplat.render.reference.view import ReferenceView
-from splat_fields import CPU, crowd, params_of, plane_gradients
+from splat_fields import CPU, crowd, double_view, params_of, plane_gradients
 from splat_scenes import KINDS, SMALL, WIDE, Scene, assert_same_vector, make, scene
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -32,15 +30,6 @@ GATE_M = 0.4
 def gated(depth: Any = "center", gate_m: float = GATE_M) -> RenderConfig:
     """Return options with a median gate; the splats of the test scenes are metres apart."""
     return RenderConfig(depth=depth, depth_gate_m=gate_m)
-
-
-def exact(camera: Camera, options: RenderConfig, variance: bool = True) -> ReferenceView:
-    """Make a reference view that computes in float64 when given float64 rows."""
-    view = ReferenceView(camera, options, variance)
-    for name in ("sums", "alpha", "g_sums", "g_alpha", "moment", "g_moment", "g_median_depth"):
-        setattr(view, name, getattr(view, name).double())
-    view.layers = view.layers._replace(median_depth=torch.zeros_like(view.alpha))
-    return view
 
 
 def carried(view: Any, params: Tensor, s: Scene, maps: bool) -> dict[str, Tensor]:
@@ -72,7 +61,7 @@ def test_planes_and_gradients_follow_the_definition(kind: str, depth: str, varia
     s = scene(kind, 60)
     options, params = gated(depth), params_of(s)
     got = carried(CpuView(s.camera, options, variance), params, s, maps)
-    want = carried(exact(s.camera, options, variance), params.double(), s, maps)
+    want = carried(double_view(s.camera, options, variance), params.double(), s, maps)
     for name, value in want.items():
         assert_same_vector(got[name], value, 1e-3 if name == "planes" else 2e-4, name)
 
@@ -82,7 +71,7 @@ def test_every_instruction_set_follows_it(isa: str, depth: str) -> None:
     s, options = scene("random", 60), gated(depth)
     params = params_of(s)
     got = carried(CpuView(s.camera, options), params, s, True)
-    want = carried(exact(s.camera, options), params.double(), s, True)
+    want = carried(double_view(s.camera, options), params.double(), s, True)
     for name, value in want.items():
         assert_same_vector(got[name], value, 1e-3 if name == "planes" else 2e-4, f"{isa} {name}")
 

@@ -18,22 +18,12 @@ from sigmasplat.render.blended_values import blend_values
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.reference import operators as reference
-from sigmasplat.render.reference.view import ReferenceView
-from splat_fields import CPU, crowd, params_of, plane_gradients
+from splat_fields import CPU, crowd, double_view, params_of, plane_gradients
 from splat_scenes import KINDS, WIDE, Scene, assert_same_vector, scene
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
 RAY = RenderConfig(depth="ray")
-
-
-def exact(camera: Camera, variance: bool = True) -> ReferenceView:
-    """Make a reference view that computes in float64 when given float64 rows."""
-    view = ReferenceView(camera, RAY, variance)
-    for name in ("sums", "alpha", "g_sums", "g_alpha", "moment", "g_moment", "g_median_depth"):
-        setattr(view, name, getattr(view, name).double())
-    view.layers = view.layers._replace(median_depth=torch.zeros_like(view.alpha))
-    return view
 
 
 def carried(view: Any, params: Tensor, s: Scene, maps: bool) -> dict[str, Tensor]:
@@ -63,7 +53,7 @@ def test_planes_and_gradients_follow_the_definition(kind: str, variance: bool, m
     s = scene(kind, 60)
     params = params_of(s)
     got = carried(CpuView(s.camera, RAY, variance), params, s, maps)
-    want = carried(exact(s.camera, variance), params.double(), s, maps)
+    want = carried(double_view(s.camera, RAY, variance), params.double(), s, maps)
     for name, value in want.items():
         assert_same_vector(got[name], value, 1e-3 if name == "planes" else 2e-4, name)
 
@@ -71,7 +61,8 @@ def test_planes_and_gradients_follow_the_definition(kind: str, variance: bool, m
 def test_every_instruction_set_follows_it(isa: str) -> None:
     s = crowd()
     params = params_of(s)
-    got, want = carried(CpuView(s.camera, RAY), params, s, True), carried(exact(s.camera), params.double(), s, True)
+    got = carried(CpuView(s.camera, RAY), params, s, True)
+    want = carried(double_view(s.camera, RAY), params.double(), s, True)
     for name, value in want.items():
         assert_same_vector(got[name], value, 2e-3, f"{isa} {name}")
 
