@@ -32,15 +32,6 @@ class Gradients:
         self.given.append((keyframe.index, grad2d.clone()))
 
 
-def double_view(camera: Camera, options: RenderConfig, variance: bool = True) -> ReferenceView:
-    """Make a reference view that computes in float64 when given float64 rows."""
-    view = ReferenceView(camera, options, variance)
-    for name in ("sums", "alpha", "g_sums", "g_alpha", "moment", "g_moment", "g_median_depth"):
-        setattr(view, name, getattr(view, name).double())
-    view.layers = view.layers._replace(median_depth=torch.zeros_like(view.alpha))
-    return view
-
-
 def params_of(s: Scene) -> Tensor:
     """Write a scene as parameter rows [N, 17], float32, with variances from e⁻⁷ to e⁻¹."""
     log_variances = torch.as_tensor(np.random.default_rng(5).uniform(-7, -1, (len(s.means), 3)))
@@ -101,9 +92,10 @@ def view_on(kernels: str, camera: Camera, variance: bool = True) -> CpuView | Cu
     return CpuView(camera, OPTIONS, variance)
 
 
-def exact_view(camera: Camera, variance: bool) -> ReferenceView:
+def exact_view(camera: Camera, variance: bool, options: RenderConfig = OPTIONS) -> ReferenceView:
     """Make a reference view that computes in float64 when given float64 rows."""
-    view = ReferenceView(camera, OPTIONS, variance)
+    view = ReferenceView(camera, options, variance)
     for name in ("sums", "alpha", "g_sums", "g_alpha", "moment", "g_moment", "g_median_depth"):
         setattr(view, name, getattr(view, name).double())
+    view.layers = view.layers._replace(median_depth=torch.zeros_like(view.alpha))
     return view

@@ -18,7 +18,7 @@ from sigmasplat.render.blended_values import blend_values
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.reference import operators as reference
-from splat_fields import CPU, crowd, double_view, params_of, plane_gradients
+from splat_fields import CPU, crowd, exact_view, params_of, plane_gradients
 from splat_scenes import KINDS, SMALL, WIDE, Scene, assert_same_vector, make, scene
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -61,7 +61,7 @@ def test_planes_and_gradients_follow_the_definition(kind: str, depth: str, varia
     s = scene(kind, 60)
     options, params = gated(depth), params_of(s)
     got = carried(CpuView(s.camera, options, variance), params, s, maps)
-    want = carried(double_view(s.camera, options, variance), params.double(), s, maps)
+    want = carried(exact_view(s.camera, variance, options), params.double(), s, maps)
     for name, value in want.items():
         assert_same_vector(got[name], value, 1e-3 if name == "planes" else 2e-4, name)
 
@@ -71,7 +71,7 @@ def test_every_instruction_set_follows_it(isa: str, depth: str) -> None:
     s, options = scene("random", 60), gated(depth)
     params = params_of(s)
     got = carried(CpuView(s.camera, options), params, s, True)
-    want = carried(double_view(s.camera, options), params.double(), s, True)
+    want = carried(exact_view(s.camera, True, options), params.double(), s, True)
     for name, value in want.items():
         assert_same_vector(got[name], value, 1e-3 if name == "planes" else 2e-4, f"{isa} {name}")
 

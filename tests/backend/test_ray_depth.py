@@ -18,7 +18,7 @@ from sigmasplat.render.blended_values import blend_values
 from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.cuda.view import CudaView
 from sigmasplat.render.reference import operators as reference
-from splat_fields import CPU, crowd, double_view, params_of, plane_gradients
+from splat_fields import CPU, crowd, exact_view, params_of, plane_gradients
 from splat_scenes import KINDS, WIDE, Scene, assert_same_vector, scene
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -53,7 +53,7 @@ def test_planes_and_gradients_follow_the_definition(kind: str, variance: bool, m
     s = scene(kind, 60)
     params = params_of(s)
     got = carried(CpuView(s.camera, RAY, variance), params, s, maps)
-    want = carried(double_view(s.camera, RAY, variance), params.double(), s, maps)
+    want = carried(exact_view(s.camera, variance, RAY), params.double(), s, maps)
     for name, value in want.items():
         assert_same_vector(got[name], value, 1e-3 if name == "planes" else 2e-4, name)
 
@@ -62,7 +62,7 @@ def test_every_instruction_set_follows_it(isa: str) -> None:
     s = crowd()
     params = params_of(s)
     got = carried(CpuView(s.camera, RAY), params, s, True)
-    want = carried(double_view(s.camera, RAY), params.double(), s, True)
+    want = carried(exact_view(s.camera, True, RAY), params.double(), s, True)
     for name, value in want.items():
         assert_same_vector(got[name], value, 2e-3, f"{isa} {name}")
 
