@@ -18,7 +18,6 @@ from sigmasplat.fit.field import fit_field, loss_weights
 from sigmasplat.fit.mapping_step import TorchStep
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model import se3
-from sigmasplat.model.camera import Camera
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.render.cpu.view import CpuView
@@ -36,14 +35,6 @@ CG = MappingConfig(
 )  # fmt: skip
 WEIGHTS = loss_weights(replace(CG, weight_mean_depth=0.5))
 RATES = Rates(torch.linspace(1e-4, 5e-3, 17))
-
-
-def exact(camera: Camera, variance: bool = True) -> ReferenceView:
-    """Make a reference view whose every plane is of float64."""
-    view = exact_view(camera, variance)
-    view.moment, view.g_moment, view.g_median_depth = (torch.zeros_like(view.alpha) for _ in range(3))
-    view.layers = view.layers._replace(median_depth=torch.zeros_like(view.alpha))
-    return view
 
 
 def carried(view: View, params: Tensor, s: Scene) -> tuple[Tensor, Tensor, Tensor]:
@@ -70,7 +61,7 @@ def test_rows_pull_and_twist_follow_the_definition(kind: str, variance: bool) ->
     s = scene(kind, 60)
     params = params_of(s)
     got = carried(CpuView(s.camera, OPTIONS, variance), params, s)
-    want = carried(exact(s.camera, variance), params.double(), s)
+    want = carried(exact_view(s.camera, variance), params.double(), s)
     for name, columns in COLUMNS.items():
         if variance or name != "log_variances":
             assert_same_vector(got[0][:, columns], want[0][:, columns], what=name)
@@ -82,7 +73,7 @@ def test_many_splats_on_threads(isa: str) -> None:
     s = crowd()
     params = params_of(s)
     got = carried(CpuView(s.camera, OPTIONS), params, s)
-    want = carried(exact(s.camera), params.double(), s)
+    want = carried(exact_view(s.camera, True), params.double(), s)
     for name, columns in COLUMNS.items():
         assert_same_vector(got[0][:, columns], want[0][:, columns], 1e-3, f"{isa} {name}")
     assert_same_vector(got[1], want[1], 1e-3, "pull")
@@ -129,7 +120,7 @@ def difference(f: Callable[[float], float], h: float) -> float:
 def test_each_new_term_by_finite_differences(name: str) -> None:
     """Along random directions of rows and pose, in double; steps so small that no pixel changes its median splat."""
     s = scene("random", 12)
-    params, T, view = params_of(s).double(), s.T_camera_world.numpy(), exact(s.camera)
+    params, T, view = params_of(s).double(), s.T_camera_world.numpy(), exact_view(s.camera, True)
     target = seen(s, tuple(view.alpha.shape))
     target.color, target.depth = target.color.double(), target.depth.double()
     assert loss_of(view, params, T, target, name) > 1e-3
@@ -207,7 +198,7 @@ def test_a_step_with_every_term_follows_its_definition(isa: str, n: int) -> None
     params = params_of(s)[:n].contiguous()
     T = se3.exp(np.array([0, 0, 0, 0, 0.4, 0])) @ s.T_camera_world.numpy()
     results = []
-    for view, rows in ((CpuView(s.camera, OPTIONS), params.clone()), (exact(s.camera), params.double())):
+    for view, rows in ((CpuView(s.camera, OPTIONS), params.clone()), (exact_view(s.camera, True), params.double())):
         target = seen(s, tuple(view.alpha.shape))
         if rows.dtype == torch.float64:
             target.color, target.depth = target.color.double(), target.depth.double()
