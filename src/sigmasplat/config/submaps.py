@@ -138,6 +138,9 @@ class FinalConfig:
     seconds: float = 0.0
     """Time budget of the refinement in seconds: it ends at the latest then, even if steps are left, and learning rates
     fall in time. The result then depends on the speed of the machine. 0 = no limit."""
+    exposure: bool = False
+    """Whether the exposure of each keyframe relative to the map is fitted during refinement: a gain and an offset for
+    each colour channel. Frames between keyframes get an interpolated exposure."""
     order: Literal["random", "epochs"] = "random"
     """Order of the keyframes in refinement: random = drawn for each step (paper); epochs = every keyframe once, in
     random order, before any is used again."""

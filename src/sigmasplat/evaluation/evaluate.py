@@ -128,11 +128,15 @@ def _anchors(run: RunFolder, records: Log, final: FinalConfig) -> NDArray[np.flo
 
 
 def _map_sources(run: RunFolder, field: GaussianField, records: Log, final: FinalConfig) -> views.MapSources:
-    """Return the final map and the submaps, with the poses of the frames in them if the checkpoint has these."""
+    """Return the final map and the submaps, with the poses of the frames in them and the exposures of the frames, if
+    the checkpoint has these."""
     anchors = _anchors(run, records, final)
-    poses = None if anchors is None else run.read_checkpoint()[0].get("T_submap_camera")
-    known = None if poses is None or len(poses) != len(records) else np.asarray(poses, np.float64)
-    return views.MapSources(field, run.submaps, anchors, T_submap_camera=known)
+    saved = {} if anchors is None else run.read_checkpoint()[0]
+    poses, exposures = (
+        np.asarray(saved[name], np.float64) if len(saved.get(name, ())) == len(records) else None
+        for name in ("T_submap_camera", "exposure")
+    )
+    return views.MapSources(field, run.submaps, anchors, T_submap_camera=poses, exposures=exposures)
 
 
 def _with_prediction(

@@ -30,6 +30,7 @@ class FinishedRun:
 
     field: the final map in the world; store: its submaps; anchors: T_world_submap of each; members: the submaps that
     are connected to the world; refined: T_submap_camera of their keyframes as the final map has moved them, by submap;
+    exposures: those of the same keyframes [K, 3, 2] relative to the final map; frame_exposures [F, 3, 2];
     submap_of [F], T_submap_camera [F, 4, 4]: the submap of each frame and its pose there; believed [F]: whether its
     pose is believed; indices [F]: its number in the source; p_off [F]; uncertainty: how sure the final map is, if it
     was measured; errors: those of the path; keyframes: their rows.
@@ -42,6 +43,8 @@ class FinishedRun:
     anchors: list[Matrix]
     members: list[int]
     refined: dict[int, list[Matrix]]
+    exposures: dict[int, Matrix]
+    frame_exposures: Matrix
     path: Trajectory
     submap_of: list[int]
     T_submap_camera: Matrix
@@ -66,16 +69,20 @@ class FinishedRun:
         }  # fmt: skip
         return FinishedRun(
             slam.config, slam.view.camera, slam.field, store, slam.atlas.anchors, slam.atlas.members(0),
-            slam.atlas.refined, slam.trajectory(), [place.submap for place in slam.atlas.places],
-            slam.atlas.T_submap_camera, slam.believed(),
+            slam.atlas.refined, slam.atlas.exposures, slam.atlas.frame_exposures(), slam.trajectory(),
+            [place.submap for place in slam.atlas.places], slam.atlas.T_submap_camera, slam.believed(),
             [step.index for step in slam.steps], np.array([step.p_off for step in slam.steps]), counts,
             slam.uncertainty, PathCovariance.of(slam.checkpoint()), slam.keyframe_indices,
         )  # fmt: skip
 
     def part(self, members: Sequence[int], refined: bool = False) -> SubmapStore:
-        """Return some submaps; with `refined`, their keyframes have the poses of the final map."""
+        """Return some submaps; with `refined`, as the final map sees them: with its keyframe poses and in its
+        exposure."""
         part = StorePart(self.store, members)
-        return RefinedStore(part, [self.refined[s] for s in members]) if refined and self.refined else part
+        if not refined:
+            return part
+        poses = [self.refined[s] for s in members] if self.refined else None
+        return RefinedStore(part, poses, [self.exposures[s] for s in members] if self.exposures else None)
 
     @property
     def held_back(self) -> list[int]:

@@ -24,6 +24,7 @@ from sigmasplat.evaluation.unseen_views import UnseenView, away_views, held_back
 from sigmasplat.evaluation.view_predictors import PREDICTORS, Predictor, SeenView, see
 from sigmasplat.metrics.scored_view import COVERED_ALPHA
 from sigmasplat.model import se3
+from sigmasplat.model.exposure import NEUTRAL, exposed
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.map_uncertainty import MapUncertainty
 from sigmasplat.model.selection import evenly_spread
@@ -184,7 +185,8 @@ def measure(
     final = maps.final()
     values = splat_values(final)
     for done, (kind, map_name, view, seen) in enumerate(_seen_views(maps, final, values, views), 1):
-        for quantity, columns in _pixels(view, seen, predictors, random).items():
+        exposure = view.exposure if map_name == FINAL else NEUTRAL
+        for quantity, columns in _pixels(view, seen, exposure, predictors, random).items():
             _add(samples.setdefault(Kind(quantity, map_name, kind), Samples()), columns)
         progress(done, total)
     facts = run_facts(run, source) | {"views": {kind: len(some) for kind, some in views.items()}}
@@ -219,14 +221,15 @@ def _seen_views(
 
 
 def _pixels(
-    view: UnseenView, seen: SeenView, predictors: Sequence[Predictor], random: np.random.Generator
+    view: UnseenView, seen: SeenView, exposure: Matrix, predictors: Sequence[Predictor], random: np.random.Generator
 ) -> dict[str, dict[str, Floats]]:
     """Return error, alpha and predictions at random pixels, by quantity.
 
-    Colour is scored on all pixels; depth where the view has a reading and the map covers the pixel.
+    Colour is scored on all pixels, in the exposure [3, 2] of the view relative to the map; depth where the view has a
+    reading and the map covers the pixel.
     """
     alpha, frame = _array(seen.rendered.alpha), view.frame
-    color_error2 = (np.clip(_array(seen.rendered.color), 0.0, 1.0) - frame.color) ** 2
+    color_error2 = (exposed(_array(seen.rendered.color), exposure) - frame.color) ** 2
     known = (frame.depth_m > 0) & (alpha > COVERED_ALPHA)
     errors = {
         "color": (color_error2, np.arange(alpha.size)),

@@ -8,6 +8,7 @@ from sigmasplat.config import Config
 from sigmasplat.evaluation.finished_run import FinishedRun
 from sigmasplat.evaluation.view_selection import working_frame
 from sigmasplat.metrics.trajectory import aligned_poses, associate
+from sigmasplat.model.exposure import NEUTRAL
 from sigmasplat.model.frame import Frame, resized_depth
 from sigmasplat.model.selection import evenly_spread
 from sigmasplat.sources.base import Source
@@ -17,13 +18,14 @@ from sigmasplat.types import Matrix
 @dataclass(frozen=True, eq=False)
 class UnseenView:
     """A recorded view to predict, and its pose in the world; exact: whether its depth is the true depth;
-    T_submap_camera: the pose of a frame of the run in its submap."""
+    T_submap_camera: the pose of a frame of the run in its submap; exposure [3, 2]: relative to the final map."""
 
     frame: Frame
     T_world_camera: Matrix
     submap: int
     exact: bool
     T_submap_camera: Matrix = field(default_factory=lambda: np.eye(4))
+    exposure: Matrix = field(default_factory=NEUTRAL.copy)
 
 
 def held_back_views(run: FinishedRun, source: Source, most: int) -> list[UnseenView]:
@@ -33,6 +35,7 @@ def held_back_views(run: FinishedRun, source: Source, most: int) -> list[UnseenV
         replace(
             _unseen_view(run.config, source, run.indices[row], run.path.T_world_camera[row], run.submap_of[row]),
             T_submap_camera=run.T_submap_camera[row],
+            exposure=run.frame_exposures[row],
         )
         for row in evenly_spread(rows, most)
     ]

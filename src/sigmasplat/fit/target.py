@@ -59,10 +59,11 @@ class Target:
         depth[: self.camera.height, : self.camera.width] = torch.from_numpy(depth_m)
         return Target(self.camera, self.color, depth, int((depth_m > 0).sum()))
 
-    def without_exposure(self, a: float, b: float) -> "Target":
-        """Return the same depth with the colours before an exposure exp(a) · colour + b, in [0, 1]."""
+    def without_exposure(self, exposure: NDArray[np.float64]) -> "Target":
+        """Return the same depth with the colours in the exposure of the map (`model.exposure`), in [0, 1]."""
+        gain, offset = torch.from_numpy(exposure).float().T[..., None, None]
         color, inside = torch.zeros_like(self.color), np.s_[:, : self.camera.height, : self.camera.width]
-        color[inside] = ((self.color[inside] - b) / np.exp(a)).clamp(0.0, 1.0)
+        color[inside] = ((self.color[inside] - offset) / gain).clamp_(0.0, 1.0)
         return Target(self.camera, color, self.depth, self.valid_pixels)
 
     def picture(self) -> Picture:

@@ -39,7 +39,8 @@ class ScoredView:
 
     recorded, rendered: [H, W, 3] in [0, 1]; recorded_depth_m [H, W] (0 = no reading); rendered_depth_m [H, W]
     (0 where alpha ≤ ½); alpha [H, W]; variance: V [H, W, 3], colour² (VarSplat §1); notes: shown below the view strip;
-    predicted: the predictive variances, None if they are not known.
+    predicted: the predictive variances, None if they are not known; neutral [H, W, 3]: the rendering in the exposure of
+    the map, None if it is `rendered`.
     """
 
     index: int
@@ -52,6 +53,7 @@ class ScoredView:
     variance: NDArray[np.float32]
     notes: tuple[str, ...] = field(default=())
     predicted: PredictedErrors | None = None
+    neutral: NDArray[np.float32] | None = None
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -87,13 +89,15 @@ class ScoredView:
         """Return the scores of the view.
 
         PSNR (dB), SSIM, depth L1 (m) and the share of depth readings that the map covers use the valid pixels. PSNR of
-        the image (dB), MS-SSIM and LPIPS use all pixels, as published systems do; nan if they are not known.
+        the image (dB), MS-SSIM and LPIPS use all pixels, as published systems do; nan if they are not known. The
+        neutral PSNR (dB, valid pixels) is that of the rendering in the exposure of the map.
         """
         valid = self.valid
         covered = float((self.rendered_depth_m > 0)[valid].mean()) if valid.any() else float("nan")
         factors = similarity_factors(self.rendered, self.recorded) if min(valid.shape) >= SSIM_LEAST_PX else None
         return {
             "psnr_db": psnr(self.rendered, self.recorded, valid),
+            "psnr_neutral_db": psnr(self.rendered if self.neutral is None else self.neutral, self.recorded, valid),
             "ssim": ssim(self.rendered, self.recorded, valid, factors),
             "depth_l1_m": depth_l1(self.rendered_depth_m, self.recorded_depth_m),
             "depth_coverage": covered,

@@ -14,6 +14,7 @@ from sigmasplat.metrics.lpips import Lpips
 from sigmasplat.metrics.scored_view import COVERED_ALPHA, PredictedErrors, ScoredView
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.exposure import exposed
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import SubmapStore
@@ -54,6 +55,7 @@ class MapSources:
     predict: predicts the variances of views of the final map; None if it was not measured how sure the map is.
     T_submap_camera [F, 4, 4]: the pose of each frame in its submap, which differs from the pose in the world if the
     refinement of the final map has moved keyframes; None: it follows from the pose in the world.
+    exposures [F, 3, 2]: those of the frames relative to the final map (`model.exposure`); None: not fitted.
     """
 
     final: GaussianField
@@ -61,6 +63,11 @@ class MapSources:
     T_world_submap: NDArray[np.float64] | None
     predict: Predictor | None = None
     T_submap_camera: NDArray[np.float64] | None = None
+    exposures: NDArray[np.float64] | None = None
+
+    def exposure(self, record: Mapping[str, Any]) -> NDArray[np.float64] | None:
+        """Return the exposure [3, 2] of a view relative to the final map; None if exposures are not fitted."""
+        return None if self.exposures is None or "row" not in record else self.exposures[record["row"]]
 
     def T_camera_submap(self, record: Mapping[str, Any]) -> NDArray[np.float64] | None:
         """Return the pose [4, 4] of a view that the splats of its submap were fitted to; None if the run kept no
@@ -91,7 +98,8 @@ def render_views(
         submap = maps.submap(index)
         for _, kind, record in group:
             frame, T_camera_world = frame_of(record["index"]), se3.inverse(record["T_world_camera"])
-            final = scored_view(frame, renderer(maps.final, frame.camera, T_camera_world), kind)
+            rendered = renderer(maps.final, frame.camera, T_camera_world)
+            final = scored_view(frame, rendered, kind, exposure=maps.exposure(record))
             if maps.predict is not None and kind == HELD_OUT:
                 final = replace(final, predicted=predicted_errors(maps.predict(frame.camera, T_camera_world)))
             before = None
@@ -102,13 +110,21 @@ def render_views(
             yield final, before
 
 
-def scored_view(frame: Frame, rendered: Render, kind: str, notes: tuple[str, ...] = ()) -> ScoredView:
-    """Pair a frame with its rendering. Depth is Σwz/Σw where the map covers the pixel, else 0."""
-    alpha = _array(rendered.alpha)
+def scored_view(
+    frame: Frame,
+    rendered: Render,
+    kind: str,
+    notes: tuple[str, ...] = (),
+    exposure: NDArray[np.float64] | None = None,
+) -> ScoredView:
+    """Pair a frame with its rendering, in the frame's exposure [3, 2] if given. Depth is Σwz/Σw where the map covers
+    the pixel, else 0."""
+    alpha, neutral = _array(rendered.alpha), np.clip(_array(rendered.color), 0.0, 1.0)
+    shown = neutral if exposure is None else exposed(_array(rendered.color), exposure)
     depth = np.where(alpha > COVERED_ALPHA, _array(rendered.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0)
     return ScoredView(
-        frame.index, kind, frame.color, frame.depth_m, np.clip(_array(rendered.color), 0.0, 1.0),
-        depth.astype(np.float32), alpha, _array(rendered.variance), notes,
+        frame.index, kind, frame.color, frame.depth_m, shown, depth.astype(np.float32), alpha,
+        _array(rendered.variance), notes, neutral=neutral,
     )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.model import se3
+from sigmasplat.model.exposure import between
 from sigmasplat.types import Matrix
 
 
@@ -44,6 +45,7 @@ class Atlas:
     places: one per frame.
     refined: T_submap_camera of the keyframes of each submap in the final map, after its refinement has moved them; the
     world poses of keyframes and of their frames then come from these.
+    exposures: those of the same keyframes [K, 3, 2] relative to the final map (`model.exposure`).
     components: one number per submap. Submaps of a component are connected, and their anchors are in one frame: the
     world for component 0, else the first camera of the component. A component joins another when a place is recognised.
     """
@@ -55,6 +57,7 @@ class Atlas:
     places: list[Place] = field(default_factory=list)
     components: list[int] = field(default_factory=list)
     refined: dict[int, list[Matrix]] = field(default_factory=dict)
+    exposures: dict[int, Matrix] = field(default_factory=dict)
 
     def begin_submap(self, T_parent_submap: Matrix | None = None, parent: int = -1) -> None:
         """Append a submap at its pose in a parent submap, the last one by default; without a pose, a new component
@@ -118,6 +121,16 @@ class Atlas:
     def T_submap_camera(self) -> Matrix:
         """Return the poses of all frames in their submaps [F, 4, 4], to which the splats of the submaps were fitted."""
         return np.array([self.keyframe_poses[s][k] @ T for s, k, T in self.places]).reshape(-1, 4, 4)
+
+    def frame_exposures(self) -> Matrix:
+        """Return the exposures of all frames [F, 3, 2] relative to the final map, interpolated between keyframes."""
+        first = dict[tuple[int, int], int]()
+        for row, (s, k, _) in enumerate(self.places):
+            first.setdefault((s, k), row)
+        known = [(row, self.exposures[s][k]) for (s, k), row in first.items() if s in self.exposures]
+        rows = np.array([row for row, _ in known], np.int64)
+        exposures = np.array([exposure for _, exposure in known]).reshape(-1, 3, 2)
+        return between(rows, exposures, np.arange(len(self.places)))
 
     def T_world_keyframe(self, submap: int) -> Matrix:
         """Return the poses of a submap's keyframes [K, 4, 4]."""

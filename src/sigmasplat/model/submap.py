@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.exposure import between, unexposed
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Detail
 from sigmasplat.model.photo import Photo
@@ -30,6 +31,12 @@ class Picture:
     def unit_color(self) -> NDArray[np.float32]:
         """Return the colour in [0, 1]."""
         return self.color.astype(np.float32) / np.float32(255.0)
+
+    def without_exposure(self, exposure: Matrix) -> "Picture":
+        """Return the same images with the colour in the exposure of the map (`model.exposure`); photo and detail are
+        not changed."""
+        color = np.rint(unexposed(self.unit_color, exposure) * 255.0).astype(np.uint8)
+        return replace(self, color=color)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,14 +140,16 @@ class StorePart:
 
 @dataclass(frozen=True, eq=False)
 class RefinedStore:
-    """The submaps of a store with the poses of their keyframes that the refinement of the final map has moved. Probe
-    views follow their keyframe. It can only be read.
+    """The submaps of a store as the final map sees them: with the poses of their keyframes that its refinement has
+    moved, and with images in the exposure of the map. Probe views follow their keyframe. It can only be read.
 
-    keyframe_poses: T_submap_camera [4, 4] of each submap's keyframes. The splats of the submaps fit the old poses.
+    keyframe_poses: T_submap_camera [4, 4] of each submap's keyframes, None: not moved. The splats of the submaps fit
+    the old poses. exposures: [K, 3, 2] of each submap's keyframes (`model.exposure`), None: not fitted.
     """
 
     store: SubmapStore
-    keyframe_poses: Sequence[Sequence[Matrix]]
+    keyframe_poses: Sequence[Sequence[Matrix]] | None = None
+    exposures: Sequence[Matrix] | None = None
 
     def __len__(self) -> int:
         return len(self.store)
@@ -151,19 +160,29 @@ class RefinedStore:
 
     def load(self, index: int) -> Submap:
         """Return a submap with the moved poses."""
-        submap, poses = self.store.load(index), np.array(self.keyframe_poses[index]).reshape(-1, 4, 4)
+        submap = self.store.load(index)
+        if self.keyframe_poses is None:
+            return submap
+        poses = np.array(self.keyframe_poses[index]).reshape(-1, 4, 4)
         keyframe = np.searchsorted(submap.frames, submap.probe_frames, side="right") - 1
         before = submap.T_submap_camera[keyframe]
         probes = poses[keyframe] @ se3.inverse(before) @ submap.T_submap_probe
         return replace(submap, T_submap_camera=poses, T_submap_probe=probes)
 
     def picture(self, index: int, keyframe: int) -> Picture:
-        """Return the images of one keyframe of a submap."""
-        return self.store.picture(index, keyframe)
+        """Return the images of one keyframe of a submap, in the exposure of the map."""
+        picture = self.store.picture(index, keyframe)
+        return picture if self.exposures is None else picture.without_exposure(self.exposures[index][keyframe])
 
     def probe(self, index: int, probe: int) -> Picture:
-        """Return the images of one probe view of a submap."""
-        return self.store.probe(index, probe)
+        """Return the images of one probe view of a submap, in the exposure of the map: its exposure is interpolated
+        between those of keyframes."""
+        picture = self.store.probe(index, probe)
+        if self.exposures is None:
+            return picture
+        submap = self.store.load(index)
+        at = np.array(submap.probe_frames[probe : probe + 1])
+        return picture.without_exposure(between(np.array(submap.frames), self.exposures[index], at)[0])
 
 
 def refuse_misfit(submap: Submap, pictures: Sequence[Picture], next_index: int, probes: Sequence[Picture] = ()) -> None:

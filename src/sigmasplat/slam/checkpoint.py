@@ -17,7 +17,8 @@ def checkpoint_of(
     active: GaussianField, path: Trajectory, atlas: Atlas, keyframes: Sequence[int], edges: Sequence[Edge]
 ) -> dict[str, Tensor]:
     """Return the active submap's field with its attributes and its optimiser state, poses, times, keyframes, anchors,
-    the submap of each frame, and the errors of the path, in host memory."""
+    the submap of each frame, the exposures of frames if they are known, and the errors of the path, in host
+    memory."""
     return {
         **_rows_of(active, ""),
         **{key: part for name, rows in active.attributes.items() for key, part in _rows_of(rows, f"{name}_").items()},
@@ -32,6 +33,7 @@ def checkpoint_of(
         "T_world_submap": torch.from_numpy(np.array(atlas.anchors).reshape(-1, 4, 4)),
         "submap_component": torch.tensor(atlas.components, dtype=torch.int64),
         "frame_submap": torch.tensor([place.submap for place in atlas.places], dtype=torch.int64),
+        **({"exposure": torch.from_numpy(atlas.frame_exposures())} if atlas.exposures else {}),
         **recorded(atlas, edges),
     }
 

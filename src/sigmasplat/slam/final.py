@@ -27,10 +27,12 @@ from sigmasplat.types import Matrix, Progress, no_progress
 
 class FinalMap(NamedTuple):
     """The global map in the world, in host memory; the poses of its keyframes, T_submap_camera [4, 4] of each submap's
-    keyframes, as refinement has moved them (None: it has moved none); the number of refinement steps."""
+    keyframes, as refinement has moved them (None: it has moved none); their exposures [K, 3, 2] relative to the map
+    (None: not fitted); the number of refinement steps."""
 
     field: GaussianField
     keyframe_poses: list[list[Matrix]] | None = None
+    keyframe_exposures: list[Matrix] | None = None
     steps: int = 0
 
 
@@ -68,7 +70,8 @@ def final_map(
     done = refine_on_photos(on_device, keyframes, config, view, random, progress, done, saved, clock)
     moves = config.final.lr_pose_translation or config.final.lr_pose_rotation
     poses = keyframes.poses_in(anchors) if moves else None
-    return FinalMap(on_device.to(torch.device("cpu")), poses, done)
+    exposures = keyframes.exposures_in_submaps() if config.final.exposure else None
+    return FinalMap(on_device.to(torch.device("cpu")), poses, exposures, done)
 
 
 def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix], final: FinalConfig) -> None:

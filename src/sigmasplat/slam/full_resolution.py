@@ -11,6 +11,7 @@ from sigmasplat.config import Config, MappingConfig
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
+from sigmasplat.model.exposure import centred
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
@@ -41,9 +42,11 @@ class PhotoReader:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def __getitem__(self, i: int) -> Keyframe:
+    def in_map_exposure(self, i: int) -> Keyframe:
+        """Return the photo of a keyframe with its colours in the exposure of the map."""
         row = self.rows[i]
-        return Keyframe(row, self._target(row), self.keyframes.poses[row], fixed=True)
+        target = self._target(row).without_exposure(centred(self.keyframes.exposures)[row])
+        return Keyframe(row, target, self.keyframes.poses[row], fixed=True)
 
     def _read(self, row: int) -> Target:
         picture = self.keyframes.store.picture(*self.keyframes.places[row])
@@ -114,4 +117,4 @@ def _draw(
     """Draw one keyframe per step, uniformly; call `progress` before each."""
     for step in steps:
         progress(step, total)
-        yield [images[int(random.integers(len(images)))]]
+        yield [images.in_map_exposure(int(random.integers(len(images))))]

@@ -11,9 +11,11 @@ import numpy as np
 from sigmasplat.config import Config, FinalConfig, MappingConfig
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.fit.adam import Rates, VectorAdam
+from sigmasplat.fit.exposure import fit_exposure
 from sigmasplat.fit.field import fit_field
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.model import se3
+from sigmasplat.model.exposure import NEUTRAL, centred
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.render.view import View
@@ -21,6 +23,8 @@ from sigmasplat.slam.pruning import prune_by_weight
 from sigmasplat.slam.shape_limits import limit_shapes
 from sigmasplat.types import Matrix, Progress
 
+EXPOSURE_FROM = 0.1
+"""Exposures are fitted from this share of the refinement on: the merged map has the colours of single submaps."""
 CACHE_BYTES = 64 << 20
 """Memory for prepared pictures; other pictures are read again when they are drawn."""
 
@@ -28,12 +32,14 @@ CACHE_BYTES = 64 << 20
 @dataclass(eq=False)
 class Refined:
     """A refinement between two steps: the steps done, the map, the keyframes' poses T_world_camera [4, 4] with their
-    Adam states, the keyframes left in this epoch, the seconds spent, and the state of the random numbers."""
+    Adam states, their exposures [K, 3, 2], the keyframes left in this epoch, the seconds spent, and the state of the
+    random numbers."""
 
     done: int
     field: GaussianField
     poses: list[Matrix]
     motions: list[VectorAdam]
+    exposures: Matrix
     left: list[int]
     spent_s: float
     numbers: dict[str, Any]
@@ -53,8 +59,9 @@ class KeyframeReader:
     """All keyframes of all submaps with their poses in the world; pictures are read from the store on demand.
 
     anchors: T_world_submap [4, 4] of each submap; `places`: submap and number of each keyframe; `poses`: their
-    T_world_camera [4, 4], which `refine` may move; `motions`: Adam's state of each pose; `left`: the keyframes left in
-    the current epoch. Raises SigmaSplatError if there is no keyframe, or a submap's camera is not the view's.
+    T_world_camera [4, 4], which `refine` may move; `motions`: Adam's state of each pose; `exposures` [K, 3, 2]: those
+    of the images relative to the map, as fitted last; `left`: the keyframes left in the current epoch. Raises
+    SigmaSplatError if there is no keyframe, or a submap's camera is not the view's.
     """
 
     def __init__(self, store: SubmapStore, anchors: Sequence[Matrix], view: View) -> None:
@@ -67,6 +74,7 @@ class KeyframeReader:
         if not self.places:
             raise SigmaSplatError("the submaps have no keyframes, so the final map cannot be refined")
         self.motions, self.left = [VectorAdam.of(6) for _ in self.poses], list[int]()
+        self.exposures = np.tile(NEUTRAL, (len(self.poses), 1, 1))
         self._target = lru_cache(max(1, CACHE_BYTES // (16 * view.alpha.numel())))(self._read)
 
     def _add(self, index: int, T_world_submap: Matrix) -> None:
@@ -83,8 +91,16 @@ class KeyframeReader:
         return (self[i] for i in range(len(self)))
 
     def __getitem__(self, i: int) -> Keyframe:
-        """Return a keyframe. Its pose can move, except that of the first keyframe, which fixes the gauge."""
+        """Return a keyframe as recorded. Its pose can move, except that of the first keyframe, which fixes the
+        gauge."""
         return Keyframe(i, self._target(i), self.poses[i], fixed=i == 0, motion=self.motions[i])
+
+    def in_map_exposure(self, i: int) -> Keyframe:
+        """Return a keyframe with its colours in the exposure of the map."""
+        keyframe = self[i]
+        if (self.exposures != NEUTRAL).any():
+            keyframe.target = keyframe.target.without_exposure(centred(self.exposures)[i])
+        return keyframe
 
     def draw(self, order: str, random: np.random.Generator) -> int:
         """Return the number of the next keyframe: uniformly drawn, or the next one of an epoch (`final.order`)."""
@@ -96,11 +112,12 @@ class KeyframeReader:
     def state(self, done: int, field: GaussianField, spent_s: float, random: np.random.Generator) -> Refined:
         """Return a refinement after `done` steps, to be saved."""
         numbers = dict(random.bit_generator.state)
-        return Refined(done, field, self.poses, self.motions, list(self.left), spent_s, numbers)
+        return Refined(done, field, self.poses, self.motions, self.exposures, list(self.left), spent_s, numbers)
 
     def take(self, state: Refined) -> None:
         """Take over the keyframes' part of a saved refinement."""
         self.poses, self.motions, self.left = state.poses, state.motions, state.left
+        self.exposures = state.exposures
 
     def poses_in(self, anchors: Sequence[Matrix]) -> list[list[Matrix]]:
         """Return T_submap_camera [4, 4] of the keyframes of each submap; anchors: T_world_submap [4, 4] of each."""
@@ -108,6 +125,11 @@ class KeyframeReader:
         for (submap, _), T in zip(self.places, self.poses, strict=True):
             found[submap].append(se3.inverse(anchors[submap]) @ T)
         return found
+
+    def exposures_in_submaps(self) -> list[Matrix]:
+        """Return the exposures [K, 3, 2] of the keyframes of each submap, relative to the mean of all."""
+        found, submap_of = centred(self.exposures), np.array([submap for submap, _ in self.places])
+        return [found[submap_of == index] for index in range(len(self.store))]
 
     def _read(self, i: int) -> Target:
         return Target.of_picture(self.store.picture(*self.places[i]), self.camera, self.size)
@@ -139,7 +161,7 @@ def refine(
         steps = range(done, min(done + until_event, final.iterations))
         degree = min(final.sh_degree, done // final.sh_every)
         rates = decaying(mapping, final, done, clock) if _changes_rates(final) else None
-        drawn = _draw(keyframes, steps, config, random, progress, clock)
+        drawn = _draw(keyframes, steps, config, random, progress, clock, view)
         losses += (fitted := fit_field(field, view, drawn, mapping, schedule=rates, degree=degree).losses)
         done += len(fitted)
         limit_shapes(field, final.max_axis_ratio, final.max_needle_ratio)
@@ -217,16 +239,18 @@ def refinement(config: Config) -> MappingConfig:
 
 def _draw(
     keyframes: KeyframeReader, steps: range, config: Config, random: np.random.Generator, progress: Progress,
-    clock: Clock,
+    clock: Clock, view: View,
 ) -> Iterator[Sequence[Keyframe]]:  # fmt: skip
-    """Draw one keyframe per step; call `progress` before each, and keep its moved pose after it. End early if the time
-    budget is spent."""
+    """Draw one keyframe per step; call `progress` before each. After each, keep its moved pose and, with
+    `final.exposure`, fit its exposure to the view's rendering. End early if the time budget is spent."""
     for step in steps:
         if clock.is_over:
             return
         progress(max(step, int(clock.share * config.final.iterations)), config.final.iterations)
         i = keyframes.draw(config.final.order, random)
-        keyframe = keyframes[i]
-        keyframe.pose_rate = config.final.lr_decay ** _share(step, config.final, clock)
+        keyframe, share = keyframes.in_map_exposure(i), _share(step, config.final, clock)
+        keyframe.pose_rate = config.final.lr_decay**share
         yield [keyframe]
         keyframes.poses[i] = keyframe.T_world_camera
+        if config.final.exposure and share >= EXPOSURE_FROM:
+            keyframes.exposures[i] = fit_exposure(view, keyframes[i].target)

@@ -83,11 +83,13 @@ class Slam(World):
         store, anchors = StorePart(self.store, members), [self.atlas.anchors[s] for s in members]
         refining, measuring = (part_of(progress, first, total) for first in (0, steps))
         final = final_map(store, anchors, self.config, self.view, self.random, refining, self.saved_refinement)
-        self._final, self.refinement_steps, refined = final.field, final.steps, None
+        self._final, self.refinement_steps = final.field, final.steps
+        refined = RefinedStore(store, final.keyframe_poses, final.keyframe_exposures)
         if final.keyframe_poses is not None:
             self.atlas.refined = dict(zip(members, final.keyframe_poses, strict=True))
-            refined = RefinedStore(store, final.keyframe_poses)
-        self.uncertainty = final_uncertainty(self._final, refined or store, anchors, self.config, self.view, measuring)
+        if final.keyframe_exposures is not None:
+            self.atlas.exposures = dict(zip(members, final.keyframe_exposures, strict=True))
+        self.uncertainty = final_uncertainty(self._final, refined, anchors, self.config, self.view, measuring)
         progress(total, total)
 
     def _refinement_steps(self) -> int:

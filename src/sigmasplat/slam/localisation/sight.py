@@ -11,6 +11,7 @@ from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
 from sigmasplat.fit.references import Reference, live_image
 from sigmasplat.fit.target import Target
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.exposure import gray_exposure, unexposed
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.photo import Photo, photo_size
 from sigmasplat.render.backend import make_view
@@ -44,7 +45,7 @@ class Sight:
 
     def without_exposure(self, exposure: tuple[float, float]) -> Self:
         """Return the frame with the exposure (a, b) of exp(a) · colour + b removed from its target."""
-        return replace(self, target=self.target.without_exposure(*exposure))
+        return replace(self, target=self.target.without_exposure(gray_exposure(*exposure)))
 
     def _with_depth(self, depth_m: NDArray[np.float32], view: View) -> tuple[Target, Pyramid]:
         target = self.target.with_depth(depth_m)
@@ -60,8 +61,8 @@ class Observation(Sight):
 
     def without_exposure(self, exposure: tuple[float, float]) -> "Observation":
         """Return the frame with the exposure (a, b) of exp(a) · colour + b removed from its target and its photo."""
-        color = np.clip((self.whole.color - np.float32(exposure[1])) / np.float32(np.exp(exposure[0])), 0.0, 1.0)
-        return replace(super().without_exposure(exposure), whole=replace(self.whole, color=color))
+        whole = replace(self.whole, color=unexposed(self.whole.color, gray_exposure(*exposure)))
+        return replace(super().without_exposure(exposure), whole=whole)
 
     def photo(self, config: Config) -> Photo | None:
         """Return the colour at the size of the final map's last stage; None if working images are as large."""
