@@ -21,6 +21,7 @@ from sigmasplat.render.ray_depth import depth_of, plane_features
 from sigmasplat.render.reference.operators import Projection
 from sigmasplat.render.render import colors_from
 
+MEANS, QUATS = COLUMNS["means"], COLUMNS["quats"]
 OWN = 6
 """Channels before the values: colour, depth, second moments of colour and of depth."""
 
@@ -88,20 +89,19 @@ def blend_values(
     name = backend_name(backend, field.params.device)
     options = options_on(name, options)
     with torch.no_grad():
-        whole = kernels.project(field.means, field.quats, field.scales, T, camera, options)
+        scales = field.params[:, COLUMNS["log_scales"]].contiguous().exp()  # contiguous: much faster
+        whole = kernels.project(field.means, field.quats, scales, T, camera, options)
         rows = reaching(whole, camera, options)
         p, own = Projection(*(x[rows] for x in whole)), field.params[rows]
-        means, quats, log_scales, log_variances = (
-            own[:, COLUMNS[name]] for name in ("means", "quats", "log_scales", "log_variances")
-        )
+        variances = own[:, COLUMNS["log_variances"]].contiguous().exp()
         center_m = float(p.z.mean()) if len(rows) else 0.0  # keeps the squares small: float32 loses digits
         colors = colors_from(field, T, rows)
-        second = (log_variances.exp() + colors.square()).mean(1)
+        second = (variances + colors.square()).mean(1)
         shared = torch.cat([colors, torch.stack([p.z, second, (p.z - center_m).square()], 1)], 1)
         features = torch.cat([shared, (values(rows) if callable(values) else values[rows]).to(p.z)], 1)
         end = features.shape[1]
         if options.depth == "ray":
-            slopes = kernels.depth_slopes(means, quats, log_scales.exp(), T, camera, options)
+            slopes = kernels.depth_slopes(own[:, MEANS], own[:, QUATS], scales[rows], T, camera, options)
             features = torch.cat([features, plane_features(p, slopes, camera)], 1)
         opacities = own[:, 10].sigmoid()
     with torch.set_grad_enabled(gather):
