@@ -98,7 +98,7 @@ def blend_values(
         colors = colors_from(field, T, rows)
         second = (variances + colors.square()).mean(1)
         shared = torch.cat([colors, torch.stack([p.z, second, (p.z - center_m).square()], 1)], 1)
-        features = torch.cat([shared, (values(rows) if callable(values) else values[rows]).to(p.z)], 1)
+        features = torch.cat([shared, (values(rows) if callable(values) else values.to(p.z)[rows]).to(p.z)], 1)
         end = features.shape[1]
         if options.depth == "ray":
             slopes = kernels.depth_slopes(own[:, MEANS], own[:, QUATS], scales[rows], T, camera, options)
