@@ -6,8 +6,10 @@ from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.model.field import COLUMNS, GaussianField
+from sigmasplat.render.backend import make_view
 from sigmasplat.render.blended_values import BlendedValues, blend_values
 from sigmasplat.render.render import on_device
+from sigmasplat.render.splat_sums import gather
 from splat_fields import params_of
 from splat_scenes import KINDS, WIDE, Scene, assert_same_vector, scene
 
@@ -56,6 +58,16 @@ def test_sums_do_not_depend_on_the_values_of_the_splats() -> None:
     changed = params.clone()
     changed[:, COLUMNS["log_variances"]] += 3.0
     assert torch.equal(blended(s, changed, numbers(60, 2, seed=5), "cpu").gather(planes), first)
+
+
+@pytest.mark.parametrize("depth", ["center", "ray"])
+def test_a_view_sums_pixels_over_splats_as_a_blend_does(kernels: str, depth: str) -> None:
+    s, planes = scene("random", 60, WIDE), numbers(3, WIDE.height, WIDE.width)
+    params, view = params_of(s), make_view(kernels, WIDE, RenderConfig(depth=depth))
+    params = params.to(view.sums.device)
+    view.forward(params, s.T_camera_world.numpy())
+    want = blended(s, params_of(s).double(), numbers(60, 0), "reference").gather(planes.movedim(0, -1))
+    assert_same_vector(gather(view, params, planes.to(params)), want, what="sums of a view")
 
 
 def test_ones_sum_to_the_weights_of_the_splats(kernels: str) -> None:

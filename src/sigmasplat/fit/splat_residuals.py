@@ -13,7 +13,7 @@ from torch import Tensor
 from sigmasplat.config import RenderConfig
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
+from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.model.map_uncertainty import Background
 from sigmasplat.render.blended_values import blend_values
 from sigmasplat.render.predictive import COVERED, directions_toward
@@ -59,7 +59,9 @@ def splat_residuals(field: GaussianField, keyframes: Iterable[Keyframe], options
         off_m = off_m.clamp(-FARTHEST_M, FARTHEST_M)[..., None]
         found = seen.gather(torch.cat([errors.sqrt() * known, known, off_m, off_m.square()], -1)).cpu().double()
         sums += found
-        directions += found[:, 2:3] * directions_toward(field, keyframe.T_world_camera).cpu().double()
+        rows = seen.rows
+        toward = directions_toward(field.params[rows, COLUMNS["means"]].detach(), keyframe.T_world_camera)
+        directions[rows.cpu()] += found[rows.cpu(), 2:3] * toward.cpu().double()
     absolute, weights, moments = sums[:, :2], sums[:, 2:4], sums[:, 4:]
     usual = absolute.sum(0) / weights.sum(0).clamp(min=1e-12)
     means = (absolute + PSEUDO_PIXELS * usual) / (weights + PSEUDO_PIXELS)

@@ -9,7 +9,15 @@ def set_threads(n: int) -> None: ...
 def threads() -> int: ...
 def tile_size() -> list[int]: ...
 def project_forward(
-    view: Array, means: Array, quats: Array, scales: Array, means2d: Array, conics: Array, z: Array, radii: Array
+    view: Array,
+    means: Array,
+    quats: Array,
+    scales: Array,
+    means2d: Array,
+    conics: Array,
+    z: Array,
+    radii: Array,
+    slopes: Array | None,
 ) -> None: ...
 def project_backward(
     view: Array,
@@ -181,6 +189,7 @@ class Rasteriser:
         g_opacities: Array,
         g_features: Array,
     ) -> None: ...
+    def gather(self, planes: Array, sums: Array) -> None: ...
     def view_forward(
         self,
         view: Array,

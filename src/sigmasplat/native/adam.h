@@ -43,6 +43,14 @@ SIGMA_INLINE void adam_vector(const AdamStep& a, const Absence& away, vf g, vf r
     store(p, value);
 }
 
+// Step values whose absences differ.
+struct Moved { vf value, moment1, moment2; };
+SIGMA_INLINE Moved adam_moved(const AdamStep& a, vf decay1, vf decay2, vf coasted, vf unbias1, vf unbias2, vf g, vf rate, vf p, vf m0, vf v0) {
+    const vf m = fma(decay1, m0, (1.f - a.beta1) * g), v = fma(decay2, v0, (1.f - a.beta2) * g * g);
+    const vf value = fnma(rate * coasted, m0 * unbias1 / (sqrt(v0 * unbias2) + a.epsilon), p);
+    return {fnma(rate, m * a.unbias1 / (sqrt(v * a.unbias2) + a.epsilon), value), m, v};
+}
+
 SIGMA_INLINE void adam_row(const AdamRates& a, const Absence& away, const float* g, float* p, float* m1, float* m2, bool stepped) {
     alignas(64) float t[3][(ROW + W - 1) / W * W] = {};
     float* from[3] = {p, m1, m2};
@@ -68,11 +76,28 @@ SIGMA_INLINE void adam_rows(const AdamRates& a, float* params, const AdamState& 
         for (int l = 0; l < W; l++) last[l] = a.step;
         return;
     }
-    for (; seen; seen &= seen - 1) {
-        const int l = __builtin_ctz(seen);
-        const size_t row = at + size_t(l) * ROW;
-        adam_row(a, Absence(a, last[l], true), g + l * ROW, params + row, state.moment1 + row, state.moment2 + row, true);
+    // Whole vectors of each row, and the last column of all rows together.
+    constexpr int LAST = ROW - 1;
+    static_assert(LAST % W == 0);
+    alignas(64) float tail[4][W] = {}, decay1[W] = {}, decay2[W] = {}, coasted[W] = {}, unbias1[W] = {}, unbias2[W] = {};
+    float *const p = params + at, *const m1 = state.moment1 + at, *const m2 = state.moment2 + at;
+    int before = last[__builtin_ctz(seen)];
+    Absence away(a, before, true);
+    for (unsigned left = seen; left; left &= left - 1) {
+        const int l = __builtin_ctz(left), row = l * ROW;
+        if (last[l] != before) away = Absence(a, before = last[l], true);
+        for (int q = 0; q < LAST; q += W) adam_vector(a, away, load(g + row + q), load(a.rate + q), p + row + q, m1 + row + q, m2 + row + q, true);
+        tail[0][l] = g[row + LAST]; tail[1][l] = p[row + LAST]; tail[2][l] = m1[row + LAST]; tail[3][l] = m2[row + LAST];
+        decay1[l] = away.decay1; decay2[l] = away.decay2;
+        coasted[l] = away.coasted; unbias1[l] = away.unbias1; unbias2[l] = away.unbias2;
         last[l] = a.step;
+    }
+    const Moved moved = adam_moved(a, load(decay1), load(decay2), load(coasted), load(unbias1), load(unbias2), load(tail[0]),
+                                   splat(a.rate[LAST]), load(tail[1]), load(tail[2]), load(tail[3]));
+    store(tail[1], moved.value); store(tail[2], moved.moment1); store(tail[3], moved.moment2);
+    for (unsigned left = seen; left; left &= left - 1) {
+        const int l = __builtin_ctz(left), row = l * ROW + LAST;
+        p[row] = tail[1][l]; m1[row] = tail[2][l]; m2[row] = tail[3][l];
     }
 }
 

@@ -145,6 +145,11 @@ public:
         kernels->blend_backward(context, {g_sums.data(), pointer(g_moment), pointer(g_alpha)},
                                 {g_means2d.data(), g_conics.data(), g_z.data(), g_opacities.data(), g_features.data()});
     }
+    void gather(ConstFloats planes, Floats sums) {
+        need(planes.ndim() == 3 && sums.ndim() == 2 && planes.shape(0) >= sums.shape(1) && sums.shape(1) <= 16, "gather sums at most 16 planes");
+        nb::gil_scoped_release unlocked;
+        kernels->gather(context, planes.data(), int(sums.shape(1)), sums.data());
+    }
     void view_forward(ConstFloats view, ConstFloats params, const Harmonics* harmonics, int k, float alpha_min, float stop, bool ray_depth, float depth_gate_m, Maybe<ConstFloats> reference,
                       Floats sums, Maybe<Floats> moment, Floats alpha, Maybe<Ints> median_id, Maybe<Floats> median_weight,
                       Maybe<Ints> dominant_id, Maybe<Floats> dominant_weight, Maybe<Floats> median_depth, Doubles seconds) {
@@ -228,10 +233,10 @@ NB_MODULE(_core, m) {
     m.def("set_threads", [](int n) { omp_set_num_threads(n); });
     m.def("threads", [] { return omp_get_max_threads(); });
     m.def("tile_size", [] { return std::vector<int>{active->pad.tile_width, active->pad.tile_height}; });
-    m.def("project_forward", [](ConstFloats view, ConstFloats means, ConstFloats quats, ConstFloats scales, Floats means2d, Floats conics, Floats z, Floats radii) {
+    m.def("project_forward", [](ConstFloats view, ConstFloats means, ConstFloats quats, ConstFloats scales, Floats means2d, Floats conics, Floats z, Floats radii, Maybe<Floats> slopes) {
         nb::gil_scoped_release unlocked;
-        active->project_forward(view.data(), means.data(), quats.data(), scales.data(), int64_t(means.shape(0)), means2d.data(), conics.data(), z.data(), radii.data());
-    });
+        active->project_forward(view.data(), means.data(), quats.data(), scales.data(), int64_t(means.shape(0)), means2d.data(), conics.data(), z.data(), radii.data(), pointer(slopes));
+    }, nb::arg("view"), nb::arg("means"), nb::arg("quats"), nb::arg("scales"), nb::arg("means2d"), nb::arg("conics"), nb::arg("z"), nb::arg("radii"), nb::arg("slopes").none());
     m.def("project_backward", [](ConstFloats view, ConstFloats means, ConstFloats quats, ConstFloats scales, ConstFloats radii, ConstFloats g_means2d,
                                  ConstFloats g_conics, ConstFloats g_z, Floats g_means, Floats g_quats, Floats g_scales, Doubles g_twist) {
         nb::gil_scoped_release unlocked;
@@ -326,6 +331,7 @@ NB_MODULE(_core, m) {
              nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(), nb::arg("median_weight").none(), nb::arg("dominant_id").none(), nb::arg("dominant_weight").none())
         .def("blend_backward", &Rasteriser::blend_backward, nb::arg("g_sums"), nb::arg("g_moment").none(),
              nb::arg("g_alpha").none(), nb::arg("g_means2d"), nb::arg("g_conics"), nb::arg("g_z"), nb::arg("g_opacities"), nb::arg("g_features"))
+        .def("gather", &Rasteriser::gather, nb::arg("planes"), nb::arg("sums"))
         .def("view_forward", &Rasteriser::view_forward, nb::arg("view"), nb::arg("params"), nb::arg("harmonics").none(), nb::arg("k"), nb::arg("alpha_min"), nb::arg("stop"), nb::arg("ray_depth"), nb::arg("depth_gate_m"),
              nb::arg("reference").none(), nb::arg("sums"), nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(),
              nb::arg("median_weight").none(), nb::arg("dominant_id").none(), nb::arg("dominant_weight").none(), nb::arg("median_depth").none(), nb::arg("seconds"))

@@ -2,14 +2,18 @@
 
 // The record of a splat's gradient in one tile. First 8 interleaved pairs (even: sums of g·{1, x, y, xx, xy, yy}; odd:
 // sums of w·∂L/∂feature), then the remaining w-sums. SLOPES: ∂L/∂depth times x and y. MOMENT: 2·∂L/∂moment, with SLOPES
-// times {1, x, y, xx, xy, yy}, and its product with −ref, with SLOPES times {1, x, y}.
+// times {1, x, y, xx, xy, yy}, and its product with −ref, with SLOPES times {1, x, y}. With SLOPES and without MOMENT, the
+// sums are packed if they fit in 16 floats but not in 8 pairs: first the 6 sums of g, then those of w.
 template <int K, bool MOMENT, bool SLOPES = false> constexpr int moment_column = K + (SLOPES ? 2 : 0);
 template <int K, bool MOMENT, bool SLOPES = false> constexpr int weight_columns =
     moment_column<K, MOMENT, SLOPES> + (!MOMENT ? 0 : SLOPES ? 9 : 2);
+template <int K, bool MOMENT, bool SLOPES = false> constexpr bool is_packed =
+    SLOPES && !MOMENT && weight_columns<K, MOMENT, SLOPES> > 8 && weight_columns<K, MOMENT, SLOPES> <= 10;
 template <int K, bool MOMENT, bool SLOPES = false> constexpr int extra_floats =
-    weight_columns<K, MOMENT, SLOPES> <= 8 ? 0 : (weight_columns<K, MOMENT, SLOPES> - 8 + W - 1) / W * W;
+    weight_columns<K, MOMENT, SLOPES> <= 8 || is_packed<K, MOMENT, SLOPES> ? 0 : (weight_columns<K, MOMENT, SLOPES> - 8 + W - 1) / W * W;
 template <int K, bool MOMENT, bool SLOPES = false> constexpr int record_floats = 16 + extra_floats<K, MOMENT, SLOPES>;
-constexpr int weight_place(int c) { return c < 8 ? 2 * c + 1 : 8 + c; }   // where a record has w-sum c
+template <bool PACKED = false> constexpr int moment_place(int q) { return PACKED ? q : 2 * q; }   // where a record has g-sum q
+template <bool PACKED = false> constexpr int weight_place(int c) { return PACKED ? 6 + c : c < 8 ? 2 * c + 1 : 8 + c; }
 
 #if defined(__AVX512F__)
 SIGMA_INLINE void store_pairs(float* out, vf g, vf w) {
@@ -51,11 +55,12 @@ template <int K, bool MOMENT, bool SLOPES> using Basis = float[W][record_floats<
 template <int K, bool MOMENT, bool SLOPES>
 SIGMA_INLINE void store_basis(const PixelGradients<K>& on_pixels, vf x, vf y, Basis<K, MOMENT, SLOPES>& basis) {
     constexpr int COLUMNS = record_floats<K, MOMENT, SLOPES>, AT = moment_column<K, MOMENT, SLOPES>;
+    constexpr bool PACKED = is_packed<K, MOMENT, SLOPES>;
     vf columns[COLUMNS];
     for (auto& c : columns) c = splat(0.f);
     const vf moments[6] = {splat(1.f), x, y, x * x, x * y, y * y};
-    for (int c = 0; c < 6; c++) columns[2 * c] = moments[c];
-    const auto weighed = [&](int c, vf v) { columns[weight_place(c)] = v; };
+    for (int c = 0; c < 6; c++) columns[moment_place<PACKED>(c)] = moments[c];
+    const auto weighed = [&](int c, vf v) { columns[weight_place<PACKED>(c)] = v; };
     for (int c = 0; c < K; c++) weighed(c, on_pixels.sums[c]);
     if constexpr (SLOPES) {
         weighed(K, on_pixels.sums[3] * x);
@@ -72,7 +77,7 @@ SIGMA_INLINE void store_basis(const PixelGradients<K>& on_pixels, vf x, vf y, Ba
     }
     for (int h = 0; h < COLUMNS; h += W) {
         transpose(columns + h);
-        for (int m = 0; m < W; m++) store(basis[m] + h, columns[h + pixel_of_pair(m)]);
+        for (int m = 0; m < W; m++) store(basis[m] + h, columns[h + (PACKED ? m : pixel_of_pair(m))]);
     }
 }
 
@@ -146,6 +151,16 @@ SIGMA_INLINE void add_to_record(const float* pairs, const Basis<K, MOMENT, SLOPE
     constexpr int EXTRA = extra_floats<K, MOMENT, SLOPES>;
     vf acc[16 / W][2], rest[EXTRA ? EXTRA / W : 1];       // two chains of additions, so that each waits half as long
     for (int h = 0; h < 16 / W; h++) { acc[h][0] = load(record + h * W); acc[h][1] = splat(0.f); }
+    if constexpr (is_packed<K, MOMENT, SLOPES>) {         // `pairs` has all g, then all w
+#pragma GCC unroll 16
+        for (int m = 0; m < W; m++) {
+            const vf gain = splat(pairs[m]), weight = splat(pairs[W + m]);
+            for (int h = 0; h < 16 / W; h++)
+                acc[h][m & 1] = fma(select(first_lanes(6 - h * W), gain, weight), load(basis[m] + h * W), acc[h][m & 1]);
+        }
+        for (int h = 0; h < 16 / W; h++) store(record + h * W, acc[h][0] + acc[h][1]);
+        return;
+    }
     for (int h = 0; h < EXTRA / W; h++) rest[h] = load(record + 16 + h * W);
 #pragma GCC unroll 16
     for (int m = 0; m < W; m++) {
@@ -181,7 +196,13 @@ SIGMA_INLINE void walk_back(int n, const Basis<K, MOMENT, SLOPES>& basis, Walk& 
         const int begin = end > ALPHA_CHUNK ? end - ALPHA_CHUNK : 0;
         for (int e = end - 1; e >= begin; e--) {
             const vf a = load(alphas[e]), w = load(weights[e]), gain = load(gains[e]);
-            store_pairs(walk.pairs[e - begin], only(gt(top, a), w * (gain - behind)), w);       // α·∂L/∂α = ∂L/∂power
+            const vf on_power = only(gt(top, a), w * (gain - behind));       // α·∂L/∂α = ∂L/∂power
+            if constexpr (is_packed<K, MOMENT, SLOPES>) {
+                store(walk.pairs[e - begin], on_power);
+                store(walk.pairs[e - begin] + W, w);
+            } else {
+                store_pairs(walk.pairs[e - begin], on_power, w);
+            }
             behind = fma(one - a, behind, a * gain);
         }
         for (int e = begin; e < end; e++)
@@ -228,7 +249,7 @@ static void blend_tiles_backward(Render& r, OutputGradients g, Finish finish) {
             if constexpr (GATE)                       // the records' own sums of depth have no gate
                 for (int k = 0; k < tile.count; k++)
                     for (int q = 0; q < 3; q++)
-                        s.records[size_t(k) * RECORD + weight_place(q ? K + q - 1 : 3)] = s.depth_sums[size_t(k) * W + q];
+                        s.records[size_t(k) * RECORD + weight_place<is_packed<K, MOMENT, SLOPES>>(q ? K + q - 1 : 3)] = s.depth_sums[size_t(k) * W + q];
             finish(s, tile);
         }
         fence();                                      // records may have been written past the caches
@@ -261,11 +282,13 @@ template <int K, bool MOMENT, class T, class At> SIGMA_INLINE void shift_depth_s
 // Copy a tile's records to each splat's own slots; the moments are now about the splat's mean.
 template <int K, bool MOMENT, bool SLOPES> static void flush_records(Render& r, Scratch& s, const Tile& tile) {
     constexpr int RECORD = record_floats<K, MOMENT, SLOPES>;
+    constexpr bool PACKED = is_packed<K, MOMENT, SLOPES>;
+    constexpr int ONE = moment_place<PACKED>(1);
     for (int k = 0; k < tile.count; k++) {
         float* m = &s.records[size_t(k) * RECORD];
-        shift_moments(m[0], m[2], m[4], m[6], m[8], m[10], s.centers[k].u, s.centers[k].v);
+        shift_moments(m[0], m[ONE], m[2 * ONE], m[3 * ONE], m[4 * ONE], m[5 * ONE], s.centers[k].u, s.centers[k].v);
         if constexpr (SLOPES)
-            shift_depth_sums<K, MOMENT>([&](int c) -> float& { return m[weight_place(c)]; }, s.centers[k].u, s.centers[k].v);
+            shift_depth_sums<K, MOMENT>([&](int c) -> float& { return m[weight_place<PACKED>(c)]; }, s.centers[k].u, s.centers[k].v);
     }
     for (int k = 0; k < tile.count; k++) {
         const Geometry& g = *reinterpret_cast<const Geometry*>(&s.rows[size_t(k) * r.row]);
@@ -291,13 +314,13 @@ template <int RECORD> SIGMA_INLINE void reduce_records(const Render& r, int64_t 
 }
 
 // ∂L/∂feature c of W splats, from their summed records.
-SIGMA_INLINE vf weight_sum(const float (*sums)[W], int c) { return load(sums[weight_place(c)]); }
+template <bool PACKED = false> SIGMA_INLINE vf weight_sum(const float (*sums)[W], int c) { return load(sums[weight_place<PACKED>(c)]); }
 
 // ∂L/∂(mean, conic) of W splats. power = −½(p² + q²), so every derivative is a moment of g about the splat's mean.
 struct Moments { vf m[6]; };                           // Σ g·{1, x, y, xx, xy, yy} about the splat's mean
-SIGMA_INLINE Moments moments_of(const float (*sums)[W]) {
+template <bool PACKED = false> SIGMA_INLINE Moments moments_of(const float (*sums)[W]) {
     Moments a;
-    for (int q = 0; q < 6; q++) a.m[q] = load(sums[2 * q]);
+    for (int q = 0; q < 6; q++) a.m[q] = load(sums[moment_place<PACKED>(q)]);
     return a;
 }
 SIGMA_INLINE FootprintGradient<vf> footprint_gradient(const Moments& moments, vf l1, vf l2, vf l3) {
@@ -316,7 +339,8 @@ SIGMA_INLINE FootprintGradient<vf> footprint_gradient(const Moments& moments, vf
 // Add ∂L/∂(depth at the pixels) of W splats to the gradient of their footprints, from w-sums about their means.
 template <int K, bool MOMENT>
 SIGMA_INLINE void add_depth_gradient(const float (*sums)[W], const Footprint<vf>& p, FootprintGradient<vf>& g) {
-    vf on_depth = weight_sum(sums, 3), on_u = weight_sum(sums, K), on_v = weight_sum(sums, K + 1);
+    constexpr bool PACKED = is_packed<K, MOMENT, true>;
+    vf on_depth = weight_sum<PACKED>(sums, 3), on_u = weight_sum<PACKED>(sums, K), on_v = weight_sum<PACKED>(sums, K + 1);
     if constexpr (MOMENT) {                           // 2·w·∂L/∂U·(z + slopes·(x, y) − ref), times 1, x and y
         constexpr int M = moment_column<K, true, true>;
         vf m[9];

@@ -23,6 +23,7 @@ template <int N> struct std_int { static constexpr int value = N; };
 #include "bin.h"
 #include "blend.h"
 #include "blend_backward.h"
+#include "gather.h"
 #include "adam.h"
 #include "view_colors.h"
 #include "losses.h"
@@ -45,7 +46,7 @@ const Kernels table = {
     SIGMA_NAME(SIGMASPLAT_ISA),
     {TILE_WIDTH, TILE_HEIGHT, W},
     create, destroy, bytes,
-    project_forward, project_backward, blend_forward, blend_backward,
+    project_forward, project_backward, blend_forward, blend_backward, gather_planes,
     view_forward, view_backward, view_step, adam_settle, view_backward_pose, view_visible,
     ssim_target, ssim, mapping_losses, tracking_loss, reference_maps, align_step, align_images,
 };

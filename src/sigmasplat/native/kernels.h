@@ -67,7 +67,7 @@ struct Kernels {
     void (*destroy)(Context*);
     size_t (*bytes)(const Context*);
     void (*project_forward)(const float* view, const float* means, const float* quats, const float* scales, int64_t n,
-                            float* means2d, float* conics, float* z, float* radii);
+                            float* means2d, float* conics, float* z, float* radii, float* slopes);
     void (*project_backward)(const float* view, const float* means, const float* quats, const float* scales, int64_t n,
                              const float* radii, const float* g_means2d, const float* g_conics, const float* g_z,
                              float* g_means, float* g_quats, float* g_scales, double* g_twist);
@@ -75,6 +75,8 @@ struct Kernels {
                           const float* opacities, const float* features, int64_t n, int k, int width, int height,
                           const float* reference, BlendOptions, Outputs);
     void (*blend_backward)(Context*, OutputGradients, SplatGradients);
+    // Σ_p w_ip g_p [n, k] of k ≤ 16 padded planes g, with the weights of the last forward pass.
+    void (*gather)(Context*, const float* planes, int k, float* sums);
     // Fused: from rows of raw parameters [n, 17] to images of (r, g, b, z[, q, q, q]) with q = σ² + c².
     void (*view_forward)(Context*, const float* view, const float* params, ViewColors, int64_t n, int k, const float* reference,
                          BlendOptions, Outputs, double* seconds);

@@ -57,14 +57,21 @@ __attribute__((noinline)) static void add_slopes_to(const View<float>& view, con
     add_slopes(view, s, splat(view.near_m), f);
 }
 
+// slopes [n, 2], or null: the slopes of depth, m/px, 0 for splats that are not seen.
 static void project_forward(const float* view_numbers, const float* means, const float* quats, const float* scales,
-                            int64_t n, float* means2d, float* conics, float* z, float* radii) {
+                            int64_t n, float* means2d, float* conics, float* z, float* radii, float* slopes) {
     const View<float> view = read_view(view_numbers);
 #pragma omp parallel for schedule(static)
     for (int64_t i = 0; i < n; i += W) {
-        const Footprint<vf> f = project(view, load_shape(means, quats, scales, i, n), splat(view.near_m));
+        const Shape<vf> shape = load_shape(means, quats, scales, i, n);
+        Footprint<vf> f = project(view, shape, splat(view.near_m));
         const Mask seen = gt(f.z, splat(view.near_m));
         alignas(64) float t[3][W];
+        if (slopes) {
+            add_slopes_to(view, shape, f);
+            store(t[0], only(seen, f.slope_u)); store(t[1], only(seen, f.slope_v));
+            store_rows<2>(slopes, i, n, t);
+        }
         store(t[0], f.u); store(t[1], f.v);
         store_rows<2>(means2d, i, n, t);
         store(t[0], f.l1); store(t[1], f.l2); store(t[2], f.l3);

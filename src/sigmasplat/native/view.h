@@ -159,7 +159,7 @@ template <int K> static void pack_view(Render& r, const float* params, const Vie
             const auto fill = [&](unsigned live) {
                 if (colors.degree) {
                     alignas(64) float harmonics[HARMONICS][W];
-                    prefetch_harmonics(colors.harmonics, colors.degree, i + W, n);
+                    prefetch_harmonics(colors.harmonics, colors.degree, i + W, n, [](int64_t) { return true; });
                     show_colors(r.view, colors, i, live, s.shape.mean, s.color, harmonics);
                 }
                 for (int q = 0; q < 3; q++) store(f[q], s.color[q]);
@@ -217,6 +217,7 @@ template <int K, bool MOMENT, bool SLOPES, class Sink, class Unseen>
 static void chain_to_params(const Render& r, const float* params, const ViewColors& colors, const float* g_median, float* pull,
                             double* g_twist, Sink sink, Unseen unseen) {
     constexpr int RECORD = record_floats<K, MOMENT, SLOPES>;
+    constexpr bool PACKED = is_packed<K, MOMENT, SLOPES>;
     const float half_width = 0.5f * float(r.width), half_height = 0.5f * float(r.height);
     if (pull) memset(pull, 0, size_t(r.n) * sizeof(float));
     const int64_t chunks = (r.n + CHUNK - 1) / CHUNK;
@@ -239,7 +240,7 @@ static void chain_to_params(const Render& r, const float* params, const ViewColo
             if (colors.degree) show_colors(r.view, colors, i, seen_bits, s.shape.mean, s.color, harmonics);
             Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
             if constexpr (SLOPES) set_slopes(r, s.shape, p);
-            FootprintGradient<vf> g = footprint_gradient(moments_of(sums), p.l1, p.l2, p.l3);
+            FootprintGradient<vf> g = footprint_gradient(moments_of<PACKED>(sums), p.l1, p.l2, p.l3);
             if constexpr (SLOPES) {
                 add_depth_gradient<K, MOMENT>(sums, p, g);
                 if (g_median) {
@@ -252,8 +253,8 @@ static void chain_to_params(const Render& r, const float* params, const ViewColo
                 }
                 drop_slopes(r.options, g);
             } else {
-                g.z = weight_sum(sums, 3);
-                if constexpr (MOMENT) g.z += fma(p.z, weight_sum(sums, K), weight_sum(sums, K + 1));
+                g.z = weight_sum<PACKED>(sums, 3);
+                if constexpr (MOMENT) g.z += fma(p.z, weight_sum<PACKED>(sums, K), weight_sum<PACKED>(sums, K + 1));
                 if (g_median) g.z += load(g_median + i);
             }
             if (pull) {
@@ -271,8 +272,8 @@ static void chain_to_params(const Render& r, const float* params, const ViewColo
             store(gradient[10], only(seen, load(sums[0]) * (1.f - s.opacity)));
             for (int q = 0; q < 3; q++) {
                 vf g_square = splat(0.f);
-                if constexpr (K > 4) g_square = weight_sum(sums, 4 + q);
-                store(gradient[11 + q], only(seen, fma(2.f * s.color[q], g_square, weight_sum(sums, q))));
+                if constexpr (K > 4) g_square = weight_sum<PACKED>(sums, 4 + q);
+                store(gradient[11 + q], only(seen, fma(2.f * s.color[q], g_square, weight_sum<PACKED>(sums, q))));
                 store(gradient[14 + q], only(seen, g_square * s.variance[q]));
             }
             sink(i, seen_bits, s, gradient, harmonics);
@@ -338,7 +339,7 @@ static double view_step(Context* context, float* params, OutputGradients g, Adam
                 for (int q = 11; q < 14; q++) gradient[q][l] = 0.f;
             if (harmonics.degree) {
                 for (const float* rows : {harmonics.params, harmonics.state.moment1, harmonics.state.moment2})
-                    prefetch_harmonics(rows, harmonics.degree, i + W, r.n);
+                    prefetch_harmonics(rows, harmonics.degree, i + W, r.n, [&](int64_t l) { return r.tiles_of[l] > 0; });
                 vf on_mean[3];
                 step_harmonics(r.view, harmonics, adam_harmonics, i, seen, s.shape.mean, gradient, lanes, on_mean);
                 for (int q = 0; q < 3; q++) moved[i / W * 3 + q] = lane_sum(on_mean[q]);

@@ -11,10 +11,11 @@ template <class F> SIGMA_INLINE void with_degree(int degree, F f) {
     }
 }
 
-// Load the harmonics of splats i … i+W−1 to the cache, if the array has them.
-SIGMA_INLINE void prefetch_harmonics(const float* rows, int degree, int64_t i, int64_t n) {
+// Load the harmonics of splats i … i+W−1 to the cache, if the array has them and needed(splat).
+template <class Needed> SIGMA_INLINE void prefetch_harmonics(const float* rows, int degree, int64_t i, int64_t n, Needed needed) {
     for (int64_t l = i; l < i + W && l < n; l++)
-        for (int q = 0; q < columns_of(degree); q += 16) __builtin_prefetch(rows + l * HARMONICS + q);
+        if (needed(l))
+            for (int q = 0; q < columns_of(degree); q += 16) __builtin_prefetch(rows + l * HARMONICS + q);
 }
 
 struct Sight { vf unit[3], inverse_length; };         // the direction from the camera to each splat

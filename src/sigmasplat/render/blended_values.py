@@ -3,6 +3,8 @@
 The weight w_ip of splat i at pixel p is that of the render: Ĉ_p = Σ_i w_ip c_i.
 """
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,13 +14,14 @@ from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
+from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.render.backend import backend_module, backend_name, options_on
 from sigmasplat.render.gated_depth import gated_depth
 from sigmasplat.render.ray_depth import depth_of, plane_features
-from sigmasplat.render.reference.operators import depth_slopes
+from sigmasplat.render.reference.operators import Projection
 from sigmasplat.render.render import colors_from
 
+MEANS, QUATS = COLUMNS["means"], COLUMNS["quats"]
 OWN = 6
 """Channels before the values: colour, depth, second moments of colour and of depth."""
 
@@ -27,7 +30,7 @@ OWN = 6
 class BlendedValues:
     """Sums over the splats of each pixel: color Σwc [H, W, 3], depth Σwz [H, W] m (z along the ray with
     `render.depth=ray`, behind the median gate with `render.depth_gate_m`), second Σw(σ²+c²) [H, W] mean over the
-    channels, values Σwv [H, W, K], alpha Σw [H, W]."""
+    channels, values Σwv [H, W, K], alpha Σw [H, W]; rows [n]: the splats that can reach the image."""
 
     color: Tensor
     depth: Tensor
@@ -39,6 +42,8 @@ class BlendedValues:
     _center_m: float
     _sums: Tensor
     _features: Tensor
+    rows: Tensor
+    _splats: int
 
     def moment_about(self, depth_m: Tensor) -> Tensor:
         """Return U = Σw(z − D)² ≥ 0 of the splats' centres about reference depths D [H, W] m (CG-SLAM eq. 10)."""
@@ -54,19 +59,29 @@ class BlendedValues:
         gradient = torch.zeros_like(self._sums)
         gradient[..., :k] = planes
         (found,) = torch.autograd.grad(self._sums, self._features, gradient)
-        return found[:, :k]
+        return found.new_zeros(self._splats, k).index_copy_(0, self.rows, found[:, :k])
+
+
+def reaching(p: Projection, camera: Camera, options: RenderConfig) -> Tensor:
+    """Return the rows [n] of the splats that can reach the image, and possibly a few more."""
+    reach = p.radii * (1.001 * math.sqrt(2.0 * math.log(1.0 / options.alpha_min))) + 1.0
+    size = p.means2d.new_tensor([camera.width, camera.height])
+    inside = (p.means2d + reach >= 0.0) & (p.means2d - reach <= size)
+    return ((p.radii[:, 0] > 0) & inside.all(1)).nonzero().squeeze(1)
 
 
 def blend_values(
     field: GaussianField,
     camera: Camera,
     T_camera_map: NDArray[np.floating],
-    values: Tensor,
+    values: Tensor | Callable[[Tensor], Tensor],
     options: RenderConfig,
     backend: str,
     gather: bool = False,
 ) -> BlendedValues:
     """Blend values [N, K] of a field's splats at a pose (4×4), on the device that holds the field.
+
+    values: all of them, or a function that returns those of some rows [n].
 
     Raises BackendError if the backend is not available.
     """
@@ -74,18 +89,21 @@ def blend_values(
     name = backend_name(backend, field.params.device)
     options = options_on(name, options)
     with torch.no_grad():
-        p = kernels.project(field.means, field.quats, field.scales, T, camera, options)
-        seen_z = p.z[p.radii[:, 0] > 0]
-        center_m = float(seen_z.mean()) if len(seen_z) else 0.0  # keeps the squares small: float32 loses digits
-        colors = colors_from(field, T)
-        second = (field.variances + colors.square()).mean(1)
-        own = torch.cat([colors, torch.stack([p.z, second, (p.z - center_m).square()], 1)], 1)
-        features = torch.cat([own, values.to(p.z)], 1)
+        scales = field.params[:, COLUMNS["log_scales"]].contiguous().exp()  # contiguous: much faster
+        whole = kernels.project(field.means, field.quats, scales, T, camera, options)
+        rows = reaching(whole, camera, options)
+        p, own = Projection(*(x[rows] for x in whole)), field.params[rows]
+        variances = own[:, COLUMNS["log_variances"]].contiguous().exp()
+        center_m = float(p.z.mean()) if len(rows) else 0.0  # keeps the squares small: float32 loses digits
+        colors = colors_from(field, T, rows)
+        second = (variances + colors.square()).mean(1)
+        shared = torch.cat([colors, torch.stack([p.z, second, (p.z - center_m).square()], 1)], 1)
+        features = torch.cat([shared, (values(rows) if callable(values) else values.to(p.z)[rows]).to(p.z)], 1)
         end = features.shape[1]
         if options.depth == "ray":
-            slopes = depth_slopes(field.means, field.quats, field.scales, T, camera, options)
+            slopes = kernels.depth_slopes(own[:, MEANS], own[:, QUATS], scales[rows], T, camera, options)
             features = torch.cat([features, plane_features(p, slopes, camera)], 1)
-        opacities = field.opacities
+        opacities = own[:, 10].sigmoid()
     with torch.set_grad_enabled(gather):
         features.requires_grad_(gather)
         b = kernels.blend(*p, opacities, features, None, camera, options)
@@ -95,5 +113,5 @@ def blend_values(
         depth = gated_depth(field.params.detach(), T, camera, options, name)
     return BlendedValues(
         sums[..., :3], depth, sums[..., 4], sums[..., OWN:end], b.alpha.detach(), sums[..., 3], sums[..., 5],
-        center_m, b.sums, features,
+        center_m, b.sums, features, rows, len(field),
     )  # fmt: skip

@@ -16,7 +16,7 @@ from torch import Tensor
 from sigmasplat.config import RenderConfig
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField
+from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.model.map_uncertainty import (
     COLOR_PARTS,
     DEPTH_PARTS,
@@ -99,8 +99,12 @@ def variance_parts(
     """Render the parts of a map's variance at a pose (4×4); splats [N, 6] as in `MapUncertainty`, gather as in
     `blend_values`."""
     field = on_device(field, backend)
-    new = novelty(field, splats[:, VARIANCES:], T_camera_map)
-    values = torch.cat([splats[:, :VARIANCES].to(new), new[:, None]], 1)
+
+    def values(rows: Tensor) -> Tensor:
+        means, known = field.params[rows, COLUMNS["means"]].detach(), splats[rows.to(splats.device)].to(field.params)
+        new = novelty(means, known[:, VARIANCES:], T_camera_map)
+        return torch.cat([known[:, :VARIANCES], new[:, None]], 1)
+
     seen = blend_values(field, camera, T_camera_map, values, options, backend, gather=gather)
     alpha = seen.alpha
     some, covered = alpha.clamp(min=1e-6), alpha.clamp(min=COVERED)
@@ -128,23 +132,24 @@ def variance_parts(
     return VarianceParts(torch.stack(color), torch.stack(depth), systematic, seen.color, depth_m, alpha, seen)
 
 
-def directions_toward(field: GaussianField, T_map_camera: NDArray[np.floating]) -> Tensor:
-    """Return the unit vectors [N, 3] from each splat to a camera (4×4)."""
-    away = torch.as_tensor(T_map_camera[:3, 3]).to(field.means) - field.means.detach()
+def directions_toward(means: Tensor, T_map_camera: NDArray[np.floating]) -> Tensor:
+    """Return the unit vectors [N, 3] from splats at `means` [N, 3] to a camera (4×4)."""
+    away = torch.as_tensor(T_map_camera[:3, 3]).to(means) - means
     return torch.nn.functional.normalize(away, dim=1)
 
 
-def novelty(field: GaussianField, seen_from: Tensor, T_camera_map: NDArray[np.floating]) -> Tensor:
+def novelty(means: Tensor, seen_from: Tensor, T_camera_map: NDArray[np.floating]) -> Tensor:
     """Return for each splat [N], in [0, 1), how far a view is from the directions that the splat was seen from.
 
-    seen_from [N, 3]: the mean m of unit vectors to the keyframes' cameras; 0 where it is 0, or without columns. With
-    the angle θ between m and the direction to the view, x = 1 − cos θ − 2 (1 − |m|), it is x / (x + 1 − cos 5°).
+    means [N, 3]: positions; seen_from [N, 3]: the mean m of unit vectors to the keyframes' cameras; 0 where it is 0, or
+    without columns. With the angle θ between m and the direction to the view, x = 1 − cos θ − 2 (1 − |m|), it is
+    x / (x + 1 − cos 5°).
     """
     if not seen_from.shape[1]:
-        return torch.zeros(len(field)).to(field.means)
-    mean = seen_from.to(field.means)
+        return torch.zeros(len(means)).to(means)
+    mean = seen_from.to(means)
     length = mean.norm(dim=1)
-    cosine = (mean * directions_toward(field, se3.inverse(np.asarray(T_camera_map)))).sum(1) / length.clamp(min=1e-6)
+    cosine = (mean * directions_toward(means, se3.inverse(np.asarray(T_camera_map)))).sum(1) / length.clamp(min=1e-6)
     beyond = (1.0 - cosine - SPREADS * (1.0 - length)).clamp(min=0.0) * (length > 0.0)
     return torch.as_tensor(beyond / (beyond + NEW_ANGLE))
 

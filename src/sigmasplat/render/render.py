@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sigmasplat.config import RenderConfig
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.field import GaussianField, Rows
+from sigmasplat.model.field import COLUMNS, GaussianField, Rows
 from sigmasplat.model.harmonics import view_colors
 from sigmasplat.render.backend import backend_module, backend_name, options_on
 from sigmasplat.render.channels import covariance_features, covariance_of, features_of, variance_of
@@ -45,13 +45,15 @@ class Render:
     covariance: Tensor | None = None
 
 
-def colors_from(field: GaussianField, T_camera_world: Tensor) -> Tensor:
-    """Return the colours [N, 3] that a camera sees."""
+def colors_from(field: GaussianField, T_camera_world: Tensor, rows: Tensor | None = None) -> Tensor:
+    """Return the colours [N, 3] that a camera sees, or those of some rows [n]."""
+    params = field.params if rows is None else field.params[rows]
+    colors = params[:, COLUMNS["colors"]]
     if "harmonics" not in field.attributes:
-        return field.colors
-    T = T_camera_world.to(field.params)
+        return colors
+    T, harmonics = T_camera_world.to(field.params), field.attributes["harmonics"].params
     position = -(T[:3, :3] * T[:3, 3:]).sum(0)
-    return view_colors(field.colors, field.attributes["harmonics"].params, field.means, position)
+    return view_colors(colors, harmonics if rows is None else harmonics[rows], params[:, COLUMNS["means"]], position)
 
 
 def _features_from(field: GaussianField, z: Tensor, T_camera_world: Tensor) -> Tensor:

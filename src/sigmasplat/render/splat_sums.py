@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from sigmasplat.model.field import COLUMNS
+from sigmasplat.render.cpu.view import CpuView
 from sigmasplat.render.view import View
 
 CHANNELS = 3
@@ -17,11 +18,15 @@ def gather(view: View, params: Tensor, planes: Tensor) -> Tensor:
     The colour of a pixel is linear in the splats' colours, so this is the gradient of the colours if g is the gradient
     of the image. The view's gradient planes of colour are 0 afterwards.
     """
-    g_params = torch.empty_like(params)
     view.g_sums.zero_()
     view.g_alpha.zero_()
     height, width = planes.shape[-2:]
     view.g_sums[:CHANNELS, :height, :width] = planes
+    if isinstance(view, CpuView):  # its kernels sum without the gradient of the alphas
+        sums = view.gather(view.g_sums[:CHANNELS])
+        view.g_sums.zero_()
+        return sums
+    g_params = torch.empty_like(params)
     view.backward(params, g_params)
     view.g_sums.zero_()
     return g_params[:, COLUMNS["colors"]]

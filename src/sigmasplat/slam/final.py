@@ -24,6 +24,9 @@ from sigmasplat.slam.predicted_submaps import PredictedSubmaps
 from sigmasplat.slam.refinement import Clock, KeyframeReader, SavedRefinement, refine
 from sigmasplat.types import Matrix, Progress, no_progress
 
+CELL_M, BITS = 0.01, 16
+"""Size of the cells of `z_order`, and the bits of a cell's number along each axis."""
+
 
 class FinalMap(NamedTuple):
     """The global map in the world, in host memory; the poses of its keyframes, T_submap_camera [4, 4] of each submap's
@@ -59,6 +62,8 @@ def final_map(
     field = seed(store, anchors, config) if found is None else found.field
     if not config.final.iterations:
         return FinalMap(field)
+    if found is None:
+        field.keep(torch.from_numpy(z_order(field.means.numpy())))
     on_device, keyframes = field.to(view.sums.device), KeyframeReader(store, anchors, view)
     if found is not None:
         keyframes.take(found)
@@ -142,6 +147,20 @@ def survivors(
     order = np.lexsort((pairs % submaps, score, place))
     _, first = np.unique(place[order], return_index=True)
     return np.isin(pair, order[first])
+
+
+def z_order(points: Matrix) -> NDArray[np.int64]:
+    """Return the rows of points [N, 3] m in the order of the Z-curve (Morton) through cells of `CELL_M`.
+
+    Kernels process splats in groups of neighbouring rows. In this order a camera sees most groups completely or not at
+    all, so it does less work.
+    """
+    cells = np.floor((points - points.min(0, initial=np.inf)) / CELL_M).clip(0, (1 << BITS) - 1).astype(np.uint64)
+    code = np.zeros(len(points), np.uint64)
+    for bit in range(BITS):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return np.argsort(code, kind="stable")
 
 
 # ---- seeding on the surface ----

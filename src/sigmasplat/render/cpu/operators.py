@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 from sigmasplat import env
+from sigmasplat.config import RenderConfig
 from sigmasplat.errors import BackendError
 from sigmasplat.model.camera import Camera
 from sigmasplat.native import _core
@@ -60,7 +61,7 @@ class _Project(torch.autograd.Function):
         view = view_params(camera, T.detach().double().numpy(), options)
         n = len(m)
         means2d, conics, z, radii = m.new_empty(n, 2), m.new_empty(n, 3), m.new_empty(n), m.new_empty(n, 2)
-        _core.project_forward(view, m, q, s, means2d, conics, z, radii)
+        _core.project_forward(view, m, q, s, means2d, conics, z, radii, None)
         seen = radii[:, :1] > 0
         means2d, conics = torch.where(seen, means2d, 0.0), torch.where(seen, conics, 0.0)
         ctx.save_for_backward(m, q, s, radii, T)
@@ -111,12 +112,27 @@ class _Blend(torch.autograd.Function):
         on_sums, on_alpha = torch.zeros(ctx.padded), torch.zeros(ctx.padded[1:])
         on_moment = None if ctx.ref is None else torch.zeros_like(on_alpha)
         on_sums[: ctx.k, :h, :w] = g_sums.permute(2, 0, 1)
+        if not any(ctx.needs_input_grad[:5]):  # only the features: their gradient does not need that of the alphas
+            g_features = torch.empty(ctx.shapes[5])
+            ctx.raster.gather(on_sums, g_features)
+            return None, None, None, None, None, g_features, None, None, None
         on_alpha[:h, :w] = g_alpha
         if on_moment is not None and g_moment is not None:
             on_moment[:h, :w] = g_moment
         m, c, z, _radii, o, f = (torch.zeros(s) for s in ctx.shapes)
         ctx.raster.blend_backward(on_sums, on_moment, on_alpha, m, c, z, o, f)
         return m, c, z, None, o, f, None, None, None
+
+
+def depth_slopes(
+    means: Tensor, quats: Tensor, scales: Tensor, T_camera_world: Tensor, camera: Camera, options: RenderConfig
+) -> Tensor:
+    """Return the slopes of `reference.depth_slopes`, without a gradient."""
+    m, q, s = _float32("means", means), _float32("quats", quats), _float32("scales", scales)
+    view, n = view_params(camera, T_camera_world.detach().double().numpy(), options), len(m)
+    means2d, conics, z, radii, slopes = (m.new_empty(n, columns) for columns in (2, 3, 1, 2, 2))
+    _core.project_forward(view, m, q, s, means2d, conics, z, radii, slopes)
+    return slopes
 
 
 project = project_with(_Project, reference.project)

@@ -34,7 +34,7 @@ class CpuView:
         self.alpha, self.g_alpha = torch.zeros(size), torch.zeros(size)
         self.moment, self.g_moment, self._reference = torch.zeros(size), torch.zeros(size), torch.zeros(size)
         self.layers, self.g_median_depth = Layers.of(*size), torch.zeros(size)
-        self._made = (False, False)
+        self._made, self._splats = (False, False), 0
         self.seconds = np.zeros(5)
 
     def forward(
@@ -53,7 +53,7 @@ class CpuView:
         if depth_reference is not None:
             self._reference[: self.camera.height, : self.camera.width] = depth_reference
             reference_depth, moment = self._reference, self.moment
-        self._made = (depth_reference is not None, layers)
+        self._made, self._splats = (depth_reference is not None, layers), len(params)
         view, planes = view_params(self.camera, T_camera_world, o), self.layers if layers else NO_LAYERS
         self.raster.view_forward(
             view, params, harmonics, self._k, o.alpha_min, o.transmittance_stop, o.depth == "ray", o.depth_gate_m,
@@ -74,6 +74,12 @@ class CpuView:
             self.seconds[3:],
         )  # fmt: skip
         return twist
+
+    def gather(self, planes: Tensor) -> Tensor:
+        """Return Σ_p w_ip g_p [N, k] of k ≤ 16 planes g [k, rows, columns] for the N splats of the last render."""
+        sums = torch.empty(self._splats, len(planes))
+        self.raster.gather(planes, sums)
+        return sums
 
     def backward_pose(self, params: Tensor) -> Matrix:
         """Return the pose twist (ρ, φ) [6] from the gradient planes of colour and depth; params are rows [N, 17]."""
