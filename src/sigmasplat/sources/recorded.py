@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.frame import Frame, resized_color
+from sigmasplat.model.frame_arrays import color_from_bytes
 from sigmasplat.model.gyroscope import Gyroscope
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
 from sigmasplat.sources.camera.calibration import Calibration
 from sigmasplat.sources.camera.depth_units import refuse_without_depth
 from sigmasplat.sources.camera.rectification import Rectification, check_image_sizes
-from sigmasplat.sources.files.images import color_from_bytes, image_size, read_color, read_depth
+from sigmasplat.sources.files.images import image_size, read_color, read_depth
 
 Size = tuple[int, int]
 File = TypeVar("File")
