@@ -27,8 +27,8 @@ LATEST_S = 1e11
 """A larger timestamp is not in seconds: this is the year 5138, and milliseconds passed it in 1973."""
 NARROWEST = 0.05
 """A focal length below this share of the image width belongs to a normalised matrix."""
-MEDIAN_STEP = 8
-"""The median depth is computed from every eighth row and column."""
+MEDIAN_OF = 4096
+"""The median depth is that of about this many pixels."""
 
 _COLOR_OF_BYTE = (np.arange(256) / 255.0).astype(np.float32)
 
@@ -196,7 +196,7 @@ def _check_scale(depth_scale: float) -> None:
 
 def _check_unit(frame: Frame, depth_scale: float | None) -> None:
     """Raise SourceError if the median depth shows that the unit is wrong."""
-    some = frame.depth_m[::MEDIAN_STEP, ::MEDIAN_STEP]
+    some = frame.depth_m.reshape(-1)[:: max(1, frame.depth_m.size // MEDIAN_OF)]
     readings = some[some > 0]
     if not len(readings) or MEDIAN_DEPTH_M[0] <= (median_m := float(np.median(readings))) <= MEDIAN_DEPTH_M[1]:
         return

@@ -59,7 +59,11 @@ class Before:
     def of(slam: Observed) -> "Before":
         """Copy what a step may change."""
         a = slam.atlas
-        kept = replace(a, anchors=list(a.anchors), components=list(a.components), refined=dict(a.refined))
+        keyframe_poses = [*a.keyframe_poses[:-1], *map(list, a.keyframe_poses[-1:])]  # only the last ones can change
+        kept = replace(
+            a, anchors=list(a.anchors), components=list(a.components), refined=dict(a.refined),
+            keyframe_poses=keyframe_poses,
+        )  # fmt: skip
         return Before(kept, len(slam.steps), frozenset(_pair(loop) for loop in slam.loops if loop.accepted))
 
 
@@ -114,8 +118,7 @@ def correction_since(slam: Observed, before: Before) -> Correction | None:
     if not refined and all(np.array_equal(*pair) for pair in zip(old.anchors, new.anchors, strict=False)):
         return None
     earlier = new.places[: before.steps]
-    was = replace(new, anchors=[*old.anchors, *new.anchors[len(old.anchors) :]], refined=old.refined, places=earlier)
-    T_before, T_now = was.T_world_camera(), replace(new, places=earlier).T_world_camera()
+    T_before, T_now = (replace(atlas, places=earlier).T_world_camera() for atlas in (old, new))
     frames = np.flatnonzero((T_before != T_now).any((1, 2)))
     if not len(frames):
         return None
