@@ -11,8 +11,8 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.types import Matrix
 
-COLOR_MARGIN = 0.01
-"""Colour may be outside [0, 1] by this much: filters that interpolate can overshoot."""
+COLOR_LIMITS = (-1.0, 2.0)
+"""Colour outside these limits has another unit, usually 0…255. Values just outside [0, 1] are accepted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Frame:
     from the camera's axes to fixed axes, the same for all frames, measured by a gyroscope; None = not measured. Only
     the rotation between two frames is used, so any fixed axes will do. The frame keeps read-only views of both arrays
     and does not copy them: do not write to them later (`frame_from_arrays` copies). Raises SourceError if an array is
-    not float32, on inconsistent shapes, values that are not finite, colour outside [0, 1], negative depth, or a matrix
+    not float32, on inconsistent shapes, values that are not finite, colour in 0…255, negative depth, or a matrix
     that is not a rotation.
     """
 
@@ -76,11 +76,8 @@ class Frame:
         for name, values in (("colour", (low, high)), ("depth", (nearest_m, farthest_m))):
             if not np.isfinite(values).all():
                 raise SourceError(f"frame {self.index}: {name} holds NaN or inf; write 0 where there is no reading")
-        if low < -COLOR_MARGIN or high > 1.0 + COLOR_MARGIN:
-            raise SourceError(
-                f"frame {self.index}: colour is from {low:g} to {high:g}; give float values in 0…1 (divide by 255), "
-                "or uint8"
-            )
+        if low < COLOR_LIMITS[0] or high > COLOR_LIMITS[1]:
+            raise SourceError(f"frame {self.index}: {color_range(low, high)}")
         if nearest_m < 0.0:
             raise SourceError(f"frame {self.index}: depth is negative ({nearest_m:.3f} m); 0 means no reading")
 
@@ -129,6 +126,11 @@ def described(value: object) -> str:
     dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
     kind = "None" if value is None else type(value).__name__
     return kind if dtype is None or shape is None else f"{kind} {dtype} {list(shape)}"
+
+
+def color_range(low: float, high: float) -> str:
+    """Return what to say of colours from `low` to `high` if they are not in [0, 1]."""
+    return f"colour is from {low:g} to {high:g}; give float values in 0…1 (divide by 255), or uint8"
 
 
 def _interpolated(color: NDArray[np.float32], rows: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sigmasplat.errors import SourceError
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame, described
+from sigmasplat.model.frame import Frame, color_range, described
 from sigmasplat.types import Matrix
 
 ColorOrder = Literal["rgb", "bgr"]
@@ -21,6 +21,8 @@ Array = ArrayLike | torch.Tensor
 
 UINT16_MAX = 65535
 """Several sensors write the largest 16-bit number for no reading."""
+COLOR_MARGIN = 0.01
+"""Colour may be outside [0, 1] by this much: filters that interpolate can overshoot."""
 MEDIAN_DEPTH_M = (0.01, 100.0)
 """If the median depth of an image is outside these limits, its unit is wrong."""
 LATEST_S = 1e11
@@ -92,7 +94,11 @@ def color_from_array(rgb: Array, color_order: ColorOrder = "rgb") -> NDArray[np.
         return color_from_bytes(np.ascontiguousarray(values))
     if values.dtype.kind != "f":
         raise SourceError(f"{name}; give uint8, or float in 0…1")
-    return _float32(values)
+    color = _float32(values)
+    low, high = float(color.min()), float(color.max())
+    if low < -COLOR_MARGIN or high > 1.0 + COLOR_MARGIN:  # false for NaN, which `Frame` refuses
+        raise SourceError(color_range(low, high))
+    return color
 
 
 def depth_from_array(depth: Array, depth_scale: float | None = None) -> NDArray[np.float32]:
