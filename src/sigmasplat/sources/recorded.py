@@ -129,8 +129,8 @@ class RecordedSource(Source):
         """Raise SourceError before a run if the gyroscope measured at another time than the images were taken."""
         if self._gyroscope is None:
             return
-        first_s, last_s = self._gyroscope.timestamps_s[[0, -1]]
-        if not any(first_s <= pair.timestamp_s <= last_s for pair in self._images):
+        if not self._gyroscope.measured_any(np.array([pair.timestamp_s for pair in self._images])):
+            first_s, last_s = self._gyroscope.timestamps_s[[0, -1]]
             raise SourceError(
                 f"{self.name}: the gyroscope measured from {first_s:.3f} to {last_s:.3f} s, but the images were taken "
                 f"from {self._images[0].timestamp_s:.3f} to {self._images[-1].timestamp_s:.3f} s; use the same clock"
