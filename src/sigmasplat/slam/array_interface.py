@@ -1,23 +1,17 @@
 """The interface of SLAM for your own camera: images as arrays, covariances, and functions to call at events."""
 
-from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeVar
 
-from sigmasplat.config import Config
 from sigmasplat.errors import SourceError
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.component import LOST
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.frame_arrays import Array, ColorOrder, frame_from_arrays
-from sigmasplat.model.submap import SubmapStore
-from sigmasplat.presets import configured
 from sigmasplat.slam.listeners import Correction, Listeners
 from sigmasplat.slam.loop_closure.closer import Loop
-from sigmasplat.slam.newest_covariance import NewestCovariance
 from sigmasplat.slam.step_result import Step
-from sigmasplat.slam.world import World
 from sigmasplat.types import Matrix
 
 OnKeyframe = TypeVar("OnKeyframe", bound=Callable[[Step], object])
@@ -25,27 +19,22 @@ OnLoop = TypeVar("OnLoop", bound=Callable[[Loop], object])
 OnCorrection = TypeVar("OnCorrection", bound=Callable[[Correction], object])
 
 
-class ArrayInterface(World):
-    """Takes arrays instead of frames. `Slam` inherits it.
+class ArrayInterface(ABC):
+    """Takes arrays instead of frames, and calls functions at events."""
 
-    config: settings, or the name of a preset, by default the default preset; settings: values that replace some, as in
-    {"input.width": 320}. Raises ConfigError on an unknown preset or setting.
-    """
-
-    def __init__(
-        self,
-        config: Config | str | None = None,
-        store: SubmapStore | None = None,
-        *,
-        settings: Mapping[str, object] | None = None,
-    ) -> None:
-        super().__init__(configured(config, settings), store)
-        self.listeners = Listeners()
-        self._newest_covariance = NewestCovariance()
+    listeners: Listeners
 
     @abstractmethod
     def step(self, frame: Frame) -> Step:
         """Process one frame."""
+
+    @abstractmethod
+    def newest_step(self) -> Step | None:
+        """Return the result of the newest frame; None before the first one."""
+
+    @abstractmethod
+    def covariance(self) -> Matrix | None:
+        """Return the covariance [6, 6] of the newest frame's pose; None if that frame is lost."""
 
     def track(
         self,
@@ -69,32 +58,18 @@ class ArrayInterface(World):
         Raises SourceError with the remedy if an argument is not as described; the state is then unchanged, and the
         next image can be given.
         """
+        newest = self.newest_step()
         frame = frame_from_arrays(
-            rgb, depth, K, timestamp, index=len(self.steps), depth_scale=depth_scale, color_order=color_order,
-            R_inertial_camera=R_inertial_camera,
+            rgb, depth, K, timestamp, index=0 if newest is None else newest.index + 1, depth_scale=depth_scale,
+            color_order=color_order, R_inertial_camera=R_inertial_camera,
         )  # fmt: skip
-        if self.steps and frame.timestamp_s <= (last_s := self.steps[-1].timestamp_s):
-            order = "repeats" if frame.timestamp_s == last_s else "is before"
+        if newest is not None and frame.timestamp_s <= newest.timestamp_s:
+            order = "repeats" if frame.timestamp_s == newest.timestamp_s else "is before"
             raise SourceError(
-                f"timestamp {frame.timestamp_s} s {order} that of the frame before ({last_s} s); give increasing times"
+                f"timestamp {frame.timestamp_s} s {order} that of the frame before ({newest.timestamp_s} s); give "
+                "increasing times"
             )
         return replace(self.step(frame), covariance=self.covariance())
-
-    def covariance(self) -> Matrix | None:
-        """Return the covariance [6, 6] of the newest frame's pose; None if that frame is lost.
-
-        Order: position x, y, z (m), then rotation about x, y, z (rad), all in the axes of the world, as in
-        geometry_msgs/PoseWithCovariance. It covers the noise and the systematic error of tracking since the first
-        camera of the component, its disagreement with mapping, and what closed loops corrected (`path_covariance`). It
-        does not cover a wrong pose that tracking did not notice: `Step.p_off` is its probability. For the first frame
-        it is 0. Raises SourceError before the first frame.
-        """
-        if not self.steps:
-            raise SourceError("no pose yet: give a frame to `track` or `step` first")
-        newest = self.steps[-1]
-        if newest.state == LOST:
-            return None
-        return self._newest_covariance.of(self.atlas, self.closer, newest.is_keyframe)
 
     def on_keyframe(self, function: OnKeyframe) -> OnKeyframe:
         """Call `function(step)` after each frame that became a keyframe. Returns the function, so this can decorate it.

@@ -28,13 +28,14 @@ from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.rules import ends_submap, is_held_back, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.slam.uncertainty import final_uncertainty
+from sigmasplat.slam.world import World
 from sigmasplat.types import Matrix, no_progress, part_of
 
 LAST_TRIES = 3
 """Number of keyframes per submap that is apart with which other components are searched at the end."""
 
 
-class Slam(ArrayInterface):
+class Slam(World, ArrayInterface):
     """Simultaneous localisation and mapping: give frames to `step`, or arrays to `track`, then call `finish`; read
     `field` and `trajectory()` at any time.
 
