@@ -33,11 +33,11 @@ from sigmasplat.io.machine import usable_cores
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.metrics.trajectory import ate
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.frame_arrays import color_from_bytes
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.presets import default_preset, preset as preset_of
 from sigmasplat.sources import open_source
 from sigmasplat.sources.base import Source
-from sigmasplat.sources.files.images import color_from_bytes
 
 arg = tyro.conf.arg
 SOURCE = "synthetic:frames=2400,rooms=2,loops=4,noise=1"

@@ -17,9 +17,9 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.frame_arrays import color_from_bytes
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
-from sigmasplat.sources.files.images import color_from_bytes
 from sigmasplat.sources.opening import Format
 
 

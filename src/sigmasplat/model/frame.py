@@ -11,6 +11,9 @@ from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.types import Matrix
 
+COLOR_LIMITS = (-1.0, 2.0)
+"""Colour outside these limits has another unit, usually 0…255. Values just outside [0, 1] are accepted."""
+
 
 @dataclass(frozen=True, eq=False)
 class Detail:
@@ -30,8 +33,10 @@ class Frame:
     color: float32 [H, W, 3] in [0, 1]; depth_m: float32 [H, W] along the optical axis in metres, 0 = no reading;
     camera: the pinhole of both; timestamp_s: seconds; index: position in the source; R_inertial_camera [3, 3]: rotation
     from the camera's axes to fixed axes, the same for all frames, measured by a gyroscope; None = not measured. Only
-    the rotation between two frames is used, so any fixed axes will do. Raises SourceError on inconsistent shapes,
-    values that are not finite, negative depth, or a matrix that is not a rotation.
+    the rotation between two frames is used, so any fixed axes will do. The frame keeps read-only views of both arrays
+    and does not copy them: do not write to them later (`frame_from_arrays` copies). Raises SourceError if an array is
+    not float32, on inconsistent shapes, values that are not finite, colour in 0…255, negative depth, or a matrix
+    that is not a rotation.
     """
 
     index: int
@@ -42,23 +47,39 @@ class Frame:
     R_inertial_camera: Matrix | None = None
 
     def __post_init__(self) -> None:
+        for name, array in (("colour", self.color), ("depth", self.depth_m)):
+            if not isinstance(array, np.ndarray) or array.dtype != np.float32:
+                raise SourceError(
+                    f"frame {self.index}: {name} is {described(array)}; give numpy float32, or use Slam.track or "
+                    "frame_from_arrays, which convert other arrays"
+                )
         size = (self.camera.height, self.camera.width)
         if self.color.shape != (*size, 3) or self.depth_m.shape != size:
             raise SourceError(
                 f"frame {self.index}: colour is {self.color.shape}, depth is {self.depth_m.shape}, the camera is "
                 f"{size[1]}×{size[0]}; register depth to colour and give both one size"
             )
-        for name, array in (("colour", self.color), ("depth", self.depth_m)):
-            if not np.isfinite(array).all():
-                raise SourceError(f"frame {self.index}: {name} holds NaN or inf; write 0 where there is no reading")
-        if float(self.depth_m.min(initial=0.0)) < 0.0:
-            raise SourceError(f"frame {self.index}: depth is negative ({self.depth_m.min():.3f} m); 0 means no reading")
+        self._check_values()
         if self.R_inertial_camera is not None and not se3.is_rotation(self.R_inertial_camera):
             raise SourceError(
                 f"frame {self.index}: R_inertial_camera is not a rotation [3, 3]; give None if it is not measured"
             )
-        self.color.setflags(write=False)
-        self.depth_m.setflags(write=False)
+        for name, array in (("color", self.color), ("depth_m", self.depth_m)):
+            view = np.ascontiguousarray(array).view()  # a view: the caller's array stays writeable
+            view.setflags(write=False)
+            object.__setattr__(self, name, view)
+
+    def _check_values(self) -> None:
+        """Raise SourceError on values that are not finite or out of range."""
+        low, high = float(self.color.min()), float(self.color.max())  # both are NaN if a value is NaN
+        nearest_m, farthest_m = float(self.depth_m.min()), float(self.depth_m.max())
+        for name, values in (("colour", (low, high)), ("depth", (nearest_m, farthest_m))):
+            if not np.isfinite(values).all():
+                raise SourceError(f"frame {self.index}: {name} holds NaN or inf; write 0 where there is no reading")
+        if low < COLOR_LIMITS[0] or high > COLOR_LIMITS[1]:
+            raise SourceError(f"frame {self.index}: {color_range(low, high)}")
+        if nearest_m < 0.0:
+            raise SourceError(f"frame {self.index}: depth is negative ({nearest_m:.3f} m); 0 means no reading")
 
     def resized(self, width: int, height: int) -> "Frame":
         """Return the frame at another size: colour averaged over the pixel's area, depth by `resized_depth`."""
@@ -98,6 +119,18 @@ class Frame:
         depth = self.depth_m[np.clip(v, 0, size[1] - 1)][:, np.clip(u, 0, size[0] - 1)]
         color, depth = np.ascontiguousarray(color.swapaxes(0, 1)), np.where(read, depth, np.float32(0.0))
         return replace(self, color=color, depth_m=depth, camera=camera)
+
+
+def described(value: object) -> str:
+    """Return the type of a value in words, of an array its dtype and shape."""
+    dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
+    kind = "None" if value is None else type(value).__name__
+    return kind if dtype is None or shape is None else f"{kind} {dtype} {list(shape)}"
+
+
+def color_range(low: float, high: float) -> str:
+    """Return what to say of colours from `low` to `high` if they are not in [0, 1]."""
+    return f"colour is from {low:g} to {high:g}; give float values in 0…1 (divide by 255), or uint8"
 
 
 def _interpolated(color: NDArray[np.float32], rows: NDArray[np.float64]) -> NDArray[np.float32]:

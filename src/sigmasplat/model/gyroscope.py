@@ -12,6 +12,13 @@ from sigmasplat.types import Matrix
 
 MAX_RAD_S = 40.0
 """Gyroscopes of phones and cameras measure up to 2000 °/s = 35 rad/s. Larger values are probably in degrees."""
+STILL_SAMPLES = 20
+"""A second with fewer samples is not judged."""
+STILL_NOISE_RAD_S = 0.01
+"""A gyroscope is still if its samples of one second vary by less than this (standard deviation): more than the noise of
+phones and cameras, less than a hand shakes."""
+MAX_BIAS_RAD_S = 0.05
+"""Biases of such gyroscopes are below 3 °/s; a larger mean is a turn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +49,10 @@ class Gyroscope:
         steps = Rotation.from_rotvec(means * np.diff(times_s)[:, None]).as_matrix()
         object.__setattr__(self, "_R_inertial_camera", np.stack(list(accumulate([np.eye(3), *steps], np.matmul))))
 
+    def measured_any(self, times_s: NDArray[np.float64]) -> bool:
+        """Return whether any of the times [N] is between the first and the last sample."""
+        return bool(((self.timestamps_s[0] <= times_s) & (times_s <= self.timestamps_s[-1])).any())
+
     def R_inertial_camera(self, time_s: float) -> Matrix | None:
         """Return the rotation [3, 3] from the camera's axes at a time to its axes at the first sample; None outside the
         samples.
@@ -56,3 +67,33 @@ class Gyroscope:
         since_s = time_s - times_s[k]
         mean = rates[k] + 0.5 * (rates[k + 1] - rates[k]) * since_s / (times_s[k + 1] - times_s[k])
         return np.asarray(self._R_inertial_camera[k] @ Rotation.from_rotvec(mean * since_s).as_matrix())
+
+
+def gyroscope_from_samples(
+    times_s: NDArray[np.float64], angular_velocity_rad_s: NDArray[np.float64]
+) -> Gyroscope | None:
+    """Make a gyroscope of recorded samples [M] and [M, 3], without its bias (`still_bias`); None if they are unusable.
+
+    Samples are sorted by time. Samples of repeated times, and values that are not finite, are left out.
+    """
+    finite = np.isfinite(times_s) & np.isfinite(angular_velocity_rad_s).all(1)
+    times, first = np.unique(times_s[finite], return_index=True)
+    rates = angular_velocity_rad_s[finite][first]
+    if len(times) < 2 or not rates.any() or np.abs(rates).max() > MAX_RAD_S:
+        return None
+    return Gyroscope(times, rates - still_bias(times, rates))
+
+
+def still_bias(times_s: NDArray[np.float64], angular_velocity_rad_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the bias [3], rad/s: the median over all seconds in which the gyroscope was still; 0 if it never was.
+
+    A slow turn without any shaking looks like a bias. The rotation is only a guess for tracking, so this costs no pose.
+    """
+    seconds = np.floor(times_s - times_s[0]).astype(np.int64)
+    starts = np.flatnonzero(np.diff(seconds, prepend=-1))
+    still = []
+    for rates in np.split(angular_velocity_rad_s, starts[1:]):
+        enough = len(rates) >= STILL_SAMPLES
+        if enough and rates.std(0).max() < STILL_NOISE_RAD_S and np.linalg.norm(rates.mean(0)) < MAX_BIAS_RAD_S:
+            still.append(rates.mean(0))
+    return np.median(still, axis=0) if still else np.zeros(3)

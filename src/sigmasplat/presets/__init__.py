@@ -1,9 +1,10 @@
 """Provide the presets by name. A preset is a set of values; each system has its own module."""
 
 import dataclasses
+from collections.abc import Mapping
 
 from sigmasplat.config import Config
-from sigmasplat.config.text import nearest
+from sigmasplat.config.text import nearest, override
 from sigmasplat.errors import ConfigError
 from sigmasplat.presets import cgslam, cgslam_released, sigma, varsplat, varsplat_released
 
@@ -34,6 +35,18 @@ def preset(name: str) -> Config:
     if name not in PRESETS:
         raise ConfigError(f"no preset {name!r}{_similar(name) or _all(name)}")
     return PRESETS[name]
+
+
+def configured(config: Config | str | None, settings: Mapping[str, object] | None = None) -> Config:
+    """Return settings, those of a preset by name, or those of the default preset, with some replaced, as in
+    {"input.width": 320}.
+
+    Raises ConfigError on an unknown preset, an unknown setting, or a value of the wrong type.
+    """
+    if config is not None and not isinstance(config, Config | str):
+        raise ConfigError(f"settings are {type(config).__name__}; give a Config or the name of a preset")
+    base = config if isinstance(config, Config) else preset(config or default_preset())
+    return override(base, {name: str(value) for name, value in (settings or {}).items()})
 
 
 def _similar(name: str) -> str:

@@ -88,7 +88,7 @@ class PathCovariance:
 
     anchors [S, 4, 4]: T_world_submap; components [S]; frame_submap, frame_keyframe [F], the latter counted in its
     submap, T_keyframe_camera [F, 4, 4], is_keyframe [F]; keyframe_submap [K], T_submap_keyframe [K, 4, 4]; hops to the
-    keyframes; edges: the trusted ones and the accepted loops.
+    keyframes; edges: the trusted ones and the accepted loops; known_factors: `factors`, None = computed on reading.
     """
 
     anchors: Matrix
@@ -101,6 +101,19 @@ class PathCovariance:
     T_submap_keyframe: Matrix
     hops: Hops
     edges: tuple[Edge, ...]
+    known_factors: Factors | None = None
+
+    @staticmethod
+    def of_keyframes(atlas: Atlas, edges: Sequence[Edge], factors: Factors | None = None) -> "PathCovariance":
+        """Return the errors of the keyframes alone, without other frames; factors: known ones, so that they need not be
+        computed."""
+        read = {name: tensor.numpy() for name, tensor in recorded(replace(atlas, places=[]), edges).items()}
+        none, anchors, components = np.empty(0, np.int64), np.array(atlas.anchors), np.array(atlas.components, np.int64)
+        return PathCovariance(
+            anchors, components, none, none, read["T_keyframe_camera"], none.astype(bool),
+            read["keyframe_submap"], read["T_submap_keyframe"],
+            Hops(read["hop_T_camera_before"], read["hop_covariance"], read["hop_bias"]), tuple(edges), factors,
+        )  # fmt: skip
 
     @staticmethod
     def of(checkpoint: Mapping[str, Tensor]) -> "PathCovariance | None":
@@ -136,6 +149,11 @@ class PathCovariance:
         error, own = self._error_of(frame)
         return np.asarray(error @ error.T + own)
 
+    def of_keyframe(self, submap: int, keyframe: int) -> Matrix:
+        """Return the covariance [6, 6] of a keyframe's pose, as `of_frame`; keyframe: counted in its submap."""
+        error = self._error_of_keyframe(int(self._first[submap]) + keyframe)
+        return np.asarray(error @ error.T)
+
     def between(self, a: int, b: int) -> Matrix:
         """Return the covariance [6, 6] of the left twist of T_a_b, the pose of frame b in the camera of frame a.
 
@@ -159,6 +177,8 @@ class PathCovariance:
         A loop from a to b and the chain both measure T_a_b. The twist between the two is the loop's error minus that of
         the chain. Loops between neighbouring submaps share most of the chain, so they show the errors of loops alone.
         """
+        if self.known_factors is not None:
+            return self.known_factors
         loops = [number for number, edge in enumerate(self.edges) if edge.loop]
         if not loops:
             return Factors()
@@ -276,8 +296,9 @@ class PathCovariance:
     def _independent(self) -> Matrix:
         """Return the independent errors of the hops [K, 6, 6], in the frames of their submaps."""
         spread = self._disagreement[1]
-        roots = [_root(C + spread if np.isfinite(C).all() else UNKNOWN) for C in self.hops.covariance]
-        return np.asarray(-se3.adjoint(self.T_submap_keyframe) @ np.stack(roots))
+        known = np.isfinite(self.hops.covariance).all((1, 2), keepdims=True)
+        roots = _root(np.where(known, self.hops.covariance + spread, UNKNOWN))
+        return np.asarray(-se3.adjoint(self.T_submap_keyframe) @ roots)
 
     @cached_property
     def _shared(self) -> tuple[Matrix, Matrix]:
@@ -315,6 +336,6 @@ class _Graph:
 
 
 def _root(covariance: Matrix) -> Matrix:
-    """Return W [6, 6] with W Wᵀ = a covariance, which may be singular."""
+    """Return W [..., 6, 6] with W Wᵀ = a covariance, which may be singular."""
     values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])

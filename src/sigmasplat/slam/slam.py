@@ -12,9 +12,11 @@ from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import RefinedStore, StorePart
+from sigmasplat.slam.array_interface import ArrayInterface
 from sigmasplat.slam.drift import Drift, mean_variance
 from sigmasplat.slam.final import final_map
 from sigmasplat.slam.found import Found
+from sigmasplat.slam.listeners import notifying
 from sigmasplat.slam.localisation.confidence import std_of
 from sigmasplat.slam.localisation.known_map import KnownMap
 from sigmasplat.slam.localisation.recovery import Link, usable
@@ -33,14 +35,15 @@ LAST_TRIES = 3
 """Number of keyframes per submap that is apart with which other components are searched at the end."""
 
 
-class Slam(World):
-    """Simultaneous localisation and mapping: give frames to `step`, then call `finish`; read `field` and `trajectory()`
-    at any time.
+class Slam(World, ArrayInterface):
+    """Simultaneous localisation and mapping: give frames to `step`, or arrays to `track`, then call `finish`; read
+    `field` and `trajectory()` at any time.
 
     Frame 0 fixes the gauge: the world is the first camera. No part of this class reads ground truth. Finished submaps
     go to `store`, by default in memory.
     """
 
+    @notifying
     def step(self, frame: Frame) -> Step:
         """Process one frame: track it, find it in the whole map if it is lost, map it if it is a keyframe, and cut the
         submap if a rule ends it here.
@@ -65,6 +68,7 @@ class Slam(World):
         self.steps.append(self._step_result(seen.frame, found))
         return self.steps[-1]
 
+    @notifying
     def finish(self, progress: Callable[[int, int], None] = no_progress) -> None:
         """Finish the last submap, look for its loops, and make the final map (VarSplat §7); call it once, at the end.
 

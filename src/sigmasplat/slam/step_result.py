@@ -25,7 +25,8 @@ class Step:
     stage.
 
     state: tracked, relocalised, lost or apart; component: that of the atlas, 0 is the world; p_off: the probability
-    that the pose is off by more than 5 cm.
+    that the pose is off by more than 5 cm; covariance [6, 6]: `Slam.covariance()` after this frame, if `Slam.track`
+    returned the step; else None.
     """
 
     index: int
@@ -41,6 +42,7 @@ class Step:
     state: str = TRACKED
     component: int = 0
     p_off: float = 0.0
+    covariance: NDArray[np.float64] | None = None
 
 
 def metrics_of(fit: PoseFit) -> dict[str, float]:

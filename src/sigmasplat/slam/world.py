@@ -1,5 +1,7 @@
 """The state of SLAM, and how to read it: map, path, components, checkpoint."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -9,16 +11,17 @@ from sigmasplat.config import Config
 from sigmasplat.errors import SourceError
 from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.component import Component
+from sigmasplat.model.component import LOST, Component
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.map_uncertainty import MapUncertainty
 from sigmasplat.model.submap import MemoryStore, SubmapStore
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.presets import default_preset, preset
+from sigmasplat.presets import configured
 from sigmasplat.render.view import View
 from sigmasplat.slam.checkpoint import checkpoint_of
 from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.features import make_extractor
+from sigmasplat.slam.listeners import Listeners
 from sigmasplat.slam.localisation.confidence import Confidence
 from sigmasplat.slam.localisation.recovery import Recovery
 from sigmasplat.slam.localisation.relocaliser import Relocaliser
@@ -26,10 +29,12 @@ from sigmasplat.slam.localisation.sight import view_of
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.merged import components_apart, merged_field
+from sigmasplat.slam.newest_covariance import NewestCovariance
 from sigmasplat.slam.probes import Probes
 from sigmasplat.slam.refinement import SavedRefinement
 from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.slam.tracker import Tracker
+from sigmasplat.types import Matrix
 
 HOST = torch.device("cpu")
 
@@ -39,10 +44,19 @@ class World:
 
     Frame 0 fixes the gauge: the world is the first camera, or that of the map that is continued. Finished submaps go to
     `store`, by default in memory.
+
+    config: settings, or the name of a preset, by default the default preset; settings: values that replace some, as in
+    {"input.width": 320}. Raises ConfigError on an unknown preset or setting.
     """
 
-    def __init__(self, config: Config | None = None, store: SubmapStore | None = None) -> None:
-        self.config = (config or preset(default_preset())).checked()
+    def __init__(
+        self,
+        config: Config | str | None = None,
+        store: SubmapStore | None = None,
+        *,
+        settings: Mapping[str, object] | None = None,
+    ) -> None:
+        self.config = configured(config, settings).checked()
         self.random = np.random.default_rng(self.config.seed)
         self.store = MemoryStore() if store is None else store
         self.atlas = Atlas()
@@ -69,6 +83,8 @@ class World:
         self.uncertainty: MapUncertainty | None = None
         """How sure the final map is; None before `finish`, or without probe views (`uncertainty.probes`)."""
         self._timer = StepTimer()
+        self.listeners = Listeners()
+        self._newest_covariance = NewestCovariance()
 
     @property
     def field(self) -> GaussianField:
@@ -101,6 +117,26 @@ class World:
     def believed(self) -> NDArray[np.bool_]:
         """Return whether the pose of each frame so far is believed [F]: not lost, and connected to the world."""
         return self.atlas.in_world & np.array([not step.lost for step in self.steps], np.bool_)
+
+    def newest_step(self) -> Step | None:
+        """Return the result of the newest frame; None before the first one."""
+        return self.steps[-1] if self.steps else None
+
+    def covariance(self) -> Matrix | None:
+        """Return the covariance [6, 6] of the newest frame's pose; None if that frame is lost.
+
+        Order: position x, y, z (m), then rotation about x, y, z (rad), all in the axes of the world, as in
+        geometry_msgs/PoseWithCovariance. It covers the noise and the systematic error of tracking since the first
+        camera of the component, its disagreement with mapping, and what closed loops corrected (`path_covariance`). It
+        does not cover a wrong pose that tracking did not notice: `Step.p_off` is its probability. For the first frame
+        it is 0. Raises SourceError before the first frame.
+        """
+        newest = self.newest_step()
+        if newest is None:
+            raise SourceError("no pose yet: give a frame to `track` or `step` first")
+        if newest.state == LOST:
+            return None
+        return self._newest_covariance.of(self.atlas, self.closer, newest.is_keyframe)
 
     def checkpoint(self) -> dict[str, Tensor]:
         """Return what is needed to read a run back, in host memory: the active submap's field with its optimiser state,

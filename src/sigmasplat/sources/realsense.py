@@ -18,9 +18,9 @@ from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame, resized_color
+from sigmasplat.model.frame_arrays import color_from_bytes
 from sigmasplat.sources.camera.calibration import Calibration, Distortion, resolve_calibration
 from sigmasplat.sources.camera.rectification import Rectification
-from sigmasplat.sources.files.images import color_from_bytes
 from sigmasplat.sources.files.optional import import_optional
 from sigmasplat.sources.live import LiveSource
 from sigmasplat.sources.opening import Format

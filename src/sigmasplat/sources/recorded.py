@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.frame import Frame, resized_color
+from sigmasplat.model.frame_arrays import color_from_bytes
 from sigmasplat.model.gyroscope import Gyroscope
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
 from sigmasplat.sources.camera.calibration import Calibration
 from sigmasplat.sources.camera.depth_units import refuse_without_depth
 from sigmasplat.sources.camera.rectification import Rectification, check_image_sizes
-from sigmasplat.sources.files.images import color_from_bytes, image_size, read_color, read_depth
+from sigmasplat.sources.files.images import image_size, read_color, read_depth
 
 Size = tuple[int, int]
 File = TypeVar("File")
@@ -128,8 +129,8 @@ class RecordedSource(Source):
         """Raise SourceError before a run if the gyroscope measured at another time than the images were taken."""
         if self._gyroscope is None:
             return
-        first_s, last_s = self._gyroscope.timestamps_s[[0, -1]]
-        if not any(first_s <= pair.timestamp_s <= last_s for pair in self._images):
+        if not self._gyroscope.measured_any(np.array([pair.timestamp_s for pair in self._images])):
+            first_s, last_s = self._gyroscope.timestamps_s[[0, -1]]
             raise SourceError(
                 f"{self.name}: the gyroscope measured from {first_s:.3f} to {last_s:.3f} s, but the images were taken "
                 f"from {self._images[0].timestamp_s:.3f} to {self._images[-1].timestamp_s:.3f} s; use the same clock"

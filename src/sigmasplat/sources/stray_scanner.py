@@ -3,12 +3,15 @@
 rgb.mp4                       depth/000000.png    16-bit millimetres, fewer pixels, same camera
 camera_matrix.csv   3×3       confidence/000000.png   0, 1 or 2: readings with 0 are ignored
 odometry.csv        timestamp, frame, x, y, z, qx, qy, qz, qw [, fx, fy, cx, cy]
+imu.csv             timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z: alpha is the angular velocity, rad/s; optional
 
 The app converts ARKit's camera axes to ours before it writes a pose (OdometryEncoder.swift). Frame, depth and pose
-share one number. Recordings of 2021, whose odometry.csv has no header, are not supported.
+share one number. The clock of imu.csv is that of the frames, and its axes are those of the phone (IMUEncoder.swift,
+DatasetEncoder.swift). Recordings of 2021, whose odometry.csv has no header, are not supported.
 """
 
 import csv
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +22,7 @@ from PIL import Image
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
+from sigmasplat.model.gyroscope import Gyroscope, gyroscope_from_samples
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.camera.calibration import MM_PER_METRE, Calibration, build_camera, resolve_calibration
 from sigmasplat.sources.files.images import guard_decoding, image_size, read_depth
@@ -27,6 +31,10 @@ from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, Size, first_size
 
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
+ANGULAR = ("alpha_x", "alpha_y", "alpha_z")
+R_CAMERA_PHONE = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+"""To the camera's axes from those of the phone. Held upright, the phone has x right, y up and z towards the user. The
+image's x points from the top of the phone to its bottom (ARKit's camera axes, with y and z reversed)."""
 INTRINSICS = ("fx", "fy", "cx", "cy")
 Rows = dict[int, dict[str, float]]
 
@@ -82,7 +90,9 @@ def open_stray_scanner(folder: Path, settings: InputConfig) -> RecordedSource:
     kept = set(numbers)
     skipped = [f"{depths[n]}: no frame {n} in rgb.mp4 or odometry.csv" for n in sorted(depths) if n not in kept]
     calibration = _calibration(folder, rows, video.size, first_size([depths[n] for n in numbers]), settings)
-    return RecordedSource(folder.resolve().name, images, calibration, settings, _truth(rows, numbers), skipped)
+    gyroscope = _gyroscope(folder / "imu.csv", np.array([rows[n]["timestamp"] for n in numbers]))
+    truth = _truth(rows, numbers)
+    return RecordedSource(folder.resolve().name, images, calibration, settings, truth, skipped, gyroscope=gyroscope)
 
 
 def with_coarser_depth(calibration: Calibration, depth_size: Size) -> Calibration:
@@ -159,6 +169,26 @@ def _truth(rows: Rows, numbers: list[int]) -> Trajectory | None:
         T[:3, :3] = se3.rotation_from_quaternion(np.array([row["qw"], row["qx"], row["qy"], row["qz"]]))
         T[:3, 3] = row["x"], row["y"], row["z"]
     return Trajectory(np.array([rows[n]["timestamp"] for n in numbers]), poses)
+
+
+def _gyroscope(path: Path, frame_times_s: NDArray[np.float64]) -> Gyroscope | None:
+    """Read the angular velocities; None if they are missing, unusable, or of another time than the frames.
+
+    Lines that cannot be read are left out: the app may be stopped while it writes one.
+    """
+    if not path.is_file():
+        return None
+    with path.open(newline="", encoding="utf-8", errors="replace") as file:
+        lines = [[word.strip() for word in line] for line in csv.reader(file) if line]
+    if not lines or not {"timestamp", *ANGULAR} <= set(lines[0]):
+        return None
+    columns, samples = [lines[0].index(name) for name in ("timestamp", *ANGULAR)], []
+    for line in lines[1:]:
+        with suppress(ValueError, IndexError):
+            samples.append([float(line[column]) for column in columns])
+    values = np.array(samples).reshape(-1, 4)
+    gyroscope = gyroscope_from_samples(values[:, 0], values[:, 1:] @ R_CAMERA_PHONE.T)
+    return gyroscope if gyroscope is not None and gyroscope.measured_any(frame_times_s) else None
 
 
 def _recognises(path: str) -> bool:

@@ -9,10 +9,10 @@ from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.frame_arrays import color_from_bytes
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
-from sigmasplat.sources.files.images import color_from_bytes
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.room.furnish import furnish_rooms
 from sigmasplat.sources.room.render import RoomScene, build_scene, render_scene

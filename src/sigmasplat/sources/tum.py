@@ -19,6 +19,7 @@ from sigmasplat.errors import RunError, SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.frame_arrays import UINT16_MAX
 from sigmasplat.model.gyroscope import Gyroscope
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
@@ -29,7 +30,6 @@ from sigmasplat.sources.camera.calibration import (
     resolve_calibration,
 )
 from sigmasplat.sources.files.association import MAX_GAP_S, associate, no_pairs
-from sigmasplat.sources.files.images import UINT16_MAX
 from sigmasplat.sources.files.poses import rigid_transform
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size

@@ -11,18 +11,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sigmasplat.errors import SourceError
+from sigmasplat.model.frame_arrays import depth_from_integers
 
 Value = TypeVar("Value")
-
-UINT16_MAX = 65535
-"""Several sensors write the largest 16-bit number for no reading."""
-
-_COLOR_OF_BYTE = (np.arange(256) / 255.0).astype(np.float32)
-
-
-def color_from_bytes(values: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Convert 8-bit colour to float32 in [0, 1], same shape."""
-    return _COLOR_OF_BYTE[values]
 
 
 def read_color(path: Path) -> NDArray[np.uint8]:
@@ -62,8 +53,7 @@ def depth_to_metres(path: Path, raw: NDArray[Any], units_per_metre: float) -> ND
         )
     if raw.dtype.kind == "f":
         return _checked_metres(path, raw.astype(np.float32))
-    readings = np.where(raw == UINT16_MAX, 0, raw)
-    return _checked_metres(path, (readings / units_per_metre).astype(np.float32))
+    return _checked_metres(path, depth_from_integers(raw, units_per_metre))
 
 
 def _checked_metres(path: Path, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:

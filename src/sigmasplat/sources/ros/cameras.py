@@ -69,7 +69,7 @@ def read_bag_calibration(bag: Bag, color: ImageTopic, depth: ImageTopic, setting
 
 def is_registered(color: ImageTopic, depth: ImageTopic) -> bool:
     """Return whether depth is registered to colour: by its topic name, or by an equal optical frame."""
-    return depth.registered or (bool(depth.frame) and depth.frame == color.frame and not _sdk_stream(depth))
+    return depth.registered or (bool(depth.frame) and depth.frame == color.frame and not sdk_stream(depth))
 
 
 def read_optics(bag: Bag, topic: ImageTopic) -> Optics | None:
@@ -114,20 +114,20 @@ def _color_depth(bag: Bag, color: ImageTopic, depth: ImageTopic) -> Matrix:
     return found
 
 
-def _sdk_stream(topic: ImageTopic) -> str:
+def sdk_stream(topic: ImageTopic) -> str:
     """Return the SDK's name of a stream, such as /device_0/sensor_0/Depth_0, or "" for other bags."""
     return topic.base.removesuffix("/image/data") if topic.base.startswith("/device_") else ""
 
 
 def _sdk_color_depth(bag: Bag, color: ImageTopic, depth: ImageTopic) -> Matrix | None:
-    poses = [_sdk_pose(bag, _sdk_stream(topic)) for topic in (color, depth)]
+    poses = [sdk_pose(bag, sdk_stream(topic)) for topic in (color, depth)]
     T_color_reference, T_depth_reference = poses
     if T_color_reference is None or T_depth_reference is None:
         return None
     return T_color_reference @ se3.inverse(T_depth_reference)
 
 
-def _sdk_pose(bag: Bag, stream: str) -> Matrix | None:
+def sdk_pose(bag: Bag, stream: str) -> Matrix | None:
     """Return T_stream_reference, None if the bag is not from the SDK."""
     found = bag.topics_of_type("geometry_msgs/msg/Transform")
     names = [topic.name for topic in found if topic.name.startswith(f"{stream}/tf/")]

@@ -1,0 +1,143 @@
+"""Call the caller's functions at keyframes, closed loops and corrections of earlier poses."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import wraps
+from typing import Concatenate, Literal, ParamSpec, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sigmasplat.model.atlas import Atlas
+from sigmasplat.slam.loop_closure.closer import Loop
+from sigmasplat.slam.step_result import Step
+from sigmasplat.types import Matrix
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+Event = TypeVar("Event")
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """The poses of earlier frames have changed.
+
+    reason: "loop" if a loop was closed, "join" if a component joined another, "final map" at the end; frames [n]: the
+    rows of `trajectory()` that moved, without the newest frame; T_world_camera [n, 4, 4]: their poses now; moved_m [n]:
+    how far they moved.
+    """
+
+    reason: Literal["loop", "join", "final map"]
+    frames: NDArray[np.int64]
+    T_world_camera: Matrix
+    moved_m: Matrix
+
+
+class Observed(Protocol):
+    """What listeners read of a SLAM system."""
+
+    atlas: Atlas
+    steps: list[Step]
+    listeners: "Listeners"
+
+    @property
+    def loops(self) -> list[Loop]: ...
+
+
+System = TypeVar("System", bound=Observed)
+
+
+@dataclass(frozen=True, eq=False)
+class Before:
+    """The state before a step, as far as listeners need it. closed: the pairs of submaps of the closed loops."""
+
+    atlas: Atlas
+    steps: int
+    closed: frozenset[tuple[int, int]]
+
+    @staticmethod
+    def of(slam: Observed) -> "Before":
+        """Copy what a step may change."""
+        a = slam.atlas
+        keyframe_poses = [*a.keyframe_poses[:-1], *map(list, a.keyframe_poses[-1:])]  # only the last ones can change
+        kept = replace(
+            a, anchors=list(a.anchors), components=list(a.components), refined=dict(a.refined),
+            keyframe_poses=keyframe_poses,
+        )  # fmt: skip
+        return Before(kept, len(slam.steps), frozenset(_pair(loop) for loop in slam.loops if loop.accepted))
+
+
+@dataclass(eq=False)
+class Listeners:
+    """The functions to call, in the order in which they were added."""
+
+    keyframe: list[Callable[[Step], object]] = field(default_factory=list)
+    loop: list[Callable[[Loop], object]] = field(default_factory=list)
+    correction: list[Callable[[Correction], object]] = field(default_factory=list)
+
+    def __bool__(self) -> bool:
+        return bool(self.keyframe or self.loop or self.correction)
+
+    def notify(self, slam: Observed, before: Before) -> None:
+        """Call the functions for what happened since `before`: keyframe, loops, correction. If functions raise, the
+        others are still called, then the first exception is raised."""
+        new = [loop for loop in slam.loops if loop.accepted and _pair(loop) not in before.closed]
+        correction = correction_since(slam, before) if self.correction else None
+        problems = _called(self.keyframe, [step for step in slam.steps[before.steps :] if step.is_keyframe])
+        problems += _called(self.loop, new)
+        problems += _called(self.correction, [] if correction is None else [correction])
+        if problems:
+            raise problems[0]
+
+
+def notifying(
+    method: Callable[Concatenate[System, Arguments], Result],
+) -> Callable[Concatenate[System, Arguments], Result]:
+    """Make a method of SLAM call the listeners after it has ended without an error."""
+
+    @wraps(method)
+    def notified(slam: System, /, *args: Arguments.args, **named: Arguments.kwargs) -> Result:
+        if not slam.listeners:
+            return method(slam, *args, **named)
+        before = Before.of(slam)
+        result = method(slam, *args, **named)
+        slam.listeners.notify(slam, before)
+        return result
+
+    return notified
+
+
+def correction_since(slam: Observed, before: Before) -> Correction | None:
+    """Return which earlier frames have other poses than before, None if none has.
+
+    Poses are compared only if an anchor or a refined keyframe has changed: mapping moves the keyframes of the active
+    submap a little at each keyframe, which is no correction.
+    """
+    old, new = before.atlas, slam.atlas
+    refined = new.refined.keys() != old.refined.keys()
+    if not refined and all(np.array_equal(*pair) for pair in zip(old.anchors, new.anchors, strict=False)):
+        return None
+    earlier = new.places[: before.steps]
+    T_before, T_now = (replace(atlas, places=earlier).T_world_camera() for atlas in (old, new))
+    frames = np.flatnonzero((T_before != T_now).any((1, 2)))
+    if not len(frames):
+        return None
+    joined = old.components != new.components[: len(old.components)]
+    moved_m = np.linalg.norm(T_now[frames, :3, 3] - T_before[frames, :3, 3], axis=1)
+    return Correction("final map" if refined else "join" if joined else "loop", frames, T_now[frames], moved_m)
+
+
+def _called(functions: Sequence[Callable[[Event], object]], events: Sequence[Event]) -> list[Exception]:
+    """Call every function with every event; return the exceptions they raise."""
+    problems = []
+    for event in events:
+        for function in functions:
+            try:
+                function(event)
+            except Exception as problem:
+                problems.append(problem)
+    return problems
+
+
+def _pair(loop: Loop) -> tuple[int, int]:
+    return loop.query, loop.database
