@@ -1,0 +1,62 @@
+"""Write a ROS 2 bag: a folder with metadata.yaml and one MCAP file, through the rosbags package (Apache-2.0)."""
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from sigmasplat.errors import RunError
+from sigmasplat.robots.ros_messages import EXTRA, TOPICS, Encoded, RosMessages, Topic
+from sigmasplat.sources.files.optional import import_optional
+
+
+class BagSink:
+    """A bag in a new folder, with all topics, also those without messages. Chunks are compressed with Zstandard."""
+
+    name = "bag"
+
+    def __init__(self, folder: Path) -> None:
+        """Raises SourceError without the rosbags package, RunError if the folder exists."""
+        self.rosbag2 = import_optional("rosbags.rosbag2", EXTRA, "a ROS bag")
+        self.interfaces = import_optional("rosbags.interfaces", EXTRA, "a ROS bag")
+        self.folder = folder
+        if folder.exists():
+            raise RunError(f"{folder} exists; give another folder for the bag")
+        self.writer: Any = None
+        self.connections = dict[str, Any]()
+
+    def open(self, messages: RosMessages) -> None:
+        """Create the folder and its topics. Raises OSError if that fails."""
+        library = self.rosbag2
+        self.writer = library.Writer(self.folder, version=9, storage_plugin=library.StoragePlugin.MCAP)
+        self.writer.set_compression(library.CompressionMode.STORAGE, library.CompressionFormat.ZSTD)
+        self.writer.open()
+        for topic in TOPICS:
+            self.connections[topic.name] = self.writer.add_connection(
+                topic.name, topic.msgtype, typestore=messages.store, offered_qos_profiles=[self._quality(topic)]
+            )
+
+    def wants(self, *topics: Topic) -> bool:
+        """Return True: a bag keeps every message."""
+        return True
+
+    def write(self, message: Encoded) -> None:
+        """Write a message; its recording time is its stamp. Raises OSError if the disk is full."""
+        self.writer.write(self.connections[message.topic.name], message.stamp_ns, message.data)
+
+    def close(self) -> None:
+        """Write the index and metadata.yaml. Raises OSError if the disk is full."""
+        self.writer.close()
+
+    def abort(self) -> None:
+        """Close the file without an index; `mcap recover` reads what was written."""
+        with suppress(Exception):
+            self.writer.abort()
+
+    def _quality(self, topic: Topic) -> Any:
+        """Return the quality of service with which a player publishes a topic."""
+        kinds, no_limit = self.interfaces, self.interfaces.QosTime(2147483647, 4294967295)
+        durability = kinds.QosDurability.TRANSIENT_LOCAL if topic.latched else kinds.QosDurability.VOLATILE
+        return kinds.Qos(
+            kinds.QosHistory.KEEP_LAST, 1 if topic.latched else 100, kinds.QosReliability.RELIABLE, durability,
+            no_limit, no_limit, kinds.QosLiveliness.AUTOMATIC, no_limit, False,
+        )  # fmt: skip

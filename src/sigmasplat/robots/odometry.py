@@ -1,0 +1,101 @@
+"""Odometry of a run: the sum of its tracked motions, which no correction changes, and the covariance of this sum."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sigmasplat.model import se3
+from sigmasplat.model.atlas import Atlas
+from sigmasplat.model.component import LOST, RELOCALISED
+from sigmasplat.types import Matrix
+
+UNKNOWN_STATES = (LOST, RELOCALISED)
+"""The motion to a frame in one of these states is not tracked. The odometry counts it as no motion."""
+
+
+def odometry_poses(T_chain_camera: Matrix, states: Sequence[str], components: Sequence[int]) -> Matrix:
+    """Return T_odom_camera [F, 4, 4] of a finished path: the identity at the first frame.
+
+    T_chain_camera [F, 4, 4]: poses without corrections by loops; states, components: of the frames. Motions from or to
+    a lost frame, to a relocalised frame, and between components are left out.
+    """
+    poses = [np.eye(4)] if len(T_chain_camera) else []
+    for i in range(1, len(T_chain_camera)):
+        known = states[i] not in UNKNOWN_STATES and states[i - 1] != LOST and components[i] == components[i - 1]
+        motion = se3.inverse(T_chain_camera[i - 1]) @ T_chain_camera[i] if known else np.eye(4)
+        poses.append(se3.orthonormalise(poses[-1] @ motion))
+    return np.array(poses).reshape(-1, 4, 4)
+
+
+class LiveOdometry:
+    """Odometry of a run that goes on: T_odom_camera [4, 4], the identity at the first frame that it is given.
+
+    covariance [6, 6]: of the left twist (ρ, φ), m and rad, of T_odom_camera; None if it is not known. It sums the
+    errors of hops between keyframes that tracking estimates: those of alignment are independent, the systematic ones
+    are the same in all hops. It does not contain what is measured only at the end of a run: the disagreement between
+    tracking and mapping (`slam.path_covariance`).
+    """
+
+    def __init__(self, atlas: Atlas) -> None:
+        self.atlas = atlas
+        self.T_odom_camera, self.covariance = np.eye(4), _zero()
+        self._independent, self._systematic = np.zeros((6, 6)), np.zeros((6, 6))
+        self._last_hop: Matrix | None = None
+        self._known, self._lost = True, False
+        self._counted: tuple[int, int] | None = None
+
+    def step(self, state: str, is_keyframe: bool) -> Matrix:
+        """Add the motion to the newest frame of the atlas; return T_odom_camera."""
+        if self._counted is None:
+            self._counted = self._hops()
+        else:
+            motion = None if state in UNKNOWN_STATES or self._lost else self._motion()
+            self._known &= motion is not None
+            if motion is not None:
+                self.T_odom_camera = se3.orthonormalise(self.T_odom_camera @ motion)
+            self._add_new_hops()
+            self.covariance = self._covariance(is_keyframe)
+        self._lost = state == LOST
+        return self.T_odom_camera
+
+    def _motion(self) -> Matrix | None:
+        """Return the motion between the last two frames; None if they are in different components.
+
+        Both poses are read now, so that changes of their keyframes by mapping are no motion.
+        """
+        atlas, (before, now) = self.atlas, self.atlas.places[-2:]
+        if atlas.components[before.submap] != atlas.components[now.submap]:
+            return None
+        T = [atlas.odometry[s] @ atlas.keyframe_poses[s][k] @ T_keyframe for s, k, T_keyframe in (before, now)]
+        return np.asarray(se3.inverse(T[0]) @ T[1])
+
+    def _hops(self) -> tuple[int, int]:
+        return len(self.atlas.hops), len(self.atlas.hops[-1])
+
+    def _add_new_hops(self) -> None:
+        """Add the errors of the hops to keyframes that are new since the last step."""
+        assert self._counted is not None
+        submaps, count = self._counted
+        new = [*self.atlas.hops[submaps - 1][count:], *(h for hops in self.atlas.hops[submaps:] for h in hops[1:])]
+        self._counted = self._hops()
+        A = -se3.adjoint(self.T_odom_camera)
+        for hop in new:
+            self._known &= bool(np.isfinite(hop.covariance).all())
+            self._independent = self._independent + A @ hop.covariance @ A.T
+            self._systematic = self._systematic + A * hop.bias
+            self._last_hop = hop.covariance + np.diag(hop.bias**2)
+
+    def _covariance(self, is_keyframe: bool) -> Matrix | None:
+        """Return the covariance of the newest frame: that of the newest keyframe, and the motion from it, which is as
+        uncertain as the hop to this keyframe."""
+        if not self._known or (self._last_hop is None and not is_keyframe):
+            return None
+        covariance = self._independent + self._systematic @ self._systematic.T
+        if not is_keyframe and self._last_hop is not None:
+            A = se3.adjoint(self.T_odom_camera)
+            covariance = covariance + A @ self._last_hop @ A.T
+        return np.asarray(covariance)
+
+
+def _zero() -> Matrix | None:
+    return np.zeros((6, 6))

@@ -1,0 +1,268 @@
+"""Stream messages to Foxglove and other viewers over a WebSocket, with Foxglove's protocol.
+
+Protocol: https://docs.foxglove.dev/docs/sdk/websocket-server, https://github.com/foxglove/ws-protocol. Foxglove's SDK
+is not used: it answers any page in the browser, because it does not check the header Origin. A test compares the
+messages with those of the SDK.
+
+Nothing that a client sends reaches the run: only `subscribe` and `unsubscribe` are read. Each client has a bounded
+queue; if it reads too slowly, its oldest messages are dropped.
+"""
+
+import asyncio
+import contextlib
+import ipaddress
+import json
+import logging
+import struct
+import threading
+from collections import deque
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from sigmasplat.env import install_extra
+from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.robots.ros_messages import TOPICS, Encoded, RosMessages, Topic
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import Server, ServerConnection
+    from websockets.http11 import Request, Response
+
+EXTRA = "foxglove"
+HOST, PORT = "127.0.0.1", 8765
+SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
+WEB_APP = "app.foxglove.dev"
+MOST_WAITING = 128
+"""At most this many messages wait for a client."""
+MOST_CLIENTS = 16
+MOST_REQUEST_BYTES = 65536
+"""A longer message from a client closes its connection."""
+CLOSE_S = 2.0
+"""At the end, clients have this many seconds to receive what waits."""
+MESSAGE_DATA = struct.Struct("<BIQ")
+"""Operation code 1, subscription, time in nanoseconds; then the message."""
+
+
+def is_allowed_origin(origin: str | None) -> bool:
+    """Return whether a request with this header Origin may read the stream.
+
+    Allowed are programs that are not browsers (no Origin, or a scheme of their own, as desktop applications have),
+    pages of this machine, and Foxglove's web application. Any other page in the browser is refused.
+    """
+    if origin is None:
+        return True
+    try:
+        page = urlsplit(origin.lower())
+        name = page.hostname or ""
+    except ValueError:
+        return False
+    if page.scheme not in ("http", "https"):
+        return bool(page.scheme)  # "null" has no scheme: a page in a sandbox
+    return name == "localhost" or (name == WEB_APP and page.scheme == "https") or _is_loopback(name)
+
+
+def _is_loopback(name: str) -> bool:
+    try:
+        return ipaddress.ip_address(name).is_loopback
+    except ValueError:
+        return False
+
+
+class _Client:
+    """A connection: the topics of its subscriptions, and the messages that wait for it. Used on the loop only."""
+
+    def __init__(self, connection: "ServerConnection") -> None:
+        self.connection = connection
+        self.topics = dict[int, Topic]()
+        self.waiting = deque[bytes](maxlen=MOST_WAITING)
+        self.ready = asyncio.Event()
+        self.dropped = 0
+
+    def add(self, message: Encoded) -> None:
+        """Queue a message for each subscription to its topic."""
+        for subscription, topic in self.topics.items():
+            if topic is message.topic:
+                self.dropped += len(self.waiting) == MOST_WAITING
+                self.waiting.append(MESSAGE_DATA.pack(1, subscription, message.stamp_ns) + message.data)
+                self.ready.set()
+
+    async def send_waiting(self) -> None:
+        """Send messages until the connection ends."""
+        while True:
+            await self.ready.wait()
+            while self.waiting:
+                await self.connection.send(self.waiting.popleft())
+            self.ready.clear()
+
+
+class StreamSink:
+    """A WebSocket server on a thread of its own.
+
+    port: the port that it listens on; lagging: number of messages that slow clients missed.
+    """
+
+    name = "stream"
+
+    def __init__(self, host: str = HOST, port: int = PORT) -> None:
+        """Start to listen; port 0 means any free port.
+
+        Raises SigmaSplatError if the websockets package is missing, or if the port is not free.
+        """
+        if not 0 <= port <= 65535:
+            raise ConfigError(f"--stream must be a port from 0 to 65535, found {port}")
+        try:
+            import websockets.asyncio.server  # noqa: F401
+        except ImportError as problem:
+            raise SigmaSplatError(f"--stream needs websockets ({problem}): {install_extra(EXTRA)}") from problem
+        logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # do not log clients that disconnect
+        self.host, self.lagging = host, 0
+        self._clients = set[_Client]()
+        self._last = dict[str, Encoded]()
+        self._wanted = frozenset[str]()
+        self._advertisement = ""
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="sigmasplat-websocket", daemon=True)
+        self._thread.start()
+        try:
+            self._server: Server = self._call(self._listen(port))
+        except OSError as problem:
+            self._stop_loop()
+            raise SigmaSplatError(
+                f"cannot stream on {host}:{port} ({problem.strerror or problem}); give another port: --stream PORT"
+            ) from problem
+        self.port = int(next(iter(self._server.sockets)).getsockname()[1])
+
+    def open(self, messages: RosMessages) -> None:
+        """Announce the channels, also to clients that are connected already."""
+        channels = [
+            {
+                "id": number, "topic": topic.name, "encoding": "cdr", "schemaName": topic.msgtype,
+                "schemaEncoding": "ros2msg", "schema": messages.schema(topic),
+            }
+            for number, topic in enumerate(TOPICS, 1)
+        ]  # fmt: skip
+        self._advertisement = json.dumps({"op": "advertise", "channels": channels})
+        self._call(self._announce())
+
+    def wants(self, *topics: Topic) -> bool:
+        """Return whether a client subscribes to one of these topics, or a later client would get its last message."""
+        return any(topic.latched or topic.name in self._wanted for topic in topics)
+
+    def write(self, message: Encoded) -> None:
+        """Queue a message for its subscribers."""
+        self._loop.call_soon_threadsafe(self._publish, message)
+
+    def close(self) -> None:
+        """Give clients a moment to receive what waits, then disconnect them."""
+        with contextlib.suppress(Exception):
+            self._call(self._close())
+        self._stop_loop()
+
+    def abort(self) -> None:
+        """Disconnect all clients."""
+        self.close()
+
+    # ---- on the loop ----
+
+    async def _listen(self, port: int) -> "Server":
+        from websockets.asyncio.server import serve
+
+        return await serve(
+            self._serve, self.host, port, process_request=self._answer, select_subprotocol=self._subprotocol,
+            compression=None, max_size=MOST_REQUEST_BYTES, max_queue=4, open_timeout=5.0, close_timeout=1.0,
+        )  # fmt: skip
+
+    def _answer(self, connection: "ServerConnection", request: "Request") -> "Response | None":
+        """Refuse pages of other sites, and more clients than `MOST_CLIENTS`."""
+        if not is_allowed_origin(request.headers.get("Origin")):
+            return connection.respond(403, "this page may not read the stream\n")
+        if len(self._clients) >= MOST_CLIENTS:
+            return connection.respond(503, f"{MOST_CLIENTS} clients are connected already\n")
+        return None
+
+    def _subprotocol(self, connection: "ServerConnection", offered: Any) -> Any:
+        """Choose the newest protocol that a client offers; refuse clients that offer none."""
+        from websockets.exceptions import NegotiationError
+
+        found = next((name for name in SUBPROTOCOLS if name in offered), None)
+        if found is None:
+            raise NegotiationError(f"the stream speaks {SUBPROTOCOLS[0]} only")
+        return found
+
+    async def _serve(self, connection: "ServerConnection") -> None:
+        """Serve a client until it disconnects."""
+        from websockets.exceptions import ConnectionClosed
+
+        client = _Client(connection)
+        self._clients.add(client)
+        sending = asyncio.ensure_future(client.send_waiting())
+        try:
+            info = {"op": "serverInfo", "name": "SigmaSplat", "capabilities": [], "metadata": {}, "sessionId": "run"}
+            await connection.send(json.dumps(info))
+            if self._advertisement:
+                await connection.send(self._advertisement)
+            async for text in connection:
+                self._request(client, text)
+        except ConnectionClosed:
+            pass
+        finally:
+            sending.cancel()
+            self._clients.discard(client)
+            self.lagging += client.dropped
+            self._count_subscriptions()
+
+    def _request(self, client: _Client, text: str | bytes) -> None:
+        """Handle a request of a client; ignore what is no valid subscription."""
+        with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError):
+            request = json.loads(text)
+            if request["op"] == "subscribe":
+                for entry in request["subscriptions"][: len(TOPICS)]:
+                    number, channel = entry["id"], entry["channelId"]
+                    known = isinstance(number, int) and 0 <= number < 2**32 and 1 <= channel <= len(TOPICS)
+                    if known and len(client.topics) < len(TOPICS):
+                        self._subscribe(client, number, TOPICS[channel - 1])
+            elif request["op"] == "unsubscribe":
+                for number in request["subscriptionIds"]:
+                    client.topics.pop(number, None)
+        self._count_subscriptions()
+
+    def _subscribe(self, client: _Client, number: int, topic: Topic) -> None:
+        client.topics[number] = topic
+        if topic.name in self._last:
+            message = self._last[topic.name]
+            client.waiting.append(MESSAGE_DATA.pack(1, number, message.stamp_ns) + message.data)
+            client.ready.set()
+
+    def _count_subscriptions(self) -> None:
+        self._wanted = frozenset(topic.name for client in self._clients for topic in client.topics.values())
+
+    def _publish(self, message: Encoded) -> None:
+        if message.topic.latched:
+            self._last[message.topic.name] = message
+        for client in self._clients:
+            client.add(message)
+
+    async def _announce(self) -> None:
+        for client in tuple(self._clients):
+            client.waiting.append(self._advertisement)  # type: ignore[arg-type]
+            client.ready.set()
+
+    async def _close(self) -> None:
+        async def emptied() -> None:
+            await asyncio.gather(*(_emptied(client) for client in self._clients))
+
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(emptied(), CLOSE_S)
+        self.lagging += sum(client.dropped for client in self._clients)
+        self._server.close()
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._server.wait_closed(), CLOSE_S)
+
+    # ---- from other threads ----
+
+    def _call(self, coroutine: Any) -> Any:
+        """Run a coroutine on the loop and wait for its result."""
+        return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result()
+
+    def _stop_loop(self) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(CLOSE_S)
