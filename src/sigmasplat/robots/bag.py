@@ -1,5 +1,6 @@
 """Write a ROS 2 bag: a folder with metadata.yaml and one MCAP file, through the rosbags package (Apache-2.0)."""
 
+import os
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,14 @@ class BagSink:
     name = "bag"
 
     def __init__(self, folder: Path) -> None:
-        """Raises SourceError without the rosbags package, RunError if the folder exists."""
+        """Raises SourceError without the rosbags package, RunError if the folder exists or cannot be made."""
         self.rosbag2 = import_optional("rosbags.rosbag2", EXTRA, "a ROS bag")
         self.interfaces = import_optional("rosbags.interfaces", EXTRA, "a ROS bag")
         self.folder = folder
         if folder.exists():
             raise RunError(f"{folder} exists; give another folder for the bag")
+        if not (folder.parent.is_dir() and os.access(folder.parent, os.W_OK)):
+            raise RunError(f"cannot write the bag {folder}: {folder.parent} is not a writable folder")
         self.writer: Any = None
         self.connections = dict[str, Any]()
 

@@ -37,8 +37,8 @@ def link_pose(T_outer_optical: Matrix) -> Matrix:
 
 
 def ros_covariance(covariance: Matrix, T_outer_world: Matrix, T_outer_link: Matrix) -> Matrix:
-    """Return the covariance [6, 6] of geometry_msgs/PoseWithCovariance: x, y, z, rotation about x, y, z, all in the axes
-    of the outer frame.
+    """Return the covariance [6, 6] as in geometry_msgs/PoseWithCovariance: x, y, z, rotation about x, y, z, all in the
+    axes of the outer frame.
 
     covariance [6, 6]: of the left twist (ρ, φ), m and rad, of the pose in the world; T_outer_world [4, 4]: from the
     world to the outer frame; T_outer_link [4, 4]: the pose in the outer frame.

@@ -1,6 +1,6 @@
 """Odometry of a run: the sum of its tracked motions, which no correction changes, and the covariance of this sum."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -9,19 +9,27 @@ from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.component import LOST, RELOCALISED
 from sigmasplat.types import Matrix
 
-UNKNOWN_STATES = (LOST, RELOCALISED)
-"""The motion to a frame in one of these states is not tracked. The odometry counts it as no motion."""
+FOUND_BY_FEATURES = "inliers"
+"""A step has this value if relocalisation decided its pose."""
 
 
-def odometry_poses(T_chain_camera: Matrix, states: Sequence[str], components: Sequence[int]) -> Matrix:
+def has_motion(state: str, tracking: Mapping[str, float]) -> bool:
+    """Return whether tracking measured the motion to a frame from the one before it, given the values of its step.
+
+    A lost frame has only a guess, and a relocalised one was found without the frame before.
+    """
+    return state not in (LOST, RELOCALISED) and FOUND_BY_FEATURES not in tracking
+
+
+def odometry_poses(T_chain_camera: Matrix, moved: Sequence[bool], lost: Sequence[bool], components: Matrix) -> Matrix:
     """Return T_odom_camera [F, 4, 4] of a finished path: the identity at the first frame.
 
-    T_chain_camera [F, 4, 4]: poses without corrections by loops; states, components: of the frames. Motions from or to
-    a lost frame, to a relocalised frame, and between components are left out.
+    T_chain_camera [F, 4, 4]: poses without corrections by loops; moved [F]: `has_motion` of each frame; lost [F];
+    components [F]. Motion that was not tracked, while the camera was lost for instance, is left out.
     """
     poses = [np.eye(4)] if len(T_chain_camera) else []
     for i in range(1, len(T_chain_camera)):
-        known = states[i] not in UNKNOWN_STATES and states[i - 1] != LOST and components[i] == components[i - 1]
+        known = moved[i] and not lost[i - 1] and components[i] == components[i - 1]
         motion = se3.inverse(T_chain_camera[i - 1]) @ T_chain_camera[i] if known else np.eye(4)
         poses.append(se3.orthonormalise(poses[-1] @ motion))
     return np.array(poses).reshape(-1, 4, 4)
@@ -38,24 +46,25 @@ class LiveOdometry:
 
     def __init__(self, atlas: Atlas) -> None:
         self.atlas = atlas
-        self.T_odom_camera, self.covariance = np.eye(4), _zero()
+        self.T_odom_camera = np.eye(4)
+        self.covariance: Matrix | None = np.zeros((6, 6))
         self._independent, self._systematic = np.zeros((6, 6)), np.zeros((6, 6))
         self._last_hop: Matrix | None = None
         self._known, self._lost = True, False
         self._counted: tuple[int, int] | None = None
 
-    def step(self, state: str, is_keyframe: bool) -> Matrix:
-        """Add the motion to the newest frame of the atlas; return T_odom_camera."""
+    def step(self, moved: bool, lost: bool, is_keyframe: bool) -> Matrix:
+        """Add the motion to the newest frame of the atlas; return T_odom_camera. moved: its `has_motion`."""
         if self._counted is None:
             self._counted = self._hops()
         else:
-            motion = None if state in UNKNOWN_STATES or self._lost else self._motion()
+            motion = self._motion() if moved and not self._lost else None
             self._known &= motion is not None
             if motion is not None:
                 self.T_odom_camera = se3.orthonormalise(self.T_odom_camera @ motion)
             self._add_new_hops()
             self.covariance = self._covariance(is_keyframe)
-        self._lost = state == LOST
+        self._lost = lost
         return self.T_odom_camera
 
     def _motion(self) -> Matrix | None:
@@ -95,7 +104,3 @@ class LiveOdometry:
             A = se3.adjoint(self.T_odom_camera)
             covariance = covariance + A @ self._last_hop @ A.T
         return np.asarray(covariance)
-
-
-def _zero() -> Matrix | None:
-    return np.zeros((6, 6))

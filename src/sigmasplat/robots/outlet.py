@@ -82,14 +82,18 @@ class Outlet:
         return {"written": self.written, "dropped": self.dropped, "failure": self.failure}
 
     def _work(self) -> None:
+        """Write until the end. The sink is opened at the first job, so that a run without frames leaves no file."""
         try:
+            if (item := self._next()) is None:
+                return self.sink.abort()
             self.sink.open(self.messages)
-            while (item := self._next()) is not None:
+            while item is not None:
                 job, topics = item
                 if self.sink.wants(*topics):
                     for message in job(self.messages):
                         self.sink.write(message)
                         self.written += 1
+                item = self._next()
             if not self.failure:
                 self.sink.close()
         except Exception as problem:

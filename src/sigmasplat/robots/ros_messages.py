@@ -186,7 +186,9 @@ class RosMessages:
 
     def _camera_info(self, stamp_ns: int, camera: Camera) -> bytes:
         fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
-        roi = self._make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+        roi = self._make(
+            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        )
         return self._encoded(
             COLOR_INFO, stamp_ns, header=self._header(stamp_ns, OPTICAL), height=camera.height, width=camera.width,
             distortion_model="plumb_bob", d=np.zeros(5), k=np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0]),

@@ -19,9 +19,9 @@ from collections import deque
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from sigmasplat.env import install_extra
 from sigmasplat.errors import ConfigError, SigmaSplatError
 from sigmasplat.robots.ros_messages import TOPICS, Encoded, RosMessages, Topic
+from sigmasplat.sources.files.optional import import_optional
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
@@ -67,6 +67,14 @@ def _is_loopback(name: str) -> bool:
         return False
 
 
+def check_stream(port: int) -> None:
+    """Raise ConfigError if the port is out of range, SourceError if the packages of the extra are missing."""
+    if not 0 <= port <= 65535:
+        raise ConfigError(f"--stream must be a port from 0 to 65535, found {port}")
+    for module in ("websockets.asyncio.server", "rosbags.typesys"):
+        import_optional(module, EXTRA, "--stream")
+
+
 class _Client:
     """A connection: the topics of its subscriptions, and the messages that wait for it. Used on the loop only."""
 
@@ -74,51 +82,63 @@ class _Client:
         self.connection = connection
         self.topics = dict[int, Topic]()
         self.waiting = deque[bytes](maxlen=MOST_WAITING)
-        self.ready = asyncio.Event()
+        self.ready, self.idle = asyncio.Event(), asyncio.Event()
+        self.idle.set()
         self.dropped = 0
 
     def add(self, message: Encoded) -> None:
         """Queue a message for each subscription to its topic."""
         for subscription, topic in self.topics.items():
             if topic is message.topic:
-                self.dropped += len(self.waiting) == MOST_WAITING
-                self.waiting.append(MESSAGE_DATA.pack(1, subscription, message.stamp_ns) + message.data)
-                self.ready.set()
+                self.queue(subscription, message)
+
+    def queue(self, subscription: int, message: Encoded) -> None:
+        """Queue a message for one subscription; drop the oldest one if too many wait."""
+        self.dropped += len(self.waiting) == MOST_WAITING
+        self.waiting.append(MESSAGE_DATA.pack(1, subscription, message.stamp_ns) + message.data)
+        self.ready.set()
+        self.idle.clear()
 
     async def send_waiting(self) -> None:
         """Send messages until the connection ends."""
-        while True:
-            await self.ready.wait()
-            while self.waiting:
-                await self.connection.send(self.waiting.popleft())
-            self.ready.clear()
+        from websockets.exceptions import ConnectionClosed
+
+        with contextlib.suppress(ConnectionClosed):
+            while True:
+                await self.ready.wait()
+                while self.waiting:
+                    await self.connection.send(self.waiting.popleft())
+                self.ready.clear()
+                self.idle.set()
 
 
 class StreamSink:
     """A WebSocket server on a thread of its own.
 
-    port: the port that it listens on; lagging: number of messages that slow clients missed.
+    port, url: where it listens; lagging: number of messages that slow clients missed.
     """
 
     name = "stream"
 
-    def __init__(self, host: str = HOST, port: int = PORT) -> None:
+    def __init__(self, messages: RosMessages, host: str = HOST, port: int = PORT) -> None:
         """Start to listen; port 0 means any free port.
 
-        Raises SigmaSplatError if the websockets package is missing, or if the port is not free.
+        Raises SigmaSplatError if a package is missing or the port is not free, ConfigError if it is out of range.
         """
-        if not 0 <= port <= 65535:
-            raise ConfigError(f"--stream must be a port from 0 to 65535, found {port}")
-        try:
-            import websockets.asyncio.server  # noqa: F401
-        except ImportError as problem:
-            raise SigmaSplatError(f"--stream needs websockets ({problem}): {install_extra(EXTRA)}") from problem
+        check_stream(port)
         logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # do not log clients that disconnect
         self.host, self.lagging = host, 0
         self._clients = set[_Client]()
         self._last = dict[str, Encoded]()
         self._wanted = frozenset[str]()
-        self._advertisement = ""
+        channels = [
+            {
+                "id": number, "topic": topic.name, "encoding": "cdr", "schemaName": topic.msgtype,
+                "schemaEncoding": "ros2msg", "schema": messages.schema(topic),
+            }
+            for number, topic in enumerate(TOPICS, 1)
+        ]  # fmt: skip
+        self._advertisement = json.dumps({"op": "advertise", "channels": channels})
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="sigmasplat-websocket", daemon=True)
         self._thread.start()
@@ -130,18 +150,10 @@ class StreamSink:
                 f"cannot stream on {host}:{port} ({problem.strerror or problem}); give another port: --stream PORT"
             ) from problem
         self.port = int(next(iter(self._server.sockets)).getsockname()[1])
+        self.url = f"ws://{f'[{host}]' if ':' in host else host}:{self.port}"
 
     def open(self, messages: RosMessages) -> None:
-        """Announce the channels, also to clients that are connected already."""
-        channels = [
-            {
-                "id": number, "topic": topic.name, "encoding": "cdr", "schemaName": topic.msgtype,
-                "schemaEncoding": "ros2msg", "schema": messages.schema(topic),
-            }
-            for number, topic in enumerate(TOPICS, 1)
-        ]  # fmt: skip
-        self._advertisement = json.dumps({"op": "advertise", "channels": channels})
-        self._call(self._announce())
+        """Do nothing: the server listens already."""
 
     def wants(self, *topics: Topic) -> bool:
         """Return whether a client subscribes to one of these topics, or a later client would get its last message."""
@@ -198,8 +210,7 @@ class StreamSink:
         try:
             info = {"op": "serverInfo", "name": "SigmaSplat", "capabilities": [], "metadata": {}, "sessionId": "run"}
             await connection.send(json.dumps(info))
-            if self._advertisement:
-                await connection.send(self._advertisement)
+            await connection.send(self._advertisement)
             async for text in connection:
                 self._request(client, text)
         except ConnectionClosed:
@@ -228,9 +239,7 @@ class StreamSink:
     def _subscribe(self, client: _Client, number: int, topic: Topic) -> None:
         client.topics[number] = topic
         if topic.name in self._last:
-            message = self._last[topic.name]
-            client.waiting.append(MESSAGE_DATA.pack(1, number, message.stamp_ns) + message.data)
-            client.ready.set()
+            client.queue(number, self._last[topic.name])
 
     def _count_subscriptions(self) -> None:
         self._wanted = frozenset(topic.name for client in self._clients for topic in client.topics.values())
@@ -241,17 +250,9 @@ class StreamSink:
         for client in self._clients:
             client.add(message)
 
-    async def _announce(self) -> None:
-        for client in tuple(self._clients):
-            client.waiting.append(self._advertisement)  # type: ignore[arg-type]
-            client.ready.set()
-
     async def _close(self) -> None:
-        async def emptied() -> None:
-            await asyncio.gather(*(_emptied(client) for client in self._clients))
-
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(emptied(), CLOSE_S)
+            await asyncio.wait_for(asyncio.gather(*(client.idle.wait() for client in self._clients)), CLOSE_S)
         self.lagging += sum(client.dropped for client in self._clients)
         self._server.close()
         with contextlib.suppress(TimeoutError):
