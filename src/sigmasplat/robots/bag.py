@@ -20,6 +20,8 @@ class BagSink:
         self.rosbag2 = import_optional("rosbags.rosbag2", EXTRA, "a ROS bag")
         self.interfaces = import_optional("rosbags.interfaces", EXTRA, "a ROS bag")
         self.folder = folder
+        if folder.suffix == ".mcap":
+            raise RunError(f"{folder}: a bag is a folder; give its name without .mcap")
         if folder.exists():
             raise RunError(f"{folder} exists; give another folder for the bag")
         if not (folder.parent.is_dir() and os.access(folder.parent, os.W_OK)):

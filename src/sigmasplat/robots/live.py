@@ -55,6 +55,8 @@ from sigmasplat.types import Matrix
 Images = Literal["none", "keyframes", "all"]
 SUBMAP_POINTS = 20_000
 """At most this many points of each submap while the run goes on."""
+STATIC = ((MAP, WORLD, T_MAP_WORLD), (LINK, OPTICAL, T_LINK_OPTICAL))
+"""Each message of static transforms contains all of them, because late subscribers get only the last one."""
 
 
 class LiveRobot:
@@ -83,8 +85,7 @@ class LiveRobot:
         """Give the messages of a step to the outlets."""
         first, self._stamp_ns = self._stamp_ns < 0, stamp_of(step.timestamp_s)
         if first:
-            static = [(MAP, WORLD, T_MAP_WORLD), (LINK, OPTICAL, T_LINK_OPTICAL)]
-            self._offer(partial(_static, self._stamp_ns, static), TF_STATIC)
+            self._offer(partial(_static, self._stamp_ns, STATIC), TF_STATIC)
         self._offer_images(step)
         moved = has_motion(step.state, step.tracking)
         T_odom_camera = self.odometry.step(moved, step.lost, step.is_keyframe)
@@ -165,8 +166,8 @@ class LiveRobot:
         self._offer(partial(_cloud, self._stamp_ns, [(points_of(field, std, MAX_POINTS), T_MAP_WORLD)]), CLOUD)
         plan = self._floor_plan()
         if plan is not None:
-            floor = [(MAP, FLOOR, T_MAP_WORLD @ se3.inverse(plan.T_floor_world))]
-            self._offer(partial(_static, self._stamp_ns, floor), TF_STATIC)
+            floor = (MAP, FLOOR, T_MAP_WORLD @ se3.inverse(plan.T_floor_world))
+            self._offer(partial(_static, self._stamp_ns, [*STATIC, floor]), TF_STATIC)
             self._offer(partial(grids, plan, self._stamp_ns, FLOOR, np.eye(4)), GRID, GRID_STD)
 
     def _floor_plan(self) -> FloorPlan | None:

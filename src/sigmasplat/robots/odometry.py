@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import Atlas
@@ -21,18 +22,22 @@ def has_motion(state: str, tracking: Mapping[str, float]) -> bool:
     return state not in (LOST, RELOCALISED) and FOUND_BY_FEATURES not in tracking
 
 
-def odometry_poses(T_chain_camera: Matrix, moved: Sequence[bool], lost: Sequence[bool], components: Matrix) -> Matrix:
-    """Return T_odom_camera [F, 4, 4] of a finished path: the identity at the first frame.
+def odometry_poses(
+    T_chain_camera: Matrix, moved: Sequence[bool], lost: Sequence[bool], components: Sequence[int]
+) -> tuple[Matrix, NDArray[np.bool_]]:
+    """Return T_odom_camera [F, 4, 4] of a finished path, the identity at the first frame, and whether all motions up to
+    each frame were tracked [F].
 
     T_chain_camera [F, 4, 4]: poses without corrections by loops; moved [F]: `has_motion` of each frame; lost [F];
     components [F]. Motion that was not tracked, while the camera was lost for instance, is left out.
     """
     poses = [np.eye(4)] if len(T_chain_camera) else []
+    tracked = np.ones(len(T_chain_camera), np.bool_)
     for i in range(1, len(T_chain_camera)):
-        known = moved[i] and not lost[i - 1] and components[i] == components[i - 1]
-        motion = se3.inverse(T_chain_camera[i - 1]) @ T_chain_camera[i] if known else np.eye(4)
+        tracked[i] = moved[i] and not lost[i - 1] and components[i] == components[i - 1]
+        motion = se3.inverse(T_chain_camera[i - 1]) @ T_chain_camera[i] if tracked[i] else np.eye(4)
         poses.append(se3.orthonormalise(poses[-1] @ motion))
-    return np.array(poses).reshape(-1, 4, 4)
+    return np.array(poses).reshape(-1, 4, 4), np.logical_and.accumulate(tracked)
 
 
 class LiveOdometry:
