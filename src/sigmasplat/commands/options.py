@@ -107,25 +107,6 @@ Host = Annotated[
     arg(metavar="ADDRESS", help="address that viewer and stream listen on; the default allows this machine only"),
 ]
 Port = Annotated[int, arg(metavar="N", help="port of the viewer; if it is busy, the next free one is used; 0 = any")]
-Bag = Annotated[
-    Path | None,
-    arg(
-        metavar="DIR",
-        help="also write a ROS 2 bag (MCAP): transforms, odometry, loops, map, images; needs no ROS",
-        help_behavior_hint="",
-    ),
-]
-Stream = Annotated[
-    Whole,
-    arg(
-        metavar="PORT",
-        help="also stream the same messages over a WebSocket to Foxglove, usually 8765; 0 = any free port",
-        help_behavior_hint="",
-    ),
-]
-BagImages = Annotated[
-    Literal["none", "keyframes", "all"], arg(help="which images the bag and the stream contain, uncompressed")
-]
 Evaluate = Annotated[bool, arg(name="eval", help="do not score the run: no metrics, no report", help_behavior_hint="")]
 MovedSource = Annotated[
     str | None,
@@ -308,7 +289,7 @@ InputOptionsFlat = Annotated[InputOptions, arg(name=""), tyro.conf.OmitArgPrefix
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of run and resume: scoring, profile, saving, all poses, logs, viewer, bag, stream."""
+    """Options of run and resume: scoring, profile, saving, all poses, logs, viewer."""
 
     evaluate: Evaluate = True
     profile: Profile = False
@@ -318,9 +299,6 @@ class RunOptions:
     view: View = False
     host: Host = HOST
     port: Port = PORT
-    bag: Bag = None
-    stream: Stream = None
-    bag_images: BagImages = "keyframes"
 
 
 DEFAULT_RUN_OPTIONS = RunOptions()

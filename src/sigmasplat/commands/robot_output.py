@@ -2,7 +2,11 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
 
 from sigmasplat.commands import options
 from sigmasplat.viewer.server import is_loopback
@@ -14,33 +18,66 @@ if TYPE_CHECKING:
     from sigmasplat.run.terminal import Screen
     from sigmasplat.slam.slam import Slam
 
+Bag = Annotated[
+    Path | None,
+    tyro.conf.arg(
+        metavar="DIR",
+        help="also write a ROS 2 bag (MCAP): transforms, odometry, loops, map, images; needs no ROS",
+        help_behavior_hint="",
+    ),
+]
+Stream = Annotated[
+    options.Whole,
+    tyro.conf.arg(
+        metavar="PORT",
+        help="also stream the same messages over a WebSocket to Foxglove, usually 8765; 0 = any free port",
+        help_behavior_hint="",
+    ),
+]
+BagImages = Annotated[
+    Literal["none", "keyframes", "all"], tyro.conf.arg(help="which images the bag and the stream contain, uncompressed")
+]
 
-def check_robot_output(run_options: options.RunOptions) -> None:
+
+@dataclass(frozen=True)
+class RobotOptions:
+    """Options of run and resume: bag and stream."""
+
+    bag: Bag = None
+    stream: Stream = None
+    bag_images: BagImages = "keyframes"
+
+
+DEFAULT_ROBOT_OPTIONS = RobotOptions()
+RobotOptionsFlat = Annotated[RobotOptions, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
+
+
+def check_robot_output(asked: RobotOptions) -> None:
     """Check the options before anything else starts.
 
     Raises RunError if the bag exists or its folder cannot be written, SigmaSplatError if a package is missing,
     ConfigError if the port is out of range.
     """
-    if run_options.bag is not None:
+    if asked.bag is not None:
         from sigmasplat.robots.bag import BagSink
 
-        BagSink(run_options.bag)
-    if run_options.stream is not None:
+        BagSink(asked.bag)
+    if asked.stream is not None:
         from sigmasplat.robots.stream import check_stream
 
-        check_stream(run_options.stream)
+        check_stream(asked.stream)
 
 
 @contextmanager
 def robot_output(
-    screen: "Screen", slam: "Slam", folder: "RunFolder", run_options: options.RunOptions
+    screen: "Screen", slam: "Slam", folder: "RunFolder", asked: RobotOptions, host: str
 ) -> Iterator["LiveRobot | None"]:
     """Yield the callback that feeds the bag and the stream, None if neither is requested; at the end complete both and
     note in run.json how many messages were written and dropped.
 
     Raises SigmaSplatError if the port is not free.
     """
-    if run_options.bag is None and run_options.stream is None:
+    if asked.bag is None and asked.stream is None:
         yield None
         return
     from sigmasplat.robots.bag import BagSink
@@ -50,17 +87,17 @@ def robot_output(
     from sigmasplat.robots.stream import StreamSink
 
     messages, sinks = RosMessages(), list["Sink"]()
-    if run_options.stream is not None:
-        stream = StreamSink(messages, run_options.host, run_options.stream)
+    if asked.stream is not None:
+        stream = StreamSink(messages, host, asked.stream)
         sinks.append(stream)
-        if not is_loopback(run_options.host):
-            screen.warn(f"anyone who can reach {run_options.host} can read the stream; omit --host to allow only "
+        if not is_loopback(host):
+            screen.warn(f"anyone who can reach {host} can read the stream; omit --host to allow only "
                         "this machine")  # fmt: skip
         screen.say(f"stream: {stream.url} (Foxglove: Open connection, Foxglove WebSocket)")
-    if run_options.bag is not None:
-        sinks.append(BagSink(run_options.bag))
+    if asked.bag is not None:
+        sinks.append(BagSink(asked.bag))
     outlets = [Outlet(sink, messages) for sink in sinks]
-    robot = LiveRobot(slam, outlets, screen.warn, run_options.bag_images)
+    robot = LiveRobot(slam, outlets, screen.warn, asked.bag_images)
     try:
         yield robot
     finally:

@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Annotated
 from sigmasplat.commands import options
 from sigmasplat.commands.evaluate import score
 from sigmasplat.commands.options import arg, configured, prepare_torch, source_of
-from sigmasplat.commands.robot_output import check_robot_output, robot_output
+from sigmasplat.commands.robot_output import (
+    DEFAULT_ROBOT_OPTIONS,
+    RobotOptions,
+    RobotOptionsFlat,
+    check_robot_output,
+    robot_output,
+)
 from sigmasplat.commands.view import keep_showing, serve_viewer
 from sigmasplat.config.text import full_path
 from sigmasplat.errors import ConfigError
@@ -74,6 +80,7 @@ def run(
     onto: options.OntoRun = None,
     final_seconds: options.FinalSeconds = None,
     final_width: FinalWidth = None,
+    robot_options: RobotOptionsFlat = DEFAULT_ROBOT_OPTIONS,
 ) -> int:
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
@@ -88,7 +95,7 @@ def run(
     from sigmasplat.slam.slam import Slam
 
     log_names(run_options.log)
-    check_robot_output(run_options)
+    check_robot_output(robot_options)
     settings += () if final_seconds is None else (f"final.seconds={final_seconds:g}",)
     settings += () if final_width is None else (f"final.width={final_width}",)
     screen, earlier = Screen(), FinishedMap.of(RunFolder.open(onto)) if onto else None
@@ -103,13 +110,14 @@ def run(
             prepare_torch()
             slam = continue_map(earlier, config, source, folder) if earlier else Slam(config, folder.submaps)
             start = StartPoint(slam)
-            return _run_and_score(screen, start, source, folder, run_options, viewer)
+            return _run_and_score(screen, start, source, folder, run_options, viewer, robot_options)
 
 
 def resume(
     run: options.RunPath,
     moved_to: options.MovedSource = None,
     run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
+    robot_options: RobotOptionsFlat = DEFAULT_ROBOT_OPTIONS,
 ) -> int:
     """Resume a run that was stopped or killed, from its last saved state.
 
@@ -121,7 +129,7 @@ def resume(
     from sigmasplat.run.terminal import Screen
 
     log_names(run_options.log)
-    check_robot_output(run_options)
+    check_robot_output(robot_options)
     screen, folder = Screen(), RunFolder.open(run)
     source = source_of(folder, moved_to)
     prepare_torch()
@@ -129,7 +137,7 @@ def resume(
         start = resumed(folder, source)
         folder.note(status="running")
         screen.say(f"{source.name}: {resume_line(start.next_index, len(source))} → {folder.path}")
-        return _run_and_score(screen, start, source, folder, run_options, viewer)
+        return _run_and_score(screen, start, source, folder, run_options, viewer, robot_options)
 
 
 def resume_line(next_index: int, frames: int) -> str:
@@ -195,6 +203,7 @@ def _run_and_score(
     folder: "RunFolder",
     run_options: options.RunOptions,
     viewer: "ViewerApp | None",
+    robot_options: RobotOptions,
 ) -> int:
     """Run the session, then score it, and keep showing it in the viewer until Ctrl-C; return the exit code.
 
@@ -209,7 +218,7 @@ def _run_and_score(
     state = StateFile(start.slam, folder, run_options.save_every)
     start.slam.saved_refinement = RefinementFile(start.slam, folder, run_options.save_every)
     with (
-        robot_output(screen, start.slam, folder, run_options) as robot,
+        robot_output(screen, start.slam, folder, robot_options, run_options.host) as robot,
         _progress(screen, start, source, folder, run_options, viewer, robot) as callback,
     ):
         session = Session(
