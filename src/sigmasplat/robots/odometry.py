@@ -35,8 +35,8 @@ def odometry_poses(
     tracked = np.ones(len(T_chain_camera), np.bool_)
     for i in range(1, len(T_chain_camera)):
         tracked[i] = moved[i] and not lost[i - 1] and components[i] == components[i - 1]
-        motion = se3.inverse(T_chain_camera[i - 1]) @ T_chain_camera[i] if tracked[i] else np.eye(4)
-        poses.append(se3.orthonormalise(poses[-1] @ motion))
+        motion = se3.inverse(T_chain_camera[i - 1]) @ T_chain_camera[i]
+        poses.append(se3.orthonormalise(poses[-1] @ motion) if tracked[i] else poses[-1])
     return np.array(poses).reshape(-1, 4, 4), np.logical_and.accumulate(tracked)
 
 

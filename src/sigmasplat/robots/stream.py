@@ -16,6 +16,7 @@ import logging
 import struct
 import threading
 from collections import deque
+from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
@@ -24,15 +25,15 @@ from sigmasplat.robots.ros_messages import TOPICS, Encoded, RosMessages, Topic
 from sigmasplat.sources.files.optional import import_optional
 
 if TYPE_CHECKING:
-    from websockets.asyncio.server import Server, ServerConnection
+    from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
 EXTRA = "foxglove"
 HOST, PORT = "127.0.0.1", 8765
 SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 WEB_APP = "app.foxglove.dev"
-MOST_WAITING = 128
-"""At most this many messages wait for a client."""
+MOST_WAITING, MOST_WAITING_BYTES = 64, 32_000_000
+"""At most this many messages wait for a client, and at most this many bytes, except for the newest message."""
 MOST_CLIENTS = 16
 MOST_REQUEST_BYTES = 65536
 """A longer message from a client closes its connection."""
@@ -81,7 +82,7 @@ class _Client:
     def __init__(self, connection: "ServerConnection") -> None:
         self.connection = connection
         self.topics = dict[int, Topic]()
-        self.waiting = deque[bytes](maxlen=MOST_WAITING)
+        self.waiting, self.waiting_bytes = deque[bytes](), 0
         self.ready, self.idle = asyncio.Event(), asyncio.Event()
         self.idle.set()
         self.dropped = 0
@@ -93,9 +94,15 @@ class _Client:
                 self.queue(subscription, message)
 
     def queue(self, subscription: int, message: Encoded) -> None:
-        """Queue a message for one subscription; drop the oldest one if too many wait."""
-        self.dropped += len(self.waiting) == MOST_WAITING
-        self.waiting.append(MESSAGE_DATA.pack(1, subscription, message.stamp_ns) + message.data)
+        """Queue a message for one subscription; drop the oldest ones if too much waits."""
+        data = MESSAGE_DATA.pack(1, subscription, message.stamp_ns) + message.data
+        while self.waiting and (
+            len(self.waiting) >= MOST_WAITING or self.waiting_bytes + len(data) > MOST_WAITING_BYTES
+        ):
+            self._next()
+            self.dropped += 1
+        self.waiting.append(data)
+        self.waiting_bytes += len(data)
         self.ready.set()
         self.idle.clear()
 
@@ -107,9 +114,14 @@ class _Client:
             while True:
                 await self.ready.wait()
                 while self.waiting:
-                    await self.connection.send(self.waiting.popleft())
+                    await self.connection.send(self._next())
                 self.ready.clear()
                 self.idle.set()
+
+    def _next(self) -> bytes:
+        data = self.waiting.popleft()
+        self.waiting_bytes -= len(data)
+        return data
 
 
 class StreamSink:
@@ -139,17 +151,17 @@ class StreamSink:
             for number, topic in enumerate(TOPICS, 1)
         ]  # fmt: skip
         self._advertisement = json.dumps({"op": "advertise", "channels": channels})
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="sigmasplat-websocket", daemon=True)
+        started = Future[tuple[asyncio.AbstractEventLoop, asyncio.Event, int]]()
+        self._thread = threading.Thread(
+            target=lambda: asyncio.run(self._run(port, started)), name="sigmasplat-websocket", daemon=True
+        )
         self._thread.start()
         try:
-            self._server: Server = self._call(self._listen(port))
+            self._loop, self._stop, self.port = started.result()
         except OSError as problem:
-            self._stop_loop()
             raise SigmaSplatError(
                 f"cannot stream on {host}:{port} ({problem.strerror or problem}); give another port: --stream PORT"
             ) from problem
-        self.port = int(next(iter(self._server.sockets)).getsockname()[1])
         self.url = f"ws://{f'[{host}]' if ':' in host else host}:{self.port}"
 
     def open(self, messages: RosMessages) -> None:
@@ -165,9 +177,9 @@ class StreamSink:
 
     def close(self) -> None:
         """Give clients a moment to receive what waits, then disconnect them."""
-        with contextlib.suppress(Exception):
-            self._call(self._close())
-        self._stop_loop()
+        with contextlib.suppress(RuntimeError):  # the loop has ended already
+            self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join(2 * CLOSE_S)
 
     def abort(self) -> None:
         """Disconnect all clients."""
@@ -175,13 +187,28 @@ class StreamSink:
 
     # ---- on the loop ----
 
-    async def _listen(self, port: int) -> "Server":
+    async def _run(self, port: int, started: "Future[tuple[asyncio.AbstractEventLoop, asyncio.Event, int]]") -> None:
+        """Serve until `_stop` is set; report loop, event and port, or why the port cannot be used."""
         from websockets.asyncio.server import serve
 
-        return await serve(
-            self._serve, self.host, port, process_request=self._answer, select_subprotocol=self._subprotocol,
-            compression=None, max_size=MOST_REQUEST_BYTES, max_queue=4, open_timeout=5.0, close_timeout=1.0,
-        )  # fmt: skip
+        try:
+            server = await serve(
+                self._serve, self.host, port, process_request=self._answer, select_subprotocol=self._subprotocol,
+                compression=None, max_size=MOST_REQUEST_BYTES, max_queue=4, open_timeout=5.0, close_timeout=1.0,
+            )  # fmt: skip
+        except Exception as problem:
+            return started.set_exception(problem)
+        stop = asyncio.Event()
+        started.set_result((asyncio.get_running_loop(), stop, int(next(iter(server.sockets)).getsockname()[1])))
+        await stop.wait()
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(asyncio.gather(*(client.idle.wait() for client in self._clients)), CLOSE_S)
+        for client in self._clients:
+            if not client.idle.is_set():
+                client.connection.transport.abort()  # it does not read, so it would not answer a farewell
+        server.close()
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(server.wait_closed(), CLOSE_S)
 
     def _answer(self, connection: "ServerConnection", request: "Request") -> "Response | None":
         """Refuse pages of other sites, and more clients than `MOST_CLIENTS`."""
@@ -249,21 +276,3 @@ class StreamSink:
             self._last[message.topic.name] = message
         for client in self._clients:
             client.add(message)
-
-    async def _close(self) -> None:
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(asyncio.gather(*(client.idle.wait() for client in self._clients)), CLOSE_S)
-        self.lagging += sum(client.dropped for client in self._clients)
-        self._server.close()
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._server.wait_closed(), CLOSE_S)
-
-    # ---- from other threads ----
-
-    def _call(self, coroutine: Any) -> Any:
-        """Run a coroutine on the loop and wait for its result."""
-        return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result()
-
-    def _stop_loop(self) -> None:
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(CLOSE_S)
