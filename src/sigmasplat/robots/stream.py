@@ -13,6 +13,7 @@ import contextlib
 import ipaddress
 import json
 import logging
+import socket
 import struct
 import threading
 from collections import deque
@@ -34,7 +35,11 @@ SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 WEB_APP = "app.foxglove.dev"
 MOST_WAITING, MOST_WAITING_BYTES = 64, 32_000_000
 """At most this many messages wait for a client, and at most this many bytes, except for the newest message."""
+SEND_BUFFER_BYTES = 262_144
+"""Size of the system's own queue in front of a client. By default it grows to megabytes, all of them out of date."""
 MOST_CLIENTS = 16
+MOST_REQUESTS = 1000
+"""A client that sends more requests is disconnected."""
 MOST_REQUEST_BYTES = 65536
 """A longer message from a client closes its connection."""
 CLOSE_S = 2.0
@@ -232,14 +237,19 @@ class StreamSink:
         from websockets.exceptions import ConnectionClosed
 
         client = _Client(connection)
+        connection.transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         self._clients.add(client)
         sending = asyncio.ensure_future(client.send_waiting())
         try:
             info = {"op": "serverInfo", "name": "SigmaSplat", "capabilities": [], "metadata": {}, "sessionId": "run"}
             await connection.send(json.dumps(info))
             await connection.send(self._advertisement)
+            requests = 0
             async for text in connection:
                 self._request(client, text)
+                requests += 1
+                if requests == MOST_REQUESTS:
+                    break
         except ConnectionClosed:
             pass
         finally:
