@@ -126,11 +126,13 @@ def test_motion_without_tracking_is_left_out_and_its_covariance_is_not_known() -
     odometry = LiveOdometry(atlas)
     hop = Hop(np.eye(4), some_covariance(0), np.zeros(6))
     known, at = [], []
-    for i, (moved, lost) in enumerate([(True, False), (True, False), (False, True), (True, False), (True, False)]):
+    relocalised, tracked, gone = (False, False), (True, False), (False, True)
+    for i, (moved, lost) in enumerate([tracked, tracked, gone, tracked, relocalised, tracked]):
         grown(atlas, se3.exp(np.array([0.1 * i, 0, 0, 0, 0, 0])), hop)
         at.append(float(odometry.step(moved, lost, is_keyframe=True)[0, 3]))
         known.append(odometry.covariance is not None)
-    assert at == pytest.approx([0.0, 0.1, 0.1, 0.1, 0.2]) and known == [True, True, False, False, False]
+    assert at == pytest.approx([0.0, 0.1, 0.1, 0.3, 0.3, 0.4])
+    assert known == [True, True, True, True, False, False]
     assert has_motion(TRACKED, {}) and not has_motion(LOST_STATE, {}) and not has_motion(RELOCALISED, {})
     assert not has_motion("apart", {"inliers": 40.0})
 
@@ -140,11 +142,13 @@ def test_a_finished_path_has_the_same_odometry() -> None:
     poses, tracked = odometry_poses(chain, [True] * 6, [False] * 6, [0] * 6)
     np.testing.assert_allclose(poses, se3.inverse(chain[0]) @ chain, atol=1e-12)
     assert tracked.all()
-    poses, tracked = odometry_poses(chain, [True] * 6, [False, False, True, False, False, False], [0] * 5 + [1])
-    np.testing.assert_array_equal(poses[3], poses[2])
-    np.testing.assert_allclose(poses[4], poses[3] @ se3.inverse(chain[3]) @ chain[4], atol=1e-12)
+    moved, lost = [True, True, False, True, False, True], [False, False, True, False, False, False]
+    poses, tracked = odometry_poses(chain, moved, lost, [0] * 5 + [1])
+    np.testing.assert_array_equal(poses[2], poses[1])
+    np.testing.assert_allclose(poses[3], poses[1] @ se3.inverse(chain[1]) @ chain[3], atol=1e-12)
+    np.testing.assert_array_equal(poses[4], poses[3])
     np.testing.assert_array_equal(poses[5], poses[4])
-    assert tracked.tolist() == [True, True, True, False, False, False]
+    assert tracked.tolist() == [True, True, True, True, False, False]
 
 
 def test_the_live_covariance_is_that_of_the_finished_path_if_mapping_agrees_with_tracking() -> None:
@@ -382,8 +386,11 @@ def test_the_exported_covariance_is_that_of_the_path(tmp_path: Path) -> None:
         expected = ros_covariance(errors.of_frame(row), T_map_world, pose(message))
         expected = expected if expected.any() else 1e-10 * np.eye(6)
         np.testing.assert_allclose(covariance(message), expected, rtol=1e-5, atol=1e-12)
-    known = [covariance(message)[0, 0] != -1.0 for message in found["/sigmasplat/odometry"]]
-    assert known == [True, True, True, False, False], "after a lost frame the way from the start is not known"
+    chain = errors.without_loops()
+    for row, message in zip([i for i in range(FRAMES) if i != LOST], found["/sigmasplat/odometry"], strict=True):
+        expected = ros_covariance(chain.of_frame(row), T_LINK_OPTICAL, pose(message))
+        expected = expected if expected.any() else 1e-10 * np.eye(6)
+        np.testing.assert_allclose(covariance(message), expected, rtol=1e-5, atol=1e-12)
 
 
 def test_images_have_the_pinhole_of_their_camera() -> None:

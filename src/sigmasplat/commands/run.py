@@ -85,6 +85,7 @@ def run(
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
     example: sigmasplat run data/kitchen --limit 200 --set input.width=480
+    for robots: sigmasplat run data/kitchen --bag kitchen-bag --stream 8765
     """
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.run.finished_map import FinishedMap, continue_map

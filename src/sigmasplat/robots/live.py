@@ -54,7 +54,7 @@ from sigmasplat.types import Matrix
 
 Images = Literal["none", "keyframes", "all"]
 SUBMAP_POINTS = 20_000
-"""At most this many points of each submap while the run goes on."""
+"""At most this many points of each submap while the run goes on; fewer if there are many submaps."""
 STATIC = ((MAP, WORLD, T_MAP_WORLD), (LINK, OPTICAL, T_LINK_OPTICAL))
 """Each message of static transforms contains all of them, because late subscribers get only the last one."""
 
@@ -221,4 +221,5 @@ def _loop(stamp_ns: int, errors: Mapping[str, Tensor], row: int, messages: RosMe
 
 
 def _cloud(stamp_ns: int, parts: Sequence[tuple[Points, Matrix]], messages: RosMessages) -> list[Encoded]:
-    return [messages.cloud(stamp_ns, MAP, Points.joined([points.moved(T) for points, T in parts]))]
+    each = MAX_POINTS // len(parts)
+    return [messages.cloud(stamp_ns, MAP, Points.joined([points.thinned(each).moved(T) for points, T in parts]))]

@@ -15,9 +15,10 @@ FOUND_BY_FEATURES = "inliers"
 
 
 def has_motion(state: str, tracking: Mapping[str, float]) -> bool:
-    """Return whether tracking measured the motion to a frame from the one before it, given the values of its step.
+    """Return whether tracking measured the motion to a frame from an earlier one, given the values of its step.
 
-    A lost frame has only a guess, and a relocalised one was found without the frame before.
+    A lost frame has only a guess, and a relocalised one was found without an earlier frame. A frame that is tracked
+    again after lost ones has a motion: it is tracked from the same keyframe as the frames before them.
     """
     return state not in (LOST, RELOCALISED) and FOUND_BY_FEATURES not in tracking
 
@@ -29,14 +30,17 @@ def odometry_poses(
     each frame were tracked [F].
 
     T_chain_camera [F, 4, 4]: poses without corrections by loops; moved [F]: `has_motion` of each frame; lost [F];
-    components [F]. Motion that was not tracked, while the camera was lost for instance, is left out.
+    components [F]. Motion that was not tracked is left out. A lost frame stays at the pose of the frame before.
     """
-    poses = [np.eye(4)] if len(T_chain_camera) else []
+    poses, last = [np.eye(4)] if len(T_chain_camera) else [], 0
     tracked = np.ones(len(T_chain_camera), np.bool_)
     for i in range(1, len(T_chain_camera)):
-        tracked[i] = moved[i] and not lost[i - 1] and components[i] == components[i - 1]
-        motion = se3.inverse(T_chain_camera[i - 1]) @ T_chain_camera[i]
-        poses.append(se3.orthonormalise(poses[-1] @ motion) if tracked[i] else poses[-1])
+        tracked[i] = lost[i] or (moved[i] and components[i] == components[last])
+        pose = poses[-1]
+        if tracked[i] and not lost[i]:
+            pose = se3.orthonormalise(pose @ se3.inverse(T_chain_camera[last]) @ T_chain_camera[i])
+        poses.append(pose)
+        last = last if lost[i] else i
     return np.array(poses).reshape(-1, 4, 4), np.logical_and.accumulate(tracked)
 
 
@@ -55,29 +59,37 @@ class LiveOdometry:
         self.covariance: Matrix | None = np.zeros((6, 6))
         self._independent, self._systematic = np.zeros((6, 6)), np.zeros((6, 6))
         self._last_hop: Matrix | None = None
-        self._known, self._lost = True, False
+        self._known = True
+        self._last: int | None = None
         self._counted: tuple[int, int] | None = None
 
     def step(self, moved: bool, lost: bool, is_keyframe: bool) -> Matrix:
-        """Add the motion to the newest frame of the atlas; return T_odom_camera. moved: its `has_motion`."""
+        """Add the motion to the newest frame of the atlas; return T_odom_camera.
+
+        moved: its `has_motion`; a lost frame adds no motion.
+        """
+        newest = len(self.atlas.places) - 1
         if self._counted is None:
-            self._counted = self._hops()
-        else:
-            motion = self._motion() if moved and not self._lost else None
+            self._counted, self._last = self._hops(), newest
+            return self.T_odom_camera
+        if not lost:
+            motion = self._motion() if moved else None
             self._known &= motion is not None
             if motion is not None:
                 self.T_odom_camera = se3.orthonormalise(self.T_odom_camera @ motion)
-            self._add_new_hops()
-            self.covariance = self._covariance(is_keyframe)
-        self._lost = lost
+            self._last = newest
+        self._add_new_hops()
+        self.covariance = self._covariance(is_keyframe)
         return self.T_odom_camera
 
     def _motion(self) -> Matrix | None:
-        """Return the motion between the last two frames; None if they are in different components.
+        """Return the motion to the newest frame from the last one that was not lost; None if they are in different
+        components.
 
         Both poses are read now, so that changes of their keyframes by mapping are no motion.
         """
-        atlas, (before, now) = self.atlas, self.atlas.places[-2:]
+        assert self._last is not None
+        atlas, (before, now) = self.atlas, (self.atlas.places[self._last], self.atlas.places[-1])
         if atlas.components[before.submap] != atlas.components[now.submap]:
             return None
         T = [atlas.odometry[s] @ atlas.keyframe_poses[s][k] @ T_keyframe for s, k, T_keyframe in (before, now)]

@@ -70,6 +70,13 @@ class Points:
         positions = self.positions.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
         return Points(positions.astype(np.float32), self.colors, self.opacities, self.depth_std_m)
 
+    def thinned(self, most: int) -> "Points":
+        """Return at most `most` points, spread evenly over the rows."""
+        if len(self.positions) <= most:
+            return self
+        rows = np.linspace(0, len(self.positions) - 1, most).astype(int)
+        return Points(self.positions[rows], self.colors[rows], self.opacities[rows], self.depth_std_m[rows])
+
     @staticmethod
     def joined(parts: "Sequence[Points]") -> "Points":
         """Return the points of all parts, at least one."""
