@@ -1,6 +1,7 @@
 """Messages for robots: frames, covariances, odometry, map; and a writer that never holds up a run."""
 
 import json
+import struct
 import threading
 from itertools import pairwise
 from pathlib import Path
@@ -28,6 +29,7 @@ from sigmasplat.slam.loop_closure.pose_graph import Edge
 from sigmasplat.slam.path_covariance import PathCovariance
 
 pytest.importorskip("rosbags", reason="rosbags is not installed (extra `ros`)")
+from sigmasplat.robots.bag import BagSink
 from sigmasplat.robots.ros_messages import ODOMETRY, POSE, TF, Encoded, Points, RosMessages, Topic, stamp_of
 
 Array = NDArray[np.float64]
@@ -303,6 +305,24 @@ def test_a_sink_that_hangs_is_left_alone_at_the_end() -> None:
     outlet.close(timeout_s=0.01)
     assert "not finished" in outlet.failure and outlet.dropped == 2
     sink.released.set()
+
+
+def test_a_bag_that_was_not_completed_holds_its_messages(tmp_path: Path) -> None:
+    """What `mcap recover` reads after a crash: complete chunks in the file."""
+    sink = BagSink(tmp_path / "bag")
+    sink.open(MESSAGES)
+    sent = [MESSAGES.odometry(i, "odom", "camera_link", some_pose(i), None) for i in range(300)]
+    for message in sent:
+        sink.write(message)
+    data = (tmp_path / "bag" / "bag.mcap").read_bytes()
+    at, messages = 8, 0
+    while at < len(data):
+        code, size = struct.unpack_from("<BQ", data, at)
+        messages += (size - 6) // 16 * (code == 7)  # an index of the messages of one channel
+        at += 9 + size
+    sink.abort()
+    assert at == len(data) and 200 < messages <= 300
+    assert not (tmp_path / "bag" / "metadata.yaml").exists()
 
 
 # ---- export of a finished run ----

@@ -184,6 +184,24 @@ def test_our_own_source_reads_the_same_frames(tmp_path: Path) -> None:
     assert again.truth() is None, "the estimated path of one run is no ground truth of the next one"
 
 
+def test_a_resumed_run_writes_a_bag_of_its_own_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    more = ("--no-eval", "--out", str(tmp_path / "run"), "--save-every", "0", *TINY)
+
+    def stopped(slam: Slam, *args: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Slam, "finish", stopped)
+        assert exit_code("run", ROOM, "--limit", "5", *more) == 130
+    facts = RunFolder(tmp_path / "run").facts()
+    assert facts["status"] == "interrupted" and "bag" not in facts
+    assert exit_code("resume", str(tmp_path / "run"), "--no-eval", "--bag", str(tmp_path / "bag")) == 0
+    bag = read_bag(tmp_path / "bag")
+    assert not bag["/tf"] and len(bag["/tf_static"]) >= 1, "all frames were done already"
+    (cloud,) = bag["/sigmasplat/cloud"]
+    assert seconds(cloud) == pytest.approx(RunFolder(tmp_path / "run").read_log()[-1]["timestamp_s"], abs=1e-8)
+
+
 @contextmanager
 def files_of_at_most(size: int) -> Iterator[None]:
     """Let no file grow beyond a size, as on a full disk."""

@@ -9,6 +9,8 @@ from sigmasplat.errors import RunError
 from sigmasplat.robots.ros_messages import EXTRA, TOPICS, Encoded, RosMessages, Topic
 from sigmasplat.sources.files.optional import import_optional
 
+CHUNK_BYTES = 65_536
+
 
 class BagSink:
     """A bag in a new folder, with all topics, also those without messages. Chunks are compressed with Zstandard."""
@@ -28,6 +30,7 @@ class BagSink:
             raise RunError(f"cannot write the bag {folder}: {folder.parent} is not a writable folder")
         self.writer: Any = None
         self.connections = dict[str, Any]()
+        self._bytes = 0
 
     def open(self, messages: RosMessages) -> None:
         """Create the folder and its topics. Raises OSError if that fails."""
@@ -47,6 +50,9 @@ class BagSink:
     def write(self, message: Encoded) -> None:
         """Write a message; its recording time is its stamp. Raises OSError if the disk is full."""
         self.writer.write(self.connections[message.topic.name], message.stamp_ns, message.data)
+        self._bytes += len(message.data)
+        if self._bytes > CHUNK_BYTES:
+            self._complete_chunk()
 
     def close(self) -> None:
         """Write the index and metadata.yaml. Raises OSError if the disk is full."""
@@ -56,6 +62,16 @@ class BagSink:
         """Close the file without an index; `mcap recover` reads what was written."""
         with suppress(Exception):
             self.writer.abort()
+
+    def _complete_chunk(self) -> None:
+        """Write the messages so far to the disk, so that little is lost if the process is killed.
+
+        By itself, the library does this after 1 MB, which are minutes of poses. A later version may have other names.
+        """
+        self._bytes = 0
+        with suppress(AttributeError):
+            self.writer.storage.close_chunk()
+            self.writer.storage.bio.flush()
 
     def _quality(self, topic: Topic) -> Any:
         """Return the quality of service with which a player publishes a topic."""

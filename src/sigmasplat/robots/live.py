@@ -83,9 +83,7 @@ class LiveRobot:
 
     def __call__(self, step: StepResult) -> None:
         """Give the messages of a step to the outlets."""
-        first, self._stamp_ns = self._stamp_ns < 0, stamp_of(step.timestamp_s)
-        if first:
-            self._offer(partial(_static, self._stamp_ns, STATIC), TF_STATIC)
+        self._now(step.timestamp_s)
         self._offer_images(step)
         moved = has_motion(step.state, step.tracking)
         T_odom_camera = self.odometry.step(moved, step.lost, step.is_keyframe)
@@ -101,6 +99,7 @@ class LiveRobot:
 
     def last_loops(self, loops: Sequence[LoopResult]) -> None:
         """Give the final map, and the last pose if the last loops have moved it."""
+        self._now(self.slam.steps[-1].timestamp_s)
         if any(loop.accepted for loop in loops):
             self._offer_loop(len(self.slam.steps) - 1)
         self._offer_final_map()
@@ -116,6 +115,12 @@ class LiveRobot:
     def _offer(self, job: Job, *topics: Topic, bulky: bool = False) -> None:
         for outlet in self.outlets:
             outlet.offer(job, *topics, bulky=bulky)
+
+    def _now(self, timestamp_s: float) -> None:
+        """Set the time of the next messages; the first time, give the static transforms."""
+        first, self._stamp_ns = self._stamp_ns < 0, stamp_of(timestamp_s)
+        if first:
+            self._offer(partial(_static, self._stamp_ns, STATIC), TF_STATIC)
 
     def _offer_images(self, step: StepResult) -> None:
         frame = self._frames.pop(step.index, None)
