@@ -237,7 +237,7 @@ def test_grids_are_the_cells_of_the_plan() -> None:
 class SlowSink:
     """Waits in its first write until it is released; fails at the writes in `failing`."""
 
-    name = "bag"
+    name, missed = "bag", 0
 
     def __init__(self, failing: tuple[int, ...] = ()) -> None:
         self.failing, self.kept = failing, list[Encoded]()
@@ -280,7 +280,7 @@ def test_a_slow_sink_loses_messages_and_never_blocks() -> None:
     assert outlet.dropped == 2 * MOST_BULKY, "images are dropped before poses"
     sink.released.set()
     outlet.close()
-    assert outlet.record() == {"written": 1 + MOST_JOBS, "dropped": 2 * MOST_BULKY, "failure": ""}
+    assert outlet.record() == {"written": 1 + MOST_JOBS, "dropped": 2 * MOST_BULKY, "missed": 0, "failure": ""}
     assert [m.stamp_ns for m in sink.kept[:3]] == [0, 1, 2] and sink.closed and not sink.aborted
 
 

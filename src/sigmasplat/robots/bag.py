@@ -16,6 +16,7 @@ class BagSink:
     """A bag in a new folder, with all topics, also those without messages. Chunks are compressed with Zstandard."""
 
     name = "bag"
+    missed = 0
 
     def __init__(self, folder: Path) -> None:
         """Raises SourceError without the rosbags package, RunError if the folder exists or cannot be made."""

@@ -23,6 +23,8 @@ class Sink(Protocol):
     """Where messages go: a bag or a stream. Only the outlet's thread calls it."""
 
     name: str
+    missed: int
+    """Number of messages that slow readers did not get."""
 
     def open(self, messages: RosMessages) -> None:
         """Prepare to write."""
@@ -79,7 +81,8 @@ class Outlet:
 
     def record(self) -> dict[str, Any]:
         """Return counts and failure as values for run.json."""
-        return {"written": self.written, "dropped": self.dropped, "failure": self.failure}
+        counts = {"written": self.written, "dropped": self.dropped, "missed": self.sink.missed}
+        return counts | {"failure": self.failure}
 
     def _work(self) -> None:
         """Write until the end. The sink is opened at the first job, so that a run without frames leaves no file."""

@@ -132,7 +132,7 @@ class _Client:
 class StreamSink:
     """A WebSocket server on a thread of its own.
 
-    port, url: where it listens; lagging: number of messages that slow clients missed.
+    port, url: where it listens; missed: number of messages that slow clients did not get.
     """
 
     name = "stream"
@@ -144,7 +144,7 @@ class StreamSink:
         """
         check_stream(port)
         logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # do not log clients that disconnect
-        self.host, self.lagging = host, 0
+        self.host, self.missed = host, 0
         self._clients = set[_Client]()
         self._last = dict[str, Encoded]()
         self._wanted = frozenset[str]()
@@ -255,7 +255,7 @@ class StreamSink:
         finally:
             sending.cancel()
             self._clients.discard(client)
-            self.lagging += client.dropped
+            self.missed += client.dropped
             self._count_subscriptions()
 
     def _request(self, client: _Client, text: str | bytes) -> None:
