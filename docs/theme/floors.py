@@ -49,6 +49,7 @@ FLOORS = (
     Floor(("run",), "programs", "run SLAM on a sequence"),
     Floor(("evaluation",), "programs", "score runs, compare them"),
     Floor(("batch",), "programs", "many runs, one table"),
+    Floor(("robots",), "programs", "ROS 2 messages: bag, live stream"),
     Floor(("exports",), "programs", "formats of other programs"),
     Floor(("viewer",), "programs", "a run in the browser"),
     Floor(("download",), "programs", "public data sets"),

@@ -103,7 +103,8 @@ View = Annotated[
     bool, arg(help="show the run in the browser while it runs, and afterwards until Ctrl-C", help_behavior_hint="")
 ]
 Host = Annotated[
-    str, arg(metavar="ADDRESS", help="address that the viewer listens on; the default allows this machine only")
+    str,
+    arg(metavar="ADDRESS", help="address that viewer and stream listen on; the default allows this machine only"),
 ]
 Port = Annotated[int, arg(metavar="N", help="port of the viewer; if it is busy, the next free one is used; 0 = any")]
 Evaluate = Annotated[bool, arg(name="eval", help="do not score the run: no metrics, no report", help_behavior_hint="")]

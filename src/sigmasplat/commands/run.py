@@ -12,6 +12,13 @@ from typing import TYPE_CHECKING, Annotated
 from sigmasplat.commands import options
 from sigmasplat.commands.evaluate import score
 from sigmasplat.commands.options import arg, configured, prepare_torch, source_of
+from sigmasplat.commands.robot_output import (
+    DEFAULT_ROBOT_OPTIONS,
+    RobotOptions,
+    RobotOptionsFlat,
+    check_robot_output,
+    robot_output,
+)
 from sigmasplat.commands.view import keep_showing, serve_viewer
 from sigmasplat.config.text import full_path
 from sigmasplat.errors import ConfigError
@@ -20,6 +27,7 @@ from sigmasplat.presets import default_preset
 if TYPE_CHECKING:
     from sigmasplat.config import Config
     from sigmasplat.io.runs import RunFolder
+    from sigmasplat.robots.live import LiveRobot
     from sigmasplat.run.protocols import Callback
     from sigmasplat.run.resume import StartPoint
     from sigmasplat.run.session import Outcome
@@ -72,10 +80,12 @@ def run(
     onto: options.OntoRun = None,
     final_seconds: options.FinalSeconds = None,
     final_width: FinalWidth = None,
+    robot_options: RobotOptionsFlat = DEFAULT_ROBOT_OPTIONS,
 ) -> int:
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
     example: sigmasplat run data/kitchen --limit 200 --set input.width=480
+    for robots: sigmasplat run data/kitchen --bag kitchen-bag --stream 8765
     """
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.run.finished_map import FinishedMap, continue_map
@@ -86,6 +96,7 @@ def run(
     from sigmasplat.slam.slam import Slam
 
     log_names(run_options.log)
+    check_robot_output(robot_options)
     settings += () if final_seconds is None else (f"final.seconds={final_seconds:g}",)
     settings += () if final_width is None else (f"final.width={final_width}",)
     screen, earlier = Screen(), FinishedMap.of(RunFolder.open(onto)) if onto else None
@@ -100,13 +111,14 @@ def run(
             prepare_torch()
             slam = continue_map(earlier, config, source, folder) if earlier else Slam(config, folder.submaps)
             start = StartPoint(slam)
-            return _run_and_score(screen, start, source, folder, run_options, viewer)
+            return _run_and_score(screen, start, source, folder, run_options, viewer, robot_options)
 
 
 def resume(
     run: options.RunPath,
     moved_to: options.MovedSource = None,
     run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
+    robot_options: RobotOptionsFlat = DEFAULT_ROBOT_OPTIONS,
 ) -> int:
     """Resume a run that was stopped or killed, from its last saved state.
 
@@ -118,6 +130,7 @@ def resume(
     from sigmasplat.run.terminal import Screen
 
     log_names(run_options.log)
+    check_robot_output(robot_options)
     screen, folder = Screen(), RunFolder.open(run)
     source = source_of(folder, moved_to)
     prepare_torch()
@@ -125,7 +138,7 @@ def resume(
         start = resumed(folder, source)
         folder.note(status="running")
         screen.say(f"{source.name}: {resume_line(start.next_index, len(source))} → {folder.path}")
-        return _run_and_score(screen, start, source, folder, run_options, viewer)
+        return _run_and_score(screen, start, source, folder, run_options, viewer, robot_options)
 
 
 def resume_line(next_index: int, frames: int) -> str:
@@ -191,6 +204,7 @@ def _run_and_score(
     folder: "RunFolder",
     run_options: options.RunOptions,
     viewer: "ViewerApp | None",
+    robot_options: RobotOptions,
 ) -> int:
     """Run the session, then score it, and keep showing it in the viewer until Ctrl-C; return the exit code.
 
@@ -204,10 +218,16 @@ def _run_and_score(
     cuda_stages.measure(run_options.profile)
     state = StateFile(start.slam, folder, run_options.save_every)
     start.slam.saved_refinement = RefinementFile(start.slam, folder, run_options.save_every)
-    with _progress(screen, start, source, folder, run_options, viewer) as callback:
-        outcome = Session(
+    with (
+        robot_output(screen, start.slam, folder, robot_options, run_options.host) as robot,
+        _progress(screen, start, source, folder, run_options, viewer, robot) as callback,
+    ):
+        session = Session(
             start.slam, source, folder, callback, state, start.next_index, start.wall_s, run_options.all_poses
-        ).execute()
+        )
+        if robot:
+            session.watch = robot.watch
+        outcome = session.execute()
     if outcome.status == "interrupted" and not outcome.frames:
         raise KeyboardInterrupt  # the folder has no results, and no state to resume from
     if run_options.profile:
@@ -231,10 +251,10 @@ def _run_and_score(
 @contextmanager
 def _progress(
     screen: "Screen", start: "StartPoint", source: "Source", folder: "RunFolder",
-    run_options: options.RunOptions, viewer: "ViewerApp | None",
+    run_options: options.RunOptions, viewer: "ViewerApp | None", robot: "LiveRobot | None",
 ) -> Iterator["Callback"]:  # fmt: skip
-    """Yield the callback that shows the session on the terminal, in the requested logs, and in the viewer if there is
-    one."""
+    """Yield the callback that shows the session on the terminal, in the requested logs, in bag and stream if there is a
+    robot output, and in the viewer if there is one."""
     from sigmasplat.run.protocols import CallbackList
     from sigmasplat.run.step_logs import log_names, step_logs
 
@@ -242,12 +262,12 @@ def _progress(
         screen.steps(None if source.live else len(source), start.next_index) as steps,
         step_logs(log_names(run_options.log), folder, start.next_index) as logs,
     ):
-        if viewer is None:
-            yield CallbackList(steps, *logs)
-            return
-        from sigmasplat.viewer.live import LiveView
+        callbacks: list[Callback] = [steps, *logs, *([robot] if robot else [])]
+        if viewer is not None:
+            from sigmasplat.viewer.live import LiveView
 
-        yield CallbackList(steps, *logs, LiveView(start.slam, viewer.show, source.name))
+            callbacks.append(LiveView(start.slam, viewer.show, source.name))
+        yield CallbackList(*callbacks)
 
 
 def _warn_of_skipped_frames(screen: "Screen", source: "Source") -> None:

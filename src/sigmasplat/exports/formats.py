@@ -203,6 +203,15 @@ def _plan(source: ExportSource, target: Path, *, cell_m: float) -> str:
     return f"{regions}, also in {target.with_suffix('.json').name}"
 
 
+def _bag(source: ExportSource, target: Path, *, pictures: bool) -> str:
+    from sigmasplat.exports.bag import export_bag
+
+    reader = source.reader()
+    with _counting("floor plan") as progress:
+        counts = export_bag(reader, target, pictures=pictures, progress=progress)
+    return f"{sum(counts.values()):,} messages of {len(counts)} topics{reader.left_out()}"
+
+
 FORMATS = (
     ExportFormat("ply", (".ply",), "3DGS PLY with σ², for every viewer", splat_formats.ply),
     ExportFormat(
@@ -230,6 +239,7 @@ FORMATS = (
         _video,
         True,
     ),
+    ExportFormat("bag", (".mcap", "-bag"), "ROS 2 messages: path with covariance, loops, map", _bag, True),
     ExportFormat("plan", (".plan.png", ".png"), "a floor plan with regions to scan again", _plan, True),
 )
 """All formats. The first one is the default."""

@@ -8,7 +8,7 @@ and scores the run afterwards.
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +19,7 @@ from sigmasplat.config import Config
 from sigmasplat.errors import RunError
 from sigmasplat.io.runs import ALL_POSES, RunFolder
 from sigmasplat.model.component import RELOCALISED
+from sigmasplat.model.frame import Frame
 from sigmasplat.run.profile import profile
 from sigmasplat.run.protocols import (
     Callback,
@@ -113,11 +114,15 @@ class Outcome:
         return line
 
 
+def ignore(frame: Frame) -> None:
+    """Do nothing with a frame."""
+
+
 @dataclass(eq=False)
 class Session:
     """A run of SLAM on a source, from its frame `first_index` on; a resumed run has already taken `wall_s` seconds.
 
-    all_poses: also write trajectory_all.txt, which has the poses of all frames.
+    all_poses: also write trajectory_all.txt, which has the poses of all frames. watch: gets each frame before its step.
     """
 
     slam: SlamSystem
@@ -128,6 +133,7 @@ class Session:
     first_index: int = 0
     wall_s: float = 0.0
     all_poses: bool = False
+    watch: Callable[[Frame], None] = ignore
     frames: int = field(default=0, init=False)
     lost: int = field(default=0, init=False)
     relocalised: int = field(default=0, init=False)
@@ -177,6 +183,7 @@ class Session:
         earlier_s, started_s, frame = self.wall_s, time.perf_counter(), None
         try:
             for frame in self.source.frames_from(self.first_index):
+                self.watch(frame)
                 step = self.slam.step(frame)
                 self._log(step)
                 self.wall_s = earlier_s + time.perf_counter() - started_s

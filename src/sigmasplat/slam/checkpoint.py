@@ -25,11 +25,18 @@ def checkpoint_of(
         "timestamps_s": torch.from_numpy(path.timestamps_s),
         "T_world_camera": torch.from_numpy(path.T_world_camera),
         "T_world_camera_odometry": torch.from_numpy(atlas.T_world_camera(loops=False)),
-        "keyframes": torch.tensor(keyframes, dtype=torch.int64),
         "T_world_keyframe": torch.from_numpy(
             np.concatenate([np.empty((0, 4, 4)), *map(atlas.T_world_keyframe, range(len(atlas.anchors)))])
         ),
         "T_submap_camera": torch.from_numpy(atlas.T_submap_camera),
+        **path_errors(atlas, keyframes, edges),
+    }
+
+
+def path_errors(atlas: Atlas, keyframes: Sequence[int], edges: Sequence[Edge]) -> dict[str, Tensor]:
+    """Return the part of a checkpoint that `PathCovariance.of` reads; arguments as for `checkpoint_of`."""
+    return {
+        "keyframes": torch.tensor(keyframes, dtype=torch.int64),
         "T_world_submap": torch.from_numpy(np.array(atlas.anchors).reshape(-1, 4, 4)),
         "submap_component": torch.tensor(atlas.components, dtype=torch.int64),
         "frame_submap": torch.tensor([place.submap for place in atlas.places], dtype=torch.int64),

@@ -183,7 +183,7 @@ class PathCovariance:
         if not loops:
             return Factors()
         chosen = evenly_spread(loops, LOOPS_MOST)
-        chain, twists, errors = self._without_loops(), [], []
+        chain, twists, errors = self.without_loops(), [], []
         claimed = np.zeros((len(chosen), 6, len(chosen), 6))
         for i, edge in enumerate(self.edges[number] for number in chosen):
             T_a_world = se3.inverse(chain.anchors[edge.a])
@@ -197,8 +197,8 @@ class PathCovariance:
         parts = [claimed.reshape(size, size), bias @ bias.T]
         return Factors(*variance_factors(np.concatenate(twists), rest @ rest.T, parts))
 
-    def _without_loops(self) -> "PathCovariance":
-        """Return the path as the trusted edges alone give it."""
+    def without_loops(self) -> "PathCovariance":
+        """Return the path as the trusted edges alone give it: odometry, and places where the camera was found."""
         edges = tuple(edge for edge in self.edges if not edge.loop)
         motions = {(edge.a, edge.b): edge.T_a_b for edge in edges}
         motions |= {(edge.b, edge.a): se3.inverse(edge.T_a_b) for edge in edges}

@@ -14,6 +14,8 @@ POSE_TYPES = (
     "geometry_msgs/msg/TransformStamped",
     "nav_msgs/msg/Odometry",
 )
+OWN_TOPICS = "/sigmasplat/"
+"""Topics of `sigmasplat run --bag` begin like this. Their poses are estimates of an earlier run."""
 
 
 def read_truth(bag: Bag, camera_frame: str, recorded_time: bool) -> Trajectory | None:
@@ -21,9 +23,10 @@ def read_truth(bag: Bag, camera_frame: str, recorded_time: bool) -> Trajectory |
 
     If the messages name the moving body, the bag's static transforms convert its poses to the camera; without such a
     transform the result is None. If they name no body (PoseStamped), the poses are assumed to be the camera's.
-    `recorded_time`: use recording times instead of header times. Raises SourceError on a damaged pose.
+    Estimates of an earlier run of SigmaSplat do not count. `recorded_time`: use recording times instead of header
+    times. Raises SourceError on a damaged pose.
     """
-    topics = bag.topics_of_type(*POSE_TYPES)
+    topics = [topic for topic in bag.topics_of_type(*POSE_TYPES) if not topic.name.startswith(OWN_TOPICS)]
     if len(topics) != 1 or topics[0].count < 2:
         return None
     name = topics[0].name

@@ -1,0 +1,230 @@
+"""Give a run that goes on to outlets: transforms, odometry, loops, images, and the map as points and as a grid."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Literal
+
+import numpy as np
+from torch import Tensor
+
+from sigmasplat.errors import SigmaSplatError
+from sigmasplat.floorplan.floor_plan import FloorPlan, floor_plan
+from sigmasplat.model import se3
+from sigmasplat.model.frame import Frame
+from sigmasplat.render import FieldRenderer
+from sigmasplat.render.predictive import predict
+from sigmasplat.robots.frames import (
+    FLOOR,
+    LINK,
+    MAP,
+    ODOM,
+    OPTICAL,
+    T_LINK_OPTICAL,
+    T_MAP_WORLD,
+    WORLD,
+    link_pose,
+    ros_covariance,
+)
+from sigmasplat.robots.map_messages import MAX_POINTS, grids, points_of
+from sigmasplat.robots.odometry import LiveOdometry, has_motion
+from sigmasplat.robots.outlet import Job, Outlet
+from sigmasplat.robots.ros_messages import (
+    CLOUD,
+    COLOR,
+    COLOR_INFO,
+    DEPTH,
+    DEPTH_INFO,
+    GRID,
+    GRID_STD,
+    LOOP,
+    ODOMETRY,
+    TF,
+    TF_STATIC,
+    Encoded,
+    Points,
+    RosMessages,
+    Topic,
+    stamp_of,
+)
+from sigmasplat.run.protocols import LoopResult, StepResult
+from sigmasplat.slam.checkpoint import path_errors
+from sigmasplat.slam.path_covariance import PathCovariance
+from sigmasplat.slam.slam import Slam
+from sigmasplat.types import Matrix
+
+Images = Literal["none", "keyframes", "all"]
+SUBMAP_POINTS = 20_000
+"""At most this many points of each submap while the run goes on; fewer if there are many submaps."""
+STATIC = ((MAP, WORLD, T_MAP_WORLD), (LINK, OPTICAL, T_LINK_OPTICAL))
+"""Each message of static transforms contains all of them, because late subscribers get only the last one."""
+
+
+class LiveRobot:
+    """A `protocols.Callback` that gives messages to outlets.
+
+    It copies small data in the thread of the run. Messages are made and written on the threads of the outlets. images:
+    of which frames images are given. warn: prints a line if an outlet fails.
+    """
+
+    def __init__(
+        self, slam: Slam, outlets: Sequence[Outlet], warn: Callable[[str], None], images: Images = "keyframes"
+    ) -> None:
+        self.slam, self.outlets, self.warn, self.images = slam, outlets, warn, images
+        self.odometry = LiveOdometry(slam.atlas)
+        self._frames = dict[int, Frame]()
+        self._points = list[Points]()
+        self._stamp_ns = -1
+        self._failed = set[str]()
+
+    def watch(self, frame: Frame) -> None:
+        """Keep a frame until its step, if its images may be wanted."""
+        if self.images != "none":
+            self._frames[frame.index] = frame
+
+    def __call__(self, step: StepResult) -> None:
+        """Give the messages of a step to the outlets."""
+        self._now(step.timestamp_s)
+        self._offer_images(step)
+        moved = has_motion(step.state, step.tracking)
+        T_odom_camera = self.odometry.step(moved, step.lost, step.is_keyframe)
+        if not step.lost:
+            self._offer_pose(step, T_odom_camera)
+        if any(loop.accepted for loop in step.loops):
+            self._offer_loop(len(self.slam.steps) - 1)
+        self._offer_submaps()
+        self._report_failures()
+
+    def finishing(self, done: int, total: int) -> None:
+        """Do nothing while the final map is made."""
+
+    def last_loops(self, loops: Sequence[LoopResult]) -> None:
+        """Give the final map, and the last pose if the last loops have moved it."""
+        self._now(self.slam.steps[-1].timestamp_s)
+        if any(loop.accepted for loop in loops):
+            self._offer_loop(len(self.slam.steps) - 1)
+        self._offer_final_map()
+
+    def close(self) -> None:
+        """Write what waits, and report outlets that failed."""
+        for outlet in self.outlets:
+            outlet.close()
+        self._report_failures()
+
+    # ---- in the thread of the run ----
+
+    def _offer(self, job: Job, *topics: Topic, bulky: bool = False) -> None:
+        for outlet in self.outlets:
+            outlet.offer(job, *topics, bulky=bulky)
+
+    def _now(self, timestamp_s: float) -> None:
+        """Set the time of the next messages; the first time, give the static transforms."""
+        first, self._stamp_ns = self._stamp_ns < 0, stamp_of(timestamp_s)
+        if first:
+            self._offer(partial(_static, self._stamp_ns, STATIC), TF_STATIC)
+
+    def _offer_images(self, step: StepResult) -> None:
+        frame = self._frames.pop(step.index, None)
+        for index in [index for index in self._frames if index < step.index]:
+            del self._frames[index]
+        if frame is not None and (self.images == "all" or step.is_keyframe):
+            job = partial(_images, self._stamp_ns, frame)
+            self._offer(job, COLOR, COLOR_INFO, DEPTH, DEPTH_INFO, bulky=True)
+
+    def _offer_pose(self, step: StepResult, T_odom_camera: Matrix) -> None:
+        """Give the transforms and the odometry of a frame that is not lost.
+
+        If the frame's component is not connected to the world, map → odom is not known and left out.
+        """
+        T_odom_link = link_pose(T_LINK_OPTICAL @ T_odom_camera)
+        links = [(ODOM, LINK, T_odom_link)]
+        if not step.component:
+            T_map_link = link_pose(T_MAP_WORLD @ step.T_world_camera)
+            links.insert(0, (MAP, ODOM, se3.orthonormalise(T_map_link @ se3.inverse(T_odom_link))))
+        known = self.odometry.covariance
+        covariance = None if known is None else ros_covariance(known, T_LINK_OPTICAL, T_odom_link)
+        self._offer(partial(_pose, self._stamp_ns, links, covariance), TF, ODOMETRY)
+
+    def _offer_loop(self, row: int) -> None:
+        """Give the pose of a frame in the map with its covariance; this is computed on the outlet's thread."""
+        slam = self.slam
+        if slam.atlas.in_world[row]:
+            errors = path_errors(slam.atlas, slam.keyframe_indices, slam.closer.believed)
+            self._offer(partial(_loop, self._stamp_ns, errors, row), LOOP)
+
+    def _offer_submaps(self) -> None:
+        """Give the points of all finished submaps of the world, when one more is finished."""
+        store, atlas = self.slam.store, self.slam.atlas
+        if len(self._points) == len(store):
+            return
+        for index in range(len(self._points), len(store)):
+            self._points.append(points_of(store.load(index).field, None, SUBMAP_POINTS))
+        parts = [
+            (points, T_MAP_WORLD @ atlas.anchors[s]) for s, points in enumerate(self._points) if not atlas.components[s]
+        ]
+        if parts:
+            self._offer(partial(_cloud, self._stamp_ns, parts), CLOUD)
+
+    def _offer_final_map(self) -> None:
+        """Give the final map as points and as a grid."""
+        field, known = self.slam.field, self.slam.uncertainty
+        std = None if known is None or known.std is None else known.std.depth_std_m
+        self._offer(partial(_cloud, self._stamp_ns, [(points_of(field, std, MAX_POINTS), T_MAP_WORLD)]), CLOUD)
+        plan = self._floor_plan()
+        if plan is not None:
+            floor = (MAP, FLOOR, T_MAP_WORLD @ se3.inverse(plan.T_floor_world))
+            self._offer(partial(_static, self._stamp_ns, [*STATIC, floor]), TF_STATIC)
+            self._offer(partial(grids, plan, self._stamp_ns, FLOOR, np.eye(4)), GRID, GRID_STD)
+
+    def _floor_plan(self) -> FloorPlan | None:
+        """Return the floor plan of the final map; None if no surface is visible."""
+        slam, config = self.slam, self.slam.config
+        path, field, known = slam.trajectory().at(slam.believed()), slam.field, slam.uncertainty
+        predictor = None
+        if known is not None:
+            predictor = partial(predict, field, known, options=config.render, backend=config.backend)
+        renderer, camera = FieldRenderer(config.render, config.backend), slam.view.camera
+        try:
+            return floor_plan(field, path, camera, renderer=renderer, predictor=predictor) if len(path) else None
+        except SigmaSplatError:
+            return None
+
+    def _report_failures(self) -> None:
+        for outlet in self.outlets:
+            name = outlet.sink.name
+            if outlet.failure and name not in self._failed:
+                self._failed.add(name)
+                self.warn(f"the {name} ended ({outlet.failure}) after {outlet.written} messages; the run goes on")
+
+
+# ---- jobs, on the threads of the outlets ----
+
+
+def _static(stamp_ns: int, links: Sequence[tuple[str, str, Matrix]], messages: RosMessages) -> list[Encoded]:
+    return [messages.transforms(TF_STATIC, stamp_ns, links)]
+
+
+def _images(stamp_ns: int, frame: Frame, messages: RosMessages) -> list[Encoded]:
+    return messages.images(stamp_ns, frame.camera, frame.color, frame.depth_m)
+
+
+def _pose(
+    stamp_ns: int, links: Sequence[tuple[str, str, Matrix]], covariance: Matrix | None, messages: RosMessages
+) -> list[Encoded]:
+    T_odom_link = links[-1][2]
+    return [
+        messages.transforms(TF, stamp_ns, links),
+        messages.odometry(stamp_ns, ODOM, LINK, T_odom_link, covariance),
+    ]
+
+
+def _loop(stamp_ns: int, errors: Mapping[str, Tensor], row: int, messages: RosMessages) -> list[Encoded]:
+    path = PathCovariance.of(errors)
+    assert path is not None
+    T_map_link = link_pose(T_MAP_WORLD @ path.T_world_camera[row])
+    covariance = ros_covariance(path.of_frame(row), T_MAP_WORLD, T_map_link)
+    return [messages.pose(LOOP, stamp_ns, MAP, T_map_link, covariance)]
+
+
+def _cloud(stamp_ns: int, parts: Sequence[tuple[Points, Matrix]], messages: RosMessages) -> list[Encoded]:
+    each = MAX_POINTS // len(parts)
+    return [messages.cloud(stamp_ns, MAP, Points.joined([points.thinned(each).moved(T) for points, T in parts]))]

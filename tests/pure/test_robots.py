@@ -1,0 +1,425 @@
+"""Messages for robots: frames, covariances, odometry, map; and a writer that never holds up a run."""
+
+import json
+import struct
+import threading
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from command_line import exit_code
+from room_run import FRAMES, LOST, PATH, made_run, picture
+from ros_reading import covariance, decoded, image, links, matrix, points, pose, read_bag, seconds
+from sigmasplat.floorplan.floor_plan import FREE, OBJECT, UNOBSERVED, WALL, FloorPlan
+from sigmasplat.model import se3
+from sigmasplat.model.atlas import UNKNOWN_HOP, Atlas, Hop
+from sigmasplat.model.camera import Camera
+from sigmasplat.model.component import LOST as LOST_STATE, RELOCALISED, TRACKED
+from sigmasplat.robots.frames import T_LINK_OPTICAL, levelled_map, link_pose, ros_covariance
+from sigmasplat.robots.map_messages import grids
+from sigmasplat.robots.odometry import LiveOdometry, has_motion, odometry_poses
+from sigmasplat.robots.outlet import MOST_BULKY, MOST_JOBS, Outlet
+from sigmasplat.slam.checkpoint import path_errors
+from sigmasplat.slam.loop_closure.pose_graph import Edge
+from sigmasplat.slam.path_covariance import PathCovariance
+
+pytest.importorskip("rosbags", reason="rosbags is not installed (extra `ros`)")
+from sigmasplat.robots.bag import BagSink
+from sigmasplat.robots.ros_messages import ODOMETRY, POSE, TF, Encoded, Points, RosMessages, Topic, stamp_of
+
+Array = NDArray[np.float64]
+MESSAGES = RosMessages()
+
+
+def some_pose(seed: int) -> Array:
+    return se3.exp(np.random.default_rng(seed).normal(size=6) * [2.0, 1.0, 2.0, 0.4, 1.0, 0.4])
+
+
+def some_covariance(seed: int, scale: float = 1e-3) -> Array:
+    A = scale * np.random.default_rng(seed).normal(size=(6, 6))
+    return A @ A.T
+
+
+# ---- frames ----
+
+
+def test_body_axes_are_forward_left_up() -> None:
+    right, down, forward = T_LINK_OPTICAL[:3, :3].T
+    assert forward.tolist() == [1, 0, 0] and right.tolist() == [0, -1, 0] and down.tolist() == [0, 0, -1]
+    assert se3.is_rigid(T_LINK_OPTICAL)
+
+
+def test_a_levelled_map_has_x_ahead_and_z_up() -> None:
+    T_floor_world = se3.exp(np.array([0.0, 0.0, 0.0, -0.5 * np.pi, 0.0, 0.0]))
+    T_floor_world[2, 3] = 1.4  # the first camera is level, 1.4 m above the floor
+    T_map_world = levelled_map(np.round(T_floor_world, 12))
+    np.testing.assert_allclose(T_map_world @ [0, 0, 2.0, 1], [2.0, 0, 1.4, 1], atol=1e-12)  # ahead of the first camera
+    np.testing.assert_allclose(T_map_world @ [1.0, 0, 0, 1], [0, -1.0, 1.4, 1], atol=1e-12)  # right of it
+
+
+def test_the_covariance_is_that_of_poses_drawn_in_the_outer_frame() -> None:
+    """Perturb a pose in the world, express it in the outer frame, and measure position and rotation there."""
+    T_outer_world, T_world_camera, C = some_pose(1), some_pose(2), some_covariance(3)
+    T = link_pose(T_outer_world @ T_world_camera)
+    root = np.linalg.cholesky(C)
+    moved = []
+    for xi in np.random.default_rng(4).normal(size=(20_000, 6)) @ root.T:
+        drawn = link_pose(T_outer_world @ se3.exp(xi) @ T_world_camera)
+        moved.append([*(drawn[:3, 3] - T[:3, 3]), *se3.log_rotation(drawn[:3, :3] @ T[:3, :3].T)])
+    expected = np.cov(np.array(moved).T)
+    size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert np.abs(ros_covariance(C, T_outer_world, T) - expected).max() < 0.05 * size.max()
+    assert (np.abs(ros_covariance(C, T_outer_world, T) - expected) / size).max() < 0.05
+
+
+# ---- odometry ----
+
+
+def grown(atlas: Atlas, T_submap_camera: Array, hop: Hop | None = None) -> None:
+    """Add a frame; with a hop it is a keyframe."""
+    if hop is not None:
+        atlas.set_keyframes([*atlas.keyframe_poses[-1], T_submap_camera], hop)
+    atlas.place_frame(T_submap_camera)
+
+
+def walked(corrections: bool) -> tuple[list[Array], list[Array]]:
+    """Walk through three submaps; return the live odometry and the poses in the world at each frame. corrections: a
+    loop moves the anchors, and mapping moves a keyframe."""
+    atlas, rng = Atlas(), np.random.default_rng(0)
+    atlas.begin_submap()
+    odometry, T_odom, T_world = LiveOdometry(atlas), list[Array](), list[Array]()
+    T = np.eye(4)
+    for i in range(30):
+        T = T @ se3.exp(rng.normal(size=6) * 0.02)
+        is_keyframe = i % 3 == 0
+        if i and i % 12 == 0:  # a cut: the submap ends with this keyframe, and the next one begins with it
+            grown_keyframe = [*atlas.keyframe_poses[-1], T]
+            atlas.set_keyframes(grown_keyframe, Hop(np.eye(4), some_covariance(i), np.zeros(6)))
+            atlas.begin_submap(T)
+            if corrections:
+                atlas.anchors[-1] = se3.exp(np.full(6, 0.1)) @ atlas.anchors[-1]
+            T = np.eye(4)
+        if corrections and i == 20:
+            atlas.keyframe_poses[-1][-1] = se3.exp(np.full(6, 1e-3)) @ atlas.keyframe_poses[-1][-1]
+            T = se3.exp(np.full(6, 1e-3)) @ T  # tracking follows the keyframe
+        grown(atlas, T, Hop(np.eye(4), some_covariance(i), np.zeros(6)) if is_keyframe else None)
+        T_odom.append(odometry.step(True, False, is_keyframe).copy())
+        T_world.append(atlas.anchors[-1] @ T)
+    return T_odom, T_world
+
+
+def test_corrections_do_not_move_the_odometry() -> None:
+    free, _ = walked(corrections=False)
+    corrected, T_world = walked(corrections=True)
+    np.testing.assert_allclose(corrected, free, atol=1e-9)
+    T_map_odom = [a @ se3.inverse(b) for a, b in zip(T_world, corrected, strict=True)]
+    moves = [np.abs(b - a).max() > 1e-9 for a, b in pairwise(T_map_odom)]
+    assert [i + 1 for i, moved in enumerate(moves) if moved] == [12, 20, 24]
+
+
+def test_motion_without_tracking_is_left_out_and_its_covariance_is_not_known() -> None:
+    atlas = Atlas()
+    atlas.begin_submap()
+    odometry = LiveOdometry(atlas)
+    hop = Hop(np.eye(4), some_covariance(0), np.zeros(6))
+    known, at = [], []
+    relocalised, tracked, gone = (False, False), (True, False), (False, True)
+    for i, (moved, lost) in enumerate([tracked, tracked, gone, tracked, relocalised, tracked]):
+        grown(atlas, se3.exp(np.array([0.1 * i, 0, 0, 0, 0, 0])), hop)
+        at.append(float(odometry.step(moved, lost, is_keyframe=True)[0, 3]))
+        known.append(odometry.covariance is not None)
+    assert at == pytest.approx([0.0, 0.1, 0.1, 0.3, 0.3, 0.4])
+    assert known == [True, True, True, True, False, False]
+    assert has_motion(TRACKED, {}) and not has_motion(LOST_STATE, {}) and not has_motion(RELOCALISED, {})
+    assert not has_motion("apart", {"inliers": 40.0})
+
+
+def test_a_finished_path_has_the_same_odometry() -> None:
+    chain = np.stack([some_pose(i) for i in range(6)])
+    poses, tracked = odometry_poses(chain, [True] * 6, [False] * 6, [0] * 6)
+    np.testing.assert_allclose(poses, se3.inverse(chain[0]) @ chain, atol=1e-12)
+    assert tracked.all()
+    moved, lost = [True, True, False, True, False, True], [False, False, True, False, False, False]
+    poses, tracked = odometry_poses(chain, moved, lost, [0] * 5 + [1])
+    np.testing.assert_array_equal(poses[2], poses[1])
+    np.testing.assert_allclose(poses[3], poses[1] @ se3.inverse(chain[1]) @ chain[3], atol=1e-12)
+    np.testing.assert_array_equal(poses[4], poses[3])
+    np.testing.assert_array_equal(poses[5], poses[4])
+    assert tracked.tolist() == [True, True, True, True, False, False]
+
+
+def test_the_live_covariance_is_that_of_the_finished_path_if_mapping_agrees_with_tracking() -> None:
+    atlas, rng = Atlas(), np.random.default_rng(1)
+    atlas.begin_submap()
+    odometry, bias = LiveOdometry(atlas), np.full(6, 1e-4)
+    T, edges, keyframes = np.eye(4), [], []
+    for i in range(9):
+        motion = se3.exp(rng.normal(size=6) * 0.1)
+        before, T = T, T @ motion
+        hop = UNKNOWN_HOP if i == 0 else Hop(se3.inverse(T) @ before, some_covariance(i), bias)
+        if i == 0:
+            T = np.eye(4)
+        atlas.set_keyframes([*atlas.keyframe_poses[-1], T], hop)
+        if i == 4:
+            edges.append(Edge(0, 1, T, np.eye(6), loop=False))
+            atlas.begin_submap(T)
+            T = np.eye(4)
+            atlas.set_keyframes([T], UNKNOWN_HOP)
+        atlas.place_frame(T)
+        keyframes.append(i)
+        odometry.step(True, False, is_keyframe=True)
+        path = PathCovariance.of(path_errors(atlas, keyframes, edges))
+        assert path is not None and odometry.covariance is not None
+        np.testing.assert_allclose(odometry.covariance, path.of_frame(i), rtol=1e-6, atol=1e-12)
+    assert np.sqrt(odometry.covariance[0, 0]) > 1e-3
+
+
+# ---- messages ----
+
+
+def test_messages_hold_what_they_are_given() -> None:
+    T, C = some_pose(5), some_covariance(6)
+    sent = MESSAGES.odometry(1_500_000_001, "odom", "camera_link", T, C)
+    read = decoded(sent.data, sent.topic.msgtype)
+    assert (read.header.frame_id, read.child_frame_id) == ("odom", "camera_link")
+    assert (read.header.stamp.sec, read.header.stamp.nanosec) == (1, 500_000_001)
+    np.testing.assert_allclose(pose(read), T, atol=1e-12)
+    np.testing.assert_array_equal(covariance(read), C)
+    assert read.twist.covariance[0] == -1.0
+    unknown, certain = (
+        decoded(MESSAGES.pose(POSE, 0, "map", T, c).data, POSE.msgtype) for c in (None, np.zeros((6, 6)))
+    )
+    assert covariance(unknown)[0, 0] == -1.0 and (np.linalg.eigvalsh(covariance(certain)) > 0).all()
+    tf = MESSAGES.transforms(TF, 5, [("map", "odom", T)])
+    np.testing.assert_allclose(links(decoded(tf.data, TF.msgtype))["map", "odom"], T, atol=1e-12)
+    assert stamp_of(-1.0) == 0 and stamp_of(1.5) == 1_500_000_000
+
+
+def test_points_keep_position_colour_and_confidence() -> None:
+    rng = np.random.default_rng(0)
+    cloud = Points(*(rng.random(shape).astype(np.float32) for shape in ((50, 3), (50, 3), 50, 50)))
+    cloud.depth_std_m[3] = np.nan
+    T = some_pose(7)
+    sent = MESSAGES.cloud(0, "map", cloud.moved(T))
+    rows = points(decoded(sent.data, sent.topic.msgtype))
+    np.testing.assert_allclose(
+        np.stack([rows["x"], rows["y"], rows["z"]], 1), cloud.positions @ T[:3, :3].T + T[:3, 3], atol=1e-5
+    )
+    packed = rows["rgb"].view(np.uint32)
+    rgb = np.stack([packed >> 16 & 255, packed >> 8 & 255, packed & 255], 1)
+    np.testing.assert_array_equal(rgb, np.rint(255 * cloud.colors))
+    np.testing.assert_array_equal(rows["depth_std"], cloud.depth_std_m)
+    np.testing.assert_array_equal(rows["opacity"], cloud.opacities)
+
+
+def test_grids_are_the_cells_of_the_plan() -> None:
+    kind = np.array([[UNOBSERVED, FREE, OBJECT], [FREE, WALL, UNOBSERVED]], np.uint8)
+    std = np.array([[np.nan, 0.013, 0.02], [0.004, 7.0, np.nan]], np.float32)
+    nothing = np.zeros_like(std)
+    plan = FloorPlan(0.05, np.array([-1.0, 2.0]), np.eye(4), kind, nothing, std, nothing, np.zeros((0, 2)), ())
+    T = some_pose(8)
+    occupied, sure = (decoded(m.data, m.topic.msgtype) for m in grids(plan, 0, "map", T, MESSAGES))
+    assert occupied.data.reshape(2, 3).tolist() == [[-1, 0, 100], [0, 100, -1]]
+    assert sure.data.reshape(2, 3).tolist() == [[-1, 1, 2], [0, 100, -1]]
+    assert (occupied.info.width, occupied.info.height) == (3, 2) and occupied.info.resolution == pytest.approx(0.05)
+    origin = occupied.info.origin.position
+    np.testing.assert_allclose([origin.x, origin.y, origin.z], (T @ [-1.0, 2.0, 0, 1])[:3], atol=1e-9)
+
+
+# ---- the writer's thread ----
+
+
+class SlowSink:
+    """Waits in its first write until it is released; fails at the writes in `failing`."""
+
+    name, missed = "bag", 0
+
+    def __init__(self, failing: tuple[int, ...] = ()) -> None:
+        self.failing, self.kept = failing, list[Encoded]()
+        self.began, self.released = threading.Event(), threading.Event()
+        self.closed = self.aborted = False
+
+    def open(self, messages: RosMessages) -> None: ...
+
+    def wants(self, *topics: Topic) -> bool:
+        return True
+
+    def write(self, message: Encoded) -> None:
+        self.began.set()
+        assert self.released.wait(60)
+        if len(self.kept) in self.failing:
+            raise OSError(28, "No space left on device")
+        self.kept.append(message)
+
+    def close(self) -> None:
+        self.closed = True
+
+    def abort(self) -> None:
+        self.aborted = True
+
+
+def numbered(i: int) -> list[Encoded]:
+    return [Encoded(ODOMETRY, i, b"")]
+
+
+def test_a_slow_sink_loses_messages_and_never_blocks() -> None:
+    sink = SlowSink()
+    outlet = Outlet(sink, MESSAGES)
+    outlet.offer(lambda messages: numbered(0), ODOMETRY)
+    assert sink.began.wait(60)
+    for i in range(2 * MOST_BULKY):
+        outlet.offer(lambda messages, i=i: numbered(1 + i), ODOMETRY, bulky=True)
+    assert outlet.dropped == MOST_BULKY
+    for i in range(MOST_JOBS):
+        outlet.offer(lambda messages, i=i: numbered(1000 + i), ODOMETRY)
+    assert outlet.dropped == 2 * MOST_BULKY, "images are dropped before poses"
+    sink.released.set()
+    outlet.close()
+    assert outlet.record() == {"written": 1 + MOST_JOBS, "dropped": 2 * MOST_BULKY, "missed": 0, "failure": ""}
+    assert [m.stamp_ns for m in sink.kept[:3]] == [0, 1, 2] and sink.closed and not sink.aborted
+
+
+def test_a_failed_sink_ends_and_the_offers_go_on() -> None:
+    sink = SlowSink(failing=(2,))
+    sink.released.set()
+    outlet = Outlet(sink, MESSAGES)
+    for i in range(10):
+        outlet.offer(lambda messages, i=i: numbered(i), ODOMETRY)
+    outlet.close()
+    outlet.offer(lambda messages: numbered(99), ODOMETRY)
+    assert outlet.failure == "No space left on device" and sink.aborted and not sink.closed
+    assert (outlet.written, outlet.dropped) == (2, 11 - 3)
+
+
+def test_a_sink_that_hangs_is_left_alone_at_the_end() -> None:
+    sink = SlowSink()
+    outlet = Outlet(sink, MESSAGES)
+    for i in range(3):
+        outlet.offer(lambda messages, i=i: numbered(i), ODOMETRY)
+    assert sink.began.wait(60)
+    outlet.close(timeout_s=0.01)
+    assert "not finished" in outlet.failure and outlet.dropped == 2
+    sink.released.set()
+
+
+def test_a_bag_that_was_not_completed_holds_its_messages(tmp_path: Path) -> None:
+    """What `mcap recover` reads after a crash: complete chunks in the file."""
+    sink = BagSink(tmp_path / "bag")
+    sink.open(MESSAGES)
+    sent = [MESSAGES.odometry(i, "odom", "camera_link", some_pose(i), None) for i in range(300)]
+    for message in sent:
+        sink.write(message)
+    data = (tmp_path / "bag" / "bag.mcap").read_bytes()
+    at, messages = 8, 0
+    while at < len(data):
+        code, size = struct.unpack_from("<BQ", data, at)
+        messages += (size - 6) // 16 * (code == 7)  # an index of the messages of one channel
+        at += 9 + size
+    sink.abort()
+    assert at == len(data) and 200 < messages <= 300
+    assert not (tmp_path / "bag" / "metadata.yaml").exists()
+
+
+# ---- export of a finished run ----
+
+
+def test_a_run_is_exported_as_a_bag(tmp_path: Path) -> None:
+    run = made_run(tmp_path / "run", submaps=True)
+    assert exit_code("export", str(run.path), "--out", str(tmp_path / "run-bag"), "--pictures") == 0
+    found = read_bag(tmp_path / "run-bag")
+    kept = [i for i in range(FRAMES) if i != LOST]
+    static = links(found["/tf_static"][0])
+    T_map_world, T_link_optical = static["map", "sigmasplat_world"], static["camera_link", "camera_optical_frame"]
+    assert [seconds(m) for m in found["/sigmasplat/pose"]] == pytest.approx([i / 10 for i in kept])
+    for row, tf, at in zip(kept, found["/tf"], found["/sigmasplat/pose"], strict=True):
+        T = links(tf)
+        T_map_optical = T["map", "odom"] @ T["odom", "camera_link"] @ T_link_optical
+        np.testing.assert_allclose(T_map_optical, T_map_world @ PATH.T_world_camera[row], atol=1e-6)
+        np.testing.assert_allclose(pose(at) @ T_link_optical, T_map_optical, atol=1e-6)
+        assert at.header.frame_id == "map" and covariance(at)[0, 0] == -1.0, "this run did not record its errors"
+    up = T_map_world[:3, :3] @ PATH.T_world_camera[0, :3, 1]
+    assert up[2] < -0.8, "down of the camera is down of the map"
+    assert [image(m)[0, 1, 0] for m in found["/camera/color/image_raw"]] == [0, 20, 40]
+    depth = image(found["/camera/aligned_depth_to_color/image_raw"][1])
+    assert np.isnan(depth[0, 0])
+    np.testing.assert_array_equal(depth.ravel()[1:], picture(2).depth_m.ravel()[1:])
+    cells = found["/map"][0]
+    assert exit_code("export", str(run.path), "--out", str(tmp_path / "run.plan.png")) == 0
+    rows = json.loads((tmp_path / "run.plan.json").read_text())["cells"]
+    values = [[{"?": -1, ",": -1, ".": 0, "o": 100, "#": 100}[sign] for sign in row] for row in rows]
+    np.testing.assert_array_equal(cells.data.reshape(cells.info.height, cells.info.width), values)
+    assert (cells.data == 0).any() and cells.header.frame_id == "map"
+    assert abs(cells.info.origin.position.z) < 1e-6
+    assert exit_code("export", str(run.path), "--out", str(tmp_path / "run-bag")) == 2
+    assert exit_code("export", str(run.path), "--out", str(tmp_path / "run-bag"), "--overwrite") == 0
+    assert "/camera/color/image_raw" not in {k for k, v in read_bag(tmp_path / "run-bag").items() if v}
+    assert exit_code("export", str(run.path), "--out", str(tmp_path / "run.mcap")) == 0
+    assert (tmp_path / "run.mcap").is_file() and len(read_bag(tmp_path / "run.mcap")["/tf"]) == len(kept)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run", "run-bag", "run.mcap", "run.plan.json", "run.plan.png"]
+
+
+def test_the_grid_and_the_points_lie_in_the_same_map(tmp_path: Path) -> None:
+    """Occupied cells have points above the floor; walls of the room lie at the edges of the free floor."""
+    run = made_run(tmp_path / "run", submaps=True)
+    assert exit_code("export", str(run.path), "--out", str(tmp_path / "run.mcap")) == 0
+    found = read_bag(tmp_path / "run.mcap")
+    rows, grid = points(found["/sigmasplat/cloud"][0]), found["/map"][0]
+    field = run.read_map()
+    assert len(rows) == int((field.opacities >= 0.5).sum())
+    T = links(found["/tf_static"][0])["map", "sigmasplat_world"]
+    opaque = field.means[field.opacities >= 0.5].numpy()
+    xyz = np.stack([rows["x"], rows["y"], rows["z"]], 1)
+    np.testing.assert_allclose(xyz, opaque @ T[:3, :3].T + T[:3, 3], atol=1e-4)
+    origin = grid.info.origin
+    T_grid_map = se3.inverse(matrix(origin.position, origin.orientation))
+    in_grid = xyz @ T_grid_map[:3, :3].T + T_grid_map[:3, 3]
+    cells = np.floor(in_grid[:, :2] / grid.info.resolution).astype(int)
+    occupancy = grid.data.reshape(grid.info.height, grid.info.width)
+    on_floor = np.abs(in_grid[:, 2]) < 0.03
+    inside = on_floor & (cells >= 0).all(1) & (cells < [grid.info.width, grid.info.height]).all(1)
+    values = occupancy[cells[inside, 1], cells[inside, 0]]
+    assert inside.sum() > 100 and (values == 0).mean() > 0.5, "points at the height of the floor are free floor"
+
+
+def test_the_exported_covariance_is_that_of_the_path(tmp_path: Path) -> None:
+    run = made_run(tmp_path / "run", submaps=True)
+    atlas = Atlas()
+    atlas.begin_submap()
+    for i in range(FRAMES):
+        if i in (0, 2, 4):
+            hop = UNKNOWN_HOP if i == 0 else Hop(np.eye(4), some_covariance(i), np.zeros(6))
+            atlas.set_keyframes([*atlas.keyframe_poses[-1], PATH.T_world_camera[i]], hop)
+        atlas.place_frame(PATH.T_world_camera[i])
+    tensors = run.read_checkpoint()[0] | path_errors(atlas, [0, 2, 4], [])
+    run.write_checkpoint({name: torch.as_tensor(value).contiguous() for name, value in tensors.items()}, {})
+    errors = PathCovariance.of(tensors)
+    assert errors is not None
+    assert exit_code("export", str(run.path), "--out", str(tmp_path / "run.mcap")) == 0
+    found = read_bag(tmp_path / "run.mcap")
+    T_map_world = links(found["/tf_static"][0])["map", "sigmasplat_world"]
+    for row, message in zip([i for i in range(FRAMES) if i != LOST], found["/sigmasplat/pose"], strict=True):
+        expected = ros_covariance(errors.of_frame(row), T_map_world, pose(message))
+        expected = expected if expected.any() else 1e-10 * np.eye(6)
+        np.testing.assert_allclose(covariance(message), expected, rtol=1e-5, atol=1e-12)
+    chain = errors.without_loops()
+    for row, message in zip([i for i in range(FRAMES) if i != LOST], found["/sigmasplat/odometry"], strict=True):
+        expected = ros_covariance(chain.of_frame(row), T_LINK_OPTICAL, pose(message))
+        expected = expected if expected.any() else 1e-10 * np.eye(6)
+        np.testing.assert_allclose(covariance(message), expected, rtol=1e-5, atol=1e-12)
+
+
+def test_images_have_the_pinhole_of_their_camera() -> None:
+    camera = Camera(4, 3, 5.0, 6.0, 1.5, 1.25)
+    color, depth = np.full((3, 4, 3), 0.5, np.float32), np.full((3, 4), 1.25, np.float32)
+    sent = MESSAGES.images(0, camera, color, depth)
+    read = [SimpleNamespace(topic=m.topic.name, message=decoded(m.data, m.topic.msgtype)) for m in sent]
+    infos = [r.message for r in read if r.topic.endswith("camera_info")]
+    assert len(infos) == 2
+    for info in infos:
+        assert info.k.tolist() == [5.0, 0, 1.5, 0, 6.0, 1.25, 0, 0, 1.0] and (info.width, info.height) == (4, 3)
+        assert info.header.frame_id == "camera_optical_frame"
