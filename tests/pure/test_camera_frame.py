@@ -1,9 +1,10 @@
-"""The camera and the frame: rays survive resizing, bad images are refused at the border, depth is never averaged."""
+"""The camera and the frame: rays survive resizing, bad images are refused, depth mixes no surfaces."""
 
 import itertools
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 
 from sigmasplat.errors import ConfigError, SourceError
@@ -93,6 +94,7 @@ def test_resizing_averages_colour_over_the_area_and_picks_depth() -> None:
     small = f.resized(4, 3)
     np.testing.assert_allclose(small.color, f.color.reshape(3, 2, 4, 2, 3).mean((1, 3)), atol=1e-6)
     cells = f.depth_m.reshape(3, 2, 4, 2).transpose(0, 2, 1, 3).reshape(3, 4, 4)
+    assert (cells.max(-1) > 1.03 * cells.min(-1)).all(), "no four readings are on one surface"
     assert (cells == small.depth_m[..., None]).any(-1).all(), "each depth is one of the four readings"
     assert small.camera == CAMERA.resized(4, 3) and (small.index, small.timestamp_s) == (3, 0.5)
     assert f.resized(8, 6) is f
@@ -102,20 +104,41 @@ def test_resizing_averages_colour_over_the_area_and_picks_depth() -> None:
 def test_resizing_finds_a_reading_anywhere_in_the_pixels_area(size: tuple[int, int]) -> None:
     camera, drawn = Camera(640, 480, 500.0, 500.0, 319.5, 239.5), np.random.default_rng(0).random((480, 640))
     number = np.arange(480 * 640).reshape(480, 640)
-    depth = (1.0 + number / 2**20).astype(np.float32)  # exact, so a reading tells which pixel it comes from
+    far = number % 2 + number // 640 % 2 * 2  # neighbours are on different surfaces, so no depth is interpolated
+    depth = (1.0 + number / 2**20 + far).astype(np.float32)  # exact, so a reading tells which pixel it comes from
     sparse = np.where(drawn < 0.5, np.float32(0.0), depth)
     nearest, found = (
         Frame(0, 0.0, np.zeros((480, 640, 3), np.float32), d, camera).resized(*size).depth_m for d in (depth, sparse)
     )
     read = found > 0
     assert read.mean() > 0.9, "half of the readings, but four or more in each pixel's area"
-    rows, columns = np.divmod(np.rint((found[read].astype(float) - 1.0) * 2**20).astype(int), 640)
+    rows, columns = np.divmod(np.rint(found[read].astype(float) % 1.0 * 2**20).astype(int), 640)
     assert (sparse[rows, columns] == found[read]).all(), "no reading is averaged"
     for at, pixels, scale in zip((rows, columns), np.nonzero(read), (480 / size[1], 640 / size[0]), strict=True):
         assert np.abs(at + 0.5 - (pixels + 0.5) * scale).max() <= 0.5 * scale + 1e-9
     kept = np.isin(nearest, sparse)
     assert 0.4 < kept.mean() < 0.6
     np.testing.assert_array_equal(found[kept], nearest[kept])
+
+
+@pytest.mark.parametrize("size", [(320, 240), (240, 180), (160, 120), (150, 113), (1280, 960)], ids=str)
+def test_resized_depth_of_a_plane_is_on_the_plane(size: tuple[int, int]) -> None:
+    camera, color = Camera(640, 480, 500.0, 500.0, 310.0, 245.0), np.zeros((480, 640, 3), np.float32)
+
+    def plane(camera: Camera) -> NDArray[np.float32]:
+        return np.asarray(1.0 / (camera.rays() @ np.array([0.2, -0.3, 0.4])), np.float32)
+
+    small = Frame(0, 0.0, color, plane(camera), camera).resized(*size)
+    inner = np.s_[2:-2, 2:-2]
+    error = (small.depth_m - plane(small.camera))[inner]
+    assert np.abs(error).max() < 1e-4, "the depth belongs to the centre of the pixel"
+
+
+def test_resizing_mixes_no_surfaces() -> None:
+    depth = np.ones((6, 8), np.float32)
+    depth[:, 3:], depth[2, 6] = 2.0, 0.0
+    small = Frame(0, 0.0, np.zeros((6, 8, 3), np.float32), depth, CAMERA).resized(4, 3)
+    assert set(np.unique(small.depth_m)) == {1.0, 2.0}
 
 
 def test_prepared_takes_out_of_range_readings_away() -> None:

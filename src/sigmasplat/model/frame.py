@@ -13,6 +13,8 @@ from sigmasplat.types import Matrix
 
 COLOR_LIMITS = (-1.0, 2.0)
 """Colour outside these limits has another unit, usually 0…255. Values just outside [0, 1] are accepted."""
+SAME_SURFACE = 1.03
+"""Neighbouring depths up to this ratio are on one surface, so depth between them is interpolated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,10 +166,44 @@ def _halved(color: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def resized_depth(depth_m: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
-    """Return depth [height, width], m: in each pixel's area the reading nearest to its centre, 0 without a reading.
+    """Return depth [height, width], m, at the centre of each pixel, 0 without a reading in its area.
 
-    Depth is never averaged: the mean of a near and a far surface is on neither of them.
+    Depth is interpolated where the four readings around the centre are on one surface (`interpolated_depth`). Elsewhere
+    it is the reading of the area that is nearest to the centre: the mean of a near and a far surface is on neither of
+    them.
     """
+    if depth_m.shape == (height, width):
+        return depth_m.copy()
+    nearest = _nearest_depth(depth_m, width, height)
+    rows, columns = ((np.arange(n) + 0.5) * (m / n) - 0.5 for n, m in zip((height, width), depth_m.shape, strict=True))
+    return interpolated_depth(depth_m, rows, columns, nearest)
+
+
+def interpolated_depth(
+    depth_m: NDArray[np.float32],
+    rows: NDArray[np.float64],
+    columns: NDArray[np.float64],
+    otherwise: NDArray[np.float32],
+) -> NDArray[np.float32]:
+    """Return depth [H, W], m, interpolated at rows [H] and columns [W] (fractional pixels).
+
+    Where the four readings around a position are not on one surface (`SAME_SURFACE`), or where `otherwise` [H, W] is 0,
+    the value of `otherwise` is returned. Depth outside the image is that of its edge.
+    """
+    (h, w), top, left = depth_m.shape, np.floor(rows), np.floor(columns)
+    down, right = (rows - top).astype(np.float32)[:, None], (columns - left).astype(np.float32)
+    corners = [
+        depth_m[np.clip(top.astype(np.intp) + y, 0, h - 1)][:, np.clip(left.astype(np.intp) + x, 0, w - 1)]
+        for y in (0, 1) for x in (0, 1)
+    ]  # fmt: skip
+    least, most = np.minimum.reduce(corners), np.maximum.reduce(corners)
+    above, below = (corners[k] + right * (corners[k + 1] - corners[k]) for k in (0, 2))
+    smooth = (least > 0) & (most < SAME_SURFACE * least) & (otherwise > 0)
+    return np.where(smooth, above + down * (below - above), otherwise)
+
+
+def _nearest_depth(depth_m: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
+    """Return in each pixel's area the reading nearest to its centre, 0 without a reading."""
     small = np.array(Image.fromarray(depth_m).resize((width, height), Image.Resampling.NEAREST), np.float32)
     holes = np.flatnonzero(small == 0.0)
     if not len(holes):

@@ -8,13 +8,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame, resized_color
+from sigmasplat.model.frame import Frame, interpolated_depth, resized_color
 
 JPEG_QUALITY = 95
 """Errors of 48 dB PSNR, far below those of any map, at 110 kB for 640×480 pixels. A WebP file of this quality is a
 third smaller, but takes 7 times as long to write."""
-SAME_SURFACE = 1.03
-"""Neighbouring depths up to this ratio are on one surface, so depth between them is interpolated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,14 +69,7 @@ def enlarged_depth(depth_m: NDArray[np.float32], camera: Camera, larger: Camera)
     that of the nearest pixel, 0 without a reading or outside the image.
     """
     columns, rows = larger.pixels_in(camera)
-    nearest = _at(depth_m, np.rint(rows), np.rint(columns))
-    top, left = np.floor(rows), np.floor(columns)
-    corners = [_at(depth_m, top + y, left + x) for y in (0, 1) for x in (0, 1)]
-    down, right = (rows - top).astype(np.float32)[:, None], (columns - left).astype(np.float32)
-    above, below = ((1 - right) * corners[k] + right * corners[k + 1] for k in (0, 2))
-    least, most = np.minimum.reduce(corners), np.maximum.reduce(corners)
-    smooth = (least > 0) & (most < SAME_SURFACE * least) & (nearest > 0)
-    return np.where(smooth, (1 - down) * above + down * below, nearest)
+    return interpolated_depth(depth_m, rows, columns, _at(depth_m, np.rint(rows), np.rint(columns)))
 
 
 def _at(depth_m: NDArray[np.float32], rows: NDArray[np.float64], columns: NDArray[np.float64]) -> NDArray[np.float32]:
