@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Literal
 
-import numpy as np
 from torch import Tensor
 
 from sigmasplat.errors import SigmaSplatError
@@ -22,6 +21,7 @@ from sigmasplat.robots.frames import (
     T_LINK_OPTICAL,
     T_MAP_WORLD,
     WORLD,
+    levelled_map,
     link_pose,
     ros_covariance,
 )
@@ -171,9 +171,9 @@ class LiveRobot:
         self._offer(partial(_cloud, self._stamp_ns, [(points_of(field, std, MAX_POINTS), T_MAP_WORLD)]), CLOUD)
         plan = self._floor_plan()
         if plan is not None:
-            floor = (MAP, FLOOR, T_MAP_WORLD @ se3.inverse(plan.T_floor_world))
+            floor = (MAP, FLOOR, T_MAP_WORLD @ se3.inverse(levelled_map(plan.T_floor_world)))
             self._offer(partial(_static, self._stamp_ns, [*STATIC, floor]), TF_STATIC)
-            self._offer(partial(grids, plan, self._stamp_ns, FLOOR, np.eye(4)), GRID, GRID_STD)
+            self._offer(partial(grids, plan, self._stamp_ns, FLOOR), GRID, GRID_STD)
 
     def _floor_plan(self) -> FloorPlan | None:
         """Return the floor plan of the final map; None if no surface is visible."""
