@@ -215,7 +215,7 @@ def files_of_at_most(size: int) -> Iterator[None]:
 
 def test_a_full_disk_ends_the_bag_and_not_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     large = "synthetic:frames=60,width=320,height=240"
-    more = ("--no-eval", "--limit", "12", *TINY)
+    more = ("--no-eval", "--limit", "8", *TINY)
     assert exit_code("run", large, "--out", str(tmp_path / "plain"), *more) == 0
     capsys.readouterr()
     largest = max(file.stat().st_size for file in (tmp_path / "plain").rglob("*") if file.is_file())
