@@ -222,13 +222,17 @@ def test_grids_are_the_cells_of_the_plan() -> None:
     std = np.array([[np.nan, 0.013, 0.02], [0.004, 7.0, np.nan]], np.float32)
     nothing = np.zeros_like(std)
     plan = FloorPlan(0.05, np.array([-1.0, 2.0]), np.eye(4), kind, nothing, std, nothing, np.zeros((0, 2)), ())
-    T = some_pose(8)
-    occupied, sure = (decoded(m.data, m.topic.msgtype) for m in grids(plan, 0, "map", T, MESSAGES))
-    assert occupied.data.reshape(2, 3).tolist() == [[-1, 0, 100], [0, 100, -1]]
-    assert sure.data.reshape(2, 3).tolist() == [[-1, 1, 2], [0, 100, -1]]
-    assert (occupied.info.width, occupied.info.height) == (3, 2) and occupied.info.resolution == pytest.approx(0.05)
-    origin = occupied.info.origin.position
-    np.testing.assert_allclose([origin.x, origin.y, origin.z], (T @ [-1.0, 2.0, 0, 1])[:3], atol=1e-9)
+    occupied, sure = (decoded(m.data, m.topic.msgtype) for m in grids(plan, 0, "map", MESSAGES))
+    assert occupied.info.resolution == pytest.approx(0.05)
+    assert (occupied.info.origin.orientation.w, occupied.header.frame_id) == (1.0, "map")
+    for message, wanted in ((occupied, {"?": -1, "f": 0, "o": 100}), (sure, {"?": -1, "f": 1, "o": 2})):
+        cells = message.data.reshape(message.info.height, message.info.width)
+        corner = message.info.origin.position
+        for name, x_right, y_ahead in (("?", -0.975, 2.025), ("f", -0.925, 2.025), ("o", -0.875, 2.025)):
+            column, row = int((y_ahead - corner.x) / 0.05), int((-x_right - corner.y) / 0.05)
+            assert cells[row, column] == wanted[name]
+        assert cells.shape == (3, 2)
+    assert sorted(sure.data.tolist()) == [-1, -1, 0, 1, 2, 100]
 
 
 # ---- the writer's thread ----
@@ -352,7 +356,8 @@ def test_a_run_is_exported_as_a_bag(tmp_path: Path) -> None:
     assert exit_code("export", str(run.path), "--out", str(tmp_path / "run.plan.png")) == 0
     rows = json.loads((tmp_path / "run.plan.json").read_text())["cells"]
     values = [[{"?": -1, ",": -1, ".": 0, "o": 100, "#": 100}[sign] for sign in row] for row in rows]
-    np.testing.assert_array_equal(cells.data.reshape(cells.info.height, cells.info.width), values)
+    turned = cells.data.reshape(cells.info.height, cells.info.width)[::-1].T  # the plan has x right, y ahead
+    np.testing.assert_array_equal(turned, values)
     assert (cells.data == 0).any() and cells.header.frame_id == "map"
     assert abs(cells.info.origin.position.z) < 1e-6
     assert exit_code("export", str(run.path), "--out", str(tmp_path / "run-bag")) == 2

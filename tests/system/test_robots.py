@@ -215,7 +215,7 @@ def files_of_at_most(size: int) -> Iterator[None]:
 
 def test_a_full_disk_ends_the_bag_and_not_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     large = "synthetic:frames=60,width=320,height=240"
-    more = ("--no-eval", "--limit", "12", *TINY)
+    more = ("--no-eval", "--limit", "8", *TINY)
     assert exit_code("run", large, "--out", str(tmp_path / "plain"), *more) == 0
     capsys.readouterr()
     largest = max(file.stat().st_size for file in (tmp_path / "plain").rglob("*") if file.is_file())
@@ -244,6 +244,27 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path: Path, capsys: pytest.
             assert exit_code("run", ROOM, "--out", str(tmp_path / "run"), "--no-eval", *TINY, *given) == 2
             assert capsys.readouterr().err.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
+def test_mcaps_own_reader_decodes_the_same(recorded: tuple[Slam, Path, list[Outlet]]) -> None:
+    pytest.importorskip("mcap_ros2", reason="mcap-ros2-support is not installed (make install-dev)")
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    bag, seen = read_bag(recorded[1]), dict[str, list[Any]]()
+    with (recorded[1] / "bag.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        for _, channel, _, message in reader.iter_decoded_messages():
+            seen.setdefault(channel.topic, []).append(message)
+    assert {topic: len(messages) for topic, messages in seen.items()} == {t: len(m) for t, m in bag.items() if m}
+    for topic in ("/sigmasplat/odometry", "/sigmasplat/loop_closure"):
+        for one, other in zip(seen[topic], bag[topic], strict=True):
+            np.testing.assert_array_equal(one.pose.covariance, other.pose.covariance)
+            np.testing.assert_array_equal(pose(one), pose(other))
+    for one, other in zip(seen["/tf"], bag["/tf"], strict=True):
+        assert all(np.array_equal(T, links(other)[name]) for name, T in links(one).items())
+    assert bytes(seen["/sigmasplat/cloud"][-1].data) == bag["/sigmasplat/cloud"][-1].data.tobytes()
+    assert list(seen["/map"][0].data) == bag["/map"][0].data.tolist()
 
 
 # ---- the stream ----

@@ -140,7 +140,7 @@ def _messages(reader: RunReader, messages: RosMessages, pictures: bool, progress
     field, std = reader.run.read_splat_std() or (reader.run.read_map(), None)
     yield messages.cloud(first_ns, MAP, points_of(field, None if std is None else std.depth_std_m).moved(T_map_world))
     if plan is not None:
-        yield from grids(plan, first_ns, MAP, T_map_world @ se3.inverse(T_floor_world), messages)
+        yield from grids(plan, first_ns, MAP, messages)
     yield from _frames(reader, messages, _FinishedPath(reader, T_map_world), pictures)
 
 

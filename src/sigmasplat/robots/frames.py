@@ -2,7 +2,7 @@
 
     map ─ odom ─ camera_link ─ camera_optical_frame
      ├─ sigmasplat_world      the world of SigmaSplat: the camera of the first frame
-     └─ floor                 live only, after the final map: z = 0 is the floor
+     └─ floor                 live only, after the final map: as `levelled_map`
 
 Only map → odom contains corrections (loops, relocalisation, mapping), so odom → camera_link is continuous.
 """

@@ -1,16 +1,17 @@
 """Give a run that goes on to outlets: transforms, odometry, loops, images, and the map as points and as a grid."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import Literal
 
-import numpy as np
 from torch import Tensor
 
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.floorplan.floor_plan import FloorPlan, floor_plan
 from sigmasplat.model import se3
+from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
+from sigmasplat.model.submap import SubmapStore
 from sigmasplat.render import FieldRenderer
 from sigmasplat.render.predictive import predict
 from sigmasplat.robots.frames import (
@@ -22,6 +23,7 @@ from sigmasplat.robots.frames import (
     T_LINK_OPTICAL,
     T_MAP_WORLD,
     WORLD,
+    levelled_map,
     link_pose,
     ros_covariance,
 )
@@ -72,7 +74,7 @@ class LiveRobot:
         self.slam, self.outlets, self.warn, self.images = slam, outlets, warn, images
         self.odometry = LiveOdometry(slam.atlas)
         self._frames = dict[int, Frame]()
-        self._points = list[Points]()
+        self._submaps = list[_SubmapPoints]()
         self._stamp_ns = -1
         self._failed = set[str]()
 
@@ -91,7 +93,7 @@ class LiveRobot:
             self._offer_pose(step, T_odom_camera)
         if any(loop.accepted for loop in step.loops):
             self._offer_loop(len(self.slam.steps) - 1)
-        self._offer_submaps()
+        self._offer_submaps(step.submap)
         self._report_failures()
 
     def finishing(self, done: int, total: int) -> None:
@@ -151,29 +153,32 @@ class LiveRobot:
             errors = path_errors(slam.atlas, slam.keyframe_indices, slam.closer.believed)
             self._offer(partial(_loop, self._stamp_ns, errors, row), LOOP)
 
-    def _offer_submaps(self) -> None:
-        """Give the points of all finished submaps of the world, when one more is finished."""
-        store, atlas = self.slam.store, self.slam.atlas
-        if len(self._points) == len(store):
+    def _offer_submaps(self, finished: int) -> None:
+        """Give the points of all finished submaps of the world, when one more is finished; they are read on the thread
+        of the outlet."""
+        if len(self._submaps) == finished:
             return
-        for index in range(len(self._points), len(store)):
-            self._points.append(points_of(store.load(index).field, None, SUBMAP_POINTS))
+        atlas = self.slam.atlas
+        new = range(len(self._submaps), finished)
+        self._submaps.extend(_SubmapPoints(self.slam.store, index) for index in new)
         parts = [
-            (points, T_MAP_WORLD @ atlas.anchors[s]) for s, points in enumerate(self._points) if not atlas.components[s]
+            (submap, T_MAP_WORLD @ atlas.anchors[s])
+            for s, submap in enumerate(self._submaps)
+            if not atlas.components[s]
         ]
         if parts:
-            self._offer(partial(_cloud, self._stamp_ns, parts), CLOUD)
+            self._offer(partial(_submaps, self._stamp_ns, parts), CLOUD)
 
     def _offer_final_map(self) -> None:
         """Give the final map as points and as a grid."""
         field, known = self.slam.field, self.slam.uncertainty
         std = None if known is None or known.std is None else known.std.depth_std_m
-        self._offer(partial(_cloud, self._stamp_ns, [(points_of(field, std, MAX_POINTS), T_MAP_WORLD)]), CLOUD)
+        self._offer(partial(_final_cloud, self._stamp_ns, field, std), CLOUD)
         plan = self._floor_plan()
         if plan is not None:
-            floor = (MAP, FLOOR, T_MAP_WORLD @ se3.inverse(plan.T_floor_world))
+            floor = (MAP, FLOOR, T_MAP_WORLD @ se3.inverse(levelled_map(plan.T_floor_world)))
             self._offer(partial(_static, self._stamp_ns, [*STATIC, floor]), TF_STATIC)
-            self._offer(partial(grids, plan, self._stamp_ns, FLOOR, np.eye(4)), GRID, GRID_STD)
+            self._offer(partial(grids, plan, self._stamp_ns, FLOOR), GRID, GRID_STD)
 
     def _floor_plan(self) -> FloorPlan | None:
         """Return the floor plan of the final map; None if no surface is visible."""
@@ -225,6 +230,24 @@ def _loop(stamp_ns: int, errors: Mapping[str, Tensor], row: int, messages: RosMe
     return [messages.pose(LOOP, stamp_ns, MAP, T_map_link, covariance)]
 
 
-def _cloud(stamp_ns: int, parts: Sequence[tuple[Points, Matrix]], messages: RosMessages) -> list[Encoded]:
+class _SubmapPoints:
+    """The points of a finished submap, in its frame; read once."""
+
+    def __init__(self, store: SubmapStore, index: int) -> None:
+        self.store, self.index = store, index
+
+    @cached_property
+    def points(self) -> Points:
+        return points_of(self.store.load(self.index).field, None, SUBMAP_POINTS)
+
+
+def _submaps(stamp_ns: int, parts: Sequence[tuple[_SubmapPoints, Matrix]], messages: RosMessages) -> list[Encoded]:
     each = MAX_POINTS // len(parts)
-    return [messages.cloud(stamp_ns, MAP, Points.joined([points.thinned(each).moved(T) for points, T in parts]))]
+    moved = [submap.points.thinned(each).moved(T) for submap, T in parts]
+    return [messages.cloud(stamp_ns, MAP, Points.joined(moved))]
+
+
+def _final_cloud(
+    stamp_ns: int, field: GaussianField, depth_std_m: Tensor | None, messages: RosMessages
+) -> list[Encoded]:
+    return [messages.cloud(stamp_ns, MAP, points_of(field, depth_std_m).moved(T_MAP_WORLD))]

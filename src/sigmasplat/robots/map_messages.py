@@ -6,7 +6,6 @@ from torch import Tensor
 from sigmasplat.floorplan.floor_plan import FREE, OBJECT, WALL, FloorPlan
 from sigmasplat.model.field import GaussianField
 from sigmasplat.robots.ros_messages import GRID, GRID_STD, Encoded, Points, RosMessages
-from sigmasplat.types import Matrix
 
 MAX_POINTS = 200_000
 MIN_OPACITY = 0.5
@@ -28,21 +27,23 @@ def points_of(field: GaussianField, depth_std_m: Tensor | None, most: int = MAX_
     return Points(means.astype(np.float32), colors.astype(np.float32), opacities[rows], std.astype(np.float32))
 
 
-def grids(plan: FloorPlan, stamp_ns: int, frame: str, T_frame_floor: Matrix, messages: RosMessages) -> list[Encoded]:
+def grids(plan: FloorPlan, stamp_ns: int, frame: str, messages: RosMessages) -> list[Encoded]:
     """Make two nav_msgs/OccupancyGrid of a floor plan: what is occupied, and how sure its surfaces are.
 
     The first: 0 free floor, 100 object or wall, −1 not observed, also where only the floor was not observed. The
     second: the standard deviation of depth of the surfaces in a cell in cm, at most 100; −1 without a surface.
+    frame: the frame with the axes of `levelled_map`. The grids are not rotated in it, because navigation software
+    ignores the rotation of a grid.
     """
     occupied = np.full(plan.kind.shape, UNKNOWN, np.int8)
     occupied[plan.kind == FREE] = EMPTY
     occupied[(plan.kind == OBJECT) | (plan.kind == WALL)] = OCCUPIED
     known = np.isfinite(plan.depth_sigma_m)
     std_cm = np.rint(CM_PER_M * np.minimum(np.where(known, plan.depth_sigma_m, 0.0), 1.0))
-    T_floor_grid = np.eye(4)
-    T_floor_grid[:2, 3] = plan.origin_m
+    T_frame_grid = np.eye(4)  # x ahead is y of the plan, y left is −x of the plan
+    T_frame_grid[:2, 3] = plan.origin_m[1], -(plan.origin_m[0] + plan.cell_m * plan.kind.shape[1])
     layers = ((GRID, occupied), (GRID_STD, np.where(known, std_cm, UNKNOWN).astype(np.int8)))
     return [
-        messages.grid(topic, stamp_ns, frame, cells, plan.cell_m, T_frame_floor @ T_floor_grid)
+        messages.grid(topic, stamp_ns, frame, np.ascontiguousarray(cells.T[::-1]), plan.cell_m, T_frame_grid)
         for topic, cells in layers
     ]
