@@ -13,7 +13,7 @@ from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.fit.references import Reference, keyframe_reference, map_reference
+from sigmasplat.fit.references import Reference, map_reference
 from sigmasplat.model import se3
 from sigmasplat.model.field import GaussianField
 from sigmasplat.render.view import View
@@ -21,6 +21,7 @@ from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.feature_image import FeatureImage, pose_by_features
 from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
+from sigmasplat.slam.localisation.tracked_keyframe import TrackedKeyframe, found_keyframe, mapped_keyframe
 from sigmasplat.slam.localisation.verdict import LEAST_COMMON, Usual, confirmed, score
 from sigmasplat.slam.rules import is_lost, jumped
 from sigmasplat.types import Matrix
@@ -294,18 +295,17 @@ class Tracker:
     def keep_keyframe(self, field: GaussianField, view: View, seen: Sight, T_world_camera: Matrix) -> None:
         """Use a keyframe that was just mapped: its refined pose, and its image as the reference of the next frames."""
         self.previous, self.lost = T_world_camera, False
-        self.keyframe_features, self.keyframe_front = seen.image, self.front
-        if self.config.method == "align" or fits_of(view).aligns:  # otherwise nothing aligns to it
-            T_camera_world = se3.inverse(T_world_camera)
-            self.keyframe = keyframe_reference(field.params, view, seen.live, T_camera_world, self.config, seen.target)
-            if seen.image is not None:
-                self.keyframe_features = seen.image.weighed(self.keyframe.weights)
+        self.follow(mapped_keyframe(field.params, view, seen, T_world_camera, self.config, self.front))
+
+    def follow(self, keyframe: TrackedKeyframe) -> None:
+        """Use a keyframe as the reference of the next frames."""
+        self.keyframe = self.keyframe if keyframe.reference is None else keyframe.reference
+        self.keyframe_features, self.keyframe_front = keyframe.image, keyframe.front
 
     def move_to(self, field: GaussianField, view: View, keyframe: FoundKeyframe, T_world_camera: Matrix) -> None:
         """Continue at another pose, with a keyframe as the reference of the next frames."""
         self.previous, self.velocity, self.lost = T_world_camera, np.eye(4), False
-        self.keyframe = keyframe_reference(field.params, view, keyframe.pyramid, keyframe.T_camera_world, self.config)
-        self.keyframe_features, self.keyframe_front = keyframe.image.weighed(self.keyframe.weights), None
+        self.follow(found_keyframe(field.params, view, keyframe, self.config))
 
     def forget(self) -> None:
         """Restart at the identity, as for the first frame."""
