@@ -101,11 +101,12 @@ class Mapper:
         self._note_visible(view)
         self._seed(view, keyframe.target, keyframe.T_world_camera)
 
-    def refining(self, view: View, steps: int) -> Slices[None]:
-        """Fit the map to its keyframes for more steps, in slices of one; the keyframes keep their poses."""
+    def refining(self, view: View, steps: int, hurried: Callable[[], bool]) -> Slices[None]:
+        """Fit the map to its keyframes for more steps, in slices of one, until `hurried` returns True; the keyframes
+        keep their poses."""
         self._choose_movable(False)
         rates = iter([Rates.of(self.config.mapping)] * steps)
-        yield from self._fit(view, self._window(view), steps, rates, 0, None, lambda: False)
+        yield from self._fit(view, self._window(view), steps, rates, 0, None, hurried, least_share=0.0)
 
     def _append(self, keyframe: Keyframe) -> None:
         """Add a keyframe to the list; the first one of a submap is fixed."""
@@ -136,6 +137,7 @@ class Mapper:
         frozen_below: int,
         stats: DensifyStats | None,
         hurried: Callable[[], bool],
+        least_share: float = LEAST_SHARE,
     ) -> Slices[FieldFit]:
         """Fit the field to the window, in slices; splats with ids below `frozen_below` keep their colours."""
         c = self.config.mapping
@@ -143,7 +145,7 @@ class Mapper:
         batches = draw_keyframes(window[::-1], steps, c.newest_probability, history, self.random, together)
         frozen = int((self.field.ids < frozen_below).sum())
         wanted = stats if self.config.primitives.split_gradient > 0 else None
-        shortened = _shortened(batches, round(steps * LEAST_SHARE), hurried)
+        shortened = _shortened(batches, round(steps * least_share), hurried)
         return (yield from fitting(self.field, view, shortened, c, rates, frozen, stats=wanted))
 
     def _frozen_below(self, first_new: int, until: str) -> int:

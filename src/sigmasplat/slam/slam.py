@@ -16,8 +16,8 @@ from sigmasplat.slam.final import final_map
 from sigmasplat.slam.found import Found
 from sigmasplat.slam.localisation.recovery import usable
 from sigmasplat.slam.localisation.relocaliser import Relocation
-from sigmasplat.slam.localisation.sight import Observation, observe, working_frame
-from sigmasplat.slam.localisation.verdict import is_better, is_questionable, stands
+from sigmasplat.slam.localisation.sight import Observation, working_frame
+from sigmasplat.slam.localisation.verdict import is_better, is_questionable
 from sigmasplat.slam.mapping import MapWork
 from sigmasplat.slam.rules import is_held_back, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer
@@ -61,7 +61,7 @@ class Slam(MapWork):
         the uncertainty is measured at; without both the total is 1. Does nothing when no rule cuts submaps and
         `final.iterations` is 0. Components that are not connected to the world are left out of the final map.
         """
-        if not self.steps or not (len(self.store) or self._cuts or self.config.final.iterations):
+        if not self.steps or not (len(self.store) or self.cuts or self.config.final.iterations):
             return
         steps, measures = self._refinement_steps(), self.config.uncertainty.probes > 0
         total = max(1, steps + measures * sum(map(len, self.atlas.keyframe_poses)))
@@ -88,11 +88,8 @@ class Slam(MapWork):
         """Resize a frame to working size and prepare it for the fits."""
         with self._timer.stage("prepare"):
             view = self._view or self.prepare(working_frame(frame, self.config).camera)
-            working = working_frame(frame, self.config, view.camera if self._resample else None)
-            if working.camera != view.camera:
-                raise SourceError(f"frame {frame.index} comes from another camera ({working.camera}) than the first")
             self._timer.start_kernels(view)
-            return observe(frame, working, view, self.config, self.extractor)
+            return self.observed(frame, view, self.extractor)
 
     def _begin(self, seen: Observation) -> Found:
         """Start the first submap at the first frame. Its camera is the world, unless there are earlier submaps: then
@@ -118,11 +115,11 @@ class Slam(MapWork):
             if self.config.submaps.variance_sum:
                 self.drift.variance_sum += mean_variance(self.mapper.field, self.view, fit.T_camera_world)
                 found.tracking["variance_sum"] = self.drift.variance_sum
-            certain = self.recovery.is_steady and self._is_certain(fit)
+            certain = self.recovery.is_steady and self.tracker.is_certain(fit)
             found.mapped = certain and not held_back and self._is_keyframe(fit.overlap)
             if found.mapped:
                 found.hop = self._hop(fit, seen)
-                if self._cuts:
+                if self.cuts:
                     found.tracking["drift_m"] = self.add_drift(found.T_submap_camera, found.hop)
             if not held_back:
                 self._question(fit, seen, found)
@@ -138,11 +135,6 @@ class Slam(MapWork):
         """Fit the frame's pose to the active submap."""
         with self._timer.stage("track"), self._timer.kernels_of(self.view, "track_kernels"):
             return self.tracker.track(self.mapper.field, self.view, seen, seen.frame.R_inertial_camera)
-
-    def _is_certain(self, fit: PoseFit) -> bool:
-        """Return whether a pose may be used for mapping."""
-        doubtful = self.tracker.doubtful if self.config.tracking.verify else 0
-        return not doubtful or (fit.comparison is not None and stands(fit.comparison, doubtful))
 
     def _is_keyframe(self, overlap: float) -> bool:
         c = self.config.mapping

@@ -1,6 +1,7 @@
 """A keyframe in the form that tracking needs: a reference to align to, and the image for features."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 from torch import Tensor
 
@@ -13,6 +14,13 @@ from sigmasplat.slam.localisation.feature_image import FeatureImage
 from sigmasplat.slam.localisation.foreground import Foreground
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.types import Matrix
+
+
+class Splats(Protocol):
+    """What tracking reads of a map: rows of splats [N, 17]."""
+
+    @property
+    def params(self) -> Tensor: ...
 
 
 @dataclass(frozen=True, eq=False)
