@@ -30,8 +30,8 @@ def run_now(task: Callable[[], None]) -> None:
 
 @dataclass(eq=False)
 class StateFile:
-    """Checkpointer that writes state.safetensors into a run folder, at most every `every_s` seconds, and less often if a
-    save takes long (`MOST_TIME_SHARE`).
+    """Checkpointer that writes state.safetensors into a run folder, at most every `every_s` seconds, and less often if
+    a save takes long (`MOST_TIME_SHARE`).
 
     With every_s = 0 it writes only after the last frame. run_save: runs a save when the state belongs to the last
     frame; in real time that is later (`RealTime.save`). A state takes some tens of MB: it contains the images of the
