@@ -213,10 +213,8 @@ def test_a_recording_in_real_time_has_latencies_and_counts_drops(tmp_path: Path)
 
 def started(out: Path) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "sigmasplat.cli", "run", ROOM, "--realtime", "--no-eval", "--limit", "90"]
-    process = subprocess.Popen(
-        [*command, "--save-every", "0.01", "--out", str(out), *SETTINGS], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env=os.environ,
-    )  # fmt: skip
+    command += ["--save-every", "0.01", "--out", str(out), *SETTINGS]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ)
     deadline_s = time.monotonic() + 90
     while not (out / "state.safetensors").exists() or len(RunFolder(out).read_log()) < 12:
         assert process.poll() is None and time.monotonic() < deadline_s
