@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from sigmasplat.run.resume import StartPoint
     from sigmasplat.run.session import Outcome
     from sigmasplat.run.terminal import Screen
+    from sigmasplat.slam.real_time.system import RealTime
     from sigmasplat.sources.base import Source
     from sigmasplat.viewer.app import ViewerApp
 
@@ -81,6 +82,7 @@ def run(
     final_seconds: options.FinalSeconds = None,
     final_width: FinalWidth = None,
     robot_options: RobotOptionsFlat = DEFAULT_ROBOT_OPTIONS,
+    realtime: options.RealTime = False,
 ) -> int:
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
@@ -110,8 +112,8 @@ def run(
             _announce(screen, config.name, source, folder, record)
             prepare_torch()
             slam = continue_map(earlier, config, source, folder) if earlier else Slam(config, folder.submaps)
-            start = StartPoint(slam)
-            return _run_and_score(screen, start, source, folder, run_options, viewer, robot_options)
+            at_once = realtime or (source.live and config.realtime.live)
+            return _run_and_score(screen, StartPoint(slam), source, folder, run_options, viewer, robot_options, at_once)
 
 
 def resume(
@@ -205,25 +207,34 @@ def _run_and_score(
     run_options: options.RunOptions,
     viewer: "ViewerApp | None",
     robot_options: RobotOptions,
+    realtime: bool = False,
 ) -> int:
     """Run the session, then score it, and keep showing it in the viewer until Ctrl-C; return the exit code.
+
+    realtime: whether frames are tracked when they arrive, on two clocks.
 
     Raises KeyboardInterrupt if Ctrl-C came before the first frame was done.
     """
     from sigmasplat.render.cuda import stages as cuda_stages
     from sigmasplat.run.resume import RefinementFile, StateFile
     from sigmasplat.run.session import Session
+    from sigmasplat.slam.real_time.system import RealTime
+    from sigmasplat.sources.arrivals import Arrivals
     from sigmasplat.sources.live import LiveSource
 
     cuda_stages.measure(run_options.profile)
     state = StateFile(start.slam, folder, run_options.save_every)
     start.slam.saved_refinement = RefinementFile(start.slam, folder, run_options.save_every)
+    system, read = (RealTime(start.slam), Arrivals(source)) if realtime else (None, source)
+    if system:
+        state.run_save = system.save
+        folder.note(realtime=True)
     with (
         robot_output(screen, start.slam, folder, robot_options, run_options.host) as robot,
-        _progress(screen, start, source, folder, run_options, viewer, robot) as callback,
+        _progress(screen, start, source, folder, run_options, viewer, robot, system) as callback,
     ):
         session = Session(
-            start.slam, source, folder, callback, state, start.next_index, start.wall_s, run_options.all_poses
+            system or start.slam, read, folder, callback, state, start.next_index, start.wall_s, run_options.all_poses
         )
         if robot:
             session.watch = robot.watch
@@ -233,6 +244,8 @@ def _run_and_score(
     if run_options.profile:
         screen.profile(folder.read_profile())
     _warn_of_skipped_frames(screen, source)
+    if system and read.dropped:
+        screen.warn(f"{read.dropped} frames were dropped because tracking was late")
     _warn_if_never_recognised(screen, folder)
     if outcome.status == "interrupted":
         _say_interrupted(screen, outcome, folder)
@@ -251,23 +264,25 @@ def _run_and_score(
 @contextmanager
 def _progress(
     screen: "Screen", start: "StartPoint", source: "Source", folder: "RunFolder",
-    run_options: options.RunOptions, viewer: "ViewerApp | None", robot: "LiveRobot | None",
+    run_options: options.RunOptions, viewer: "ViewerApp | None", robot: "LiveRobot | None", system: "RealTime | None",
 ) -> Iterator["Callback"]:  # fmt: skip
     """Yield the callback that shows the session on the terminal, in the requested logs, in bag and stream if there is a
     robot output, and in the viewer if there is one."""
-    from sigmasplat.run.protocols import CallbackList
+    from sigmasplat.run.protocols import BetweenFrames, CallbackList
     from sigmasplat.run.step_logs import log_names, step_logs
 
     with (
         screen.steps(None if source.live else len(source), start.next_index) as steps,
         step_logs(log_names(run_options.log), folder, start.next_index) as logs,
     ):
-        callbacks: list[Callback] = [steps, *logs, *([robot] if robot else [])]
+        readers: list[Callback] = [robot] if robot else []  # they read the system, not only the step
         if viewer is not None:
             from sigmasplat.viewer.live import LiveView
 
-            callbacks.append(LiveView(start.slam, viewer.show, source.name))
-        yield CallbackList(*callbacks)
+            readers.append(LiveView(start.slam, viewer.show, source.name))
+        if system:
+            readers = [BetweenFrames(reader, system.between_frames) for reader in readers]
+        yield CallbackList(steps, *logs, *readers)
 
 
 def _warn_of_skipped_frames(screen: "Screen", source: "Source") -> None:

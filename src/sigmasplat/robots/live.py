@@ -126,8 +126,9 @@ class LiveRobot:
 
     def _offer_images(self, step: StepResult) -> None:
         frame = self._frames.pop(step.index, None)
-        for index in [index for index in self._frames if index < step.index]:
-            del self._frames[index]
+        for index in list(self._frames):  # a copy: in real time `watch` runs on another thread
+            if index < step.index:
+                del self._frames[index]
         if frame is not None and (self.images == "all" or step.is_keyframe):
             job = partial(_images, self._stamp_ns, frame)
             self._offer(job, COLOR, COLOR_INFO, DEPTH, DEPTH_INFO, bulky=True)
