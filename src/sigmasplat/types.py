@@ -1,6 +1,7 @@
 """Define the types that many modules share, and the default for an optional callback."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,19 @@ Matrix = NDArray[np.float64]
 """A float64 array of any shape; the docstring of its function gives the shape, as in T_world_camera [4, 4]."""
 Progress = Callable[[int, int], None]
 """Called with (done, total) while a long task runs; a total of 0 is not known yet."""
+Result = TypeVar("Result")
+Slices = Generator[None, None, Result]
+"""A long task in slices: it yields after each slice, and returns its result after the last one."""
+
+
+def completed(slices: Slices[Result]) -> Result:
+    """Run all slices of a task and return its result."""
+    while True:
+        try:
+            next(slices)
+        except StopIteration as end:
+            result: Result = end.value
+            return result
 
 
 def no_progress(done: int, total: int) -> None:

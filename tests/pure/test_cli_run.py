@@ -137,6 +137,9 @@ class MadeUpSlam:
         self.steps.append(step)
         return step
 
+    def settle(self) -> None:
+        pass
+
     def finish(self, progress: Callable[[int, int], None]) -> None:
         progress(0, 2)
         self.at.get("loops", lambda: None)()

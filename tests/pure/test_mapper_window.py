@@ -64,14 +64,14 @@ def mapped(made: Mapper, places_m: Sequence[float]) -> Mapper:
 def looked_at(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
     """Write down the keyframes of every batch a mapper fits to."""
     batches: list[list[int]] = []
-    fit = mapper_module.fit_field
+    fit = mapper_module.fitting
 
     def watched(field: Any, view: Any, drawn: Iterator[list[Keyframe]], *rest: Any, **named: Any) -> Any:
         kept = list(drawn)
         batches.extend([keyframe.index for keyframe in batch] for batch in kept)
         return fit(field, view, kept, *rest, **named)
 
-    monkeypatch.setattr(mapper_module, "fit_field", watched)
+    monkeypatch.setattr(mapper_module, "fitting", watched)
     return batches
 
 

@@ -21,6 +21,10 @@ QUICK = [
 ]
 
 
+WAITING = ("--set", "realtime.live=off")
+"""A frame waits until the one before it is mapped."""
+
+
 @pytest.fixture
 def device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Device:
     made = Device()
@@ -34,7 +38,7 @@ def test_ctrl_c_ends_the_frames_and_the_run_is_finished_and_scored(
 ) -> None:
     device.missed_between = 1
     device.on_frame = lambda number: signal.raise_signal(signal.SIGINT) if number == 2 * (WARM_UP_FRAMES + 6) else None
-    assert exit_code("run", "realsense", "--out", "run", "--stride", "1", *QUICK) == 0
+    assert exit_code("run", "realsense", "--out", "run", "--stride", "1", *QUICK, *WAITING) == 0
     said = capsys.readouterr()
     assert "until Ctrl-C" in said.out and "were dropped because SLAM was slower" in said.out
     run = RunFolder.open(Path("run"))
@@ -50,6 +54,21 @@ def test_ctrl_c_ends_the_frames_and_the_run_is_finished_and_scored(
     assert metrics["frames"] == len(log) and metrics["ate"] is None and metrics["training"]["psnr_db"] > 5
     assert exit_code("eval", "run") == 0  # does not open a camera
     assert device.started == device.stopped == 1
+
+
+def test_a_live_camera_is_tracked_in_real_time(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
+    """This camera is faster than any tracking: frames are dropped and counted, those that are left are recorded."""
+    device.on_frame = lambda number: signal.raise_signal(signal.SIGINT) if number == WARM_UP_FRAMES + 40 else None
+    assert exit_code("run", "realsense", "--out", "run", "--no-eval", *QUICK) == 0
+    run = RunFolder.open(Path("run"))
+    facts, log = run.facts(), run.read_log()
+    assert facts["status"] == "complete" and facts["realtime"] is True and facts["dropped"] > 0
+    recorded = open_source(facts["source_path"], run.config().input)
+    assert [line["timestamp_s"] for line in log] == pytest.approx(
+        [recorded.timestamp_s(line["index"]) for line in log], abs=1e-6
+    )
+    assert len(run.read_checkpoint()[0]["frame_submap"]) == len(log)
+    assert "dropped because tracking was late" in capsys.readouterr().err
 
 
 def test_an_unplugged_camera_gives_one_line_and_a_valid_run(device: Device, capsys: pytest.CaptureFixture[str]) -> None:

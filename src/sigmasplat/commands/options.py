@@ -87,6 +87,7 @@ Overwrite = Annotated[bool, arg(help="replace an earlier result", help_behavior_
 Limit = Annotated[Whole, arg(metavar="N", help="use at most N frames", help_behavior_hint="(default: all)")]
 Profile = Annotated[bool, arg(help="print the time spent in each stage", help_behavior_hint="")]
 SaveEvery = Annotated[float, arg(metavar="S", help="save the state for `resume` every S seconds; 0 = at the end only")]
+RealTime = Annotated[bool, arg(help="replay a recording at its own times, and track it in real time")]
 AllPoses = Annotated[
     bool,
     arg(help="also write trajectory_all.txt with the poses of all frames, including lost ones", help_behavior_hint=""),

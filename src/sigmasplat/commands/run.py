@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sigmasplat.run.resume import StartPoint
     from sigmasplat.run.session import Outcome
     from sigmasplat.run.terminal import Screen
+    from sigmasplat.slam.real_time.system import RealTime
     from sigmasplat.sources.base import Source
     from sigmasplat.viewer.app import ViewerApp
 
@@ -72,6 +73,7 @@ def run(
     onto: options.OntoRun = None,
     final_seconds: options.FinalSeconds = None,
     final_width: FinalWidth = None,
+    realtime: options.RealTime = False,
 ) -> int:
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
@@ -99,8 +101,8 @@ def run(
             _announce(screen, config.name, source, folder, record)
             prepare_torch()
             slam = continue_map(earlier, config, source, folder) if earlier else Slam(config, folder.submaps)
-            start = StartPoint(slam)
-            return _run_and_score(screen, start, source, folder, run_options, viewer)
+            at_once = realtime or (source.live and config.realtime.live)
+            return _run_and_score(screen, StartPoint(slam), source, folder, run_options, viewer, at_once)
 
 
 def resume(
@@ -191,28 +193,39 @@ def _run_and_score(
     folder: "RunFolder",
     run_options: options.RunOptions,
     viewer: "ViewerApp | None",
+    realtime: bool = False,
 ) -> int:
     """Run the session, then score it, and keep showing it in the viewer until Ctrl-C; return the exit code.
+
+    realtime: whether frames are tracked when they arrive, on two clocks.
 
     Raises KeyboardInterrupt if Ctrl-C came before the first frame was done.
     """
     from sigmasplat.render.cuda import stages as cuda_stages
     from sigmasplat.run.resume import RefinementFile, StateFile
     from sigmasplat.run.session import Session
+    from sigmasplat.slam.real_time.system import RealTime
+    from sigmasplat.sources.arrivals import Arrivals
     from sigmasplat.sources.live import LiveSource
 
     cuda_stages.measure(run_options.profile)
     state = StateFile(start.slam, folder, run_options.save_every)
     start.slam.saved_refinement = RefinementFile(start.slam, folder, run_options.save_every)
-    with _progress(screen, start, source, folder, run_options, viewer) as callback:
+    system, read = (RealTime(start.slam), Arrivals(source)) if realtime else (None, source)
+    if system:
+        state.run_save = system.save
+        folder.note(realtime=True)
+    with _progress(screen, start, source, folder, run_options, viewer, system) as callback:
         outcome = Session(
-            start.slam, source, folder, callback, state, start.next_index, start.wall_s, run_options.all_poses
+            system or start.slam, read, folder, callback, state, start.next_index, start.wall_s, run_options.all_poses
         ).execute()
     if outcome.status == "interrupted" and not outcome.frames:
         raise KeyboardInterrupt  # the folder has no results, and no state to resume from
     if run_options.profile:
         screen.profile(folder.read_profile())
     _warn_of_skipped_frames(screen, source)
+    if system and read.dropped:
+        screen.warn(f"{read.dropped} frames were dropped because tracking was late")
     _warn_if_never_recognised(screen, folder)
     if outcome.status == "interrupted":
         _say_interrupted(screen, outcome, folder)
@@ -231,11 +244,11 @@ def _run_and_score(
 @contextmanager
 def _progress(
     screen: "Screen", start: "StartPoint", source: "Source", folder: "RunFolder",
-    run_options: options.RunOptions, viewer: "ViewerApp | None",
+    run_options: options.RunOptions, viewer: "ViewerApp | None", system: "RealTime | None",
 ) -> Iterator["Callback"]:  # fmt: skip
     """Yield the callback that shows the session on the terminal, in the requested logs, and in the viewer if there is
     one."""
-    from sigmasplat.run.protocols import CallbackList
+    from sigmasplat.run.protocols import BetweenFrames, CallbackList
     from sigmasplat.run.step_logs import log_names, step_logs
 
     with (
@@ -247,7 +260,8 @@ def _progress(
             return
         from sigmasplat.viewer.live import LiveView
 
-        yield CallbackList(steps, *logs, LiveView(start.slam, viewer.show, source.name))
+        shown: Callback = LiveView(start.slam, viewer.show, source.name)
+        yield CallbackList(steps, *logs, BetweenFrames(shown, system.between_frames) if system else shown)
 
 
 def _warn_of_skipped_frames(screen: "Screen", source: "Source") -> None:

@@ -12,6 +12,7 @@ from sigmasplat.config.densify import DensifyConfig
 from sigmasplat.config.features import FeatureConfig
 from sigmasplat.config.frames import MappingConfig, RenderConfig, SeedConfig, TrackingConfig
 from sigmasplat.config.input import InputConfig
+from sigmasplat.config.real_time import RealTimeConfig
 from sigmasplat.config.recovery import RecoveryConfig
 from sigmasplat.config.submaps import FinalConfig, LoopConfig, RegistrationConfig, SubmapConfig
 from sigmasplat.config.surface import SurfaceConfig
@@ -20,8 +21,8 @@ from sigmasplat.errors import ConfigError
 
 __all__ = [
     "Config", "DensifyConfig", "FeatureConfig", "FinalConfig", "InputConfig", "LoopConfig", "MappingConfig",
-    "RecoveryConfig", "RegistrationConfig", "RenderConfig", "SeedConfig", "SubmapConfig", "SurfaceConfig",
-    "TrackingConfig", "UncertaintyConfig",
+    "RealTimeConfig", "RecoveryConfig", "RegistrationConfig", "RenderConfig", "SeedConfig", "SubmapConfig",
+    "SurfaceConfig", "TrackingConfig", "UncertaintyConfig",
 ]  # fmt: skip
 
 
@@ -51,6 +52,7 @@ class Config:
     final: FinalConfig = field(default_factory=FinalConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     uncertainty: UncertaintyConfig = field(default_factory=UncertaintyConfig)
+    realtime: RealTimeConfig = field(default_factory=RealTimeConfig)
 
     def changed(self, **sections: Mapping[str, Any]) -> "Config":
         """Return the settings with some values replaced, as in config.changed(mapping={"every": 5})."""

@@ -18,7 +18,7 @@ from sigmasplat.model import se3
 from sigmasplat.model.field import COLUMNS, GaussianField
 from sigmasplat.model.stopwatch import Stopwatch
 from sigmasplat.render.view import View
-from sigmasplat.types import Matrix
+from sigmasplat.types import Matrix, Slices, completed
 
 
 @dataclass
@@ -87,6 +87,20 @@ def fit_field(
     Raises BackendError if the field is not on the view's device; ConfigError if colour covariances or view-dependent
     colours are to be fitted to several keyframes at once.
     """
+    return completed(fitting(field, view, batches, config, schedule, frozen_colors, degree, stats))
+
+
+def fitting(
+    field: GaussianField,
+    view: View,
+    batches: Iterable[Sequence[Keyframe]],
+    config: MappingConfig,
+    schedule: Iterable[Rates] | None = None,
+    frozen_colors: int = 0,
+    degree: int = 0,
+    stats: FitStats | None = None,
+) -> Slices[FieldFit]:
+    """Fit as `fit_field` does, in slices of one step."""
     if field.params.device != view.sums.device:
         where = f"the field is on {field.params.device}, the view on {view.sums.device}"
         raise BackendError(f"{where}; bring the field to the view's device with GaussianField.to")
@@ -99,6 +113,7 @@ def fit_field(
         for keyframe, twist in zip(batch, twists, strict=True):
             if pose_rates.any() and keyframe.movable and not keyframe.fixed:
                 keyframe.move(twist, pose_rates)
+        yield
     fits_of(view).settle(field, rates)
     for name, attribute in field.attributes.items():
         settle(attribute, rates.of_attribute(name))

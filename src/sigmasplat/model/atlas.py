@@ -103,7 +103,10 @@ class Atlas:
 
     def place_frame(self, T_submap_camera: Matrix) -> None:
         """Append a frame, relative to the newest keyframe of the last submap."""
-        T_keyframe_camera = se3.inverse(self.keyframe_poses[-1][-1]) @ T_submap_camera
+        self.place_by_keyframe(se3.inverse(self.keyframe_poses[-1][-1]) @ T_submap_camera)
+
+    def place_by_keyframe(self, T_keyframe_camera: Matrix) -> None:
+        """Append a frame at its pose [4, 4] relative to the newest keyframe of the last submap."""
         place = Place(len(self.anchors) - 1, len(self.keyframe_poses[-1]) - 1, se3.orthonormalise(T_keyframe_camera))
         self.places.append(place)
 

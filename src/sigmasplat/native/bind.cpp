@@ -188,7 +188,10 @@ public:
         nb::gil_scoped_release unlocked;
         kernels->view_backward_pose(context, params.data(), {g_sums.data(), nullptr, nullptr}, g_twist.data(), seconds.data());
     }
-    void visible(Bytes out) const { kernels->view_visible(context, out.data()); }
+    void visible(Bytes out) const {
+        nb::gil_scoped_release unlocked;
+        kernels->view_visible(context, out.data());
+    }
 
 private:
     const Kernels* kernels;

@@ -84,7 +84,7 @@ static void ssim_target(const float* target, const float* mask, int width, int h
 static double ssim(const float* image, const float* target, const float* cache, int width, int height, size_t stride,
                    size_t plane, const float* mask, float weight, float* gradient) {
     static const Window window;
-    static SsimScratch scratch;                       // not thread-safe: one call at a time, like every kernel here
+    static thread_local SsimScratch scratch;          // each thread that calls has its own
     const size_t wide = wide_of(width), field = wide * height;
     float* f[6];
     for (int i = 0; i < 6; i++) f[i] = scratch.fields[i].reserve(3 * field + W);

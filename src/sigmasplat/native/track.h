@@ -122,7 +122,7 @@ static float per_value(const Plane& p, bool kept, float weight, int channels, Ch
 static double tracking_loss(const float* sums, const float* alpha, bool variance, const float* target_color,
                             const float* target_depth, Plane p, TrackOptions o, float gain, float offset, float* g_sums,
                             double* g_exposure) {
-    static Selection scratch;                         // not thread-safe: one call at a time, like every kernel here
+    static thread_local Selection scratch;            // each thread that calls has its own
     const float* depth = sums + 3 * p.plane;
     const auto error_at = [&](size_t at) { return abs(load(depth + at) - load(target_depth + at)); };
     const auto counts = [&](size_t at) {
@@ -185,7 +185,7 @@ static double tracking_loss(const float* sums, const float* alpha, bool variance
 // reference depth, if given. Elsewhere the weight is 1, because V has no meaning where the map is thin.
 static void reference_maps(const float* sums, const float* alpha, const float* moment, bool variance, Plane p, TrackOptions o,
                            float* gray, float* depth, float* weight_gray, float* weight_depth) {
-    static Selection scratch;
+    static thread_local Selection scratch;
     const auto opaque_at = [&](size_t at) { return gt(load(alpha + at), splat(o.alpha_above)); };
     const auto U = [&](size_t at) { return load(moment + at) + WEIGHT_EPSILON; };
     const auto measured = [&](size_t at) { return both(opaque_at(at), gt(load(moment + at), splat(0.f))); };

@@ -1,6 +1,6 @@
 """Define what a session needs from the SLAM system, from callbacks and from checkpointers."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -81,6 +81,9 @@ class SlamSystem(Protocol):
 
     def step(self, frame: Frame) -> StepResult: ...
     def finish(self, progress: Progress) -> None: ...
+    def settle(self) -> None:
+        """Finish the work on all frames so far; after that, the results below include them."""
+
     def trajectory(self) -> Trajectory:
         """Return the poses of all frames, including lost ones."""
         ...
@@ -137,6 +140,25 @@ class CallbackList:
         """Call every callback with the loops tried after the last step."""
         for callback in self.callbacks:
             callback.last_loops(loops)
+
+
+class BetweenFrames:
+    """Calls another callback in tasks of a system in real time, so that it reads the system between two frames."""
+
+    def __init__(self, callback: Callback, run: Callable[[Callable[[], None]], None]) -> None:
+        self.callback, self.run = callback, run
+
+    def __call__(self, step: StepResult) -> None:
+        """Call the callback with a step as soon as the step's frame is in the map."""
+        self.run(lambda: self.callback(step))
+
+    def finishing(self, done: int, total: int) -> None:
+        """Call the callback with the progress of the final map."""
+        self.callback.finishing(done, total)
+
+    def last_loops(self, loops: Sequence[LoopResult]) -> None:
+        """Call the callback with the loops tried after the last step."""
+        self.callback.last_loops(loops)
 
 
 class Checkpointer(Protocol):

@@ -1,6 +1,7 @@
 """Save the state of a run from time to time, so that a stopped or killed run can resume where it left off."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from sigmasplat.errors import RunError
@@ -19,23 +20,31 @@ REFINEMENT_CLASSES: tuple[type, ...] = (GaussianField, Refined, Rows, VectorAdam
 """The classes that a partly refined final map contains."""
 
 
+def run_now(task: Callable[[], None]) -> None:
+    """Run a task at once."""
+    task()
+
+
 @dataclass(eq=False)
 class StateFile:
     """Checkpointer that writes state.safetensors into a run folder, at most every `every_s` seconds.
 
-    With every_s = 0 it writes only after the last frame. A state takes some tens of MB: it contains the images of the
+    With every_s = 0 it writes only after the last frame. run_save: runs a save when the state belongs to the last
+    frame; in real time that is later (`RealTime.save`). A state takes some tens of MB: it contains the images of the
     active submap's keyframes.
     """
 
     slam: Slam
     run: RunFolder
     every_s: float = 0.0
+    run_save: Callable[[Callable[[], None]], None] = run_now
     last_s: float = field(default_factory=time.perf_counter)
 
     def after_frame(self, index: int, wall_s: float) -> None:
         """Save the state after source frame `index`, `wall_s` seconds into the run, if a save is due."""
         if self.every_s and time.perf_counter() - self.last_s >= self.every_s:
-            self.save(index, wall_s)
+            self.last_s = time.perf_counter()
+            self.run_save(lambda: self.save(index, wall_s))
 
     def save(self, index: int, wall_s: float) -> None:
         """Write the state after source frame `index`. Raises RunError if it cannot be written."""

@@ -160,7 +160,8 @@ class Session:
             raise
         finally:
             self._write_results()
-            self.run.note(status=status, wall_s=self.wall_s, skipped=self.source.skipped)
+            dropped = {} if self.source.arrived_s is None else {"dropped": self.source.dropped}
+            self.run.note(status=status, wall_s=self.wall_s, skipped=self.source.skipped, **dropped)
         if status == "complete":
             self.checkpointer.delete()
         return self._outcome(status)
@@ -178,7 +179,7 @@ class Session:
         try:
             for frame in self.source.frames_from(self.first_index):
                 step = self.slam.step(frame)
-                self._log(step)
+                self._log(step, self.source.arrived_s)
                 self.wall_s = earlier_s + time.perf_counter() - started_s
                 self.callback(step)
                 self.checkpointer.after_frame(frame.index, self.wall_s)
@@ -186,15 +187,20 @@ class Session:
                     break
         finally:
             self.wall_s = earlier_s + time.perf_counter() - started_s
+            self.slam.settle()
         if frame is not None:
             self.checkpointer.save(frame.index, self.wall_s)
         if self.source.live:
             interrupt.clear()  # this Ctrl-C has ended the live frames; the next one interrupts the final map
         return not interrupt.is_set()
 
-    def _log(self, step: StepResult) -> None:
-        """Append the step to log.jsonl, update loops.json if loops were tried, and count the frame."""
-        self.run.log(log_line(step))
+    def _log(self, step: StepResult, arrived_s: float | None) -> None:
+        """Append the step to log.jsonl, with the time since the image arrived if it is known; update loops.json if
+        loops were tried, and count the frame."""
+        line = log_line(step)
+        if arrived_s is not None:
+            line["seconds"]["latency"] = time.perf_counter() - arrived_s
+        self.run.log(line)
         if step.loops:
             self._write_loops()
         self.frames += 1

@@ -1,7 +1,7 @@
 """Mapping at a keyframe: seed new splats, fit the field in two halves; densify, fade and prune splats in between
 (VarSplat §2; CG-SLAM §4, 5, 7)."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field as dataclass_field
 
 import numpy as np
@@ -12,7 +12,7 @@ from torch import Tensor
 from sigmasplat.config import Config
 from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.densify_stats import DensifyStats
-from sigmasplat.fit.field import FieldFit, fit_field
+from sigmasplat.fit.field import FieldFit, fitting
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.fit.tracking_loss import PoseMaps
 from sigmasplat.model import se3
@@ -26,6 +26,10 @@ from sigmasplat.slam.pruning import fade, splat_depth_residuals, splat_uncertain
 from sigmasplat.slam.rules import draw_keyframes
 from sigmasplat.slam.seeding import first_pixels, later_pixels, make_splats, thin_out
 from sigmasplat.slam.window import choose_window, dominating
+from sigmasplat.types import Slices, completed
+
+LEAST_SHARE = 1 / 3
+"""Share of a keyframe's iterations that are made even if another keyframe waits."""
 
 
 @dataclass(eq=False)
@@ -51,16 +55,26 @@ class Mapper:
 
         The first keyframe of a submap that inherits splats is already mapped; it is only added to the list.
         """
+        return completed(
+            self.mapping(
+                view, Keyframe(index, target, T_world_camera, descriptor=descriptor, detail=detail, photo=photo)
+            )
+        )
+
+    def mapping(self, view: View, newest: Keyframe, hurried: Callable[[], bool] = lambda: False) -> Slices[FieldFit]:
+        """Map a keyframe as `map` does, in slices of one iteration.
+
+        hurried: asked before each iteration; if it returns True, the rest of a part's iterations is left out after
+        `LEAST_SHARE` of them.
+        """
         self.field = self.field.to(view.sums.device)  # the active field stays on the view's device
         c, first_new, begun = self.config.mapping, self.field.next_id, len(self.field) > 0
-        fixed = not self.keyframes
-        self.keyframes.append(
-            Keyframe(index, target, T_world_camera, fixed, descriptor=descriptor, detail=detail, photo=photo)
-        )
+        self._append(newest)
         if begun and len(self.keyframes) == 1:
             self._note_visible(view)
             return FieldFit()
-        self._seed(view, target, T_world_camera)
+        self._seed(view, newest.target, newest.T_world_camera)
+        yield
         if c.fresh_adam:
             self.field.forget()
         steps = c.iterations if begun else c.first_iterations
@@ -68,14 +82,36 @@ class Mapper:
         window = self._window(view)
         stats = DensifyStats.of(self.keyframes[-1], len(self.field), self.field.params.device)
         self._choose_movable(c.poses_from == "start")
-        fit = self._fit(view, window, steps // 2, rates, self._frozen_below(first_new, "half"), stats)
+        frozen_below = self._frozen_below(first_new, "half")
+        fit = yield from self._fit(view, window, steps // 2, rates, frozen_below, stats, hurried)
         self._densify(view, stats)
         self._prune(view)
+        yield
         faded = self._fade_uncertain(view, window)
+        yield
         self._choose_movable(True)
-        fit.join(self._fit(view, window, steps - steps // 2, rates, self._frozen_below(first_new, "end"), None))
+        frozen_below = self._frozen_below(first_new, "end")
+        fit.join((yield from self._fit(view, window, steps - steps // 2, rates, frozen_below, None, hurried)))
         self._prune(view, self._still_uncertain(view, window, faded))
         return fit
+
+    def add(self, view: View, keyframe: Keyframe) -> None:
+        """Add a keyframe and seed splats at it, without fitting them. The submap must have a keyframe."""
+        self._append(keyframe)
+        self._note_visible(view)
+        self._seed(view, keyframe.target, keyframe.T_world_camera)
+
+    def refining(self, view: View, steps: int, hurried: Callable[[], bool]) -> Slices[None]:
+        """Fit the map to its keyframes for more steps, in slices of one, until `hurried` returns True; the keyframes
+        keep their poses."""
+        self._choose_movable(False)
+        rates = iter([Rates.of(self.config.mapping)] * steps)
+        yield from self._fit(view, self._window(view), steps, rates, 0, None, hurried, least_share=0.0)
+
+    def _append(self, keyframe: Keyframe) -> None:
+        """Add a keyframe to the list; the first one of a submap is fixed."""
+        keyframe.fixed = not self.keyframes
+        self.keyframes.append(keyframe)
 
     def _window(self, view: View) -> list[Keyframe]:
         """Return the keyframes to fit, the newest first; all of them if `mapping.window` is 0."""
@@ -100,14 +136,17 @@ class Mapper:
         rates: Iterator[Rates],
         frozen_below: int,
         stats: DensifyStats | None,
-    ) -> FieldFit:
-        """Fit the field to the window; splats with ids below `frozen_below` keep their colours."""
+        hurried: Callable[[], bool],
+        least_share: float = LEAST_SHARE,
+    ) -> Slices[FieldFit]:
+        """Fit the field to the window, in slices; splats with ids below `frozen_below` keep their colours."""
         c = self.config.mapping
         together, history = c.frames_per_step or len(window), c.keyframe_history
         batches = draw_keyframes(window[::-1], steps, c.newest_probability, history, self.random, together)
         frozen = int((self.field.ids < frozen_below).sum())
         wanted = stats if self.config.primitives.split_gradient > 0 else None
-        return fit_field(self.field, view, batches, c, rates, frozen, stats=wanted)
+        shortened = _shortened(batches, round(steps * least_share), hurried)
+        return (yield from fitting(self.field, view, shortened, c, rates, frozen, stats=wanted))
 
     def _frozen_below(self, first_new: int, until: str) -> int:
         """Return the id below which splats keep their colours until half or the end of a keyframe's steps; `first_new`
@@ -209,3 +248,11 @@ class Mapper:
         gone = self.field.opacities <= self.config.mapping.prune_opacity
         gone |= too_large(self.field, T_camera_world, view.camera, p.most_scale_m, p.most_radius_px)
         self.field.keep(~(gone if also is None else gone | also))
+
+
+def _shortened(batches: Iterable[list[Keyframe]], least: int, hurried: Callable[[], bool]) -> Iterator[list[Keyframe]]:
+    """Yield batches, but none after the first `least` ones as soon as `hurried` returns True."""
+    for done, batch in enumerate(batches):
+        if done >= least and hurried():
+            return
+        yield batch

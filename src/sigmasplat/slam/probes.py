@@ -35,12 +35,16 @@ class Probes:
     def offer(self, index: int, keyframe: int, since: int, T_keyframe_camera: Matrix, target: Target) -> None:
         """Keep a frame if it is nearer to the wanted distance from its keyframe than the one kept; since: frames since
         the keyframe."""
-        if not self.most or since > 1 + keyframe % max(1, self.every - 1):
+        if not self.wants(keyframe, since):
             return
         self.kept = [probe for probe in self.kept if probe.keyframe != keyframe]
         self.kept.append(Probe(index, keyframe, T_keyframe_camera, target.picture()))
         if len(self.kept) > self.most:
             self.kept.pop(self._most_crowded())
+
+    def wants(self, keyframe: int, since: int) -> bool:
+        """Return whether a frame may be kept, `since` frames after a keyframe."""
+        return bool(self.most) and since <= 1 + keyframe % max(1, self.every - 1)
 
     def _most_crowded(self) -> int:
         """Return which probe to drop: the one nearest to its neighbours, but the newest only if it is the only one."""

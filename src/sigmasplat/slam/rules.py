@@ -19,6 +19,13 @@ def is_keyframe(frames_since: int, every: int, overlap: float, overlap_below: fl
     return frames_since >= every or overlap < overlap_below
 
 
+def has_moved(T_keyframe_camera: NDArray[np.float64], depth_m: float, most_deg: float) -> bool:
+    """Return whether the image has moved by more than an angle since the last keyframe: rotation plus translation
+    divided by the mean depth."""
+    moved_m = float(np.linalg.norm(T_keyframe_camera[:3, 3]))
+    return bool(np.rad2deg(se3.rotation_angle(T_keyframe_camera[:3, :3]) + moved_m / depth_m) > most_deg)
+
+
 def is_held_back(index: int, every: int) -> bool:
     """Return whether a frame is held back from the map: the last one of each `every` frames; 0 = none."""
     return every > 0 and index % every == every - 1

@@ -1,6 +1,6 @@
 """SLAM: track every frame, map keyframes, cut submaps, close loops. `Slam.step` follows the papers' overviews."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -9,33 +9,25 @@ from sigmasplat.fit.pose import PoseFit
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import UNKNOWN_HOP, Hop
 from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
-from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.submap import RefinedStore, StorePart
 from sigmasplat.slam.array_interface import ArrayInterface
-from sigmasplat.slam.drift import Drift, mean_variance
+from sigmasplat.slam.drift import mean_variance
 from sigmasplat.slam.final import final_map
 from sigmasplat.slam.found import Found
 from sigmasplat.slam.listeners import notifying
-from sigmasplat.slam.localisation.confidence import std_of
-from sigmasplat.slam.localisation.known_map import KnownMap
-from sigmasplat.slam.localisation.recovery import Link, usable
-from sigmasplat.slam.localisation.relocaliser import INDEX_AT_MOST, Relocation, sight_of
-from sigmasplat.slam.localisation.sight import Observation, Sight, observe, working_frame
-from sigmasplat.slam.localisation.verdict import is_better, is_questionable, stands
-from sigmasplat.slam.loop_closure.closer import Loop
-from sigmasplat.slam.mapper import Mapper
-from sigmasplat.slam.rules import ends_submap, is_held_back, is_keyframe
+from sigmasplat.slam.localisation.recovery import usable
+from sigmasplat.slam.localisation.relocaliser import Relocation
+from sigmasplat.slam.localisation.sight import Observation, working_frame
+from sigmasplat.slam.localisation.verdict import is_better, is_questionable
+from sigmasplat.slam.mapping import MapWork
+from sigmasplat.slam.rules import is_held_back, is_keyframe
 from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.slam.uncertainty import final_uncertainty
-from sigmasplat.slam.world import World
-from sigmasplat.types import Matrix, no_progress, part_of
-
-LAST_TRIES = 3
-"""Number of keyframes per submap that is apart with which other components are searched at the end."""
+from sigmasplat.types import Matrix, completed, no_progress, part_of
 
 
-class Slam(World, ArrayInterface):
+class Slam(MapWork, ArrayInterface):
     """Simultaneous localisation and mapping: give frames to `step`, or arrays to `track`, then call `finish`; read
     `field` and `trajectory()` at any time.
 
@@ -57,11 +49,8 @@ class Slam(World, ArrayInterface):
             seen = seen.without(self.tracker.front, self.view)
             if self.config.mapping.exposure:
                 seen = seen.without_exposure(found.exposure)
-            found.T_submap_camera = self._map(seen, found.T_submap_camera, found.hop)
-            if self._submap_ends(found.T_submap_camera):
-                found.loops += self._cut(found.T_submap_camera)
-                found.T_submap_camera = self._map(seen, np.eye(4))  # the next submap begins with the same keyframe
-            self._seek_component(seen, found)
+            self._map(seen, found)
+            self.seek_component(seen, found.T_submap_camera)
         else:
             self._offer_probe(seen, found)
         self.atlas.place_frame(found.T_submap_camera)
@@ -76,12 +65,12 @@ class Slam(World, ArrayInterface):
         the uncertainty is measured at; without both the total is 1. Does nothing when no rule cuts submaps and
         `final.iterations` is 0. Components that are not connected to the world are left out of the final map.
         """
-        if not self.steps or not (len(self.store) or self._cuts or self.config.final.iterations):
+        if not self.steps or not (len(self.store) or self.cuts or self.config.final.iterations):
             return
         steps, measures = self._refinement_steps(), self.config.uncertainty.probes > 0
         total = max(1, steps + measures * sum(map(len, self.atlas.keyframe_poses)))
         progress(0, total)
-        self._finish_submap()
+        completed(self.finish_submap())
         self._connect_components()
         members = self.atlas.members(0)
         store, anchors = StorePart(self.store, members), [self.atlas.anchors[s] for s in members]
@@ -103,11 +92,8 @@ class Slam(World, ArrayInterface):
         """Resize a frame to working size and prepare it for the fits."""
         with self._timer.stage("prepare"):
             view = self._view or self.prepare(working_frame(frame, self.config).camera)
-            working = working_frame(frame, self.config, view.camera if self._resample else None)
-            if working.camera != view.camera:
-                raise SourceError(f"frame {frame.index} comes from another camera ({working.camera}) than the first")
             self._timer.start_kernels(view)
-            return observe(frame, working, view, self.config, self.extractor)
+            return self.observed(frame, view, self.extractor)
 
     def _begin(self, seen: Observation) -> Found:
         """Start the first submap at the first frame. Its camera is the world, unless there are earlier submaps: then
@@ -118,17 +104,10 @@ class Slam(World, ArrayInterface):
                 f"{self.config.input.max_depth_m}] m to start a map from; check the depth scale or start at a later one"
             )
         self.tracker.start(seen, seen.frame.R_inertial_camera)
-        place = self._relocalise(seen, index_at_most=None) if self.atlas.anchors else None
+        place = self.begin_first(seen)
         if place is None:
-            self._begin_component()
             return Found(np.eye(4), TRACKED, mapped=True)
-        self._begin_at(place.where[0], place.T_submap_camera, place.information, self._splats_of(place))
         return Found(np.eye(4), RELOCALISED, place.values(), mapped=True)
-
-    def _begin_component(self) -> None:
-        """Begin a map at the camera, which is its origin."""
-        self.atlas.begin_submap()
-        self.confidence.begun(None, 0.0)
 
     def _localise(self, seen: Observation) -> Found:
         """Track a frame; if it is lost, search the whole map for it; if that fails too often, begin a new map."""
@@ -140,17 +119,17 @@ class Slam(World, ArrayInterface):
             if self.config.submaps.variance_sum:
                 self.drift.variance_sum += mean_variance(self.mapper.field, self.view, fit.T_camera_world)
                 found.tracking["variance_sum"] = self.drift.variance_sum
-            certain = self.recovery.is_steady and self._is_certain(fit)
+            certain = self.recovery.is_steady and self.tracker.is_certain(fit)
             found.mapped = certain and not held_back and self._is_keyframe(fit.overlap)
             if found.mapped:
                 found.hop = self._hop(fit, seen)
-                if self._cuts:
-                    found.tracking["drift_m"] = self._add_drift(fit, found.hop)
+                if self.cuts:
+                    found.tracking["drift_m"] = self.add_drift(found.T_submap_camera, found.hop)
             if not held_back:
                 self._question(fit, seen, found)
         elif held_back:
             return found  # a search for the camera could make a keyframe of this frame
-        elif (place := self._relocalise(seen)) is not None:
+        elif (place := self.relocalise(seen)) is not None:
             self._go_to(place, seen, found)
         elif self.recovery.gives_up and usable(seen):
             self._begin_apart(seen, found)
@@ -160,11 +139,6 @@ class Slam(World, ArrayInterface):
         """Fit the frame's pose to the active submap."""
         with self._timer.stage("track"), self._timer.kernels_of(self.view, "track_kernels"):
             return self.tracker.track(self.mapper.field, self.view, seen, seen.frame.R_inertial_camera)
-
-    def _is_certain(self, fit: PoseFit) -> bool:
-        """Return whether a pose may be used for mapping."""
-        doubtful = self.tracker.doubtful if self.config.tracking.verify else 0
-        return not doubtful or (fit.comparison is not None and stands(fit.comparison, doubtful))
 
     def _is_keyframe(self, overlap: float) -> bool:
         c = self.config.mapping
@@ -178,27 +152,18 @@ class Slam(World, ArrayInterface):
             return UNKNOWN_HOP._replace(T_camera_before=T_camera_before)
         return Hop(T_camera_before, alignment.covariance, alignment.bias)
 
-    def _add_drift(self, fit: PoseFit, hop: Hop) -> float:
-        """Add the hop to this keyframe to the submap's drift; return the standard deviation of its position, metres."""
-        T_submap_camera = se3.inverse(fit.T_camera_world)
-        self.drift.hop(T_submap_camera, None if np.isnan(hop.covariance).any() else hop.covariance)
-        return self.drift.position_m(T_submap_camera)
+    def _map(self, seen: Observation, found: Found) -> None:
+        """Map a keyframe, and cut the submap if a rule ends it here."""
+        found.T_submap_camera = self._mapped(seen, found.T_submap_camera, found.hop)
+        if self.submap_ends(len(self.steps), found.T_submap_camera):
+            found.loops += completed(self.cut(found.T_submap_camera))
+            found.T_submap_camera = self._mapped(seen, np.eye(4))  # the next submap begins with the same keyframe
 
-    def _map(self, seen: Observation, T_submap_camera: Matrix, hop: Hop = UNKNOWN_HOP) -> Matrix:
-        """Map a keyframe, which `hop` leads to; return its pose, which mapping may have moved."""
-        index, frame = len(self.steps), seen.frame
-        with self._timer.stage("describe"):
-            descriptor = self.descriptor.describe(frame.color, frame.depth_m) if self._describes else None
-        with self._timer.stage("map"):
-            detail = None if seen.image is None else seen.image.detail
-            photo = seen.photo(self.config)
-            fit = self.mapper.map(self.view, index, seen.target, T_submap_camera, descriptor, detail, photo)
-        self._timer.add(fit.seconds, prefix="map_")
-        if self.keyframe_indices[-1:] != [index]:  # a keyframe that two submaps share is counted once
-            self.keyframe_indices.append(index)
-        self.atlas.set_keyframes([keyframe.T_world_camera for keyframe in self.mapper.keyframes], hop)
-        self.tracker.keep_keyframe(self.mapper.field, self.view, seen, self.atlas.keyframe_poses[-1][-1])
-        return self.atlas.keyframe_poses[-1][-1]
+    def _mapped(self, seen: Observation, T_submap_camera: Matrix, hop: Hop = UNKNOWN_HOP) -> Matrix:
+        """Map a keyframe, and track the next frames relative to it; return its pose."""
+        T_submap_camera = completed(self.map_keyframe(seen, len(self.steps), T_submap_camera, hop))
+        self.tracker.keep_keyframe(self.mapper.field, self.view, seen, T_submap_camera)
+        return T_submap_camera
 
     def _offer_probe(self, seen: Observation, found: Found) -> None:
         """Offer a frame as a probe view if it was tracked without doubt and is not held back."""
@@ -209,69 +174,13 @@ class Slam(World, ArrayInterface):
             last = len(self.mapper.keyframes) - 1
             self.probes.offer(index, last, index - newest.index, T_keyframe_camera, seen.target)
 
-    def _submap_ends(self, T_submap_camera: Matrix) -> bool:
-        since, moved_m = len(self.steps) - self.mapper.keyframes[0].index, self.drift.position_m(T_submap_camera)
-        return bool(ends_submap(T_submap_camera, since, moved_m, self.config.submaps, self.drift.variance_sum))
-
-    def _cut(self, T_submap_camera: Matrix) -> list[Loop]:
-        """Finish the active submap and start the next one at its newest keyframe; return the loops tried."""
-        return self._branch(len(self.store), T_submap_camera, self.drift.information, self.mapper.field)
-
-    def _branch(self, parent: int, T_parent_camera: Matrix, information: Matrix, field: GaussianField) -> list[Loop]:
-        """Finish the active submap and start the next one at the camera, connected to a parent submap; return the loops
-        tried.
-
-        information [6, 6]: of T_parent_camera's left twist; field: the parent's splats, which the new submap may
-        inherit.
-        """
-        with self._timer.stage("cut"):
-            loops = self._finish_submap()
-            self._begin_at(parent, T_parent_camera, information, field)
-            return loops
-
-    def _begin_at(self, parent: int, T_parent_camera: Matrix, information: Matrix, field: GaussianField) -> None:
-        """Start a submap at the camera, connected to a parent submap, as `_branch` does."""
-        self.closer.connect(parent, len(self.store), T_parent_camera, information)
-        self.atlas.begin_submap(T_parent_camera, parent)
-        self.confidence.begun(parent, std_of(information))
-        self.mapper = Mapper(self.config, self.random, field).successor(self.view, T_parent_camera)
-        self.drift = Drift()
-
-    def _finish_submap(self) -> list[Loop]:
-        """Move the active submap to the store and look for its loops, which may move anchors."""
-        submap, pictures = self.mapper.finished(len(self.store))
-        submap, probes = self.probes.of(submap)
-        self.store.save(submap, pictures, probes)
-        self.probes.kept = []
-        descriptors = [keyframe.descriptor for keyframe in self.mapper.keyframes]
-        known = [descriptor for descriptor in descriptors if descriptor is not None]
-        loops = self.closer.submap_finished(submap, known, self.atlas, self.view)
-        self.confidence.closed(loops)
-        return loops
-
     # ---- lost and found ----
-
-    def _relocalise(
-        self, seen: Sight, apart_from: int | None = None, index_at_most: int | None = INDEX_AT_MOST
-    ) -> Relocation | None:
-        """Search the map for the camera; apart_from: only in components that are not that of this submap."""
-        if not self.config.recovery.relocalise or not usable(seen):
-            return None
-        components = self.atlas.components
-        wanted = [apart_from is None or number != components[apart_from] for number in components]
-        with self._timer.stage("relocalise"):
-            return self.relocaliser.find(self._known(wanted), self.view, seen, index_at_most)
-
-    def _known(self, wanted: Sequence[bool]) -> KnownMap:
-        """Return the map as relocalisation reads it; wanted [S]: which submaps are searched."""
-        active = self.mapper.keyframes, self.mapper.field
-        return KnownMap(self.store, self.atlas.keyframe_poses, *active, wanted.__getitem__)
 
     def _question(self, fit: PoseFit, seen: Observation, found: Found) -> None:
         """After some doubtful frames, search the whole map for a pose that explains the frame much better."""
         if fit.comparison is None or not is_questionable(self.tracker.doubtful):
             return
-        place = self._relocalise(seen)
+        place = self.relocalise(seen)
         if place is not None and is_better(place.comparison, fit.comparison):
             self._go_to(place, seen, found)
 
@@ -283,48 +192,16 @@ class Slam(World, ArrayInterface):
             found.T_submap_camera = place.T_submap_camera
             self.tracker.move_to(self.mapper.field, self.view, place.keyframe, place.T_submap_camera)
         else:
-            field = self._splats_of(place)
-            found.loops += self._branch(submap, place.T_submap_camera, place.information, field)
+            found.loops += completed(self.branch_at(place))
             found.T_submap_camera, found.mapped = np.eye(4), True
         self.recovery.found()
 
-    def _splats_of(self, place: Relocation) -> GaussianField:
-        return self.store.load(place.where[0]).field.to(self.view.sums.device)
-
     def _begin_apart(self, seen: Observation, found: Found) -> None:
         """Begin a new map at the camera, whose place in the world is not known yet."""
-        found.loops += self._finish_submap()
-        self._begin_component()
-        self.mapper, self.drift = Mapper(self.config, self.random), Drift()
+        found.loops += completed(self.begin_apart())
         self.tracker.forget()
         self.recovery.found()
         found.T_submap_camera, found.state, found.mapped = np.eye(4), APART, True
-
-    def _seek_component(self, seen: Observation, found: Found) -> None:
-        """Look for a place of another component; two observations that agree join the components."""
-        if len(set(self.atlas.components)) > 1:
-            self._seek_link(seen, len(self.store), found.T_submap_camera)
-
-    def _connect_components(self) -> None:
-        """When all is mapped, search other components for the keyframes of those that are apart."""
-        for s, poses in enumerate(self.atlas.keyframe_poses):
-            for k in sorted({round(i) for i in np.linspace(0, len(poses) - 1, LAST_TRIES)}):
-                if self.atlas.components[s]:
-                    keyframe = self._known([True] * len(self.atlas.components)).keyframe((s, k))
-                    self._seek_link(sight_of(keyframe, self.view), s, keyframe.T_submap_camera)
-
-    def _seek_link(self, seen: Sight, submap: int, T_submap_camera: Matrix) -> None:
-        """Search other components for a camera of a submap; if a second observation agrees, join them."""
-        place = self._relocalise(seen, apart_from=submap)
-        if place is None:
-            return
-        link = Link(place.where[0], submap, place.T_submap_camera @ se3.inverse(T_submap_camera), place.information)
-        if self.recovery.confirms(link, self.atlas):
-            kept, moved = sorted((link.a, link.b), key=self.atlas.components.__getitem__)
-            members = self.atlas.members(self.atlas.components[moved])
-            self.confidence.joined(members, moved, kept, std_of(link.information))
-            self.atlas.join(link.a, link.b, link.T_a_b)
-            self.closer.connect(link.a, link.b, link.T_a_b, link.information)
 
     def _step_result(self, frame: Frame, found: Found) -> Step:
         component, in_submap_m = self.atlas.components[-1], self.drift.position_m(found.T_submap_camera)

@@ -13,15 +13,15 @@ from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.pose import PoseFit, fit_pose_adam, fit_pose_align
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.fit.references import Reference, keyframe_reference, map_reference
+from sigmasplat.fit.references import Reference, map_reference
 from sigmasplat.model import se3
-from sigmasplat.model.field import GaussianField
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.feature_image import FeatureImage, pose_by_features
 from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foreground
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
-from sigmasplat.slam.localisation.verdict import LEAST_COMMON, Usual, confirmed, score
+from sigmasplat.slam.localisation.tracked_keyframe import Splats, TrackedKeyframe, found_keyframe, mapped_keyframe
+from sigmasplat.slam.localisation.verdict import LEAST_COMMON, Usual, confirmed, score, stands
 from sigmasplat.slam.rules import is_lost, jumped
 from sigmasplat.types import Matrix
 
@@ -89,7 +89,7 @@ class Tracker:
         """Fix the gauge: the first camera is the world. R_inertial_camera: as in `Frame`."""
         self.last_image, self.last_features, self.R_inertial_camera = seen.live, seen.image, R_inertial_camera
 
-    def track(self, field: GaussianField, view: View, seen: Sight, R_inertial_camera: Matrix | None = None) -> PoseFit:
+    def track(self, field: Splats, view: View, seen: Sight, R_inertial_camera: Matrix | None = None) -> PoseFit:
         """Estimate T_camera_world of a frame; `self.lost` then says whether tracking failed.
 
         R_inertial_camera: as in `Frame`. A lost frame gets the best available guess (odometry, else the last pose), and
@@ -113,7 +113,7 @@ class Tracker:
         return best
 
     def _uncovered(
-        self, field: GaussianField, view: View, seen: Sight, predicted: Matrix, fit: PoseFit
+        self, field: Splats, view: View, seen: Sight, predicted: Matrix, fit: PoseFit
     ) -> tuple[PoseFit, Sight]:
         """Find what is in front of the scene, and fit the pose without it; return the fit and the frame without it.
 
@@ -172,7 +172,7 @@ class Tracker:
             last = last @ turn
         return Expected(motion, turn, self.previous @ motion if self.config.motion_model else last, last, measured)
 
-    def _fit(self, field: GaussianField, view: View, seen: Sight, guess: Matrix, patience: int = 1) -> PoseFit:
+    def _fit(self, field: Splats, view: View, seen: Sight, guess: Matrix, patience: int = 1) -> PoseFit:
         """Fit from an initial T_world_camera; patience: factor on the number of iterations of gradient descent."""
         T_camera_world = se3.inverse(guess)
         if self.config.method == "adam":
@@ -218,7 +218,7 @@ class Tracker:
             if found is not None:
                 yield self.previous @ se3.inverse(found.T_live_reference)
 
-    def _retry(self, field: GaussianField, view: View, seen: Sight, fit: PoseFit, expected: Expected) -> PoseFit:
+    def _retry(self, field: Splats, view: View, seen: Sight, fit: PoseFit, expected: Expected) -> PoseFit:
         """Retry from odometry with twice the iterations (VarSplat §3), and from the last pose; return the best fit.
 
         With alignment, also try the map rendered at these poses: it contains more than the newest keyframe.
@@ -289,23 +289,34 @@ class Tracker:
         """Return whether a pose is doubtful for another reason than a small overlap, which a new keyframe mends."""
         return self._doubts(fit) if fit.comparison is None else self.usual.contradicts(fit.comparison)
 
+    def is_certain(self, fit: PoseFit) -> bool:
+        """Return whether the pose of the last frame may be used for mapping."""
+        doubtful = self.doubtful if self.config.verify else 0
+        return not doubtful or (fit.comparison is not None and stands(fit.comparison, doubtful))
+
     # ---- keyframes ----
 
-    def keep_keyframe(self, field: GaussianField, view: View, seen: Sight, T_world_camera: Matrix) -> None:
+    def keep_keyframe(self, field: Splats, view: View, seen: Sight, T_world_camera: Matrix) -> None:
         """Use a keyframe that was just mapped: its refined pose, and its image as the reference of the next frames."""
         self.previous, self.lost = T_world_camera, False
-        self.keyframe_features, self.keyframe_front = seen.image, self.front
-        if self.config.method == "align" or fits_of(view).aligns:  # otherwise nothing aligns to it
-            T_camera_world = se3.inverse(T_world_camera)
-            self.keyframe = keyframe_reference(field.params, view, seen.live, T_camera_world, self.config, seen.target)
-            if seen.image is not None:
-                self.keyframe_features = seen.image.weighed(self.keyframe.weights)
+        self.follow(mapped_keyframe(field.params, view, seen, T_world_camera, self.config, self.front))
 
-    def move_to(self, field: GaussianField, view: View, keyframe: FoundKeyframe, T_world_camera: Matrix) -> None:
+    def follow(self, keyframe: TrackedKeyframe) -> None:
+        """Use a keyframe as the reference of the next frames."""
+        self.keyframe = self.keyframe if keyframe.reference is None else keyframe.reference
+        self.keyframe_features, self.keyframe_front = keyframe.image, keyframe.front
+
+    def move_to(self, field: Splats, view: View, keyframe: FoundKeyframe, T_world_camera: Matrix) -> None:
         """Continue at another pose, with a keyframe as the reference of the next frames."""
         self.previous, self.velocity, self.lost = T_world_camera, np.eye(4), False
-        self.keyframe = keyframe_reference(field.params, view, keyframe.pyramid, keyframe.T_camera_world, self.config)
-        self.keyframe_features, self.keyframe_front = keyframe.image.weighed(self.keyframe.weights), None
+        self.follow(found_keyframe(field.params, view, keyframe, self.config))
+
+    def move_by(self, T_new_old: Matrix) -> None:
+        """Express the last pose and the reference in other coordinates [4, 4]."""
+        self.previous = T_new_old @ self.previous
+        if self.keyframe is not None:
+            T_camera_new = self.keyframe.T_camera_world @ se3.inverse(T_new_old)
+            self.keyframe = dataclasses.replace(self.keyframe, T_camera_world=T_camera_new)
 
     def forget(self) -> None:
         """Restart at the identity, as for the first frame."""

@@ -13,6 +13,7 @@ from sigmasplat.model.atlas import Atlas
 from sigmasplat.model.camera import Camera
 from sigmasplat.model.component import LOST, Component
 from sigmasplat.model.field import GaussianField
+from sigmasplat.model.frame import Frame
 from sigmasplat.model.map_uncertainty import MapUncertainty
 from sigmasplat.model.submap import MemoryStore, SubmapStore
 from sigmasplat.model.trajectory import Trajectory
@@ -20,12 +21,12 @@ from sigmasplat.presets import configured
 from sigmasplat.render.view import View
 from sigmasplat.slam.checkpoint import checkpoint_of
 from sigmasplat.slam.drift import Drift
-from sigmasplat.slam.features import make_extractor
+from sigmasplat.slam.features import Extractor, make_extractor
 from sigmasplat.slam.listeners import Listeners
 from sigmasplat.slam.localisation.confidence import Confidence
 from sigmasplat.slam.localisation.recovery import Recovery
 from sigmasplat.slam.localisation.relocaliser import Relocaliser
-from sigmasplat.slam.localisation.sight import view_of
+from sigmasplat.slam.localisation.sight import Observation, observe, view_of, working_frame
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.merged import components_apart, merged_field
@@ -158,7 +159,29 @@ class World:
         return self._view
 
     @property
-    def _cuts(self) -> bool:
+    def is_prepared(self) -> bool:
+        """Return whether there is a view yet."""
+        return self._view is not None
+
+    def observed(self, frame: Frame, view: View, extractor: Extractor | None) -> Observation:
+        """Resize a frame to working size and prepare it for the fits. Raises SourceError if it comes from another
+        camera than the first."""
+        working = working_frame(frame, self.config, view.camera if self._resample else None)
+        if working.camera != view.camera:
+            raise SourceError(f"frame {frame.index} comes from another camera ({working.camera}) than the first")
+        return observe(frame, working, view, self.config, extractor)
+
+    def start_timer(self) -> StepTimer:
+        """Measure the stages from now on; return the timer."""
+        self._timer = StepTimer()
+        self._timer.start_kernels(self.view)
+        return self._timer
+
+    def settle(self) -> None:
+        """Finish the work on all frames so far. Nothing is left to do: `step` does all work on its frame."""
+
+    @property
+    def cuts(self) -> bool:
         """Return whether any rule may end a submap."""
         s = self.config.submaps
         return bool(s.distance_m or s.angle_deg or s.frames or s.uncertainty_m or s.variance_sum)
@@ -167,4 +190,4 @@ class World:
     def _describes(self) -> bool:
         """Return whether any part compares keyframes by their descriptors."""
         m = self.config.mapping
-        return (self._cuts and self.config.loops.close) or (m.window > 2 and m.covisibility == "descriptor")
+        return (self.cuts and self.config.loops.close) or (m.window > 2 and m.covisibility == "descriptor")

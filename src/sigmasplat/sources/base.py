@@ -25,7 +25,9 @@ class Source(ABC):
     depth_units_per_metre: divisor of whole-number depth, None if depth is stored in metres;
     depth_registered: whether the source itself moved depth to the colour camera; registrable: whether it could do so,
     because the depth camera is known;
-    live: whether frames come from a live camera: each only once, and their number is unknown (LiveSource).
+    live: whether frames come from a live camera: each only once, and their number is unknown (LiveSource);
+    arrived_s: when the last frame arrived, by `time.perf_counter`, if frames do not wait for the consumer (Arrivals);
+    dropped: number of frames that were dropped because the consumer was late.
     """
 
     name: str
@@ -35,6 +37,8 @@ class Source(ABC):
     depth_registered: bool = False
     registrable: bool = False
     live: bool = False
+    arrived_s: float | None = None
+    dropped: int = 0
 
     def __init__(self, name: str, camera: Camera, strict: bool = False) -> None:
         self.name = name

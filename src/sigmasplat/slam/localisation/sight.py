@@ -42,6 +42,10 @@ class Sight:
         depth_m = np.where(front.hidden, np.float32(HIDDEN_M), self.target.depth_image.numpy())
         return replace(self.without(front, view), live=self._with_depth(depth_m, view)[1])
 
+    def separate(self) -> Self:
+        """Return the same frame with an own image for features, which are found and kept when they are first needed."""
+        return replace(self, image=None if self.image is None else self.image.with_depth(self.image.depth_m))
+
     def without_exposure(self, exposure: tuple[float, float]) -> Self:
         """Return the frame with the exposure (a, b) of exp(a) · colour + b removed from its target."""
         return replace(self, target=self.target.without_exposure(*exposure))

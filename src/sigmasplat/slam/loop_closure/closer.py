@@ -28,7 +28,7 @@ from sigmasplat.slam.loop_closure.descriptors import Descriptor, OrientationGrid
 from sigmasplat.slam.loop_closure.pose_graph import Edge, LoopVerdict, optimise
 from sigmasplat.slam.loop_closure.registration import Registrar, Registration
 from sigmasplat.slam.predicted_submaps import PredictedSubmaps
-from sigmasplat.types import Matrix
+from sigmasplat.types import Matrix, Slices, completed
 
 RIGID = np.diag(np.repeat([1e-4, 1e-5], 3) ** -2.0)
 """Information of the edge to a submap of an earlier session: 0.1 mm and 0.0006°. Its map is finished, and poses in its
@@ -143,12 +143,21 @@ class LoopCloser:
         descriptors [D]: one per keyframe, in order, of unit norm or zero. Returns the pairs that were tried, each with
         the latest verdict.
         """
+        return completed(self.closing(submap, descriptors, atlas, view))
+
+    def closing(
+        self, submap: Submap, descriptors: Sequence[NDArray[np.float32]], atlas: Atlas, view: View
+    ) -> Slices[list[Loop]]:
+        """Look for loops as `submap_finished` does, in slices of one pair."""
         if not self.config.loops.close or not descriptors:
             return []
         query = self._described(submap, descriptors)
         pairs = self._pairs(query, atlas)
         self.descriptors.append(query)
-        tried = [self._try(pair, submap, atlas, view) for pair in pairs]
+        tried = list[Loop]()
+        for pair in pairs:
+            yield
+            tried.append(self._try(pair, submap, atlas, view))
         if any(loop.accepted for loop in tried):
             self._correct(atlas, atlas.components[submap.index])
         return self.loops[len(self.loops) - len(tried) :]

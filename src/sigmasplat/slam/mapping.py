@@ -1,0 +1,197 @@
+"""The work on the map: map keyframes, cut submaps, close loops, search for lost cameras, join components.
+
+Both clocks do this work: `Slam.step` between two frames, `RealTime` beside them. Long work is done in slices.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from sigmasplat.fit.target import Keyframe
+from sigmasplat.model import se3
+from sigmasplat.model.atlas import UNKNOWN_HOP, Hop
+from sigmasplat.model.field import GaussianField
+from sigmasplat.slam.drift import Drift
+from sigmasplat.slam.localisation.confidence import std_of
+from sigmasplat.slam.localisation.known_map import KnownMap
+from sigmasplat.slam.localisation.recovery import Link, usable
+from sigmasplat.slam.localisation.relocaliser import INDEX_AT_MOST, Relocation, sight_of
+from sigmasplat.slam.localisation.sight import Observation, Sight
+from sigmasplat.slam.loop_closure.closer import Loop
+from sigmasplat.slam.mapper import Mapper
+from sigmasplat.slam.rules import ends_submap
+from sigmasplat.slam.world import World
+from sigmasplat.types import Matrix, Slices
+
+LAST_TRIES = 3
+"""Number of keyframes per submap that is apart with which other components are searched at the end."""
+
+
+class MapWork(World):
+    """What changes the map, the atlas and the store. None of it changes the tracker."""
+
+    # ---- keyframes ----
+
+    def map_keyframe(
+        self,
+        seen: Observation,
+        index: int,
+        T_submap_camera: Matrix,
+        hop: Hop = UNKNOWN_HOP,
+        hurried: Callable[[], bool] = lambda: False,
+    ) -> Slices[Matrix]:
+        """Map frame number `index`, which `hop` leads to, in slices; return its pose, which mapping may have moved.
+
+        hurried: as in `Mapper.mapping`.
+        """
+        keyframe = self._keyframe(seen, index, T_submap_camera)
+        with self._timer.stage("map"):
+            fit = yield from self.mapper.mapping(self.view, keyframe, hurried)
+        self._timer.add(fit.seconds, prefix="map_")
+        return self._placed(index, hop)
+
+    def add_keyframe(self, seen: Observation, index: int, T_submap_camera: Matrix, hop: Hop) -> Matrix:
+        """Add frame number `index` to the keyframes of the active submap without fitting the map; return its pose."""
+        self.mapper.add(self.view, self._keyframe(seen, index, T_submap_camera))
+        return self._placed(index, hop)
+
+    def _keyframe(self, seen: Observation, index: int, T_submap_camera: Matrix) -> Keyframe:
+        frame = seen.frame
+        with self._timer.stage("describe"):
+            descriptor = self.descriptor.describe(frame.color, frame.depth_m) if self._describes else None
+        detail = None if seen.image is None else seen.image.detail
+        with self._timer.stage("map"):
+            photo = seen.photo(self.config)
+        return Keyframe(index, seen.target, T_submap_camera, descriptor=descriptor, detail=detail, photo=photo)
+
+    def _placed(self, index: int, hop: Hop) -> Matrix:
+        """Write the poses of the active submap's keyframes to the atlas; return that of the newest."""
+        if self.keyframe_indices[-1:] != [index]:  # a keyframe that two submaps share is counted once
+            self.keyframe_indices.append(index)
+        self.atlas.set_keyframes([keyframe.T_world_camera for keyframe in self.mapper.keyframes], hop)
+        return self.atlas.keyframe_poses[-1][-1]
+
+    def add_drift(self, T_submap_camera: Matrix, hop: Hop) -> float:
+        """Add the hop to a keyframe to the submap's drift; return the standard deviation of its position, metres."""
+        self.drift.hop(T_submap_camera, None if np.isnan(hop.covariance).any() else hop.covariance)
+        return self.drift.position_m(T_submap_camera)
+
+    # ---- submaps ----
+
+    def submap_ends(self, index: int, T_submap_camera: Matrix) -> bool:
+        """Return whether a rule ends the active submap at frame number `index`."""
+        since, moved_m = index - self.mapper.keyframes[0].index, self.drift.position_m(T_submap_camera)
+        return bool(ends_submap(T_submap_camera, since, moved_m, self.config.submaps, self.drift.variance_sum))
+
+    def cut(self, T_submap_camera: Matrix) -> Slices[list[Loop]]:
+        """Finish the active submap and start the next one at its newest keyframe, in slices; return the loops tried."""
+        return self.branch(len(self.store), T_submap_camera, self.drift.information, self.mapper.field)
+
+    def branch(
+        self, parent: int, T_parent_camera: Matrix, information: Matrix, field: GaussianField
+    ) -> Slices[list[Loop]]:
+        """Finish the active submap and start the next one at the camera, connected to a parent submap, in slices;
+        return the loops tried.
+
+        information [6, 6]: of T_parent_camera's left twist; field: the parent's splats, which the new submap may
+        inherit.
+        """
+        with self._timer.stage("cut"):
+            loops = yield from self.finish_submap()
+            self.begin_at(parent, T_parent_camera, information, field)
+            return loops
+
+    def branch_at(self, place: Relocation) -> Slices[list[Loop]]:
+        """Finish the active submap and start the next one where the camera was found, in slices; return the loops."""
+        return self.branch(place.where[0], place.T_submap_camera, place.information, self._splats_of(place))
+
+    def begin_at(self, parent: int, T_parent_camera: Matrix, information: Matrix, field: GaussianField) -> None:
+        """Start a submap at the camera, connected to a parent submap, as `branch` does."""
+        self.closer.connect(parent, len(self.store), T_parent_camera, information)
+        self.atlas.begin_submap(T_parent_camera, parent)
+        self.confidence.begun(parent, std_of(information))
+        self.mapper = Mapper(self.config, self.random, field).successor(self.view, T_parent_camera)
+        self.drift = Drift()
+
+    def begin_first(self, seen: Sight) -> Relocation | None:
+        """Start the first submap of a session; return where the map of an earlier session shows the camera, if it
+        does: the submap is connected to this place, else it begins a component."""
+        place = self.relocalise(seen, index_at_most=None) if self.atlas.anchors else None
+        if place is None:
+            self._begin_component()
+        else:
+            self.begin_at(place.where[0], place.T_submap_camera, place.information, self._splats_of(place))
+        return place
+
+    def begin_apart(self) -> Slices[list[Loop]]:
+        """Finish the active submap and begin a component at the camera, in slices; return the loops tried."""
+        loops = yield from self.finish_submap()
+        self._begin_component()
+        self.mapper, self.drift = Mapper(self.config, self.random), Drift()
+        return loops
+
+    def _begin_component(self) -> None:
+        """Begin a map at the camera, which is its origin."""
+        self.atlas.begin_submap()
+        self.confidence.begun(None, 0.0)
+
+    def finish_submap(self) -> Slices[list[Loop]]:
+        """Move the active submap to the store and look for its loops, which may move anchors, in slices."""
+        submap, pictures = self.mapper.finished(len(self.store))
+        submap, probes = self.probes.of(submap)
+        yield
+        self.store.save(submap, pictures, probes)
+        self.probes.kept = []
+        descriptors = [keyframe.descriptor for keyframe in self.mapper.keyframes]
+        known = [descriptor for descriptor in descriptors if descriptor is not None]
+        yield
+        loops = yield from self.closer.closing(submap, known, self.atlas, self.view)
+        self.confidence.closed(loops)
+        return loops
+
+    # ---- search and join ----
+
+    def relocalise(
+        self, seen: Sight, apart_from: int | None = None, index_at_most: int | None = INDEX_AT_MOST
+    ) -> Relocation | None:
+        """Search the map for the camera; apart_from: only in components that are not that of this submap."""
+        if not self.config.recovery.relocalise or not usable(seen):
+            return None
+        components = self.atlas.components
+        wanted = [apart_from is None or number != components[apart_from] for number in components]
+        with self._timer.stage("relocalise"):
+            return self.relocaliser.find(self._known(wanted), self.view, seen, index_at_most)
+
+    def _known(self, wanted: Sequence[bool]) -> KnownMap:
+        """Return the map as relocalisation reads it; wanted [S]: which submaps are searched."""
+        active = self.mapper.keyframes, self.mapper.field
+        return KnownMap(self.store, self.atlas.keyframe_poses, *active, wanted.__getitem__)
+
+    def _splats_of(self, place: Relocation) -> GaussianField:
+        return self.store.load(place.where[0]).field.to(self.view.sums.device)
+
+    def seek_component(self, seen: Sight, T_submap_camera: Matrix) -> None:
+        """Look for a place of another component; two observations that agree join the components."""
+        if len(set(self.atlas.components)) > 1:
+            self._seek_link(seen, len(self.store), T_submap_camera)
+
+    def _connect_components(self) -> None:
+        """When all is mapped, search other components for the keyframes of those that are apart."""
+        for s, poses in enumerate(self.atlas.keyframe_poses):
+            for k in sorted({round(i) for i in np.linspace(0, len(poses) - 1, LAST_TRIES)}):
+                if self.atlas.components[s]:
+                    keyframe = self._known([True] * len(self.atlas.components)).keyframe((s, k))
+                    self._seek_link(sight_of(keyframe, self.view), s, keyframe.T_submap_camera)
+
+    def _seek_link(self, seen: Sight, submap: int, T_submap_camera: Matrix) -> None:
+        """Search other components for a camera of a submap; if a second observation agrees, join them."""
+        place = self.relocalise(seen, apart_from=submap)
+        if place is None:
+            return
+        link = Link(place.where[0], submap, place.T_submap_camera @ se3.inverse(T_submap_camera), place.information)
+        if self.recovery.confirms(link, self.atlas):
+            kept, moved = sorted((link.a, link.b), key=self.atlas.components.__getitem__)
+            members = self.atlas.members(self.atlas.components[moved])
+            self.confidence.joined(members, moved, kept, std_of(link.information))
+            self.atlas.join(link.a, link.b, link.T_a_b)
+            self.closer.connect(link.a, link.b, link.T_a_b, link.information)

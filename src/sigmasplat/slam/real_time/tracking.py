@@ -1,0 +1,213 @@
+"""The clock of the camera: track frames against the newest snapshot of the map, and choose keyframes."""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sigmasplat.config import Config
+from sigmasplat.errors import SourceError
+from sigmasplat.fit.pose import PoseFit
+from sigmasplat.fit.references import Reference
+from sigmasplat.fit.target import Target
+from sigmasplat.model import se3
+from sigmasplat.model.component import APART, LOST, RELOCALISED, TRACKED
+from sigmasplat.model.field import GaussianField
+from sigmasplat.render.view import View
+from sigmasplat.slam.drift import Drift
+from sigmasplat.slam.found import Found
+from sigmasplat.slam.localisation.confidence import Confidence
+from sigmasplat.slam.localisation.recovery import Recovery, usable
+from sigmasplat.slam.localisation.sight import Observation
+from sigmasplat.slam.localisation.tracked_keyframe import TrackedKeyframe
+from sigmasplat.slam.localisation.verdict import is_questionable
+from sigmasplat.slam.probes import Probes
+from sigmasplat.slam.real_time.messages import Offer, Search, Snapshot, TrackedFrame
+from sigmasplat.slam.rules import has_moved, is_held_back, is_keyframe
+from sigmasplat.slam.step_result import Step, StepTimer
+from sigmasplat.slam.tracker import Tracker
+from sigmasplat.types import Matrix
+
+NOTHING = GaussianField.empty()
+
+
+@dataclass(eq=False)
+class CameraClock:
+    """Everything that changes at the rate of the camera.
+
+    poses: T_submap_camera [4, 4] of the newest mapped keyframe and of later keyframes and searched frames, in the
+    coordinates of the tracker; frames: number of frames so far; newest: number of the frame of the last keyframe;
+    offered, refused: numbers of keyframes that were handed to the map, and that were not because too many waited;
+    searching: number of the frame that is searched for, −1 = none; waits: numbers of the keyframes not yet mapped.
+    """
+
+    config: Config
+    tracker: Tracker
+    recovery: Recovery
+    confidence: Confidence = field(default_factory=lambda: Confidence([0.0]))
+    snapshot: Snapshot | None = None
+    poses: Mapping[int, Matrix] = field(default_factory=dict)
+    frames: int = 0
+    newest: int = 0
+    offered: int = 0
+    refused: int = 0
+    searching: int = -1
+    waits: tuple[int, ...] = ()
+    found: str = ""
+    loops: int = 0
+
+    def copied(self) -> "CameraClock":
+        """Return a copy that later frames do not change."""
+        tracker = replace(
+            self.tracker, agreements=self.tracker.agreements[:], first_losses=self.tracker.first_losses[:],
+            usual=copy.deepcopy(self.tracker.usual),
+        )  # fmt: skip
+        return replace(self, tracker=tracker, recovery=copy.copy(self.recovery), confidence=copy.copy(self.confidence))
+
+    # ---- a new snapshot ----
+
+    def adopt(self, snapshot: Snapshot) -> None:
+        """Continue with a new snapshot: express all poses in its submap, and track relative to its keyframe if no later
+        frame is a keyframe."""
+        before, now = self.poses[snapshot.frame], snapshot.poses[snapshot.frame]
+        moved = not np.array_equal(before, now)
+        if moved:
+            T_new_old = now @ se3.inverse(before)
+            self.tracker.move_by(T_new_old)
+            if snapshot.frame == self.frames - 1:
+                self.tracker.previous = now  # without rounding
+        kept = {n: T_new_old @ T if moved else T for n, T in self.poses.items() if n > snapshot.newest}
+        self.poses = kept | dict(snapshot.poses)
+        if snapshot.state:
+            self._found(snapshot)
+        if snapshot.newest >= self.newest or snapshot.state:
+            self.tracker.follow(snapshot.keyframe)
+            self.newest = snapshot.newest
+        self.waits = tuple(number for number in self.waits if number > snapshot.newest)
+        if snapshot.searched >= self.searching:
+            self.searching = -1
+        self.confidence.spread_m, self.snapshot = [snapshot.spread_m], snapshot
+
+    def _found(self, snapshot: Snapshot) -> None:
+        """Continue where the camera was found, or in a new map."""
+        self.recovery.found()
+        self.found = snapshot.state
+        self.tracker.velocity = np.eye(4)
+        if snapshot.state == APART:
+            self.tracker.lost = False
+
+    def adopt_newest(self, snapshot: Snapshot) -> None:
+        """Adopt a snapshot that follows others which were not adopted."""
+        if snapshot.frame in self.poses:
+            self.adopt(snapshot)
+
+    # ---- a frame ----
+
+    def track(self, seen: Observation, view: View, timer: StepTimer) -> TrackedFrame:
+        """Track a frame, and decide whether it becomes a keyframe."""
+        number, offer, search = self.frames, None, None
+        if number == 0:
+            found, offer = self._begin(seen)
+        else:
+            with timer.stage("track"), timer.kernels_of(view, "track_kernels"):
+                splats = NOTHING if self.snapshot is None else self.snapshot
+                fit = self.tracker.track(splats, view, seen, seen.frame.R_inertial_camera)
+            found = Found.of(fit, se3.inverse(fit.T_camera_world), self.tracker.lost)
+            self.recovery.count(self.tracker.lost, self.tracker.doubtful > 0, seen)
+            held_back = is_held_back(number, self.config.input.hold_every)
+            offer = None if held_back else self._offer(fit, seen, view, found)
+            search = None if held_back else self._search(fit, seen, offer)
+        if offer is not None or search is not None:
+            self.poses = {**self.poses, number: found.T_submap_camera}
+        step = self._step(seen, found, timer, view)
+        self.frames += 1
+        based_on = -1 if self.snapshot is None else self.snapshot.frame
+        probe = self._probe(number, seen, found)
+        return TrackedFrame(number, step, found.T_submap_camera, self.poses, based_on, offer, search, probe)
+
+    def _begin(self, seen: Observation) -> tuple[Found, Offer]:
+        """Start at the first frame, whose camera is the world until the map says otherwise."""
+        if not (seen.frame.depth_m > 0).any():
+            raise SourceError(no_depth(seen, self.config))
+        self.tracker.start(seen, seen.frame.R_inertial_camera)
+        self._follow(0, seen, np.eye(4))
+        return Found(np.eye(4), TRACKED, mapped=True), Offer(seen.separate())
+
+    def _offer(self, fit: PoseFit, seen: Observation, view: View, found: Found) -> Offer | None:
+        """Return the frame as a keyframe, if it becomes one; track the next frames relative to it."""
+        certain = not self.tracker.lost and self.recovery.is_steady and self.tracker.is_certain(fit)
+        if not certain or not self._is_keyframe(fit, found.T_submap_camera):
+            return None
+        if len(self.waits) >= self.config.realtime.waiting_most:
+            self.refused += 1
+            return None
+        found.mapped, alignment = True, self.tracker.hop(fit, seen.live)
+        shown = seen.without(self.tracker.front, view)
+        self._follow(self.frames, shown, found.T_submap_camera)
+        return Offer(shown.separate(), alignment, self.tracker.front, found.exposure)
+
+    def _follow(self, number: int, seen: Observation, T_submap_camera: Matrix) -> None:
+        """Track the next frames relative to a frame, before the map has weights for its pixels."""
+        reference = Reference(seen.live, se3.inverse(T_submap_camera))
+        self.tracker.follow(TrackedKeyframe(reference, seen.image, self.tracker.front))
+        self.newest, self.offered, self.waits = number, self.offered + 1, (*self.waits, number)
+
+    def _is_keyframe(self, fit: PoseFit, T_submap_camera: Matrix) -> bool:
+        c, since, most_deg = self.config.mapping, self.frames - self.newest, self.config.realtime.keyframe_deg
+        if not most_deg:
+            return is_keyframe(since, c.every, fit.overlap, c.overlap_below)
+        depth_m = 1.0 if fit.alignment is None else fit.alignment.depth_m
+        moved = has_moved(se3.inverse(self.poses[self.newest]) @ T_submap_camera, depth_m, most_deg)
+        return moved or fit.overlap < c.overlap_below
+
+    def _search(self, fit: PoseFit, seen: Observation, offer: Offer | None) -> Search | None:
+        """Return the frame to be searched for in the whole map, if it is lost or doubtful and no other is searched."""
+        searched, apart = self.config.recovery.relocalise, self.recovery.gives_up
+        if self.searching >= 0 or offer is not None or not usable(seen):
+            return None
+        if self.tracker.lost and (searched or apart):
+            self.searching = self.frames
+            return Search(seen.separate(), apart=apart)
+        if not searched or self.tracker.lost:
+            return None
+        if fit.comparison is None or not is_questionable(self.tracker.doubtful):
+            return None
+        self.searching = self.frames
+        return Search(seen.separate(), fit.comparison)
+
+    def _probe(self, number: int, seen: Observation, found: Found) -> Target | None:
+        """Return the images of a frame that may become a probe view."""
+        usual = found.state == TRACKED and not found.mapped and self.recovery.is_steady and not self.tracker.doubtful
+        if not usual or is_held_back(number, self.config.input.hold_every):
+            return None
+        probes = Probes(self.config.uncertainty.probes, self.config.mapping.every)
+        return seen.target if probes.wants(self.offered - 1, number - self.newest) else None
+
+    def _step(self, seen: Observation, found: Found, timer: StepTimer, view: View) -> Step:
+        s = self.snapshot
+        drift, submap, component = (Drift(), 0, 0) if s is None else (s.drift, s.submap, s.component)
+        if found.state == TRACKED and self.found:
+            found.state, self.found = (RELOCALISED if self.found == RELOCALISED else TRACKED), ""
+        state = APART if component and found.state != LOST else found.state
+        loops = () if s is None else s.loops[self.loops :]
+        self.loops += len(loops)
+        in_submap_m = drift.position_m(found.T_submap_camera)
+        found.tracking |= {
+            "position_std_m": self.confidence.position_std_m(in_submap_m), "doubtful": float(self.tracker.doubtful),
+            "usual_residual": self.tracker.usual.residual, "waiting": float(len(self.waits)),
+        }  # fmt: skip
+        p_off = self.confidence.probability(state, found.tracking)
+        anchor, splats = (np.eye(4), 0) if s is None else (s.T_world_submap, len(s.params))
+        return Step(
+            seen.frame.index, seen.frame.timestamp_s, anchor @ found.T_submap_camera, found.mapped, state == LOST,
+            found.tracking, splats, submap, loops, timer.stop(view), state, component, p_off,
+        )  # fmt: skip
+
+
+def no_depth(seen: Observation, config: Config) -> str:
+    """Return the message for a first frame without depth."""
+    return (
+        f"frame {seen.frame.index} has no depth reading in [{config.input.min_depth_m}, {config.input.max_depth_m}] m "
+        "to start a map from; check the depth scale or start at a later one"
+    )

@@ -1,0 +1,245 @@
+"""SLAM on two clocks: laws that hold for every interleaving of tracking and the work on the map."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from command_line import exit_code
+from schedules import AtOnce, Drawn
+from sigmasplat.config import Config
+from sigmasplat.config.text import override
+from sigmasplat.errors import RunError
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.metrics.trajectory import ate
+from sigmasplat.model.component import LOST, RELOCALISED
+from sigmasplat.model.frame import Frame
+from sigmasplat.model.submap import MemoryStore
+from sigmasplat.presets import preset
+from sigmasplat.slam.real_time.schedule import MappingThread
+from sigmasplat.slam.real_time.system import RealTime
+from sigmasplat.slam.slam import Slam
+from sigmasplat.slam.state import restore, state_of
+from small_room import SMALL, frames, walk
+
+pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
+
+FRAMES = 40
+QUICK = SMALL | {
+    "mapping.first_iterations": "12", "mapping.iterations": "6", "submaps.frames": "12", "final.iterations": "0",
+    "registration.iterations": "2", "loops.min_interval": "1", "realtime.spare_iterations": "8",
+}  # fmt: skip
+
+
+def config(**changes: str) -> Config:
+    return override(preset("sigma"), QUICK | {name.replace("__", "."): value for name, value in changes.items()})
+
+
+def error_m(system: RealTime) -> float:
+    truth, path = walk().truth(), system.trajectory()
+    assert truth is not None
+    return float(ate(path, truth).rmse_m)
+
+
+def test_the_results_are_those_of_a_recording_if_mapping_always_ends_before_the_next_frame() -> None:
+    same = config(realtime__keyframe_deg="0", realtime__spare_iterations="0")
+    usual, system = Slam(same), RealTime(Slam(same), AtOnce())
+    for frame in frames(FRAMES):
+        usual.step(frame)
+        system.step(frame)
+    system.settle()
+    assert len(usual.atlas.anchors) > 2
+    assert np.array_equal(usual.trajectory().T_world_camera, system.trajectory().T_world_camera)
+    assert np.array_equal(usual.field.params.numpy(), system.field.params.numpy())
+    assert usual.keyframe_indices == system.slam.keyframe_indices
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_interleaving_gives_every_frame_a_pose_and_leaves_snapshots_whole(seed: int) -> None:
+    system = RealTime(Slam(config()), Drawn(seed, most=10 + 30 * (seed % 2)))
+    kept = []
+    for number, frame in enumerate(frames(FRAMES)):
+        step = system.step(frame)
+        assert step.index == number and np.isfinite(step.T_world_camera).all() and not step.lost
+        snapshot = system.snapshot
+        if snapshot is not None:
+            kept.append((snapshot, snapshot.params.clone(), snapshot.keyframe.reference.T_camera_world.copy()))
+    system.settle()
+    for snapshot, params, T_camera_submap in kept:
+        assert np.array_equal(snapshot.params.numpy(), params.numpy())
+        assert np.array_equal(snapshot.keyframe.reference.T_camera_world, T_camera_submap)
+    slam = system.slam
+    assert [step.index for step in slam.steps] == list(range(FRAMES)) and len(slam.atlas.places) == FRAMES
+    assert len(slam.atlas.anchors) > 1 and slam.keyframe_indices == sorted(set(slam.keyframe_indices))
+    assert error_m(system) < 0.03
+
+
+def test_the_same_interleaving_gives_the_same_bytes() -> None:
+    paths = []
+    for _ in range(2):
+        system = RealTime(Slam(config()), Drawn(5))
+        for frame in frames(20):
+            system.step(frame)
+        system.settle()
+        paths.append(system.trajectory().T_world_camera)
+    assert np.array_equal(*paths)
+
+
+def covered(frame: Frame) -> Frame:
+    return replace(frame, color=np.zeros_like(frame.color), depth_m=np.zeros_like(frame.depth_m))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_lost_camera_is_reported_at_once_and_found_again(seed: int) -> None:
+    """Frames go on while the whole map is searched. The camera returns to a place of a finished submap."""
+    seen = frames(80)[::2]
+    path = [*seen, *[covered(frame) for frame in seen[:3]], *[seen[4]] * 40]
+    system, states = RealTime(Slam(config()), Drawn(seed, most=60)), []
+    for number, frame in enumerate(path):
+        states.append(system.step(replace(frame, index=number, timestamp_s=number / 30)).state)
+    system.settle()
+    assert LOST in states[40:43] and RELOCALISED in states[43:]
+    poses = system.trajectory().T_world_camera
+    assert np.abs(poses[-1, :3, 3] - poses[4, :3, 3]).max() < 0.03
+    assert np.isfinite(poses).all()
+
+
+def test_a_keyframe_is_a_matter_of_motion() -> None:
+    """A camera at rest makes no keyframe after the first one."""
+    system = RealTime(Slam(config()), AtOnce())
+    still = [replace(frames(1)[0], index=i, timestamp_s=i / 30) for i in range(15)]
+    assert [system.step(frame).is_keyframe for frame in still] == [True] + [False] * 14
+
+
+def test_too_many_waiting_keyframes_are_refused_and_counted() -> None:
+    class Never(AtOnce):
+        def wake(self) -> None:
+            pass
+
+        def settle(self) -> None:
+            AtOnce.wake(self)
+
+    system = RealTime(Slam(config(realtime__keyframe_deg="0.5", realtime__waiting_most="3")), Never())
+    steps = [system.step(frame) for frame in frames(20)]
+    assert sum(step.is_keyframe for step in steps) == 3 and system.keyframes_refused > 5
+    assert max(step.tracking["waiting"] for step in steps) == 3
+    system.settle()
+    assert len(system.slam.keyframe_indices) == 3
+
+
+# ---- the thread ----
+
+
+@pytest.fixture
+def frantic() -> Iterator[None]:
+    """Threads change as often as possible."""
+    usual = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(usual)
+
+
+def test_a_thread_maps_all_keyframes_before_the_results_are_read(frantic: None) -> None:
+    system = RealTime(Slam(config()))
+    for frame in frames(FRAMES):
+        assert np.isfinite(system.step(frame).T_world_camera).all()
+    seen: list[int] = []
+    system.between_frames(lambda: seen.append(len(system.slam.steps)))
+    system.settle()
+    assert seen == [FRAMES] and len(system.trajectory()) == FRAMES
+    assert error_m(system) < 0.05
+    assert len(system.slam.mapper.field) > 100
+
+
+class FullStore(MemoryStore):
+    def save(self, *args: object) -> None:
+        raise RunError("no space left")
+
+
+@pytest.mark.parametrize("schedule", [AtOnce, MappingThread])
+def test_what_mapping_raises_reaches_the_caller(schedule: type) -> None:
+    system = RealTime(Slam(config(), FullStore()), schedule())
+    with pytest.raises(RunError, match="no space left"):
+        for frame in frames(FRAMES):
+            system.step(frame)
+        system.settle()
+    system.settle()  # has nothing left to raise
+    assert len(system.trajectory()) > 0
+
+
+# ---- runs ----
+
+
+def test_a_state_that_was_saved_beside_the_frames_belongs_to_one_frame() -> None:
+    system, states = RealTime(Slam(config()), Drawn(1)), []
+    for number, frame in enumerate(frames(30)):
+        system.step(frame)
+        if number == 20:
+            system.save(lambda: states.append(state_of(system.slam)))
+    system.settle()
+    assert len(states) == 1
+    resumed = Slam(config(), system.slam.store)
+    resumed.prepare(system.slam.view.camera)
+    saved = states[0]
+    restore(resumed, saved | {name: saved[name] for name in saved})
+    assert len(resumed.steps) >= 21 and np.isfinite(resumed.tracker.previous).all()
+
+
+ROOM = "synthetic:frames=200,width=80,height=60"
+SETTINGS = [
+    word
+    for setting in ("input.width=80", "mapping.first_iterations=5", "mapping.iterations=3", "final.iterations=5",
+                    "submaps.frames=10", "registration.iterations=2")
+    for word in ("--set", setting)
+]  # fmt: skip
+
+
+def test_a_recording_in_real_time_has_latencies_and_counts_drops(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    assert exit_code("run", ROOM, "--realtime", "--limit", "30", "--out", str(out), *SETTINGS) == 0
+    run = RunFolder.open(out)
+    log, facts = run.read_log(), run.facts()
+    assert facts["status"] == "complete" and facts["realtime"] and facts["dropped"] == 30 - len(log)
+    assert all(line["seconds"]["latency"] > 0 for line in log)
+    assert len(run.read_trajectory()) == len(log) - sum(line["lost"] for line in log)
+
+
+def started(out: Path) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "sigmasplat.cli", "run", ROOM, "--realtime", "--no-eval", "--save-every", "0.01"]
+    process = subprocess.Popen(
+        [*command, "--out", str(out), *SETTINGS], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=os.environ,
+    )  # fmt: skip
+    deadline_s = time.monotonic() + 90
+    while not (out / "state.safetensors").exists() or len(RunFolder(out).read_log()) < 12:
+        assert process.poll() is None and time.monotonic() < deadline_s
+        time.sleep(0.01)
+    return process
+
+
+def test_ctrl_c_leaves_a_valid_run_with_all_frames_mapped(tmp_path: Path) -> None:
+    process = started(tmp_path / "run")
+    process.send_signal(signal.SIGINT)
+    said, errors = process.communicate(timeout=90)
+    assert process.returncode == 130 and "Traceback" not in said + errors
+    run = RunFolder.open(tmp_path / "run")
+    log = run.read_log()
+    assert run.facts()["status"] == "interrupted" and len(log) == len(run.read_checkpoint()[0]["frame_submap"])
+    assert exit_code("resume", str(tmp_path / "run"), "--no-eval") == 0
+
+
+def test_a_killed_run_resumes(tmp_path: Path) -> None:
+    process = started(tmp_path / "run")
+    process.send_signal(signal.SIGKILL)
+    process.communicate(timeout=90)
+    assert exit_code("resume", str(tmp_path / "run"), "--no-eval") == 0
+    run = RunFolder.open(tmp_path / "run")
+    assert run.facts()["status"] == "complete" and len(run.read_map()) > 100
+    assert len(run.read_checkpoint()[0]["frame_submap"]) == len(run.read_log())
