@@ -38,8 +38,9 @@ class CameraClock:
     """Everything that changes at the rate of the camera.
 
     poses: T_submap_camera [4, 4] of the newest mapped keyframe and of later keyframes and searched frames, in the
-    coordinates of the tracker; frames: number of frames so far; newest: number of the frame of the last keyframe;
-    offered, refused: numbers of keyframes that were handed to the map, and that were not because too many waited;
+    coordinates of the tracker; frames: number of frames so far; newest: number of the frame that is the
+    reference of tracking; offered, refused: numbers of keyframes that were handed to the map, and that were not because
+    too many waited;
     searching: number of the frame that is searched for, −1 = none; waits: numbers of the keyframes not yet mapped.
     """
 
@@ -141,6 +142,7 @@ class CameraClock:
             raise SourceError(no_depth(seen, self.config))
         self.tracker.start(seen, seen.frame.R_inertial_camera)
         self._follow(0, seen, np.eye(4))
+        self.offered, self.waits = 1, (0,)
         return Found(np.eye(4), TRACKED, mapped=True), Offer(seen.separate())
 
     def _offer(self, fit: PoseFit, seen: Observation, view: View, found: Found) -> Offer | None:
@@ -148,42 +150,39 @@ class CameraClock:
         certain = not self.tracker.lost and self.recovery.is_steady and self.tracker.is_certain(fit)
         if not certain or not self._is_keyframe(fit, found.T_submap_camera):
             return None
+        alignment, shown = self.tracker.hop(fit, seen.live), seen.without(self.tracker.front, view)
+        self._follow(self.frames, shown, found.T_submap_camera)
         if len(self.waits) >= self.config.realtime.waiting_most:
             self.refused += 1
             return None
-        found.mapped, alignment = True, self.tracker.hop(fit, seen.live)
-        shown = seen.without(self.tracker.front, view)
-        self._follow(self.frames, shown, found.T_submap_camera)
+        found.mapped, self.offered, self.waits = True, self.offered + 1, (*self.waits, self.frames)
         return Offer(shown.separate(), alignment, self.tracker.front, found.exposure)
 
     def _follow(self, number: int, seen: Observation, T_submap_camera: Matrix) -> None:
         """Track the next frames relative to a frame, before the map has weights for its pixels."""
         reference = Reference(seen.live, se3.inverse(T_submap_camera))
         self.tracker.follow(TrackedKeyframe(reference, seen.image, self.tracker.front))
-        self.newest, self.offered, self.waits = number, self.offered + 1, (*self.waits, number)
+        self.newest = number
 
     def _is_keyframe(self, fit: PoseFit, T_submap_camera: Matrix) -> bool:
         c, since, most_deg = self.config.mapping, self.frames - self.newest, self.config.realtime.keyframe_deg
-        if not most_deg:
+        reference = self.tracker.keyframe
+        if not most_deg or reference is None:
             return is_keyframe(since, c.every, fit.overlap, c.overlap_below)
         depth_m = 1.0 if fit.alignment is None else fit.alignment.depth_m
-        moved = has_moved(se3.inverse(self.poses[self.newest]) @ T_submap_camera, depth_m, most_deg)
+        moved = has_moved(reference.T_camera_world @ T_submap_camera, depth_m, most_deg)
         return moved or fit.overlap < c.overlap_below
 
     def _search(self, fit: PoseFit, seen: Observation, offer: Offer | None) -> Search | None:
         """Return the frame to be searched for in the whole map, if it is lost or doubtful and no other is searched."""
+        if self.searching >= 0 or offer is not None:
+            return None
         searched, apart = self.config.recovery.relocalise, self.recovery.gives_up
-        if self.searching >= 0 or offer is not None or not usable(seen):
-            return None
-        if self.tracker.lost and (searched or apart):
-            self.searching = self.frames
-            return Search(seen.separate(), apart=apart)
-        if not searched or self.tracker.lost:
-            return None
-        if fit.comparison is None or not is_questionable(self.tracker.doubtful):
+        lost, questionable = self.tracker.lost, fit.comparison is not None and is_questionable(self.tracker.doubtful)
+        if not ((lost and (searched or apart)) or (not lost and searched and questionable)) or not usable(seen):
             return None
         self.searching = self.frames
-        return Search(seen.separate(), fit.comparison)
+        return Search(seen.separate(), apart=apart) if lost else Search(seen.separate(), fit.comparison)
 
     def _probe(self, number: int, seen: Observation, found: Found) -> Target | None:
         """Return the images of a frame that may become a probe view."""

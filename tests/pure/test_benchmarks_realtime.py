@@ -1,0 +1,38 @@
+"""The benchmark of real time: which latencies count, and what its table says."""
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmark_results import laid_out
+from sigmasplat.config import Config
+from sigmasplat.io.runs import RunFolder
+
+realtime = importlib.import_module("realtime")
+
+
+def figures(**changed: Any) -> dict[str, Any]:
+    usual = {"frames": 10, "lost": 0, "keyframes": 3, "dropped": 0, "ate_cm": 1.1, "psnr_db": 24.0}
+    return usual | {"latency_ms": {"p50": 9.0, "p99": 20.0, "worst": 31.0}} | changed
+
+
+def test_latencies_of_the_first_second_do_not_count(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run", Config(), "made")
+    for i in range(60):
+        seconds = {"total": 0.01, "latency": 0.5 if i <= 30 else 0.001 * i}
+        run.log({"timestamp_s": i / 30, "lost": False, "is_keyframe": i % 10 == 0, "seconds": seconds})
+    run.write_metrics({"ate": {"rmse_m": 0.02}, "training": {"psnr_db": 25.0}})
+    run.note(dropped=2)
+    found = realtime.figures_of(run)
+    assert found["latency_ms"]["worst"] == 59.0 and 31 <= found["latency_ms"]["p50"] <= 46
+    assert found["ate_cm"] == pytest.approx(2.0) and found["dropped"] == 2 and found["keyframes"] == 6
+
+
+def test_the_table_compares_both_runs_and_shows_the_goals() -> None:
+    other = figures(ate_cm=1.0, psnr_db=24.5, latency_ms=None, dropped=None)
+    found = {"source": "room", "seed": 0} | realtime.compared(figures(), other)
+    table = laid_out("realtime", {"runs": [found]})["Real time"]
+    assert list(table.rows[0]) == ["room", "0", "9.00", "20.0", "31.0", "0", "0", "1.10", "1.10", "0.50"]
+    assert list(table.rows[1][2:5]) == ["≤ 12", "≤ 33", "≤ 66"]
