@@ -17,6 +17,7 @@ import numpy as np
 from sigmasplat import RealTime, SigmaSplatError, Slam
 from sigmasplat.io.splats.ply import write_field
 from sigmasplat.io.trajectory import write_trajectory
+from sigmasplat.run.session import interrupt_event
 
 FOCAL = [getattr(cv2, f"CAP_PROP_OBSENSOR_INTRINSIC_{name}") for name in ("FX", "FY", "CX", "CY")]
 
@@ -37,7 +38,7 @@ def main(out: str = "camera-out") -> RealTime:
     K = [capture.get(number) for number in FOCAL]
     slam.on_loop(lambda loop: print(f"loop closed: submaps {loop.query} and {loop.database}"))
     slam.on_correction(lambda moved: print(f"{len(moved.frames)} poses moved by up to {moved.moved_m.max():.3f} m"))
-    try:
+    with interrupt_event() as stopped:  # Ctrl-C ends the loop after an image, never in the middle of one
         for time_s, bgr, depth in images(capture):
             try:
                 step = slam.track(bgr, depth, K, time_s, depth_scale=1000, color_order="bgr")
@@ -47,10 +48,10 @@ def main(out: str = "camera-out") -> RealTime:
             x, y, z = step.T_world_camera[:3, 3]
             std_m = np.nan if step.covariance is None else np.sqrt(step.covariance[:3, :3].trace())
             print(f"{step.index:5d}  {step.state:11s} x={x:+.3f} y={y:+.3f} z={z:+.3f} ± {std_m:.3f} m")
-    except KeyboardInterrupt:
-        print("making the final map")
-    finally:
-        capture.release()
+            if stopped.is_set():
+                break
+    capture.release()
+    print("making the final map")
     slam.finish()
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)

@@ -20,6 +20,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from sigmasplat import RealTime, SigmaSplatError, Slam
 from sigmasplat.io.splats.ply import write_field
+from sigmasplat.run.session import interrupt_event
 
 R_MAP_WORLD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 LAYOUTS = {"rgb8": ("u1", 3), "bgr8": ("u1", 3), "16UC1": ("u2", 1), "mono16": ("u2", 1), "32FC1": ("f4", 1)}
@@ -52,8 +53,6 @@ class SlamNode(Node):
 
     def track(self, color: Image, depth: Image) -> None:
         """Track one pair of images."""
-        if self.K is None:
-            return self.get_logger().warning("no camera_info yet")
         scale = None if depth.encoding == "32FC1" else 1000.0
         time_s, order = color.header.stamp.sec + 1e-9 * color.header.stamp.nanosec, color.encoding[:3]
         try:
@@ -79,11 +78,11 @@ def main() -> None:
     """Run the node until Ctrl-C."""
     rclpy.init()
     node = SlamNode()
-    try:
-        rclpy.spin(node)
-    except KeyboardInterrupt:
-        node.slam.finish()
-        write_field(Path("map.ply"), node.slam.field)
+    with interrupt_event() as stopped:  # Ctrl-C never interrupts an image
+        while not stopped.is_set():
+            rclpy.spin_once(node, timeout_sec=0.1)
+    node.slam.finish()
+    write_field(Path("map.ply"), node.slam.field)
 
 
 if __name__ == "__main__":

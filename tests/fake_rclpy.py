@@ -4,6 +4,7 @@ The messages have the types of ROS 2 Humble as rosbags defines them. Like rclpy'
 zeros and empty lists, and a published message must serialise to the layout of its type.
 """
 
+import signal
 import sys
 from collections.abc import Callable
 from types import ModuleType, SimpleNamespace
@@ -105,15 +106,15 @@ class Robot:
                                 function(a, b)
                             return
 
-        def spin(node: Node) -> None:
+        def spin_once(node: Node, timeout_sec: float) -> None:
             robot.spun()
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
 
         def kind(name: str) -> Callable[[], Any]:
             return lambda: new(name)
 
         modules = {
-            "rclpy": {"init": lambda: None, "spin": spin},
+            "rclpy": {"init": lambda: None, "spin_once": spin_once},
             "rclpy.node": {"Node": Node},
             "rclpy.qos": {"qos_profile_sensor_data": "sensor data"},
             "message_filters": {"Subscriber": Subscriber, "ApproximateTimeSynchronizer": ApproximateTimeSynchronizer},

@@ -131,6 +131,8 @@ def camera_from(K: Camera | Array, width: int, height: int) -> Camera:
         if (K.width, K.height) != (width, height):
             raise SourceError(f"colour is {width}×{height}, but the camera is for {K.width}×{K.height}; see resized")
         return K
+    if K is None:
+        raise SourceError("K is None; give a 3×3 matrix or (fx, fy, cx, cy) in pixels")
     try:
         values = _array("K", K).astype(np.float64)
     except (TypeError, ValueError):
