@@ -6,6 +6,7 @@ zeros and empty lists, and a published message must serialise to the layout of i
 
 import signal
 import sys
+from array import array
 from collections.abc import Callable
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -52,7 +53,10 @@ class Robot:
 
     def send(self, topic: str, message: Any) -> None:
         for function in self.subscriptions.get(topic, []):
-            function(through_the_wire(message))
+            received = through_the_wire(message)
+            if hasattr(received, "data"):
+                received.data = array("B", received.data.tobytes())  # rclpy's type of uint8[]
+            function(received)
 
     def install(self, patch: pytest.MonkeyPatch) -> None:
         """Make the modules importable."""
@@ -134,10 +138,10 @@ def time_s(message: Any) -> float:
     return float(message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec)
 
 
-def image(array: np.ndarray, encoding: str, seconds: float, frame: str, pad: int = 0, big: bool = False) -> Any:
+def image(values: np.ndarray, encoding: str, seconds: float, frame: str, pad: int = 0, big: bool = False) -> Any:
     """Return a sensor_msgs/Image, with padded rows or big-endian numbers."""
-    message, (height, width) = new("sensor_msgs/msg/Image"), array.shape[:2]
-    rows = np.ascontiguousarray(array.byteswap() if big else array).reshape(height, -1).view(np.uint8)
+    message, (height, width) = new("sensor_msgs/msg/Image"), values.shape[:2]
+    rows = np.ascontiguousarray(values.byteswap() if big else values).reshape(height, -1).view(np.uint8)
     data = np.pad(rows, ((0, 0), (0, pad)), constant_values=7)
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(round(seconds * 1e9), 10**9)
     message.header.frame_id, message.encoding, message.is_bigendian = frame, encoding, int(big)

@@ -240,11 +240,13 @@ class PathCovariance:
         """Return the covariance [6, 6] of a frame's motion from its keyframe.
 
         It is that of the hop to the next keyframe, which is tracked against the same image; at the end of a submap,
-        that of the hop before. Computing it for each frame would double the time of tracking.
+        that of the hop before. If the submap has no hop yet, it is that of the newest hop before. Computing it for each
+        frame would double the time of tracking.
         """
         rows, row = self._rows_of_hops(int(self.frame_submap[frame])), int(self._row[frame])
-        near = [self.hops.known(r) for r in (row + 1, row) if rows.start <= r < rows.stop]
-        return next((covariance for covariance in near if covariance is not None), UNKNOWN)
+        near = [r for r in (row + 1, row) if rows.start <= r < rows.stop]
+        known = (self.hops.known(r) for r in near or range(row, -1, -1))
+        return next((covariance for covariance in known if covariance is not None), UNKNOWN)
 
     @lru_cache(maxsize=64)  # noqa: B019 - the object lives as long as one evaluation or export
     def _error_of_keyframe(self, row: int) -> Matrix:
