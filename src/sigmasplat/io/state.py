@@ -19,7 +19,10 @@ from sigmasplat.io.tensors import open_tensors, write_tensors
 INLINE = 64
 """Arrays with at most this many numbers are stored in the text, since there are many poses and each tensor needs a
 header."""
-VERSION = "4"
+VERSION = "5"
+TEXT = "state"
+"""Name of the tensor with the tree as JSON, bytes."""
+_json = json.JSONEncoder().encode
 
 
 def write_state(path: Path, tree: Any, classes: Iterable[type], fixed: Mapping[str, Any]) -> None:
@@ -29,8 +32,9 @@ def write_state(path: Path, tree: Any, classes: Iterable[type], fixed: Mapping[s
     be written, TypeError on any other type in the tree.
     """
     encoder = _Encoder({c.__name__: c for c in classes}, {id(value): name for name, value in fixed.items()})
-    text = json.dumps(encoder.encode(tree))
-    write_tensors(path, encoder.tensors, {"state": text, "version": VERSION})
+    text = encoder.text(tree).encode()
+    encoder.tensors[TEXT] = torch.frombuffer(bytearray(text), dtype=torch.uint8)
+    write_tensors(path, encoder.tensors, {"version": VERSION})
 
 
 def read_state(path: Path, classes: Iterable[type], fixed: Mapping[str, Any]) -> Any:
@@ -42,37 +46,48 @@ def read_state(path: Path, classes: Iterable[type], fixed: Mapping[str, Any]) ->
         if facts.get("version") != VERSION:
             raise RunError(f"{path} was written by another version ({facts.get('version')}); run it again")
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        return _Decoder(tensors, {c.__name__: c for c in classes}, fixed).decode(json.loads(facts["state"]))
+        tree = json.loads(tensors[TEXT].numpy().tobytes())
+        return _Decoder(tensors, {c.__name__: c for c in classes}, fixed).decode(tree)
 
 
 class _Encoder:
-    """Converts objects to JSON values. Large arrays are collected as tensors. An array that is used twice is stored
-    once, so that it is still shared after reading."""
+    """Converts objects to JSON text. Large arrays are collected as tensors. An array that is used twice is stored once,
+    so that it is still shared after reading.
+
+    The text is made part by part. After a long run, a tree of millions of JSON values, or one call that writes them
+    all, would hold Python's lock for a second, and tracking in real time would have to wait.
+    """
 
     def __init__(self, classes: Mapping[str, type], fixed: Mapping[int, str]) -> None:
         self.classes, self.fixed = classes, fixed
         self.tensors: dict[str, Tensor] = {}
         self.seen: dict[int, tuple[str, Any]] = {}
 
-    def encode(self, value: Any) -> Any:
+    def text(self, value: Any) -> str:
+        """Return a value as JSON."""
         if id(value) in self.fixed:
-            return {"fixed": self.fixed[id(value)]}
+            return _json({"fixed": self.fixed[id(value)]})
         if value is None or isinstance(value, bool | int | float | str):
-            return value
+            return _json(value)
         if isinstance(value, np.generic):
-            return value.item()
+            return _json(value.item())
         if isinstance(value, Tensor | np.ndarray):
-            return self._array(value)
+            return _json(self._array(value))
         if isinstance(value, list):
-            return [self.encode(item) for item in value]
+            return self._list(value)
         if isinstance(value, dict):
-            return {"dict": [[self.encode(key), self.encode(item)] for key, item in value.items()]}
+            pairs = ", ".join(f"[{self.text(key)}, {self.text(item)}]" for key, item in value.items())
+            return f'{{"dict": [{pairs}]}}'
         name = type(value).__name__
         if self.classes.get(name) is type(value):
-            return {"object": name, "fields": {n: self.encode(v) for n, v in _fields(value).items()}}
+            fields = ", ".join(f"{_json(n)}: {self.text(v)}" for n, v in _fields(value).items())
+            return f'{{"object": {_json(name)}, "fields": {{{fields}}}}}'
         if type(value) is tuple:
-            return {"tuple": [self.encode(item) for item in value]}
+            return f'{{"tuple": {self._list(value)}}}'
         raise TypeError(f"a state cannot hold {type(value)}")
+
+    def _list(self, values: Iterable[Any]) -> str:
+        return f"[{', '.join(map(self.text, values))}]"
 
     def _array(self, value: Tensor | np.ndarray[Any, Any]) -> Any:
         kind = "tensor" if isinstance(value, Tensor) else "array"

@@ -19,6 +19,9 @@ from sigmasplat.sources.base import Source
 REFINEMENT_CLASSES: tuple[type, ...] = (GaussianField, Refined, Rows, VectorAdam)
 """The classes that a partly refined final map contains."""
 
+MOST_TIME_SHARE = 0.05
+"""Maximum share of the run's time that is spent on saves: a state grows with the number of frames."""
+
 
 def run_now(task: Callable[[], None]) -> None:
     """Run a task at once."""
@@ -27,7 +30,8 @@ def run_now(task: Callable[[], None]) -> None:
 
 @dataclass(eq=False)
 class StateFile:
-    """Checkpointer that writes state.safetensors into a run folder, at most every `every_s` seconds.
+    """Checkpointer that writes state.safetensors into a run folder, at most every `every_s` seconds, and less often if
+    a save takes long (`MOST_TIME_SHARE`).
 
     With every_s = 0 it writes only after the last frame. run_save: runs a save when the state belongs to the last
     frame; in real time that is later (`RealTime.save`). A state takes some tens of MB: it contains the images of the
@@ -39,18 +43,20 @@ class StateFile:
     every_s: float = 0.0
     run_save: Callable[[Callable[[], None]], None] = run_now
     last_s: float = field(default_factory=time.perf_counter)
+    took_s: float = 0.0
 
     def after_frame(self, index: int, wall_s: float) -> None:
         """Save the state after source frame `index`, `wall_s` seconds into the run, if a save is due."""
-        if self.every_s and time.perf_counter() - self.last_s >= self.every_s:
+        if self.every_s and time.perf_counter() >= self.last_s + max(self.every_s, self.took_s / MOST_TIME_SHARE):
             self.last_s = time.perf_counter()
             self.run_save(lambda: self.save(index, wall_s))
 
     def save(self, index: int, wall_s: float) -> None:
         """Write the state after source frame `index`. Raises RunError if it cannot be written."""
-        tree = state_of(self.slam) | {"index": index, "wall_s": wall_s}
+        started_s, tree = time.perf_counter(), state_of(self.slam) | {"index": index, "wall_s": wall_s}
         write_state(self.run.state, tree, CLASSES, fixed(self.slam))
         self.last_s = time.perf_counter()
+        self.took_s = self.last_s - started_s
 
     def delete(self) -> None:
         """Delete the state of a complete run, and its partly refined final map."""

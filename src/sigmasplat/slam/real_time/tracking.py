@@ -187,7 +187,8 @@ class CameraClock:
     def _probe(self, number: int, seen: Observation, found: Found) -> Target | None:
         """Return the images of a frame that may become a probe view."""
         usual = found.state == TRACKED and not found.mapped and self.recovery.is_steady and not self.tracker.doubtful
-        if not usual or is_held_back(number, self.config.input.hold_every):
+        full = len(self.waits) >= self.config.realtime.waiting_most
+        if not usual or full or is_held_back(number, self.config.input.hold_every):
             return None
         probes = Probes(self.config.uncertainty.probes, self.config.mapping.every)
         return seen.target if probes.wants(self.offered - 1, number - self.newest) else None
