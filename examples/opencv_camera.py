@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sigmasplat import SigmaSplatError, Slam
+from sigmasplat import RealTime, SigmaSplatError, Slam
 from sigmasplat.io.splats.ply import write_field
 from sigmasplat.io.trajectory import write_trajectory
 from sigmasplat.run.session import interrupt_event
@@ -32,9 +32,9 @@ def images(capture: cv2.VideoCapture) -> Iterator[tuple[float, np.ndarray, np.nd
             yield time_s, bgr, depth
 
 
-def main(out: str = "camera-out") -> Slam:
+def main(out: str = "camera-out") -> RealTime:
     """Track images until they end or Ctrl-C is pressed, then write trajectory.txt and map.ply into `out`."""
-    capture, slam = cv2.VideoCapture(0, cv2.CAP_OBSENSOR), Slam("sigma")
+    capture, slam = cv2.VideoCapture(0, cv2.CAP_OBSENSOR), RealTime(Slam("sigma"))
     K = [capture.get(number) for number in FOCAL]
     slam.on_loop(lambda loop: print(f"loop closed: submaps {loop.query} and {loop.database}"))
     slam.on_correction(lambda moved: print(f"{len(moved.frames)} poses moved by up to {moved.moved_m.max():.3f} m"))

@@ -18,7 +18,7 @@ from rclpy.qos import qos_profile_sensor_data
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
 
-from sigmasplat import SigmaSplatError, Slam
+from sigmasplat import RealTime, SigmaSplatError, Slam
 from sigmasplat.io.splats.ply import write_field
 from sigmasplat.run.session import interrupt_event
 
@@ -36,11 +36,11 @@ def pixels(message: Image) -> np.ndarray:
 
 
 class SlamNode(Node):
-    """Tracks pairs of images as they arrive. While a pair is processed, only the newest next ones are kept."""
+    """Tracks pairs of images as they arrive; the map is made on another thread."""
 
     def __init__(self) -> None:
         super().__init__("sigmasplat")
-        self.slam, self.K = Slam(self.declare_parameter("preset", "sigma").value), None
+        self.slam, self.K = RealTime(Slam(self.declare_parameter("preset", "sigma").value)), None
         self.publisher = self.create_publisher(Odometry, "odometry", 10)
         self.create_subscription(CameraInfo, "camera_info", self.set_camera, qos_profile_sensor_data)
         topics = [Subscriber(self, Image, name, qos_profile=qos_profile_sensor_data) for name in ("color", "depth")]

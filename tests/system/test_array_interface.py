@@ -1,5 +1,6 @@
 """SLAM on arrays of your own camera: the same bytes as a recorded run, covariances, functions called at events."""
 
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 import torch
 
 from recorded_room import write_images
+from schedules import AtOnce, Drawn
 from sigmasplat import Camera, Slam, open_source
 from sigmasplat.config import Config, InputConfig
 from sigmasplat.config.text import override
@@ -16,6 +18,7 @@ from sigmasplat.errors import ConfigError, SourceError
 from sigmasplat.model import se3
 from sigmasplat.presets import default_preset, preset
 from sigmasplat.slam.path_covariance import PathCovariance
+from sigmasplat.slam.real_time.system import RealTime
 from sigmasplat.slam.step_result import Step
 from small_room import SMALL, frames, walk
 
@@ -191,7 +194,7 @@ def test_a_lost_frame_has_no_covariance_and_an_uncertain_pose() -> None:
 class Recorder:
     """Collects what is called."""
 
-    def __init__(self, slam: Slam) -> None:
+    def __init__(self, slam: Slam | RealTime) -> None:
         self.keyframes: list[Step] = []
         self.loops: list[Any] = []
         self.corrections: list[Any] = []
@@ -258,3 +261,60 @@ def test_a_function_that_fails_leaves_the_state_valid(run: Slam) -> None:
     slam.finish()
     assert failed == [f"at {i}" for i in called] and called == run.keyframe_indices
     assert contents(slam) == contents(run)
+
+
+# ---- in real time ----
+
+
+def test_real_time_gives_the_same_poses_and_covariances_if_mapping_keeps_up() -> None:
+    same = CUTS | {"realtime.keyframe_deg": "0", "realtime.spare_iterations": "0"}
+    usual, system = Slam(settings=same), RealTime(Slam(settings=same), AtOnce())
+    for i in range(14):
+        rgb, depth = images(i)
+        a, b = (each.track(rgb, depth, K, i / 30, depth_scale=1000) for each in (usual, system))
+        assert np.allclose(a.T_world_camera, b.T_world_camera, atol=2e-3) and a.covariance is not None
+        if a.is_keyframe:  # its own motion is measured when it is mapped
+            assert b.covariance is not None and np.linalg.eigvalsh(b.covariance).min() >= 0
+        else:
+            assert np.allclose(a.covariance, b.covariance, rtol=1e-6)
+    with pytest.raises(SourceError, match="repeats"):
+        system.track(rgb, depth, K, 13 / 30, depth_scale=1000)
+    system.settle()
+    assert np.array_equal(usual.trajectory().T_world_camera, system.trajectory().T_world_camera)
+
+
+@pytest.mark.parametrize("schedule", [AtOnce(), Drawn(3), None], ids=["at once", "drawn", "thread"])
+def test_real_time_calls_functions_on_the_thread_of_the_caller(schedule: Any) -> None:
+    system = RealTime(Slam(settings=LOOPS | {"realtime.keyframe_deg": "0"}), schedule)
+    seen, threads = Recorder(system), set[int]()
+    for listen in (system.on_keyframe, system.on_loop, system.on_correction):
+        listen(lambda event: threads.add(threading.get_ident()))
+    for i in range(40):
+        rgb, depth = images(i)
+        step = system.track(rgb, depth, K, i / 30, depth_scale=1000)
+        assert step.covariance is not None and np.isfinite(step.covariance).all()
+    system.finish()
+    assert [step.index for step in seen.keyframes] == [step.index for step in system.slam.steps if step.is_keyframe]
+    closed = {(loop.query, loop.database) for loop in system.loops if loop.accepted}
+    assert closed <= {(loop.query, loop.database) for loop in seen.loops}
+    assert seen.corrections[-1].reason == "final map" and threads == {threading.get_ident()}
+    moved = [correction for correction in seen.corrections[:-1]]
+    assert (len(moved) > 0) == (len(seen.loops) > 0) and all(c.reason == "loop" for c in moved)
+
+
+def test_in_real_time_a_function_that_fails_leaves_the_state_valid() -> None:
+    system = RealTime(Slam(settings=SETTINGS), AtOnce())
+
+    @system.on_keyframe
+    def fails(step: Step) -> None:
+        raise ValueError(f"at {step.index}")
+
+    for i in range(8):
+        rgb, depth = images(i)
+        try:
+            system.track(rgb, depth, K, i / 30, depth_scale=1000)
+        except ValueError as problem:
+            assert str(problem) == f"at {i}"
+        assert system.newest_step().index == i  # type: ignore[union-attr]
+    system.finish()
+    assert len(system.trajectory()) == 8 and system.believed().all()

@@ -225,7 +225,7 @@ def _run_and_score(
     cuda_stages.measure(run_options.profile)
     state = StateFile(start.slam, folder, run_options.save_every)
     start.slam.saved_refinement = RefinementFile(start.slam, folder, run_options.save_every)
-    system, read = (RealTime(start.slam), Arrivals(source)) if realtime else (None, source)
+    system, read = (RealTime(start.slam, covariances=False), Arrivals(source)) if realtime else (None, source)
     if system:
         state.run_save = system.save
         folder.note(realtime=True)

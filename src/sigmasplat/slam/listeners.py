@@ -79,15 +79,41 @@ class Listeners:
         return bool(self.keyframe or self.loop or self.correction)
 
     def notify(self, slam: Observed, before: Before) -> None:
-        """Call the functions for what happened since `before`: keyframe, loops, correction. If functions raise, the
-        others are still called, then the first exception is raised."""
-        new = [loop for loop in slam.loops if loop.accepted and _pair(loop) not in before.closed]
+        """Call the functions for what happened since `before`."""
+        closed = [loop for loop in slam.loops if loop.accepted and _pair(loop) not in before.closed]
         correction = correction_since(slam, before) if self.correction else None
-        problems = _called(self.keyframe, [step for step in slam.steps[before.steps :] if step.is_keyframe])
-        problems += _called(self.loop, new)
-        problems += _called(self.correction, [] if correction is None else [correction])
+        corrections = [] if correction is None else [correction]
+        self.call([step for step in slam.steps[before.steps :] if step.is_keyframe], closed, corrections)
+
+    def call(self, keyframes: Sequence[Step], closed: Sequence[Loop], corrections: Sequence[Correction]) -> None:
+        """Call the functions for keyframes, closed loops and corrections. If functions raise, the others are still
+        called, then the first exception is raised."""
+        problems = _called(self.keyframe, keyframes) + _called(self.loop, closed)
+        problems += _called(self.correction, corrections)
         if problems:
             raise problems[0]
+
+
+class Events:
+    """Collects what the work on the map reports, until the caller's functions can be called."""
+
+    def __init__(self, loops: Sequence[Loop]) -> None:
+        self._closed = {_pair(loop) for loop in loops if loop.accepted}
+        self._new: list[Loop] = []
+        self._corrections: list[Correction] = []
+
+    def add(self, loops: Sequence[Loop], correction: Correction | None) -> None:
+        """Add what a snapshot contains; loops: all pairs tried so far."""
+        new = [loop for loop in loops if loop.accepted and _pair(loop) not in self._closed]
+        self._new += new
+        self._closed |= {_pair(loop) for loop in new}
+        if correction is not None:
+            self._corrections.append(correction)
+
+    def tell(self, listeners: Listeners, keyframes: Sequence[Step] = ()) -> None:
+        """Call the functions for everything collected, and forget it."""
+        closed, corrections, self._new, self._corrections = self._new, self._corrections, [], []
+        listeners.call(keyframes, closed, corrections)
 
 
 def notifying(

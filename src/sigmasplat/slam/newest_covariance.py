@@ -1,4 +1,4 @@
-"""Covariance of the newest frame's pose while frames arrive: that of `path_covariance`, from what is known so far."""
+"""Covariance of a new pose while frames arrive: that of `path_covariance`, from what is known so far."""
 
 from dataclasses import dataclass
 
@@ -15,39 +15,48 @@ FIRST_HOP = np.diag(np.repeat([HOP_M**2, HOP_RAD**2], 3))
 """Covariance of a frame's motion from its keyframe before any motion between keyframes was measured, m² and rad²."""
 
 
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """What the covariance of a new pose needs: of_keyframe [6, 6] of the newest keyframe's pose in the world, and hop
+    [6, 6] of a frame's motion from a keyframe, both of left twists."""
+
+    of_keyframe: Matrix
+    hop: Matrix
+
+    def of(self, T_world_camera: Matrix, hops: int) -> Matrix:
+        """Return the covariance [6, 6] of position and rotation in the axes of the world, m² and rad², of a pose that
+        is so many independent motions away from the keyframe."""
+        A, J = se3.adjoint(T_world_camera), se3.displacement(T_world_camera)
+        return np.asarray(J @ (self.of_keyframe + hops * (A @ self.hop @ A.T)) @ J.T)
+
+
+NO_ERRORS = PoseErrors(np.zeros((6, 6)), FIRST_HOP)
+"""At the first frame."""
+
+
 @dataclass(eq=False)
 class NewestCovariance:
-    """Computes the covariance of the newest pose. The errors of the keyframes are computed again only after a keyframe,
-    the factors of `PathCovariance` only after a closed loop."""
+    """Computes the errors of new poses. Those of the keyframes are computed again only after a keyframe, the factors of
+    `PathCovariance` only after a closed loop."""
 
-    _keyframes: bytes = b""
+    _state: bytes = b""
     _loops: int = 0
     _factors: Factors | None = None
-    _of_keyframe: Matrix | None = None
+    _errors: PoseErrors = NO_ERRORS
 
-    def of(self, atlas: Atlas, closer: LoopCloser, is_keyframe: bool) -> Matrix:
-        """Return the covariance [6, 6] of position and rotation of the newest frame's pose T_world_camera, in the axes
-        of the world, m² and rad²."""
-        submap, keyframe, T_keyframe_camera = atlas.places[-1]
-        T_world_keyframe = atlas.anchors[submap] @ atlas.keyframe_poses[submap][keyframe]
-        T_world_camera = T_world_keyframe @ T_keyframe_camera
-        of_keyframe = self._covariance_of_keyframe(atlas, closer, T_world_keyframe)
-        A, J = se3.adjoint(T_world_camera), se3.displacement(T_world_camera)
-        own = np.zeros((6, 6)) if is_keyframe else A @ newest_hop(atlas) @ A.T
-        return np.asarray(J @ (of_keyframe + own) @ J.T)
-
-    def _covariance_of_keyframe(self, atlas: Atlas, closer: LoopCloser, T_world_keyframe: Matrix) -> Matrix:
-        submap, keyframe, _ = atlas.places[-1]
+    def errors(self, atlas: Atlas, closer: LoopCloser) -> PoseErrors:
+        """Return the errors for poses relative to the newest keyframe."""
+        submap, keyframe = len(atlas.keyframe_poses) - 1, len(atlas.keyframe_poses[-1]) - 1
         counts = np.array([submap, keyframe, sum(map(len, atlas.keyframe_poses)), *atlas.components])
-        state = counts.tobytes() + T_world_keyframe.tobytes()
-        if self._of_keyframe is None or state != self._keyframes:
+        state = counts.tobytes() + (atlas.anchors[-1] @ atlas.keyframe_poses[-1][-1]).tobytes()
+        if state != self._state:
             edges = closer.believed
             loops = sum(edge.loop for edge in edges)
             known = self._factors if loops == self._loops else None
             path = PathCovariance.of_keyframes(atlas, edges, known)
-            self._of_keyframe = path.of_keyframe(submap, keyframe)
-            self._keyframes, self._loops, self._factors = state, loops, path.factors
-        return self._of_keyframe
+            self._errors = PoseErrors(path.of_keyframe(submap, keyframe), newest_hop(atlas))
+            self._state, self._loops, self._factors = state, loops, path.factors
+        return self._errors
 
 
 def newest_hop(atlas: Atlas) -> Matrix:

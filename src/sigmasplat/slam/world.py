@@ -30,7 +30,7 @@ from sigmasplat.slam.localisation.sight import Observation, observe, view_of, wo
 from sigmasplat.slam.loop_closure.closer import Loop, LoopCloser, make_descriptor
 from sigmasplat.slam.mapper import Mapper
 from sigmasplat.slam.merged import components_apart, merged_field
-from sigmasplat.slam.newest_covariance import NewestCovariance
+from sigmasplat.slam.newest_covariance import NewestCovariance, PoseErrors
 from sigmasplat.slam.probes import Probes
 from sigmasplat.slam.refinement import SavedRefinement
 from sigmasplat.slam.step_result import Step, StepTimer
@@ -137,7 +137,14 @@ class World:
             raise SourceError("no pose yet: give a frame to `track` or `step` first")
         if newest.state == LOST:
             return None
-        return self._newest_covariance.of(self.atlas, self.closer, newest.is_keyframe)
+        T_world_camera = (
+            self.atlas.anchors[-1] @ self.atlas.keyframe_poses[-1][-1] @ self.atlas.places[-1].T_keyframe_camera
+        )
+        return self.pose_errors().of(T_world_camera, int(not newest.is_keyframe))
+
+    def pose_errors(self) -> PoseErrors:
+        """Return the errors of poses relative to the newest keyframe."""
+        return self._newest_covariance.errors(self.atlas, self.closer)
 
     def checkpoint(self) -> dict[str, Tensor]:
         """Return what is needed to read a run back, in host memory: the active submap's field with its optimiser state,

@@ -12,10 +12,12 @@ from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.compare import Comparison
 from sigmasplat.fit.target import Target
 from sigmasplat.slam.drift import Drift
+from sigmasplat.slam.listeners import Correction
 from sigmasplat.slam.localisation.foreground import Foreground
 from sigmasplat.slam.localisation.sight import Observation
 from sigmasplat.slam.localisation.tracked_keyframe import TrackedKeyframe
 from sigmasplat.slam.loop_closure.closer import Loop
+from sigmasplat.slam.newest_covariance import NO_ERRORS, PoseErrors
 from sigmasplat.slam.step_result import Step
 from sigmasplat.types import Matrix
 
@@ -31,7 +33,8 @@ class Snapshot:
     submap; state: how the frame came into the map, "" if it was tracked; params [N, 17]: rows of the splats; keyframe:
     reference of the next frames; T_world_submap [4, 4]; spread_m: standard deviation of the submap's position; loops:
     all pairs tried so far; searched: number of the last frame that was searched for in the whole map; seconds: of the
-    work since the snapshot before.
+    work since the snapshot before; errors: of poses relative to the newest keyframe, if the system computes them;
+    correction: of earlier poses since the snapshot before, if a function of the caller wants it.
     """
 
     frame: int
@@ -48,6 +51,8 @@ class Snapshot:
     loops: tuple[Loop, ...] = ()
     searched: int = -1
     seconds: float = 0.0
+    errors: PoseErrors = NO_ERRORS
+    correction: Correction | None = None
 
 
 @dataclass(frozen=True, eq=False)

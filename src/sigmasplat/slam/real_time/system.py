@@ -7,14 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.model.component import Component
+from sigmasplat.errors import SourceError
+from sigmasplat.model.component import LOST, Component
 from sigmasplat.model.field import GaussianField
 from sigmasplat.model.frame import Frame
 from sigmasplat.model.map_uncertainty import MapUncertainty
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.render.backend import set_kernel_threads
 from sigmasplat.render.view import View
+from sigmasplat.slam.array_interface import ArrayInterface
 from sigmasplat.slam.features import make_extractor
+from sigmasplat.slam.listeners import Events
 from sigmasplat.slam.localisation.recovery import Recovery
 from sigmasplat.slam.localisation.sight import view_of, working_frame
 from sigmasplat.slam.loop_closure.closer import Loop
@@ -25,19 +28,21 @@ from sigmasplat.slam.real_time.work import MapClock
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.step_result import Step, StepTimer
 from sigmasplat.slam.tracker import Tracker
-from sigmasplat.types import Progress, no_progress
+from sigmasplat.types import Matrix, Progress, no_progress
 
 
-class RealTime:
+class RealTime(ArrayInterface):
     """Runs a `Slam` on two clocks. `step` tracks a frame and returns; a mapping thread does everything else, and hands
     back snapshots of the map.
 
     Between `step` calls the state of `slam` belongs to the mapping thread: read it in a task (`between_frames`), or
     after `settle`. The results depend on how fast the machine is, so they are not reproducible. schedule: when the work
-    on the map runs, by default on a thread.
+    on the map runs, by default on a thread; covariances: whether `track` and `covariance` return covariances, which
+    cost some milliseconds of work per keyframe. Functions of `on_keyframe`, `on_loop` and `on_correction` are called by
+    the thread that calls `step`, when it learns of the event.
     """
 
-    def __init__(self, slam: Slam, schedule: Schedule | None = None) -> None:
+    def __init__(self, slam: Slam, schedule: Schedule | None = None, covariances: bool = True) -> None:
         self.slam, c = slam, slam.config
         wanted = c.tracking.features or c.recovery.relocalise
         self._extractor = make_extractor(c.features) if wanted else None  # not shared with the mapping thread
@@ -45,6 +50,9 @@ class RealTime:
         self._camera = CameraClock(c, tracker, Recovery(c.recovery))
         self._snapshots: queue.SimpleQueue[Snapshot] = queue.SimpleQueue()
         self._map = MapClock(slam, self._snapshots.put)
+        self._map.with_errors = covariances
+        self.listeners = slam.listeners
+        self._newest, self._events = slam.newest_step(), Events(slam.loops)
         self._schedule = MappingThread() if schedule is None else schedule
         self._view: View | None = None
         self._runs, self._threads = False, 0
@@ -66,7 +74,25 @@ class RealTime:
         tracked = self._camera.track(seen, self._view, timer)
         self._map.given.put(tracked)
         self._schedule.wake()
+        self._newest = tracked.step
+        self._events.tell(self.listeners, [tracked.step] if tracked.step.is_keyframe else [])
         return tracked.step
+
+    def newest_step(self) -> Step | None:
+        """Return the result of the newest frame; None before the first one."""
+        return self._newest
+
+    def covariance(self) -> Matrix | None:
+        """Return the covariance [6, 6] of the newest frame's pose, as `Slam.covariance`; None if that frame is
+        lost, or without `covariances`.
+
+        Raises SourceError before the first frame.
+        """
+        if self._newest is None:
+            raise SourceError("no pose yet: give a frame to `track` or `step` first")
+        if self._newest.state == LOST or not self._map.with_errors:
+            return None
+        return self._camera.covariance(self._newest)
 
     def _start(self, frame: Frame) -> View:
         """Make the two views of the camera, and start the mapping thread."""
@@ -90,6 +116,7 @@ class RealTime:
                 return mapping_s
             mapping_s += snapshot.seconds
             self._camera.adopt(snapshot)
+            self._events.add(snapshot.loops, snapshot.correction)
 
     @property
     def snapshot(self) -> Snapshot | None:
@@ -134,6 +161,7 @@ class RealTime:
             set_kernel_threads(self._threads)
             self._adopt()
             self._give_back(self._camera.copied())
+        self._events.tell(self.listeners)
 
     def _give_back(self, camera: CameraClock) -> None:
         """Put the state of tracking into `slam`."""

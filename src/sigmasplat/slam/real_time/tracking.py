@@ -22,6 +22,7 @@ from sigmasplat.slam.localisation.recovery import Recovery, usable
 from sigmasplat.slam.localisation.sight import Observation
 from sigmasplat.slam.localisation.tracked_keyframe import TrackedKeyframe
 from sigmasplat.slam.localisation.verdict import is_questionable
+from sigmasplat.slam.newest_covariance import NO_ERRORS
 from sigmasplat.slam.probes import Probes
 from sigmasplat.slam.real_time.messages import Offer, Search, Snapshot, TrackedFrame
 from sigmasplat.slam.rules import has_moved, is_held_back, is_keyframe
@@ -102,6 +103,14 @@ class CameraClock:
         """Adopt a snapshot that follows others which were not adopted."""
         if snapshot.frame in self.poses:
             self.adopt(snapshot)
+
+    def covariance(self, step: Step) -> Matrix:
+        """Return the covariance [6, 6] of the newest step's pose, as `World.covariance`. Keyframes that are not mapped
+        yet each add one motion."""
+        s = self.snapshot
+        if s is None:  # then the first frame waits too, whose pose is known
+            return NO_ERRORS.of(step.T_world_camera, len(self.waits) - step.is_keyframe)
+        return s.errors.of(step.T_world_camera, len(self.waits) + (not step.is_keyframe))
 
     # ---- a frame ----
 

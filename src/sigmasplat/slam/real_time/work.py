@@ -11,23 +11,30 @@ from sigmasplat.model import se3
 from sigmasplat.model.atlas import UNKNOWN_HOP, Hop
 from sigmasplat.model.component import APART, RELOCALISED
 from sigmasplat.slam.drift import mean_variance
+from sigmasplat.slam.listeners import Before, correction_since
 from sigmasplat.slam.localisation.relocaliser import Relocation
 from sigmasplat.slam.localisation.sight import Observation
 from sigmasplat.slam.localisation.tracked_keyframe import TrackedKeyframe, found_keyframe, mapped_keyframe
 from sigmasplat.slam.localisation.verdict import is_better
 from sigmasplat.slam.mapping import MapWork
+from sigmasplat.slam.newest_covariance import NO_ERRORS
 from sigmasplat.slam.real_time.messages import Offer, Search, Snapshot, Task, TrackedFrame
 from sigmasplat.slam.step_result import StepTimer
 from sigmasplat.types import Matrix
 
 
 class MapClock:
-    """Does the work that tracking hands over, in the order of the frames. It owns the map, the atlas and the store."""
+    """Does the work that tracking hands over, in the order of the frames. It owns the map, the atlas and the store.
+
+    with_errors: whether snapshots contain the errors of poses.
+    """
 
     def __init__(self, system: MapWork, publish: Callable[[Snapshot], None]) -> None:
         self.system, self.publish = system, publish
         self.given: queue.SimpleQueue[TrackedFrame | Task] = queue.SimpleQueue()
         self.last: Snapshot | None = None
+        self.with_errors = False
+        self._before = Before.of(system)
         self._pending: deque[TrackedFrame | Task] = deque()
         self._spare = 0
         self._found = -1
@@ -179,7 +186,8 @@ class MapClock:
             yield from system.begin_apart()
             yield from self._map_found(number, search.seen, APART)
         elif self.last is not None:
-            self._hand_over(replace(self.last, state="", searched=number, loops=tuple(system.loops), seconds=0.0))
+            last = replace(self.last, state="", searched=number, loops=tuple(system.loops), seconds=0.0)
+            self._hand_over(replace(last, correction=None))
 
     def _has_recovered(self, search: Search) -> bool:
         """Return whether a lost camera was tracked again meanwhile."""
@@ -209,11 +217,15 @@ class MapClock:
         system, seconds = self.system, self._timer.stop(self.system.view)["total"]
         if state:
             self._found = number
+        correction = correction_since(system, self._before) if system.listeners.correction else None
+        self._before = Before.of(system)
+        errors = system.pose_errors() if self.with_errors else NO_ERRORS
         self._hand_over(
             Snapshot(
                 number, self._newest, poses, state, system.mapper.field.params.clone(), keyframe,
                 len(system.atlas.anchors) - 1, system.atlas.components[-1], system.atlas.anchors[-1].copy(),
-                replace(system.drift), system.confidence.spread_m[-1], tuple(system.loops), number, seconds,
+                replace(system.drift), system.confidence.spread_m[-1], tuple(system.loops), number, seconds, errors,
+                correction,
             )
         )  # fmt: skip
 
