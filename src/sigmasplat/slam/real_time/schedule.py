@@ -9,8 +9,9 @@ from typing import Protocol
 from sigmasplat import env
 from sigmasplat.render.backend import set_kernel_threads
 
-NICENESS = 10
-"""How much the mapping thread yields to tracking if both want the same core (Linux)."""
+NICENESS = 5
+"""How much the mapping thread yields to tracking if both want the same core (Linux). With a larger value, other
+programs keep it from running while it holds the interpreter lock, and tracking has to wait for it."""
 SWITCH_S = 0.0005
 """How long a thread may hold the interpreter lock while another one waits for it; Python's default is 5 ms."""
 
