@@ -131,11 +131,12 @@ def _map_sources(run: RunFolder, field: GaussianField, records: Log, final: Fina
     """Return the final map and the submaps, with the poses of the frames in them and the exposures of the frames, if
     the checkpoint has these."""
     anchors = _anchors(run, records, final)
-    saved = {} if anchors is None else run.read_checkpoint()[0]
+    saved = run.read_checkpoint()[0] if (run.path / "checkpoint.safetensors").is_file() else {}
     poses, exposures = (
         np.asarray(saved[name], np.float64) if len(saved.get(name, ())) == len(records) else None
         for name in ("T_submap_camera", "exposure")
     )
+    poses = None if anchors is None else poses
     return views.MapSources(field, run.submaps, anchors, T_submap_camera=poses, exposures=exposures)
 
 
