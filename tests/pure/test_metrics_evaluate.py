@@ -508,6 +508,19 @@ def test_the_path_is_scored_on_keyframes_and_on_all_frames(run: RunFolder) -> No
     assert unknown["ate_keyframes"] is unknown["ate_all_frames"] is None
 
 
+def test_exposures_of_the_checkpoint_are_used_even_if_no_submaps_are_kept(run: RunFolder) -> None:
+    """The images are twice as bright in the exposure of the map as recorded: the score with it differs."""
+    plain = score(run, HandMade(truth_of()), renderer=Gray())
+    half = np.tile([[0.5, 0.0]] * 3, (FRAMES, 1, 1))
+    run.write_checkpoint({"exposure": torch.from_numpy(half)}, {})
+    exposed = score(run, HandMade(truth_of()), renderer=Gray())
+    for kind in ("training", "held_out"):
+        if plain[kind]["views"]:
+            assert exposed[kind]["psnr_neutral_db"] == pytest.approx(plain[kind]["psnr_db"])
+            assert abs(exposed[kind]["psnr_db"] - plain[kind]["psnr_db"]) > 0.5
+    assert plain["training"]["views"]
+
+
 class Gray:
     """Renders gray at any size; the depth is exact."""
 
