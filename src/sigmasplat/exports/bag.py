@@ -9,13 +9,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from sigmasplat.errors import RunError, SigmaSplatError
 from sigmasplat.exports.axes import level_cameras
 from sigmasplat.exports.run_reader import RunReader
 from sigmasplat.floorplan.floor_plan import FloorPlan
-from sigmasplat.io.runs import RunFolder
-from sigmasplat.model import se3
 from sigmasplat.model.component import LOST
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.report.plan import run_floor_plan
@@ -27,6 +26,7 @@ from sigmasplat.robots.frames import (
     OPTICAL,
     T_LINK_OPTICAL,
     WORLD,
+    camera_links,
     levelled_map,
     link_pose,
     ros_covariance,
@@ -93,6 +93,11 @@ class _FinishedPath:
     T_map_world: Matrix
 
     @cached_property
+    def checkpoint(self) -> dict[str, Tensor]:
+        """Return the tensors of the run's checkpoint."""
+        return self.reader.run.read_checkpoint()[0]
+
+    @cached_property
     def believed(self) -> dict[int, Matrix]:
         """Return T_map_link [4, 4] of each believed frame."""
         path = self.reader.believed_path()
@@ -101,7 +106,7 @@ class _FinishedPath:
     @cached_property
     def odometry(self) -> tuple[Matrix, NDArray[np.bool_]]:
         """Return T_odom_camera [F, 4, 4] of all frames, and whether all motions up to each frame were tracked [F]."""
-        tensors, frames = self.reader.run.read_checkpoint()[0], self.reader.frames
+        tensors, frames = self.checkpoint, self.reader.frames
         chain = tensors.get("T_world_camera_odometry", tensors["T_world_camera"]).numpy()
         components = [0] * len(frames)
         if "submap_component" in tensors:
@@ -113,7 +118,7 @@ class _FinishedPath:
     @cached_property
     def errors(self) -> tuple[PathCovariance, PathCovariance] | None:
         """Return the errors of the path, and of the path without loops; None if the run did not record them."""
-        errors = PathCovariance.of(self.reader.run.read_checkpoint()[0])
+        errors = PathCovariance.of(self.checkpoint)
         return None if errors is None else (errors, errors.without_loops())
 
     def in_map(self, row: int) -> Matrix | None:
@@ -147,7 +152,7 @@ def _messages(reader: RunReader, messages: RosMessages, pictures: bool, progress
 def _frames(reader: RunReader, messages: RosMessages, path: _FinishedPath, pictures: bool) -> Iterator[Encoded]:
     """Yield the messages of the frames: transforms, odometry, pose with covariance, loops, images of keyframes."""
     images = reader.keyframes() if pictures else iter(())
-    loops, picture = _loop_frames(reader.run), next(images, None)
+    loops, picture = _loop_frames(reader), next(images, None)
     for row, record in enumerate(reader.frames.log):
         stamp_ns = stamp_of(record["timestamp_s"])
         if picture is not None and picture[0] == row:
@@ -156,23 +161,20 @@ def _frames(reader: RunReader, messages: RosMessages, path: _FinishedPath, pictu
         if reader.frames.states[row] == LOST:
             continue
         T_odom_link = link_pose(T_LINK_OPTICAL @ path.odometry[0][row])
-        links = [(ODOM, LINK, T_odom_link)]
-        if row in path.believed:
-            T_map_link = path.believed[row]
-            links.insert(0, (MAP, ODOM, se3.orthonormalise(T_map_link @ se3.inverse(T_odom_link))))
-        yield messages.transforms(TF, stamp_ns, links)
+        T_map_link = path.believed.get(row)
+        yield messages.transforms(TF, stamp_ns, camera_links(T_odom_link, T_map_link))
         yield messages.odometry(stamp_ns, ODOM, LINK, T_odom_link, path.in_odom(row))
-        if row in path.believed:
+        if T_map_link is not None:
             for topic in (POSE, LOOP) if row in loops else (POSE,):
                 yield messages.pose(topic, stamp_ns, MAP, T_map_link, path.in_map(row))
 
 
-def _loop_frames(run: RunFolder) -> set[int]:
+def _loop_frames(reader: RunReader) -> set[int]:
     """Return the rows of the log at which a loop was found that is accepted at the end."""
-    accepted = {(loop["query"], loop["database"]) for loop in run.read_loops() if loop["accepted"]}
+    accepted = {(loop["query"], loop["database"]) for loop in reader.run.read_loops() if loop["accepted"]}
     return {
         row
-        for row, record in enumerate(run.read_log())
+        for row, record in enumerate(reader.frames.log)
         if any((loop["query"], loop["database"]) in accepted for loop in record.get("loops", ()))
     }
 

@@ -23,6 +23,7 @@ from sigmasplat.robots.frames import (
     T_LINK_OPTICAL,
     T_MAP_WORLD,
     WORLD,
+    camera_links,
     levelled_map,
     link_pose,
     ros_covariance,
@@ -139,10 +140,7 @@ class LiveRobot:
         If the frame's component is not connected to the world, map → odom is not known and left out.
         """
         T_odom_link = link_pose(T_LINK_OPTICAL @ T_odom_camera)
-        links = [(ODOM, LINK, T_odom_link)]
-        if not step.component:
-            T_map_link = link_pose(T_MAP_WORLD @ step.T_world_camera)
-            links.insert(0, (MAP, ODOM, se3.orthonormalise(T_map_link @ se3.inverse(T_odom_link))))
+        links = camera_links(T_odom_link, None if step.component else link_pose(T_MAP_WORLD @ step.T_world_camera))
         known = self.odometry.covariance
         covariance = None if known is None else ros_covariance(known, T_LINK_OPTICAL, T_odom_link)
         self._offer(partial(_pose, self._stamp_ns, links, covariance), TF, ODOMETRY)
