@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import UNKNOWN_HOP, Hop
@@ -70,6 +71,13 @@ class MapWork(World):
             self.keyframe_indices.append(index)
         self.atlas.set_keyframes([keyframe.T_world_camera for keyframe in self.mapper.keyframes], hop)
         return self.atlas.keyframe_poses[-1][-1]
+
+    def hop_to(self, T_camera_submap: Matrix, alignment: Alignment | None) -> Hop:
+        """Return the motion from the newest keyframe to a new one, with its errors; alignment: of the new one to it."""
+        T_camera_before = T_camera_submap @ self.atlas.keyframe_poses[-1][-1]
+        if alignment is None:
+            return UNKNOWN_HOP._replace(T_camera_before=T_camera_before)
+        return Hop(T_camera_before, alignment.covariance, alignment.bias)
 
     def add_drift(self, T_submap_camera: Matrix, hop: Hop) -> float:
         """Add the hop to a keyframe to the submap's drift; return the standard deviation of its position, metres."""

@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sigmasplat.errors import SourceError
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.model import se3
 from sigmasplat.model.atlas import UNKNOWN_HOP, Hop
@@ -18,7 +17,7 @@ from sigmasplat.slam.found import Found
 from sigmasplat.slam.listeners import notifying
 from sigmasplat.slam.localisation.recovery import usable
 from sigmasplat.slam.localisation.relocaliser import Relocation
-from sigmasplat.slam.localisation.sight import Observation, working_frame
+from sigmasplat.slam.localisation.sight import Observation, refuse_first_without_depth, working_frame
 from sigmasplat.slam.localisation.verdict import is_better, is_questionable
 from sigmasplat.slam.mapping import MapWork
 from sigmasplat.slam.rules import is_held_back, is_keyframe
@@ -100,11 +99,7 @@ class Slam(MapWork, ArrayInterface):
     def _begin(self, seen: Observation) -> Found:
         """Start the first submap at the first frame. Its camera is the world, unless there are earlier submaps: then
         it is connected to the place where it is found, or begins a new component."""
-        if not (seen.frame.depth_m > 0).any():
-            raise SourceError(
-                f"frame {seen.frame.index} has no depth reading in [{self.config.input.min_depth_m}, "
-                f"{self.config.input.max_depth_m}] m to start a map from; check the depth scale or start at a later one"
-            )
+        refuse_first_without_depth(seen.frame, self.config)
         self.tracker.start(seen, seen.frame.R_inertial_camera)
         place = self.begin_first(seen)
         if place is None:
@@ -124,7 +119,7 @@ class Slam(MapWork, ArrayInterface):
             certain = self.recovery.is_steady and self.tracker.is_certain(fit)
             found.mapped = certain and not held_back and self._is_keyframe(fit.overlap)
             if found.mapped:
-                found.hop = self._hop(fit, seen)
+                found.hop = self.hop_to(fit.T_camera_world, self.tracker.hop(fit, seen.live))
                 if self.cuts:
                     found.tracking["drift_m"] = self.add_drift(found.T_submap_camera, found.hop)
             if not held_back:
@@ -145,14 +140,6 @@ class Slam(MapWork, ArrayInterface):
     def _is_keyframe(self, overlap: float) -> bool:
         c = self.config.mapping
         return is_keyframe(len(self.steps) - self.mapper.keyframes[-1].index, c.every, overlap, c.overlap_below)
-
-    def _hop(self, fit: PoseFit, seen: Observation) -> Hop:
-        """Return the motion to this keyframe from the one before it, with its errors."""
-        T_camera_before = fit.T_camera_world @ self.atlas.keyframe_poses[-1][-1]
-        alignment = self.tracker.hop(fit, seen.live)
-        if alignment is None:
-            return UNKNOWN_HOP._replace(T_camera_before=T_camera_before)
-        return Hop(T_camera_before, alignment.covariance, alignment.bias)
 
     def _map(self, seen: Observation, found: Found) -> None:
         """Map a keyframe, and cut the submap if a rule ends it here."""

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.config import Config
+from sigmasplat.errors import SourceError
 from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
 from sigmasplat.fit.references import Reference, live_image
 from sigmasplat.fit.target import Target
@@ -109,3 +110,12 @@ class FoundKeyframe(Reference):
     features."""
 
     image: FeatureImage
+
+
+def refuse_first_without_depth(frame: Frame, config: Config) -> None:
+    """Raise SourceError if the first frame of a map, at working size, has no depth."""
+    if not (frame.depth_m > 0).any():
+        raise SourceError(
+            f"frame {frame.index} has no depth reading in [{config.input.min_depth_m}, {config.input.max_depth_m}] m "
+            "to start a map from; check the depth scale or start at a later one"
+        )

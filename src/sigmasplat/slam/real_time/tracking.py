@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sigmasplat.config import Config
-from sigmasplat.errors import SourceError
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Target
@@ -19,7 +18,7 @@ from sigmasplat.slam.drift import Drift
 from sigmasplat.slam.found import Found
 from sigmasplat.slam.localisation.confidence import Confidence
 from sigmasplat.slam.localisation.recovery import Recovery, usable
-from sigmasplat.slam.localisation.sight import Observation
+from sigmasplat.slam.localisation.sight import Observation, refuse_first_without_depth
 from sigmasplat.slam.localisation.tracked_keyframe import TrackedKeyframe
 from sigmasplat.slam.localisation.verdict import is_questionable
 from sigmasplat.slam.newest_covariance import NO_ERRORS
@@ -138,8 +137,7 @@ class CameraClock:
 
     def _begin(self, seen: Observation) -> tuple[Found, Offer]:
         """Start at the first frame, whose camera is the world until the map says otherwise."""
-        if not (seen.frame.depth_m > 0).any():
-            raise SourceError(no_depth(seen, self.config))
+        refuse_first_without_depth(seen.frame, self.config)
         self.tracker.start(seen, seen.frame.R_inertial_camera)
         self._follow(0, seen, np.eye(4))
         self.offered, self.waits = 1, (0,)
@@ -212,11 +210,3 @@ class CameraClock:
             seen.frame.index, seen.frame.timestamp_s, anchor @ found.T_submap_camera, found.mapped, state == LOST,
             found.tracking, splats, submap, loops, timer.stop(view), state, component, p_off,
         )  # fmt: skip
-
-
-def no_depth(seen: Observation, config: Config) -> str:
-    """Return the message for a first frame without depth."""
-    return (
-        f"frame {seen.frame.index} has no depth reading in [{config.input.min_depth_m}, {config.input.max_depth_m}] m "
-        "to start a map from; check the depth scale or start at a later one"
-    )

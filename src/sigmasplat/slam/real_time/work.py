@@ -118,7 +118,7 @@ class MapClock:
             state, T, hop = ("" if place is None else RELOCALISED), np.eye(4), UNKNOWN_HOP
         else:
             state, T = "", self._pose(each)
-            hop = self._hop(offer, T)
+            hop = system.hop_to(se3.inverse(T), offer.alignment)
             self._add_drift(number, T, hop)
         if not first and self._keyframe_waits():
             system.add_keyframe(seen, number, T, hop)
@@ -137,12 +137,6 @@ class MapClock:
         """Place a keyframe, which is the newest one."""
         self.system.atlas.place_frame(self.system.atlas.keyframe_poses[-1][-1])
         self.system.steps.append(each.step)
-
-    def _hop(self, offer: Offer, T_submap_camera: Matrix) -> Hop:
-        T_camera_before = se3.inverse(T_submap_camera) @ self.system.atlas.keyframe_poses[-1][-1]
-        if offer.alignment is None:
-            return UNKNOWN_HOP._replace(T_camera_before=T_camera_before)
-        return Hop(T_camera_before, offer.alignment.covariance, offer.alignment.bias)
 
     def _add_drift(self, number: int, T_submap_camera: Matrix, hop: Hop) -> None:
         system = self.system
