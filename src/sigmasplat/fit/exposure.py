@@ -9,8 +9,8 @@ from sigmasplat.model.exposure import NEUTRAL
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
 
-EVERY = 17
-"""Every 17th pixel is used: 4500 pixels of a 320×240 image determine two numbers per channel well."""
+EVERY = 47
+"""Every 47th pixel is used: 1600 pixels of a 320×240 image determine two numbers per channel well."""
 OPAQUE, DARKEST, BRIGHTEST = 0.9, 0.01, 0.98
 """Pixels are used if the map covers them, and no channel of the recorded colour is black or saturated."""
 OUTLIER = 0.03

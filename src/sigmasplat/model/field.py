@@ -181,6 +181,8 @@ class GaussianField(Rows):
     def append(self, other: "GaussianField") -> None:
         """Append another field's splats, from any device, with new ids. An attribute that only one of the fields has is
         0 for the splats of the other."""
+        if not len(other):
+            return
         for name in {**self.attributes, **other.attributes}:
             self.get_or_create(name).join(other.get_or_create(name))
         self.ids = torch.cat([self.ids, torch.arange(self.next_id, self.next_id + len(other), device=self.ids.device)])
@@ -209,6 +211,8 @@ class GaussianField(Rows):
         """Keep the splats selected by a bool mask [N] or an index tensor."""
         if rows.dtype == torch.bool:
             rows = rows.nonzero().squeeze(1)  # once for all parts: on a device the host waits for the number of rows
+            if len(rows) == len(self):
+                return
         for part in (self, *self.attributes.values()):
             part.choose(rows)
         self.ids = self.ids[rows]

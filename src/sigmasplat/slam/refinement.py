@@ -25,7 +25,7 @@ from sigmasplat.types import Matrix, Progress
 
 EXPOSURE_FROM = 0.1
 """Exposures are fitted from this share of the refinement on: the merged map has the colours of single submaps."""
-CACHE_BYTES = 64 << 20
+CACHE_BYTES = 128 << 20
 """Memory for prepared pictures; other pictures are read again when they are drawn."""
 
 
