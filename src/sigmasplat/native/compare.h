@@ -31,7 +31,7 @@ SIGMA_INLINE float seen_depth(float z, const CompareRules& o) { return z >= floa
 
 static double noise_scale(const float* depth, int width, int height, CompareRules o) {
     const int last = (width - 2) / o.step * o.step;
-    Buffer<double> bends;
+    static thread_local Buffer<double> bends;         // each thread that calls has its own
     double* bend = bends.reserve(size_t(height / o.step + 1) * (width / o.step + 1));
     int64_t n = 0;
     for (int y = 0; y < height; y += o.step)
@@ -78,7 +78,7 @@ static double correlation(const Point* points, int64_t n, double flat) {
 // Write the comparison of `count` points to `found`; comparable: number of readings of the reference that nothing hides.
 static void judge(Point* points, int64_t count, int64_t comparable, int64_t live_readings, const CompareRules& o, double* found) {
     int64_t close = 0, front = 0, behind = 0, kept = 0;
-    Buffer<double> errors;
+    static thread_local Buffer<double> errors;
     double* error = errors.reserve(count);
     for (int64_t i = 0; i < count; i++) {
         const Point p = points[i];
@@ -99,7 +99,7 @@ static void judge(Point* points, int64_t count, int64_t comparable, int64_t live
 
 static bool compare(ComparedImages c, const double* T, CompareRules o, double* found) {
     const double scale = noise_scale(c.live_depth, c.width, c.height, o);
-    Buffer<Point> found_points;
+    static thread_local Buffer<Point> found_points;
     Point* points = found_points.reserve(size_t((c.height + o.step - 1) / o.step) * ((c.width + o.step - 1) / o.step));
     int64_t readings = 0, inside = 0, hidden = 0, count = 0, live_readings = 0;
     for (int v = 0; v < c.height; v += o.step)

@@ -22,7 +22,7 @@ SIGMA_INLINE Pixels load_pixels(const float* p) {
 
 static void halve_color(const float* color, int width, int height, float* half) {
     const int n = 6 * width;                           // floats in a row of the source
-    Buffer<float> means;
+    static thread_local Buffer<float> means;          // each thread that calls has its own
     float* row = means.reserve(n + W);
     for (int y = 0; y < height; y++, half += 3 * width) {
         const float *top = color + size_t(2 * y) * n, *bottom = top + n;
