@@ -19,7 +19,7 @@ from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.denoise import denoised
-from sigmasplat.slam.localisation.feature_image import FeatureImage, detail_of
+from sigmasplat.slam.localisation.feature_image import FeatureImage, LateDetail
 from sigmasplat.slam.localisation.foreground import Foreground
 
 
@@ -101,7 +101,7 @@ def observe(whole: Frame, working: Frame, view: View, config: Config, extractor:
     target = Target.of(working, (view.sums.shape[1], view.sums.shape[2]))
     live, image = live_image(view, working.color, working.depth_m, target), None
     if extractor is not None:
-        image = FeatureImage(detail_of(whole, config.features.width), working.depth_m, working.camera)
+        image = FeatureImage(LateDetail(whole, config.features.width), working.depth_m, working.camera)
     return Observation(target, live, image, frame=working, whole=whole)
 
 
