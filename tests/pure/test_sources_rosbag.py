@@ -11,7 +11,7 @@ from recordings import FRAMES, Scene, encoded, scene
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import resized_color
+from sigmasplat.model.resizing import resized_color
 from sigmasplat.sources import open_source
 from sigmasplat.sources.camera.depth_registration import DepthRegistration
 from sigmasplat.sources.camera.distortion import Undistortion, distort

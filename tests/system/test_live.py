@@ -2,6 +2,7 @@
 
 import signal
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,9 @@ import pytest
 from command_line import exit_code
 from fake_realsense import Device
 from sigmasplat.io.runs import RunFolder
+from sigmasplat.model.frame import Frame
+from sigmasplat.slam.real_time.system import RealTime
+from sigmasplat.slam.step_result import Step
 from sigmasplat.sources import open_source
 from sigmasplat.sources.realsense import WARM_UP_FRAMES
 
@@ -56,9 +60,25 @@ def test_ctrl_c_ends_the_frames_and_the_run_is_finished_and_scored(
     assert device.started == device.stopped == 1
 
 
-def test_a_live_camera_is_tracked_in_real_time(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
-    """This camera is faster than any tracking: frames are dropped and counted, those that are left are recorded."""
-    device.on_frame = lambda number: signal.raise_signal(signal.SIGINT) if number == WARM_UP_FRAMES + 40 else None
+def test_a_live_camera_is_tracked_in_real_time(
+    device: Device, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """This camera is faster than tracking: frames are dropped and counted, those that are left are recorded."""
+    read, track = threading.Semaphore(0), RealTime.step
+
+    def on_frame(number: int) -> None:
+        if number > WARM_UP_FRAMES:
+            read.release()
+        if number == WARM_UP_FRAMES + 40:
+            signal.raise_signal(signal.SIGINT)
+
+    def track_late(system: RealTime, frame: Frame) -> Step:
+        for _ in range(4):
+            read.acquire(timeout=0.5)  # no frame is read after Ctrl-C
+        return track(system, frame)
+
+    device.on_frame = on_frame
+    monkeypatch.setattr(RealTime, "step", track_late)
     assert exit_code("run", "realsense", "--out", "run", "--no-eval", *QUICK) == 0
     run = RunFolder.open(Path("run"))
     facts, log = run.facts(), run.read_log()

@@ -9,7 +9,8 @@ from sigmasplat.evaluation.finished_run import FinishedRun
 from sigmasplat.evaluation.view_selection import working_frame
 from sigmasplat.metrics.trajectory import aligned_poses, associate
 from sigmasplat.model.exposure import NEUTRAL
-from sigmasplat.model.frame import Frame, resized_depth
+from sigmasplat.model.frame import Frame
+from sigmasplat.model.resizing import resized_depth
 from sigmasplat.model.selection import evenly_spread
 from sigmasplat.sources.base import Source
 from sigmasplat.types import Matrix

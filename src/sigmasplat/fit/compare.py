@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid
+from sigmasplat.native import kernels
 from sigmasplat.types import Matrix
 
 LEVEL = 0
@@ -54,6 +55,21 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
 
     Points of the reference that fall on live pixels of depth `HIDDEN_M` are left out.
     """
+    core = kernels()
+    if core is None:
+        return compare_in_numpy(reference, live, T_live_reference)
+    level = min(LEVEL, len(reference.cameras) - 1)
+    host, c, found = reference.kernels.to_host, reference.cameras[level], np.empty(8)
+    images = [host(plane[level]) for plane in (reference.depth, reference.gray, live.depth, live.gray)]
+    T = np.ascontiguousarray(T_live_reference, np.float64)
+    if not core.compare(*images, [c.fx, c.fy, c.cx, c.cy], T, _rules(HIDDEN_M), found):
+        return NOTHING
+    common, close, front, behind, residual, correlation, points, covered = found.tolist()
+    return Comparison(common, close, front, behind, residual, correlation, int(points), covered)
+
+
+def compare_in_numpy(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comparison:
+    """Return what `compare` returns, but for rounding, also where the kernels are not built."""
     level = min(LEVEL, len(reference.cameras) - 1)
     host, camera = reference.kernels.to_host, reference.cameras[level]
     depth, gray = (host(plane)[::STEP, ::STEP] for plane in (reference.depth[level], reference.gray[level]))
@@ -76,7 +92,10 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
     count, comparable = int(other.sum()), len(u) - int((hidden[top, left] & ~other).sum())
     if count < LEAST_PIXELS:
         return NOTHING
-    difference, noise = difference[other], (NOISE_RELATIVE * seen[other] ** 2 + NOISE_M) * noise_scale(live_depth)
+    difference, noise = (
+        difference[other],
+        (NOISE_RELATIVE * seen[other] ** 2 + NOISE_M) * noise_scale_in_numpy(live_depth),
+    )
     limit = CLOSE_SIGMA * noise + CLOSE_M
     covered = min(1.0, count / max(int(np.count_nonzero(live_depth[::STEP, ::STEP])), 1))
     front = difference <= -limit
@@ -97,6 +116,15 @@ def noise_scale(depth: NDArray[np.float32]) -> float:
     It is measured by the difference of each reading from the mean of its two neighbours in the row. Without noise, this
     difference is nearly 0 on smooth surfaces.
     """
+    core = kernels()
+    if core is None:
+        return noise_scale_in_numpy(depth)
+    scale: float = core.noise_scale(np.ascontiguousarray(depth), _rules(float("inf")))
+    return scale
+
+
+def noise_scale_in_numpy(depth: NDArray[np.float32]) -> float:
+    """Return the same value as `noise_scale`, also where the kernels are not built."""
     rows = depth[::STEP]
     width = (rows.shape[1] - 2) // STEP * STEP
     left, middle, right = (rows[:, i : i + width : STEP] for i in range(3))
@@ -107,6 +135,11 @@ def noise_scale(depth: NDArray[np.float32]) -> float:
     bend = np.abs(middle[read] - 0.5 * (left[read] + right[read])) / noise
     # For normal noise the bend has 1.22 standard deviations, and the median of its absolute value is 0.67 of these.
     return max(1.0, float(np.median(bend)) / (1.2247 * 0.6745))
+
+
+def _rules(hidden_m: float) -> list[float]:
+    """Return the constants of a comparison in the order of the kernels; readings from hidden_m on are left out."""
+    return [STEP, LEAST_PIXELS, NOISE_RELATIVE, NOISE_M, CLOSE_SIGMA, CLOSE_M, FLAT, hidden_m]
 
 
 def _nearest_surface(

@@ -5,13 +5,20 @@ from numpy.typing import NDArray
 from scipy.ndimage import sobel
 from torch import Tensor
 
+from sigmasplat.native import kernels
+
 Image = NDArray[np.float32]
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
 
 def gray_of(color: Image) -> Image:
     """Return the luma [H, W] of colour [H, W, 3]."""
-    return np.asarray(color @ LUMA)
+    core = kernels()
+    if core is None or color.dtype != np.float32 or not color.flags.c_contiguous:
+        return np.asarray(color @ LUMA)
+    gray = np.empty(color.shape[:-1], np.float32)
+    core.gray(color, LUMA.tolist(), gray)
+    return gray
 
 
 def luma(color: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from sigmasplat.model.camera import Camera
 from sigmasplat.model.frame import Detail, Frame
 from sigmasplat.model.photo import Photo
 from sigmasplat.model.submap import Picture
+from sigmasplat.native import kernels
 
 
 @dataclass(eq=False)
@@ -37,6 +38,16 @@ class Target:
     @staticmethod
     def of(frame: Frame, size: tuple[int, int]) -> "Target":
         """Make the target of a frame on planes of `size` = (rows, columns), at least the frame's size."""
+        core = kernels()
+        if core is None:
+            return Target.in_torch(frame, size)
+        color, depth = torch.empty(3, *size), torch.empty(size)
+        readings: int = core.image_planes(frame.color, frame.depth_m, color.numpy(), depth.numpy())
+        return Target(frame.camera, color, depth, readings)
+
+    @staticmethod
+    def in_torch(frame: Frame, size: tuple[int, int]) -> "Target":
+        """Return the target that `of` makes, also where the kernels are not built."""
         h, w = frame.depth_m.shape
         color, depth = torch.zeros(3, *size), torch.zeros(size)
         color[:, :h, :w] = torch.tensor(frame.color).movedim(-1, 0)

@@ -1,20 +1,19 @@
 """One RGB-D image: immutable, checked on construction, without ground truth."""
 
+import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from sigmasplat.errors import SourceError
 from sigmasplat.model import se3
 from sigmasplat.model.camera import Camera
+from sigmasplat.model.resizing import resized_color, resized_depth, within
 from sigmasplat.types import Matrix
 
 COLOR_LIMITS = (-1.0, 2.0)
 """Colour outside these limits has another unit, usually 0…255. Values just outside [0, 1] are accepted."""
-SAME_SURFACE = 1.03
-"""Neighbouring depths up to this ratio are on one surface, so depth between them is interpolated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +65,12 @@ class Frame:
             raise SourceError(
                 f"frame {self.index}: R_inertial_camera is not a rotation [3, 3]; give None if it is not measured"
             )
-        for name, array in (("color", self.color), ("depth_m", self.depth_m)):
-            view = np.ascontiguousarray(array).view()  # a view: the caller's array stays writeable
+        self._keep(self.color, self.depth_m)
+
+    def _keep(self, color: NDArray[np.float32], depth_m: NDArray[np.float32]) -> None:
+        """Keep read-only views of both images; the caller's arrays stay writeable."""
+        for name, array in (("color", color), ("depth_m", depth_m)):
+            view = np.ascontiguousarray(array).view()
             view.setflags(write=False)
             object.__setattr__(self, name, view)
 
@@ -88,7 +91,7 @@ class Frame:
         if (width, height) == (self.camera.width, self.camera.height):
             return self
         color, depth_m = resized_color(self.color, width, height), resized_depth(self.depth_m, width, height)
-        return replace(self, color=color, depth_m=depth_m, camera=self.camera.resized(width, height))
+        return self._with_images(color, depth_m, self.camera.resized(width, height))
 
     def prepared(self, width: int, min_depth_m: float, max_depth_m: float, crop_px: int = 0) -> "Frame":
         """Return the working frame: the size of `Camera.prepared`, and depth 0 outside the range.
@@ -96,14 +99,25 @@ class Frame:
         Raises ConfigError if no pixel would remain after the crop.
         """
         camera = self.camera.prepared(width, crop_px)
-        small = self.resized(camera.width + 2 * crop_px, camera.height + 2 * crop_px)
+        size = camera.width + 2 * crop_px, camera.height + 2 * crop_px
+        if size == (self.camera.width, self.camera.height):
+            color, depth_m = self.color, within(self.depth_m, min_depth_m, max_depth_m)
+        else:
+            color, depth_m = (
+                resized_color(self.color, *size),
+                resized_depth(self.depth_m, *size, min_depth_m, max_depth_m),
+            )
+        if color is self.color and depth_m is self.depth_m and not crop_px:
+            return self
         inner = np.s_[crop_px : crop_px + camera.height, crop_px : crop_px + camera.width]
-        depth = small.depth_m[inner]
-        keep = (depth >= min_depth_m) & (depth <= max_depth_m)
-        if keep.all() and not crop_px:
-            return small
-        color = np.ascontiguousarray(small.color[inner])
-        return replace(self, color=color, depth_m=np.where(keep, depth, np.float32(0.0)), camera=camera)
+        return self._with_images(color[inner], depth_m[inner], camera)
+
+    def _with_images(self, color: NDArray[np.float32], depth_m: NDArray[np.float32], camera: Camera) -> "Frame":
+        """Return the frame with images that were made from its own: their values need no check."""
+        frame = copy.copy(self)
+        object.__setattr__(frame, "camera", camera)
+        frame._keep(color, depth_m)
+        return frame
 
     def seen_by(self, camera: Camera) -> "Frame":
         """Return the frame as a camera with other intrinsics at the same pose sees it: a homography, exact for depth.
@@ -142,91 +156,3 @@ def _interpolated(color: NDArray[np.float32], rows: NDArray[np.float64]) -> NDAr
     share = (at - above).astype(np.float32)[:, None, None]
     below = np.minimum(above + 1, len(color) - 1)
     return np.asarray((1 - share) * color[above] + share * color[below], np.float32)
-
-
-def resized_color(color: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
-    """Return colour [height, width, 3], each pixel the mean over its area."""
-    if color.shape[:2] == (height, width):
-        return color
-    if color.shape[:2] == (2 * height, 2 * width):
-        return _halved(color)
-    planes = [np.ascontiguousarray(color[..., c]) for c in range(3)]
-    small = [np.asarray(Image.fromarray(plane).resize((width, height), Image.Resampling.BOX)) for plane in planes]
-    return np.asarray(np.clip(np.stack(small, -1), 0.0, 1.0), np.float32)
-
-
-def _halved(color: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return colour at half the size, the same bytes as Pillow's box filter, in a fifth of its time."""
-    small = np.empty((color.shape[0] // 2, color.shape[1] // 2, 3), np.float32)
-    for c in range(3):
-        rows = color[:, ::2, c] + color[:, 1::2, c]
-        np.add(rows[::2], rows[1::2], out=small[..., c])
-    small *= np.float32(0.25)
-    return np.clip(small, 0.0, 1.0, out=small)
-
-
-def resized_depth(depth_m: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
-    """Return depth [height, width], m, at the centre of each pixel, 0 without a reading in its area.
-
-    Depth is interpolated where the four readings around the centre are on one surface (`interpolated_depth`). Elsewhere
-    it is the reading of the area that is nearest to the centre: the mean of a near and a far surface is on neither of
-    them.
-    """
-    if depth_m.shape == (height, width):
-        return depth_m.copy()
-    nearest = _nearest_depth(depth_m, width, height)
-    rows, columns = ((np.arange(n) + 0.5) * (m / n) - 0.5 for n, m in zip((height, width), depth_m.shape, strict=True))
-    return interpolated_depth(depth_m, rows, columns, nearest)
-
-
-def interpolated_depth(
-    depth_m: NDArray[np.float32],
-    rows: NDArray[np.float64],
-    columns: NDArray[np.float64],
-    otherwise: NDArray[np.float32],
-) -> NDArray[np.float32]:
-    """Return depth [H, W], m, interpolated at rows [H] and columns [W] (fractional pixels).
-
-    Where the four readings around a position are not on one surface (`SAME_SURFACE`), or where `otherwise` [H, W] is 0,
-    the value of `otherwise` is returned. Depth outside the image is that of its edge.
-    """
-    (h, w), top, left = depth_m.shape, np.floor(rows), np.floor(columns)
-    down, right = (rows - top).astype(np.float32)[:, None], (columns - left).astype(np.float32)
-    corners = [
-        depth_m[np.clip(top.astype(np.intp) + y, 0, h - 1)][:, np.clip(left.astype(np.intp) + x, 0, w - 1)]
-        for y in (0, 1) for x in (0, 1)
-    ]  # fmt: skip
-    least, most = np.minimum.reduce(corners), np.maximum.reduce(corners)
-    above, below = (corners[k] + right * (corners[k + 1] - corners[k]) for k in (0, 2))
-    smooth = (least > 0) & (most < SAME_SURFACE * least) & (otherwise > 0)
-    return np.where(smooth, above + down * (below - above), otherwise)
-
-
-def _nearest_depth(depth_m: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
-    """Return in each pixel's area the reading nearest to its centre, 0 without a reading."""
-    small = np.array(Image.fromarray(depth_m).resize((width, height), Image.Resampling.NEAREST), np.float32)
-    holes = np.flatnonzero(small == 0.0)
-    if not len(holes):
-        return small
-    readings, filled = depth_m.ravel(), small.ravel()
-    at_rows, at_columns = (_area(*sizes) for sizes in zip(depth_m.shape, small.shape, strict=True))
-    around = [(dy, dx) for dy in at_rows for dx in at_columns if dy or dx]
-    for dy, dx in sorted(around, key=lambda d: d[0] ** 2 + d[1] ** 2):
-        source = (at_rows[dy] * depth_m.shape[1])[:, None] + at_columns[dx]
-        found = readings.take(source.ravel().take(holes))
-        filled[holes] = found
-        holes = holes[found == 0.0]
-    return small
-
-
-def _area(size: int, resized: int) -> dict[int, NDArray[np.intp]]:
-    """Return the source pixels whose centres a resized row of pixels covers, by their offset from the nearest one.
-
-    Where a pixel does not reach as far as the offset, its outermost source pixel is repeated.
-    """
-    edges = np.arange(resized + 1) * (size / resized)
-    nearest = (edges[:-1] + 0.5 * size / resized).astype(np.intp)
-    inside = np.ceil(edges - 0.5).astype(np.intp)
-    first, last = np.minimum(inside[:-1], nearest), np.maximum(inside[1:] - 1, nearest)
-    offsets = range(int((first - nearest).min()), int((last - nearest).max()) + 1)
-    return {offset: np.clip(nearest + offset, first, last) for offset in offsets}

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame, interpolated_depth, resized_color
+from sigmasplat.model.frame import Frame
+from sigmasplat.model.resizing import interpolated_depth, resized_color
 
 JPEG_QUALITY = 95
 """Errors of 48 dB PSNR, far below those of any map, at 110 kB for 640×480 pixels. A WebP file of this quality is a

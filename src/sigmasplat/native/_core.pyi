@@ -126,6 +126,35 @@ def mesh_depth(
     depth: Array,
     face: Array,
 ) -> None: ...
+def halve_color(color: Array, half: Array) -> None: ...
+def resize_depth(
+    depth: Array,
+    row_pixels: Array,
+    row_share: Array,
+    column_pixels: Array,
+    column_share: Array,
+    same_surface: float,
+    area_rows: Array,
+    area_columns: Array,
+    least_m: float,
+    most_m: float,
+    resized: Array,
+) -> None: ...
+def image_planes(color: Array, depth: Array, color_planes: Array, depth_plane: Array) -> int: ...
+def gray(color: Array, luma: list[float], gray: Array) -> None: ...
+def halve(image: Array, half: Array) -> None: ...
+def halve_depth(depth: Array, step_m: float, half: Array) -> None: ...
+def noise_scale(depth: Array, rules: list[float]) -> float: ...
+def compare(
+    reference_depth: Array,
+    reference_gray: Array,
+    live_depth: Array,
+    live_gray: Array,
+    intrinsics: list[float],
+    T_live_reference: Array,
+    rules: list[float],
+    found: Array,
+) -> bool: ...
 
 class Level:
     def __init__(

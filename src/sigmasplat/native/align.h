@@ -5,8 +5,32 @@
 #include "align_pixel.h"
 static_assert(CELL % W == 0, "a cell is whole vectors wide");
 
+// A live image with gray and depth of each pixel side by side: one load fetches both of two neighbours.
+struct LivePairs { const float* pairs; int width; };
+SIGMA_INLINE Neighbours neighbours(const LivePairs& live, vi i) {
+    vf above[4], below[4];
+    gather_fours(live.pairs, i + i, above);
+    gather_fours(live.pairs + 2 * live.width, i + i, below);
+    return {{above[0], above[2], below[0], below[2]}, {above[1], above[3], below[1], below[3]}};
+}
+template <int FROM, int... L> SIGMA_INLINE vf interleaved(vf a, vf b, std::integer_sequence<int, L...>) {
+    return __builtin_shufflevector(a, b, (L % 2 * W + FROM + L / 2)...);
+}
+static LivePairs side_by_side(const AlignLevel& L, Buffer<float>& memory) {
+    const int64_t pixels = int64_t(L.width) * L.height;
+    float* pairs = memory.reserve(2 * pixels);
+    int64_t i = 0;
+    for (; i + W <= pixels; i += W) {
+        const vf gray = load(L.live_gray + i), depth = load(L.live_depth + i);
+        store(pairs + 2 * i, interleaved<0>(gray, depth, std::make_integer_sequence<int, W>{}));
+        store(pairs + 2 * i + W, interleaved<W / 2>(gray, depth, std::make_integer_sequence<int, W>{}));
+    }
+    for (; i < pixels; i++) { pairs[2 * i] = L.live_gray[i]; pairs[2 * i + 1] = L.live_depth[i]; }
+    return {pairs, L.width};
+}
+
 // Residuals and derivatives of W reference pixels from (x, y) on. Adds to H and sums (acc) and to b (pull).
-SIGMA_INLINE void add_pixels(const AlignLevel& L, const AlignOptions& o, const Motion& T, int x, int y, vf* acc, vf* pull) {
+SIGMA_INLINE void add_pixels(const AlignLevel& L, const LivePairs& live, const AlignOptions& o, const Motion& T, int x, int y, vf* acc, vf* pull) {
     const size_t at = size_t(y) * L.width + x;
     const int lanes = L.width - x < W ? L.width - x : W;
     alignas(64) float edge[4][W] = {};
@@ -17,11 +41,10 @@ SIGMA_INLINE void add_pixels(const AlignLevel& L, const AlignOptions& o, const M
         if (lanes < W) { memcpy(edge[k], planes[k], lanes * 4); planes[k] = edge[k]; }
     }
     const vf off_x = lane_index() + (float(x) - L.cx);
-    add_residuals(L, o, T, off_x, float(y) - L.cy, first_lanes(lanes), {planes[0], planes[1], planes[2], planes[3]}, acc, pull);
+    add_residuals(L, live, o, T, off_x, float(y) - L.cy, first_lanes(lanes), {planes[0], planes[1], planes[2], planes[3]}, acc, pull);
 }
 
-static void align_step(const AlignLevel* level, const AlignOptions* o, const double* T, double* H, double* b, double* S, double* sums) {
-    const AlignLevel& L = *level;
+static void linearise(const AlignLevel& L, const LivePairs& live, const AlignOptions* o, const double* T, double* H, double* b, double* S, double* sums) {
     const Motion motion = motion_of(T);
     const int bands = (L.height + CELL - 1) / CELL, cells = (L.width + CELL - 1) / CELL;
     Buffer<double> band_sums;
@@ -37,7 +60,7 @@ static void align_step(const AlignLevel* level, const AlignOptions* o, const dou
             const vf used = acc[22], read = acc[23], agreeing = acc[24];
             const int bottom = (band + 1) * CELL < L.height ? (band + 1) * CELL : L.height, right = (cell + 1) * CELL < L.width ? (cell + 1) * CELL : L.width;
             for (int y = band * CELL; y < bottom; y++)
-                for (int x = cell * CELL; x < right; x += W) add_pixels(L, *o, motion, x, y, acc, pull);
+                for (int x = cell * CELL; x < right; x += W) add_pixels(L, live, *o, motion, x, y, acc, pull);
             double g[6];
             for (int k = 0; k < 6; k++) { g[k] = lane_sum(pull[k]); total[21 + k] += g[k]; }
             // Two counts in one sum, exact below 2²⁴: pixels in view without a reading or agreeing, and readings.
@@ -59,14 +82,22 @@ static void align_step(const AlignLevel* level, const AlignOptions* o, const dou
     memcpy(S, total + COMMON + 1, 21 * sizeof(double));
 }
 
+static void align_step(const AlignLevel* level, const AlignOptions* o, const double* T, double* H, double* b, double* S, double* sums) {
+    static thread_local Buffer<float> memory;         // each thread that calls has its own
+    linearise(*level, side_by_side(*level, memory), o, T, H, b, S, sums);
+}
+
 // Align from the coarsest level, `levels[count - 1]`, to the finest. T is the guess on input and the motion on output.
 // found: sums of the last or best iterate of the finest level. Returns the number of steps.
 static int align_images(const AlignLevel* levels, const AlignOptions* options, int count, AlignLoop o, double* T, double* found, int* degenerate) {
     double normal[NORMAL_TERMS];
+    static thread_local Buffer<float> memory;
+    LivePairs live{};
     Descent d = begin_descent(T, count);
-    while (d.level >= 0 && o.iterations > 0) {
+    for (int before = count; d.level >= 0 && o.iterations > 0;) {
         const int k = d.level;
-        align_step(&levels[k], &options[k], d.T, normal, normal + 21, normal + COMMON + 1, normal + 27);
+        if (k != before) live = side_by_side(levels[before = k], memory);
+        linearise(levels[k], live, &options[k], d.T, normal, normal + 21, normal + COMMON + 1, normal + 27);
         take_step(d, o, normal);
     }
     copy(d.T, 12, T);

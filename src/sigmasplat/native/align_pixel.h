@@ -46,9 +46,14 @@ struct ReferencePixels { const float *depth, *gray, *weight_gray, *weight_depth;
 // that are scattered do not matter as long as a quarter of the pixels fall on a reading.
 inline double common_pixels(double in_view, double read) { return in_view < 4.0 * read ? in_view : 4.0 * read; }
 
+// Gray and depth of live pixels: at a position, to its right, below it, and to the right of that.
+struct Neighbours { vf gray[4], depth[4]; };
+
 // Add residuals and derivatives of reference pixels to H (acc, 21), sums (acc + 21, 4) and b (pull, 6). off_x, off_y:
-// position relative to the principal point. inside: lanes that are pixels of the image.
-SIGMA_INLINE void add_residuals(const AlignLevel& L, const AlignOptions& o, const Motion& T, vf off_x, float off_y, Mask inside,
+// position relative to the principal point. inside: lanes that are pixels of the image. `neighbours(live, i)` reads the live
+// pixels next to those with the numbers i.
+template <class Live>
+SIGMA_INLINE void add_residuals(const AlignLevel& L, const Live& live, const AlignOptions& o, const Motion& T, vf off_x, float off_y, Mask inside,
                                 const ReferencePixels& pixels, vf* acc, vf* pull) {
     const float *R = T.R, *t = T.t;
     const vf d = load(pixels.depth);
@@ -66,8 +71,9 @@ SIGMA_INLINE void add_residuals(const AlignLevel& L, const AlignOptions& o, cons
     v = clamp(v, 0.f, L.height - 1.001f);
     const vf fu = floor(u), fv = floor(v), a = u - fu, c = v - fv;
     const vi i00 = to_int(fma(fv, splat(float(L.width)), fu));
-    const Bilinear I = interpolate(gather(L.live_gray, i00), gather(L.live_gray + 1, i00), gather(L.live_gray + L.width, i00), gather(L.live_gray + L.width + 1, i00), a, c);
-    const vf d00 = gather(L.live_depth, i00), d10 = gather(L.live_depth + 1, i00), d01 = gather(L.live_depth + L.width, i00), d11 = gather(L.live_depth + L.width + 1, i00);
+    const Neighbours near = neighbours(live, i00);
+    const vf *g = near.gray, d00 = near.depth[0], d10 = near.depth[1], d01 = near.depth[2], d11 = near.depth[3];
+    const Bilinear I = interpolate(g[0], g[1], g[2], g[3], a, c);
     Bilinear D = interpolate(d00, d10, d01, d11, a, c);
     vf nearest = min(min(d00, d10), min(d01, d11));
     const vf farthest = max(max(d00, d10), max(d01, d11));

@@ -3,23 +3,18 @@
 #include <cmath>
 #include <cstring>
 #include <memory>
-#include <stdexcept>
 #include <string>
 #include <vector>
 
 #include <omp.h>
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
-#include "kernels.h"
+#include "bind.h"
 #include "mesh.h"
-
-namespace nb = nanobind;
 
 namespace sigmasplat {
 #if defined(SIGMASPLAT_HAS_avx2)
@@ -41,13 +36,6 @@ inline double only(bool m, double a) { return m ? a : 0.0; }
 }  // namespace sigmasplat
 
 using namespace sigmasplat;
-using Floats = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
-using ConstFloats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
-using Ints = nb::ndarray<int, nb::c_contig, nb::device::cpu>;
-using Bytes = nb::ndarray<uint8_t, nb::c_contig, nb::device::cpu>;
-using Doubles = nb::ndarray<double, nb::c_contig, nb::device::cpu>;
-using ConstDoubles = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
-using ConstInts = nb::ndarray<const int, nb::c_contig, nb::device::cpu>;
 template <class T> using Maybe = std::optional<T>;
 
 static std::vector<const Kernels*> supported() {
@@ -61,10 +49,9 @@ static std::vector<const Kernels*> supported() {
     found.push_back(&baseline::table);
     return found;
 }
-static const Kernels* active = supported().front();
+const Kernels* sigmasplat::active = supported().front();
 
 template <class A> static auto* pointer(Maybe<A>& a) { return a ? a->data() : nullptr; }
-static void need(bool ok, const char* what) { if (!ok) throw std::invalid_argument(what); }
 static Outputs outputs(Floats& sums, Maybe<Floats>& moment, Floats& alpha, Maybe<Ints>& median_id, Maybe<Floats>& median_weight,
                        Maybe<Ints>& dominant_id, Maybe<Floats>& dominant_weight) {
     return {sums.data(), pointer(moment), alpha.data(), pointer(median_id), pointer(median_weight), pointer(dominant_id), pointer(dominant_weight)};
@@ -323,6 +310,7 @@ NB_MODULE(_core, m) {
         }
         return std::make_pair(steps, degenerate);
     });
+    bind_images(m);
     nb::class_<Harmonics>(m, "Harmonics")
         .def(nb::init<Floats, Floats, Floats, Ints, int, int, float, bool>(), nb::arg("params"), nb::arg("moment1"), nb::arg("moment2"),
              nb::arg("last_step"), nb::arg("degree"), nb::arg("step"), nb::arg("rate"), nb::arg("camera_moves_colors"));

@@ -4,6 +4,8 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "image_kernels.h"
+
 namespace sigmasplat {
 
 struct Context;                            // buffers of one render, private to the instruction set that made it
@@ -102,6 +104,7 @@ struct Kernels {
                            float* gray, float* depth, float* weight_gray, float* weight_depth);
     void (*align_step)(const AlignLevel*, const AlignOptions*, const double* T, double* H, double* b, double* S, double* sums);
     int (*align_images)(const AlignLevel*, const AlignOptions*, int levels, AlignLoop, double* T, double* sums, int* degenerate);
+    const ImageKernels* images;
 };
 
 }  // namespace sigmasplat

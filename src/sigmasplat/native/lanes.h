@@ -192,6 +192,24 @@ template <int S = 1> SIGMA_INLINE void transpose(vf* rows) {
     }
 }
 
+// Load four floats for each lane, from p + at on: `out[k]` has the k-th of each.
+typedef float four_floats __attribute__((vector_size(16)));
+template <int... L, class V> SIGMA_INLINE auto joined(V a, V b, std::integer_sequence<int, L...>) { return __builtin_shufflevector(a, b, L...); }
+template <int COUNT> SIGMA_INLINE auto load_fours(const float* p, const int* at) {     // those of each fourth lane
+    if constexpr (COUNT == 1) { four_floats r; memcpy(&r, p + at[0], sizeof r); return r; }
+    else return joined(load_fours<COUNT / 2>(p, at), load_fours<COUNT / 2>(p, at + 2 * COUNT), std::make_integer_sequence<int, 4 * COUNT>{});
+}
+SIGMA_INLINE void gather_fours(const float* p, vi at, vf* out) {
+    constexpr auto lanes = std::make_integer_sequence<int, W>{};
+    alignas(64) int from[W];
+    store(from, at);
+    for (int k = 0; k < 4; k++) out[k] = load_fours<W / 4>(p, from + k);
+    exchange<1>(out[0], out[1], lanes);
+    exchange<1>(out[2], out[3], lanes);
+    exchange<2>(out[0], out[2], lanes);
+    exchange<2>(out[1], out[3], lanes);
+}
+
 // Store past the caches, for values that are not read again soon. Call `fence` before another thread reads them.
 #if defined(__AVX512F__)
 SIGMA_INLINE void stream(float* p, vf a) { _mm512_stream_ps(p, (__m512)a); }
@@ -211,7 +229,6 @@ SIGMA_INLINE void fence() {}
 // A (BLOCK_WIDTH × BLOCK_HEIGHT) block of an image plane; rows are `stride` floats apart.
 typedef float row_of_block __attribute__((vector_size(BLOCK_WIDTH * 4)));
 SIGMA_INLINE row_of_block load_row(const float* p) { row_of_block r; memcpy(&r, p, sizeof r); return r; }
-template <int... L, class V> SIGMA_INLINE auto joined(V a, V b, std::integer_sequence<int, L...>) { return __builtin_shufflevector(a, b, L...); }
 SIGMA_INLINE vf load_block(const float* p, size_t stride) {   // joined in registers: loading data just stored would stall
     constexpr auto two_rows = std::make_integer_sequence<int, 2 * BLOCK_WIDTH>{};
     const auto top = joined(load_row(p), load_row(p + stride), two_rows);

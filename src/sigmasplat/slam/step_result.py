@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +47,7 @@ class Step:
 
 def metrics_of(fit: PoseFit) -> dict[str, float]:
     """Return the tracking values that a step reports."""
-    compared = {} if fit.comparison is None else asdict(fit.comparison)
+    compared = {} if fit.comparison is None else vars(fit.comparison)
     return {
         "agreement": fit.agreement, "overlap": fit.overlap, "first_loss": fit.first_loss,
         "loss": fit.loss, "iterations": float(fit.iterations),

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.camera import Camera
-from sigmasplat.model.frame import Frame, resized_color
+from sigmasplat.model.frame import Frame
 from sigmasplat.model.frame_arrays import color_from_bytes
+from sigmasplat.model.resizing import resized_color
 from sigmasplat.sources.camera.calibration import Calibration, Distortion, resolve_calibration
 from sigmasplat.sources.camera.rectification import Rectification
 from sigmasplat.sources.files.optional import import_optional

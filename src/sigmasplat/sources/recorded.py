@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
-from sigmasplat.model.frame import Frame, resized_color
+from sigmasplat.model.frame import Frame
 from sigmasplat.model.frame_arrays import color_from_bytes
 from sigmasplat.model.gyroscope import Gyroscope
+from sigmasplat.model.resizing import resized_color
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
 from sigmasplat.sources.camera.calibration import Calibration

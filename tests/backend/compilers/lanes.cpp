@@ -153,6 +153,12 @@ static void check_movements() {
     const vf found = gather(numbers, places);
     for (int l = 0; l < W; l++) expect("gather", found[l] == numbers[places[l]]);
     const size_t stride = 11;
+    vi from;
+    for (int l = 0; l < W; l++) from[l] = (7 * l + 3) % (W * W - 4);
+    vf fours[4];
+    gather_fours(numbers, from, fours);
+    for (int k = 0; k < 4; k++)
+        for (int l = 0; l < W; l++) expect("gather_fours", fours[k][l] == numbers[from[l] + k]);
     const vf block = load_block(numbers + 1, stride);
     for (int l = 0; l < W; l++) expect("load_block", block[l] == numbers[1 + l / BLOCK_WIDTH * stride + l % BLOCK_WIDTH]);
     float image[64] = {};

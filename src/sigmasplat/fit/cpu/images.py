@@ -1,4 +1,4 @@
-"""Halve and align images in host memory with numpy and the compiled CPU kernels (native/align.h)."""
+"""Halve and align images in host memory with the compiled CPU kernels (native/resize.h, native/align.h)."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -9,6 +9,7 @@ import torch
 from sigmasplat.fit.gray import Image, gray_of
 from sigmasplat.fit.interface import NORMAL_TERMS, AlignedPose, AlignRules, ImageKernels, LevelPlanes
 from sigmasplat.fit.target import Target
+from sigmasplat.native import kernels
 from sigmasplat.render.backend import backend_module
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
@@ -18,26 +19,54 @@ if TYPE_CHECKING:
 
 Half = Image | None
 
+DEPTH_STEP_M = 0.05
+"""Readings of a cell that differ by this much are not averaged."""
+
 
 def halve(averaged: tuple[Half, Half], depth: Half) -> tuple[Half, Half, Half]:
     """Implement `ImageKernels.halve`."""
-    first, second = (None if image is None else np.asarray(_quarter(image).mean(0)) for image in averaged)
-    return first, second, None if depth is None else _half_depth(depth)
+    first, second = (None if image is None else halved(image) for image in averaged)
+    return first, second, None if depth is None else halved_depth(depth)
+
+
+def halved(image: Image) -> Image:
+    """Return the mean of each 2×2 cell of an image [H, W], as [H/2, W/2]."""
+    core = kernels()
+    if core is None:
+        return halved_in_numpy(image)
+    half = np.empty((image.shape[0] // 2, image.shape[1] // 2), np.float32)
+    core.halve(image, half)
+    return half
+
+
+def halved_depth(depth: Image) -> Image:
+    """Average the readings of 2×2 cells. A cell gets no reading if it has a single one or contains a depth step."""
+    core = kernels()
+    if core is None:
+        return halved_depth_in_numpy(depth)
+    half = np.empty((depth.shape[0] // 2, depth.shape[1] // 2), np.float32)
+    core.halve_depth(depth, DEPTH_STEP_M, half)
+    return half
+
+
+def halved_in_numpy(image: Image) -> Image:
+    """Return the same bytes as `halved`, also where the kernels are not built."""
+    return np.asarray(_quarter(image).mean(0))
+
+
+def halved_depth_in_numpy(depth: Image) -> Image:
+    """Return the same bytes as `halved_depth`, also where the kernels are not built."""
+    cells = _quarter(depth)
+    readings = (cells > 0).sum(0, dtype=np.float32)
+    near, far = np.where(cells > 0, cells, np.float32(np.inf)).min(0), cells.max(0)
+    mean = cells.sum(0) / np.maximum(readings, 1)
+    return np.where((readings > 1) & (far - near < DEPTH_STEP_M), mean, np.float32(0.0))
 
 
 def _quarter(image: Image) -> Image:
     """Return the four pixels of each 2×2 cell, stacked as [4, H/2, W/2]."""
     h, w = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
     return np.stack([image[0:h:2, 0:w:2], image[0:h:2, 1:w:2], image[1:h:2, 0:w:2], image[1:h:2, 1:w:2]])
-
-
-def _half_depth(depth: Image) -> Image:
-    """Average the readings of 2×2 cells. A cell gets no reading if it has a single one or contains a depth step."""
-    cells = _quarter(depth)
-    readings = (cells > 0).sum(0, dtype=np.float32)
-    near, far = np.where(cells > 0, cells, np.float32(np.inf)).min(0), cells.max(0)
-    mean = cells.sum(0) / np.maximum(readings, 1)
-    return np.where((readings > 1) & (far - near < 0.05), mean, np.float32(0.0))
 
 
 def readings_of(finest: Image, coarsest: Image) -> Matrix:

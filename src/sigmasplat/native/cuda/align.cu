@@ -12,7 +12,6 @@ typedef bool Mask;
 #define SIGMA_INLINE inline
 inline vf splat(float a) { return a; }
 inline vf load(const float* p) { return *p; }
-inline vf gather(const float* p, vi i) { return p[i]; }
 inline vf fma(vf a, vf b, vf c) { return fmaf(a, b, c); }
 inline vf min(vf a, vf b) { return fminf(a, b); }
 inline vf max(vf a, vf b) { return fmaxf(a, b); }
@@ -32,6 +31,12 @@ inline vf select(Mask mask, vf a, vf b) { return mask ? a : b; }
 #include "align_level.h"
 #include "align_loop.h"
 #include "align_pixel.h"
+
+struct LivePlanes { const float *gray, *depth; int width; };
+inline Neighbours neighbours(const LivePlanes& live, int i) {
+    const float *g = live.gray + i, *d = live.depth + i;
+    return {{g[0], g[1], g[live.width], g[live.width + 1]}, {d[0], d[1], d[live.width], d[live.width + 1]}};
+}
 
 static_assert(CELL * CELL == THREADS, "a thread for each pixel of a cell");
 constexpr int WARPS = THREADS / 32;
@@ -90,7 +95,7 @@ inline void store_cell(const AlignLevel& L, const AlignOptions& o, const double*
         const size_t at = size_t(y) * L.width + x;
         const ReferencePixels pixel = {L.reference_depth + at, L.reference_gray + at, L.weight_gray ? L.weight_gray + at : nullptr,
                                        L.weight_depth ? L.weight_depth + at : nullptr};
-        add_residuals(L, o, motion_of(T), float(x) - L.cx, float(y) - L.cy, true, pixel, terms, terms + PULL);
+        add_residuals(L, LivePlanes{L.live_gray, L.live_depth, L.width}, o, motion_of(T), float(x) - L.cx, float(y) - L.cy, true, pixel, terms, terms + PULL);
     }
     of_warps[thread / 32][thread % 32] = sum_of_lanes<16>(terms);
     __syncthreads();

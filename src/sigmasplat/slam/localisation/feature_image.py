@@ -1,6 +1,7 @@
 """Find features in the image of a frame: gray at its own size, depth at working size."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,38 @@ def gray_levels(color: NDArray[np.float32]) -> NDArray[np.uint8]:
     return gray
 
 
+class LateDetail:
+    """The gray image of a frame, computed when it is first needed: most frames do not need it."""
+
+    def __init__(self, frame: Frame, width: int) -> None:
+        """frame, width: as in `detail_of`."""
+        self._frame: Frame | None = frame
+        self._detail: Detail | None = None
+        self._width = width
+
+    def get(self) -> Detail:
+        """Return the gray image. Threads may share this object."""
+        frame = self._frame
+        if frame is not None:
+            self._detail = detail_of(frame, self._width)
+            self._frame = None
+        assert self._detail is not None  # it is set before the frame is dropped
+        return self._detail
+
+
+class DetailField:
+    """The field of a dataclass that is given as a `Detail` or as a `LateDetail`, and read as a `Detail`."""
+
+    def __get__(self, owner: Any, _: type) -> Detail:
+        if owner is None:
+            raise AttributeError("the field has no default")
+        given = owner.given_detail
+        return given.get() if isinstance(given, LateDetail) else given
+
+    def __set__(self, owner: Any, given: Detail | LateDetail) -> None:
+        owner.given_detail = given
+
+
 @dataclass(eq=False)
 class FeatureImage:
     """The gray image of a frame at its own size, and its depth [h, w] (m, 0 = no reading) in the working camera.
@@ -44,10 +77,11 @@ class FeatureImage:
     they are first needed, and kept.
     """
 
-    detail: Detail
-    depth_m: NDArray[np.float32]
-    camera: Camera
+    detail: DetailField = DetailField()
+    depth_m: NDArray[np.float32]  # type: ignore[misc]  # mypy takes the descriptor above for a default
+    camera: Camera  # type: ignore[misc]
     weights: NDArray[np.float32] | None = None
+    given_detail: Detail | LateDetail = field(init=False, repr=False)
     _features: Features | None = field(default=None, init=False, repr=False)
     _landmarks: Landmarks | None = field(default=None, init=False, repr=False)
 
@@ -59,13 +93,13 @@ class FeatureImage:
 
     def with_depth(self, depth_m: NDArray[np.float32]) -> "FeatureImage":
         """Return the same image with other depth [h, w], m; features that were found already are kept."""
-        other = FeatureImage(self.detail, depth_m, self.camera, self.weights)
+        other = FeatureImage(self.given_detail, depth_m, self.camera, self.weights)
         other._features = self._features
         return other
 
     def weighed(self, weights: NDArray[np.float32] | None) -> "FeatureImage":
         """Return the same image with other weights; features that were found already are kept."""
-        other = FeatureImage(self.detail, self.depth_m, self.camera, weights)
+        other = FeatureImage(self.given_detail, self.depth_m, self.camera, weights)
         other._features = self._features
         return other
 

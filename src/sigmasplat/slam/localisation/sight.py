@@ -19,7 +19,7 @@ from sigmasplat.render.backend import make_view
 from sigmasplat.render.view import View
 from sigmasplat.slam.features import Extractor
 from sigmasplat.slam.localisation.denoise import denoised
-from sigmasplat.slam.localisation.feature_image import FeatureImage, detail_of
+from sigmasplat.slam.localisation.feature_image import FeatureImage, LateDetail
 from sigmasplat.slam.localisation.foreground import Foreground
 
 
@@ -91,7 +91,8 @@ def working_frame(frame: Frame, config: Config, camera: Camera | None = None) ->
     working = frame.prepared(i.width, i.min_depth_m, i.max_depth_m, i.crop_px)
     if camera is not None and working.camera != camera:
         working = frame.seen_by(camera).prepared(0, i.min_depth_m, i.max_depth_m)
-    return replace(working, depth_m=denoised(working.depth_m)) if i.denoise_depth else working
+    depth_m = denoised(working.depth_m) if i.denoise_depth else working.depth_m
+    return working if depth_m is working.depth_m else replace(working, depth_m=depth_m)
 
 
 def observe(whole: Frame, working: Frame, view: View, config: Config, extractor: Extractor | None) -> Observation:
@@ -100,7 +101,7 @@ def observe(whole: Frame, working: Frame, view: View, config: Config, extractor:
     target = Target.of(working, (view.sums.shape[1], view.sums.shape[2]))
     live, image = live_image(view, working.color, working.depth_m, target), None
     if extractor is not None:
-        image = FeatureImage(detail_of(whole, config.features.width), working.depth_m, working.camera)
+        image = FeatureImage(LateDetail(whole, config.features.width), working.depth_m, working.camera)
     return Observation(target, live, image, frame=working, whole=whole)
 
 
