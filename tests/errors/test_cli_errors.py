@@ -35,7 +35,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["run", "/no/such/place", "--preset", "quick"], "no preset 'quick'"),
         (["run", "/no/such/place", "--set", "tracking.speed=9"], "unknown setting 'tracking.speed'"),
         (["run", "/no/such/place", "--set", "fast"], "SECTION.NAME=VALUE"),
-        (["run", "/no/such/place", "--seed", "-1"], "seed must be finite and not negative"),
+        (["run", "/no/such/place", "--seed", "-1"], "seed must be not negative, found -1"),
         (["demo", "--frames", "0"], "--frames must be at least 1"),
         (["demo", "--frames", "3", "--set", "tracking.method=guess"], "must be one of adam, align"),
         (["eval", "/no/such/run"], "no run folder /no/such/run"),
