@@ -61,8 +61,6 @@ def demo(
 
     example: sigmasplat demo --frames 40
     """
-    if frames < 1:
-        raise ConfigError(f"--frames must be at least 1, found {frames}")
     whole_walk = max(frames, DEMO_FRAMES)  # a short demo is the start of this walk, at the same pace
     limit = options.InputOptions(limit=frames)
     return run(f"synthetic:frames={whole_walk}", preset, settings, out, overwrite=True, input_options=limit, seed=seed)
