@@ -28,7 +28,7 @@ MIN_GAIN = 0.1
 """A delay is reported if its correlation is above that without a delay by this."""
 MIN_DELAY = 0.7
 """Shorter delays, in frames, are not reported."""
-JUMP = 6.0
+JUMP = 2.8
 """A view jumps if the image changes by more than this multiple of the median change around it."""
 JUMP_LEAST = 0.08
 """Smallest mean change of a jump, colours 0 to 1."""
@@ -90,7 +90,8 @@ class Motion:
         one, two = self.changes(), self.changes(2)
         if len(one) < 3:
             return []
-        found = (two[:-1] < SWAPPED * one[:-2]) & (two[1:] < SWAPPED * one[2:])
+        between = (one[1:-1] < one[:-2]) & (one[1:-1] < one[2:])
+        found = between & (two[:-1] < SWAPPED * one[:-2]) & (two[1:] < SWAPPED * one[2:])
         return [int(i) + 1 for i in np.flatnonzero(found)]
 
     def jumps(self) -> list[int]:
@@ -118,3 +119,27 @@ def _correlation(first: Numbers, second: Numbers, lag: int) -> float:
     a = first[: len(first) - lag] if lag >= 0 else first[-lag:]
     b = second[lag:] if lag >= 0 else second[: len(second) + lag]
     return float(np.corrcoef(a, b)[0, 1]) if a.std() > 0 and b.std() > 0 else 0.0
+
+
+def motion_warnings(motion: Motion, first: int = 0) -> list[str]:
+    """Return warnings about consecutive frames; `first` is the number of the first one in the recording."""
+    warnings = []
+    delay = motion.delay_frames()
+    if delay is not None:
+        seconds = abs(delay) * float(np.median(np.diff(motion.times_s)))
+        late, early = ("depth", "colour") if delay > 0 else ("colour", "depth")
+        warnings.append(
+            f"{late} is {seconds:.3f} s ({abs(delay):.1f} frames) behind {early}, judged by the motion of both; "
+            f"subtract this from the times of {late}"
+        )
+    found = {"black": motion.black(), "swapped with the next": motion.swapped()}
+    for name, frames in found.items():
+        if frames:
+            warnings.append(
+                f"{len(frames)} frames are {name} (first: frame {first + frames[0]}); remove or correct them"
+            )
+    if jumps := motion.jumps():
+        warnings.append(
+            f"the view jumps {len(jumps)} times (first: before frame {first + jumps[0]}); tracking may be lost there"
+        )
+    return warnings
