@@ -9,7 +9,7 @@ import dataclasses
 import itertools
 import sys
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_args
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "settings.md"
@@ -18,7 +18,8 @@ HEAD = """# Settings
 `--set SECTION.NAME=VALUE` changes a setting of `demo`, `run`, `inspect` and `bench`. The `config.json` of a run holds
 all settings that it used. *Default* is the value if the preset does not set one. *`{preset}`* is the value of the
 default preset, shown if it differs. Units are in the names: `_m` metres, `_deg` degrees, `_px` pixels, `_s` seconds.
-`lr_` is a learning rate, `weight_` the weight of a loss. "Ours" marks what is in neither paper.
+`lr_` is a learning rate, `weight_` the weight of a loss. "Ours" marks what is in neither paper. *Takes* is the type
+and the valid range. A run is refused if a value is out of range, infinite or not a number; the error names all of them.
 
 Generated from [`config/`](../src/sigmasplat/config/) by `docs/theme/settings.py`. Back to the [README](../README.md).
 """
@@ -38,7 +39,9 @@ def classes() -> dict[str, ast.ClassDef]:
 
 def table(defaults: Any, chosen: Any, preset_name: str, prefix: str = "") -> str:
     """Return the table of one section: a row per field that is not a section itself."""
-    said, kinds = sentences(classes()[type(defaults).__name__].body), get_type_hints(type(defaults))
+    from sigmasplat.config.ranges import kinds_of
+
+    said, kinds = sentences(classes()[type(defaults).__name__].body), kinds_of(type(defaults))
     rows = [f"| setting | takes | default | `{preset_name}` | meaning |", "|---|---|---|---|---|"]
     for name in (field.name for field in dataclasses.fields(defaults)):
         value, other = getattr(defaults, name), getattr(chosen, name)
@@ -78,9 +81,13 @@ def _text(node: ast.stmt) -> str:
 
 
 def _words(kind: Any) -> str:
-    if choices := get_args(kind):  # Literal["a", "b"]
+    from sigmasplat.config.ranges import unpacked
+
+    base, range_ = unpacked(kind)
+    if choices := get_args(base):  # Literal["a", "b"]
         return ", ".join(f"`{choice}`" for choice in choices)
-    return {int: "whole number", float: "number", bool: "`true`, `false`", str: "text"}[kind]
+    name = {int: "whole number", float: "number", bool: "`true`, `false`", str: "text"}[base]
+    return f"{name}, {range_}" if range_ else name
 
 
 def _written(value: Any) -> str:

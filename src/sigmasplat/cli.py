@@ -17,6 +17,7 @@ from sigmasplat.commands.export import export
 from sigmasplat.commands.inspect import inspect
 from sigmasplat.commands.localise import localise
 from sigmasplat.commands.mesh import make_mesh
+from sigmasplat.commands.option_ranges import checked
 from sigmasplat.commands.run import demo, resume, run
 from sigmasplat.commands.view import view
 from sigmasplat.config.text import nearest
@@ -56,7 +57,11 @@ def _refuse_unknown(command: str) -> None:
 def _run_command(arguments: Sequence[str]) -> int:
     """Run the command in the arguments and return its exit code."""
     code: int = tyro.extras.subcommand_cli_from_dict(
-        COMMANDS, prog="sigmasplat", description=DESCRIPTION, args=arguments, config=(tyro.conf.FlagCreatePairsOff,)
+        {name: checked(command) for name, command in COMMANDS.items()},
+        prog="sigmasplat",
+        description=DESCRIPTION,
+        args=arguments,
+        config=(tyro.conf.FlagCreatePairsOff,),
     )
     return code
 

@@ -129,7 +129,7 @@ def test_a_truncated_image_is_skipped_and_counted(
     truncate(tiny_tum / part / "2.png")
     assert exit_code("run", str(tiny_tum), "--out", str(tmp_path / "run"), *QUICK) == 0
     err = capsys.readouterr().err
-    assert err.count("1 unreadable image skipped") == 1 and f"{part}/2.png" in err and "Traceback" not in err
+    assert err.count("1 image skipped") == 1 and f"{part}/2.png" in err and "Traceback" not in err
     run = RunFolder.open(tmp_path / "run")
     assert [record["index"] for record in run.read_log()] == [0, 1, 3]
     skipped = run.facts()["skipped"]

@@ -513,7 +513,7 @@ def test_a_terminal_shows_progress_bars(corridor: Corridor) -> None:
 def test_unreadable_images_are_counted(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:
     corridor.broken = {1, 4}
     assert exit_code("run", "corridor", "--no-eval", "--out", "some") == 0
-    assert "2 unreadable images skipped (first: 1.png is truncated)" in capsys.readouterr().err
+    assert "2 images skipped (first: 1.png is truncated)" in capsys.readouterr().err
     facts = json.loads(Path("some/run.json").read_text())
     assert facts["skipped"] == ["1.png is truncated", "4.png is truncated"]
     assert [record["index"] for record in RunFolder.open(Path("some")).read_log()] == [0, 2, 3, 5]

@@ -1,6 +1,7 @@
 """Settings: values that --set and the environment accept, and saving to config.json."""
 
 import dataclasses
+import math
 import os
 import subprocess
 import sys
@@ -9,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from sigmasplat import env
-from sigmasplat.config import Config
+from sigmasplat.config import SECTIONS, Config
+from sigmasplat.config.ranges import kinds_of, problem_of, unpacked
 from sigmasplat.config.text import override, split_settings
 from sigmasplat.errors import ConfigError
 from sigmasplat.presets import list_presets, preset
@@ -74,6 +76,71 @@ def test_override_refuses(name: str, text: str, says: str) -> None:
     with pytest.raises(ConfigError, match=says) as refused:
         override(Config(), {name: text})
     assert "\n" not in str(refused.value)
+
+
+def test_every_number_has_a_range_and_every_default_is_in_it() -> None:
+    for name, section in SECTIONS.items():
+        assert section.section == name
+        for setting, kind in kinds_of(section).items():
+            base, range_ = unpacked(kind)
+            assert range_ is not None or base not in (int, float), f"{name}.{setting} declares no range"
+            assert problem_of(kind, getattr(section(), setting)) is None, f"{name}.{setting}"
+
+
+@pytest.mark.parametrize(
+    ("section", "setting", "value"),
+    [
+        ("mapping", "every", 0),
+        ("mapping", "every", -1),
+        ("mapping", "every", 1.5),
+        ("mapping", "every", True),
+        ("mapping", "every", "3"),
+        ("mapping", "every", 10**400),
+        ("input", "width", 1),
+        ("input", "width", 100_000),
+        ("input", "max_depth_m", math.nan),
+        ("tracking", "tau", 0.0),
+        ("tracking", "tau", math.inf),
+        ("tracking", "method", "guess"),
+        ("tracking", "exposure", None),
+        ("loops", "weights", 3),
+        ("loops", "weight_max", 0.5),
+        ("seeding", "opacity", 0.0),
+        ("uncertainty", "probes", -1),
+    ],
+)
+def test_values_that_cannot_work_are_refused_in_python_and_in_files(section: str, setting: str, value: object) -> None:
+    with pytest.raises(ConfigError, match=rf"^{section}\.{setting} must be ") as refused:
+        Config().changed(**{section: {setting: value}})
+    with pytest.raises(ConfigError, match=rf"^{section}\.{setting} must be "):
+        Config.from_dict({section: {setting: value}})
+    assert len(str(refused.value)) < 200
+
+
+@pytest.mark.parametrize("section", [None, [], 3, "fast"])
+def test_a_section_that_is_no_object_is_refused(section: object) -> None:
+    with pytest.raises(ConfigError, match="mapping must be an object of settings"):
+        Config.from_dict({"mapping": section})
+
+
+def test_all_invalid_values_are_named_at_once() -> None:
+    wrong = {"mapping.every": "0", "input.width": "1", "tracking.tau": "nan", "trackng.tau": "1", "seed": "-1"}
+    with pytest.raises(ConfigError) as refused:
+        override(Config(), wrong)
+    assert all(name in str(refused.value) for name in wrong) and "\n" not in str(refused.value)
+    with pytest.raises(ConfigError) as refused:
+        Config.from_dict({"mapping": {"every": 0, "window": -1}, "input": {"width": 1}, "seed": -1, "sed": 2})
+    assert all(name in str(refused.value) for name in ("mapping.every", "mapping.window", "input.width", "seed", "sed"))
+
+
+def test_limits_that_depend_on_each_other_are_set_together() -> None:
+    config = override(Config(), {"input.start_s": "5", "input.end_s": "9"})
+    later = override(config, {"input.start_s": "20", "input.end_s": "30"})
+    assert (later.input.start_s, later.input.end_s) == (20.0, 30.0)
+    with pytest.raises(ConfigError, match=r"input\.end_s must be after"):
+        override(config, {"input.start_s": "20"})
+    with pytest.raises(ConfigError, match=r"input\.max_depth_m must be above input\.min_depth_m"):
+        override(config, {"input.min_depth_m": "9"})
 
 
 def test_settings_that_exclude_each_other_are_refused_before_a_run() -> None:

@@ -379,13 +379,13 @@ def test_what_no_map_can_be_made_of_is_refused() -> None:
 @pytest.mark.parametrize(
     ("settings", "complaint"),
     [
-        ({"sh_degree": 4}, "degrees 0 to 3, found 4"),
+        ({"sh_degree": 4}, r"final\.sh_degree must be between 0 and 3, found 4"),
         ({"spacing_m": 0.0}, r"final\.spacing_m must be above 0, found 0\.0"),
         ({"merge_m": 0.0}, r"final\.merge_m must be above 0"),
         ({"lr_decay": 0.0}, r"final\.lr_decay must be above 0"),
         ({"max_axis_ratio": 0.5}, r"final\.max_axis_ratio must be 0 or at least 1"),
-        ({"sh_every": 0}, r"final\.sh_every must be above 0"),
-        ({"prune_every": -1}, r"final\.prune_every must be above 0"),
+        ({"sh_every": 0}, r"final\.sh_every must be at least 1"),
+        ({"prune_every": -1}, r"final\.prune_every must be at least 1"),
     ],
 )
 def test_settings_out_of_range_are_refused(settings: dict[str, object], complaint: str) -> None:

@@ -48,7 +48,7 @@ def test_colour_without_depth_is_left_out_with_a_reason(tiny_tum):
         file.write("9.0 rgb/0.png\n")
     source = open_source(tiny_tum)
     assert len(source) == 4
-    assert source.skipped == [f"{tiny_tum}/rgb/0.png: no depth within 0.02 s"]
+    assert source.skipped == [f"{tiny_tum}/rgb/0.png: no depth within 0.02 s, nearest 8.696 s away"]
 
 
 def test_65535_means_no_reading(tiny_tum):

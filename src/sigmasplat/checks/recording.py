@@ -1,12 +1,15 @@
 """Inspect a recording before a run: format, size, depth and poses; problems that degrade the map, and their fixes."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from sigmasplat.checks.motion import Motion, motion_warnings
 from sigmasplat.checks.registration import EdgeAgreement, edge_agreement, overlay
+from sigmasplat.checks.timing import time_warnings, times_of
 from sigmasplat.config import InputConfig
 from sigmasplat.drawing import colormap, contact_sheet
 from sigmasplat.errors import SourceError
@@ -14,7 +17,7 @@ from sigmasplat.model.frame import Frame
 from sigmasplat.presets import default_preset, list_presets
 from sigmasplat.sources import open_source
 from sigmasplat.sources.base import Source
-from sigmasplat.sources.camera.calibration import CameraUnknown
+from sigmasplat.sources.camera.calibration import CameraUnknown, unlikely_camera
 from sigmasplat.sources.camera.depth_units import depth_warning
 from sigmasplat.sources.opening import format_of
 
@@ -22,7 +25,11 @@ SAMPLES = 16
 SHOWN = 6
 USUAL_FOCAL = 0.9
 """Typical focal length of depth cameras, in image widths: a field of view of 58°. Enough to inspect, not to map."""
-MANY_HOLES = 0.6
+CONSECUTIVE = 300
+"""Number of consecutive frames, in the middle of the recording, whose motion is checked."""
+MANY_UNUSED = 0.05
+"""If more than this share of the images is not used, warn."""
+MANY_HOLES = 0.45
 """If more than this share of the pixels has no depth, warn of holes in the map."""
 MAX_BRIGHTNESS_STEP = 0.2
 """If the median change of brightness between sampled frames is larger than this share, suggest `tracking.exposure`."""
@@ -46,11 +53,17 @@ def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPL
     if not frames:
         raise SourceError(f"{source.name}: none of {samples} sampled frames can be read; check the image files")
     agreement = edge_agreement(frames)
+    times_s = times_of(source)
+    first = max(0, (len(source) - CONSECUTIVE) // 2)
     warnings = [
         *guessed,
+        *_warnings_of_one(unlikely_camera(source.camera)),
+        *time_warnings(times_s),
+        *_unused_warnings(source),
         *_depth_warnings(source, frames, settings),
         *_registration_warnings(source, agreement),
         *_brightness_warnings(frames),
+        *motion_warnings(Motion.of(_consecutive(source, first)), first),
     ]
     rows = [
         ("format", format_.name),
@@ -83,6 +96,27 @@ def _sampled(source: Source, samples: int) -> list[Frame]:
         except SourceError as problem:
             source.skipped.append(str(problem))
     return frames
+
+
+def _consecutive(source: Source, first: int) -> Iterator[Frame]:
+    """Yield the readable frames of the part whose motion is checked."""
+    for i in range(first, min(first + CONSECUTIVE, len(source))):
+        try:
+            yield source.frame(i)
+        except SourceError:
+            continue
+
+
+def _warnings_of_one(warning: str | None) -> list[str]:
+    return [warning] if warning else []
+
+
+def _unused_warnings(source: Source) -> list[str]:
+    """Warn if many images are not used, with the reason of the first one."""
+    unused = len(source.skipped)
+    if unused <= MANY_UNUSED * (len(source) + unused):
+        return []
+    return [f"{unused} of {len(source) + unused} images are not used (first: {source.skipped[0]})"]
 
 
 def _size_rows(source: Source, first: Frame) -> list[tuple[str, str]]:
@@ -139,7 +173,7 @@ def _holes(frames: list[Frame]) -> float:
 
 
 def _depth_warnings(source: Source, frames: list[Frame], settings: InputConfig) -> list[str]:
-    warnings = [warning] if (warning := depth_warning(source)) else []
+    warnings = _warnings_of_one(depth_warning(source))
     if _holes(frames) > MANY_HOLES:
         warnings.append(f"{_holes(frames):.0%} of the pixels have no depth; the map will have holes")
     beyond = np.mean([(frame.depth_m > settings.max_depth_m).mean() for frame in frames])

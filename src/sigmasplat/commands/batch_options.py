@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from sigmasplat.commands.options import arg
+from sigmasplat.commands.options import From1, arg
 
 DataFolders = Annotated[
     tuple[str, ...],
@@ -16,7 +16,7 @@ DataFolders = Annotated[
         help_behavior_hint="(repeatable)",
     ),
 ]
-Jobs = Annotated[int, arg(metavar="N", help="number of runs at the same time on this machine")]
+Jobs = Annotated[From1, arg(metavar="N", help="number of runs at the same time on this machine")]
 Scheduler = Annotated[
     str | None,
     arg(

@@ -51,9 +51,6 @@ class Ablation:
         """Return what to compare. Raises ConfigError on invalid values."""
         if not self.sources:
             raise ConfigError("no SOURCE given; give one or more folders of sequences")
-        for name, value in (("seeds", self.seeds), ("limit", self.limit)):
-            if value is not None and value < 1:
-                raise ConfigError(f"--{name} must be at least 1, found {value}")
         config = common_config(self.preset, self.settings, self.tau)
         return Study(tuple(dict.fromkeys(self.sources)), config, self.seeds, self.limit, self.without_variance)
 

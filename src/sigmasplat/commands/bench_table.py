@@ -52,8 +52,6 @@ class PaperTable:
         from sigmasplat.batch.definition import Table
         from sigmasplat.run.terminal import Screen
 
-        if self.seeds < 1:
-            raise ConfigError(f"--seeds must be at least 1, found {self.seeds}")
         if not self.data:
             raise ConfigError("no --data given; give the folder that contains the scenes of the data set")
         screen = Screen()

@@ -54,10 +54,6 @@ class Uncertainty:
 
         if not self.sources:
             raise ConfigError("no SOURCE given; give one or more folders of sequences")
-        smallest = {"seeds": (self.seeds, 1), "limit": (self.limit, 1), "views": (self.views, 1)}
-        for name, (value, least) in (smallest | {"hold-every": (self.hold_every, 2)}).items():
-            if value is not None and value < least:
-                raise ConfigError(f"--{name} must be at least {least}, found {value}")
         config = study_config(self.preset, self.settings)
         sources = tuple(dict.fromkeys(self.sources))
         return Study(sources, config, self.seeds, self.limit, self.hold_every, self.views)

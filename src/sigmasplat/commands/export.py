@@ -6,12 +6,14 @@ from typing import Annotated, Literal
 
 import tyro
 
-from sigmasplat.commands import options
+from sigmasplat.commands import options, picture_options
 from sigmasplat.commands.options import prepare_torch, refuse_existing, source_of
+from sigmasplat.config.ranges import Range
 from sigmasplat.exports.formats import FORMATS, ExportSource, choose, listed, refuse_unused
 
 MaxSplats = Annotated[
     options.Whole,
+    Range(1),
     tyro.conf.arg(
         metavar="N",
         help="keep at most N splats, those that fill the most pixels of the run's views",
@@ -29,6 +31,7 @@ MapAxes = Annotated[
 ]
 SpzVersion = Annotated[
     options.Whole,
+    Range(2, 4),
     tyro.conf.arg(metavar="{2,3,4}", help="version of SPZ", help_behavior_hint="(default: 3, which most viewers read)"),
 ]
 
@@ -46,12 +49,12 @@ class ExportOptions:
     plain: options.Plain = False
     pictures: options.Pictures = False
     voxel_m: options.VoxelM = 0.01
-    size: options.FilmSize = 0
-    fps: options.FilmRate = 25.0
-    seconds: options.FilmSeconds = None
-    path: options.FilmPath = "run"
-    panels: options.FilmPanels = "all"
-    cell_m: options.CellM = 0.05
+    size: picture_options.FilmSize = 0
+    fps: picture_options.FilmRate = 25.0
+    seconds: picture_options.FilmSeconds = None
+    path: picture_options.FilmPath = "run"
+    panels: picture_options.FilmPanels = "all"
+    cell_m: picture_options.CellM = 0.05
     source: options.MovedSource = None
 
     def given(self) -> list[str]:

@@ -5,6 +5,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from sigmasplat.config.ranges import Range
+
 arg = tyro.conf.arg
 
 MeshFile = Annotated[
@@ -15,7 +17,7 @@ MeshFile = Annotated[
         help_behavior_hint="(default: mesh.ply in RUN)",
     ),
 ]
-Triangles = Annotated[int, arg(metavar="N", help="largest number of triangles; 0 = no limit")]
+Triangles = Annotated[int, Range(0), arg(metavar="N", help="largest number of triangles; 0 = no limit")]
 MeshAxes = Annotated[
     Literal["y-up", "z-up", "y-down", "camera"] | None,
     arg(

@@ -9,8 +9,9 @@ import tyro
 
 from sigmasplat import env
 from sigmasplat.config import Config, InputConfig
+from sigmasplat.config.ranges import Range
 from sigmasplat.config.text import override, split_settings
-from sigmasplat.errors import ConfigError, RunError
+from sigmasplat.errors import RunError
 from sigmasplat.presets import families, preset as preset_of
 from sigmasplat.viewer.server import HOST, PORT
 
@@ -34,6 +35,8 @@ def _number(read: Callable[[str], float]) -> tyro.constructors.PrimitiveConstruc
 
 Whole = Annotated[int | None, _number(int)]
 Number = Annotated[float | None, _number(float)]
+From0 = Annotated[Number, Range(0)]
+From1 = Annotated[int, Range(1)]
 PresetName = Annotated[str, arg(metavar="NAME", help=f"preset of settings to start from: {', '.join(families())}")]
 Shell = Annotated[
     Literal["bash", "zsh"], tyro.conf.Positional, arg(metavar="{bash,zsh}", help="the shell that you use")
@@ -50,7 +53,7 @@ OutFolder = Annotated[
     arg(metavar="DIR", aliases=["--output"], help="run folder", help_behavior_hint="(default: a new one in runs/)"),
 ]
 DemoFolder = Annotated[Path, arg(metavar="DIR", aliases=["--output"], help="run folder")]
-Frames = Annotated[int, arg(metavar="N", help="number of frames")]
+Frames = Annotated[From1, arg(metavar="N", help="number of frames")]
 SourcePath = Annotated[
     str,
     tyro.conf.Positional,
@@ -65,12 +68,12 @@ SourcePaths = Annotated[
         help_behavior_hint="(at least one)",
     ),
 ]
-Seeds = Annotated[int, arg(metavar="N", help="number of runs of each variant, with seeds 0 to N − 1")]
-Runs = Annotated[int, arg(metavar="N", help="number of runs of each sequence, with seeds 0 to N − 1")]
-HoldEvery = Annotated[int, arg(metavar="N", help="hold back every N-th frame from the map")]
-MostViews = Annotated[int, arg(metavar="N", help="largest number of views that are scored, of each kind")]
+Seeds = Annotated[From1, arg(metavar="N", help="number of runs of each variant, with seeds 0 to N − 1")]
+Runs = Annotated[From1, arg(metavar="N", help="number of runs of each sequence, with seeds 0 to N − 1")]
+HoldEvery = Annotated[int, Range(2), arg(metavar="N", help="hold back every N-th frame from the map")]
+MostViews = Annotated[From1, arg(metavar="N", help="largest number of views that are scored, of each kind")]
 StudyFolder = Annotated[Path, arg(metavar="DIR", help="folder of the results; finished runs in it are reused")]
-Tau = Annotated[float, arg(metavar="T", help="τ, the same for every weight and sequence")]
+Tau = Annotated[float, Range(0, open_below=True), arg(metavar="T", help="τ, the same for every weight and sequence")]
 WithoutVariance = Annotated[
     bool, arg(help="also run without learning any variance, as a reference", help_behavior_hint="")
 ]
@@ -84,9 +87,11 @@ Keep = Annotated[
     arg(metavar="DIR", help="keep the run folders in DIR", help_behavior_hint="(default: they are removed)"),
 ]
 Overwrite = Annotated[bool, arg(help="replace an earlier result", help_behavior_hint="")]
-Limit = Annotated[Whole, arg(metavar="N", help="use at most N frames", help_behavior_hint="(default: all)")]
+Limit = Annotated[Whole, Range(1), arg(metavar="N", help="use at most N frames", help_behavior_hint="(default: all)")]
 Profile = Annotated[bool, arg(help="print the time spent in each stage", help_behavior_hint="")]
-SaveEvery = Annotated[float, arg(metavar="S", help="save the state for `resume` every S seconds; 0 = at the end only")]
+SaveEvery = Annotated[
+    float, Range(0), arg(metavar="S", help="save the state for `resume` every S seconds; 0 = at the end only")
+]
 RealTime = Annotated[bool, arg(help="replay a recording at its own times, and track it in real time")]
 AllPoses = Annotated[
     bool,
@@ -107,7 +112,9 @@ Host = Annotated[
     str,
     arg(metavar="ADDRESS", help="address that viewer and stream listen on; the default allows this machine only"),
 ]
-Port = Annotated[int, arg(metavar="N", help="port of the viewer; if it is busy, the next free one is used; 0 = any")]
+Port = Annotated[
+    int, Range(0, 65535), arg(metavar="N", help="port of the viewer; if it is busy, the next free one is used; 0 = any")
+]
 Evaluate = Annotated[bool, arg(name="eval", help="do not score the run: no metrics, no report", help_behavior_hint="")]
 MovedSource = Annotated[
     str | None,
@@ -130,7 +137,11 @@ Record = Annotated[
         help_behavior_hint="(default: recording/ in the run folder)",
     ),
 ]
-VoxelM = Annotated[float, arg(metavar="M", help="edge of a voxel in metres; the truncation distance is 4 voxels")]
+VoxelM = Annotated[
+    float,
+    Range(0, open_below=True),
+    arg(metavar="M", help="edge of a voxel in metres; the truncation distance is 4 voxels"),
+]
 WithMesh = Annotated[
     bool,
     arg(name="mesh", help="also write mesh.ply, and score it if the true surface is known", help_behavior_hint=""),
@@ -141,7 +152,7 @@ OntoRun = Annotated[
     arg(metavar="RUN", help="continue the map of a finished run in a new run folder", help_behavior_hint=""),
 ]
 FinalSeconds = Annotated[
-    Number,
+    From0,
     arg(
         metavar="S",
         help="time budget of the final map's refinement in seconds: short form of --set final.seconds=S",
@@ -162,7 +173,7 @@ FormatName = Annotated[
     arg(metavar="NAME", help="format to write", help_behavior_hint="(default: by the ending of FILE, else ply)"),
 ]
 SigmaBelow = Annotated[
-    Number,
+    From0,
     arg(
         metavar="S",
         help="keep only splats with σ below S, for colours 0 to 1; σ is learned, not calibrated",
@@ -170,7 +181,7 @@ SigmaBelow = Annotated[
     ),
 ]
 StdBelowM = Annotated[
-    Number,
+    From0,
     arg(
         metavar="M",
         help="keep only splats whose surface has a standard deviation of depth below M metres (depth_std_m, "
@@ -179,7 +190,7 @@ StdBelowM = Annotated[
     ),
 ]
 OpacityAbove = Annotated[
-    Number,
+    From0,
     arg(metavar="A", help="keep only splats with opacity above A", help_behavior_hint="(default: all)"),
 ]
 Plain = Annotated[
@@ -192,30 +203,6 @@ Plain = Annotated[
 Pictures = Annotated[
     bool, arg(help="also write the images of the keyframes, and export only keyframes as views", help_behavior_hint="")
 ]
-CellM = Annotated[float, arg(metavar="M", help="cell size of the floor plan in metres")]
-FilmSize = Annotated[
-    int,
-    arg(
-        metavar="PX",
-        help="width of each panel of a video in pixels",
-        help_behavior_hint="(default: that of the run's images)",
-    ),
-]
-FilmRate = Annotated[float, arg(metavar="N", help="images per second of a video")]
-FilmSeconds = Annotated[
-    Number,
-    arg(
-        metavar="S",
-        help="length of a video in seconds",
-        help_behavior_hint="(default: that of the path, 4 to 20; orbit: 12)",
-    ),
-]
-FilmPath = Annotated[
-    Literal["run", "orbit"], arg(help="camera path of a video: along the run's path, or in a circle above the room")
-]
-FilmPanels = Annotated[
-    Literal["all", "color"], arg(help="panels of a video: colour, depth and uncertainty side by side, or colour alone")
-]
 
 
 @dataclass(frozen=True)
@@ -223,13 +210,14 @@ class InputOptions:
     """Options that select and calibrate the input: short forms of the settings input.* of --set."""
 
     limit: Limit = None
-    stride: Annotated[Whole, arg(metavar="N", help="use every N-th frame", help_behavior_hint="")] = None
-    start: Annotated[Number, arg(metavar="S", help="start S seconds after the first frame", help_behavior_hint="")] = (
+    stride: Annotated[Whole, Range(1), arg(metavar="N", help="use every N-th frame", help_behavior_hint="")] = None
+    start: Annotated[From0, arg(metavar="S", help="start S seconds after the first frame", help_behavior_hint="")] = (
         None
     )
-    end: Annotated[Number, arg(metavar="S", help="stop S seconds after the first frame", help_behavior_hint="")] = None
+    end: Annotated[From0, arg(metavar="S", help="stop S seconds after the first frame", help_behavior_hint="")] = None
     hold_out: Annotated[
         Whole,
+        Range(2, or_zero=True),
         arg(
             metavar="N",
             help="hold back every N-th frame: it is tracked but not mapped, so that it can test the map",
@@ -244,20 +232,20 @@ class InputOptions:
         arg(metavar="FILE", help="calibration.json to use instead of the recorded calibration", help_behavior_hint=""),
     ] = None
     fx: Annotated[
-        Number,
+        From0,
         arg(
             metavar="PX",
             help="horizontal focal length in pixels; also the vertical one unless --fy is given",
             help_behavior_hint="",
         ),
     ] = None
-    fy: Annotated[Number, arg(metavar="PX", help="vertical focal length in pixels", help_behavior_hint="")] = None
-    cx: Annotated[Number, arg(metavar="PX", help="column of the principal point in pixels", help_behavior_hint="")] = (
+    fy: Annotated[From0, arg(metavar="PX", help="vertical focal length in pixels", help_behavior_hint="")] = None
+    cx: Annotated[From0, arg(metavar="PX", help="column of the principal point in pixels", help_behavior_hint="")] = (
         None
     )
-    cy: Annotated[Number, arg(metavar="PX", help="row of the principal point in pixels", help_behavior_hint="")] = None
+    cy: Annotated[From0, arg(metavar="PX", help="row of the principal point in pixels", help_behavior_hint="")] = None
     depth_scale: Annotated[
-        Number, arg(metavar="UNITS", help="units of the depth images per metre", help_behavior_hint="")
+        From0, arg(metavar="UNITS", help="units of the depth images per metre", help_behavior_hint="")
     ] = None
     color_topic: Annotated[
         str | None, arg(metavar="NAME", help="ROS bag: topic of the colour images", help_behavior_hint="")
@@ -271,10 +259,7 @@ class InputOptions:
     ] = "auto"
 
     def settings(self) -> dict[str, str]:
-        """Return the given options by the names of their settings. Raises ConfigError on invalid numbers."""
-        for name in ("limit", "stride"):
-            if (value := getattr(self, name)) is not None and value < 1:
-                raise ConfigError(f"--{name} must be at least 1, found {value}")
+        """Return the given options by the names of their settings."""
         names = {"start": "start_s", "end": "end_s", "hold_out": "hold_every"}
         given = {field.name: getattr(self, field.name) for field in fields(self)}
         given["register_depth"] = None if self.register_depth == "auto" else self.register_depth

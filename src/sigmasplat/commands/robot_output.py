@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sigmasplat.commands import options
+from sigmasplat.config.ranges import Range
 from sigmasplat.viewer.server import is_loopback
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ Bag = Annotated[
 ]
 Stream = Annotated[
     options.Whole,
+    Range(0, 65535),
     tyro.conf.arg(
         metavar="PORT",
         help="also stream the same messages over a WebSocket to Foxglove, usually 8765; 0 = any free port",

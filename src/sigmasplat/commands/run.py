@@ -61,8 +61,6 @@ def demo(
 
     example: sigmasplat demo --frames 40
     """
-    if frames < 1:
-        raise ConfigError(f"--frames must be at least 1, found {frames}")
     whole_walk = max(frames, DEMO_FRAMES)  # a short demo is the start of this walk, at the same pace
     limit = options.InputOptions(limit=frames)
     return run(f"synthetic:frames={whole_walk}", preset, settings, out, overwrite=True, input_options=limit, seed=seed)
@@ -152,6 +150,7 @@ def resume_line(next_index: int, frames: int) -> str:
 
 def _opened(screen: "Screen", path: str, config: "Config", record: Path | None) -> tuple["Source", "Config"]:
     """Open the source and warn of doubtful depth; the settings of a live camera become those of its recording."""
+    from sigmasplat.checks.timing import time_warnings, times_of
     from sigmasplat.sources import open_source
     from sigmasplat.sources.camera.depth_units import depth_warning
     from sigmasplat.sources.live import LiveSource, recording_settings
@@ -163,8 +162,10 @@ def _opened(screen: "Screen", path: str, config: "Config", record: Path | None) 
             source.record_to(record)
     elif record:
         raise ConfigError("--record is for a live camera only; this sequence is already a recording")
-    elif warning := depth_warning(source):
-        screen.warn(warning)
+    else:
+        for warning in (depth_warning(source), *time_warnings(times_of(source))):
+            if warning:
+                screen.warn(warning)
     if source.registrable and not source.depth_registered:
         screen.warn("depth and colour come from different cameras; --register-depth on aligns them (see inspect)")
     _warn_without_weights(screen, config)
@@ -291,7 +292,7 @@ def _warn_of_skipped_frames(screen: "Screen", source: "Source") -> None:
 
     if source.skipped:
         images = "image" if len(source.skipped) == 1 else "images"
-        screen.warn(f"{len(source.skipped)} unreadable {images} skipped (first: {source.skipped[0]})")
+        screen.warn(f"{len(source.skipped)} {images} skipped (first: {source.skipped[0]})")
     if isinstance(source, LiveSource) and source.ending:
         screen.warn(source.ending)
     if isinstance(source, LiveSource) and source.dropped:

@@ -12,6 +12,7 @@ from sigmasplat.config.densify import DensifyConfig
 from sigmasplat.config.features import FeatureConfig
 from sigmasplat.config.frames import MappingConfig, RenderConfig, SeedConfig, TrackingConfig
 from sigmasplat.config.input import InputConfig
+from sigmasplat.config.ranges import Count, Section, kinds_of, problems_of, refuse, shown
 from sigmasplat.config.real_time import RealTimeConfig
 from sigmasplat.config.recovery import RecoveryConfig
 from sigmasplat.config.submaps import FinalConfig, LoopConfig, RegistrationConfig, SubmapConfig
@@ -33,7 +34,7 @@ class Config:
 
     name: str = "custom"
     """Name of these settings in reports and folder names: the name of the preset."""
-    seed: int = 0
+    seed: Count = 0
     """Seed of all random numbers. Runs with other seeds show how much a result depends on chance."""
     backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
     """Renderer: auto = the value of SIGMASPLAT_BACKEND if it is set, else cpu; cuda needs an NVIDIA GPU; reference is
@@ -53,6 +54,11 @@ class Config:
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     uncertainty: UncertaintyConfig = field(default_factory=UncertaintyConfig)
     realtime: RealTimeConfig = field(default_factory=RealTimeConfig)
+
+    def __post_init__(self) -> None:
+        others = [name for name, section in SECTIONS.items() if not isinstance(getattr(self, name), section)]
+        sections = (f"{name} must be an object of settings, found {shown(getattr(self, name))}" for name in others)
+        refuse([*problems_of(self), *sections])
 
     def changed(self, **sections: Mapping[str, Any]) -> "Config":
         """Return the settings with some values replaced, as in config.changed(mapping={"every": 5})."""
@@ -80,7 +86,6 @@ class Config:
                 "submaps.variance_sum needs variances that mapping learns; set mapping.weight_nll_color above 0, or "
                 "submaps.variance_sum=0"
             )
-        _ = self.final.width_px  # raises ConfigError
         return self
 
     def to_dict(self) -> dict[str, Any]:
@@ -93,23 +98,29 @@ class Config:
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "Config":
-        """Make settings from nested dicts. Raises ConfigError on an unknown name."""
-        sections: dict[str, Any] = {}
-        known = {f.name: f for f in dataclasses.fields(Config)}
+        """Make settings from nested dicts. Raises ConfigError with every unknown name and every invalid value."""
+        if not isinstance(values, dict):
+            raise ConfigError(f"settings must be an object of sections, found {shown(values)}")
+        known, found, problems = {f.name for f in dataclasses.fields(Config)}, dict[str, Any](), list[str]()
         for name, value in values.items():
             if name not in known:
-                raise ConfigError(f"unknown setting {name!r} (known: {', '.join(known)})")
-            if isinstance(value, dict):
-                section = type(getattr(Config(), name))
-                names = {f.name for f in dataclasses.fields(section)}
-                unknown = set(value) - names
-                if unknown:
-                    raise ConfigError(
-                        f"unknown setting {name}.{sorted(unknown)[0]} (known: {', '.join(sorted(names))})"
-                    )
-                value = section(**value)
-            sections[name] = value
-        return Config(**sections)
+                problems.append(f"unknown setting {name!r} (known: {', '.join(sorted(known))})")
+            elif name in SECTIONS and isinstance(value, dict):
+                names = kinds_of(SECTIONS[name])
+                unknown = sorted(set(value) - set(names))
+                problems += [f"unknown setting {name}.{key} (known: {', '.join(sorted(names))})" for key in unknown]
+                try:
+                    found[name] = SECTIONS[name](**{key: item for key, item in value.items() if key in names})
+                except ConfigError as problem:
+                    problems.append(str(problem))
+            else:
+                found[name] = value
+        try:
+            config = Config(**found)
+        except ConfigError as problem:
+            problems.append(str(problem))
+        refuse(problems)
+        return config
 
     @staticmethod
     def load(path: Path) -> "Config":
@@ -118,3 +129,9 @@ class Config:
             return Config.from_dict(json.loads(path.read_text()))
         except (OSError, json.JSONDecodeError) as problem:
             raise ConfigError(f"cannot read settings from {path}: {problem}") from problem
+
+
+SECTIONS: dict[str, type[Section]] = {
+    f.name: f.type for f in dataclasses.fields(Config) if isinstance(f.type, type) and issubclass(f.type, Section)
+}
+"""The class of each section by its name in `Config`."""

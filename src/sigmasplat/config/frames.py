@@ -1,29 +1,28 @@
 """Settings of the work per frame: rendering, seeding, mapping, tracking."""
 
-import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from sigmasplat.errors import ConfigError
+from sigmasplat.config.ranges import Above0, AtLeastOne, Count, NotNegative, Range, Section, Share, WeightBound
 
 
 @dataclass(frozen=True)
-class RenderConfig:
+class RenderConfig(Section, name="render"):
     """Rendering of splats; the thresholds are those of 3DGS. Raises ConfigError on invalid values."""
 
-    alpha_min: float = 1.0 / 255.0
+    alpha_min: Share = 1.0 / 255.0
     """A splat is ignored at pixels where its alpha is below this."""
-    transmittance_stop: float = 1e-4
+    transmittance_stop: Share = 1e-4
     """A splat contributes to a pixel only if at least this share of light passes the splats in front of it."""
-    near_m: float = 0.05
+    near_m: Above0 = 0.05
     """Splats closer to the camera than this are not drawn, in metres. Use a smaller value for cameras very close to
     surfaces."""
-    low_pass_px2: float = 0.3
+    low_pass_px2: NotNegative = 0.3
     """Added to the diagonal of the 2D covariance, in px²."""
     depth: Literal["center", "ray"] = "center"
     """Depth of a splat at a pixel: center = that of its centre (papers); ray = where the ray meets it most densely, so
     that a flat splat can show a slanted surface (RaDe-GS). On CUDA it is center, with a warning."""
-    depth_gate_m: float = 0.0
+    depth_gate_m: NotNegative = 0.0
     """Scale s of the median gate, in metres; 0 = off (papers). In the rendered depth a splat at a distance δ behind the
     median depth counts as at δ·exp(−(δ/s)²) behind it, so that splats far behind the surface do not change the depth
     (GauS-SLAM). Not supported on CUDA."""
@@ -37,120 +36,116 @@ class RenderConfig:
     color_pose_gradient: bool = True
     """Whether the pose gradient includes the path through view-dependent colours."""
 
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.depth_gate_m < math.inf:
-            raise ConfigError(f"render.depth_gate_m must be finite and not negative, found {self.depth_gate_m}")
-
 
 @dataclass(frozen=True)
-class SeedConfig:
+class SeedConfig(Section, name="seeding"):
     """Creation of new splats (VarSplat §2, seeding)."""
 
-    first_uniform: int = 100_000
+    first_uniform: Count = 100_000
     """Number of pixels of the first keyframe, drawn uniformly, that become splats. Use more for large images, fewer for
     speed."""
-    first_gradient: int = 50_000
+    first_gradient: Count = 50_000
     """Number of additional pixels of the first keyframe, drawn in proportion to the image gradient, that become
     splats."""
     first_edges: bool = True
     """Whether all pixels on and beside Canny edges of the first keyframe become splats too."""
-    later_max: int = 30_000
+    later_max: Count = 30_000
     """Maximum number of new splats per later keyframe; 0 = no limit."""
-    alpha_below: float = 0.6
+    alpha_below: NotNegative = 0.6
     """Pixels are seeded where the rendered alpha of the map is below this. A higher value fills holes sooner and makes
     more splats."""
-    depth_error_factor: float = 40.0
+    depth_error_factor: NotNegative = 40.0
     """Pixels are seeded where the rendered surface is behind the measured one by this multiple of the median depth
     error; 0 = off (CG-SLAM)."""
-    depth_error_least_m: float = 0.0
+    depth_error_least_m: NotNegative = 0.0
     """Minimum distance, in metres, between rendered and measured surface for seeding by `depth_error_factor`."""
-    min_distance_m: float = 0.01
+    min_distance_m: NotNegative = 0.01
     """No seed is placed closer than this to an existing splat in view."""
-    opacity: float = 0.5
+    opacity: Annotated[float, Range(0, 1, open_below=True)] = 0.5
     """Initial opacity of seeds, 0 to 1. With a higher value the map can be used for tracking sooner; a lower value
     leaves more freedom to the fit."""
     scale_from: Literal["neighbours", "pixel"] = "neighbours"
     """Initial size of seeds: neighbours = root mean squared distance to the 3 nearest splats (papers); pixel = size of
     a pixel at that depth × spacing of the seeds."""
-    scale_factor: float = 1.0
+    scale_factor: Above0 = 1.0
     """Factor on the size from `scale_from`. A larger one closes gaps, a smaller one keeps edges."""
-    thickness: float = 1.0
+    thickness: Above0 = 1.0
     """Size of a seed along the surface's normal, as a share of its size along the surface; 1 = a sphere (papers). Below
     1 seeds are discs on the surface that the depth image shows, and wider where they are seen at an angle."""
-    push_back: float = 1.005
+    push_back: Above0 = 1.005
     """Factor on the depth of seeds. Blending with closer splats makes the rendered depth too small at first; a factor
     above 1 compensates for this (VarSplat's code)."""
-    density: float = 1.0
+    density: Share = 1.0
     """Share of the chosen pixels of a later keyframe that become splats."""
-    outlier_neighbours: int = 0
+    outlier_neighbours: Count = 0
     """Number of neighbours for statistical outlier removal; 0 = off."""
     outlier_first: bool = True
     """Whether outliers are also removed from the seeds of an empty map; off = VarSplat's code."""
-    voxel_m: float = 0.0
+    voxel_m: NotNegative = 0.0
     """Edge of the voxels in which splats are counted before seeding, in metres; 0 = off (papers)."""
-    voxel_most: int = 8
+    voxel_most: AtLeastOne = 8
     """With `voxel_m`: no seed is placed in a voxel that has this many splats."""
-    max_splats: int = 0
+    max_splats: Count = 0
     """Maximum number of splats in a submap; 0 = no limit."""
 
 
 @dataclass(frozen=True)
-class MappingConfig:
+class MappingConfig(Section, name="mapping"):
     """Fit of the map to keyframes: iterations, loss weights, learning rates (VarSplat §2; CG-SLAM §3, 5, 7)."""
 
-    every: int = 1
+    every: AtLeastOne = 1
     """A frame becomes a keyframe this many frames after the last keyframe."""
-    overlap_below: float = 0.0
+    overlap_below: NotNegative = 0.0
     """A frame also becomes a keyframe if its overlap with the newest keyframe is below this; 0 = off."""
-    iterations: int = 100
+    iterations: Count = 100
     """Optimisation steps per keyframe: the first setting to change to trade speed for quality."""
-    first_iterations: int = 100
+    first_iterations: Count = 100
     """Optimisation steps for the first keyframe of a map. Until about 150 steps, a new map renders surfaces too
     close."""
-    newest_probability: float = 0.4
+    newest_probability: Share = 0.4
     """Probability that a step uses the newest keyframe; the other steps use older ones, drawn uniformly."""
-    weight_l1: float = 0.8
+    weight_l1: NotNegative = 0.8
     """Weight of the loss |Ĉ − C|, colours in [0, 1] (VarSplat §2)."""
-    weight_ssim: float = 0.2
+    weight_ssim: NotNegative = 0.2
     """Weight of the loss 1 − SSIM, which compares structure rather than brightness (VarSplat §2)."""
-    weight_depth: float = 1.0
+    weight_depth: NotNegative = 1.0
     """Weight of the loss |D̂ − D| in metres. Use less if the sensor's depth is worse than its colour (VarSplat §2)."""
-    weight_mean_depth: float = 0.0
+    weight_mean_depth: NotNegative = 0.0
     """Weight of the loss |D̂/A − D| in metres where the alpha A is above ½ (ours). D̂/A is the mean depth of the splats;
     D̂ alone is too small where light passes the map. Instead of `weight_depth` it keeps splats on the surface."""
-    weight_isotropy: float = 1.0
+    weight_isotropy: NotNegative = 1.0
     """Weight of the loss |s − mean(s)| of the scales s in metres (VarSplat §2)."""
-    weight_isotropy_ratio: float = 0.0
+    weight_isotropy_ratio: NotNegative = 0.0
     """Weight of the loss max(s) / min(s) − 1 of the scales s (CG-SLAM eq. 17)."""
-    weight_alignment: float = 0.0
+    weight_alignment: NotNegative = 0.0
     """Weight of the loss |D̂ − median depth| (CG-SLAM eq. 16)."""
-    weight_moment: float = 0.0
+    weight_moment: NotNegative = 0.0
     """Weight of the loss U, the variance of the splats' depths about the sensor's depth (CG-SLAM eq. 10)."""
-    weight_nll_color: float = 1e-4
+    weight_nll_color: NotNegative = 1e-4
     """Weight of the negative log-likelihood of the colour error under V, which trains σ² (VarSplat §2); 0 = σ² is not
     learned from colour."""
-    weight_nll_depth: float = 0.0
+    weight_nll_depth: NotNegative = 0.0
     """Weight of the negative log-likelihood of the depth error in metres; 0 = σ² is not learned from depth."""
-    lr_means: float = 1e-4
+    lr_means: NotNegative = 1e-4
     """Learning rate of positions, metres per step of Adam."""
-    lr_means_first: float = 0.0
+    lr_means_first: NotNegative = 0.0
     """Learning rate of positions at the start of the first keyframe; it decays exponentially to `lr_means`. 0 =
     `lr_means` throughout."""
-    lr_quats: float = 1e-3
+    lr_quats: NotNegative = 1e-3
     """Learning rate of rotations: change of a unit quaternion's components per step."""
-    lr_log_scales: float = 5e-3
+    lr_log_scales: NotNegative = 5e-3
     """Learning rate of sizes: change of their logarithm per step; 0.005 is half a per cent."""
-    lr_opacity_logits: float = 0.05
+    lr_opacity_logits: NotNegative = 0.05
     """Learning rate of opacities: change of the logit per step."""
-    lr_colors: float = 2.5e-3
+    lr_colors: NotNegative = 2.5e-3
     """Learning rate of colours (0 to 1): change per step."""
-    lr_log_variances: float = 2.5e-3
+    lr_log_variances: NotNegative = 2.5e-3
     """Learning rate of σ²: change of its logarithm per step. Use a higher one with few `iterations`, so that σ²
     converges."""
-    lr_pose_translation: float = 0.0
+    lr_pose_translation: NotNegative = 0.0
     """Learning rate of keyframe positions in mapping, metres per step; 0 = positions are not optimised. The first pose
     is always fixed."""
-    lr_pose_rotation: float = 0.0
+    lr_pose_rotation: NotNegative = 0.0
     """Learning rate of keyframe rotations in mapping, radians per step; 0 = rotations are not optimised."""
     poses: Literal["all", "newest"] = "all"
     """Which poses mapping optimises: those of all keyframes in use (CG-SLAM eq. 21), or only the newest (CG-SLAM's
@@ -171,31 +166,31 @@ class MappingConfig:
     fresh_adam: bool = False
     """Whether each keyframe starts with a new Adam optimiser, without the moments of earlier keyframes (VarSplat's
     code)."""
-    prune_opacity: float = 0.5
+    prune_opacity: Share = 0.5
     """Splats with at most this opacity are removed after the steps of a keyframe. A lower value keeps faint splats, a
     higher one makes holes."""
-    keyframe_history: int = 0
+    keyframe_history: Count = 0
     """Steps on older keyframes use only this many of the latest keyframes; 0 = all keyframes."""
-    window: int = 0
+    window: Count = 0
     """Use only this many keyframes: the newest two, and those that overlap most with the newest (CG-SLAM's
     sliding-window bundle adjustment). 0 = all, drawn at random (VarSplat)."""
     covisibility: Literal["splats", "frustum", "descriptor"] = "splats"
     """How the overlap of the window's keyframes is measured: by common dominant splats, by depth readings that the
     other keyframe sees too, or by the image descriptor of `loops`."""
-    frames_per_step: int = 1
+    frames_per_step: Count = 1
     """Each step minimises the mean loss of this many keyframes of the window; 0 = of all of them (CG-SLAM)."""
 
 
 @dataclass(frozen=True)
-class TrackingConfig:
+class TrackingConfig(Section, name="tracking"):
     """Fit of camera poses: method, iterations, masks, weights (VarSplat §3; CG-SLAM §6)."""
 
     method: Literal["adam", "align"] = "adam"
     """adam: gradient descent through the renderer, as in the papers; align: one render, then Gauss–Newton on that
     image."""
-    iterations: int = 200
+    iterations: Count = 200
     """Maximum number of Adam steps per frame. Use more for fast or shaky motion, fewer for speed."""
-    align_iterations: int = 15
+    align_iterations: Count = 15
     """Maximum number of Gauss–Newton steps per pyramid level."""
     align_to: Literal["keyframe", "map"] = "keyframe"
     """keyframe: align to the newest keyframe's own image, weighted by V; map: to the map rendered at the predicted
@@ -203,9 +198,9 @@ class TrackingConfig:
     align_depth_by: Literal["V", "U"] = "V"
     """Whether alignment weights depth residuals by V, like gray residuals, or in the same way by the depth variance U
     of the map (CG-SLAM eq. 10)."""
-    align_stop: float = 1e-4
+    align_stop: NotNegative = 1e-4
     """Alignment ends a pyramid level when a step is smaller than this (metres and radians)."""
-    align_weight_color: float = 0.5
+    align_weight_color: Share = 0.5
     """Weight of gray residuals in alignment; depth residuals have 1 minus this."""
     amsgrad: bool = False
     """Whether Adam divides by the largest second moment so far (AMSGrad, VarSplat's code). On a CUDA device such a
@@ -213,16 +208,16 @@ class TrackingConfig:
     parametrisation: Literal["quaternion", "axis-angle"] = "quaternion"
     """What Adam optimises: a quaternion and a translation relative to the initial guess (VarSplat's code), or the
     axis-angle rotation and the position of the camera (CG-SLAM)."""
-    first_iterations: int = 0
+    first_iterations: Count = 0
     """Number of Adam steps for the second frame, which has no motion model yet; 0 = as for other frames."""
-    first_lr_rotation: float = 0.0
+    first_lr_rotation: NotNegative = 0.0
     """Learning rate of rotation for the second frame; 0 = as for other frames."""
-    lr_rotation: float = 2e-3
+    lr_rotation: NotNegative = 2e-3
     """Learning rate of rotation, radians per step; with quaternions the angle per step is twice as large. Use a higher
     one for fast motion."""
-    lr_translation: float = 1e-2
+    lr_translation: NotNegative = 1e-2
     """Learning rate of translation, metres per step."""
-    weight_color: float = 0.6
+    weight_color: Share = 0.6
     """λ_c, the weight of the colour loss; the depth loss has 1 − λ_c."""
     uncertainty: bool = True
     """Whether pixels are weighted by exp(−(log V − median)/τ); off = LoopSplat."""
@@ -230,18 +225,18 @@ class TrackingConfig:
     """The variance in the weights of the newest keyframe: published = V and U of the papers; predicted = the variance
     of colour, and with `align_depth_by` U that of depth, which the map predicts there (ours). predicted needs `method`
     align."""
-    tau: float = 50.0
+    tau: Above0 = 50.0
     """τ of the pixel weights, in units of log V: at 50, a V of ten times the median lowers the weight by 5 %. A smaller
     τ gives V more influence."""
-    weight_max: float = 3.0
+    weight_max: WeightBound = 3.0
     """Bounds of the pixel weights: at most this, at least 1 / this."""
-    alpha_power: float = 3.0
+    alpha_power: NotNegative = 3.0
     """Pixels are weighted by the rendered alpha to this power. A higher one ignores parts where the map is thin."""
-    alpha_above: float = 0.0
+    alpha_above: NotNegative = 0.0
     """Only pixels with a rendered alpha above this are used; 0 = off."""
-    outlier_factor: float = 50.0
+    outlier_factor: NotNegative = 50.0
     """Only pixels with a depth error below this multiple of its median are used; 0 = off."""
-    outlier_factor_color: float = 0.0
+    outlier_factor_color: NotNegative = 0.0
     """Colour is used only at pixels where its error, summed over the channels, is below this multiple of its median; 0
     = off."""
     average: Literal["image", "kept"] = "image"
@@ -249,12 +244,12 @@ class TrackingConfig:
     (CG-SLAM)."""
     motion_model: bool = True
     """Whether the initial guess assumes constant velocity; off = it is the last pose, for jerky cameras."""
-    reinit_factor: float = 5.0
+    reinit_factor: NotNegative = 5.0
     """If the first loss exceeds this multiple of its running median, tracking restarts from odometry with twice the
     iterations."""
     exposure: bool = False
     """Whether a factor and an offset of the colour are fitted with the pose, for cameras that change their exposure."""
-    lr_exposure: float = 0.01
+    lr_exposure: NotNegative = 0.01
     """Learning rate of the exposure: change per step of the factor's logarithm and of the offset (colours 0 to 1)."""
     features: bool = False
     """Whether sparse features give a second guess of the pose where motion is wide or the first fit is doubtful (ours).
@@ -262,18 +257,18 @@ class TrackingConfig:
     verify: bool = False
     """Whether a pose is judged by comparing surfaces at it (ours); off = by agreement and overlap only. It needs
     `method` align."""
-    lost_agreement: float = 0.6
+    lost_agreement: NotNegative = 0.6
     """Tracking is lost if map and sensor agree in depth on less than this share of the pixels where both have a
     surface; not used with `verify`."""
-    lost_share: float = 0.2
+    lost_share: NotNegative = 0.2
     """Tracking is lost if the map agrees with less than this share of the sensor's readings (agreement × overlap); with
     `verify`, if reference and frame have less than this share of the reference's readings in common."""
-    update_stop: float = 0.0
+    update_stop: NotNegative = 0.0
     """Adam stops when a step is smaller than this (metres and radians); 0 = run every iteration."""
-    plateau_stop: float = 0.0
+    plateau_stop: NotNegative = 0.0
     """Adam stops when `plateau_window` steps have not lowered the loss by this share; a level of alignment stops when
     one step changes the loss by less than this share; 0 = off."""
-    plateau_window: int = 10
+    plateau_window: AtLeastOne = 10
     """Number of Adam steps within which the loss must fall by the share `plateau_stop`."""
     cuda_graphs: bool = True
     """On a CUDA device, whether several iterations of descent are launched as one CUDA graph; off = each kernel is

@@ -1,24 +1,24 @@
 """Settings of the input, for every format: which frames, which calibration, which pixels."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from sigmasplat.errors import ConfigError
+from sigmasplat.config.ranges import WIDTHS_PX, Above0, AtLeastOne, Count, NotNegative, Range, Section
 
 
 @dataclass(frozen=True)
-class InputConfig:
+class InputConfig(Section, name="input"):
     """Selection and processing of the frames of a source. Raises ConfigError on invalid values."""
 
-    stride: int = 1
+    stride: AtLeastOne = 1
     """Use every N-th frame."""
-    limit: int = 0
+    limit: Count = 0
     """Maximum number of frames; 0 = all."""
-    start_s: float = 0.0
+    start_s: NotNegative = 0.0
     """Start this many seconds after the first frame of the recording."""
-    end_s: float = 0.0
+    end_s: NotNegative = 0.0
     """Stop this many seconds after the first frame of the recording; 0 = at its end."""
-    hold_every: int = 0
+    hold_every: Annotated[int, Range(2, or_zero=True)] = 0
     """Hold back every N-th frame: it is tracked but never becomes a keyframe, so that it can test the map; 0 = none."""
     strict: bool = False
     """Whether an unreadable image stops the run. If off, such images are skipped and counted."""
@@ -30,17 +30,17 @@ class InputConfig:
 
     calibration: str = ""
     """Path of a calibration.json that replaces the calibration of the recording; empty = as recorded."""
-    fx: float = 0.0
+    fx: NotNegative = 0.0
     """Horizontal focal length of the colour camera in pixels; 0 = as recorded."""
-    fy: float = 0.0
+    fy: NotNegative = 0.0
     """Vertical focal length of the colour camera in pixels; 0 = as recorded, or equal to fx if nothing is recorded."""
-    cx: float = 0.0
+    cx: NotNegative = 0.0
     """Column of the colour camera's principal point in pixels; 0 = as recorded, or the image centre if nothing is
     recorded."""
-    cy: float = 0.0
+    cy: NotNegative = 0.0
     """Row of the colour camera's principal point in pixels; 0 = as recorded, or the image centre if nothing is
     recorded."""
-    depth_scale: float = 0.0
+    depth_scale: NotNegative = 0.0
     """Units of the depth images per metre; 0 = as recorded."""
 
     register_depth: Literal["auto", "on", "off"] = "auto"
@@ -48,24 +48,26 @@ class InputConfig:
     camera."""
     undistort: bool = True
     """Whether lens distortion is removed, if it is known."""
-    width: int = 0
+    width: Annotated[int, WIDTHS_PX] = 0
     """Width of the working images in pixels, height in proportion; 0 = as in the source."""
-    crop_px: int = 0
+    crop_px: Count = 0
     """Pixels removed at each edge after resizing, for undistorted images or sensors without depth at the edges."""
-    min_depth_m: float = 0.1
+    min_depth_m: NotNegative = 0.1
     """Smaller depth readings are ignored: below its range a sensor returns noise."""
-    max_depth_m: float = 8.0
+    max_depth_m: Above0 = 8.0
     """Larger depth readings are ignored: their errors grow with the square of the depth."""
     denoise_depth: bool = False
     """Whether depth images that are noisier than those of a structured-light sensor are smoothed."""
 
-    def __post_init__(self) -> None:
-        if self.stride < 1 or self.limit < 0:
-            raise ConfigError(
-                "input.stride must be at least 1 and input.limit at least 0, "
-                f"found stride={self.stride}, limit={self.limit}"
+    def problems(self) -> list[str]:
+        """Describe each invalid value, and limits that exclude every frame or every depth reading."""
+        if found := super().problems():
+            return found
+        if self.end_s and self.end_s <= self.start_s:
+            found.append(f"input.end_s must be after input.start_s, found {self.start_s:g} to {self.end_s:g} s")
+        if self.max_depth_m <= self.min_depth_m:
+            found.append(
+                "input.max_depth_m must be above input.min_depth_m, "
+                f"found {self.min_depth_m:g} to {self.max_depth_m:g} m"
             )
-        if self.hold_every < 0 or self.hold_every == 1:
-            raise ConfigError(f"input.hold_every must be 0 or at least 2, found {self.hold_every}")
-        if self.start_s < 0 or (self.end_s and self.end_s <= self.start_s):
-            raise ConfigError(f"input.end_s must be after input.start_s, found {self.start_s:g} to {self.end_s:g} s")
+        return found

@@ -2,26 +2,20 @@
 
 from dataclasses import dataclass
 
-from sigmasplat.errors import ConfigError
+from sigmasplat.config.ranges import AtLeastOne, Count, NotNegative, Section
 
 
 @dataclass(frozen=True)
-class RealTimeConfig:
+class RealTimeConfig(Section, name="realtime"):
     """Live cameras and `run --realtime`: when frames become keyframes, and how much mapping may wait. Raises
     ConfigError on invalid values."""
 
     live: bool = True
     """Whether live cameras run in real time; off = a frame waits until the one before it is mapped."""
-    keyframe_deg: float = 5.0
+    keyframe_deg: NotNegative = 5.0
     """A frame becomes a keyframe when the image has moved by this angle since the last keyframe: rotation plus
     translation divided by the mean depth; 0 = by the number of frames, as in a recording."""
-    waiting_most: int = 24
+    waiting_most: AtLeastOne = 24
     """Maximum number of keyframes that wait for mapping; while as many wait, no frame becomes a keyframe."""
-    spare_iterations: int = 60
+    spare_iterations: Count = 60
     """Maximum number of additional iterations after a keyframe is mapped, while no other keyframe waits; 0 = none."""
-
-    def __post_init__(self) -> None:
-        if self.keyframe_deg < 0 or self.spare_iterations < 0:
-            raise ConfigError("realtime.keyframe_deg and realtime.spare_iterations must not be negative")
-        if self.waiting_most < 1:
-            raise ConfigError(f"realtime.waiting_most must be at least 1, found {self.waiting_most}")

@@ -2,26 +2,39 @@
 
 import sys
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
+from sigmasplat.config.ranges import (
+    WIDTHS_PX,
+    Above0,
+    AtLeastOne,
+    Count,
+    NotNegative,
+    Range,
+    RatioLimit,
+    Section,
+    Share,
+    WeightBound,
+    shown,
+)
 from sigmasplat.errors import ConfigError
 
 
 @dataclass(frozen=True)
-class SubmapConfig:
+class SubmapConfig(Section, name="submaps"):
     """Rules that end the active submap and start the next one; checked at each keyframe (VarSplat §2)."""
 
-    distance_m: float = 0.0
+    distance_m: NotNegative = 0.0
     """A new submap starts if the camera is farther than this from the submap's first pose; 0 = off. If all rules are
     off, the map is one submap."""
-    angle_deg: float = 0.0
+    angle_deg: NotNegative = 0.0
     """A new submap starts if the camera has rotated by more than this from the submap's first pose; 0 = off."""
-    frames: int = 0
+    frames: Count = 0
     """A new submap starts this many frames after the first one of the active submap; 0 = off."""
-    uncertainty_m: float = 0.0
+    uncertainty_m: NotNegative = 0.0
     """A new submap starts if the standard deviation of the camera's position in the submap, accumulated from keyframe
     to keyframe, exceeds this (`slam.drift`); 0 = off."""
-    variance_sum: float = 0.0
+    variance_sum: NotNegative = 0.0
     """A new submap starts if the mean V rendered at each tracked frame, summed since the submap began, exceeds this
     (colours 0 to 1, squared); 0 = off. It reads the paper's accumulated uncertainty as V, and costs a render per
     frame."""
@@ -31,7 +44,7 @@ class SubmapConfig:
 
 
 @dataclass(frozen=True)
-class LoopConfig:
+class LoopConfig(Section, name="loops"):
     """Selection of submaps that may show the same place (VarSplat §4)."""
 
     close: bool = True
@@ -42,54 +55,54 @@ class LoopConfig:
     warning."""
     weights: str = ""
     """File of NetVLAD weights, needed by descriptor=netvlad; read at the start."""
-    min_similarity: float = 0.5
+    min_similarity: Share = 0.5
     """Sets the similarity that a loop must exceed: the k-th highest similarity of a keyframe to the keyframes of its
     own submap, where k is this share of their number."""
-    min_interval: int = 2
+    min_interval: AtLeastOne = 2
     """Two submaps are tested as a loop only if their numbers differ by at least this."""
-    similarity_floor: float = 0.0
+    similarity_floor: NotNegative = 0.0
     """Pairs of keyframes with a similarity of at most this are never tested."""
-    near_m: float = 0.0
+    near_m: NotNegative = 0.0
     """Keyframes closer than this by the current poses are tested too, whatever their similarity; 0 = off (paper)."""
-    near_deg: float = 30.0
+    near_deg: Annotated[float, Range(0, 180)] = 30.0
     """Maximum rotation between the keyframes of a pair that `near_m` selects."""
-    most: int = 4
+    most: Count = 4
     """Maximum number of pairs registered per finished submap, the most similar first; 0 = no limit."""
     uncertainty: bool = True
     """Whether similarity is multiplied by a gate from the variance-weighted opacity ratio; off = LoopSplat."""
     variance: Literal["published", "predicted"] = "published"
     """The variance of a splat in that ratio: published = σ²; predicted = σ² and its residuals at the keyframes of the
     submap, weighted as in the predicted variance (ours)."""
-    tau: float = 10.0
+    tau: Above0 = 10.0
     """τ of the splat weights in that opacity ratio, computed from σ². A smaller τ separates certain from uncertain
     splats more sharply."""
-    weight_max: float = 3.0
+    weight_max: WeightBound = 3.0
     """Bounds of the splat weights in the opacity ratio: at most this, at least 1 / this."""
 
 
 @dataclass(frozen=True)
-class RegistrationConfig:
+class RegistrationConfig(Section, name="registration"):
     """Registration of two submaps, and acceptance of the result (VarSplat §5)."""
 
-    keyframes: int = 2
+    keyframes: AtLeastOne = 2
     """Number of keyframes of each submap that are localised in the other one."""
-    iterations: int = 100
+    iterations: Count = 100
     """Maximum number of Adam steps per keyframe, after alignment; each step is a render."""
-    lr_rotation: float = 1.5e-2
+    lr_rotation: NotNegative = 1.5e-2
     """Learning rate of rotation in registration, as `tracking.lr_rotation`."""
-    lr_translation: float = 5e-3
+    lr_translation: NotNegative = 5e-3
     """Learning rate of translation in registration, metres per step."""
-    plateau_stop: float = 1e-4
+    plateau_stop: NotNegative = 1e-4
     """The steps of registration end when `plateau_window` steps have not lowered the loss by this share; 0 = run every
     iteration."""
-    plateau_window: int = 10
+    plateau_window: AtLeastOne = 10
     """Number of steps within which the loss of registration must fall by the share `plateau_stop`."""
     target: Literal["recorded", "rendered"] = "recorded"
     """Which image of a keyframe is localised in the other submap: the recorded one, or the one that its own submap
     renders at its pose (VarSplat's code for ScanNet)."""
     exposure: bool = True
     """Whether a factor and an offset of the colour are fitted too, because submaps may differ in exposure."""
-    weight_color: float = 0.95
+    weight_color: Share = 0.95
     """λ_c, the weight of the colour loss in registration; the depth loss has 1 − λ_c."""
     color_mean: Literal["values", "pixels"] = "values"
     """How the colour errors of registration are averaged: values = over pixels and channels (paper); pixels = over
@@ -99,43 +112,43 @@ class RegistrationConfig:
     variance: Literal["published", "predicted"] = "published"
     """The variance in these weights: published = V (VarSplat §1); predicted = the variance of colour that the other
     submap predicts, from the residuals of its splats at its keyframes (ours)."""
-    tau: float = 50.0
+    tau: Above0 = 50.0
     """τ of the pixel weights in registration, as `tracking.tau`."""
-    weight_max: float = 3.0
+    weight_max: WeightBound = 3.0
     """Bounds of the pixel weights in registration: at most this, at least 1 / this."""
-    overlap_least: float = 0.2
+    overlap_least: NotNegative = 0.2
     """A loop is rejected if less than this share of the splats has a neighbour within `overlap_m` in the other
     submap."""
-    overlap_m: float = 0.1
+    overlap_m: NotNegative = 0.1
     """Maximum distance in metres between a splat and its neighbour in the other submap, for `overlap_least`: about the
     distance between two maps of the same wall."""
-    agreement_least: float = 0.8
+    agreement_least: NotNegative = 0.8
     """A localisation is valid only if at least this share of the common surface agrees in depth."""
-    share_least: float = 0.3
+    share_least: NotNegative = 0.3
     """A localisation is valid only if the other submap explains at least this share of its depth readings."""
-    spread_m: float = 0.1
+    spread_m: NotNegative = 0.1
     """Localisations agree if they are within this distance of one of them, in metres. A loop is rejected if fewer than
     two agree."""
-    spread_deg: float = 5.0
+    spread_deg: NotNegative = 5.0
     """Localisations agree if their rotations differ from one of them by at most this. A loop is rejected if fewer than
     two agree."""
 
 
 @dataclass(frozen=True)
-class FinalConfig:
+class FinalConfig(Section, name="final"):
     """The global map, made from all submaps after the last frame (VarSplat §7)."""
 
     seed_from: Literal["submaps", "mesh"] = "submaps"
     """Initial splats of the final map: submaps = the splats of the submaps; mesh = new splats on the fused surface
     (paper)."""
-    iterations: int = 0
+    iterations: Count = 0
     """Number of refinement steps over all keyframes; 0 = no refinement."""
-    lr_pose_translation: float = 0.0
+    lr_pose_translation: NotNegative = 0.0
     """Learning rate of keyframe positions during refinement, in metres; the poses of frames follow their keyframes. 0 =
     fixed (paper)."""
-    lr_pose_rotation: float = 0.0
+    lr_pose_rotation: NotNegative = 0.0
     """Learning rate of keyframe rotations during refinement, in rad; 0 = fixed (paper)."""
-    seconds: float = 0.0
+    seconds: NotNegative = 0.0
     """Time budget of the refinement in seconds: it ends at the latest then, even if steps are left, and learning rates
     fall in time. The result then depends on the speed of the machine. 0 = no limit."""
     exposure: bool = False
@@ -144,45 +157,45 @@ class FinalConfig:
     order: Literal["random", "epochs"] = "random"
     """Order of the keyframes in refinement: random = drawn for each step (paper); epochs = every keyframe once, in
     random order, before any is used again."""
-    lr_factor: float = 1.0
+    lr_factor: Above0 = 1.0
     """Factor on the learning rates of mapping (`mapping.lr_…`) in the first refinement step, except that of
     positions."""
-    lr_decay: float = 1.0
+    lr_decay: Above0 = 1.0
     """Learning rates of splats and poses in the last refinement step, as a share of those in the first; they decay
     exponentially. 1 = constant."""
-    lr_means_last: float = 0.0
+    lr_means_last: NotNegative = 0.0
     """Learning rate of positions in the last refinement step; it decays exponentially from `mapping.lr_means` (3DGS). 0
     = `mapping.lr_means` throughout."""
-    sh_degree: int = 0
+    sh_degree: Annotated[int, Range(0, 3)] = 0
     """Degree of view-dependent colour reached during refinement, 0 to 3."""
-    sh_every: int = 1000
+    sh_every: AtLeastOne = 1000
     """Number of refinement steps after which the degree of view-dependent colour rises by one."""
-    spacing_m: float = 0.02
+    spacing_m: Above0 = 0.02
     """Distance between the splats seeded on the mesh."""
-    merge_m: float = 0.02
+    merge_m: Above0 = 0.02
     """Edge in metres of the voxels in which merging keeps the splats of one submap only."""
-    max_splats: int = 0
+    max_splats: Count = 0
     """Largest number of splats of the final map; those that contribute least to the images of keyframes are removed. 0
     = no limit."""
-    prune_weight_px: float = 0.0
+    prune_weight_px: NotNegative = 0.0
     """Before and after refinement, splats are removed if their weights in every keyframe sum to less than this, in
     pixels. 0 = none are removed."""
-    prune_every: int = 500
+    prune_every: AtLeastOne = 500
     """Number of refinement steps between removals of splats with low opacity (`prune_opacity`)."""
-    prune_opacity: float = 0.005
+    prune_opacity: Share = 0.005
     """Splats with at most this opacity, 0 to 1, are removed during refinement."""
     width: str = "working"
     """Width of the images in the last stage of refinement: working = no such stage, only working images are used;
     camera = as recorded; or a number of pixels, at most the recorded width. If it is above `input.width`, the colour of
     each keyframe is kept at this size."""
-    width_iterations: int = 1500
+    width_iterations: Count = 1500
     """Number of refinement steps of the stage with images of `width`, after those of `iterations`, if `iterations` is
     above 0. Two thirds of them use working images, so that the map stays sharp at that size too."""
     weight_moment: bool = True
     """Whether the depth uncertainty U stays in the loss of refinement (`mapping.weight_moment`); off is faster."""
-    max_axis_ratio: float = 0.0
+    max_axis_ratio: RatioLimit = 0.0
     """Largest ratio of a splat's longest axis to its shortest; refinement lengthens shorter axes. 0 = no limit."""
-    max_needle_ratio: float = 0.0
+    max_needle_ratio: RatioLimit = 0.0
     """Largest ratio of a splat's longest axis to its second longest; refinement shortens the longest. 0 = no limit."""
     uncertainty: bool = True
     """Whether variance is used to merge submaps and still learned during refinement; off = paper."""
@@ -194,6 +207,21 @@ class FinalConfig:
     def width_px(self) -> int:
         """Return `width` in pixels; 0 = working, a very large number = camera. Raises ConfigError on other text."""
         named = {"working": 0, "camera": sys.maxsize}
-        if self.width not in named and not self.width.isdecimal():
-            raise ConfigError(f"final.width must be working, camera or a number of pixels, found {self.width!r}")
-        return named[self.width] if self.width in named else int(self.width)
+        if self.width in named:
+            return named[self.width]
+        pixels = int(self.width) if self.width.isdecimal() and len(self.width) < 6 else -1
+        if pixels not in WIDTHS_PX:
+            raise ConfigError(
+                f"final.width must be working, camera or a number of pixels ({WIDTHS_PX}), found {shown(self.width)}"
+            )
+        return pixels
+
+    def problems(self) -> list[str]:
+        """Describe each invalid value, and a `width` that is neither a word nor a number of pixels."""
+        found = super().problems()
+        if isinstance(self.width, str):
+            try:
+                _ = self.width_px
+            except ConfigError as problem:
+                found.append(str(problem))
+        return found

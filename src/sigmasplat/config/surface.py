@@ -3,17 +3,13 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from sigmasplat.errors import ConfigError
+from sigmasplat.config.ranges import Section
 
 
 @dataclass(frozen=True)
-class SurfaceConfig:
+class SurfaceConfig(Section, name="surface"):
     """The mesh of a finished run. Raises ConfigError on invalid values."""
 
     depth: Literal["map", "map+sensor"] = "map"
     """Depth that is fused at each keyframe: map = rendered from its submap (VarSplat §7); map+sensor = rendered from
     the final map, and the readings of the keyframe, weighted by their variances (ours)."""
-
-    def __post_init__(self) -> None:
-        if self.depth not in ("map", "map+sensor"):
-            raise ConfigError(f"surface.depth must be map or map+sensor, found {self.depth}")

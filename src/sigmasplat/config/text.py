@@ -2,31 +2,38 @@
 
 import dataclasses
 import difflib
-import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin
 
-from sigmasplat.config import Config
+from sigmasplat.config import SECTIONS, Config
+from sigmasplat.config.ranges import kinds_of, problem_of, refuse, shown, unpacked
 from sigmasplat.errors import ConfigError
 
 
 def override(config: Config, settings: Mapping[str, str]) -> Config:
     """Return the settings with some replaced, as in {"tracking.iterations": "60", "seed": "1"}; text is converted.
 
-    Raises ConfigError on an unknown name (and lists the known ones), text of another type, or a negative number.
+    Raises ConfigError with every unknown name (and the known ones), text of another type, and value out of range.
     """
+    changes: dict[str, dict[str, Any]] = {}
+    problems: list[str] = []
     for name, text in settings.items():
         section, _, field = name.rpartition(".")
-        if not section:
-            config = _replaced(config, name, name, text)
-            continue
-        inner = getattr(config, section, None)
-        if not dataclasses.is_dataclass(inner) or isinstance(inner, type):
-            sections = [f.name for f in dataclasses.fields(config) if dataclasses.is_dataclass(getattr(config, f.name))]
-            raise ConfigError(f"unknown setting {name!r}{nearest(section, sections)}; sections: {', '.join(sections)}")
-        config = dataclasses.replace(config, **{section: _replaced(inner, field, name, text)})
-    return config
+        try:
+            changes.setdefault(section, {})[field] = _converted(name, _kind(config, section, field, name), text.strip())
+        except ConfigError as problem:
+            problems.append(str(problem))
+    made: dict[str, Any] = changes.pop("", {})
+    kinds = kinds_of(Config)
+    problems += [f"{name} {wrong}" for name, value in made.items() if (wrong := problem_of(kinds[name], value))]
+    for section, values in changes.items():
+        try:
+            made[section] = dataclasses.replace(getattr(config, section), **values)
+        except ConfigError as problem:
+            problems.append(str(problem))
+    refuse(problems)
+    return dataclasses.replace(config, **made)
 
 
 def split_settings(settings: Iterable[str]) -> dict[str, str]:
@@ -51,19 +58,23 @@ def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
     return flat | {f"{key}.{name}": item for key, section in inner.items() if section for name, item in section.items()}
 
 
-def _replaced(section: Any, field: str, name: str, text: str) -> Any:
-    """Return a section with one value replaced; `name` is the full name that the user gave."""
-    types = {known: kind for known, kind in get_type_hints(type(section)).items() if not dataclasses.is_dataclass(kind)}
-    if field not in types:
-        raise ConfigError(f"unknown setting {name!r}{nearest(field, types)}; known: {', '.join(types)}")
-    return dataclasses.replace(section, **{field: _converted(name, types[field], text.strip())})
+def _kind(config: Config, section: str, field: str, name: str) -> Any:
+    """Return the type of a setting with its range; `name` is the full name that the user gave. Raises ConfigError."""
+    if section and section not in SECTIONS:
+        raise ConfigError(f"unknown setting {name!r}{nearest(section, SECTIONS)}; sections: {', '.join(SECTIONS)}")
+    kinds = kinds_of(SECTIONS[section] if section else type(config))
+    if field not in kinds or (not section and field in SECTIONS):
+        known = [known for known in kinds if section or known not in SECTIONS]
+        raise ConfigError(f"unknown setting {name!r}{nearest(field, known)}; known: {', '.join(known)}")
+    return kinds[field]
 
 
 def _converted(name: str, kind: Any, text: str) -> Any:
-    """Convert text to a setting's type. Raises ConfigError."""
-    if get_origin(kind) is Literal:
-        return _chosen(name, {str(value): value for value in get_args(kind)}, text)
-    if kind is bool:
+    """Convert text to a setting's type. Raises ConfigError if it is not of this type; the section checks its range."""
+    base, _ = unpacked(kind)
+    if get_origin(base) is Literal:
+        return _chosen(name, {str(value): value for value in get_args(base)}, text)
+    if base is bool:
         words = {
             "true": True,
             "1": True,
@@ -75,16 +86,13 @@ def _converted(name: str, kind: Any, text: str) -> Any:
             "off": False,
         }
         return _chosen(name, words, text.lower())
-    if kind is str:
+    if base is str:
         return text
     try:
-        value = kind(text)
+        return base(text)
     except ValueError:
-        wanted = "a whole number" if kind is int else "a number"
-        raise ConfigError(f"{name} needs {wanted}, found {text!r}") from None
-    if not math.isfinite(value) or value < 0:
-        raise ConfigError(f"{name} must be finite and not negative, found {text!r}")
-    return value
+        wanted = "a whole number" if base is int else "a number"
+        raise ConfigError(f"{name} needs {wanted}, found {shown(text)}") from None
 
 
 def _chosen(name: str, allowed: Mapping[str, Any], text: str) -> Any:

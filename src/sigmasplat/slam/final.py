@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from sigmasplat.config import Config, FinalConfig
-from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.config import Config
+from sigmasplat.errors import SigmaSplatError
 from sigmasplat.model.field import COLUMNS, INITIAL_LOG_VARIANCE, GaussianField, Rows
-from sigmasplat.model.harmonics import count
 from sigmasplat.model.mesh import Mesh
 from sigmasplat.model.submap import SubmapStore
 from sigmasplat.model.tsdf import packed
@@ -53,10 +52,9 @@ def final_map(
 
     Calls `progress(steps done, total)`. With `saved`, refinement continues after the last saved step, and the result
     has the same bytes as that of an uninterrupted refinement. Memory contains this map, one submap and some pictures.
-    Raises SigmaSplatError if there is no submap, a submap has no anchor, or its camera is not the view's; ConfigError
-    on settings out of range.
+    Raises SigmaSplatError if there is no submap, a submap has no anchor, or its camera is not the view's.
     """
-    _refuse_misfits(store, anchors, config.final)
+    _refuse_misfits(store, anchors)
     seed = seeded_on_surface if config.final.seed_from == "mesh" else merged
     found = None if saved is None else saved.load()
     field = seed(store, anchors, config) if found is None else found.field
@@ -79,19 +77,12 @@ def final_map(
     return FinalMap(on_device.to(torch.device("cpu")), poses, exposures, done)
 
 
-def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix], final: FinalConfig) -> None:
-    """Raise SigmaSplatError or ConfigError if no final map can be made."""
+def _refuse_misfits(store: SubmapStore, anchors: Sequence[Matrix]) -> None:
+    """Raise SigmaSplatError if no final map can be made."""
     if not 0 < len(store) <= len(anchors):
         raise SigmaSplatError(
             f"the final map needs submaps and one anchor for each, found {len(store)} and {len(anchors)}"
         )
-    count(final.sh_degree)
-    for name in ("spacing_m", "merge_m", "sh_every", "prune_every", "lr_factor", "lr_decay"):
-        if not getattr(final, name) > 0:
-            raise ConfigError(f"final.{name} must be above 0, found {getattr(final, name)}")
-    for name in ("max_axis_ratio", "max_needle_ratio"):
-        if getattr(final, name) != 0 and not getattr(final, name) >= 1:
-            raise ConfigError(f"final.{name} must be 0 or at least 1, found {getattr(final, name)}")
 
 
 # ---- merging ----

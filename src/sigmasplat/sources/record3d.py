@@ -22,7 +22,13 @@ from numpy.typing import NDArray
 from sigmasplat.config import InputConfig
 from sigmasplat.errors import SourceError
 from sigmasplat.model.trajectory import Trajectory
-from sigmasplat.sources.camera.calibration import Calibration, build_camera, json_number, resolve_calibration
+from sigmasplat.sources.camera.calibration import (
+    Calibration,
+    build_camera,
+    check_positive,
+    json_number,
+    resolve_calibration,
+)
 from sigmasplat.sources.files.archive import Archive
 from sigmasplat.sources.files.images import decode_color, depth_to_metres, image_size
 from sigmasplat.sources.files.optional import import_optional
@@ -164,7 +170,7 @@ def _times_s(where: Path, metadata: dict[str, Any], numbers: list[int]) -> NDArr
     if isinstance(times, list) and len(times) > numbers[-1]:
         values = [json_number(where, {"frameTimestamps": times[n]}, "frameTimestamps") for n in numbers]
         return np.array(values)
-    return np.array(numbers) / (json_number(where, metadata, "fps", 60.0) or 60.0)
+    return np.array(numbers) / (check_positive(where, "fps", json_number(where, metadata, "fps", 60.0) or 60.0))
 
 
 def _truth(

@@ -16,7 +16,7 @@ from sigmasplat.model.gyroscope import Gyroscope
 from sigmasplat.model.resizing import resized_color
 from sigmasplat.model.trajectory import Trajectory
 from sigmasplat.sources.base import Source
-from sigmasplat.sources.camera.calibration import Calibration
+from sigmasplat.sources.camera.calibration import Calibration, refuse_impossible_camera
 from sigmasplat.sources.camera.depth_units import refuse_without_depth
 from sigmasplat.sources.camera.rectification import Rectification, check_image_sizes
 from sigmasplat.sources.files.images import image_size, read_color, read_depth
@@ -72,6 +72,7 @@ class RecordedSource(Source):
         Raises SourceError if the first images do not match the calibration, no image has a depth reading, or no image
         was taken while the gyroscope measured.
         """
+        refuse_impossible_camera(name, calibration.camera)
         self._rectified = Rectification(name, calibration, settings)
         super().__init__(name, self._rectified.camera, settings.strict)
         self.depth_units_per_metre: float = calibration.depth_units_per_metre

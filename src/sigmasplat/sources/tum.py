@@ -29,7 +29,7 @@ from sigmasplat.sources.camera.calibration import (
     freiburg_calibration,
     resolve_calibration,
 )
-from sigmasplat.sources.files.association import MAX_GAP_S, associate, no_pairs
+from sigmasplat.sources.files.association import MAX_GAP_S, associate, nearest_gaps_s, no_pairs, refuse_other_units
 from sigmasplat.sources.files.poses import rigid_transform
 from sigmasplat.sources.opening import Format
 from sigmasplat.sources.recorded import ImagePair, RecordedSource, first_size
@@ -49,12 +49,20 @@ def open_tum(
     """
     color_times_s, colors = read_list(folder / "rgb.txt")
     depth_times_s, depths = _depth_list(folder)
+    times_s = {"rgb.txt": color_times_s, "depth.txt": depth_times_s}
+    refuse_other_units(folder, times_s)
     pairs = associate(color_times_s, depth_times_s)
     if not len(pairs):
-        raise no_pairs(folder, {"rgb.txt": color_times_s, "depth.txt": depth_times_s})
+        raise no_pairs(folder, times_s)
     images = [ImagePair(float(color_times_s[i]), colors[i], depths[j]) for i, j in pairs]
     paired = set(pairs[:, 0].tolist())
-    skipped = [f"{path}: no depth within {MAX_GAP_S:g} s" for i, path in enumerate(colors) if i not in paired]
+    gaps_s = nearest_gaps_s(color_times_s, depth_times_s)
+    skipped = [
+        f"{path}: no depth within {MAX_GAP_S:g} s, nearest {gaps_s[i]:.3f} s away"
+        + " (used by another image)" * bool(gaps_s[i] < MAX_GAP_S)
+        for i, path in enumerate(colors)
+        if i not in paired
+    ]
     truth_path = folder / "groundtruth.txt"
     # Read now: damaged ground truth must stop the run before it starts, not its evaluation an hour later.
     truth = read_poses(truth_path) if truth_path.is_file() else None

@@ -198,6 +198,51 @@ def build_camera(path: Path, width: int, height: int, focal: list[float]) -> Cam
         raise SourceError(f"{path}: {error}") from error
 
 
+POSSIBLE_VIEW_DEG = (2.0, 170.0)
+"""A pinhole image with a field of view outside this range is taken for a mistake in the calibration."""
+USUAL_VIEW_DEG = (25.0, 120.0)
+"""Horizontal field of view of depth cameras and phones."""
+CENTRED = 0.2
+"""Principal points are usually within this share of the image size from its centre."""
+
+
+def refuse_impossible_camera(name: str, camera: Camera) -> None:
+    """Raise SourceError if the intrinsics cannot be those of a camera with such images."""
+    low, high = POSSIBLE_VIEW_DEG
+    for axis, degrees in zip("xy", fields_of_view_deg(camera), strict=True):
+        if not low <= degrees <= high:
+            raise SourceError(
+                f"{name}: f{axis} = {getattr(camera, 'f' + axis):g} pixels gives a field of view of {degrees:.3g}°; "
+                f"correct the calibration, or give --f{axis} PIXELS"
+            )
+    if not (-0.5 <= camera.cx <= camera.width - 0.5 and -0.5 <= camera.cy <= camera.height - 0.5):
+        raise SourceError(
+            f"{name}: the principal point ({camera.cx:g}, {camera.cy:g}) is outside the image of "
+            f"{camera.width}×{camera.height}; correct the calibration, or give --cx and --cy"
+        )
+
+
+def unlikely_camera(camera: Camera) -> str | None:
+    """Return a warning if the intrinsics are unusual, None if they are plausible."""
+    degrees, (low, high) = fields_of_view_deg(camera)[0], USUAL_VIEW_DEG
+    if not low <= degrees <= high:
+        return f"the field of view is {degrees:.0f}°, which is unusual for a depth camera; check fx"
+    if not 0.8 <= camera.fx / camera.fy <= 1.25:
+        return f"fx = {camera.fx:g} and fy = {camera.fy:g} differ; pixels are usually square: check both"
+    x, y = camera.cx - (camera.width - 1) / 2, camera.cy - (camera.height - 1) / 2
+    if abs(x) > CENTRED * camera.width or abs(y) > CENTRED * camera.height:
+        return f"the principal point is ({x:+.0f}, {y:+.0f}) pixels from the image centre; check cx and cy"
+    return None
+
+
+def fields_of_view_deg(camera: Camera) -> tuple[float, float]:
+    """Return the horizontal and the vertical field of view of the image, degrees."""
+    return (
+        float(np.degrees(2 * np.arctan(0.5 * camera.width / camera.fx))),
+        float(np.degrees(2 * np.arctan(0.5 * camera.height / camera.fy))),
+    )
+
+
 def _camera(path: Path, fields: dict[str, Any], size: tuple[int, int]) -> Camera:
     width, height = json_number(path, fields, "width", size[0]), json_number(path, fields, "height", size[1])
     return build_camera(

@@ -13,6 +13,9 @@ Times = NDArray[np.float64]
 MAX_GAP_S = 0.02
 """Largest time difference of a colour and a depth image of one camera at 30 Hz; TUM's own tool uses the same."""
 
+UNIT_RATIO = 200.0
+"""Median steps of two lists that differ by this factor are in different units, such as s and ms."""
+
 
 def associate(first_s: Times, second_s: Times, tolerance_s: float = MAX_GAP_S) -> NDArray[np.intp]:
     """Pair timestamps [N] and [M], seconds, that differ by less than `tolerance_s`; return indices [K, 2] by time.
@@ -39,6 +42,23 @@ def no_pairs(path: Path, times_s: Mapping[str, Times]) -> SourceError:
     return SourceError(
         f"no colour image of {path} has depth within {MAX_GAP_S:g} s ({spans}); are both from one recording?"
     )
+
+
+def refuse_other_units(path: Path, times_s: Mapping[str, Times]) -> None:
+    """Raise SourceError if the steps of two lists of times differ so much that their units do."""
+    steps = {name: float(np.median(np.abs(np.diff(t)))) for name, t in times_s.items() if len(t) > 2}
+    if len(steps) < 2 or min(steps.values()) <= 0 or max(steps.values()) < UNIT_RATIO * min(steps.values()):
+        return
+    found = ", ".join(f"{name} {step:.6g}" for name, step in steps.items())
+    raise SourceError(f"{path}: times are in different units (median steps: {found}); write both in seconds")
+
+
+def nearest_gaps_s(first_s: Times, second_s: Times) -> Times:
+    """Return the time from each of the first times to the nearest of the second, seconds [N]."""
+    ordered = np.sort(second_s)
+    after = np.clip(np.searchsorted(ordered, first_s), 1, max(len(ordered) - 1, 1))
+    before, later = ordered[after - 1], ordered[np.minimum(after, len(ordered) - 1)]
+    return np.asarray(np.minimum(np.abs(first_s - before), np.abs(first_s - later)))
 
 
 def _candidates(first_s: Times, second_s: Times, tolerance_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
