@@ -225,7 +225,8 @@ def _run_and_score(
     cuda_stages.measure(run_options.profile)
     state = StateFile(start.slam, folder, run_options.save_every)
     start.slam.saved_refinement = RefinementFile(start.slam, folder, run_options.save_every)
-    system, read = (RealTime(start.slam, covariances=False), Arrivals(source)) if realtime else (None, source)
+    read = Arrivals(source) if realtime else source
+    system = RealTime(start.slam, covariances=False, hurried=read.waits) if isinstance(read, Arrivals) else None
     if system:
         state.run_save = system.save
         folder.note(realtime=True)
@@ -238,6 +239,8 @@ def _run_and_score(
         )
         if robot:
             session.watch = robot.watch
+        if system:
+            session.later = system.between_frames
         outcome = session.execute()
     if outcome.status == "interrupted" and not outcome.frames:
         raise KeyboardInterrupt  # the folder has no results, and no state to resume from
