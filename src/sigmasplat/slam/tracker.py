@@ -1,7 +1,7 @@
 """Tracking: predict the pose, fit it to the fixed map, judge the fit, and try other guesses if it is doubtful."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field as dataclass_field
 
 import numpy as np
@@ -22,7 +22,7 @@ from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foregro
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.tracked_keyframe import Splats, TrackedKeyframe, found_keyframe, mapped_keyframe
 from sigmasplat.slam.localisation.verdict import LEAST_COMMON, Usual, confirmed, score, stands
-from sigmasplat.slam.rules import is_lost, jumped
+from sigmasplat.slam.rules import Asked, is_lost, jumped, never, unless
 from sigmasplat.types import Matrix
 
 DOUBT = 0.7
@@ -90,12 +90,7 @@ class Tracker:
         self.last_image, self.last_features, self.R_inertial_camera = seen.live, seen.image, R_inertial_camera
 
     def track(
-        self,
-        field: Splats,
-        view: View,
-        seen: Sight,
-        R_inertial_camera: Matrix | None = None,
-        hurried: Callable[[], bool] = lambda: False,
+        self, field: Splats, view: View, seen: Sight, R_inertial_camera: Matrix | None = None, hurried: Asked = never
     ) -> PoseFit:
         """Estimate T_camera_world of a frame; `self.lost` then says whether tracking failed.
 
@@ -227,7 +222,7 @@ class Tracker:
                 yield self.previous @ se3.inverse(found.T_live_reference)
 
     def _retry(
-        self, field: Splats, view: View, seen: Sight, fit: PoseFit, expected: Expected, hurried: Callable[[], bool]
+        self, field: Splats, view: View, seen: Sight, fit: PoseFit, expected: Expected, hurried: Asked
     ) -> PoseFit:
         """Retry from odometry with twice the iterations (VarSplat §3), and from the last pose; return the best fit.
 
@@ -235,9 +230,7 @@ class Tracker:
         """
         odometry = None if hurried() else self._odometry(view, seen.live, expected)
         starts = [expected.last] if odometry is None else [odometry, expected.last]
-        fits = [fit]
-        if not hurried():
-            fits += [self._fit(field, view, seen, start, 2) for start in unless(hurried, starts)]
+        fits = [fit, *(self._fit(field, view, seen, start, 2) for start in unless(hurried, starts))]
         by_map = self.config.method == "align" and self.config.align_to == "keyframe"  # with "map", `_fit` has tried it
         if by_map and not hurried():
             for start in unless(hurried, starts):
@@ -345,14 +338,6 @@ class Tracker:
             return fit.alignment
         T_live_keyframe = fit.T_camera_world @ se3.inverse(self.keyframe.T_camera_world)
         return align(self.keyframe.pyramid, live, T_live_keyframe, 0, self.config.align_weight_color)
-
-
-def unless(hurried: Callable[[], bool], guesses: Iterable[Matrix]) -> Iterator[Matrix]:
-    """Yield guesses; after the first one, only while `hurried` returns False."""
-    for guess in guesses:
-        yield guess
-        if hurried():
-            return
 
 
 def _without_motion(config: TrackingConfig) -> TrackingConfig:
