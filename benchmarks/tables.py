@@ -34,7 +34,7 @@ SUBJECTS = {
     "Exported maps": ("export_sizes",),
     "Geometry": ("four_frames", "away_from_path"),
     "Kernels": ("cpu", "versus", "gpu", "kernels"),
-    "Real time": ("realtime",),
+    "Real time": ("realtime", "long_live"),
     "Long runs": ("long_run", "viewer_memory"),
 }
 """Benchmarks by the subject under which their results are listed, in this order; all others follow at the end."""

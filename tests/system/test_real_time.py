@@ -134,6 +134,18 @@ def test_too_many_waiting_keyframes_are_refused_and_counted() -> None:
     assert len(system.slam.keyframe_indices) == 3
 
 
+@pytest.mark.parametrize("hurried", [0, 8])
+def test_a_hurried_frame_tries_no_further_guesses_and_tracking_recovers_afterwards(hurried: int) -> None:
+    """After a jump the first guess fails. While frames wait, it is the only one; then features find the camera."""
+    seen, lost = frames(80), list[bool]()
+    system = RealTime(Slam(config(recovery__relocalise="off")), AtOnce(), hurried=lambda: len(lost) < hurried)
+    for number, frame in enumerate([*seen[:6], *seen[18:22]]):
+        lost.append(system.step(replace(frame, index=number, timestamp_s=number / 30)).lost)
+    system.settle()
+    assert np.isfinite(system.trajectory().T_world_camera).all()
+    assert lost == [False] * 6 + [bool(hurried)] * 2 + [False] * 2
+
+
 # ---- the thread ----
 
 

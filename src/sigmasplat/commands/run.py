@@ -226,7 +226,8 @@ def _run_and_score(
     cuda_stages.measure(run_options.profile)
     state = StateFile(start.slam, folder, run_options.save_every)
     start.slam.saved_refinement = RefinementFile(start.slam, folder, run_options.save_every)
-    system, read = (RealTime(start.slam, covariances=False), Arrivals(source)) if realtime else (None, source)
+    read = Arrivals(source) if realtime else source
+    system = RealTime(start.slam, covariances=False, hurried=read.waits) if isinstance(read, Arrivals) else None
     if system:
         state.run_save = system.save
         folder.note(realtime=True)
@@ -237,16 +238,15 @@ def _run_and_score(
         session = Session(
             system or start.slam, read, folder, callback, state, start.next_index, start.wall_s, run_options.all_poses
         )
-        if robot:
-            session.watch = robot.watch
+        session.watch = robot.watch if robot else session.watch
+        session.later = system.between_frames if system else session.later
         outcome = session.execute()
     if outcome.status == "interrupted" and not outcome.frames:
         raise KeyboardInterrupt  # the folder has no results, and no state to resume from
     if run_options.profile:
         screen.profile(folder.read_profile())
     _warn_of_skipped_frames(screen, source)
-    if system and read.dropped:
-        screen.warn(f"{read.dropped} frames were dropped because tracking was late")
+    _warn_of_dropped_frames(screen, read)
     _warn_if_never_recognised(screen, folder)
     if outcome.status == "interrupted":
         _say_interrupted(screen, outcome, folder)
@@ -297,6 +297,12 @@ def _warn_of_skipped_frames(screen: "Screen", source: "Source") -> None:
         screen.warn(source.ending)
     if isinstance(source, LiveSource) and source.dropped:
         screen.say(f"{source.dropped} frames of the camera were dropped because SLAM was slower")
+
+
+def _warn_of_dropped_frames(screen: "Screen", read: "Source") -> None:
+    """Print how many frames were dropped in real time."""
+    if read.arrived_s is not None and read.dropped:
+        screen.warn(f"{read.dropped} frames were dropped because tracking was late")
 
 
 def _warn_if_never_recognised(screen: "Screen", folder: "RunFolder") -> None:

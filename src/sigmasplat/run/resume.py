@@ -11,6 +11,7 @@ from sigmasplat.io.json_files import read_text
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.state import read_state, write_state
 from sigmasplat.model.field import GaussianField, Rows
+from sigmasplat.run.session import run_now
 from sigmasplat.slam.refinement import Refined
 from sigmasplat.slam.slam import Slam
 from sigmasplat.slam.state import CLASSES, fixed, restore, state_of
@@ -21,11 +22,6 @@ REFINEMENT_CLASSES: tuple[type, ...] = (GaussianField, Refined, Rows, VectorAdam
 
 MOST_TIME_SHARE = 0.05
 """Maximum share of the run's time that is spent on saves: a state grows with the number of frames."""
-
-
-def run_now(task: Callable[[], None]) -> None:
-    """Run a task at once."""
-    task()
 
 
 @dataclass(eq=False)

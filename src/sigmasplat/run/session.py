@@ -118,11 +118,17 @@ def ignore(frame: Frame) -> None:
     """Do nothing with a frame."""
 
 
+def run_now(task: Callable[[], None]) -> None:
+    """Run a task at once."""
+    task()
+
+
 @dataclass(eq=False)
 class Session:
     """A run of SLAM on a source, from its frame `first_index` on; a resumed run has already taken `wall_s` seconds.
 
     all_poses: also write trajectory_all.txt, which has the poses of all frames. watch: gets each frame before its step.
+    later: runs a task that no frame needs to wait for; at once by default, beside the frames in real time.
     """
 
     slam: SlamSystem
@@ -134,6 +140,7 @@ class Session:
     wall_s: float = 0.0
     all_poses: bool = False
     watch: Callable[[Frame], None] = ignore
+    later: Callable[[Callable[[], None]], None] = run_now
     frames: int = field(default=0, init=False)
     lost: int = field(default=0, init=False)
     relocalised: int = field(default=0, init=False)
@@ -209,7 +216,7 @@ class Session:
             line["seconds"]["latency"] = time.perf_counter() - arrived_s
         self.run.log(line)
         if step.loops:
-            self._write_loops()
+            self.later(self._write_loops)
         self.frames += 1
         self.lost += step.lost
         self.relocalised += step.state == RELOCALISED

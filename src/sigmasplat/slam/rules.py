@@ -1,6 +1,6 @@
 """Decide by rules: small functions that answer yes or no, or choose from a list."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -11,6 +11,13 @@ from sigmasplat.fit.pose import PoseFit
 from sigmasplat.model import se3
 
 Item = TypeVar("Item")
+Asked = Callable[[], bool]
+"""Asked again and again during long work."""
+
+
+def never() -> bool:
+    """Return False."""
+    return False
 
 
 def is_keyframe(frames_since: int, every: int, overlap: float, overlap_below: float) -> bool:
@@ -89,3 +96,11 @@ def draw_keyframes(
             others = [i for i in range(len(everything)) if i != drawn[0]]
             drawn += [int(i) for i in random.choice(others, min(together - 1, len(others)), replace=False)]
         yield [everything[i] for i in drawn]
+
+
+def unless(hurried: Asked, guesses: Iterable[Item]) -> Iterator[Item]:
+    """Yield guesses while `hurried` returns False."""
+    for guess in guesses:
+        if hurried():
+            return
+        yield guess

@@ -22,7 +22,7 @@ from sigmasplat.slam.localisation.foreground import Earlier, Foreground, foregro
 from sigmasplat.slam.localisation.sight import FoundKeyframe, Sight
 from sigmasplat.slam.localisation.tracked_keyframe import Splats, TrackedKeyframe, found_keyframe, mapped_keyframe
 from sigmasplat.slam.localisation.verdict import LEAST_COMMON, Usual, confirmed, score, stands
-from sigmasplat.slam.rules import is_lost, jumped
+from sigmasplat.slam.rules import Asked, is_lost, jumped, never, unless
 from sigmasplat.types import Matrix
 
 DOUBT = 0.7
@@ -89,20 +89,23 @@ class Tracker:
         """Fix the gauge: the first camera is the world. R_inertial_camera: as in `Frame`."""
         self.last_image, self.last_features, self.R_inertial_camera = seen.live, seen.image, R_inertial_camera
 
-    def track(self, field: Splats, view: View, seen: Sight, R_inertial_camera: Matrix | None = None) -> PoseFit:
+    def track(
+        self, field: Splats, view: View, seen: Sight, R_inertial_camera: Matrix | None = None, hurried: Asked = never
+    ) -> PoseFit:
         """Estimate T_camera_world of a frame; `self.lost` then says whether tracking failed.
 
-        R_inertial_camera: as in `Frame`. A lost frame gets the best available guess (odometry, else the last pose), and
-        the velocity is reset.
+        R_inertial_camera: as in `Frame`. hurried: asked before each further guess; if it returns True, that guess and
+        the later ones are left out. A lost frame gets the best available guess (odometry, else the last pose), and the
+        velocity is reset.
         """
         expected = self._expected(R_inertial_camera)
         best = self._fit(field, view, seen, expected.predicted)
         best, shown = self._uncovered(field, view, seen, expected.predicted, best)
-        if self._is_wide(best, view) or self._doubts(best):
-            guesses = [self._fit(field, view, shown, guess) for guess in self._other_guesses(shown, expected)]
-            best = max([best, *guesses], key=self._score)
+        if (self._is_wide(best, view) or self._doubts(best)) and not hurried():
+            guesses = unless(hurried, self._other_guesses(shown, expected))
+            best = max([best, *(self._fit(field, view, shown, guess) for guess in guesses)], key=self._score)
         if self._doubts(best):
-            best = self._retry(field, view, shown, best, expected)
+            best = self._retry(field, view, shown, best, expected, hurried)
         self.R_inertial_camera = R_inertial_camera
         self.lost = self._is_lost(best) or self._leaps(best, expected.predicted)
         if self.lost:
@@ -218,16 +221,19 @@ class Tracker:
             if found is not None:
                 yield self.previous @ se3.inverse(found.T_live_reference)
 
-    def _retry(self, field: Splats, view: View, seen: Sight, fit: PoseFit, expected: Expected) -> PoseFit:
+    def _retry(
+        self, field: Splats, view: View, seen: Sight, fit: PoseFit, expected: Expected, hurried: Asked
+    ) -> PoseFit:
         """Retry from odometry with twice the iterations (VarSplat §3), and from the last pose; return the best fit.
 
         With alignment, also try the map rendered at these poses: it contains more than the newest keyframe.
         """
-        odometry = self._odometry(view, seen.live, expected)
+        odometry = None if hurried() else self._odometry(view, seen.live, expected)
         starts = [expected.last] if odometry is None else [odometry, expected.last]
-        fits = [fit] + [self._fit(field, view, seen, s, 2) for s in starts]
-        if self.config.method == "align" and self.config.align_to == "keyframe":  # with "map", `_fit` has tried it
-            for start in starts:
+        fits = [fit, *(self._fit(field, view, seen, start, 2) for start in unless(hurried, starts))]
+        by_map = self.config.method == "align" and self.config.align_to == "keyframe"  # with "map", `_fit` has tried it
+        if by_map and not hurried():
+            for start in unless(hurried, starts):
                 reference = map_reference(field.params, view, se3.inverse(start), self.config)
                 fits.append(self._aligned(reference, seen.live, se3.inverse(start)))
         best = max(fits, key=self._score)

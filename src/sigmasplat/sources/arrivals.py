@@ -51,9 +51,14 @@ class Arrivals(Source):
         self.depth_registered, self.registrable = whole.depth_registered, whole.registrable
         self.dropped = 0
         self._whole, self._clock, self._wait = whole, clock, wait
+        self._queue = _Newest()
 
     def __len__(self) -> int:
         return len(self._whole)
+
+    def waits(self) -> bool:
+        """Return whether the next frame has arrived already."""
+        return self._queue.waits
 
     def frame(self, i: int) -> Frame:
         """Read frame i at once."""
@@ -65,7 +70,7 @@ class Arrivals(Source):
 
     def frames_from(self, first: int) -> Iterator[Frame]:
         """Yield frames as they arrive. Raises as the source does."""
-        queue = _Newest()
+        queue = self._queue = _Newest()
         thread = threading.Thread(target=self._deliver, args=(first, queue), name="camera", daemon=True)
         thread.start()
         try:
@@ -107,6 +112,11 @@ class _Newest:
         self._ended, self._error = False, None
 
     _error: BaseException | None = None
+
+    @property
+    def waits(self) -> bool:
+        """Return whether a frame waits."""
+        return bool(self._frames)
 
     def put(self, arrival: Arrival) -> None:
         """Add a frame; drop the oldest if too many wait."""

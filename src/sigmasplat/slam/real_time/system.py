@@ -38,12 +38,19 @@ class RealTime(ArrayInterface):
     Between `step` calls the state of `slam` belongs to the mapping thread: read it in a task (`between_frames`), or
     after `settle`. The results depend on how fast the machine is, so they are not reproducible. schedule: when the work
     on the map runs, by default on a thread; covariances: whether `track` and `covariance` return covariances, which
-    cost some milliseconds of work per keyframe. Functions of `on_keyframe`, `on_loop` and `on_correction` are called by
+    cost some milliseconds of work per keyframe; hurried: returns whether the next frame has arrived already, then no
+    further guess of a doubtful pose is tried. Functions of `on_keyframe`, `on_loop` and `on_correction` are called by
     the thread that calls `step`, when it learns of the event.
     """
 
-    def __init__(self, slam: Slam, schedule: Schedule | None = None, covariances: bool = True) -> None:
-        self.slam, c = slam, slam.config
+    def __init__(
+        self,
+        slam: Slam,
+        schedule: Schedule | None = None,
+        covariances: bool = True,
+        hurried: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self.slam, self._hurried, c = slam, hurried, slam.config
         wanted = c.tracking.features or c.recovery.relocalise
         self._extractor = make_extractor(c.features) if wanted else None  # not shared with the mapping thread
         tracker = Tracker(c.tracking, self._extractor if c.tracking.features else None)
@@ -71,7 +78,7 @@ class RealTime(ArrayInterface):
             seen = self.slam.observed(frame, self._view, self._extractor)
         if mapping_s:
             timer.add({"mapping": mapping_s})
-        tracked = self._camera.track(seen, self._view, timer)
+        tracked = self._camera.track(seen, self._view, timer, self._hurried)
         self._map.given.put(tracked)
         self._schedule.wake()
         self._newest = tracked.step

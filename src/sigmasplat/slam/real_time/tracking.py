@@ -1,7 +1,7 @@
 """The clock of the camera: track frames against the newest snapshot of the map, and choose keyframes."""
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -113,15 +113,17 @@ class CameraClock:
 
     # ---- a frame ----
 
-    def track(self, seen: Observation, view: View, timer: StepTimer) -> TrackedFrame:
-        """Track a frame, and decide whether it becomes a keyframe."""
+    def track(
+        self, seen: Observation, view: View, timer: StepTimer, hurried: Callable[[], bool] = lambda: False
+    ) -> TrackedFrame:
+        """Track a frame, and decide whether it becomes a keyframe; hurried: as in `Tracker.track`."""
         number, offer, search = self.frames, None, None
         if number == 0:
             found, offer = self._begin(seen)
         else:
             with timer.stage("track"), timer.kernels_of(view, "track_kernels"):
                 splats = NOTHING if self.snapshot is None else self.snapshot
-                fit = self.tracker.track(splats, view, seen, seen.frame.R_inertial_camera)
+                fit = self.tracker.track(splats, view, seen, seen.frame.R_inertial_camera, hurried)
             found = Found.of(fit, se3.inverse(fit.T_camera_world), self.tracker.lost)
             self.recovery.count(self.tracker.lost, self.tracker.doubtful > 0, seen)
             held_back = is_held_back(number, self.config.input.hold_every)
