@@ -1,5 +1,6 @@
 """Extract a surface from a run's map: sigmasplat mesh."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -47,7 +48,8 @@ def make_mesh(
         surface = decimated(surface, triangles)
     if chosen != "camera":
         surface = surface.moved(transform_to(chosen, levelled(RunReader(folder, lambda: source))))
-    write_mesh(target, surface, f"sigmasplat, unit metre, axes {chosen}")
+    with nullcontext() if out else folder.locked(screen.warn):
+        write_mesh(target, surface, f"sigmasplat, unit metre, axes {chosen}")
     screen.say(f"axes {chosen}, {len(surface.vertices):,} vertices, {len(surface.faces):,} triangles: {target}")
     return 0
 
