@@ -99,8 +99,14 @@ def cannot_write(path: Path, problem: OSError) -> RunError:
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder and its parents unless they exist. Raises RunError if that is not possible."""
+    """Create a folder and its parents unless they exist; their names are then on the disk.
+
+    Raises RunError if that is not possible.
+    """
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as problem:
         raise cannot_write(path, problem) from problem
+    for folder in missing:
+        sync_folder(folder.parent)

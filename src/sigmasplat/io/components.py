@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from sigmasplat.io.atomic import make_folder
 from sigmasplat.io.splats import ply
 from sigmasplat.io.trajectory import write_trajectory
 from sigmasplat.model.component import Component
@@ -19,7 +20,7 @@ def write_components(folder: Path, components: Sequence[Component]) -> None:
     """
     for component in components:
         own = folder / str(component.number)
-        own.mkdir(parents=True, exist_ok=True)
+        make_folder(own)
         write_trajectory(own / "trajectory.txt", component.trajectory)
         ply.write_field(own / "map.ply", component.field)
     for number in set(component_numbers(folder)) - {component.number for component in components}:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sigmasplat.errors import RunError
-from sigmasplat.io.atomic import cannot_write
+from sigmasplat.io.atomic import cannot_write, make_folder
 
 LOCK = ".lock"
 """The locked file in a run folder; it contains the process and the computer. After a kill it stays, without a lock."""
@@ -59,8 +59,8 @@ def _acquired(folder: Path, warn: Callable[[str], None]) -> int | None:
     """Lock the file of a folder and write this process into it; return it, or None if the file system has no locks."""
     path = folder / LOCK
     while True:
+        make_folder(folder)
         try:
-            folder.mkdir(parents=True, exist_ok=True)
             file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         except OSError as problem:
             raise cannot_write(folder, problem) from problem
