@@ -4,6 +4,7 @@ Operations are what Python's audit events report: a file opened to write, a rena
 fsync. Files that a compiled library writes are seen when Python renames them.
 """
 
+import importlib
 import json
 import os
 import signal
@@ -16,6 +17,8 @@ from typing import Any
 
 os.environ.setdefault("SIGMASPLAT_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: threads do not survive a fork
+LOADED = ("cli", "slam.slam", "run.session", "run.terminal", "run.resume", "sources.synthetic")
+"""Modules that are imported once, before the processes are forked."""
 AUDITED = {"open": "create", "os.rename": "rename", "os.remove": "remove", "os.mkdir": "mkdir", "os.rmdir": "rmdir"}
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 
@@ -94,6 +97,8 @@ def run(arguments: Sequence[str], watched: Path, scratch: Path, kill: Kill | Non
 
     The state is saved after every frame and every step of the final map.
     """
+    for name in LOADED:
+        importlib.import_module(f"sigmasplat.{name}")
     records, output = scratch / "operations.jsonl", scratch / "output.txt"
     child = os.fork()
     if not child:

@@ -35,8 +35,6 @@ from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.splats.any_format import read_any
 from sigmasplat.io.tensors import open_tensors
 from sigmasplat.io.trajectory import read_trajectory
-from sigmasplat.run import resume  # noqa: F401 - imported before the processes are forked
-from sigmasplat.sources import open_source  # noqa: F401
 
 arg = tyro.conf.arg
 KILLED = -9
@@ -231,9 +229,9 @@ def timeless_log(path: Path) -> Any:
 
 
 def timeless_json(path: Path) -> Any:
-    """Return a JSON object without the keys of times and rates."""
+    """Return a JSON object without times, rates, and the commit, which changes if the checkout is edited meanwhile."""
     values = json.loads(path.read_text(encoding="utf-8"))
-    return {key: value for key, value in values.items() if not key.endswith("_s")}
+    return {key: value for key, value in values.items() if not key.endswith("_s") and key != "code"}
 
 
 def name_only(path: Path) -> str:
