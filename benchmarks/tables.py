@@ -36,6 +36,7 @@ SUBJECTS = {
     "Kernels": ("cpu", "versus", "gpu", "kernels"),
     "Real time": ("realtime", "long_live"),
     "Long runs": ("long_run", "viewer_memory"),
+    "Killed runs": ("crashes",),
 }
 """Benchmarks by the subject under which their results are listed, in this order; all others follow at the end."""
 BLOCK = re.compile(r"(<!-- bench:(?P<what>[\w./+-]+|\*) -->\n)(?P<body>.*?)(<!-- /bench -->)", re.DOTALL)

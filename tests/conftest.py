@@ -21,7 +21,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Their assertions explain themselves as those of tests do.
-pytest.register_assert_rewrite("benchmark_results", "command_line")
+pytest.register_assert_rewrite("benchmark_results", "command_line", "run_process")
 
 TINY_SIZE = (32, 24)  # width, height
 TINY_DEPTH_M = 2.0

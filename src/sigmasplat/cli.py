@@ -1,5 +1,6 @@
 """Run the command line: a table of commands, and their exit codes."""
 
+import resource
 import sys
 from collections.abc import Callable, Sequence
 
@@ -21,9 +22,11 @@ from sigmasplat.commands.option_ranges import checked
 from sigmasplat.commands.run import demo, resume, run
 from sigmasplat.commands.view import view
 from sigmasplat.config.text import nearest
-from sigmasplat.errors import ConfigError, SigmaSplatError
+from sigmasplat.errors import ConfigError, SigmaSplatError, is_out_of_memory, out_of_memory
 
 REFUSED, INTERRUPTED = 2, 130
+LEAST_MEMORY = 1_200_000_000
+"""Address space, bytes: a run of tiny images needs that much (1.0 GB was too little with torch 2.13)."""
 DESCRIPTION = """RGB-D SLAM on 3D Gaussian splats, with uncertainty.
 
 Start with: sigmasplat demo, then: sigmasplat run PATH.
@@ -54,6 +57,16 @@ def _refuse_unknown(command: str) -> None:
         raise ConfigError(f"no command '{command}'{nearest(command, COMMANDS)}; the commands are {', '.join(COMMANDS)}")
 
 
+def _refuse_memory_limit() -> None:
+    """Raise ConfigError if the process may use too little memory to load torch, whose loading may then never end."""
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY and limit < LEAST_MEMORY:
+        raise ConfigError(
+            f"the memory of this process is limited to {limit / 1e6:.0f} MB, but at least {LEAST_MEMORY / 1e6:.0f} MB "
+            "of address space are needed; raise the limit (ulimit -v unlimited)"
+        )
+
+
 def _run_command(arguments: Sequence[str]) -> int:
     """Run the command in the arguments and return its exit code."""
     code: int = tyro.extras.subcommand_cli_from_dict(
@@ -76,6 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         env.switches()
         _refuse_unknown(given[0])
+        _refuse_memory_limit()
         code = _run_command(given)
     except SigmaSplatError as problem:
         print(f"sigmasplat: {problem}", file=sys.stderr)
@@ -83,6 +97,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("sigmasplat: interrupted", file=sys.stderr)
         code = INTERRUPTED
+    except Exception as problem:
+        if not is_out_of_memory(problem):
+            raise
+        print(f"sigmasplat: {out_of_memory(problem)}", file=sys.stderr)
+        code = REFUSED
     sys.exit(code)
 
 

@@ -1,56 +1,19 @@
 """Runs stopped by Ctrl-C or killed: their folders can be read afterwards, or are refused with one line."""
 
-import os
 import signal
-import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 import torch
 
 from command_line import exit_code
+from run_process import PATIENCE_S, ROOM, lines, running, wait_for
 from sigmasplat.errors import RunError
 from sigmasplat.evaluation.evaluate import evaluate
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.sources import open_source
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
-
-ROOM = "synthetic:frames=200,width=80,height=60"
-QUICK = ["input.width=80", "mapping.first_iterations=5", "mapping.iterations=3", "submaps.distance_m=0",
-         "submaps.angle_deg=0"]  # fmt: skip
-PATIENCE_S = 90.0
-
-
-@contextmanager
-def running(out: Path, *more: str, room: str = ROOM) -> Iterator[subprocess.Popen[str]]:
-    """Start a run in a separate process, with additional settings; kill it at the end."""
-    settings = [word for setting in (*QUICK, *more) for word in ("--set", setting)]
-    command = [sys.executable, "-m", "sigmasplat.cli", "run", room, "--out", str(out), *settings]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-def wait_for(process: subprocess.Popen[str], happened: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not happened():
-        assert process.poll() is None, f"ended too early: {process.communicate()}"
-        assert time.monotonic() < deadline_s, "timeout"
-        time.sleep(0.01)
-
-
-def lines(out: Path) -> int:
-    """Count the complete lines of the log."""
-    log = out / "log.jsonl"
-    return log.read_text().count("\n") if log.exists() else 0
 
 
 def test_ctrl_c_leaves_a_usable_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

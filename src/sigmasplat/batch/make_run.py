@@ -19,7 +19,7 @@ import torch
 
 from sigmasplat import env
 from sigmasplat.batch.job import Job
-from sigmasplat.errors import SigmaSplatError
+from sigmasplat.errors import SigmaSplatError, is_out_of_memory, out_of_memory
 from sigmasplat.evaluation.evaluate import evaluate
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.metrics.lpips import find_lpips
@@ -42,9 +42,14 @@ def make_run(job: Job, folder: Path, data: str | None, save_every_s: float) -> N
             return
         path = job.sequence(data)
         source = open_source(path, job.config.input)
-        run = RunFolder(folder)
-        if not (job.started_in(folder) and run.facts().get("status") == "complete"):
-            run, start = _started(job, folder, source, path)
+        _make_and_score(job, RunFolder(folder), source, path, save_every_s)
+
+
+def _make_and_score(job: Job, run: RunFolder, source: Source, path: str, save_every_s: float) -> None:
+    """Make or resume the run unless it is complete, then score it."""
+    with run.locked():
+        if not (job.started_in(run.path) and run.facts().get("status") == "complete"):
+            run, start = _started(job, run.path, source, path)
             state = StateFile(start.slam, run, save_every_s)
             start.slam.saved_refinement = RefinementFile(start.slam, run, save_every_s)
             outcome = Session(
@@ -99,6 +104,11 @@ def main(job_text: str, folder: str, save_every_s: str, data: str | None = None)
         return REFUSED
     except KeyboardInterrupt:
         return INTERRUPTED
+    except Exception as problem:
+        if not is_out_of_memory(problem):
+            raise
+        print(out_of_memory(problem), file=sys.stderr)
+        return REFUSED
     return 0
 
 

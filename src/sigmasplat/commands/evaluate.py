@@ -73,10 +73,12 @@ def evaluate_run(
     from sigmasplat.run.terminal import Screen
 
     folder, screen = RunFolder.open(run), Screen()
-    source = source_of(folder, moved_to)
-    prepare_torch()
-    if unscored := score(screen, folder, source, mesh, eval_options):
-        screen.say(unscored)
+    with folder.locked(screen.warn):
+        folder.remove_leftovers()
+        source = source_of(folder, moved_to)
+        prepare_torch()
+        if unscored := score(screen, folder, source, mesh, eval_options):
+            screen.say(unscored)
     return 0
 
 

@@ -1,5 +1,6 @@
 """Extract a surface from a run's map: sigmasplat mesh."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,16 +40,17 @@ def make_mesh(
     refuse_existing(out, overwrite)
     source = source_of(folder, moved_to)
     prepare_torch()
-    fusion_input = FusionInput.of(folder, source.camera)
-    with screen.counting("surface") as progress:
-        surface = fusion_input.surface(voxel_m, progress=progress)
-    if len(surface.faces) > triangles > 0:
-        screen.say(f"{len(surface.faces):,} triangles are reduced to {triangles:,} (--triangles)")
-        surface = decimated(surface, triangles)
-    if chosen != "camera":
-        surface = surface.moved(transform_to(chosen, levelled(RunReader(folder, lambda: source))))
-    write_mesh(target, surface, f"sigmasplat, unit metre, axes {chosen}")
-    screen.say(f"axes {chosen}, {len(surface.vertices):,} vertices, {len(surface.faces):,} triangles: {target}")
+    with nullcontext() if out else folder.locked(screen.warn):
+        fusion_input = FusionInput.of(folder, source.camera)
+        with screen.counting("surface") as progress:
+            surface = fusion_input.surface(voxel_m, progress=progress)
+        if len(surface.faces) > triangles > 0:
+            screen.say(f"{len(surface.faces):,} triangles are reduced to {triangles:,} (--triangles)")
+            surface = decimated(surface, triangles)
+        if chosen != "camera":
+            surface = surface.moved(transform_to(chosen, levelled(RunReader(folder, lambda: source))))
+        write_mesh(target, surface, f"sigmasplat, unit metre, axes {chosen}")
+        screen.say(f"axes {chosen}, {len(surface.vertices):,} vertices, {len(surface.faces):,} triangles: {target}")
     return 0
 
 

@@ -90,7 +90,7 @@ def run(
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.run.finished_map import FinishedMap, continue_map
     from sigmasplat.run.resume import StartPoint
-    from sigmasplat.run.session import new_folder, removed_on_early_failure
+    from sigmasplat.run.session import new_run
     from sigmasplat.run.step_logs import log_names
     from sigmasplat.run.terminal import Screen
     from sigmasplat.slam.slam import Slam
@@ -104,14 +104,15 @@ def run(
     if earlier:
         earlier.refuse_other_size(config)
     source, config = _opened(screen, path, config, record)
-    with _viewer(screen, run_options) as viewer:
-        folder = new_folder(out, config, source, overwrite, keep=onto, source_path=full_path(path))
-        with removed_on_early_failure(folder):
-            _announce(screen, config.name, source, folder, record)
-            prepare_torch()
-            slam = continue_map(earlier, config, source, folder) if earlier else Slam(config, folder.submaps)
-            at_once = realtime or (source.live and config.realtime.live)
-            return _run_and_score(screen, StartPoint(slam), source, folder, run_options, viewer, robot_options, at_once)
+    with (
+        _viewer(screen, run_options) as viewer,
+        new_run(out, config, source, overwrite, onto, screen.warn, source_path=full_path(path)) as folder,
+    ):
+        _announce(screen, config.name, source, folder, record)
+        prepare_torch()
+        slam = continue_map(earlier, config, source, folder) if earlier else Slam(config, folder.submaps)
+        at_once = realtime or (source.live and config.realtime.live)
+        return _run_and_score(screen, StartPoint(slam), source, folder, run_options, viewer, robot_options, at_once)
 
 
 def resume(
@@ -126,6 +127,7 @@ def resume(
     """
     from sigmasplat.io.runs import RunFolder
     from sigmasplat.run.resume import resume as resumed
+    from sigmasplat.run.same_conditions import other_instruction_set
     from sigmasplat.run.step_logs import log_names
     from sigmasplat.run.terminal import Screen
 
@@ -134,8 +136,10 @@ def resume(
     screen, folder = Screen(), RunFolder.open(run)
     source = source_of(folder, moved_to)
     prepare_torch()
-    with _viewer(screen, run_options) as viewer:
+    with _viewer(screen, run_options) as viewer, folder.locked(screen.warn):
         start = resumed(folder, source)
+        if warning := other_instruction_set(folder):
+            screen.warn(warning)
         folder.note(status="running")
         screen.say(f"{source.name}: {resume_line(start.next_index, len(source))} → {folder.path}")
         return _run_and_score(screen, start, source, folder, run_options, viewer, robot_options)

@@ -1,29 +1,63 @@
-"""Write files completely or not at all: neither Ctrl-C nor a full disk leaves a partial file under its final name."""
+"""Write files completely or not at all: Ctrl-C, a full disk or a power failure leave no partial file under its final
+name."""
 
+import errno
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from sigmasplat.errors import RunError
 
+FULL = {errno.ENOSPC, errno.EDQUOT}
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; rename it to `path` if the block succeeds, else remove it.
+    """Yield a temporary path beside `path`; if the block succeeds, rename it to `path`, else remove it.
 
-    Raises RunError if the file cannot be written.
+    The content is on the disk before the rename, and the rename is on the disk when the block ends. Raises RunError if
+    the file cannot be written.
     """
-    temporary = path.with_name(f".{path.name}.part")
+    temporary = part_of(path)
     try:
         yield temporary
+        _sync(temporary)
         os.replace(temporary, path)
+        sync_folder(path.parent)
     except OSError as problem:
         temporary.unlink(missing_ok=True) if temporary.parent.is_dir() else None
-        raise RunError(f"cannot write {path}: {problem.strerror or problem}; choose a writable place") from problem
+        raise cannot_write(path, problem) from problem
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def part_of(path: Path) -> Path:
+    """Return the temporary path from which `path` is renamed."""
+    return path.with_name(f".{path.name}.part")
+
+
+def sync_file(path: Path) -> None:
+    """Wait until the content of a file is on the disk. Raises RunError if it cannot be written."""
+    try:
+        _sync(path)
+    except OSError as problem:
+        raise cannot_write(path, problem) from problem
+
+
+def _sync(path: Path) -> None:
+    file = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)
+
+
+def sync_folder(folder: Path) -> None:
+    """Wait until the names in a folder are on the disk; some file systems cannot do this, and nothing happens there."""
+    with suppress(OSError):
+        _sync(folder)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -32,9 +66,47 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def write_text_on_full_disk(path: Path, text: str) -> None:
+    """Write a short UTF-8 text file atomically; if the disk is full, write over the existing file.
+
+    That needs no space. Text shorter than the existing file is then padded with spaces. Raises RunError if it cannot
+    be written.
+    """
+    try:
+        write_text(path, text)
+    except RunError as problem:
+        if getattr(problem.__cause__, "errno", None) not in FULL or not path.is_file():
+            raise
+        earlier = path.read_bytes()
+        try:
+            _write_over(path, text.encode().ljust(len(earlier)))  # one call: a kill does not divide it
+        except OSError:
+            _write_over(path, earlier)
+            raise problem from None
+
+
+def _write_over(path: Path, content: bytes) -> None:
+    with path.open("r+b", buffering=0) as file:
+        written = file.write(content) or 0
+        if written < len(content):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        file.truncate()
+
+
+def cannot_write(path: Path, problem: OSError) -> RunError:
+    """Return the error of a file that cannot be written."""
+    return RunError(f"cannot write {path}: {problem.strerror or problem}; choose a writable place")
+
+
 def make_folder(path: Path) -> None:
-    """Create a folder and its parents unless they exist. Raises RunError if that is not possible."""
+    """Create a folder and its parents unless they exist; their names are then on the disk.
+
+    Raises RunError if that is not possible.
+    """
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as problem:
-        raise RunError(f"cannot write {path}: {problem.strerror or problem}; choose a writable place") from problem
+        raise cannot_write(path, problem) from problem
+    for folder in missing:
+        sync_folder(folder.parent)

@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from sigmasplat.errors import RunError
-from sigmasplat.io.atomic import write_text
+from sigmasplat.io.atomic import write_text, write_text_on_full_disk
 
 
 def to_json(value: Any) -> Any:
@@ -27,7 +27,16 @@ def to_json(value: Any) -> Any:
 
 def write_json(path: Path, values: Any) -> None:
     """Write a file atomically. Raises RunError if it cannot be written."""
-    write_text(path, json.dumps(to_json(values), indent=2, allow_nan=False) + "\n")
+    write_text(path, _json_text(values))
+
+
+def write_json_on_full_disk(path: Path, values: Any) -> None:
+    """Write a short file atomically, also if the disk is full (`write_text_on_full_disk`). Raises as `write_json`."""
+    write_text_on_full_disk(path, _json_text(values))
+
+
+def _json_text(values: Any) -> str:
+    return json.dumps(to_json(values), indent=2, allow_nan=False) + "\n"
 
 
 def read_json(path: Path) -> Any:

@@ -1,8 +1,8 @@
 """Write and read the folder of a run, which is valid at any time."""
 
 import shutil
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,15 +13,18 @@ from torch import Tensor
 from sigmasplat.config import Config
 from sigmasplat.errors import RunError
 from sigmasplat.io import machine, trajectory as tum, uncertainty as uncertainty_files
-from sigmasplat.io.atomic import replacing, write_text
+from sigmasplat.io.atomic import part_of, replacing, sync_file, write_text
+from sigmasplat.io.components import COMPONENT_FILES, component_numbers, write_components
 from sigmasplat.io.frames import RunFrames
-from sigmasplat.io.json_files import append_line, read_json, read_lines, write_json
+from sigmasplat.io.json_files import append_line, read_json, read_lines, write_json, write_json_on_full_disk
+from sigmasplat.io.leftovers import remove_leftovers
+from sigmasplat.io.lock import LOCK, locked, no_warning
 from sigmasplat.io.splats import ply
 from sigmasplat.io.submaps import DiskStore
 from sigmasplat.io.tensors import open_tensors, write_tensors
 from sigmasplat.model.component import Component
 from sigmasplat.model.field import GaussianField
-from sigmasplat.model.map_uncertainty import SPLAT_COLUMNS, VARIANCES, MapUncertainty, SplatStd
+from sigmasplat.model.map_uncertainty import MapUncertainty, SplatStd
 from sigmasplat.model.trajectory import Trajectory
 
 PROGRAM = "sigmasplat"
@@ -40,10 +43,10 @@ FILES = (
     "metrics.json", "profile.json", "report.html", TRUTH, uncertainty_files.JSON, uncertainty_files.TENSORS,
 )  # fmt: skip
 """Files that a run may have in addition to run.json, which always exists and identifies the folder as ours."""
-COMPONENTS, COMPONENT_FILES = "components", ("trajectory.txt", "map.ply")
-"""The folder of components that are not connected to the world, and the files of each."""
-PARTIAL_RUN_JSON = ".run.json.part"
-"""The only file of a run that was killed before its run.json was complete."""
+COMPONENTS = "components"
+"""The folder of components that are not connected to the world."""
+FIRST_FILES = {part_of(Path("run.json")).name, LOCK}
+"""The only files of a run that was killed before its run.json was complete."""
 
 
 @dataclass(frozen=True)
@@ -97,14 +100,19 @@ class RunFolder:
 
         With this order, a run that is killed at any time leaves a folder that the next run can overwrite.
         """
-        if self.path.exists() and not self.path.is_dir():
-            raise RunError(f"output {self.path} is a file; give a folder")
-        if self.path.is_dir() and any(entry.name != PARTIAL_RUN_JSON for entry in self.path.iterdir()):
-            self._refuse_to_clear(overwrite)
+        self.refuse_taken(self.path, overwrite)
         self.path.mkdir(parents=True, exist_ok=True)
         write_json(self.path / "run.json", facts)
         self._clear()
         self.images.mkdir(exist_ok=True)
+
+    @staticmethod
+    def refuse_taken(path: Path, overwrite: bool) -> None:
+        """Raise RunError if a new run cannot have this folder: it has other content, or a run that must be kept."""
+        if path.exists() and not path.is_dir():
+            raise RunError(f"output {path} is a file; give a folder")
+        if path.is_dir() and any(entry.name not in FIRST_FILES for entry in path.iterdir()):
+            RunFolder(path)._refuse_to_clear(overwrite)
 
     def _refuse_to_clear(self, overwrite: bool) -> None:
         """Raise RunError unless the folder is that of an earlier run and may be overwritten."""
@@ -130,6 +138,7 @@ class RunFolder:
         for picture in self.images.glob("*.png"):
             picture.unlink()
         shutil.rmtree(self.logs, ignore_errors=True)
+        self.remove_leftovers()
         self.submaps.clear()
         self.write_components(())
 
@@ -168,11 +177,26 @@ class RunFolder:
 
     def note(self, **facts: Any) -> None:
         """Add or change facts in run.json, for instance status="complete" or "interrupted", wall_s=…"""
-        write_json(self.path / "run.json", self.facts() | facts)
+        write_json_on_full_disk(self.path / "run.json", self.facts() | facts)
+
+    def locked(self, warn: Callable[[str], None] = no_warning) -> AbstractContextManager[None]:
+        """Hold the run while a block writes to it. Raises RunError if another process holds it (`io.lock`)."""
+        return locked(self.path, warn)
+
+    def remove_leftovers(self) -> None:
+        """Remove temporary files of killed processes, and the state of a complete run."""
+        remove_leftovers(self.path, self.images, self.submaps.folder, *(self.path / COMPONENTS).glob("*"))
+        if self.facts().get("status") == "complete":
+            self.state.unlink(missing_ok=True)
+            self.refinement.unlink(missing_ok=True)
 
     def log(self, record: dict[str, Any]) -> None:
         """Append one line to log.jsonl. Raises RunError if the file cannot be written."""
         append_line(self.path / "log.jsonl", record)
+
+    def sync_log(self) -> None:
+        """Wait until the lines of log.jsonl are on the disk. Raises RunError if they cannot be written."""
+        sync_file(self.path / "log.jsonl")
 
     def read_log(self) -> list[dict[str, Any]]:
         """Read the lines of log.jsonl; an incomplete last line, left by an interruption, is skipped.
@@ -216,32 +240,17 @@ class RunFolder:
         tum.write_trajectory(self.path / ALL_POSES, trajectory)
 
     def write_components(self, components: Sequence[Component]) -> None:
-        """Write components/N/trajectory.txt and map.ply of each component N that is not connected to the world.
-
-        Both are in the component's own frame. Files of components that are not given are removed.
-        """
-        for component in components:
-            folder = self._component(component.number)
-            folder.mkdir(parents=True, exist_ok=True)
-            tum.write_trajectory(folder / "trajectory.txt", component.trajectory)
-            ply.write_field(folder / "map.ply", component.field)
-        for number in set(self.component_numbers()) - {component.number for component in components}:
-            for name in COMPONENT_FILES:
-                (self._component(number) / name).unlink(missing_ok=True)
-            _remove_if_empty(self._component(number))
-        _remove_if_empty(self.path / COMPONENTS)
+        """Write components/, the path and map of each component that is not connected to the world; remove others."""
+        write_components(self.path / COMPONENTS, components)
 
     def component_numbers(self) -> list[int]:
         """Return the numbers of the components that are not connected to the world, in ascending order."""
-        return sorted(int(folder.name) for folder in (self.path / COMPONENTS).glob("*") if folder.name.isdecimal())
+        return component_numbers(self.path / COMPONENTS)
 
     def read_component(self, number: int) -> Component:
         """Read a component from components/. Raises RunError if a file is missing, SourceError if it is damaged."""
         trajectory, field = (self._existing(f"{COMPONENTS}/{number}/{name}") for name in COMPONENT_FILES)
         return Component(number, ply.read_field(field), tum.read_trajectory(trajectory))
-
-    def _component(self, number: int) -> Path:
-        return self.path / COMPONENTS / str(number)
 
     def write_map(self, field: GaussianField) -> None:
         """Write map.ply (3DGS PLY, world frame)."""
@@ -276,12 +285,8 @@ class RunFolder:
         Raises RunError if a file is damaged, or does not have one row for each splat.
         """
         uncertainty = self.read_uncertainty()
-        if uncertainty is None:
-            return None
-        std, (rows, columns) = uncertainty.std, uncertainty.splats.shape
-        fits = std is None or std.depth_std_m.shape == std.color_std.shape == (len(field),)
-        if rows != len(field) or columns not in (VARIANCES, len(SPLAT_COLUMNS)) or not fits:
-            raise RunError(f"{self.path} has uncertainties of {rows} rows for {len(field)} splats; run it again")
+        if uncertainty is not None:
+            uncertainty_files.refuse_misfit(self.path, uncertainty, len(field))
         return uncertainty
 
     def map_bytes(self) -> int:
@@ -343,8 +348,3 @@ class RunFolder:
         if not isinstance(values, dict):
             raise RunError(f"{self.path / name} is not a JSON object")
         return values
-
-
-def _remove_if_empty(folder: Path) -> None:
-    with suppress(OSError):
-        folder.rmdir()

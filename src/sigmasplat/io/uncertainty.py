@@ -11,6 +11,7 @@ from sigmasplat.model.map_uncertainty import (
     COLOR_PARTS,
     DEPTH_PARTS,
     SPLAT_COLUMNS,
+    VARIANCES,
     Background,
     Calibration,
     MapUncertainty,
@@ -62,3 +63,11 @@ def read_uncertainty(folder: Path) -> MapUncertainty | None:
 def _weight(weights: Mapping[str, float], name: str) -> float:
     """Return the weight of a part; 0 for a part that runs of older versions do not have."""
     return float(weights.get(name, 0.0) if name in ADDED_PARTS else weights[name])
+
+
+def refuse_misfit(folder: Path, uncertainty: MapUncertainty, splats: int) -> None:
+    """Raise RunError unless the uncertainty of a run has one row for each splat of its map."""
+    std, (rows, columns) = uncertainty.std, uncertainty.splats.shape
+    fits = std is None or std.depth_std_m.shape == std.color_std.shape == (splats,)
+    if rows != splats or columns not in (VARIANCES, len(SPLAT_COLUMNS)) or not fits:
+        raise RunError(f"{folder} has uncertainties of {rows} rows for {splats} splats; run it again")

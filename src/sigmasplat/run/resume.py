@@ -11,6 +11,7 @@ from sigmasplat.io.json_files import read_text
 from sigmasplat.io.runs import RunFolder
 from sigmasplat.io.state import read_state, write_state
 from sigmasplat.model.field import GaussianField, Rows
+from sigmasplat.run.same_conditions import refuse_other_sequence
 from sigmasplat.run.session import run_now
 from sigmasplat.slam.refinement import Refined
 from sigmasplat.slam.slam import Slam
@@ -50,6 +51,7 @@ class StateFile:
     def save(self, index: int, wall_s: float) -> None:
         """Write the state after source frame `index`. Raises RunError if it cannot be written."""
         started_s, tree = time.perf_counter(), state_of(self.slam) | {"index": index, "wall_s": wall_s}
+        self.run.sync_log()  # the state needs these lines, also after a power failure
         write_state(self.run.state, tree, CLASSES, fixed(self.slam))
         self.last_s = time.perf_counter()
         self.took_s = self.last_s - started_s
@@ -102,10 +104,13 @@ class StartPoint:
 def resume(run: RunFolder, source: Source) -> StartPoint:
     """Restore SLAM from the run's last saved state, and remove what the run wrote after it.
 
-    Raises RunError if the run is complete, has no state, or has fewer files than its state requires.
+    Raises RunError if the run is complete, has no state, was made from another sequence, or has fewer files than its
+    state requires.
     """
     if run.facts().get("status") == "complete":
         raise RunError(f"{run.path} is complete, so it cannot be resumed; to repeat it, use run --overwrite")
+    refuse_other_sequence(run, source)
+    run.remove_leftovers()
     config = run.config()
     slam = Slam(config, run.submaps)
     camera = source.camera.prepared(config.input.width, config.input.crop_px)

@@ -5,18 +5,17 @@ write a checkpoint; make the final map; write the results. The command (`command
 and scores the run afterwards.
 """
 
-import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from sigmasplat.config import Config
 from sigmasplat.errors import RunError
+from sigmasplat.io.lock import LOCK, locked, no_warning
 from sigmasplat.io.runs import ALL_POSES, RunFolder
 from sigmasplat.model.component import RELOCALISED
 from sigmasplat.model.frame import Frame
@@ -29,6 +28,8 @@ from sigmasplat.run.protocols import (
     SlamSystem,
     StepResult,
 )
+from sigmasplat.run.same_conditions import start_facts
+from sigmasplat.run.signals import interrupt_event
 from sigmasplat.sources.base import Source
 
 RUNS = Path("runs")
@@ -39,14 +40,48 @@ def new_folder(
 ) -> RunFolder:
     """Create a run folder and write facts to its run.json; the default is runs/SOURCE-PRESET, numbered if it exists.
 
-    keep: a run that must not be overwritten. Raises RunError if the folder cannot be written, is `keep`, or is not
-    empty and may not be overwritten.
+    keep: a run that must not be overwritten. Raises RunError if the folder cannot be written, is `keep`, is in use by
+    another process, or is not empty and may not be overwritten.
     """
+    path = _new_path(out, config, source, overwrite, keep)
+    with locked(path):
+        return _created(path, config, source, overwrite, facts)
+
+
+@contextmanager
+def new_run(
+    out: Path | None,
+    config: Config,
+    source: Source,
+    overwrite: bool = False,
+    keep: Path | None = None,
+    warn: Callable[[str], None] = no_warning,
+    **facts: Any,
+) -> Iterator[RunFolder]:
+    """Yield a new run folder as `new_folder` does, and hold its lock during the block (`io.lock`).
+
+    A folder without results is removed if the block fails (`removed_on_early_failure`). Raises as `new_folder`.
+    """
+    path = _new_path(out, config, source, overwrite, keep)
+    with locked(path, warn):
+        folder = _created(path, config, source, overwrite, facts)
+        with removed_on_early_failure(folder):
+            yield folder
+
+
+def _new_path(out: Path | None, config: Config, source: Source, overwrite: bool, keep: Path | None) -> Path:
+    """Return the path of a new run folder. Raises RunError if it is `keep`, or may not be written."""
     plain_name = "".join(c if c.isalnum() or c in "._-" else "-" for c in source.name).strip("-.") or "run"
     default = RUNS / f"{plain_name}-{config.name}"
     path = out or (default if overwrite else unused_path(default))
     if keep and path.resolve() == keep.resolve():
         raise RunError(f"output {path} is the run that --onto continues, which is never changed; give another --out")
+    RunFolder.refuse_taken(path, overwrite)
+    return path
+
+
+def _created(path: Path, config: Config, source: Source, overwrite: bool, facts: dict[str, Any]) -> RunFolder:
+    facts = start_facts(source) | facts
     folder = RunFolder.create(path, config, source.name, overwrite)
     folder.note(**facts)
     return folder
@@ -74,9 +109,10 @@ def removed_on_early_failure(run: RunFolder) -> Iterator[None]:
         # run.json goes last: it marks the folder as ours, so that after a kill in between --overwrite still accepts it.
         written_first = [run.path / "config.json", run.path / "run.json"]
         copied = {run.submaps.folder, *run.submaps.folder.glob("*")}
-        if {*run.path.rglob("*")} <= {run.images, *written_first, *copied}:
+        lock = run.path / LOCK
+        if {*run.path.rglob("*")} <= {run.images, lock, *written_first, *copied}:
             run.submaps.clear()
-            for file in written_first:
+            for file in (*written_first, lock):
                 file.unlink(missing_ok=True)
             for folder in (run.images, run.path, RUNS):
                 with suppress(OSError):
@@ -153,9 +189,14 @@ class Session:
         The results are also written if the session is interrupted. The first Ctrl-C stops after the current frame, or
         at the next progress report of the final map; a second one stops immediately. Both end as "interrupted", and a
         session interrupted between frames makes no final map. A live source ends only with Ctrl-C: the first one ends
-        its frames, and the final map is made. Any other exception marks the run as "failed" and gets a note with the
-        path of the run folder.
+        its frames, and the final map is made. SIGTERM and SIGHUP do the same as Ctrl-C. Any other exception marks the
+        run as "failed" and gets a note with the path of the run folder. Raises RunError if another process holds the
+        run folder.
         """
+        with self.run.locked():
+            return self._execute()
+
+    def _execute(self) -> Outcome:
         if self.first_index:
             self._count_earlier_frames()
         status = "failed"
@@ -172,12 +213,26 @@ class Session:
                 problem.add_note(f"the run up to frame {self.frames} is in {self.run.path}")
             raise
         finally:
-            self._write_results()
-            dropped = {} if self.source.arrived_s is None else {"dropped": self.source.dropped}
-            self.run.note(status=status, wall_s=self.wall_s, skipped=self.source.skipped, **dropped)
+            self._end(status)
         if status == "complete":
             self.checkpointer.delete()
         return self._outcome(status)
+
+    def _end(self, status: str) -> None:
+        """Write the results and the status.
+
+        The status is "interrupted" (or "failed") until the results are complete, and stays so if they cannot be
+        written: the run can be resumed.
+        """
+        dropped = {} if self.source.arrived_s is None else {"dropped": self.source.dropped}
+        ending = {"wall_s": self.wall_s, "skipped": self.source.skipped, **dropped}
+        self.run.note(status="failed" if status == "failed" else "interrupted", **ending)
+        try:
+            self._write_results()
+        except BaseException as problem:
+            self.run.note(status="interrupted" if isinstance(problem, KeyboardInterrupt) else "failed")
+            raise
+        self.run.note(status=status)
 
     def _count_earlier_frames(self) -> None:
         """Restore the counts of a resumed run from its log."""
@@ -239,6 +294,7 @@ class Session:
         """Write the results of the frames so far. The maps are the last files because they take longest."""
         if self.frames == 0:
             return
+        self.run.sync_log()
         path, components = self.slam.trajectory(), self.slam.components()
         self.apart = tuple(len(component.trajectory) for component in components)
         self.run.write_trajectory(path.at(self.slam.believed()))
@@ -279,25 +335,3 @@ def log_line(step: StepResult) -> dict[str, Any]:
         "T_world_camera": step.T_world_camera,
     }
     return line | {"loops": [loop.record() for loop in step.loops]} if step.loops else line
-
-
-@contextmanager
-def interrupt_event() -> Iterator[threading.Event]:
-    """Convert the first Ctrl-C to an event, so that no step is interrupted; the next one raises KeyboardInterrupt.
-
-    Outside the main thread signals cannot be handled, and the event is never set.
-    """
-    interrupt = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield interrupt
-        return
-
-    def on_signal(signum: int, frame: FrameType | None) -> None:
-        interrupt.set()
-        signal.signal(signal.SIGINT, earlier)
-
-    earlier = signal.signal(signal.SIGINT, on_signal)
-    try:
-        yield interrupt
-    finally:
-        signal.signal(signal.SIGINT, earlier)

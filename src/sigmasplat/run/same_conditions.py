@@ -1,0 +1,99 @@
+"""Compare the sequence and the machine of a resumed run with those it was started with."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from sigmasplat import env
+from sigmasplat.errors import RunError
+from sigmasplat.io.frames import SAME_TIME_S
+from sigmasplat.io.json_files import read_lines
+from sigmasplat.io.runs import RunFolder
+from sigmasplat.sources.base import Source
+
+SAME_SHARE = 1e-6
+"""Numbers of a calibration that differ by less are equal: a recording has them as text."""
+
+
+def start_facts(source: Source) -> dict[str, Any]:
+    """Return what run.json keeps to recognise the sequence when the run is resumed, and the kernels' instruction set.
+
+    A live camera is compared by its image size and intrinsics alone: its recording has its own depth unit.
+    """
+    facts: dict[str, Any] = {"camera": asdict(source.camera), "isa": instruction_set()}
+    if not source.live:
+        facts |= {"source_frames": len(source), "depth_units_per_metre": source.depth_units_per_metre}
+    return facts
+
+
+def refuse_other_sequence(run: RunFolder, source: Source) -> None:
+    """Raise RunError, with the first difference, unless a source has the camera and the frames of a run's start."""
+    facts = run.facts()
+    difference = _other_camera(facts, source) or _other_frame(run, source) or _other_length(facts, source)
+    if difference:
+        raise RunError(
+            f"{run.path} cannot be resumed, because its sequence has changed: {difference}; give the original one "
+            "(--source PATH), or start again with: sigmasplat run"
+        )
+
+
+def _other_camera(facts: Mapping[str, Any], source: Source) -> str:
+    noted = dict(facts.get("camera") or {})
+    found: dict[str, Any] = asdict(source.camera)
+    if "depth_units_per_metre" in facts:
+        noted["depth_units_per_metre"] = facts["depth_units_per_metre"]
+        found["depth_units_per_metre"] = source.depth_units_per_metre
+    for name, value in noted.items():
+        if not _same(value, found.get(name)):
+            return f"{name} is {_text(found.get(name))}, it was {_text(value)}"
+    return ""
+
+
+def _other_frame(run: RunFolder, source: Source) -> str:
+    """Compare the times of the logged frames."""
+    log = run.path / "log.jsonl"
+    for record in read_lines(log) if log.is_file() else ():
+        index, time_s = record["index"], record["timestamp_s"]
+        if index >= len(source):
+            return f"it has {len(source)} frames, but frame {index} was already processed"
+        found_s = source.timestamp_s(index)
+        if abs(found_s - time_s) > SAME_TIME_S:
+            return f"frame {index} is of {found_s:.6f} s, it was of {time_s:.6f} s"
+    return ""
+
+
+def _other_length(facts: Mapping[str, Any], source: Source) -> str:
+    noted = facts.get("source_frames", len(source))
+    return "" if noted == len(source) else f"it has {len(source)} frames, it had {noted}"
+
+
+def _same(noted: Any, found: Any) -> bool:
+    if isinstance(noted, int | float) and isinstance(found, int | float):
+        return math.isclose(noted, found, rel_tol=SAME_SHARE, abs_tol=SAME_SHARE)
+    return bool(noted == found)
+
+
+def _text(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def instruction_set() -> str | None:
+    """Return the instruction set of the kernels; None if they are not built."""
+    try:
+        from sigmasplat.native import _core
+    except ImportError:
+        return None
+    asked = env.switches().isa
+    return _core.isa_name() if asked == "auto" else asked
+
+
+def other_instruction_set(run: RunFolder) -> str:
+    """Return the warning for a run that was started with other kernels than those of this process, else ""."""
+    noted, found = run.facts().get("isa"), instruction_set()
+    if noted in (None, found):
+        return ""
+    return (
+        f"the run was started with the {noted} kernels and goes on with {found}, so its result will differ a little "
+        f"from that of an uninterrupted run; for equal results set SIGMASPLAT_ISA={noted}"
+    )
