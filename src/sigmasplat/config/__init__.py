@@ -17,7 +17,10 @@ from sigmasplat.config.recovery import RecoveryConfig
 from sigmasplat.config.submaps import FinalConfig, LoopConfig, RegistrationConfig, SubmapConfig
 from sigmasplat.config.surface import SurfaceConfig
 from sigmasplat.config.uncertainty import UncertaintyConfig
+from sigmasplat.config.value_types import of_types
 from sigmasplat.errors import ConfigError
+from sigmasplat.reading.guard import guarded
+from sigmasplat.reading.structured import read_json
 
 __all__ = [
     "Config", "DensifyConfig", "FeatureConfig", "FinalConfig", "InputConfig", "LoopConfig", "MappingConfig",
@@ -93,13 +96,15 @@ class Config:
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "Config":
-        """Make settings from nested dicts. Raises ConfigError on an unknown name."""
+        """Make settings from nested dicts. Raises ConfigError on an unknown name or a section that is not a dict."""
         sections: dict[str, Any] = {}
         known = {f.name: f for f in dataclasses.fields(Config)}
         for name, value in values.items():
             if name not in known:
                 raise ConfigError(f"unknown setting {name!r} (known: {', '.join(known)})")
-            if isinstance(value, dict):
+            if dataclasses.is_dataclass(getattr(Config(), name)):
+                if not isinstance(value, dict):
+                    raise ConfigError(f"setting {name!r} is {str(value)[:60]}, not a section with settings")
                 section = type(getattr(Config(), name))
                 names = {f.name for f in dataclasses.fields(section)}
                 unknown = set(value) - names
@@ -107,14 +112,15 @@ class Config:
                     raise ConfigError(
                         f"unknown setting {name}.{sorted(unknown)[0]} (known: {', '.join(sorted(names))})"
                     )
-                value = section(**value)
+                value = section(**of_types(section, value, f"{name}."))
             sections[name] = value
-        return Config(**sections)
+        return Config(**of_types(Config, sections, ""))
 
     @staticmethod
     def load(path: Path) -> "Config":
         """Read a config.json. Raises ConfigError if it is missing, not JSON, or has unknown settings."""
-        try:
-            return Config.from_dict(json.loads(path.read_text()))
-        except (OSError, json.JSONDecodeError) as problem:
-            raise ConfigError(f"cannot read settings from {path}: {problem}") from problem
+        values = read_json(path, ConfigError)
+        if not isinstance(values, dict):
+            raise ConfigError(f"cannot read settings from {path}: it holds {str(values)[:60]}, not a JSON object")
+        with guarded(path, "write the settings again", ConfigError, "a setting has a value of another type"):
+            return Config.from_dict(values)
