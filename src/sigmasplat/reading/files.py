@@ -59,10 +59,12 @@ def read_text(
     """
     data = read_bytes(path, error, most)
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) and errors == "strict":
-        raise error(f"{path}: not readable as text: it is UTF-16; save it as UTF-8")
+        raise error(f"cannot read {path}: it is UTF-16; save it as UTF-8")
     try:
         text = data.removeprefix(codecs.BOM_UTF8).decode("utf-8", errors)
     except UnicodeDecodeError as problem:
         line = data.count(b"\n", 0, problem.start) + 1
-        raise error(f"{path}:{line}: not readable as text ({cause(problem)}); save it as UTF-8") from problem
+        raise error(
+            f"cannot read {path}:{line}: not readable as text ({cause(problem)}); save it as UTF-8"
+        ) from problem
     return text.replace("\r\n", "\n").replace("\r", "\n")

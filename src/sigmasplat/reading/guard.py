@@ -2,6 +2,7 @@
 
 import csv
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -11,7 +12,8 @@ from sigmasplat.errors import SigmaSplatError
 
 DAMAGED: tuple[type[Exception], ...] = (
     OSError, ValueError, ArithmeticError, LookupError, TypeError, AttributeError, AssertionError, SyntaxError, EOFError,
-    MemoryError, RuntimeError, csv.Error, struct.error, zlib.error, zipfile.BadZipFile, zipfile.LargeZipFile,
+    MemoryError, RuntimeError, StopIteration, tokenize.TokenError, csv.Error, struct.error, zlib.error,
+    zipfile.BadZipFile, zipfile.LargeZipFile,
 )  # fmt: skip
 """What parsers raise on damaged or hostile content: the standard library, numpy, Pillow, safetensors and others.
 RuntimeError includes RecursionError and NotImplementedError, ValueError includes UnicodeDecodeError."""

@@ -71,7 +71,9 @@ class Bag:
 
     def first_message(self, name: str) -> Message:
         """Read the first message of a topic. Raises SourceError if it is damaged."""
-        return next(self.messages(name))
+        for message in self.messages(name):
+            return message
+        raise SourceError(f"{self.path}: unreadable bag (topic {name} has no message); copy it again")
 
     def messages(self, name: str) -> Iterator[Message]:
         """Read the messages of a topic in recording order. Raises SourceError if one is damaged."""
