@@ -64,7 +64,5 @@ def read_text(
         text = data.removeprefix(codecs.BOM_UTF8).decode("utf-8", errors)
     except UnicodeDecodeError as problem:
         line = data.count(b"\n", 0, problem.start) + 1
-        raise error(
-            f"cannot read {path}:{line}: not readable as text ({cause(problem)}); save it as UTF-8"
-        ) from problem
+        raise error(f"cannot read {path}:{line}: it is not text ({cause(problem)}); save it as UTF-8") from problem
     return text.replace("\r\n", "\n").replace("\r", "\n")

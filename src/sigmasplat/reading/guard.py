@@ -30,7 +30,9 @@ def guarded(where: object, remedy: str, error: type[SigmaSplatError], what: str 
     try:
         yield
     except DAMAGED as problem:
-        raise error(f"{where}: {what} ({cause(problem)}); {remedy}") from problem
+        name = problem.filename if isinstance(problem, OSError) else None
+        file = "" if name is None or str(name) in str(where) else f": {str(name)[-MOST_CHARACTERS:]}"
+        raise error(f"{where}: {what} ({cause(problem)}{file}); {remedy}") from problem
 
 
 def cause(problem: BaseException) -> str:
