@@ -13,6 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from sigmasplat.reading.guard import DAMAGED
+
 Files = dict[str, bytes]
 PIPE, FOLDER, LOOP, BROKEN, ZERO = (f"\0{kind}".encode() for kind in ("pipe", "folder", "loop", "broken", "zero"))
 """Contents that stand for other entries than files: written by `write_files`."""
@@ -87,7 +89,7 @@ def _content(name: str, data: bytes, rng: random.Random) -> bytes:
     if structured and rng.random() < 0.6:
         try:
             return structured(data, rng)
-        except (ValueError, IndexError, KeyError, struct.error, zipfile.BadZipFile, OSError, EOFError, RecursionError):
+        except DAMAGED:
             return _bytes(data, rng)
     if name.endswith(TEXT_ENDINGS) and rng.random() < 0.7:
         return _text(data, rng)

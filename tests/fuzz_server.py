@@ -116,6 +116,7 @@ def _run_in_child(arguments: Sequence[str], errors: Path, folder: Path) -> None:
         os.dup2(null, 0)
         os.dup2(null, 1)
         os.dup2(file, 2)
+        sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
         before = _status("VmRSS")
         with open("/proc/self/clear_refs", "w") as reset:  # 5: the peak starts again
             reset.write("5")
