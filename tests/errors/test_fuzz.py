@@ -18,7 +18,7 @@ pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built
 for module in ("cv2", "rosbags", "lzfse", "OpenEXR"):
     pytest.importorskip(module)
 
-INPUTS, SEED = 120, 0
+INPUTS, SEED = 80, 0
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.io.run_values import REQUIRED, check_fields
 from sigmasplat.model.component import LOST, TRACKED, outside_world, states_at_end, submaps_outside
 from sigmasplat.model.trajectory import Trajectory
 
@@ -39,10 +38,7 @@ class RunFrames:
 
         In runs of old releases the log has no states and the trajectory contains the lost frames too. Their poses are
         not believed. If their trajectory is shorter than the log, only the frames before its end count.
-        Raises RunError if a record has no time.
         """
-        for number, record in enumerate(log, 1):
-            check_fields(record, {}, REQUIRED, f"log.jsonl:{number}")
         rows, poses = _common(log, trajectory.timestamps_s)
         if not any("state" in record for record in log):
             log = log[: rows[-1] + 1] if len(rows) else []

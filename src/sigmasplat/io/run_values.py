@@ -61,8 +61,6 @@ LOG: Mapping[str, Test] = {
     "T_world_camera": _pose, "loops": _records,
 }  # fmt: skip
 """Values of a line of log.jsonl."""
-REQUIRED = ("timestamp_s", "is_keyframe")
-"""Those that the path of a run needs; the logs of all versions have them."""
 FACTS: Mapping[str, Test] = {
     "source": is_kind(str), "source_path": is_kind(str), "status": is_kind(str), "skipped": _texts,
     "wall_s": _number_or_null, "finish_s": _number_or_null, "final_steps": _number_or_null, "machine": is_kind(dict),
@@ -93,11 +91,21 @@ def check_fields(values: Any, tests: Mapping[str, Test], required: tuple[str, ..
     return checked
 
 
+class Record(dict[str, Any]):
+    """A line of log.jsonl; a missing field raises RunError. Logs of older versions lack some fields."""
+
+    def __init__(self, values: Mapping[str, Any], where: str) -> None:
+        super().__init__(values)
+        self.where = where
+
+    def __missing__(self, name: str) -> Any:
+        raise RunError(f"{self.where}: field {name!r} is missing; {REMEDY}")
+
+
 def check_log(records: list[Any], path: Path) -> list[dict[str, Any]]:
     """Return the records of a log. Raises RunError naming the line of a wrong value."""
-    for number, record in enumerate(records, 1):
-        check_fields(record, LOG, (), f"{path}:{number}")
-    return records
+    places = (f"{path}:{number}" for number in range(1, len(records) + 1))
+    return [Record(check_fields(record, LOG, (), where), where) for record, where in zip(records, places, strict=True)]
 
 
 class Tensors(dict[str, Tensor]):
