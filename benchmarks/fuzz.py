@@ -70,7 +70,7 @@ def main() -> None:
             "inputs": counts.total(), "seconds": seconds, "seed": given.seed, **{kind: counts[kind] for kind in kinds},
             "samples": {name: dict(sorted(each.items())) for name, each in sorted(by_sample.items())},
         }  # fmt: skip
-        record.write(record.results("fuzz", figures, {"count": given.count, "seed": given.seed}))
+        record.write(record.results("fuzz", figures, seeds=[given.seed]))
     sys.exit(bool(sum(counts[kind] for kind in fuzz_server.FAILURES)))
 
 
